@@ -1,9 +1,10 @@
 """The speed of the service: samples per second end to end, latency, memory, and its parts.
 
     python benchmarks/service.py                 all parts at a small size, some two minutes
-    python benchmarks/service.py mqtt            one part: journal, engine, mqtt, http, units, soak, fuzz
+    python benchmarks/service.py mqtt            one part: journal, engine, mqtt, latency, http, units, soak, fuzz
     python benchmarks/service.py soak --seconds 900
     python benchmarks/service.py fuzz --count 100000
+    chrt -r 1 python benchmarks/service.py latency         where other programs use the processor too
     python benchmarks/service.py --quick         the parts that need no broker, in seconds
 
 The model is ARX(1, 1), tracked by Kalman(q=1e-4, r=0.1), with times; each sample is journaled before the update. The
@@ -36,6 +37,7 @@ from driftfit.service.core.engine import Engine
 from driftfit.service.settings.config import parse
 from driftfit.service.sources.incoming import INCOMING, decoded
 from driftfit.service.sources.samples import Batch, decode
+from driftfit.service.supervisor import cut_the_tail
 from driftfit.service.threads import SinkThread, SourceThread
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
@@ -182,9 +184,9 @@ def send(broker, messages, size, units, rate=1_000_000):
 
 
 def mqtt(options, folder):
-    """Over MQTT: the floor, a consumer by hand, the service without and with a sink; then latencies at a rate."""
+    """Over MQTT: the floor, a consumer by hand, the service without and with a sink."""
     known = importlib.util.find_spec("filterpy") is not None
-    print(f"{'mqtt: samples in a message, handler':<44}{'samples/s':>10}{'CPU us':>8}  client decode engine   sink")
+    print(f"{'mqtt: samples in a message, handler':<44}{'samples/s':>10}{'CPU us':>8}  source engine   sink")
     for size, messages in ((1, 20_000), (20, 20_000)):
         broker, count = Broker(folder), messages * size
         line(f"{size}, empty (the floor)", count, listened(broker, messages, size, options.units, lambda *_: None))
@@ -194,12 +196,17 @@ def mqtt(options, folder):
             found = served(broker, folder / f"{what}{size}", messages, size, options.units, sink=what)
             line(f"{size}, the service, sink {what}", count, found[:2], found[3])
         broker.process.terminate()
+
+
+def latency(options, folder):
+    """Seconds from the arrival of a message to its result, and until it is in the sink, at two rates."""
     for rate in (5_000, 20_000):
         broker = Broker(folder)
         *_, found, _ = served(broker, folder / f"at{rate}", rate // 4, 20, options.units, rate // 20)
         broker.process.terminate()
-        what = f"mqtt at {rate} samples/s in messages of 20: p50, p99 (ms)"
-        say(what, f"{found['p50'] * 1e3:.1f} {found['p99'] * 1e3:.1f}")
+        for name, key in (("result", ""), ("sink", "sink ")):
+            what = f"mqtt at {rate} samples/s in messages of 20, to {name}: p50, p99 (ms)"
+            say(what, f"{found[f'{key}p50'] * 1e3:.1f} {found[f'{key}p99'] * 1e3:.1f}")
 
 
 def line(what, count, found, stages=None):
@@ -263,7 +270,7 @@ def listened(broker, messages, size, units, handle):
     return found
 
 
-STAGES = ("paho", "driftfit-source", "engine", "driftfit-sink")
+STAGES = ("driftfit-source", "engine", "driftfit-sink")
 """How the names of the threads begin."""
 
 
@@ -289,17 +296,20 @@ def served(broker, folder, messages, size, units, rate=1_000_000, sink="sqlite")
     for thread in (*runners, worker):
         thread.start()
     time.sleep(1.0)
+    cut_the_tail()
     sender, before = send(broker, messages, size, units, rate), one.samples
     while one.samples == before:
         time.sleep(0.01)
     begun, cpu, first = time.perf_counter(), time.process_time(), clocks()
-    one.latencies.clear()
+    for each in (one, *runners[1:]):
+        each.latencies.clear()
     while time.perf_counter() - begun < 300 and (
         one.samples - before < messages * size or any(sink.count < messages * size for sink in runners[1:])
     ):
         time.sleep(0.01)
     last = clocks()
-    found = time.perf_counter() - begun, time.process_time() - cpu, one.status()
+    status = one.status() | {f"sink {key}": value for sink in runners[1:] for key, value in sink.status().items()}
+    found = time.perf_counter() - begun, time.process_time() - cpu, status
     for runner in runners:
         runner.stop()
     one.stop()
@@ -417,7 +427,16 @@ def fuzz(options, folder):
     one.close()
 
 
-PARTS = {"journal": journal, "engine": engine, "mqtt": mqtt, "http": http, "units": units, "soak": soak, "fuzz": fuzz}
+PARTS = {
+    "journal": journal,
+    "engine": engine,
+    "mqtt": mqtt,
+    "latency": latency,
+    "http": http,
+    "units": units,
+    "soak": soak,
+    "fuzz": fuzz,
+}
 
 
 def main():
@@ -431,7 +450,7 @@ def main():
     options = parser.parse_args()
     if options.quick:
         options.parts, options.units, options.count = ["journal", "engine", "fuzz"], 20, 500
-    for name in options.parts or PARTS:
+    for name in options.parts or [name for name in PARTS if name != "soak"]:
         with tempfile.TemporaryDirectory(prefix="driftfit-benchmark-", dir=os.environ.get("TMPDIR")) as folder:
             PARTS[name](options, Path(folder))
 

@@ -1,7 +1,8 @@
 """Fleets on Spark: rows per second of batch and streams, beside the floor and beside the obvious ways.
 
 All on local[2] in one run, with n = 4, forty rows per unit, and results written nowhere ("noop"), so that what is
-measured is Spark's shuffle, the passage to Python and back, and the step:
+measured is Spark's shuffle, the passage to Python and back, and the step. Seconds by the clock depend on what else the
+machine does, so the CPU of Java and of the Python workers is counted too:
 
     floor          the same shuffle and sort, and `mapInArrow` returning columns of the same bytes without a step
     spark.track    a row of results per sample
@@ -12,7 +13,7 @@ measured is Spark's shuffle, the passage to Python and back, and the step:
 
     python -m benchmarks.spark             1,000 to 50,000 units
     python -m benchmarks.spark streams     a part: step, batch, streams, equal
-    python -m benchmarks.spark --quick     200 and 1,000 units
+    python -m benchmarks.spark --quick     100 units
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
@@ -48,14 +49,27 @@ def rows_of(units: int, each: int, begin: float = 0.0, seed: int = 0) -> pl.Data
     return pl.DataFrame({"unit": unit, "t": t, "y": rng.normal(size=len(t)), "u": rng.normal(size=len(t))})
 
 
-def seconds(run: Callable[[], Any], best: int = 2) -> float:
-    """The shorter of some runs."""
+class Took(NamedTuple):
+    """Seconds by the clock, and of CPU of Java and of Python workers."""
+
+    wall: float
+    java: float
+    python: float
+
+    @property
+    def cpu(self) -> float:
+        return self.java + self.python
+
+
+def measured(run: Callable[[], Any], best: int = 2) -> Took:
+    """The least of some runs."""
     found = []
     for _ in range(best):
-        begin = time.perf_counter()
+        before, begin = used(), time.perf_counter()
         run()
-        found.append(time.perf_counter() - begin)
-    return min(found)
+        wall, after = time.perf_counter() - begin, used()
+        found.append((wall, after[0] - before[0], after[1] - before[1]))
+    return Took(*map(min, zip(*found, strict=True)))
 
 
 def nowhere(frame: Any) -> None:
@@ -123,29 +137,34 @@ def step() -> None:
 
 
 def batch(session: Any, folder: Path, sizes: list[int]) -> None:
-    """Rows per second of a table."""
-    print(f"{'units':>8} {'rows':>9} {'floor':>11} {'spark.track':>12} {'times':>6} {'summary':>11}   rows per second")
+    """Rows per second of a table, and CPU per row."""
+    print(f"{'':>18} {'rows per second':>35} {'us of CPU per row':>35}")
+    names = f"{'floor':>11} {'track':>11} {'summary':>11}"
+    print(f"{'units':>8} {'rows':>9} {names} {'floor':>9} {'track':>9} {'times':>5} {'summary':>9}")
     for units in sizes:
         path = folder / f"table{units}.parquet"
         rows_of(units, EACH).write_parquet(path, row_group_size=100_000)
         frame = session.read.parquet(str(path))
         run = lambda frame, **more: nowhere(bridge.track(frame, MODEL, TRACKER, **COLUMNS, **more))  # noqa: E731
-        base = seconds(lambda: nowhere(floor(frame)))  # noqa: B023
-        full = seconds(lambda: run(frame))  # noqa: B023
-        short = seconds(lambda: run(frame, outputs="summary"))  # noqa: B023
+        base = measured(lambda: nowhere(floor(frame)))  # noqa: B023
+        full = measured(lambda: run(frame))  # noqa: B023
+        short = measured(lambda: run(frame, outputs="summary"))  # noqa: B023
         count = units * EACH
-        rates = f"{count / base:>11,.0f} {count / full:>12,.0f} {full / base:>6.2f} {count / short:>11,.0f}"
-        print(f"{units:>8} {count:>9} {rates}")
+        rates = " ".join(f"{count / one.wall:>11,.0f}" for one in (base, full, short))
+        each = [1e6 * one.cpu / count for one in (base, full, short)]
+        cpu = f"{each[0]:>9.2f} {each[1]:>9.2f} {each[1] / each[0]:>5.2f} {each[2]:>9.2f}"
+        print(f"{units:>8} {count:>9} {rates} {cpu}", flush=True)
 
 
 def obvious(session: Any, folder: Path, units: int) -> None:
-    """Rows per second of one call per unit, on the smallest table."""
+    """The same of one call per unit, on a part of the smallest table."""
     frame = session.read.parquet(str(folder / f"table{units}.parquet"))
-    some = frame.where(f"unit < 'meter {units // 5:07d}'")
+    some, count = frame.where(f"unit < 'meter {units // 5:07d}'"), units // 5 * EACH
     made = f"{SCHEMA}, a1 double, e double"
     for name, function in (("applyInPandas, track", by_track), ("applyInPandas, statsmodels", by_statsmodels)):
-        wall = seconds(lambda: nowhere(some.groupBy("unit").applyInPandas(function, made)), 1)  # noqa: B023
-        print(f"{name:<28} {units // 5 * EACH / wall:>11,.0f} rows per second")
+        took = measured(lambda: nowhere(some.groupBy("unit").applyInPandas(function, made)), 1)  # noqa: B023
+        rate, cpu = f"{count / took.wall:,.0f} rows per second", f"{1e6 * took.cpu / count:.0f} us of CPU per row"
+        print(f"{name:<28} {rate:>26} {cpu:>26}", flush=True)
 
 
 def used() -> tuple[float, float]:
@@ -209,17 +228,18 @@ def followed(path: str) -> Callable[[Any, Callable[..., None]], Any]:
     return begin
 
 
-def streams(session: Any, folder: Path, sizes: list[int]) -> None:
+def streams(session: Any, folder: Path, sizes: list[int], quick: bool) -> None:
     """Seconds and CPU per batch of a stream in which every unit has some rows, after the first batch."""
+    files = 3 if quick else 4
     print(f"{'':>18} {'s per batch':>15} {'rows per s':>17} {'us of CPU per row':>33} {'bytes of a state':>17}")
     heads = f"{'floor':>7} {'follow':>7} {'floor':>8} {'follow':>8}"
     print(f"{'units':>8} {'rows each':>9} {heads} {'Java: floor':>11} {'follow':>6} {'Python':>6} {'follow':>6}"
           f" {'packed':>8} {'on disk':>8}")  # fmt: skip
     for units in sizes:
-        for each in (1, 20):
+        for each in (20,) if quick else (1, 20):
             where = folder / f"stream{units}x{each}"
             (where / "in").mkdir(parents=True)
-            for i in range(6):
+            for i in range(files):
                 path = where / "in" / f"{i}.parquet"
                 rows_of(units, each, float(i * each), i).write_parquet(path)
                 os.utime(path, (1e9 + i, 1e9 + i))
@@ -227,7 +247,7 @@ def streams(session: Any, folder: Path, sizes: list[int]) -> None:
             base = flowing(session, where, passed_on(where))
             own = flowing(session, where, followed(out))
             state = bridge.Store(session, out).states().selectExpr("avg(octet_length(state))").first()[0]
-            disk = sum(one.stat().st_size for one in Path(out).glob("batch=5/kind=state/*.parquet")) / units
+            disk = sum(one.stat().st_size for one in Path(out).glob(f"batch={files - 1}/kind=state/*.parquet")) / units
             rows = units * each
             rates = f"{base[0]:>7.2f} {own[0]:>7.2f} {rows / base[0]:>8,.0f} {rows / own[0]:>8,.0f}"
             cpu = " ".join(f"{1e6 * one[k] / rows:>{wide}.1f}" for k, one, wide in
@@ -256,7 +276,7 @@ def equal(session: Any, folder: Path, units: int) -> None:
 
 
 def main(quick: bool = False, part: str = "") -> None:
-    sizes = [200, 1_000] if quick else [1_000, 10_000, 50_000]
+    sizes = [100] if quick else [1_000, 10_000, 50_000]
     session = bridge.session("local[2]", spark__ui__enabled="false", spark__driver__memory="3g",
                              spark__sql__shuffle__partitions="4")  # fmt: skip
     session.sparkContext.setLogLevel("OFF")
@@ -272,10 +292,12 @@ def main(quick: bool = False, part: str = "") -> None:
         if part in ("", "equal"):
             equal(session, folder, 500 if quick else 20_000)
         if part in ("", "streams"):
-            streams(session, folder, sizes)
-    session.stop()
+            streams(session, folder, sizes, quick)
 
 
 if __name__ == "__main__":
     given = [one for one in sys.argv[1:] if not one.startswith("--")]
     main("--quick" in sys.argv, *given[:1])
+    from pyspark.sql import SparkSession
+
+    SparkSession.builder.getOrCreate().stop()

@@ -9,7 +9,7 @@ With --cluster Spark starts a cluster on this machine, local-cluster[2,1,1024]: 
 their own; three of them are killed too, with the Python workers that they have.
 
     python -m benchmarks.spark_kill             200,000 rows
-    python -m benchmarks.spark_kill --quick     6,000 rows, one kill of each kind
+    python -m benchmarks.spark_kill --quick     2,000 rows, one kill of each kind
 """
 
 from __future__ import annotations
@@ -180,14 +180,14 @@ def different(one: pl.DataFrame, other: pl.DataFrame) -> int:
 
 
 def main(quick: bool = False) -> None:
-    units, T, files = (50, 120, 6) if quick else (500, 400, 20)
+    units, T, files = (50, 40, 4) if quick else (500, 400, 20)
     kinds = ["driver", "worker", "executor"] if "--cluster" in sys.argv else ["driver", "worker"]
     kills = kinds if quick else kinds * 3
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "in").mkdir()
         rows = write_rows(folder / "in", units, T, files)
-        for said in disturb(folder, kills, files, 1800.0):
+        for said in disturb(folder, kills, files, 7200.0):
             print(f"killed the {said}")
         for what, count in compare(folder, rows).items():
             print(f"{what:>20} {count:>8}")

@@ -59,7 +59,7 @@ def settled(engine):
 def results_of(engine):
     """All stored results, as rows."""
     settled(engine)
-    return [row for _, parts, _ in engine.journal.outcomes(0, 10**6) for one in parts for row in one.rows()]
+    return [row for _, parts, *_ in engine.journal.outcomes(0, 10**6) for one in parts for row in one.rows()]
 
 
 def events(engine, kind=None):

@@ -5,6 +5,7 @@ import pytest
 
 from driftfit import ARX, AdaptiveKalman, Kalman, Live, Regression, track
 from driftfit.systems import scenarios
+from driftfit.trackers.parts.excitation import learned, window
 
 BURN = 200
 MODELS = {"regression": Regression(3), "arx": ARX(2, 2)}
@@ -178,3 +179,42 @@ def test_small_residuals_in_a_row_are_no_reason_for_narrow_bands(kind, most, lea
         inside.append(np.nanmean((np.abs(y - run.prediction) < 1.96 * run.innovation_std)[BURN:]))
     assert np.sqrt(np.mean(squares)) < most  # levels below the present noise: 0.095 and 0.14
     assert np.mean(inside) > least  # 0.76 and 0.89
+
+
+def jump_of_one(seed):
+    """Estimates and truth after one of three parameters has jumped, at sample 400 of 600."""
+    rng = np.random.default_rng([17, seed])
+    u, theta = rng.normal(size=(600, 3)), np.tile(rng.normal(size=3), (600, 1))
+    theta[400:, 1] += 1.5
+    y = np.sum(u * theta, axis=1) + 0.3 * rng.normal(size=600)
+    return (track(Regression(3), AdaptiveKalman(), y, u).theta - theta)[405:440]
+
+
+def test_the_jump_of_one_parameter_makes_the_others_no_less_certain():
+    off = np.array([jump_of_one(seed) for seed in range(8)])
+    jumped, others = np.sqrt(np.mean(off[..., 1] ** 2)), np.sqrt(np.mean(off[..., [0, 2]] ** 2))
+    assert others < 0.05
+    assert jumped < 0.22
+
+
+def test_what_never_changes_is_expected_to_change_less_often():
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=(6000, 3))
+    run = track(Regression(3), AdaptiveKalman(), u @ [1.0, -0.5, 2.0] + 0.3 * rng.normal(size=6000), u)
+    jumps = track(Regression(3), AdaptiveKalman(), u @ [1.0, -0.5, 2.0] * (1.0 + np.arange(6000) // 100 % 2), u)
+    assert run.state["calm"] < 0.5
+    assert jumps.state["calm"] == 1.0
+
+
+def test_a_signal_far_from_zero_beside_an_intercept_is_being_learned_and_one_at_rest_is_not():
+    """The window of `excitation`, and variances of least squares: offsets decide nothing."""
+    rng = np.random.default_rng(0)
+    for rests in (0, 400):
+        signal = 53.0 + np.append(rng.standard_normal(600), np.zeros(rests))
+        phi = np.column_stack([signal, np.ones_like(signal)])
+        c, fade = np.mean(phi**2, axis=0), 1.0 - 1.0 / window(2)
+        scaled = phi / np.sqrt(c)
+        G = (fade ** np.arange(len(phi))[::-1, None] * scaled).T @ scaled
+        var = 0.01 * np.diag(np.linalg.inv(phi.T @ phi))
+        lane = {"information": np.tril(G), "c": c, "var": var, "r": 0.01, "seen_samples": float(len(phi))}
+        assert learned(lane).tolist() == [rests == 0] * 2

@@ -1,29 +1,29 @@
 """Spark: batch and streams give what `track` gives on one machine, bit for bit, also after a crash."""
 
+import importlib
 import os
+import re
+import textwrap
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
+from spark_support import COLUMNS, HOLD, MODEL, PAIR, K, arriving, fleet_of, packed, rows_of
 from support import same
 
-from driftfit import ARX, Kalman, Live, track
-from driftfit.bridges.spark.session import java, missing
+from driftfit import ARX, Kalman, Live, Regression, track
+from driftfit.bridges import spark
+from driftfit.bridges.spark.session import missing
 
 if reason := missing():
     pytest.skip(reason, allow_module_level=True)
 
-from driftfit.bridges import spark
-from driftfit.bridges.spark import task as tasks
-from driftfit.bridges.spark.flow import Flow
+PAGE = Path(__file__).parent.parent / "docs" / "spark.md"
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning:pyspark", "ignore::ResourceWarning")
-
-MODEL, K = ARX(2, 2), Kalman(q=1e-4, r=0.1)
-COLUMNS = {"y": "y", "u": "u", "by": "unit", "time": "t"}
-HOLD = 4.0
 
 
 @pytest.fixture(scope="module")
@@ -32,28 +32,12 @@ def session():
         warnings.simplefilter("ignore")
         found = spark.session(
             "local[2]", spark__sql__shuffle__partitions="2", spark__ui__enabled="false", spark__driver__memory="1g",
-            spark__python__unix__domain__socket__enabled="true",
+            spark__python__unix__domain__socket__enabled="true", spark__sql__codegen__wholeStage="false",
+            spark__driver__extraJavaOptions="-XX:TieredStopAtLevel=1 -XX:+UseSerialGC",  # half the CPU of short jobs
         )  # fmt: skip
         found.sparkContext.setLogLevel("OFF")
         yield found
         found.stop()
-
-
-def rows_of(units=40, seed=0, most=40):
-    """Units of unequal lengths with gaps and missing values; unit names read as numbers."""
-    rng = np.random.default_rng(seed)
-    length = rng.integers(1, most, units)
-    N = int(length.sum())
-    time = np.concatenate([np.cumsum(rng.choice([1.0, 2.5], T, p=[0.95, 0.05])) for T in length])
-    y, u = 0.3 * rng.normal(size=N).cumsum(), rng.normal(size=N)
-    y[rng.random(N) < 0.05], u[rng.random(N) < 0.02] = np.nan, np.nan
-    return pl.DataFrame({"unit": np.repeat([str(k) for k in range(units)], length), "t": time, "y": y, "u": u})
-
-
-def fleet_of(rows, tracker=K):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return track(MODEL, tracker, "y", "u", data=rows, by="unit", time="t")
 
 
 def polars(frame):
@@ -86,44 +70,13 @@ def test_a_table_gives_what_one_machine_gives(session, tmp_path, monkeypatch):
     assert (ends["repeated"].sum(), ends["p"].to_list()[-1]) == (7, fleet[ends["unit"][-1]].verdict().p)
 
 
-def test_a_unit_is_run_in_parts(monkeypatch):
-    """A piece ends where a unit ends; a longer unit is cut, and goes on from its state."""
-    import pyarrow as pa
-
-    from driftfit.bridges.spark.batch import Partition, schema_of
-
-    monkeypatch.setattr(tasks, "ROWS", 100)
-    rows = pl.concat([rows_of(6, 1, 60), rows_of(1, 2, 900).with_columns(unit=pl.lit("z"))]).sort("unit", "t")
-    task = tasks.Task(MODEL, K, "y", ("u",), ("unit",), "t")
-    kinds = {"unit": "string", "t": "double"}
-    types = pa.schema({"unit": pa.string(), **dict.fromkeys("tyu", pa.float64())})
-    batches = rows.to_arrow().cast(types).to_batches(30)
-    sizes, tables = [], {kind: [] for kind in ("samples", "states")}
-    for kind, parts in tables.items():
-        part = Partition(task, kind, schema_of(task, kinds, kind))
-        for table, more in tasks.chunks(iter(batches), ("unit",), parts=True):
-            sizes.append(table.num_rows)
-            parts += part.run(table, more)
-    assert max(sizes) < 130
-    fleet = fleet_of(rows)
-    samples = pl.concat([pl.from_arrow(one) for one in tables["samples"]])
-    assert samples.drop("failed").equals(fleet.to_table())
-    for unit, state in pl.concat([pl.from_arrow(one) for one in tables["states"]]).select("unit", "state").rows():
-        run = fleet[unit]
-        assert state[24:] == run.program.pack(run._lane.tile, run._lane.lane)[24:]
-
-
-def stream_of(session, folder, rows, files=3, seed=0):
-    """Rows in the order in which they arrive, five per cent late but within the hold, as a stream of files."""
-    rng = np.random.default_rng(seed)
+def stream_of(session, folder, parts):
+    """Tables as a stream of files."""
     folder.mkdir()
-    time = rows["t"].to_numpy()
-    arrival = time + np.where(rng.random(len(time)) < 0.05, rng.uniform(0.0, 0.9 * HOLD, len(time)), 0.0)
-    order = np.argsort(arrival, kind="stable")
-    for i, part in enumerate(np.array_split(order, files)):
-        pl.concat([rows[part], rows[part].head(3)]).write_parquet(folder / f"{i}.parquet")
+    for i, part in enumerate(parts):
+        part.write_parquet(folder / f"{i}.parquet")
         os.utime(folder / f"{i}.parquet", (1e9 + i, 1e9 + i))
-    schema = "unit string, t double, y double, u double"
+    schema = ", ".join(f"{name} {'string' if name == 'unit' else 'double'}" for name in parts[0].columns)
     return session.readStream.schema(schema).option("maxFilesPerTrigger", 1).parquet(str(folder))
 
 
@@ -142,7 +95,7 @@ def test_a_stream_gives_what_the_sorted_table_gives(session, tmp_path):
     reference = track(MODEL, K, *np.random.default_rng(1).normal(size=(2, 400)))
     rule = reference.detect("glr", every=200.0, reference=300).rule
     seen = []
-    stream = stream_of(session, tmp_path / "in", rows)
+    stream = stream_of(session, tmp_path / "in", arriving(rows, 3))
     store = run(stream, tmp_path, hold=HOLD, rule=rule, sink=lambda table, batch: seen.append((batch, table.count())))
     due = rows.filter(pl.col("t") <= pl.col("t").max().over("unit") - HOLD)
     fleet = fleet_of(due)
@@ -160,8 +113,8 @@ def test_a_stream_gives_what_the_sorted_table_gives(session, tmp_path):
     assert set(on) == {False, True}
     assert found.filter(pl.col("unit") == unit)["alarm"].to_list() == on
     states = {unit: state for unit, state in store.states().select("unit", "state").collect()}
-    for key, one in fleet.items():
-        assert bytes(states[key])[24:] == one.program.pack(one._lane.tile, one._lane.lane)[24:]
+    for key, state in packed(fleet).items():
+        assert bytes(states[key])[24:] == state
 
     # the last batch again, as after a crash: once complete, and once as if it had been cut off
     before = found.sort("batch", "unit", "t")
@@ -188,25 +141,31 @@ def test_a_stream_gives_what_the_sorted_table_gives(session, tmp_path):
     assert same(last["theta_a1"].to_numpy(), rest_run.theta[: len(last), 0])
 
 
+def begun(session, tmp_path, rows, model, columns):
+    """(the states after the first rows, a stream of the others and of a unit that comes much later)."""
+    rows.filter(pl.col("t") < 20.0).write_parquet(tmp_path / "first")
+    begin = spark.track(session.read.parquet(str(tmp_path / "first")), model, K, outputs="states", **columns)
+    late = rows.head(1).with_columns(unit=pl.lit("new"), t=pl.lit(500.0))
+    parts = [rows.filter(pl.col("t") >= 20.0), late, late.with_columns(t=pl.lit(501.0))]
+    return begin, stream_of(session, tmp_path / "in", parts)
+
+
 def test_a_stream_begins_with_states_and_ends_silent_units(session, tmp_path):
-    rows = rows_of(6, 4, 60)
-    first, rest = rows.filter(pl.col("t") < 20.0), rows.filter(pl.col("t") >= 20.0)
-    late = pl.DataFrame({"unit": ["new"], "t": [500.0], "y": [1.0], "u": [1.0]})
-    rest.write_parquet(tmp_path / "rest")
-    first.write_parquet(tmp_path / "first")
-    begin = spark.track(session.read.parquet(str(tmp_path / "first")), MODEL, K, outputs="states", **COLUMNS)
-    (tmp_path / "in").mkdir()
-    for i, part in enumerate((rest, late, late.with_columns(t=pl.lit(501.0)))):
-        part.write_parquet(tmp_path / "in" / f"{i}.parquet")
-        os.utime(tmp_path / "in" / f"{i}.parquet", (1e9 + i, 1e9 + i))
-    schema = "unit string, t double, y double, u double"
-    stream = session.readStream.schema(schema).option("maxFilesPerTrigger", 1).parquet(str(tmp_path / "in"))
-    store = run(stream, tmp_path, initial=begin, expire=100.0)
-    expected = fleet_of(rows).to_table().filter(pl.col("t") >= 20.0).sort("unit", "t")
+    """Two outputs; what waits when a unit ends is processed, once."""
+    columns = {**COLUMNS, "y": ["flow", "pressure"]}
+    rows = rows_of(6, 4, 60, y=columns["y"])
+    begin, stream = begun(session, tmp_path, rows, PAIR, columns)
+    more = {"trigger": {"availableNow": True}, "hold": HOLD, "initial": begin, "expire": 100.0}
+    query = spark.follow(stream, ARX(1, 1, ny=2), K, path=str(tmp_path / "out"), **columns, **more)
+    query.awaitTermination()
+    store = spark.Store(session, str(tmp_path / "out"))
+    fleet = fleet_of(rows, model=PAIR)
+    expected = fleet.to_table().filter(pl.col("t") >= 20.0).sort("unit", "t")
     found = polars(store.results())
     assert found.filter(pl.col("unit") != "new").select(expected.columns).equals(expected)
     assert [row[0] for row in store.states().select("unit").collect()] == ["new"]
-    assert store.read("expired").count() == rows["unit"].n_unique()
+    expired = {unit: bytes(state)[24:] for unit, state in store.read("expired").select("unit", "state").collect()}
+    assert expired == packed(fleet)
 
 
 def test_what_cannot_run_is_said_before_any_job(session):
@@ -215,6 +174,10 @@ def test_what_cannot_run_is_said_before_any_job(session):
         spark.track(frame, MODEL, K, **COLUMNS)
     with pytest.raises(ValueError, match="there is no column 'flow'"):
         spark.track(frame, MODEL, K, **{**COLUMNS, "y": "flow"})
+    with pytest.raises(ValueError, match="Several outputs need ny= in the model"):
+        spark.track(frame, MODEL, K, **{**COLUMNS, "y": ["y", "t"]})
+    with pytest.raises(ValueError, match="share one theta are not followed on Spark"):
+        spark.track(frame, Regression(1, ny=2, shared=True), K, **COLUMNS)
     with pytest.raises(ValueError, match="Kalman: q, r must be given"):
         spark.track(frame, MODEL, Kalman(), **{**COLUMNS, "u": "y"})
     with pytest.raises(ValueError, match="Data frames of Spark have no order"):
@@ -228,63 +191,6 @@ def test_what_cannot_run_is_said_before_any_job(session):
         spark.follow(dated, MODEL, K, path="x", dt="1min", hold=3, **COLUMNS)
 
 
-def test_what_is_missing_is_said(monkeypatch, tmp_path):
-    monkeypatch.setenv("JAVA_HOME", str(tmp_path))
-    assert java() == (None, None)
-    assert "Spark needs Java 17 or 21, and no java is on the PATH" in missing()
-    with pytest.raises(ImportError, match="Java 17 or 21"):
-        spark.session()
-
-
-def test_a_flow_is_pickled_without_what_it_has_made():
-    import pickle
-
-    task = tasks.Task(MODEL, K, "y", ("u",), ("unit",), "t")
-    assert task.program.names == task.names
-    again = pickle.loads(pickle.dumps(Flow(task, {}, 0.0)))
-    assert again.task == task
-    assert "program" not in vars(again.task)
-
-
-def test_a_unit_with_keyed_state_gives_what_the_sorted_table_gives():
-    """The step by itself, with numbers and dates."""
-    from driftfit.bridges.spark.keyed import Unit
-
-    rows = rows_of(1, 3, 80)
-    y, u, t = (rows[name].to_numpy() for name in "yut")
-    reference = track(MODEL, K, *np.random.default_rng(1).normal(size=(2, 400)))
-    for dated in (False, True):
-        rule = reference.detect("glr" if dated else "innovation", every=20.0, reference=300).rule
-        hold = np.timedelta64(4, "s") if dated else HOLD
-        task = tasks.Task(MODEL, K, "y", ("u",), ("unit",), "t", "1s" if dated else None)
-        time = (t * 1e6).astype("M8[us]") if dated else t
-        unit, state, found = Unit(task, hold, dated, rule), None, []
-        order = np.argsort(t + np.random.default_rng(1).uniform(0.0, 3.5, len(t)), kind="stable")
-        for part in np.array_split(order, 12):
-            stamps = time[part].astype(int) if dated else time[part]
-            given = [("a", *row) for row in zip(stamps.tolist(), y[part].tolist(), u[part].tolist(), strict=True)]
-            state, some = unit.step(state, [*given, given[0], ("a", None, 1.0, 1.0)])
-            found += some
-        run = fleet_of(rows)["0"]
-        good = [one for one in found if "failed" not in one]
-        assert len(good) > len(run) - 6
-        for name, path in (("prediction", run.prediction), ("theta_b1[u]", run.theta[:, 2]), ("std_a1", run.std[:, 0])):
-            assert same([one[name] for one in good], path[: len(good)])
-        assert sorted({one["failed"] for one in found if "failed" in one}) == ["at a repeated time", "without a time"]
-        alarms, watch = live_alarm(rule), []
-        stamps = np.array([one["t"] for one in good]).astype("M8[us]") if dated else t[: len(good)]
-        for one, stamp in zip(good, stamps, strict=True):
-            alarms[0].update(one["y"], one["u"], time=stamp)
-            watch.append((alarms[1].active, alarms[1].cause if alarms[1].active else None))
-        assert [(one["alarm"], one["cause"]) for one in good] == watch
-
-
-def live_alarm(rule):
-    """A stream and its alarm."""
-    live = Live(MODEL, K, dt="1s" if rule.kind == "glr" else None)
-    return live, live.detect(rule)
-
-
 def test_a_stream_with_keyed_state_gives_what_the_sorted_table_gives(session, tmp_path):
     from pyspark.sql.group import GroupedData
 
@@ -292,14 +198,42 @@ def test_a_stream_with_keyed_state_gives_what_the_sorted_table_gives(session, tm
         pytest.skip("this PySpark has no keyed state for rows; 4.1 has it")
     session.conf.set("spark.sql.streaming.stateStore.providerClass",
                      "org.apache.spark.sql.execution.streaming.state.RocksDBStateStoreProvider")  # fmt: skip
-    few = rows_of(3, 3, 60)
-    keyed = spark.follow_keyed(stream_of(session, tmp_path / "in", few, files=2), MODEL, K, hold=HOLD, **COLUMNS)
+    rows = rows_of(3, 3, 60)
+    begin, stream = begun(session, tmp_path, rows, MODEL, COLUMNS)
+    keyed = spark.follow_keyed(stream, MODEL, K, hold=HOLD, initial=begin, expire=100.0, **COLUMNS)
     query = (
         keyed.writeStream.format("parquet").option("path", str(tmp_path / "out"))
         .option("checkpointLocation", str(tmp_path / "check")).trigger(availableNow=True).start()
     )  # fmt: skip
     query.awaitTermination()
-    due = few.filter(pl.col("t") <= pl.col("t").max().over("unit") - HOLD)
-    expected = fleet_of(due).to_table().sort("unit", "t")
-    good = pl.read_parquet(tmp_path / "out" / "*.parquet").filter(pl.col("failed").is_null()).sort("unit", "t")
-    assert good.select(expected.columns).equals(expected)
+    fleet = fleet_of(rows)
+    expected = fleet.to_table().filter(pl.col("t") >= 20.0).sort("unit", "t")
+    found = pl.read_parquet(tmp_path / "out" / "*.parquet").sort("unit", "t")
+    assert found.filter(pl.col("failed").is_null()).select(expected.columns).equals(expected)
+    expired = found.filter(pl.col("failed") == "silent for too long").select("unit", "state").rows()
+    assert [unit for unit, _ in expired] == ["0", "1", "2"]
+    assert {unit: state[24:] for unit, state in expired} == packed(fleet)
+
+
+def test_the_chapter_is_followed_word_by_word(session, tmp_path, capsys):
+    """Its first section, from the Parquet file to the table that it shows; Java stays in the folder where it began."""
+    chapter = PAGE.read_text().split("\n## ")[1]
+    blocks = re.findall(r"(?:^    .*\n|^\n)+", re.sub(r"```.*?```", "", chapter, flags=re.S), re.M)
+    code = "".join(textwrap.dedent(one) for one in blocks if re.match(r"\s*(import|from) ", one))
+    code = code.replace('"readings.parquet"', repr(str(tmp_path / "readings.parquet")))
+    exec(compile(code, PAGE.name, "exec"), {})
+    (table,) = re.findall(r"```text\n(.*?)```", chapter, re.S)
+    assert capsys.readouterr().out.split() == table.split()
+
+
+def test_benchmarks_run_quickly(session, capsys):
+    """Those of streams, and a stream whose driver and worker are killed in the middle of a batch."""
+    costs, kills = (importlib.import_module(f"benchmarks.{name}").main for name in ("spark", "spark_kill"))
+    costs(True, "equal")
+    costs(True, "streams")
+    kills(True)
+    printed = capsys.readouterr().out
+    assert "0 of 11 columns differ" in printed
+    assert "killed the driver" in printed
+    for what in ("lost", "doubled", "results that differ", "states that differ"):
+        assert re.search(rf"^ *{what} +0$", printed, re.M)

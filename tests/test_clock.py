@@ -6,10 +6,12 @@ from datetime import UTC, date, datetime, timedelta
 
 import numpy as np
 import pandas as pd
+import polars as pl
 import pytest
 
-from driftfit import ARX, Kalman, Live, track
+from driftfit import ARX, RLS, Kalman, Live, Regression, track
 from driftfit.data.clock import NEAR, Clock, instant, median_interval
+from driftfit.data.times.periods import span
 from driftfit.engine.settings import DataWarning
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-3, r=0.1)
@@ -254,3 +256,50 @@ def test_times_of_every_kind_are_one_instant():
         assert instant(time) == expected
     assert instant(date(2024, 3, 1)) == np.datetime64("2024-03-01")
     assert instant(np.float32(2.5)) == 2.5
+
+
+PERIODS = {
+    "1970 Q1": ("1970-01-01", "1970-03-31"), "1970-Q2": ("1970-04-01", "1970-06-30"),
+    "1970q4": ("1970-10-01", "1970-12-31"), "Q3 1970": ("1970-07-01", "1970-09-30"),
+    "1Q1970": ("1970-01-01", "1970-03-31"), "2020M03": ("2020-03-01", "2020-03-31"),
+    "2020-12": ("2020-12-01", "2020-12-31"), "02/2020": ("2020-02-01", "2020-02-29"),
+    "Mar 2020": ("2020-03-01", "2020-03-31"), "2020 September": ("2020-09-01", "2020-09-30"),
+    "2020-W05": ("2020-01-27", "2020-02-02"), "2020W05-3": ("2020-01-29", "2020-01-29"),
+    "2020H2": ("2020-07-01", "2020-12-31"), "2020-01-27/2020-02-02": ("2020-01-27", "2020-02-02"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", PERIODS)
+def test_a_period_begins_with_its_first_day_and_ends_with_its_last(text):
+    first, after = span(text)
+    assert (str(first), str(after - timedelta(1))) == PERIODS[text]
+
+
+@pytest.mark.parametrize("text", ["2020-13", "1970Q5", "2021-W53", "Ma 2020", "spring 1970", "2020", "2020-01-31"])
+def test_what_is_no_period(text):
+    assert span(text) is None
+
+
+def test_quarters_as_text_are_times_wherever_times_are_given():
+    rng = np.random.default_rng(0)
+    y, u = rng.standard_normal((2, 8))
+    texts = [f"{1970 + k // 4} Q{k % 4 + 1}" for k in range(8)]
+    wanted = track(Regression(1), RLS(1.0), y, u, time=np.arange("1970-01", "1972-01", 3, "M8[M]"), dt="quarter")
+    frame, index = {"t": texts, "y": y, "u": u}, pd.PeriodIndex([text.replace(" ", "") for text in texts], freq="Q")
+    tables = pl.DataFrame(frame), pd.DataFrame(frame), pd.DataFrame(frame | {"t": index})
+    runs = [track(Regression(1), RLS(1.0), y, u, time=times, dt="quarter") for times in (texts, index, np.array(texts))]
+    runs += [track(Regression(1), RLS(1.0), "y", "u", data=table, time="t", dt="quarter") for table in tables]
+    for run in runs:
+        np.testing.assert_array_equal(run.time, wanted.time)
+        np.testing.assert_array_equal(run.theta, wanted.theta)
+    live = Live(Regression(1), RLS(1.0), dt="quarter")
+    for t in range(3):
+        live.update(y[t], u[t], time=texts[t])
+    assert live.theta[0] == wanted.theta[2, 0]
+    left = track(Regression(1), RLS(1.0), y, u, time=texts, dt="quarter", exclude=[("1970 Q2", "1970 Q3")])
+    assert np.flatnonzero(~left.ok).tolist() == [1, 2]
+    for wrong in (["spring 1970", *texts[1:]], [*texts[:7], "1971 Q5"]):
+        with pytest.raises(ValueError, match=r"is not a date; write 2024-01-31.*'1970 Q1'"):
+            track(Regression(1), RLS(1.0), y, u, time=wrong, dt="quarter")
+        with pytest.raises(ValueError, match=r"neither a number nor a date.*'1970 Q1'"):
+            track(Regression(1), RLS(1.0), "y", "u", data=pl.DataFrame(frame | {"t": wrong}), time="t", dt="quarter")

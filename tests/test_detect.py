@@ -9,7 +9,7 @@ from support import Doubtful, arx_record, rows_of
 
 from driftfit import ARX, AugmentedFLS, HammersteinWiener, Kalman, Regression, track
 from driftfit.engine.kernel import kernel
-from driftfit.judge.alarms.calibration import _begun, _least, innovations, null_records, residuals
+from driftfit.judge.alarms.calibration import _least, begun_over, innovations, null_records, residuals
 from driftfit.judge.alarms.detect import Alarms
 from driftfit.judge.alarms.onsets import (
     chance,
@@ -150,7 +150,8 @@ def test_probability_alarm_is_calibrated_by_simulation():
 @pytest.mark.parametrize("allowed", [0.0, 3.0, 40.0])
 def test_simulated_limit_is_the_least_above_which_onsets_are_few(allowed):
     series = [np.round(np.cumsum(x), 1) for x in np.random.default_rng(5).normal(size=(3, 200))]
-    limit = _least(*_begun(series), allowed)
+    joined = np.concatenate([part for values in series for part in ([-np.inf], values)])
+    limit = _least(*begun_over(joined, allowed), allowed)
     limits = np.unique(np.concatenate(series))
     begun = np.array([sum(len(onsets(values > c)) for values in series) for c in limits])
     assert (begun[limits >= limit] <= allowed).all()

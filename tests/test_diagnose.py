@@ -7,7 +7,7 @@ from support import arx_record
 
 from driftfit import ARX, RLS, AdaptiveKalman, AugmentedFLS, Kalman, Regression, track
 from driftfit.judge.compare import errors
-from driftfit.judge.diagnose import holds_constant
+from driftfit.judge.diagnose import holds_constant, standardised
 from driftfit.judge.excitation import excitation
 
 TRUE = Kalman(q=0.0, r=0.01)
@@ -38,7 +38,7 @@ def test_numbers_are_what_plain_numpy_gives():
     assert said["symmetry"].value == pytest.approx(stats.skew(held))
     clipped = np.clip(z, *(np.array([-1, 1]) * 3.0 * 1.4826 * np.median(np.abs(z))))
     r = [np.sum(clipped[k:] * clipped[:-k]) / np.sum(clipped**2) for k in range(1, 21)]
-    assert said.white.r == pytest.approx(r)
+    assert standardised(run)[1].r == pytest.approx(r)
     assert said["constancy (p)"].value == run.verdict().p
 
 
@@ -119,8 +119,8 @@ def test_picture_has_six_panels_and_marks_what_is_out_of_bounds():
     causes = ({"outliers"}, {"whiteness (p)"}, {"noise level", "steady noise"}, {"symmetry", "outliers"})
     assert marked[:4] == [bool(cause & wrong) for cause in causes]
     assert marked[2]
-    np.testing.assert_array_equal(panels[0].lines[0].get_ydata(), said.z)
-    assert [bar.get_height() for bar in panels[1].patches] == list(said.white.r)
+    np.testing.assert_array_equal(panels[0].lines[0].get_ydata(), standardised(said.run)[0])
+    assert [bar.get_height() for bar in panels[1].patches] == list(standardised(said.run)[1].r)
 
 
 def test_a_tracker_that_may_move_is_not_accused_on_short_constant_records():

@@ -38,6 +38,7 @@ ELSEWHERE = {
     "python examples/controller.py": ("tests/test_embedded.py", '["controller.py"]'),
     "python -m lab bench accuracy": ("lab/tests/test_bench.py", '["bench", "accuracy", "--quick"'),
     "python -m lab structure": ("lab/tests/test_structure.py", '["structure", "--picture"'),
+    "python -m benchmarks.spark": ("tests/test_bridge_spark.py", 'costs(True, "streams")'),
     "python -m lab bench speed": ("lab/tests/test_bench.py", '["bench", "speed", "--quick"'),
 }  # fmt: skip
 """Commands, by how they begin, with the test that runs them quickly and what stands there."""
@@ -104,8 +105,6 @@ def test_benchmarks_run_quickly(command, monkeypatch):
         pytest.importorskip("statsmodels", reason="there is no statsmodels")
     if "import JulierSigmaPoints" in said:
         pytest.importorskip("filterpy", reason="there is no filterpy")
-    if "bridges" in said and "spark" in script:
-        pytest.importorskip("pyspark", reason="there is no pyspark")
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     monkeypatch.setattr("sys.argv", [script, *given, "--quick"] if "typer" not in said else [script, "--quick"])
     printed = io.StringIO()

@@ -6,8 +6,10 @@ from scipy import stats
 from support import arx_record, rows_of
 
 from driftfit import ARX, AugmentedFLS, Kalman, Live, Regression, track
+from driftfit.judge.alarms.bootstrap import START
 from driftfit.judge.alarms.frozen import frozen_model, noise_model
 from driftfit.judge.alarms.onsets import onsets
+from driftfit.judge.alarms.side_by_side import Records, statistics_of
 from driftfit.run.live.likelihood_ratio import (
     ALPHA,
     BETA,
@@ -120,6 +122,26 @@ def test_statistics_are_those_of_a_naive_twin(ar):
         assert findings[t, NOISE] == pytest.approx(np.nanmax([found[4] for found in best.values()]))
     assert np.array_equal(findings[30], findings[29])
     assert np.array_equal(findings[120], findings[119])
+
+
+@pytest.mark.parametrize("cusum", [False, True])
+def test_records_side_by_side_have_the_statistics_of_each(cusum):
+    """Eleven records in two vectors, each with a model of its own; the third has a regressor that is always zero."""
+    rng, R, T, n = np.random.default_rng(3), 11, 400, 2
+    numbers = np.zeros((R, NORMAL + 1))
+    numbers[:, [CLIP, K, V, KAPPA, SCALE, NORMAL]] = [2.5, 0.98, 0.95, 1.2, 1.0, 480]
+    numbers[:, V] += 0.01 * np.arange(R)
+    numbers[:, LONGEST] = 30 + 30 * np.arange(R)
+    root = 0.05 * rng.normal(size=(R, n, n))
+    phi, g = rng.normal(size=(R, T, n)), np.clip(rng.normal(size=(R, T)), -2.5, 2.5)
+    phi[2, :, 1] = 0.0
+    records = Records(root @ root.transpose(0, 2, 1), numbers, phi, g)
+    for k, found in enumerate(statistics_of(records, cusum)):
+        model = Frozen(np.zeros(n), np.ones(n), np.zeros(0), records.cov[k], numbers[k])
+        findings = np.empty((T, CUSUM + n + 1))
+        scan(np.column_stack([phi[k], g[k], np.ones((T, 3))]), model, memory_of(n, 0), findings)
+        alone = findings[START:, CUSUM:] if cusum else findings[START:, [ONE, JOINT, NOISE]]
+        np.testing.assert_allclose(found[START:], np.nan_to_num(alone), rtol=1e-9, atol=1e-9)
 
 
 def noise_of(kind, T, rng):

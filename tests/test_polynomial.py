@@ -4,7 +4,22 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from driftfit import ARMAX, ARX, OE, RLS, AdaptiveKalman, BoxJenkins, InstrumentalVariables, Kalman, Live, track
+from driftfit import (
+    ARMAX,
+    ARX,
+    OE,
+    RLS,
+    AdaptiveKalman,
+    Bank,
+    BoxJenkins,
+    Change,
+    InstrumentalVariables,
+    Kalman,
+    Live,
+    PolynomialModel,
+    Sensor,
+    track,
+)
 from driftfit.models.polynomial import FORGOTTEN
 from driftfit.models.polynomials.steps import SETTLING
 from driftfit.run.program import Program
@@ -230,3 +245,32 @@ def test_gains_and_responses_of_transfer_functions():
     for verb in (lambda: run.simulate(u[:5], y=y[:2]), run.long_run):
         with pytest.raises(ValueError, match=r"from rest|is for ARX"):
             verb()
+
+
+def test_a_frozen_sensor_repeats_readings_and_not_what_is_left_of_them():
+    """The regression of a model that is linearised at every sample has another output: the reading less a shift."""
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=400)
+    y = 20.0 + signal.lfilter([0.0, 0.5], [1.0, -0.8], u) + 0.05 * rng.normal(size=400)
+    y[200:220] = y[199]
+    sensors = [Sensor.nominal(r=0.0025), Sensor.frozen(0.01)]
+    bank = Bank([Change(q=1e-6)], sensors, (None, [[0.98, 0.02], [0.05, 0.95]]), p0=10.0)
+    found = track(OE(1, 1, offset=True), bank, y, u).hypotheses.found()
+    assert [(event.span.first, event.span.last) for event in found if event.span.first > 180] == [(200, 219)]
+
+
+def test_readings_are_judged_and_not_what_a_shift_leaves_of_them():
+    """The step of a coarse meter, a spike and a frozen sensor are found where the regression has another output."""
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=600)
+    y = 20.0 + signal.lfilter([0.0, 0.5], [1.0, -0.8], u) + 0.05 * rng.normal(size=600)
+    model = PolynomialModel(na=1, nb=1, nc=1, nd=1, nf=1)
+    coarse = track(model, AdaptiveKalman(), 0.5 * np.round(y / 0.5), u).state
+    assert coarse["quantum"] == 0.5
+    assert coarse["coarse"] > 0.0
+    y[400], y[500:520] = 9999.0, y[499]
+    run = track(model, AdaptiveKalman(), y, u)
+    assert run.state["left_out"] == 1.0
+    assert run.state["frozen_readings"] >= 19.0
+    left_out = np.flatnonzero(~run.ok)
+    assert {400, *range(501, 520)} <= set(left_out[left_out > 20]) <= {400, 401, *range(500, 521)}

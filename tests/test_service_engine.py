@@ -28,6 +28,7 @@ from service_support import (
 from driftfit import ARX, track
 from driftfit.run.states.advance import advance
 from driftfit.service.core.archive import export
+from driftfit.service.core.engine import KEPT
 from driftfit.service.core.intake import Intake
 from driftfit.service.core.section import Section
 from driftfit.service.sources.samples import Batch
@@ -56,6 +57,25 @@ def test_states_and_results_are_those_of_track(engine):
     assert np.array_equal([row[8] for row in rows], run.theta)
     assert np.array_equal([row[9] for row in rows], run.std)
     assert [row[2] for row in rows] == run.time.tolist()
+
+
+def test_sinks_see_results_once_before_and_after_these_are_stored(engine):
+    y, u = record(KEPT + 6)
+    seen, at = [], 0
+    for k in range(KEPT + 5):
+        feed(engine, message("plant/a", [k], y[k : k + 1], u[k : k + 1]))
+        found = engine.after(at, engine.journal) if k % 7 == 0 else []  # sometimes slower than memory reaches back
+        seen += [row for group in found for part in group.parts for row in part.rows()]
+        at = found[-1].first if found else at
+    (fresh,) = engine.after(engine.next - 2, engine.journal)
+    assert fresh.first not in [group.first for group in engine.journal.outcomes(0)]
+    assert engine.after(0, engine.journal)[0].first == 1
+    settled(engine)
+    while found := engine.after(at, engine.journal):
+        seen += [row for group in found for part in group.parts for row in part.rows()]
+        at = found[-1].first
+    assert repr(seen) == repr(results_of(engine))
+    assert len(seen) == KEPT + 5
 
 
 def test_a_new_process_continues_with_the_same_bits(tmp_path):

@@ -1,16 +1,21 @@
 """The page and the HTTP interface: who may do what, bounds, downsampling, and a real browser."""
 
 import asyncio
+import http.server
 import io
 import json
 import os
+import random
+import re
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -253,8 +258,8 @@ def free_port():
         return one.getsockname()[1]
 
 
-def started(port):
-    command = [sys.executable, "-m", "driftfit", "serve", "--demo", "--port", str(port)]
+def started(port, *what):
+    command = [sys.executable, "-m", "driftfit", "serve", *(what or ["--demo"]), "--port", str(port)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     until = time.monotonic() + 90
     while time.monotonic() < until:
@@ -299,6 +304,8 @@ def test_the_demo_in_a_browser(tmp_path):
         page.until("document.querySelector('#events').textContent.includes('a test')")
         page.key("Escape")
         page.until("!document.querySelector('#fleet').hidden")
+        page.call("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=2, mobile=True)
+        page.until("document.documentElement.scrollWidth <= 390")  # nothing is cut off on a phone
         assert page.console == []
         logs = stopped(process)
         assert any(one["message"] == "alarm" and one["unit"] == "pump 3" for one in logs)
@@ -312,3 +319,50 @@ def test_the_demo_in_a_browser(tmp_path):
             os.kill(process.pid, signal.SIGTERM)
             process.wait(60)
         process.stderr.close()
+
+
+class Phone(http.server.BaseHTTPRequestHandler):
+    got = []  # noqa: RUF012
+
+    def do_POST(self):
+        self.got.append((self.headers["title"], self.rfile.read(int(self.headers["content-length"])).decode()))
+        self.send_response(200)
+        self.end_headers()
+
+    def log_message(self, *args):
+        pass
+
+
+def test_the_docs_lead_to_an_alarm_on_a_phone(tmp_path):
+    """The file and the program of the page, word for word but for the addresses, and quicker."""
+    pytest.importorskip("uvicorn", reason="the page needs driftfit[serve]")
+    chapter = (Path(__file__).parent.parent / "docs" / "service.md").read_text()
+    chapter = chapter[chapter.index("## An alarm on a phone") : chapter.index("## Your own plant")]
+    (settings,), (program,) = (re.findall(f"```{kind}\n(.*?)```", chapter, re.S) for kind in ("toml", "python"))
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Phone)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    here, port = f"http://127.0.0.1:{server.server_port}/", free_port()
+    (tmp_path / "pump.toml").write_text(settings.replace("https://ntfy.sh/choose-a-long-name", here))
+    process = started(port, str(tmp_path / "pump.toml"), "--folder", str(tmp_path / "data"))
+
+    def wait(seconds):
+        """Until the limits of the alarms are known, after the ten minutes of the reference."""
+        until, address = time.monotonic() + 60.0, f"http://127.0.0.1:{port}/api/events"
+        while len(sent) == 10 and b"calibrated" not in urllib.request.urlopen(address).read():
+            assert time.monotonic() < until
+            time.sleep(0.1)
+
+    sent = []
+    try:
+        random.seed(1)
+        text = program.replace("http://127.0.0.1:8765", f"http://127.0.0.1:{port}").replace("time.sleep", "wait")
+        exec(text, {"wait": wait, "print": sent.append})
+        until = time.monotonic() + 30.0
+        while not Phone.got and time.monotonic() < until:
+            time.sleep(0.05)
+    finally:
+        stopped(process)
+        process.stderr.close()
+        server.shutdown()
+        server.server_close()
+    assert any(who == "pump 1" and said.startswith("pump 1: band alarm, b1[pressure] is ") for who, said in Phone.got)

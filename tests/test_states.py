@@ -1,5 +1,6 @@
 """States as bytes: small, checked, the same everywhere, refused where they do not belong; runs that continue them."""
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from driftfit import ARX, DataWarning, Kalman, Live, track
 from driftfit.data.known import Known
 from driftfit.data.record import Records
 from driftfit.run.program import Program
+from driftfit.run.states import late
 from driftfit.run.states.advance import advance
 from driftfit.run.states.late import LATE, RELEASED, REPEATED, UNTIMED, WAITING, HoldBack, sort_out
 from driftfit.run.states.layout import MANY, packed, unpacked
@@ -164,6 +166,21 @@ def test_fates_of_dates_are_those_of_numbers():
     assert same(found.order, plain.order)
     assert same(found.fate, plain.fate)
     assert set(plain.fate.tolist()) == set(range(5))
+
+
+def test_rows_in_order_have_the_same_fates_with_and_without_sorting(monkeypatch):
+    rng, quick, counted = np.random.default_rng(4), late._all_in_order, Counter()
+    for _ in range(300):
+        series, time = np.sort(rng.integers(0, 3, 6)), np.cumsum(rng.integers(0, 3, 6)) * 1.0
+        time[rng.uniform(size=6) < 0.03] = rng.choice([np.nan, np.inf])
+        newest = rng.choice([np.nan, 0.0, 2.0], 3)
+        given = series, time, np.zeros(6, bool), newest, 0.0
+        monkeypatch.setattr(late, "_all_in_order", quick)
+        counted[quick(series, time, newest) is not None] += 1
+        found = sort_out(*given)
+        monkeypatch.setattr(late, "_all_in_order", lambda *_: None)
+        assert all(map(same, found, sort_out(*given)))
+    assert min(counted[True], counted[False]) > 30
 
 
 def test_rows_that_are_too_late_are_counted():

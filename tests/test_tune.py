@@ -7,6 +7,8 @@ from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Regression, frontier, 
 from driftfit.models.regression import Regression as Base
 from driftfit.systems.drift import RandomWalk, paths
 from driftfit.systems.time_varying import EXAMPLES, example
+from driftfit.tune.parametrisation import Knobs
+from driftfit.tune.search import Counted, Search
 
 
 def walks(seed, std=(0.1, 0.1), noise=0.5, T=200):
@@ -41,7 +43,10 @@ def test_drift_of_each_parameter_and_zero():
     y, u = walks(3, std=(0.1, 0.0), T=2000)
     tuned = tune(Regression(2), Kalman(), y, u, groups="each")
     q = tuned.tracker.q
-    assert q[0] == pytest.approx(0.01, rel=0.5)
+    logs = [track(Regression(2), Kalman(q=[0.01 * np.exp(h), 0.0], r=0.25), y, u).loglik for h in (-0.1, 0.0, 0.1)]
+    error = 0.1 / np.sqrt(2.0 * logs[1] - logs[0] - logs[2])  # of log q, from the curvature at the truth
+    assert error < 0.15
+    assert abs(np.log(q[0] / 0.01)) < 3.3 * error
     assert q[1] < 1e-5
     low, high = tuned.interval["q[theta2]/r"]
     assert low == 0.0
@@ -119,7 +124,8 @@ REFERENCE = {
 @pytest.mark.filterwarnings("ignore:tune:UserWarning")
 @pytest.mark.parametrize(("name", "method"), REFERENCE)
 def test_selectors_on_the_examples(name, method):
-    """Median parameter error of the smoothed path; a loose band, for the reference has more seeds."""
+    """Median parameter error of the smoothed path. The third to the fourteenth of sixteen errors contain the median of
+    all records, which is the reference's, with probability 1 - 2 (1 + 16 + 120) / 2^16 = .996."""
     assert name in EXAMPLES
     errors = []
     for s in range(16):
@@ -127,7 +133,8 @@ def test_selectors_on_the_examples(name, method):
         tuned = tune(d.model, FLS(), d.y, d.u, method=method)
         path = track(d.model, tuned.tracker, d.y, d.u).smooth()
         errors.append(np.sqrt(np.mean((path.theta - d.theta) ** 2)))
-    assert np.median(errors) == pytest.approx(REFERENCE[name, method], rel=0.3)
+    low, high = np.sort(errors)[[2, -3]]
+    assert low < REFERENCE[name, method] < high
 
 
 def test_loo_and_gcv_of_the_choice():
@@ -296,4 +303,21 @@ def test_an_arx_model_with_lags_that_are_filled():
         y[t] = 0.5 * y[t - 1] + u[t - 1] + 0.1 * rng.normal()
     y[100:103] = np.nan
     tuned = tune(ARX(1, 1), Kalman(), y, u)
-    assert tuned.noise == pytest.approx(0.01, rel=0.2)
+    assert tuned.noise == pytest.approx(0.01, rel=3.3 * np.sqrt(2.0 / 490))  # the variance of a mean of squares
+
+
+def test_a_profile_stays_within_the_range_of_the_others():
+    """A flat ridge leads far outside: 300 decades of q are infinite."""
+    low, high = np.array([-5.0, -5.0]), np.array([5.0, 5.0])
+
+    def valley(points):
+        assert (points >= low).all()
+        assert (points <= high).all()
+        return 5e3 * (points[:, 1] - 300.0 * points[:, 0]) ** 2 + 0.5 * points[:, 0] ** 2
+
+    knobs = Knobs(low, high, np.zeros(2, bool), False, None, None, ("a", "b"), np.arange(2), lambda x: x)
+    f = Counted(valley)
+    f(np.zeros((1, 2)))
+    found = Search(f, knobs, np.zeros(2))
+    assert found.ridge(0)[1] == pytest.approx(300.0, rel=1e-3)
+    assert found.profile(0, 0.95)[0] < 0.0 < found.profile(0, 0.95)[1]

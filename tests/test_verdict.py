@@ -295,7 +295,7 @@ def test_steps_are_found_one_after_the_other_with_their_sizes():
     assert abs(got.first(0) - 200) < 6
     assert abs(got.first(2) - 450) < 25
     assert got.first(1) is None
-    assert (got.after - got.before)[[0, 2]] == pytest.approx([2.0, -0.8], abs=0.3)
+    assert (np.abs(got.after - got.before - [2.0, 0.0, -0.8, 0.0])[[0, 2]] < 3.3 * got.std[[0, 2]]).all()
     assert got.std[0] == pytest.approx(np.sqrt(1 / 200 + 1 / 400), rel=0.3)
     path = np.where(np.arange(600)[:, None] < 350, THETA, THETA + np.array([0.0, 0.0, 1.0, 0.0]))
     said = track(ARX(2, 2), Kalman(q=1e-3, r=0.01), *arx_record(600, 1, theta=path)).verdict()
@@ -485,3 +485,19 @@ def test_a_value_is_back_only_if_it_returned():
     moved = Moved("a", 1.0, 0.01, 0.01, True, 9, "9", -0.4074, -0.415, 0.0007, -0.3203, 1, 9, ("b", "c"))
     assert sentence(moved).endswith("then -0.3203 at the end (or b or c: their steps explain the record as well)")
     assert "back to -0.407" in sentence(replace(moved, last=-0.407))
+
+
+def test_readings_of_a_coarse_meter_that_mostly_repeat_still_have_a_noise_level():
+    """A flow meter in steps of one, whose readings are interpolated now and then; the median residual is next to 0."""
+    accused, found = 0, 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        u, T = rng.standard_normal(1000), 1000
+        v = signal.lfilter([0.8], [1.0, -0.6], rng.standard_normal(T))
+        flow, closed = 32.0 + 0.12 * u + 0.4 * v, (np.arange(T) >= 577) & (np.arange(T) < 979)
+        held = 0.01 * np.where(rng.random(T) < 0.5, rng.random(T), 0.0)
+        X = np.column_stack([u, np.ones(T)])
+        accused += constancy(X, np.round(flow) + held).p_joint < 0.05
+        found += constancy(X, np.round(flow - closed) + held).p_joint < 1e-4 if seed < 10 else 0
+    assert accused <= 6
+    assert found == 10

@@ -7,12 +7,13 @@ those runs: the mean of e^2 / s at r = 1.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from driftfit import trackers
+from driftfit import Kalman, trackers, tune
 from driftfit.engine.kernel import Array
 from driftfit.trackers.base import Tracker
 from driftfit.tracking import track
@@ -76,6 +77,15 @@ def least_squares(record: Record, setting: Any, c: Array) -> Outcome:
     return run(trackers.found()["RLS"](forgetting=1.0), record)  # type: ignore[call-arg]
 
 
+def likeliest(record: Record, setting: Any, c: Array) -> Outcome:
+    """Our Kalman filter with the drift of every parameter by maximum likelihood on the very record that is scored."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # an optimum at a bound: nothing drifts, or everything does
+        tuned = tune(record.model, Kalman(), record.y, record.u, groups="each")
+    assert isinstance(tuned.tracker, Tracker)  # of one output
+    return run(tuned.tracker, record)
+
+
 KALMAN = Contestant("Kalman", "driftfit", kalman, RATIOS, default=False, relative=True)
 
 ONE_NUMBER = {"RLS": ("forgetting", FORGETTING), "FLS": ("mu", LARGE_PRICES), "AugmentedFLS": ("mu", PRICES)}
@@ -87,7 +97,8 @@ def own() -> list[Contestant]:
     known = trackers.found()
     free = [as_it_comes(kind) for kind in known.values() if not kind.required]
     one = [ours(name, *ONE_NUMBER[name]) for name in ONE_NUMBER if name in known]
-    return [*free, KALMAN, *one, Contestant("RLS(1), constant LS", "driftfit", least_squares)]
+    others = (("Kalman, ML each", likeliest), ("RLS(1), constant LS", least_squares))
+    return [*free, KALMAN, *one, *(Contestant(name, "driftfit", follow) for name, follow in others)]
 
 
 PEERS = (

@@ -17,6 +17,7 @@ intervals as its record does.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
@@ -25,6 +26,7 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
+from driftfit.data.times.periods import EXAMPLES, periods
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import warn
 from driftfit.models.arx import GAP
@@ -254,6 +256,8 @@ def instant(time: Any) -> Any:
         return time.to_datetime64()
     if isinstance(time, datetime) and time.tzinfo is not None:
         time = time.astimezone(UTC).replace(tzinfo=None)
+    if isinstance(time, str):
+        return _of_texts([time])[0]
     return _by_days(np.asarray(time, dtype="datetime64" if isinstance(time, np.datetime64) else "datetime64[us]"))[()]
 
 
@@ -264,11 +268,32 @@ def instants(time: Any) -> tuple[Array, str | None]:
         return axis.astype(float), None
     if axis.dtype.kind == "M":
         return _by_days(axis), None
+    if axis.dtype.kind in "UT" or (axis.dtype.kind == "O" and axis.size and isinstance(axis.flat[0], str)):
+        return _of_texts(axis.ravel().tolist()).reshape(axis.shape), None
     if axis.dtype.kind == "O" and axis.size and isinstance(axis.flat[0], datetime) and axis.flat[0].tzinfo is not None:
         zone = zone_name(axis.flat[0].tzinfo)
         flat = [one.astimezone(UTC).replace(tzinfo=None) for one in axis.flat]
         return np.array(flat, dtype="datetime64[us]").reshape(axis.shape), zone
     return np.asarray(time, dtype="datetime64[us]"), None
+
+
+def _of_texts(texts: Sequence[str]) -> Array:
+    """Dates in the form of ISO 8601, or beginnings of periods."""
+    found = periods(texts)
+    days = [_date_of_text(text) for text in texts] if found is None else found
+    for text, day in zip(texts, days, strict=True):
+        if np.isnat(day) and text.strip().lower() != "nat":
+            raise ValueError(
+                f"time: {text!r} is not a date; write 2024-01-31, 2024-01-31 12:00:00, or a period as in {EXAMPLES}."
+            )
+    return np.asarray(days, dtype="datetime64[us]")
+
+
+def _date_of_text(text: str) -> np.datetime64:
+    try:
+        return np.datetime64(text, "us")
+    except ValueError:
+        return np.datetime64("NaT", "us")
 
 
 def zone_name(zone: Any) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 import polars as pl
 
 from driftfit.data.clock import zone_name
+from driftfit.data.times.periods import EXAMPLES, periods
 from driftfit.engine.arrays import as_numbers
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
@@ -98,6 +99,8 @@ def times_of_column(series: nw.Series[Any], where: str, base: int) -> tuple[Arra
             return _numbers_of_text(text, where, base), None
         series = nw.from_native(_dates_of_text(text, where, base), series_only=True)
     native: Any = series.to_native()
+    if str(getattr(native, "dtype", "")).startswith("period["):  # pandas: periods, which narwhals does not know
+        return np.asarray(native.dt.to_timestamp().to_numpy()), None
     if (
         hasattr(native, "dt") and getattr(native.dtype, "tz", None) is not None
     ):  # narwhals does not support all zones of pandas
@@ -144,15 +147,20 @@ def _year_first(text: pl.Series, where: str) -> pl.Series:
 
 
 def _dates_of_text(text: pl.Series, where: str, base: int) -> pl.Series:
+    begin = periods(text.to_list())
     try:
-        dates = _year_first(text, where).str.to_datetime(time_unit="us", strict=False)
+        if begin is None:
+            dates = _year_first(text, where).str.to_datetime(time_unit="us", strict=False)
+        else:
+            dates = pl.Series(text.name, begin)
     except pl.exceptions.ComputeError:  # the first cells contain no date from which to infer the format
         dates = pl.Series(text.name, [None] * len(text), dtype=pl.Datetime("us"))
     wrong = (dates.is_null() & text.is_not_null()).arg_true()
     if len(wrong):
         raise ValueError(
             f"{where}, row {wrong[0] + base} of column {text.name!r} holds {text[wrong[0]]!r}, which is neither a "
-            "number nor a date in the form of the column's first cells (2024-01-31 or 2024-01-31 12:00:00)."
+            "number nor a date in the form of the column's first cells (2024-01-31, 2024-01-31 12:00:00, or a period "
+            f"as in {EXAMPLES})."
         )
     return dates
 

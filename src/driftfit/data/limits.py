@@ -17,13 +17,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from datetime import date, datetime
+from datetime import date, datetime, timedelta
 from typing import Any
 from zoneinfo import ZoneInfo
 
 import numpy as np
 
 from driftfit.data.clock import instant
+from driftfit.data.times.periods import span
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
@@ -142,7 +143,7 @@ def _end(given: Any, axis: Array, zone: str | None, upper: int) -> Any:
     try:
         if axis.dtype.kind != "M":
             return float(given)
-        stamp = _stamp(given)
+        stamp = _stamp(given, upper)
         coarse = isinstance(stamp, np.datetime64) and np.datetime_data(stamp.dtype)[0] in ("Y", "M", "W", "D")
         moment = _in_utc((stamp + upper).astype("datetime64[us]") if coarse else instant(stamp), stamp, zone)
         return moment - np.timedelta64(1, "us") if coarse and upper else moment
@@ -153,12 +154,16 @@ def _end(given: Any, axis: Array, zone: str | None, upper: int) -> Any:
         ) from None
 
 
-def _stamp(given: Any) -> Any:
-    """Text and days as datetime64 in the resolution in which they were given; text with a zone as a datetime."""
+def _stamp(given: Any, upper: int) -> Any:
+    """Text and days as datetime64 in the resolution in which they were given, of periods the first or last day; text
+    with a zone as a datetime.
+    """
     if isinstance(given, date) and not isinstance(given, datetime):
         return np.datetime64(given)
     if not isinstance(given, str):
         return given
+    if (found := span(given)) is not None:
+        return np.datetime64(found[1] - timedelta(1) if upper else found[0])
     zoned = re.search(r"\d\d:\d\d.*([+-]\d\d:?\d\d|Z)$", given.strip())
     return datetime.fromisoformat(given) if zoned else np.datetime64(given)
 

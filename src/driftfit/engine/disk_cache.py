@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numba
 
-from driftfit.engine.numba_internals import dumps, processor, versions
+from driftfit.engine.numba_internals import dumps, target
 
 PACKAGE = Path(__file__).parent
 ENDING = ".compiled"
@@ -66,7 +66,7 @@ def makers() -> str:
     build = hashlib.sha256()
     for name in MAKERS:
         build.update((PACKAGE / name).read_bytes())
-    return f"{platform.python_version()}{versions()}{processor()}{build.hexdigest()}"
+    return f"{platform.python_version()}{target()}{build.hexdigest()}"
 
 
 def name_of(function: str, identity: str, signature: Any) -> str:

@@ -26,16 +26,15 @@ import numba
 import numpy as np
 from numba import types
 
-from driftfit.engine.kernel import Array, Driver, State, Step, kernel
-from driftfit.engine.tracker_part import EDGE, tracker_part, whole_record
+from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
+from driftfit.engine.outlined import outlined
+from driftfit.engine.tracker_part import BOUNDARY, tracker_part, whole_record
 
 WIDTH = 32
 """Lanes of a fleet's tile. It must be a constant of the type: a run-time lane count is not vectorised."""
 
 LARGEST = 1e38
-"""Signals at least this large are not used: about the largest number in single precision, and more than any
-measurement.
-"""
+"""Signals at least this large are not used: it is about the largest number in single precision."""
 
 SMALLEST = 1e-38
 """Signals below this are zero. Between the two the fourth power of any ratio of signals is a number: no product of a
@@ -125,9 +124,11 @@ class TrackerSteps(NamedTuple):
     columns of ``known``, those after interval, noise and drift, for trackers that take more factors.
     ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when a run is replayed for a smoother.
     With ``doubts`` the model weighs lags that the tracker doubts; with ``instruments`` a model that has its own writes
-    them to s.zeta (n,), a field of the tracker. Steps see the fields of the tracker and those that
-    every record has but for ``u``, so that they are compiled once for all models (`driftfit.engine.tracker_part`);
-    with ``reads_model`` they see those of the model too.
+    them to s.zeta (n,), a field of the tracker. Steps see the fields of the tracker and those that every record has but
+    for ``u``, so that they are compiled once for all models (`driftfit.engine.tracker_part`); with ``reads_model`` they
+    see those of the model too. ``outlined`` steps are compiled apart from the drivers, which call them
+    (`driftfit.engine.outlined`): for trackers that take so long that a call costs nothing. ``note`` comes before all of
+    them and may write what they change later.
     """
 
     predict: Step
@@ -142,6 +143,8 @@ class TrackerSteps(NamedTuple):
     doubts: bool = False
     instruments: bool = False
     reads_model: bool = False
+    outlined: bool = False
+    note: Step = nothing
 
 
 def _common(n: int) -> dict[str, Any]:
@@ -158,7 +161,7 @@ def held_in(record: np.dtype[Any], own: Collection[str] = ()) -> list[str]:
     """The fields of a record that hold something: a tracker's ``own``, the model's, the common and the open ones."""
     first, second, *rest = _common(0)
     behind = [first, second, "u", *rest, *OPEN]
-    names = [name for name in record.names or () if name not in (EDGE, "pad")]
+    names = [name for name in record.names or () if name not in (BOUNDARY, "padding")]
     return sorted(names, key=lambda name: 0 if name in own or name not in behind else 1 + behind.index(name))
 
 
@@ -179,16 +182,18 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
     own = trackers[0].keys() | _common(n).keys()
     seen = [field for field in fields if field[0] in own]
     others = [field for field in fields if field[0] not in own]
-    fields = [*seen, _filling(EDGE, seen, L), *others]
-    tile = _aligned(_followed_by(np.dtype([*fields, _filling("pad", fields, L)], align=True), opened), 1)
+    fields = [*seen, _padding(BOUNDARY, seen, L), *others]
+    tile = _aligned(_followed_by(np.dtype([*fields, _padding("padding", fields, L)], align=True), opened), 1)
     for l, start in enumerate(starts):
         for name, value in start.items():
             tile[name][0, ..., l] = value
+    if opened:
+        tile[BOUNDARY][0, 0] = tile[opened[0][0]].ctypes.data - tile[BOUNDARY].ctypes.data
     return tile
 
 
-def _filling(name: str, fields: Sequence[Any], L: int) -> tuple[str, type, tuple[int, int]]:
-    """A field behind others that ends with a cache line, so that no vector load of a lane block straddles two.
+def _padding(name: str, fields: Sequence[Any], L: int) -> tuple[str, type, tuple[int, int]]:
+    """A field of padding, after which others begin on a cache line, so that no load of a vector of lanes crosses two.
 
     It has as many rows for every L: a packed state of one lane is read into tiles of any width.
     """
@@ -311,8 +316,9 @@ def _advance(tracker: TrackerSteps) -> Any:
         return advance
 
     def start(s: State) -> None:
+        alone = s.theta.shape[1] == 1  # a constant, for which there is no code of the others
         for l in range(s.theta.shape[1]):
-            if s.root[l] > 0:
+            if alone or s.root[l] > 0:
                 begin(s, l)
             else:
                 predict(s, l)
@@ -343,13 +349,14 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     one sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u (`Drivers.updater`); both
     take what is known from the fields ``interval``, ``noise`` and ``drift`` of the record and return (y_hat, e, s, ok).
     """
-    regress, push, ready = model
+    ready = model.ready
     ready(1)
     for machine in tracker.machines:
         machine.load()
     driver = partial(Driver, instead=tracker.instead)
     part = whole_record if tracker.reads_model else tracker_part
-    sample = _sample(regress, push, _advance(tracker), part)
+    advance = _advance(tracker)
+    sample = _sample(model, tracker.note, outlined(advance) if tracker.outlined else advance, part)
     keep_more = covariance if keep == "cov" else nothing_more
     run = _run(driver, sample, tracker.read_extra, _stored(tracker.store, keep_more), part)
 
@@ -375,8 +382,9 @@ def _stored(store: Any, keep_more: Any) -> Any:
     return stored
 
 
-def _sample(regress: Step, push: Step, advance: Any, part: Any) -> Any:
+def _sample(model: ModelSteps, note: Step, advance: Any, part: Any) -> Any:
     """One sample of all lanes, whose signals and known factors are in the record."""
+    regress, push, _ = model
 
     @kernel
     def sample(s: State) -> None:
@@ -384,6 +392,7 @@ def _sample(regress: Step, push: Step, advance: Any, part: Any) -> Any:
         for l in range(L):
             regress(s, l)
             clean(s, l)
+            note(part(s), l)
         advance(part(s))
         for l in range(L):
             push(s, l)

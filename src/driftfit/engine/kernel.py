@@ -37,6 +37,7 @@ from driftfit.engine import compile_notice, disk_cache
 from driftfit.engine import numba_internals as internals
 from driftfit.engine.compile_notice import compiling
 from driftfit.engine.identity import identity
+from driftfit.engine.outlined import called_by, object_code
 
 Array = npt.NDArray[Any]
 State = Any
@@ -225,24 +226,16 @@ class Driver:
 
     def _made(self, arguments: tuple[types.Type, ...]) -> Any:
         """From disk, or from the compiler."""
-        source = self.function
-        name = disk_cache.name_of(source.__name__, self._identity, arguments)
-        code = disk_cache.read(name)
-        if code is None:
-            twin = FunctionType(source.__code__, source.__globals__, source.__name__, None, source.__closure__)
-            twin.__qualname__ = name.removesuffix(disk_cache.ENDING).replace("-", "_")
-            try:
-                with compiling():
-                    code = internals.emit(twin, arguments)
-            except KeyError as missing:
-                raise TypeError(
-                    f"a compiled step names the field {missing}, which its record does not have. The steps of a "
-                    "tracker see fields of the model only with TrackerSteps(..., reads_model=True)."
-                ) from None
-            if code.lasting:
-                disk_cache.write(name, tuple(code))
+        name = disk_cache.name_of(self.function.__name__, self._identity, arguments)
+        stored = disk_cache.read(name)
+        code = None if stored is None else internals.Code(*stored)
+        outside = code and called_by(code, self._instead)
+        if code is None or outside is None:
+            code = object_code(self.function, name, arguments)
+            outside = called_by(code, self._instead)
             internals.forget(KEPT)
-        return internals.load(internals.Code(*code), self._instead)
+        assert outside is not None
+        return internals.load(code, outside)
 
     def let_go(self, found: Any) -> None:
         """Forget an entry point; whoever holds it may continue to use it."""
@@ -313,11 +306,11 @@ def _release_locks() -> None:
 if hasattr(os, "register_at_fork"):  # a child process has no thread that would release its parent's locks
     os.register_at_fork(before=_acquire_locks, after_in_parent=_release_locks, after_in_child=_release_locks)
 
-floats = internals.matrix_at("floats", types.float64)
+floats = internals.array_of("floats", 2, types.float64)
 """floats(address, rows, columns): the array (rows, columns) of floats that begins at an address."""
-cubes = internals.cube_at("cubes", types.float64)
+cubes = internals.array_of("cubes", 3, types.float64)
 """cubes(address, rows, columns, lanes): the array (rows, columns, lanes) of floats that begins at an address."""
-wholes = internals.matrix_at("wholes", types.int64)
+wholes = internals.array_of("wholes", 2, types.int64)
 """wholes(address, rows, columns): the array (rows, columns) of whole numbers that begins at an address."""
 
 

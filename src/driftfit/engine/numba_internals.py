@@ -16,9 +16,8 @@ for each, which names in one sentence what broke. Tried with the versions in `TR
                    remove_user_function, _dispose
     object code    codegen._tm, llvmlite's ORC,     drivers are kept as object code and freed with the last reference
                    numba._dynfunc, environments
-    symbols        add_symbol, llvm_cfunc_wrapper   machines are called by name
-    arrays         context.make_array,              an array at an address without reference counts
-                   populate_array
+    symbols        llvm_cfunc_wrapper, call_conv   machines and outlined steps are called by name
+    arrays         make_array, populate_array      an array at an address without reference counts
     fields         AttributeTemplate                fields of a table by name; see `driftfit.trackers.bank.table`
     vectors        llvmlite.ir                      instructions on SIMD vectors; see `driftfit.engine.simd`
 
@@ -118,14 +117,10 @@ def under_ieee(function: Callable[..., Any], **options: bool) -> Any:
 # ---- stored ---------------------------------------------------------------------------------------------------------
 
 
-def processor() -> str:
-    """The processor for which code is generated."""
-    return f"{sys.byteorder}{cpu_target.target_context.codegen().magic_tuple()}"
-
-
-def versions() -> tuple[str, str]:
-    """The versions on which code depends."""
-    return numba.__version__, llvmlite.__version__
+def target() -> str:
+    """The versions on which code depends, and the processor for which it is generated."""
+    processor = cpu_target.target_context.codegen().magic_tuple()
+    return f"{numba.__version__, llvmlite.__version__}{sys.byteorder}{processor}"
 
 
 class Stored(_Cache):
@@ -334,8 +329,7 @@ for _manager in (passes.ModulePassManager, passes.FunctionPassManager):
         _manager._dispose = passes.NewPassManager._dispose
 
 _recent: OrderedDict[Any, None] = OrderedDict()
-"""(dispatcher, types of the arguments) of functions that were compiled only to be linked, the most recently used last.
-"""
+"""(dispatcher, types of arguments) of functions that were compiled only to be linked, the most recently used last."""
 
 
 def _note_use(dispatcher: Any, signature: Any) -> None:
@@ -367,14 +361,14 @@ OWN_ADDRESSES = "numba.dynamic.globals"
 
 
 class Code(NamedTuple):
-    """A compiled function that Python calls, as stored on disk."""
+    """A compiled function that Python or other code calls, as stored on disk."""
 
     data: bytes
     """Object code."""
     module: str
     name: str
-    wrapper: str
-    """Symbol of the function that Python calls."""
+    entry: str
+    """Symbol of the function that is called."""
     outside: tuple[str, ...]
     """Symbols that it calls and does not define."""
     environments: tuple[tuple[str, Any], ...]
@@ -383,10 +377,11 @@ class Code(NamedTuple):
     """Whether it is valid in another process."""
 
 
-def emit(function: FunctionType, arguments: tuple[Any, ...]) -> Code:
-    """Compile a function for one signature, with all that it calls, to object code."""
+def emit(function: FunctionType, arguments: tuple[Any, ...], from_python: bool = True) -> Code:
+    """Compile a function for one signature, with all that it inlines, to object code."""
     with compiler_lock:
-        dispatcher = as_part(under_ieee(function, no_cfunc_wrapper=True), WholeDispatcher)
+        options = {"no_cfunc_wrapper": True, "no_cpython_wrapper": not from_python}
+        dispatcher = as_part(under_ieee(function, **options), WholeDispatcher)
         dispatcher.compile(arguments)
         made = dispatcher.overloads[arguments]
         module = made.library._final_module
@@ -395,34 +390,43 @@ def emit(function: FunctionType, arguments: tuple[Any, ...]) -> Code:
         names = [own, *(name for name in variables if name.startswith(ENVIRONMENT) and name != own)]
         environments = {name: lookup_environment(name) for name in names if name in variables}
         absent = [f.name for f in (*module.functions, *module.global_variables) if f.is_declaration]
+        entry = made.fndesc.llvm_cpython_wrapper_name if from_python else made.fndesc.llvm_func_name
         return Code(
-            made.library.codegen._tm.emit_object(module), made.fndesc.modname, function.__name__,
-            made.fndesc.llvm_cpython_wrapper_name, tuple(name for name in absent if not name.startswith("llvm.")),
+            made.library.codegen._tm.emit_object(module), made.fndesc.modname, function.__name__, entry,
+            tuple(name for name in absent if not name.startswith("llvm.")),
             ((own, made.environment), *((name, env) for name, env in environments.items() if name != own and env)),
             all(env is None or env.can_cache() for env in environments.values())
             and not any(name.startswith(OWN_ADDRESSES) for name in variables),
         )  # fmt: skip
 
 
-def load(code: Code, instead: Mapping[str, str] = MappingProxyType({})) -> Any:
-    """The entry point of code. Numba's loader never frees anything; this one does with the last reference to it.
+class Linked:
+    """Code in this process, at ``address``. Numba's loader never frees anything; this one does with the last reference.
 
-    ``instead`` maps symbols that the code calls to those that are called in their place.
+    ``outside`` maps symbols that the code calls to what they stand for: another symbol, or linked code.
     """
-    library = llvm.JITLibraryBuilder().add_object_img(code.data).add_current_process().export_symbol(code.wrapper)
-    loader = _loader()
-    for name in code.outside:
-        address = llvm.address_of_symbol(instead.get(name, name))
-        if address is not None:
-            library.import_symbol(name, address)
-    for name, _ in code.environments:
-        library.export_symbol(name)
-    tracker = library.link(loader, f"driftfit{next(_numbers)}")
-    for name, environment in code.environments:
-        ctypes.c_void_p.from_address(tracker[name]).value = id(environment)
-    kept = (tracker, *(environment for _, environment in code.environments))
-    module, own = sys.modules.get(code.module), code.environments[0][1]
-    return _dynfunc.make_function(module, code.name, code.name, tracker[code.wrapper], own, kept)
+
+    def __init__(self, code: Code, outside: Mapping[str, Any] = MappingProxyType({})) -> None:
+        library = llvm.JITLibraryBuilder().add_object_img(code.data).add_current_process().export_symbol(code.entry)
+        loader = _loader()
+        for name in code.outside:
+            other = outside.get(name, name)
+            address = other.address if isinstance(other, Linked) else llvm.address_of_symbol(other)
+            if address is not None:
+                library.import_symbol(name, address)
+        for name, _ in code.environments:
+            library.export_symbol(name)
+        tracker = library.link(loader, f"driftfit{next(_numbers)}")
+        for name, environment in code.environments:
+            ctypes.c_void_p.from_address(tracker[name]).value = id(environment)
+        self._kept = tracker, dict(outside), code.environments
+        self.address: int = tracker[code.entry]
+
+
+def load(code: Code, outside: Mapping[str, Any] = MappingProxyType({})) -> Any:
+    """The entry point of code for Python."""
+    made, module, own = Linked(code, outside), sys.modules.get(code.module), code.environments[0][1]
+    return _dynfunc.make_function(module, code.name, code.name, made.address, own, (made,))
 
 
 _numbers = itertools.count()
@@ -447,20 +451,15 @@ def publish(dispatcher: Any, arguments: tuple[Any, ...], symbol: str) -> Any:
     return made.library
 
 
+def call(context: Any, builder: Any, symbol: str, arguments: tuple[Any, ...], given: Any) -> Any:
+    """Call a function that returns nothing by its symbol, as Numba's functions call each other."""
+    rules, known = context.call_conv, builder.module.globals
+    called = known.get(symbol) or ir.Function(builder.module, rules.get_function_type(types.none, arguments), symbol)
+    rules.call_function(builder, called, types.none, arguments, given)
+    return context.get_dummy_value()
+
+
 # ---- arrays ---------------------------------------------------------------------------------------------------------
-
-
-def _array(dtype: Any, *shape: Any) -> Any:
-    """The typed half of an intrinsic ``f(address, *shape)``: the C array of this shape that begins at an address.
-
-    `numba.carray` does the same with two additional functions for every caller, and counts references.
-    """
-    array = types.Array(dtype, len(shape), "C")
-
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return array_at(context, builder, array, given[0], given[1:])
-
-    return array(types.intp, *(types.intp for _ in shape)), build
 
 
 def array_at(context: Any, builder: Any, array: Any, address: Any, shape: Any) -> Any:
@@ -475,22 +474,23 @@ def array_at(context: Any, builder: Any, array: Any, address: Any, shape: Any) -
     return made._getvalue()
 
 
-def matrix_at(name: str, dtype: Any) -> Any:
-    """An intrinsic ``f(address, rows, columns)``: the array that begins at an address."""
+def array_of(name: str, axes: int, dtype: Any) -> Any:
+    """An intrinsic ``f(address, rows, columns)`` or ``f(address, rows, columns, lanes)``: the C array at an address.
+
+    `numba.carray` does the same with two additional functions for every caller, and counts references.
+    """
+    array = types.Array(dtype, axes, "C")
+
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return array_at(context, builder, array, given[0], given[1:])
 
     def matrix(context: Any, address: Any, rows: Any, columns: Any) -> Any:
-        return _array(dtype, rows, columns)
-
-    return named_intrinsic(name, matrix)
-
-
-def cube_at(name: str, dtype: Any) -> Any:
-    """An intrinsic ``f(address, rows, columns, lanes)``: the array that begins at an address."""
+        return array(*[types.intp] * 3), build
 
     def cube(context: Any, address: Any, rows: Any, columns: Any, lanes: Any) -> Any:
-        return _array(dtype, rows, columns, lanes)
+        return array(*[types.intp] * 4), build
 
-    return named_intrinsic(name, cube)
+    return named_intrinsic(name, matrix if axes == 2 else cube)
 
 
 def named_intrinsic(name: str, typed: Any) -> Any:

@@ -199,6 +199,15 @@ def _two(operation: str) -> Any:
     return typed
 
 
+def _root(context: Any, a: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        name = "llvm.sqrt.v8f64"
+        kind = ir.FunctionType(_VECTOR8, [_VECTOR8])
+        return builder.call(builder.module.globals.get(name) or ir.Function(builder.module, kind, name), given)
+
+    return vector8(vector8), build
+
+
 def _reaches(context: Any, a: Any, b: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         return _one_where(builder, builder.fcmp_ordered(">=", *given))
@@ -258,6 +267,8 @@ plus, minus, times, over = (
     _named(name, _two(operation))
     for name, operation in (("plus", "fadd"), ("minus", "fsub"), ("times", "fmul"), ("over", "fdiv"))
 )
+root = _named("root", _root)
+"""Square roots of the entries."""
 reaches = _named("reaches", _reaches)
 """1 where the first is at least the second, 0 elsewhere."""
 equal, below = _named("equal", _compare("==")), _named("below", _compare("<"))

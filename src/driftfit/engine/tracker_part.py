@@ -1,8 +1,8 @@
 """The part of a record that the steps of a tracker see, as a type of its own.
 
-A record begins with the fields of the tracker and those that every record has, which end at the field `EDGE`; those of
-the model follow. The part up to there depends on the tracker, the number of parameters and the lanes only. Steps that
-are compiled for it serve every model with that many parameters, at a third of the time of compiling them again.
+A record begins with the fields of the tracker and those that every record has, which end at the field `BOUNDARY`; those
+of the model follow. The part up to there depends on the tracker, the number of parameters and the lanes only. Steps
+that are compiled for it serve every model with that many parameters, at a third of the time of compiling them again.
 """
 
 from __future__ import annotations
@@ -10,23 +10,26 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 from numba import types
 
 from driftfit.engine.kernel import State, kernel
 from driftfit.engine.numba_internals import named_intrinsic
 
-EDGE = "edge"
-"""The field behind the last one that a tracker sees; it holds nothing, and fills a cache line."""
+BOUNDARY = "boundary"
+"""The field behind the last one that a tracker sees, which fills a cache line. It holds the distance in bytes to the
+open fields, which are at the end of the record, if there are any.
+"""
 
 
 @lru_cache(maxsize=256)
 def _part(record: Any) -> Any:
     """The type of the part; its last field has a name that no record has, for which Numba would take it to be one."""
-    edge = record.fields[EDGE]
-    seen = {name: field for name, field in record.fields.items() if field.offset < edge.offset} | {"end": edge}
+    boundary = record.fields[BOUNDARY]
+    seen = {name: field for name, field in record.fields.items() if field.offset < boundary.offset} | {"end": boundary}
     return types.Record(
         [(name, {"type": one.type, "offset": one.offset, "alignment": one.alignment}) for name, one in seen.items()],
-        edge.offset + 8 * edge.type.nitems,
+        boundary.offset + 8 * boundary.type.nitems,
         record.aligned,
     )
 
@@ -42,6 +45,12 @@ def _typed(context: Any, record: Any) -> Any:
 
 tracker_part = named_intrinsic("tracker_part", _typed)
 """tracker_part(s): the same memory as s, of which only the fields of the tracker and the common ones can be named."""
+
+
+@kernel
+def open_at(s: State) -> int:
+    """The address of the first of the open fields of a record, of whose part a step sees."""
+    return s.end.ctypes.data + np.int64(s.end[0, 0])  # type: ignore[no-any-return]
 
 
 @kernel

@@ -32,11 +32,9 @@ from rich.text import Text
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
-from driftfit.judge.compare import errors
+from driftfit.judge.evidence import Evidence
 from driftfit.judge.excitation import INDEX, Excitation, excitation
 from driftfit.judge.plots import Health, draw_diagnosis
-from driftfit.judge.regressors import Rows, regressors
-from driftfit.judge.statistics.constancy import Constancy, constancy
 from driftfit.judge.statistics.paired import paired
 from driftfit.judge.statistics.robust import core
 from driftfit.judge.statistics.whiteness import Whiteness, crossing, whiteness
@@ -89,11 +87,6 @@ class Diagnosis(Printed):
 
     checks: tuple[Check, ...]
     run: Track = field(repr=False, compare=False)
-    z: Array = field(repr=False, compare=False)
-    white: Whiteness = field(repr=False, compare=False)
-    excited: Excitation = field(repr=False, compare=False)
-    constant: Constancy = field(repr=False, compare=False)
-    rows: Rows = field(repr=False, compare=False)
 
     @property
     def ok(self) -> bool:
@@ -122,29 +115,40 @@ class Diagnosis(Printed):
 
         ``ax`` as for `Track.plot`.
         """
-        parts = (self.run, self.z, self.white, self.excited, self.constant, self.rows)
+        z, white = standardised(self.run)
+        known = Evidence(self.run)
+        parts = (self.run, z, white, excitation(known.rows.phi), known.test, known.rows)
         return draw_diagnosis(Health(*parts, lambda name: self[name].ok), ax)
 
 
 def diagnose(run: Track) -> Diagnosis:
     """Check a run; see the module for the numbers and their limits. Bad data never raise an error."""
-    start = burn_in(run.model.n)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z = run.innovation / run.innovation_std
-    z = np.where(run.ok & np.isfinite(z) & (np.arange(len(run)) >= min(start, len(run) // 2)), z, np.nan)
-    rows = regressors(run)
-    # without a covariance there is no scale, but correlation does not need one
-    white = whiteness(z if np.isfinite(z).any() else np.where(run.ok, run.innovation, np.nan))
-    excited, constant = excitation(rows.phi), constancy(rows.phi, rows.y)
+    return diagnosis(Evidence(run))
+
+
+def diagnosis(known: Evidence) -> Diagnosis:
+    """The same where the test of constancy may be shared with the verdict."""
+    run = known.run
+    z, white = standardised(run)
     checks = (
         _whiteness(white),
         *_inputs(run, z),
         *_level(z, white, _robust(run)),
         *_distribution(z, _robust(run)),
-        _excitation(run, excited),
-        _constancy(run, constant),
+        _excitation(run, excitation(known.rows.phi)),
+        _constancy(known),
     )
-    return Diagnosis(checks, run, z, white, excited, constant, rows)
+    return Diagnosis(checks, run)
+
+
+def standardised(run: Track) -> tuple[Array, Whiteness]:
+    """Standardised innovations after the start, NaN where there are none, and their whiteness."""
+    start = burn_in(run.model.n)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = run.innovation / run.innovation_std
+    z = np.where(run.ok & np.isfinite(z) & (np.arange(len(run)) >= min(start, len(run) // 2)), z, np.nan)
+    # without a covariance there is no scale, but correlation does not need one
+    return z, whiteness(z if np.isfinite(z).any() else np.where(run.ok, run.innovation, np.nan))
 
 
 def _whiteness(white: Whiteness) -> Check:
@@ -244,13 +248,14 @@ def _excitation(run: Track, excited: Excitation) -> Check:
     return Check("excitation", float(excited.condition.max()), 0.0, INDEX, advice)
 
 
-def _constancy(run: Track, test: Constancy) -> Check:
-    if holds_constant(run):
+def _constancy(known: Evidence) -> Check:
+    test = known.test
+    if holds_constant(known.run):
         advice = (
             "The coefficients move, but this tracker holds them constant: use Kalman with a drift, or AdaptiveKalman."
         )
         return Check("constancy (p)", test.p_joint, SURE, np.inf, advice)
-    error = errors(run)
+    error = known.errors
     own, steady = (part[error.scored] for part in (error.tracked, error.constant_ls))
     least, most = root_mean_square(steady), root_mean_square(own)
     advice = (

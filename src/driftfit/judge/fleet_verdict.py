@@ -22,9 +22,10 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.diagnose import Diagnosis, diagnose
+from driftfit.judge.diagnose import Diagnosis, diagnose, diagnosis
+from driftfit.judge.evidence import Evidence
 from driftfit.judge.on_all_cores import on_all_cores
-from driftfit.judge.verdict import Verdict, p_text, verdict
+from driftfit.judge.verdict import Verdict, judged, p_text, verdict
 from driftfit.show.parts.text import Printed, key_text, table_of
 
 if TYPE_CHECKING:
@@ -233,7 +234,24 @@ def verdicts(
     runs: Mapping[Hashable, Track], level: float, lags: int | None = None, burn: int | None = None
 ) -> ManyVerdicts:
     """Judge runs by key; see `driftfit.judge.verdict.verdict` for the settings and errors."""
-    said = on_all_cores(runs, lambda key: verdict(runs[key], level, lags, burn), "verdict")
+    return ranked(on_all_cores(runs, lambda key: verdict(runs[key], level, lags, burn), "verdict"), level)
+
+
+def verdicts_and_diagnoses(runs: Mapping[Hashable, Track], level: float) -> tuple[ManyVerdicts, ManyDiagnoses]:
+    """Both, which share the test of constancy of each run."""
+
+    def both(key: Hashable) -> tuple[Verdict, Diagnosis]:
+        known = Evidence(runs[key])
+        return judged(known, level), diagnosis(known)
+
+    said = on_all_cores(runs, both, "report")
+    return ranked({key: one for key, (one, _) in said.items()}, level), ManyDiagnoses(
+        {k: d for k, (_, d) in said.items()}
+    )
+
+
+def ranked(said: Mapping[Hashable, Verdict], level: float) -> ManyVerdicts:
+    """Verdicts by key with their q-values, the clearest first."""
     q, q_pays = (
         discoveries(np.array(p)) for p in ([v.p for v in said.values()], [v.constants.p for v in said.values()])
     )

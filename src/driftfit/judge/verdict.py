@@ -33,17 +33,18 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.engine.settings import whole
-from driftfit.judge.compare import errors
-from driftfit.judge.constant_fit import constant_least_squares
-from driftfit.judge.regressors import Rows, regressors
+from driftfit.judge.evidence import Evidence
+from driftfit.judge.regressors import Rows
 from driftfit.judge.statistics.attribution import Attribution, alike, attribute
-from driftfit.judge.statistics.constancy import Constancy, constancy, least_rows
+from driftfit.judge.statistics.constancy import Constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
 from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, facts, table_of
 
+LEVEL = 0.05
+"""Error rate of the statement that the parameters move, where none is given."""
 RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
 CORRELATED = 1e-3
 """If the p-value of whiteness of the residuals of segments is below this, they are reported as correlated."""
@@ -261,7 +262,7 @@ def p_equals(p: float) -> str:
     return f"p {p_text(p)}" if p < 1e-4 else f"p = {p_text(p)}"
 
 
-def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> Verdict:
+def verdict(run: Track, level: float = LEVEL, lags: int | None = None, burn: int | None = None) -> Verdict:
     """Judge a run.
 
     Parameters
@@ -286,16 +287,18 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
     for name, given in (("lags", lags), ("burn", burn)):
         if given is not None:
             whole("verdict", name, given, 0)
-    burn = burn_in(run.model.n) if burn is None else burn
-    steady = constant_least_squares(run.model, run.record)
-    rows = regressors(run, steady)
-    test = constancy(rows.phi, rows.y, lags)
+    return judged(Evidence(run, lags, burn), level)
+
+
+def judged(known: Evidence, level: float) -> Verdict:
+    """The verdict where the test of constancy may be shared with the diagnosis."""
+    run, rows, test, lags = known.run, known.rows, known.test, known.lags
     drifts = None if np.isnan(test.p_joint) else bool(test.p_joint < level)
     steps = attribute(rows.phi, rows.y, test, level, lags) if drifts else None
     names = enumerate(run.model.names)
     moved = tuple(_moved(run, rows, test, steps, (i, name)) for i, name in names)
     at, similar = alike(rows.phi, test) if drifts and not any(m.moves for m in moved) else (0, ())
-    own, *others, scored = errors(run, burn, steady)
+    own, *others, scored = known.errors
     rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))
     return Verdict(
         drifts=drifts,
@@ -312,7 +315,7 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
         scored=int(scored.sum()),
         correlated=test.noise is not None and bool(whiteness(test.noise.residual).p < CORRELATED),
         lags=test.lags,
-        burn=burn,
+        burn=burn_in(run.model.n) if known.burn is None else known.burn,
     )
 
 

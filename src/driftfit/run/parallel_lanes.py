@@ -96,6 +96,8 @@ def _groups(programs: Sequence[Program]) -> list[list[int]]:
     """Series whose trackers have the same steps and fields, so that they can share tiles."""
     groups: dict[Any, list[int]] = defaultdict(list)
     kinds: dict[int, list[int]] = {}  # most series share one program, and its steps take 100 us to compare
+    if len({id(program) for program in programs}) == 1:
+        return [list(range(len(programs)))]
     for k, program in enumerate(programs):
         group = kinds.get(id(program))
         if group is None:
@@ -150,13 +152,13 @@ def run_jobs(jobs: Sequence[Job], records: Records, threads: int | None = None) 
 
     On a single thread they run in the calling one.
     """
-    for job in {(job.run, job.tile.dtype, job.out.dtype): job for job in jobs}.values():
-        _drive(job, records, 0)  # compiles, so that threads do not wait for each other
     if threads == 1:
         for job in jobs:
             _drive(job, records, len(job.out))
             job.done = True
         return
+    for job in {(job.run, job.tile.dtype, job.out.dtype): job for job in jobs}.values():
+        _drive(job, records, 0)  # compiles, so that threads do not wait for each other
     total = sum(len(job.out) * int(job.live.sum()) for job in jobs)
     with progress("tracking", total, total > SHOWN) as advance, ThreadPoolExecutor(threads or cores()) as pool:
         waiting = {pool.submit(_drive, job, records, len(job.out)): job for job in jobs}

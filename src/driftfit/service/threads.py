@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import deque
 from typing import Any
 
-from driftfit.service.core.engine import Engine
+from driftfit.service.core.engine import Engine, quantiles
 from driftfit.service.core.journal import Journal, Names
 from driftfit.service.core.results import Results
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
@@ -96,7 +97,9 @@ class SinkThread(WorkerThread):
         super().__init__(engine, sink.name)
         self.sink = sink
         self.at = int(engine.positions.get(f"sink:{sink.name}", 0))
-        self.missed = 0
+        self.latencies: deque[float] = deque(maxlen=2000)
+        """Seconds from the arrival of the oldest sample of a group until it is written."""
+        self._arrived: list[float] = []
 
     def work(self) -> None:
         """Write until the thread is stopped."""
@@ -104,6 +107,7 @@ class SinkThread(WorkerThread):
         writer: Writer | None = None
         try:
             names = Names(journal)
+            self._arrived.clear()
             writer = self.sink.open()
             self.state = "running"
             while (batch := self._next(journal, names)) is not None:
@@ -112,6 +116,9 @@ class SinkThread(WorkerThread):
                     writer.write(outcome)
                 self.at = self.engine.progress[self.sink.name] = upto
                 self.count += len(outcome)
+                now = time.time()
+                self.latencies.extend(now - at for at in self._arrived)
+                self._arrived.clear()
         finally:
             if writer is not None:
                 writer.close()
@@ -124,13 +131,14 @@ class SinkThread(WorkerThread):
         events: list[Any] = []
         count, first, upto = 0, 0, self.at
         while True:
-            groups = journal.outcomes(upto)
-            for group, parts, happened in groups:
+            groups = self.engine.after(upto, journal)
+            for group, parts, happened, at in groups:
                 first = first or group
                 results += parts
                 count += sum(len(one.number) for one in parts)
                 events += happened
                 upto = group
+                self._arrived.append(at)
             late = time.monotonic() - begun >= self.sink.gather or count >= self.sink.most
             if (results or events) and (late or self.stopping.is_set()):
                 return names.outcome(first, results, events), upto
@@ -142,4 +150,4 @@ class SinkThread(WorkerThread):
 
     def status(self) -> dict[str, Any]:
         """Numbers for the page."""
-        return super().status() | {"at": self.at}
+        return super().status() | {"at": self.at, **quantiles(self.latencies)}

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftfit.engine import __version__
-from driftfit.judge.diagnose import Diagnosis, diagnose
-from driftfit.judge.verdict import Verdict, p_text, verdict
+from driftfit.judge.diagnose import Diagnosis, diagnosis
+from driftfit.judge.evidence import Evidence
+from driftfit.judge.verdict import LEVEL, Verdict, judged, p_text
 from driftfit.models.arx import ARX
 from driftfit.run.result import Track, burn_in
 from driftfit.show.page_parts import document, picture, section, table
@@ -75,7 +76,8 @@ def check_path(path: str | PathLike[str]) -> Path:
 
 def page(run: Track, title: str | None = None, alarms: Alarms | None = None, labels: Array | None = None) -> str:
     """The page as HTML text."""
-    facts, said, health = summarise(run), verdict(run), diagnose(run)
+    facts, known = summarise(run), Evidence(run)
+    said, health = judged(known, LEVEL), diagnosis(known)
     heading = title or _heading(run)
     sections = [
         f"<h1>{escape(heading)}</h1>",

@@ -49,14 +49,14 @@ def many_faults(runs: Mapping[Hashable, Track], alarms: ManyAlarms | None, label
         begun, row = onsets(wrong), watched.get(key)
         marked = escape(runs[key].time_text(int(begun[0]))) if len(begun) else ""
         cells: tuple[str, ...] = (escape(key_text(key)), str(len(begun)) if key in labels else "", marked)
-        if row is not None and (len(begun) or len(row.alarms.onsets)):
+        if row is not None and (len(begun) or row.onsets):
             score = row.alarms.score(wrong)
             found = (str(score.found), str(score.false)) if key in labels else ("", "")
-            cells += (str(len(row.alarms.onsets)), escape(row.first), escape(p_text(row.q)), *found)
+            cells += (str(len(row.onsets)), escape(row.first), escape(p_text(row.q)), *found)
         if len(cells) > 3 or len(begun):
             rows.append((*cells, *[""] * (8 - len(cells))))
     heads = ("", "labelled", "the first", "alarms", "the first", "q", "found", "false")
-    shown = [row for row in watched.values() if len(row.alarms.onsets)][:PICTURED]
+    shown = [row for row in watched.values() if row.onsets][:PICTURED]
     pictures = (
         f'<div class="one"><h3>{escape(key_text(row.key))}</h3>'
         f"{picture(row.alarms.plot(_given(runs, labels, row.key)), runs[row.key], PICTURE)}</div>"

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftfit.engine import __version__
-from driftfit.judge.fleet_verdict import Judgement, ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
-from driftfit.judge.verdict import p_text
+from driftfit.judge.fleet_verdict import Judgement, ManyDiagnoses, ManyVerdicts, verdicts_and_diagnoses
+from driftfit.judge.verdict import LEVEL, p_text
 from driftfit.show.page_parts import document, picture, section, table
 from driftfit.show.page_style import READING
 from driftfit.show.parts.text import key_text
@@ -32,7 +32,6 @@ PICTURED = 4
 """Most runs with pictures."""
 NAMED = 4
 """Fewer runs, or models, than this are listed by name instead of counted."""
-LEVEL = 0.05
 
 MANY = """<p>Each row was tested separately. Among many tests some reject by chance: q is the share of false rejections
 among all series with a q this small or smaller (false discovery rate).</p>"""
@@ -48,7 +47,7 @@ def page_of_many(
     """The page as HTML text; ``failed`` gives the reasons of missing results; ``labels`` by key are true for faults."""
     if not runs:
         raise ValueError("report: no series has a result to report.")
-    said, health = verdicts(runs, LEVEL, None), diagnoses(runs)
+    said, health = verdicts_and_diagnoses(runs, LEVEL)
     heading = title or (", ".join(map(key_text, runs)) if len(runs) < NAMED else f"{len(runs)} series")
     samples, used = sum(map(len, runs.values())), sum(int(run.ok.sum()) for run in runs.values())
     counted = f"{len(runs)} series, {samples} samples, {used} used, {samples - used} skipped"

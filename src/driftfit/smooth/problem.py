@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps, output_type
-from driftfit.engine.kernel import Array, State, Step, kernel
+from driftfit.engine.kernel import Array, State, kernel
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.program import BLOCK, lanes_of, put_fields
 from driftfit.run.result import Track
@@ -20,13 +20,18 @@ from driftfit.smooth.parts.walk import NONE, Walk, free
 from driftfit.trackers.base import RandomWalk
 
 
+@kernel
+def note_noise(s: State, l: int) -> None:
+    s.used_noise[l] = s.noise[l]
+
+
 @lru_cache
 def attentive(steps: TrackerSteps) -> TrackerSteps:
     """Steps that store the factor of the noise variance when the tracker runs, and the tracker's ``smoother_fields``.
 
     A model may make it larger than the factor that the user gave (measurement noise that enters through a curve).
     """
-    predict, begin, store = steps.predict, steps.begin, steps.store_for_smoother
+    store = steps.store_for_smoother
 
     @kernel
     def collect_all(o: State, s: State, l: int) -> None:
@@ -34,21 +39,7 @@ def attentive(steps: TrackerSteps) -> TrackerSteps:
         store(o, s, l)
         o.used_noise[l] = s.used_noise[l]
 
-    @kernel
-    def noting(s: State, l: int) -> None:
-        s.used_noise[l] = s.noise[l]
-        predict(s, l)
-
-    if begin is None:
-        return steps._replace(predict=noting, store=collect_all)
-    first: Step = begin
-
-    @kernel
-    def noting_first(s: State, l: int) -> None:
-        s.used_noise[l] = s.noise[l]
-        first(s, l)
-
-    return steps._replace(predict=noting, begin=noting_first, store=collect_all)
+    return steps._replace(store=collect_all, note=note_noise)
 
 
 def replay(run: Track) -> dict[str, Array]:

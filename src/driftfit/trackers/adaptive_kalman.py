@@ -2,10 +2,10 @@
 
 K random-walk filters run side by side. Filter k lets parameter i drift by ``q_ki = ratio_k w_ki r / c_i`` a nominal
 sample, where r is the present noise variance and c_i the mean square of regressor i, so ratio_k w_ki is the share of r
-that the drift of one parameter adds to the output per sample, whatever the units. The first ratio is 0. All weights w
-are 1 for one half of the filters; for the others they are learned from the record
-(`driftfit.trackers.parts.modes.weights`), so that parameters may drift at different rates. The filters are the modes of
-a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
+that the drift of one parameter adds to the output per sample, whatever the units. The first ratio is 0. In the common
+ladder of ratios all weights w are 1; in a second one they are learned from the record
+(`driftfit.trackers.parts.modes.weights`); and, with up to eight parameters, each has a ladder on which it alone drifts.
+The filters are the modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each
 filter the levels are merged at once, by a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings far
@@ -19,14 +19,16 @@ The results are the mean and covariance of the mixture. The one-step variance ex
 for samples that are not outliers.
 
 The start is exact diffuse least squares without drift, in which regressors out of proportion count less too, until
-there are enough residuals to estimate r. The filters then start from there, in the directions that the regressors span
-by then. Scaling inputs or outputs changes only the units.
+there are enough residuals to estimate r. Then every filter starts from generalised least squares with its own drift
+over the same samples (`driftfit.trackers.parts.modes.start`), in the directions that the regressors span by then.
+Scaling inputs or outputs changes only the units.
 
 Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Which parameters drift is learned
 in a few hundred samples; ``groups`` tells it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the ladder of ratios, its transitions, the noise
-levels and the scaling are ours. Cost per sample: O(K^2 n^2 + K J) for K modes and J levels; K = 16 without groups.
+levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 13 + 3 n
+for up to eight parameters, and 13 for more.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -69,6 +72,7 @@ from driftfit.trackers.parts.modes.filters import (
 from driftfit.trackers.parts.modes.ladder import filters, mix
 from driftfit.trackers.parts.modes.noise_levels import any_level, finest, learn_noise, noise_prior
 from driftfit.trackers.parts.modes.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
+from driftfit.trackers.parts.modes.start import begin_with_drift, keep_start
 from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
 from driftfit.trackers.parts.outlying_readings import (
     bound_leverage,
@@ -94,19 +98,35 @@ def start_density(e: float, s: float, nu: float) -> float:
 
 
 @kernel
+def interact(s: State, l: int) -> None:
+    if s.ok[l] > 0.0:
+        # now, not before the next sample: its prediction may not depend on whether its output will be there
+        mix(s, l)
+
+
+@kernel
+def go_on(s: State, l: int) -> None:
+    """The estimate of the mixture, and the interaction of the filters, while columns may be free."""
+    if s.ok[l] > 0.0:
+        located_within(s, l)
+    interact(s, l)
+    unseen_variance(s, l)
+
+
+@kernel
 def settle(s: State, l: int) -> None:
     """Start the filters from least squares once there are residuals to estimate r: z = M theta ~ N(d, r I)."""
-    if s.count[l] >= RESIDUALS:
-        s.r[l] = max(s.scale[l], finest(s, l))
-        s.scale[l] = 1.0
-        s.settled[l] = 1
-        for i in range(s.theta.shape[0]):
-            for k in range(s.mu.shape[0]):
-                s.m[i, k, l] = s.d[i, l]
-                s.C[i, i, k, l] = s.r[l] if s.S[i, i, l] > 0.0 else 0.0
-            for j in range(i + 1):
-                s.P[i, j, l] *= s.r[l]
-        frame(s, l)
+    s.r[l] = max(s.scale[l], finest(s, l))
+    s.scale[l] = 1.0
+    s.settled[l] = 1
+    for i in range(s.theta.shape[0]):
+        for k in range(s.modes[l]):
+            s.m[i, k, l] = s.d[i, l]
+            s.C[i, i, k, l] = 1.0 if s.S[i, i, l] > 0.0 else 0.0
+    frame(s, l)
+    begin_with_drift(s, finest(s, l), l)
+    mixture(s, l)
+    go_on(s, l)
 
 
 @kernel
@@ -116,7 +136,7 @@ def learn(s: State, l: int, odd: float) -> None:
     learn_proportion(s, l, odd)
 
 
-@kernel
+@partial(kernel, inline=False)
 def follow(s: State, entering: int, l: int) -> None:
     """One sample of the running filters; ``entering`` is the column in a new direction, or -1."""
     resolve(s, l)
@@ -151,13 +171,6 @@ def correct(s: State, l: int) -> None:
 
 
 @kernel
-def interact(s: State, l: int) -> None:
-    if s.ok[l] > 0.0:
-        # now, not before the next sample: its prediction may not depend on whether its output will be there
-        mix(s, l)
-
-
-@kernel
 def report(s: State, l: int) -> None:
     mixture(s, l)
     share_among_filters(s, l)
@@ -177,10 +190,7 @@ def begin(s: State, l: int) -> None:
         follow(s, whiten_within(s, s.white.ctypes.data, l), l)
         mixture(s, l)
         share_among_filters(s, l)
-        if s.ok[l] > 0.0:
-            located_within(s, l)
-        interact(s, l)
-        unseen_variance(s, l)
+        go_on(s, l)
     else:
         resolve(s, l)
         learn_scales(s, l)
@@ -190,12 +200,14 @@ def begin(s: State, l: int) -> None:
         s.noise[l] = noise * s.leverage[l]
         take_in(s, l)
         s.noise[l] = noise
+        keep_start(s, l)
         if s.s[l] < np.inf:
             residuals = s.count[l]
             learn_scale(s, l)
             s.density[l] = start_density(s.e[l], s.s[l], residuals)
         spanned_variance(s, l)
-        settle(s, l)
+        if s.count[l] >= RESIDUALS:
+            settle(s, l)
 
 
 @kernel
@@ -211,7 +223,7 @@ class AdaptiveKalman(Tracker):
     ----------
     groups : sequence of sequences of indices, or None
         Parameters that drift together, such as ``[[0, 1], [2]]``: each group has filters in which it alone drifts.
-        None: only quantities that are learned from the record.
+        None: each of up to eight parameters has.
 
     Raises
     ------
@@ -228,6 +240,7 @@ class AdaptiveKalman(Tracker):
     adapts: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
         *SCRATCH, "gain", "e_k", "step", "h", "inverse", "joint", "mu_next", "share", "row", "m_next",
+        "weighted", "Z",
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -262,6 +275,9 @@ class AdaptiveKalman(Tracker):
             "e_k": np.zeros(K),
             "step": np.zeros(K),
             "h": np.zeros(K),
+            "waited": 0.0,
+            "weighted": np.zeros(K),
+            "mean_prior": np.zeros(K),
             "inverse": np.zeros((J, K)),
             "joint": np.zeros((J, K)),
             **knowing_nothing(n),
@@ -291,6 +307,7 @@ class AdaptiveKalman(Tracker):
             store_for_smoother=store_for_smoother,
             machines=(*FRAME, machine_weights),
             doubts=True,
+            outlined=True,
         )
 
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:

@@ -50,8 +50,11 @@ class Tracker(Settings, ABC):
     required: ClassVar[tuple[str, ...]] = ()
     width: ClassVar[int] = 32
     outputs: ClassVar[tuple[str, ...]] = ()
-    replaces: ClassVar[tuple[str, ...]] = ()
-    """Fields of the model's memory whose start the tracker gives; all its other names must differ from the model's."""
+    replaces: ClassVar[tuple[str, ...]] = ("shift",)
+    """Fields of the model's memory whose start the tracker gives; all its other names must differ from the model's.
+    ``shift`` is common to all: what the model subtracted from y, for trackers that judge readings
+    (`driftfit.trackers.parts.resolution`).
+    """
     weighs: ClassVar[bool] = False
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
     smoother_fields: ClassVar[tuple[str, ...]] = ()
@@ -100,7 +103,7 @@ class Tracker(Settings, ABC):
     @property
     def pads(self) -> bool:
         """Whether a parameter that is known to be 0 and never excited leaves the others bit for bit as they are without
-        it, so that structures of several sizes may share a driver (`driftfit.trackers.parts.padded`).
+        it, so that structures of several sizes may share a driver (`driftfit.trackers.parts.common_size`).
         """
         return False
 

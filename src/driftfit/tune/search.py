@@ -37,12 +37,12 @@ class Counted:
     """An objective that stores every point at which it was evaluated."""
 
     def __init__(self, objective: Objective) -> None:
-        self._objective = objective
+        self.objective = objective
         self.points: list[Array] = []
         self.values: list[Array] = []
 
     def __call__(self, points: Array) -> Array:
-        values = self._objective(points)
+        values = self.objective(points)
         self.points.append(points)
         self.values.append(values)
         return values
@@ -197,6 +197,8 @@ class Search:
         points = np.repeat(self.x[None], len(axis), axis=0)
         if np.isfinite(self.x[i]):
             points += (axis - self.x[i])[:, None] * self.ridge(i)
+            # far from the best point the others stay within their range, where the ridge of the best would leave it
+            points = np.where(np.isfinite(points), np.clip(points, self.knobs.low, self.knobs.high), points)
         points[:, i] = axis
         return points
 

@@ -13,6 +13,7 @@ from driftfit.engine.kernel import Array
 from driftfit.show.parts.axes import BLUE, RED, panels
 from driftfit.show.parts.text import Printed, facts, shortened, table_of
 from driftfit.trackers.base import Tracker
+from driftfit.tune.averaged import Averaged, averaged
 from driftfit.tune.search import Search
 
 if TYPE_CHECKING:
@@ -33,14 +34,26 @@ METHODS = {
 class Tuned(Printed):
     """The result of `tune`; printing it shows the estimates with their intervals.
 
-    Attributes ---------- tracker : Tracker The tracker with all its settings, ready for `track` and `Live`. method :
-    str The criterion. loglik : float Log-likelihood of the record under ``tracker`` and ``noise``; NaN for trackers
-    without a variance. For trackers that estimate their scale on-line (`RLS`, `FLS`) it is above that of a run, which
-    had less information at the start. noise : float Estimated noise variance; unreliable if ``at_bound`` is not empty.
-    at_bound : tuple of str Settings that ended at a bound of the search, or at zero; empty if the optimum is inside.
-    interval : dict of (low, high) By name of setting, the interval of the likelihood at ``level``: from profiles (for
-    "q[..]/r", "mu", "forgetting" and a single "q" or "r"), or from the curvature (for "q[..]" and "r" estimated
-    together). NaN for other methods. level : float The level of the intervals.
+    Attributes
+    ----------
+    tracker : Tracker
+        The tracker with all its settings, ready for `track` and `Live`.
+    method : str
+        The criterion.
+    loglik : float
+        Log-likelihood of the record under ``tracker`` and ``noise``; NaN for trackers without a variance. For trackers
+        that estimate their scale on-line (`RLS`, `FLS`) it is above that of a run, which had less information at the
+        start.
+    noise : float
+        Estimated noise variance; unreliable if ``at_bound`` is not empty.
+    at_bound : tuple of str
+        Settings that ended at a bound of the search, or at zero; empty if the optimum is inside.
+    interval : dict of (low, high)
+        By name of setting, the interval of the likelihood at ``level``: from profiles (for "q[..]/r", "mu",
+        "forgetting" and a single "q" or "r"), or from the curvature (for "q[..]" and "r" estimated together). NaN for
+        other methods.
+    level : float
+        The level of the intervals.
     """
 
     tracker: Tracker
@@ -98,6 +111,15 @@ class Tuned(Printed):
             settings = np.array([self._search.knobs.values(x)[entry] for x in points])
             curves.append((self._search.knobs.names[entry], settings, self._criterion(values)))
         return curves
+
+    def average(self, draws: int = 64, seed: int = 0) -> Averaged:
+        """Estimates and bands averaged over the settings that the record allows, weighted by their likelihood.
+
+        ``draws`` settings are drawn from their posterior (`driftfit.tune.averaged`) with the generator ``seed``. The
+        bands are wider than those under the best settings alone, and cover where these do not. ValueError for another
+        method than "ml", and for settings of several records.
+        """
+        return averaged(self._search, draws, seed)
 
     def plot(self, ax: Any = None) -> Figure:
         """The criterion along each setting, with the others optimised if it is a likelihood; a matplotlib figure.

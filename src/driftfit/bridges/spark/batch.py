@@ -16,13 +16,10 @@ import pyarrow as pa
 from driftfit.bridges.spark.frames import rows_of, task_of
 from driftfit.bridges.spark.pieces import (
     COUNTS,
-    JUDGED,
     REPEATED,
-    SQUARES,
-    STANDARD,
-    SUMS,
     UNTIMED,
     Piece,
+    Sums,
     add,
     ends,
     filled,
@@ -31,13 +28,24 @@ from driftfit.bridges.spark.pieces import (
     results,
     why,
 )
-from driftfit.bridges.spark.task import Task, chunks, continued, series_of, times, units_of, words_after
+from driftfit.bridges.spark.task import (
+    Task,
+    chunks,
+    continued,
+    parameters_schema,
+    results_schema,
+    series_of,
+    times,
+    units_of,
+    words_after,
+)
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
 from driftfit.judge.verdict import verdict
 from driftfit.models.base import Model
-from driftfit.run.program import Program
+from driftfit.run.outputs import Outputs
 from driftfit.run.result import Lane, Track
+from driftfit.run.states.joint import Joint
 from driftfit.trackers.base import Tracker
 
 OUTPUTS = ("samples", "summary", "verdict", "states")
@@ -45,9 +53,9 @@ VERDICT = {"drifts": "boolean", "p": "double", "pays": "boolean", "moved": "stri
 
 
 def track(
-    df: Any, model: Model, tracker: Tracker, *, y: str, by: str | Sequence[str], time: str,
-    u: str | Sequence[str] | None = None, dt: Any = None, settings: Any = None, outputs: str = "samples",
-    arrays: bool = False,
+    df: Any, model: Model, tracker: Tracker | Mapping[str, Tracker], *, y: str | Sequence[str],
+    by: str | Sequence[str], time: str, u: str | Sequence[str] | None = None, dt: Any = None, settings: Any = None,
+    outputs: str = "samples", arrays: bool = False,
 ) -> Any:  # fmt: skip
     """Track every unit of a data frame of Spark.
 
@@ -56,10 +64,12 @@ def track(
     df : pyspark.sql.DataFrame
         One row per sample, in any order.
     model, tracker : Model, Tracker
-        As for `driftfit.track`; the model has one output.
+        As for `driftfit.track`. A model with several outputs has a theta for each; ``tracker`` may map the name of each
+        output to its tracker.
     y, u, time : names of columns
-        Output, inputs and time (numbers, timestamps or dates). Rows without a time are counted and left out; so are
-        rows at a repeated time, of which the one with the smallest numbers is used, because data frames have no order.
+        Output or outputs, inputs and time (numbers, timestamps or dates). Rows without a time are counted and left out;
+        so are rows at a repeated time, of which the one with the smallest numbers is used, because data frames have no
+        order.
     by : name or names of columns
         What identifies a unit. Rows in which all of them are null are reported as a unit that failed.
     dt : number, duration or step of the calendar
@@ -75,6 +85,9 @@ def track(
         unit with its state, from which `follow` begins.
     arrays : bool
         Put the parameters of a sample into the array columns ``theta`` and ``std``.
+
+    Of several outputs, the columns of results end in the name of the output in brackets, ``prediction[flow]``; a sample
+    is used if one of its outputs is.
 
     Returns
     -------
@@ -92,7 +105,7 @@ def track(
     one_of("spark.track", "outputs", outputs, OUTPUTS)
     task = task_of(df, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, settings, arrays)
     rows = rows_of(df, task, settings)
-    order = [*task.by, task.time, task.y, *task.u]
+    order = [*task.by, task.time, *task.y, *task.u]
     sorted_rows = rows.repartition(*task.by).sortWithinPartitions(*order)
     made = schema_of(task, dict(rows.dtypes), outputs)
     return sorted_rows.mapInArrow(_worker(task, outputs, made), ", ".join(f"`{n}` {kind}" for n, kind in made.items()))
@@ -102,27 +115,14 @@ def schema_of(task: Task, kinds: Mapping[str, str], outputs: str) -> dict[str, s
     """Columns and types of a result, before any data."""
     own = {name: kinds[name] for name in (*task.by, task.time)}
     if outputs == "samples":
-        own |= dict.fromkeys((task.y, *task.u), "double")
+        own |= dict.fromkeys((*task.y, *task.u), "double")
         return own | results_schema(task) | {"failed": "string"}
     counts = dict.fromkeys(COUNTS, "bigint")
     if outputs == "states":
         return own | {"state": "binary", "settings": "string"} | counts | {"failed": "string"}
-    sums = {"rms": "double", "standardised": "double"}
-    judged = VERDICT if outputs == "verdict" else {}
-    return own | parameters_schema(task) | sums | judged | counts | {"failed": "string"}
-
-
-def results_schema(task: Task) -> dict[str, str]:
-    """Columns and types of the results at a sample; those of parameters need no complete tracker."""
-    own = {"prediction": "double", "innovation": "double", "innovation_std": "double", "ok": "boolean"}
-    return own | parameters_schema(task)
-
-
-def parameters_schema(task: Task) -> dict[str, str]:
-    """Columns and types of the parameters."""
-    if task.arrays:
-        return {"theta": "array<double>", "std": "array<double>"}
-    return {f"{what}_{name}": "double" for name in task.names for what in ("theta", "std")}
+    judged = {"rms": "double", "standardised": "double"} | (VERDICT if outputs == "verdict" else {})
+    sums = {f"{name}{of}": kind for of in task.suffixes for name, kind in judged.items()}
+    return own | parameters_schema(task) | sums | counts | {"failed": "string"}
 
 
 def _worker(
@@ -153,8 +153,7 @@ class Partition:
         self._going = piece if more else None
         if self.outputs == "samples" and piece.found is not None:
             rows = pa.array(piece.some.rows)
-            names = (*self.task.by, self.task.time, self.task.y, *self.task.u)
-            own = {name: table.column(name).take(rows) for name in names}
+            own = {name: table.column(name).take(rows) for name in self.task.columns}
             yield filled(own | results(self.task, piece.found), self.schema, table)
         good = [k for k, reason in enumerate(piece.reasons) if reason is None]
         bad = [k for k, reason in enumerate(piece.reasons) if reason is not None]
@@ -169,21 +168,22 @@ class Partition:
         first, code = units_of(table, task.by)
         time, there = times(table.column(task.time)), named(table, task.by)[first]
         settings = task.settings_of(table, first)
-        programs = [task.program_for(one) for one in settings]
+        joints = [task.joint_for(one) for one in settings]
         last = np.full(len(first), "NaT" if time.dtype.kind == "M" else np.nan, time.dtype)
         states: dict[int, Array] = {}
-        sums = np.zeros((len(first), SUMS))
+        sums = Sums.of(len(first), task)
         if self._going is not None:
-            last[0], sums[0], states = self._going.last[0], self._going.sums[0], dict(self._going.words)
-        rows = _usable(code, time, last, sums)
-        good = there & np.array([isinstance(one, Program) for one in programs])
+            last[0], states = self._going.last[0], dict(self._going.words)
+            sums.counts[0], sums.squares[0] = (part[0] for part in self._going.sums)
+        rows = _usable(code, time, last, sums.counts)
+        good = there & np.array([isinstance(one, Joint) for one in joints])
         some = series_of(task, table, code, rows, time, good)
-        found = continued(task, table, some, programs, states, last) if len(some.rows) else None
+        found = continued(task, table, some, joints, states, last) if len(some.rows) else None
         if found is not None:
             add(sums, some, found)
             last[some.keys] = some.time[some.first + some.length - 1]
             states |= words_after(found, some)
-        return Piece(table, first, settings, programs, why(programs, there, sums), last, sums, some, found, states)
+        return Piece(table, first, settings, joints, why(joints, there, sums), last, sums, some, found, states)
 
     def _named(self, piece: Piece, which: list[int]) -> dict[str, Any]:
         """The units, and their last times."""
@@ -192,37 +192,42 @@ class Partition:
         return columns | {self.task.time: instants(piece.last[which], piece.table.schema.field(self.task.time).type)}
 
     def _counts(self, piece: Piece, which: list[int]) -> dict[str, Any]:
-        return {name: piece.sums[which, j].astype(np.int64) for j, name in enumerate(COUNTS)}
+        return {name: piece.sums.counts[which, j] for j, name in enumerate(COUNTS)}
 
     def _of_units(self, piece: Piece, which: list[int]) -> dict[str, Any]:
         """A row for each unit that has a result."""
         own = self._named(piece, which) | self._counts(piece, which)
         if self.outputs == "states":
-            packed = [piece.programs[k].layout.pack(piece.words[k]) for k in which]  # type: ignore[union-attr]
+            packed = [piece.joints[k].pack(piece.words[k]) for k in which]  # type: ignore[union-attr]
             return own | {"state": packed, "settings": [piece.settings[k] for k in which]}
-        sums = piece.sums[which]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            rms, standardised = (np.sqrt(sums[:, j] / sums[:, JUDGED]) for j in (SQUARES, STANDARD))
-        own |= ends(self.task, piece, which) | {"rms": rms, "standardised": standardised}
+        own |= ends(self.task, piece, which)
         return own | (self._verdicts(piece, which) if self.outputs == "verdict" else {})
 
     def _verdicts(self, piece: Piece, which: list[int]) -> dict[str, Any]:
+        """What is judged of every output of each unit."""
         found, place = piece.found, {int(k): j for j, k in enumerate(piece.some.keys)}
         assert found is not None
-        lanes = found.lanes()
-        columns: dict[str, list[Any]] = {name: [] for name in VERDICT}
+        lanes, ny = found.lanes(), len(self.task.y)
+        columns: dict[str, list[Any]] = {f"{name}{of}": [] for of in self.task.suffixes for name in VERDICT}
         for k in which:
-            j = place[k]
-            job, lane = lanes[j]
-            run = Track(found.programs[j], found.records.part(j), Lane(job.out[: piece.some.length[j]], job.tile, lane))
-            said = verdict(run)
-            most = min(said.parameters, key=lambda one: one.p)
-            for name, value in zip(VERDICT, (said.drifts, said.p, said.pays, most.name), strict=True):
-                columns[name].append(value)
+            j, length = place[k], int(piece.some.length[place[k]])
+            each = range(j * ny, (j + 1) * ny)
+            own = [Lane(job.out[:length], job.tile, lane) for job, lane in (lanes[i] for i in each)]
+            programs = [found.programs[i] for i in each]
+            runs = (
+                [Track(programs[0], found.records.part(j), own[0])]
+                if ny == 1
+                else Outputs(programs, found.records.only(j), own, {}, {}).values()
+            )
+            for run, of in zip(runs, self.task.suffixes, strict=True):
+                said = verdict(run)
+                most = min(said.parameters, key=lambda one: one.p)
+                for name, value in zip(VERDICT, (said.drifts, said.p, said.pays, most.name), strict=True):
+                    columns[f"{name}{of}"].append(value)
         return columns
 
 
-def _usable(code: Array, time: Array, last: Array, sums: Array) -> Array:
+def _usable(code: Array, time: Array, last: Array, counts: Array) -> Array:
     """The rows that become samples, of rows in the order of unit and time; the others are counted."""
     untimed = np.isnat(time) if time.dtype.kind == "M" else ~np.isfinite(time)
     timed = np.flatnonzero(~untimed)
@@ -230,5 +235,5 @@ def _usable(code: Array, time: Array, last: Array, sums: Array) -> Array:
     again[1:] = (code[timed][1:] == code[timed][:-1]) & (time[timed][1:] == time[timed][:-1])
     again |= time[timed] == last[code[timed]]
     for place, rows in ((UNTIMED, np.flatnonzero(untimed)), (REPEATED, timed[again])):
-        sums[:, place] += np.bincount(code[rows], minlength=len(sums))
+        counts[:, place] += np.bincount(code[rows], minlength=len(counts))
     return timed[~again]

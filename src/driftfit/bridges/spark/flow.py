@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -10,18 +10,21 @@ import numpy as np
 import pyarrow as pa
 
 from driftfit.bridges.spark.pieces import (
+    ARROW,
     COUNTS,
     LATE,
     REPEATED,
-    SUMS,
     UNTIMED,
+    Sums,
     add,
-    alarm_of,
+    alarms_of,
+    alarms_schema,
+    collects,
     filled,
     instants,
     named,
     results,
-    watch_of,
+    watched,
 )
 from driftfit.bridges.spark.task import (
     Series,
@@ -35,12 +38,13 @@ from driftfit.bridges.spark.task import (
     words_after,
 )
 from driftfit.engine.kernel import Array
-from driftfit.run.live.rule import FROZEN, AlarmRule
-from driftfit.run.program import Program, state_of
+from driftfit.run.live.rule import AlarmRule
+from driftfit.run.program import state_of
 from driftfit.run.states import late
 from driftfit.run.states.advance import Advanced
+from driftfit.run.states.joint import Joint
+from driftfit.run.states.layout import tag_of, unpacked
 from driftfit.run.warm_start import End, carried
-from driftfit.trackers.base import Tracker
 
 OLD, WAITED, NEW = range(3)
 """Values of the column ``_kind``: a state, a row that waits, a row that has come."""
@@ -48,19 +52,26 @@ PLACES = {late.LATE: LATE, late.REPEATED: REPEATED, late.UNTIMED: UNTIMED}
 """Where rows that are left out are counted."""
 
 
+class Origin(NamedTuple):
+    """What made states: the tracker, or that of each output, and the fields of a state in the version of that time."""
+
+    tracker: Any
+    fields: str
+
+
 @dataclass(frozen=True)
 class Flow:
     """The settings of a stream that a worker receives in addition to its task.
 
-    ``before`` is the tracker that made the states so far, where it was another one; units whose newest time is before
-    ``expired`` end.
+    ``rules`` has the rule of each output. ``origins`` are the trackers and versions that made states before; units
+    whose newest time is before ``expired`` end.
     """
 
     task: Task
     schema: Mapping[str, str]
     hold: Any
-    rule: AlarmRule | None = None
-    before: Tracker | None = None
+    rules: tuple[AlarmRule | None, ...]
+    origins: tuple[Origin, ...] = ()
     expired: Any = None
 
     def work(self, batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
@@ -69,16 +80,6 @@ class Flow:
             for found in self.tables(Known.of(self, table)):
                 yield from found.to_batches()
 
-    def migrated(self, state: bytes, settings: str | None, now: Program) -> Array:
-        """The words of a state that was made with other settings: what depends on them begins with the new ones."""
-        old = self.task.program_for(settings, self.before)
-        if isinstance(old, str):
-            raise ValueError(old)
-        end = End((old,), (state_of(old.unpack(state)),), None)
-        (fields,) = carried(end, (now,))
-        words: Array = now.layout.taken(now.tile(fields))[0]
-        return words
-
     def tables(self, known: Known) -> Iterator[pa.Table]:
         """All that comes out, by kind."""
         task, table = self.task, known.table
@@ -86,22 +87,21 @@ class Flow:
         waited = known.kind[rows] == WAITED
         fates = late.sort_out(known.code[rows], known.time[rows], waited, known.newest, self.hold)
         order = rows[fates.order]
-        good = known.there & np.array([not isinstance(one, str) for one in known.programs])
+        good = known.there & np.array([not isinstance(one, str) for one in known.joints])
         right = good[known.code[order]]
         known.newest[good] = fates.newest[good]
-        released = order[right & (fates.fate == late.RELEASED)]
+        silent = known.silent(self.expired)
+        fate = late.ended(fates.fate, silent[known.code[order]])
+        released = order[right & (fate == late.RELEASED)]
         some = series_of(task, table, known.code, released, known.time, good)
-        frozen = self.rule is not None and self.rule.kind in FROZEN
-        going = (task, table, some, known.programs, known.words, known.last, frozen)
+        going = (task, table, some, known.joints, known.unpacked(some.keys), known.last, collects(self.rules))
         found = continued(*going) if len(released) else None
         if found is not None:
             yield self._results(known, some, found)
-        yield from self._left_out(known, order[right], fates.fate[right])
-        yield from self._states(known, good)
+        yield from self._left_out(known, order[right], fate[right])
+        yield from self._states(known, good, silent)
         if (bad := np.flatnonzero(~good)).size:
-            reasons = [
-                one if isinstance(one := known.programs[k], str) else "rows without a unit" for k in bad.tolist()
-            ]
+            reasons = [one if isinstance(one := known.joints[k], str) else "rows without a unit" for k in bad.tolist()]
             yield self._table("failed", known.keys(bad), {"failed": reasons}, table)
 
     def _table(self, kind: str, *columns: Any) -> pa.Table:
@@ -113,27 +113,32 @@ class Flow:
 
     def _results(self, known: Known, some: Series, found: Advanced) -> pa.Table:
         """A row per sample; the units' states, times and sums go on."""
-        sums = np.zeros((len(known.first), SUMS))
+        sums = Sums.of(len(known.first), self.task)
         add(sums, some, found)
         earlier = known.counts[:, 0].copy()
-        known.counts[...] += sums[:, : len(COUNTS)].astype(np.int64)
+        known.counts[...] += sums.counts
         known.last[some.keys] = some.time[some.first + some.length - 1]
         known.words.update(words_after(found, some))
         own = {name: known.table.column(name).take(pa.array(some.rows)) for name in self.task.columns}
-        alarms = {} if self.rule is None else self._watched(known, some, found, earlier)
+        alarms = self._watched(known, some, found, earlier) if any(self.rules) else {}
         return self._table("result", own, results(self.task, found), alarms, known.table)
 
     def _watched(self, known: Known, some: Series, found: Advanced, earlier: Array) -> dict[str, Any]:
         """The alarms at every sample, as `LiveAlarm` gives them."""
-        assert self.rule is not None
-        causes: list[str | None] = [None] * len(some.rows)
+        schema, ny = alarms_schema(self.task, self.rules), len(self.task.y)
+        columns: dict[str, list[Any]] = {name: [] for name in schema}
         lanes = found.lanes()
         for j, k in enumerate(some.keys.tolist()):
-            (job, lane), count, first = lanes[j], int(some.length[j]), int(some.first[j])
-            alarm = alarm_of(self.rule, found.programs[j], known.watch[k], int(earlier[k]))
-            causes[first : first + count] = alarm.take_many(job.out[:count], lane, np.ones(count))
-            known.watch[k] = watch_of(alarm)
-        return {"alarm": [cause is not None for cause in causes], "cause": pa.array(causes, pa.string())}
+            joint, count = known.joints[k], int(some.length[j])
+            assert isinstance(joint, Joint)
+            rows = [(job.out[:count], lane) for job, lane in lanes[j * ny : (j + 1) * ny]]
+            causes, known.watch[k] = watched(self.rules, joint, known.watch[k], int(earlier[k]), rows)
+            for name, values in alarms_of(schema, causes).items():
+                columns[name] += values
+        return {
+            name: pa.array(values, ARROW[kind])
+            for (name, kind), values in zip(schema.items(), columns.values(), strict=True)
+        }
 
     def _left_out(self, known: Known, order: Array, fate: Array) -> Iterator[pa.Table]:
         """Rows that wait, and rows that are left out and counted."""
@@ -149,9 +154,8 @@ class Flow:
                 own = {name: known.table.column(name).take(pa.array(which)) for name in names}
                 yield self._table("late", own, {"failed": [late.REASONS[code]] * len(which)}, known.table)
 
-    def _states(self, known: Known, good: Array) -> Iterator[pa.Table]:
+    def _states(self, known: Known, good: Array, silent: Array) -> Iterator[pa.Table]:
         """The states of units, those that go on and those that have been silent for too long."""
-        silent = np.zeros(len(good), bool) if self.expired is None else known.newest < self.expired
         for kind, which in (("state", np.flatnonzero(good & ~silent)), ("expired", np.flatnonzero(good & silent))):
             if which.size:
                 units, like = which.tolist(), known.table.schema.field(self.task.time).type
@@ -173,10 +177,10 @@ class Known(NamedTuple):
     time: Array
     there: Array
     settings: list[str | None]
-    programs: list[Program | str]
+    joints: list[Joint | str]
     words: dict[int, Array]
     arrived: dict[int, bytes]
-    """States as they came, of units that go on unchanged."""
+    """States as they came, which are unpacked if a sample follows."""
     last: Array
     newest: Array
     counts: Array
@@ -198,34 +202,61 @@ class Known(NamedTuple):
             given = task.settings_of(table, latest)
             come = kind[latest] == NEW
             settings = [new if new_rows else kept for new, kept, new_rows in zip(given, before, come, strict=True)]
-        programs = [task.program_for(one) for one in settings]
+        joints = [task.joint_for(one) for one in settings]
         words, packed = {}, {}
         states = heads.column("state").to_pylist()
-        arrived = np.bincount(code[kind == NEW], minlength=len(first)) > 0
         for k in np.flatnonzero(old).tolist():
-            program = programs[k]
-            if isinstance(program, str):
+            joint = joints[k]
+            if isinstance(joint, str):
                 continue
-            if before[k] == settings[k] and flow.before is None:
+            if before[k] == settings[k] and tag_of(states[k]) == joint.tag:
                 packed[k] = states[k]
-                if arrived[k]:
-                    words[k] = program.layout.unpack(states[k])
             else:
-                words[k] = flow.migrated(states[k], before[k], program)
+                words[k] = migrated(task, joint, states[k], before[k], flow.origins)
         return cls(
             flow, table, first, code, kind, times(table.column(task.time)), named(table, task.by)[first], settings,
-            programs, words, packed, times(heads.column("last")).copy(), times(heads.column("newest")).copy(),
+            joints, words, packed, times(heads.column("last")).copy(), times(heads.column("newest")).copy(),
             np.nan_to_num(counts).astype(np.int64), heads.column("watch").to_pylist(),
         )  # fmt: skip
+
+    def silent(self, before: Any) -> Array:
+        """Which units have no new row, and have had none since a time; none if that is None."""
+        come = np.bincount(self.code[self.kind == NEW], minlength=len(self.first)) > 0
+        return np.zeros(len(come), bool) if before is None else ~come & (self.newest < before)
 
     def keys(self, which: Array) -> dict[str, Any]:
         """The names of units."""
         return {name: self.table.column(name).take(pa.array(self.first[which])) for name in self.flow.task.by}
 
+    def unpacked(self, keys: Array) -> dict[int, Array]:
+        """The words of the states so far, among them those of these units."""
+        for k in keys.tolist():
+            if k in self.arrived and k not in self.words:
+                joint = self.joints[k]
+                assert isinstance(joint, Joint)
+                self.words[k] = joint.unpack(self.arrived[k])
+        return self.words
+
     def packed(self, k: int) -> bytes:
         """The state of a unit as bytes."""
-        program = self.programs[k]
-        assert isinstance(program, Program)
+        joint = self.joints[k]
+        assert isinstance(joint, Joint)
         if k in self.words:
-            return program.layout.pack(self.words[k])
-        return self.arrived[k] if k in self.arrived else program.pack(program.tile())
+            return joint.pack(self.words[k])
+        return self.arrived.get(k, joint.start)
+
+
+def migrated(task: Task, now: Joint, state: bytes, settings: str | None, origins: Sequence[Origin]) -> Array:
+    """The words of a state that other settings of the tracker or another version made.
+
+    What depends on settings begins with the new ones, all else is carried over; fields are matched by their names.
+    ``settings`` are those of the unit at that time. ValueError for a state that none of ``origins`` made.
+    """
+    tag, words = unpacked(state)
+    for tracker, fields in ((task.tracker, now.text), *origins):
+        old = task.joint_of(settings, tracker)
+        if old.tag == tag or old.made_by(tag, fields):
+            tile = old.filled(words) if old.tag == tag else old.filled(old.matched(words, fields))
+            states = tuple(state_of(tile, lane) for lane in range(len(old.programs)))
+            return now.taken(now.tile(carried(End(old.programs, states, None), now.programs)))
+    return now.unpack(state)  # which says that it is another's

@@ -14,16 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.bridges.spark.batch import results_schema
-from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow
+from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow, Origin
 from driftfit.bridges.spark.frames import rows_of, task_of
-from driftfit.bridges.spark.pieces import COUNTS
+from driftfit.bridges.spark.pieces import COUNTS, alarms_schema, rules_of
 from driftfit.bridges.spark.store import NEXT, Store
-from driftfit.bridges.spark.task import SETTING, Task
+from driftfit.bridges.spark.task import SETTING, Task, results_schema, trackers_of
 from driftfit.data.clock import Clock
 from driftfit.data.storage import describe, rebuild
 from driftfit.models.base import Model
-from driftfit.run.live.alarm import check_rule
 from driftfit.run.live.rule import AlarmRule
 from driftfit.trackers.base import Tracker
 
@@ -32,10 +30,10 @@ STATE = {"state": "binary", "settings": "string", **dict.fromkeys(COUNTS, "bigin
 
 
 def follow(
-    stream: Any, model: Model, tracker: Tracker, *, path: str, y: str, by: str | Sequence[str], time: str,
-    u: str | Sequence[str] | None = None, dt: Any = None, settings: Any = None, arrays: bool = False, hold: Any = 0,
-    rule: AlarmRule | None = None, expire: Any = None, initial: Any = None, migrate: bool = False, sink: Any = None,
-    trigger: Mapping[str, Any] | None = None,
+    stream: Any, model: Model, tracker: Tracker | Mapping[str, Tracker], *, path: str, y: str | Sequence[str],
+    by: str | Sequence[str], time: str, u: str | Sequence[str] | None = None, dt: Any = None, settings: Any = None,
+    arrays: bool = False, hold: Any = 0, rule: AlarmRule | Mapping[str, AlarmRule] | None = None, expire: Any = None,
+    initial: Any = None, migrate: bool = False, sink: Any = None, trigger: Mapping[str, Any] | None = None,
 ) -> Any:  # fmt: skip
     """Follow every unit of a stream of Spark.
 
@@ -50,15 +48,18 @@ def follow(
     hold : number or duration
         How far behind the newest time of its unit a row may come: samples wait for so long, and go on in the order of
         their times. Rows that are later, at a repeated time, or without a time are counted and kept (`Store.late`).
-    rule : AlarmRule or None
-        The rule of a reference run, ``run.detect(...).rule``: gives the columns ``alarm`` and ``cause``.
+    rule : AlarmRule, mapping from outputs to rules, or None
+        The rule of a reference run, ``run.detect(...).rule``: gives the columns ``alarm`` and ``cause``; of several
+        outputs each may have a rule, under its name.
     expire : number, duration or None
-        Units whose newest time is so far behind the newest of all end; their states are kept with the kind "expired".
+        Units without a row in a batch whose newest time is so far behind the newest of all before that batch end with
+        it: samples that wait are processed, and the states are kept with the kind "expired". Rows that come later begin
+        the unit anew.
     initial : pyspark.sql.DataFrame or None
         States to begin with: ``track(..., outputs="states")``, or those of another stream, ``Store.states()``.
     migrate : bool
-        Go on from states that another tracker's settings made: what depends on settings takes its new value, all else
-        is carried over.
+        Go on from states that another tracker's settings, or another version of this library, made: what depends on
+        settings takes its new value, all else is carried over; fields are matched by their names.
     sink : callable or None
         ``sink(results, batch)`` is called after a batch is written, and may be called again for the same batch after a
         crash: it must be idempotent, as a MERGE by unit and time, or a write that replaces the batch.
@@ -79,11 +80,10 @@ def follow(
     task = task_of(stream, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, settings, arrays)
     kinds = dict(rows_of(stream, task, None).dtypes)
     dated = kinds[time].startswith("timestamp")
-    if rule is not None:
-        check_rule(rule)
-    schema = _schema(task, kinds, rule is not None)
+    rules = rules_of(task, rule)
+    schema = _schema(task, kinds, rules)
     store = Store(stream.sparkSession, path)
-    flow = Flow(task, schema, duration("hold", hold, dated), rule, _before(store, task, schema, migrate))
+    flow = Flow(task, schema, duration("hold", hold, dated), rules, _origins(store, task, schema, migrate))
     run = _Batches(store, flow, settings, initial, None if expire is None else duration("expire", expire, dated), sink)
     writer = stream.writeStream.foreachBatch(run).option("checkpointLocation", f"{store.path}/checkpoint")
     return writer.trigger(**(trigger or {"processingTime": "0 seconds"})).start()
@@ -102,41 +102,52 @@ def duration(name: str, value: Any, dated: bool) -> Any:
     return span
 
 
-def _schema(task: Task, kinds: Mapping[str, str], watched: bool) -> dict[str, str]:
+def _schema(task: Task, kinds: Mapping[str, str], rules: Sequence[AlarmRule | None]) -> dict[str, str]:
     """Columns and types of the table."""
-    own = {name: kinds[name] for name in task.columns}
-    alarms = {"alarm": "boolean", "cause": "string"} if watched else {}
+    own = {name: kinds[name] for name in task.columns} | results_schema(task) | alarms_schema(task, rules)
     times = {"last": kinds[task.time], "newest": kinds[task.time]}
-    return {"kind": "string", **own, **results_schema(task), **alarms, "failed": "string", **STATE, **times}
+    return {"kind": "string", **own, "failed": "string", **STATE, **times}
 
 
-def _before(store: Store, task: Task, schema: Mapping[str, str], migrate: bool) -> Tracker | None:
-    """The tracker that made the states, if it is another one; notes what is followed from now on."""
-    program = task.program_for(None)
-    text = "" if isinstance(program, str) else program.layout.text
+def _origins(store: Store, task: Task, schema: Mapping[str, str], migrate: bool) -> tuple[Origin, ...]:
+    """The trackers and versions that made the states so far, the newest first; notes what is followed from now on.
+
+    Those before the newest count too: a batch that was cut off before it was complete has not carried states over.
+    """
+    joint = task.joint_for(None)
+    text = "" if isinstance(joint, str) else joint.text
     results = [name for name in schema if name not in ("kind", *STATE, "last", "newest", "failed")]
-    about = {"model": describe(task.model), "tracker": describe(task.tracker), "fields": text, "results": results}
+    about: dict[str, Any] = {"model": describe(task.model), "fields": text, "results": results}
+    about["tracker"] = [describe(one) for one in trackers_of(task.tracker)]
     about |= {"schema": ", ".join(f"`{name}` {kind}" for name, kind in {"batch": "int", **schema}.items())}
     about |= {"rows": list(task.columns), "states": [*task.by, *STATE, "last", "newest"]}
     found = store.abouts()
     if not found:
         store.begin(about)
-        return None
+        return ()
     last = found[-1]
     if last["model"] != about["model"]:
         raise ValueError(
             f"spark.follow: the states in {store.path} were made with {rebuild(last['model'], Model)!r}, not with "
             f"{task.model!r}; begin in another folder."
         )
-    old: Tracker = rebuild(last["tracker"], Tracker)
-    if old != task.tracker and not migrate:
+    origins = tuple(_origin(task, one) for one in reversed(found))
+    if not migrate and (origins[0].tracker != task.tracker or last["fields"] != text):
+        other = f"not with {task.tracker!r}" if origins[0].tracker != task.tracker else "in another version"
         raise ValueError(
-            f"spark.follow: the states in {store.path} were made with {old!r}, not with {task.tracker!r}: give "
+            f"spark.follow: the states in {store.path} were made with {origins[0].tracker!r}, {other}: give "
             "migrate=True to carry them over, or begin in another folder."
         )
     if last != about:
         store.begin(about)
-    return old if old != task.tracker else None
+    return origins
+
+
+def _origin(task: Task, about: Mapping[str, Any]) -> Origin:
+    """What made states, from what was noted of it."""
+    trackers: list[Tracker] = [rebuild(one, Tracker) for one in about["tracker"]]
+    several = len(trackers) > 1
+    return Origin(dict(zip(task.y, trackers, strict=True)) if several else trackers[0], about["fields"])
 
 
 class _Batches:
@@ -172,7 +183,6 @@ class _Batches:
             if self.expire is not None:
                 flow = replace(flow, expired=self._oldest(kept))
         else:
-            flow = replace(flow, before=None)
             if self.initial is not None:
                 parts.append(_begun(self.initial, task).withColumn("_kind", F.lit(OLD)))
         every = parts[0]
@@ -184,7 +194,7 @@ class _Batches:
                 every = every.withColumn(name, F.lit(None).cast(kind))
         own = [SETTING + name for name in task.settings]
         every = every.select(*task.columns, *STATE, "last", "newest", *own, "_kind")
-        order = [*task.by, "_kind", task.time, task.y, *task.u]
+        order = [*task.by, "_kind", task.time, *task.y, *task.u]
         made = ", ".join(f"`{name}` {kind}" for name, kind in flow.schema.items())
         return every.repartition(*task.by).sortWithinPartitions(*order).mapInArrow(flow.work, made)
 

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from driftfit.bridges.spark.session import missing
-from driftfit.bridges.spark.task import SETTING, Task
+from driftfit.bridges.spark.task import SETTING, Task, results_schema, trackers_of
 from driftfit.data.arguments import check_roles
+from driftfit.data.outputs import named_outputs
 from driftfit.engine.settings import near
 from driftfit.models.base import Model
-from driftfit.run.program import programs_of
-from driftfit.trackers.base import Tracker
 
 KEYS = ("string", "tinyint", "smallint", "int", "bigint", "date", "timestamp", "boolean")
 """Types of columns that identify units."""
@@ -23,21 +22,30 @@ TIMES = ("timestamp", "timestamp_ntz", "date", "tinyint", "smallint", "int", "bi
 
 
 def task_of(
-    df: Any, model: Model, tracker: Tracker, columns: Mapping[str, Any], dt: Any, settings: Any, arrays: bool
+    df: Any, model: Model, tracker: Any, columns: Mapping[str, Any], dt: Any, settings: Any, arrays: bool
 ) -> Task:
     """The task for a data frame; ``columns`` are y, u, by and time. ValueError for what cannot run."""
     if problem := missing():
         raise ImportError(problem)
-    check_roles("track", model, tracker, several=False)
-    if len(model.outputs) > 1:
-        raise ValueError("spark: a model with several outputs is not followed on Spark; give one output at a time.")
+    check_roles("track", model, tracker, several=True)
+    if model.shared:
+        raise ValueError("spark: outputs that share one theta are not followed on Spark; leave out shared=True.")
     names = {name: _names(name, columns[name]) for name in ("y", "u", "by", "time")}
-    for name in ("y", "time"):
-        if len(names[name]) != 1:
-            raise ValueError(
-                f"spark: {name}= is the name of one column; got {columns[name]!r}."
-                + (" Data frames of Spark have no order, so samples need a time." if name == "time" else "")
-            )
+    if len(names["time"]) != 1:
+        raise ValueError(
+            f"spark: time= is the name of one column; got {columns['time']!r}. Data frames of Spark have no order, so "
+            "samples need a time."
+        )
+    if len(names["y"]) != len(model.outputs):
+        raise ValueError(
+            f"spark: y= names the columns of the model's outputs, which are {', '.join(model.outputs)}; got "
+            f"{columns['y']!r}. Several outputs need ny= in the model, as in ARX(2, 2, ny=2)."
+        )
+    if len(names["y"]) > 1:
+        model, place = named_outputs(model, names["y"])
+        names["y"] = tuple(names["y"][j] for j in place)
+        if isinstance(tracker, Mapping) and set(tracker) == set(names["y"]):
+            tracker = {name: tracker[name] for name in names["y"]}
     if not names["by"]:
         raise ValueError("spark: by= names the columns that identify units; a single series runs on one machine.")
     _check_types(df, names)
@@ -45,21 +53,15 @@ def task_of(
     dated = kind in ("timestamp", "timestamp_ntz", "date")
     zone = df.sparkSession.conf.get("spark.sql.session.timeZone") if kind == "timestamp" else None
     own = () if settings is None else _settings(settings, tracker, names["by"])
-    task = Task(model, tracker, names["y"][0], names["u"], names["by"], names["time"][0], dt, zone, own, arrays)
+    task = Task(model, tracker, names["y"], names["u"], names["by"], names["time"][0], dt, zone, own, arrays)
     task.clock.steps(np.array([0, 1], "M8[us]") if dated else np.array([0.0, 1.0]))
     if not own:
-        programs_of(model, tracker, task.order)
+        task.joint_of(None, tracker)
     used = [*names["by"], *names["time"], *names["y"], *names["u"]]
-    results = [*used, *schema_names(task)]
+    results = [*used, *results_schema(task), "failed"]
     if twice := [name for name in dict.fromkeys(results) if results.count(name) > 1]:
         raise ValueError(f"spark: the table of results would have {twice[0]!r} twice; rename that column first.")
     return task
-
-
-def schema_names(task: Task) -> list[str]:
-    """The columns that results add."""
-    own = ["prediction", "innovation", "innovation_std", "ok", "failed"]
-    return own + (["theta", "std"] if task.arrays else [f"{w}_{p}" for p in task.names for w in ("theta", "std")])
 
 
 def _names(argument: str, value: Any) -> tuple[str, ...]:
@@ -83,14 +85,15 @@ def _check_types(df: Any, names: Mapping[str, Sequence[str]]) -> None:
                 )
 
 
-def _settings(settings: Any, tracker: Tracker, by: Sequence[str]) -> tuple[str, ...]:
+def _settings(settings: Any, tracker: Any, by: Sequence[str]) -> tuple[str, ...]:
     """The settings that a table gives for every unit."""
-    known = [field.name for field in fields(tracker) if field.init]  # type: ignore[arg-type]
+    one = trackers_of(tracker)[0]
+    known = [field.name for field in fields(one) if field.init]  # type: ignore[arg-type]
     own = [name for name in settings.columns if name not in by]
     if wrong := [name for name in by if name not in settings.columns]:
         raise ValueError(f"spark: the table of settings has no column {wrong[0]!r}, by which units are found.")
     if wrong := [name for name in own if name not in known]:
-        raise ValueError(f"spark: {type(tracker).__name__} has no setting {wrong[0]!r}: {near(wrong[0], known)}")
+        raise ValueError(f"spark: {type(one).__name__} has no setting {wrong[0]!r}: {near(wrong[0], known)}")
     return tuple(own)
 
 
@@ -101,7 +104,7 @@ def rows_of(df: Any, task: Task, settings: Any) -> Any:
     kind = dict(df.dtypes)[task.time]
     to = "timestamp_ntz" if kind == "date" else kind if kind.startswith("timestamp") else "double"
     columns = [*(F.col(name) for name in task.by), F.col(task.time).cast(to).alias(task.time)]
-    columns += [F.col(name).cast("double").alias(name) for name in (task.y, *task.u)]
+    columns += [F.col(name).cast("double").alias(name) for name in (*task.y, *task.u)]
     rows = df.select(*columns)
     if settings is None:
         return rows

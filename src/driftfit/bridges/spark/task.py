@@ -20,6 +20,7 @@ from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.run.program import Program, programs_of
 from driftfit.run.states.advance import Advanced, advance
+from driftfit.run.states.joint import Joint
 from driftfit.trackers.base import Tracker
 
 ROWS = 64_000
@@ -32,12 +33,13 @@ SETTING = "_set_"
 class Task:
     """Model, tracker and columns: pickled once for each task of Spark.
 
+    The model's outputs have the names ``y``. ``tracker`` is one for all of them, or a mapping from their names.
     ``settings`` names the settings of the tracker that rows bring along, ``zone`` is the time zone of the session.
     """
 
     model: Model
-    tracker: Tracker
-    y: str
+    tracker: Any
+    y: tuple[str, ...]
     u: tuple[str, ...]
     by: tuple[str, ...]
     time: str
@@ -54,17 +56,21 @@ class Task:
     @property
     def columns(self) -> tuple[str, ...]:
         """The columns that are read."""
-        return (*self.by, self.time, self.y, *self.u)
+        return (*self.by, self.time, *self.y, *self.u)
+
+    @property
+    def suffixes(self) -> tuple[str, ...]:
+        """What follows the names of an output's results: its name in brackets, if there are several."""
+        return ("",) if len(self.y) == 1 else tuple(f"[{name}]" for name in self.y)
 
     @cached_property
-    def program(self) -> Program:
-        """The program of a unit without settings of its own; ValueError if they are not complete."""
-        return programs_of(self.model, self.tracker, self.order)[0]
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return self.tracker.names_for(self.model.bind(self.order))
+    def names(self) -> tuple[tuple[str, ...], ...]:
+        """Names of the parameters of each output; the tracker may be incomplete."""
+        bound, trackers = self.model.bind(self.order), trackers_of(self.tracker)
+        if len(self.y) == 1:
+            return (trackers[0].names_for(bound),)
+        each = trackers * len(self.y) if len(trackers) == 1 else trackers
+        return tuple(Program(bound, one, name).names for one, name in zip(each, self.y, strict=True))
 
     @cached_property
     def order(self) -> tuple[str, ...]:
@@ -74,20 +80,22 @@ class Task:
         return tuple(self.u[int(j)] for j in sorted_[0])
 
     @cached_property
-    def _made(self) -> dict[str | None, Program | str]:
+    def _made(self) -> dict[str | None, Joint | str]:
         return {}
 
     def __reduce__(self) -> Any:
         """Without what was made here."""
         return _task, ({name: getattr(self, name) for name in self.__dataclass_fields__},)
 
-    def program_for(self, settings: str | None, tracker: Tracker | None = None) -> Program | str:
-        """The program of a unit with these settings (JSON), or why there is none."""
-        if tracker is not None:
-            return programs_of(self.model, _with(tracker, settings), self.order)[0]
+    def joint_of(self, settings: str | None, tracker: Any) -> Joint:
+        """The programs of a unit with these settings (JSON); ValueError if they are not complete."""
+        return Joint(programs_of(self.model, _with(tracker, settings), self.order))
+
+    def joint_for(self, settings: str | None) -> Joint | str:
+        """The programs of a unit with these settings (JSON) of its own, or why there are none."""
         if settings not in self._made:
             try:
-                self._made[settings] = programs_of(self.model, _with(self.tracker, settings), self.order)[0]
+                self._made[settings] = self.joint_of(settings, self.tracker)
             except (ValueError, TypeError) as error:
                 self._made[settings] = f"settings: {error}"
         return self._made[settings]
@@ -105,12 +113,32 @@ def _task(fields: Mapping[str, Any]) -> Task:
     return Task(**fields)
 
 
-def _with(tracker: Tracker, settings: str | None) -> Tracker:
-    """A tracker with the settings of a unit."""
+def trackers_of(tracker: Any) -> tuple[Tracker, ...]:
+    """The tracker of all outputs, or of each."""
+    return tuple(tracker.values()) if isinstance(tracker, Mapping) else (tracker,)
+
+
+def _with(tracker: Any, settings: str | None) -> Any:
+    """A tracker, or that of each output, with the settings of a unit."""
     if settings is None:
         return tracker
-    changed: Tracker = replace(tracker, **json.loads(settings))  # type: ignore[type-var]
-    return changed
+    if isinstance(tracker, Mapping):
+        return {name: _with(one, settings) for name, one in tracker.items()}
+    return replace(tracker, **json.loads(settings))
+
+
+def results_schema(task: Task) -> dict[str, str]:
+    """Columns and types of the results at a sample; those of parameters need no complete tracker."""
+    own = {"prediction": "double", "innovation": "double", "innovation_std": "double", "ok": "boolean"}
+    each = {f"{name}{of}": kind for of in task.suffixes for name, kind in own.items()}
+    return each | parameters_schema(task)
+
+
+def parameters_schema(task: Task) -> dict[str, str]:
+    """Columns and types of the parameters."""
+    if task.arrays:
+        return {f"{what}{of}": "array<double>" for of in task.suffixes for what in ("theta", "std")}
+    return {f"{what}_{name}": "double" for names in task.names for name in names for what in ("theta", "std")}
 
 
 class Units(NamedTuple):
@@ -179,6 +207,7 @@ class Series(NamedTuple):
     first: Array
     length: Array
     y: Array
+    """(N, ny)"""
     time: Array
 
 
@@ -186,16 +215,17 @@ def series_of(task: Task, table: pa.Table, code: Array, rows: Array, time: Array
     """The samples of the units that are ``good`` (U,), from rows in the order of unit and time."""
     rows = rows[good[code[rows]]]
     keys, first, length = np.unique(code[rows], return_index=True, return_counts=True)
-    return Series(keys, rows, first, length, numbers(table.column(task.y))[rows], time[rows])
+    y = np.stack([numbers(table.column(name))[rows] for name in task.y], axis=1)
+    return Series(keys, rows, first, length, y, time[rows])
 
 
 def continued(
-    task: Task, table: pa.Table, some: Series, programs: Sequence[Any], states: Mapping[int, Array], last: Array,
+    task: Task, table: pa.Table, some: Series, joints: Sequence[Any], states: Mapping[int, Array], last: Array,
     collected: bool = False,
 ) -> Advanced:  # fmt: skip
     """Run the series from their states, by the number of the unit; ``last`` (U,) are times of their last samples.
 
-    ``programs`` has an entry for each unit; those of the series are programs.
+    ``joints`` has an entry for each unit; those of the series are programs.
     """
     before = np.roll(some.time, 1)
     before[some.first] = last[some.keys]
@@ -203,23 +233,36 @@ def continued(
     before[new] = some.time[new]
     gaps = task.clock.between(before, some.time)
     gaps[new] = 1.0
+    keys, ny = some.keys.tolist(), len(task.y)
+    begun = np.array([k in states for k in keys])
+    words = np.zeros((len(keys) * ny, max((len(states[k]) // ny for k in keys if k in states), default=0)), np.int64)
+    for j in np.flatnonzero(begun).tolist():
+        own = states[keys[j]].reshape(ny, -1)
+        words[j * ny : (j + 1) * ny, : own.shape[1]] = own
+    programs = [one for k in keys for one in joints[k].programs]
+    records = _records(task, table, some, gaps)
+    return advance(programs, records, words, np.repeat(begun, ny), threads=1, collected=collected)
+
+
+def _records(task: Task, table: pa.Table, some: Series, gaps: Array) -> Records:
+    """The series as records."""
     inputs = [numbers(table.column(name))[some.rows] for name in task.order]
     u = np.stack(inputs, axis=1) if inputs else np.zeros((len(some.rows), 0))
-    labels = Labels(task.y, task.order, task.time, zone=task.zone, by=task.by)
-    records = Records(tuple(some.keys.tolist()), some.first, some.length, some.y, u, Known.of(gaps), some.time, labels)
-    keys = some.keys.tolist()
-    begun = np.array([k in states for k in keys])
-    words = np.zeros((len(keys), max((len(states[k]) for k in keys if k in states), default=0)), np.int64)
-    for j in np.flatnonzero(begun).tolist():
-        words[j, : len(states[keys[j]])] = states[keys[j]]
-    return advance([programs[k] for k in keys], records, words, begun, threads=1, collected=collected)
+    keys, y, known, outputs = tuple(some.keys.tolist()), some.y[:, 0], Known.of(gaps), tuple[str, ...]()
+    if len(task.y) > 1:
+        y, known, outputs = some.y, known.for_outputs(np.ones(some.y.shape)), task.y
+    labels = Labels(task.y[0] if not outputs else "y", task.order, task.time, zone=task.zone, by=task.by)
+    return Records(keys, some.first, some.length, y, u, known, some.time, labels, outputs=outputs)
 
 
 def words_after(found: Advanced, some: Series) -> dict[int, Array]:
-    """The words of every series after its last sample, by the number of its unit."""
-    rows = found.states()
-    sizes = [program.layout.size for program in found.programs]
-    return {k: row[:size] for k, row, size in zip(some.keys.tolist(), rows, sizes, strict=True)}
+    """The words of every unit after its last sample, by its number."""
+    rows, ny = found.states(), found.records.ny
+    sizes = [program.layout.size for program in found.programs[::ny]]
+    places = range(0, len(rows), ny)
+    return {
+        k: rows[j : j + ny, :size].reshape(-1) for k, j, size in zip(some.keys.tolist(), places, sizes, strict=True)
+    }
 
 
 def lists(values: Array) -> pa.Array:

@@ -10,6 +10,7 @@ import io
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from typing import Any, NamedTuple
 
 import narwhals as nw
@@ -18,6 +19,7 @@ import polars as pl
 
 from driftfit.data.columns import Columns, Wanted, convert
 from driftfit.data.files import FILE, _paths
+from driftfit.data.times.periods import EXAMPLES, span
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
@@ -218,10 +220,14 @@ def moment(text: str, axis: Array, zone: str | None, end: bool = False) -> Any:
             return float(text)
         except ValueError:
             raise ValueError(f"{text!r} is not a number, but the times of the record are.") from None
+    if (days := span(text)) is not None:
+        text, end = (str(days[1] - timedelta(1)), True) if end else (str(days[0]), False)
     try:
         found = pl.Series([text.strip()]).str.to_datetime(time_unit="us")
     except pl.exceptions.PolarsError:
-        raise ValueError(f"{text!r} is not a date; write 2024-01-31 or '2024-01-31 12:00:00'.") from None
+        raise ValueError(
+            f"{text!r} is not a date; write 2024-01-31, '2024-01-31 12:00:00', or a period as in {EXAMPLES}."
+        ) from None
     if zone is not None:
         found = (
             found.dt.replace_time_zone(zone, ambiguous="earliest")

@@ -14,25 +14,25 @@ Source: Kunsch (1989) for blocks; Wu (1986) for signs. Cost: half a second at n 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.calibration import limit_of
-from driftfit.judge.alarms.frozen import Rows, noise_model
+from driftfit.judge.alarms.frozen import Rows, noise_models
+from driftfit.judge.alarms.side_by_side import Records, statistics_of
 from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.live.likelihood_ratio import (
     CLIP,
-    CUSUM,
     LEVELS,
     SCALE,
     SHORT,
     Frozen,
     K,
     levels,
-    memory_of,
     played,
-    scan_scores,
 )
 
 RECORDS, SAMPLES = 64, 1000
@@ -48,57 +48,62 @@ CORRELATED = 1e-3
 STEP = 8.0
 """Factor between the two rates that determine the line."""
 
-Made = list[tuple[Array, int]]
-"""(statistics (T, c), first sample that counts) of simulated records."""
 
-
-def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> Made:
-    """The statistics of records without a change; fewer records are the first of more."""
-    rng = np.random.default_rng(seed)
+def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> Records:
+    """Records without a change; fewer records are the first of more."""
     (N, n), T = rows.phi.shape, SAMPLES + START
-    root, block = np.linalg.cholesky(frozen.cov), _block(frozen, rows.x)
-    drawn = scipy.special.ndtri(scipy.stats.qmc.Sobol(n, rng=seed).random(records) * (1.0 - 1e-9) + 5e-10)
-    made = []
-    for z in drawn:
-        known, later = _played(frozen, rows.x[_blocks(rng, N, N, block)], rng), _blocks(rng, N, T, block)
-        numbers, _ = noise_model(known, 0)
-        w, h = _played(frozen, rows.x[later], rng) / numbers[SCALE], np.empty(T)
-        levels(w, numbers, h)
-        phi = rows.phi[later] / np.sqrt(h)[:, None]
-        g = np.clip(w / np.sqrt(h), -numbers[CLIP], numbers[CLIP]) - numbers[K] * (phi @ (root @ z))
-        findings = np.empty((T, CUSUM + n + 1))
-        scan_scores(phi, g, frozen._replace(numbers=numbers), memory_of(n, 0), findings)
-        made.append((findings, START))
-    return made
+    draws = [np.random.default_rng([seed, k]) for k in range(3)]
+    block = int(np.clip(N // 20, 20, 200)) if drawn_in_blocks(frozen, rows.x) else 1
+    root, sobol = np.linalg.cholesky(frozen.cov), scipy.stats.qmc.Sobol(n, rng=np.random.default_rng([seed, 3]))
+    z = scipy.special.ndtri(sobol.random_base2(int(np.ceil(np.log2(records))))[:records] * (1.0 - 1e-9) + 5e-10)
+    known, later = (_blocks(rng, (records, length), N, block) for rng, length in zip(draws[:2], (N, T), strict=True))
+    signs = draws[2].integers(0, 2, (records, N + T)) * 2.0 - 1.0
+    w = _played(frozen, rows.x[np.hstack([known, later])] * signs, N)
+    numbers, _ = noise_models(w[:, :N], 0)
+    w, h = w[:, N:] / numbers[:, SCALE, None], np.empty((records, T))
+    for one, own, level in zip(w, numbers, h, strict=True):
+        levels(one, own, level)
+    phi = rows.phi[later] / np.sqrt(h)[..., None]
+    clip, k = numbers[:, CLIP, None], numbers[:, K, None]
+    g = np.clip(w / np.sqrt(h), -clip, clip) - k * np.einsum("rti,ri->rt", phi, z @ root.T)
+    return Records(np.broadcast_to(frozen.cov, (records, n, n)), numbers, phi, g)
 
 
-def _block(frozen: Frozen, x: Array) -> int:
-    """Length of blocks: 1, unless the size of the residuals is correlated even so.
+def together(parts: Sequence[Records]) -> Records:
+    """The records of several references in one."""
+    return Records(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def drawn_in_blocks(frozen: Frozen, x: Array) -> bool:
+    """Whether the size of the residuals is correlated even after the GARCH part, so that they are drawn in blocks.
 
     In blocks, a short window has no other sums of squares than those of the reference, whose largest is then the
     largest of all.
     """
     g = np.clip(x, -frozen.numbers[CLIP], frozen.numbers[CLIP])
-    return 1 if whiteness(g * g - np.mean(g * g)).p > CORRELATED else int(np.clip(len(x) // 20, 20, 200))
+    return whiteness(g * g - np.mean(g * g)).p <= CORRELATED
 
 
-def _blocks(rng: np.random.Generator, N: int, T: int, block: int) -> Array:
-    """Indices (T,) of blocks of a record of N samples."""
-    first = rng.integers(0, N, T // block + 1)
-    return np.asarray((first[:, None] + np.arange(block)).ravel()[:T] % N)
+def _blocks(rng: np.random.Generator, shape: tuple[int, int], N: int, block: int) -> Array:
+    """Indices (R, T) of blocks of a record of N samples."""
+    R, T = shape
+    first = rng.integers(0, N, (R, T // block + 1))
+    return np.asarray((first[..., None] + np.arange(block)).reshape(R, -1)[:, :T] % N)
 
 
-def _played(frozen: Frozen, x: Array, rng: np.random.Generator) -> Array:
-    """Residuals with the variances of the model and random signs."""
-    w = np.empty(len(x))
-    played(x * rng.choice((-1.0, 1.0), len(x)), frozen.numbers, w)
+def _played(frozen: Frozen, x: Array, N: int) -> Array:
+    """Residuals (R, N + T) with the variances of the model, which start again after the N of the reference."""
+    w = np.empty(x.shape)
+    for one, into in zip(x, w, strict=True):
+        played(one[:N], frozen.numbers, into[:N])
+        played(one[N:], frozen.numbers, into[N:])
     return w
 
 
-def limits(made: Made, columns: list[int], every: float) -> tuple[Array, Array]:
-    """Limits (c,) of columns for one onset in ``every`` samples, and the growth (c,) of their square with its log."""
-    parts = [(findings[:, columns], start) for findings, start in made]
-    base = min(every, max(SAMPLES * len(made) / SEEN, STEP * OFTEN))
+def limits(records: Records, cusum: bool, every: float) -> tuple[Array, Array]:
+    """Limits (c,) of "glr" or "cusum" for one onset in ``every`` samples; growth (c,) of their square with its log."""
+    parts = [(one, START) for one in statistics_of(records, cusum)]
+    base = min(every, max(SAMPLES * len(parts) / SEEN, STEP * OFTEN))
     often = max(base / STEP, OFTEN)
     near, nearer = limit_of(parts, base), limit_of(parts, often)
     growth = np.maximum(near**2 - nearer**2, 0.1) / np.log(base / often)

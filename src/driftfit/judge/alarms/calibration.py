@@ -15,7 +15,7 @@ alarms, so the rate is known to about 1 / sqrt(TIMES).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -35,6 +35,8 @@ MOST = 4000
 """Largest number of records."""
 STEPS = 6
 """Bisections of the interval in which the rate of one of several columns is searched."""
+HIGHEST = 0.05
+"""The share of all values among which a limit is searched first."""
 LATER = 10
 """Number of samples after which the tracker has recovered from an error."""
 
@@ -109,11 +111,15 @@ def limit_of(made: Iterable[tuple[Array, int]], every: float) -> Array:
     ``made`` contains (statistic (T, c), first sample judged) of records. All columns have the same rate, which is the
     largest possible one: columns that exceed at the same time begin only one alarm.
     """
-    parts = [np.where(np.isfinite(part), part, -np.inf) for part in (statistic[start:] for statistic, start in made)]
-    allowed = sum(len(part) for part in parts) / every
-    columns = parts[0].shape[1]
+    parts: list[Array] = []
+    for statistic, start in made:
+        parts += [np.full((1, statistic.shape[1]), -np.inf), statistic[start:]]
+    joined = np.ascontiguousarray(np.concatenate(parts).T)  # -inf before each record
+    joined[~np.isfinite(joined)] = -np.inf
+    columns, samples = joined.shape
+    allowed = (samples - len(parts) // 2) / every
 
-    rates = [_begun([part[:, column] for part in parts]) for column in range(columns)]
+    rates = [begun_over(column, allowed) for column in joined]
 
     def limits(share: float) -> Array:
         return np.array([_least(*rate, share) for rate in rates])
@@ -121,25 +127,31 @@ def limit_of(made: Iterable[tuple[Array, int]], every: float) -> Array:
     low, high = allowed / columns, allowed
     for _ in range(STEPS if columns > 1 else 0):
         middle = 0.5 * (low + high)
-        over = limits(middle)
-        begun = sum([len(onsets(np.any(part > over, axis=1))) for part in parts])
+        begun = len(onsets(np.any(joined > limits(middle)[:, None], axis=0)))
         low, high = (middle, high) if begun <= allowed else (low, middle)
     return limits(low)
 
 
-def _begun(series: Sequence[Array]) -> tuple[Array, Array]:
-    """(limits, largest number of onsets over each and those above it), for every limit that makes a difference.
+def begun_over(values: Array, allowed: float) -> tuple[Array, Array]:
+    """(limits, largest number of onsets over each and those above it) of values (T,), -inf before each record.
 
     A step from a to b > a is an onset over the limits c with a <= c < b, so the number at c is that of the a up to c
     minus that of the b up to c. As the limit decreases, the number grows and falls again once normal values exceed it.
+    The highest values suffice if there are more than ``allowed`` onsets over some of them; otherwise every limit that
+    makes a difference is counted.
     """
-    before = np.concatenate([np.concatenate([[-np.inf], values[:-1]]) for values in series])
-    after = np.concatenate(list(series))
-    rising = after > before
-    low, high = np.sort(before[rising]), np.sort(after[rising])
-    limits = np.unique(after)
-    begun = np.searchsorted(low, limits, side="right") - np.searchsorted(high, limits, side="right")
-    return limits, np.maximum.accumulate(begun[::-1])[::-1]
+    before, after = values[:-1], values[1:]
+    for share in (HIGHEST, 1.0):
+        lower = int((1.0 - share) * len(after))
+        high = after >= np.partition(after, lower)[lower]
+        rising = high & (after > before)
+        below, above = np.sort(before[rising]), np.sort(after[rising])
+        limits = np.unique(after[high & np.isfinite(after)])
+        begun = np.searchsorted(below, limits, side="right") - np.searchsorted(above, limits, side="right")
+        most = np.maximum.accumulate(begun[::-1])[::-1]
+        if len(most) and most[0] > allowed:
+            break
+    return limits, most
 
 
 def _least(limits: Array, begun: Array, allowed: float) -> float:

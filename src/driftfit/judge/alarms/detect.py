@@ -51,7 +51,7 @@ from driftfit.judge.alarms.bootstrap import RECORDS
 from driftfit.judge.alarms.calibration import limit_of, null_records
 from driftfit.judge.alarms.onsets import held, onsets
 from driftfit.judge.alarms.reference import burn, in_samples
-from driftfit.judge.alarms.statistics import Reference, chance_of, findings_of, rule_of, statistic_of
+from driftfit.judge.alarms.statistics import Reference, chance_of, findings_of, highest, rule_of, statistic_of
 from driftfit.judge.plots import plot_alarms
 from driftfit.judge.verdict import p_text
 from driftfit.run.live.change import Change, change_of
@@ -250,26 +250,31 @@ def detect(
         raise TypeError(f"detect: the run comes first, as in detect(run, 'band'); got {run!r}.")
     if isinstance(kind, AlarmRule):
         return judged(run, kind, start)
-    one_of("detect", "kind", kind, KINDS)
-    every = numbers("detect", "every", every, ndim=0, low=1.0, strict=True)
+    asked = asked_for(kind, every, window, hold)
     if kind == "innovation" and run.tracker.adapts:
         _warn_of_following(run)
-        kind = "glr"
-    asked = AlarmRule(kind, every, (), (), whole("detect", "hold", hold, 0), whole("detect", "window", window, 4))
+        asked = replace(asked, kind="glr")
     reference = in_samples(run, reference)
     rule, first = rule_of(run, asked, reference, seed, whole("detect", "records", records, 8))
-    if kind in FROZEN or (not calibrate and kind != "probability"):
+    if asked.kind in FROZEN or (not calibrate and kind != "probability"):
         return judged(run, rule, first)
     made = []
-    for null in null_records(run, every, at, seed):
+    for null in null_records(run, asked.every, at, seed):
         own, begin = rule_of(null, asked, reference, seed)
         made.append((statistic_of(null, own, begin), begin))
-    limits = limit_of(made, every)
+    limits = limit_of(made, asked.every)
     said = judged(run, replace(rule, limits=tuple(limits.tolist()), simulated=True), first)
-    extreme = _highest(said.statistic, first)
-    as_far = [np.max(_highest(*one) / limits) >= np.max(extreme / limits) for one in made]
+    extreme = highest(said.statistic, first)
+    as_far = [np.max(highest(*one) / limits) >= np.max(extreme / limits) for one in made]
     p = (1.0 + sum(as_far)) / (1.0 + len(made)) if np.isfinite(extreme).any() else float("nan")
     return replace(said, p=p)
+
+
+def asked_for(kind: str, every: float, window: int = 50, hold: int = 0) -> AlarmRule:
+    """A rule without names and limits; ValueError for settings that are wrong."""
+    one_of("detect", "kind", kind, KINDS)
+    every = numbers("detect", "every", every, ndim=0, low=1.0, strict=True)
+    return AlarmRule(kind, every, (), (), whole("detect", "hold", hold, 0), whole("detect", "window", window, 4))
 
 
 def judged(run: Track, rule: AlarmRule, start: int | None = None) -> Alarms:
@@ -280,15 +285,9 @@ def judged(run: Track, rule: AlarmRule, start: int | None = None) -> Alarms:
     findings = findings_of(run, rule, start) if rule.kind in FROZEN else np.zeros((0, 0))
     statistic = findings[:, rule.entries] if rule.kind in FROZEN else statistic_of(run, rule, start)
     count = int(np.isfinite(statistic[start:]).any(axis=1).sum())
-    p = chance_of(run, rule)(_highest(statistic, start), count) if count else float("nan")
+    p = chance_of(run, rule)(highest(statistic, start), count) if count else float("nan")
     active = held(rule.exceeded(statistic) & (np.arange(len(run)) >= start), rule.hold)
     return Alarms(rule, active, onsets(active), statistic, start, p, run, findings)
-
-
-def _highest(statistic: Array, start: int) -> Array:
-    """The largest value of each column, (c,), over the judged samples; -inf if there is none."""
-    part = statistic[start:]
-    return np.asarray(np.max(np.where(np.isfinite(part), part, -np.inf), axis=0, initial=-np.inf))
 
 
 def _warn_of_following(run: Track) -> None:

@@ -11,39 +11,37 @@ probability that a record without a fault is as extreme as this one, and
 is below ``level`` for the series in ``faulty``. On average at most that share of them has no fault, if the series are
 independent or positively dependent. A series can have an alarm and not be among them, and vice versa.
 
-The limits of "glr" and "cusum" come from simulated records. A series is first judged by those of a few of them, and by
-all only if it is not clearly without a fault then: its p-value is at most 0.1, or twice the level.
+The limits of "glr" and "cusum" come from simulated records. A series is first judged by the limits of a group of like
+series (`driftfit.judge.alarms.groups`), and by limits of its own if an alarm or a fault is possible then. So every
+alarm and every fault that is reported is one by the limits that the series has as a single run.
 
 Source: Benjamini and Hochberg (1995); Besag and Clifford (1991) for a simulation that ends when the answer is clear.
-Cost: that of `detect` for each run, a third of it for "glr" and "cusum" where there are few faults; limits by
-simulation need records for N every samples, N times.
+Cost: that of `detect` for each run; for "glr" and "cusum" that of the reference model and the statistics, and a
+bootstrap for each series in doubt. Limits by ``calibrate=True`` need records for N every samples, N times. Memory: two
+kilobytes for each series; its statistics are computed again when `Watch.alarms` is read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.engine.settings import numbers
-from driftfit.judge.alarms.detect import Alarms, detect
+from driftfit.judge.alarms.detect import Alarms, asked_for, detect, judged
+from driftfit.judge.alarms.groups import Look, chance, in_doubt, look, with_limits
 from driftfit.judge.fleet_verdict import SHOWN, discoveries
 from driftfit.judge.on_all_cores import on_all_cores
 from driftfit.judge.verdict import p_text
-from driftfit.run.live.rule import FROZEN
+from driftfit.run.live.rule import FROZEN, AlarmRule
 from driftfit.show.parts.text import Printed, facts, key_text, table_of
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track
-
-FIRST = 8
-"""Simulated records by which every series is judged first."""
-CLEAR = 0.1
-"""p-value of that judgement above which it is final."""
 
 
 @dataclass(frozen=True)
@@ -51,17 +49,20 @@ class Watch:
     """One series among many: its alarms, its q-value, and whether it is reported as faulty."""
 
     key: Hashable
-    alarms: Alarms
+    run: Track = field(repr=False)
+    rule: AlarmRule
+    start: int
+    p: float
+    onsets: tuple[int, ...]
+    first: str
+    """The beginning of its first alarm and the cause; empty if there is none."""
     q: float
     faulty: bool
 
     @property
-    def first(self) -> str:
-        """The beginning of its first alarm and the cause; empty if there is none."""
-        if not len(self.alarms.onsets):
-            return ""
-        t = int(self.alarms.onsets[0])
-        return f"{self.alarms.run.time_text(t)}, {self.alarms.cause(t)}"
+    def alarms(self) -> Alarms:
+        """All that `Track.detect` gives for this series, computed when it is asked for."""
+        return replace(judged(self.run, self.rule, self.start), p=self.p)
 
 
 @dataclass(frozen=True)
@@ -103,12 +104,12 @@ class ManyAlarms(Printed):
     @property
     def alarmed(self) -> tuple[Hashable, ...]:
         """Keys of the series with an alarm."""
-        return tuple(row.key for row in self.rows if len(row.alarms.onsets))
+        return tuple(row.key for row in self.rows if row.onsets)
 
     @property
     def expected(self) -> float:
         """Expected number of false alarms in all series together, if none had a fault."""
-        return float(sum((len(row.alarms.active) - row.alarms.start) / row.alarms.every for row in self.rows))
+        return float(sum((len(row.run) - row.start) / row.rule.every for row in self.rows))
 
     @property
     def table(self) -> Any:
@@ -117,15 +118,17 @@ class ManyAlarms(Printed):
 
         columns: dict[str, list[Any]] = {name: [] for name in ("key", "from", "to", "cause", "p", "q", "faulty")}
         for row in self.rows:
+            if not row.onsets:
+                continue
             said = row.alarms
-            for t in map(int, said.onsets):
+            for t in row.onsets:
                 cells = (key_text(row.key), *said.span(t), said.cause(t), said.p, row.q, row.faulty)
                 for column, cell in zip(columns.values(), cells, strict=True):
                     column.append(cell)
         return polars.DataFrame(columns, strict=False)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        begun = sum(len(row.alarms.onsets) for row in self.rows)
+        begun = sum(len(row.onsets) for row in self.rows)
         yield facts(
             ("Alarm", f"{self.kind}, one false alarm of all {len(self.rows)} series in {self.every:g} samples"),
             ("Alarms", f"{begun} in {len(self.alarmed)} series; {self.expected:.2g} false alarms expected"),
@@ -136,8 +139,8 @@ class ManyAlarms(Printed):
         )
         table = table_of("The most extreme first", "", "alarms", "the first", "p", "q", "", names=1)
         for row in self.rows[:SHOWN]:
-            numbers = (p_text(row.alarms.p), p_text(row.q), "fault" if row.faulty else "")
-            table.add_row(Text(key_text(row.key)), str(len(row.alarms.onsets)), Text(row.first), *numbers)
+            numbers = (p_text(row.p), p_text(row.q), "fault" if row.faulty else "")
+            table.add_row(Text(key_text(row.key)), str(len(row.onsets)), Text(row.first), *numbers)
         yield table
         if len(self.rows) > SHOWN:
             yield Text(f" and {len(self.rows) - SHOWN} more", "dim")
@@ -162,22 +165,68 @@ def alarms(
             f"detect: reference is missing for {', '.join(lacking[:SHOWN])}; give one for every key, or one for all."
         )
 
-    staged, clear = kind in FROZEN and "records" not in settings, max(CLEAR, 2.0 * level)
+    each = {key: reference[key] if own else reference for key in runs}
+    settings = {"every": every * len(runs)} | settings
+    if kind in FROZEN and "records" not in settings:
+        judge, failed = _by_groups(runs, kind, each, level, settings)
+    else:
+        judge, failed = lambda key: _judged(runs[key], kind, each[key], settings), {}
 
-    def watch(key: Hashable) -> Alarms | ValueError:
-        given = {"every": every * len(runs), "reference": reference[key] if own else reference} | settings
+    said = on_all_cores([key for key in runs if key not in failed], judge, "alarms")
+    good = {key: one for key, one in said.items() if isinstance(one, Judged)}
+    errors = failed | {key: one for key, one in said.items() if isinstance(one, ValueError)}
+    if not good:
+        raise next(iter(errors.values()))
+    q = discoveries(np.array([one.p for one in good.values()]))
+    rows = [
+        Watch(key, runs[key], *one, float(a), bool(a < level)) for (key, one), a in zip(good.items(), q, strict=True)
+    ]
+    rows.sort(key=lambda row: (np.isnan(row.q), row.p))
+    return ManyAlarms(tuple(rows), kind, float(every), level, {key: str(error) for key, error in errors.items()})
+
+
+class Judged(NamedTuple):
+    """What is kept of the alarms of a series: fields of `Watch`."""
+
+    rule: AlarmRule
+    start: int
+    p: float
+    onsets: tuple[int, ...]
+    first: str
+
+
+def _judged(run: Track, kind: str, reference: Any, settings: dict[str, Any]) -> Judged | ValueError:
+    """The alarms of a series by its own limits, or why there are none."""
+    try:
+        said = detect(run, kind, reference=reference, **settings)
+    except ValueError as error:
+        return error
+    begun = tuple(map(int, said.onsets))
+    first = f"{run.time_text(begun[0])}, {said.cause(begun[0])}" if begun else ""
+    return Judged(said.rule, said.start, said.p, begun, first)
+
+
+def _by_groups(
+    runs: Mapping[Hashable, Track], kind: str, each: dict[Hashable, Any], level: float, settings: dict[str, Any]
+) -> tuple[Callable[[Hashable], Judged | ValueError], dict[Hashable, ValueError]]:
+    """How to judge a series, by the limits of its group where they suffice; and the series that cannot be judged."""
+    asked = asked_for(kind, **{name: settings[name] for name in ("every", "window", "hold") if name in settings})
+
+    def first_look(key: Hashable) -> Look | ValueError:
         try:
-            quick = detect(runs[key], kind, records=FIRST, **given) if staged else None
-            return quick if quick is not None and quick.p > clear else detect(runs[key], kind, **given)
+            return look(runs[key], asked, each[key])
         except ValueError as error:
             return error
 
-    said = on_all_cores(runs, watch, "alarms")
-    good = {key: one for key, one in said.items() if isinstance(one, Alarms)}
-    failed = {key: one for key, one in said.items() if isinstance(one, ValueError)}
-    if not good:
-        raise next(iter(failed.values()))
-    q = discoveries(np.array([one.p for one in good.values()]))
-    rows = [Watch(key, one, float(a), bool(a < level)) for (key, one), a in zip(good.items(), q, strict=True)]
-    rows.sort(key=lambda row: (np.isnan(row.q), row.alarms.p))
-    return ManyAlarms(tuple(rows), kind, float(every), level, {key: str(error) for key, error in failed.items()})
+    seen = on_all_cores(runs, first_look, "reference models")
+    looks = {key: one for key, one in seen.items() if isinstance(one, Look)}
+    rules = with_limits(runs, looks, each, int(settings.get("seed", 0)))
+    p = {key: chance(runs[key], rules[key], one) for key, one in looks.items()}
+    q = dict(zip(p, discoveries(np.array(list(p.values()))), strict=True))
+
+    def judge(key: Hashable) -> Judged | ValueError:
+        if in_doubt(p[key], q[key], level, looks[key], asked.every):
+            return _judged(runs[key], kind, each[key], settings)
+        return Judged(rules[key], looks[key].start, p[key], (), "")
+
+    return judge, {key: one for key, one in seen.items() if isinstance(one, ValueError)}

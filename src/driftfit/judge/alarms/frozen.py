@@ -16,8 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.engine.simd import WIDTH
+from driftfit.judge.alarms.side_by_side import losses
 from driftfit.judge.statistics.robust import CLIP as OF_FIT
-from driftfit.judge.statistics.robust import robust_fit
+from driftfit.judge.statistics.robust import medians, robust_fit
 from driftfit.run.live.likelihood_ratio import (
     ALPHA,
     BETA,
@@ -45,6 +47,9 @@ GAIN = 4.0
 the larger the tails, the larger the gain by chance.
 """
 PERSISTENCE, REACTION = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98), (0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
+GARCH = np.array([(0.0, 0.0), *((a, both - a) for both in PERSISTENCE for a in REACTION if a < both)])
+GARCH = np.ascontiguousarray(np.vstack([GARCH, np.repeat(GARCH[-1:], -len(GARCH) % WIDTH, axis=0)]).T)
+"""alpha and beta of the candidates (2, C), constant noise first, the last repeated to fill a vector."""
 SHARE = 8
 """The noise is judged by windows of at most this part of the reference."""
 UNSEEN = 1e-6
@@ -85,29 +90,34 @@ def frozen_model(phi: Array, y: Array, ok: Array) -> tuple[Frozen, Rows]:
 
 def noise_model(w: Array, n: int) -> tuple[Array, Array]:
     """(`Frozen.numbers`, variances h (N,)) of white residuals w (N,) of a fit of n parameters."""
-    numbers = np.zeros(NORMAL + 1)
-    numbers[CLIP], numbers[NORMAL], numbers[LONGEST] = CLIPPED, len(w), max(len(w) // SHARE, 8)
-    numbers[SCALE] = _scale(w, n)
-    x, h = w / numbers[SCALE], np.ones(len(w))
-    numbers[V] = np.mean(np.clip(x, -CLIPPED, CLIPPED) ** 2)
-    numbers[INSIDE] = np.mean(np.where(np.abs(x) < CLIPPED, x * x, 0.0))
-    chance = GAIN * np.var(np.clip(x, -CLIPPED, CLIPPED) ** 2) / numbers[INSIDE] ** 2
-    best = levels(x, numbers, h) - chance
-    chosen = (0.0, 0.0)
-    for together in PERSISTENCE:
-        for alpha in REACTION:
-            numbers[ALPHA], numbers[BETA] = alpha, together - alpha
-            if alpha < together:
-                loss = levels(x, numbers, h)
-                best, chosen = (loss, (alpha, together - alpha)) if loss < best else (best, chosen)
-    numbers[ALPHA], numbers[BETA] = chosen
-    levels(x, numbers, h)
-    numbers[SCALE] *= _scale(w / (numbers[SCALE] * np.sqrt(h)), n)
-    x = w / (numbers[SCALE] * np.sqrt(h))
-    g = np.clip(x, -CLIPPED, CLIPPED)
-    numbers[K], numbers[V], numbers[KAPPA] = np.mean(np.abs(x) < CLIPPED), np.mean(g * g), np.var(g * g)
+    numbers, h = noise_models(w[None], n)
+    return numbers[0], h[0]
+
+
+def noise_models(w: Array, n: int) -> tuple[Array, Array]:
+    """The same for R references of N residuals each, w (R, N): numbers (R, k) and h (R, N)."""
+    R, N = w.shape
+    numbers, h = np.zeros((R, NORMAL + 1)), np.empty((R, N))
+    numbers[:, CLIP], numbers[:, NORMAL], numbers[:, LONGEST] = CLIPPED, N, max(N // SHARE, 8)
+    numbers[:, SCALE] = _scales(w, n)
+    x = w / numbers[:, SCALE, None]
+    square = np.clip(x, -CLIPPED, CLIPPED) ** 2
+    numbers[:, V] = square.mean(axis=1)
+    numbers[:, INSIDE] = np.mean(np.where(np.abs(x) < CLIPPED, x * x, 0.0), axis=1)
+    chance = GAIN * np.var(square, axis=1) / numbers[:, INSIDE] ** 2
+    for one, own, by_chance, level in zip(x, numbers, chance, h, strict=True):
+        total = np.zeros((1, GARCH.shape[1]))
+        losses(one, CLIPPED, own[V], own[INSIDE], GARCH, np.ones(total.shape), total)
+        total[0, 0] -= by_chance
+        own[[ALPHA, BETA]] = GARCH[:, np.argmin(total)]
+        levels(one, own, level)
+    numbers[:, SCALE] *= _scales(w / (numbers[:, SCALE, None] * np.sqrt(h)), n)
+    x = w / (numbers[:, SCALE, None] * np.sqrt(h))
+    square = np.clip(x, -CLIPPED, CLIPPED) ** 2
+    numbers[:, K], numbers[:, V] = np.mean(np.abs(x) < CLIPPED, axis=1), square.mean(axis=1)
+    numbers[:, KAPPA] = square.var(axis=1)
     raw = np.clip(x, -WIDE, WIDE) ** 2
-    numbers[RAW], numbers[SPREAD] = np.mean(raw), np.var(raw)
+    numbers[:, RAW], numbers[:, SPREAD] = raw.mean(axis=1), raw.var(axis=1)
     return numbers, h
 
 
@@ -135,16 +145,14 @@ def _autoregression(e: Array, ok: Array) -> Array:
     limit = 3.0 * 1.4826 * float(np.median(np.abs(e[ok])))
     e, most = np.clip(e, -limit, limit), min(ORDER, len(e) // 20)
     used, _ = _whitened(e[:, None], ok, np.zeros(most))
-    best, chosen = len(used) * np.log(np.mean(e[used] ** 2)), np.zeros(0)
-    for p in range(1, most + 1):
-        lags = np.column_stack([e[used - lag] for lag in range(1, p + 1)])
-        a = np.linalg.lstsq(lags, e[used], rcond=None)[0]
-        bic = len(used) * np.log(np.mean((e[used] - lags @ a) ** 2)) + p * np.log(len(used))
-        if bic < best:
-            best, chosen = bic, a
-    return chosen
+    N, lags = len(used), [e[used - lag] for lag in range(1, most + 1)]
+    R = np.asarray(np.linalg.qr(np.column_stack([*lags, e[used]]), mode="r"))  # order p leaves the squares below row p
+    left = np.cumsum(R[::-1, -1] ** 2)[::-1][: most + 1]
+    p = int(np.argmin(N * np.log(left / N) + np.arange(most + 1) * np.log(N)))
+    return np.linalg.lstsq(R[:p, :p], R[:p, -1], rcond=None)[0] if p else np.zeros(0)
 
 
-def _scale(w: Array, n: int) -> float:
-    """Standard deviation from the median, with the degrees of freedom of n parameters."""
-    return float(1.4826 * np.median(np.abs(w)) * np.sqrt(len(w) / max(len(w) - n, 1)))
+def _scales(w: Array, n: int) -> Array:
+    """Standard deviations (R,) of w (R, N) from medians, with the degrees of freedom of n parameters."""
+    N = w.shape[1]
+    return np.asarray(1.4826 * medians(np.abs(w)) * np.sqrt(N / max(N - n, 1)))

@@ -15,7 +15,7 @@ from driftfit.engine.drivers import output_type
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import plain
 from driftfit.judge.alarms.bootstrap import RECORDS, limits, simulated
-from driftfit.judge.alarms.frozen import frozen_model
+from driftfit.judge.alarms.frozen import Rows, frozen_model
 from driftfit.judge.alarms.onsets import (
     chance,
     mean_limit,
@@ -35,6 +35,9 @@ from driftfit.trackers.bank.results.results import Hypotheses
 
 Reference = Mapping[str, tuple[float, float]] | tuple[Any, Any] | int | None
 
+Samples = tuple[Array, Array]
+"""What `samples_of` returns."""
+
 Chance = Callable[[Array, int], float]
 """Probability that a record without a fault reaches these highest values (c,) in a given number of samples."""
 
@@ -48,7 +51,7 @@ def rule_of(
     return RULES[rule.kind](run, rule, reference)
 
 
-def samples_of(run: Track) -> tuple[Array, Array]:
+def samples_of(run: Track) -> Samples:
     """Regressors (T, n) of a run, and (T, 4): y, ok, noise, dt, as the tracker receives them."""
     steps = run.program.steps._replace(store=collect)
     tile = run.fresh()
@@ -60,12 +63,21 @@ def samples_of(run: Track) -> tuple[Array, Array]:
 
 def _frozen(run: Track, rule: AlarmRule, reference: Reference, seed: int, records: int) -> tuple[AlarmRule, int]:
     """The model of the reference, and limits by its bootstrap."""
+    rule, rows, start, _ = modelled(run, rule, reference)
+    made = simulated(rule.reference, rows, seed, records)
+    found, growth = limits(made, rule.kind == "cusum", rule.every)
+    return replace(rule, limits=plain(found), growth=plain(growth)), start
+
+
+def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, Rows, int, Samples]:
+    """The rule with the model of the reference, without limits; the reference; its end; and `samples_of` the run."""
     if isinstance(reference, Mapping):
         raise ValueError(
             f'detect: the reference of "{rule.kind}" must be a number of samples, such as reference=500, or (from, to).'
         )
     first, start = first_third(run) if reference is None else stretch(run, reference)
-    phi, rest = (part[first:start] for part in samples_of(run))
+    samples = samples_of(run)
+    phi, rest = (part[first:start] for part in samples)
     y, ok, noise = rest[:, 0], (rest[:, 1] > 0.0) & (rest[:, 3] > 0.0), rest[:, 2]
     n, names, least = phi.shape[1], run.model.names, max(100, 10 * phi.shape[1])
     if run.theta.shape[1] != n or ok.sum() < least:
@@ -85,8 +97,7 @@ def _frozen(run: Track, rule: AlarmRule, reference: Reference, seed: int, record
         frozen=tuple(plain(one) for one in frozen),
         simulated=True,
     )
-    found, growth = limits(simulated(frozen, known, seed, records), rule.entries, rule.every)
-    return replace(rule, limits=plain(found), growth=plain(growth)), start
+    return rule, known, start, samples
 
 
 def _band(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
@@ -166,9 +177,9 @@ def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
     return _carried(statistic)
 
 
-def findings_of(run: Track, rule: AlarmRule, start: int) -> Array:
-    """The findings of "glr" and "cusum" for every sample, (T, k), NaN before ``start``."""
-    n, (phi, rest), model = len(rule.parameters), samples_of(run), rule.reference
+def findings_of(run: Track, rule: AlarmRule, start: int, samples: Samples | None = None) -> Array:
+    """The findings of "glr" and "cusum", (T, k), NaN before ``start``; ``samples`` of the run if they are known."""
+    n, (phi, rest), model = len(rule.parameters), samples or samples_of(run), rule.reference
     findings = np.full((len(run), CUSUM + n + 1), np.nan)
     rows = np.column_stack([phi, np.ones((len(run), n - phi.shape[1])), rest])
     scan(rows[start:], model, memory_of(n, len(model.ar)), findings[start:])
@@ -179,6 +190,12 @@ def _carried(statistic: Array) -> Array:
     """Repeat the last statistic where there is no new sample."""
     place = np.maximum.accumulate(np.where(np.isfinite(statistic[:, 0]), np.arange(len(statistic)), -1))
     return np.where((place >= 0)[:, None], statistic[place], np.nan)
+
+
+def highest(statistic: Array, start: int) -> Array:
+    """The largest value of each column, (c,), over the judged samples; -inf if there is none."""
+    part = statistic[start:]
+    return np.asarray(np.max(np.where(np.isfinite(part), part, -np.inf), axis=0, initial=-np.inf))
 
 
 def chance_of(run: Track, rule: AlarmRule) -> Chance:

@@ -335,27 +335,14 @@ def scan(rows: Array, frozen: Frozen, memory: Memory, findings: Array) -> None:
 
 
 @Driver
-def scan_scores(phi: Array, g: Array, frozen: Frozen, memory: Memory, findings: Array) -> None:
-    """The same for whitened regressors phi (T, n) and scores g (T,), all of them used."""
-    for t in range(phi.shape[0]):
-        enter_scores(phi[t], g[t], g[t], memory.sample)
-        judge(memory, frozen, findings[t])
-
-
-@Driver
-def levels(x: Array, numbers: Array, h: Array) -> float:
-    """The variances h (T,) of residuals x (T,) in units of their scale; returns sum log h + g^2 / inside.
-
-    With this factor h = 1 is the best constant for every distribution of x.
-    """
+def levels(x: Array, numbers: Array, h: Array) -> None:
+    """The variances h (T,) of residuals x (T,) in units of their scale."""
     alpha, beta, v, clip = numbers[ALPHA], numbers[BETA], numbers[V], numbers[CLIP]
-    total, level = 0.0, 1.0
+    level = 1.0
     for t in range(x.shape[0]):
         h[t] = level
         g = min(clip, max(-clip, x[t] / np.sqrt(level)))
-        total += log(level) + g * g / numbers[INSIDE]
         level = 1.0 - alpha - beta + (alpha * g * g / v + beta) * level
-    return total
 
 
 @Driver

@@ -2,11 +2,14 @@
 
 This is what a process needs that receives a few samples of many series, with their states, and must be fast: no
 `Track` is made for a series. The samples, results and states of a series are those of its record, bit for bit.
+
+Of K series with ny outputs each, programs and states have K ny entries, those of a series one after the other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -23,18 +26,27 @@ class Advanced:
         self.programs, self.records, self.jobs = programs, records, jobs
 
     def column(self, name: str) -> Array:
-        """A field of the output at every sample of every series, (N,) or (N, n)."""
-        shape = self.jobs[0].out[name].shape[1:-1]
-        into = np.empty((len(self.records.y), int(np.prod(shape))))
+        """A field of the driver's output at every sample: (N, ..), or (N, ny, ..) of several outputs."""
+        shape, ny = self.jobs[0].out[name].shape[1:-1], self.records.ny
+        into = np.empty((len(self.records.y), ny, int(np.prod(shape))))
+        self.columns([name], into)
+        return into.reshape(-1, *((ny,) if self.records.outputs else ()), *shape)
+
+    def columns(self, names: Sequence[str], into: Array) -> None:
+        """Write fields of the output at every sample side by side ``into`` (N, k), or (N, ny, k) of several outputs."""
+        into = into[:, None] if into.ndim == 2 else into
         for job in self.jobs:
-            lanes = np.flatnonzero(job.live)
-            series = job.lanes[lanes]
-            field = job.out[name].reshape(len(job.out), -1, len(job.lanes))
-            _natural(field, lanes, self.records.first[series], self.records.length[series], into)
-        return into.reshape(-1, *shape)
+            lanes, L = np.flatnonzero(job.live), len(job.lanes)
+            series, output = np.divmod(job.lanes[lanes], self.records.ny)
+            fields: Mapping[str, Any] = job.out.dtype.fields or {}
+            places = (fields[name][:2] for name in names)
+            begin = [np.arange(at, at + kind.itemsize, 8 * L) // 8 for kind, at in places]
+            words = job.out.view(np.float64).reshape(len(job.out), -1)
+            first, length = self.records.first[series], self.records.length[series]
+            _natural(words, np.concatenate(begin), lanes, first, length, output, into)
 
     def lanes(self) -> list[tuple[Job, int]]:
-        """The job and the lane of each series."""
+        """The job and the lane of each program."""
         found: list[tuple[Job, int]] = [(self.jobs[0], 0)] * len(self.programs)
         for job in self.jobs:
             for lane in np.flatnonzero(job.live).tolist():
@@ -42,7 +54,7 @@ class Advanced:
         return found
 
     def states(self) -> Array:
-        """The words (K, W) of each series after its last sample; of a layout with fewer words the first of them."""
+        """The words (K ny, W) after the last samples; of a layout with fewer words the first of them."""
         layouts = [self.programs[job.lanes[0]].layout for job in self.jobs]
         found = np.zeros((len(self.programs), max(one.size for one in layouts)), np.int64)
         for job, layout in zip(self.jobs, layouts, strict=True):
@@ -54,10 +66,11 @@ def advance(
     programs: Sequence[Program], records: Records, states: Array, begun: Array, threads: int | None = None,
     collected: bool = False,
 ) -> Advanced:  # fmt: skip
-    """Run every series of one output by its program, from its state if it has ``begun``.
+    """Run every series by its programs, from their states if they have ``begun``.
 
-    ``states`` (K, W) are the words of the states (`Layout.unpack`), as `Advanced.states` returns them; a series that
-    has not ``begun`` (K,) is at its start. With ``collected`` the fields of `collected_samples.COLLECTED` are kept too.
+    ``states`` (K ny, W) are the words of the states (`Layout.unpack`), as `Advanced.states` returns them; a program
+    that has not ``begun`` (K ny,) is at its start. With ``collected`` the fields of `collected_samples.COLLECTED` are
+    kept too.
     """
     jobs = prepare(programs, records, "std", collected=collected)
     for job in jobs:
@@ -70,10 +83,9 @@ def advance(
 
 
 @Driver
-def _natural(field: Array, lanes: Array, first: Array, length: Array, into: Array) -> None:
-    """Copy lanes of a field (T, k, L) to their rows of (N, k)."""
+def _natural(words: Array, begin: Array, lanes: Array, first: Array, length: Array, output: Array, into: Array) -> None:
+    """Copy lanes of an output (T, words), whose fields ``begin`` (k,) at these words, to their rows of (N, ny, k)."""
     for j in range(len(lanes)):
-        l = lanes[j]
         for t in range(length[j]):
-            for i in range(field.shape[1]):
-                into[first[j] + t, i] = field[t, i, l]
+            for i in range(len(begin)):
+                into[first[j] + t, output[j], i] = words[t, begin[i] + lanes[j]]

@@ -53,6 +53,10 @@ def sort_out(series: Array, time: Array, waited: Array, newest: Array, hold: Any
     hold : number or timedelta64
         Not negative.
     """
+    if not hold and not waited.any() and (ends := _all_in_order(series, time, newest)) is not None:
+        after = newest.copy()
+        after[series[ends]] = time[ends]
+        return Fates(np.arange(len(time)), np.full(len(time), RELEASED), after)
     order = np.lexsort((time, series))
     series, time, arriving = series[order], time[order], ~waited[order]
     untimed = np.isnat(time) if time.dtype.kind == "M" else ~np.isfinite(time)
@@ -67,6 +71,26 @@ def sort_out(series: Array, time: Array, waited: Array, newest: Array, hold: Any
     fate[arriving & (again | (time == before)) & ((fate != LATE) | (time == before))] = REPEATED
     fate[untimed] = UNTIMED
     return Fates(order, fate, after)
+
+
+def ended(fate: Array, over: Array) -> Array:
+    """Fates (N,) where rows are of a series that is ``over`` (N,): what waits is released, since nothing else comes."""
+    return np.where((fate == WAITING) & over, RELEASED, fate)
+
+
+def _all_in_order(series: Array, time: Array, newest: Array) -> Array | None:
+    """The last row of every series if all rows are sorted and each is after the one before; None otherwise.
+
+    Most rows arrive so, and to see it takes a fifth of the time of sorting and deciding on each.
+    """
+    if not len(time) or time.dtype.kind != "f" or not np.isfinite(time).all() or (series[1:] < series[:-1]).any():
+        return None
+    ends = np.append(np.flatnonzero(series[1:] != series[:-1]), len(series) - 1)
+    before = np.empty(len(time))
+    before[1:] = time[:-1]
+    begin = np.append(0, ends[:-1] + 1)
+    before[begin] = newest[series[begin]]
+    return None if (time <= before).any() else ends
 
 
 class HoldBack:

@@ -37,6 +37,8 @@ MAGIC, FORMAT = b"DFst", 1
 HEAD = Struct("<4sHHI8sI")
 CHECKED = 12
 """The first byte that the CRC covers."""
+TAG = slice(12, 20)
+"""The fingerprint."""
 MANY = 512
 """From this number of words on, zeros are left out where that makes the bytes fewer."""
 WORD = np.dtype("<i8")
@@ -88,7 +90,11 @@ class Layout:
     @cached_property
     def tag(self) -> bytes:
         """Fingerprint of model, tracker and layout, 8 bytes."""
-        plain = json.dumps([self.owner, self.text], sort_keys=True, separators=(",", ":"))
+        return self.tag_with(self.text)
+
+    def tag_with(self, text: str) -> bytes:
+        """The fingerprint of the same model and tracker in a version whose fields are ``text``."""
+        plain = json.dumps([self.owner, text], sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(plain.encode()).digest()[:8]
 
     def taken(self, tile: Array) -> Array:
@@ -152,6 +158,11 @@ def unpacked(data: bytes) -> tuple[bytes, Array]:
     words = np.zeros(count, np.int64)
     words[there] = np.frombuffer(data, WORD, int(there.sum()), HEAD.size + bits)
     return tag, words
+
+
+def tag_of(data: bytes) -> bytes:
+    """The fingerprint in a packed state, which is not checked."""
+    return data[TAG]
 
 
 def _native(words: Array) -> Array:

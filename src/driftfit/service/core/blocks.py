@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array
+from driftfit.engine.kernel import Array, Driver
 from driftfit.service.core.results import TIME, Results, S
 
 SIZE = 64
@@ -23,73 +23,87 @@ class Blocks:
 
     def __init__(self, columns: int) -> None:
         self._values = np.empty((0, SIZE, columns))
-        self._count = np.zeros(0, np.int64)
-        self._first, self._last = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        self._state: Array = np.zeros((0, 3), np.int64)
+        """(count, first number, last number) of each unit."""
 
     @property
     def capacity(self) -> int:
         """Units for which there is room."""
-        return len(self._count)
+        return len(self._state)
+
+    @property
+    def columns(self) -> int:
+        """Numbers of a result."""
+        return int(self._values.shape[2])
 
     def grow(self, capacity: int) -> None:
         """Make room for more units."""
-        more = capacity - len(self._count)
+        more = capacity - self.capacity
         self._values = np.concatenate([self._values, np.empty((more, *self._values.shape[1:]))])
-        zeros = np.zeros(more, np.int64)
-        self._count, self._first, self._last = (
-            np.concatenate([old, zeros]) for old in (self._count, self._first, self._last)
-        )
+        self._state = np.concatenate([self._state, np.zeros((more, 3), np.int64)])
 
     def add(self, places: Array, results: Results) -> list[tuple[Any, ...]]:
         """Add results, sorted by place (N,); the rows of the table ``block`` for the blocks that they complete."""
-        values, found = history_of(results), []
-        new = np.flatnonzero(np.append(True, places[1:] != places[:-1]))
-        at = self._count[places] + np.arange(len(places)) - np.repeat(new, np.diff(np.append(new, len(places))))
-        for turn in range(int(at.max()) // SIZE + 1):
-            now = np.flatnonzero(at // SIZE == turn)
-            here, number = places[now], results.number[now]
-            self._values[here, at[now] - turn * SIZE] = values[now]
-            begun = here[self._count[here] == 0]
-            self._first[begun], self._last[begun] = np.iinfo(np.int64).max, 0
-            np.minimum.at(self._first, here, number)
-            np.maximum.at(self._last, here, number)
-            np.add.at(self._count, here, 1)
-            full = np.unique(here[self._count[here] == SIZE])
-            if full.size:
-                owner = dict(zip(here.tolist(), results.unit[now].tolist(), strict=True))
-                found += self._rows(full, [owner[place] for place in full.tolist()])
-        return found
+        most = len(places) // SIZE + np.count_nonzero(places[1:] != places[:-1]) + 1
+        rows, about = np.empty((most, SIZE, self.columns)), np.zeros((most + 1, 3), np.int64)
+        _add(results.number, places, results.values, self._values, self._state, rows, about)
+        about = about[: about[-1, 0]]
+        rows = rows[: len(about)]
+        units, extremes = results.unit[about[:, 0]].tolist(), extremes_of(rows)
+        start, stop = (rows[:, k, TIME].tolist() for k in (0, -1))
+        return [
+            (*one, SIZE, rows[k].tobytes(), extremes[k].tobytes())
+            for k, one in enumerate(zip(units, *about[:, 1:].T.tolist(), start, stop, strict=True))
+        ]
 
     def flush(self, place: int, unit: int) -> list[tuple[Any, ...]]:
         """The row of the table ``block`` for what a unit has so far; none if it has nothing."""
-        return self._rows(np.array([place]), [unit]) if self._count[place] else []
-
-    def _rows(self, places: Array, units: list[int]) -> list[tuple[Any, ...]]:
-        """The blocks at places with equal counts, which become empty."""
-        count = int(self._count[places[0]])
-        values = self._values[places, :count]
-        extremes, first, last = extremes_of(values), self._first[places].tolist(), self._last[places].tolist()
-        self._count[places] = 0
-        start, stop = (values[:, k, TIME].tolist() for k in (0, -1))
-        return [
-            (*about, count, values[k].tobytes(), extremes[k].tobytes())
-            for k, about in enumerate(zip(units, first, last, start, stop, strict=True))
-        ]
+        count, first, last = self._state[place].tolist()
+        if not count:
+            return []
+        self._state[place] = 0
+        values = self._values[place, :count]
+        start, stop = values[0, TIME].item(), values[-1, TIME].item()
+        return [(unit, first, last, start, stop, count, values.tobytes(), extremes_of(values).tobytes())]
 
 
-def history_of(results: Results) -> Array:
-    """The columns of the history (N, 5 + 2 n); where samples have no times their numbers are used."""
-    values = results.values.copy()
-    untimed = np.isnan(values[:, TIME])
-    values[untimed, TIME] = results.number[untimed]
-    with np.errstate(invalid="ignore"):
-        values[:, S] = np.sqrt(values[:, S])
-    return values
+@Driver
+def _add(number: Array, places: Array, given: Array, values: Array, state: Array, rows: Array, about: Array) -> None:
+    """Copy results to the blocks of their places, whose ``state`` is (count, first, last).
+
+    Complete ones are moved to ``rows``, with (a result of theirs, first, last); how many that are is written into the
+    last row of ``about``. Where samples have no times their numbers are used; variances of innovations become standard
+    deviations. All are plain loops: with slices it would take ten times as long to compile.
+    """
+    complete = 0
+    for i in range(len(number)):
+        p = places[i]
+        k = state[p, 0]
+        for c in range(given.shape[1]):
+            values[p, k, c] = given[i, c]
+        if np.isnan(values[p, k, TIME]):
+            values[p, k, TIME] = number[i]
+        values[p, k, S] = np.sqrt(values[p, k, S])
+        state[p, 0] = k + 1
+        if k == 0 or number[i] < state[p, 1]:
+            state[p, 1] = number[i]
+        if k == 0 or number[i] > state[p, 2]:
+            state[p, 2] = number[i]
+        if k + 1 == SIZE:
+            for t in range(SIZE):
+                for c in range(given.shape[1]):
+                    rows[complete, t, c] = values[p, t, c]
+            about[complete, 0], about[complete, 1], about[complete, 2] = i, state[p, 1], state[p, 2]
+            state[p, 0] = 0
+            complete += 1
+    about[-1, 0] = complete
 
 
 def extremes_of(values: Array) -> Array:
     """Least, largest and mean (.., 3, c) of columns (.., T, c), over finite numbers; NaN if there are none."""
     fine = np.isfinite(values)
+    if fine.all():
+        return np.stack([values.min(axis=-2), values.max(axis=-2), values.mean(axis=-2)], axis=-2)
     count = fine.sum(axis=-2)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.where(fine, values, 0.0).sum(axis=-2) / count

@@ -13,7 +13,7 @@ import sqlite3
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ import numpy as np
 from driftfit.service.core.archive import Archive
 from driftfit.service.core.calibration import rules_of
 from driftfit.service.core.intake import Action, Arrived, Intake
-from driftfit.service.core.journal import NEEDED_FROM, Act, Item, Journal, Pending
+from driftfit.service.core.journal import NEEDED_FROM, Act, Group, Item, Journal, Pending
 from driftfit.service.core.unit import Out, Unit
 from driftfit.service.core.units import Units
 from driftfit.service.settings.config import Config
@@ -33,11 +33,19 @@ BUDGET = 0.02
 """Seconds of one transaction that may go into storing states."""
 IDLE = 0.25
 """Seconds that the engine waits for samples before it does other work."""
-PACE = 0.01
-"""Seconds from one transaction to the next at least: with single samples in a message the fixed cost of a group, about
-a millisecond, would otherwise be most of the work."""
+PACE, SLOWEST_PACE, SHARE = 0.01, 0.025, 5.0
+"""Seconds from one transaction to the next at least, and at least so many times what the last one took of the
+processor: the fixed cost of a group, about a millisecond, would otherwise be most of the work."""
+KEPT = 16
+"""Groups of which the results are kept in memory."""
 RETRY = 1.0
 """Seconds between two attempts to write the journal."""
+
+
+def quantiles(seconds: Iterable[float]) -> dict[str, float | None]:
+    """Median and 99th percentile; None without any."""
+    found = sorted(seconds)
+    return {f"p{k}": found[len(found) * k // 100] if found else None for k in (50, 99)}
 
 
 class Engine:
@@ -52,12 +60,16 @@ class Engine:
         self.progress: dict[str, int] = {}
         """The last group that each sink has written."""
         self.news = threading.Condition()
-        """Notified when results have been stored."""
+        """Notified when there are results."""
         self.problem = ""
         self.samples = 0
         self.last_stored = 0
         """The last group whose results were stored by this process."""
         self.next = self.journal.next_number()
+        self._fresh: deque[Group] = deque()
+        """The newest results, so that sinks need not wait until these are stored."""
+        self._elsewhere = self.next - 1
+        """The number up to which results are in the database only."""
         self.latencies: deque[float] = deque(maxlen=2000)
         """Seconds from the arrival of a batch to the results of its samples."""
         self._dirty: OrderedDict[int, tuple[int, float]] = OrderedDict()
@@ -77,7 +89,7 @@ class Engine:
                 again += self._apply(number, item, out, replay=True)
                 number += item.length
             if first >= unstored:
-                self._pending.add_results(first, out.results, out.events, time.time())
+                self._pending.add_results(Group(first, out.results, out.events, time.time()))
             self._pending.blocks += out.blocks
         for unit in self.units.resident:
             self._ask_for_limits(unit)
@@ -109,12 +121,20 @@ class Engine:
         for unit in units:
             self._dirty.setdefault(unit, since)
 
+    def prepare(self) -> None:
+        """Compile what the first samples need; on a new computer that takes some seconds."""
+        self.problem = "the trackers are compiled once for this computer"
+        for section in self.units.sections:
+            section.prepare()
+        self.problem = ""
+
     def run(self) -> None:
         """Work until `stop`."""
         while not self._stop.is_set():
-            begun = time.monotonic()
+            begun, used = time.monotonic(), time.thread_time()
             self.step(IDLE)
-            self._stop.wait(begun + PACE - time.monotonic())
+            pace = min(max(PACE, SHARE * (time.thread_time() - used)), SLOWEST_PACE)
+            self._stop.wait(begun + pace - time.monotonic())
         if not self.problem:  # otherwise nothing more may be written: sources send again what was not acknowledged
             self.step(0.0)
             self._store_states(everything=True)
@@ -136,7 +156,8 @@ class Engine:
         """Take, journal and process the batches that have arrived; the number of samples."""
         arrived = self.intake.take(self.config.service.group, 0.0 if self._pending else wait)
         first, items = self.next, self._admit(arrived)
-        now = time.time()
+        oldest = min((batch.arrived for _, batch in arrived.batches if batch.arrived), default=time.monotonic())
+        now = time.time() - (time.monotonic() - oldest)
         if items:
             self._pending.add_group(first, items, now)
             self.next += sum(item.length for item in items)
@@ -173,14 +194,33 @@ class Engine:
         for item in items:
             self._apply(number, item, out)
             number += item.length
-        self._pending.add_results(first, out.results, out.events, now)
+        group = Group(first, out.results, out.events, now)
+        self._pending.add_results(group)
         self._pending.blocks += out.blocks
+        self._publish(group)
         for unit in out.to_calibrate:
             self._ask_for_limits(self.units.get(unit))
         self.samples += sum(len(one.number) for one in out.results)
         for _, unit, _, kind, detail in out.events:
             log.info(kind, extra={"unit": self.units.get(unit).name, "detail": detail})
         return number - first
+
+    def _publish(self, group: Group) -> None:
+        """Let sinks see results. They are not stored yet, but what they follow from is in the journal."""
+        if not group.parts and not group.events:
+            return
+        with self.news:
+            self._fresh.append(group)
+            while len(self._fresh) > KEPT:
+                self._elsewhere = self._fresh.popleft().first
+            self.news.notify_all()
+
+    def after(self, group: int, stored: Journal) -> list[Group]:
+        """The results after a group, some of them if there are many."""
+        with self.news:
+            if group >= self._elsewhere:
+                return [one for one in self._fresh if one.first > group]
+        return stored.outcomes(group)
 
     def _ask_for_limits(self, unit: Unit) -> None:
         """Find the limits of a unit's alarms in another thread; they come back as an action in the journal."""
@@ -239,12 +279,8 @@ class Engine:
             break
         self.problem = ""
         self.positions |= self._pending.positions
-        results = bool(self._pending.results)
         self.last_stored = max([self.last_stored, *(first for first, *_ in self._pending.results)])
         self._pending = Pending()
-        if results:
-            with self.news:
-                self.news.notify_all()
         return True
 
     def _sinks_at(self) -> int:
@@ -254,11 +290,8 @@ class Engine:
 
     def status(self) -> dict[str, Any]:
         """Numbers for the page and for Prometheus."""
-        recent = sorted(self.latencies)
-        return {
+        return quantiles(self.latencies) | {
             "samples": self.samples, "next": self.next, "units": len(self.units), "waiting": self.intake.waiting,
             "held_back": self.intake.held_back, "refused": dict(self.units.refused), "problem": self.problem,
-            "p50": recent[len(recent) // 2] if recent else None,
-            "p99": recent[int(len(recent) * 0.99)] if recent else None,
             "dirty": len(self._dirty), "recovered": self.recovered, "positions": dict(self.positions),
         }  # fmt: skip

@@ -37,12 +37,13 @@ create table if not exists result (first integer primary key, count integer, at 
 create table if not exists program (tag blob primary key, about text);
 create table if not exists snapshot (unit integer primary key, number integer, state blob);
 create table if not exists block (unit integer, first integer, last integer, start real, stop real, count integer,
-    rows blob, extremes blob, primary key (unit, first)) without rowid;
+    rows blob, extremes blob, primary key (unit, first));
 create table if not exists event (id integer primary key, number integer, unit integer, at real, kind text,
     detail text);
 create index if not exists event_of_unit on event (unit, id);
 create table if not exists position (name text primary key, value text);
 """
+PRAGMAS = ("page_size=8192", "journal_mode=wal", "synchronous=full", "wal_autocheckpoint=2000", "temp_store=memory")
 FORMAT = "2"
 RESULTS_FROM, NEEDED_FROM = "results from", "needed from"
 """Keys of ``meta``: of `Journal.first_without_results` and `Journal.first_needed`."""
@@ -95,6 +96,18 @@ class Act(NamedTuple):
         return [self.unit, self.action]
 
 
+class Group(NamedTuple):
+    """The results of a group."""
+
+    first: int
+    """Number of its first sample."""
+    parts: list[Results]
+    events: list[list[Any]]
+    """With units as numbers."""
+    at: float
+    """When the oldest of its samples arrived, in seconds since 1970."""
+
+
 Item = Rows | Act
 _decode = msgspec.msgpack.Decoder(list[list[Any]]).decode
 _encode = msgspec.msgpack.Encoder().encode
@@ -113,7 +126,7 @@ class Journal:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         self.db = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False, timeout=10.0)
         self.path.chmod(0o600)
-        for line in ("journal_mode=wal", "synchronous=full", "wal_autocheckpoint=4000", "temp_store=memory"):
+        for line in PRAGMAS:
             self.db.execute(f"pragma {line}")
         self.db.executescript(SCHEMA)
         self.db.execute("insert or ignore into meta values ('format', ?)", (FORMAT,))
@@ -155,11 +168,11 @@ class Journal:
                 yield start, [Rows.of(*one) if len(one) == 4 else Act(*one) for one in _decode(items)]
             first = rows[-1][0] + 1
 
-    def outcomes(self, after: int, most: int = 64) -> list[tuple[int, list[Results], list[list[Any]]]]:
-        """(number of the group, results, rows of events) of groups after one, the units as numbers."""
-        query = "select first, rows from result where first > ? order by first limit ?"
-        found = [(first, *_RESULTS.decode(rows)) for first, rows in self.db.execute(query, (after, most)).fetchall()]
-        return [(first, [Results.of(*one) for one in parts], events) for first, parts, events in found]
+    def outcomes(self, after: int, most: int = 64) -> list[Group]:
+        """The stored results of groups after one."""
+        query = "select first, at, rows from result where first > ? order by first limit ?"
+        found = [(*one, *_RESULTS.decode(rows)) for *one, rows in self.db.execute(query, (after, most)).fetchall()]
+        return [Group(first, [Results.of(*one) for one in parts], events, at) for first, at, parts, events in found]
 
     def units(self, after: int = 0) -> list[tuple[int, str, int, str, int, str]]:
         """(number, name, section, topic, born, about) of the units with larger numbers."""
@@ -211,8 +224,9 @@ class Pending:
         self.log = (first, count, at, _encode([item.plain() for item in items]))
         self.meta["next"] = str(first + count)
 
-    def add_results(self, first: int, parts: list[Results], events: list[list[Any]], at: float) -> None:
+    def add_results(self, group: Group) -> None:
         """The results of a group."""
+        first, parts, events, at = group
         if parts or events:
             count = sum(len(one.number) for one in parts)
             self.results.append((first, count, at, _encode(([one.plain() for one in parts], events))))

@@ -18,11 +18,12 @@ from driftfit.data.record import Records
 from driftfit.engine.kernel import Array
 from driftfit.run.live.interventions import HELD
 from driftfit.run.live.rule import FROZEN
+from driftfit.run.parallel_lanes import FEWEST
 from driftfit.run.states import late
 from driftfit.run.states.advance import Advanced, advance
 from driftfit.service.core.blocks import Blocks
 from driftfit.service.core.journal import Rows
-from driftfit.service.core.results import ALARM, OK, THETA, Results
+from driftfit.service.core.results import ALARM, OK, THETA, TIME, Y_HAT, Results, Y
 from driftfit.service.core.streams import SAMPLES, USED, Streams
 from driftfit.service.core.unit import Out, Unit
 from driftfit.service.settings.config import UnitSettings
@@ -30,6 +31,8 @@ from driftfit.service.settings.config import UnitSettings
 AHEAD = 86_400.0
 """A time so many seconds ahead of both the last sample and this machine's clock is refused: it would make every later
 sample late."""
+COLUMNS = ("y_hat", "e", "s", "theta", "var", "ok")
+"""Fields of a tracker's output, in the order of the results; the last becomes a flag."""
 REFUSED = {late.LATE: "late", late.REPEATED: "duplicate", late.UNTIMED: "no time"}
 """How samples are counted that do not enter the journal."""
 
@@ -50,6 +53,17 @@ class Section:
             self.blocks.grow(self.streams.capacity)
         self.units.append(unit)
         return unit
+
+    def prepare(self) -> None:
+        """Compile what the first samples need, so that they do not wait; lanes only if there are units for them."""
+        for count in (1, FEWEST) if len(self.units) >= FEWEST else (1,):
+            trial = Section(self.streams.index, self.streams.settings)
+            for k in range(count):
+                trial.add(k, "")
+            number = np.arange(count, dtype=np.int32)
+            time = None if self.streams.settings.time is None else np.zeros(count)
+            values = np.zeros((count, len(self.streams.settings.columns)))
+            trial.process(0, Rows(self.streams.index, number, time, values), Out())
 
     def admit(self, places: Array, time: Array | None, values: Array) -> Rows | None:
         """The samples (N,) that enter the journal, sorted by unit and time; the others are counted."""
@@ -162,12 +176,16 @@ class Section:
     def _tell(self, found: Advanced, rows: Rows, noise: Array, number: Array, out: Out) -> None:
         """Pass on results; ``rows`` have places for units."""
         places, records = rows.unit, found.records
+        values = np.empty((len(places), self.blocks.columns))
+        values[:, TIME] = math.nan if rows.time is None else rows.time
+        values[:, Y] = rows.values[:, 0]
+        given = np.empty((len(places), values.shape[1] - Y_HAT + 1))
+        found.columns(COLUMNS, given)
+        values[:, Y_HAT:] = given[:, :-1]
+        std = values[:, THETA + self.streams.program.model.n :]
         with np.errstate(invalid="ignore"):
-            std = np.sqrt(found.column("var"))
-        time = np.full(len(places), math.nan) if rows.time is None else rows.time
-        heads = np.column_stack([time, rows.values[:, 0], *(found.column(name) for name in ("y_hat", "e", "s"))])
-        values = np.concatenate([heads, found.column("theta"), std], axis=1)
-        flags = (found.column("ok") > 0.0).astype(np.uint8) * np.uint8(OK)
+            np.sqrt(std, out=std)
+        flags = (given[:, -1] > 0.0).astype(np.uint8) * np.uint8(OK)
         np.add.at(self.streams.counted[:, USED], places, flags)
         lanes = None
         for k, place in enumerate(places[records.first].tolist()):

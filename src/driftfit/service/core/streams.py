@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -117,6 +118,7 @@ class Streams:
         self.begun[place], self.last[place], self.held[place] = False, math.nan, False
         self.waiting.put(place, np.zeros(0), np.zeros((0, self.waiting.rows.shape[1])))
 
+    @cached_property
     def about(self) -> tuple[bytes, str]:
         """(the fingerprint of states, what made them)."""
         described = {"model": describe(self.settings.model), "tracker": describe(self.settings.tracker)}

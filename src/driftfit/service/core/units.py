@@ -114,7 +114,7 @@ class Units:
 
     def note_programs(self, pending: Pending) -> None:
         """Add to the next transaction what the states of this process are made with."""
-        for tag, about in (one.streams.about() for one in self.sections):
+        for tag, about in (one.streams.about for one in self.sections):
             if self._programs.get(tag) != about:
                 self._programs[tag] = about
                 pending.programs.append((tag, about))

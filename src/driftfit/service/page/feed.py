@@ -73,7 +73,7 @@ class Feed:
         now = time.time()
         for _ in range(20):
             groups = self.journal.outcomes(self.at)
-            for group, parts, events in groups:
+            for group, parts, events, _ in groups:
                 self.at = group
                 self.count += sum(len(part.number) for part in parts)
                 for part in parts:
@@ -145,7 +145,7 @@ class Feed:
         rows: deque[list[Any]] = deque(maxlen=RECENT)
         end = self.at
         while at < end and (groups := self.journal.outcomes(at)):
-            for group, parts, _ in groups:
+            for group, parts, *_ in groups:
                 at = group
                 for part in parts if group <= end else []:
                     rows.extend(part.some(np.flatnonzero(part.unit == unit)).rows())

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 
+from driftfit.engine.kernel import Array
 from driftfit.service.core.results import OK, THETA, Results
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
 
@@ -58,15 +59,21 @@ class _Sqlite(Writer):
         self.db.close()
 
 
-def rows_of(batch: Outcome, part: Results) -> Iterator[tuple[Any, ...]]:
+def rows_of(batch: Outcome, part: Results) -> Iterable[tuple[Any, ...]]:
     """Rows of the table ``result``; SQLite stores NaN as NULL."""
-    number, unit, flags, values = (column.tolist() for column in part)
-    encode, n = msgspec.json.Encoder().encode, part.n
-    for k, row in enumerate(values):
-        name = batch.names[unit[k]]
-        names = batch.about[name]["names"]
-        theta, std = (encode(dict(zip(names, row[a : a + n], strict=False))).decode() for a in (THETA, THETA + n))
-        yield (number[k], name, *row[:THETA], flags[k] & OK, flags[k] >> 1, theta, std)
+    units, n = part.unit.tolist(), part.n
+    heads = (column.tolist() for column in part.values[:, :THETA].T)
+    ok, alarm = (part.flags & OK).tolist(), (part.flags >> 1).tolist()
+    named = {unit: batch.about[batch.names[unit]]["names"] for unit in set(units)}
+    texts = (_texts(map(named.get, units), values) for values in (part.theta, part.std[:, :n]))
+    return zip(part.number.tolist(), map(batch.names.get, units), *heads, ok, alarm, *texts, strict=True)
+
+
+def _texts(names: Iterable[Any], values: Array) -> list[str]:
+    """Rows of numbers as objects in JSON, for all rows at once: one after the other they would take twice the time."""
+    objects = list(map(dict, map(zip, names, values.tolist())))
+    lines: str = msgspec.json.Encoder().encode_lines(objects).decode()
+    return lines.split("\n")[:-1]
 
 
 def by_name(batch: Outcome, unit: str, values: list[float]) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
     {"unit": "pump 7", "kind": "alarm", "at": "2026-01-31T12:00:00+00:00", "text": "...", "detail": {...}}
 
-``title`` and ``text`` are what services such as ntfy or Mattermost show. An answer other than 2xx is tried again;
+``title`` and ``text`` are what services such as Mattermost show. With ``body = "text"`` the text alone is sent, and the
+unit as the header ``Title``: so the app of ntfy shows it on a phone. An answer other than 2xx is tried again;
 a 4xx other than 408 and 429 would not be better later, and is logged and left out. The header ``Idempotency-Key`` is
 the same when an event comes again.
 """
@@ -30,6 +31,8 @@ class Webhook(Sink):
 
     url: str
     events: list[str] = field(default_factory=lambda: ["alarm", "failed"])
+    body: str = "json"
+    """json, or text."""
     token: Secret | None = None
     """Sent as ``Authorization: Bearer``."""
 
@@ -38,6 +41,8 @@ class Webhook(Sink):
         parts = urlsplit(self.url)
         if parts.scheme not in ("http", "https") or not parts.hostname or parts.password:
             raise ValueError(f"webhook: url must be https://... without a password; got {self.url!r}.")
+        if self.body not in ("json", "text"):
+            raise ValueError(f"webhook: body must be json or text; got {self.body!r}.")
 
     def open(self) -> Writer:
         """Nothing is connected before an event."""
@@ -59,11 +64,16 @@ class _Webhook(Writer):
         self.sent.clear()
 
     def _send(self, event: Event) -> None:
-        headers = {"Content-Type": "application/json", "User-Agent": "driftfit",
-                   "Idempotency-Key": f"{event.number}-{event.kind}"}  # fmt: skip
+        said = message(event)
+        if self.options.body == "json":
+            headers, data = {"Content-Type": "application/json"}, json.dumps(said)
+        else:  # in a header only characters of ASCII arrive everywhere
+            title = event.unit.encode("ascii", "replace").decode()
+            headers, data = {"Content-Type": "text/plain; charset=utf-8", "Title": title}, str(said["text"])
+        headers |= {"User-Agent": "driftfit", "Idempotency-Key": f"{event.number}-{event.kind}"}
         if self.options.token is not None:
             headers["Authorization"] = f"Bearer {self.options.token.value}"
-        request = urllib.request.Request(self.options.url, json.dumps(message(event)).encode(), headers, method="POST")
+        request = urllib.request.Request(self.options.url, data.encode(), headers, method="POST")
         try:
             with urllib.request.urlopen(request, timeout=TIMEOUT):
                 pass

@@ -2,13 +2,21 @@
 
 With ``qos = 1`` (the default) and ``time`` in the units, nothing is lost while the service or the broker is away, and
 samples that the broker sends again are recognised by their time. A retained message is a sample like any other.
+
+The thread of the source does the client's network work too (paho's methods for an event loop of one's own): a message
+passes through one thread less, and while the service is held back, messages wait at the broker and not in memory.
 """
 
 from __future__ import annotations
 
-import queue
+import contextlib
+import select
+import socket
+import ssl
 import time
+from collections import deque
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -20,7 +28,9 @@ from driftfit.service.sources.sparkplug import REBIRTH, Sparkplug, UnknownAliasE
 MOST = 2_000
 """Messages of one batch."""
 AWAY = 20.0
-"""Seconds without a connection after which the source is reported to be away."""
+"""Seconds in which the broker must have accepted a connection."""
+LEAVE = 1.0
+"""Seconds for which a reader that is closed waits for acknowledgements."""
 
 PATIENCE = 30.0
 """Seconds between two commands to a node to declare its metrics again."""
@@ -76,45 +86,97 @@ class _Mqtt(Reader):
         self.sparkplug = Sparkplug() if options.payload == "sparkplug" else None
         self.asked: dict[str, float] = {}
         """When nodes were last asked to declare their metrics again."""
-        self.messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.batch = Heard()
+        self.unconfirmed = 0
+        """Messages passed on that are not yet acknowledged to the broker."""
+        self.confirmed: deque[list[int]] = deque()
+        """Those that are in the journal, from the thread of the journal."""
+        self.woken, self.waker = socket.socketpair()
+        self.woken.setblocking(False)
+        self.waker.setblocking(False)
+        self.more = False
+        """Whether the last read left messages behind."""
+        self.begun = time.monotonic()
         name = options.client or f"driftfit-{options.name}"
         self.client = mqtt.Client(CallbackAPIVersion.VERSION2, name, clean_session=False, manual_ack=True)
-        self.client.on_message = lambda client, user, message: self.messages.put(message)
+        self.client.on_message = self._hear
         self.client.on_connect = self._subscribe
+        self.client.on_socket_register_write = lambda *_: None  # packets are sent by `_send`, not one by one
+        self.line = Line(self.client)
         secure(self.client, options)
-        self.lost = time.monotonic()
         host, port = connected(options.url)
         self.client.connect(host, port, keepalive=30)
-        self.client.loop_start()
 
     def _subscribe(self, client: Any, user: Any, flags: Any, reason: Any, properties: Any) -> None:
-        if not reason.is_failure:
-            client.subscribe([(topic, self.options.qos) for topic in self.options.topic.split()])
+        if reason.is_failure:
+            raise ConnectionError(f"{self.options.url} refuses: {reason}")
+        client.subscribe([(topic, self.options.qos) for topic in self.options.topic.split()])
+
+    def _hear(self, client: Any, user: Any, message: Any) -> None:
+        """Decode a message; what cannot be read is counted."""
+        heard = self.batch
+        heard.count += 1
+        if message.qos:
+            heard.identifiers.append(message.mid)
+        try:
+            if len(message.payload) > LARGEST:
+                raise ValueError
+            read = self._decode(message.topic, message.payload)
+        except ValueError:  # it is acknowledged like any other: sent again it would not be better
+            heard.refused += 1
+        else:
+            heard.samples += [] if read is None else [read]
 
     def read(self, wait: float) -> Batch | None:
         """The messages that have arrived."""
-        if self.client.is_connected():
-            self.lost = time.monotonic()
-        elif time.monotonic() - self.lost > AWAY:
+        until = time.monotonic() + wait
+        while not self.batch.count:
+            self._send()
+            left = until - time.monotonic()
+            if left <= 0.0:
+                return None
+            self._wait(left)
+            self._receive()
+        heard, self.batch = self.batch, Heard()
+        self.unconfirmed += len(heard.identifiers)
+        confirm = partial(self._confirm, heard.identifiers)
+        return Batch(heard.samples, confirm, refused=heard.refused, arrived=time.monotonic())
+
+    def _send(self) -> None:
+        """Acknowledge what is in the journal, and send what waits."""
+        while self.confirmed:
+            identifiers = self.confirmed.popleft()
+            self.unconfirmed -= len(identifiers)
+            for one in identifiers:
+                self.client.ack(one, 1)
+        self._checked(self.client.loop_misc())
+        if self.client.want_write():
+            self._checked(self.client.loop_write())
+        self.line.flush()
+
+    def _wait(self, seconds: float) -> None:
+        """Until messages arrive, or acknowledgements are to be sent."""
+        socket = self.client.socket()
+        if socket is None or (not self.client.is_connected() and time.monotonic() - self.begun > AWAY):
             raise ConnectionError(f"no connection to {self.options.url}")
-        try:
-            found = [self.messages.get(timeout=wait)]
-        except queue.Empty:
-            return None
-        arrived = time.monotonic()
-        while len(found) < MOST and not self.messages.empty():
-            found.append(self.messages.get())
-        samples: list[Samples] = []
-        refused = 0
-        for message in found:
-            try:
-                if len(message.payload) > LARGEST:
-                    raise ValueError
-                read = self._decode(message.topic, message.payload)
-                samples += [] if read is None else [read]
-            except ValueError:  # it is counted, and acknowledged like any other: sent again it would not be better
-                refused += 1
-        return Batch(samples, lambda: self._acknowledge(found), refused=refused, arrived=arrived)
+        if self.more or (isinstance(socket, ssl.SSLSocket) and socket.pending()):
+            return
+        writing = [socket] if self.line.to_send or self.client.want_write() else []
+        ready, *_ = select.select([socket, self.woken], writing, [], seconds)
+        if self.woken in ready:
+            self.woken.recv(4096)
+
+    def _receive(self) -> None:
+        """Read what is there."""
+        self.more = True
+        while self.more and self.batch.count < MOST:  # a call reads one packet
+            before = self.batch.count
+            self._checked(self.client.loop_read())
+            self.more = self.batch.count > before or self.line.holds
+
+    def _checked(self, code: int) -> None:
+        if code:
+            raise ConnectionError(f"{self.options.url}: {paho().error_string(code)}")
 
     def _decode(self, topic: str, payload: bytes) -> Samples | None:
         """The samples of a message; None if it has none."""
@@ -129,15 +191,77 @@ class _Mqtt(Reader):
                 self.client.publish(command, REBIRTH)
             raise
 
-    def _acknowledge(self, messages: list[Any]) -> None:
-        for message in messages:
-            if message.qos:
-                self.client.ack(message.mid, message.qos)
+    def _confirm(self, identifiers: list[int]) -> None:
+        """Let the thread of the source acknowledge messages."""
+        self.confirmed.append(identifiers)
+        with contextlib.suppress(OSError):  # it is awake already, or closed: the broker sends them again
+            self.waker.send(b"1")
 
     def close(self) -> None:
-        """Disconnect; the session stays at the broker."""
-        self.client.disconnect()
-        self.client.loop_stop()
+        """Disconnect, once what was passed on is acknowledged; the session stays at the broker."""
+        until = time.monotonic() + LEAVE
+        with contextlib.suppress(OSError):
+            while self.unconfirmed and (left := until - time.monotonic()) > 0.0:
+                select.select([self.woken], [], [], left)
+                self._send()
+            self.line.release()
+            self.client.disconnect()
+            self._checked(self.client.loop_write())
+        self.woken.close()
+        self.waker.close()
+
+
+class Heard:
+    """The messages of the next batch."""
+
+    def __init__(self) -> None:
+        self.samples: list[Samples] = []
+        self.identifiers: list[int] = []
+        """Of those that are to be acknowledged."""
+        self.count = self.refused = 0
+
+
+class Line:
+    """The socket of a client, read in large pieces, and written once for many packets.
+
+    paho-mqtt takes three calls of the system to read a message and one to acknowledge it, which is more than half of
+    its cost. It has no public way to change that: should its methods be named otherwise one day, it is only slower.
+    """
+
+    def __init__(self, client: Any) -> None:
+        self.to_send = bytearray()
+        self._client, self._read, self._at = client, b"", 0
+        self.theirs = {name: getattr(client, name) for name in ("_sock_recv", "_sock_send") if hasattr(client, name)}
+        if len(self.theirs) == 2:
+            client._sock_recv, client._sock_send = self.receive, self.send
+
+    @property
+    def holds(self) -> bool:
+        """Whether something was read that the client has not yet taken."""
+        return self._at < len(self._read)
+
+    def receive(self, most: int) -> bytes:
+        """At most so many bytes; BlockingIOError if there are none, none at the end."""
+        if not self.holds:
+            self._read, self._at = self.theirs["_sock_recv"](max(most, 1 << 16)), 0
+        self._at += most
+        return self._read[self._at - most : self._at]
+
+    def send(self, data: bytes) -> int:
+        """Add to what `flush` sends."""
+        self.to_send += data
+        return len(data)
+
+    def flush(self) -> None:
+        """Send as much as the system takes."""
+        with contextlib.suppress(BlockingIOError):
+            while self.to_send:
+                del self.to_send[: self.theirs["_sock_send"](self.to_send)]
+
+    def release(self) -> None:
+        """Send the rest, and give the socket back to the client."""
+        self.flush()
+        vars(self._client).update(self.theirs)
 
 
 def paho() -> Any:

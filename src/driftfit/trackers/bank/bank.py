@@ -17,8 +17,8 @@ nominal sensor is None), q and p0 are in units of it, unless a ``guess`` of it i
 A sample that is not used changes no weight: the leaves are widened by the changes that may have happened, and depth
 counts used samples. Until there are four residuals (with known noise: full rank, or four samples without a new
 direction) only the first change acts. The tree then grows in the directions that the regressors span, and a later
-direction enters as the exact limit of a wide prior. A bank with changes that reset or return to a prior, with leaves
-that have their own output lags, with `FirstFloor` or form="sqrt" waits for full rank.
+direction enters as the exact limit of a wide prior. Until then changes that reset or return to a prior act only on what
+has been determined.
 
 form="sqrt" keeps factors of the leaves' covariances (`driftfit.trackers.bank.leaves.square_root_form`): the same
 numbers for ordinary data, and no loss of digits or signs for collinear regressors with a wide prior; about twice the
@@ -51,11 +51,14 @@ from driftfit.trackers.bank.layout import (
     FADE,
     FAULTS,
     HEAD,
-    LAST,
+    HIGHEST,
     LEAVES,
     LIMIT,
+    LOWEST,
     MOST_REPORTED,
+    READING,
     ROW,
+    SETTLED,
     SIZE,
     WHOLE,
     R,
@@ -63,7 +66,7 @@ from driftfit.trackers.bank.layout import (
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.factored import factorise, widened
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
-from driftfit.trackers.bank.machine.start import GROWTH, begin
+from driftfit.trackers.bank.machine.start import begin, limit_forgetting
 from driftfit.trackers.bank.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.prior import chains, events, per_sample
 from driftfit.trackers.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
@@ -283,15 +286,17 @@ class Bank(Tracker):
         P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
         theta0 = vector("Bank", "theta0", self.theta0, n)
         sample, counters = np.zeros(SIZE), np.zeros(COUNT, int)
-        sample[LAST], sample[R], sample[LIMIT] = np.nan, 1.0, nominal.limit or np.inf
+        sample[READING], sample[R], sample[LIMIT] = np.nan, 1.0, nominal.limit or np.inf
+        sample[LOWEST], sample[HIGHEST] = np.inf, -np.inf
         sample[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
         count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
         squares *= nominal.guess or 0.0
         arrays = arrays_of(self, n, na, unit, theta0)
         scale = 1.0 if nominal.r is not None else np.nan
         if self.p0 is not None and (nominal.r is not None or guessed):
-            arrays["places"][forget.CAP] = GROWTH * np.trace(P0) or np.inf
-            begin.py_func(SimpleNamespace(**arrays, theta=theta0, cov=P0, counters=counters), count, squares)
+            leaf = SimpleNamespace(**arrays, n=n, theta=theta0, cov=P0, counters=counters)
+            limit_forgetting.py_func(leaf)
+            begin.py_func(leaf, count, squares)
             if self.form == "sqrt":
                 factorise.py_func(arrays["leaves"][FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 0.0)
             arrays["root"][:, 0], scale = arrays["leaves"][:, 0], 1.0
@@ -420,7 +425,8 @@ class Bank(Tracker):
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])
-        return never & bool(lane["framed"] and lane["seen_samples"] >= window(len(never)))
+        begun = lane["counters"][SETTLED] > 0
+        return never & bool(begun and lane["seen_samples"] >= window(len(never)))
 
     @property
     def steps(self) -> TrackerSteps:

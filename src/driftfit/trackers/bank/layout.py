@@ -42,6 +42,7 @@ from __future__ import annotations
 from typing import Any
 
 from driftfit.engine.kernel import kernel
+from driftfit.engine.tracker_part import open_at
 from driftfit.trackers.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
 
 (
@@ -58,11 +59,14 @@ is another than that of one nominal interval, PARTED that leaves are continued a
 WAITING, READY = 0, -1
 (
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
-    SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SIZE,
-) = range(22)  # fmt: skip
+    SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SHIFT, READING, LOWEST, HIGHEST, DOUBTS, ENTERS, SIZE,
+) = range(28)  # fmt: skip
 """Numbers of the present sample: what comes in, and what goes out. MOST is the largest mean square that a leaf's own
 prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`). FREEDOM is that of an estimated noise
-variance before the tree grows: the residuals until then; inf for a variance that is given.
+variance before the tree grows: the residuals until then; inf for a variance that is given. The reading is y + SHIFT
+(`driftfit.trackers.parts.resolution`). READING is the last one that counted, LAST the same less the present shift;
+LOWEST and HIGHEST are the limits of all that counted. DOUBTS is the recent number of refused samples within them.
+ENTERS is not 0 if the regressor is the first along a direction (`machine.late_direction`): its length along it.
 """
 NEVER = 1e9
 """Levels since the last change of a leaf that has none, or more."""
@@ -121,13 +125,13 @@ table_at = TABLE.at
 @kernel
 def report_at(s: Any) -> int:
     """Where the field `report` begins, the first of those whose length is no part of the compiled type."""
-    return s.report.ctypes.data  # type: ignore[no-any-return]
+    return open_at(s)  # type: ignore[no-any-return]
 
 
 @kernel
 def memory_at(s: Any) -> int:
     """Where the field `memory` begins, behind the report."""
-    return s.report.ctypes.data + 8 * s.theta.shape[1] * s.table[REPORT_AT, 2, 0]  # type: ignore[no-any-return]
+    return open_at(s) + 8 * s.theta.shape[1] * s.table[REPORT_AT, 2, 0]  # type: ignore[no-any-return]
 
 
 @kernel

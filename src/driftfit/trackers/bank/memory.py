@@ -100,7 +100,7 @@ def _of_changes(bank: Settings, n: int, unit: float, theta0: Array) -> dict[str,
     steps, lower, wide = [one.increments(n) for one in changes], np.tril_indices(n), _whole_vectors(tri)
     scaled, forgets = any(sizes.any() for _, sizes in steps), any(one.forgets for one in changes)
     places = np.zeros((forget.ANCHORS + (Hd * n if forgets else 0), n))
-    places[forget.MEAN], places[forget.CAP] = theta0, np.inf
+    places[forget.MEAN] = theta0
     if forgets:
         places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in changes])
     transition, initial = bank.event_probabilities

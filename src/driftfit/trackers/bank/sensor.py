@@ -88,7 +88,8 @@ class Sensor(Settings):
         ``nu`` samples; without a guess it comes from the first residuals, and q and p0 are in units of it.
 
         A sample further than ``limit`` standard deviations from its forecast is treated as a fault code: it counts as
-        missing, also as a lag, and is counted. After three in a row the next one is accepted. None: never.
+        missing, also as a lag, and is counted. After three in a row the next one is accepted, and so are readings
+        within the range of earlier ones after three in some fifty samples: the forecasts are wrong then. None: never.
         """
         return cls("nominal", r, prob, guess=guess, nu=nu, memory=memory, limit=limit)
 

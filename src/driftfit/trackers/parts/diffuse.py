@@ -59,6 +59,8 @@ AT_S, AT_D, AT_R, AT_P, AT_THETA, AT_PHI, AT_WORK, AT_NOW, AT_VAR, ADDRESSES = r
 """Addresses that `machine_learn` is given."""
 
 
+NARROW = 40
+"""Parameters up to which a row of P is summed in order."""
 SCRATCH = ("H", "pivot", "work", "at_start")
 """Fields of the start that carry nothing from one sample to the next."""
 
@@ -78,10 +80,14 @@ def knowing(n: int) -> dict[str, Any]:
 
 
 def product_with(entry: Any) -> Any:
-    """A kernel that fills s.g = P x from the lower triangle of P and returns x' P x, for x_i = entry(s, i, l)."""
+    """A kernel that fills s.g = P x from the lower triangle of P and returns x' P x, for x_i = entry(s, i, l).
+
+    With more than NARROW parameters a row is read once, for its own entry of P x and those of its columns, and summed
+    in eight parts: a sum in order waits for each of its additions.
+    """
 
     @kernel
-    def product(s: State, l: int) -> float:
+    def narrow(s: State, l: int) -> None:
         n = s.theta.shape[0]
         for i in range(n):
             g = 0.0
@@ -90,6 +96,35 @@ def product_with(entry: Any) -> Any:
             for j in range(i + 1, n):
                 g += s.P[j, i, l] * entry(s, j, l)
             s.g[i, l] = g
+
+    @kernel
+    def wide(s: State, l: int) -> None:
+        for i in range(s.theta.shape[0]):
+            a, b, c, d, e, f, g, h = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            whole, x = i - i % 8, entry(s, i, l)
+            for j in range(0, whole, 8):
+                a += s.P[i, j, l] * entry(s, j, l)
+                b += s.P[i, j + 1, l] * entry(s, j + 1, l)
+                c += s.P[i, j + 2, l] * entry(s, j + 2, l)
+                d += s.P[i, j + 3, l] * entry(s, j + 3, l)
+                e += s.P[i, j + 4, l] * entry(s, j + 4, l)
+                f += s.P[i, j + 5, l] * entry(s, j + 5, l)
+                g += s.P[i, j + 6, l] * entry(s, j + 6, l)
+                h += s.P[i, j + 7, l] * entry(s, j + 7, l)
+            rest = s.P[i, i, l] * x
+            for j in range(whole, i):
+                rest += s.P[i, j, l] * entry(s, j, l)
+            for j in range(i):
+                s.g[j, l] += s.P[i, j, l] * x
+            s.g[i, l] = rest + (((a + e) + (c + g)) + ((b + f) + (d + h)))
+
+    @kernel
+    def product(s: State, l: int) -> float:
+        n = s.theta.shape[0]
+        if n > NARROW:
+            wide(s, l)
+        else:
+            narrow(s, l)
         total = 0.0
         for i in range(n):
             total += entry(s, i, l) * s.g[i, l]

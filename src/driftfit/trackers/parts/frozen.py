@@ -8,7 +8,8 @@ although they were not frozen. So
 
     pi <- odds / (1 + odds),    odds = pi' / (1 - pi') / max(delta p, a),    pi' = ENTER (1 - pi) + STAY pi
 
-if the reading repeats, and 0 if it does not. A reading that is more likely frozen than not is not used: theta is held,
+if the reading repeats, and 0 if it does not; pi = pi' where nothing can be predicted, such as after lags that are
+missing because the sensor is frozen. A reading that is more likely frozen than not is not used: theta is held,
 with its uncertainty growing as in a gap, and the lag of the reading is that of a missing one. One repeated reading is
 enough where readings have many digits; a coarse meter needs several, and none is enough where repeats are predicted. A
 summary counts those of two in a row and more, because one in a few thousand readings repeats by chance.
@@ -24,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, exp, kernel
-from driftfit.trackers.parts.resolution import ROUNDING
+from driftfit.trackers.parts.resolution import reading, same_reading
 
 ENTER, STAY = 0.001, 0.98
 """Probability that a sensor freezes, and that it stays frozen, per reading."""
@@ -39,20 +40,21 @@ def not_frozen() -> dict[str, Any]:
 
 @kernel
 def leave_out_frozen(s: State, l: int) -> None:
-    """Leave out a reading that is more likely frozen than not; s.y_hat and s.s must be known."""
+    """Leave out a reading that is more likely frozen than not; s.y_hat and s.s must have been computed."""
     if s.seen[l] > 0.0:
-        repeats = abs(s.y[l] - s.before[l]) <= ROUNDING * abs(s.y[l])
-        s.before[l] = s.y[l]
+        repeats = same_reading(s, s.before[l], l)
+        s.before[l] = reading(s, l)
         frozen = 0.0
-        if repeats & (s.steps[l] >= FIRST) & (s.valid[l] > 0.0) & (s.s[l] < np.inf) & (s.s[l] > 0.0):
-            e = max(abs(s.y[l] - s.y_hat[l]) - 0.5 * s.quantum[l], 0.0)
-            prior = ENTER * (1.0 - s.frozen[l]) + STAY * s.frozen[l]
-            others = s.repeats[l] - 1.0 - s.held[l]
-            chance = max(
-                others / (others + s.steps[l]),
-                s.quantum[l] * exp(-0.5 * e * e / s.s[l]) / np.sqrt(2.0 * np.pi * s.s[l]),
-            )
-            chance = min(chance, 1.0)
+        if repeats & (s.steps[l] >= FIRST):
+            prior, chance = ENTER * (1.0 - s.frozen[l]) + STAY * s.frozen[l], 1.0
+            if (s.valid[l] > 0.0) & (s.s[l] < np.inf) & (s.s[l] > 0.0):
+                e = max(abs(s.y[l] - s.y_hat[l]) - 0.5 * s.quantum[l], 0.0)
+                others = s.repeats[l] - 1.0 - s.held[l]
+                chance = max(
+                    others / (others + s.steps[l]),
+                    s.quantum[l] * exp(-0.5 * e * e / s.s[l]) / np.sqrt(2.0 * np.pi * s.s[l]),
+                )
+                chance = min(chance, 1.0)
             frozen = prior / (prior + (1.0 - prior) * chance)
         s.frozen[l] = frozen
         if frozen > 0.5:

@@ -26,6 +26,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from driftfit.engine.kernel import Array, State, kernel
+from driftfit.trackers.parts.resolution import reading
 
 REACH = 10.0
 """Standard deviations of the readings beyond which one is an outlier."""
@@ -50,7 +51,7 @@ def no_proportion() -> dict[str, Any]:
 @kernel
 def leave_out(s: State, l: int) -> None:
     """Leave out a reading far outside the usual range; s.y_hat must be known."""
-    away, e = (s.y[l] - s.middle[l]) ** 2, (s.y[l] - s.y_hat[l]) ** 2
+    away, e = (reading(s, l) - s.middle[l]) ** 2, (s.y[l] - s.y_hat[l]) ** 2
     e = e if s.valid[l] > 0.0 else away
     reach = REACH * REACH * s.spread[l]
     limit = reach * s.patience[l] * s.patience[l]
@@ -75,7 +76,7 @@ def learn_proportion(s: State, l: int, outlier: float) -> None:
     if s.seen[l] > 0.0 and (s.fresh[l] > 0.0 or s.readings[l] < 1.0):
         s.readings[l] += 1.0
         share = 1.0 / min(s.readings[l], MEMORY)
-        away = s.y[l] - s.middle[l]
+        away = reading(s, l) - s.middle[l]
         s.middle[l] += share * away
         s.spread[l] += share * ((1.0 - share) * away * away - s.spread[l])
 

@@ -13,7 +13,8 @@ collapses, and bands and likelihood with it. Therefore
 and no tracker takes its noise variance to be below ``coarse``. `AdaptiveKalman` also treats readings that repeat as
 one rounding error observed several times (`lasting`). Readings of a fine sensor never repeat, and nothing changes for
 them. If they do repeat, at a limit, at 0 while a pump is off, or because a value is held, the other steps have all
-sizes, and no step is frequent.
+sizes, and no step is frequent. A model that subtracts a shift from y (`driftfit.models.linearised`) writes it into the
+field ``shift``: the reading is y + shift.
 
 Source: quantum^2 / 12 is Sheppard's (1898); the rest is ours. Cost per sample: a few comparisons.
 """
@@ -42,17 +43,30 @@ def unresolved() -> dict[str, Any]:
     """Fields before the first reading."""
     return {
         "reading": np.nan, "quantum": np.inf, "smallest": 0.0, "steps": 0.0, "repeats": 0.0, "coarse": 0.0,
-        "fresh": 1.0, "alike": 0.0,
+        "fresh": 1.0, "alike": 0.0, "shift": 0.0,
     }  # fmt: skip
+
+
+@kernel
+def reading(s: State, l: int) -> float:
+    """The output as it was measured."""
+    return s.y[l] + s.shift[l]  # type: ignore[no-any-return]
+
+
+@kernel
+def same_reading(s: State, other: float, l: int) -> bool:
+    """Whether the reading is another one but for rounding, also that of the shift; not if the other is NaN."""
+    y = reading(s, l)
+    return abs(y - other) <= ROUNDING * (abs(y) + abs(s.shift[l]))  # type: ignore[no-any-return]
 
 
 @kernel
 def resolve(s: State, l: int) -> None:
     """Process a reading."""
-    y, seen, quantum = s.y[l], s.seen[l], s.quantum[l]
+    y, seen, quantum = reading(s, l), s.seen[l], s.quantum[l]
     step = abs(y - s.reading[l])  # NaN at the first reading, which neither moves nor repeats
-    moved = seen if step > ROUNDING * abs(y) else 0.0
-    repeated = seen if step <= ROUNDING * abs(y) else 0.0
+    repeated = seen if same_reading(s, s.reading[l], l) else 0.0
+    moved = seen - repeated if step >= 0.0 else 0.0
     near = moved if step < 1.5 * quantum else 0.0
     smallest = near + (s.smallest[l] if (moved == 0.0) | (step >= 0.75 * quantum) else 0.0)
     quantum = step if (moved > 0.0) & (step < quantum) else quantum

@@ -12,12 +12,11 @@ from __future__ import annotations
 from typing import Any
 
 from driftfit.engine.kernel import Array, kernel, shared
-from driftfit.engine.simd import fill, higher, load, lower, minus, over, plus, reaches, store, times
+from driftfit.engine.simd import fill, higher, load, minus, over, plus, reaches, store, times
 from driftfit.trackers.bank.leaves.factored import absorb, add, along, raised
 from driftfit.trackers.bank.leaves.forget import (
     ANCHORS,
     BEFORE,
-    CAP,
     DIRECTIONAL,
     EXPONENTIAL,
     GAIN,
@@ -25,6 +24,7 @@ from driftfit.trackers.bank.leaves.forget import (
     KIND,
     MEAN,
     PARTIAL,
+    PER_CAP,
     RESET,
     STABILISED,
 )
@@ -32,19 +32,20 @@ from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 
 
 @kernel
-def guard(C: Array, n: int, l: int, keep: float, cap: float) -> None:
+def guard(C: Array, n: int, l: int, keep: float, per_cap: Array) -> None:
     """`forget.guard` on what was divided by the factor, before its walk."""
-    total, at = fill(0.0), 0
-    for j in range(n):
-        squares = fill(1.0)
-        for i in range(j):
-            squares = plus(squares, times(load(C, at + i, l), load(C, at + i, l)))
-        total = plus(total, times(load(C, at + j, l), squares))
-        at += j + 1
-    most = over(higher(fill(cap), over(total, fill(keep))), total)
+    most = fill(1.0)
+    for i in range(n):
+        variance = load(C, i * (i + 3) // 2, l)
+        for j in range(i + 1, n):
+            at = j * (j + 1) // 2
+            u = load(C, at + i, l)
+            variance = plus(variance, times(load(C, at + j, l), times(u, u)))
+        most = higher(most, times(variance, fill(per_cap[i])))
+    less = higher(over(fill(1.0), most), fill(1.0 / keep))
     for j in range(n):
         at = j * (j + 3) // 2
-        store(C, at, l, times(load(C, at, l), lower(fill(1.0), most)))
+        store(C, at, l, times(load(C, at, l), less))
 
 
 @kernel
@@ -106,7 +107,7 @@ def develop_eight(t: Any, A: Array, of: int, c: int, C: Array, m: Array, to: int
         store(C, at, to, times(load(C, at, to), fill(keep)))
         store(m, j, to, fill(places[MEAN, j]) if maps[c, RESET] > 0.0 else load(A, FIRST + j, of))
     if kind == EXPONENTIAL:
-        guard(C, n, to, keep, places[CAP, 0])
+        guard(C, n, to, keep, places[PER_CAP])
     elif kind == PARTIAL and maps[c, GAIN] > 0.0:
         renew(C, m, n, to, places[ANCHORS + c * n], places[MEAN], V)
     raised(C, n, to, t.Q[c], fill(1.0), V)

@@ -1,6 +1,6 @@
 """Changes that forget: the changes of a leaf N(m, C) other than a random walk.
 
-    exponential   C <- C / lam, which is a random walk with Q = (1/lam - 1) C; its trace never grows above the cap
+    exponential   C <- C / lam, which is a random walk with Q = (1/lam - 1) C; no variance grows above its cap
     directional   C <- C + (1/lam - 1) g g' / (z' g),   g = C z, z the regressor of the last sample that was used
     stabilised    C^-1 <- lam C^-1 + (1 - lam) A^-1,   C^-1 m <- lam C^-1 m + (1 - lam) A^-1 theta0
     reset         m <- theta0, C <- Q; of some parameters: these, independent of the others
@@ -28,9 +28,14 @@ KEEP, RESET, KIND, GAIN = range(4)
 interval 1/lam - 1 (directional), 1 - lam (stabilised), or whether time passes.
 """
 WALK, EXPONENTIAL, DIRECTIONAL, STABILISED, PARTIAL = range(5)
-MEAN, BEFORE, CAP, ANCHORS = range(4)
-"""Rows of the table of places: theta0, the regressor of the last used sample, the cap of the trace of C, and from
+MEAN, BEFORE, PER_CAP, RAY, ANCHORS = range(5)
+"""Rows of the table of places: theta0, the regressor of the last used sample, the reciprocals of the caps of variances
+(0: none), the direction that a sample determines first (`driftfit.trackers.bank.machine.late_direction`), and from
 ANCHORS on n rows for every change: W, or in the first of them which parameters are reset.
+"""
+GROWTH = 1e8
+"""Exponential forgetting may let a variance grow to this multiple of its value when the tree begins, or when a sample
+first determines it.
 """
 
 
@@ -56,16 +61,16 @@ def for_interval(settings: Array, dt: float, maps: Array) -> None:
 
 @shared
 def guard(t: Any, C: Array, a: int, b: int, c: int, h: Array) -> None:
-    """Limit forgetting by the cap of the trace: lam <- min(1, max(lam, tr C / cap))."""
-    n, keep, cap, q = t.n, t.maps[c, KEEP], t.places[CAP, 0], t.Q[c]
+    """Limit forgetting by the caps: lam <- min(1, max(lam, max_i C_ii / cap_i))."""
+    n, keep, per_cap, q = t.n, t.maps[c, KEEP], t.places[PER_CAP], t.Q[c]
     for l in range(a, b):
         h[l] = 0.0
     for i in range(n):
         at = i * (i + 3) // 2
         for l in range(a, b):
-            h[l] += abs(C[at, l] - q[at])
+            h[l] = max(h[l], abs(C[at, l] - q[at]) * per_cap[i])
     for l in range(a, b):
-        h[l] = max(cap, h[l] / keep) / h[l] if h[l] > cap else 1.0
+        h[l] = max(1.0 / h[l], 1.0 / keep) if h[l] > 1.0 else 1.0
     for k in range(n * (n + 1) // 2):
         for l in range(a, b):
             C[k, l] = (C[k, l] - q[k]) * h[l] + q[k] if h[l] != 1.0 else C[k, l]

@@ -27,7 +27,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, floats, kernel, machine, shared
 from driftfit.engine.simd import WIDTH
-from driftfit.trackers.bank.layout import LAST
+from driftfit.trackers.bank.layout import READING, SHIFT
 from driftfit.trackers.bank.leaves.callback import address_of, call
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
 
@@ -47,7 +47,9 @@ def judge(t: Any, which: float, at: int, l: int, y: float, r: float, said: Array
     B, expected = t.leaves, t.expected
     unit = B[S, at + l] / (B[NU, at + l] - 2.0) if t.unknown > 0 else 1.0
     h = expected[0, l]
-    call(t.own_likelihoods, (which, y, expected[1, l], h * unit, r * unit, t.sample[LAST]), said.ctypes.data)
+    shift = t.sample[SHIFT]
+    readings = y + shift, expected[1, l] + shift
+    call(t.own_likelihoods, (which, *readings, h * unit, r * unit, t.sample[READING]), said.ctypes.data)
     most = LARGEST * (h + r)
     said[NOISE] = max(said[NOISE] / unit, LEAST * r) if said[NOISE] < most * unit else most
     said[LOG_P] = said[LOG_P] if said[LOG_P] < np.inf else -np.inf

@@ -15,11 +15,13 @@ from typing import Any
 
 from driftfit.engine.kernel import Array, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, minus, over, plus, store, sum_of, times
+from driftfit.trackers.bank.layout import ENTERS
 from driftfit.trackers.bank.leaves import forget, leaf_matrix
 from driftfit.trackers.bank.leaves.factored import absorb, along, condense, factorise, raised
 from driftfit.trackers.bank.leaves.factored_changes import add_walked, average, blur, develop_eight
+from driftfit.trackers.bank.leaves.forget import RAY
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S, regressors, variance_factor
-from driftfit.trackers.bank.machine import grow, start
+from driftfit.trackers.bank.machine import grow, late_direction, start
 from driftfit.trackers.bank.machine.gaps import chain_gap
 from driftfit.trackers.bank.reducing import lookahead, merge, refilter
 
@@ -174,6 +176,26 @@ def widen(t: Any, weight: Array, X: Array) -> None:
 
 
 @shared
+def spread_along(t: Any, B: Array, L: int, v: float) -> None:
+    """`late_direction.spread_along`: G applied to the columns of the factor, and one more."""
+    n, z, r, u = t.n, t.z, t.places[RAY], t.sample[ENTERS]
+    room = -(-(n + 1) // WIDTH) * WIDTH
+    W = t.narrow.reshape(t.narrow.shape[0] * WIDTH)[: (n + 2) * room].reshape((n + 2, room))
+    for l in range(L):
+        spill(B, l, n, 1.0, W, 0)
+        for k in range(n):
+            f = 0.0
+            for i in range(n):
+                f += z[i, l if t.output_lags > 0 else 0] * W[i, k]
+            for i in range(n):
+                W[i, k] -= r[i] * f / u
+        for i in range(n):
+            W[i, n] = r[i]
+        W[n, n] = v / (u * u)
+        condense(W, n + 1, n, B, l)
+
+
+@shared
 def widen_leaf(t: Any, k: int, q: Array) -> None:
     """`chain_gap.widen_leaf`; q is factorised."""
     A, W, n = t.parents, t.narrow, t.n
@@ -205,6 +227,7 @@ def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) 
 PARTS = {
     leaf_matrix.ready: ready, leaf_matrix.mixture: mixture, start.begin: begin,
     forget.foresee: foresee, grow.ahead: ahead, grow.correct: correct, merge.pool: pool,
-    refilter.widen: widen, chain_gap.widen_leaf: widen_leaf, lookahead.width: width,
+    late_direction.spread_along: spread_along, refilter.widen: widen, chain_gap.widen_leaf: widen_leaf,
+    lookahead.width: width,
 }  # fmt: skip
 """Each part with the one that replaces it."""

@@ -16,7 +16,9 @@ from driftfit.trackers.bank.layout import (
     ALIKE,
     CHAINED,
     CLOCK,
+    DOUBTS,
     ELAPSED,
+    ENTERS,
     EVIDENCE,
     EXPANDED,
     FAULTS,
@@ -24,6 +26,7 @@ from driftfit.trackers.bank.layout import (
     FREEDOM,
     GROUPS,
     HELD,
+    HIGHEST,
     IMPOSSIBLE,
     IN_DT,
     IN_NOISE,
@@ -35,14 +38,17 @@ from driftfit.trackers.bank.layout import (
     LAST,
     LEAVES,
     LIMIT,
+    LOWEST,
     MOST,
     OPEN,
     PARENTS,
     PARTED,
+    READING,
     REFUSED,
     S2,
     SAMPLE_HEAD,
     SETTLED,
+    SHIFT,
     STORED,
     TAKEN,
     TREE_LEVELS,
@@ -53,7 +59,7 @@ from driftfit.trackers.bank.layout import (
     table_at,
 )
 from driftfit.trackers.bank.leaves.forecast import expect, expect_together, weighted
-from driftfit.trackers.bank.leaves.forget import BEFORE, CAP, for_interval, foresee
+from driftfit.trackers.bank.leaves.forget import BEFORE, for_interval, foresee
 from driftfit.trackers.bank.leaves.lags import push, shift_covariance, widen_by_lags
 from driftfit.trackers.bank.leaves.leaf_matrix import (
     FIRST,
@@ -71,7 +77,8 @@ from driftfit.trackers.bank.machine.ancestry import marginals, pick, shift, summ
 from driftfit.trackers.bank.machine.gaps.chain_gap import add_covariance, add_variance, further, go_on, origins, split
 from driftfit.trackers.bank.machine.gaps.gap import chances, close, covariances, extend, odds, take_back, widen
 from driftfit.trackers.bank.machine.grow import grow
-from driftfit.trackers.bank.machine.start import GROWTH, trace, wait
+from driftfit.trackers.bank.machine.late_direction import determine
+from driftfit.trackers.bank.machine.start import limit_forgetting, wait
 from driftfit.trackers.bank.reducing.merge import combine, mix, sort, take
 from driftfit.trackers.bank.reducing.refilter import NOISE, TIME, Y, histories, refilter
 from driftfit.trackers.bank.reducing.selection import (
@@ -93,6 +100,9 @@ from driftfit.trackers.bank.reducing.selection import (
 
 FAULTS_IN_A_ROW = 3
 """So many samples in a row, at most, are taken for fault codes."""
+DOUBTED, FORGOTTEN = 3.0, 0.98
+"""So many recent samples with an ordinary reading, at most; and the share of this number that is left after a sample
+that counts."""
 
 
 @shared
@@ -378,11 +388,15 @@ def let_pass(t: Any, L: int) -> None:
 @shared
 def refused(sample: Array, counters: Array) -> bool:
     """Whether a sample is so far from the forecast that it is taken for a fault code, and counts as missing. A value
-    that persists is not a fault code.
+    that persists is not a fault code; and where readings within the range of earlier ones are often far from their
+    forecasts, it is the forecasts that are wrong.
     """
-    far = sample[IN_Y] - sample[Y_HAT]
-    if counters[REFUSED] < FAULTS_IN_A_ROW and far * far > sample[LIMIT] * sample[LIMIT] * sample[S2]:
+    far, y = sample[IN_Y] - sample[Y_HAT], sample[IN_Y] + sample[SHIFT]
+    usual = sample[LOWEST] <= y <= sample[HIGHEST]
+    patient = counters[REFUSED] < FAULTS_IN_A_ROW and (sample[DOUBTS] < DOUBTED or not usual)
+    if patient and far * far > sample[LIMIT] * sample[LIMIT] * sample[S2]:
         sample[IN_OK], sample[IN_SEEN] = 0.0, 0.0
+        sample[DOUBTS] += 1.0 if usual else 0.0
         counters[REFUSED] += 1
         counters[FAULTS] += 1
         counters[AGAIN] = 1
@@ -406,6 +420,8 @@ def advance(t: Any) -> None:
         take_in(t)
     else:
         let_pass(t, counters[LEAVES])
+        if sample[ENTERS] != 0.0:
+            determine(t, counters[LEAVES])
     counters[CLOCK] += 1
     L = counters[LEAVES]
     mixture(t.n, t, L)
@@ -415,8 +431,6 @@ def advance(t: Any) -> None:
         variance_factor(t, t.scratch, 0, L)
         widen(t.gap, weighted(t.leaves, L, t.scratch, 0), t.cov)
     sample[WINDOW] = marginals(t, L)
-    if sample[IN_SEEN] > 0.0:
-        sample[LAST] = sample[IN_Y]
 
 
 @shared
@@ -446,10 +460,20 @@ def note(t: Any, window: float) -> None:
         ring[row, SAMPLE_HEAD + e] = lag_prob[len(lag_prob) - 1, e]
 
 
+@shared
+def remember_reading(sample: Array) -> None:
+    """Update what is known of the readings, after a sample."""
+    if sample[IN_SEEN] > 0.0:
+        y = sample[IN_Y] + sample[SHIFT]
+        sample[READING], sample[DOUBTS] = y, FORGOTTEN * sample[DOUBTS]
+        sample[LOWEST], sample[HIGHEST] = min(sample[LOWEST], y), max(sample[HIGHEST], y)
+
+
 @machine
 def bank(address: int) -> None:
     """Process one sample, given the table of a bank. A sample refused as a fault code is processed again as missing."""
     t = table_at(address)
+    t.sample[LAST] = t.sample[READING] - t.sample[SHIFT]
     counters, head = t.counters, t.report
     begun = counters[SETTLED] == 1
     counters[AGAIN] = 1 if begun else 0
@@ -458,11 +482,12 @@ def bank(address: int) -> None:
         advance(t)
         head[0], head[1], head[2], head[3] = t.sample[EVIDENCE], t.sample[WINDOW], t.sample[KEPT], counters[LEAVES]
     if not begun:
-        t.places[CAP, 0] = GROWTH * trace(t.cov)
+        limit_forgetting(t)
         wait(t)
         for row in range(len(t.root)):
             t.root[row, 0] = t.leaves[row, 0]
         head[0], head[1], head[2], head[3] = lone_density(t.sample), 0.0, 1.0, 1.0
     t.sample[ELAPSED] += t.sample[IN_DT]
+    remember_reading(t.sample)
     summary(t.lag_prob, t.newest)
     note(t, head[1])

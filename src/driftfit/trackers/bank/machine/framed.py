@@ -21,12 +21,20 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, packed, shared, wholes
 from driftfit.trackers.bank.layout import LEAVES, MEMORY_AT, ROW, ROWS, memory_at
+from driftfit.trackers.bank.leaves.forget import GROWTH, PER_CAP
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S
-from driftfit.trackers.parts.coordinates import frame, in_units_of_theta, located_within, new_row, unseen_variance
+from driftfit.trackers.parts.coordinates import (
+    OUTGROWN,
+    frame,
+    in_units_of_theta,
+    located_within,
+    new_row,
+    unseen_variance,
+)
 from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, Y
 
-FIELDS = ("walks", "fixed_walks", "relative_walks", "leaves", "gap", "path", "prior")
-WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR = (ROW[name] for name in FIELDS)
+FIELDS = ("walks", "fixed_walks", "relative_walks", "leaves", "gap", "path", "prior", "places")
+WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR, PLACES = (ROW[name] for name in FIELDS)
 """Rows of the table."""
 (
     AT_MEMORY, AT_TABLE, AT_COUNTERS, AT_S, AT_W, AT_C, AT_X, AT_D, AT_P, AT_G, AT_NOW, ADDRESSES,
@@ -74,25 +82,33 @@ def enter_packed(M: Array, at: int, step: int, x: Array, j: int, sign: float, no
 
 
 @shared
-def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, unknown: bool, g: Array) -> float:
-    """Add the direction to all leaves and to the covariances of the gap; returns the mean noise variance."""
-    n, j, sign, noise = len(x), int(now[ENTERING]), now[OK], now[NOISE]
+def mean_noise(M: Array, table: Array, leaves: int, unknown: bool) -> float:
+    """Mean of the noise variance over the leaves; 1 if it is known."""
     B, columns, mean = table[3 * COLUMNS] // 8, table[3 * COLUMNS + 2], 0.0
+    for leaf in range(B, B + leaves):
+        each = M[leaf + S * columns] / (M[leaf + NU * columns] - 2.0) if unknown else 1.0
+        mean += M[leaf + WEIGHT * columns] * each
+    return mean
+
+
+@shared
+def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, g: Array) -> None:
+    """Add the direction to all leaves and to the covariances of the gap."""
+    n, j, sign, noise = len(x), int(now[ENTERING]), now[OK], now[NOISE]
+    B, columns = table[3 * COLUMNS] // 8, table[3 * COLUMNS + 2]
     for leaf in range(many[LEAVES]):
         at, e = B + leaf, now[Y]
         for i in range(n):
             e -= x[i] * M[at + (FIRST + i) * columns]
         enter_packed(M, at + (FIRST + n) * columns, columns, x, j, sign, noise, g)
         M[at + (FIRST + j) * columns] = sign * e
-        each = M[at + S * columns] / (M[at + NU * columns] - 2.0) if unknown else 1.0
-        mean += M[at + WEIGHT * columns] * each * noise
     gap, columns = table[3 * GAP] // 8, table[3 * GAP + 2]
     for i in range(1, table[3 * GAP + 1]):
         enter_packed(M, gap + i * columns, 1, x, j, sign, 0.0, g)
     path, columns, H = table[3 * PATH] // 8, table[3 * PATH + 2], table[3 * PRIOR + 1]
     for i in range(2 * H, table[3 * PATH + 1] - 1):
         enter_packed(M, path + i * columns, 1, x, j, sign, 0.0, g)
-    return mean
+    M[table[3 * PLACES] // 8 + PER_CAP * n + j] = 1.0 / (GROWTH * noise)
 
 
 @shared
@@ -131,11 +147,30 @@ def machine_enter(fields: int, unknown: int, size: int, counters: int, n: int, L
     t, m = wholes(at[0, AT_TABLE], 3 * ROWS, L)[:, l], floats(at[0, AT_MEMORY], size, L)[:, l]
     many, now = wholes(at[0, AT_COUNTERS], counters, L)[:, l], floats(at[0, AT_NOW], NOW, L)[:, l]
     x, g = floats(at[0, AT_X], n, L)[:, l], floats(at[0, AT_G], n, L)[:, l]
-    noise = enter_leaves(m, t, many, x, now, unknown > 0, g)
+    noise = now[NOISE] * mean_noise(m, t, many[LEAVES], unknown > 0)
+    enter_leaves(m, t, many, x, now, g)
     enter_mixture(floats(at[0, AT_D], n, L)[:, l], cubes(at[0, AT_P], n, n, L)[:, :, l], x, now, noise, g)
 
 
-FRAMED = (machine_walks, machine_enter)
+@machine
+def machine_outgrown(fields: int, unknown: int, size: int, counters: int, n: int, L: int, l: int) -> None:
+    """The first coordinate about which this sample has `OUTGROWN` times the information of all earlier ones, or -1, in
+    ``now[ENTERING]``; for lane l of L, from the addresses of fields.
+    """
+    at = wholes(fields, 1, ADDRESSES)
+    t, m = wholes(at[0, AT_TABLE], 3 * ROWS, L)[:, l], floats(at[0, AT_MEMORY], size, L)[:, l]
+    many, now = wholes(at[0, AT_COUNTERS], counters, L)[:, l], floats(at[0, AT_NOW], NOW, L)[:, l]
+    x, P = floats(at[0, AT_X], n, L)[:, l], cubes(at[0, AT_P], n, n, L)[:, :, l]
+    others, now[ENTERING] = now[NOISE] * mean_noise(m, t, many[LEAVES], unknown > 0), -1.0
+    for j in range(n):
+        own = x[j] * x[j] * P[j, j]
+        if own > OUTGROWN * others:
+            now[ENTERING] = j
+            break
+        others += own
+
+
+FRAMED = (machine_walks, machine_enter, machine_outgrown)
 """What the steps here call, apart from the routines of the coordinates."""
 
 
@@ -165,13 +200,30 @@ def write_walks(s: State, l: int) -> None:
 
 
 @kernel
+def outgrown(s: State, l: int) -> int:
+    """The coordinate whose earlier information a covariance would lose beside that of this sample, or -1."""
+    n, L = s.d.shape
+    s.at_start[NOISE, l] = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
+    fields = packed((
+        memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
+        s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data,
+    ))  # fmt: skip
+    machine_outgrown(fields, s.unknown[l], s.table[MEMORY_AT, 2, 0], s.counters.shape[0], n, L, l)
+    return int(s.at_start[ENTERING, l])
+
+
+@kernel
 def enter_bank(s: State, column: int, l: int) -> None:
-    """Process a regressor that leaves the span by a column; the compiled routine has made the time update."""
+    """Row ``column`` of M becomes the rest of this regressor. The compiled routine has made the time update, and
+    outside these coordinates (`driftfit.trackers.bank.machine.late_direction`) the rest.
+    """
     n, L = s.d.shape
     for i in range(column, n):
         s.x[i, l] = 0.0
     sign = new_row(s, s.phi, column, l)
     s.root[l] = 1
+    if s.framed[l] == 0:
+        return
     noise = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column
     fields = packed((

@@ -6,14 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, shared
+from driftfit.engine.kernel import shared
 from driftfit.trackers.bank.layout import (
     CLOCK,
     EXPANDED,
     GROUPS,
     IN_SEEN,
-    IN_Y,
-    LAST,
     LEAST,
     LEAVES,
     NEVER,
@@ -23,11 +21,9 @@ from driftfit.trackers.bank.layout import (
     TIMES,
     Y_HAT,
 )  # fmt: skip
+from driftfit.trackers.bank.leaves.forget import GROWTH, PER_CAP
 from driftfit.trackers.bank.leaves.lags import push
 from driftfit.trackers.bank.leaves.leaf_matrix import AGE, FIRST, LOG, NU, WEIGHT, S
-
-GROWTH = 1e8
-"""Exponential forgetting may let the trace of a covariance grow to this multiple of its value when the tree begins."""
 
 
 @shared
@@ -60,15 +56,13 @@ def wait(t: Any) -> None:
     y_hat = t.leaves[WEIGHT, :1]
     y_hat[0] = sample[Y_HAT] if abs(sample[Y_HAT]) < np.inf else 0.0
     push(t, 1, sample[IN_SEEN] > 0.0, y_hat, np.inf)
-    sample[LAST] = sample[IN_Y] if sample[IN_SEEN] > 0.0 else sample[LAST]
     counters[CLOCK] += 1
     if counters[SETTLED] == READY:
         begin(t, sample[TIMES], max(sample[SQUARES], sample[LEAST] * sample[TIMES]))
 
 
 @shared
-def trace(P: Array) -> float:
-    total = 0.0
-    for i in range(len(P)):
-        total += P[i, i]
-    return total
+def limit_forgetting(t: Any) -> None:
+    """The caps of variances, from those of the single filter."""
+    for i in range(t.n):
+        t.places[PER_CAP, i] = 1.0 / (GROWTH * t.cov[i, i]) if t.cov[i, i] > 0.0 else 0.0

@@ -11,6 +11,7 @@ from driftfit.trackers.bank.layout import (
     COUNT,
     COUNTERS_AT,
     COV_AT,
+    ENTERS,
     FREEDOM,
     IN_DT,
     IN_NOISE,
@@ -30,6 +31,7 @@ from driftfit.trackers.bank.layout import (
     S2,
     SAMPLE_AT,
     SETTLED,
+    SHIFT,
     SIZE,
     SQUARES,
     THETA_AT,
@@ -43,9 +45,10 @@ from driftfit.trackers.bank.layout import (
 from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
 from driftfit.trackers.bank.leaves.own_sensor import own_address
 from driftfit.trackers.bank.machine.advance import bank
-from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, read_framed, write_walks
+from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, outgrown, read_framed, write_walks
 from driftfit.trackers.bank.machine.grow import FLOOR
-from driftfit.trackers.parts.coordinates import FRAME, whiten_within
+from driftfit.trackers.bank.machine.late_direction import begin_within, point_along
+from driftfit.trackers.parts.coordinates import FRAME, unseen_variance, whiten_within
 from driftfit.trackers.parts.diffuse import enter, measurement, prediction, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.resolution import resolve
@@ -183,9 +186,10 @@ def run(s: State, l: int) -> None:
 def hand_over(s: State, l: int) -> None:
     """Write the numbers of this sample for the compiled routine."""
     s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
-    s.sample[IN_TIME, l] = s.dt[l] * s.drift[l]
+    s.sample[IN_TIME, l], s.sample[SHIFT, l] = s.dt[l] * s.drift[l], s.shift[l]
     s.sample[IN_OK, l], s.sample[IN_SEEN, l] = s.ok[l], s.seen[l]
     s.sample[R, l], s.sample[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])
+    s.sample[ENTERS, l] = 0.0
     s.sample[MOST, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
 
 
@@ -201,9 +205,14 @@ def alone(s: State, l: int, counts: bool) -> None:
     s.sample[Y_HAT, l], s.sample[S2, l] = s.y_hat[l], s.s[l]
     s.sample[SQUARES, l], s.sample[TIMES, l] = s.squares[l], s.count[l]
     ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
-    if ready and s.root[l] > 0 and s.can_frame[l] > 0 and s.within[l] >= RESIDUALS:
-        begin_framed(s, l)
-    ready = ready and (s.root[l] == 0 or s.framed[l] > 0)
+    within = s.root[l] == 0
+    if ready and s.root[l] > 0 and s.within[l] >= RESIDUALS:
+        if s.can_frame[l] > 0:
+            begin_framed(s, l)
+            within = True
+        else:
+            within = begin_within(s, l)
+    ready = ready and within
     s.counters[SETTLED, l] = READY if ready else WAITING
     run(s, l)
     if ready:
@@ -226,39 +235,59 @@ def correct(s: State, l: int) -> None:
 
 
 @kernel
-def in_coordinates(s: State, l: int) -> None:
-    """Process one sample in the coordinates of the start; a sample outside the span changes no weight."""
-    column, y_hat = whiten_within(s, s.phi.ctypes.data, l), prediction(s, l)
-    write_walks(s, l)
+def read(s: State, l: int) -> None:
+    """theta and its variance from the mixture."""
+    if s.framed[l] > 0:
+        read_framed(s, l)
+    else:
+        report(s, l)
+        unseen_variance(s, l)
+
+
+@kernel
+def in_span(s: State, l: int) -> None:
+    """Process one sample of a tree that began before the regressors spanned everything, or in the coordinates of the
+    start; a sample that enters a column changes no weight.
+    """
+    column, y_hat, framed = whiten_within(s, s.phi.ctypes.data, l), prediction(s, l), s.framed[l] > 0
+    if framed:
+        write_walks(s, l)
     hand_over(s, l)
+    outside = column >= 0
+    if framed and not outside and s.ok[l] > 0.0:
+        column = outgrown(s, l)
     if column >= 0:
+        s.sample[ENTERS, l] = point_along(s, column, l) if s.ok[l] > 0.0 and not framed else 0.0
         s.sample[IN_OK, l] = 0.0
     run(s, l)
     if column >= 0:
-        s.y_hat[l], s.s[l] = y_hat, np.inf
+        s.y_hat[l], s.s[l] = y_hat if outside else s.sample[Y_HAT, l], np.inf if outside else s.sample[S2, l]
         if s.ok[l] > 0.0:
             enter_bank(s, column, l)
+            if not outside:
+                e, v = s.y[l] - s.y_hat[l], s.s[l]
+                floats(report_at(s), s.table[REPORT_AT, 2, 0], s.theta.shape[1])[0, l] = -0.5 * (
+                    log(2.0 * np.pi * v) + e * e / v
+                )
     else:
         s.y_hat[l], s.s[l] = s.sample[Y_HAT, l], s.sample[S2, l]
         s.ok[l], s.seen[l] = s.sample[IN_OK, l], s.sample[IN_SEEN, l]
     s.e[l] = s.y[l] - s.y_hat[l]
     learn_scales(s, l)
-    read_framed(s, l)
+    read(s, l)
 
 
 @kernel
 def begin(s: State, l: int) -> None:
     resolve(s, l)
     if s.counters[SETTLED, l] > 0:
-        in_coordinates(s, l)
+        in_span(s, l)
     else:
         only_drifted(s, l)
         enter(s, l)
         alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
-        if s.framed[l] > 0:
-            read_framed(s, l)
-        elif s.counters[SETTLED, l] > 0:
-            report(s, l)
+        if s.counters[SETTLED, l] > 0:
+            read(s, l)
         else:
             spanned_variance(s, l)
 
@@ -275,4 +304,4 @@ def take_known(s: State, known: Array, t: int, l: int) -> None:
             column += 1
 
 
-STEPS = TrackerSteps(nothing, correct, report, begin, keep, take_known, machines=(*FRAME, *FRAMED), reads_model=True)
+STEPS = TrackerSteps(nothing, correct, report, begin, keep, take_known, machines=(*FRAME, *FRAMED), outlined=True)

@@ -35,7 +35,7 @@ import numpy as np
 from driftfit.engine.drivers import diagonal
 from driftfit.engine.kernel import State, kernel
 from driftfit.trackers.parts.diffuse import spanned_variance
-from driftfit.trackers.parts.resolution import lasting
+from driftfit.trackers.parts.resolution import lasting, reading
 
 RATE = 4.0 * np.pi**2
 SEEN = 0.01
@@ -77,10 +77,11 @@ def count_levels(s: State, kept: float, known: bool, l: int) -> None:
     """The number of levels of the prediction in the tracker's memory, of which the share ``kept`` remains."""
     ok = s.ok[l]
     quantum = s.quantum[l] if s.coarse[l] > 0.0 else 1.0
-    step = abs(s.y_hat[l] - s.stayed[l]) / (MOVED * quantum)  # NaN at the first sample
+    y_hat = s.y_hat[l] + s.shift[l]
+    step = abs(y_hat - s.stayed[l]) / (MOVED * quantum)  # NaN at the first sample
     moved = min(step * step, 1.0) if (step > 0.0) & known else 0.0
     s.levels[l] = max(kept * s.levels[l] + ok * moved, 1.0)
-    s.stayed[l] = s.y_hat[l] if ok > 0.0 else s.stayed[l]
+    s.stayed[l] = y_hat if ok > 0.0 else s.stayed[l]
 
 
 @kernel
@@ -100,7 +101,7 @@ def share_rounding(s: State, per_noise: float, l: int) -> None:
     kept = 1.0 - ok * max(1.0 - s.noise[l] / per_noise, 0.0) / n
     N = kept * s.readings_in[l] + ok
     weight = ok / max(N, 1.0)
-    off = s.y[l] - s.middle[l]
+    off = reading(s, l) - s.middle[l]
     s.middle[l] = s.middle[l] + weight * off
     s.spread[l] = (1.0 - weight) * (s.spread[l] + weight * off * off)
     s.readings_in[l] = N

@@ -21,6 +21,8 @@ to 1. Cost per sample: O(K n^2 + K J) for K filters and J levels, and O(K n^3 / 
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from driftfit.engine.kernel import State, exp, kernel, log
@@ -28,32 +30,39 @@ from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new
 from driftfit.trackers.parts.diffuse import LEFT
 from driftfit.trackers.parts.modes.ladder import TOP, leap
 from driftfit.trackers.parts.modes.noise_levels import OUTLIER
+from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
 from driftfit.trackers.parts.resolution import lasting
 
 LEAST = 1e-100
 """Probability that a filter is never below."""
 
 
+@partial(kernel, inline=False)
+def wander(s: State, size: float, l: int) -> None:
+    """Drift of all filters: ``size`` in units of their ratios over the scales of the regressors."""
+    n = s.parameters[l]  # not the constant, with which the loop over filters would be repeated n^3 / 6 times
+    for i in range(n):
+        unit = size / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        for a in range(i + 1):
+            for b in range(a + 1):
+                moved = unit * s.S[a, i, l] * s.S[b, i, l]
+                for k in range(s.modes[l]):
+                    s.C[a, b, k, l] += s.ratio[i, k, l] * moved
+
+
 @kernel
 def predict(s: State, l: int) -> None:
     time = s.dt[l] * s.drift[l]
     if s.settled[l] > 0 and s.dt[l] > 0.0:
-        for k in range(s.mu.shape[0]):
+        for k in range(s.modes[l]):
             s.prior[k, l] = s.mu[k, l]
-        n = s.theta.shape[0]
-        for i in range(n):
-            unit = s.r[l] * time / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
-            for a in range(i + 1):
-                for b in range(a + 1):
-                    moved = unit * s.S[a, i, l] * s.S[b, i, l]
-                    for k in range(s.mu.shape[0]):
-                        s.C[a, b, k, l] += s.ratio[i, k, l] * moved
+        wander(s, s.r[l] * time, l)
 
 
-@kernel
-def innovate(s: State, l: int) -> None:
-    """Innovation of every filter, and prediction and variance of the mixture before the sample."""
-    n, K, J = s.theta.shape[0], s.mu.shape[0], s.nu.shape[0]
+@partial(kernel, inline=False)
+def project(s: State, l: int) -> None:
+    """x' m, g and h of every filter."""
+    n, K = s.theta.shape[0], s.modes[l]
     for k in range(K):
         s.e_k[k, l] = 0.0
         s.h[k, l] = 0.0
@@ -72,18 +81,25 @@ def innovate(s: State, l: int) -> None:
     for i in range(n):
         for k in range(K):  # below 0: an absurd sample left no digits of C, and no gain can be trusted
             s.gain[i, k, l] = s.gain[i, k, l] if s.h[k, l] >= 0.0 else 0.0
-    mean = 0.0
     for k in range(K):
         s.h[k, l] = max(s.h[k, l], 0.0)
+
+
+@kernel
+def innovate(s: State, l: int) -> None:
+    """Innovation of every filter, and prediction and variance of the mixture before the sample."""
+    K, J = s.modes[l], s.nu.shape[0]
+    project(s, l)
     for k in range(K):
         s.e_k[k, l] += s.explained[l]
-        mean += s.prior[k, l] * s.e_k[k, l]
+        s.row[k, l] = s.prior[k, l] * s.e_k[k, l]
+    mean = sum_of_row(s, l)
     level = 0.0
     for j in range(J - 1):
         level += s.nu_prior[j, l] * max(s.level[j, l] * s.r[l], s.coarse[l])
-    v = s.noise[l] * s.leverage[l] * level / (1.0 - OUTLIER)
     for k in range(K):
-        v += s.prior[k, l] * (s.h[k, l] + (s.e_k[k, l] - mean) ** 2)
+        s.row[k, l] = s.prior[k, l] * (s.h[k, l] + (s.e_k[k, l] - mean) ** 2)
+    v = s.noise[l] * s.leverage[l] * level / (1.0 - OUTLIER) + sum_of_row(s, l)
     for k in range(K):
         s.e_k[k, l] = s.y[l] - s.e_k[k, l]
     s.y_hat[l] = mean
@@ -92,19 +108,10 @@ def innovate(s: State, l: int) -> None:
 
 
 @kernel
-def sum_of_row(s: State, l: int) -> float:
-    """Sum of the scratch row over the filters."""
-    total = 0.0
-    for k in range(s.mu.shape[0]):
-        total += s.row[k, l]
-    return total
-
-
-@kernel
 def likelihoods(s: State, l: int) -> float:
     """joint[j, k] = c_k nu_j N(e_k; 0, s_kj) exp(nearest / 2) (2 pi)^(1/2); returns nearest."""
-    K, J = s.mu.shape[0], s.nu.shape[0]
-    nearest, factor = np.inf, s.noise[l] * s.leverage[l]
+    K, J = s.modes[l], s.nu.shape[0]
+    factor = s.noise[l] * s.leverage[l]
     more = lasting(s, l)
     leap(s, l, factor * max(s.r[l], s.coarse[l]))
     for k in range(K):
@@ -117,20 +124,19 @@ def likelihoods(s: State, l: int) -> float:
             v = s.h[k, l] + max(noise, min(square, widest))
             s.inverse[j, k, l] = 1.0 / v
             s.row[k, l] = min(s.row[k, l], square / v)
-    for k in range(K):
-        nearest = min(nearest, s.row[k, l])
+    nearest = least_of_row(s, l)
     for j in range(J):
         for k in range(K):
             far = s.e_k[k, l] * s.e_k[k, l] * s.inverse[j, k, l] - nearest
             p = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(s.inverse[j, k, l]) * exp(-0.5 * far)
             s.joint[j, k, l] = p * (s.rare[l] if k == TOP else 1.0)
-    return nearest
+    return nearest  # type: ignore[no-any-return]
 
 
 @kernel
 def as_predicted(s: State, nearest: float, l: int) -> None:
     """Add the density without an outlier to the scratch row of each filter, where ``joint`` has another."""
-    K, J = s.mu.shape[0], s.nu.shape[0]
+    K, J = s.modes[l], s.nu.shape[0]
     factor = s.noise[l] * s.leverage[l]
     for j in range(J - 1):
         noise = factor * max(s.level[j, l] * s.r[l], s.coarse[l])
@@ -144,7 +150,7 @@ def as_predicted(s: State, nearest: float, l: int) -> None:
 def predictive_density(s: State, nearest: float, l: int) -> None:
     """The log density of the sample under its prediction: without a leap, with the noise of a reading that does not
     repeat, and with a tail that integrates to 1."""
-    K, J = s.mu.shape[0], s.nu.shape[0]
+    K, J = s.modes[l], s.nu.shape[0]
     factor = s.noise[l] * s.leverage[l]
     noise = factor * max(s.level[J - 1, l] * s.r[l], s.coarse[l])
     for k in range(K):
@@ -168,7 +174,7 @@ def predictive_density(s: State, nearest: float, l: int) -> None:
 @kernel
 def weigh(s: State, l: int) -> None:
     """Joint probabilities of drift modes and noise levels after the sample, and its density before it."""
-    K, J = s.mu.shape[0], s.nu.shape[0]
+    K, J = s.modes[l], s.nu.shape[0]
     nearest = likelihoods(s, l)
     predictive_density(s, nearest, l)
     for k in range(K):
@@ -181,34 +187,20 @@ def weigh(s: State, l: int) -> None:
         # at 0 a mode that only such modes lead to would have no mixture at all
         s.mu[k, l] = max(s.row[k, l] * share, LEAST)
     for j in range(J):
-        s.nu[j, l] = 0.0
         for k in range(K):
             s.joint[j, k, l] *= share
-        for k in range(K):
-            s.nu[j, l] += s.joint[j, k, l]
+            s.row[k, l] = s.joint[j, k, l]
+        s.nu[j, l] = sum_of_row(s, l)
     s.odd[l] = s.nu[J - 1, l] + (s.mu[TOP, l] - s.joint[J - 1, TOP, l] if s.rare[l] < 1.0 else 0.0)
     # an outlier says nothing about the level: the chain keeps its state
     for j in range(J - 1):
         s.nu[j, l] += s.nu[J - 1, l] * s.nu_prior[j, l] / (1.0 - OUTLIER)
 
 
-@kernel
-def update_filters(s: State, l: int) -> None:
-    """Each filter takes the sample with its noise levels merged: one rank-one update."""
-    n, K, J = s.theta.shape[0], s.mu.shape[0], s.nu.shape[0]
-    for k in range(K):
-        s.row[k, l] = 0.0
-        s.mu_next[k, l] = 0.0
-    for j in range(J):
-        for k in range(K):
-            share = s.joint[j, k, l] / max(s.mu[k, l], 1e-300)
-            s.row[k, l] += share * s.inverse[j, k, l]
-            s.mu_next[k, l] += share * s.inverse[j, k, l] * s.inverse[j, k, l]
-    for k in range(K):
-        a = s.row[k, l]
-        spread = max(s.mu_next[k, l] - a * a, 0.0)
-        s.h[k, l] = a - spread * s.e_k[k, l] * s.e_k[k, l]
-        s.step[k, l] = a * s.e_k[k, l]
+@partial(kernel, inline=False)
+def absorb(s: State, l: int) -> None:
+    """The rank-one update: m + g step, C - h g g'."""
+    n, K = s.theta.shape[0], s.modes[l]
     for i in range(n):
         for k in range(K):
             s.m[i, k, l] += s.gain[i, k, l] * s.step[k, l]
@@ -218,6 +210,26 @@ def update_filters(s: State, l: int) -> None:
         for k in range(K):
             left = s.C[i, i, k, l] - s.h[k, l] * s.gain[i, k, l] * s.gain[i, k, l]
             s.C[i, i, k, l] = max(left, LEFT * s.C[i, i, k, l])
+
+
+@kernel
+def update_filters(s: State, l: int) -> None:
+    """Each filter takes the sample with its noise levels merged: one rank-one update."""
+    K, J = s.modes[l], s.nu.shape[0]
+    for k in range(K):
+        s.weighted[k, l] = 0.0
+        s.mu_next[k, l] = 0.0
+    for j in range(J):
+        for k in range(K):
+            share = s.joint[j, k, l] / max(s.mu[k, l], 1e-300)
+            s.weighted[k, l] += share * s.inverse[j, k, l]
+            s.mu_next[k, l] += share * s.inverse[j, k, l] * s.inverse[j, k, l]
+    for k in range(K):
+        a = s.weighted[k, l]
+        spread = max(s.mu_next[k, l] - a * a, 0.0)
+        s.h[k, l] = a - spread * s.e_k[k, l] * s.e_k[k, l]
+        s.step[k, l] = a * s.e_k[k, l]
+    absorb(s, l)
 
 
 @kernel
@@ -235,7 +247,7 @@ def outgrown(s: State, l: int) -> int:
 @kernel
 def enter_filters(s: State, j: int, l: int) -> None:
     """Row j of M becomes the rest of phi; all filters are updated in z_j by the rest of the innovation."""
-    n, K = s.theta.shape[0], s.mu.shape[0]
+    n, K = s.theta.shape[0], s.modes[l]
     y_hat, e, v = s.y_hat[l], s.e[l], s.s[l]
     for i in range(j, n):
         s.x[i, l] = 0.0
@@ -252,20 +264,21 @@ def enter_filters(s: State, j: int, l: int) -> None:
     s.density[l] = -0.5 * (log(2.0 * np.pi * v) + e * e / v)
 
 
-@kernel
+@partial(kernel, inline=False)
 def mixture(s: State, l: int) -> None:
     """Mean d of the filters, and the covariance of theta; without a sample d keeps its bits."""
-    for i in range(s.theta.shape[0]):
-        mean = 0.0
-        for k in range(s.mu.shape[0]):
-            mean += s.mu[k, l] * s.m[i, k, l]
+    n, K = s.theta.shape[0], s.modes[l]
+    for i in range(n):
+        for k in range(K):
+            s.row[k, l] = s.mu[k, l] * s.m[i, k, l]
+        mean = sum_of_row(s, l)
         s.d[i, l] = mean if s.ok[l] > 0.0 else s.d[i, l]
         for j in range(i + 1):
-            total = 0.0
-            for k in range(s.mu.shape[0]):
+            for k in range(K):
                 away = (s.m[i, k, l] - s.d[i, l]) * (s.m[j, k, l] - s.d[j, l])
-                total += s.mu[k, l] * (s.C[i, j, k, l] + away)
-            s.P[i, j, l] = total
+                s.row[k, l] = s.mu[k, l] * (s.C[i, j, k, l] + away)
+            s.Z[i, j, l] = sum_of_row(s, l)
+            s.P[i, j, l] = s.Z[i, j, l]
     in_units_of_theta(s, l)
-    for i in range(s.theta.shape[0]):
+    for i in range(n):
         s.var[i, l] = s.P[i, i, l]

@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, exp, kernel
+from driftfit.engine.kernel import Array, State, exp, kernel, log
+from driftfit.trackers.parts.modes.rows import sum_of_row
 from driftfit.trackers.parts.resolution import lasting
 
 LEVELS = (1.0, 4.0, 16.0, 100.0)
@@ -31,6 +32,9 @@ MEMORY = 70.0
 """Memory of r, in samples."""
 IN_A_ROW, RISE = 4.0, 0.3
 """From the third outlier in a row on (`driftfit.trackers.parts.outlying_readings`), log r rises by this with each."""
+MISFIT, SETTLED, EARLY = 0.5, 20.0, 140.0
+"""Among the first `EARLY` samples, if the mean of e^2 / s, with a memory of `SETTLED`, is below `MISFIT`, r falls by as
+much: drift at the start was taken for noise. Later it does not, see above."""
 FINEST = 1e-12
 """r is never below this share of the mean square of y: the rounding of the data."""
 
@@ -44,6 +48,7 @@ def any_level() -> dict[str, Any]:
         "nu": np.array([START, *np.full(J - 2, (1.0 - START) / (J - 2)), 0.0]),
         "nu_prior": np.zeros(J),
         "odd": 0.0,
+        "fit": 1.0,
     }
 
 
@@ -82,8 +87,8 @@ def learn_noise(s: State, l: int) -> None:
     """r follows the part of the innovations that the ordinary levels do not explain, and moves towards the level in
     use.
     """
-    K, J = s.mu.shape[0], s.nu.shape[0]
-    surprise, level = 0.0, 0.0
+    K, J = s.modes[l], s.nu.shape[0]
+    level = 0.0
     more = lasting(s, l)
     for k in range(K):
         s.row[k, l] = 0.0
@@ -92,11 +97,18 @@ def learn_noise(s: State, l: int) -> None:
             square = s.e_k[k, l] * s.e_k[k, l] * s.inverse[j, k, l]
             s.row[k, l] += s.joint[j, k, l] * (square / (1.0 - more * s.inverse[j, k, l]) - 1.0)
         level += s.nu[j, l] * s.log_level[j, l]
-    for k in range(K):
-        surprise += s.row[k, l]
+    surprise = sum_of_row(s, l)
+    ordinary = 0.0
+    for j in range(J - 1):
+        for k in range(K):
+            s.row[k, l] = s.joint[j, k, l]
+        ordinary += sum_of_row(s, l)
     s.count[l] += 1.0
+    s.fit[l] += (surprise + ordinary * (1.0 - s.fit[l])) / SETTLED
     step = 1.0 / min(s.count[l] + 1.0, MEMORY)
     move = step * (surprise + level)
     if s.patience[l] > IN_A_ROW:
         move += RISE * s.odd[l]
-    s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), finest(s, l))
+    fall = log(max(s.fit[l], 1e-6) / MISFIT) / SETTLED if (s.fit[l] < MISFIT) & (s.count[l] < EARLY) else 0.0
+    s.fit[l] *= exp(-fall)
+    s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move)) + fall), finest(s, l))

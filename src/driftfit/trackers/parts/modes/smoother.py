@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.modes.ladder import TOP
+from driftfit.trackers.parts.modes.ladder import TOP, chain
 from driftfit.trackers.parts.modes.noise_levels import level_chain
 
 SMOOTHER_FIELDS = (
     "joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight", "white",
-    "explained",
+    "explained", "calm",
 )  # fmt: skip
 """Fields that are stored at every sample."""
 
@@ -45,14 +45,16 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
         o.white[i, l] = s.white[i, l]
     o.r[l], o.leverage[l], o.coarse[l], o.alike[l] = s.r[l], s.leverage[l], s.coarse[l], s.alike[l]
     o.leapt[l], o.weighed[l], o.settled[l], o.explained[l] = s.leapt[l], s.weighed[l], s.settled[l], s.explained[l]
+    o.calm[l] = s.calm[l]
 
 
-def given_all(after: Array, transition: Array, moves: Array) -> Array:
-    """Probabilities (T, K) of the states of a chain, which ``moves`` at some samples, given all samples."""
-    found, ahead = after.copy(), after @ transition
+def given_all(after: Array, stay: Array, change: Array, rate: Array, moves: Array) -> Array:
+    """Probabilities (T, K) of states, given all samples; at samples that move, transitions are stay + rate_t change."""
+    found, ahead = after.copy(), after @ stay + rate[:, None] * (after @ change)
     for t in range(len(found) - 2, -1, -1):
         if moves[t]:
-            found[t] = after[t] * (transition @ (found[t + 1] / np.maximum(ahead[t], 1e-300)))
+            later = found[t + 1] / np.maximum(ahead[t], 1e-300)
+            found[t] = after[t] * (stay @ later + rate[t] * (change @ later))
             found[t] /= found[t].sum()
         else:
             found[t] = found[t + 1]
@@ -66,14 +68,19 @@ def estimated_variances(
     running, weighed = fields["settled"] > 0, fields["weighed"] > 0
     r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
     after = np.where(weighed[:, None], fields["joint"].sum(axis=1), fields["prior"])
-    w, span, learned = given_all(after, state["transition"], weighed), r * time, state["learned"]
+    J = len(state["level"]) - 1
+    w, span, learned = (
+        given_all(after, *chain(state["moves"], state["arrive"]), fields["calm"], weighed),
+        r * time,
+        state["learned"],
+    )
     ratio = np.where(learned > 0.0, 0.0, state["ratio"])
     with np.errstate(divide="ignore", invalid="ignore"):
         leapt = np.where(weighed, fields["leapt"] / span, 0.0)
         drift = w @ ratio.T + (w @ learned)[:, None] * fields["weight"]
         q = (drift + (w[:, TOP] * leapt)[:, None] * ratio[:, TOP]) * span[:, None] / fields["c"]
     q = np.where(running[:, None] & (span[:, None] > 0.0) & (fields["c"] > 0.0), q, 0.0)
-    levels = given_all(fields["nu"][:, :-1], level_chain(), weighed)
+    levels = given_all(fields["nu"][:, :-1], level_chain(), np.zeros((J, J)), np.zeros(len(r)), weighed)
     v = np.sum(levels * np.maximum(state["level"][:-1] * r[:, None], fields["coarse"][:, None]), axis=1)
     v = np.where(running, v + fields["coarse"] * fields["alike"] * (fields["alike"] + 2.0), r) * fields["leverage"]
     outlier = np.where(weighed, fields["joint"][:, -1].sum(axis=1), 0.0)

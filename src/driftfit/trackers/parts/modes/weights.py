@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, kernel, machine, shared
+from driftfit.trackers.parts.modes.rows import sum_of_row
 
 BLOCK, WINDOW = 50, 100
 """Samples between two passes, and samples of a pass."""
@@ -128,18 +129,18 @@ def machine_weights(past: int, newest: int, scores: int, n: int, L: int, l: int)
 @kernel
 def remember(s: State, at: int, l: int) -> None:
     """Store a sample that the filters used, in units of r and c; s.d is scratch here."""
-    n, K = s.theta.shape[0], s.mu.shape[0]
-    e, precision = 0.0, 0.0
+    n, K = s.theta.shape[0], s.modes[l]
     for k in range(K):
-        e += s.mu[k, l] * s.step[k, l]
-        precision += s.mu[k, l] * s.row[k, l]
+        s.row[k, l] = s.mu[k, l] * s.step[k, l]
+    e = sum_of_row(s, l)
+    for k in range(K):
+        s.row[k, l] = s.mu[k, l] * s.weighted[k, l]
+        s.mean_prior[k, l] += (s.prior[k, l] - s.mean_prior[k, l]) / BLOCK
+    precision = sum_of_row(s, l)
     for i in range(n):
-        gain, assumed = 0.0, 0.0
         for k in range(K):
-            gain += s.mu[k, l] * s.row[k, l] * s.gain[i, k, l]
-            assumed += s.prior[k, l] * s.ratio[i, k, l]
-        s.d[i, l] = gain
-        s.scores[ASSUMED, i, l] += (assumed - s.scores[ASSUMED, i, l]) / BLOCK
+            s.row[k, l] = s.mu[k, l] * s.weighted[k, l] * s.gain[i, k, l]
+        s.d[i, l] = sum_of_row(s, l)
     for i in range(n):
         gain, unit = 0.0, np.sqrt(s.c[i, l])
         for j in range(i, n):
@@ -159,8 +160,12 @@ def learn_weights(s: State, l: int) -> None:
     remember(s, at, l)
     s.remembered[l] += 1
     if s.remembered[l] >= WINDOW and s.remembered[l] % BLOCK == 0:
+        for i in range(n):
+            for k in range(s.modes[l]):
+                s.row[k, l] = s.mean_prior[k, l] * s.ratio[i, k, l]
+            s.scores[ASSUMED, i, l] = sum_of_row(s, l)
         machine_weights(s.samples.ctypes.data, at, s.scores.ctypes.data, n, L, l)
         for i in range(n):
             s.weight[i, l] = s.scores[WEIGHT, i, l]
-            for k in range(s.mu.shape[0]):
+            for k in range(s.modes[l]):
                 s.ratio[i, k, l] = s.learned[k, l] * s.weight[i, l] if s.learned[k, l] > 0.0 else s.ratio[i, k, l]

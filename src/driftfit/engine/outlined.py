@@ -1,0 +1,96 @@
+"""Steps that drivers call instead of inlining them, compiled to object code of their own for each type of record.
+
+A driver inlines the steps of a tracker, and the compiler optimises them again in each driver: for every model, for
+every set of stored results, for records and for streams. For a step that takes a microsecond a call costs nothing, so
+it is compiled once for each type of record that it works on, and drivers refer to it by its symbol.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import FunctionType
+from typing import Any
+from weakref import WeakValueDictionary
+
+from numba import types
+
+from driftfit.engine import disk_cache
+from driftfit.engine import numba_internals as internals
+from driftfit.engine.compile_notice import compiling
+
+PREFIX = "outlined-"
+"""Beginning of the symbols of outlined steps, which are the names of their files too."""
+
+_SOURCES: dict[str, tuple[FunctionType, types.Type]] = {}
+"""The function and the type of its record, by symbol, of all steps that this process met while it compiled."""
+
+_LINKED: WeakValueDictionary[Any, internals.Linked] = WeakValueDictionary()
+"""Outlined steps that drivers of this process use, by symbol and by the routines that are called instead of others."""
+
+
+def outlined(step: Any) -> Any:
+    """A step, which takes the record only, as drivers call it."""
+
+    def typed(context: Any, record: Any) -> Any:
+        symbol = disk_cache.name_of(PREFIX.rstrip("-"), step.identity, record)
+        _SOURCES[symbol] = step.py_func, record
+
+        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+            return internals.call(context, builder, symbol, (record,), given)
+
+        return types.none(record), build
+
+    made = internals.named_intrinsic(f"outlined.{step.identity}", typed)
+    made.py_func = step.py_func
+    return made
+
+
+def called_by(code: internals.Code, instead: Mapping[str, str]) -> dict[str, Any] | None:
+    """What the symbols stand for that code calls; None if the code of an outlined step is neither in this process nor
+    on disk, and its source is not known here: the driver that calls it must be compiled again.
+
+    ``instead`` maps symbols of machines to those that are called in their place, by the outlined steps too.
+    """
+    outside: dict[str, Any] = dict(instead)
+    for symbol in code.outside:
+        if symbol.startswith(PREFIX):
+            found = _found(symbol, instead)
+            if found is None:
+                return None
+            outside[symbol] = found
+    return outside
+
+
+def _found(symbol: str, instead: Mapping[str, str]) -> internals.Linked | None:
+    """An outlined step in this process, from disk, or from the compiler."""
+    key = symbol, tuple(sorted(instead.items()))
+    found = _LINKED.get(key)
+    if found is None:
+        stored = disk_cache.read(symbol)
+        if stored is None:
+            if symbol not in _SOURCES:
+                return None
+            source, record = _SOURCES[symbol]
+            stored = object_code(source, symbol, (record,), from_python=False)
+        found = _LINKED[key] = internals.Linked(internals.Code(*stored), instead)
+    return found
+
+
+def object_code(
+    source: Callable[..., Any], name: str, arguments: tuple[types.Type, ...], from_python: bool = True
+) -> internals.Code:
+    """Compile a function for one signature, and store the code on disk under a name."""
+    assert isinstance(source, FunctionType)
+    twin = FunctionType(source.__code__, source.__globals__, source.__name__, None, source.__closure__)
+    twin.__qualname__ = name.removesuffix(disk_cache.ENDING).replace("-", "_")
+    try:
+        with compiling():
+            code = internals.emit(twin, arguments, from_python)
+    except KeyError as missing:
+        raise TypeError(
+            f"a compiled step names the field {missing}, which its record does not have. The steps of a "
+            "tracker see fields of the model only with TrackerSteps(..., reads_model=True)."
+        ) from None
+    if code.lasting:
+        disk_cache.write(name, tuple(code))
+    return code

@@ -1,0 +1,41 @@
+"""What the verdict and the diagnosis of a run share: its regression, the test of constancy, the errors of rivals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.compare import Errors, errors
+from driftfit.judge.constant_fit import constant_least_squares
+from driftfit.judge.regressors import Rows, regressors
+from driftfit.judge.statistics.constancy import Constancy, constancy
+from driftfit.run.result import Track
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Each part is computed when it is first asked for; ``lags`` and ``burn`` are those of `Track.verdict`."""
+
+    run: Track
+    lags: int | None = None
+    burn: int | None = None
+
+    @cached_property
+    def _steady(self) -> Array:
+        return constant_least_squares(self.run.model, self.run.record)
+
+    @cached_property
+    def rows(self) -> Rows:
+        """The record as samples of a regression."""
+        return regressors(self.run, self._steady)
+
+    @cached_property
+    def test(self) -> Constancy:
+        """Whether constants explain it."""
+        return constancy(self.rows.phi, self.rows.y, self.lags)
+
+    @cached_property
+    def errors(self) -> Errors:
+        """One-step errors of the run and of simpler predictors."""
+        return errors(self.run, self.burn, self._steady)

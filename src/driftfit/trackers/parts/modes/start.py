@@ -1,0 +1,101 @@
+"""The start of the filters: each from generalised least squares with its own drift, on the samples so far.
+
+Least squares without drift determine the coordinates z and their estimate d. When there are residuals, every filter
+runs again over the samples so far, from m = d and C = `LOOSE` I in units of r, in which least squares have C = I, so
+that next to nothing of this prior is left:
+
+    m_k, C_k,    S_k = sum e_k^2 / s_k,    log p_k = -1/2 sum log s_k - (nu / 2) log S_k
+
+with nu the number of residuals, and p_k Student's density of the samples given the drift of filter k, whatever r. The
+filters start with probabilities proportional to p_k, and with r the mean of S_k / nu. Parameters that move from the
+first sample on are therefore neither taken for noise nor for estimates that many samples agree on.
+
+Source: marginal likelihood under an inverse-gamma variance, West and Harrison, Bayesian Forecasting and Dynamic Models
+(1997), section 4.5. Cost: O(K n^2) for each sample of the start, once.
+"""
+
+from __future__ import annotations
+
+from driftfit.engine.kernel import State, exp, kernel, log
+from driftfit.trackers.parts.modes.filters import absorb, project, wander
+from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
+from driftfit.trackers.parts.modes.weights import WINDOW
+
+LOOSE = 1e4
+"""Variance of each coordinate before the first sample, in units of what least squares leave. A larger one would cost
+as many digits of the estimates."""
+Y, SPAN, NOISE = 0, 1, 2
+"""Entries of a stored sample of the start, after its regressor."""
+
+
+@kernel
+def keep_start(s: State, l: int) -> None:
+    """Store a sample of the start, where those of `driftfit.trackers.parts.modes.weights` will be."""
+    n, at = s.theta.shape[0], s.remembered[l]
+    s.waited[l] += s.dt[l] * s.drift[l]
+    if s.ok[l] > 0.0:
+        if at < WINDOW:
+            for i in range(n):
+                s.samples[at, i, l] = s.phi[i, l]
+            s.samples[at, n + Y, l] = s.y[l]
+            s.samples[at, n + SPAN, l] = s.waited[l]
+            s.samples[at, n + NOISE, l] = s.noise[l] * s.leverage[l]
+        s.remembered[l] += 1
+        s.waited[l] = 0.0
+
+
+@kernel
+def whitened(s: State, at: int, l: int) -> None:
+    """x of a stored sample, which is in the span of the columns that are not free."""
+    for j in range(s.theta.shape[0]):
+        u = s.samples[at, j, l]
+        for i in range(j):
+            u -= s.S[i, j, l] * s.x[i, l]
+        s.x[j, l] = u / s.S[j, j, l] if s.S[j, j, l] > 0.0 else 0.0
+
+
+@kernel
+def run_again(s: State, l: int) -> None:
+    """Every filter over the stored samples, in units of r; sums of squares in ``weighted``, of logs in ``mu_next``."""
+    n, K = s.theta.shape[0], s.modes[l]
+    for k in range(K):
+        s.weighted[k, l], s.mu_next[k, l] = 0.0, 0.0
+    for i in range(n):
+        for k in range(K):
+            s.C[i, i, k, l] *= LOOSE
+    for at in range(s.remembered[l]):
+        if at > 0:
+            wander(s, s.samples[at, n + SPAN, l], l)
+        whitened(s, at, l)
+        project(s, l)
+        for k in range(K):
+            e, v = s.samples[at, n + Y, l] - s.e_k[k, l], s.h[k, l] + s.samples[at, n + NOISE, l]
+            s.weighted[k, l] += e * e / v
+            s.mu_next[k, l] += log(v)
+            s.step[k, l], s.h[k, l] = e / v, 1.0 / v
+        absorb(s, l)
+
+
+@kernel
+def begin_with_drift(s: State, least: float, l: int) -> None:
+    """Estimates, r, which is at least ``least``, and probabilities of the filters, which have m = d and C = I."""
+    n, K = s.theta.shape[0], s.modes[l]
+    if s.remembered[l] <= WINDOW:
+        run_again(s, l)
+        for k in range(K):
+            # residuals below the floor of r are rounding, and say nothing about the drift
+            s.weighted[k, l] = max(s.weighted[k, l] / s.count[l], least)
+            s.row[k, l] = s.mu_next[k, l] + s.count[l] * log(s.weighted[k, l])
+        nearest = least_of_row(s, l)
+        for k in range(K):
+            s.row[k, l] = s.mu[k, l] * exp(-0.5 * (s.mu_next[k, l] + s.count[l] * log(s.weighted[k, l]) - nearest))
+        share = 1.0 / sum_of_row(s, l)
+        for k in range(K):
+            s.mu[k, l] = s.row[k, l] * share
+            s.row[k, l] = s.mu[k, l] * s.weighted[k, l]
+        s.r[l] = sum_of_row(s, l)
+    for i in range(n):
+        for j in range(i + 1):
+            for k in range(K):
+                s.C[i, j, k, l] *= s.r[l]
+    s.remembered[l] = 0
