@@ -37,7 +37,8 @@ class Advanced:
         for job in self.jobs:
             lanes, L = np.flatnonzero(job.live), len(job.lanes)
             series, output = np.divmod(job.lanes[lanes], ny)
-            fields = [job.out.dtype.fields[name] for name in names]
+            known = job.out.dtype.fields or {}
+            fields = [known[name] for name in names]
             begin = [np.arange(at, at + kind.itemsize, 8 * L) // 8 for kind, at, *_ in fields]
             words = job.out.view(np.float64).reshape(len(job.out), -1)
             first, length = self.records.first[series], self.records.length[series]
