@@ -7,7 +7,7 @@ and one parameter, a random walk, at the very edge of its band, which is the wor
 The second table is for fleets of 50 series, 10 of which have a fault, watched together: false alarms of all series in
 "every" samples, and the share of series without a fault among those that are reported.
 
-Run: python benchmarks/alarm_rates.py [records per line, 20 by default] [fleets, 20 by default] [--quick]
+Run: python benchmarks/alarm_rates.py [records per line, 20; 0: only fleets] [fleets, 20] [--quick]
 """
 
 import sys
@@ -140,18 +140,19 @@ def fleets(count: int) -> Table:
 
 
 def main(records: int = 20, of_fleets: int = 20, T: int = T) -> None:
-    table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Samples for one false alarm, {records} records of {T}")
-    for head in ("alarm", "set", "measured", "from", "to"):
-        table.add_column(head, justify="left" if head == "alarm" else "right")
-    for name, alarms in LINES:
-        for every in (500.0, 5000.0):
-            found = np.array([alarms(seed, every, T) for seed in range(records)])
-            begun, samples = found.sum(axis=0)
-            spread = 2.0 * found[:, 0].std() * np.sqrt(records)
-            ends = (f"{samples / max(begun + spread, 0.5):.0f}", f"{samples / max(begun - spread, 0.5):.0f}")
-            table.add_row(name, f"{every:g}", f"{samples / max(begun, 0.5):.0f}", *ends)
-    Console(width=110).print(table)
-    Console(width=110).print(fleets(of_fleets))
+    if records:
+        table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Samples for one false alarm, {records} records of {T}")
+        for head in ("alarm", "set", "measured", "from", "to"):
+            table.add_column(head, justify="left" if head == "alarm" else "right")
+        for name, alarms in LINES:
+            for every in (500.0, 5000.0):
+                found = np.array([alarms(seed, every, T) for seed in range(records)])
+                begun, samples = found.sum(axis=0)
+                spread = 2.0 * found[:, 0].std() * np.sqrt(records)
+                ends = (f"{samples / max(begun + spread, 0.5):.0f}", f"{samples / max(begun - spread, 0.5):.0f}")
+                table.add_row(name, f"{every:g}", f"{samples / max(begun, 0.5):.0f}", *ends)
+        Console(width=110).print(table)
+    Console(width=120).print(fleets(of_fleets))
 
 
 if __name__ == "__main__":

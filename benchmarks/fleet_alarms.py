@@ -1,8 +1,9 @@
-"""The alarms and the report of a fleet: processor time per series, and what judging clear series early saves.
+"""Verdict, alarms and report of a fleet: processor time per series, memory, and what groups of like series save.
 
-Pumps as in `benchmarks/fleet_verdict.py`, 1,200 samples each; the gain of one in ten falls by 15 % half-way. "in
-stages" is `Fleet.detect` as it is, "all records" with the 64 simulated records of a single run for every series
-(``records=64``). Processor time is that of all threads, and 20,000 series take so many times more.
+Pumps as in `benchmarks/fleet_verdict.py`, 1,200 samples each; the gain of one in ten falls by 15 % half-way. "detect"
+is `Fleet.detect` as it is; "detect, each with limits of its own" simulates 64 records for each of the first hundred
+series (``records=64``). Processor time is that of all threads; two cores need at least half of it by the clock. Memory
+is the largest that the process had until then, with the records and the results of the tracker.
 
 Run: python benchmarks/fleet_alarms.py [--quick]
 """
@@ -32,20 +33,27 @@ def spent(job: Callable[[], Any]) -> tuple[float, Any]:
 
 
 def main(units: int) -> None:
-    fleet = fleet_verdict.tracked(fleet_verdict.pumps(units))
-    fleet_verdict.tracked(fleet_verdict.pumps(2)).detect()  # compiles
+    small = fleet_verdict.tracked(fleet_verdict.pumps(2))
+    small.detect(), small.verdict()  # compiles
+    fleet, alone = (fleet_verdict.tracked(fleet_verdict.pumps(count)) for count in (units, min(units, 100)))
     table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"{units} series of {fleet_verdict.T} samples")
-    for head in ("", "ms a series", "min for 20,000", "with an alarm", "with a fault"):
+    for head in ("", "ms a series", "min for 20,000", "peak, MB", "with an alarm", "with a fault"):
         table.add_column(head, justify="right" if head else "left")
-    for name, given in (("detect, in stages", {}), ("detect, all records", {"records": 64})):
-        seconds, said = spent(lambda: fleet.detect(**given))  # noqa: B023
-        found = str(len(said.alarmed)), str(len(said.faulty))
-        table.add_row(name, f"{1e3 * seconds / units:.1f}", f"{seconds / units * 20_000 / 60.0:.0f}", *found)
     with tempfile.TemporaryDirectory() as folder:
-        seconds, _ = spent(lambda: fleet.report(Path(folder) / "fleet.html"))
-    table.add_row("report", f"{1e3 * seconds / units:.1f}", f"{seconds / units * 20_000 / 60.0:.0f}")
+        jobs = {
+            "verdict": fleet.verdict,
+            "detect": fleet.detect,
+            "report": lambda: fleet.report(Path(folder) / "fleet.html"),
+            "detect, each with limits of its own": lambda: alone.detect(records=64),
+        }
+        for name, job in jobs.items():
+            seconds, said = spent(job)
+            seconds /= len(alone if "own" in name else fleet)
+            found = (str(len(said.alarmed)), str(len(said.faulty))) if "detect" in name else ("", "")
+            cells = (f"{1e3 * seconds:.1f}", f"{seconds * 20_000 / 60.0:.1f}", f"{fleet_verdict.peak():.0f}")
+            table.add_row(name, *cells, *found)
     Console(width=110).print(table)
 
 
 if __name__ == "__main__":
-    main(10 if "--quick" in sys.argv[1:] else 200)
+    main(10 if "--quick" in sys.argv[1:] else 600)

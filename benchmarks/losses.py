@@ -1,40 +1,46 @@
 """Why rows of the accuracy scoreboard beat AdaptiveKalman: its error with a part taken out, over its error.
 
-"one ratio" puts the ratio of the scenario on every rung of the common ladder and takes the ladders of single parameters
-away (without drift: closes the ways up), so that nothing has to be learned about it; "one noise level" leaves the
-outliers only; "groups" tells it which parameter is fast. Medians over the twenty scored runs. Run:
-python -m benchmarks.losses
+"one ratio" gives all filters the drift ratio of the scenario (without drift: no filter is entered but the one without),
+so that nothing has to be learned about it; "one noise level" leaves the outliers only; "groups" tells it which
+parameter is fast. Medians over the twenty scored runs. Run: python -m benchmarks.losses
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from driftfit import AdaptiveKalman
-from driftfit.trackers.parts.modes import ladder, noise_levels
 from lab.bench.contestants import run
 from lab.bench.records import simulated
 from lab.bench.scores import parameter_error
 
 LEARNED = {"missing_data": ("regression",), "collinear_inputs": ("regression",), "lost_excitation": ("arx",)}
 RATIO = 1e-3
-ONE_RATIO = {"LADDER": (RATIO,) * len(ladder.LADDER), "LEARNED": (RATIO,) * len(ladder.LEARNED), "MOST_ALONE": 0}
-ALL_AT_REST = {"CLIMB": 0.0, "JUMP": 0.0, "ACROSS": 0.0}
-ONE_LEVEL = (*np.ones(len(noise_levels.LEVELS) - 1), noise_levels.LEVELS[-1])
 
 
-@contextmanager
-def told(module: object, **values: object) -> Iterator[None]:
-    """Other numbers in a module, for a while."""
-    before = {name: getattr(module, name) for name in values}
-    for name, value in values.items():
-        setattr(module, name, value)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            setattr(module, name, value)
+@dataclass(frozen=True)
+class Part(AdaptiveKalman):
+    """The tracker without some of its transitions, ratios or noise levels."""
+
+    at_rest: bool = False
+    one_ratio: bool = False
+    one_level: bool = False
+
+    def state(self, n: int) -> Mapping[str, Any]:
+        state = dict(super().state(n))
+        if self.at_rest:
+            alone = np.arange(len(state["arrive"])) == 0
+            state["moves"] = state["moves"] * [[0.0], [1.0], [1.0]]
+            state["arrive"] = np.where(alone, state["arrive"], 0.0)
+            state["arrivals"] = state["arrive"].sum()
+        if self.one_ratio:
+            state["ratio"], state["learned"] = np.full_like(state["ratio"], RATIO), np.zeros_like(state["learned"])
+        if self.one_level:
+            state["level"] = np.where(state["level"] < state["level"][-1], 1.0, state["level"])
+            state["log_level"] = np.log(state["level"])
+        return state
 
 
 def errors(tracker: AdaptiveKalman, name: str, kind: str) -> np.ndarray:
@@ -46,12 +52,11 @@ def main() -> None:
     plain = AdaptiveKalman()
     for name, kinds in {"no_drift": ("regression", "arx"), **LEARNED}.items():
         for kind in kinds:
-            other = ALL_AT_REST if name == "no_drift" else ONE_RATIO
-            base = errors(plain, name, kind)
-            with told(ladder, **other):
-                one = np.median(errors(plain, name, kind) / base)
-                with told(noise_levels, LEVELS=ONE_LEVEL):
-                    both = np.median(errors(plain, name, kind) / base)
+            base, rest = errors(plain, name, kind), name == "no_drift"
+            one, both = (
+                np.median(errors(Part(at_rest=rest, one_ratio=not rest, one_level=level), name, kind) / base)
+                for level in (False, True)
+            )
             print(f"{name}, {kind}: one ratio {one:.3f}, and one noise level {both:.3f}")
     for kind in ("regression", "arx"):
         grouped = errors(AdaptiveKalman(groups=[[0]]), "mixed_rates", kind)

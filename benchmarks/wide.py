@@ -1,6 +1,6 @@
 """Wide models: one record with n parameters against the loop in C of that size, and against NumPy with BLAS.
 
-    python -m benchmarks.wide            n = 4 to 100; compiling the larger sizes takes minutes of processor time
+    python -m benchmarks.wide            n = 4 to 200; compiling the larger sizes takes minutes of processor time
     python -m benchmarks.wide --quick
 
 ARX(n/2, n/2), a random-walk Kalman filter. P phi takes n^2 products and sums, the update of one triangle of P half as
@@ -49,7 +49,7 @@ def main(quick: Annotated[bool, typer.Option(help="Small sizes, to see that it w
     for head in ("n", "ours", "C", "NumPy with BLAS", "C, times ours", "NumPy, times ours", "ours, GFLOP/s"):
         table.add_column(head, justify="right")
     with tempfile.TemporaryDirectory() as folder:
-        for n in (4, 12) if quick else (4, 8, 12, 24, 48, 100):
+        for n in (4, 12) if quick else (4, 8, 12, 24, 48, 100, 200):
             T = max(200, 400_000 // n**2)
             tile = Tile(n, 1, max(T, 4 * n))
             T = len(tile.y)

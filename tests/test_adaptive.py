@@ -5,6 +5,7 @@ import pytest
 
 from driftfit import ARX, AdaptiveKalman, Kalman, Live, Regression, track
 from driftfit.systems import scenarios
+from driftfit.trackers.parts.excitation import learned, window
 
 BURN = 200
 MODELS = {"regression": Regression(3), "arx": ARX(2, 2)}
@@ -203,3 +204,17 @@ def test_what_never_changes_is_expected_to_change_less_often():
     jumps = track(Regression(3), AdaptiveKalman(), u @ [1.0, -0.5, 2.0] * (1.0 + np.arange(6000) // 100 % 2), u)
     assert run.state["calm"] < 0.5
     assert jumps.state["calm"] == 1.0
+
+
+def test_a_signal_far_from_zero_beside_an_intercept_is_being_learned_and_one_at_rest_is_not():
+    """The window of `excitation`, and variances of least squares: offsets decide nothing."""
+    rng = np.random.default_rng(0)
+    for rests in (0, 400):
+        signal = 53.0 + np.append(rng.standard_normal(600), np.zeros(rests))
+        phi = np.column_stack([signal, np.ones_like(signal)])
+        c, fade = np.mean(phi**2, axis=0), 1.0 - 1.0 / window(2)
+        scaled = phi / np.sqrt(c)
+        G = (fade ** np.arange(len(phi))[::-1, None] * scaled).T @ scaled
+        var = 0.01 * np.diag(np.linalg.inv(phi.T @ phi))
+        lane = {"information": np.tril(G), "c": c, "var": var, "r": 0.01, "seen_samples": float(len(phi))}
+        assert learned(lane).tolist() == [rests == 0] * 2

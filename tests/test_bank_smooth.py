@@ -55,10 +55,16 @@ def test_events_say_what_moved_and_how_far():
     segments = piecewise(run)
     events = run.hypotheses.events()
     assert segments.bounds.tolist() == [0, *(event.date for event in events), 120]
+    smoothed = run.smooth()  # whose increments are those of a dense solve, above
     for k, event in enumerate(events):
-        for i, name in enumerate(run.names):
-            assert event.shift[name] == pytest.approx(segments.theta[k + 1, i] - segments.theta[k, i], abs=0.1)
-            assert 0.01 < event.std[name] < 0.2
+        shift, spread = smoothed.increment(event.date)
+        assert list(event.shift.values()) == pytest.approx(shift, abs=1e-9)
+        assert list(event.std.values()) == pytest.approx(np.sqrt(np.diag(spread)), rel=1e-9)
+        # constants on both sides know theta slightly better than paths that drift
+        sides = (slice(*segments.bounds[i : i + 2]) for i in (k, k + 1))
+        constant = np.sqrt(np.diag(sum(R * np.linalg.inv(U[part].T @ U[part]) for part in sides)))
+        assert (list(event.std.values()) > constant).all()
+        assert (np.abs(segments.theta[k + 1] - segments.theta[k] - shift) < constant).all()
 
 
 def test_segments_are_the_limit_of_large_jumps():
@@ -107,7 +113,11 @@ def test_bands_of_the_smoothed_path_hold_where_parameters_walk(walk, unit):
     assert (np.mean(covered, axis=0)[~walks] > 0.95).all()  # and more: a constant may have drifted as well
     assert kept <= 4
     truth = np.array(walk) ** 2 / (0.5 * DRIFT) ** 2  # of what the bank takes for granted
-    np.testing.assert_allclose(np.median(widened, axis=0), np.maximum(truth, 1.0), rtol=0.4)
+    # the second to the eleventh of twelve contain the median with probability 1 - 2 (1 + 12) / 2^12 = .994
+    low, high = np.sort(widened, axis=0)[[1, -2]]
+    assert (low <= np.maximum(truth, 1.0)).all()
+    assert (np.maximum(truth, 1.0) <= high).all()
+    assert (high[walks] < 4.0 * low[walks]).all()
 
 
 @pytest.mark.parametrize("walk", [0.02, 0.05])

@@ -215,23 +215,25 @@ def test_a_stream_with_keyed_state_gives_what_the_sorted_table_gives(session, tm
     assert {unit: state[24:] for unit, state in expired} == packed(fleet)
 
 
-def test_the_chapter_is_followed_word_by_word(session, tmp_path, monkeypatch, capsys):
-    """Its first section, from the Parquet file to the table that it shows."""
-    monkeypatch.chdir(tmp_path)
+def test_the_chapter_is_followed_word_by_word(session, tmp_path, capsys):
+    """Its first section, from the Parquet file to the table that it shows; Java stays in the folder where it began."""
     chapter = PAGE.read_text().split("\n## ")[1]
     blocks = re.findall(r"(?:^    .*\n|^\n)+", re.sub(r"```.*?```", "", chapter, flags=re.S), re.M)
     code = "".join(textwrap.dedent(one) for one in blocks if re.match(r"\s*(import|from) ", one))
+    code = code.replace('"readings.parquet"', repr(str(tmp_path / "readings.parquet")))
     exec(compile(code, PAGE.name, "exec"), {})
     (table,) = re.findall(r"```text\n(.*?)```", chapter, re.S)
     assert capsys.readouterr().out.split() == table.split()
 
 
 def test_benchmarks_run_quickly(session, capsys):
-    """The costs in small, and a stream whose driver and worker are killed in the middle of a batch."""
-    for name in ("spark", "spark_kill"):
-        importlib.import_module(f"benchmarks.{name}").main(True)
+    """Those of streams, and a stream whose driver and worker are killed in the middle of a batch."""
+    costs, kills = (importlib.import_module(f"benchmarks.{name}").main for name in ("spark", "spark_kill"))
+    costs(True, "equal")
+    costs(True, "streams")
+    kills(True)
     printed = capsys.readouterr().out
-    assert "500 units" in printed
-    assert printed.count("killed the ") == 2
+    assert "0 of 11 columns differ" in printed
+    assert "killed the driver" in printed
     for what in ("lost", "doubled", "results that differ", "states that differ"):
         assert re.search(rf"^ *{what} +0$", printed, re.M)

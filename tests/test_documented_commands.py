@@ -38,7 +38,7 @@ ELSEWHERE = {
     "python examples/controller.py": ("tests/test_embedded.py", '["controller.py"]'),
     "python -m lab bench accuracy": ("lab/tests/test_bench.py", '["bench", "accuracy", "--quick"'),
     "python -m lab structure": ("lab/tests/test_structure.py", '["structure", "--picture"'),
-    "python -m benchmarks.spark": ("tests/test_bridge_spark.py", 'import_module(f"benchmarks.{name}").main(True)'),
+    "python -m benchmarks.spark": ("tests/test_bridge_spark.py", 'costs(True, "streams")'),
     "python -m lab bench speed": ("lab/tests/test_bench.py", '["bench", "speed", "--quick"'),
 }  # fmt: skip
 """Commands, by how they begin, with the test that runs them quickly and what stands there."""

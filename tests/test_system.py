@@ -148,7 +148,7 @@ def test_simulation_is_the_difference_equation_with_the_band_of_drawn_parameters
     assert got.y_hat == pytest.approx(signal.lfilter([0.0, *theta[2:]], [1.0, *-theta[:2]], u))
     drawn = rng.multivariate_normal(theta, still.cov(-1), 4000)
     outputs = np.array([signal.lfilter([0.0, *x[2:]], [1.0, *-x[:2]], u) for x in drawn])
-    assert got.theta_std[5:] == pytest.approx(outputs.std(axis=0)[5:], rel=0.1)
+    assert got.theta_std[5:] == pytest.approx(outputs.std(axis=0)[5:], rel=4.0 / np.sqrt(2.0 * len(drawn)))
     psi = signal.lfilter([1.0], [1.0, *-theta[:2]], np.eye(1, 40)[0])
     assert got.y_std**2 == pytest.approx(got.theta_std**2 + 0.01 * np.cumsum(psi**2), rel=1e-6)
 

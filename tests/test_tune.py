@@ -43,7 +43,10 @@ def test_drift_of_each_parameter_and_zero():
     y, u = walks(3, std=(0.1, 0.0), T=2000)
     tuned = tune(Regression(2), Kalman(), y, u, groups="each")
     q = tuned.tracker.q
-    assert q[0] == pytest.approx(0.01, rel=0.5)
+    logs = [track(Regression(2), Kalman(q=[0.01 * np.exp(h), 0.0], r=0.25), y, u).loglik for h in (-0.1, 0.0, 0.1)]
+    error = 0.1 / np.sqrt(2.0 * logs[1] - logs[0] - logs[2])  # of log q, from the curvature at the truth
+    assert error < 0.15
+    assert abs(np.log(q[0] / 0.01)) < 3.3 * error
     assert q[1] < 1e-5
     low, high = tuned.interval["q[theta2]/r"]
     assert low == 0.0
@@ -121,7 +124,8 @@ REFERENCE = {
 @pytest.mark.filterwarnings("ignore:tune:UserWarning")
 @pytest.mark.parametrize(("name", "method"), REFERENCE)
 def test_selectors_on_the_examples(name, method):
-    """Median parameter error of the smoothed path; a loose band, for the reference has more seeds."""
+    """Median parameter error of the smoothed path. The third to the fourteenth of sixteen errors contain the median of
+    all records, which is the reference's, with probability 1 - 2 (1 + 16 + 120) / 2^16 = .996."""
     assert name in EXAMPLES
     errors = []
     for s in range(16):
@@ -129,7 +133,8 @@ def test_selectors_on_the_examples(name, method):
         tuned = tune(d.model, FLS(), d.y, d.u, method=method)
         path = track(d.model, tuned.tracker, d.y, d.u).smooth()
         errors.append(np.sqrt(np.mean((path.theta - d.theta) ** 2)))
-    assert np.median(errors) == pytest.approx(REFERENCE[name, method], rel=0.3)
+    low, high = np.sort(errors)[[2, -3]]
+    assert low < REFERENCE[name, method] < high
 
 
 def test_loo_and_gcv_of_the_choice():
@@ -298,7 +303,7 @@ def test_an_arx_model_with_lags_that_are_filled():
         y[t] = 0.5 * y[t - 1] + u[t - 1] + 0.1 * rng.normal()
     y[100:103] = np.nan
     tuned = tune(ARX(1, 1), Kalman(), y, u)
-    assert tuned.noise == pytest.approx(0.01, rel=0.2)
+    assert tuned.noise == pytest.approx(0.01, rel=3.3 * np.sqrt(2.0 / 490))  # the variance of a mean of squares
 
 
 def test_a_profile_stays_within_the_range_of_the_others():

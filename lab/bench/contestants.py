@@ -82,6 +82,7 @@ def likeliest(record: Record, setting: Any, c: Array) -> Outcome:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # an optimum at a bound: nothing drifts, or everything does
         tuned = tune(record.model, Kalman(), record.y, record.u, groups="each")
+    assert isinstance(tuned.tracker, Tracker)  # of one output
     return run(tuned.tracker, record)
 
 

@@ -42,6 +42,30 @@ print(json.dumps(Count.compiled))
 """
 )
 
+WARM = (
+    COUNT
+    + """
+from driftfit.cli import app
+
+app(["warm", "--model", "arx:1,1", "--tracker", "rls", "-p", "forgetting=0.98"], standalone_mode=False)
+print(json.dumps(Count.compiled))
+"""
+)
+
+WARMED = (
+    COUNT
+    + """
+import numpy as np
+from driftfit import ARX, RLS, Live, track
+
+y, u = np.random.default_rng(1).normal(size=(2, 300))
+run = track(ARX(1, 1), RLS(0.99), y, u)
+run.summary(), run.verdict()
+Live(ARX(1, 1), RLS(0.99)).update(0.0, u[0])
+print(json.dumps(Count.compiled))
+"""
+)
+
 OWN_TRACKER = (
     COUNT
     + """
@@ -97,18 +121,24 @@ class Half(Tracker):
 
 
 def run(code, tmp_path, shared=False):
-    """What a fresh process prints, as JSON; with a cache of its own unless it is shared with the other tests."""
+    """What a fresh process prints last, as JSON; with a cache of its own unless it is shared with the other tests."""
     paths = [str(tmp_path), str(SRC), str(Path(__file__).parents[1])]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     environment["NUMBA_CACHE_DIR"] = os.environ.get("NUMBA_CACHE_DIR", "") if shared else str(tmp_path / "cache")
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def test_a_second_process_compiles_nothing(tmp_path):
     run(EVERY_TRACKER, tmp_path, shared=True)  # with the other tests: much of it is there already
     assert run(EVERY_TRACKER, tmp_path, shared=True) == 0
+
+
+def test_warm_leaves_nothing_to_compile(tmp_path):
+    """`driftfit warm`, as in a container image: record, stream, summary and verdict of another process find it all."""
+    assert run(WARM, tmp_path) > 0
+    assert run(WARMED, tmp_path) == 0
 
 
 @pytest.mark.parametrize(

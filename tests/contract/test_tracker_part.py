@@ -61,10 +61,10 @@ def test_a_model_begins_on_a_cache_line_of_its_own(lanes):
     model = ARX(2, 2)
     tile = make_tile(model.n, model.m, model.memory(), [RLS(0.98).state_for(model)] * lanes)
     places = {name: at for name, (_, at, *_) in tile.dtype.fields.items()}
-    own = [name for name in (*model.memory(), "u") if places[name] > places["edge"]]
+    own = [name for name in (*model.memory(), "u") if places[name] > places["boundary"]]
     assert own == [*model.memory(), "u"]
     assert min(places[name] for name in own) % 64 == 0
-    assert max(places[name] for name in ("theta", "P", "phi", "used_noise")) < places["edge"]
+    assert max(places[name] for name in ("theta", "P", "phi", "used_noise")) < places["boundary"]
     assert all(at % (8 * lanes) == 0 for at in places.values())
 
 

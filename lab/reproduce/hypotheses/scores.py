@@ -111,6 +111,8 @@ class Measured(NamedTuple):
     """The numbers of `HEADS`."""
     each: Array
     """(runs,): RMSE of every record."""
+    without: Array
+    """(runs, 3): RMSE of all samples, of those after jumps and of those long after, each without one record."""
 
 
 def measure(contest: Contest, name: str, runs: int) -> Measured:
@@ -130,4 +132,5 @@ def measure(contest: Contest, name: str, runs: int) -> Measured:
         float(np.mean([s.log_p for s in scores])), float(np.mean([s.nees for s in scores])),
         float(np.mean([s.leaves for s in scores])),
     )  # fmt: skip
-    return Measured(values, np.sqrt(squares[:, 0] / counts[:, 0]))
+    without = np.sqrt((squares.sum(axis=0) - squares) / (counts.sum(axis=0) - counts))
+    return Measured(values, np.sqrt(squares[:, 0] / counts[:, 0]), without)

@@ -28,15 +28,13 @@ from numba import types
 
 from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
-from driftfit.engine.tracker_part import EDGE, tracker_part, whole_record
+from driftfit.engine.tracker_part import BOUNDARY, tracker_part, whole_record
 
 WIDTH = 32
 """Lanes of a fleet's tile. It must be a constant of the type: a run-time lane count is not vectorised."""
 
 LARGEST = 1e38
-"""Signals at least this large are not used: about the largest number in single precision, and more than any
-measurement.
-"""
+"""Signals at least this large are not used: it is about the largest number in single precision."""
 
 SMALLEST = 1e-38
 """Signals below this are zero. Between the two the fourth power of any ratio of signals is a number: no product of a
@@ -126,11 +124,11 @@ class TrackerSteps(NamedTuple):
     columns of ``known``, those after interval, noise and drift, for trackers that take more factors.
     ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when a run is replayed for a smoother.
     With ``doubts`` the model weighs lags that the tracker doubts; with ``instruments`` a model that has its own writes
-    them to s.zeta (n,), a field of the tracker. Steps see the fields of the tracker and those that
-    every record has but for ``u``, so that they are compiled once for all models (`driftfit.engine.tracker_part`);
-    with ``reads_model`` they see those of the model too. ``outlined`` steps are compiled apart from the drivers, which
-    call them (`driftfit.engine.outlined`): for trackers that take so long that a call costs nothing. ``note`` comes
-    before all of them and may write what they change later.
+    them to s.zeta (n,), a field of the tracker. Steps see the fields of the tracker and those that every record has but
+    for ``u``, so that they are compiled once for all models (`driftfit.engine.tracker_part`); with ``reads_model`` they
+    see those of the model too. ``outlined`` steps are compiled apart from the drivers, which call them
+    (`driftfit.engine.outlined`): for trackers that take so long that a call costs nothing. ``note`` comes before all of
+    them and may write what they change later.
     """
 
     predict: Step
@@ -163,7 +161,7 @@ def held_in(record: np.dtype[Any], own: Collection[str] = ()) -> list[str]:
     """The fields of a record that hold something: a tracker's ``own``, the model's, the common and the open ones."""
     first, second, *rest = _common(0)
     behind = [first, second, "u", *rest, *OPEN]
-    names = [name for name in record.names or () if name not in (EDGE, "pad")]
+    names = [name for name in record.names or () if name not in (BOUNDARY, "padding")]
     return sorted(names, key=lambda name: 0 if name in own or name not in behind else 1 + behind.index(name))
 
 
@@ -184,19 +182,18 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
     own = trackers[0].keys() | _common(n).keys()
     seen = [field for field in fields if field[0] in own]
     others = [field for field in fields if field[0] not in own]
-    fields = [*seen, _filling(EDGE, seen, L), *others]
-    tile = _aligned(_followed_by(np.dtype([*fields, _filling("pad", fields, L)], align=True), opened), 1)
+    fields = [*seen, _padding(BOUNDARY, seen, L), *others]
+    tile = _aligned(_followed_by(np.dtype([*fields, _padding("padding", fields, L)], align=True), opened), 1)
     for l, start in enumerate(starts):
         for name, value in start.items():
             tile[name][0, ..., l] = value
     if opened:
-        places = tile.dtype.fields or {}
-        tile[EDGE][0, 0] = places[opened[0][0]][1] - places[EDGE][1]
+        tile[BOUNDARY][0, 0] = tile[opened[0][0]].ctypes.data - tile[BOUNDARY].ctypes.data
     return tile
 
 
-def _filling(name: str, fields: Sequence[Any], L: int) -> tuple[str, type, tuple[int, int]]:
-    """A field behind others that ends with a cache line, so that no vector load of a lane block straddles two.
+def _padding(name: str, fields: Sequence[Any], L: int) -> tuple[str, type, tuple[int, int]]:
+    """A field of padding, after which others begin on a cache line, so that no load of a vector of lanes crosses two.
 
     It has as many rows for every L: a packed state of one lane is read into tiles of any width.
     """

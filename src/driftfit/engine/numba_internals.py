@@ -420,7 +420,7 @@ class Linked:
         for name, environment in code.environments:
             ctypes.c_void_p.from_address(tracker[name]).value = id(environment)
         self._kept = tracker, dict(outside), code.environments
-        self.address = tracker[code.entry]
+        self.address: int = tracker[code.entry]
 
 
 def load(code: Code, outside: Mapping[str, Any] = MappingProxyType({})) -> Any:

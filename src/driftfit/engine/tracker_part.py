@@ -1,8 +1,8 @@
 """The part of a record that the steps of a tracker see, as a type of its own.
 
-A record begins with the fields of the tracker and those that every record has, which end at the field `EDGE`; those of
-the model follow. The part up to there depends on the tracker, the number of parameters and the lanes only. Steps that
-are compiled for it serve every model with that many parameters, at a third of the time of compiling them again.
+A record begins with the fields of the tracker and those that every record has, which end at the field `BOUNDARY`; those
+of the model follow. The part up to there depends on the tracker, the number of parameters and the lanes only. Steps
+that are compiled for it serve every model with that many parameters, at a third of the time of compiling them again.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numba import types
 from driftfit.engine.kernel import State, kernel
 from driftfit.engine.numba_internals import named_intrinsic
 
-EDGE = "edge"
+BOUNDARY = "boundary"
 """The field behind the last one that a tracker sees, which fills a cache line. It holds the distance in bytes to the
 open fields, which are at the end of the record, if there are any.
 """
@@ -25,11 +25,11 @@ open fields, which are at the end of the record, if there are any.
 @lru_cache(maxsize=256)
 def _part(record: Any) -> Any:
     """The type of the part; its last field has a name that no record has, for which Numba would take it to be one."""
-    edge = record.fields[EDGE]
-    seen = {name: field for name, field in record.fields.items() if field.offset < edge.offset} | {"end": edge}
+    boundary = record.fields[BOUNDARY]
+    seen = {name: field for name, field in record.fields.items() if field.offset < boundary.offset} | {"end": boundary}
     return types.Record(
         [(name, {"type": one.type, "offset": one.offset, "alignment": one.alignment}) for name, one in seen.items()],
-        edge.offset + 8 * edge.type.nitems,
+        boundary.offset + 8 * boundary.type.nitems,
         record.aligned,
     )
 

@@ -39,10 +39,10 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.engine.settings import input_names, numbers
+from driftfit.engine.settings import input_names
 from driftfit.models.arx import GAP
 from driftfit.models.base import Model
-from driftfit.models.formulas import Formula, check_inputs, compiled, parse
+from driftfit.models.formulas import Formula, check_inputs, compiled, parse, start_values
 from driftfit.models.functions import equation_text
 from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
 
@@ -85,18 +85,7 @@ class Equation(Model):
             self._set("inputs", input_names("Equation", "inputs", self.inputs))
         if absent := [name for name in formula.inputs if name not in self.input_names]:
             raise ValueError(f"Equation: inputs must hold {', '.join(absent)}, which the equation uses.")
-        given = self.start
-        if isinstance(given, Sequence) and not isinstance(given, str) and all(len(one) == 2 for one in given):
-            given = dict(given)
-        if isinstance(given, Mapping):
-            if unknown := sorted(set(given) - set(formula.parameters)):
-                raise ValueError(
-                    f"Equation: start names {', '.join(unknown)}; the parameters are {', '.join(formula.parameters)}."
-                )
-            named = tuple((name, numbers("Equation", "start", value, ndim=0)) for name, value in given.items())
-            self._set("start", named)
-        else:
-            self._set("start", numbers("Equation", "start", given, ndim=0))
+        self._set("start", start_values("Equation", self.start, formula.parameters))
 
     def bind(self, inputs: int | Sequence[str]) -> Equation:
         check_inputs(self, inputs)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, exp, kernel, log
+from driftfit.engine.settings import numbers
 
 LONGEST = 20000
 """Characters of a formula."""
@@ -285,6 +286,23 @@ def check_inputs(model: Any, inputs: int | Sequence[str]) -> None:
     if count != model.m:
         names = ", ".join(model.input_names)
         raise ValueError(f"{type(model).__name__}: {model.m} inputs ({names}), but u has {count} columns.")
+
+
+def start_values(model: str, given: Any, names: Sequence[str]) -> Any:
+    """``start`` of a model of equations: one number for all, or (name, number) pairs from a mapping or such pairs.
+
+    Raises
+    ------
+    ValueError
+        If it names something that the equations do not have, or holds something that is not a number.
+    """
+    pairs = isinstance(given, Sequence) and all(isinstance(one, Sequence) and len(one) == 2 for one in given)
+    if isinstance(given, str) or not (pairs or isinstance(given, Mapping)):
+        return numbers(model, "start", given, ndim=0)
+    found = dict(given)
+    if unknown := sorted(set(found) - set(names)):
+        raise ValueError(f"{model}: start names {', '.join(unknown)}; there are {', '.join(names)}.")
+    return tuple((name, numbers(model, "start", value, ndim=0)) for name, value in found.items())
 
 
 @lru_cache(maxsize=256)

@@ -37,9 +37,9 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.engine.settings import input_names, numbers
+from driftfit.engine.settings import input_names
 from driftfit.models.base import Model
-from driftfit.models.formulas import Formula, Writer, check_inputs, parse, written
+from driftfit.models.formulas import Formula, Writer, check_inputs, parse, start_values, written
 from driftfit.models.functions import CLOCK, system_text
 
 TIME = "dt"
@@ -130,14 +130,7 @@ class StateSpace(Model):
             self._set("inputs", input_names("StateSpace", "inputs", self.inputs))
         if absent := [name for name in system.inputs if name not in self.input_names]:
             raise ValueError(f"StateSpace: inputs must hold {', '.join(absent)}, which the equations use.")
-        if isinstance(self.start, Mapping | Sequence):
-            given = dict(self.start)
-            if unknown := sorted(set(given) - set(self.names)):
-                raise ValueError(f"StateSpace: start names {', '.join(unknown)}; there are {', '.join(self.names)}.")
-            named = ((name, numbers("StateSpace", "start", value, ndim=0)) for name, value in given.items())
-            self._set("start", tuple(named))
-        else:
-            self._set("start", numbers("StateSpace", "start", self.start, ndim=0))
+        self._set("start", start_values("StateSpace", self.start, self.names))
 
     def bind(self, inputs: int | Sequence[str]) -> StateSpace:
         check_inputs(self, inputs)

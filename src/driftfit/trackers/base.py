@@ -103,7 +103,7 @@ class Tracker(Settings, ABC):
     @property
     def pads(self) -> bool:
         """Whether a parameter that is known to be 0 and never excited leaves the others bit for bit as they are without
-        it, so that structures of several sizes may share a driver (`driftfit.trackers.parts.padded`).
+        it, so that structures of several sizes may share a driver (`driftfit.trackers.parts.common_size`).
         """
         return False
 

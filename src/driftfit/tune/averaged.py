@@ -31,6 +31,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.run.result import Track
 from driftfit.show.parts.text import Printed, facts, table_of
+from driftfit.smooth.smoothed import Smoothed
 from driftfit.tune.lanes import score
 from driftfit.tune.objective import Criterion, run_task
 from driftfit.tune.parametrisation import Knobs
@@ -92,7 +93,7 @@ class Averaged(Printed):
 
     @cached_property
     def _smoothed(self) -> tuple[Array, Array]:
-        paths = (run.smooth() for run in self.runs)
+        paths = (Smoothed.of(run) for run in self.runs)
         return _mixed([(path.theta, path.std) for path in paths])
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -144,7 +145,8 @@ def _draws(f: Callable[[Array], Array], knobs: Knobs, best: Array, draws: int, r
         at, now = np.where(taken[:, None], proposed, at), np.where(taken, then, now)
         if step >= STEPS // 2:
             kept.append(at)
-    return np.concatenate(kept)[np.linspace(0, len(kept) * CHAINS - 1, draws).round().astype(int)]
+    every: Array = np.concatenate(kept)
+    return np.asarray(every[np.linspace(0, len(every) - 1, draws).round().astype(int)])
 
 
 def _log_prior(knobs: Knobs) -> Array:

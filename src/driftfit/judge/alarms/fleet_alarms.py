@@ -118,8 +118,10 @@ class ManyAlarms(Printed):
 
         columns: dict[str, list[Any]] = {name: [] for name in ("key", "from", "to", "cause", "p", "q", "faulty")}
         for row in self.rows:
-            said = row.alarms if row.onsets else None
-            for t in row.onsets if said is not None else ():
+            if not row.onsets:
+                continue
+            said = row.alarms
+            for t in row.onsets:
                 cells = (key_text(row.key), *said.span(t), said.cause(t), said.p, row.q, row.faulty)
                 for column, cell in zip(columns.values(), cells, strict=True):
                     column.append(cell)

@@ -146,7 +146,7 @@ def _autoregression(e: Array, ok: Array) -> Array:
     e, most = np.clip(e, -limit, limit), min(ORDER, len(e) // 20)
     used, _ = _whitened(e[:, None], ok, np.zeros(most))
     N, lags = len(used), [e[used - lag] for lag in range(1, most + 1)]
-    R = np.linalg.qr(np.column_stack([*lags, e[used]]), mode="r")  # e'e left by order p is that of its last rows
+    R = np.asarray(np.linalg.qr(np.column_stack([*lags, e[used]]), mode="r"))  # order p leaves the squares below row p
     left = np.cumsum(R[::-1, -1] ** 2)[::-1][: most + 1]
     p = int(np.argmin(N * np.log(left / N) + np.arange(most + 1) * np.log(N)))
     return np.linalg.lstsq(R[:p, :p], R[:p, -1], rcond=None)[0] if p else np.zeros(0)
@@ -155,4 +155,4 @@ def _autoregression(e: Array, ok: Array) -> Array:
 def _scales(w: Array, n: int) -> Array:
     """Standard deviations (R,) of w (R, N) from medians, with the degrees of freedom of n parameters."""
     N = w.shape[1]
-    return 1.4826 * medians(np.abs(w)) * np.sqrt(N / max(N - n, 1))
+    return np.asarray(1.4826 * medians(np.abs(w)) * np.sqrt(N / max(N - n, 1)))

@@ -43,8 +43,8 @@ class Look(NamedTuple):
     start: int
     extreme: Array
     """(c,)"""
-    count: int
-    """Samples with a statistic."""
+    samples: int
+    """Those with a statistic."""
     like: Hashable
     """Equal for like series."""
 
@@ -101,10 +101,10 @@ def _limits_of(chosen: Sequence[tuple[Track, AlarmRule, Reference]], seed: int) 
 
 def chance(run: Track, rule: AlarmRule, seen: Look) -> float:
     """The p-value of a series by these limits; NaN if nothing was judged."""
-    return chance_of(run, rule)(seen.extreme, seen.count) if seen.count else float("nan")
+    return chance_of(run, rule)(seen.extreme, seen.samples) if seen.samples else float("nan")
 
 
 def in_doubt(p: float, q: float, level: float, seen: Look, every: float) -> bool:
     """Whether an alarm or a fault is possible by the limits of the series itself."""
-    alarm = -np.expm1(-seen.count / every)  # the p-value of a series whose largest statistic is at its limit
+    alarm = -np.expm1(-seen.samples / every)  # the p-value of a series whose largest statistic is at its limit
     return bool(q <= MARGIN * level or p <= MARGIN * alarm)

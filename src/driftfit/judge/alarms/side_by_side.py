@@ -102,9 +102,10 @@ def statistics_of(records: Records, cusum: bool) -> list[Array]:
 def work(n: int) -> Work:
     """The scratch before the first sample."""
     size = n + 1 + n * (n + 1) // 2
-    rows = (LEVELS * BLOCKS * size, size, n * n, n * n, n, n, n)
-    last = np.full((2 * LEVELS * 3, WIDTH), LOWEST)
-    return Work(*(np.zeros((count, WIDTH)) for count in rows), last)
+    rows = (LEVELS * BLOCKS * size, size, n * n, n * n, n, n, n, 3 * 2 * LEVELS)
+    made = Work(*(np.zeros((count, WIDTH)) for count in rows))
+    made.last[:] = LOWEST
+    return made
 
 
 @kernel

@@ -4,7 +4,7 @@
 
 The union is run once to collect its regressors (missing lags are filled by constant least squares on all of
 them), so all structures use the same rows. They run in parallel, in lanes of drivers for a few sizes: a structure
-has columns of zeros up to the next size (`driftfit.trackers.parts.padded`), and most share one compiled driver.
+has columns of zeros up to the next size (`driftfit.trackers.parts.common_size`), and most share one compiled driver.
 Trackers that do not allow that take a driver for each number of columns. Several records are run separately, each from
 the start, and written one after the other.
 """
@@ -28,7 +28,7 @@ from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program
 from driftfit.run.result import Lane, Track, burn_in, track_record
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.padded import padded, size_of
+from driftfit.trackers.parts.common_size import padded, size_of
 
 TOGETHER = 32
 

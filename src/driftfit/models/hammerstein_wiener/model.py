@@ -47,11 +47,11 @@ from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import numbers, output_names, warn, whole
 from driftfit.models.base import Model
-from driftfit.models.hammerstein_wiener.any_orders import AnyOrders
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.evaluate_bases import DIGITS
 from driftfit.models.hammerstein_wiener.products import Structure
 from driftfit.models.hammerstein_wiener.regressor_rows import FLOOR
+from driftfit.models.hammerstein_wiener.run_time_orders import RunTimeOrders
 from driftfit.models.hammerstein_wiener.step_memory import memory, places_of
 from driftfit.models.hammerstein_wiener.steps import applying, build
 
@@ -273,7 +273,7 @@ class HammersteinWiener(Model):
 
     def as_large_as(self, family: Sequence[Model]) -> Model:
         room = max(np.size(one.memory()["blocks"]) for one in family)
-        return AnyOrders(self, self.family, self.places, max(one.n for one in family), room)
+        return RunTimeOrders(self, self.family, self.places, max(one.n for one in family), room)
 
     @property
     def apply(self) -> Step | None:

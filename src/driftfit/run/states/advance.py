@@ -8,7 +8,8 @@ Of K series with ny outputs each, programs and states have K ny entries, those o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -25,24 +26,24 @@ class Advanced:
         self.programs, self.records, self.jobs = programs, records, jobs
 
     def column(self, name: str) -> Array:
-        """A field of the output at every sample: (N, ..), or (N, ny, ..) of several outputs."""
+        """A field of the driver's output at every sample: (N, ..), or (N, ny, ..) of several outputs."""
         shape, ny = self.jobs[0].out[name].shape[1:-1], self.records.ny
         into = np.empty((len(self.records.y), ny, int(np.prod(shape))))
         self.columns([name], into)
         return into.reshape(-1, *((ny,) if self.records.outputs else ()), *shape)
 
     def columns(self, names: Sequence[str], into: Array) -> None:
-        """Write fields side by side at every sample of every series, ``into`` (N, k), or (N, ny, k)."""
-        ny = self.records.ny
+        """Write fields of the output at every sample side by side ``into`` (N, k), or (N, ny, k) of several outputs."""
+        into = into[:, None] if into.ndim == 2 else into
         for job in self.jobs:
             lanes, L = np.flatnonzero(job.live), len(job.lanes)
-            series, output = np.divmod(job.lanes[lanes], ny)
-            known = job.out.dtype.fields or {}
-            fields = [known[name] for name in names]
-            begin = [np.arange(at, at + kind.itemsize, 8 * L) // 8 for kind, at, *_ in fields]
+            series, output = np.divmod(job.lanes[lanes], self.records.ny)
+            fields: Mapping[str, Any] = job.out.dtype.fields or {}
+            places = (fields[name][:2] for name in names)
+            begin = [np.arange(at, at + kind.itemsize, 8 * L) // 8 for kind, at in places]
             words = job.out.view(np.float64).reshape(len(job.out), -1)
             first, length = self.records.first[series], self.records.length[series]
-            _natural(words, np.concatenate(begin), lanes, first, length, output, into.reshape(len(into), ny, -1))
+            _natural(words, np.concatenate(begin), lanes, first, length, output, into)
 
     def lanes(self) -> list[tuple[Job, int]]:
         """The job and the lane of each program."""
@@ -83,9 +84,7 @@ def advance(
 
 @Driver
 def _natural(words: Array, begin: Array, lanes: Array, first: Array, length: Array, output: Array, into: Array) -> None:
-    """Copy lanes of an output (T, words), whose fields ``begin`` (k,) at these words, to their rows and outputs of
-    (N, ny, k).
-    """
+    """Copy lanes of an output (T, words), whose fields ``begin`` (k,) at these words, to their rows of (N, ny, k)."""
     for j in range(len(lanes)):
         for t in range(length[j]):
             for i in range(len(begin)):

@@ -73,6 +73,11 @@ def sort_out(series: Array, time: Array, waited: Array, newest: Array, hold: Any
     return Fates(order, fate, after)
 
 
+def ended(fate: Array, over: Array) -> Array:
+    """Fates (N,) where rows are of a series that is ``over`` (N,): what waits is released, since nothing else comes."""
+    return np.where((fate == WAITING) & over, RELEASED, fate)
+
+
 def _all_in_order(series: Array, time: Array, newest: Array) -> Array | None:
     """The last row of every series if all rows are sorted and each is after the one before; None otherwise.
 
@@ -86,11 +91,6 @@ def _all_in_order(series: Array, time: Array, newest: Array) -> Array | None:
     begin = np.append(0, ends[:-1] + 1)
     before[begin] = newest[series[begin]]
     return None if (time <= before).any() else ends
-
-
-def ended(fate: Array, over: Array) -> Array:
-    """Fates (N,) where rows are of a series that is ``over`` (N,): what waits is released, since nothing else comes."""
-    return np.where((fate == WAITING) & over, RELEASED, fate)
 
 
 class HoldBack:

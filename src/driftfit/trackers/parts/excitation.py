@@ -5,7 +5,9 @@
 
 A regressor without excitation keeps its scale, since a mean square that decays to 0 would inflate any drift measured in
 it. So does y, whose scale keeps the noise variance of a failed sensor from falling to 0. Parameter i is being learned
-while 1 / (G^-1)_ii, the information that no other parameter can explain, is above that of one sample.
+while 1 / (G^-1)_ii, the information that no other parameter can explain, is above that of one sample, or is more than a
+tenth of what as many samples carried on average until now, 1 / var_i from all of them. The second holds for regressors
+far from zero beside an intercept, of which a sample never tells much.
 
 Cost per sample: O(n^2); the flag inverts G when it is requested.
 """
@@ -25,6 +27,9 @@ MEMORY = 50.0
 """Memory of the mean square of a regressor, in samples."""
 DULL = 1e-4
 """A square below this share of the mean square counts as no excitation."""
+
+LITTLE = 0.1
+"""Share of the average information below which a parameter is not being learned."""
 
 LARGE = 25.0
 """A square above this multiple of the mean square counts as this multiple."""
@@ -84,7 +89,9 @@ def learn_information(s: State, l: int) -> None:
 
 def learned(lane: Mapping[str, Array]) -> Array:
     """Which parameters the regressors of the window distinguish from all others, (n,) bool."""
-    lower = np.tril(lane["information"])
+    lower, n = np.tril(lane["information"]), len(lane["c"])
     G = lower + np.tril(lower, -1).T
-    own: Array = 1.0 / np.diag(np.linalg.inv(G + 1e-9 * np.eye(len(G))))
-    return own > 1.0
+    own: Array = 1.0 / np.diag(np.linalg.inv(G + 1e-9 * np.eye(n)))
+    var, noise = np.where(np.isfinite(lane["var"]), lane["var"], 0.0), float(lane["r"])
+    share = window(n) / max(float(lane["seen_samples"]), window(n))
+    return (own > 1.0) | (var * own * lane["c"] > LITTLE * share * noise)

@@ -5,7 +5,7 @@ import pytest
 
 from driftfit import FLS, RLS, AdaptiveKalman, AugmentedFLS, Bank, Kalman, Law, Regression, track
 from driftfit.run.program import Program
-from driftfit.trackers.parts.padded import padded, size_of
+from driftfit.trackers.parts.common_size import padded, size_of
 
 TRACKERS = [
     Kalman(q=1e-3, r=0.1),

@@ -45,7 +45,7 @@ from driftfit.models.hammerstein_wiener.steps import regress_work
 
 
 @dataclass(frozen=True)
-class AnyOrders(Model):
+class RunTimeOrders(Model):
     """A model with the number of parameters and the memory of a larger one.
 
     ``kinds`` are the compiled functions of its bases, that of the output last; ``places`` its orders, and where the
@@ -58,7 +58,7 @@ class AnyOrders(Model):
     size: int
     room: int
 
-    def bind(self, inputs: int | Sequence[str]) -> AnyOrders:
+    def bind(self, inputs: int | Sequence[str]) -> RunTimeOrders:
         return self
 
     @property
