@@ -11,7 +11,7 @@ from driftfit import ARX, Kalman, track
 from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow, Known
 from driftfit.bridges.spark.follow import STATE, _schema
 from driftfit.bridges.spark.pieces import ARROW
-from driftfit.bridges.spark.task import Task
+from driftfit.bridges.spark.task import SETTING, Task
 
 MODEL, K = ARX(2, 2), Kalman(q=1e-4, r=0.1)
 PAIR = ARX(1, 1, ny=("flow", "pressure"))
@@ -59,8 +59,8 @@ KINDS = {"unit": "string", "t": "double", "u": "double"}
 class ByHand:
     """A stream whose batches are given one by one: what Spark does for `driftfit.bridges.spark.follow`."""
 
-    def __init__(self, model=MODEL, tracker=K, rules=None, hold=HOLD, origins=()):
-        task = task_of(model, tracker)
+    def __init__(self, model=MODEL, tracker=K, rules=None, hold=HOLD, origins=(), settings=()):
+        task = replace(task_of(model, tracker), settings=tuple(settings))
         rules = (None,) * len(task.y) if rules is None else rules
         kinds = KINDS | dict.fromkeys(task.y, "double")
         self.flow = Flow(task, _schema(task, kinds, rules), hold, rules, origins)
@@ -71,7 +71,8 @@ class ByHand:
         """Process new rows; units without a row since ``expired`` end."""
         task, schema = self.flow.task, self.flow.schema
         columns = [*task.columns, *STATE, "last", "newest"]
-        types = pa.schema({name: ARROW[schema[name]] for name in columns} | {"_kind": pa.int32()})
+        own = dict.fromkeys((SETTING + name for name in task.settings), pa.float64())
+        types = pa.schema({name: ARROW[schema[name]] for name in columns} | own | {"_kind": pa.int32()})
         parts = [rows.with_columns(_kind=pl.lit(NEW)), *self.kept]
         every = pl.concat(parts, how="diagonal_relaxed").sort("unit", "_kind", "t", *task.y, "u")
         table = pa.Table.from_pydict({name: every[name].to_list() if name in every.columns else [None] * len(every)

@@ -1,5 +1,6 @@
 """What a worker of Spark runs, without Spark: pieces of a table, batches of a stream, one unit with keyed state."""
 
+import json
 import pickle
 import sys
 from dataclasses import replace
@@ -12,7 +13,7 @@ import pytest
 from spark_support import HOLD, KINDS, MODEL, PAIR, ByHand, K, arriving, fleet_of, packed, rows_of, task_of
 from support import same
 
-from driftfit import AdaptiveKalman, Live, track
+from driftfit import AdaptiveKalman, Kalman, Live, track
 from driftfit.bridges import spark
 from driftfit.bridges.spark import task as tasks
 from driftfit.bridges.spark.batch import Partition, schema_of
@@ -154,6 +155,73 @@ def test_states_survive_other_settings_and_another_version(model):
         foreign.batch(rest)
 
 
+def test_outputs_have_trackers_each():
+    """In a table, in a stream and with keyed state; the results are those of `track` for one unit."""
+    rows = rows_of(2, 7, 60, y=PAIR.outputs)
+    own = {"flow": K, "pressure": replace(K, r=0.4)}
+    _, table = pieces_of(rows.sort("unit", "t"), task_of(PAIR, own), "samples")
+    stream, unit = ByHand(PAIR, own, hold=0.0), Unit(task_of(PAIR, own), 0.0, False, (None, None))
+    for part in (rows.filter(pl.col("t") < 20.0), rows.filter(pl.col("t") >= 20.0)):
+        stream.batch(part)
+    assert stream.rows().select(table.columns).equals(table)
+    state, keyed = None, []
+    for key in "01":
+        one = rows.filter(pl.col("unit") == key)
+        run = track(PAIR, own, ["flow", "pressure"], "u", data=one, time="t")
+        found = table.filter(pl.col("unit") == key)
+        for j, names in enumerate(run.names):
+            assert same(found.select(f"theta_{name}" for name in names), run.theta[:, j])
+    for part in (one[:20], one[20:]):
+        state, some = unit.step(state, part.select("t", "flow", "pressure", "u").rows())
+        keyed += some
+    assert pl.DataFrame(keyed).select(found.columns[1:-1]).equals(found[:, 1:-1])
+
+
+def test_a_unit_whose_settings_go_wrong_keeps_its_state():
+    """For one batch unit 1 has a wrong setting and unit 2 none; what waited goes on, no row is lost."""
+    rows = rows_of(4, 7, 60)
+    parts = [rows.filter(pl.col("t") // 12 == k) for k in range(int(rows["t"].max() // 12) + 1)]
+    given = pl.DataFrame({"unit": list("0123"), "_set_r": [0.1, 0.2, 0.3, 0.4]})
+    wrong = given.with_columns(_set_r=pl.Series([0.1, -1.0, None, 0.4]))
+    stream = ByHand(tracker=Kalman(q=1e-4), settings=("r",))
+    stream.batch(parts[0].join(given, on="unit"))
+    before, states = stream.kept, stream.states()
+    stream.batch(parts[1].join(wrong, on="unit"))
+    for old, new in zip(before, stream.kept, strict=True):
+        rest = pl.col("unit").is_in(["1", "2"])
+        assert new.filter(rest).sort("unit", "t").equals(old.filter(rest).sort("unit", "t"))
+    for part in parts[2:]:
+        stream.batch(part.join(given, on="unit"))
+    refused = stream.rows("late")
+    reasons = dict(refused.select("unit", "failed").rows())
+    assert reasons["1"].startswith("settings: Kalman: r must be finite and above 0; got -1")
+    assert reasons["2"].startswith("settings: Kalman: r must be given")
+    assert len(refused) == len(parts[1].filter(pl.col("unit").is_in(["1", "2"]))) > 0
+    assert stream.rows("failed")["unit"].to_list() == ["1", "2"]
+    assert len(refused) + len(stream.rows()) + len(stream.found["waiting"][-1]) == len(rows)
+    used = rows.join(refused, on=["unit", "t"], how="anti")
+    due = used.filter(pl.col("t") <= pl.col("t").max().over("unit") - HOLD)
+    expected = fleet_of(due, {unit: Kalman(q=1e-4, r=r) for unit, r in given.rows()}).to_table().sort("unit", "t")
+    assert stream.rows().select(expected.columns).equals(expected)
+
+    # a tracker that lacks this setting, and does not say so before a unit has a row
+    other = ByHand(tracker=AdaptiveKalman(), settings=("r",))
+    other.kept = before
+    new = parts[1].filter(pl.col("unit") == "1").with_columns(_set_r=0.1)
+    other.batch(new, expired=-1.0)
+    assert other.states() == states
+    assert len(other.rows("late")) == len(new)
+    other.batch(new.with_columns(unit=pl.lit("new")), expired=1e9)
+    assert dict(other.rows("expired").select("unit", "state").rows()) == states
+    assert len(other.rows("late")) == 2 * len(new) + len(before[0])
+
+
+def test_a_setting_of_a_wrong_length_is_a_reason():
+    task = task_of()
+    for q in ([1.0, 2.0], []):
+        assert "but the model has 4 parameters" in task.joint_for(json.dumps({"q": q}))
+
+
 def test_a_unit_with_keyed_state_gives_what_the_sorted_table_gives():
     """With numbers and dates; it begins with a state, goes on with other settings, and ends with what waits."""
     rows = rows_of(1, 3, 80)
@@ -241,4 +309,5 @@ def test_a_table_without_a_usable_unit_gives_reasons():
     stream = ByHand()
     stream.batch(rows)
     assert stream.found["failed"][0]["failed"].to_list() == ["rows without a unit"]
-    assert stream.found["late"][0]["failed"].to_list() == ["without a time"]
+    late = pl.concat(stream.found["late"])
+    assert late["failed"].to_list() == ["without a time", "rows without a unit"]

@@ -50,6 +50,8 @@ OLD, WAITED, NEW = range(3)
 """Values of the column ``_kind``: a state, a row that waits, a row that has come."""
 PLACES = {late.LATE: LATE, late.REPEATED: REPEATED, late.UNTIMED: UNTIMED}
 """Where rows that are left out are counted."""
+REFUSED = -1
+"""The fate of a row of a unit that cannot run, besides those of `driftfit.run.states.late`."""
 
 
 class Origin(NamedTuple):
@@ -88,21 +90,22 @@ class Flow:
         fates = late.sort_out(known.code[rows], known.time[rows], waited, known.newest, self.hold)
         order = rows[fates.order]
         good = known.there & np.array([not isinstance(one, str) for one in known.joints])
-        right = good[known.code[order]]
         known.newest[good] = fates.newest[good]
         silent = known.silent(self.expired)
-        fate = late.ended(fates.fate, silent[known.code[order]])
-        released = order[right & (fate == late.RELEASED)]
+        over, stays = silent[known.code[order]], known.kind[order] == WAITED
+        # a unit that cannot run stays as it is: what waits goes on waiting, and the rest is refused
+        other = np.where(stays & ~over, late.WAITING, REFUSED)
+        fate = np.where(good[known.code[order]], late.ended(fates.fate, over), other)
+        released = order[fate == late.RELEASED]
         some = series_of(task, table, known.code, released, known.time, good)
         going = (task, table, some, known.joints, known.unpacked(some.keys), known.last, collects(self.rules))
         found = continued(*going) if len(released) else None
         if found is not None:
             yield self._results(known, some, found)
-        yield from self._left_out(known, order[right], fate[right])
-        yield from self._states(known, good, silent)
+        yield from self._left_out(known, order, fate)
+        yield from self._states(known, good | known.old, silent)
         if (bad := np.flatnonzero(~good)).size:
-            reasons = [one if isinstance(one := known.joints[k], str) else "rows without a unit" for k in bad.tolist()]
-            yield self._table("failed", known.keys(bad), {"failed": reasons}, table)
+            yield self._table("failed", known.keys(bad), {"failed": known.reasons(bad)}, table)
 
     def _table(self, kind: str, *columns: Any) -> pa.Table:
         """Rows of a kind, from columns and the table that they came from."""
@@ -147,16 +150,19 @@ class Flow:
         if waiting.size:
             rows = pa.array(waiting)
             yield self._table("waiting", {name: known.table.column(name).take(rows) for name in names}, known.table)
-        for code, place in PLACES.items():
+        for code in (*PLACES, REFUSED):
             which = order[fate == code]
             if which.size:
-                known.counts[:, place] += np.bincount(known.code[which], minlength=len(known.first))
+                unit = known.code[which]
+                reasons = known.reasons(unit) if code == REFUSED else [late.REASONS[code]] * len(which)
+                if code != REFUSED:
+                    known.counts[:, PLACES[code]] += np.bincount(unit, minlength=len(known.first))
                 own = {name: known.table.column(name).take(pa.array(which)) for name in names}
-                yield self._table("late", own, {"failed": [late.REASONS[code]] * len(which)}, known.table)
+                yield self._table("late", own, {"failed": reasons}, known.table)
 
-    def _states(self, known: Known, good: Array, silent: Array) -> Iterator[pa.Table]:
+    def _states(self, known: Known, kept: Array, silent: Array) -> Iterator[pa.Table]:
         """The states of units, those that go on and those that have been silent for too long."""
-        for kind, which in (("state", np.flatnonzero(good & ~silent)), ("expired", np.flatnonzero(good & silent))):
+        for kind, which in (("state", np.flatnonzero(kept & ~silent)), ("expired", np.flatnonzero(kept & silent))):
             if which.size:
                 units, like = which.tolist(), known.table.schema.field(self.task.time).type
                 own: dict[str, Any] = {"state": [known.packed(k) for k in units]}
@@ -207,9 +213,9 @@ class Known(NamedTuple):
         states = heads.column("state").to_pylist()
         for k in np.flatnonzero(old).tolist():
             joint = joints[k]
-            if isinstance(joint, str):
-                continue
-            if before[k] == settings[k] and tag_of(states[k]) == joint.tag:
+            if isinstance(joint, str):  # it stays as it is, with the settings that made it
+                packed[k], settings[k] = states[k], before[k]
+            elif before[k] == settings[k] and tag_of(states[k]) == joint.tag:
                 packed[k] = states[k]
             else:
                 words[k] = migrated(task, joint, states[k], before[k], flow.origins)
@@ -223,6 +229,15 @@ class Known(NamedTuple):
         """Which units have no new row, and have had none since a time; none if that is None."""
         come = np.bincount(self.code[self.kind == NEW], minlength=len(self.first)) > 0
         return np.zeros(len(come), bool) if before is None else ~come & (self.newest < before)
+
+    @property
+    def old(self) -> Array:
+        """Which units have a state."""
+        return np.asarray(self.kind[self.first] == OLD)
+
+    def reasons(self, which: Array) -> list[str]:
+        """Why units cannot run."""
+        return [one if isinstance(one := self.joints[k], str) else "rows without a unit" for k in which.tolist()]
 
     def keys(self, which: Array) -> dict[str, Any]:
         """The names of units."""
@@ -239,11 +254,11 @@ class Known(NamedTuple):
 
     def packed(self, k: int) -> bytes:
         """The state of a unit as bytes."""
+        if k in self.arrived and k not in self.words:
+            return self.arrived[k]
         joint = self.joints[k]
         assert isinstance(joint, Joint)
-        if k in self.words:
-            return joint.pack(self.words[k])
-        return self.arrived.get(k, joint.start)
+        return joint.pack(self.words[k]) if k in self.words else joint.start
 
 
 def migrated(task: Task, now: Joint, state: bytes, settings: str | None, origins: Sequence[Origin]) -> Array:

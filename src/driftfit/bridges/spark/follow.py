@@ -42,7 +42,8 @@ def follow(
     stream : pyspark.sql.DataFrame
         A streaming data frame; one row per sample.
     model, tracker, y, u, by, time, dt, settings, arrays
-        As for `driftfit.bridges.spark.track`.
+        As for `driftfit.bridges.spark.track`. Rows of a unit whose settings cannot run in a batch are kept with the
+        reason (`Store.late`), and its state stays as it is.
     path : str
         The folder of the results, the states and the checkpoint (`Store`).
     hold : number or duration

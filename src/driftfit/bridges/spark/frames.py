@@ -94,6 +94,13 @@ def _settings(settings: Any, tracker: Any, by: Sequence[str]) -> tuple[str, ...]
         raise ValueError(f"spark: the table of settings has no column {wrong[0]!r}, by which units are found.")
     if wrong := [name for name in own if name not in known]:
         raise ValueError(f"spark: {type(one).__name__} has no setting {wrong[0]!r}: {near(wrong[0], known)}")
+    kinds = dict(settings.dtypes)
+    for name in own:
+        if kinds[name].replace("array<", "").rstrip(">").partition("(")[0] not in (*NUMBERS, "string", "void"):
+            raise ValueError(
+                f"spark: the setting {name!r} is of type {kinds[name]}; it must be a number, a string or an array of "
+                "numbers."
+            )
     return tuple(own)
 
 

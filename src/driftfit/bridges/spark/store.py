@@ -1,7 +1,8 @@
 """The table of a stream: a folder for each batch, with its results and the states after it, in one write.
 
     PATH/batch=17/kind=result/*.parquet     a row per sample
-                 /kind=late                 rows that came too late, twice or without a time, with the reason
+                 /kind=late                 rows that came too late, twice, without a time or to a unit that cannot run,
+                                            with the reason
                  /kind=failed               units that cannot run, with the reason
                  /kind=expired              states of units that were silent for too long
                  /kind=state, kind=waiting  what the next batch begins with

@@ -95,7 +95,9 @@ class Task:
         """The programs of a unit with these settings (JSON) of its own, or why there are none."""
         if settings not in self._made:
             try:
-                self._made[settings] = self.joint_of(settings, self.tracker)
+                found = self.joint_of(settings, self.tracker)
+                found.tile()  # where settings meet the number of parameters
+                self._made[settings] = found
             except (ValueError, TypeError) as error:
                 self._made[settings] = f"settings: {error}"
         return self._made[settings]
@@ -106,7 +108,7 @@ class Task:
             return [None] * len(first)
         given = table.select([SETTING + name for name in self.settings]).take(first).to_pylist()
         rows = [{name.removeprefix(SETTING): v for name, v in row.items() if v is not None} for row in given]
-        return [json.dumps(row, sort_keys=True) if row else None for row in rows]
+        return [json.dumps(row, sort_keys=True, default=float) if row else None for row in rows]  # of decimals
 
 
 def _task(fields: Mapping[str, Any]) -> Task:
