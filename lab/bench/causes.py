@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+LEARNED = (
+    "The ratio is learned from the record; the tuned rows have it from other runs of the scenario, hindsight and "
+    "maximum likelihood from these very runs."
+)
+
 CAUSES: dict[str, str] = {
     "no_drift": (
         "Where nothing changes, least squares is optimal. `AdaptiveKalman` keeps filters that could follow a drift "
@@ -9,7 +14,9 @@ CAUSES: dict[str, str] = {
         "ratios are equally probable at the start, and filters with small ratios are distinguished from no drift only "
         "slowly."
     ),
-    "ramp": "The ratio is learned from the record; hindsight has the ratio that is best on these very runs.",
+    "fast_walk": LEARNED,
+    "sinusoid": LEARNED,
+    "ramp": LEARNED,
     "sparse_jumps": (
         "`Bank()` assumes that parameters are constant between jumps. Where they are random walks, or where outliers "
         "occur for which it has no hypothesis, it is far behind."
