@@ -4,10 +4,10 @@ y = u' theta + v with two white inputs, r = 1 and random walks theta with varian
 parameter is estimated. *error* is the root mean square error of the estimates over that of the filter, or smoother,
 that knows q and r. The first 20 samples are left out.
 
-Run: python benchmarks/settings_coverage.py [records]
+Run: python benchmarks/settings_coverage.py [--records 40] [--quick]
 """
 
-import sys
+import argparse
 import warnings
 
 import numpy as np
@@ -60,13 +60,17 @@ def scores(T: int, q: tuple[float, float], seed: int) -> Array:
     return np.array(rows)
 
 
-def main(records: int = 40) -> None:
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--records", type=int, default=40)
+    parser.add_argument("--quick", action="store_true", help="two records of one case")
+    given = parser.parse_args()
     print(f"{'T':>4}  {'q':14}" + "".join(f"{name:>20}" for name in ROWS))
-    for T, q in CASES:
-        means = np.mean([scores(T, q, seed) for seed in range(records)], axis=0)
+    for T, q in CASES[:1] if given.quick else CASES:
+        means = np.mean([scores(T, q, seed) for seed in range(2 if given.quick else given.records)], axis=0)
         cells = "".join(f"{f'{inside:.2f} (error {error:.2f})':>20}" for inside, error in means)
         print(f"{T:4}  {f'{q[0]:g}, {q[1]:g}':14}{cells}", flush=True)
 
 
 if __name__ == "__main__":
-    main(*(int(a) for a in sys.argv[1:2]))
+    main()

@@ -9,7 +9,7 @@ The records are not part of the project. The folder must contain, besides those 
 heat_exchanger.csv (DaISy), pump_loop_skab.csv (SKAB), air_quality_sensors.csv (UCI) and us_consumption_change.csv
 (fpp2).
 
-Run: python -m examples.real_rivals FOLDER
+Run: python examples/real_rivals.py FOLDER
 """
 
 import sys
@@ -17,6 +17,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+from real_records import Case, building, building_arx, furnace, river
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -25,7 +26,6 @@ from driftfit import ARX, RLS, AdaptiveKalman, Regression, track
 from driftfit.data import read_columns
 from driftfit.judge.compare import persistence
 from driftfit.run.result import root_mean_square
-from examples.real_records import Case, building, building_arx, furnace, river
 
 MEMORIES = 1.0 - 10.0 ** np.linspace(-3.5, -0.7, 15)
 STEPS = 10.0 ** np.linspace(-2.5, 0.0, 11)

@@ -114,7 +114,8 @@ def test_benchmarks_run_quickly(command, monkeypatch):
 
 
 @pytest.mark.parametrize("command", of_kind("record"))
-def test_scripts_on_real_records_load_and_are_called_as_they_say(command):
+def test_scripts_on_real_records_load_and_are_called_as_they_say(command, monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
     _, script, *given = shlex.split(command)
     found = runpy.run_path(str(ROOT / script), run_name="loaded")
     asked = re.search(rf"python {script}((?: \S+)*)", " ".join(found["__doc__"].split()))
