@@ -1,8 +1,8 @@
 """Forecasts of real records, several samples ahead: their error beside persistence, and what their bands cover.
 
 The model and its drift are those of `examples/real_records.py`: chosen by one-step error in the first half. In the
-second half a stream forecasts from every fifth sample, with inputs that were observed later. "constants" is the same
-model without drift. Persistence holds the last value.
+second half a stream forecasts from every fifth sample, with the inputs that were observed later. "constants" is the
+same model without drift. Persistence holds the last value.
 
 Run: python examples/real_forecasts.py FOLDER
 """

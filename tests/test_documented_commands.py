@@ -34,7 +34,7 @@ ELSEWHERE = {
     "python -m lab reproduce hypotheses": (
         "lab/tests/test_reproduce_hypotheses.py", '["reproduce", "hypotheses", "--quick"',
     ),
-    "driftfit serve": ("tests/test_service_page.py", '"driftfit", "serve", "--demo"'),
+    "driftfit serve": ("tests/test_service_page.py", '"driftfit", "serve", *(what or ["--demo"])'),
     "python examples/controller.py": ("tests/test_embedded.py", '["controller.py"]'),
     "python -m lab bench accuracy": ("lab/tests/test_bench.py", '["bench", "accuracy", "--quick"'),
     "python -m lab structure": ("lab/tests/test_structure.py", '["structure", "--picture"'),

@@ -41,7 +41,6 @@ def twin(y, u, point, p0):
 
 def test_a_pass_at_a_point_is_its_slow_twin():
     y, u = plant(800, 0)
-    y[0] = 0.0  # nothing is known before the first input
     point = (0.8, 0.3, 0.7, 0.7)
     run = track(BJ.held_at(point), InstrumentalVariables(1.0, p0=100.0), y, u)
     np.testing.assert_allclose(run.theta[-1], twin(y, u, point, 100.0), rtol=1e-8)
@@ -114,7 +113,7 @@ def test_what_cannot_be_refined_says_so():
     y, u = plant(200, 6)
     with pytest.raises(ValueError, match="refine: ARX is not linearised"):
         track(ARX(1, 1), RLS(1.0), y, u).refine()
-    with pytest.raises(ValueError, match="refine: the run has not determined all parameters"):
+    with pytest.raises(ValueError, match="refine: the record does not determine all parameters"):
         track(BJ, RLS(1.0), y, 0.0 * u).refine()
     with pytest.raises(ValueError, match="point must have 4 entries"):
         PolynomialModel(0, 1, 1, 1, 1, inputs=1, point=(0.5,))

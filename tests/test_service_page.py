@@ -338,7 +338,7 @@ def test_the_docs_lead_to_an_alarm_on_a_phone(tmp_path):
     pytest.importorskip("uvicorn", reason="the page needs driftfit[serve]")
     chapter = (Path(__file__).parent.parent / "docs" / "service.md").read_text()
     chapter = chapter[chapter.index("## An alarm on a phone") : chapter.index("## Your own plant")]
-    (settings,), (program,) = (re.findall(f"```{kind}\n(.*?)```", chapter, re.S) for kind in ("toml", "python"))
+    (settings,), (program,) = (re.findall(f"```{kind}\n(.*?)```", chapter, re.S) for kind in ("toml", "py"))
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Phone)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     here, port = f"http://127.0.0.1:{server.server_port}/", free_port()

@@ -295,7 +295,7 @@ def test_steps_are_found_one_after_the_other_with_their_sizes():
     assert abs(got.first(0) - 200) < 6
     assert abs(got.first(2) - 450) < 25
     assert got.first(1) is None
-    assert (np.abs(got.after - got.before - [2.0, 0.0, -0.8, 0.0])[[0, 2]] < 3.3 * got.std[[0, 2]]).all()
+    assert (np.abs(got.after - got.before - [2.0, 0.0, -0.8])[[0, 2]] < 3.3 * got.std[[0, 2]]).all()
     assert got.std[0] == pytest.approx(np.sqrt(1 / 200 + 1 / 400), rel=0.3)
     path = np.where(np.arange(600)[:, None] < 350, THETA, THETA + np.array([0.0, 0.0, 1.0, 0.0]))
     said = track(ARX(2, 2), Kalman(q=1e-3, r=0.01), *arx_record(600, 1, theta=path)).verdict()

@@ -153,16 +153,17 @@ class _Reader:
             raise _refused(f"{function!r} cannot be read; call functions of numpy, of math, or plain ones")
         try:
             source = textwrap.dedent(inspect.getsource(self.function))
-            self.tree = ast.parse(source).body[0]
+            tree = ast.parse(source).body[0]
         except (OSError, SyntaxError, IndentationError) as error:
             raise _refused(f"the source of {_name(self.function)} was not found: {error}") from None
-        if not isinstance(self.tree, ast.FunctionDef):
+        if not isinstance(tree, ast.FunctionDef):
             raise _refused("a lambda cannot be read; write it with def")
+        self.body = tree.body
         found = inspect.getclosurevars(self.function)
         self.outside = {**vars(builtins), **found.globals, **found.nonlocals}
 
     def result(self, given: Mapping[str, Any]) -> Any:
-        found = self.run(self.tree.body, dict(given))
+        found = self.run(self.body, dict(given))
         if found is None:
             raise _refused(f"{self.function.__name__} has a way on which it returns nothing")
         return found

@@ -34,7 +34,8 @@ treats the noise as white. A model without past outputs has its regressors as in
 There is no smoother: this is not the estimate of a random walk.
 
 A sample with 1 / w + phi' G zeta below one half of 1 / w is not learned from: G would more than double in a direction,
-which happens where instruments and regressors have nothing in common.
+which happens where instruments and regressors have nothing in common. With refined instruments G is set to C where that
+sum is more than a million times 1 / w + zeta' C zeta: it has lost its digits.
 
 Source: Young, Recursive Estimation and Time-Series Analysis (2011), chapters 6 (the auxiliary model, and its filter)
 and 7; Soderstrom and Stoica, Instrumental Variable Methods for System Identification (1983), chapter 6. Departures: the
@@ -51,7 +52,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps
+from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, vector
 from driftfit.models.base import Model
@@ -79,6 +80,9 @@ LEAST_SQUARES = 10.0
 
 LEAST = 0.5
 """Least share of its noise variance that 1 / w + phi' G zeta may be."""
+
+MOST = 1e6
+"""The most that it may be beside 1 / w + zeta' C zeta, with refined instruments."""
 
 start_of_rls = rls.begin
 
@@ -113,6 +117,15 @@ def instrument(s: State, i: int, l: int) -> float:
     return s.zeta[i, l]  # type: ignore[no-any-return]
 
 
+@kernel
+def symmetric(s: State, l: int) -> None:
+    """G = C, to which refined instruments bring it in the limit."""
+    for i in range(s.theta.shape[0]):
+        for j in range(i + 1):
+            s.G[i, j, l] = s.P[i, j, l]
+            s.G[j, i, l] = s.P[i, j, l]
+
+
 @lru_cache
 def learning(refined: bool) -> Step:
     """The correction; with refined instruments the covariance is that of least squares on them."""
@@ -124,7 +137,10 @@ def learning(refined: bool) -> Step:
         noise, y_hat = s.noise[l], prediction(s, l)
         v = product(s, l) + noise  # s.g = C phi, or C zeta
         common = noise + weigh_instruments(s, l)
-        e, learned = s.y[l] - y_hat, (s.ok[l] > 0.0) & (common >= LEAST * noise)
+        if refined and not abs(common) < MOST * v:
+            symmetric(s, l)
+            common = noise + weigh_instruments(s, l)
+        e, learned = s.y[l] - y_hat, (s.ok[l] > 0.0) & (common >= LEAST * noise) & (common < LARGEST) & (v < LARGEST)
         gain, v_used = (1.0 / common if learned else 0.0), (v if learned else 0.0)
         along = 1.0 / v if learned else 0.0
         for i in range(n):
@@ -200,10 +216,7 @@ def steps(na: int | None) -> TrackerSteps:
     def begin(s: State, l: int) -> None:
         instruments(s, l)
         start_of_rls(s, l)
-        for i in range(s.theta.shape[0]):
-            for j in range(i + 1):
-                s.G[i, j, l] = s.P[i, j, l]
-                s.G[j, i, l] = s.P[i, j, l]
+        symmetric(s, l)
         follow(s, l)
 
     return TrackerSteps(forget, correct, folded, begin, machines=MACHINES, instruments=na is None)

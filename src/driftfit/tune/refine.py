@@ -6,6 +6,8 @@ linear regression, and the record is run until the estimate settles:
 
     theta'  <-  the estimate of the run that is linearised at theta',   until it moves by less than a share of its std
 
+by half the way, and half of that, while the prediction error at the new point is larger.
+
 `RLS(1.0)` is then the Gauss-Newton method of prediction errors (maximum likelihood for Gaussian noise), and
 `InstrumentalVariables(1.0)` the iterative refined instrumental variable method (Young's RIV, SRIV and SRIVC). The
 signals before the record are taken as 0, as in the source.
@@ -22,13 +24,23 @@ from typing import TypeVar
 
 import numpy as np
 
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.run.result import Track, track_record
+from driftfit.trackers.base import Tracker
+from driftfit.trackers.instrumental import InstrumentalVariables
+from driftfit.trackers.rls import RLS
 
 R = TypeVar("R", bound=Track)
 
 CLOSE = 0.01
 """Share of its standard deviation that no parameter may move by at the last pass."""
+
+LEAST = 0.01
+"""Least share of a step that is tried."""
+
+NOTHING = 1e-20
+"""Covariance of parameters that are held."""
 
 
 def refine(run: R, passes: int = 20, drifting: bool = False) -> R:
@@ -49,28 +61,61 @@ def refine(run: R, passes: int = 20, drifting: bool = False) -> R:
         If the model is linear, or the run has not determined all parameters.
     """
     whole("refine", "passes", passes, 1)
+    point = run.theta[len(run) // 2 :].mean(axis=0) if drifting else run.theta[-1]
     found, moved = run, np.inf
     for _ in range(passes):
-        point = found.theta[len(found) // 2 :].mean(axis=0) if drifting else found.theta[-1]
+        found = _at(run, point)
+        goal = found.theta[len(found) // 2 :].mean(axis=0) if drifting else found.theta[-1]
         if not np.isfinite(found.std[-1]).all():
             raise ValueError(
-                "refine: the run has not determined all parameters; give a longer record, or lower orders."
+                "refine: the record does not determine all parameters; give a longer one, or lower orders."
             )
-        model = found.program.model.held_at(point)
-        if model is None:
-            raise ValueError(
-                f"refine: {type(run.model).__name__} is not linearised, so there is nothing to refine; it is for OE, "
-                "ARMAX, BoxJenkins, PolynomialModel and ContinuousTransfer."
-            )
-        last = found.theta[-1]
-        once = track_record(replace(run.program, model=model), run.record, start=run.start)
-        found = type(run)(once.program, once.record, once._lane, once.start)
-        moved = float(np.max(np.abs(found.theta[-1] - last) / found.std[-1]))
+        moved = float(np.max(np.abs(goal - point) / found.std[-1]))
         if moved < CLOSE:
             return found
+        step = _downhill(run, point, goal)
+        if step is None:
+            return found
+        point = step
     warnings.warn(
         f"refine: after {passes} passes a parameter still moves by {moved:.2g} of its standard deviation; the orders "
         "may be too high for the record, or the run too far from the truth.",
         stacklevel=3,
     )
     return found
+
+
+def _at(run: R, point: Array, tracker: Tracker | None = None) -> R:
+    """The run linearised at a point."""
+    model = run.program.model.held_at(point)
+    if model is None:
+        raise ValueError(
+            f"refine: {type(run.model).__name__} is not linearised, so there is nothing to refine; it is for OE, "
+            "ARMAX, BoxJenkins, PolynomialModel and ContinuousTransfer."
+        )
+    program = replace(run.program, model=model, tracker=run.tracker if tracker is None else tracker)
+    once = track_record(program, run.record)
+    return type(run)(once.program, once.record, once._lane, once.start)
+
+
+def _downhill(run: Track, point: Array, goal: Array) -> Array | None:
+    """The first point on the way back from the goal that predicts better; None if there is none.
+
+    Of a tracker for parameters that drift it is the goal, because no point has an error of its own.
+    """
+    if not isinstance(run.tracker, RLS | InstrumentalVariables):
+        return goal
+    before, share = _error(run, run.tracker, point), 1.0
+    while share > LEAST:
+        step: Array = point + share * (goal - point)
+        if _error(run, run.tracker, step) < before:
+            return step
+        share *= 0.5
+    return None
+
+
+def _error(run: Track, tracker: RLS | InstrumentalVariables, point: Array) -> float:
+    """The mean squared prediction error at a point; infinite where the model is unstable."""
+    known = replace(tracker, p0=NOTHING, theta0=tuple(point.tolist()))
+    held = _at(run, point, known)
+    return float(np.nanmean(held.innovation**2)) if np.array_equal(held.state["point"], point) else np.inf

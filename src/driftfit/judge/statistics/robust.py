@@ -139,7 +139,8 @@ def scale_of(x: Array) -> float:
         for i in range(1, k):
             below = max(below, x[i])
         half = 0.5 * (below + half)
-    return max(1.4826 * half, LEAST * high)
+    scale: float = max(1.4826 * half, LEAST * high)
+    return scale
 
 
 @shared

@@ -123,7 +123,7 @@ def _candidate(o: Orders) -> tuple[Any, Any]:
         if n == 4:
             one = s.p[0, l] * s.p[1, l] * s.p[2, l]
             other = s.p[2, l] * s.p[2, l] + s.p[0, l] * s.p[0, l] * s.p[3, l]
-        return one > MARGIN * other  # type: ignore[no-any-return]
+        return one > MARGIN * other
 
     @kernel
     def fastest(s: State, l: int) -> float:

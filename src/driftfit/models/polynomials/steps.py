@@ -373,7 +373,7 @@ def regressing(p: Places, place: Step, regressors: Any) -> Step:
 @lru_cache
 def pushing(p: Places, place: Step) -> Step:
     """``push``."""
-    na, n, m = p.na, p.n, p.m
+    na, n, m, held = p.na, p.n, p.m, place is staying
     at_offset, first_f = p.at_offset, p.nf[0] if p.m == 1 else 0
     linearise, (predict, noise), (colour, whitened) = point(p, place), predictions(p), filters(p)
 
@@ -413,7 +413,9 @@ def pushing(p: Places, place: Step) -> Step:
         linearise(s, l)
         fitted = predict(s, False, l)
         fitted = possible(s, fitted, l) if seen else fitted
-        e = s.measured[l] - fitted if seen & predicted else 0.0
+        # a point that is held says what noise is, also before theta is determined, and before the first regressor
+        known = (s.valid[l] > 0.0) | (s.started[l] == 0.0) if held else predicted
+        e = s.measured[l] - fitted if seen & known else 0.0
         # what is left of an interpolated sample is rounding, and no regressor
         e = e if abs(e) > ROUNDING * (abs(s.measured[l]) + abs(fitted)) else 0.0
         e = within(s, e, l)

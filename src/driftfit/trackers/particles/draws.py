@@ -64,7 +64,7 @@ def normal(counter: int, seed: int) -> float:
         low = (((((((5.2264952788528545610e3 * r + 2.8729085735721942674e4) * r + 3.9307895800092710610e4) * r
                + 2.1213794301586595867e4) * r + 5.3941960214247511077e3) * r + 6.8718700749205790830e2) * r
                + 4.2313330701600911252e1) * r + 1.0)  # fmt: skip
-        return q * top / low
+        return q * top / low  # type: ignore[no-any-return]
     r = np.sqrt(-log(min(p, 1.0 - p)))
     if r <= 5.0:
         r -= 1.6
@@ -82,4 +82,4 @@ def normal(counter: int, seed: int) -> float:
         low = (((((((2.04426310338993978564e-15 * r + 1.42151175831644588870e-7) * r + 1.84631831751005468180e-5) * r
                + 7.86869131145613259100e-4) * r + 1.48753612908506148525e-2) * r + 1.36929880922735805310e-1) * r
                + 5.99832206555887937690e-1) * r + 1.0)  # fmt: skip
-    return top / low if q > 0.0 else -top / low
+    return top / low if q > 0.0 else -top / low  # type: ignore[no-any-return]

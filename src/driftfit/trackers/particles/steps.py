@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, TrackerSteps
-from driftfit.engine.kernel import State, Step, exp, kernel, log
+from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.models.state_space import equations_of
 from driftfit.trackers.particles.draws import normal, uniform
 from driftfit.trackers.parts.diffuse import LEFT
@@ -27,7 +27,7 @@ def at_particle(s: State, i: int, l: int) -> None:
 
 
 @lru_cache
-def _moving(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool) -> Step:
+def _moving(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool) -> Any:
     """``move(s, i, l)``: the states of a particle and their covariance through the equations; lower triangles."""
     transition = equations_of(equations, inputs).move
 
@@ -75,8 +75,7 @@ def _moving(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool) -
     def still(s: State, p: int, l: int) -> None:
         """There are no states."""
 
-    step: Step = repeated if hidden else still
-    return step
+    return repeated if hidden else still
 
 
 @kernel
@@ -166,7 +165,7 @@ def _forecast(equations: str, inputs: tuple[str, ...]) -> Any:
             v += s.phi[i, l] * s.gain[p, i, l]
         s.shown[p, l] = s.value[l] if finite else 0.0
         s.spread[p, l] = max(v, 0.0) + s.r[l] * s.noise[l] if finite else -1.0
-        return finite
+        return finite  # type: ignore[no-any-return]
 
     @kernel
     def forecast(s: State, l: int) -> bool:

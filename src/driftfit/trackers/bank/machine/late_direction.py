@@ -123,7 +123,7 @@ def begin_within(s: State, l: int) -> bool:
     if good:
         frame(s, l)
         nearest(s, l)
-    return good
+    return good  # type: ignore[no-any-return]
 
 
 @kernel
