@@ -57,11 +57,12 @@ def drive(folder: Path) -> None:
     """The driver: follow all files, then end."""
     from driftfit.bridges import spark as bridge
 
-    # a task may fail four times, as on a cluster
+    # a task may fail four times, as on a cluster; Java compiles little, which halves the CPU of a short life
     master = "local-cluster[2,1,1024]" if "--cluster" in sys.argv else "local[2,4]"
     path = os.environ.get("PYTHONPATH", "")
     session = bridge.session(master, spark__sql__shuffle__partitions="2", spark__ui__enabled="false",
-                             spark__executorEnv__PYTHONPATH=path)  # fmt: skip
+                             spark__executorEnv__PYTHONPATH=path, spark__sql__codegen__wholeStage="false",
+                             spark__driver__extraJavaOptions="-XX:TieredStopAtLevel=1 -XX:+UseSerialGC")  # fmt: skip
     session.sparkContext.setLogLevel("OFF")
     rows = session.readStream.schema(SCHEMA).option("maxFilesPerTrigger", 1).parquet(str(folder / "in"))
     columns = {"y": "y", "u": "u", "by": "unit", "time": "t"}
