@@ -132,5 +132,6 @@ def measure(contest: Contest, name: str, runs: int) -> Measured:
         float(np.mean([s.log_p for s in scores])), float(np.mean([s.nees for s in scores])),
         float(np.mean([s.leaves for s in scores])),
     )  # fmt: skip
-    without = np.sqrt((squares.sum(axis=0) - squares) / (counts.sum(axis=0) - counts))
+    with np.errstate(invalid="ignore"):  # NaN without the only record
+        without = np.sqrt((squares.sum(axis=0) - squares) / (counts.sum(axis=0) - counts))
     return Measured(values, np.sqrt(squares[:, 0] / counts[:, 0]), without)

@@ -8,10 +8,8 @@ from contextlib import ExitStack
 from time import monotonic
 from typing import TypeVar
 
-from rich.console import Console
-from rich.progress import Progress
-
 from driftfit.run.parallel_lanes import cores
+from driftfit.run.program import progress_bar
 
 Said = TypeVar("Said")
 PATIENCE = 2.0
@@ -22,7 +20,7 @@ def on_all_cores(keys: Iterable[Hashable], judge: Callable[[Hashable], Said], wh
     """``judge(key)`` for each key, in their order; the first alone, so that only one thread compiles."""
     keys = list(keys)
     said = [judge(key) for key in keys[:1]]
-    progress = Progress(console=Console(stderr=True), transient=True)
+    progress = progress_bar()
     task, begun, shown = progress.add_task(what, total=len(keys), completed=len(said)), monotonic(), False
     with ThreadPoolExecutor(cores()) as pool, ExitStack() as stack:
         for one in pool.map(judge, keys[1:]):

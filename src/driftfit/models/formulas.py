@@ -120,7 +120,10 @@ def parse(text: str, known: bool = False) -> Formula:
         raise ValueError(f"Equation: {text!r} is not an equation such as 'y = theta.k * sqrt(p1 - p2) - theta.c'.")
     parameters: dict[str, None] = {}
     lags: dict[tuple[str, int], None] = {}
-    _check(tree, parameters, lags)
+    try:
+        _check(tree, parameters, lags)
+    except RecursionError:
+        raise ValueError("Equation: the formula has too many operations within each other; shorten it.") from None
     if (output, 0) in lags:
         raise ValueError(f"Equation: {output} on the right must have a lag, as {output}[-1].")
     if not parameters and not known:

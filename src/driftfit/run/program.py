@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -39,13 +40,20 @@ State = Mapping[str, Array]
 """Fields of one lane of a tile, by name."""
 
 
+def progress_bar() -> Progress:
+    """A progress bar on the error stream; in a notebook without ipywidgets none, since rich would only warn there."""
+    return Progress(
+        console=Console(stderr=True, force_jupyter=None if find_spec("ipywidgets") else False), transient=True
+    )
+
+
 @contextmanager
 def progress(what: str, total: int, shown: bool) -> Iterator[Callable[[int], None]]:
     """A progress bar that is called with what has been done; making one that is not shown would take a millisecond."""
     if not shown:
         yield lambda count: None
         return
-    with Progress(console=Console(stderr=True), transient=True) as display:
+    with progress_bar() as display:
         task = display.add_task(what, total=total)
         yield lambda count: display.advance(task, count)
 
