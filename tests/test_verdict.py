@@ -12,7 +12,6 @@ from driftfit.judge.constant_fit import constant_errors
 from driftfit.judge.statistics.attribution import attribute, holm
 from driftfit.judge.statistics.constancy import constancy, missing_lags
 from driftfit.judge.statistics.noise import noise, whitened
-from driftfit.judge.statistics.paired import newey_west, paired
 from driftfit.judge.statistics.quadratic import quantile, tail
 from driftfit.judge.statistics.robust import orthonormal, robust_fit
 from driftfit.judge.statistics.supremum import scanned, suprema, together
@@ -385,31 +384,6 @@ def test_the_test_of_an_arx_model_in_correlated_noise_has_the_lags_that_make_it_
     both = np.column_stack([rows, beside])
     for column in np.column_stack(lags)[6:].T:
         assert column == pytest.approx(both[1:] @ np.linalg.lstsq(both[1:], column, rcond=None)[0], abs=1e-6)
-
-
-def test_comparison_is_that_of_the_summary():
-    y, u = damaged(*arx_record(400, 5))
-    run = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u)
-    said, comparison = run.verdict(), run.summary().comparison
-    rms = {rival.name: rival.rms for rival in said.rivals}
-    assert (said.rms, rms["persistence"], rms["constant LS"], rms["constant ARX"]) == comparison[:4]
-    assert said.scored == comparison.samples
-    assert said.samples == int(run.ok.sum())
-
-
-def test_paired_is_the_textbook_formula():
-    rng = np.random.default_rng(3)
-    own, rival = rng.normal(size=(2, 300))
-    d = rival**2 - own**2
-    centred, lags = d - d.mean(), int(4 * 3 ** (2 / 9))
-    v = np.mean(centred**2) + 2 * sum(
-        (1 - k / (lags + 1)) * np.sum(centred[k:] * centred[:-k]) / 300 for k in range(1, lags + 1)
-    )
-    got = paired("rival", rival, own)
-    assert newey_west(d) == pytest.approx(v, rel=1e-12)
-    assert got.t == pytest.approx(d.mean() / np.sqrt(v / 300), rel=1e-12)
-    assert got.p == pytest.approx(stats.norm.sf(got.t), rel=1e-9)
-    assert got.rms == pytest.approx(np.sqrt(np.mean(rival**2)))
 
 
 def test_records_that_can_tell_nothing():

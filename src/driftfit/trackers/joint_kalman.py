@@ -92,6 +92,17 @@ def _repeated(move: Step, timed: bool) -> Step:
     return step
 
 
+@kernel
+def moves_are_finite(s: State, hidden: int, l: int) -> bool:
+    """Whether the next hidden states and their derivatives are numbers of a usable size."""
+    finite = True
+    for i in range(hidden):
+        finite = finite & (abs(s.next[i, l]) < LARGEST)
+        for j in range(s.theta.shape[0]):
+            finite = finite & (abs(s.slopes[i, j, l]) < LARGEST)
+    return finite
+
+
 @lru_cache
 def _extended(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool) -> TrackerSteps:
     transition, _, output, _ = equations_of(equations, inputs)
@@ -110,12 +121,7 @@ def _extended(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool)
         first = n - hidden
         at_estimate(s, l)
         transition(s, l)
-        finite = True
-        for i in range(hidden):
-            finite = finite & (abs(s.next[i, l]) < LARGEST)
-            for j in range(n):
-                finite = finite & (abs(s.slopes[i, j, l]) < LARGEST)
-        if finite:
+        if moves_are_finite(s, hidden, l):
             for i in range(hidden):
                 for j in range(n):
                     s.W[i, j, l] = linear(s, i, j, l)

@@ -10,6 +10,7 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.models.state_space import equations_of
+from driftfit.trackers.joint_kalman import moves_are_finite
 from driftfit.trackers.particles.draws import normal, uniform
 from driftfit.trackers.parts.diffuse import LEFT
 from driftfit.trackers.parts.varying_drift import read_drift
@@ -45,12 +46,7 @@ def _moving(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool) -
         first = n - hidden
         at_particle(s, p, l)
         transition(s, l)
-        finite = True
-        for i in range(hidden):
-            finite = finite & (abs(s.next[i, l]) < LARGEST)
-            for j in range(n):
-                finite = finite & (abs(s.slopes[i, j, l]) < LARGEST)
-        if finite:
+        if moves_are_finite(s, hidden, l):
             for i in range(hidden):
                 for j in range(n):
                     s.W[i, j, l] = linear(s, p, i, j, l)
