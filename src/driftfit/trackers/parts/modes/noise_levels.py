@@ -35,8 +35,9 @@ IN_A_ROW, RISE = 4.0, 0.3
 MISFIT, SETTLED, EARLY = 0.5, 20.0, 140.0
 """Among the first `EARLY` samples, if the mean of e^2 / s, with a memory of `SETTLED`, is below `MISFIT`, r falls by as
 much: drift at the start was taken for noise. Later it does not, see above."""
-FINEST = 1e-12
-"""r is never below this share of the mean square of y: the rounding of the data."""
+FINEST = 1e-14
+"""r is never below this share of the mean square of y, the rounding of the data: a hundredth of r where y is a million
+standard deviations of the noise from zero."""
 
 
 def any_level() -> dict[str, Any]:
