@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
+from rich.progress import Progress
 from scipy import stats
 from support import THETA, arx_record, rows_of
 
@@ -93,7 +94,7 @@ def test_a_share_of_almost_nothing_is_one_of_its_error(fleet):
 @pytest.mark.parametrize(("patience", "shown"), [(0.0, 1), (1e9, 0)])
 def test_progress_is_shown_where_it_takes_long(fleet, monkeypatch, patience, shown):
     started = []
-    monkeypatch.setattr(on_all_cores.Progress, "start", lambda bar: started.append(bar))
+    monkeypatch.setattr(Progress, "start", lambda bar: started.append(bar))
     monkeypatch.setattr(on_all_cores, "PATIENCE", patience)
     assert len(fleet.verdict()) == 7
     assert len(started) == shown
