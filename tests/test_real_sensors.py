@@ -473,6 +473,18 @@ def test_bands_of_coarse_meters_do_not_count_one_error_of_rounding_as_many(track
     assert np.mean(inside) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / len(inside))
 
 
+def test_a_bank_counts_one_error_of_rounding_once_as_well():
+    x, inside, errors = 3.0 * np.sin(np.arange(1000) / 60.0), [], []
+    for seed in range(6):
+        y = np.round(3.0 + 1.5 * x + 0.05 * np.random.default_rng(seed).normal(size=1000))
+        run = track(Regression(1, intercept=True), Bank(), y, x)
+        away = np.abs(run.theta - [1.5, 3.0])[100:]
+        inside.append(np.mean(away <= 1.96 * run.std[100:]))
+        errors.append(np.mean(away**2))
+    assert np.mean(inside) > 0.93  # as many readings of their own: 0.70
+    assert np.sqrt(np.mean(errors)) < 0.2  # 1.15
+
+
 @pytest.mark.parametrize("tracker", [FLS(1e6), AdaptiveKalman()], ids=repr)
 def test_smoothed_bands_of_coarse_meters_share_errors_of_rounding_too(tracker):
     inside = []
