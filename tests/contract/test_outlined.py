@@ -7,9 +7,10 @@ from support import arx_record
 from driftfit import ARX, Regression
 from driftfit.engine import disk_cache, kernel
 from driftfit.engine import numba_internals as internals
-from driftfit.engine.drivers import TrackerSteps, drivers, make_tile, output_type
+from driftfit.engine.drivers import TrackerSteps, drivers
 from driftfit.engine.kernel import machine
 from driftfit.engine.outlined import PREFIX
+from driftfit.engine.tiles import make_tile, output_type
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 

@@ -20,8 +20,8 @@ from driftfit.data.known import Known
 from driftfit.data.labels import held, ordered, times_of, together
 from driftfit.data.limits import Limits, marked, within_each
 from driftfit.data.signals import as_inputs, as_output, intervals, noise_of
-from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import as_numbers, factor
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 

@@ -7,9 +7,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from driftfit.data.clock import Clock, instants
-from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import Settings, missing_settings
+from driftfit.engine.settings import Settings, as_numbers, factor, missing_settings
 
 S = TypeVar("S", bound=Settings)
 

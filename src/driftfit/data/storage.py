@@ -33,9 +33,9 @@ from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
-from driftfit.engine.drivers import held_in
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings
+from driftfit.engine.tiles import held_in
 
 FORMAT = 1
 """Of .npz files."""

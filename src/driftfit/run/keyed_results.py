@@ -17,8 +17,8 @@ import numpy as np
 from driftfit.data import storage
 from driftfit.data.known import Known
 from driftfit.data.record import Labels, Records
-from driftfit.engine.drivers import repeat_tile
 from driftfit.engine.kernel import Array
+from driftfit.engine.tiles import repeat_tile
 from driftfit.models.base import Model
 from driftfit.run.program import Program, State, kept, programs_of, state_of
 from driftfit.run.public_class import Plain

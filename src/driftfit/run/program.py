@@ -19,8 +19,9 @@ from rich.progress import Progress
 from driftfit.data import storage
 from driftfit.data.record import Record
 from driftfit.data.signals import check_ready
-from driftfit.engine.drivers import Drivers, TrackerSteps, drivers, held_in, make_tile, output_type, repeat_tile
+from driftfit.engine.drivers import Drivers, TrackerSteps, drivers
 from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.tiles import held_in, make_tile, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.collected_samples import COLLECTED, collecting

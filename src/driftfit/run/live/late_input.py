@@ -8,8 +8,9 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-from driftfit.engine.drivers import INPUTS, tile_type
+from driftfit.engine.drivers import INPUTS
 from driftfit.engine.kernel import Array, Driver, Step
+from driftfit.engine.tiles import tile_type
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 

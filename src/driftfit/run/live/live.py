@@ -18,9 +18,10 @@ from driftfit.data.arguments import check_roles
 from driftfit.data.clock import instant
 from driftfit.data.labels import by_name, order_of
 from driftfit.data.signals import noise_of
-from driftfit.engine.arrays import as_numbers, factor
-from driftfit.engine.drivers import as_compiled, one_or_all
+from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import as_numbers, factor
+from driftfit.engine.tiles import as_compiled
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.live.alarm import LiveAlarm

@@ -11,9 +11,9 @@ import numpy as np
 from driftfit.data import storage
 from driftfit.data.clock import Clock, Pace, instant
 from driftfit.data.limits import Gate
-from driftfit.engine.drivers import as_compiled
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
+from driftfit.engine.tiles import as_compiled
 from driftfit.models.base import Model
 from driftfit.run.live.alarm import LiveAlarm, check_rule
 from driftfit.run.live.batch import Batched

@@ -27,8 +27,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.engine.drivers import WIDTH, make_tile
 from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.tiles import WIDTH, make_tile
 from driftfit.smooth.parts.walk import Path, Walk
 from driftfit.trackers.parts import information
 

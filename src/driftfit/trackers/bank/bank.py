@@ -38,10 +38,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
+from driftfit.engine.settings import as_numbers, covariance, factor, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.bank import change as changes_
 from driftfit.trackers.bank import reduction as reductions
