@@ -31,6 +31,7 @@ from driftfit.run.live.interventions import HELD, Operated
 from driftfit.run.live.late_input import INPUT, LATER, NOTHING
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.live.stream import Stream
+from driftfit.run.live_output import LiveOutput
 from driftfit.run.program import Program, state_of
 from driftfit.run.warm_start import Run
 from driftfit.trackers.base import Tracker
@@ -55,7 +56,7 @@ class Live(Operated, Stream):
 
     With several outputs y and all that `update` returns are (ny,); ``theta`` and ``std`` are (ny, n), or (n,) where the
     outputs share one theta. A stream can be copied, pickled and sent to another process, as well as saved: it continues
-    as if never stopped.
+    as if never stopped. ``live["level"]`` has what is known of one of several outputs, (n,).
 
     Parameters
     ----------
@@ -126,6 +127,17 @@ class Live(Operated, Stream):
         """Names of the parameters; one tuple for each output where they have one theta each."""
         found = tuple(one.names for one in self.programs)
         return found[0] if len(found) == 1 else found
+
+    def __getitem__(self, output: str | int) -> LiveOutput:
+        """One of several outputs that each have their own theta, by name or index; KeyError for any other."""
+        outputs = self.model.outputs if len(self.programs) > 1 else ()
+        if output not in outputs and output not in range(len(outputs)):
+            there = f"there are {', '.join(outputs)}" if outputs else "this stream has one theta, live.theta"
+            raise KeyError(f"there is no output {output!r}; {there}.")
+        return LiveOutput(self, output if isinstance(output, int) else outputs.index(output))
+
+    __iter__ = None
+    """A stream is no sequence: `update` processes its samples."""
 
     @overload
     def update(
