@@ -47,14 +47,17 @@ def fleet():
 
 
 @pytest.fixture
-def notebook(monkeypatch):
+def notebook():
     """What rich takes for Jupyter."""
 
     class ZMQInteractiveShell:
         pass
 
-    monkeypatch.setattr(builtins, "get_ipython", ZMQInteractiveShell, raising=False)
-    monkeypatch.setattr(rich, "_console", None)  # made once, and kept after the notebook is gone
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(builtins, "get_ipython", ZMQInteractiveShell, raising=False)
+        rich.reconfigure()  # its console was made before, and stays when the notebook is gone
+        yield
+    rich.reconfigure()
 
 
 def results(run, fleet):

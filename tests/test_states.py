@@ -169,16 +169,16 @@ def test_fates_of_dates_are_those_of_numbers():
 
 
 def test_rows_in_order_have_the_same_fates_with_and_without_sorting(monkeypatch):
-    rng, quick, counted = np.random.default_rng(4), late._all_in_order, Counter()
+    rng, quick, counted = np.random.default_rng(4), late.all_in_order, Counter()
     for _ in range(300):
         series, time = np.sort(rng.integers(0, 3, 6)), np.cumsum(rng.integers(0, 3, 6)) * 1.0
         time[rng.uniform(size=6) < 0.03] = rng.choice([np.nan, np.inf])
         newest = rng.choice([np.nan, 0.0, 2.0], 3)
         given = series, time, np.zeros(6, bool), newest, 0.0
-        monkeypatch.setattr(late, "_all_in_order", quick)
+        monkeypatch.setattr(late, "all_in_order", quick)
         counted[quick(series, time, newest) is not None] += 1
         found = sort_out(*given)
-        monkeypatch.setattr(late, "_all_in_order", lambda *_: None)
+        monkeypatch.setattr(late, "all_in_order", lambda *_: None)
         assert all(map(same, found, sort_out(*given)))
     assert min(counted[True], counted[False]) > 20
 

@@ -84,7 +84,7 @@ def test_both_are_found_on_disk_and_a_driver_whose_step_was_lost_is_compiled_aga
     assert len(compiled) == before
     for path in disk_cache.folder().glob(f"{PREFIX}*"):
         path.unlink()
-    for known in ("_SOURCES", "_LINKED"):  # as in a process that has compiled nothing
+    for known in ("SOURCES", "LINKED"):  # as in a process that has compiled nothing
         monkeypatch.setattr(f"driftfit.engine.outlined.{known}", {})
     assert predictions(Regression(1)) == [1.0]
     assert [name.split("_")[0] for name in compiled[before:]] == ["run", "outlined"]

@@ -53,7 +53,7 @@ def sort_out(series: Array, time: Array, waited: Array, newest: Array, hold: Any
     hold : number or timedelta64
         Not negative.
     """
-    if not hold and not waited.any() and (ends := _all_in_order(series, time, newest)) is not None:
+    if not hold and not waited.any() and (ends := all_in_order(series, time, newest)) is not None:
         after = newest.copy()
         after[series[ends]] = time[ends]
         return Fates(np.arange(len(time)), np.full(len(time), RELEASED), after)
@@ -78,7 +78,7 @@ def ended(fate: Array, over: Array) -> Array:
     return np.where((fate == WAITING) & over, RELEASED, fate)
 
 
-def _all_in_order(series: Array, time: Array, newest: Array) -> Array | None:
+def all_in_order(series: Array, time: Array, newest: Array) -> Array | None:
     """The last row of every series if all rows are sorted and each is after the one before; None otherwise.
 
     Most rows arrive so, and to see it takes a fifth of the time of sorting and deciding on each.
