@@ -42,7 +42,7 @@ from driftfit.models.state_space import StateSpace, equations_of
 from driftfit.trackers.kalman import drift_matrix
 from driftfit.trackers.parts.diffuse import corrected, symmetric_product
 from driftfit.trackers.parts.varying_drift import read_drift
-from driftfit.trackers.state_space_tracker import StateSpaceTracker
+from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
 MOST = 1000.0
 """Times that equations are repeated for one gap, at most."""

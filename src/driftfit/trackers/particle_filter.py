@@ -34,8 +34,8 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.settings import near, whole
 from driftfit.models.state_space import StateSpace
-from driftfit.trackers.particles.steps import steps
-from driftfit.trackers.state_space_tracker import StateSpaceTracker
+from driftfit.trackers.state_space.particle_steps import steps
+from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
 
 @dataclass(frozen=True)
