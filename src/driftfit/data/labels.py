@@ -129,11 +129,11 @@ def order_of(owner: str, wanted: Sequence[str], given: Sequence[str], what: str 
     more = [name for name in given if name not in wanted]
     if not absent and not more:
         return [list(given).index(name) for name in wanted]
-    said = [f"{absent[0]!r} is missing"] if absent else []
-    said += [f"{more[0]!r} is none of them"] if more else []
+    problems = [f"{absent[0]!r} is missing"] if absent else []
+    problems += [f"{more[0]!r} is none of them"] if more else []
     raise ValueError(
         f"{owner} has the {what} {', '.join(wanted)}, but {letter} has the columns {', '.join(given)}; "
-        f"{'; '.join(said)}. Named signals are matched by name: rename or select columns, or give {letter} as an "
+        f"{'; '.join(problems)}. Named signals are matched by name: rename or select columns, or give {letter} as an "
         "array to match by position."
     )
 

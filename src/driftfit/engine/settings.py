@@ -44,8 +44,8 @@ class Settings:
     def __repr__(self) -> str:
         """The expression that constructs it again: settings without a default, and those that differ from it."""
         own = [field for field in fields(self) if field.init]  # type: ignore[arg-type]
-        said = [f"{f.name}={getattr(self, f.name)!r}" for f in own if getattr(self, f.name) != f.default]
-        return f"{type(self).__name__}({', '.join(said)})"
+        given = [f"{f.name}={getattr(self, f.name)!r}" for f in own if getattr(self, f.name) != f.default]
+        return f"{type(self).__name__}({', '.join(given)})"
 
     def settings(self) -> dict[str, Any]:
         """The fields as plain data (numbers, strings, None, nested tuples)."""

@@ -66,7 +66,7 @@ class End(NamedTuple):
         return cls(programs, states, *(extra[name] for name in ("last", "awaits", "dt", "zone")))
 
 
-UNSAID: Mapping[str, Any] = {
+ABSENT: Mapping[str, Any] = {
     "dt": None, "zone": None, "limits": None, "last": None, "ignored": 0, "lag": 0, "awaits": 0, "cold": False,
     "windows": (), "alarms": (),
 }  # fmt: skip
@@ -81,7 +81,7 @@ def written(
     model = programs[0].whole
     header: dict[str, Any] = {"kind": KINDS[len(model.outputs) > 1], "model": storage.describe(model)}
     header |= {"tracker": described[0] if len(described) == 1 else described, "fields": programs[0].layout.text}
-    header |= {"extra": {name: value for name, value in extra.items() if value != UNSAID[name]}}
+    header |= {"extra": {name: value for name, value in extra.items() if value != ABSENT[name]}}
     return header, {f"state{lane}": np.frombuffer(data, np.uint8) for lane, data in enumerate(lanes)}
 
 
@@ -89,7 +89,7 @@ def read(header: Mapping[str, Any]) -> tuple[Model, tuple[Tracker, ...], dict[st
     """(the model, the tracker of each output, everything else) from a header that `written` made."""
     given = header["tracker"]
     trackers = tuple(storage.rebuild(one, Tracker) for one in (given if isinstance(given, list) else [given]))
-    return storage.rebuild(header["model"], Model), trackers, {**UNSAID, **header["extra"]}
+    return storage.rebuild(header["model"], Model), trackers, {**ABSENT, **header["extra"]}
 
 
 def by_output(model: Model, trackers: Sequence[Tracker]) -> Any:

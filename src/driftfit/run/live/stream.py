@@ -23,7 +23,7 @@ from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import programs_of, state_of, tile_of
 from driftfit.run.public_class import Plain
 from driftfit.run.result import burn_in
-from driftfit.run.warm_start import KINDS, UNSAID, End, Run, by_output, carried, ended, read, restore, written
+from driftfit.run.warm_start import ABSENT, KINDS, End, Run, by_output, carried, ended, read, restore, written
 from driftfit.trackers.base import Tracker
 
 
@@ -206,7 +206,7 @@ class Stream(Batched, Plain, storage.Kept):
 
     def __reduce__(self) -> Any:
         header, arrays = self._written()
-        header["extra"] = {**UNSAID, **header["extra"]}
+        header["extra"] = {**ABSENT, **header["extra"]}
         return type(self)._again, ("the copy", (self.model, self.trackers), header, arrays)
 
     @classmethod
