@@ -17,7 +17,7 @@ from driftfit.data.signals import as_inputs
 from driftfit.engine.kernel import Array
 
 PLAIN = (np.ndarray, list, tuple, float, int)
-"""What has neither names nor an index."""
+"""Types that have neither names nor an index."""
 
 
 class Held(NamedTuple):
@@ -57,7 +57,9 @@ def held(what: str, given: Any) -> Held:
 
 
 def _names(given: Sequence[Any]) -> tuple[str, ...]:
-    """Names of columns; none if one is not text, such as the numbers that pandas gives to columns without names."""
+    """Names of columns; no names at all if one of them is not text, such as the numbers that pandas gives to unnamed
+    columns.
+    """
     return tuple(given) if all(isinstance(name, str) and name for name in given) else ()
 
 

@@ -25,7 +25,7 @@ def check_ready(tracker: S) -> S:
 
 
 def as_output(y: Any) -> Array:
-    """y as (T,)."""
+    """The output as an array (T,)."""
     array = as_numbers("y", y)
     if array.ndim == 2 and array.shape[1] == 1:
         array = array[:, 0]
@@ -38,7 +38,7 @@ def as_output(y: Any) -> Array:
 
 
 def as_inputs(u: Any, T: int) -> Array:
-    """u as (T, m); None is no input."""
+    """The inputs as an array (T, m); None means that there are none."""
     if u is None:
         return np.zeros((T, 0))
     array = as_numbers("u", u)

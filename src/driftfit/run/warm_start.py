@@ -45,18 +45,22 @@ class End(NamedTuple):
     zone: str | None = None
 
     def end(self) -> End:
-        """Itself: a run continues from it."""
+        """The end itself, so that it can be used in place of a run."""
         return self
 
     def to_bytes(self) -> bytes:
-        """What `Live.from_bytes` and ``warm_start=`` continue from: a few hundred bytes more than the state itself."""
+        """The end as bytes for `Live.from_bytes` and ``warm_start=``: a few hundred bytes more than the state
+        itself.
+        """
         lanes = [one.pack(one.tile(state)) for one, state in zip(self.programs, self.states, strict=True)]
         extra = {"last": self.last, "awaits": self.awaits, "dt": self.dt, "zone": self.zone}
         return storage.compact(*written(self.programs, lanes, extra))
 
     @classmethod
     def from_bytes(cls, data: bytes) -> End:
-        """From the bytes of an end or of a stream (``live.to_bytes()``); ValueError if they are damaged or foreign."""
+        """The end from bytes, or from those of a stream (``live.to_bytes()``); ValueError if they are damaged or of
+        another kind.
+        """
         header, arrays = storage.expand(data, KINDS)
         model, trackers, extra = read(header)
         programs = programs_of(model, by_output(model, trackers), model.m)

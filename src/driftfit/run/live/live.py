@@ -155,15 +155,15 @@ class Live(Operated, Stream):
     ) -> Any:
         """Process one sample and return (y_hat, e, s, ok), numbers, or arrays (ny,) for several outputs.
 
-        ``y`` is a number, or of several outputs (ny,) or a mapping from their names; None, NaN or inf if it is missing.
-        ``u`` is a number for one input, a sequence of m otherwise ((ny, m) where outputs share one theta), or a mapping
-        from the names of the inputs; None if it is missing. If ``u`` is left out, it comes with
-        `apply`, before the next sample; ValueError for a model that has inputs and needs them at once. With ``time``,
-        the interval since the last sample scales the drift; a time that is not after the last is counted in ``ignored``
-        and leaves the state unchanged. ``weight`` divides the noise variance of this sample (0: do not use it); it is
-        one number, or one for each output,
-        ``drift`` multiplies the drift before it: one number, or one for each parameter (random-walk trackers) or change
-        (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its changes or joint events at this sample.
+        ``y`` is a number, or for several outputs an array (ny,) or a mapping from their names; None, NaN or inf if it
+        is missing. ``u`` is a number for one input, a sequence of m otherwise ((ny, m) where outputs share one theta),
+        or a mapping from the names of the inputs; None if it is missing. If ``u`` is left out, it comes with `apply`,
+        before the next sample; ValueError for a model that has inputs and needs them at once. With ``time``, the
+        interval since the last sample scales the drift; a time that is not after the last is counted in ``ignored`` and
+        leaves the state unchanged. ``weight`` divides the noise variance of this sample (0: do not use it); it is one
+        number, or one for each output, ``drift`` multiplies the drift before it: one number, or one for each parameter
+        (random-walk trackers) or change (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its changes or
+        joint events at this sample.
         """
         if prob is not None or type(drift) is not float:
             return self._update_with_extra(y, u, time, weight, drift, prob)
@@ -407,10 +407,10 @@ class Live(Operated, Stream):
         return None if time is None else time[0]
 
     def driven_on(self, inputs: Array) -> tuple[list[tuple[Program, Array]], Array]:
-        """(each program with a copy of its state to be driven on, inputs (h, m) then).
+        """(each program with a copy of its state that a forecast may advance, the inputs (h, m) for it).
 
-        What `apply` is to bring is the first of the inputs. There is no copy where outputs are regressors of each
-        other.
+        While `apply` is outstanding, its input is the first of the inputs. Outputs that are regressors of each other
+        are left out.
         """
         apart = [(one if self._single else one.alone, lane) for lane, one in enumerate(self.programs)]
         copies = [(one, one.resting(self.lane(lane))) for one, lane in apart if one is not None]
@@ -461,7 +461,7 @@ class Live(Operated, Stream):
 
     @property
     def regressors(self) -> Array:
-        """Those of the last sample, (n,)."""
+        """The regressors of the last sample, (n,)."""
         phi: Array = self._tile["phi"][0, :, 0].copy()
         return phi
 
@@ -471,6 +471,6 @@ class Live(Operated, Stream):
         return values[0] if len(values) == 1 else values
 
     def _by_lane(self, found: Callable[[Tracker, dict[str, Array]], Array]) -> Array:
-        """What each tracker finds in its lane; without the first axis if there is one theta."""
+        """The results of a function of each tracker and its lane, stacked; a single result if there is one theta."""
         parts = [found(tracker, self.lane(lane)) for lane, tracker in enumerate(self.trackers)]
         return parts[0] if len(parts) == 1 else np.array(parts)

@@ -1,4 +1,4 @@
-"""What a stream keeps besides its tile: time, limits, late inputs, windows, alarms, and its files."""
+"""What a stream stores in addition to its tile: time, limits, late inputs, windows and alarms; and its files."""
 
 from __future__ import annotations
 
@@ -214,7 +214,7 @@ class Stream(Batched, Plain, storage.Kept):
         cls, source: str, settings: tuple[Model, tuple[Tracker, ...]], header: Mapping[str, Any],
         arrays: Mapping[str, Array],
     ) -> Self:  # fmt: skip
-        """The stream from its state."""
+        """The stream that continues from a stored state."""
         (model, trackers), extra = settings, header["extra"]
         limits, outside = extra["limits"] or ([], [])
         make: Any = cls
