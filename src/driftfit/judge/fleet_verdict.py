@@ -236,7 +236,7 @@ def verdicts(
 
 
 def verdicts_and_diagnoses(runs: Mapping[Hashable, Track], level: float) -> tuple[ManyVerdicts, ManyDiagnoses]:
-    """Both, which share the test of constancy of each run."""
+    """The verdicts and the diagnoses, which share the test of constancy of each run."""
 
     def both(key: Hashable) -> tuple[Verdict, Diagnosis]:
         known = Evidence(runs[key])

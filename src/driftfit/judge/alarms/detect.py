@@ -31,8 +31,8 @@ its innovations are soon normal again, so "innovation" gives an alarm, if at all
 ``p`` is the probability that a record without a fault is as extreme as this one: from the same rates (the smallest of
 the columns, 1 - P(first within) exp(-samples rate), times their number), or the share of the simulated records.
 
-Only the calibration looks ahead. Verified by ``benchmarks/alarm_rates.py``. Cost: O(T), and as many runs as
-50 every / T for a calibration.
+Only the calibration looks ahead. Verified by ``benchmarks/alarm_rates.py``. Cost: O(T), and 50 every / T runs
+for a calibration.
 """
 
 from __future__ import annotations

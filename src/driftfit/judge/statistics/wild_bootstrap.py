@@ -10,7 +10,8 @@ from a few rows at the end of a record is useless there, so the tests of `driftf
 ends out. F takes the variance of the noise from the whole record, and random signs keep the variance of every row. Near
 the ends the residuals themselves would count the change as noise. Every row there is a date, and about MIDDLE between.
 
-For scores without correlation and records of at least LEAST rows: with fewer the signs know too little of tails.
+For scores without correlation and records of at least LEAST rows: with fewer rows, random signs represent the tails too
+poorly.
 
 Source: Hansen (2000), a fixed-regressor bootstrap; Liu (1988) for signs; Besag and Clifford (1991) for sequential
 p-values. Departure: the ends. Cost: O(DRAWS (N n + MIDDLE n^2)), without a change a fifth of that.
