@@ -140,7 +140,9 @@ def _relative(run: Outputs) -> tuple[Array, Array]:
 
 
 def _log_density(z: Array, q: Array, S: Array, d: Array) -> Array:
-    """Log density (T,) of the observed outputs; S (T, ny, ny) and the degrees of freedom d are those before the sample."""
+    """Log density (T,) of the observed outputs; S (T, ny, ny) and the degrees of freedom d are those before
+    the sample.
+    """
     found, gamma = np.full(len(z), np.nan), scipy.special.gammaln
     for seen, rows in _patterns(np.isfinite(z)):
         at, k = rows[d[rows] > 0.0], len(seen)

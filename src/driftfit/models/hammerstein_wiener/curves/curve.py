@@ -182,7 +182,7 @@ class Functions(Basis):
         return self.labels or super().names
 
     def __repr__(self) -> str:
-        """With the places of the functions, from which they are imported again."""
+        """The expression with the modules and names of the functions, from which they are imported again."""
         given: dict[str, Any] = {name: _place(getattr(self, name)) for name in ("values", "slopes")}
         given |= {} if self.n == 1 else {"n": self.n}
         given |= {} if self.numbers == (0.0,) else {"numbers": self.numbers}
