@@ -151,7 +151,9 @@ def test_outputs_of_one_record(tmp_path):
 
 
 def test_alarms_of_a_fleet_share_one_rate(fleet):
-    """Each series is watched for its part of the rate; what is found is named, what is too short is told."""
+    """Each series is watched for its part of the rate; what is found is named, and series that are too short are
+    reported.
+    """
     said = fleet.detect("band", every=1000.0, reference=140)
     assert set(said.faulty) == set(said.alarmed) == {f"<{k}>" for k in MOVED}
     assert len(said) == 6
@@ -171,9 +173,9 @@ def test_alarms_of_a_fleet_share_one_rate(fleet):
     assert f"Alarms {len(table)} in 2 series; 0.14 false alarms expected".split() in printed
     for row in said.rows:
         judged = [str(len(row.alarms.onsets)), *row.first.split()]
-        told = next(line for line in printed if line[0] == row.key)
-        assert told[1 : 1 + len(judged)] == judged
-        assert (told[-1] == "fault") == row.faulty
+        printed_row = next(line for line in printed if line[0] == row.key)
+        assert printed_row[1 : 1 + len(judged)] == judged
+        assert (printed_row[-1] == "fault") == row.faulty
     assert ["not", "judged,", "<6>:"] in [line[:3] for line in printed]
     with pytest.raises(KeyError, match="too short"):
         said["<6>"]

@@ -97,7 +97,7 @@ WAYS = {"pickle": lambda one: pickle.loads(pickle.dumps(one)), "copy": copy.copy
 
 
 @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-def test_a_copied_stream_goes_on_by_itself(way):
+def test_a_copied_stream_continues_independently(way):
     for model, y, settings in ((ARX(2, 2), Y, {"lag": 3}), (ARX(2, 2), Y, {}), (ARX(1, 1, ny=2), TWO, {"lag": 3})):
         live = Live(model, K, **settings)
         for t in range(50):

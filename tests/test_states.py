@@ -51,7 +51,7 @@ def test_bytes_of_an_older_version_are_read_by_the_names_of_fields():
     np.testing.assert_allclose(live.update(1.0, 1.0, time=8.0), golden().update(1.0, 1.0, time=8.0), rtol=1e-12)
 
 
-def test_a_state_is_a_few_hundred_bytes_beside_its_numbers():
+def test_a_state_is_its_numbers_and_a_few_hundred_bytes():
     live = Live(ARX(2, 2), K)
     for t in range(60):
         live.update(Y[t], U[t])
