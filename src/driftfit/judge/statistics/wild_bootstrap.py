@@ -45,6 +45,7 @@ def _share_above(X: Array, psi: Array, c: Array, dates: Array, roots: Array, sha
             if at < m and dates[at] == t:
                 S[at] = whole
                 at += 1
+            # xorshift: one random number decides the sign and, near the ends, the row that is drawn
             state ^= state << np.uint64(13)
             state ^= state >> np.uint64(7)
             state ^= state << np.uint64(17)
@@ -55,6 +56,7 @@ def _share_above(X: Array, psi: Array, c: Array, dates: Array, roots: Array, sha
             signed = value if (state >> np.uint64(32)) & np.uint64(1) else -value
             for i in range(n):
                 whole[i] += X[t, i] * signed
+        # S*_b = S_b - A_b A_T^-1 S_T, and its quadratic form F_b
         best = 0.0
         for b in range(m):
             total = 0.0
@@ -67,6 +69,7 @@ def _share_above(X: Array, psi: Array, c: Array, dates: Array, roots: Array, sha
                     z += roots[b, i, j] * S[b, j]
                 total += z * z
             best = max(best, total)
+        # sequential: stop as soon as enough draws exceed the observed supremum
         above += 1 if best >= found else 0
         if above == ABOVE:
             return above / (draw + 1)

@@ -250,6 +250,7 @@ def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: 
         cost[t] = np.nan
         if not factor(P[t], scale, L):
             continue
+        # the weighted residual L^-1 (theta - g(zeta)) at the start
         now = zeta[t]
         residual(theta[t], now, orders, sizes, rho)
         whiten(L, scale, rho)
@@ -258,6 +259,7 @@ def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: 
             best += rho[i] * rho[i]
         damping = 0.0
         for _ in range(STEPS):
+            # Gauss-Newton: N step = J' rho, with more damping until the cost does not rise
             equations(now, orders, sizes, L, scale, J, N)
             gradient(J, rho, right)
             better = False
@@ -276,6 +278,7 @@ def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: 
                 damping = max(10.0 * damping, 1e-3)
             if not better:
                 break
+            # accept the step, and restore |c| = 1
             gain = best - value
             best = value
             now[:] = moved
@@ -284,6 +287,7 @@ def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: 
             damping = 0.0 if damping < 1e-3 else 0.1 * damping
             if gain <= 1e-12 * best or gain == 0.0:
                 break
+        # the covariance is N^-1 at the minimum, column by column, projected onto |c| = 1
         cost[t] = best
         equations(now, orders, sizes, L, scale, J, N)
         for x in range(n_x):
