@@ -234,6 +234,22 @@ def gradient(J: Array, rho: Array, right: Array) -> None:
         right[x] = total
 
 
+@shared
+def inverse(N: Array, C: Array, right: Array, step: Array, out: Array) -> None:
+    """out = N^-1, column by column and symmetric; C, right and step are scratch. NaN from where N has no factor."""
+    n = N.shape[0]
+    for x in range(n):
+        right[:] = 0.0
+        right[x] = 1.0
+        if not solve(N, 0.0, right, C, step):
+            break
+        for z in range(n):
+            out[z, x] = step[z]
+    for x in range(n):
+        for z in range(x):
+            out[z, x] = out[x, z]
+
+
 @Driver
 def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: Array, cov: Array, cost: Array) -> None:
     """Refine zeta (T, n_z) in place; fill cov (T, n_z, n_z) and cost (T,), NaN where P is no finite covariance.
@@ -290,14 +306,5 @@ def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: 
         # the covariance is N^-1 at the minimum, column by column, projected onto |c| = 1
         cost[t] = best
         equations(now, orders, sizes, L, scale, J, N)
-        for x in range(n_x):
-            right[:] = 0.0
-            right[x] = 1.0
-            if not solve(N, 0.0, right, C, step):
-                break
-            for z in range(n_x):
-                cov[t, z, x] = step[z]
-        for x in range(n_x):
-            for z in range(x):
-                cov[t, z, x] = cov[t, x, z]
+        inverse(N, C, right, step, cov[t])
         project(now, orders[0], sizes, cov[t], right, step)
