@@ -27,7 +27,7 @@ def idle() -> None:
     rng = np.random.default_rng(0)
     x, v = rng.normal(size=T), 0.1 * rng.normal(size=T)
     y = np.where(np.arange(T) < 1000, 1.0, 2.0) * x + v
-    print("An input that stands still: response to x, 2 after a jump, at the end")
+    print("An input that is constant: response to x, 2 after a jump, at the end")
     print(f"  {'second column':16}{'AdaptiveKalman':>22}{'Bank()':>22}{'RLS(0.98)':>22}{'Kalman':>22}")
     for name, second in (("moves too", rng.normal(size=T)), ("stays at 0", np.zeros(T)), ("is x again", x)):
         cells = []

@@ -172,7 +172,7 @@ def test_orders_and_names():
     assert parts["F"][0].tolist() == [1.0, -1.5, 0.7]
     with pytest.raises(ValueError, match="different numbers of inputs"):
         OE([1, 1], [1, 1, 1])
-    with pytest.raises(ValueError, match="needs an input"):
+    with pytest.raises(ValueError, match="needs at least 1 input"):
         OE(1, 1).bind(0)
     with pytest.raises(ValueError, match="nothing to estimate"):
         OE(0, 0)

@@ -57,7 +57,7 @@ def first(rng, x):
 IDLE = {
     "an idle input": (noise, level(0.0), [2]),
     "the same tag twice": (noise, first, [0, 2]),
-    "a constant beside an intercept": (level(50.0), level(1.0), [1, 2]),
+    "a constant next to an intercept": (level(50.0), level(1.0), [1, 2]),
 }
 
 
@@ -269,7 +269,7 @@ def test_a_smoothed_path_is_about_as_good_as_with_the_true_drift():
     assert np.mean(inside) > 0.91
 
 
-def test_bands_hold_where_the_walk_is_too_slow_to_be_seen():
+def test_bands_hold_where_the_walk_is_too_slow_to_be_observed():
     inside = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -304,7 +304,7 @@ def test_a_fleet_warns_once_of_what_its_series_could_not_learn():
 
 @pytest.mark.parametrize("unit", [1.0, 1e-9, 1e9])
 def test_a_direction_enters_as_the_limit_of_wide_priors_however_weakly(unit):
-    """A set-point beside an intercept moves by the least step there is, and much later by more."""
+    """A set-point next to an intercept moves by the smallest possible step, and much later by more."""
     x, y, u = np.random.default_rng(6).normal(size=(3, T)) * [[1.0], [0.1], [1.0]]
     set_point = np.full(T, 50.0)
     set_point[700:] += 1e-9
@@ -328,7 +328,9 @@ LATE = Bank(changes=[Change(q=1e-4)], sensors=[Sensor.nominal(r=0.01)])
 
 @pytest.mark.parametrize("reduce", [Beam(9), Decide(2), IMM()], ids=lambda one: type(one).__name__)
 def test_a_late_direction_enters_all_hypotheses_as_it_enters_the_kalman_filter(reduce):
-    """Columns that wake one after the other, the last one beside a fourth that repeats it; gaps before and after."""
+    """Columns that wake one after the other, the last one together with a fourth that repeats it; gaps before and
+    after.
+    """
     y, u = jumping(noise, noise, jump=T)
     u[:300, 1], u[:700, 2] = 0.0, 3.0 * u[:700, 0]
     u = np.column_stack([u, 2.0 * u[:, 2]])
@@ -341,7 +343,7 @@ def test_a_late_direction_enters_all_hypotheses_as_it_enters_the_kalman_filter(r
         with pytest.warns(UserWarning, match="theta3, theta4 could not be learned"):
             run = track(Regression(4), bank, y, u)
         np.testing.assert_array_equal(np.isinf(run.std), np.isinf(exact.std))
-        if changes is two:  # in a gap a change comes beside the ordinary course, and not in its place
+        if changes is two:  # in a gap a change is added to the nominal course and does not replace it
             far = np.isin(np.arange(T) // 50, [5, 6, 7, 13, 14, 15], invert=True)
         known = np.isfinite(run.std) & far[:, None]
         np.testing.assert_allclose(run.std[known], exact.std[known], rtol=1e-6)
@@ -402,7 +404,7 @@ def naive_density(lane, phi, y):
     return total
 
 
-def test_where_parameters_stand_can_be_said_in_a_stream():
+def test_parameters_can_be_reset_in_a_stream():
     y, u = jumping(noise, noise)
     live = Live(MODEL, AdaptiveKalman())
     for t in range(750):
@@ -455,10 +457,10 @@ COARSE = [RLS(1.0), RLS(0.98), FLS(300.0), AdaptiveKalman()]
 
 @pytest.mark.parametrize("tracker", COARSE, ids=repr)
 @pytest.mark.parametrize(
-    ("quantum", "held", "told"),
+    ("quantum", "held", "fewest"),
     [(1.0, 400, 38), (1.0, 20, 38), (2.0, 20, 38), (2.0, 1, 38), (3.0, 400, 20), (5.0, 1, 20)],
 )
-def test_bands_of_coarse_meters_do_not_count_one_error_of_rounding_as_many(tracker, quantum, held, told):
+def test_bands_of_coarse_meters_do_not_count_one_error_of_rounding_as_many(tracker, quantum, held, fewest):
     """The variance of what readings share does not shrink with their number; without it 0.3 to 0.9 of them cover.
 
     With the last two quanta readings alternate between two values, and their variance says nothing about the noise.
@@ -469,7 +471,7 @@ def test_bands_of_coarse_meters_do_not_count_one_error_of_rounding_as_many(track
         run = track(Regression(1), tracker, y, x)
         if np.isfinite(run.std[-1, 0]):
             inside.append(abs(run.theta[-1, 0] - theta) <= 1.96 * run.std[-1, 0])
-    assert len(inside) >= told
+    assert len(inside) >= fewest
     assert np.mean(inside) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / len(inside))
 
 

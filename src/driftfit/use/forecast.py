@@ -26,10 +26,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.data.labels import inputs_for
-from driftfit.engine.arrays import as_numbers
-from driftfit.engine.drivers import as_compiled, one_or_all
+from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import whole
+from driftfit.engine.settings import as_numbers, whole
+from driftfit.engine.tiles import as_compiled
 from driftfit.models.base import Model
 from driftfit.run.live.live import Live
 from driftfit.run.outputs import Outputs

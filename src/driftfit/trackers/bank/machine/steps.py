@@ -61,9 +61,9 @@ GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift
 def keep(o: State, s: State, l: int) -> None:
     """Store the report of events."""
     size, L = o.report.shape
-    said = floats(report_at(s), size, L)
+    report = floats(report_at(s), size, L)
     for k in range(size):
-        o.report[k, l] = said[k, l]
+        o.report[k, l] = report[k, l]
 
 
 @kernel
