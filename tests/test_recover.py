@@ -98,6 +98,8 @@ def test_exponential_autoregression():
     assert np.median([f.noise for f in found]) == pytest.approx(0.01, rel=0.02)
     assert sum(f.interval[0] <= 1.0 <= f.interval[1] for f in found) >= 18
     d = exp_ar(500, rng=np.random.default_rng(0))
+    e = d.y[2:] - np.sum(found[0].theta(d.y)[2:] * np.stack([d.y[1:-1], d.y[:-2]], axis=1), axis=1)
+    assert found[0].noise == pytest.approx(e @ e / (len(e) - 5))
     np.testing.assert_allclose(found[0].theta(d.y)[5:], d.theta[5:], atol=0.02)
 
 
