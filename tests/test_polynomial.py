@@ -147,7 +147,7 @@ def test_missing_data_and_gaps_do_no_harm():
 
 
 def test_the_noise_model_is_uncertain_in_forecasts_too():
-    """As the lags of an ARX are; and where the noise model is hardly known .90 of the outputs are within 95 % bands, .71
+    """As the lags of an ARX are; and if the noise model is hardly known .90 of the outputs are within 95 % bands, .71
     within those of the estimate of C and D."""
     y, u = arx_record(200, 5)
     as_arx, other = (track(one, Kalman(q=0.0, r=0.01), y, u) for one in (ARX(2, 2), PolynomialModel(na=2, nb=2, nc=0)))
