@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.arguments import check_roles
+from driftfit.data.limits import FAR, absurd
 from driftfit.data.record import Reading
 from driftfit.engine.settings import one_of, whole
 from driftfit.models.base import Model
@@ -125,6 +126,7 @@ def _tuned(
     """Tune on a checked record."""
     if order_by is not None:
         task = along(task, tracker, order_by)
+    _warn_of_fault_codes(task)
     knobs = find_knobs(task, tracker, groups, bounds)
     f = Counted(Criterion(task, knobs, method, h))
     search = Search(f, knobs, minimise(f, knobs))
@@ -142,6 +144,23 @@ def _tuned(
     )
     _warn(tuned)
     return tuned
+
+
+def _warn_of_fault_codes(task: Task) -> None:
+    """Warn of readings that decide the likelihood alone."""
+    records = task.records
+    for signal, columns in (("y", records.y.reshape(len(records.y), -1)), ("u", records.u)):
+        for j in range(columns.shape[1]):
+            places = absurd(columns[:, j])
+            if len(places):
+                name = f"{signal}{j + 1}" if columns.shape[1] > 1 else signal
+                warnings.warn(
+                    f"tune: {name} is {columns[places[0], j]:.6g} at sample {places[0]}, more than {FAR:.0f} times its "
+                    f"usual deviation ({len(places)} such values): they decide the likelihood alone. If they are fault "
+                    f'codes, give limits={{"{name}": (low, high)}}.',
+                    UserWarning,
+                    stacklevel=4,
+                )
 
 
 def _warn(tuned: Tuned) -> None:
