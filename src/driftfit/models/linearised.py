@@ -19,8 +19,8 @@ from driftfit.engine.kernel import State, kernel
 from driftfit.models.fault_codes import UNJUDGED, judge
 
 MEMORY: Mapping[str, Any] = {
-    "shift": 0.0, "measured": np.nan, "without": 0.0, "usable": 0.0, "started": 0.0, "last_row": np.nan, "moved_on": 1.0,
-    **UNJUDGED,
+    "shift": 0.0, "measured": np.nan, "without": 0.0, "usable": 0.0, "started": 0.0, "last_row": np.nan,
+    "moved_on": 1.0, **UNJUDGED,
 }  # fmt: skip
 """The shift; y_t; successive samples without an output; usable samples with a regressor unlike the one before; whether
 there was a complete regressor; a sum over the last regressor, and whether it was another one."""

@@ -96,7 +96,8 @@ def summarise(run: Track) -> Summary:
     tracker = shortened(repr(run.tracker))
     return Summary(
         repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
-        _signals(run), _span(run), counts(run.labels.dropped), (*remarks, *_missing(run), *refusals(run.state), *run.tracker.remarks(run)),
+        _signals(run), _span(run), counts(run.labels.dropped),
+        (*remarks, *_missing(run), *refusals(run.state), *run.tracker.remarks(run)),
     )  # fmt: skip
 
 
