@@ -148,16 +148,15 @@ def _tuned(
 
 def _warn_of_fault_codes(task: Task) -> None:
     """Warn of readings that decide the likelihood alone."""
-    records = task.records
-    for signal, columns in (("y", records.y.reshape(len(records.y), -1)), ("u", records.u)):
-        for j in range(columns.shape[1]):
-            places = absurd(columns[:, j])
-            if len(places):
-                name = f"{signal}{j + 1}" if columns.shape[1] > 1 else signal
+    for record in task.records:
+        m = record.u.shape[1]
+        columns = {"y": record.y} | {f"u{j + 1}" if m > 1 else "u": record.u[:, j] for j in range(m)}
+        for name, x in columns.items():
+            if x.ndim == 1 and len(places := absurd(x)):
                 warnings.warn(
-                    f"tune: {name} is {columns[places[0], j]:.6g} at sample {places[0]}, more than {FAR:.0f} times its "
-                    f"usual deviation ({len(places)} such values): they decide the likelihood alone. If they are fault "
-                    f'codes, give limits={{"{name}": (low, high)}}.',
+                    f"tune: {name} is {x[places[0]]:.6g} at sample {places[0]}, more than {FAR:.0f} times its "
+                    f"usual deviation ({len(places)} such values): they decide the likelihood alone. If fault codes, "
+                    f'give limits={{"{name}": (low, high)}}.',
                     UserWarning,
                     stacklevel=4,
                 )
