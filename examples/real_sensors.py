@@ -49,14 +49,17 @@ def codes() -> None:
     print("\nFault codes: largest distance from [0.7, 2], 5 and 500 samples after the last of them")
     names = ("AdaptiveKalman", "RLS(0.98)", "Kalman")
     print(f"  {'codes':22}" + "".join(f"{name:>18}" for name in names))
-    for code, count, where in ((9999.0, 1, "y"), (9999.0, 5, "y"), (-999.0, 1, "y"), (9999.0, 1, "u")):
+    for code, count, where, begin in (
+        (9999.0, 1, "y", 100), (9999.0, 5, "y", 100), (-999.0, 1, "y", 100), (9999.0, 1, "u", 100),
+        (9999.0, 1, "y", 0), (9999.0, 20, "y", 0), (-999.0, 1, "y", 4), (9999.0, 1, "u", 4),
+    ):  # fmt: skip
         record = {"y": y.copy(), "u": u.copy()}
-        record[where][100 : 100 + count] = code
+        record[where][begin : begin + count] = code
         cells = []
         for tracker in (AdaptiveKalman(), FORGET, WALK):
             away = np.abs(track(ARX(1, 1), tracker, **record).theta - [0.7, 2.0]).max(axis=1)
-            cells.append(f"{away[104 + count]:.3f}, {away[599 + count]:.3f}")
-        print(f"  {f'{code:g}, {count} in {where}':22}" + "".join(f"{cell:>18}" for cell in cells))
+            cells.append(f"{away[begin + count + 4]:.3f}, {away[begin + count + 499]:.3f}")
+        print(f"  {f'{code:g}, {count} in {where}, from {begin}':22}" + "".join(f"{cell:>18}" for cell in cells))
 
 
 def coarse() -> None:

@@ -90,9 +90,9 @@ class Times(NamedTuple):
 def times_of(time: Any, parts: Sequence[Held]) -> Times:
     """The times that a user passed, or the first index of dates among the signals."""
     if time is None:
-        index = next((part.index for part in parts if _dated(part.index)), None)
+        index = next((part.index for part in parts if dated(part.index)), None)
         return Times() if index is None else _dates(index)._replace(labels=True)
-    if _dated(time):
+    if dated(time):
         return _dates(time)
     if isinstance(time, np.ndarray | list | tuple):
         return Times(*instants(time))
@@ -107,7 +107,7 @@ def times_of(time: Any, parts: Sequence[Held]) -> Times:
     return Times(axis, zone, (_names([series.name]) or (None,))[0])
 
 
-def _dated(index: Any) -> bool:
+def dated(index: Any) -> bool:
     """Whether the index consists of dates or of periods."""
     return hasattr(index, "to_series") and (hasattr(index, "to_timestamp") or getattr(index.dtype, "kind", "") == "M")
 

@@ -162,6 +162,8 @@ def records_of(
     if data is None and reading.units is not None:
         raise ValueError("track: units= maps the names of columns to their units, so data= is needed.")
     failed: Mapping[Hashable, str] = {}
+    if data is not None and u is None:
+        u = model.input_names or None
     if len(model.outputs) > 1:
         if data is not None:
             model, records, failed = outputs.of_table(model, y, u, data, by, reading)
@@ -229,8 +231,9 @@ def warn_unlearned(run: Track | KeyedResults) -> None:
         named = (
             f"in {found} of {len(run.keys())} series {', '.join(f'{name} ({k})' for name, k in counts.most_common())}"
         )
+    reason = "its regressor" if len(counts) == 1 else "their regressors"
     warn(
-        f"{owners[0]}: {named} could not be learned, because their regressors never varied separately from the "
+        f"{owners[0]}: {named} could not be learned, because {reason} never varied separately from the "
         "others: std is inf. The other parameters are not affected; to avoid this warning leave out columns that are "
         "constant or repeat another.",
         UserWarning,

@@ -78,6 +78,7 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
     if own and tracker.smoother_fields:
         fields = {name: seen[name][..., 0] for name in tracker.smoother_fields}
         q, r_of = tracker.estimated_variances(run.model, fields, seen["e"][:, 0], drift)
+        weight[tracker.left_out(fields, phi, y, ok)] = 0.0
         phi, y = tracker.regression(fields, phi, y)
         drift_root, weight, time, drift = np.sqrt(q), weight / r_of, drift, np.ones(len(drift))
     trend = dt if prior.slopes else NONE

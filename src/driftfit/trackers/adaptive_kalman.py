@@ -21,8 +21,9 @@ estimates themselves (`driftfit.trackers.parts.modes.filters`). The one-step var
 band is for samples that are not outliers.
 
 The start is exact diffuse least squares without drift, in which regressors out of proportion count less too, until
-there are enough residuals to estimate r. Then every filter starts from generalised least squares with its own drift
-over the same samples (`driftfit.trackers.parts.modes.start`), in the directions that the regressors span by then.
+there are enough residuals to estimate r. Fault codes among these samples are found then, and least squares repeated
+without them (`driftfit.trackers.parts.first_samples`). Every filter starts from generalised least squares with its own
+drift over the same samples (`driftfit.trackers.parts.modes.start`), in the directions that the regressors span by then.
 Scaling inputs or outputs changes only the units.
 
 Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Which parameters drift is learned
@@ -58,7 +59,7 @@ from driftfit.trackers.parts.coordinates import (
     whiten,
     whiten_within,
 )
-from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, prediction, spanned_variance, take_in
+from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, prediction, spanned_variance
 from driftfit.trackers.parts.excitation import learn_information, learn_scales, learned, no_excitation, window
 from driftfit.trackers.parts.frozen import held_readings, leave_out_frozen, not_frozen
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
@@ -74,7 +75,7 @@ from driftfit.trackers.parts.modes.filters import (
 from driftfit.trackers.parts.modes.ladder import filters, mix
 from driftfit.trackers.parts.modes.noise_levels import any_level, finest, learn_noise, noise_prior
 from driftfit.trackers.parts.modes.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
-from driftfit.trackers.parts.modes.start import begin_with_drift, keep_start
+from driftfit.trackers.parts.modes.start import begin_with_drift, faults, machine_doubt, reconsider, take_start
 from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
 from driftfit.trackers.parts.outlying_readings import (
     bound_leverage,
@@ -84,10 +85,11 @@ from driftfit.trackers.parts.outlying_readings import (
     proportion,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
-from driftfit.trackers.rls import learn_scale
 
 RESIDUALS = 4
 """Number of residuals before the filters start."""
+SURE = 12
+"""The same while first samples are doubtful: of those that are not."""
 LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi * math.sqrt(3.0))))
 """log(gamma((nu + 1) / 2) / gamma(nu / 2) / sqrt(pi nu)) of Student's density, for nu = 1, 2, 3."""
 
@@ -195,20 +197,13 @@ def begin(s: State, l: int) -> None:
         go_on(s, l)
     else:
         resolve(s, l)
-        learn_scales(s, l)
-        bound_leverage(s, l)  # the drift is in units of scales that such a regressor did not move much either
-        learn(s, l, 0.0)
-        noise = s.noise[l]
-        s.noise[l] = noise * s.leverage[l]
-        take_in(s, l)
-        s.noise[l] = noise
-        keep_start(s, l)
+        residuals = s.count[l]
+        take_start(s, l)
         if s.s[l] < np.inf:
-            residuals = s.count[l]
-            learn_scale(s, l)
             s.density[l] = start_density(s.e[l], s.s[l], residuals)
+        ready = s.count[l] >= RESIDUALS and reconsider(s, SURE, l)
         spanned_variance(s, l)
-        if s.count[l] >= RESIDUALS:
+        if ready:
             settle(s, l)
 
 
@@ -307,7 +302,7 @@ class AdaptiveKalman(Tracker):
             begin,
             keep_density,
             store_for_smoother=store_for_smoother,
-            machines=(*FRAME, machine_weights),
+            machines=(*FRAME, machine_doubt, machine_weights),
             doubts=True,
             outlined=True,
         )
@@ -315,6 +310,9 @@ class AdaptiveKalman(Tracker):
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
         running = fields["settled"] > 0
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
+
+    def left_out(self, fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
+        return faults(fields, phi, y, ok)
 
     def estimated_variances(
         self, model: Model, fields: Mapping[str, Array], e: Array, time: Array
