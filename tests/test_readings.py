@@ -16,6 +16,7 @@ from driftfit import (
     HammersteinWiener,
     Kalman,
     OutputError,
+    ParticleFilter,
     PolynomialModel,
     Sensor,
 )
@@ -27,6 +28,7 @@ LASTING = [[0.97, 0.02, 0.01], [0.5, 0.5, 0.0], [0.1, 0.0, 0.9]]
 TRACKERS = {
     "Kalman": ready(Kalman), "Kalman, sqrt": ready(Kalman, form="sqrt"), "RLS": RLS(0.98),
     "AdaptiveKalman": AdaptiveKalman(), "AugmentedFLS": ready(AugmentedFLS), "Bank": Bank(),
+    "ParticleFilter": ready(ParticleFilter),
     "Bank, sensors": Bank([Change(1e-4), Change(1.0, prob=0.01)], SENSORS, (None, LASTING)),
 }  # fmt: skip
 EVERY = PolynomialModel(na=1, nb=1, nc=1, nd=1, nf=1)

@@ -319,8 +319,12 @@ def test_a_direction_enters_as_the_limit_of_wide_priors_however_weakly(unit):
     truth = np.array([1.0, 0.5 / unit, 3.0])
     assert (np.abs(run.theta[1010:] - truth) < 5.0 * run.std[1010:]).all()
     assert np.abs(run.theta[-1] / truth - 1.0)[:2].max() < 0.05
-    exact = track(Regression(2, intercept=True), Kalman(q=0.0, r=0.01, form="sqrt"), y, columns)
-    np.testing.assert_allclose(run.std[700, 1], exact.std[700, 1], rtol=0.2)
+    live = Live(Regression(2, intercept=True), AdaptiveKalman())
+    for t in range(701):
+        live.update(y[t], columns[t])
+    exact = track(Regression(2, intercept=True), Kalman(q=0.0, r=float(live.lane()["r"]), form="sqrt"), y, columns)
+    assert float(live.lane()["r"]) == pytest.approx(0.01, rel=0.15)
+    np.testing.assert_allclose(run.std[700, 1], exact.std[700, 1], rtol=0.02)
 
 
 LATE = Bank(changes=[Change(q=1e-4)], sensors=[Sensor.nominal(r=0.01)])
@@ -473,6 +477,18 @@ def test_bands_of_coarse_meters_do_not_count_one_error_of_rounding_as_many(track
             inside.append(abs(run.theta[-1, 0] - theta) <= 1.96 * run.std[-1, 0])
     assert len(inside) >= fewest
     assert np.mean(inside) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / len(inside))
+
+
+def test_a_bank_counts_one_error_of_rounding_once_as_well():
+    x, inside, errors = 3.0 * np.sin(np.arange(1000) / 60.0), [], []
+    for seed in range(6):
+        y = np.round(3.0 + 1.5 * x + 0.05 * np.random.default_rng(seed).normal(size=1000))
+        run = track(Regression(1, intercept=True), Bank(), y, x)
+        away = np.abs(run.theta - [1.5, 3.0])[100:]
+        inside.append(np.mean(away <= 1.96 * run.std[100:]))
+        errors.append(np.mean(away**2))
+    assert np.mean(inside) > 0.93  # as many readings of their own: 0.70
+    assert np.sqrt(np.mean(errors)) < 0.2  # 1.15
 
 
 @pytest.mark.parametrize("tracker", [FLS(1e6), AdaptiveKalman()], ids=repr)

@@ -413,8 +413,13 @@ def test_bands_cover_when_the_model_is_true():
 
 def test_picture_shows_every_parameter():
     phi, y = record(40, 2)
-    figure = track(Regression(["gain", "offset"]), FLS(mu=3.0), y, phi).smooth().plot()
+    path = track(Regression(["gain", "offset"]), FLS(mu=3.0), y, phi).smooth()
+    figure = path.plot()
     assert [axis.get_ylabel() for axis in figure.axes] == ["gain", "offset"]
+    for i, axis in enumerate(figure.axes):
+        np.testing.assert_array_equal(
+            [line.get_ydata() for line in axis.lines], [path.theta[:, i], path.run.theta[:, i]]
+        )
     with pytest.raises(ValueError, match="level must be between"):
         track(Regression(2), FLS(mu=3.0), y, phi).smooth().band(95)
 

@@ -17,8 +17,8 @@ of the text (dual numbers), together with f and in the same compiled code.
 
 theta' begins at ``start``, and goes to the estimate in the course of the first 10 n usable samples: a parameter that
 enters nonlinearly needs a start from which linear steps lead to it. Where f or a derivative is not finite at theta'
-(the root of a negative number), the sample is linearised at ``start`` instead; where it is not finite there either, it
-is not used.
+(the root of a negative number), or f is out of all proportion to the readings so far, the sample is linearised at
+``start`` instead; where it is not finite there either, it is not used.
 
 A missing output is replaced by its prediction among the lags, for at most as many samples as the longest lag; samples
 that need a missing input are not used. A gap in time breaks the lags as in `ARX`.
@@ -40,6 +40,7 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.models.arx import GAP
+from driftfit.models.fault_codes import possible
 from driftfit.models.formulas import Formula, compiled, parse, start_values
 from driftfit.models.functions import equation_text
 from driftfit.models.inputs import NamedInputs
@@ -165,7 +166,7 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
     def regress(s: State, l: int) -> None:
         age(s, l)
         evaluate(s, l)
-        if not finite(s, l):
+        if not (finite(s, l) and possible(s, s.value[l], l)):
             for i in range(n):
                 s.point[i, l] = s.first_point[i, l]
             evaluate(s, l)

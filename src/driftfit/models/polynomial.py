@@ -23,7 +23,7 @@ Every tracker of linear regressions follows theta by the linearisation of y_hat 
 parameters that drift. In contrast to least squares in an `ARX` model they are not biased by coloured noise, and their
 covariance is that of the prediction error estimate.
 
-theta' is theta with the zeros of C and F_j drawn towards 0 while one of them is unstable. Signals that are absurd
+theta' is theta with the zeros of C, D and F_j drawn towards 0 while one of them is unstable. Signals that are absurd
 beside the readings (`driftfit.models.polynomials.steps.BEYOND`), which a theta that one reading spoiled computes, are
 not used: e and v are bounded, and w begins anew, from y if there is one input. The start needs care, because
 the gradient with respect to F is 0 at theta = 0, and e means nothing before A and B are known: the first 4 n usable

@@ -37,6 +37,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
+from driftfit.models.fault_codes import UNJUDGED, judge
 from driftfit.models.formulas import Formula, Writer, parse, start_values, written
 from driftfit.models.functions import CLOCK, system_text
 from driftfit.models.inputs import NamedInputs
@@ -160,7 +161,7 @@ class StateSpace(NamedInputs):
         return {
             "y_lag": np.full(depth, np.nan), "u_lag": np.full((max(self.m, 1), depth), np.nan),
             "u_known": np.zeros((max(self.m, 1), depth)), "point": np.zeros(n), "next": np.zeros(n),
-            "slopes": np.zeros((max(len(self.hidden), 1), n)), "value": 0.0, "without": 0.0, "clock": -1.0,
+            "slopes": np.zeros((max(len(self.hidden), 1), n)), "value": 0.0, "without": 0.0, "clock": -1.0, **UNJUDGED,
         }  # fmt: skip
 
     @property
@@ -253,6 +254,7 @@ def _steps(equations: str, inputs: tuple[str, ...]) -> ModelSteps:
 
     @kernel
     def regress(s: State, l: int) -> None:
+        judge(s, np.nan, l)
         s.clock[l] += s.dt[l]
         for i in range(reach, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]

@@ -8,11 +8,11 @@ from typing import Any
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Machine
-from driftfit.engine.substitute import substituted
 from driftfit.trackers.bank.leaves import square_root_form
 from driftfit.trackers.bank.leaves.own_sensor import entry_of, own_address
 from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.steps import STEPS
+from driftfit.trackers.bank.substitute import substituted
 
 
 @cache
