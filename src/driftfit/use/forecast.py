@@ -128,8 +128,7 @@ def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
             slopes[k], covs[k] = lane["phi"], tracker.cov(lane)
     if lagged is not None or tracker.output_error:  # an output error is never fed back
         return result._replace(y_std=np.sqrt(result.y_std))
-    noise *= model.noise_factor(now, result.y_hat[0])
-    later = _fed_back(model, now, slopes, covs, noise)
+    later = _fed_back(model, now, slopes, covs, float(noise) * model.noise_factor(now, result.y_hat[0]))
     return result._replace(y_std=np.sqrt(result.y_std + later) / model.output_slope(now, result.y_hat))
 
 

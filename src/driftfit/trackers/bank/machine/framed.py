@@ -117,7 +117,7 @@ def enter_mixture(z: Array, P: Array, C: Array, x: Array, now: Array, noise: flo
         for j in range(i + 1):
             P[i, j] = C[k]
             k += 1
-    return left
+    return left  # type: ignore[no-any-return]
 
 
 @machine
