@@ -30,8 +30,9 @@ from rich.table import Table
 
 from driftfit import ARX, Kalman, Live
 from driftfit.data.known import Known
-from driftfit.engine.drivers import drivers, make_tile, output_type
+from driftfit.engine.drivers import drivers
 from driftfit.engine.kernel import Driver
+from driftfit.engine.tiles import make_tile, output_type
 from lab.bench.computer import computer, installed, times
 
 HERE = Path(__file__).parent

@@ -116,7 +116,7 @@ class Boastful(NLMS):
 
 
 class Deaf(Kalman):
-    """Promises a drift for each parameter and is not told of any."""
+    """Declares a drift for each parameter and ignores it."""
 
     @property
     def steps(self) -> TrackerSteps:
@@ -159,7 +159,7 @@ def test_trackers_that_keep_their_promises(tracker):
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_broken_promises_are_said(tracker, said):
+def test_broken_promises_are_reported(tracker, said):
     sentences = check_tracker(tracker)
     for words in said:
         assert any(words in sentence for sentence in sentences), sentences

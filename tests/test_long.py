@@ -110,7 +110,7 @@ def test_a_structure_that_changes_half_way(tracker):
     np.testing.assert_allclose(impulse(theta[half - 2000 : half].mean(axis=0)), impulse(path[0]), atol=0.005)
     np.testing.assert_allclose(impulse(theta[half + 1000 : half + 3000].mean(axis=0)), impulse(THETA), atol=0.007)
     np.testing.assert_allclose(impulse(theta[-2000:].mean(axis=0)), impulse(THETA), atol=0.015)
-    if tracker.covariance:  # the order is told from 1 only where it is 2
+    if tracker.covariance:  # the order is distinguished from 1 only where it is 2
         assert told_apart(tracker, run, slice(1000, half, 50)).mean() < 0.02
         assert told_apart(tracker, run, slice(half + 1000, None, 50)).mean() > 0.99
 

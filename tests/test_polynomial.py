@@ -190,7 +190,7 @@ def test_orders_and_names():
     assert parts["F"][0].tolist() == [1.0, -1.5, 0.7]
     with pytest.raises(ValueError, match="different numbers of inputs"):
         OE([1, 1], [1, 1, 1])
-    with pytest.raises(ValueError, match="needs an input"):
+    with pytest.raises(ValueError, match="needs at least 1 input"):
         OE(1, 1).bind(0)
     with pytest.raises(ValueError, match="nothing to estimate"):
         OE(0, 0)
@@ -284,9 +284,9 @@ def test_readings_are_judged_and_not_what_a_shift_leaves_of_them():
     y = 20.0 + signal.lfilter([0.0, 0.5], [1.0, -0.8], u) + 0.05 * rng.normal(size=600)
     model = PolynomialModel(na=1, nb=1, nc=1, nd=1, nf=1)
     coarse = track(model, AdaptiveKalman(), 0.5 * np.round(y / 0.5), u).state
-    assert coarse["quantum"] == 0.5
+    assert coarse["quantum"] == pytest.approx(0.5)
     assert coarse["coarse"] > 0.0
-    y[400], y[500:520] = 9999.0, y[499]
+    y[400], y[500:520] = 40.0, y[499]
     run = track(model, AdaptiveKalman(), y, u)
     assert run.state["left_out"] == 1.0
     assert run.state["frozen_readings"] >= 19.0

@@ -73,7 +73,7 @@ def test_a_sample_outside_the_record_is_named(t):
         track(ARX(2, 2), K, Y, U).cov(t)
 
 
-def test_no_covariance_is_said_so():
+def test_a_missing_covariance_is_reported():
     with pytest.raises(ValueError, match="AugmentedFLS carries no covariance"):
         track(ARX(2, 2), AugmentedFLS(1.0), Y, U, keep="cov")
     assert np.isnan(track(ARX(2, 2), AugmentedFLS(1.0), Y, U).loglik)

@@ -176,7 +176,7 @@ def test_records_of_every_length_are_eliminated_from_both_ends(L):
     assert quick.cost == pytest.approx(safe.cost, rel=1e-10, abs=1e-20)
 
 
-def test_memory_beside_the_result_is_a_small_part_of_it():
+def test_the_smoother_needs_little_memory_in_addition_to_its_result():
     phi, y = record(20_000, 4)
     run = track(Regression(4), FLS(30.0), y, phi)
     run.smooth()
@@ -439,7 +439,9 @@ def test_what_the_record_does_not_determine_is_as_asked():
 
 
 def test_noise_that_the_model_adds_is_the_noise_of_the_smoother():
-    """Measurement noise that comes in through a curve, beside the user's weights: the last point is the filter's."""
+    """Measurement noise that enters through a curve, in addition to the user's weights: the last point is the
+    filter's.
+    """
     s = linear_record()
     weights = np.random.default_rng(2).uniform(0.3, 2.0, len(s[0]))
     model = HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2), output_noise=0.05)

@@ -31,10 +31,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.data.labels import inputs_for
-from driftfit.engine.arrays import as_numbers
-from driftfit.engine.drivers import as_compiled, one_or_all
+from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import whole
+from driftfit.engine.settings import as_numbers, whole
+from driftfit.engine.tiles import as_compiled
 from driftfit.models.base import Model
 from driftfit.run.live.live import Live
 from driftfit.run.outputs import Outputs
@@ -128,7 +128,8 @@ def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
             slopes[k], covs[k] = lane["phi"], tracker.cov(lane)
     if lagged is not None or tracker.output_error:  # an output error is never fed back
         return result._replace(y_std=np.sqrt(result.y_std))
-    later = _fed_back(model, now, slopes, covs, float(noise) * model.noise_factor(now, result.y_hat[0]))
+    noise *= model.noise_factor(now, result.y_hat[0])
+    later = _fed_back(model, now, slopes, covs, float(noise))
     return result._replace(y_std=np.sqrt(result.y_std + later) / model.output_slope(now, result.y_hat))
 
 

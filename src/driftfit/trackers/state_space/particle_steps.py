@@ -11,9 +11,9 @@ from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.models.state_space import equations_of
 from driftfit.trackers.joint_kalman import moves_are_finite
-from driftfit.trackers.particles.draws import normal, uniform
 from driftfit.trackers.parts.diffuse import LEFT
 from driftfit.trackers.parts.varying_drift import read_drift
+from driftfit.trackers.state_space.draws import normal, uniform
 
 HALF_LOG_2_PI = 0.9189385332046727
 MOST = 1000.0
