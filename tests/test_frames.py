@@ -214,3 +214,30 @@ def test_future_inputs_are_matched():
     later = X.iloc[:5]
     assert np.array_equal(run.forecast(5, later).y_hat, run.forecast(5, later[["b", "a"]].to_numpy()).y_hat)
     assert np.array_equal(run.simulate(later).y_hat, run.simulate(later[["b", "a"]].to_numpy()).y_hat)
+
+
+def test_a_table_needs_no_list_of_the_inputs_that_the_model_names():
+    y, X = record()
+    table = X.assign(flow=y, other=1.0)
+    named = track(NAMED, TRACKER, "flow", data=table)
+    assert np.array_equal(named.theta, track(NAMED, TRACKER, "flow", ["a", "b"], data=table).theta)
+    fleet = track(NAMED, TRACKER, "flow", data=table.assign(pump="A"), by="pump")
+    assert np.array_equal(fleet["A"].theta, named.theta)
+    with pytest.raises(ValueError, match=r"the model has 2 regressors .*, but u has 0 columns"):
+        track(Regression(2), TRACKER, "flow", data=table)
+
+
+def test_an_index_of_dates_labels_the_rows_of_a_table():
+    y, X = record()
+    days = pd.date_range("2024-01-05", periods=T, freq="B", name="day")
+    for index in (days, days.tz_localize("Europe/Berlin"), pd.period_range("1990Q1", periods=T, freq="Q")):
+        table = X.assign(flow=y).set_axis(index)
+        run, same = track(NAMED, TRACKER, "flow", data=table), track(NAMED, TRACKER, table["flow"], table[["a", "b"]])
+        assert np.array_equal(run.time, same.time)
+        assert np.array_equal(run.theta, same.theta)
+    table = X.assign(flow=y).set_axis(days)
+    assert track(ARX(1, 1), TRACKER, "flow", "a", data=table).ok.sum() == T - 1
+    with pytest.warns(UserWarning, match="business day"):
+        assert track(ARX(1, 1), TRACKER, "flow", "a", data=table, dt="1d").ok.sum() < T - 5
+    for plain in (table.sample(frac=1.0, random_state=0), table.reset_index(drop=True), table.assign(day=0)):
+        assert np.array_equal(track(NAMED, TRACKER, "flow", data=plain).time, np.arange(T))

@@ -9,14 +9,16 @@ used. Rows without a unit or without a time never become samples; they are count
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from driftfit.data.clock import Clock
+from driftfit.data.clock import LABEL, Clock
 from driftfit.data.columns import Columns, Wanted
 from driftfit.data.files import read
 from driftfit.data.known import Known
+from driftfit.data.labels import dated
 from driftfit.data.record import Labels, Reading, Records, drift_of
 from driftfit.data.signals import noise_of
 from driftfit.engine.kernel import Array
@@ -34,6 +36,7 @@ def read_records(
         that cannot be read, or a single series without a usable row. Where there are units, those without one have a
         reason, and there may be none with one.
     """
+    data, reading = _dated(data, by, reading)
     inputs, weights, drift, time = _names("u", u), reading.weights, reading.drift, reading.time
     axis = None if time is None else _name("time", time)
     each = () if isinstance(drift, str) or np.ndim(drift) == 0 else _names("drift", drift)
@@ -61,6 +64,22 @@ def read_records(
     labels = Labels(y, inputs, axis, dict(reading.units or {}), columns.zone, {}, wanted.by, dt=clock.plain)
     named = tuple(keys[k] for k in there)
     return Records(named, first, length[there], values[y], signals, known, times, labels, dropped, drifts), failed
+
+
+def _dated(data: Any, by: Any, reading: Reading) -> tuple[Any, Reading]:
+    """A data frame with an index of dates in order, if no time is given: the index as a column that labels samples."""
+    index: Any = getattr(data, "index", None)
+    if reading.time is not None or by is not None or not reading.indexed or not dated(index):
+        return data, reading
+    if not (index.is_monotonic_increasing and index.is_unique):
+        return data, reading
+    name = index.name if isinstance(index.name, str) else "time"
+    if name in data.columns:
+        return data, reading
+    stamps = index.to_timestamp() if hasattr(index, "to_timestamp") else index
+    return data.set_axis(stamps).reset_index(names=name), replace(
+        reading, time=name, dt=LABEL if reading.dt is None else reading.dt
+    )
 
 
 def _name(argument: str, value: Any) -> str:

@@ -30,7 +30,7 @@ most.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -39,12 +39,11 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.engine.settings import input_names
 from driftfit.models.arx import GAP
-from driftfit.models.base import Model
 from driftfit.models.fault_codes import possible
-from driftfit.models.formulas import Formula, check_inputs, compiled, parse, start_values
+from driftfit.models.formulas import Formula, compiled, parse, start_values
 from driftfit.models.functions import equation_text
+from driftfit.models.inputs import NamedInputs
 from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
 
 SETTLING = 10.0
@@ -52,7 +51,7 @@ SETTLING = 10.0
 
 
 @dataclass(frozen=True)
-class Equation(Model):
+class Equation(NamedInputs):
     """y = f(inputs, lags; theta), given as text; see `driftfit.models.equation`.
 
     Parameters
@@ -80,29 +79,12 @@ class Equation(Model):
         if callable(self.equation):
             self._set("equation", equation_text(self.equation))
         formula = parse(self.equation)
-        if self.inputs is None:
-            self._set("inputs", formula.inputs)
-        else:
-            self._set("inputs", input_names("Equation", "inputs", self.inputs))
-        if absent := [name for name in formula.inputs if name not in self.input_names]:
-            raise ValueError(f"Equation: inputs must hold {', '.join(absent)}, which the equation uses.")
+        self._check_inputs(formula.inputs)
         self._set("start", start_values("Equation", self.start, formula.parameters))
-
-    def bind(self, inputs: int | Sequence[str]) -> Equation:
-        check_inputs(self, inputs)
-        return self
 
     @property
     def formula(self) -> Formula:
         return parse(self.equation)
-
-    @property
-    def m(self) -> int:
-        return len(self.input_names)
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        return self.inputs or ()
 
     @property
     def names(self) -> tuple[str, ...]:

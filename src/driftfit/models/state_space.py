@@ -37,11 +37,10 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.engine.settings import input_names
-from driftfit.models.base import Model
 from driftfit.models.fault_codes import UNJUDGED, judge
-from driftfit.models.formulas import Formula, Writer, check_inputs, parse, start_values, written
+from driftfit.models.formulas import Formula, Writer, parse, start_values, written
 from driftfit.models.functions import CLOCK, system_text
+from driftfit.models.inputs import NamedInputs
 
 TIME = "dt"
 
@@ -96,7 +95,7 @@ def system_of(text: str) -> System:
 
 
 @dataclass(frozen=True)
-class StateSpace(Model):
+class StateSpace(NamedInputs):
     """Equations with hidden states, given as text; see `driftfit.models.state_space`. Follow it with `JointKalman`.
 
     Parameters
@@ -125,17 +124,8 @@ class StateSpace(Model):
         if not isinstance(self.equations, str) and isinstance(self.equations, Sequence):
             self._set("equations", system_text(self.equations))
         system = system_of(self.equations)
-        if self.inputs is None:
-            self._set("inputs", system.inputs)
-        else:
-            self._set("inputs", input_names("StateSpace", "inputs", self.inputs))
-        if absent := [name for name in system.inputs if name not in self.input_names]:
-            raise ValueError(f"StateSpace: inputs must hold {', '.join(absent)}, which the equations use.")
+        self._check_inputs(system.inputs)
         self._set("start", start_values("StateSpace", self.start, self.names))
-
-    def bind(self, inputs: int | Sequence[str]) -> StateSpace:
-        check_inputs(self, inputs)
-        return self
 
     @property
     def system(self) -> System:
@@ -145,14 +135,6 @@ class StateSpace(Model):
     def hidden(self) -> tuple[str, ...]:
         """Names of the states; empty if the equations have none."""
         return self.system.hidden
-
-    @property
-    def m(self) -> int:
-        return len(self.input_names)
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        return self.inputs or ()
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -74,7 +74,7 @@ def parts(
 
 
 class Kept(NamedTuple):
-    """What is stored of every sample, in which precision, and what is known of events beforehand."""
+    """What is stored for every sample, in which precision, and the known prior probabilities of events."""
 
     keep: str = "std"
     dtype: Any = "float64"
@@ -131,7 +131,7 @@ def _prepared(
 
 
 def _any_of(tracker: Any) -> list[Any]:
-    """A tracker by which a fleet without a series knows its parameters."""
+    """Some tracker: a fleet without a series needs one for the names of its parameters."""
     some = tracker.values() if isinstance(tracker, Mapping) else [tracker] if isinstance(tracker, Tracker) else tracker
     return [next(iter(some))]
 
@@ -162,6 +162,8 @@ def records_of(
     if data is None and reading.units is not None:
         raise ValueError("track: units= maps the names of columns to their units, so data= is needed.")
     failed: Mapping[Hashable, str] = {}
+    if data is not None and u is None:
+        u = model.input_names or None
     if len(model.outputs) > 1:
         if data is not None:
             model, records, failed = outputs.of_table(model, y, u, data, by, reading)
@@ -229,8 +231,9 @@ def warn_unlearned(run: Track | KeyedResults) -> None:
         named = (
             f"in {found} of {len(run.keys())} series {', '.join(f'{name} ({k})' for name, k in counts.most_common())}"
         )
+    reason = "its regressor" if len(counts) == 1 else "their regressors"
     warn(
-        f"{owners[0]}: {named} could not be learned, because their regressors never varied separately from the "
+        f"{owners[0]}: {named} could not be learned, because {reason} never varied separately from the "
         "others: std is inf. The other parameters are not affected; to avoid this warning leave out columns that are "
         "constant or repeat another.",
         UserWarning,

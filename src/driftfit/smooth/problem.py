@@ -10,8 +10,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, output_type
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.tiles import output_type
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.program import BLOCK, lanes_of, put_fields
 from driftfit.run.result import Track
@@ -78,6 +79,7 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
     if own and tracker.smoother_fields:
         fields = {name: seen[name][..., 0] for name in tracker.smoother_fields}
         q, r_of = tracker.estimated_variances(run.model, fields, seen["e"][:, 0], drift)
+        weight[tracker.left_out(fields, phi, y, ok)] = 0.0
         phi, y = tracker.regression(fields, phi, y)
         drift_root, weight, time, drift = np.sqrt(q), weight / r_of, drift, np.ones(len(drift))
     trend = dt if prior.slopes else NONE

@@ -4,7 +4,8 @@ K random-walk filters run side by side. Filter k lets parameter i drift by ``q_k
 sample, where r is the present noise variance and c_i the mean square of regressor i, so ratio_k w_ki is the share of r
 that the drift of one parameter adds to the output per sample, whatever the units. The first ratio is 0. In the common
 ladder of ratios all weights w are 1; in a second one they are learned from the record
-(`driftfit.trackers.parts.modes.weights`); and, with up to eight parameters, each has a ladder on which it alone drifts.
+(`driftfit.trackers.parts.modes.weights`); the filters of a third follow a trend
+(`driftfit.trackers.parts.modes.trend`); and, with up to eight parameters, each has a ladder on which it alone drifts.
 The filters are the modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each
@@ -15,20 +16,22 @@ of the parameters (`driftfit.trackers.parts.modes.ladder`), or more noise. Readi
 last value are left out too (`driftfit.trackers.parts.frozen`). If innovations are correlated, the previous one is an
 additional regressor (`driftfit.trackers.parts.modes.coloured`).
 
-The results are the mean and covariance of the mixture. The one-step variance excludes the outlier level, so its band is
-for samples that are not outliers.
+The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
+estimates themselves (`driftfit.trackers.parts.modes.filters`). The one-step variance excludes the outlier level, so its
+band is for samples that are not outliers.
 
 The start is exact diffuse least squares without drift, in which regressors out of proportion count less too, until
-there are enough residuals to estimate r. Then every filter starts from generalised least squares with its own drift
-over the same samples (`driftfit.trackers.parts.modes.start`), in the directions that the regressors span by then.
+there are enough residuals to estimate r. Fault codes among these samples are found then, and least squares repeated
+without them (`driftfit.trackers.parts.first_samples`). Every filter starts from generalised least squares with its own
+drift over the same samples (`driftfit.trackers.parts.modes.start`), in the directions that the regressors span by then.
 Scaling inputs or outputs changes only the units.
 
 Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Which parameters drift is learned
 in a few hundred samples; ``groups`` tells it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the ladder of ratios, its transitions, the noise
-levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 13 + 3 n
-for up to eight parameters, and 13 for more.
+levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 16 + 3 n
+for up to eight parameters, and 16 for more.
 """
 
 from __future__ import annotations
@@ -56,7 +59,7 @@ from driftfit.trackers.parts.coordinates import (
     whiten,
     whiten_within,
 )
-from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, prediction, spanned_variance, take_in
+from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, prediction, spanned_variance
 from driftfit.trackers.parts.excitation import learn_information, learn_scales, learned, no_excitation, window
 from driftfit.trackers.parts.frozen import held_readings, leave_out_frozen, not_frozen
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
@@ -72,7 +75,7 @@ from driftfit.trackers.parts.modes.filters import (
 from driftfit.trackers.parts.modes.ladder import filters, mix
 from driftfit.trackers.parts.modes.noise_levels import any_level, finest, learn_noise, noise_prior
 from driftfit.trackers.parts.modes.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
-from driftfit.trackers.parts.modes.start import begin_with_drift, keep_start
+from driftfit.trackers.parts.modes.start import begin_with_drift, faults, machine_doubt, reconsider, take_start
 from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
 from driftfit.trackers.parts.outlying_readings import (
     bound_leverage,
@@ -82,10 +85,11 @@ from driftfit.trackers.parts.outlying_readings import (
     proportion,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
-from driftfit.trackers.rls import learn_scale
 
 RESIDUALS = 4
 """Number of residuals before the filters start."""
+SURE = 12
+"""The same while first samples are doubtful: of those that are not."""
 LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi * math.sqrt(3.0))))
 """log(gamma((nu + 1) / 2) / gamma(nu / 2) / sqrt(pi nu)) of Student's density, for nu = 1, 2, 3."""
 
@@ -193,20 +197,13 @@ def begin(s: State, l: int) -> None:
         go_on(s, l)
     else:
         resolve(s, l)
-        learn_scales(s, l)
-        bound_leverage(s, l)  # the drift is in units of scales that such a regressor did not move much either
-        learn(s, l, 0.0)
-        noise = s.noise[l]
-        s.noise[l] = noise * s.leverage[l]
-        take_in(s, l)
-        s.noise[l] = noise
-        keep_start(s, l)
+        residuals = s.count[l]
+        take_start(s, l)
         if s.s[l] < np.inf:
-            residuals = s.count[l]
-            learn_scale(s, l)
             s.density[l] = start_density(s.e[l], s.s[l], residuals)
+        ready = s.count[l] >= RESIDUALS and reconsider(s, SURE, l)
         spanned_variance(s, l)
-        if s.count[l] >= RESIDUALS:
+        if ready:
             settle(s, l)
 
 
@@ -305,7 +302,7 @@ class AdaptiveKalman(Tracker):
             begin,
             keep_density,
             store_for_smoother=store_for_smoother,
-            machines=(*FRAME, machine_weights),
+            machines=(*FRAME, machine_doubt, machine_weights),
             doubts=True,
             outlined=True,
         )
@@ -313,6 +310,9 @@ class AdaptiveKalman(Tracker):
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
         running = fields["settled"] > 0
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
+
+    def left_out(self, fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
+        return faults(fields, phi, y, ok)
 
     def estimated_variances(
         self, model: Model, fields: Mapping[str, Array], e: Array, time: Array
@@ -340,14 +340,14 @@ class AdaptiveKalman(Tracker):
         lane, names = run.state, np.array(run.names)
         never = np.isinf(lane["var"])
         lately = ~never & ~learned(lane)
-        said = []
+        facts = []
         if never.any():
-            said.append(
+            facts.append(
                 ("Not learned", f"{', '.join(names[never])}: never varied separately from the others; std is inf")
             )
         if lately.any():
-            said.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
-        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane), *colour(lane))
+            facts.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
+        return (*facts, *proportion(lane), *held_readings(lane), *resolution(lane), *colour(lane))
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])

@@ -141,6 +141,10 @@ class Tracker(Settings, ABC):
         """phi (T, n) and y (T,) as the tracker used them; ``fields`` as in `estimated_variances`."""
         return phi, y
 
+    def left_out(self, fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
+        """Which of the used samples, ok (T,), it left out later; ``fields`` as in `estimated_variances`."""
+        return np.zeros(len(y), bool)
+
     def estimated_variances(
         self, model: Model, fields: Mapping[str, Array], e: Array, time: Array
     ) -> tuple[Array, Array]:

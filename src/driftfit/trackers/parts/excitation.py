@@ -4,10 +4,14 @@
     G   <- fade G + D phi phi' D,   D = diag(c)^(-1/2)
 
 A regressor without excitation keeps its scale, since a mean square that decays to 0 would inflate any drift measured in
-it. So does y, whose scale keeps the noise variance of a failed sensor from falling to 0. Parameter i is being learned
-while 1 / (G^-1)_ii, the information that no other parameter can explain, is above that of one sample, or is more than a
-tenth of what as many samples carried on average until now, 1 / var_i from all of them. The second holds for regressors
-far from zero beside an intercept, of which a sample never tells much.
+it. That is one far smaller than it was, unless its share of the output, theta_i phi_i, is still larger than five
+standard deviations of the innovation: an input may move less from now on, and its parameter still be followed. A scale
+from fewer than `MEMORY` samples is lost again after many times as many small ones, because those may have been fault
+codes. The scale of y is kept likewise, and with it the noise variance of a failed sensor.
+
+Parameter i is being learned while 1 / (G^-1)_ii, the information that no other parameter can explain, is above that of
+one sample, or is more than a tenth of what as many samples carried on average until now, 1 / var_i from all of them.
+The second holds for regressors far from zero beside an intercept, of which a sample never tells much.
 
 Cost per sample: O(n^2); the flag inverts G when it is requested.
 """
@@ -26,13 +30,19 @@ from driftfit.trackers.parts.resolution import reading
 MEMORY = 50.0
 """Memory of the mean square of a regressor, in samples."""
 DULL = 1e-4
-"""A square below this share of the mean square counts as no excitation."""
+"""A square below this share of the mean square counts as no excitation, if its share of the output is small too."""
 
 LITTLE = 0.1
 """Share of the average information below which a parameter is not being learned."""
 
 LARGE = 25.0
 """A square above this multiple of the mean square counts as this multiple."""
+
+LOST = 1e-14
+"""A square below this share of the mean square never counts: variances in the old unit would be rounding in its own."""
+
+DOUBT = 0.05
+"""Samples of excitation that a sample without it cancels while the scale rests on few."""
 
 
 def window(n: int) -> int:
@@ -68,8 +78,11 @@ def learn_scales(s: State, l: int) -> None:
     s.power[l] += active * (square - s.power[l]) / min(max(s.seen_samples[l], 1.0), MEMORY)
     for i in range(s.theta.shape[0]):
         square = bounded(s.phi[i, l] * s.phi[i, l], s.c[i, l], s.active[i, l])
-        active = s.ok[l] if square > DULL * s.c[i, l] else 0.0
-        s.active[i, l] += active
+        share = s.theta[i, l] * s.phi[i, l]
+        matters = (s.active[i, l] <= 0.0) | (share * share > LARGE * s.s[l])
+        active = s.ok[l] if square > (LOST if matters else DULL) * s.c[i, l] else 0.0
+        dull = s.ok[l] - active if (square > 0.0) & (s.active[i, l] < MEMORY) else 0.0
+        s.active[i, l] = max(s.active[i, l] + active - DOUBT * dull, 0.0)
         s.c[i, l] += active * (square - s.c[i, l]) / min(max(s.active[i, l], 1.0), MEMORY)
 
 

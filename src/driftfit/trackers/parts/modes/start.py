@@ -10,38 +10,176 @@ with nu the number of residuals, and p_k Student's density of the samples given 
 filters start with probabilities proportional to p_k, and with r the mean of S_k / nu. Parameters that move from the
 first sample on are therefore neither taken for noise nor for estimates that many samples agree on.
 
+Before that the samples are judged together (`driftfit.trackers.parts.first_samples`). If some are fault codes, least
+squares, scales and proportions start again without them; while it cannot be decided, the start goes on.
+
 Source: marginal likelihood under an inverse-gamma variance, West and Harrison, Bayesian Forecasting and Dynamic Models
 (1997), section 4.5. Cost: O(K n^2) for each sample of the start, once.
 """
 
 from __future__ import annotations
 
-from driftfit.engine.kernel import State, exp, kernel, log
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, State, cubes, exp, kernel, log, machine
+from driftfit.trackers.parts.diffuse import take_in
+from driftfit.trackers.parts.excitation import learn_information, learn_scales
+from driftfit.trackers.parts.first_samples import NOISE, READING, SPAN, WORSE, Y, doubt, doubtful
 from driftfit.trackers.parts.modes.filters import absorb, project, wander
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
-from driftfit.trackers.parts.modes.weights import WINDOW
+from driftfit.trackers.parts.modes.weights import MORE, WINDOW
+from driftfit.trackers.parts.outlying_readings import bound_leverage, learn_proportion
+from driftfit.trackers.parts.resolution import reading, same_reading
+from driftfit.trackers.rls import learn_scale
 
 LOOSE = 1e4
 """Variance of each coordinate before the first sample, in units of what least squares leave. A larger one would cost
 as many digits of the estimates."""
-Y, SPAN, NOISE = 0, 1, 2
-"""Entries of a stored sample of the start, after its regressor."""
+
+
+@machine
+def machine_doubt(samples: int, count: int, n: int, L: int, l: int) -> None:
+    """`doubt` for lane l of L, from the address of the samples."""
+    doubt(cubes(samples, WINDOW, 2 * n + MORE, L)[:, :, l], count, n)
 
 
 @kernel
-def keep_start(s: State, l: int) -> None:
+def keep(s: State, l: int) -> None:
     """Store a sample of the start, where those of `driftfit.trackers.parts.modes.weights` will be."""
     n, at = s.theta.shape[0], s.remembered[l]
-    s.waited[l] += s.dt[l] * s.drift[l]
     if s.ok[l] > 0.0:
         if at < WINDOW:
             for i in range(n):
                 s.samples[at, i, l] = s.phi[i, l]
             s.samples[at, n + Y, l] = s.y[l]
             s.samples[at, n + SPAN, l] = s.waited[l]
-            s.samples[at, n + NOISE, l] = s.noise[l] * s.leverage[l]
+            s.samples[at, n + NOISE, l] = s.noise[l]
+            s.samples[at, n + READING, l] = reading(s, l)
         s.remembered[l] += 1
         s.waited[l] = 0.0
+
+
+@kernel
+def take_first(s: State, l: int) -> None:
+    """One sample of least squares, and its residual, with the noise variance s.noise."""
+    learn_information(s, l)
+    learn_proportion(s, l, 0.0)
+    take_in(s, l)
+    if s.s[l] < np.inf:
+        learn_scale(s, l)
+
+
+@kernel
+def take_start(s: State, l: int) -> None:
+    """A sample of the start."""
+    s.waited[l] += s.dt[l] * s.drift[l]
+    if s.remembered[l] == 0:
+        for i in range(s.theta.shape[0]):
+            s.m[i, 0, l] = s.theta[i, l]  # no filter needs it yet
+    learn_scales(s, l)
+    bound_leverage(s, l)  # the drift is in units of scales that such a regressor did not move much either
+    noise = s.noise[l]
+    s.noise[l] = noise * s.leverage[l]
+    take_first(s, l)
+    keep(s, l)
+    s.noise[l] = noise
+
+
+@kernel
+def forget(s: State, l: int) -> None:
+    """As before the first sample, but for the readings that `driftfit.trackers.parts.resolution` compares."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        s.theta[i, l], s.d[i, l], s.F[i, l], s.c[i, l], s.active[i, l] = s.m[i, 0, l], 0.0, 1.0, 0.0, 0.0
+        for j in range(n):
+            s.S[i, j, l], s.information[i, j, l] = 0.0, 0.0
+            s.R[i, j, l] = 1.0 if i == j else 0.0
+    s.volume[l], s.rank[l], s.squares[l], s.count[l], s.scale[l] = 0.0, 0, 0.0, 0.0, np.nan
+    s.seen_samples[l], s.power[l], s.middle[l], s.spread[l], s.readings[l], s.patience[l] = 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
+
+
+@partial(kernel, inline=False)
+def repeat(s: State, every: bool, l: int) -> float:
+    """Repeat least squares, with every sample or without the doubtful ones.
+
+    Returns the sum of squares of the residuals of those that are not doubtful.
+    """
+    n, rows, last, squares = s.theta.shape[0], s.remembered[l], np.nan, 0.0
+    forget(s, l)
+    for at in range(rows):
+        s.noise[l] = abs(s.samples[at, n + NOISE, l])
+        if every or s.samples[at, n + NOISE, l] > 0.0:
+            for i in range(n):
+                s.phi[i, l] = s.samples[at, i, l]
+            s.y[l] = s.samples[at, n + Y, l]
+            s.shift[l] = s.samples[at, n + READING, l] - s.y[l]
+            s.fresh[l] = 0.0 if same_reading(s, last, l) else 1.0
+            last = reading(s, l)
+            learn_scales(s, l)
+            take_first(s, l)
+    for at in range(rows):
+        if s.samples[at, n + NOISE, l] > 0.0:
+            e = s.samples[at, n + Y, l]
+            for i in range(n):
+                e -= s.samples[at, i, l] * s.theta[i, l]
+            squares += e * e / s.samples[at, n + NOISE, l]
+    return squares
+
+
+@kernel
+def drop(s: State, l: int) -> None:
+    """Remove the doubtful samples."""
+    n, rows, left, waited = s.theta.shape[0], s.remembered[l], 0, 0.0
+    for at in range(rows):
+        waited += s.samples[at, n + SPAN, l]
+        if s.samples[at, n + NOISE, l] > 0.0:
+            for i in range(n + READING + 1):
+                s.samples[left, i, l] = s.samples[at, i, l]
+            s.samples[left, n + SPAN, l] = waited
+            left, waited = left + 1, 0.0
+    s.waited[l] += waited
+    s.left_out[l] += rows - left
+    s.remembered[l] = left
+
+
+@partial(kernel, inline=False)
+def reconsider(s: State, enough: int, l: int) -> bool:
+    """Whether the filters may start: not while samples are doubtful, and the others have not ``enough`` residuals."""
+    n, L = s.theta.shape[0], s.theta.shape[1]
+    ready, some, rows = True, False, s.remembered[l]
+    if rows <= WINDOW:
+        machine_doubt(s.samples.ctypes.data, rows, n, L, l)
+        for at in range(rows):
+            some = some or s.samples[at, n + NOISE, l] < 0.0
+    if some:
+        y, y_hat, e, v, noise, shift = s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l]
+        ok, fresh, leverage = s.ok[l], s.fresh[l], s.leverage[l]
+        s.ok[l], s.seen[l], s.leverage[l] = 1.0, 1.0, 1.0
+        alone = repeat(s, False, l)
+        ready = s.count[l] >= enough
+        if repeat(s, True, l) > WORSE * alone and ready:
+            repeat(s, False, l)
+            drop(s, l)
+        s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l] = y, y_hat, e, v, noise, shift
+        s.ok[l], s.seen[l], s.fresh[l], s.leverage[l] = ok, ok, fresh, leverage
+        for i in range(n):
+            s.phi[i, l] = s.samples[rows - 1, i, l]
+    return ready
+
+
+def faults(fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
+    """Which samples (T,) of the start `reconsider` left out."""
+    start = int(np.argmax(fields["settled"] > 0)) + 1
+    rows, n = np.flatnonzero(ok[:start]), phi.shape[1]
+    found = np.zeros(len(y), bool)
+    if fields["left_out"][start - 1] > 0.0:
+        samples = np.column_stack([phi[rows], y[rows], np.ones((len(rows), 2)), y[rows]])
+        doubtful(samples, n)
+        found[rows] = samples[:, n + NOISE] < 0.0
+    return found
 
 
 @kernel
@@ -69,7 +207,7 @@ def run_again(s: State, l: int) -> None:
         whitened(s, at, l)
         project(s, l)
         for k in range(K):
-            e, v = s.samples[at, n + Y, l] - s.e_k[k, l], s.h[k, l] + s.samples[at, n + NOISE, l]
+            e, v = s.samples[at, n + Y, l] - s.e_k[k, l], s.h[k, l] + abs(s.samples[at, n + NOISE, l])
             s.weighted[k, l] += e * e / v
             s.mu_next[k, l] += log(v)
             s.step[k, l], s.h[k, l] = e / v, 1.0 / v

@@ -1,0 +1,98 @@
+"""Fault codes among the first samples, which are judged together; and scales of inputs that rest on fault codes."""
+
+import numpy as np
+import pytest
+
+from driftfit import ARX, AdaptiveKalman, Regression, track
+
+T, THETA = 600, (1.1, -0.5, 1.0, 0.5)
+PLANT = ARX(2, 2)
+
+
+def plant(seed=0):
+    rng = np.random.default_rng(seed)
+    u, y = rng.normal(size=T), np.zeros(T)
+    for t in range(2, T):
+        y[t] = 1.1 * y[t - 1] - 0.5 * y[t - 2] + u[t - 1] + 0.5 * u[t - 2] + 0.1 * rng.normal()
+    return y, u
+
+
+def left_out(run):
+    return int(run.state["left_out"])
+
+
+def wrong(run, t):
+    return np.abs(run.theta[t] - THETA).max()
+
+
+@pytest.mark.parametrize("signal", ["y", "u"])
+@pytest.mark.parametrize("code", [999.0, -1e6])
+def test_a_fault_code_at_any_of_the_first_samples_does_no_harm(signal, code):
+    y, u = plant()
+    clean = track(PLANT, AdaptiveKalman(), y, u)
+    for at in range(16):
+        broken = {"y": y.copy(), "u": u.copy()}
+        broken[signal][at] = code
+        run = track(PLANT, AdaptiveKalman(), broken["y"], broken["u"])
+        assert wrong(run, 150) < 0.06
+        assert np.abs(run.theta - clean.theta)[-1].max() < 0.01
+        assert np.abs(run.smooth().theta - THETA).max() < 0.15
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 40])
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_a_record_may_begin_with_a_run_of_fault_codes(count, unit):
+    y, u = plant()
+    y[:count] = 9999.0
+    run = track(PLANT, AdaptiveKalman(), unit * y, u)
+    theta = run.theta / [1.0, 1.0, unit, unit]
+    assert np.abs(theta[count + 100] - THETA).max() < 0.08
+    assert left_out(run) >= count
+
+
+def test_what_was_left_out_is_marked_and_counted():
+    y, u = plant()
+    y[4] = 9999.0
+    run = track(PLANT, AdaptiveKalman(), y, u)
+    assert left_out(run) == 3  # an output once, and a lag twice
+    assert left_out(track(PLANT, AdaptiveKalman(), *plant())) == 0
+
+
+def test_a_large_response_to_a_large_input_is_kept():
+    y, u = plant()
+    rng = np.random.default_rng(1)
+    u *= 0.001
+    u[3] = 100.0
+    y = np.zeros(T)
+    for t in range(2, T):
+        y[t] = 1.1 * y[t - 1] - 0.5 * y[t - 2] + u[t - 1] + 0.5 * u[t - 2] + 0.1 * rng.normal()
+    run = track(PLANT, AdaptiveKalman(), y, u)
+    assert wrong(run, 30) < 0.02  # without this one response the inputs would tell nothing
+
+
+def test_first_samples_of_another_level_are_no_fault_codes():
+    rng = np.random.default_rng(0)
+    u = np.r_[np.zeros(7), np.ones(T - 7)]
+    y = 50.0 * u + 0.01 * rng.normal(size=T)
+    run = track(Regression(1, intercept=True), AdaptiveKalman(), y, u)
+    assert run.ok[:20].all()
+    np.testing.assert_allclose(run.theta[-1], [50.0, 0.0], atol=0.02)
+
+
+@pytest.mark.parametrize("large", [1000.0, 1e5])
+def test_an_input_that_moves_less_from_now_on_is_still_followed(large):
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=3000)
+    u[:100] *= large
+    b = np.where(np.arange(3000) < 1500, 2.0, 3.0)
+    run = track(Regression(1, intercept=True), AdaptiveKalman(), 5.0 + b * u + 0.1 * rng.normal(size=3000), u)
+    np.testing.assert_allclose(run.theta[[1499, 1600, 2999], 0], [2.0, 3.0, 3.0], atol=0.05)
+
+
+def test_a_scale_that_rests_on_a_few_fault_codes_is_lost_again():
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=T)
+    y = 5.0 + 2.0 * u + 0.1 * rng.normal(size=T)
+    u[:8] = 9999.0
+    run = track(Regression(1, intercept=True), AdaptiveKalman(), y, u)
+    np.testing.assert_allclose(run.theta[-1], [2.0, 5.0], atol=0.05)
