@@ -16,7 +16,7 @@ efficient. If the model of the noise is wrong, B and F are still consistent: w d
 
 B and F of theta' follow theta with the share `FOLLOWING` of the distance at each sample, C and D at once; or theta' is
 held (``point``), which is one iteration of the method for a whole record. Before the filters are known, the first
-samples are an ARX regression; C and D enter after 30 n samples, and until then the instruments are the regressors.
+samples are an ARX regression; C and D enter after 10 n samples, and until then the instruments are the regressors.
 
 Source: Young, Recursive Estimation and Time-Series Analysis (2011), chapter 7: RIV, and SRIV without C and D; Young and
 Jakeman, Int. J. Control 29 (1979). Departures: noise and plant are estimated by one recursion, where the source has one
@@ -53,7 +53,7 @@ XI, XI_C, XI_F, MORE = range(4)
 FOLLOWING = 0.05
 """Share of the distance to theta that B and F of the point move at a sample."""
 
-WAITING = 30.0
+WAITING = 10.0
 """Samples for each parameter before C and D enter. Until then the errors of B and F are larger than the noise; a noise
 model that learns from them has zeros of C at the unit circle, where the gradient is huge and its bands are too narrow.
 """
