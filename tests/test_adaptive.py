@@ -75,7 +75,7 @@ def test_a_million_dull_samples_and_excitation_back():
     assert np.isfinite(run.theta).all()
     for u in dull[:2000]:
         live.update(u @ truth + 0.1 * rng.normal(), u)
-    assert not live.learning.any()  # the first two cannot be told apart, the third is 0
+    assert not live.learning.any()  # the first two cannot be distinguished, the third is 0
     assert np.abs(live.theta - truth).max() < 0.3
     truth = truth + 0.5
     for u in rng.normal(size=(15, 3)):
@@ -126,7 +126,7 @@ def test_frozen_readings_are_left_out():
     assert "Frozen" in dict(AdaptiveKalman().remarks(run))
 
 
-def test_a_reading_that_repeats_by_chance_is_not_told_as_frozen():
+def test_a_reading_that_repeats_by_chance_is_not_reported_as_frozen():
     """Level of a tank in steps of 0.001, forty records of 800: one in twenty said so before runs were asked for."""
     said = 0
     for seed in range(40):
@@ -150,7 +150,7 @@ def test_groups_beyond_the_parameters_are_refused():
         track(Regression(3), AdaptiveKalman(groups=[[3]]), np.ones(5), np.ones((5, 3)))
 
 
-def test_a_coarse_sensor_that_stands_still_does_not_poison():
+def test_a_coarse_sensor_that_repeats_its_reading_does_not_spoil_the_estimates():
     """Flow in whole litres that seldom changes: probabilities of whole filters fall below the smallest number."""
     rng = np.random.default_rng(3)
     u = np.where(rng.random(2000) < 0.3, 0.38, 0.05)
@@ -206,7 +206,7 @@ def test_what_never_changes_is_expected_to_change_less_often():
     assert jumps.state["calm"] == 1.0
 
 
-def test_a_signal_far_from_zero_beside_an_intercept_is_being_learned_and_one_at_rest_is_not():
+def test_a_signal_far_from_zero_is_learned_next_to_an_intercept_and_one_at_rest_is_not():
     """The window of `excitation`, and variances of least squares: offsets decide nothing."""
     rng = np.random.default_rng(0)
     for rests in (0, 400):

@@ -10,7 +10,6 @@ from support import arx_record, damaged, run_lanes, same
 from test_bank import N, R, changes, record
 
 from driftfit import ARX, Bank, Kalman, Live, Regression, track
-from driftfit.engine.substitute import substituted
 from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.leaves import leaf_matrix
 from driftfit.trackers.bank.leaves.factored import factorise, widened
@@ -20,6 +19,7 @@ from driftfit.trackers.bank.machine import start
 from driftfit.trackers.bank.reducing import merge
 from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
 from driftfit.trackers.bank.sensor import Sensor
+from driftfit.trackers.bank.substitute import substituted
 
 T = 90
 Y, U = record(T, 5, (30, 60), (40, 75))

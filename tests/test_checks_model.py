@@ -101,7 +101,7 @@ class Twice(ARX):
         (Drawn, "play gives"), (Fickle, "follows returns False"), (Twice, "names must be 4 different names"),
     ],
 )  # fmt: skip
-def test_wrong_declarations_are_said(kind, said):
+def test_wrong_declarations_are_reported(kind, said):
     broken = check_model(kind(1, 3))
     assert len(broken) == (2 if kind is Short else 1)  # without its whole reach it cannot be played either
     assert re.match(said, broken[0]), broken

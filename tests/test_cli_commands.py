@@ -1,4 +1,4 @@
-"""Commands beside `track`: each prints what Python gives, for the part of the file that was asked for."""
+"""Commands other than `track`: they print the same results as Python, for the selected part of the file."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_valid_ranges_and_stretches_left_out(table):
     assert "FROM..TO" in fails("track", *SIGNALS, "--exclude", "4")
 
 
-def test_a_saved_run_or_stream_goes_on(table):
+def test_a_saved_run_or_stream_is_continued(table):
     run("track", *SIGNALS, "--rows", ":200", "--out", "first.npz")
     y, u, _ = simulate()
     stream = Live(ARX(1, 1, inputs=["valve"]), K)

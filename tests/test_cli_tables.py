@@ -99,7 +99,7 @@ def test_a_tracker_of_the_users_own(folder):
         assert said in " ".join(result.output.split())
 
 
-def test_what_is_wrong_is_said_in_one_line(folder):
+def test_an_error_is_reported_in_one_line(folder):
     for arguments, said in (
         (["a.csv", "--y", "flo"], "has no column 'flo': did you mean flow?"),
         (["z*.csv", "--y", "flow"], "no file matches z*.csv"),

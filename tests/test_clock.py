@@ -55,7 +55,7 @@ GIVEN = {
 
 
 @pytest.mark.parametrize("plain", GIVEN)
-def test_what_is_said_of_an_interval(plain):
+def test_an_interval_in_words(plain):
     for given in GIVEN[plain]:
         time = pd.date_range("2024-12-20", periods=20, freq="13h").to_numpy()
         assert np.allclose(Clock.of(given).steps(time), Clock.of(plain).steps(time), rtol=1e-12), given
@@ -201,7 +201,7 @@ def test_a_warm_start_counts_from_the_end_of_the_run_before():
     assert np.array_equal(rest.theta, whole.theta[25:])
 
 
-def test_what_is_lost_to_dt_is_said():
+def test_samples_lost_to_dt_are_reported():
     y, u = signals()
     with pytest.warns(
         DataWarning, match=r"59 of 60 samples .* median interval is 10, dt is 1, .* Give dt=10, or dt='label'"
@@ -224,14 +224,14 @@ def test_what_is_lost_to_dt_is_said():
     assert [one.filename for one in said] == [__file__]
 
 
-def test_weekends_that_cost_mondays_are_said():
+def test_weekends_that_cost_mondays_are_reported():
     y, u = signals()
     time = pd.date_range("2024-01-01", periods=T, freq="B")
     with pytest.warns(DataWarning, match="dt='business day'"):
         track(MODEL, TRACKER, y, u, time=time, dt="1d")
 
 
-def test_nothing_is_said_where_nothing_is_lost():
+def test_no_warning_where_no_sample_is_lost():
     y, u = signals()
     rng = np.random.default_rng(0)
     track(MODEL, TRACKER, y, u, time=10.0 * np.arange(T), dt="label")

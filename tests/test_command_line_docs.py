@@ -1,6 +1,6 @@
-"""docs/command_line.md: every command that it shows runs, and prints what stands below it.
+"""docs/command_line.md: every command that it shows runs, and prints the text below it.
 
-Run as a program, it prints the page anew: ``python tests/test_command_line_docs.py``.
+Run as a program, it prints the page again: ``python tests/test_command_line_docs.py``.
 """
 
 import os

@@ -124,15 +124,17 @@ def test_picture_has_six_panels_and_marks_what_is_out_of_bounds():
 
 
 def test_a_tracker_that_may_move_is_not_accused_on_short_constant_records():
-    """The tracker without settings loses a little to constants, sometimes more than 3 % by chance: that is no fault."""
-    rng = np.random.default_rng(11)
-    u, v = rng.normal(size=(2, 25, 200, 3))
+    """The tracker without settings loses a little to constants (0.4 to 1 % on average), by chance more than 3 % on a
+    few of these records: that is no fault."""
     dearer = accused = 0
-    for k in range(25):
-        run = track(Regression(3), AdaptiveKalman(), u[k] @ [1.0, -1.0, 0.5] + v[k, :, 0], u[k])
-        error = errors(run)
-        own, steady = (np.mean(e[error.scored] ** 2) for e in (error.tracked, error.constant_ls))
-        dearer += own > 1.03**2 * steady
-        accused += not run.diagnose()["constancy (p)"].ok
-    assert dearer >= 1
+    for seed in (11, 12):
+        rng = np.random.default_rng(seed)
+        u, v = rng.normal(size=(2, 25, 200, 3))
+        for k in range(25):
+            run = track(Regression(3), AdaptiveKalman(), u[k] @ [1.0, -1.0, 0.5] + v[k, :, 0], u[k])
+            error = errors(run)
+            own, steady = (np.mean(e[error.scored] ** 2) for e in (error.tracked, error.constant_ls))
+            dearer += own > 1.03**2 * steady
+            accused += not run.diagnose()["constancy (p)"].ok
+    assert dearer >= 3
     assert accused <= 1

@@ -41,7 +41,7 @@ ELSEWHERE = {
     "python -m benchmarks.spark": ("tests/test_bridge_spark.py", 'costs(True, "streams")'),
     "python -m lab bench speed": ("lab/tests/test_bench.py", '["bench", "speed", "--quick"'),
 }  # fmt: skip
-"""Commands, by how they begin, with the test that runs them quickly and what stands there."""
+"""Commands, by how they begin, with the test that runs them quickly and the text that it contains."""
 
 
 def commands() -> list[str]:

@@ -285,7 +285,7 @@ def test_the_simulink_block_gives_the_bits_of_a_stream(tmp_path, inputs):
         np.testing.assert_array_equal(np.array(line.split(), dtype=float), np.array(expected, dtype=float))
 
 
-def test_what_cannot_be_exported_is_said(tmp_path):
+def test_an_export_that_is_not_possible_is_refused(tmp_path):
     with pytest.raises(ValueError, match="Bank has no C form"):
         export_c(ARX(1, 1), Bank(), tmp_path)
     with pytest.raises(ValueError, match="one output at a time"):

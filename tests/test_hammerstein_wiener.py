@@ -439,7 +439,7 @@ def test_forecasts_have_the_unit_of_the_output():
     assert np.mean(said, axis=0)[4] == pytest.approx(1.97 * np.mean(said, axis=0)[0], rel=0.02)
 
 
-def test_a_run_goes_on_with_its_own_model_only():
+def test_a_run_is_continued_only_with_its_own_model():
     rng = np.random.default_rng(12)
     y, u = rng.uniform(-1.0, 1.0, (2, 60))
     run = track(SMALL, K, y[:30], u[:30])

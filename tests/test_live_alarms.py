@@ -54,7 +54,7 @@ def test_a_stream_says_what_the_record_says(record, tracker, kind, settings):
     assert FAULT - CUT > 100 > len(said.onsets) > 0
     live = Live(ARX(2, 2), tracker, warm_start=before)
     alarm = live.detect(rule)
-    begun, told = [], []
+    begun, onsets = [], []
     for t in range(CUT, T):
         live.update(y[t], u[t], time=float(t))
         if t % 60 == 0:
@@ -67,18 +67,18 @@ def test_a_stream_says_what_the_record_says(record, tracker, kind, settings):
             now, then = alarm.change, said.change(t)
             assert now is None or now[1:4] == then[1:4]
         begun += [t] if alarm.begun else []
-        told += alarm.onsets()
+        onsets += alarm.onsets()
     assert begun == said.onsets.tolist()
-    assert [onset.sample + CUT for onset in told] == begun
-    assert [onset.time for onset in told] == [float(t) for t in begun]
-    assert all(onset.statistic > onset.limit and onset.limit in rule.limits for onset in told)
-    assert [onset.cause for onset in told] == [said.cause(t) for t in begun]
+    assert [onset.sample + CUT for onset in onsets] == begun
+    assert [onset.time for onset in onsets] == [float(t) for t in begun]
+    assert all(onset.statistic > onset.limit and onset.limit in rule.limits for onset in onsets)
+    assert [onset.cause for onset in onsets] == [said.cause(t) for t in begun]
     assert alarm.onsets() == []
     many, causes = in_parts(before, whole, rule), []
     for found in many[1]:
         causes += found
     assert causes == [said.cause(t) if said.active[t] else None for t in range(CUT, T)]
-    assert many[0].onsets() == [onset._replace(time=None) for onset in told]
+    assert many[0].onsets() == [onset._replace(time=None) for onset in onsets]
     assert same(many[0].statistic, alarm.statistic)
 
 

@@ -61,7 +61,7 @@ def test_it_finds_the_structure_and_finds_it_again_after_a_change():
     assert max(after) <= 22
 
 
-def test_what_cannot_be_weighed_is_said():
+def test_candidates_that_cannot_be_weighed_are_refused():
     for arguments, says in (
         (([], K), "at least one model"), ((CANDIDATES, K, 0.0), "forgetting must be in"),
         ((CANDIDATES, AugmentedFLS(mu=1.0)), "with one variance"), ((CANDIDATES, Bank()), "with one variance"),

@@ -43,7 +43,7 @@ def test_those_that_move_are_found_and_named(fleet):
     said = fleet.verdict()
     assert set(said.drifting) == {f"<{k}>" for k in MOVED}
     assert said["<1>"].moving == ("b1[u]",)
-    assert said["<1>"].said == fleet["<1>"].verdict()
+    assert said["<1>"].verdict == fleet["<1>"].verdict()
     assert said["<1>"].pays
     assert said.rows[-1].key == "<6>"
     assert "move in 2 of 6" in said.sentences[0]
@@ -64,7 +64,7 @@ def test_a_level_is_the_false_discovery_rate(fleet):
     strict = fleet.verdict(level=1e-12)
     assert set(strict.drifting) <= {f"<{k}>" for k in MOVED}
     for row in fleet.verdict().rows:
-        assert np.isnan(row.q) or row.q >= row.said.p
+        assert np.isnan(row.q) or row.q >= row.verdict.p
 
 
 def test_ranked_by_change_puts_the_largest_share_first(fleet):
@@ -87,8 +87,8 @@ def test_ranked_by_change_puts_the_largest_share_first(fleet):
 
 def test_a_share_of_almost_nothing_is_one_of_its_error(fleet):
     row = fleet.verdict()["<1>"]
-    parts = tuple(replace(m, before=1e-9, after=0.5, std=0.1) if m.moves else m for m in row.said.parameters)
-    assert replace(row, said=replace(row.said, parameters=parts)).relative == pytest.approx(5.0)
+    parts = tuple(replace(m, before=1e-9, after=0.5, std=0.1) if m.moves else m for m in row.verdict.parameters)
+    assert replace(row, verdict=replace(row.verdict, parameters=parts)).relative == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize(("patience", "shown"), [(0.0, 1), (1e9, 0)])
@@ -151,7 +151,9 @@ def test_outputs_of_one_record(tmp_path):
 
 
 def test_alarms_of_a_fleet_share_one_rate(fleet):
-    """Each series is watched for its part of the rate; what is found is named, what is too short is told."""
+    """Each series is watched for its part of the rate; what is found is named, and series that are too short are
+    reported.
+    """
     said = fleet.detect("band", every=1000.0, reference=140)
     assert set(said.faulty) == set(said.alarmed) == {f"<{k}>" for k in MOVED}
     assert len(said) == 6
@@ -171,9 +173,9 @@ def test_alarms_of_a_fleet_share_one_rate(fleet):
     assert f"Alarms {len(table)} in 2 series; 0.14 false alarms expected".split() in printed
     for row in said.rows:
         judged = [str(len(row.alarms.onsets)), *row.first.split()]
-        told = next(line for line in printed if line[0] == row.key)
-        assert told[1 : 1 + len(judged)] == judged
-        assert (told[-1] == "fault") == row.faulty
+        printed_row = next(line for line in printed if line[0] == row.key)
+        assert printed_row[1 : 1 + len(judged)] == judged
+        assert (printed_row[-1] == "fault") == row.faulty
     assert ["not", "judged,", "<6>:"] in [line[:3] for line in printed]
     with pytest.raises(KeyError, match="too short"):
         said["<6>"]

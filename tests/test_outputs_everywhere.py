@@ -282,6 +282,28 @@ def test_an_output_missing_before_anything_is_known_is_not_taken_for_theta0():
     assert track(JOINT, Kalman(q=1e-4, r=0.01), y, u).ok[41].all()  # and this one the model's own prediction
 
 
+def test_one_output_of_a_stream():
+    (joint, y, u, _), (shared, *_) = records()
+    run, live = track(joint, TRACKER, y, u), Live(ARX(1, 1, inputs=1, ny=NAMES), TRACKER)
+    flow = live["flow"]
+    for t in range(len(y)):
+        live.update(y[t], u[t])
+    assert (flow.output, flow.names, flow.tracker) == ("flow", run["flow"].names, TRACKER)
+    assert flow.alarm is None
+    np.testing.assert_array_equal(flow.theta, run["flow"].theta[-1])
+    np.testing.assert_array_equal(flow.std, live[1].std)
+    np.testing.assert_array_equal(flow.cov, run["flow"].cov(len(y) - 1))
+    with pytest.raises(ValueError, match="FLS keeps no windowed information"):
+        _ = flow.learning
+    for absent in ("pressure", 2):
+        with pytest.raises(KeyError, match="there are level, flow"):
+            _ = live[absent]
+    with pytest.raises(KeyError, match="one theta"):
+        _ = Live(shared, TRACKER)["flow"]
+    with pytest.raises(TypeError):
+        iter(live)
+
+
 def test_live_loads_a_stream_with_several_outputs(tmp_path):
     (_, y, u, _), (shared, z, phi, _) = records()
     for model, out, given in ((ARX(1, 1, inputs=1, ny=NAMES), y, u), (shared, z, phi)):

@@ -103,7 +103,7 @@ def test_jacobian_of_a_known_function():
     assert got[0] == pytest.approx(np.array([[2.0, 1.0], [2.0, 0.0]]))
 
 
-def test_one_step_ahead_is_what_the_run_said(run):
+def test_one_step_ahead_is_the_prediction_of_the_run(run):
     got = run.ahead(1)
     assert got.y_hat[3:] == pytest.approx(run.prediction[3:])
     assert got.y_std[10:] == pytest.approx(run.innovation_std[10:])

@@ -155,7 +155,7 @@ def test_the_larger_a_fault_the_surer():
         assert constancy(phi, y + size * np.clip((np.arange(1000) - 700) / 60.0, 0.0, 1.0)).p_joint < 1e-4
 
 
-def test_a_passing_fault_is_told_as_such():
+def test_a_temporary_fault_is_reported_as_such():
     phi, y = fault(30.0)
     said = track(Regression(1, intercept=True), Kalman(q=1e-3, r=0.25), y, phi[:, 0]).verdict()
     assert said.moving == ("intercept",)
@@ -270,7 +270,7 @@ def test_the_interval_holds_the_date():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_parameters_that_are_not_told_apart_are_named_as_a_group(seed):
+def test_parameters_that_cannot_be_distinguished_are_named_as_a_group(seed):
     """Regressors with correlation 0.999: one of the two moves, and which one nobody can tell."""
     rng = np.random.default_rng(seed)
     u = rng.normal(size=(400, 3)) @ [[1.0, 0.999, 0.0], [0.0, 0.045, 0.0], [0.0, 0.0, 1.0]]
@@ -286,7 +286,9 @@ def test_parameters_that_are_not_told_apart_are_named_as_a_group(seed):
 
 
 def test_steps_are_found_one_after_the_other_with_their_sizes():
-    """A large move of one gain of an ARX system makes others look moved; two steps of two parameters are told apart."""
+    """A large move of one gain of an ARX system makes others seem to move; two steps of two parameters are
+    distinguished.
+    """
     phi, y = record(600, 8)
     y += 2.0 * phi[:, 0] * (np.arange(600) >= 200) - 0.8 * phi[:, 2] * (np.arange(600) >= 450)
     got = attribute(phi, y, constancy(phi, y), 0.05)
@@ -378,10 +380,10 @@ def test_the_test_of_an_arx_model_in_correlated_noise_has_the_lags_that_make_it_
     constants = robust_fit(X, y[5:])
     found = noise(orthonormal(X)[0], constants.residual, 200, 16, 0)._replace(ar=a, level=np.ones(295))
     rows = whitened(X, y[5:], a)[0]
-    beside = missing_lags(X, rows, found)
-    assert beside.shape == (295, 2)
-    assert beside.T @ beside == pytest.approx(295.0 * np.eye(2), abs=1e-6)
-    both = np.column_stack([rows, beside])
+    lagged = missing_lags(X, rows, found)
+    assert lagged.shape == (295, 2)
+    assert lagged.T @ lagged == pytest.approx(295.0 * np.eye(2), abs=1e-6)
+    both = np.column_stack([rows, lagged])
     for column in np.column_stack(lags)[6:].T:
         assert column == pytest.approx(both[1:] @ np.linalg.lstsq(both[1:], column, rcond=None)[0], abs=1e-6)
 

@@ -70,7 +70,7 @@ def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool
 
 
 def _again(dispatcher: Any, again: Callable[..., Any]) -> Any:
-    """Store how a function like this one is made from another source; see `driftfit.engine.substitute`."""
+    """Store how a function like this one is made from another source; see `driftfit.trackers.bank.substitute`."""
     dispatcher.again = again
     return dispatcher
 

@@ -1,4 +1,4 @@
-"""Everything that uses private parts of Numba and llvmlite. No other module imports `numba.core` or llvmlite.
+"""What uses private parts of Numba and llvmlite. No other module but `numba_lowering` imports `numba.core` or llvmlite.
 
 Each section names the private parts that it uses, and the reason. `tests/contract/test_numba_internals.py` has a canary
 for each, which names in one sentence what broke. Tried with the versions in `TRIED`.
@@ -45,7 +45,7 @@ from llvmlite.binding import newpassmanagers as passes
 from numba import _dynfunc, njit, types
 from numba.core.caching import _Cache
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase, CompileResult, DefaultPassBuilder, Flags
+from numba.core.compiler import CompileResult, Flags
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import lookup_environment
 from numba.core.registry import CPUDispatcher, cpu_target
@@ -55,6 +55,8 @@ from numba.core.targetconfig import ConfigStack
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
+
+from driftfit.engine.numba_lowering import Pipeline
 
 __all__ = ["AttributeTemplate", "dumps", "ir"]
 
@@ -91,22 +93,6 @@ STEP = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
 
 LINKED = {**STEP, "_nrt": False}
 """The same without reference counts, which took nine tenths of the time of compiling a bank: no array is made."""
-
-
-UNUSED = {
-    "LiteralPropagation", "annotate_types", "dump_parfor_diagnostics", "inline_closure_likes", "inline_inlinables",
-    "inline_overloads", "literal_unroll", "make_function_op_code_to_jit_function", "nopython_rewrites", "with_lifting",
-}  # fmt: skip
-"""Passes for comprehensions, inner functions, expressions of whole arrays and ``with``, which nothing here has."""
-
-
-class Pipeline(CompilerBase):
-    """Numba's passes without those, which take 6 per cent of the time of compiling."""
-
-    def define_pipelines(self) -> list[Any]:
-        made = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        made.passes = [one for one in made.passes if one[0].name() not in UNUSED]
-        return [made]
 
 
 def under_ieee(function: Callable[..., Any], **options: bool) -> Any:

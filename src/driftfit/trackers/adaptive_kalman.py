@@ -340,14 +340,14 @@ class AdaptiveKalman(Tracker):
         lane, names = run.state, np.array(run.names)
         never = np.isinf(lane["var"])
         lately = ~never & ~learned(lane)
-        said = []
+        facts = []
         if never.any():
-            said.append(
+            facts.append(
                 ("Not learned", f"{', '.join(names[never])}: never varied separately from the others; std is inf")
             )
         if lately.any():
-            said.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
-        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane), *colour(lane))
+            facts.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
+        return (*facts, *proportion(lane), *held_readings(lane), *resolution(lane), *colour(lane))
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])

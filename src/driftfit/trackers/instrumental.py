@@ -84,6 +84,9 @@ LEAST = 0.5
 MOST = 1e6
 """The most that it may be beside 1 / w + zeta' C zeta, with refined instruments."""
 
+LATE = 1.5
+"""Factor of the samples that are forgotten again, with refined instruments: the model of the noise begins late."""
+
 start_of_rls = rls.begin
 
 
@@ -311,7 +314,7 @@ class InstrumentalVariables(Tracker):
         return steps(model.output_lags)
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
-        return {**self.state(model.n), "discounted": model.settling}
+        return {**self.state(model.n), "discounted": model.settling * (LATE if model.instruments else 1.0)}
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         super().widen(lane, p)

@@ -4,8 +4,9 @@ Every simulated record has its own reference. The residuals x of the reference a
 (sums of fitted residuals in their order vary too little), they get the variances h of the model, and scale and
 variances are estimated from them again; so is the error of theta, from its covariance. A record of regressors and
 residuals drawn together follows, whose scores are those of the model that was estimated from its own reference. The
-limits so allow for everything that is estimated: a stream carries these errors for ever. Whether the variance changes
-at all is seldom certain, so alpha and beta of each record are drawn from those that the reference leaves plausible.
+limits therefore allow for everything that is estimated: a stream keeps these errors for as long as it runs. Whether the
+variance changes at all is seldom certain, so alpha and beta of each record are drawn from those that the reference
+leaves plausible.
 
 With a deviate c as statistic the logarithm of the rate of onsets falls nearly as a straight line in c^2. A limit that
 is rarer than the simulated records can show is found along that line, which also gives the probability of an extreme.
@@ -82,8 +83,8 @@ def together(parts: Sequence[Records]) -> Records:
 def drawn_in_blocks(frozen: Frozen, x: Array) -> bool:
     """Whether the size of the residuals is correlated even after the GARCH part, so that they are drawn in blocks.
 
-    In blocks, a short window has no other sums of squares than those of the reference, whose largest is then the
-    largest of all.
+    With blocks, the sums of squares of a short window are those that occur in the reference, so that none exceeds its
+    largest.
     """
     g = np.clip(x, -frozen.numbers[CLIP], frozen.numbers[CLIP])
     return whiteness(g * g - np.mean(g * g)).p <= CORRELATED
