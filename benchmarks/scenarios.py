@@ -1,11 +1,11 @@
 """Trackers without settings on scenarios they were not designed on: error of theta over that of the filter that knows.
 
 *Oracle* is the Kalman filter that knows the drift covariance and the noise variance of every sample, when jumps occur,
-and which readings are faults. Ratios are medians over runs.
-*each* is ``AdaptiveKalman(groups=[[0], [1], ..])``, *faults* a `Bank` with a hypothesis for outliers, *ML each* the
-Kalman filter with the drift of every parameter and the noise variance by maximum likelihood from the whole record, and
-*best* that with the one ratio q c / r that is best on these very runs. The last columns are shares within the 95 %
-bands of each tracker of ours, of theta and of y (without faults).
+and which readings are faults. Ratios are medians over runs. *each* is ``AdaptiveKalman(groups=[[0], [1], ..])``,
+*faults* a `Bank` with a hypothesis for outliers, *ML each* the Kalman filter with the drift of every parameter and the
+noise variance by maximum likelihood from the whole record, and *best* that with the one ratio q c / r that is best on
+these very runs. The last columns are shares within the 95 % bands of `AdaptiveKalman`, of theta and of y (without
+faults).
 
 Run: python -m benchmarks.scenarios [--runs 20] [--only NAME ..] [--columns default each bank ml best] [--quick]
 """

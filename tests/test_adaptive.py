@@ -128,15 +128,15 @@ def test_frozen_readings_are_left_out():
 
 def test_a_reading_that_repeats_by_chance_is_not_reported_as_frozen():
     """Level of a tank in steps of 0.001, forty records of 800: one in twenty said so before runs were asked for."""
-    said = 0
+    result = 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
         u, y = np.repeat(rng.normal(size=160), 5), np.zeros(800)
         for t in range(1, 800):
             y[t] = 0.8 * y[t - 1] + u[t - 1] + 0.1 * rng.normal()
         run = track(ARX(1, 1), AdaptiveKalman(), np.round(y, 3), u)
-        said += "Frozen" in dict(AdaptiveKalman().remarks(run))
-    assert said == 0
+        result += "Frozen" in dict(AdaptiveKalman().remarks(run))
+    assert result == 0
 
 
 @pytest.mark.parametrize("groups", [[[0], [0, 1]], [[]], [[-1]]])

@@ -61,9 +61,9 @@ def test_outputs_have_a_summary_each():
             judged = run.ok[:, j] & np.isfinite(run.innovation_std[:, j])
             e = run.innovation[judged, j]
             assert one[f"rms[{name}]"] == pytest.approx(np.sqrt(np.mean(e**2)), rel=1e-12)
-            said = run[name].verdict()
-            assert same([one[f"p[{name}]"], one[f"theta_{run.names[j][1]}"]], [said.p, run.theta[-1, j, 1]])
-            assert (one[f"drifts[{name}]"], one[f"pays[{name}]"]) == (said.drifts, said.pays)
+            message = run[name].verdict()
+            assert same([one[f"p[{name}]"], one[f"theta_{run.names[j][1]}"]], [message.p, run.theta[-1, j, 1]])
+            assert (one[f"drifts[{name}]"], one[f"pays[{name}]"]) == (message.drifts, message.pays)
 
 
 @pytest.mark.parametrize("model", [MODEL, PAIR])

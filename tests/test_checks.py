@@ -146,7 +146,7 @@ def test_trackers_that_keep_their_promises(tracker):
 
 
 @pytest.mark.parametrize(
-    ("tracker", "said"),
+    ("tracker", "result"),
     [
         (Always(), ["must be a factor of the gain", "no time passes and no sample is used"]),
         (Careless(), ["index every field with [..., l]", "must be a factor of the gain"]),
@@ -159,9 +159,9 @@ def test_trackers_that_keep_their_promises(tracker):
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_broken_promises_are_reported(tracker, said):
+def test_broken_promises_are_reported(tracker, result):
     sentences = check_tracker(tracker)
-    for words in said:
+    for words in result:
         assert any(words in sentence for sentence in sentences), sentences
 
 

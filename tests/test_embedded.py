@@ -227,8 +227,8 @@ def test_the_self_test_passes_unoptimised_and_under_sanitizers(tmp_path, name, f
 @needs_gcc
 @pytest.mark.parametrize("name", ["adaptive", "blocks", "start", "one parameter"])
 def test_single_precision_is_close(tmp_path, name):
-    said = selftest(tmp_path, name, ["gcc", "-O2", "-DTRACKER_SINGLE"], [])
-    assert 0.0 < float(re.search(r"difference is (\S+)", said)[1]) < 1e-4
+    result = selftest(tmp_path, name, ["gcc", "-O2", "-DTRACKER_SINGLE"], [])
+    assert 0.0 < float(re.search(r"difference is (\S+)", result)[1]) < 1e-4
 
 
 @needs_controller
@@ -387,8 +387,8 @@ def test_the_loop_of_the_docs_prints_what_they_say(capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["controller.py"])
     runpy.run_path(str(ROOT / "examples" / "controller.py"), run_name="__main__")
     page = (ROOT / "docs" / "embedded.md").read_text()
-    said = re.search(r"`python examples/controller.py` prints.*?```text\n(.*?)```", page, re.S)[1]
-    assert capsys.readouterr().out.split() == said.split()
+    result = re.search(r"`python examples/controller.py` prints.*?```text\n(.*?)```", page, re.S)[1]
+    assert capsys.readouterr().out.split() == result.split()
 
 
 def test_the_command_writes_the_same(tmp_path):

@@ -31,17 +31,17 @@ def test_the_weights_are_those_of_the_record(tmp_path):
     y[100], u[200] = np.nan, np.inf
     expected = select(CANDIDATES, y, u, tracker=K).average(0.98)
     live = LiveSelection(CANDIDATES, K, forgetting=0.98)
-    weights, said = np.empty((600, len(CANDIDATES))), np.empty(600)
+    weights, result = np.empty((600, len(CANDIDATES))), np.empty(600)
     for t in range(600):
         if t == 350:
             live.save(tmp_path / "state")
             live = LiveSelection.load(tmp_path / "state")
         weights[t] = live.weights
-        said[t] = live.update(y[t], u[t])
+        result[t] = live.update(y[t], u[t])
     assert_allclose(weights, expected.weights, atol=1e-9)
     known = np.isfinite(expected.y_hat)
     assert known.sum() > 580
-    assert_allclose(said[known], expected.y_hat[known], atol=1e-9)
+    assert_allclose(result[known], expected.y_hat[known], atol=1e-9)
     assert repr(CANDIDATES[STUCK]) in repr(live)
 
 

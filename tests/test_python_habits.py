@@ -139,8 +139,8 @@ def test_results_can_be_copied_and_sent(run, fleet, way):
         assert str(other.summary()) == str(one.summary())
         assert same(other.forecast(2, U[:2]).y_std, one.forecast(2, U[:2]).y_std)
     assert str(way(fleet).summary()) == str(fleet.summary())
-    for said in results(run, fleet):
-        assert str(way(said)) == str(said)
+    for result in results(run, fleet):
+        assert str(way(result)) == str(result)
     tuned = tune(ARX(2, 2), Kalman(), Y, U)
     other = way(tuned)
     assert repr(other) == repr(tuned)

@@ -296,9 +296,9 @@ def test_a_fleet_warns_once_of_what_its_series_could_not_learn():
     y, u = jumping(noise, level(0.0))
     every = np.stack([u, u, u])
     every[1, :, 2] = np.random.default_rng(3).normal(size=T)
-    with pytest.warns(UserWarning, match=r"in 2 of 3 series theta3 \(2\) could not be learned") as said:
+    with pytest.warns(UserWarning, match=r"in 2 of 3 series theta3 \(2\) could not be learned") as result:
         fleet = track(MODEL, AdaptiveKalman(), np.stack([y, y, y]), every, by="row")
-    assert len(said) == 1
+    assert len(result) == 1
     assert np.isinf(fleet[0].std[-1, 2])
 
 
@@ -436,16 +436,16 @@ def test_resumed_runs_and_structures_are_judged_by_the_density_of_the_mixture(tr
         np.testing.assert_array_equal(rest.theta, whole.theta[cut:])
         np.testing.assert_array_equal(rest.log_density, whole.log_density[cut:])
     models = [Regression(2), Regression(2, intercept=True)]
-    said = select(models, y, u[:, :2], tracker=tracker)
+    result = select(models, y, u[:, :2], tracker=tracker)
     runs = [track(model, tracker, y, u[:, :2]) for model in models]
-    sums = [run.log_density[said.judged].sum() for run in runs]
-    first = np.flatnonzero(said.judged)[0] if np.asarray(said.judged).dtype == bool else np.min(said.judged)
+    sums = [run.log_density[result.judged].sum() for run in runs]
+    first = np.flatnonzero(result.judged)[0] if np.asarray(result.judged).dtype == bool else np.min(result.judged)
     learned = [total - 0.5 * run.model.n * np.log(first) for run, total in zip(runs, sums, strict=True)]
-    np.testing.assert_allclose(sorted(row.loglik for row in said.rows), sorted(learned), rtol=1e-9)
+    np.testing.assert_allclose(sorted(row.loglik for row in result.rows), sorted(learned), rtol=1e-9)
     for run in runs:
         square = (run.innovation / run.innovation_std) ** 2
         gaussian = -0.5 * (np.log(2.0 * np.pi * run.innovation_std**2) + square)
-        assert np.abs(gaussian - run.log_density)[said.judged].sum() > 10.0
+        assert np.abs(gaussian - run.log_density)[result.judged].sum() > 10.0
 
 
 def coarse_record(seed, quantum, held):

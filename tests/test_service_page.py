@@ -274,9 +274,9 @@ def started(port, *what):
 
 def stopped(process):
     process.send_signal(signal.SIGTERM)
-    said = process.communicate(timeout=60)[1]
-    assert process.returncode == 0, said
-    return [json.loads(line) for line in said.splitlines() if line.startswith("{")]
+    result = process.communicate(timeout=60)[1]
+    assert process.returncode == 0, result
+    return [json.loads(line) for line in result.splitlines() if line.startswith("{")]
 
 
 @pytest.mark.skipif(browser.PROGRAM is None, reason="needs Chromium")
@@ -365,4 +365,6 @@ def test_the_docs_lead_to_an_alarm_on_a_phone(tmp_path):
         process.stderr.close()
         server.shutdown()
         server.server_close()
-    assert any(who == "pump 1" and said.startswith("pump 1: band alarm, b1[pressure] is ") for who, said in Phone.got)
+    assert any(
+        who == "pump 1" and result.startswith("pump 1: band alarm, b1[pressure] is ") for who, result in Phone.got
+    )

@@ -59,9 +59,9 @@ def start(code, *arguments, **environment):
 
 
 def ended(process):
-    said, errors = process.communicate(timeout=300)
+    result, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
-    return said.strip(), errors
+    return result.strip(), errors
 
 
 def test_two_processes_that_compile_at_once_do_not_mix_layouts(tmp_path):
@@ -97,8 +97,8 @@ def test_where_nothing_can_be_written_code_is_compiled_in_memory_with_one_warnin
     script = tmp_path / "nowhere.py"
     script.write_text(NOWHERE)
     code = f"import runpy; runpy.run_path({str(script)!r}, run_name='nowhere')"
-    said, _ = ended(start(code, NUMBA_CACHE_DIR=str(blocked / "cache"), HOME=str(blocked)))
-    assert said == "1.0 1.0 1 True"
+    result, _ = ended(start(code, NUMBA_CACHE_DIR=str(blocked / "cache"), HOME=str(blocked)))
+    assert result == "1.0 1.0 1 True"
 
 
 def test_the_package_can_be_imported_where_no_folder_can_be_written(tmp_path, monkeypatch):
@@ -293,8 +293,8 @@ def test_a_fork_while_another_thread_compiles(tmp_path):
     script = tmp_path / "forks.py"
     script.write_text(FORKS)
     code = f"import runpy; runpy.run_path({str(script)!r}, run_name='forks')"
-    said, _ = ended(start(code, NUMBA_CACHE_DIR=str(tmp_path / "cache")))
-    assert said == "2.0 3.0"
+    result, _ = ended(start(code, NUMBA_CACHE_DIR=str(tmp_path / "cache")))
+    assert result == "2.0 3.0"
 
 
 class Interrupt(event.Listener):

@@ -61,7 +61,7 @@ class Loop(NamedTuple):
     left: Any
 
 
-class Short(Lower):  # type: ignore[misc]
+class Short(Lower):
     """Numba's step from typed code to LLVM's language, with fewer instructions for the same code."""
 
     def _find_singly_assigned_variable(self) -> None:
@@ -215,7 +215,7 @@ class Short(Lower):  # type: ignore[misc]
         if isinstance(later, Loop):
             made.iter, made.stop, made.step, made.count = later.next, later.stop, self._whole(1), later.left
         elif isinstance(later.kind, types.RangeType):
-            made.start, made.stop, made.step = *later.entries, self._whole(1)
+            (made.start, made.stop), made.step = later.entries, self._whole(1)
         else:
             made.first, made.second = later.entries
         return made._getvalue()
@@ -224,7 +224,7 @@ class Short(Lower):  # type: ignore[misc]
         """Lower an expression; an entry of what was not made is that entry."""
         place = expr.index if expr.op == "static_getitem" else {"pair_first": 0, "pair_second": 1}.get(expr.op)
         row = self._later.get(expr.value.name) if isinstance(place, int) else None
-        if isinstance(row, Row):
+        if isinstance(place, int) and isinstance(row, Row):
             entry = row.entries[place]
             return (
                 entry if expr.op != "static_getitem" else self.context.cast(self.builder, entry, row.kind[place], resty)
@@ -310,7 +310,7 @@ def _is_zero(value: Any) -> bool:
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
-class ShortLowering(NativeLowering):  # type: ignore[misc]
+class ShortLowering(NativeLowering):
     """Numba's pass with `Short` code."""
 
     _name = "short_lowering"
@@ -328,7 +328,7 @@ UNUSED = {
 """Passes for comprehensions, inner functions, expressions of whole arrays and ``with``, which nothing here has."""
 
 
-class Pipeline(CompilerBase):  # type: ignore[misc]
+class Pipeline(CompilerBase):
     """Numba's passes without those, which take 6 per cent of the time of compiling, and with short code."""
 
     def define_pipelines(self) -> list[Any]:

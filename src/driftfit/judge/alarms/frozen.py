@@ -134,7 +134,8 @@ def _losses(x: Array, numbers: Array) -> Array:
     """`losses` (C,) of residuals x (N,) in units of their scale for the candidates."""
     total = np.zeros((1, GARCH.shape[1]))
     losses(x, CLIPPED, numbers[V], numbers[INSIDE], GARCH, np.ones(total.shape), total)
-    return np.asarray(total[0])
+    found: Array = total[0]
+    return found
 
 
 def _covariance(phi: Array, x: Array) -> Array:
