@@ -256,7 +256,7 @@ def _sample(model: ModelSteps, note: Step, advance: Any, part: Any) -> Any:
         L = s.theta.shape[1]
         for l in range(L):
             regress(s, l)
-            clean(s, l)
+            clean(tracker_part(s), l)
             note(part(s), l)
         advance(part(s))
         for l in range(L):
