@@ -15,12 +15,11 @@ import sys
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 from rich.console import Console
 from rich.table import Table
 
 from driftfit import ARX, AdaptiveKalman, Kalman, Regression, track
-from driftfit.engine.kernel import Array
+from driftfit.engine.kernel import Array, Driver, part
 from driftfit.systems import scenarios
 
 BURN = 200
@@ -38,7 +37,7 @@ def regressors(kind: str, y: Array, u: Array) -> Array:
     return phi
 
 
-@njit(cache=True)
+@part
 def mixed(m: Array, P: Array, mu: Array, stay: float) -> tuple[Array, Array, Array]:
     """Interaction of K filters: all transitions to other modes have the same probability."""
     K = len(mu)
@@ -54,7 +53,7 @@ def mixed(m: Array, P: Array, mu: Array, stay: float) -> tuple[Array, Array, Arr
     return means, covariances, prior
 
 
-@njit(cache=True)
+@Driver
 def bank(phi: Array, y: Array, ratios: Array, fade: float, stay: float) -> Array:
     """Filters in parallel; stay = 1: weights by faded likelihood; below 1: IMM with that probability to stay."""
     T, n = phi.shape
@@ -96,7 +95,7 @@ def bank(phi: Array, y: Array, ratios: Array, fade: float, stay: float) -> Array
     return out
 
 
-@njit(cache=True)
+@Driver
 def slow_log_q(phi: Array, y: Array, rate: float) -> Array:
     """One filter; log q follows d log N(e; 0, s) / d log q, the derivative of P being q's own share of it."""
     T, n = phi.shape
@@ -127,7 +126,7 @@ def slow_log_q(phi: Array, y: Array, rate: float) -> Array:
     return out
 
 
-@njit(cache=True)
+@Driver
 def memories(phi: Array, y: Array, meta: float) -> Array:
     """Least squares with a memory per parameter, shorter while a parameter's corrections agree in sign."""
     T, n = phi.shape

@@ -45,14 +45,14 @@ def at_the_edge(seed: int, every: float, T: int) -> tuple[int, int]:
     run = track(Regression(1), Kalman(q=9e-4, r=0.25), y, u)
     # the band (-inf, theta) moves with the truth: the alarm's own statistic with high = theta_t
     z = (run.theta[:, 0] - theta) / run.std[:, 0]
-    said = run.detect("band", every=every, reference={"theta1": (-1e9, 1e9)})
-    return len(onsets(z[50:] > said.limits[0])), T - 50
+    detected = run.detect("band", every=every, reference={"theta1": (-1e9, 1e9)})
+    return len(onsets(z[50:] > detected.limits[0])), T - 50
 
 
 def watched(kind: str, outliers: bool, **settings: object) -> Callable[[int, float, int], tuple[int, int]]:
     def count(seed: int, every: float, T: int) -> tuple[int, int]:
-        said = system(seed, outliers, T).detect(kind, every=every, **settings)  # type: ignore[arg-type]
-        return len(said.onsets), T - said.start
+        detected = system(seed, outliers, T).detect(kind, every=every, **settings)  # type: ignore[arg-type]
+        return len(detected.onsets), T - detected.start
 
     return count
 
@@ -64,8 +64,8 @@ def jumps(seed: int, every: float, T: int) -> tuple[int, int]:
     y = 2.0 * u + 0.1 * rng.normal(size=T)
     changes = [Change(1e-6), Change(1.0, prob=0.005)]
     run = track(Regression(1), Bank(changes, [Sensor.nominal(r=0.01)], p0=1.0), y, u)
-    said = run.detect("probability", every=every)
-    return len(said.onsets), T - said.start
+    detected = run.detect("probability", every=every)
+    return len(detected.onsets), T - detected.start
 
 
 LINES: list[tuple[str, Callable[[int, float, int], tuple[int, int]]]] = [
@@ -106,12 +106,12 @@ def watched_fleet(
     gain[faulty, 1000:] += rng.choice([-1.0, 1.0], FAULTY)[:, None] * rng.uniform(0.2, 1.2, FAULTY)[:, None]
     held = Kalman(q=1e-4 if kind == "band" else 0.0, r=1.0, p0=10.0)
     fleet = track(Regression(1), held, gain * u + v, u, by="row")
-    said = fleet.detect(kind, every=every, reference=500, **settings)
-    begun = sum(sum(t < (1000 if row.key in faulty else LONG) for t in row.onsets) for row in said.rows)
+    detected = fleet.detect(kind, every=every, reference=500, **settings)
+    begun = sum(sum(t < (1000 if row.key in faulty else LONG) for t in row.onsets) for row in detected.rows)
     judged = FAULTY * 500 + (SERIES - FAULTY) * 1000
-    wrong = sum(key not in faulty for key in said.faulty)
-    found = len(said.faulty) - wrong
-    return begun, judged / (every * SERIES), wrong / max(len(said.faulty), 1), found / FAULTY
+    wrong = sum(key not in faulty for key in detected.faulty)
+    found = len(detected.faulty) - wrong
+    return begun, judged / (every * SERIES), wrong / max(len(detected.faulty), 1), found / FAULTY
 
 
 WATCHED: dict[str, dict[str, Any]] = {

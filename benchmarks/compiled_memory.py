@@ -60,8 +60,8 @@ def main(quick: bool) -> None:
             place = cache if way != "all kept" else os.path.join(cache, "apart")
             environment = {**os.environ, "NUMBA_CACHE_DIR": place}
             command = [sys.executable, __file__, "--worker", way, str(count)]
-            said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
-            table.add_row(way, *said.split(), "")
+            result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+            table.add_row(way, *result.split(), "")
     Console(width=96).print(table)
 
 

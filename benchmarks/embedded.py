@@ -174,8 +174,8 @@ def state_and_cost(model: ARX, tracker: Any) -> list[str]:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         export_c(model, tracker, folder)
-        said = (folder / "README.md").read_text().split("State: ")[1].split(" with")[0]
-        states = [word for word in said.replace(",", "").split() if word.isdigit()]
+        result = (folder / "README.md").read_text().split("State: ")[1].split(" with")[0]
+        states = [word for word in result.replace(",", "").split() if word.isdigit()]
         for single in (False, True):
             row += [states[single], *exported(folder, single)]
     return row

@@ -47,9 +47,9 @@ def main(units: int) -> None:
             "detect, each with limits of its own": lambda: alone.detect(records=64),
         }
         for name, job in jobs.items():
-            seconds, said = spent(job)
+            seconds, alarms = spent(job)
             seconds /= len(alone if "own" in name else fleet)
-            found = (str(len(said.alarmed)), str(len(said.faulty))) if "detect" in name else ("", "")
+            found = (str(len(alarms.alarmed)), str(len(alarms.faulty))) if "detect" in name else ("", "")
             cells = (f"{1e3 * seconds:.1f}", f"{seconds * 20_000 / 60.0:.1f}", f"{fleet_verdict.peak():.0f}")
             table.add_row(name, *cells, *found)
     Console(width=110).print(table)

@@ -51,7 +51,7 @@ def main(units: int) -> None:
     tracked(pumps(8)).verdict()  # compiles
     fleet = tracked(pumps(units))
     before, elapsed, processor = peak(), time.perf_counter(), time.process_time()
-    said = fleet.verdict()
+    result = fleet.verdict()
     elapsed, processor = time.perf_counter() - elapsed, time.process_time() - processor
     table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"{units} series of {T} samples on {cores()} cores")
     heads = (
@@ -66,7 +66,7 @@ def main(units: int) -> None:
         table.add_column(head, justify="right")
     table.add_row(
         f"{elapsed:.1f}", f"{processor:.1f}", f"{1e3 * processor / units:.2f}", f"{peak():.0f}",
-        f"{peak() - before:.0f}", f"{len(said.drifting)}",
+        f"{peak() - before:.0f}", f"{len(result.drifting)}",
     )  # fmt: skip
     Console(width=110).print(table)
 

@@ -109,8 +109,8 @@ def rule(alarm: str, seed: int, n: int) -> AlarmRule:
 def ours(alarm: str, fault: str, seed: int) -> tuple[float, int]:
     """(delay, onsets before the fault)."""
     y, phi = faulty(fault, seed)
-    said = track(Regression(phi.shape[1]), HELD, y, phi).detect(rule(alarm, seed, phi.shape[1]), start=NORMAL)
-    return first_of(said.onsets[said.onsets >= NORMAL + START]), int(np.sum(said.onsets < NORMAL + START))
+    detected = track(Regression(phi.shape[1]), HELD, y, phi).detect(rule(alarm, seed, phi.shape[1]), start=NORMAL)
+    return first_of(detected.onsets[detected.onsets >= NORMAL + START]), int(np.sum(detected.onsets < NORMAL + START))
 
 
 def first_of(places: Array) -> float:

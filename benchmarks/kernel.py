@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import llvmlite.binding as llvm
-import numba
 import numpy as np
 import typer
 from rich.console import Console
@@ -31,7 +30,9 @@ from rich.table import Table
 
 from driftfit import ARX, Kalman, Live
 from driftfit.data.known import Known
-from driftfit.engine.drivers import drivers, make_tile, output_type
+from driftfit.engine.drivers import drivers
+from driftfit.engine.kernel import Driver
+from driftfit.engine.tiles import make_tile, output_type
 from lab.bench.computer import computer, installed, times
 
 HERE = Path(__file__).parent
@@ -127,7 +128,7 @@ def record(quick: bool) -> Iterator[Row]:
             yield Row(f"n = {n}, L = 1, against C", f"{ours:.1f} ns", f"{other:.1f} ns", ours / other, 1.5)
 
 
-@numba.njit
+@Driver
 def stream(y: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
     """Read y and u and write as many numbers as the driver does, and nothing else."""
     for t in range(out.shape[0]):

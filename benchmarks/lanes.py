@@ -15,7 +15,8 @@ from rich.console import Console
 from rich.table import Table
 
 from driftfit import ARX, Kalman
-from driftfit.engine.drivers import WIDTH, drivers, make_tile, output_type
+from driftfit.engine.drivers import drivers
+from driftfit.engine.tiles import WIDTH, make_tile, output_type
 from driftfit.run.parallel_lanes import BLOCK, width_of
 from driftfit.run.program import Program
 

@@ -61,7 +61,7 @@ def main() -> None:
                 began = time.perf_counter()
                 wrong, count = failures(model, this, range(0, T, 30 if quick else 1), T + AFTER + 10)
                 totals[name] = [a + b for a, b in zip(totals[name], (1, count, len(wrong)), strict=True)]
-                what = sorted({(value, signal, said) for _, value, signal, said in wrong}, key=str)
+                what = sorted({(value, signal, result) for _, value, signal, result in wrong}, key=str)
                 print(f"{name:25} {kind:22} {form or ''!s:20} {count:6} records, {len(wrong)} wrong, "
                       f"{time.perf_counter() - began:.0f} s", *what[:6], sep="\n    ", flush=True)  # fmt: skip
     print(f"{'':25} trackers and forms   records   neither finite nor marked, or not recovered")

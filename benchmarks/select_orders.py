@@ -57,8 +57,8 @@ def main(records: int = 60, lengths: tuple[int, ...] = (200, 600, 2000)) -> None
             found = np.zeros(4)
             for _ in range(records):
                 y, u = record(rng, T, bool(drifts), bool(heavy))
-                said = select(CANDIDATES, y, u)
-                names = said.best, said.simplest, select(CANDIDATES, y, u, tracker=SLOW).best, bic(y, u)
+                result = select(CANDIDATES, y, u)
+                names = result.best, result.simplest, select(CANDIDATES, y, u, tracker=SLOW).best, bic(y, u)
                 found += [chosen == TRUTH for chosen in names]
             table.add_row(name, str(T), *(f"{100.0 * share:.0f}" for share in found / records))
     Console(width=96).print(table)

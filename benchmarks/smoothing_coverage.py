@@ -20,8 +20,8 @@ def main(records: int = 200) -> None:
             rng = np.random.default_rng(seed)
             u, theta = rng.normal(size=(T, 2)), 1.0 + np.cumsum(step * rng.normal(size=(T, 2)), axis=0)
             run = track(Regression(2), AdaptiveKalman(), (u * theta).sum(axis=1) + 0.3 * rng.normal(size=T), u)
-            for found, said in ((followed, run), (smoothed, run.smooth())):
-                found.append(np.mean((np.abs(said.theta - theta) < 1.96 * said.std)[100:]))
+            for found, result in ((followed, run), (smoothed, run.smooth())):
+                found.append(np.mean((np.abs(result.theta - theta) < 1.96 * result.std)[100:]))
         error = np.std(smoothed) / np.sqrt(records)
         below = np.mean(np.array(smoothed) < 0.8)
         print(f"{step:>6} {T:>8} {np.mean(followed):>9.3f} {np.mean(smoothed):>9.3f} {error:>6.3f} {below:>10.3f}")

@@ -119,7 +119,7 @@ def end(session: int) -> None:
 def disturb(folder: Path, kills: list[str], files: int, patience: float) -> list[str]:
     """Run the driver to its end, and kill what ``kills`` says on the way; returns what was killed and when."""
     random.seed(0)
-    said, driver, began = [], start(folder), time.monotonic()
+    result, driver, began = [], start(folder), time.monotonic()
     marks = [round((k + 1) * files / (len(kills) + 1)) for k in range(len(kills))]
     for what, mark in zip(kills, marks, strict=True):
         while done(folder) < mark and driver.poll() is None and time.monotonic() - began < patience:
@@ -133,11 +133,11 @@ def disturb(folder: Path, kills: list[str], files: int, patience: float) -> list
             found = processes(driver.pid, what)
             if found:
                 os.kill(found[0], signal.SIGKILL)
-                said.append(f"{what} after {done(folder)} batches")
+                result.append(f"{what} after {done(folder)} batches")
         else:
             end(driver.pid)
             driver.wait()
-            said.append(f"driver after {done(folder)} batches")
+            result.append(f"driver after {done(folder)} batches")
             driver = start(folder)
     try:
         code = driver.wait(timeout=max(patience - (time.monotonic() - began), 1.0))
@@ -146,7 +146,7 @@ def disturb(folder: Path, kills: list[str], files: int, patience: float) -> list
         raise
     if code:
         raise RuntimeError((folder / "driver.log").read_text()[-3000:])
-    return said
+    return result
 
 
 def compare(folder: Path, rows: pl.DataFrame) -> dict[str, int]:
@@ -188,8 +188,8 @@ def main(quick: bool = False) -> None:
         folder = Path(name)
         (folder / "in").mkdir()
         rows = write_rows(folder / "in", units, T, files)
-        for said in disturb(folder, kills, files, 7200.0):
-            print(f"killed the {said}")
+        for result in disturb(folder, kills, files, 7200.0):
+            print(f"killed the {result}")
         for what, count in compare(folder, rows).items():
             print(f"{what:>20} {count:>8}")
 

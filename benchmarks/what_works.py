@@ -25,6 +25,7 @@ from driftfit import (
     AdaptiveKalman,
     Bank,
     BoxJenkins,
+    ContinuousTransfer,
     DynamicGLM,
     Equation,
     HammersteinWiener,
@@ -33,6 +34,7 @@ from driftfit import (
     Kalman,
     Law,
     Live,
+    ParticleFilter,
     Polynomial,
     Regression,
     StateSpace,
@@ -61,6 +63,14 @@ PAIRS: list[tuple[str, Any, Any, Any]] = [
     ("Equation, Kalman", Equation("y = theta.g * tanh(u[-1]) + theta.a * y[-1]"), K, Kalman(p0=1.0)),
     ("HammersteinWiener, Kalman", HammersteinWiener(1, 1, input=Polynomial(2)), K, Kalman(p0=1.0)),
     ("StateSpace, JointKalman", HIDDEN, JointKalman(q=1e-4, r=0.1, p0=1.0), JointKalman(q=1e-4, p0=1.0)),
+    ("StateSpace, JointKalman, extended", HIDDEN, JointKalman(q=1e-4, r=0.1, p0=1.0, method="extended"), None),
+    ("StateSpace, ParticleFilter", HIDDEN, ParticleFilter(20, q=1e-4, r=0.1, p0=1.0), None),
+    ("OE, InstrumentalVariables", OE(1, 1), InstrumentalVariables(0.99), None),
+    ("BoxJenkins, InstrumentalVariables", BoxJenkins(1, 1, 1, 1), InstrumentalVariables(0.99), None),
+    ("ContinuousTransfer, RLS", ContinuousTransfer(1), RLS(0.99), RLS()),
+    ("ContinuousTransfer, Kalman", ContinuousTransfer(1), K, Kalman(p0=1.0)),
+    ("ContinuousTransfer, AdaptiveKalman", ContinuousTransfer(1), AdaptiveKalman(), None),
+    ("ContinuousTransfer, InstrumentalVariables", ContinuousTransfer(1), InstrumentalVariables(0.99), None),
     ("Regression, DynamicGLM", Regression(1), DynamicGLM("poisson", q=1e-4, p0=1.0), None),
 ]
 
@@ -133,11 +143,11 @@ def cells_of(name: str, model: Any, tracker: Any, open_tracker: Any, reasons: di
 def main() -> None:
     """Print the table, and the reasons of every "no"."""
     warnings.simplefilter("ignore")
-    print(f"{'':30}" + "".join(f"{name:>9}" for name in COLUMNS))
+    print(f"{'':42}" + "".join(f"{name:>9}" for name in COLUMNS))
     reasons: dict[str, list[str]] = {}
     for name, model, tracker, open_tracker in PAIRS[: 1 if "--quick" in sys.argv else None]:
         cells = cells_of(name, model, tracker, open_tracker, reasons)
-        print(f"{name:30}" + "".join(f"{cell:>9}" for cell in cells), flush=True)
+        print(f"{name:42}" + "".join(f"{cell:>9}" for cell in cells), flush=True)
     print()
     for reason, names in reasons.items():
         print(f"{reason}\n    {', '.join(names)}")

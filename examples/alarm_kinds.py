@@ -35,12 +35,12 @@ def record(seed: int, fault: str) -> tuple[np.ndarray, np.ndarray]:
 def watched(seed: int, tracker: object, kind: str) -> dict[str, Alarms]:
     """The rule of the reference, applied to each of the records that begin with it."""
     rule = None
-    said = {}
+    detected = {}
     for fault in FAULTS:
         y, u = record(seed, fault)
         rule = rule or track(MODEL, tracker, y[:KNOWN], u[:KNOWN]).detect(kind, every=EVERY, reference=KNOWN).rule
-        said[fault] = track(MODEL, tracker, y, u).detect(rule, start=KNOWN)
-    return said
+        detected[fault] = track(MODEL, tracker, y, u).detect(rule, start=KNOWN)
+    return detected
 
 
 def main() -> None:
@@ -50,7 +50,7 @@ def main() -> None:
         cells = []
         for fault in FAULTS[:-1]:
             labels = np.arange(T) >= START
-            delays = np.array([said[fault].score(labels).delay for said in found])
+            delays = np.array([detected[fault].score(labels).delay for detected in found])
             seen = np.isfinite(delays)
             after = f", {np.median(delays[seen]):.0f}" if seen.any() else ""
             cells.append(f"{100.0 * seen.mean():.0f} %{after}")

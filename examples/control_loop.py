@@ -50,10 +50,10 @@ def followed(order: str, law: object, seed: int) -> float:
 def main() -> None:
     print(f"{'':<44}{'error, median':>14}{'largest':>10}{'lost':>8}")
     for name, law in (("certainty equivalence", certain), ("cautious", cautious)):
-        for order, said in (("right", "update(y), apply(u)"), ("wrong", "update(y, u)")):
+        for order, result in (("right", "update(y), apply(u)"), ("wrong", "update(y, u)")):
             found = np.array([followed(order, law, seed) for seed in range(LOOPS)])
             lost = f"{100.0 * np.mean(np.isinf(found)):.0f} %"
-            print(f"{name:<23}{said:<21}{np.median(found):>14.3f}{found.max():>10.3f}{lost:>8}")
+            print(f"{name:<23}{result:<21}{np.median(found):>14.3f}{found.max():>10.3f}{lost:>8}")
     print(f"{'least possible':<44}{0.1:>14.3f}")
 
 

@@ -61,12 +61,12 @@ def main(path: str) -> None:
     y, u = data["co2"].to_numpy(), data["gas_rate"].to_numpy()
     for na, nb in ((2, 2), (3, 5), (4, 3)):
         run = track(ARX(na, nb, nk=3, intercept=True), AdaptiveKalman(), y="co2", u="gas_rate", data=data)
-        said = run.verdict()
+        found = run.verdict()
         if (na, nb) == (2, 2):
-            print("\n".join(said.sentences))
+            print("\n".join(found.sentences))
         wald, p = bootstrap(y, u, na, nb)
         print(
-            f"ARX({na}, {nb}): p = {said.p:.1g} with {said.lags} lags; largest Wald {wald:.0f}, bootstrap p = {p:.2g}"
+            f"ARX({na}, {nb}): p = {found.p:.1g} with {found.lags} lags; largest Wald {wald:.0f}, bootstrap p = {p:.2g}"
         )
 
 

@@ -28,13 +28,13 @@ def bank(factor):
 def main():
     records = [scenarios.simulate("sparse_jumps", "regression", seed) for seed in range(RUNS)]
     r = float(np.mean([np.mean(one.noise) for one in records]))
-    told = error(bank(1.0), records)
-    print(f"size of the jumps told right: {told:.4f}")
+    given = error(bank(1.0), records)
+    print(f"size of the jumps given:  {given:.4f}")
     for factor in (0.1, 1.0 / 3.0, 3.0, 10.0):
-        print(f"{factor:5.2g} times as large: {error(bank(factor), records) / told:.2f}")
-    print(f"Bank():               {error(Bank(), records) / told:.2f}")
+        print(f"{factor:5.2g} times as large: {error(bank(factor), records) / given:.2f}")
+    print(f"Bank():               {error(Bank(), records) / given:.2f}")
     best = min(error(Kalman(q=ratio * r, r=r), records) for ratio in np.logspace(-4.0, 0.0, 9))
-    print(f"Kalman, best ratio:   {best / told:.2f}")
+    print(f"Kalman, best ratio:   {best / given:.2f}")
 
 
 if __name__ == "__main__":

@@ -11,8 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit import ARX, RLS, Live, Tracker, check_tracker, track
-from driftfit.extend import State, TrackerSteps, kernel, nothing, numbers, unknown
-from driftfit.trackers.parts.diffuse import prediction
+from driftfit.extend import State, TrackerSteps, kernel, nothing, numbers, prediction, unknown
 
 
 @kernel

@@ -54,12 +54,12 @@ def main(path: str, figures: str | None = None) -> None:
         reference = int(np.argmax(labels)) * 3 // 4
         run = followed(part, reference)
         for kind in ("band", "innovation"):
-            said = run.detect(kind, every=EVERY, reference=reference, window=20, hold=30)
-            got = said.score(labels)
+            alarms = run.detect(kind, every=EVERY, reference=reference, window=20, hold=30)
+            got = alarms.score(labels)
             numbers = (got.events, got.found, f"{got.delay:g}", got.false, f"{got.normal / EVERY:.2f}", got.normal)
             table.add_row(name, kind, *map(str, numbers))
             if figures:
-                said.plot(labels).savefig(Path(figures) / f"{name}_{kind}.png", dpi=70)
+                alarms.plot(labels).savefig(Path(figures) / f"{name}_{kind}.png", dpi=70)
     Console(width=110).print(table)
 
 

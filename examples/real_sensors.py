@@ -27,7 +27,7 @@ def idle() -> None:
     rng = np.random.default_rng(0)
     x, v = rng.normal(size=T), 0.1 * rng.normal(size=T)
     y = np.where(np.arange(T) < 1000, 1.0, 2.0) * x + v
-    print("An input that stands still: response to x, 2 after a jump, at the end")
+    print("An input that is constant: response to x, 2 after a jump, at the end")
     print(f"  {'second column':16}{'AdaptiveKalman':>22}{'Bank()':>22}{'RLS(0.98)':>22}{'Kalman':>22}")
     for name, second in (("moves too", rng.normal(size=T)), ("stays at 0", np.zeros(T)), ("is x again", x)):
         cells = []
@@ -70,7 +70,9 @@ def coarse() -> None:
     y = np.round(u @ [2.0, 32.0] + 0.05 * rng.normal(size=T))
     print("\nWhole numbers, inputs that change every 20 samples (1 / sqrt 12 is 0.289)")
     print(f"  {'':18}{'innovation std':>16}{'y in band':>12}{'theta in band':>15}{'log-likelihood':>16}")
-    for name, tracker in (("AdaptiveKalman", AdaptiveKalman()), ("RLS(0.98)", FORGET), ("Kalman", WALK)):
+    for name, tracker in (
+        ("AdaptiveKalman", AdaptiveKalman()), ("Bank()", Bank()), ("RLS(0.98)", FORGET), ("Kalman", WALK),
+    ):  # fmt: skip
         run, late = track(Regression(2), tracker, y, u), slice(200, None)
         inside = np.abs(run.innovation[late]) < 1.96 * run.innovation_std[late]
         covered = np.abs(run.theta[late] - [2.0, 32.0]) < 1.96 * run.std[late]

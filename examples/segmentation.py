@@ -47,10 +47,10 @@ def main(records: int = 20, folder: str | None = None) -> None:
         total, inside, theirs = np.zeros(2, int), [], np.zeros(2, int)
         for seed in range(records):
             y = record(seed, size, kind)
-            said = segment(y)
-            total += score([one.at for one in said.breaks])
-            if len(said.breaks) == len(AT):
-                inside += [one.first <= at <= one.last for one, at in zip(said.breaks, AT, strict=True)]
+            segmentation = segment(y)
+            total += score([one.at for one in segmentation.breaks])
+            if len(segmentation.breaks) == len(AT):
+                inside += [one.first <= at <= one.last for one, at in zip(segmentation.breaks, AT, strict=True)]
             theirs += score(by_ruptures(y)) if peer and folder else (0, 0)
         name = f"{kind}, jumps of {size:g}" if size else "no jumps"
         held = f"{sum(inside)} of {len(inside)}" if size else ""

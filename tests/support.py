@@ -10,8 +10,9 @@ from typing import ClassVar
 import numpy as np
 
 from driftfit import Kalman
-from driftfit.engine.drivers import drivers, make_tile, output_type
+from driftfit.engine.drivers import drivers
 from driftfit.engine.kernel import exp, kernel
+from driftfit.engine.tiles import make_tile, output_type
 from driftfit.trackers.kalman import INDEPENDENT
 
 BAD = (np.nan, np.inf, -np.inf, 1e200, -1e200)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support import rows_of
 
 from benchmarks.settings_coverage import scores
 from driftfit import FLS, AugmentedFLS, Kalman, Regression, tune
@@ -62,7 +63,9 @@ def test_other_trackers_and_units():
     np.testing.assert_allclose(high - low, 2.0 * 1.6448536 * plain.smoothed_std, rtol=1e-6)
     mu = tune(Regression(1), FLS(), y, u).average(draws=8)
     assert np.isfinite(mu.smoothed_std).all()
-    assert "mu" in str(mu)
+    assert mu.settings.keys() == {"mu", "r"}
+    for name, draws in mu.settings.items():
+        assert [name, *(f"{number:.4g}" for number in np.quantile(draws, [0.5, 0.025, 0.975]))] in rows_of(mu)
 
 
 def test_what_cannot_be_averaged_is_refused():

@@ -203,7 +203,7 @@ def test_leaves_clean_their_own_lags():
 
 
 def test_lags_that_were_predicted_are_uncertain():
-    """One history, told by prob=: every sample from 20 on is an additive outlier, or missing, for a while."""
+    """One history, given by prob=: every sample from 20 on is an additive outlier, or missing, for a while."""
     rng = np.random.default_rng(3)
     T, q = 60, 1e-3
     u, y = rng.standard_normal(T), np.zeros(T)

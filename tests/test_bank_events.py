@@ -245,7 +245,7 @@ def test_waiting_pays_if_some_number_of_samples_does(ahead, decided):
     p, r, cost = np.array([0.8, 0.2]), 64.0, 0.01
     reduce = Decide("auto", max_depth=6, tau=1e-9, wait_cost=cost, ahead=ahead)
     bank = Bank([Change(1e-4), Change(9.0, prob=0.2)], [Sensor.nominal(r)], reduce=reduce, p0=0.1)
-    said, rule, near = [], [], []
+    ruled, rule, near = [], [], []
     for y in np.linspace(0.0, 30.0, 41):
         run, leaves = track(Regression(N), bank, [y], [SIGHT]), []
         for chance, q in zip(p, (1e-4, 9.0), strict=True):
@@ -257,8 +257,8 @@ def test_waiting_pays_if_some_number_of_samples_does(ahead, decided):
         leaves = [(w / total, m, C) for w, m, C in leaves]
         risk = min(leaf[0] for leaf in leaves)
         gains = [risk - k * cost - expected(leaves, p, k, r) for k in range(1, ahead + 1)]
-        said.append(bool(reported(run, "decided")[0, 0, 0] >= 0.0))
+        ruled.append(bool(reported(run, "decided")[0, 0, 0] >= 0.0))
         rule.append(max(gains) <= 0.0)
         near.append(abs(max(gains)) < 1e-5)
-    assert [a == b or c for a, b, c in zip(said, rule, near, strict=True)] == [True] * 41
-    assert sum(said) == decided
+    assert [a == b or c for a, b, c in zip(ruled, rule, near, strict=True)] == [True] * 41
+    assert sum(ruled) == decided

@@ -214,7 +214,7 @@ def test_transitions_may_vary_in_time():
         track(Regression(N), bank, y, u, prob=Pt * 0.5)
 
 
-def test_a_chain_goes_on_over_an_interval():
+def test_a_chain_continues_over_an_interval():
     """Markov changes: P to the power of the interval."""
     Pm = np.array([[0.97, 0.02, 0.01], [0.3, 0.6, 0.1], [0.2, 0.3, 0.5]])
     y, u = record(6, 7)

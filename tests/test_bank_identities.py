@@ -75,7 +75,7 @@ def test_scale_with_known_noise():
 
 
 @pytest.mark.parametrize("reduce", [GPB(2), IMM()], ids=str)
-def test_a_hypothesis_told_twice_counts_once(reduce):
+def test_a_hypothesis_given_twice_counts_once(reduce):
     one = track(Regression(N), Bank(changes(), [Sensor.nominal(R)], reduce=reduce, p0=2.0), Y, U)
     twice = [changes()[0], *(Change(q, prob=p / 2.0) for q, p in zip(Q[1:], PROBS[1:], strict=True) for _ in "ab")]
     other = track(Regression(N), Bank(twice, [Sensor.nominal(R)], reduce=reduce, p0=2.0), Y, U)

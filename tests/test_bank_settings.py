@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from driftfit import RLS, Bank, Live, Regression, track
-from driftfit.engine.drivers import as_compiled, tile_type
+from driftfit.engine.tiles import as_compiled, tile_type
 from driftfit.run.program import Program
 from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid

@@ -101,15 +101,15 @@ def test_the_structure_of_merged_experiments():
     """The logliks of the experiments add up, each from the start, and so do the variances of their differences."""
     merged = merge(*(Experiment(*arx_record(130, seed)) for seed in range(4)))
     models = [ARX(1, 1), ARX(2, 2)]
-    said = select(models, tracker=RLS(1.0), **merged.arguments)
-    assert said.best == said.simplest == "ARX(na=2, nb=2)"
+    result = select(models, tracker=RLS(1.0), **merged.arguments)
+    assert result.best == result.simplest == "ARX(na=2, nb=2)"
     alone = [select(models, one.y, one.u, tracker=RLS(1.0)) for one in merged]
-    assert said.scored == sum(one.scored for one in alone)
-    for row in said.rows:
+    assert result.scored == sum(one.scored for one in alone)
+    for row in result.rows:
         assert row.loglik == pytest.approx(sum(r.loglik for one in alone for r in one.rows if r.n == row.n))
     spread = [row.std for one in alone for row in one.rows if row.n == 2]
-    assert said.rows[1].std == pytest.approx(np.sqrt(np.sum(np.square(spread))))
-    assert len(said.average().y_hat) == 4 * 130
+    assert result.rows[1].std == pytest.approx(np.sqrt(np.sum(np.square(spread))))
+    assert len(result.average().y_hat) == 4 * 130
 
 
 def test_merged_experiments_need_one_interval():

@@ -62,16 +62,16 @@ def test_predictions_are_those_of_live():
 
 
 def test_a_feature_that_appears_late_was_zero_before():
-    late, told = TrackedRegressor(RLS(0.99)), TrackedRegressor(RLS(0.99))
+    late, given = TrackedRegressor(RLS(0.99)), TrackedRegressor(RLS(0.99))
     rng = np.random.default_rng(1)
     for t in range(150):
         a, b, c = rng.normal(size=3)
         x = {"a": a, "b": b} if t < 50 else {"a": a, "b": b, "c": c}
         y = a + 2 * b + 3 * x.get("c", 0.0)
         late.learn_one(x, y)
-        told.learn_one({"c": 0.0} | x, y)
+        given.learn_one({"c": 0.0} | x, y)
     assert late.coef == pytest.approx({"a": 1.0, "b": 2.0, "c": 3.0}, abs=1e-6)
-    assert late.coef == pytest.approx(told.coef, abs=1e-6)
+    assert late.coef == pytest.approx(given.coef, abs=1e-6)
 
 
 def test_missing_values_are_not_used_and_do_not_poison():

@@ -46,7 +46,7 @@ def test_it_is_a_track_of_the_rows(rows):
     assert np.all((std > 0.1) & (std < 0.2))
 
 
-def test_partial_fit_goes_on(rows):
+def test_partial_fit_continues(rows):
     X, y = rows
     whole = TrackedRegressor(RLS(0.98)).fit(X, y)
     parts = TrackedRegressor(RLS(0.98)).partial_fit(X[:150], y[:150]).partial_fit(X[150:], y[150:])

@@ -180,7 +180,7 @@ def test_a_stream_begins_with_states_and_ends_silent_units(session, tmp_path):
     assert expired == states
 
 
-def test_what_cannot_run_is_said_before_any_job(session):
+def test_wrong_arguments_are_reported_before_any_job(session):
     frame = session.createDataFrame([("a", 0.0, 1.0, "x")], "unit string, t double, y double, u string")
     with pytest.raises(ValueError, match=r"u: column 'u' is of type string; .*cast\('double'\)"):
         spark.track(frame, MODEL, K, **COLUMNS)

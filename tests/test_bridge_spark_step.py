@@ -61,14 +61,14 @@ def test_outputs_have_a_summary_each():
             judged = run.ok[:, j] & np.isfinite(run.innovation_std[:, j])
             e = run.innovation[judged, j]
             assert one[f"rms[{name}]"] == pytest.approx(np.sqrt(np.mean(e**2)), rel=1e-12)
-            said = run[name].verdict()
-            assert same([one[f"p[{name}]"], one[f"theta_{run.names[j][1]}"]], [said.p, run.theta[-1, j, 1]])
-            assert (one[f"drifts[{name}]"], one[f"pays[{name}]"]) == (said.drifts, said.pays)
+            message = run[name].verdict()
+            assert same([one[f"p[{name}]"], one[f"theta_{run.names[j][1]}"]], [message.p, run.theta[-1, j, 1]])
+            assert (one[f"drifts[{name}]"], one[f"pays[{name}]"]) == (message.drifts, message.pays)
 
 
 @pytest.mark.parametrize("model", [MODEL, PAIR])
 def test_what_waits_is_processed_when_a_unit_ends(model):
-    """Rows that come later begin the unit anew; a unit with rows does not end, however old they are."""
+    """Rows that arrive later begin the unit again; a unit with rows does not end, however old they are."""
     rows = rows_of(4, 4, 50, y=model.outputs)
     stream = ByHand(model)
     for part in arriving(rows, 3):
@@ -259,7 +259,7 @@ def test_a_unit_with_keyed_state_gives_what_the_sorted_table_gives():
         assert [(one["alarm"], one["cause"]) for one in good] == watch
 
 
-def test_a_unit_with_keyed_state_goes_on_with_other_settings():
+def test_a_unit_with_keyed_state_continues_with_other_settings():
     rows = rows_of(1, 3, 80, y=PAIR.outputs)
     first, rest = rows[:30], rows[30:]
     other = replace(K, r=0.3)
@@ -287,7 +287,7 @@ def test_a_flow_is_pickled_without_what_it_has_made():
     assert not again.task._made
 
 
-def test_what_is_missing_is_said(monkeypatch, tmp_path):
+def test_a_missing_requirement_is_reported(monkeypatch, tmp_path):
     """Tests of Spark are skipped with this sentence."""
     monkeypatch.setenv("JAVA_HOME", str(tmp_path))
     monkeypatch.setitem(sys.modules, "pyspark", SimpleNamespace(__version__="4.1.0"))

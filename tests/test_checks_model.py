@@ -92,7 +92,7 @@ class Twice(ARX):
 
 
 @pytest.mark.parametrize(
-    ("kind", "said"),
+    ("kind", "result"),
     [
         (Short, "reach is 1, but signals of sample 30 are in the regressors of sample 33"),
         (Proud, r"A missing u at sample 30 makes samples \[31, 32, 33\] unusable; declared: \[30\]"),
@@ -101,10 +101,10 @@ class Twice(ARX):
         (Drawn, "play gives"), (Fickle, "follows returns False"), (Twice, "names must be 4 different names"),
     ],
 )  # fmt: skip
-def test_wrong_declarations_are_said(kind, said):
+def test_wrong_declarations_are_reported(kind, result):
     broken = check_model(kind(1, 3))
     assert len(broken) == (2 if kind is Short else 1)  # without its whole reach it cannot be played either
-    assert re.match(said, broken[0]), broken
+    assert re.match(result, broken[0]), broken
 
 
 def test_the_package_knows_of_hammerstein_wiener_models_only_what_models_declare():

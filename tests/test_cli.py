@@ -60,8 +60,8 @@ def expected(inputs="pressure", **given):
 def test_track_prints_the_summary_of_the_run(file):
     result = run("track", file, "--y", "flow rate", "--u", "pressure", "--model", "arx:1,1", *SETTINGS)
     assert result.exit_code == 0, result.output
-    said = [line for line in result.output.splitlines() if "flow rate from pressure" not in line]
-    assert str(expected().summary()).splitlines() == said
+    printed = [line for line in result.output.splitlines() if "flow rate from pressure" not in line]
+    assert str(expected().summary()).splitlines() == printed
 
 
 def test_without_settings_the_tracker_chooses_them(file):

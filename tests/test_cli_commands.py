@@ -1,4 +1,4 @@
-"""Commands beside `track`: each prints what Python gives, for the part of the file that was asked for."""
+"""Commands other than `track`: they print the same results as Python, for the selected part of the file."""
 
 from __future__ import annotations
 
@@ -123,8 +123,8 @@ def test_valid_ranges_and_stretches_left_out(table):
     left = track(ARX(1, 1, inputs=["valve"]), K, whole, u).theta[:, 1]
     assert np.array_equal(theta(*SIGNALS, "--exclude", "101..121"), left)
     assert np.array_equal(theta(*DATED, "--exclude", "2024-03-01 09:40..2024-03-01 10:00"), left)
-    said = run("track", *SIGNALS, "--limits", "flow=-2:2", "--exclude", "101..121")
-    assert "21 excluded" in " ".join(said.split())
+    printed = run("track", *SIGNALS, "--limits", "flow=-2:2", "--exclude", "101..121")
+    assert "21 excluded" in " ".join(printed.split())
     run("tune", *SIGNALS[:-2], "--limits", "flow=-2:2", "--exclude", "101..121")
     assert "an interval of rows" in fails("track", *SIGNALS, "--exclude", "2024-03-01..2024-03-02")
     assert "column=low:high" in fails("track", *SIGNALS, "--limits", "flow=2")
@@ -132,7 +132,7 @@ def test_valid_ranges_and_stretches_left_out(table):
     assert "FROM..TO" in fails("track", *SIGNALS, "--exclude", "4")
 
 
-def test_a_saved_run_or_stream_goes_on(table):
+def test_a_saved_run_or_stream_is_continued(table):
     run("track", *SIGNALS, "--rows", ":200", "--out", "first.npz")
     y, u, _ = simulate()
     stream = Live(ARX(1, 1, inputs=["valve"]), K)
@@ -148,25 +148,25 @@ def test_a_saved_run_or_stream_goes_on(table):
 
 
 def test_verdict_and_tables_of_eighty_columns(table, monkeypatch):
-    said = run("verdict", *DATED)
+    printed = run("verdict", *DATED)
     of_run = expected().verdict()
-    assert f"p = {of_run.p:.2g}" in " ".join(said.split()) or "p < 0.0001" in said
+    assert f"p = {of_run.p:.2g}" in " ".join(printed.split()) or "p < 0.0001" in printed
     monkeypatch.setattr(cli.parts.program.out, "width", 80)
-    said = run("verdict", *DATED)
-    assert "…" not in said
-    assert "< 0.0001" in said
-    assert "2024-03-01" in said.split("Parameters")[1]
+    printed = run("verdict", *DATED)
+    assert "…" not in printed
+    assert "< 0.0001" in printed
+    assert "2024-03-01" in printed.split("Parameters")[1]
 
 
 def test_detect_scores_labels_and_writes_alarms(table):
     options = ["--reference", "150", "--every", "1000", "--labels", "leak"]
-    said = run(
+    printed = run(
         "detect", *DATED, *options, "--kind", "band", "--out", "alarms.csv", "--plot", "a.png", "--report", "page.html"
     )
     alarms = expected().detect("band", reference=150, every=1000)
     score = alarms.score(simulate()[2])
     assert score.found == 1
-    assert f"Labels: 1 of 1 found, {score.delay:g} samples after" in said
+    assert f"Labels: 1 of 1 found, {score.delay:g} samples after" in printed
     written = pl.read_csv("alarms.csv")
     assert len(written) == len(alarms.onsets)
     assert written["from"][0] == str(START + alarms.onsets[0] * MINUTE).replace("T", " ")[:19]
@@ -174,37 +174,39 @@ def test_detect_scores_labels_and_writes_alarms(table):
     assert "Faults and alarms" in page
     assert "2024-03-01 11:20:00" in page  # the label begins
     assert "1 of 1 labelled intervals found" in page
-    said = run("detect", *DATED, "--kind", "band", "--reference", "b1[valve]=0.5:1.5", "--from", "2024-03-01 08:10")
-    assert "b1[valve]" in said
+    printed = run("detect", *DATED, "--kind", "band", "--reference", "b1[valve]=0.5:1.5", "--from", "2024-03-01 08:10")
+    assert "b1[valve]" in printed
     assert "leave out --by" in fails("detect", *DATED, "--labels", "leak", "--by", "leak")
     assert "name=low:high" in fails("detect", *DATED, "--reference", "a1=x:y")
 
 
 def test_tune_smooth_and_forecast(table):
     kalman = ["pump.csv", "--y", "flow", "--u", "valve", "--model", "arx:1,1", "--tracker", "kalman"]
-    said = run("tune", *kalman, "-p", "r=0.01")
-    assert "--tracker kalman -p q=" in said
+    printed = run("tune", *kalman, "-p", "r=0.01")
+    assert "--tracker kalman -p q=" in printed
     run("smooth", *SIGNALS, "--out", "path.csv")
     path = pl.read_csv("path.csv")
     assert np.allclose(path["theta_b1[valve]"], expected().smooth().theta[:, 1], rtol=1e-12)
     table.tail(4).select("valve").write_csv("plan.csv")
-    said = run("forecast", *SIGNALS, "--future", "plan.csv", "--out", "ahead.csv")
+    printed = run("forecast", *SIGNALS, "--future", "plan.csv", "--out", "ahead.csv")
     made = expected().forecast(4, table["valve"].to_numpy()[-4:])
     assert np.allclose(pl.read_csv("ahead.csv")["flow"], made.y_hat)
-    assert f"{made.y_hat[0]:.6g}" in said
+    assert f"{made.y_hat[0]:.6g}" in printed
     assert "--future FILE" in fails("forecast", *SIGNALS)
 
 
 def test_select_compares_models(table):
-    said = run("select", "pump.csv", "--y", "flow", "--u", "valve", *KALMAN, "--model", "arx:1,1", "--model", "arx:1,0")
-    assert said.index("ARX(na=1, inputs=('valve',))") < said.index("nb=0")
+    printed = run(
+        "select", "pump.csv", "--y", "flow", "--u", "valve", *KALMAN, "--model", "arx:1,1", "--model", "arx:1,0"
+    )
+    assert printed.index("ARX(na=1, inputs=('valve',))") < printed.index("nb=0")
 
 
 def test_warm_and_cache(table):
-    said = run("warm", "--model", "arx:1,1", *KALMAN)
-    assert "Folder" in said
-    said = run("cache")
-    assert "of this version and processor" in said
+    printed = run("warm", "--model", "arx:1,1", *KALMAN)
+    assert "Folder" in printed
+    printed = run("cache")
+    assert "of this version and processor" in printed
     assert "at least 0" in fails("cache", "--prune", "--days", "-1")
 
 

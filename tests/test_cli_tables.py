@@ -89,18 +89,18 @@ def test_a_tracker_of_the_users_own(folder):
         "r=1",
     )
     assert "Mine(q=0.0, r=1.0" in text
-    for place, said in (
+    for place, message in (
         ("mine_for_cli:Other", "has no Tracker of the name Other"),
         ("mine_for_cli", "name the module and the class"),
         ("absent_module:Mine", "No module named 'absent_module'"),
     ):
         result = CliRunner().invoke(app, ["track", "a.csv", "--y", "flow", "--u", "valve", "--with", place])
         assert result.exit_code == 2
-        assert said in " ".join(result.output.split())
+        assert message in " ".join(result.output.split())
 
 
-def test_what_is_wrong_is_said_in_one_line(folder):
-    for arguments, said in (
+def test_an_error_is_reported_in_one_line(folder):
+    for arguments, message in (
         (["a.csv", "--y", "flo"], "has no column 'flo': did you mean flow?"),
         (["z*.csv", "--y", "flow"], "no file matches z*.csv"),
         (["a.csv", "--y", "flow", "--unit", "flow"], "give a unit as column=unit"),
@@ -109,7 +109,7 @@ def test_what_is_wrong_is_said_in_one_line(folder):
             app, ["track", *arguments, "--model", "arx:1,0", "--tracker", "kalman", "-p", "q=0", "-p", "r=1"]
         )
         assert result.exit_code == 2
-        assert said in " ".join(result.output.split())
+        assert message in " ".join(result.output.split())
 
 
 @pytest.fixture
@@ -172,7 +172,7 @@ def test_a_fleet_of_several_outputs(tanks):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("--model", "arx:1,1,ny=3", "--y", "level,flow"), "ny=3, but --y names level, flow"),
         (("--y", ","), "names no column"),
@@ -180,10 +180,10 @@ def test_a_fleet_of_several_outputs(tanks):
         (("--y", "level,flow", "--u", "valve"), "inputs must be different names"),
     ],
 )
-def test_what_several_outputs_cannot_have(tanks, arguments, said):
+def test_what_several_outputs_cannot_have(tanks, arguments, message):
     result = CliRunner().invoke(app, ["track", "all.csv", "--u", "valve", *KALMAN, *arguments])
     assert result.exit_code == 2
-    assert said in " ".join(result.output.split())
+    assert message in " ".join(result.output.split())
 
 
 def test_the_package_is_the_command(monkeypatch, capsys):

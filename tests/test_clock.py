@@ -55,12 +55,12 @@ GIVEN = {
 
 
 @pytest.mark.parametrize("plain", GIVEN)
-def test_what_is_said_of_an_interval(plain):
+def test_an_interval_in_words(plain):
     for given in GIVEN[plain]:
         time = pd.date_range("2024-12-20", periods=20, freq="13h").to_numpy()
         assert np.allclose(Clock.of(given).steps(time), Clock.of(plain).steps(time), rtol=1e-12), given
-        said = Clock.of(given).plain
-        assert Clock.of(said).plain == said
+        result = Clock.of(given).plain
+        assert Clock.of(result).plain == result
     assert Clock.of(GIVEN[plain][0]).plain == plain
 
 
@@ -201,7 +201,7 @@ def test_a_warm_start_counts_from_the_end_of_the_run_before():
     assert np.array_equal(rest.theta, whole.theta[25:])
 
 
-def test_what_is_lost_to_dt_is_said():
+def test_samples_lost_to_dt_are_reported():
     y, u = signals()
     with pytest.warns(
         DataWarning, match=r"59 of 60 samples .* median interval is 10, dt is 1, .* Give dt=10, or dt='label'"
@@ -214,24 +214,24 @@ def test_what_is_lost_to_dt_is_said():
     table = pd.DataFrame(
         {"y": np.tile(y, 2), "u": np.tile(u, 2), "t": np.tile(10 * np.arange(T), 2), "k": [0] * T + [1] * T}
     )
-    with pytest.warns(DataWarning, match="118 of 120") as said:
+    with pytest.warns(DataWarning, match="118 of 120") as result:
         track(MODEL, TRACKER, "y", "u", data=table, by="k", time="t")
-    assert len(said) == 1
-    assert said[0].filename == __file__
+    assert len(result) == 1
+    assert result[0].filename == __file__
     live = Live(MODEL, TRACKER)
-    with pytest.warns(DataWarning, match="first 20 samples") as said:
+    with pytest.warns(DataWarning, match="first 20 samples") as result:
         [live.update(y[t], u[t], time=10.0 * t) for t in range(T)]
-    assert [one.filename for one in said] == [__file__]
+    assert [one.filename for one in result] == [__file__]
 
 
-def test_weekends_that_cost_mondays_are_said():
+def test_weekends_that_cost_mondays_are_reported():
     y, u = signals()
     time = pd.date_range("2024-01-01", periods=T, freq="B")
     with pytest.warns(DataWarning, match="dt='business day'"):
         track(MODEL, TRACKER, y, u, time=time, dt="1d")
 
 
-def test_nothing_is_said_where_nothing_is_lost():
+def test_no_warning_where_no_sample_is_lost():
     y, u = signals()
     rng = np.random.default_rng(0)
     track(MODEL, TRACKER, y, u, time=10.0 * np.arange(T), dt="label")

@@ -1,6 +1,6 @@
-"""docs/command_line.md: every command that it shows runs, and prints what stands below it.
+"""docs/command_line.md: every command that it shows runs, and prints the text below it.
 
-Run as a program, it prints the page anew: ``python tests/test_command_line_docs.py``.
+Run as a program, it prints the page again: ``python tests/test_command_line_docs.py``.
 """
 
 import os
@@ -19,7 +19,7 @@ BLOCK = re.compile(r"```(python|bash)\n(.*?)```(?:\n\n```text\n(.*?)```)?", re.S
 
 def printed(commands: str) -> str:
     """What the lines of a block print; ``cat FILE |`` goes to stdin."""
-    said = ""
+    output = ""
     for line in commands.strip().splitlines():
         words, piped = shlex.split(line), None
         if words[0] == "cat":
@@ -27,8 +27,8 @@ def printed(commands: str) -> str:
         assert words[0] == "driftfit"
         result = CliRunner().invoke(cli.app, words[1:], input=piped)
         assert result.exit_code == 0, f"{line}\n{result.output}"
-        said += result.stdout
-    return "\n".join(line.rstrip() for line in said.strip("\n").splitlines())
+        output += result.stdout
+    return "\n".join(line.rstrip() for line in output.strip("\n").splitlines())
 
 
 def blocks(text: str):
@@ -47,9 +47,9 @@ def squeezed(text: str) -> list[str]:
 def test_every_command_prints_what_the_page_says(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     compared = 0
-    for block, said in blocks(PAGE.read_text()):
+    for block, output in blocks(PAGE.read_text()):
         if block[3] is not None:
-            assert squeezed(said) == squeezed(block[3]), block[2]
+            assert squeezed(output) == squeezed(block[3]), block[2]
             compared += 1
     assert compared >= 7
 
@@ -64,7 +64,7 @@ def test_every_command_has_an_example():
 if __name__ == "__main__":
     page = PAGE.read_text()
     os.chdir(tempfile.mkdtemp())
-    for block, said in blocks(page):
+    for block, output in blocks(page):
         if block[3] is not None:
-            page = page.replace(block[0], f"```bash\n{block[2]}```\n\n```text\n{said}\n```")
+            page = page.replace(block[0], f"```bash\n{block[2]}```\n\n```text\n{output}\n```")
     PAGE.write_text(page)

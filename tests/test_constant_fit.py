@@ -23,7 +23,7 @@ def test_constants_are_those_of_rls_from_a_diffuse_start():
 
 
 def test_constants_of_regressors_that_are_the_same():
-    """A column that stands there three times is not divided by its rounding."""
+    """A column that occurs three times is not divided by its rounding error."""
     y, u = arx_record(300, 8)
     lag = np.concatenate([[0.0], u[:-1]])
     run = track(Regression(4), Kalman(q=1e-4, r=0.01), y, np.column_stack([lag, u, lag, 0.5 * lag]))

@@ -75,7 +75,7 @@ def test_what_is_no_process_model_is_refused():
             make()
 
 
-def test_conversion_is_that_of_scipy_and_goes_back():
+def test_conversion_is_that_of_scipy_and_can_be_inverted():
     rng = np.random.default_rng(0)
     u = rng.normal(size=400)
     y = signal.lfilter([0.0, 0.3, 0.1], [1.0, -1.2, 0.5], u) + 0.1 * rng.normal(size=400)

@@ -34,7 +34,7 @@ def test_statsmodels_counts_the_diffuse_directions(level):
     local_level(exact_diffuse=True, run=level, constant=0.5 * np.log(2.0 * np.pi))
 
 
-def test_p0_stands_before_the_first_step_of_the_drift():
+def test_p0_applies_before_the_first_step_of_the_drift():
     run = track(Regression(0, intercept=True), Kalman(q=Q, r=R, theta0=1000.0, p0=1e4), NILE)
     gain = (1e4 + Q) / (1e4 + Q + R)
     assert run.theta[0, 0] == pytest.approx(1000.0 + gain * 120.0)

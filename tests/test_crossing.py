@@ -59,7 +59,7 @@ def test_a_path_that_is_looked_at_once_a_sample_passes_as_if_the_limit_were_fart
     assert np.abs(farther - drawn).max() < 0.015
 
 
-def test_what_is_known_exactly_and_what_stands_still():
+def test_crossings_of_a_known_start_and_of_constant_parameters():
     y, u = record()
     known = track(Regression(2), Kalman(q=Q, r=R, theta0=[3.0, 1.0], p0=0.0), y[:1], u[:1] * 0.0)
     start = np.sqrt(Q)  # the first sample is preceded by one step

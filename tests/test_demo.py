@@ -88,22 +88,22 @@ def test_best_is_inside_the_grid(found):
 
 
 def test_sentence_says_what_a_textbook_filter_says(record, found):
-    said = re.match(
+    output = re.match(
         r"The coefficient of (\w+) went from ([\d.]+) \(standard error ([\d.]+)\) in (\d+) Q(\d) to ([\d.]+) "
         r"\(standard error ([\d.]+)\) in (\d+) Q(\d), .* log-likelihood by ([\d.]+) over no drift\.$",
         demo.sentence(found),
     )
-    assert said
-    assert said[1] == "income"
+    assert output
+    assert output[1] == "income"
     settings = found.run.tracker.settings()
     theta, std, _, _ = naive(record, np.array(settings["q"]), settings["r"])
-    for value, error, year, quarter in (said.group(2, 3, 4, 5), said.group(6, 7, 8, 9)):
+    for value, error, year, quarter in (output.group(2, 3, 4, 5), output.group(6, 7, 8, 9)):
         t = (int(year) - 1959) * 4 + int(quarter) - 1
         assert float(value) == pytest.approx(theta[t - 1, 1], abs=6e-4)
         assert float(error) == pytest.approx(std[t - 1, 1], abs=6e-4)
     still = found.still.tracker.settings()["r"]
     gain = naive_loglik(record, np.array(settings["q"]), settings["r"]) - naive_loglik(record, np.zeros(4), still)
-    assert float(said[10]) == pytest.approx(gain, abs=0.1)
+    assert float(output[10]) == pytest.approx(gain, abs=0.1)
 
 
 def test_move_is_the_largest_within_two_years(found):
@@ -117,15 +117,15 @@ def test_move_is_the_largest_within_two_years(found):
 def test_caveat_says_what_the_searches_say(record, found):
     early = demo.search(record.until(2008.0))
     assert early.run.time[-1] == 2007.75
-    said = demo.caveat(found, early)
+    output = demo.caveat(found, early)
     gains = {which: max(run.loglik for run in row.values()) for which, row in early.runs.items()}
     for which in ("income", "all four"):
-        assert f"{gains[which] - early.still.loglik:.1f}" in said
-    assert f"up to 2007 Q4 income gains {gains['income'] - early.still.loglik:.1f}" in said
+        assert f"{gains[which] - early.still.loglik:.1f}" in output
+    assert f"up to 2007 Q4 income gains {gains['income'] - early.still.loglik:.1f}" in output
     half = 1.96 * found.run.std[:, demo.INCOME]
     move = demo.largest_move(found.run.theta[:, demo.INCOME])
     gap = abs(found.run.theta[move.before, demo.INCOME] - found.run.theta[move.after, demo.INCOME])
-    assert ("dates overlap" in said) == (gap < half[move.before] + half[move.after])
+    assert ("dates overlap" in output) == (gap < half[move.before] + half[move.after])
 
 
 def test_quarters():
@@ -163,10 +163,10 @@ def test_without_matplotlib_the_numbers_stay(tmp_path, monkeypatch):
 
 def test_what_the_tracker_without_settings_finds(record, found):
     adaptive = demo.free(record)
-    said = demo.adaptive_estimate(found, adaptive)
+    output = demo.adaptive_estimate(found, adaptive)
     move = demo.largest_move(adaptive.theta[:, demo.INCOME])
     for t in (move.before, move.after):
-        assert f"{adaptive.theta[t, demo.INCOME]:.3f}" in said
-        assert demo.quarter(adaptive.time[t]) in said
+        assert f"{adaptive.theta[t, demo.INCOME]:.3f}" in output
+        assert demo.quarter(adaptive.time[t]) in output
     late = slice(demo.SETTLED, None)
-    assert f"{np.sqrt(np.nanmean(adaptive.innovation[late] ** 2)):.4f}" in said
+    assert f"{np.sqrt(np.nanmean(adaptive.innovation[late] ** 2)):.4f}" in output

@@ -54,14 +54,14 @@ def jump_record(T=3000, at=2000, size=1.0, seed=3):
 
 def test_band_alarm_finds_a_jump_and_names_it():
     run = track(ARX(2, 2), K, *jump_record())
-    said = run.detect("band", every=1e5, reference={"b1": (0.7, 1.3), "b2": (0.1, 0.7)})
-    assert len(said.onsets) >= 1
-    assert 2000 <= said.onsets[0] < 2040
-    assert said.cause(int(said.onsets[0])) == "b1"
-    assert (said.limits < stats.norm.isf(1.0 / 2e5)).all()  # what begins is rarer than what exceeds
-    assert (said.limits > stats.norm.isf(1.0 / 2e3)).all()
+    raised = run.detect("band", every=1e5, reference={"b1": (0.7, 1.3), "b2": (0.1, 0.7)})
+    assert len(raised.onsets) >= 1
+    assert 2000 <= raised.onsets[0] < 2040
+    assert raised.cause(int(raised.onsets[0])) == "b1"
+    assert (raised.limits < stats.norm.isf(1.0 / 2e5)).all()  # what begins is rarer than what exceeds
+    assert (raised.limits > stats.norm.isf(1.0 / 2e3)).all()
     outside = np.maximum(run.theta[:, 2] - 1.3, 0.7 - run.theta[:, 2]) / run.std[:, 2]
-    assert said.statistic[100:, 0] == pytest.approx(outside[100:])
+    assert raised.statistic[100:, 0] == pytest.approx(outside[100:])
     learned = run.detect("band", every=1e5, reference=1500)
     assert learned.start == 1500
     assert learned.onsets[0] >= 2000
@@ -104,11 +104,11 @@ def test_innovation_alarm_rate(reference, error):
     for seed in range(20):
         u, v = np.random.default_rng(seed).normal(size=(2, 20_000))
         y = signal.lfilter([0.0, 1.0, 0.4], [1.0, -1.2, 0.5], u) + signal.lfilter([0.1], [1.0, -1.2, 0.5], v)
-        said = track(ARX(2, 2), Kalman(q=0.0, r=0.01), y, u).detect(
+        raised = track(ARX(2, 2), Kalman(q=0.0, r=0.01), y, u).detect(
             "innovation", every=300.0, window=20, reference=reference
         )
-        begun.append(len(said.onsets))
-        expected.append((20_000 - said.start) / 300.0)
+        begun.append(len(raised.onsets))
+        expected.append((20_000 - raised.start) / 300.0)
     check_rate(begun, expected, error)
 
 
@@ -116,9 +116,9 @@ def test_innovation_alarm_finds_louder_noise_and_a_bias():
     y, u = arx_record(3000, 4)
     noise = 0.2 * np.random.default_rng(1).normal(size=3000)
     louder = track(ARX(2, 2), Kalman(q=0.0, r=0.01), y + np.where(np.arange(3000) > 2000, noise, 0.0), u)
-    said = louder.detect("innovation", every=1e5)
-    assert 2000 <= said.onsets[0] < 2060
-    assert said.cause(int(said.onsets[0])) == "power"
+    raised = louder.detect("innovation", every=1e5)
+    assert 2000 <= raised.onsets[0] < 2060
+    assert raised.cause(int(raised.onsets[0])) == "power"
     offset = track(ARX(2, 2), Kalman(q=0.0, r=0.01), y + 0.3 * (np.arange(3000) > 2000), u).detect(
         "innovation", every=1e5
     )
@@ -138,11 +138,11 @@ def test_normal_scores_bound_outliers():
 def test_probability_alarm_is_calibrated_by_simulation():
     u, v = np.random.default_rng(2).normal(size=(2, 5000))
     run = track(Regression(1), Doubtful(q=0.0, r=1.0), u + v, u)
-    said = run.detect("probability", every=250.0)
+    raised = run.detect("probability", every=250.0)
     # onsets of independent exceedances: p (1 - p) = 1 / 250, known from 50 simulated alarms; limit = 1 - exp(-z^2 / 2)
-    p = 2.0 * stats.norm.sf(np.sqrt(-2.0 * np.log(1.0 - said.limits[0])))
+    p = 2.0 * stats.norm.sf(np.sqrt(-2.0 * np.log(1.0 - raised.limits[0])))
     assert 250.0 * p * (1.0 - p) == pytest.approx(1.0, abs=2.0 / np.sqrt(50.0))
-    assert abs(len(said.onsets) - 4950 * p * (1.0 - p)) < 3.0 * np.sqrt(20.0)
+    assert abs(len(raised.onsets) - 4950 * p * (1.0 - p)) < 3.0 * np.sqrt(20.0)
     with pytest.raises(ValueError, match="Bank"):
         track(ARX(2, 2), K, *arx_record(100, 1)).detect("probability")
 
@@ -211,18 +211,18 @@ def test_score_by_hand():
     labels[6:12] = 1
     labels[17:] = 1
     rule = AlarmRule("band", 10.0, ("b1",), (1.0,))
-    said = Alarms(rule, active, onsets(active), np.zeros((20, 1)), 2, 0.5, None)
-    assert said.score(labels) == (2, 1, 2.0, 2, 9)
+    raised = Alarms(rule, active, onsets(active), np.zeros((20, 1)), 2, 0.5, None)
+    assert raised.score(labels) == (2, 1, 2.0, 2, 9)
     # an alarm that was on before the label is false, and finds nothing however long it stays
     early = np.zeros(20, bool)
     early[5:10] = True
-    got = replace(said, active=early, onsets=onsets(early)).score(labels)
+    got = replace(raised, active=early, onsets=onsets(early)).score(labels)
     assert (got.found, got.false, np.isnan(got.delay)) == (0, 1, True)
     again = early.copy()
     again[8] = False
-    assert replace(said, active=again, onsets=onsets(again)).score(labels) == (2, 1, 3.0, 1, 9)
+    assert replace(raised, active=again, onsets=onsets(again)).score(labels) == (2, 1, 3.0, 1, 9)
     with pytest.raises(ValueError, match="20 samples"):
-        said.score(labels[:5])
+        raised.score(labels[:5])
 
 
 def test_held_alarms():
@@ -234,18 +234,18 @@ def test_held_alarms():
 
 def test_table_says_what_was_found():
     run = track(ARX(2, 2), K, *jump_record())
-    said = run.detect("band", every=1e4, reference=1500)
-    lines = rows_of(said)
+    raised = run.detect("band", every=1e4, reference=1500)
+    lines = rows_of(raised)
     found = {line[0]: line for line in lines}
-    limits = " ".join(f"{name} {limit:.4g}," for name, limit in zip(run.names, said.limits, strict=True))
+    limits = " ".join(f"{name} {limit:.4g}," for name, limit in zip(run.names, raised.limits, strict=True))
     assert " ".join(found["Limits"][1:]) == limits.rstrip(",")
     assert " ".join(found["Alarm"]) == "Alarm band, one false alarm in 10000 samples"
     assert " ".join(found["Samples"]) == "Samples 1500 judged from sample 1500 on; 0.15 false alarms expected"
     rows = lines[next(i for i, line in enumerate(lines) if line[:2] == ["from", "to"]) + 2 :]
-    for t, row in zip(said.onsets, rows, strict=False):
-        j = said.names.index(said.cause(t))
-        assert row == [*said.span(t), "b1", f"{said.statistic[t, j]:.4g}", f"{said.limits[j]:.4g}"]
-    assert len(rows) == len(said.onsets)
+    for t, row in zip(raised.onsets, rows, strict=False):
+        j = raised.names.index(raised.cause(t))
+        assert row == [*raised.span(t), "b1", f"{raised.statistic[t, j]:.4g}", f"{raised.limits[j]:.4g}"]
+    assert len(rows) == len(raised.onsets)
 
 
 def drawn(figure):
@@ -263,13 +263,13 @@ def drawn(figure):
 
 def test_picture_shows_statistics_over_limits_alarms_and_labels():
     run = track(ARX(2, 2), K, *jump_record())
-    said = run.detect("band", every=1e4, reference=1500)
-    figure = said.plot(np.arange(3000) > 2000)
-    limits = [f"limit {limit:.4g}" for limit in said.limits]
+    raised = run.detect("band", every=1e4, reference=1500)
+    figure = raised.plot(np.arange(3000) > 2000)
+    limits = [f"limit {limit:.4g}" for limit in raised.limits]
     shaded = [True, True]  # alarms, labels
-    assert drawn(figure) == [(name, [1.0], [text], shaded) for name, text in zip(said.names, limits, strict=True)]
+    assert drawn(figure) == [(name, [1.0], [text], shaded) for name, text in zip(raised.names, limits, strict=True)]
     for j, axis in enumerate(figure.axes[1:]):
-        assert axis.get_lines()[0].get_ydata() == pytest.approx(said.statistic[:, j] / said.limits[j], nan_ok=True)
+        assert axis.get_lines()[0].get_ydata() == pytest.approx(raised.statistic[:, j] / raised.limits[j], nan_ok=True)
     assert figure.axes[0].get_lines()[0].get_ydata() == pytest.approx(run.y)
 
 
@@ -277,14 +277,14 @@ def test_probabilities_show_their_limit():
     run = track(ARX(2, 2), K, *arx_record(200, 1))
     p = np.full((200, 1), 0.1)
     p[150:160] = 0.99995
-    said = Alarms(
+    raised = Alarms(
         AlarmRule("probability", 50.0, ("probability",), (0.99987,)), p[:, 0] > 0.5, np.array([150]), p, 50, 0.1, run
     )
-    text = " ".join(str(said).split())
+    text = " ".join(str(raised).split())
     assert "Limits probability 1 - 0.00013" in text
     assert "probability 1 - 5e-05 1 - 0.00013" in text
-    assert drawn(said.plot()) == [("probability", [0.99987], ["limit 1 - 0.00013"], [True])]
-    half = replace(said, rule=replace(said.rule, limits=(0.5,), simulated=True))
+    assert drawn(raised.plot()) == [("probability", [0.99987], ["limit 1 - 0.00013"], [True])]
+    half = replace(raised, rule=replace(raised.rule, limits=(0.5,), simulated=True))
     assert "Limits probability 0.5 (by simulation)" in " ".join(str(half).split())
 
 

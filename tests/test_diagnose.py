@@ -14,32 +14,32 @@ TRUE = Kalman(q=0.0, r=0.01)
 
 
 def faults(tracker, y, u):
-    said = track(ARX(2, 2), tracker, y, u).diagnose()
-    return {check.name for check in said.checks if not check.ok}, said
+    diagnosis = track(ARX(2, 2), tracker, y, u).diagnose()
+    return {check.name for check in diagnosis.checks if not check.ok}, diagnosis
 
 
 def test_a_true_model_has_no_faults():
-    found, said = faults(TRUE, *arx_record(600, 3))
+    found, diagnosis = faults(TRUE, *arx_record(600, 3))
     assert not found
-    assert said.ok
-    assert said.sentences == ()
-    assert "Everything is within its limits" in str(said)
+    assert diagnosis.ok
+    assert diagnosis.sentences == ()
+    assert "Everything is within its limits" in str(diagnosis)
 
 
 def test_numbers_are_what_plain_numpy_gives():
     y, u = arx_record(600, 3)
-    _, said = faults(TRUE, y, u)
-    run = said.run
+    _, diagnosis = faults(TRUE, y, u)
+    run = diagnosis.run
     z = (run.innovation / run.innovation_std)[50:]
     inside = z[np.abs(z) <= 3.0 * 1.4826 * np.median(np.abs(z))]
-    assert said["noise level"].value == pytest.approx(np.mean(inside**2) / 0.9733)
-    assert said["outliers"].value == np.mean(np.abs(z) > 4.0)
+    assert diagnosis["noise level"].value == pytest.approx(np.mean(inside**2) / 0.9733)
+    assert diagnosis["outliers"].value == np.mean(np.abs(z) > 4.0)
     held = np.clip(z - np.median(z), -4.0, 4.0)
-    assert said["symmetry"].value == pytest.approx(stats.skew(held))
+    assert diagnosis["symmetry"].value == pytest.approx(stats.skew(held))
     clipped = np.clip(z, *(np.array([-1, 1]) * 3.0 * 1.4826 * np.median(np.abs(z))))
     r = [np.sum(clipped[k:] * clipped[:-k]) / np.sum(clipped**2) for k in range(1, 21)]
     assert standardised(run)[1].r == pytest.approx(r)
-    assert said["constancy (p)"].value == run.verdict().p
+    assert diagnosis["constancy (p)"].value == run.verdict().p
 
 
 @pytest.mark.parametrize(
@@ -53,10 +53,10 @@ def test_numbers_are_what_plain_numpy_gives():
 )
 def test_each_fault_has_its_name_and_its_sentence(name, tracker, spoil):
     y, u = arx_record(600, 3)
-    found, said = faults(tracker, spoil(y), u)
+    found, diagnosis = faults(tracker, spoil(y), u)
     assert name in found
-    assert said[name].advice in said.sentences
-    assert said[name].advice in " ".join(str(said).split())
+    assert diagnosis[name].advice in diagnosis.sentences
+    assert diagnosis[name].advice in " ".join(str(diagnosis).split())
 
 
 NOISE = np.random.default_rng(7).normal(size=600)
@@ -83,9 +83,9 @@ def test_lost_excitation_is_found_and_named():
     y, u = arx_record(600, 3)
     quiet = u.copy()
     quiet[200:330] = 0.0
-    found, said = faults(TRUE, y, quiet)
+    found, diagnosis = faults(TRUE, y, quiet)
     assert "excitation" in found
-    assert "b1" in said["excitation"].advice
+    assert "b1" in diagnosis["excitation"].advice
 
 
 def test_eigenvalues_of_windows():
@@ -102,37 +102,39 @@ def test_eigenvalues_of_windows():
 def test_short_records_and_trackers_without_covariance_are_diagnosed_too():
     y, u = arx_record(600, 3)
     for tracker, T in ((AugmentedFLS(mu=10.0), 600), (TRUE, 12)):
-        said = track(ARX(2, 2), tracker, y[:T], u[:T]).diagnose()
-        assert np.isnan(said["noise level"].value)
-        assert said["noise level"].ok
-        assert "not known" in str(said)
-        said.plot()
+        diagnosis = track(ARX(2, 2), tracker, y[:T], u[:T]).diagnose()
+        assert np.isnan(diagnosis["noise level"].value)
+        assert diagnosis["noise level"].ok
+        assert "not known" in str(diagnosis)
+        diagnosis.plot()
 
 
 def test_picture_has_six_panels_and_marks_what_is_out_of_bounds():
     y, u = arx_record(600, 3)
-    said = track(ARX(2, 2), Kalman(q=0.0, r=0.001), y, u).diagnose()
-    panels = said.plot().axes
+    diagnosis = track(ARX(2, 2), Kalman(q=0.0, r=0.001), y, u).diagnose()
+    panels = diagnosis.plot().axes
     marked = ["out of bounds" in panel.get_title(loc="left") for panel in panels]
-    wrong = {check.name for check in said.checks if not check.ok}
+    wrong = {check.name for check in diagnosis.checks if not check.ok}
     assert len(panels) == 6
     causes = ({"outliers"}, {"whiteness (p)"}, {"noise level", "steady noise"}, {"symmetry", "outliers"})
     assert marked[:4] == [bool(cause & wrong) for cause in causes]
     assert marked[2]
-    np.testing.assert_array_equal(panels[0].lines[0].get_ydata(), standardised(said.run)[0])
-    assert [bar.get_height() for bar in panels[1].patches] == list(standardised(said.run)[1].r)
+    np.testing.assert_array_equal(panels[0].lines[0].get_ydata(), standardised(diagnosis.run)[0])
+    assert [bar.get_height() for bar in panels[1].patches] == list(standardised(diagnosis.run)[1].r)
 
 
 def test_a_tracker_that_may_move_is_not_accused_on_short_constant_records():
-    """The tracker without settings loses a little to constants, sometimes more than 3 % by chance: that is no fault."""
-    rng = np.random.default_rng(11)
-    u, v = rng.normal(size=(2, 25, 200, 3))
+    """The tracker without settings loses a little to constants (0.4 to 1 % on average), by chance more than 3 % on a
+    few of these records: that is no fault."""
     dearer = accused = 0
-    for k in range(25):
-        run = track(Regression(3), AdaptiveKalman(), u[k] @ [1.0, -1.0, 0.5] + v[k, :, 0], u[k])
-        error = errors(run)
-        own, steady = (np.mean(e[error.scored] ** 2) for e in (error.tracked, error.constant_ls))
-        dearer += own > 1.03**2 * steady
-        accused += not run.diagnose()["constancy (p)"].ok
-    assert dearer >= 1
+    for seed in (11, 12):
+        rng = np.random.default_rng(seed)
+        u, v = rng.normal(size=(2, 25, 200, 3))
+        for k in range(25):
+            run = track(Regression(3), AdaptiveKalman(), u[k] @ [1.0, -1.0, 0.5] + v[k, :, 0], u[k])
+            error = errors(run)
+            own, steady = (np.mean(e[error.scored] ** 2) for e in (error.tracked, error.constant_ls))
+            dearer += own > 1.03**2 * steady
+            accused += not run.diagnose()["constancy (p)"].ok
+    assert dearer >= 3
     assert accused <= 1

@@ -33,8 +33,8 @@ def present(page):
     try:
         yield
     except ImportError as error:
-        said = f"{error.name or ''} {error.__cause__ or ''} {error}"
-        absent = next((name for name in OPTIONAL if name in said), None)
+        result = f"{error.name or ''} {error.__cause__ or ''} {error}"
+        absent = next((name for name in OPTIONAL if name in result), None)
         if absent is None:
             raise
         pytest.skip(f"{page}: {absent} is not installed, so the rest of the page was not run")
@@ -59,11 +59,11 @@ def test_python_blocks_print_what_the_page_says(page, tmp_path, monkeypatch):
 
 def shown() -> list[object]:
     """Each script with what the pages say that it prints, the parts of one script together."""
-    said: dict[str, list[str]] = {}
+    result: dict[str, list[str]] = {}
     for page in PAGES:
         for found in SCRIPT.finditer(page.read_text()):
-            said.setdefault(found[1], []).append(found[2])
-    return [pytest.param(script, parts, id=Path(script).stem) for script, parts in said.items()]
+            result.setdefault(found[1], []).append(found[2])
+    return [pytest.param(script, parts, id=Path(script).stem) for script, parts in result.items()]
 
 
 @pytest.mark.parametrize(("script", "parts"), shown())
@@ -72,8 +72,8 @@ def test_scripts_print_what_the_docs_say(script, parts, monkeypatch):
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         runpy.run_path(str(ROOT / script), run_name="__main__")
-    for said in parts:
-        assert squeezed(printed.getvalue()) == squeezed(said)
+    for result in parts:
+        assert squeezed(printed.getvalue()) == squeezed(result)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -7,6 +7,7 @@ import matplotlib
 import pytest
 
 import driftfit
+from driftfit import models, trackers
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGES = [DOCS / "from_matlab.md", DOCS / "from_r.md"]
@@ -40,3 +41,8 @@ def test_the_reference_has_every_public_name():
     pages = "\n".join(page.read_text() for page in (DOCS / "api").glob("*.md"))
     named = re.findall(r"^::: driftfit\.(\w+)$", pages, re.M)
     assert sorted(named) == sorted({*driftfit.__all__} - {"__version__"})
+
+
+def test_every_tracker_and_model_is_public():
+    """But for what a model becomes when it is bound, or in a record of several."""
+    assert {*models.found(), *trackers.found()} - {*driftfit.__all__} == {"JointARX", "RunTimeOrders"}

@@ -41,7 +41,7 @@ ELSEWHERE = {
     "python -m benchmarks.spark": ("tests/test_bridge_spark.py", 'costs(True, "streams")'),
     "python -m lab bench speed": ("lab/tests/test_bench.py", '["bench", "speed", "--quick"'),
 }  # fmt: skip
-"""Commands, by how they begin, with the test that runs them quickly and what stands there."""
+"""Commands, by how they begin, with the test that runs them quickly and the text that it contains."""
 
 
 def commands() -> list[str]:
@@ -91,22 +91,22 @@ def test_commands_are_found():
 
 @pytest.mark.parametrize("command", of_kind("elsewhere"))
 def test_another_test_runs_it(command):
-    _, (name, said) = next(item for item in ELSEWHERE.items() if command.startswith(item[0]))
-    assert said in (ROOT / name).read_text()
+    _, (name, content) = next(item for item in ELSEWHERE.items() if command.startswith(item[0]))
+    assert content in (ROOT / name).read_text()
 
 
 @pytest.mark.parametrize("command", of_kind("benchmark"))
 def test_benchmarks_run_quickly(command, monkeypatch):
     script, *given = shlex.split(command.replace("-m benchmarks.", "benchmarks/"))[1:]
     script = script if script.endswith(".py") else f"{script}.py"
-    said = (ROOT / script).read_text()
-    assert "--quick" in said or "quick: Annotated" in said
-    if "import statsmodels" in said:
+    content = (ROOT / script).read_text()
+    assert "--quick" in content or "quick: Annotated" in content
+    if "import statsmodels" in content:
         pytest.importorskip("statsmodels", reason="there is no statsmodels")
-    if "import JulierSigmaPoints" in said:
+    if "import JulierSigmaPoints" in content:
         pytest.importorskip("filterpy", reason="there is no filterpy")
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    monkeypatch.setattr("sys.argv", [script, *given, "--quick"] if "typer" not in said else [script, "--quick"])
+    monkeypatch.setattr("sys.argv", [script, *given, "--quick"] if "typer" not in content else [script, "--quick"])
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         runpy.run_path(str(ROOT / script), run_name="__main__")

@@ -227,8 +227,8 @@ def test_the_self_test_passes_unoptimised_and_under_sanitizers(tmp_path, name, f
 @needs_gcc
 @pytest.mark.parametrize("name", ["adaptive", "blocks", "start", "one parameter"])
 def test_single_precision_is_close(tmp_path, name):
-    said = selftest(tmp_path, name, ["gcc", "-O2", "-DTRACKER_SINGLE"], [])
-    assert 0.0 < float(re.search(r"difference is (\S+)", said)[1]) < 1e-4
+    result = selftest(tmp_path, name, ["gcc", "-O2", "-DTRACKER_SINGLE"], [])
+    assert 0.0 < float(re.search(r"difference is (\S+)", result)[1]) < 1e-4
 
 
 @needs_controller
@@ -285,7 +285,7 @@ def test_the_simulink_block_gives_the_bits_of_a_stream(tmp_path, inputs):
         np.testing.assert_array_equal(np.array(line.split(), dtype=float), np.array(expected, dtype=float))
 
 
-def test_what_cannot_be_exported_is_said(tmp_path):
+def test_an_export_that_is_not_possible_is_refused(tmp_path):
     with pytest.raises(ValueError, match="Bank has no C form"):
         export_c(ARX(1, 1), Bank(), tmp_path)
     with pytest.raises(ValueError, match="one output at a time"):
@@ -387,8 +387,8 @@ def test_the_loop_of_the_docs_prints_what_they_say(capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["controller.py"])
     runpy.run_path(str(ROOT / "examples" / "controller.py"), run_name="__main__")
     page = (ROOT / "docs" / "embedded.md").read_text()
-    said = re.search(r"`python examples/controller.py` prints.*?```text\n(.*?)```", page, re.S)[1]
-    assert capsys.readouterr().out.split() == said.split()
+    result = re.search(r"`python examples/controller.py` prints.*?```text\n(.*?)```", page, re.S)[1]
+    assert capsys.readouterr().out.split() == result.split()
 
 
 def test_the_command_writes_the_same(tmp_path):

@@ -66,7 +66,7 @@ def test_filter_is_kalman_with_an_estimated_scale():
     np.testing.assert_allclose(fls.prediction, kalman.prediction, rtol=1e-12, atol=1e-13)
 
 
-def test_prior_stands_at_the_first_sample():
+def test_the_prior_holds_at_the_first_sample():
     phi, y = record()
     p0, mu = np.array([[2.0, 0.3], [0.3, 1.0]]), 4.0
     fls = track(Regression(2), FLS(mu, theta0=1.0, p0=p0), y, phi)

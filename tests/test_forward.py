@@ -73,11 +73,11 @@ def test_drawn_bands_are_the_delta_method_where_that_is_exact_enough():
 def test_bands_of_a_hammerstein_wiener_model_cover():
     y, u = curved_record(noise=0.03)
     run = track(SMALL, Kalman(q=0.0, r=9e-4, p0=1.0), y, u)
-    said = run.ahead(4)
+    result = run.ahead(4)
     later = slice(150, None)
-    low, high = (end[later] for end in said.band(0.9))
+    low, high = (end[later] for end in result.band(0.9))
     assert 0.87 < np.mean((y[later] > low) & (y[later] < high)) < 0.94
-    assert np.isnan(said.y_hat[:4]).all()
+    assert np.isnan(result.y_hat[:4]).all()
     once = run.ahead(1)
     # the filter widens its grid only when an output leaves it, and predicts within the grid
     assert np.mean(np.abs(once.y_hat - run.prediction)[later] < 1e-4) > 0.98
@@ -88,11 +88,11 @@ def test_free_simulation_of_a_hammerstein_wiener_model():
     run = track(SMALL, Kalman(q=0.0, r=1e-4, p0=1.0), y, u)
     fresh = np.random.default_rng(9).uniform(-1.0, 1.0, 60)
     truth = simulate(SMALL, [-0.6], [0.5], [0.3], [0.2], T=60, rng=np.random.default_rng(0), u=fresh).y
-    said = run.simulate(fresh)
-    assert np.abs(said.y_hat - truth)[5:].max() < 0.006
-    assert (said.theta_std[5:] <= said.y_std[5:] + 1e-3).all()
+    result = run.simulate(fresh)
+    assert np.abs(result.y_hat - truth)[5:].max() < 0.006
+    assert (result.theta_std[5:] <= result.y_std[5:] + 1e-3).all()
     again = run.simulate(fresh)
-    assert np.array_equal(again.paths, said.paths)
+    assert np.array_equal(again.paths, result.paths)
     begun = run.simulate(fresh, y=truth[:10])
     assert np.array_equal(begun.y_hat[:10], truth[:10])
     assert begun.y_std[:10].max() < 1e-12
@@ -101,9 +101,9 @@ def test_free_simulation_of_a_hammerstein_wiener_model():
 def test_a_tracker_of_the_free_parameters():
     y, u = curved_record(noise=0.01)
     run = track(SMALL, ExtendedKalman(q=0.0, r=1e-4, p0=1.0, theta0=0.1), y, u)
-    said = run.simulate(u[:50])
-    assert np.abs(said.y_hat - y[:50])[5:].max() < 0.06
-    assert np.isfinite(said.y_std[5:]).all()
+    result = run.simulate(u[:50])
+    assert np.abs(result.y_hat - y[:50])[5:].max() < 0.06
+    assert np.isfinite(result.y_std[5:]).all()
 
 
 def test_draws_have_the_covariance_that_is_asked_for():

@@ -181,14 +181,14 @@ def test_a_change_is_found_named_and_sized(unit, name, size):
         u, v, after = rng.normal(size=1600), rng.normal(size=1600), np.arange(1600) >= 1200
         y = (2.0 + after * size * (name == "gain")) * u + 1.0 + after * size * (name == "intercept")
         y += v * np.where(after & (name == "noise"), size, 1.0)
-        said = track(GAIN, AugmentedFLS(mu=10.0), unit * y, u).detect(every=1000.0, reference=1000, hold=20)
-        begun = said.onsets[said.onsets >= 1200]
+        detected = track(GAIN, AugmentedFLS(mu=10.0), unit * y, u).detect(every=1000.0, reference=1000, hold=20)
+        begun = detected.onsets[detected.onsets >= 1200]
         late.append(begun[0] - 1200)
-        settled = said.change(int(begun[0]) + 150)
+        settled = detected.change(int(begun[0]) + 150)
         scale = 1.0 if name == "noise" else unit
         covered.append(settled.low < size * scale < settled.high)
         assert settled.name == name
-        since.append(said.change(int(begun[0])).since - 1200)
+        since.append(detected.change(int(begun[0])).since - 1200)
     assert np.median(late) < 60
     assert sum(covered) >= 3
     assert np.median(np.abs(since)) < 20

@@ -267,8 +267,8 @@ def test_live_and_fleet_say_what_the_record_says(tmp_path):
         if t == 95:
             live.save(tmp_path / "state")
             live = Live.load(tmp_path / "state")
-        said = live.update(float(y[t]), float(s.u[t]))
-        assert same(said[:2], (run.prediction[t], run.innovation[t]))
+        result = live.update(float(y[t]), float(s.u[t]))
+        assert same(result[:2], (run.prediction[t], run.innovation[t]))
         assert same(live.theta, run.theta[t])
     fleet = track(s.model, K, np.stack([y, s.y]), np.stack([s.u, s.u]), by="row")
     assert same(fleet[0].theta, run.theta)
@@ -423,7 +423,7 @@ def test_forecasts_have_the_unit_of_the_output():
     rng = np.random.default_rng(11)
     model, e = HammersteinWiener(1, 1, output=Polynomial(3)), 0.02
     weights = (-0.8, 0.5, 0.4, 0.6)
-    errors, said = [], []
+    errors, result = [], []
     for _ in range(500):
         u = np.concatenate([rng.normal(size=40), np.zeros(5)])
         s = simulate(model, [weights[0]], [weights[1]], [], weights[2:], T=45, rng=rng, u=u, equation_noise=e)
@@ -432,14 +432,14 @@ def test_forecasts_have_the_unit_of_the_output():
         ahead = run.forecast(5, s.u[40:])
         if s.y[:40].min() < s.y[40:].min() and s.y[40:].max() < s.y[:40].max():
             errors.append(s.y[40:] - ahead.y_hat)
-            said.append(ahead.y_std)
+            result.append(ahead.y_std)
     assert len(errors) > 440
-    ratio = np.sqrt(np.mean((np.array(errors) / np.array(said)) ** 2, axis=0))
+    ratio = np.sqrt(np.mean((np.array(errors) / np.array(result)) ** 2, axis=0))
     assert (np.abs(ratio - 1.0) < 0.1).all()  # three standard errors
-    assert np.mean(said, axis=0)[4] == pytest.approx(1.97 * np.mean(said, axis=0)[0], rel=0.02)
+    assert np.mean(result, axis=0)[4] == pytest.approx(1.97 * np.mean(result, axis=0)[0], rel=0.02)
 
 
-def test_a_run_goes_on_with_its_own_model_only():
+def test_a_run_is_continued_only_with_its_own_model():
     rng = np.random.default_rng(12)
     y, u = rng.uniform(-1.0, 1.0, (2, 60))
     run = track(SMALL, K, y[:30], u[:30])

@@ -122,7 +122,7 @@ def test_shared_curves_are_the_nearest_of_rank_one():
             assert_allclose(found, nearest[o * lags : (o + 1) * lags], rtol=1e-8)
 
 
-def test_what_several_outputs_cannot_have_is_said():
+def test_settings_that_several_outputs_cannot_have_are_refused():
     y, u = record(60)
     for wrong, says in (
         (lambda: HammersteinWiener(1, 1, output=[None, Polynomial(2)]), "bases of one kind and size"),

@@ -11,8 +11,8 @@ import pytest
 from support import arx_record, run_lanes, same
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Live, Regression, track
-from driftfit.engine.drivers import WIDTH, make_tile
 from driftfit.engine.kernel import exp, kernel, log
+from driftfit.engine.tiles import WIDTH, make_tile
 
 R = 0.3
 

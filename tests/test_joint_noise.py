@@ -78,7 +78,7 @@ def test_an_output_that_is_missing_leaves_the_density_of_the_other():
     assert noise.log_density[-1] == pytest.approx(one, abs=1e-9)
 
 
-def test_a_run_goes_on_where_another_ended():
+def test_a_run_continues_where_another_ended():
     y, u = record()
     model = Regression(N, ny=NY)
     whole = track(model, RLS(1.0), y, u).joint_noise()
@@ -122,7 +122,7 @@ def test_a_bank_has_one_tree_for_all_outputs():
     assert max(first, second) <= 3
 
 
-def test_what_cannot_share_its_noise_is_said():
+def test_runs_that_cannot_share_their_noise_are_refused():
     y, u = record()
     with pytest.raises(ValueError, match="does not estimate"):
         track(Regression(N, ny=NY), Kalman(1e-3, 1.0), y, u).joint_noise()

@@ -46,39 +46,39 @@ def test_a_stream_says_what_the_record_says(record, tracker, kind, settings):
     before = track(ARX(2, 2), tracker, y[:CUT], u[:CUT])
     rule = before.detect(kind, every=50.0, **settings).rule
     whole = track(ARX(2, 2), tracker, y, u)
-    said = whole.detect(rule, start=CUT)
+    record_alarms = whole.detect(rule, start=CUT)
     if "calibrate" not in settings and kind != "probability" and settings.get("reference") == CUT:
         own = whole.detect(kind, every=50.0, **settings)
         assert own.rule == rule  # limits and reference are those of the first samples, whatever comes later
-        assert same(own.active, said.active)
-    assert FAULT - CUT > 100 > len(said.onsets) > 0
+        assert same(own.active, record_alarms.active)
+    assert FAULT - CUT > 100 > len(record_alarms.onsets) > 0
     live = Live(ARX(2, 2), tracker, warm_start=before)
     alarm = live.detect(rule)
-    begun, told = [], []
+    begun, onsets = [], []
     for t in range(CUT, T):
         live.update(y[t], u[t], time=float(t))
         if t % 60 == 0:
             live = pickle.loads(pickle.dumps(live)) if t % 120 else Live.from_bytes(live.to_bytes())
             (alarm,) = live.alarms
-        assert alarm.active == said.active[t], t
+        assert alarm.active == record_alarms.active[t], t
         if alarm.active:
-            assert same(alarm.statistic, said.statistic[t]), t
-            assert alarm.cause == said.cause(t)
-            now, then = alarm.change, said.change(t)
+            assert same(alarm.statistic, record_alarms.statistic[t]), t
+            assert alarm.cause == record_alarms.cause(t)
+            now, then = alarm.change, record_alarms.change(t)
             assert now is None or now[1:4] == then[1:4]
         begun += [t] if alarm.begun else []
-        told += alarm.onsets()
-    assert begun == said.onsets.tolist()
-    assert [onset.sample + CUT for onset in told] == begun
-    assert [onset.time for onset in told] == [float(t) for t in begun]
-    assert all(onset.statistic > onset.limit and onset.limit in rule.limits for onset in told)
-    assert [onset.cause for onset in told] == [said.cause(t) for t in begun]
+        onsets += alarm.onsets()
+    assert begun == record_alarms.onsets.tolist()
+    assert [onset.sample + CUT for onset in onsets] == begun
+    assert [onset.time for onset in onsets] == [float(t) for t in begun]
+    assert all(onset.statistic > onset.limit and onset.limit in rule.limits for onset in onsets)
+    assert [onset.cause for onset in onsets] == [record_alarms.cause(t) for t in begun]
     assert alarm.onsets() == []
     many, causes = in_parts(before, whole, rule), []
     for found in many[1]:
         causes += found
-    assert causes == [said.cause(t) if said.active[t] else None for t in range(CUT, T)]
-    assert many[0].onsets() == [onset._replace(time=None) for onset in told]
+    assert causes == [record_alarms.cause(t) if record_alarms.active[t] else None for t in range(CUT, T)]
+    assert many[0].onsets() == [onset._replace(time=None) for onset in onsets]
     assert same(many[0].statistic, alarm.statistic)
 
 
@@ -96,29 +96,29 @@ def test_the_probability_of_a_bank():
     y, u = jumping(150, 5, (40, 90))
     bank = Bank(changes(), [Sensor.nominal(R)], reduce=Beam(9), p0=2.0)
     rule = AlarmRule("probability", 100.0, ("probability",), (0.5,))
-    said = track(Regression(N), bank, y, u).detect(rule, start=5)
+    record_alarms = track(Regression(N), bank, y, u).detect(rule, start=5)
     live = Live(Regression(N), bank)
     alarm = live.detect(rule, wait=5)
     for t in range(150):
         live.update(y[t], u[t])
-        assert alarm.active == said.active[t]
-        assert t < 5 or same(alarm.statistic, said.statistic[t])
-    assert [onset.sample for onset in alarm.onsets()] == said.onsets.tolist()
-    assert all(min(abs(t - jump) for t in said.onsets) < 4 for jump in (40, 90))
+        assert alarm.active == record_alarms.active[t]
+        assert t < 5 or same(alarm.statistic, record_alarms.statistic[t])
+    assert [onset.sample for onset in alarm.onsets()] == record_alarms.onsets.tolist()
+    assert all(min(abs(t - jump) for t in record_alarms.onsets) < 4 for jump in (40, 90))
 
 
 def test_the_start_of_an_estimate_is_no_alarm(record):
     y, u = record
     rule = track(ARX(2, 2), K, y[:CUT], u[:CUT]).detect("innovation", every=20.0, window=4).rule
-    said = track(ARX(2, 2), K, y, u).detect(rule)
-    assert said.start == 50
+    record_alarms = track(ARX(2, 2), K, y, u).detect(rule)
+    assert record_alarms.start == 50
     live = Live(ARX(2, 2), K)
     alarm = live.detect(rule)
     active = []
     for t in range(T):
         live.update(y[t], u[t])
         active.append(alarm.active)
-    assert same(active, said.active)
+    assert same(active, record_alarms.active)
     assert 50 < np.flatnonzero(active)[0] < 300
     assert "on after" in repr(alarm) or "off after" in repr(alarm)
 
@@ -132,13 +132,15 @@ def test_alarms_of_several_outputs(record):
     whole = track(Regression(1, ny=("level", "flow")), K, both, u)
     live = Live(Regression(1, ny=("level", "flow")), K, warm_start=before)
     live.detect(rules)
-    said = {name: whole[name].detect(rule, start=CUT) for name, rule in rules.items()}
+    record_alarms = {name: whole[name].detect(rule, start=CUT) for name, rule in rules.items()}
     for t in range(CUT, CUT + 120):
         live.update(both[t], u[t])
         if t == CUT + 60:
             live = type(live).from_bytes(live.to_bytes())
-        assert {name: alarm.active for name, alarm in live.alarms.items()} == {n: s.active[t] for n, s in said.items()}
-    assert all(len(one.onsets) for one in said.values())
+        assert {name: alarm.active for name, alarm in live.alarms.items()} == {
+            n: s.active[t] for n, s in record_alarms.items()
+        }
+    assert all(len(one.onsets) for one in record_alarms.values())
     ahead, whole = live.forecast(3, u[:3]), track(whole.model, K, both[: CUT + 120], u[: CUT + 120]).forecast(3, u[:3])
     assert all(same(a, b) for a, b in zip(ahead, whole, strict=True))
     with pytest.raises(ValueError, match=r"by the name of their output; got \['speed'\]"):
@@ -215,19 +217,19 @@ def test_a_reference_in_local_time():
     )
     data = pl.DataFrame({"t": local, "y": y, "u": u})
     run = track(ARX(2, 2), K, "y", "u", data=data, time="t", dt=timedelta(hours=1))
-    said = run.detect("band", reference=("2024-01-04", "2024-01-08"))
-    assert said.start == 7 * 24
-    assert said.rule.low == tuple(run.theta[3 * 24 : 7 * 24].min(axis=0).tolist())
+    record_alarms = run.detect("band", reference=("2024-01-04", "2024-01-08"))
+    assert record_alarms.start == 7 * 24
+    assert record_alarms.rule.low == tuple(run.theta[3 * 24 : 7 * 24].min(axis=0).tolist())
 
 
 def test_a_tracker_that_adapts_is_judged_by_the_frozen_model():
     y, u = arx_record(400, 3)
     run = track(ARX(2, 2), AdaptiveKalman(), y, u)
     with pytest.warns(UserWarning, match=r"AdaptiveKalman .* follows a fault: .*\"glr\".*tune"):
-        said = run.detect("innovation", reference=200)
-    assert said.kind == "glr"
+        record_alarms = run.detect("innovation", reference=200)
+    assert record_alarms.kind == "glr"
     other = track(ARX(2, 2), K, y, u).detect(reference=200).rule  # the tracker gives the regressors only
-    assert said.rule.limits == pytest.approx(other.limits, abs=0.1)
+    assert record_alarms.rule.limits == pytest.approx(other.limits, abs=0.1)
     run.detect("band", reference={"b1": (0.0, 2.0)})  # warnings are errors
 
 

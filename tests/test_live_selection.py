@@ -31,17 +31,17 @@ def test_the_weights_are_those_of_the_record(tmp_path):
     y[100], u[200] = np.nan, np.inf
     expected = select(CANDIDATES, y, u, tracker=K).average(0.98)
     live = LiveSelection(CANDIDATES, K, forgetting=0.98)
-    weights, said = np.empty((600, len(CANDIDATES))), np.empty(600)
+    weights, result = np.empty((600, len(CANDIDATES))), np.empty(600)
     for t in range(600):
         if t == 350:
             live.save(tmp_path / "state")
             live = LiveSelection.load(tmp_path / "state")
         weights[t] = live.weights
-        said[t] = live.update(y[t], u[t])
+        result[t] = live.update(y[t], u[t])
     assert_allclose(weights, expected.weights, atol=1e-9)
     known = np.isfinite(expected.y_hat)
     assert known.sum() > 580
-    assert_allclose(said[known], expected.y_hat[known], atol=1e-9)
+    assert_allclose(result[known], expected.y_hat[known], atol=1e-9)
     assert repr(CANDIDATES[STUCK]) in repr(live)
 
 
@@ -61,7 +61,7 @@ def test_it_finds_the_structure_and_finds_it_again_after_a_change():
     assert max(after) <= 22
 
 
-def test_what_cannot_be_weighed_is_said():
+def test_candidates_that_cannot_be_weighed_are_refused():
     for arguments, says in (
         (([], K), "at least one model"), ((CANDIDATES, K, 0.0), "forgetting must be in"),
         ((CANDIDATES, AugmentedFLS(mu=1.0)), "with one variance"), ((CANDIDATES, Bank()), "with one variance"),

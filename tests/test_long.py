@@ -5,7 +5,7 @@ import pytest
 from contract_table import SLOW, as_arx, model_of, ready
 from support import THETA, arx_record
 
-from driftfit import ARX, RLS, AugmentedFLS, InstrumentalVariables, Kalman, Regression, track
+from driftfit import ARX, RLS, AugmentedFLS, InstrumentalVariables, Kalman, OutputError, Regression, track
 from driftfit.run.result import root_mean_square
 from driftfit.trackers import found
 
@@ -28,11 +28,11 @@ def test_a_drifting_system_is_followed_to_the_end(tracker):
     steady = track(ARX(2, 2), RLS(1.0), y, u)
     for part in (slice(1000, 50_000), slice(50_000, LONG)):
         error = root_mean_square(theta[part] - path[part])
-        assert error < 0.04
-        assert error < 0.25 * root_mean_square(steady.theta[part] - path[part])
-        assert root_mean_square(run.innovation[part]) < 1.4 * 0.1
+        assert error < 0.023
+        assert error < 0.09 * root_mean_square(steady.theta[part] - path[part])
+        assert root_mean_square(run.innovation[part]) < 1.25 * 0.1
     first, last = (root_mean_square(run.innovation[part]) for part in (slice(1000, 21_000), slice(80_000, LONG)))
-    assert last == pytest.approx(first, rel=0.05)  # as good at the end as at the start
+    assert last == pytest.approx(first, rel=0.02)  # as good at the end as at the start
 
 
 def unstable_in_closed_loop(T, seed):
@@ -46,6 +46,11 @@ def unstable_in_closed_loop(T, seed):
     return y, u
 
 
+IN_CLOSED_LOOP = {InstrumentalVariables: (30.0, 0.03, 0.3), OutputError: (10.0, 0.012, 0.15)}
+"""Largest prediction, error of the mean and RMS innovation of what assumes an open loop: under feedback instruments and
+simulated outputs are correlated with the noise, and such an estimate wanders, but does not run away."""
+
+
 @pytest.mark.parametrize("tracker", TRACKERS)
 def test_an_unstable_system_with_bounded_output(tracker):
     """Filled lags of an unstable estimate must not run away: outages are cut after na outputs."""
@@ -56,10 +61,9 @@ def test_an_unstable_system_with_bounded_output(tracker):
     run = track(model_of(tracker, ARX(1, 1)), tracker, y, u)
     theta = as_arx(tracker, run.theta, 1, 1)
     assert np.isfinite(theta).all()
-    # under feedback instruments are correlated with the noise: that estimate wanders, but does not run away
-    largest, error = (30.0, 0.3) if isinstance(tracker, InstrumentalVariables) else (10.0, 0.2)
+    largest, off, error = IN_CLOSED_LOOP.get(type(tracker), (6.0, 0.005, 0.11))
     assert np.nanmax(np.abs(run.prediction)) < largest
-    np.testing.assert_allclose(theta[LONG // 2 :].mean(axis=0), [1.1, 1.0], atol=0.05)
+    np.testing.assert_allclose(theta[LONG // 2 :].mean(axis=0), [1.1, 1.0], atol=off)
     assert root_mean_square(run.innovation[run.ok][1000:]) < error
 
 
@@ -103,12 +107,12 @@ def test_a_structure_that_changes_half_way(tracker):
     y, u = arx_record(LONG, 4, theta=path)
     run = track(model_of(tracker, ARX(2, 2)), tracker, y, u, keep="cov" if tracker.covariance else "std")
     theta = as_arx(tracker, run.theta)
-    np.testing.assert_allclose(impulse(theta[half - 2000 : half].mean(axis=0)), impulse(path[0]), atol=0.05)
-    np.testing.assert_allclose(impulse(theta[half + 1000 : half + 3000].mean(axis=0)), impulse(THETA), atol=0.05)
-    np.testing.assert_allclose(impulse(theta[-2000:].mean(axis=0)), impulse(THETA), atol=0.05)
-    if tracker.covariance:  # the order is told from 1 only where it is 2
-        assert told_apart(tracker, run, slice(1000, half, 50)).mean() < 0.1
-        assert told_apart(tracker, run, slice(half + 1000, None, 50)).mean() > 0.95
+    np.testing.assert_allclose(impulse(theta[half - 2000 : half].mean(axis=0)), impulse(path[0]), atol=0.005)
+    np.testing.assert_allclose(impulse(theta[half + 1000 : half + 3000].mean(axis=0)), impulse(THETA), atol=0.007)
+    np.testing.assert_allclose(impulse(theta[-2000:].mean(axis=0)), impulse(THETA), atol=0.015)
+    if tracker.covariance:  # the order is distinguished from 1 only where it is 2
+        assert told_apart(tracker, run, slice(1000, half, 50)).mean() < 0.02
+        assert told_apart(tracker, run, slice(half + 1000, None, 50)).mean() > 0.99
 
 
 def random_walk(T, seed, q, r, n=1):
@@ -191,5 +195,5 @@ def test_augmented_fls_has_a_floor_that_does_not_drift():
     y, u = arx_record(LONG, 10)
     run = track(ARX(2, 2), AugmentedFLS(5.0), y, u)
     early, late = (root_mean_square(run.theta[part] - THETA) for part in (slice(1000, 50_000), slice(50_000, LONG)))
-    assert 0.0 < late < 0.1
-    assert late == pytest.approx(early, rel=0.1)
+    assert 0.02 < late < 0.03
+    assert late == pytest.approx(early, rel=0.05)

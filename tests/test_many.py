@@ -40,23 +40,23 @@ def test_q_values_are_those_of_benjamini_and_hochberg():
 
 
 def test_those_that_move_are_found_and_named(fleet):
-    said = fleet.verdict()
-    assert set(said.drifting) == {f"<{k}>" for k in MOVED}
-    assert said["<1>"].moving == ("b1[u]",)
-    assert said["<1>"].said == fleet["<1>"].verdict()
-    assert said["<1>"].pays
-    assert said.rows[-1].key == "<6>"
-    assert "move in 2 of 6" in said.sentences[0]
-    assert "1 cannot be tested" in said.sentences[-1]
-    table = said.table
-    assert table["key"][0] in said.drifting
+    result = fleet.verdict()
+    assert set(result.drifting) == {f"<{k}>" for k in MOVED}
+    assert result["<1>"].moving == ("b1[u]",)
+    assert result["<1>"].verdict == fleet["<1>"].verdict()
+    assert result["<1>"].pays
+    assert result.rows[-1].key == "<6>"
+    assert "move in 2 of 6" in result.sentences[0]
+    assert "1 cannot be tested" in result.sentences[-1]
+    table = result.table
+    assert table["key"][0] in result.drifting
     assert table.filter(pl.col("drifts"))["moving"].to_list() == ["b1[u]"] * 2
-    printed = {row[0]: row for row in rows_of(said)}
-    for key in said.drifting:
+    printed = {row[0]: row for row in rows_of(result)}
+    for key in result.drifting:
         assert "b1[u]" in printed[key]
     assert not any("b1[u]" in printed[f"<{k}>"] for k in range(7) if k not in MOVED)
     with pytest.raises(KeyError, match="<9>"):
-        said["<9>"]
+        result["<9>"]
 
 
 def test_a_level_is_the_false_discovery_rate(fleet):
@@ -64,7 +64,7 @@ def test_a_level_is_the_false_discovery_rate(fleet):
     strict = fleet.verdict(level=1e-12)
     assert set(strict.drifting) <= {f"<{k}>" for k in MOVED}
     for row in fleet.verdict().rows:
-        assert np.isnan(row.q) or row.q >= row.said.p
+        assert np.isnan(row.q) or row.q >= row.verdict.p
 
 
 def test_ranked_by_change_puts_the_largest_share_first(fleet):
@@ -73,22 +73,22 @@ def test_ranked_by_change_puts_the_largest_share_first(fleet):
     path = np.tile(THETA, (T, 1))
     path[150:, 3] += 0.8
     y, u = arx_record(T, 24, theta=path)
-    said = verdicts({**dict(fleet.items()), "<4>": track(ARX(2, 2), K, y, u)}, 0.05)
-    rows = said.ranked("change").rows
+    result = verdicts({**dict(fleet.items()), "<4>": track(ARX(2, 2), K, y, u)}, 0.05)
+    rows = result.ranked("change").rows
     assert [row.key for row in rows[:2]] == ["<4>", "<1>"]
     assert rows[0].relative == pytest.approx(2.0, abs=0.1)
     assert rows[1].relative == pytest.approx(1.0, abs=0.05)
     assert all(row.relative == 0.0 for row in rows[2:])
     assert {row.key for row in rows} == {f"<{k}>" for k in range(7)}
-    assert said.ranked("change").ranked("clearest").rows == said.rows
+    assert result.ranked("change").ranked("clearest").rows == result.rows
     with pytest.raises(ValueError, match="'change'"):
-        said.ranked("size")
+        result.ranked("size")
 
 
 def test_a_share_of_almost_nothing_is_one_of_its_error(fleet):
     row = fleet.verdict()["<1>"]
-    parts = tuple(replace(m, before=1e-9, after=0.5, std=0.1) if m.moves else m for m in row.said.parameters)
-    assert replace(row, said=replace(row.said, parameters=parts)).relative == pytest.approx(5.0)
+    parts = tuple(replace(m, before=1e-9, after=0.5, std=0.1) if m.moves else m for m in row.verdict.parameters)
+    assert replace(row, verdict=replace(row.verdict, parameters=parts)).relative == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize(("patience", "shown"), [(0.0, 1), (1e9, 0)])
@@ -135,8 +135,8 @@ def test_outputs_of_one_record(tmp_path):
     gain = np.where(np.arange(T) < 150, 1.0, 2.0)
     y = np.column_stack([u @ [1.0, -0.5], gain * u[:, 0]]) + 0.1 * rng.normal(size=(T, 2))
     run = track(Regression(2, ny=("level", "flow")), K, y, u)
-    said = run.verdict()
-    assert said.drifting == ("flow",)
+    result = run.verdict()
+    assert result.drifting == ("flow",)
     assert run.diagnose()["level"]["noise level"].ok
     run.report(tmp_path / "outputs.html")
     page = (tmp_path / "outputs.html").read_text()
@@ -151,32 +151,34 @@ def test_outputs_of_one_record(tmp_path):
 
 
 def test_alarms_of_a_fleet_share_one_rate(fleet):
-    """Each series is watched for its part of the rate; what is found is named, what is too short is told."""
-    said = fleet.detect("band", every=1000.0, reference=140)
-    assert set(said.faulty) == set(said.alarmed) == {f"<{k}>" for k in MOVED}
-    assert len(said) == 6
-    assert "too short" in said.failed["<6>"]
+    """Each series is watched for its part of the rate; what is found is named, and series that are too short are
+    reported.
+    """
+    result = fleet.detect("band", every=1000.0, reference=140)
+    assert set(result.faulty) == set(result.alarmed) == {f"<{k}>" for k in MOVED}
+    assert len(result) == 6
+    assert "too short" in result.failed["<6>"]
     alone = fleet["<1>"].detect("band", every=7000.0, reference=140)
-    assert np.array_equal(said["<1>"].limits, alone.limits)
-    assert np.array_equal(said["<1>"].onsets, alone.onsets)
-    assert said.expected == pytest.approx(6 * 160 / 7000.0)
-    assert [row.q for row in said.rows] == pytest.approx(discoveries(np.array([row.alarms.p for row in said.rows])))
-    assert {row.key for row in said.rows[:2]} == {f"<{k}>" for k in MOVED}
-    table = said.table
-    assert len(table) == sum(len(row.alarms.onsets) for row in said.rows)
+    assert np.array_equal(result["<1>"].limits, alone.limits)
+    assert np.array_equal(result["<1>"].onsets, alone.onsets)
+    assert result.expected == pytest.approx(6 * 160 / 7000.0)
+    assert [row.q for row in result.rows] == pytest.approx(discoveries(np.array([row.alarms.p for row in result.rows])))
+    assert {row.key for row in result.rows[:2]} == {f"<{k}>" for k in MOVED}
+    table = result.table
+    assert len(table) == sum(len(row.alarms.onsets) for row in result.rows)
     assert set(table["key"]) == {f"<{k}>" for k in MOVED}
-    assert said.rows[0].first.endswith(said.rows[0].alarms.cause(int(said.rows[0].alarms.onsets[0])))
-    printed = rows_of(said)
+    assert result.rows[0].first.endswith(result.rows[0].alarms.cause(int(result.rows[0].alarms.onsets[0])))
+    printed = rows_of(result)
     assert ["Alarm", "band,", "one", "false", "alarm", "of", "all", "6", "series", "in", "1000", "samples"] in printed
     assert f"Alarms {len(table)} in 2 series; 0.14 false alarms expected".split() in printed
-    for row in said.rows:
+    for row in result.rows:
         judged = [str(len(row.alarms.onsets)), *row.first.split()]
-        told = next(line for line in printed if line[0] == row.key)
-        assert told[1 : 1 + len(judged)] == judged
-        assert (told[-1] == "fault") == row.faulty
+        printed_row = next(line for line in printed if line[0] == row.key)
+        assert printed_row[1 : 1 + len(judged)] == judged
+        assert (printed_row[-1] == "fault") == row.faulty
     assert ["not", "judged,", "<6>:"] in [line[:3] for line in printed]
     with pytest.raises(KeyError, match="too short"):
-        said["<6>"]
+        result["<6>"]
 
 
 def test_clear_series_are_judged_by_the_limits_of_their_group_and_the_others_by_their_own():
@@ -185,24 +187,24 @@ def test_clear_series_are_judged_by_the_limits_of_their_group_and_the_others_by_
     y = u + 0.1 * rng.normal(size=u.shape)
     y[2, 500:] += 0.2 * u[2, 500:]
     fleet = track(Regression(1), Kalman(q=0.0, r=0.01), y, u, by="row")
-    said, full = fleet.detect("glr", every=1000.0), fleet.detect("glr", every=1000.0, records=64)
-    assert said.faulty == full.faulty == (2,)
-    assert said.alarmed == full.alarmed == (2,)
-    assert said[2].rule == full[2].rule
-    clear = [k for k in fleet if said[k].rule != full[k].rule]
+    result, full = fleet.detect("glr", every=1000.0), fleet.detect("glr", every=1000.0, records=64)
+    assert result.faulty == full.faulty == (2,)
+    assert result.alarmed == full.alarmed == (2,)
+    assert result[2].rule == full[2].rule
+    clear = [k for k in fleet if result[k].rule != full[k].rule]
     assert len(clear) >= 3
     for k in clear:
-        assert min(said[k].p, full[k].p) > 0.05
-        np.testing.assert_allclose(said[k].limits, full[k].limits, rtol=0.15)
+        assert min(result[k].p, full[k].p) > 0.05
+        np.testing.assert_allclose(result[k].limits, full[k].limits, rtol=0.15)
     with pytest.raises(ValueError, match="at least 100 usable samples"):
         fleet.detect("glr", reference=80)
 
 
 def test_every_series_may_have_a_reference_of_its_own(fleet):
     bands = {key: {"b1[u]": (0.5, 1.5)} for key in fleet} | {"<4>": {"b1[u]": (0.5, 2.5)}}
-    said = fleet.detect("band", every=1000.0, reference=bands)
-    assert said.faulty == ("<1>",)
-    assert not said.failed
+    result = fleet.detect("band", every=1000.0, reference=bands)
+    assert result.faulty == ("<1>",)
+    assert not result.failed
 
 
 def test_alarms_of_several_outputs():
@@ -211,9 +213,9 @@ def test_alarms_of_several_outputs():
     y = u * [1.0, -2.0] + 0.1 * rng.normal(size=(600, 2))
     y[400:, 1] += 0.5
     run = track(Regression(1, ny=("level", "flow")), Kalman(q=0.0, r=0.01), y, u)
-    said = run.detect("innovation", reference=300)
-    assert said.faulty == ("flow",)
-    assert 400 <= said["flow"].onsets[0] < 450
+    result = run.detect("innovation", reference=300)
+    assert result.faulty == ("flow",)
+    assert 400 <= result["flow"].onsets[0] < 450
 
 
 def test_without_faults_few_series_are_accused():

@@ -117,7 +117,7 @@ def naive_output_error(y, u, q, r, p0, xi, q_w=1e-6, p_w=0.5):
 
     The first ten outputs are not used."""
     x, P = np.r_[0.0, xi], np.diag(np.r_[p_w, np.full(9, p0)])
-    path, said = [], []
+    path, result = [], []
     for t in range(len(y)):
         y_hat = np.nan
         if t >= 2:
@@ -142,8 +142,8 @@ def naive_output_error(y, u, q, r, p0, xi, q_w=1e-6, p_w=0.5):
                 left = np.eye(10) - np.outer(k, H)
                 P = left @ P @ left.T + r * np.outer(k, k)
         path.append(x[1:].copy())
-        said.append(y_hat)
-    return np.array(path), np.array(said), P[1:, 1:]
+        result.append(y_hat)
+    return np.array(path), np.array(result), P[1:, 1:]
 
 
 def test_the_output_error_filter_of_several_inputs_is_its_naive_twin():
@@ -152,9 +152,9 @@ def test_the_output_error_filter_of_several_inputs_is_its_naive_twin():
     y[[60, 61, 120]] = np.nan
     late = np.r_[np.zeros(10), np.ones(190)]
     run = track(TWO, OutputError(q=1e-6, r=SIGMA**2, p0=0.01, theta0=TRUTH + 0.05), y, u, weights=late)
-    path, said, P = naive_output_error(y, u, 1e-6, SIGMA**2, 0.01, TRUTH + 0.05)
+    path, result, P = naive_output_error(y, u, 1e-6, SIGMA**2, 0.01, TRUTH + 0.05)
     assert_allclose(run.theta[2:], path[2:], rtol=1e-7, atol=1e-9)
-    assert_allclose(run.prediction[10:], said[10:], atol=1e-7)
+    assert_allclose(run.prediction[10:], result[10:], atol=1e-7)
     assert_allclose(run.cov(-1), P, rtol=1e-5, atol=1e-10)
     assert np.abs(run.theta[-1] - TRUTH).max() < 3.0 * run.std[-1].max()
 

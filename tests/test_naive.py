@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from support import BAD, run_lanes
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track
-from driftfit.engine.drivers import WIDTH
+from driftfit.engine.tiles import WIDTH
 
 MODELS = {
     "ARX(1, 1)": lambda start: (ARX(1, 1, start=start), naive.ARX(1, [(1, 1)], False, start)),

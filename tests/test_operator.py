@@ -47,7 +47,7 @@ def test_a_record_cut_in_two_is_the_whole(tracker, cut):
     assert len(more) == len(y)
 
 
-def test_a_fleet_goes_on_from_a_fleet():
+def test_a_fleet_continues_a_fleet():
     y, u = np.stack([record(seed=k)[0] for k in range(12)]), np.stack([record(seed=k)[1] for k in range(12)])
     time = np.arange(200.0)
     whole = track(MODEL, KINDS[0], y, u, by="row", time=time)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support import same
+from support import rows_of, same
 
 from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Live, Regression, track
 
@@ -150,7 +150,9 @@ def test_summary_and_pictures():
     assert "level 119" in repr(run)
     z, phi = measured()
     shared = track(Regression(2, ny=2, shared=True), FLS(50.0), z, phi)
-    assert "One-step prediction error" in str(shared.summary())
+    said = shared.summary()
+    c = said.comparison
+    assert [f"{value:.5g}" for value in (c.tracked, c.persistence, c.constant_ls, c.constant_arx)] in rows_of(said)
     drawn = {axis.get_ylabel(): axis.get_lines()[0].get_ydata() for axis in shared.plot().axes}
     assert all(same(drawn[name][1::2], shared.theta[:, i]) for i, name in enumerate(shared.names))
 

@@ -282,6 +282,28 @@ def test_an_output_missing_before_anything_is_known_is_not_taken_for_theta0():
     assert track(JOINT, Kalman(q=1e-4, r=0.01), y, u).ok[41].all()  # and this one the model's own prediction
 
 
+def test_one_output_of_a_stream():
+    (joint, y, u, _), (shared, *_) = records()
+    run, live = track(joint, TRACKER, y, u), Live(ARX(1, 1, inputs=1, ny=NAMES), TRACKER)
+    flow = live["flow"]
+    for t in range(len(y)):
+        live.update(y[t], u[t])
+    assert (flow.output, flow.names, flow.tracker) == ("flow", run["flow"].names, TRACKER)
+    assert flow.alarm is None
+    np.testing.assert_array_equal(flow.theta, run["flow"].theta[-1])
+    np.testing.assert_array_equal(flow.std, live[1].std)
+    np.testing.assert_array_equal(flow.cov, run["flow"].cov(len(y) - 1))
+    with pytest.raises(ValueError, match="FLS keeps no windowed information"):
+        _ = flow.learning
+    for absent in ("pressure", 2):
+        with pytest.raises(KeyError, match="there are level, flow"):
+            _ = live[absent]
+    with pytest.raises(KeyError, match="one theta"):
+        _ = Live(shared, TRACKER)["flow"]
+    with pytest.raises(TypeError):
+        iter(live)
+
+
 def test_live_loads_a_stream_with_several_outputs(tmp_path):
     (_, y, u, _), (shared, z, phi, _) = records()
     for model, out, given in ((ARX(1, 1, inputs=1, ny=NAMES), y, u), (shared, z, phi)):
@@ -353,18 +375,18 @@ def test_outputs_that_share_one_theta_are_a_track_of_instants():
 
 def test_summaries_are_objects():
     (joint, y, u, _), (shared, z, phi, _) = records()
-    said = track(joint, TRACKER, y, u).summary()
-    assert list(said) == ["level", "flow"]
-    assert said["flow"].rows[0].name == "a1[flow<-level]"
-    assert str(said["flow"]) in str(said)
+    result = track(joint, TRACKER, y, u).summary()
+    assert list(result) == ["level", "flow"]
+    assert result["flow"].rows[0].name == "a1[flow<-level]"
+    assert str(result["flow"]) in str(result)
     run = track(shared, TRACKER, z, phi)
-    said = run.summary()
-    assert said.rows[0].theta == run.theta[-1, 0]
+    result = run.summary()
+    assert result.rows[0].theta == run.theta[-1, 0]
     late = run.innovation[max(50, 5 * run.model.n) :]
     errors = np.sqrt(np.nanmean(late**2, axis=0))
-    assert ", ".join(f"{name} {one:.5g}" for name, one in zip(run.outputs, errors, strict=True)) in str(said)
+    assert ", ".join(f"{name} {one:.5g}" for name, one in zip(run.outputs, errors, strict=True)) in str(result)
     last = np.stack([persistence(one) for one in run.y.T], axis=1)  # of the same output, not of the row before
-    assert said.comparison.persistence == pytest.approx(np.sqrt(np.nanmean((run.y - last)[25:] ** 2)), rel=0.02)
+    assert result.comparison.persistence == pytest.approx(np.sqrt(np.nanmean((run.y - last)[25:] ** 2)), rel=0.02)
 
 
 def test_frontier_and_select_give_a_result_for_each_output():
@@ -477,16 +499,16 @@ def test_alarms_of_outputs_that_share_a_theta():
     y = np.einsum("toi,i->to", phi, [1.0, -2.0]) + 0.1 * rng.standard_normal((400, 2))
     y[300:] += 1.0
     run = track(SHARED, Kalman(q=1e-6, r=0.01), y, phi, time=np.arange(400.0))
-    said = run.detect("innovation", reference=400)
-    assert 600 <= said.onsets[0] < 620
-    assert said.span(said.onsets[0])[0] == str(said.onsets[0] // 2)
+    result = run.detect("innovation", reference=400)
+    assert 600 <= result.onsets[0] < 620
+    assert result.span(result.onsets[0])[0] == str(result.onsets[0] // 2)
     live = Live(SHARED, Kalman(q=1e-6, r=0.01))
-    alarm = live.detect(said.rule)["rows"]
+    alarm = live.detect(result.rule)["rows"]
     for t in range(400):
         live.update(y[t], phi[t], time=float(t))
         if t == 350:
             live = Live.from_bytes(live.to_bytes())
             alarm = live.alarms["rows"]
-    again = run.detect(said.rule)
+    again = run.detect(result.rule)
     assert alarm.samples == 800
     assert alarm.onsets()[0].time == again.onsets[0] // 2

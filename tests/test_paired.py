@@ -12,11 +12,11 @@ from driftfit.judge.statistics.paired import newey_west, paired
 def test_comparison_is_that_of_the_summary():
     y, u = damaged(*arx_record(400, 5))
     run = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u)
-    said, comparison = run.verdict(), run.summary().comparison
-    rms = {rival.name: rival.rms for rival in said.rivals}
-    assert (said.rms, rms["persistence"], rms["constant LS"], rms["constant ARX"]) == comparison[:4]
-    assert said.scored == comparison.samples
-    assert said.samples == int(run.ok.sum())
+    result, comparison = run.verdict(), run.summary().comparison
+    rms = {rival.name: rival.rms for rival in result.rivals}
+    assert (result.rms, rms["persistence"], rms["constant LS"], rms["constant ARX"]) == comparison[:4]
+    assert result.scored == comparison.samples
+    assert result.samples == int(run.ok.sum())
 
 
 def test_paired_is_the_textbook_formula():

@@ -6,7 +6,7 @@ from scipy import stats
 from support import same
 
 from driftfit import JointKalman, Live, ParticleFilter, StateSpace, track
-from driftfit.trackers.particles.draws import normal
+from driftfit.trackers.state_space.draws import normal
 
 BENDING = StateSpace(
     """

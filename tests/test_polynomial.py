@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy import signal
+from support import arx_record
 
 from driftfit import (
     ARMAX,
@@ -145,6 +146,23 @@ def test_missing_data_and_gaps_do_no_harm():
     assert np.abs(run.theta[-1] - THETA)[[0, 1, 4, 5]].max() < 0.25
 
 
+def test_the_noise_model_is_uncertain_in_forecasts_too():
+    """As the lags of an ARX are; and if the noise model is hardly known .90 of the outputs are within 95 % bands, .71
+    within those of the estimate of C and D."""
+    y, u = arx_record(200, 5)
+    as_arx, other = (track(one, Kalman(q=0.0, r=0.01), y, u) for one in (ARX(2, 2), PolynomialModel(na=2, nb=2, nc=0)))
+    ahead, by_response = as_arx.forecast(12, np.ones(12)), other.forecast(12, np.ones(12))
+    np.testing.assert_allclose(by_response.y_std, ahead.y_std, rtol=2e-4)
+    rng = np.random.default_rng(3)
+    inside = []
+    for _ in range(100):
+        u, e = rng.normal(size=25), 0.3 * rng.normal(size=25)
+        y = signal.lfilter([0.0, 1.0], [1.0, -0.7], u) + signal.lfilter([1.0, 0.5], [1.0, -0.8], e)
+        ahead = track(BoxJenkins(), RLS(1.0), y[:15], u[:15]).forecast(10, u[15:])
+        inside.append(np.abs(y[15:] - ahead.y_hat) < 1.96 * ahead.y_std)
+    assert np.mean(inside) > 0.87
+
+
 def test_the_forecast_of_coloured_noise_decays():
     y, u, _ = plant(THETA, 1000, 6)
     live = Live(BJ, Kalman(q=0.0, r=0.25, p0=1e-20, theta0=tuple(THETA)))
@@ -172,7 +190,7 @@ def test_orders_and_names():
     assert parts["F"][0].tolist() == [1.0, -1.5, 0.7]
     with pytest.raises(ValueError, match="different numbers of inputs"):
         OE([1, 1], [1, 1, 1])
-    with pytest.raises(ValueError, match="needs an input"):
+    with pytest.raises(ValueError, match="needs at least 1 input"):
         OE(1, 1).bind(0)
     with pytest.raises(ValueError, match="nothing to estimate"):
         OE(0, 0)
@@ -266,9 +284,9 @@ def test_readings_are_judged_and_not_what_a_shift_leaves_of_them():
     y = 20.0 + signal.lfilter([0.0, 0.5], [1.0, -0.8], u) + 0.05 * rng.normal(size=600)
     model = PolynomialModel(na=1, nb=1, nc=1, nd=1, nf=1)
     coarse = track(model, AdaptiveKalman(), 0.5 * np.round(y / 0.5), u).state
-    assert coarse["quantum"] == 0.5
+    assert coarse["quantum"] == pytest.approx(0.5)
     assert coarse["coarse"] > 0.0
-    y[400], y[500:520] = 9999.0, y[499]
+    y[400], y[500:520] = 40.0, y[499]
     run = track(model, AdaptiveKalman(), y, u)
     assert run.state["left_out"] == 1.0
     assert run.state["frozen_readings"] >= 19.0

@@ -1,4 +1,4 @@
-"""Preparation: what was done is noted, undone exactly, and never looks ahead."""
+"""Preparation: its steps are recorded, can be undone exactly, and never look ahead."""
 
 from __future__ import annotations
 

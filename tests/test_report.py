@@ -67,13 +67,13 @@ def test_page_is_whole_and_loads_nothing(run, tmp_path):
 
 def test_page_says_what_the_judges_say(run):
     text = " ".join(" ".join(read(page(run)).text).split())
-    said, health = run.verdict(), run.diagnose()
-    for sentence in (*said.sentences, *health.sentences):
+    result, health = run.verdict(), run.diagnose()
+    for sentence in (*result.sentences, *health.sentences):
         assert " ".join(sentence.split()) in text
-    assert text.index(said.sentences[0]) < text.index("Parameters over time")
+    assert text.index(result.sentences[0]) < text.index("Parameters over time")
     for name in run.names:
         assert name in text
-    assert f"{said.rms:.5g}" in text
+    assert f"{result.rms:.5g}" in text
     assert f"{len(run) - int(run.ok.sum())} skipped" in text
     assert "largest pole" in text
 
@@ -99,10 +99,10 @@ def test_other_models_and_trackers(tmp_path):
     y, u = arx_record(300, 2)
     for model, tracker in ((Regression(1), K), (ARX(2, 2), AugmentedFLS(mu=10.0))):
         run = track(model, tracker, y, u)
-        said = " ".join(read(page(run)).text)
-        assert all(name in said for name in run.names)
-        assert ("largest pole" in said) == isinstance(model, ARX)
-        assert f"{run.verdict().rms:.5g}" in said
+        shown = " ".join(read(page(run)).text)
+        assert all(name in shown for name in run.names)
+        assert ("largest pole" in shown) == isinstance(model, ARX)
+        assert f"{run.verdict().rms:.5g}" in shown
     read(page(track(ARX(2, 2), K, y[:30], u[:30])))
 
 
@@ -141,15 +141,15 @@ def test_command_line_writes_a_page(tmp_path):
     done = CliRunner().invoke(app, [*base, "--report", str(tmp_path / "r.html")])
     assert done.exit_code == 0, done.output
     expected = track(ARX(2, 2), K, "y", "u", data=str(tmp_path / "r.csv"))
-    said = " ".join(" ".join(read((tmp_path / "r.html").read_text()).text).split())
+    shown = " ".join(" ".join(read((tmp_path / "r.html").read_text()).text).split())
     for sentence in (*expected.verdict().sentences, *expected.diagnose().sentences):
-        assert " ".join(sentence.split()) in said
+        assert " ".join(sentence.split()) in shown
     fleet = CliRunner().invoke(app, [*base, "--by", "unit", "--report", str(tmp_path / "f.html")])
     assert fleet.exit_code == 0, fleet.output
     both = track(ARX(2, 2), K, "y", "u", data=str(tmp_path / "r.csv"), by="unit")
-    said = " ".join(" ".join(read((tmp_path / "f.html").read_text()).text).split())
+    shown = " ".join(" ".join(read((tmp_path / "f.html").read_text()).text).split())
     for sentence in both.verdict().sentences:
-        assert " ".join(sentence.split()) in said
+        assert " ".join(sentence.split()) in shown
 
 
 def test_page_shows_faults_and_alarms(run):

@@ -79,10 +79,10 @@ def test_intervals_hold_their_level(kind, rho, size):
     """95 % of 120 dates, less three standard errors; and they are not the whole record."""
     inside, width = [], []
     for seed in range(60):
-        said = segment(two_jumps(seed, size, kind, rho))
-        if len(said.breaks) == 2:
-            inside += [one.first <= at <= one.last for one, at in zip(said.breaks, AT, strict=True)]
-            width += [one.last - one.first for one in said.breaks]
+        segmentation = segment(two_jumps(seed, size, kind, rho))
+        if len(segmentation.breaks) == 2:
+            inside += [one.first <= at <= one.last for one, at in zip(segmentation.breaks, AT, strict=True)]
+            width += [one.last - one.first for one in segmentation.breaks]
     assert len(inside) > 100
     assert np.mean(inside) > 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / len(inside))
     assert np.median(width) < 25
@@ -108,26 +108,26 @@ def test_parameters_and_standard_errors_of_segments():
     y[[50, 400]] = np.nan
     time = np.datetime64("2024-01-01") + t * np.timedelta64(1, "h")
     run = track(Regression(2), RLS(1.0), y, u, time=time, dt=np.timedelta64(1, "h"))
-    said = run.segment()
-    (only,) = said.breaks
+    segmentation = run.segment()
+    (only,) = segmentation.breaks
     assert only.at == pytest.approx(300, abs=3)
     assert only.date == time[only.at]
     assert only.first <= time[300] <= only.last
-    for part, gain, count in zip(said.segments, (1.0, 2.0), (298, 199), strict=True):
+    for part, gain, count in zip(segmentation.segments, (1.0, 2.0), (298, 199), strict=True):
         assert np.abs((part.theta - [gain, -1.0]) / part.std).max() < 4.0
         assert part.std == pytest.approx(0.3 / np.sqrt(count), rel=3.5 / np.sqrt(count))  # of two standard deviations
-    assert said.theta.shape == (500, 2)
-    assert str(only.date)[:13].replace("T", " ") in said.summary()
-    top, *panels = said.plot().axes
+    assert segmentation.theta.shape == (500, 2)
+    assert str(only.date)[:13].replace("T", " ") in segmentation.summary()
+    top, *panels = segmentation.plot().axes
     np.testing.assert_array_equal(top.lines[0].get_ydata(), run.y)
     for i, panel in enumerate(panels):
-        drawn = [line.get_ydata()[0] for line in panel.lines[: len(said.segments)]]
-        assert drawn == [part.theta[i] for part in said.segments]
+        drawn = [line.get_ydata()[0] for line in panel.lines[: len(segmentation.segments)]]
+        assert drawn == [part.theta[i] for part in segmentation.segments]
         assert panel.lines[-1].get_xdata()[0] == only.date
     assert i == 1
     large = segment(1000.0 * y, u, Regression(2))
     assert [one.at for one in large.breaks] == [only.at]
-    assert large.segments[0].theta == pytest.approx(1000.0 * said.segments[0].theta)
+    assert large.segments[0].theta == pytest.approx(1000.0 * segmentation.segments[0].theta)
 
 
 def test_lags_of_the_output_and_records_that_cannot_be_divided():
@@ -135,8 +135,8 @@ def test_lags_of_the_output_and_records_that_cannot_be_divided():
     u, y = rng.normal(size=600), np.zeros(600)
     for t in range(1, 600):
         y[t] = 0.7 * y[t - 1] + (1.0 if t < 350 else 1.4) * u[t - 1] + 0.2 * rng.normal()
-    said = segment(y, u, ARX(1, 1))
-    assert [one.at for one in said.breaks] == pytest.approx([350], abs=3)
+    segmentation = segment(y, u, ARX(1, 1))
+    assert [one.at for one in segmentation.breaks] == pytest.approx([350], abs=3)
     assert segment(y[:15]).breaks == ()
     assert segment(np.full(100, 3.0)).segments[0].theta == pytest.approx([3.0])
     assert np.isnan(segment(np.full(100, np.nan)).segments[0].theta).all()

@@ -20,7 +20,7 @@ def record():
 
 
 @pytest.fixture(scope="module")
-def said(record):
+def selection(record):
     return select(ORDERS, *record, tracker=K)
 
 
@@ -28,10 +28,10 @@ def terms(run):
     return stats.norm.logpdf(run.innovation, scale=run.innovation_std)
 
 
-def test_loglik_is_that_of_a_run_of_the_model_itself(record, said):
-    assert said.scored == 400
-    for row in said.rows:
-        run = track(said.model(row.name), K, *record)
+def test_loglik_is_that_of_a_run_of_the_model_itself(record, selection):
+    assert selection.scored == 400
+    for row in selection.rows:
+        run = track(selection.model(row.name), K, *record)
         # shorter lags of their own would let a structure begin a sample earlier
         learned = 0.5 * row.n * np.log(100.0)  # in the samples that are not scored
         assert row.loglik == pytest.approx(np.sum(terms(run)[100:]) - learned, rel=1e-4)
@@ -39,26 +39,26 @@ def test_loglik_is_that_of_a_run_of_the_model_itself(record, said):
         assert row.n == run.model.n
 
 
-def test_the_true_structure_is_found(said):
-    assert said.model() == ARX(2, 2, inputs=1)
-    assert said.model(said.simplest).n == 4
-    assert said.rows[0].below == 0.0
-    assert all(a.loglik >= b.loglik for a, b in zip(said.rows, said.rows[1:], strict=False))
-    assert said.regressors() == ("a1", "a2", "b1", "b2")
+def test_the_true_structure_is_found(selection):
+    assert selection.model() == ARX(2, 2, inputs=1)
+    assert selection.model(selection.simplest).n == 4
+    assert selection.rows[0].below == 0.0
+    assert all(a.loglik >= b.loglik for a, b in zip(selection.rows, selection.rows[1:], strict=False))
+    assert selection.regressors() == ("a1", "a2", "b1", "b2")
 
 
 def test_useless_lags_are_within_the_error_and_not_the_simplest():
     y, u = arx_record(400, 6, theta=[0.8, 0.0, 1.0, 0.0])
-    said = select(ORDERS, y, u, tracker=K)
-    assert said.model(said.simplest).n == 2
-    assert max(row.below for row in said.rows) < 25.0
+    selection = select(ORDERS, y, u, tracker=K)
+    assert selection.model(selection.simplest).n == 2
+    assert max(row.below for row in selection.rows) < 25.0
 
 
 def test_delay_is_found_and_structures_share_their_samples():
     y, u = arx_record(400, 5)
     moved = np.concatenate([[np.nan] * 2, y[:-2]])  # an output that was recorded two samples late
-    said = select(grid(ARX, na=2, nb=2, nk=[1, 2, 3]), moved, u, tracker=K)
-    assert said.model().nk == 3
+    selection = select(grid(ARX, na=2, nb=2, nk=[1, 2, 3]), moved, u, tracker=K)
+    assert selection.model().nk == 3
 
 
 def test_subsets_are_all_up_to_five_and_a_search_beyond():
@@ -79,26 +79,26 @@ def test_subsets_are_all_up_to_five_and_a_search_beyond():
     assert max(row.n for row in many.rows) <= 3
 
 
-def test_average_is_the_recursion_written_out(said):
-    got = said.average(0.95)
-    order = [s.name for s in said.structures]
+def test_average_is_the_recursion_written_out(selection):
+    got = selection.average(0.95)
+    order = [s.name for s in selection.structures]
     w = np.full(len(order), 1.0 / len(order))
-    y = said.pool.y
+    y = selection.pool.y
     for t in range(len(y)):
         raised = w**0.95
         raised /= raised.sum()
         assert got.weights[t] == pytest.approx(raised, abs=1e-9)
-        likelihood = np.exp([p.loglik[t] for p in said.predictions])
+        likelihood = np.exp([p.loglik[t] for p in selection.predictions])
         if np.isfinite(likelihood).all():
             w = np.maximum(raised * likelihood / np.sum(raised * likelihood), 1e-300)
     t = 300
-    y_k = np.array([p.y_hat[t] for p in said.predictions])
-    s_k = np.array([p.s[t] for p in said.predictions])
+    y_k = np.array([p.y_hat[t] for p in selection.predictions])
+    s_k = np.array([p.s[t] for p in selection.predictions])
     mean = got.weights[t] @ y_k
     assert got.y_hat[t] == pytest.approx(mean)
     assert got.std[t] ** 2 == pytest.approx(got.weights[t] @ (s_k + (y_k - mean) ** 2))
     assert got.inclusion[t, 0] == pytest.approx(1.0)
-    assert got.rms == pytest.approx(np.sqrt(np.mean((y - got.y_hat)[said.judged] ** 2)))
+    assert got.rms == pytest.approx(np.sqrt(np.mean((y - got.y_hat)[selection.judged] ** 2)))
 
 
 def test_an_average_forgets_nothing_over_missing_samples(record):
@@ -135,27 +135,30 @@ def test_a_model_that_is_no_set_of_columns_runs_by_itself(record):
 
     y, u = record
     models: list[Model] = [Regression(1), Bent(1)]
-    said = select(models, y, u, tracker=K)
-    plain, bent = (next(row for row in said.rows if row.name.startswith(name)) for name in ("Regression", "Bent"))
-    assert bent.loglik - plain.loglik == pytest.approx(0.25 * said.scored)
+    selection = select(models, y, u, tracker=K)
+    plain, bent = (next(row for row in selection.rows if row.name.startswith(name)) for name in ("Regression", "Bent"))
+    assert bent.loglik - plain.loglik == pytest.approx(0.25 * selection.scored)
 
 
-def test_damaged_records_and_the_table(said):
+def test_damaged_records_and_the_table(selection):
     y, u = damaged(*arx_record(500, 3))
     assert select(ORDERS, y, u, tracker=K).model().n == 4
-    assert said.table["name"].to_list() == [row.name for row in said.rows]
-    assert said.table["below"].to_list() == sorted(row.below for row in said.rows)
-    lines = str(said).splitlines()
+    assert selection.table["name"].to_list() == [row.name for row in selection.rows]
+    assert selection.table["below"].to_list() == sorted(row.below for row in selection.rows)
+    lines = str(selection).splitlines()
     shown = [line for line in lines if line.startswith(" ARX(")]
-    assert [float(line.split()[-3]) for line in shown[:4]] == pytest.approx([row.below for row in said.rows], abs=0.06)
-    assert f" best: {said.best}" in lines
-    distances, losses = said.plot(4).axes
-    assert distances.lines[0].get_xdata() == pytest.approx([-row.below for row in said.rows[:4]])
+    assert [float(line.split()[-3]) for line in shown[:4]] == pytest.approx(
+        [row.below for row in selection.rows], abs=0.06
+    )
+    assert f" best: {selection.best}" in lines
+    distances, losses = selection.plot(4).axes
+    assert distances.lines[0].get_xdata() == pytest.approx([-row.below for row in selection.rows[:4]])
     drawn = {line.get_label(): line.get_ydata()[-1] for line in losses.lines[:3]}
     order = {
-        one.name: found.loglik[said.judged].sum() for one, found in zip(said.structures, said.predictions, strict=True)
+        one.name: found.loglik[selection.judged].sum()
+        for one, found in zip(selection.structures, selection.predictions, strict=True)
     }
-    assert drawn == pytest.approx({row.name: order[row.name] - order[said.best] for row in said.rows[1:4]})
+    assert drawn == pytest.approx({row.name: order[row.name] - order[selection.best] for row in selection.rows[1:4]})
 
 
 @pytest.mark.parametrize(
@@ -171,15 +174,15 @@ def test_wrong_settings(arguments, match):
         select(*arguments, u[:, 0], u, tracker=K)
 
 
-def test_other_wrong_settings(record, said):
+def test_other_wrong_settings(record, selection):
     with pytest.raises(ValueError, match="no variance"):
         select(ORDERS, *record, tracker=AugmentedFLS(mu=1.0))
     with pytest.raises(ValueError, match="no regressor"):
         select(ARX(2, 2), *record, tracker=K, keep=["a9"])
     with pytest.raises(ValueError, match="forgetting"):
-        said.average(1.5)
+        selection.average(1.5)
     with pytest.raises(ValueError, match="no structure"):
-        said.model("ARX(9)")
+        selection.model("ARX(9)")
     with pytest.raises(ValueError, match="grid"):
         grid(ARX, na=[-1])
     assert len(grid(ARX, na=[0, 1], nb=[0, 1])) == 3
@@ -193,10 +196,10 @@ def test_orders_and_basis_of_a_hammerstein_wiener_model():
     for t in range(1, 400):
         w[t] = 0.5 * w[t - 1] + v[t - 1] + 0.02 * rng.normal()
     candidates = grid(HammersteinWiener, na=1, nb=1, input=[None, Polynomial(2), Polynomial(3)])
-    said = select(candidates, w, u, tracker=Kalman(q=1e-8, r=4e-4))
-    assert said.model().input == Polynomial(2)
-    run = track(said.model(), Kalman(q=1e-8, r=4e-4), w, u)
-    shared = said.predictions[candidates.index(said.model())]  # in a driver that all candidates share
+    selection = select(candidates, w, u, tracker=Kalman(q=1e-8, r=4e-4))
+    assert selection.model().input == Polynomial(2)
+    run = track(selection.model(), Kalman(q=1e-8, r=4e-4), w, u)
+    shared = selection.predictions[candidates.index(selection.model())]  # in a driver that all candidates share
     np.testing.assert_array_equal(shared.y_hat, run.prediction)
     np.testing.assert_array_equal(shared.loglik, run.log_density)
     assert not run.verdict().drifts

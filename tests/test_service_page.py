@@ -133,10 +133,10 @@ def test_exports_and_history_are_the_samples(service, client):
     part = pl.read_ipc(io.BytesIO(ask("GET", "/api/export?unit=a&format=arrow&from=100&to=109")[1]))
     assert part["time"].to_list() == list(range(100, 110))
     for points in (20, 100, 400):
-        told = json.loads(ask("GET", f"/api/history?unit=a&points={points}")[1])
-        assert told["count"] == 400
-        assert len(told["mean"][0]) <= points
-        low, high, mean = (np.array(told[name][1], float) for name in ("low", "high", "mean"))
+        answer = json.loads(ask("GET", f"/api/history?unit=a&points={points}")[1])
+        assert answer["count"] == 400
+        assert len(answer["mean"][0]) <= points
+        low, high, mean = (np.array(answer[name][1], float) for name in ("low", "high", "mean"))
         assert (min(low), max(high)) == (min(arrow["y"]), max(arrow["y"]))
         assert (low <= mean + 1e-12).all()
         assert (mean <= high + 1e-12).all()
@@ -155,11 +155,11 @@ def test_a_million_samples_are_reduced_by_blocks(tmp_path):
         db.execute("insert into block values (?, ?, ?, ?, ?, ?, ?, ?)", (*row, history.extremes_of(values).tobytes()))
     db.execute("commit")
     begun = time.process_time()
-    told = history.reduced(engine.journal, 1, [], -np.inf, np.inf, 500)
+    answer = history.reduced(engine.journal, 1, [], -np.inf, np.inf, 500)
     assert time.process_time() - begun < 2.0
-    assert told["count"] == 128_000
-    assert len(told["mean"][1]) == 500
-    assert abs(np.mean(told["mean"][1])) < 0.02
+    assert answer["count"] == 128_000
+    assert len(answer["mean"][1]) == 500
+    assert abs(np.mean(answer["mean"][1])) < 0.02
     engine.close()
 
 
@@ -274,9 +274,9 @@ def started(port, *what):
 
 def stopped(process):
     process.send_signal(signal.SIGTERM)
-    said = process.communicate(timeout=60)[1]
-    assert process.returncode == 0, said
-    return [json.loads(line) for line in said.splitlines() if line.startswith("{")]
+    result = process.communicate(timeout=60)[1]
+    assert process.returncode == 0, result
+    return [json.loads(line) for line in result.splitlines() if line.startswith("{")]
 
 
 @pytest.mark.skipif(browser.PROGRAM is None, reason="needs Chromium")
@@ -365,4 +365,6 @@ def test_the_docs_lead_to_an_alarm_on_a_phone(tmp_path):
         process.stderr.close()
         server.shutdown()
         server.server_close()
-    assert any(who == "pump 1" and said.startswith("pump 1: band alarm, b1[pressure] is ") for who, said in Phone.got)
+    assert any(
+        who == "pump 1" and result.startswith("pump 1: band alarm, b1[pressure] is ") for who, result in Phone.got
+    )

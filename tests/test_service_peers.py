@@ -121,14 +121,14 @@ def test_mqtt_through_an_absence_of_the_broker(tmp_path):
     broker = Broker(tmp_path)
     url = f"mqtt://127.0.0.1:{broker.port}"
     source = f'[source.plant]\nkind = "mqtt"\nurl = "{url}"\ntopic = "plant/+"\n'
-    sink = f'[[sink]]\nkind = "mqtt"\nurl = "{url}"\ntopic = "told/{{pump}}"\n'
+    sink = f'[[sink]]\nkind = "mqtt"\nurl = "{url}"\ntopic = "received/{{pump}}"\n'
     config = configured(UNIT, sink, source)
     engine = opened(config, tmp_path / "folder")
     got, y, u = {}, *record(300)
     listener = Client(CallbackAPIVersion.VERSION2, "listener", clean_session=False)
     listener.on_message = lambda client, user, one: got.setdefault(one.topic, []).append(json.loads(one.payload))
     listener.connect("127.0.0.1", broker.port)
-    listener.on_connect = lambda client, *_: client.subscribe([("told/#", 1)])
+    listener.on_connect = lambda client, *_: client.subscribe([("received/#", 1)])
     listener.loop_start()
     sender = Client(CallbackAPIVersion.VERSION2, "sender")
     sender.connect("127.0.0.1", broker.port)
@@ -147,16 +147,16 @@ def test_mqtt_through_an_absence_of_the_broker(tmp_path):
         send(range(150, 300))
         broker.start()
         until(lambda: engine.samples >= 300, 40)
-        until(lambda: len({one["number"] for one in got.get("told/7", [])}) >= 300, 40)
+        until(lambda: len({one["number"] for one in got.get("received/7", [])}) >= 300, 40)
     sender.loop_stop()
     listener.loop_stop()
     broker.stop()
     run = track(MODEL, TRACKER, y, u, time=np.arange(300) * 1.0, dt=1.0)
     assert np.array_equal(engine.units.get(engine.units.names["7"]).live.theta, run.theta[-1])
     assert engine.units.refused["unreadable"] == 1
-    told = {one["number"]: one for one in got["told/7"]}
-    assert sorted(one["time"] for one in told.values()) == list(range(300))
-    assert next(one for one in told.values() if one["time"] == 299.0)["theta"]["a1"] == run.theta[-1, 0]
+    received = {one["number"]: one for one in got["received/7"]}
+    assert sorted(one["time"] for one in received.values()) == list(range(300))
+    assert next(one for one in received.values() if one["time"] == 299.0)["theta"]["a1"] == run.theta[-1, 0]
     engine.close()
 
 
@@ -306,10 +306,10 @@ def test_kafka(tmp_path):
     reader.close()
     assert first == [k for k in range(20) if k != 5]
     assert batch.samples[0].topic == "plant/7"
-    writer = Sink("out", brokers, "told").open()
+    writer = Sink("out", brokers, "received").open()
     writer.write(outcome())
     consumer = Consumer({"bootstrap.servers": brokers, "group.id": "t", "auto.offset.reset": "earliest"})
-    consumer.subscribe(["told"])
+    consumer.subscribe(["received"])
     got = []
     until(
         lambda: (

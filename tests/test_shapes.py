@@ -7,7 +7,7 @@ import pandas as pd
 import polars as pl
 import pyarrow as pa
 import pytest
-from support import arx_record, same
+from support import arx_record, rows_of, same
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Live, Regression, track
 
@@ -73,7 +73,7 @@ def test_a_sample_outside_the_record_is_named(t):
         track(ARX(2, 2), K, Y, U).cov(t)
 
 
-def test_no_covariance_is_said_so():
+def test_a_missing_covariance_is_reported():
     with pytest.raises(ValueError, match="AugmentedFLS carries no covariance"):
         track(ARX(2, 2), AugmentedFLS(1.0), Y, U, keep="cov")
     assert np.isnan(track(ARX(2, 2), AugmentedFLS(1.0), Y, U).loglik)
@@ -171,4 +171,7 @@ def test_a_record_of_one_sample():
     assert len(run) == 1
     assert not run.ok.any()
     assert np.isinf(run.std).all()
-    assert str(run.summary())
+    printed = rows_of(run.summary())
+    assert ["1,", "0", "used,", "1", "skipped"] in [line[1:] for line in printed]
+    assert ["a1", "0", "inf", "-inf", "inf", "0", "0"] in printed
+    assert "nothing to compare" in str(run.summary())

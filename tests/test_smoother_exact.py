@@ -176,7 +176,7 @@ def test_records_of_every_length_are_eliminated_from_both_ends(L):
     assert quick.cost == pytest.approx(safe.cost, rel=1e-10, abs=1e-20)
 
 
-def test_memory_beside_the_result_is_a_small_part_of_it():
+def test_the_smoother_needs_little_memory_in_addition_to_its_result():
     phi, y = record(20_000, 4)
     run = track(Regression(4), FLS(30.0), y, phi)
     run.smooth()
@@ -413,8 +413,13 @@ def test_bands_cover_when_the_model_is_true():
 
 def test_picture_shows_every_parameter():
     phi, y = record(40, 2)
-    figure = track(Regression(["gain", "offset"]), FLS(mu=3.0), y, phi).smooth().plot()
+    path = track(Regression(["gain", "offset"]), FLS(mu=3.0), y, phi).smooth()
+    figure = path.plot()
     assert [axis.get_ylabel() for axis in figure.axes] == ["gain", "offset"]
+    for i, axis in enumerate(figure.axes):
+        np.testing.assert_array_equal(
+            [line.get_ydata() for line in axis.lines], [path.theta[:, i], path.run.theta[:, i]]
+        )
     with pytest.raises(ValueError, match="level must be between"):
         track(Regression(2), FLS(mu=3.0), y, phi).smooth().band(95)
 
@@ -434,7 +439,9 @@ def test_what_the_record_does_not_determine_is_as_asked():
 
 
 def test_noise_that_the_model_adds_is_the_noise_of_the_smoother():
-    """Measurement noise that comes in through a curve, beside the user's weights: the last point is the filter's."""
+    """Measurement noise that enters through a curve, in addition to the user's weights: the last point is the
+    filter's.
+    """
     s = linear_record()
     weights = np.random.default_rng(2).uniform(0.3, 2.0, len(s[0]))
     model = HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2), output_noise=0.05)

@@ -51,7 +51,7 @@ def test_bytes_of_an_older_version_are_read_by_the_names_of_fields():
     np.testing.assert_allclose(live.update(1.0, 1.0, time=8.0), golden().update(1.0, 1.0, time=8.0), rtol=1e-12)
 
 
-def test_a_state_is_a_few_hundred_bytes_beside_its_numbers():
+def test_a_state_is_its_numbers_and_a_few_hundred_bytes():
     live = Live(ARX(2, 2), K)
     for t in range(60):
         live.update(Y[t], U[t])
@@ -169,16 +169,16 @@ def test_fates_of_dates_are_those_of_numbers():
 
 
 def test_rows_in_order_have_the_same_fates_with_and_without_sorting(monkeypatch):
-    rng, quick, counted = np.random.default_rng(4), late._all_in_order, Counter()
+    rng, quick, counted = np.random.default_rng(4), late.all_in_order, Counter()
     for _ in range(300):
         series, time = np.sort(rng.integers(0, 3, 6)), np.cumsum(rng.integers(0, 3, 6)) * 1.0
         time[rng.uniform(size=6) < 0.03] = rng.choice([np.nan, np.inf])
         newest = rng.choice([np.nan, 0.0, 2.0], 3)
         given = series, time, np.zeros(6, bool), newest, 0.0
-        monkeypatch.setattr(late, "_all_in_order", quick)
+        monkeypatch.setattr(late, "all_in_order", quick)
         counted[quick(series, time, newest) is not None] += 1
         found = sort_out(*given)
-        monkeypatch.setattr(late, "_all_in_order", lambda *_: None)
+        monkeypatch.setattr(late, "all_in_order", lambda *_: None)
         assert all(map(same, found, sort_out(*given)))
     assert min(counted[True], counted[False]) > 20
 

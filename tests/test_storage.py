@@ -13,7 +13,7 @@ from support import arx_record, same
 from driftfit import ARX, RLS, DataWarning, Kalman, Live, Track, track
 from driftfit.data import storage
 from driftfit.run.states import layout as states
-from driftfit.run.warm_start import UNSAID
+from driftfit.run.warm_start import ABSENT
 
 Y, U = arx_record(60, 1)
 
@@ -209,7 +209,7 @@ def test_a_state_that_was_written_as_npz_is_read(tmp_path):
     for t in range(60):
         live.update(Y[t], U[t])
     header, _ = live._written()
-    header = {"kind": "state", "model": header["model"], "tracker": header["tracker"], "extra": dict(UNSAID)}
+    header = {"kind": "state", "model": header["model"], "tracker": header["tracker"], "extra": dict(ABSENT)}
     storage.write(tmp_path / "old", header, {f"state_{name}": value for name, value in live.lane().items()})
     again = Live.load(tmp_path / "old")
     assert same(again.update(1.0, 2.0), live.update(1.0, 2.0))

@@ -71,7 +71,7 @@ def test_comparison_uses_the_samples_that_all_can_predict():
     assert got.constant_ls == pytest.approx(np.sqrt(np.mean((y - expected)[scored] ** 2)), rel=1e-7)
 
 
-def test_persistence_is_the_last_output_seen():
+def test_persistence_is_the_last_observed_output():
     y = np.array([np.nan, 1.0, np.nan, np.nan, 4.0, 5.0])
     assert same(persistence(y), [np.nan, np.nan, 1.0, 1.0, 1.0, 4.0])
 

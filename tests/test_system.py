@@ -103,7 +103,7 @@ def test_jacobian_of_a_known_function():
     assert got[0] == pytest.approx(np.array([[2.0, 1.0], [2.0, 0.0]]))
 
 
-def test_one_step_ahead_is_what_the_run_said(run):
+def test_one_step_ahead_is_the_prediction_of_the_run(run):
     got = run.ahead(1)
     assert got.y_hat[3:] == pytest.approx(run.prediction[3:])
     assert got.y_std[10:] == pytest.approx(run.innovation_std[10:])
@@ -206,7 +206,7 @@ def test_picture_of_the_system_shows_what_is_computed(run):
 def test_picture_of_a_validation_says_the_fit(run):
     y, u = arx_record(100, 7)
     signal, error = run.plot_validation(y, u).axes
-    said = run.simulate(u, y=y[:2])
-    assert np.allclose(signal.lines[1].get_ydata(), said.y_hat)
-    assert np.allclose(error.lines[0].get_ydata(), y - said.y_hat)
-    assert signal.get_title(loc="left") == f"fit {fit(y[2:], said.y_hat[2:]):.1f} %"
+    result = run.simulate(u, y=y[:2])
+    assert np.allclose(signal.lines[1].get_ydata(), result.y_hat)
+    assert np.allclose(error.lines[0].get_ydata(), y - result.y_hat)
+    assert signal.get_title(loc="left") == f"fit {fit(y[2:], result.y_hat[2:]):.1f} %"

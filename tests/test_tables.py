@@ -104,7 +104,7 @@ def test_nullable_types_of_pandas():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_rows_are_put_in_order_and_the_first_of_a_time_stands(kind):
+def test_rows_are_sorted_and_of_several_at_one_time_the_first_is_used(kind):
     y, u = signals()
     time = np.arange(T) * 2.0
     shuffled = np.random.default_rng(3).permutation(T)

@@ -168,7 +168,7 @@ def test_several_inputs_in_use():
     assert np.std(again - y[5:45]) < 0.1
 
 
-def test_what_several_inputs_cannot_have_is_said():
+def test_settings_that_several_inputs_cannot_have_are_refused():
     y, u, _ = record(T=200)
     with pytest.raises(ValueError, match="has 2 inputs, but u has 1 columns; give input= a list"):
         track(VALVES, K, y, u[:, :1])
@@ -189,11 +189,11 @@ def test_forecasts_never_warn(h):
         run = track(VALVES, K, output, u[: len(output)])
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            told = run.forecast(h, u=np.resize(u, (h, 2)))
+            forecast = run.forecast(h, u=np.resize(u, (h, 2)))
             silent = run.forecast(h)
-        assert (np.isfinite(told.y_std) | np.isnan(told.y_hat)).all()
+        assert (np.isfinite(forecast.y_std) | np.isnan(forecast.y_hat)).all()
         assert h == 1 or np.isnan(silent.y_hat[-1])
         if output is y:
-            assert told.y_std[-1] == pytest.approx(0.02 if h == 1 else 0.02 / 0.6, rel=0.05)
+            assert forecast.y_std[-1] == pytest.approx(0.02 if h == 1 else 0.02 / 0.6, rel=0.05)
         elif h == 2000:
-            assert np.nanmax(told.y_std) > 1e30  # up to where readings end
+            assert np.nanmax(forecast.y_std) > 1e30  # up to where readings end

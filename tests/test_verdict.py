@@ -155,15 +155,15 @@ def test_the_larger_a_fault_the_surer():
         assert constancy(phi, y + size * np.clip((np.arange(1000) - 700) / 60.0, 0.0, 1.0)).p_joint < 1e-4
 
 
-def test_a_passing_fault_is_told_as_such():
+def test_a_temporary_fault_is_reported_as_such():
     phi, y = fault(30.0)
-    said = track(Regression(1, intercept=True), Kalman(q=1e-3, r=0.25), y, phi[:, 0]).verdict()
-    assert said.moving == ("intercept",)
-    moved = said.parameters[1]
+    result = track(Regression(1, intercept=True), Kalman(q=1e-3, r=0.25), y, phi[:, 0]).verdict()
+    assert result.moving == ("intercept",)
+    moved = result.parameters[1]
     assert (moved.before, moved.after, moved.last) == pytest.approx((32.0, 2.0, 32.0), abs=0.2)
     assert moved.at == pytest.approx(560, abs=5)
-    assert "from 32" in said.sentences[1]
-    assert "back to 3" in said.sentences[1]
+    assert "from 32" in result.sentences[1]
+    assert "back to 3" in result.sentences[1]
 
 
 def test_what_returns_to_where_it_was_is_not_named_as_a_move():
@@ -180,22 +180,22 @@ def test_the_headline_is_one_statement_of_both_answers():
     rng = np.random.default_rng(3)
     u = rng.normal(size=600)
     y = np.sin(2.0 * np.pi * np.arange(600) / 40.0) * u + 0.2 * rng.normal(size=600)
-    said = track(Regression(1, intercept=True), Kalman(q=0.02, r=0.04), y, u).verdict()
-    assert said.drifts is False
-    assert said.pays
-    assert "No drift" not in str(said)
-    assert said.sentences[0].startswith("Tracking reduces the error")
-    assert "smaller than that of constants" in said.sentences[0]
+    result = track(Regression(1, intercept=True), Kalman(q=0.02, r=0.04), y, u).verdict()
+    assert result.drifts is False
+    assert result.pays
+    assert "No drift" not in str(result)
+    assert result.sentences[0].startswith("Tracking reduces the error")
+    assert "smaller than that of constants" in result.sentences[0]
 
 
 def test_a_mean_that_wanders_as_noise_does_is_followed_as_well_by_lags():
     e = signal.lfilter([1.0], [1.0, -0.95], np.random.default_rng(3).normal(size=600))
-    said = track(Regression(0, intercept=True), Kalman(q=1.0, r=0.1), 5.0 + e).verdict()
-    assert said.drifts is False
-    assert said.pays is False
-    assert said.rivals[1].p < 1e-4
+    result = track(Regression(0, intercept=True), Kalman(q=1.0, r=0.1), 5.0 + e).verdict()
+    assert result.drifts is False
+    assert result.pays is False
+    assert result.rivals[1].p < 1e-4
     assert (
-        "Tracking them predicts better than constants, but not than constants with two more lags" in said.sentences[0]
+        "Tracking them predicts better than constants, but not than constants with two more lags" in result.sentences[0]
     )
 
 
@@ -241,15 +241,15 @@ def test_the_parameter_that_moves_is_named_where_regressors_are_correlated():
     theta = np.tile([1.0, 2.0, -1.0], (T, 1))
     theta[350:, 1] = 2.6
     y = np.sum(phi * theta, axis=1) + 0.5 * rng.normal(size=T)
-    said = track(Regression(3), Kalman(q=1e-3, r=0.25), y, phi).verdict()
-    assert said.drifts
-    assert said.moving == ("theta2",)
-    moved = said.parameters[1]
+    result = track(Regression(3), Kalman(q=1e-3, r=0.25), y, phi).verdict()
+    assert result.drifts
+    assert result.moving == ("theta2",)
+    moved = result.parameters[1]
     assert abs(moved.at - 350) < 15
     assert moved.before == pytest.approx(2.0, abs=0.1)
     assert moved.after == pytest.approx(2.6, abs=0.1)
     assert 0.6 / moved.std > 5.0
-    assert said.parameters[0].p < 0.05  # Hansen's own statistic sees the move in all scores
+    assert result.parameters[0].p < 0.05  # Hansen's own statistic sees the move in all scores
 
 
 def test_the_interval_holds_the_date():
@@ -270,23 +270,25 @@ def test_the_interval_holds_the_date():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_parameters_that_are_not_told_apart_are_named_as_a_group(seed):
+def test_parameters_that_cannot_be_distinguished_are_named_as_a_group(seed):
     """Regressors with correlation 0.999: one of the two moves, and which one nobody can tell."""
     rng = np.random.default_rng(seed)
     u = rng.normal(size=(400, 3)) @ [[1.0, 0.999, 0.0], [0.0, 0.045, 0.0], [0.0, 0.0, 1.0]]
     y = u.sum(axis=1) + 0.5 * u[:, 0] * (np.arange(400) >= 250) + 0.5 * rng.normal(size=400)
-    said = track(Regression(3), Kalman(q=1e-3, r=0.25), y, u).verdict()
-    assert said.drifts
-    assert said.moving == ()
-    assert said.alike == ("theta1", "theta2")
-    assert abs(int(said.since) - 250) < 15
-    assert f"It is one of theta1, theta2, from about {said.since}" in said.sentences[1]
+    result = track(Regression(3), Kalman(q=1e-3, r=0.25), y, u).verdict()
+    assert result.drifts
+    assert result.moving == ()
+    assert result.alike == ("theta1", "theta2")
+    assert abs(int(result.since) - 250) < 15
+    assert f"It is one of theta1, theta2, from about {result.since}" in result.sentences[1]
     still = track(Regression(3), Kalman(q=1e-3, r=0.25), y[:250], u[:250]).verdict()
     assert still.alike == ()
 
 
 def test_steps_are_found_one_after_the_other_with_their_sizes():
-    """A large move of one gain of an ARX system makes others look moved; two steps of two parameters are told apart."""
+    """A large move of one gain of an ARX system makes others seem to move; two steps of two parameters are
+    distinguished.
+    """
     phi, y = record(600, 8)
     y += 2.0 * phi[:, 0] * (np.arange(600) >= 200) - 0.8 * phi[:, 2] * (np.arange(600) >= 450)
     got = attribute(phi, y, constancy(phi, y), 0.05)
@@ -297,9 +299,9 @@ def test_steps_are_found_one_after_the_other_with_their_sizes():
     assert (np.abs(got.after - got.before - [2.0, 0.0, -0.8])[[0, 2]] < 3.3 * got.std[[0, 2]]).all()
     assert got.std[0] == pytest.approx(np.sqrt(1 / 200 + 1 / 400), rel=0.3)
     path = np.where(np.arange(600)[:, None] < 350, THETA, THETA + np.array([0.0, 0.0, 1.0, 0.0]))
-    said = track(ARX(2, 2), Kalman(q=1e-3, r=0.01), *arx_record(600, 1, theta=path)).verdict()
-    assert said.moving == ("b1",)
-    assert int(said.parameters[2].when) == pytest.approx(350, abs=3)
+    result = track(ARX(2, 2), Kalman(q=1e-3, r=0.01), *arx_record(600, 1, theta=path)).verdict()
+    assert result.moving == ("b1",)
+    assert int(result.parameters[2].when) == pytest.approx(350, abs=3)
 
 
 def test_robust_fit_is_the_minimum_of_hubers_loss():
@@ -334,10 +336,10 @@ def test_following_correlated_noise_does_not_pay():
         rng = np.random.default_rng(seed)
         e, u = signal.lfilter([1.0], [1.0, -0.9], rng.normal(size=(2, 600)))[:, 300:]
         run = track(Regression(1, intercept=True), Kalman(q=0.5, r=0.5), 0.5 * u + e, u)
-        said = run.verdict()
-        assert said.rms < said.rivals[1].rms
-        assert said.constants.name == "LS with lags"
-        pays.append(said.pays)
+        result = run.verdict()
+        assert result.rms < result.rivals[1].rms
+        assert result.constants.name == "LS with lags"
+        pays.append(result.pays)
     assert sum(pays) <= 2
     b = np.where(np.arange(300) < 150, 0.5, 2.0)
     moved = track(Regression(1, intercept=True), Kalman(q=0.01, r=1.0), b * u + rng.normal(size=300), u).verdict()
@@ -378,22 +380,22 @@ def test_the_test_of_an_arx_model_in_correlated_noise_has_the_lags_that_make_it_
     constants = robust_fit(X, y[5:])
     found = noise(orthonormal(X)[0], constants.residual, 200, 16, 0)._replace(ar=a, level=np.ones(295))
     rows = whitened(X, y[5:], a)[0]
-    beside = missing_lags(X, rows, found)
-    assert beside.shape == (295, 2)
-    assert beside.T @ beside == pytest.approx(295.0 * np.eye(2), abs=1e-6)
-    both = np.column_stack([rows, beside])
+    lagged = missing_lags(X, rows, found)
+    assert lagged.shape == (295, 2)
+    assert lagged.T @ lagged == pytest.approx(295.0 * np.eye(2), abs=1e-6)
+    both = np.column_stack([rows, lagged])
     for column in np.column_stack(lags)[6:].T:
         assert column == pytest.approx(both[1:] @ np.linalg.lstsq(both[1:], column, rcond=None)[0], abs=1e-6)
 
 
 def test_records_that_can_tell_nothing():
     y, u = arx_record(20, 1)
-    said = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u).verdict()
-    assert np.isnan(said.p)
-    assert said.drifts is None
-    assert said.pays is None
-    assert "18 samples can be used, and at least 24 are needed" in said.sentences[0]
-    assert "0 samples remain after the first 50" in said.sentences[0]
+    result = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u).verdict()
+    assert np.isnan(result.p)
+    assert result.drifts is None
+    assert result.pays is None
+    assert "18 samples can be used, and at least 24 are needed" in result.sentences[0]
+    assert "0 samples remain after the first 50" in result.sentences[0]
     assert track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u).verdict(burn=5).scored == 15
     same = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), *arx_record(200, 1)[:1], np.zeros(200)).verdict()
     assert np.isnan(same.p)
@@ -407,8 +409,8 @@ def test_weights_are_the_noise_that_the_test_takes_out():
     weights = np.where(np.arange(300) < 200, 1.0, 0.04)
     y = phi @ np.arange(1.0, 4.0) + (y - phi @ np.arange(1.0, 4.0)) / np.sqrt(weights)
     root = np.sqrt(weights)
-    said = track(Regression(3), Kalman(q=1e-3, r=0.25), y, phi, weights=weights).verdict()
-    assert said.p == pytest.approx(constancy(phi * root[:, None], y * root).p_joint, rel=1e-9)
+    result = track(Regression(3), Kalman(q=1e-3, r=0.25), y, phi, weights=weights).verdict()
+    assert result.p == pytest.approx(constancy(phi * root[:, None], y * root).p_joint, rel=1e-9)
 
 
 def test_holm_by_hand():

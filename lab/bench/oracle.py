@@ -32,28 +32,29 @@ def oracle(record: Record) -> Outcome:
 def known_walk(y: Array, phi: Array, na: int, q: Array, r: Array) -> Outcome:
     """The filter with q (T, n) and r (T,); the first ``na`` columns of phi are lags of y."""
     T, n = phi.shape
-    theta, P, filled, run_of = np.zeros(n), DIFFUSE * np.eye(n), np.full(T + na, np.nan), 0
     out = Outcome(np.empty((T, n)), np.empty((T, n)), np.full(T, np.nan), np.full(T, np.nan))
-    _loop(np.ascontiguousarray(y), np.ascontiguousarray(phi), na, q, r, theta, P, filled, run_of, *out)
+    _loop(np.ascontiguousarray(y), np.ascontiguousarray(phi), na, np.column_stack([q, r]), *out)
     return out
 
 
 @Driver
 def _loop(
-    y: Array, phi: Array, na: int, q: Array, r: Array, theta: Array, P: Array, filled: Array, missing: int,
-    thetas: Array, stds: Array, predictions: Array, prediction_stds: Array,
+    y: Array, phi: Array, na: int, variances: Array, thetas: Array, stds: Array, predictions: Array,
+    prediction_stds: Array,
 ) -> None:  # fmt: skip
-    n = len(theta)
+    """``variances`` (T, n + 1) are q and r of every sample."""
+    T, n = phi.shape
+    theta, P, filled, missing = np.zeros(n), DIFFUSE * np.eye(n), np.full(T + na, np.nan), 0
     for t in range(len(y)):
         x = phi[t].copy()
         for i in range(na):
             x[i] = filled[t + na - 1 - i]
         for i in range(n):
-            P[i, i] += q[t, i]
+            P[i, i] += variances[t, i]
         known, y_hat = np.isfinite(x).all(), np.nan
         if known:
             g = P @ x
-            s, y_hat = x @ g + r[t], x @ theta
+            s, y_hat = x @ g + variances[t, n], x @ theta
             predictions[t], prediction_stds[t] = y_hat, np.sqrt(s)
             if np.isfinite(y[t]):
                 theta += g * ((y[t] - y_hat) / s)

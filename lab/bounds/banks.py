@@ -57,13 +57,13 @@ def trespassed(lane: Any) -> list[str]:
     """The arrays after which something was written."""
     from driftfit.trackers.bank.layout import PACKED, REPORTED, ROW
 
-    said = []
+    result = []
     for name in PACKED:
         start, rows, columns = lane["table"][ROW[name]]
         after = start // 8 + rows * columns
         if name not in REPORTED and not np.isnan(lane["memory"][after : after + APART]).all():
-            said.append(f"written beyond {name}")
-    return said
+            result.append(f"written beyond {name}")
+    return result
 
 
 def drawn(rng: np.random.Generator, form: str, quick: bool) -> tuple[Any, Any, dict[str, Any]]:
@@ -179,7 +179,7 @@ def run_banks(seeds: range, quick: bool, noted: Noted) -> int:
         each = list(run.values()) if len(model.outputs) > 1 else [run]
         for one in each:
             one.hypotheses.found()
-        wrong = noted.take() + [said for one in each for said in faults(one)]
+        wrong = noted.take() + [result for one in each for result in faults(one)]
         if wrong:
             bad += 1
             print(f"bank {seed}: {bank!r}\n    " + "\n    ".join(wrong), flush=True)

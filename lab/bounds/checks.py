@@ -40,9 +40,9 @@ class Noted:
 
     def take(self) -> list[str]:
         """The violations since the last call."""
-        said = [f"{place}: index {index} of {size}" for place, (index, size) in sorted(self.places.items())]
+        result = [f"{place}: index {index} of {size}" for place, (index, size) in sorted(self.places.items())]
         self.places.clear()
-        return said
+        return result
 
 
 def watch() -> Noted:

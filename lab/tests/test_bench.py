@@ -57,7 +57,7 @@ def test_oracle_is_the_kalman_filter_where_the_drift_is_constant(record):
     close(oracle.oracle(record), Outcome.of(run))
 
 
-def test_oracle_is_told_jumps_and_outliers():
+def test_the_oracle_knows_jumps_and_outliers():
     jumpy = simulated("sparse_jumps", "regression", 3, 400)
     jump = np.flatnonzero(jumpy.truth.q.any(axis=1))
     found_claims = oracle.oracle(jumpy)

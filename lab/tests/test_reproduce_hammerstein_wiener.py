@@ -106,10 +106,10 @@ def test_the_bias_is_the_mean_error():
 def test_the_command_runs():
     result = CliRunner().invoke(app, ["reproduce", "hammerstein-wiener", "--quick"])
     assert result.exit_code == 0, result.output
-    said = " ".join(result.output.split())
-    assert "1 seed; largest deviation" in said
-    assert "Estimates reach a small error from any start: holds" in said
-    assert "A higher order is more accurate (example 4): not judged with one order" in said
+    printed = " ".join(result.output.split())
+    assert "1 seed; largest deviation" in printed
+    assert "Estimates reach a small error from any start: holds" in printed
+    assert "A higher order is more accurate (example 4): not judged with one order" in printed
     for example_, _, what, *_ in tables.ROWS:
-        assert f"{example_} {what}" in said
-    assert "ns of the filter" in said
+        assert f"{example_} {what}" in printed
+    assert "ns of the filter" in printed

@@ -129,8 +129,8 @@ def test_no_verdict_is_left_out():
 class Made:
     """Tables of banks whose values are 1 but where said, by (table, row, column)."""
 
-    def __init__(self, **said):
-        self.said = {tuple(key.split("|")): value for key, value in said.items()}
+    def __init__(self, **result):
+        self.said = {tuple(key.split("|")): value for key, value in result.items()}
 
     def __getitem__(self, table):
         return _Table(self, table)

@@ -12,9 +12,9 @@ OLD = f"{structure.MOVED}^"
 
 
 def test_the_present_structure_is_printed_and_drawn(tmp_path):
-    said = CliRunner().invoke(app, ["structure", "--picture", str(tmp_path / "layers.png")])
-    assert said.exit_code == 0, said.output
-    rows = {line[:40].strip(): line.split()[-1] for line in said.output.splitlines() if line.strip()}
+    result = CliRunner().invoke(app, ["structure", "--picture", str(tmp_path / "layers.png")])
+    assert result.exit_code == 0, result.output
+    rows = {line[:40].strip(): line.split()[-1] for line in result.output.splitlines() if line.strip()}
     assert rows["imports that point up"] == rows["circles"] == "0"
     assert (tmp_path / "layers.png").stat().st_size > 10_000
 

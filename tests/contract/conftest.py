@@ -1,4 +1,4 @@
-"""The contract: what every tracker that stands in the folder promises. A new file there is tested by being there."""
+"""The contract: what every tracker in the folder promises. A new file in it is found and tested."""
 
 import pytest
 from contract_table import forms, model_of, ready

@@ -83,7 +83,7 @@ def test_a_sample_of_weight_0_is_not_used(model, tracker):
     assert np.flatnonzero(~run.ok[2:]).tolist() == [98, 99, 198]
     assert same(run.theta[101], run.theta[99])
     y2 = y.copy()
-    y2[100] += 5.0  # its value still stands in the lags, so only its own sample may ignore it
+    y2[100] += 5.0  # its value is still in the lags, so only its own sample may ignore it
     other = track(model, tracker, y2, u, weights=weights)
     assert same(other.theta[:101], run.theta[:101])
     assert same(other.theta[102:], run.theta[102:]) == tracker.output_error  # whose regressors do not hold y

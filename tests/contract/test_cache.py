@@ -146,7 +146,7 @@ def test_warm_leaves_nothing_to_compile(tmp_path):
     [("GAIN = 0.5", "GAIN = 0.25"), ("s.ok[l]", "s.ok[l] * 0.5"), ("2.0 * x", "1.0 * x")],
     ids=["constant", "step", "kept on disk by itself"],
 )
-def test_an_edit_in_another_file_is_seen(tmp_path, edit):
+def test_an_edit_in_another_file_is_noticed(tmp_path, edit):
     (tmp_path / "own_tracker.py").write_text(OWN_FILE)
     (tmp_path / "own_parts.py").write_text(OWN_PARTS)
     compiled, theta = run(OWN_TRACKER, tmp_path)

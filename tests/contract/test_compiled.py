@@ -59,9 +59,9 @@ def start(code, *arguments, **environment):
 
 
 def ended(process):
-    said, errors = process.communicate(timeout=300)
+    result, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
-    return said.strip(), errors
+    return result.strip(), errors
 
 
 def test_two_processes_that_compile_at_once_do_not_mix_layouts(tmp_path):
@@ -91,14 +91,14 @@ with warnings.catch_warnings(record=True) as said:
 """
 
 
-def test_where_nothing_can_be_written_code_is_compiled_in_memory_and_said_once(tmp_path):
+def test_where_nothing_can_be_written_code_is_compiled_in_memory_with_one_warning(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("no folder")
     script = tmp_path / "nowhere.py"
     script.write_text(NOWHERE)
     code = f"import runpy; runpy.run_path({str(script)!r}, run_name='nowhere')"
-    said, _ = ended(start(code, NUMBA_CACHE_DIR=str(blocked / "cache"), HOME=str(blocked)))
-    assert said == "1.0 1.0 1 True"
+    result, _ = ended(start(code, NUMBA_CACHE_DIR=str(blocked / "cache"), HOME=str(blocked)))
+    assert result == "1.0 1.0 1 True"
 
 
 def test_the_package_can_be_imported_where_no_folder_can_be_written(tmp_path, monkeypatch):
@@ -134,13 +134,13 @@ def second(y):
     return y[0, 1]
 
 
-def test_layouts_are_told_apart(own_cache):
+def test_layouts_are_distinguished(own_cache):
     driver = Driver(second)
     table = np.arange(12.0).reshape(3, 4)
     assert [driver(a) for a in (table, np.asfortranarray(table), table[:, ::2], table.T)] == [1.0, 1.0, 2.0, 4.0]
 
 
-def test_memory_goes_with_the_last_reference(own_cache, monkeypatch):
+def test_memory_is_freed_with_the_last_reference(own_cache, monkeypatch):
     monkeypatch.setattr(kernel, "MOST_ENTRIES", 2)
     driver = Driver(second)
     arrays = [np.ones((3, 3), kind) for kind in ("f8", "f4", "i8")]
@@ -199,7 +199,7 @@ print("done")
 """
 
 
-def test_compiling_is_said_once_and_only_where_somebody_looks():
+def test_compiling_is_announced_once_and_only_on_a_terminal():
     process = start(WAITS)
     assert ended(process) == ("done", "")
     ours, theirs = pty.openpty()
@@ -293,8 +293,8 @@ def test_a_fork_while_another_thread_compiles(tmp_path):
     script = tmp_path / "forks.py"
     script.write_text(FORKS)
     code = f"import runpy; runpy.run_path({str(script)!r}, run_name='forks')"
-    said, _ = ended(start(code, NUMBA_CACHE_DIR=str(tmp_path / "cache")))
-    assert said == "2.0 3.0"
+    result, _ = ended(start(code, NUMBA_CACHE_DIR=str(tmp_path / "cache")))
+    assert result == "2.0 3.0"
 
 
 class Interrupt(event.Listener):

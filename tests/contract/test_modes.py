@@ -91,7 +91,7 @@ def test_a_lane_says_what_the_record_says(model, tracker):
 
 
 def test_lanes_do_not_touch_each_other(model, tracker):
-    """One lane full of rubbish beside healthy ones, at other places of the tile: nothing changes."""
+    """One lane of meaningless numbers next to ordinary ones, at other places of the tile: nothing changes."""
     y, u = arx_record(T, 3)
     alone = track(model, tracker, y, u)
     ys, us = (np.repeat(signal[:, None], tracker.width, axis=1) for signal in (y, u))

@@ -7,9 +7,10 @@ from support import arx_record
 from driftfit import ARX, Regression
 from driftfit.engine import disk_cache, kernel
 from driftfit.engine import numba_internals as internals
-from driftfit.engine.drivers import TrackerSteps, drivers, make_tile, output_type
+from driftfit.engine.drivers import TrackerSteps, drivers
 from driftfit.engine.kernel import machine
 from driftfit.engine.outlined import PREFIX
+from driftfit.engine.tiles import make_tile, output_type
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -83,7 +84,7 @@ def test_both_are_found_on_disk_and_a_driver_whose_step_was_lost_is_compiled_aga
     assert len(compiled) == before
     for path in disk_cache.folder().glob(f"{PREFIX}*"):
         path.unlink()
-    for known in ("_SOURCES", "_LINKED"):  # as in a process that has compiled nothing
+    for known in ("SOURCES", "LINKED"):  # as in a process that has compiled nothing
         monkeypatch.setattr(f"driftfit.engine.outlined.{known}", {})
     assert predictions(Regression(1)) == [1.0]
     assert [name.split("_")[0] for name in compiled[before:]] == ["run", "outlined"]

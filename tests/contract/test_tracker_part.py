@@ -5,8 +5,9 @@ import pytest
 from support import arx_record
 
 from driftfit import ARX, RLS, Regression, track
-from driftfit.engine.drivers import LARGEST, TrackerSteps, drivers, make_tile, output_type
+from driftfit.engine.drivers import LARGEST, TrackerSteps, drivers
 from driftfit.engine.kernel import kernel
+from driftfit.engine.tiles import make_tile, output_type
 
 
 @kernel

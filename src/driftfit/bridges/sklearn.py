@@ -99,8 +99,8 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
 
             from sklearn.exceptions import DataConversionWarning
 
-            said = "A column-vector y was passed when a 1d array was expected."
-            warnings.warn(said, DataConversionWarning, stacklevel=3)
+            message = "A column-vector y was passed when a 1d array was expected."
+            warnings.warn(message, DataConversionWarning, stacklevel=3)
             y = y[:, 0]
         if y.shape != (len(X),):
             raise ValueError(f"y must be ({len(X)},), one output for each row of X; got shape {y.shape}.")

@@ -95,8 +95,8 @@ def _live(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     y[AT], u[AT + 8] = np.nan, np.nan
     record, live = track(model, still, y, u), Live(model, still)
     for t in range(T):
-        said = live.update(y[t], u[t])
-        if not _same(said[:2], (record.prediction[t], record.innovation[t])):
+        step = live.update(y[t], u[t])
+        if not _same(step[:2], (record.prediction[t], record.innovation[t])):
             yield f"Live and track differ from sample {t} on: keep all memory in fields of the state."
             return
 
@@ -130,8 +130,8 @@ def _touched(model: Model, still: Tracker, run: Track) -> Iterator[str]:
         y, u = run.y.copy(), run.u.copy()
         (y if name == "y" else u)[AT] = np.nan
         lost = np.flatnonzero(run.ok & ~track(model, still, y, u).ok)
-        said = model.touched(AT, name)
-        expected = [AT] if said is None and name == "y" else None if said is None else list(said)
+        declared = model.touched(AT, name)
+        expected = [AT] if declared is None and name == "y" else None if declared is None else list(declared)
         if expected is not None and lost.tolist() != expected:
             yield f"A missing {name} at sample {AT} makes samples {lost.tolist()} unusable; declared: {expected}."
 
@@ -184,9 +184,9 @@ def _late_input(model: Model, still: Tracker, run: Track) -> Iterator[str]:
         return
     live = Live(model, still)
     for t in range(T):
-        said = live.update(run.y[t])
+        step = live.update(run.y[t])
         live.apply(run.u[t])
-        if not _same(said[:2], (run.prediction[t], run.innovation[t])):
+        if not _same(step[:2], (run.prediction[t], run.innovation[t])):
             yield f"An input given by apply has another effect than one given with its output, from sample {t} on."
             return
 

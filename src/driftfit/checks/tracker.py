@@ -104,8 +104,11 @@ def _live(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
     run, live = track(model, tracker, y, u), Live(model, tracker)
     for t in range(T):
         y_hat, e, _s, ok = live.update(y[t], u[t])
-        said, expected = (y_hat, e, ok, *live.theta), (run.prediction[t], run.innovation[t], run.ok[t], *run.theta[t])
-        if not np.array_equal(said, expected, equal_nan=True):
+        reported, expected = (
+            (y_hat, e, ok, *live.theta),
+            (run.prediction[t], run.innovation[t], run.ok[t], *run.theta[t]),
+        )
+        if not np.array_equal(reported, expected, equal_nan=True):
             yield (
                 f"Live and track differ from sample {t} on: a step may use only its own sample and the state, "
                 "so keep whatever must be remembered in fields of the state."

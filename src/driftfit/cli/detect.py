@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,21 +20,33 @@ from driftfit.results import Track
 from driftfit.show.report import check_path
 
 
-@app.command()
-@reads
-def detect(
-    given: Given,
-    kind: Annotated[str, typer.Option(help="glr, cusum, band, innovation or probability.")] = "glr",
-    every: Annotated[float, typer.Option(help="Samples in which one false alarm may begin.")] = 10_000.0,
+@dataclass(frozen=True)
+class AlarmOptions:
+    """The options that say what an alarm is."""
+
+    kind: Annotated[str, typer.Option(help="glr, cusum, band, innovation or probability.")] = "glr"
+    every: Annotated[float, typer.Option(help="Samples in which one false alarm may begin.")] = 10_000.0
     reference: Annotated[
         list[str] | None,
         typer.Option(
             help="What is normal: a number of first samples, FROM..TO in times, or name=low:high; repeat the last."
         ),
-    ] = None,
-    window: Annotated[int, typer.Option(help="Samples in the sums of the innovation alarm.")] = 50,
-    hold: Annotated[int, typer.Option(help="Samples for which an alarm stays on after its cause.")] = 0,
-    calibrate: Annotated[bool, typer.Option("--calibrate", help="Find the limits by simulation.")] = False,
+    ] = None
+    window: Annotated[int, typer.Option(help="Samples in the sums of the innovation alarm.")] = 50
+    hold: Annotated[int, typer.Option(help="Samples for which an alarm stays on after its cause.")] = 0
+    calibrate: Annotated[bool, typer.Option("--calibrate", help="Find the limits by simulation.")] = False
+
+    def find(self, run: Any) -> Any:
+        """The alarms of a run, an `Outputs` or a fleet."""
+        settings = {"every": self.every, "window": self.window, "hold": self.hold, "calibrate": self.calibrate}
+        return run.detect(self.kind, reference=parse_reference(self.reference, run), **settings)
+
+
+@app.command()
+@reads
+def detect(
+    given: Given,
+    options: AlarmOptions,
     labels: Annotated[
         str | None, typer.Option(help="Column of labels, 0 or 1, that mark faults; the alarms are scored.")
     ] = None,
@@ -50,24 +63,23 @@ def detect(
         check_path(report)
     rows = given.read(labels) if labels is not None else None
     run = given.run(rows)
-    settings = {"every": every, "window": window, "hold": hold, "calibrate": calibrate}
-    said = run.detect(kind, reference=parse_reference(reference, run), **settings)
-    say(said)
-    wrong = None
+    alarms = options.find(run)
+    say(alarms)
+    faulty = None
     if rows is not None and labels is not None:
-        wrong = np.nan_to_num(rows.numbers[labels][rows.order()]) > 0.5
-        score = said.score(wrong)
+        faulty = np.nan_to_num(rows.numbers[labels][rows.order()]) > 0.5
+        score = alarms.score(faulty)
         late = "" if np.isnan(score.delay) else f", {score.delay:g} samples after they began (median)"
         found = f" Labels: {score.found} of {score.events} found{late};"
         say(Text(f"{found} {score.false} false alarms in {score.normal} normal samples."), soft_wrap=True)
     if write_to is not None:
-        _write(said, write_to)
+        _write(alarms, write_to)
     if plot is not None:
         if not isinstance(run, Track):
             raise ValueError("--plot: alarms are drawn for one series; --report has those of a fleet.")
-        said.plot(wrong).savefig(plot, dpi=150)
+        alarms.plot(faulty).savefig(plot, dpi=150)
     if report is not None:
-        run.report(report, alarms=said, **({} if wrong is None else {"labels": wrong}))
+        run.report(report, alarms=alarms, **({} if faulty is None else {"labels": faulty}))
 
 
 def parse_reference(given: list[str] | None, run: Any) -> Any:
@@ -94,20 +106,20 @@ def _band(entry: str) -> tuple[str, tuple[float, float]]:
         raise ValueError(f"--reference {entry}: give a band as name=low:high.") from None
 
 
-def _write(said: Any, path: Path) -> None:
-    table = _table(said) if isinstance(said, Alarms) else said.table
+def _write(alarms: Any, path: Path) -> None:
+    table = _table(alarms) if isinstance(alarms, Alarms) else alarms.table
     table.write_csv(path) if path.suffix.lower() == ".csv" else table.write_parquet(path)
 
 
-def _table(said: Alarms) -> pl.DataFrame:
+def _table(alarms: Alarms) -> pl.DataFrame:
     """One row per alarm."""
-    places = [int(t) for t in said.onsets]
-    names = [said.names.index(said.cause(t)) for t in places]
-    spans = [said.span(t) for t in places]
+    places = [int(t) for t in alarms.onsets]
+    names = [alarms.names.index(alarms.cause(t)) for t in places]
+    spans = [alarms.span(t) for t in places]
     columns = {
         "from": [first for first, _ in spans], "to": [last for _, last in spans],
-        "cause": [said.names[j] for j in names],
-        "statistic": [float(said.statistic[t, j]) for t, j in zip(places, names, strict=True)],
-        "limit": [float(said.limits[j]) for j in names],
+        "cause": [alarms.names[j] for j in names],
+        "statistic": [float(alarms.statistic[t, j]) for t, j in zip(places, names, strict=True)],
+        "limit": [float(alarms.limits[j]) for j in names],
     }  # fmt: skip
     return pl.DataFrame(columns, schema_overrides=dict.fromkeys(("from", "to", "cause"), pl.String))

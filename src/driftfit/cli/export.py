@@ -34,6 +34,6 @@ def to_c(
 
     with helpful():
         export_c(parse_model(model), parse_tracker(tracker, p or [], own), out, fixed_rate=fixed_rate)
-        said = (out / "README.md").read_text(encoding="utf-8")
-        state = said.split("State: ")[1].split(".")[0]
+        readme = (out / "README.md").read_text(encoding="utf-8")
+        state = readme.split("State: ")[1].split(".")[0]
         say(facts(("Written", str(out)), ("State", state), ("Check it", f"see {out / 'README.md'}")))

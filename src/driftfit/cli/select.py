@@ -26,11 +26,11 @@ def select(
 
     models = given.models()
     with progress.status("comparing"):
-        said = compare(
+        selection = compare(
             models if len(models) > 1 else models[0], tracker=given.chosen_tracker(), keep=tuple(listed(keep)),
             most=most, **given.arrays(),
         )  # fmt: skip
-    say(said)
-    assert isinstance(said, Selection)  # `arrays` are of one output
+    say(selection)
+    assert isinstance(selection, Selection)  # `arrays` are of one output
     if plot is not None:
-        said.plot().savefig(plot, dpi=150)
+        selection.plot().savefig(plot, dpi=150)

@@ -41,19 +41,19 @@ def smooth(
         assert isinstance(tuned, Tuned)  # `arrays` are of one output
         tracker = tuned.tracker
     run = given.run(tracker=tracker)
-    said = run.smooth()
+    smoothed = run.smooth()
     say(facts(("Model", repr(run.model)), ("Tracker", repr(run.tracker)), ("Samples", str(len(run)))))
     table = table_of("Parameters from the whole record", "at", *run.names)
     for t in np.unique(np.linspace(0, len(run) - 1, PLACES).astype(int)):
-        cells = (f"{v:.4g} +- {s:.2g}" for v, s in zip(said.theta[t], said.std[t], strict=True))
+        cells = (f"{v:.4g} +- {s:.2g}" for v, s in zip(smoothed.theta[t], smoothed.std[t], strict=True))
         table.add_row(Text(run.time_text(int(t))), *cells)
     say(table)
     say(Text(" +- one standard deviation", "dim"))
     if write_to is not None:
         columns: dict[str, Any] = {run.labels.time or "sample": run.time}
-        columns |= {f"theta_{name}": said.theta[:, i] for i, name in enumerate(run.names)}
-        columns |= {f"std_{name}": said.std[:, i] for i, name in enumerate(run.names)}
+        columns |= {f"theta_{name}": smoothed.theta[:, i] for i, name in enumerate(run.names)}
+        columns |= {f"std_{name}": smoothed.std[:, i] for i, name in enumerate(run.names)}
         frame = pl.DataFrame(columns)
         frame.write_csv(write_to) if write_to.suffix.lower() == ".csv" else frame.write_parquet(write_to)
     if plot is not None:
-        said.plot().savefig(plot, dpi=150)
+        smoothed.plot().savefig(plot, dpi=150)

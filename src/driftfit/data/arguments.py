@@ -47,7 +47,7 @@ def _is(value: Any, kind: type) -> bool:
 
 
 def _called(value: Any) -> str:
-    """An instance as it was constructed; a class with its required settings."""
+    """The expression that makes an instance; for a class, one with its required settings."""
     if not isinstance(value, type):
         return repr(value)
     needed = [p.name for p in signature(value).parameters.values() if p.default is p.empty]

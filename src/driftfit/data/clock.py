@@ -159,7 +159,7 @@ class Clock:
         return np.asarray(shown.reshape(np.shape(time)))
 
     def _in_utc(self, time: Array) -> Array:
-        """The inverse; NaT for times that the wall clock skips."""
+        """The inverse of `_local`; NaT for times that the wall clock skips."""
         if self.zone is None:
             return time
         import polars as pl
@@ -245,7 +245,7 @@ class Clock:
 
 
 UNSET = Clock("unset")
-"""No dt was given."""
+"""The clock if no dt was given."""
 
 
 def instant(time: Any) -> Any:

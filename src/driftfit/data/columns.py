@@ -16,9 +16,8 @@ import polars as pl
 
 from driftfit.data.clock import zone_name
 from driftfit.data.times.periods import EXAMPLES, periods
-from driftfit.engine.arrays import as_numbers
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import near
+from driftfit.engine.settings import as_numbers, near
 
 MISSING = ("", "na", "n/a", "nan", "null", "none")
 """Cell contents that mean "no value", in lower case."""

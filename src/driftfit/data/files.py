@@ -127,7 +127,7 @@ def _csv(path: str, wanted: Wanted) -> tuple[list[str], pl.DataFrame]:
 
 
 def _encoding(path: str) -> str:
-    """That of the header and the first cells."""
+    """The encoding of a file, judged by its header and its first cells."""
     with open(path, "rb") as file:
         start = file.read(1 << 16)
     try:
@@ -142,17 +142,17 @@ COMMA = r"^\s*[+-]?(\d+|\d{1,3}(\.\d{3})+)?(,\d*)?([eE][+-]?\d+)?\s*$"
 
 
 def _with_points(text: pl.Series) -> pl.Series:
-    """A column whose numbers have decimal commas, with points; another one as it is."""
+    """A column with decimal points instead of decimal commas; a column without commas is returned unchanged."""
     comma = text.str.contains(",", literal=True)
     if not comma.any() or not text.filter(comma).str.contains(COMMA).all():
         return text
-    if text.filter(~comma).str.contains(r"\.\d{0,2}$|\.\d{4,}").any():  # both kinds of numbers: leave it to the message
-        return text
+    if text.filter(~comma).str.contains(r"\.\d{0,2}$|\.\d{4,}").any():
+        return text  # a mixture of both: the error message names the cell
     return text.str.replace_all(".", "", literal=True).str.replace(",", ".", literal=True)
 
 
 def _whole(text: pl.Series) -> pl.Series:
-    """A column that names units, which has no type in a file of text: integers where all of it reads as such."""
+    """A column that names units. In a file of text it has no type; it becomes integers if every cell is one."""
     whole = text.cast(pl.Int64, strict=False)
     return whole if whole.cast(pl.String).eq_missing(text).all() else text
 
@@ -175,7 +175,7 @@ def _together(parts: Mapping[str, Columns]) -> Columns:
 
 
 def _of_one_type(units: list[Any]) -> list[Any]:
-    """Text for all of them if some files name units by text, and others by integers."""
+    """The names of units as text in all files, if some files name units by text and others by integers."""
     if not any(isinstance(unit, str) for unit in units):
         return units
     return [str(unit) if isinstance(unit, int) else unit for unit in units]

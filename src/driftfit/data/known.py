@@ -1,4 +1,4 @@
-"""Known numbers of every sample besides its signals: how much time has passed, its noise, how far theta may move."""
+"""Known numbers of every sample in addition to its signals: elapsed time, noise, and how far theta may move."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Known:
 
     @classmethod
     def of(cls, interval: Any = 1.0, noise: Any = 1.0, drift: Any = 1.0) -> Known:
-        """From numbers or arrays (T,)."""
+        """The columns made of numbers or of arrays (T,)."""
         parts = (interval, noise, drift)
         if not (np.ndim(interval) or np.ndim(noise) or np.ndim(drift)):  # a row for all samples
             return cls(np.array([[float(interval), float(noise), float(drift)]]))
@@ -64,19 +64,19 @@ class Known:
 
     @property
     def common(self) -> Known:
-        """Without the extra columns."""
+        """The same numbers without the extra columns."""
         return Known(self.columns[:, :COMMON])
 
     def part(self, rows: slice | Array) -> Known:
-        """Of some samples."""
+        """The known numbers of some of the samples."""
         return self if self.constant else Known(self.columns[rows])
 
     def over(self, T: int) -> Known:
-        """With a row for each of T samples; not to be written to."""
+        """The same numbers with a row for each of T samples; the arrays must not be changed."""
         return Known(np.broadcast_to(self.columns, (T, *self.columns.shape[1:])))
 
     def changed(self, interval: Any = None, noise: Any = None) -> Known:
-        """With other intervals or factors of the noise; those of a single row hold for all."""
+        """The same numbers with other intervals or noise factors; a single row applies to all samples."""
         given = {INTERVAL: interval, NOISE: noise}
         T = max(len(self), *(np.size(values) for values in given.values() if values is not None))
         columns = self.over(T).columns.copy()
@@ -86,32 +86,32 @@ class Known:
         return Known(columns)
 
     def begun(self, factors: Mapping[int, float]) -> Known:
-        """With the interval before some samples, by their number, multiplied by a factor."""
+        """The same numbers, with the intervals before the samples of these indices multiplied by a factor."""
         columns = self.columns.copy()
         for place, factor in factors.items():
             columns[place, INTERVAL] *= factor
         return Known(columns)
 
     def with_extra(self, columns: Array) -> Known:
-        """With extra columns (T, k) after interval, noise and drift."""
+        """The same numbers with extra columns (T, k) after interval, noise and drift."""
         common = self.common.over(len(columns)).columns
         if common.ndim > 2:
             columns = np.repeat(columns[:, :, None], common.shape[2], axis=2)
         return Known(np.hstack([common, columns]))
 
     def for_outputs(self, noise: Array) -> Known:
-        """The same for each of several outputs, which have separate factors of the noise variance (T, ny)."""
+        """The same numbers for each of several outputs, which have separate factors of the noise variance (T, ny)."""
         T, ny = noise.shape
         columns = np.repeat(self.over(T).columns[:, :, None], ny, axis=2)
         columns[:, NOISE] = noise
         return Known(columns)
 
     def for_output(self, output: int) -> Known:
-        """Of one of several outputs."""
+        """The known numbers of one of several outputs."""
         return Known(self.columns[..., output])
 
     def in_rows(self, T: int) -> Known:
-        """(T ny, k): every output as a sample; between those of one instant no time passes."""
+        """(T ny, k): one row for each output of each instant; no time passes between the rows of an instant."""
         ny = self.columns.shape[2]
         columns = np.moveaxis(self.over(T).columns, 1, 2).flatten().reshape(T * ny, -1)
         columns[np.arange(T * ny) % ny > 0, INTERVAL] = 0.0

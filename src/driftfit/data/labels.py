@@ -17,7 +17,7 @@ from driftfit.data.signals import as_inputs
 from driftfit.engine.kernel import Array
 
 PLAIN = (np.ndarray, list, tuple, float, int)
-"""What has neither names nor an index."""
+"""Types that have neither names nor an index."""
 
 
 class Held(NamedTuple):
@@ -57,7 +57,9 @@ def held(what: str, given: Any) -> Held:
 
 
 def _names(given: Sequence[Any]) -> tuple[str, ...]:
-    """Names of columns; none if one is not text, such as the numbers that pandas gives to columns without names."""
+    """Names of columns; no names at all if one of them is not text, such as the numbers that pandas gives to unnamed
+    columns.
+    """
     return tuple(given) if all(isinstance(name, str) and name for name in given) else ()
 
 
@@ -129,11 +131,11 @@ def order_of(owner: str, wanted: Sequence[str], given: Sequence[str], what: str 
     more = [name for name in given if name not in wanted]
     if not absent and not more:
         return [list(given).index(name) for name in wanted]
-    said = [f"{absent[0]!r} is missing"] if absent else []
-    said += [f"{more[0]!r} is none of them"] if more else []
+    problems = [f"{absent[0]!r} is missing"] if absent else []
+    problems += [f"{more[0]!r} is none of them"] if more else []
     raise ValueError(
         f"{owner} has the {what} {', '.join(wanted)}, but {letter} has the columns {', '.join(given)}; "
-        f"{'; '.join(said)}. Named signals are matched by name: rename or select columns, or give {letter} as an "
+        f"{'; '.join(problems)}. Named signals are matched by name: rename or select columns, or give {letter} as an "
         "array to match by position."
     )
 

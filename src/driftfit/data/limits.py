@@ -28,6 +28,9 @@ from driftfit.data.times.periods import span
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
+FAR, FEWEST = 300.0, 20
+"""Usual deviations beyond which a value looks like a fault code, and how many values it takes to say so."""
+
 
 class Limits:
     """Valid ranges of ny outputs and m inputs: ``low`` and ``high`` (ny + m,), infinite if there is no limit."""
@@ -91,6 +94,19 @@ class Gate:
 
     def restore(self, counts: Sequence[int]) -> None:
         self._counts[:] = counts
+
+
+def absurd(x: Array) -> Array:
+    """The values of a signal (T,) that are `FAR` times its usual deviation from its median, by sample; often empty.
+
+    The usual deviation is the median one of those that are not zero, so that a signal may rest most of the time.
+    """
+    known = np.isfinite(x)
+    away = np.abs(np.where(known, x, np.nan) - (np.median(x[known]) if known.any() else 0.0))
+    moving = away[known & (away > 0.0)]
+    if len(moving) < FEWEST:
+        return np.empty(0, int)
+    return np.flatnonzero(known & (away > FAR * float(np.median(moving))))
 
 
 def _bounds(key: Any, bounds: Any) -> tuple[float, float]:

@@ -13,8 +13,8 @@ from driftfit.data.known import Known
 from driftfit.data.labels import Held, held, order_of, ordered, times_of, together
 from driftfit.data.record import PLAIN, Reading, Records
 from driftfit.data.signals import as_inputs, intervals, noise_of
-from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import as_numbers, factor
 from driftfit.models.base import Model
 
 

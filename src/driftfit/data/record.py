@@ -20,8 +20,8 @@ from driftfit.data.known import Known
 from driftfit.data.labels import held, ordered, times_of, together
 from driftfit.data.limits import Limits, marked, within_each
 from driftfit.data.signals import as_inputs, as_output, intervals, noise_of
-from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import as_numbers, factor
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 
@@ -110,7 +110,7 @@ class Record:
         return np.broadcast_to(self.known.noise, len(self))
 
     def part(self, rows: slice) -> Record:
-        """Some samples in a row."""
+        """A range of consecutive samples."""
         time = None if self.time is None else self.time[rows]
         return replace(self, y=self.y[rows], u=self.u[rows], known=self.known.part(rows), time=time)
 
@@ -142,7 +142,7 @@ class Records:
 
     @property
     def ny(self) -> int:
-        """Outputs of every series."""
+        """Number of outputs of every series."""
         return max(len(self.outputs), 1)
 
     def part(self, k: int) -> Record:
@@ -168,7 +168,7 @@ class Records:
         )
 
     def only(self, k: int) -> Records:
-        """Series k alone; its arrays are views."""
+        """Records that contain only series k; their arrays are views."""
         one = self.part(k)
         first, length = np.zeros(1, dtype=int), np.array([len(one)])
         return replace(
@@ -195,7 +195,9 @@ class Records:
         return replace(self, first=first, length=length, y=y, u=u, known=known, time=time, outputs=())
 
     def for_trackers(self, model: Model, trackers: Sequence[Tracker], prob: Any = None) -> Records:
-        """With everything that is known of the samples as columns of ``known``, as these trackers take it."""
+        """The same series with everything that is known of the samples as columns of ``known``, in the form that these
+        trackers read.
+        """
         if self.drifts is None and prob is None:
             return self
         columns, *others = (one.extra_columns(model, len(self.y), prob, self.drifts) for one in dict.fromkeys(trackers))

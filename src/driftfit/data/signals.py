@@ -7,9 +7,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from driftfit.data.clock import Clock, instants
-from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import Settings, missing_settings
+from driftfit.engine.settings import Settings, as_numbers, factor, missing_settings
 
 S = TypeVar("S", bound=Settings)
 
@@ -26,7 +25,7 @@ def check_ready(tracker: S) -> S:
 
 
 def as_output(y: Any) -> Array:
-    """y as (T,)."""
+    """The output as an array (T,)."""
     array = as_numbers("y", y)
     if array.ndim == 2 and array.shape[1] == 1:
         array = array[:, 0]
@@ -39,7 +38,7 @@ def as_output(y: Any) -> Array:
 
 
 def as_inputs(u: Any, T: int) -> Array:
-    """u as (T, m); None is no input."""
+    """The inputs as an array (T, m); None means that there are none."""
     if u is None:
         return np.zeros((T, 0))
     array = as_numbers("u", u)

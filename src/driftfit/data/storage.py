@@ -1,6 +1,6 @@
 """Files of states and results: arrays and a header of plain JSON, without pickle.
 
-Results are .npz files. States are small and there may be millions of them, so they have a form of their own, in which
+Results are .npz files. States are small and there may be millions of them, so they have a separate format, in which
 the names and sizes of the arrays are in the header: with all numbers little-endian,
 
     bytes 0 .. 7      "driftfit"
@@ -33,21 +33,24 @@ from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
-from driftfit.engine.drivers import held_in
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings
+from driftfit.engine.tiles import held_in
 
 FORMAT = 1
-"""Of .npz files."""
+"""Version of the format of .npz files."""
 MAGIC, COMPACT = b"driftfit", 2
-"""How the bytes of a state begin, and their format."""
+"""The first bytes of a packed state, and the version of its format."""
 HEAD = Struct("<8sHHII")
 CHECKED = 16
-"""Where that begins which the CRC covers."""
+"""Number of the first byte that the CRC covers."""
 
 
 def describe(settings: Settings) -> dict[str, Any]:
-    """A model or tracker as plain data, without absent settings: one that a later version adds changes nothing."""
+    """A model or tracker as plain data.
+
+    Settings that are None are omitted, so that a setting which a later version adds changes nothing.
+    """
     absent = {field.name for field in dataclass_fields(settings) if field.default is None}  # type: ignore[arg-type]
     given = {name: one for name, one in settings.settings().items() if one is not None or name not in absent}
     return {"class": f"{type(settings).__module__}:{type(settings).__qualname__}", "settings": given}

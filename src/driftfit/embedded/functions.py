@@ -107,8 +107,8 @@ class Body(Statements):
                 del own[one]
         declared = [f"    {TYPES[kind]} {one};" for one, kind in own.items()]
         unread = [f"    (void){one};" for one in [*sorted(taken), *own] if not self._reads(one)]
-        said = (ast.get_docstring(self.tree) or "").split("\n")[0]
-        comment = [f"/* {said} */"] if said else []
+        summary = (ast.get_docstring(self.tree) or "").split("\n")[0]
+        comment = [f"/* {summary} */"] if summary else []
         text = "\n".join([*comment, f"{signature} {{", *declared, *unread, *self.lines, "}"])
         if ".view(" in ast.unparse(self.tree):
             text = self._of_doubles(name, text)

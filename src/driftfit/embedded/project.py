@@ -172,7 +172,7 @@ def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
     source = SOURCE.format(what=what) + _source(made, set(program.model.memory_for(program.steps)))
     readme = README.format(
         what=what, names=names, doubles=made.layout(8).itemsize, singles=made.layout(4).itemsize,
-        ops=_said(made.entry.operations), ordinary=_after_the_start(made),
+        ops=_counted(made.entry.operations), ordinary=_after_the_start(made),
     )  # fmt: skip
     test = selftest(program.model, program.tracker)
     return {
@@ -238,8 +238,8 @@ def _face(made: Translation, memory: set[str]) -> str:
 
 def _after_the_start(made: Translation) -> str:
     """The operations of a sample after the start, if the start takes more."""
-    ordinary = _said(_ordinary(made.unit))
-    differs = ordinary != _said(made.entry.operations)
+    ordinary = _counted(_ordinary(made.unit))
+    differs = ordinary != _counted(made.entry.operations)
     return f" After the start a sample takes at most\n  {ordinary}." if differs else ""
 
 
@@ -252,7 +252,7 @@ def _ordinary(unit: Unit) -> Counter[str]:
     return sum(parts, Counter[str]())
 
 
-def _said(ops: Counter[str]) -> str:
+def _counted(ops: Counter[str]) -> str:
     """Operations in words."""
     kinds = {
         "multiply": "multiplication",
@@ -261,8 +261,8 @@ def _said(ops: Counter[str]) -> str:
         "square root": "square root",
         "sine": "sine",
     }
-    said = [f"{ops[kind]} {name}{'s' * (ops[kind] > 1)}" for kind, name in kinds.items() if ops[kind]]
-    return ", ".join(said[:-1]) + f" and {said[-1]}" if len(said) > 1 else "".join(said)
+    parts = [f"{ops[kind]} {name}{'s' * (ops[kind] > 1)}" for kind, name in kinds.items() if ops[kind]]
+    return ", ".join(parts[:-1]) + f" and {parts[-1]}" if len(parts) > 1 else "".join(parts)
 
 
 def write(path: Path, texts: dict[str, Any]) -> None:

@@ -22,7 +22,7 @@ TEXT_IN_MEMORY = "driftfit: compiling; no folder can be written to keep the code
 lock = threading.RLock()
 _spent = 0.0
 _depth = 0
-_said = False
+_shown = False
 
 
 @contextmanager
@@ -32,7 +32,7 @@ def compiling() -> Iterator[None]:
     with lock:
         _depth += 1
         timer = None
-        if _depth == 1 and not _said and watched():
+        if _depth == 1 and not _shown and watched():
             timer = threading.Timer(max(PATIENCE - _spent, 0.0), say)
             timer.daemon = True
             timer.start()
@@ -58,9 +58,9 @@ def watched() -> bool:
 
 def say() -> None:
     """Print the notice, once."""
-    global _said
+    global _shown
     from driftfit.engine.disk_cache import folder
 
-    if not _said:
-        _said = True
+    if not _shown:
+        _shown = True
         print(TEXT if folder() else TEXT_IN_MEMORY, file=sys.stderr, flush=True)

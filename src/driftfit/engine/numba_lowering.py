@@ -224,7 +224,7 @@ class Short(Lower):
         """Lower an expression; an entry of what was not made is that entry."""
         place: Any = expr.index if expr.op == "static_getitem" else {"pair_first": 0, "pair_second": 1}.get(expr.op)
         row = self._later.get(expr.value.name) if isinstance(place, int) else None
-        if isinstance(row, Row):
+        if isinstance(place, int) and isinstance(row, Row):
             entry = row.entries[place]
             return (
                 entry if expr.op != "static_getitem" else self.context.cast(self.builder, entry, row.kind[place], resty)

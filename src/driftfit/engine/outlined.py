@@ -21,10 +21,10 @@ from driftfit.engine.compile_notice import compiling
 PREFIX = "outlined-"
 """Beginning of the symbols of outlined steps, which are the names of their files too."""
 
-_SOURCES: dict[str, tuple[FunctionType, types.Type]] = {}
+SOURCES: dict[str, tuple[FunctionType, types.Type]] = {}
 """The function and the type of its record, by symbol, of all steps that this process met while it compiled."""
 
-_LINKED: WeakValueDictionary[Any, internals.Linked] = WeakValueDictionary()
+LINKED: WeakValueDictionary[Any, internals.Linked] = WeakValueDictionary()
 """Outlined steps that drivers of this process use, by symbol and by the routines that are called instead of others."""
 
 
@@ -33,7 +33,7 @@ def outlined(step: Any) -> Any:
 
     def typed(context: Any, record: Any) -> Any:
         symbol = disk_cache.name_of(PREFIX.rstrip("-"), step.identity, record)
-        _SOURCES[symbol] = step.py_func, record
+        SOURCES[symbol] = step.py_func, record
 
         def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
             return internals.call(context, builder, symbol, (record,), given)
@@ -64,15 +64,15 @@ def called_by(code: internals.Code, instead: Mapping[str, str]) -> dict[str, Any
 def _found(symbol: str, instead: Mapping[str, str]) -> internals.Linked | None:
     """An outlined step in this process, from disk, or from the compiler."""
     key = symbol, tuple(sorted(instead.items()))
-    found = _LINKED.get(key)
+    found = LINKED.get(key)
     if found is None:
         stored = disk_cache.read(symbol)
         if stored is None:
-            if symbol not in _SOURCES:
+            if symbol not in SOURCES:
                 return None
-            source, record = _SOURCES[symbol]
+            source, record = SOURCES[symbol]
             stored = object_code(source, symbol, (record,), from_python=False)
-        found = _LINKED[key] = internals.Linked(internals.Code(*stored), instead)
+        found = LINKED[key] = internals.Linked(internals.Code(*stored), instead)
     return found
 
 

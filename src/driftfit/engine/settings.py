@@ -1,4 +1,7 @@
-"""Settings: frozen dataclasses whose values are checked at construction and can be written down as plain data."""
+"""Settings: frozen dataclasses whose values are checked at construction and can be written down as plain data.
+
+Also the conversion of other numbers that users pass: arrays of floats, missing values as NaN, factors of variances.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,8 @@ from pkgutil import walk_packages
 from typing import Any, Self
 
 import numpy as np
+
+from driftfit.engine.kernel import Array
 
 
 class DataWarning(UserWarning):
@@ -39,8 +44,8 @@ class Settings:
     def __repr__(self) -> str:
         """The expression that constructs it again: settings without a default, and those that differ from it."""
         own = [field for field in fields(self) if field.init]  # type: ignore[arg-type]
-        said = [f"{f.name}={getattr(self, f.name)!r}" for f in own if getattr(self, f.name) != f.default]
-        return f"{type(self).__name__}({', '.join(said)})"
+        given = [f"{f.name}={getattr(self, f.name)!r}" for f in own if getattr(self, f.name) != f.default]
+        return f"{type(self).__name__}({', '.join(given)})"
 
     def settings(self) -> dict[str, Any]:
         """The fields as plain data (numbers, strings, None, nested tuples)."""
@@ -182,3 +187,34 @@ def output_names(owner: str, ny: Any) -> tuple[str, ...]:
     if not names or len(set(names)) < len(names):
         raise ValueError(f"{owner}: ny must be the number of outputs or their names, all different; got {ny!r}.")
     return names
+
+
+def as_numbers(name: str, values: Any) -> Array:
+    """Values as floats; None and masked entries become NaN; for text the error names its position."""
+    if isinstance(values, np.ma.MaskedArray):
+        values = np.ma.filled(values.astype(float), np.nan)
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        pass
+    given = np.asarray(values, dtype=object)
+    out = np.empty(given.shape)
+    for place, value in np.ndenumerate(given):
+        try:
+            out[place] = np.nan if value is None or value == "" else float(value)
+        except (TypeError, ValueError):
+            where = f"entry {place[0] if len(place) == 1 else place}" if place else "it"
+            raise ValueError(f"{name}: {where} is {value!r}, which is not a number.") from None
+    return out
+
+
+def factor(name: str, value: Any, T: int | None = None) -> Array:
+    """A known factor of a variance: finite and not negative, one number or one per sample."""
+    if type(value) is float and 0.0 <= value < np.inf:  # what most calls give, at a tenth of the cost
+        return np.asarray(value)
+    array = as_numbers(name, value)
+    if array.ndim > 1 or (array.ndim == 1 and len(array) != T):
+        raise ValueError(f"{name} must be one number or one per sample ({T}); got shape {array.shape}.")
+    if not (np.isfinite(array) & (array >= 0.0)).all():
+        raise ValueError(f"{name} must be finite and not negative everywhere.")
+    return array

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.record import Reading, Record
-from driftfit.engine.drivers import LARGEST, TrackerSteps, drivers, make_tile, output_type, repeat_tile, unknown
+from driftfit.engine.drivers import LARGEST, TrackerSteps, drivers, unknown
 from driftfit.engine.kernel import Array, Driver, State, kernel, shared
+from driftfit.engine.tiles import make_tile, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.fleet import Fleet

@@ -127,7 +127,7 @@ def diagnose(run: Track) -> Diagnosis:
 
 
 def diagnosis(known: Evidence) -> Diagnosis:
-    """The same where the test of constancy may be shared with the verdict."""
+    """As `diagnose`, with a test of constancy that may be shared with the verdict."""
     run = known.run
     z, white = standardised(run)
     checks = (

@@ -50,7 +50,7 @@ class Judgement:
     """One run among many: its verdict, and the q-values of "the parameters move" and of "tracking them pays"."""
 
     key: Hashable
-    said: Verdict
+    verdict: Verdict
     q: float
     q_pays: float
     drifts: bool
@@ -59,7 +59,7 @@ class Judgement:
     @property
     def moving(self) -> tuple[str, ...]:
         """Names of the parameters that move."""
-        return self.said.moving if self.drifts else ()
+        return self.verdict.moving if self.drifts else ()
 
     @property
     def relative(self) -> float:
@@ -67,13 +67,13 @@ class Judgement:
 
         If the value before is smaller than the standard error of the change, that standard error replaces it.
         """
-        moved = [m for m in self.said.parameters if m.moves] if self.drifts else []
+        moved = [m for m in self.verdict.parameters if m.moves] if self.drifts else []
         return max((abs(m.after - m.before) / max(abs(m.before), m.std) for m in moved), default=0.0)
 
     @property
     def change(self) -> str:
         """The change of the first parameter that moves, in words."""
-        moved = [m for m in self.said.parameters if m.moves] if self.drifts else []
+        moved = [m for m in self.verdict.parameters if m.moves] if self.drifts else []
         more = f" and {len(moved) - 1} more" if len(moved) > 1 else ""
         if not moved:
             return ""
@@ -108,7 +108,7 @@ class ManyVerdicts(Printed):
         """The same rows in another order: the "clearest" first, or the largest relative "change" first."""
         if by not in ("clearest", "change"):
             raise ValueError(f"ranked: by must be 'clearest' or 'change'; got {by!r}.")
-        clear = sorted(self.rows, key=lambda row: (np.isnan(row.q), row.said.p, -row.said.statistic))
+        clear = sorted(self.rows, key=lambda row: (np.isnan(row.q), row.verdict.p, -row.verdict.statistic))
         if by == "change":
             clear.sort(key=lambda row: -row.relative)
         return ManyVerdicts(tuple(clear), self.level)
@@ -146,16 +146,16 @@ class ManyVerdicts(Printed):
         return polars.DataFrame(
             {
                 "key": [key_text(row.key) for row in self.rows],
-                "p": [row.said.p for row in self.rows],
+                "p": [row.verdict.p for row in self.rows],
                 "q": [row.q for row in self.rows],
                 "drifts": [row.drifts for row in self.rows],
                 "moving": [", ".join(row.moving) for row in self.rows],
                 "change": [row.change for row in self.rows],
                 "relative": [row.relative for row in self.rows],
-                "rms": [row.said.rms for row in self.rows],
-                "constant_ls": [row.said.rivals[1].rms for row in self.rows],
+                "rms": [row.verdict.rms for row in self.rows],
+                "constant_ls": [row.verdict.rivals[1].rms for row in self.rows],
                 "pays": [row.pays for row in self.rows],
-                "samples": [row.said.samples for row in self.rows],
+                "samples": [row.verdict.samples for row in self.rows],
             }
         )
 
@@ -167,8 +167,8 @@ class ManyVerdicts(Printed):
         for column, width in zip(table.columns[2:], (8, 8, 7, 7, 4), strict=True):
             column.ratio, column.min_width = None, width
         for row in self.rows[:SHOWN]:
-            errors = (f"{row.said.rms:.4g}", f"{row.said.rivals[1].rms:.4g}", "yes" if row.pays else "")
-            table.add_row(Text(key_text(row.key)), Text(row.change), p_text(row.said.p), p_text(row.q), *errors)
+            errors = (f"{row.verdict.rms:.4g}", f"{row.verdict.rivals[1].rms:.4g}", "yes" if row.pays else "")
+            table.add_row(Text(key_text(row.key)), Text(row.change), p_text(row.verdict.p), p_text(row.q), *errors)
         yield table
         if len(self.rows) > SHOWN:
             yield Text(f" and {len(self.rows) - SHOWN} more", "dim")
@@ -195,15 +195,13 @@ class ManyDiagnoses(Printed):
     @property
     def ok(self) -> bool:
         """Whether everything is within its limits everywhere."""
-        return all(said.ok for said in self.of.values())
+        return all(one.ok for one in self.of.values())
 
     @property
     def counts(self) -> dict[str, int]:
         """How many runs are out of bounds, by number."""
-        names = dict.fromkeys(check.name for said in self.of.values() for check in said.checks)
-        return {
-            name: sum(not c.ok for said in self.of.values() for c in said.checks if c.name == name) for name in names
-        }
+        names = dict.fromkeys(check.name for one in self.of.values() for check in one.checks)
+        return {name: sum(not c.ok for one in self.of.values() for c in one.checks if c.name == name) for name in names}
 
     @property
     def worst(self) -> tuple[Hashable, ...]:
@@ -215,8 +213,8 @@ class ManyDiagnoses(Printed):
         """One row a run with every number, as a polars table."""
         import polars
 
-        rows = [{"key": key_text(key)} | {c.name: c.value for c in said.checks} for key, said in self.of.items()]
-        out = [len(said.sentences) for said in self.of.values()]
+        rows = [{"key": key_text(key)} | {c.name: c.value for c in one.checks} for key, one in self.of.items()]
+        out = [len(one.sentences) for one in self.of.values()]
         return polars.DataFrame(rows, infer_schema_length=None).with_columns(polars.Series("out_of_bounds", out))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -238,26 +236,26 @@ def verdicts(
 
 
 def verdicts_and_diagnoses(runs: Mapping[Hashable, Track], level: float) -> tuple[ManyVerdicts, ManyDiagnoses]:
-    """Both, which share the test of constancy of each run."""
+    """The verdicts and the diagnoses, which share the test of constancy of each run."""
 
     def both(key: Hashable) -> tuple[Verdict, Diagnosis]:
         known = Evidence(runs[key])
         return judged(known, level), diagnosis(known)
 
-    said = on_all_cores(runs, both, "report")
-    return ranked({key: one for key, (one, _) in said.items()}, level), ManyDiagnoses(
-        {k: d for k, (_, d) in said.items()}
+    pairs = on_all_cores(runs, both, "report")
+    return ranked({key: one for key, (one, _) in pairs.items()}, level), ManyDiagnoses(
+        {k: d for k, (_, d) in pairs.items()}
     )
 
 
-def ranked(said: Mapping[Hashable, Verdict], level: float) -> ManyVerdicts:
+def ranked(verdicts: Mapping[Hashable, Verdict], level: float) -> ManyVerdicts:
     """Verdicts by key with their q-values, the clearest first."""
     q, q_pays = (
-        discoveries(np.array(p)) for p in ([v.p for v in said.values()], [v.constants.p for v in said.values()])
+        discoveries(np.array(p)) for p in ([v.p for v in verdicts.values()], [v.constants.p for v in verdicts.values()])
     )
     rows = [
         Judgement(key, one, float(a), float(b), bool(a < level), bool(b < level))
-        for (key, one), a, b in zip(said.items(), q, q_pays, strict=True)
+        for (key, one), a, b in zip(verdicts.items(), q, q_pays, strict=True)
     ]
     return ManyVerdicts(tuple(rows), level).ranked("clearest")
 

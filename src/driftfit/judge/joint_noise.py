@@ -140,7 +140,9 @@ def _relative(run: Outputs) -> tuple[Array, Array]:
 
 
 def _log_density(z: Array, q: Array, S: Array, d: Array) -> Array:
-    """Of the outputs that are there, (T,); S (T, ny, ny) and the degrees of freedom d are those before the sample."""
+    """Log density (T,) of the observed outputs; S (T, ny, ny) and the degrees of freedom d are those before
+    the sample.
+    """
     found, gamma = np.full(len(z), np.nan), scipy.special.gammaln
     for seen, rows in _patterns(np.isfinite(z)):
         at, k = rows[d[rows] > 0.0], len(seen)
@@ -155,7 +157,7 @@ def _log_density(z: Array, q: Array, S: Array, d: Array) -> Array:
 
 
 def _patterns(there: Array) -> list[tuple[Array, Array]]:
-    """Which outputs are there, and at which samples; but for samples at which none is."""
+    """Every pattern of observed outputs and the samples that have it; samples without an output are left out."""
     kinds, which = np.unique(there, axis=0, return_inverse=True)
     each = [(np.flatnonzero(kind), np.flatnonzero(which.ravel() == k)) for k, kind in enumerate(kinds)]
     return [(seen, at) for seen, at in each if len(seen)]

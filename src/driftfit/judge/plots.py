@@ -38,14 +38,14 @@ class Health(NamedTuple):
     fine: Callable[[str], bool]
 
 
-def draw_diagnosis(said: Health, ax: Any = None) -> Figure:
+def draw_diagnosis(diagnosis: Health, ax: Any = None) -> Figure:
     """Six plots on one page."""
     figure, axes = panels(ax, (11.0, 8.2), 6, 2)
     for draw, axis in zip((_innovations, _correlations, _levels, _quantiles, _excitation, _paths), axes, strict=True):
-        draw(axis, said)
+        draw(axis, diagnosis)
     for axis in (*axes[::2], axes[5]):
-        axis.set_xlabel(time_label(said.run))
-        date_axis(axis, said.run)
+        axis.set_xlabel(time_label(diagnosis.run))
+        date_axis(axis, diagnosis.run)
     return figure
 
 
@@ -55,74 +55,76 @@ def _titled(axis: Axes, title: str, ok: bool) -> None:
     axis.tick_params(labelsize=8)
 
 
-def _innovations(axis: Axes, said: Health) -> None:
-    axis.plot(said.run.time, said.z, ls="", marker=".", ms=2.5, color=BLUE)
+def _innovations(axis: Axes, diagnosis: Health) -> None:
+    axis.plot(diagnosis.run.time, diagnosis.z, ls="", marker=".", ms=2.5, color=BLUE)
     for limit in (-1.96, 1.96):
         axis.axhline(limit, color=GREY, lw=0.8, ls="--")
-    shown = np.abs(said.z[np.isfinite(said.z)])
+    shown = np.abs(diagnosis.z[np.isfinite(diagnosis.z)])
     if shown.size:
         axis.set_ylim(*(np.array([-1.1, 1.1]) * max(4.0, min(shown.max(), 12.0))))
-    _titled(axis, "innovation / its standard deviation", said.fine("outliers"))
+    _titled(axis, "innovation / its standard deviation", diagnosis.fine("outliers"))
 
 
-def _correlations(axis: Axes, said: Health) -> None:
-    lags = np.arange(1, len(said.white.r) + 1)
-    axis.bar(lags, said.white.r, width=0.5, color=BLUE)
-    axis.fill_between(lags, -1.96 * said.white.std, 1.96 * said.white.std, color=GREY, alpha=0.3, lw=0)
+def _correlations(axis: Axes, diagnosis: Health) -> None:
+    lags = np.arange(1, len(diagnosis.white.r) + 1)
+    axis.bar(lags, diagnosis.white.r, width=0.5, color=BLUE)
+    axis.fill_between(lags, -1.96 * diagnosis.white.std, 1.96 * diagnosis.white.std, color=GREY, alpha=0.3, lw=0)
     axis.axhline(0.0, color=GREY, lw=0.8)
     axis.set_xlabel("lag, samples", fontsize=9)
-    _titled(axis, "correlation of innovations", said.fine("whiteness (p)"))
+    _titled(axis, "correlation of innovations", diagnosis.fine("whiteness (p)"))
 
 
-def _levels(axis: Axes, said: Health) -> None:
+def _levels(axis: Axes, diagnosis: Health) -> None:
     """Mean square of clipped innovations in a moving window."""
-    known = np.flatnonzero(np.isfinite(said.z))
+    known = np.flatnonzero(np.isfinite(diagnosis.z))
     window = max(20, len(known) // 40)
     if len(known) > window:
-        square = np.minimum(said.z[known] ** 2, 16.0)
+        square = np.minimum(diagnosis.z[known] ** 2, 16.0)
         total = np.concatenate([[0.0], np.cumsum(square)])
-        axis.plot(said.run.time[known[window - 1 :]], (total[window:] - total[:-window]) / window, color=BLUE, lw=1.1)
+        axis.plot(
+            diagnosis.run.time[known[window - 1 :]], (total[window:] - total[:-window]) / window, color=BLUE, lw=1.1
+        )
         half = 1.96 * np.sqrt(2.0 / window)
         axis.axhspan(max(1.0 - half, 0.0), 1.0 + half, color=GREY, alpha=0.25, lw=0)
     axis.set_ylim(bottom=0.0)
-    fine = said.fine("noise level") and said.fine("steady noise")
+    fine = diagnosis.fine("noise level") and diagnosis.fine("steady noise")
     _titled(axis, f"normalised innovation squared, mean of {window}", fine)
 
 
-def _quantiles(axis: Axes, said: Health) -> None:
-    z = np.sort(said.z[np.isfinite(said.z)])
+def _quantiles(axis: Axes, diagnosis: Health) -> None:
+    z = np.sort(diagnosis.z[np.isfinite(diagnosis.z)])
     if len(z):
         normal = scipy.special.ndtri((np.arange(len(z)) + 0.5) / len(z))
         axis.plot(normal, normal, color=GREY, lw=0.9)
         axis.plot(normal, np.clip(z, -12.0, 12.0), ls="", marker=".", ms=3.0, color=BLUE)
     axis.set_xlabel("normal quantile", fontsize=9)
-    _titled(axis, "distribution of innovations", said.fine("symmetry") and said.fine("outliers"))
+    _titled(axis, "distribution of innovations", diagnosis.fine("symmetry") and diagnosis.fine("outliers"))
 
 
-def _excitation(axis: Axes, said: Health) -> None:
-    excited = said.excited
+def _excitation(axis: Axes, diagnosis: Health) -> None:
+    excited = diagnosis.excited
     if len(excited.at):
-        time = said.run.time[said.rows.at[excited.at]]
+        time = diagnosis.run.time[diagnosis.rows.at[excited.at]]
         values = np.maximum(excited.eigenvalues, 1e-12)
         for i in range(values.shape[1]):
             last = i in (0, values.shape[1] - 1)
             axis.plot(time, values[:, i], color=RED if i == 0 else BLUE, lw=1.3 if last else 0.6)
         axis.plot(time, values[:, -1] / 1e4, color=GREY, lw=0.9, ls="--")
         axis.set_yscale("log")
-    _titled(axis, "excitation: eigenvalues of windows, and the limit", said.fine("excitation"))
+    _titled(axis, "excitation: eigenvalues of windows, and the limit", diagnosis.fine("excitation"))
 
 
-def _paths(axis: Axes, said: Health) -> None:
-    path: Array = said.constant.path
+def _paths(axis: Axes, diagnosis: Health) -> None:
+    path: Array = diagnosis.constant.path
     if len(path) and np.isfinite(path).all():
         inner = slice(len(path) // 20, len(path) - len(path) // 20)
-        for i, name in enumerate(said.run.model.names):
+        for i, name in enumerate(diagnosis.run.model.names):
             colour = COLOURS[i % len(COLOURS)]
-            axis.plot(said.run.time[said.rows.at][inner], path[inner, i], lw=1.1, color=colour, label=name)
+            axis.plot(diagnosis.run.time[diagnosis.rows.at][inner], path[inner, i], lw=1.1, color=colour, label=name)
         axis.axhspan(-3.0, 3.0, color=GREY, alpha=0.2, lw=0)
         if path.shape[1] <= 8:
             axis.legend(fontsize=7, ncols=2, frameon=False)
-    _titled(axis, "constancy: paths of the estimates, standardised", said.fine("constancy (p)"))
+    _titled(axis, "constancy: paths of the estimates, standardised", diagnosis.fine("constancy (p)"))
 
 
 def plot_alarms(

@@ -226,9 +226,11 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
         Segment(limits[k], limits[k + 1], *_fitted(rows.phi[a:b], rows.y[a:b], found, a, b))
         for k, (a, b) in enumerate(pairwise(edges))
     )
-    said = tuple(Break(time[t], time[rows.at[a]], time[rows.at[b]], t) for t, (a, b) in zip(at, spans, strict=True))
+    described = tuple(
+        Break(time[t], time[rows.at[a]], time[rows.at[b]], t) for t, (a, b) in zip(at, spans, strict=True)
+    )
     spread = float(np.median(found.level))
-    return Segmentation(said, parts, level, found.penalty, spread, tuple(map(float, found.ar)), run)
+    return Segmentation(described, parts, level, found.penalty, spread, tuple(map(float, found.ar)), run)
 
 
 def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, Array]:

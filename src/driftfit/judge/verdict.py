@@ -3,24 +3,25 @@
 The verdict answers two questions whose answers may differ:
 
 * *Do the parameters move?* Score tests of constant coefficients (`driftfit.judge.statistics.constancy`): the mean
-square of Nyblom and Hansen, and the suprema over one break and over an interval, with one error rate for all. Their
-null distribution follows the noise and the excitation of the record itself, so outliers, a changing noise variance,
-changing inputs and correlated noise are not mistaken for drift. The tests use the record, not the tracker: q and r do
-not enter. If the parameters are constant, the verdict says that they move with probability ``level``, as
-``benchmarks/verdict_error_rate.py`` verifies. * *Does following them pay?* The one-step errors of the run are compared
-with those of persistence, constant least squares on the past, the same with two lags of the outputs and regressors, and
-a constant ARX, on the same samples, with paired tests (`driftfit.judge.statistics.paired`). Correlated noise can be
-predicted, which a drifting parameter does as well: so following pays where the run beats the better of constants
-without lags and with them.
+  square of Nyblom and Hansen, and the suprema over one break and over an interval, with one error rate for all. Their
+  null distribution follows the noise and the excitation of the record itself, so outliers, a changing noise variance,
+  changing inputs and correlated noise are not mistaken for drift. The tests use the record, not the tracker: q and r do
+  not enter. If the parameters are constant, the verdict says that they move with probability ``level``, as
+  ``benchmarks/verdict_error_rate.py`` verifies.
+* *Does following them pay?* The one-step errors of the run are compared with those of persistence, constant least
+  squares on the past, the same with two lags of the outputs and regressors, and a constant ARX, on the same samples,
+  with paired tests (`driftfit.judge.statistics.paired`). Correlated noise can be predicted, and so can the effect of a
+  drifting parameter. Following therefore pays where the run beats the better of constants without lags and with them.
 
-The first sentence combines both answers. A parameter is named as one that moves where the joint test
-rejects, its own still does when the parameters named before are taken into account
-(`driftfit.judge.statistics.attribution`), and its values before and after differ by more than chance.
+The first sentence combines both answers. A parameter is named as one that moves if the joint test rejects
+constancy, the test of the parameter still rejects it when the parameters named before are taken into account
+(`driftfit.judge.statistics.attribution`), and its values before and after differ by more than chance explains.
 
 A model without enough lags has correlated noise, which is hard to tell from a drifting intercept. The order of an
 autoregression of the noise is found from the record, ``lags=`` sets it, and the verdict says so. A parameter that
-wanders as fast as the noise itself passes for such noise. Not for smooth fast oscillations: a parameter that swings
-many times within the record leaves little trace in a cumulated score. Cost: three constant fits, O(T n^2).
+wanders as fast as the noise itself is mistaken for such noise. Do not use the verdict for fast smooth oscillations: a
+parameter that swings many times within the record leaves little trace in a cumulated score. Cost: three constant fits,
+O(T n^2).
 """
 
 from __future__ import annotations

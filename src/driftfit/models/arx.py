@@ -26,7 +26,7 @@ O(ny (ny na + nb)) for the lags of several outputs.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -34,16 +34,16 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
-from driftfit.engine.settings import input_names, one_of, output_names, whole
-from driftfit.models.base import Model
+from driftfit.engine.settings import one_of, output_names, whole
 from driftfit.models.doubted_lags import doubted, no_doubts, shift_doubts
+from driftfit.models.inputs import CountedInputs
 
 GAP = 1.5
 """Intervals longer than this many nominal ones break the lags."""
 
 
 @dataclass(frozen=True)
-class ARX(Model):
+class ARX(CountedInputs):
     """ARX(na, nb, nk) with one output and any number of inputs.
 
     Parameters
@@ -71,93 +71,37 @@ class ARX(Model):
     intercept: bool = False
     start: str = "drop"
     ny: int | tuple[str, ...] = 1
+    per_input = ("nb", "nk")
 
     def __post_init__(self) -> None:
         if not isinstance(self.ny, int):
             self._set("ny", output_names("ARX", self.ny))
         output_names("ARX", self.ny)
         self._set("na", whole("ARX", "na", self.na, 0))
-        counts = set()
-        for name, low in (("nb", 0), ("nk", 0)):
-            value = getattr(self, name)
-            if isinstance(value, Sequence | np.ndarray):
-                self._set(name, tuple(whole("ARX", name, int(v) if v == int(v) else v, low) for v in value))
-                counts.add(len(value))
-            else:
-                self._set(name, whole("ARX", name, value, low))
-        if isinstance(self.inputs, str):
-            self._set("inputs", (self.inputs,))
-        elif isinstance(self.inputs, int | np.integer):
-            self._set("inputs", whole("ARX", "inputs", self.inputs, 0))
-        elif self.inputs is not None:
-            self._set("inputs", input_names("ARX", "inputs", self.inputs))
-        elif self.inputs is None and counts:
-            self._set("inputs", counts.pop() if len(counts) == 1 else None)
-        elif self.inputs is None and self.nb == 0:
-            self._set("inputs", 0)
-        if counts - {self._count}:
-            raise ValueError(
-                f"ARX: nb={self.nb!r}, nk={self.nk!r} and inputs={self.inputs!r} imply different numbers of inputs."
-            )
+        self._check_inputs()
         one_of("ARX", "start", self.start, ("drop", "zero"))
         if self.inputs is not None and self.n == 0:
             raise ValueError("ARX: there is nothing to estimate with na=0, nb=0 and no intercept.")
 
-    @property
-    def _count(self) -> int | None:
-        return self.inputs if isinstance(self.inputs, int) or self.inputs is None else len(self.inputs)
-
     def bind(self, inputs: int | Sequence[str]) -> ARX:
-        bound = self._bound(inputs)
-        if len(self.outputs) == 1:
-            return bound
-        return JointARX.from_settings(bound.settings())
+        bound = super().bind(inputs)
+        return bound if len(self.outputs) == 1 else JointARX.from_settings(bound.settings())
 
     @property
     def outputs(self) -> tuple[str, ...]:
         return output_names("ARX", self.ny)
 
-    def _bound(self, inputs: int | Sequence[str]) -> ARX:
-        count = inputs if isinstance(inputs, int) else len(inputs)
-        if self.inputs is None:
-            if count == 0:
-                raise ValueError(f"ARX: nb={self.nb!r} needs an input, but there is no u; give u, or nb=0.")
-            return replace(self, inputs=count if isinstance(inputs, int) else tuple(inputs))
-        if count != self.m:
-            raise ValueError(
-                f"ARX: the model has {self.m} inputs (nb={self.nb!r}, inputs={self.inputs!r}), "
-                f"but u has {count} columns."
-            )
-        if isinstance(self.inputs, int) and not isinstance(inputs, int):
-            return replace(self, inputs=tuple(inputs))
-        return self
-
-    @property
-    def m(self) -> int:
-        if self._count is None:
-            return 1
-        return self._count
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        return self.inputs if isinstance(self.inputs, tuple) else ()
-
     @property
     def lags(self) -> tuple[tuple[int, int], ...]:
         """(nb, nk) of every input."""
-        nb = self.nb if isinstance(self.nb, tuple) else (self.nb,) * self.m
-        nk = self.nk if isinstance(self.nk, tuple) else (self.nk,) * self.m
-        return tuple(zip(nb, nk, strict=True))
+        return tuple(zip(self.for_each_input("nb"), self.for_each_input("nk"), strict=True))
 
     @property
     def names(self) -> tuple[str, ...]:
-        return (*(f"a{i + 1}" for i in range(self.na)), *self._input_names())
+        return (*(f"a{i + 1}" for i in range(self.na)), *self._names_after_lags())
 
-    def _input_names(self) -> tuple[str, ...]:
-        names: list[str] = []
-        for number, (nb, _) in enumerate(self.lags):
-            given = self.inputs[number] if isinstance(self.inputs, tuple) else f"u{number + 1}" if self.m > 1 else ""
-            names += [f"b{j + 1}[{given}]" if given else f"b{j + 1}" for j in range(nb)]
+    def _names_after_lags(self) -> tuple[str, ...]:
+        names = [f"b{i + 1}{u}" for u, (nb, _) in zip(self.suffixes, self.lags, strict=True) for i in range(nb)]
         return (*names, "intercept") if self.intercept else tuple(names)
 
     @property
@@ -313,7 +257,7 @@ class JointARX(ARX):
     @property
     def names(self) -> tuple[str, ...]:
         own = [f"a{i + 1}[<-{output}]" for output in self.outputs for i in range(self.na)]
-        return (*own, *self._input_names())
+        return (*own, *self._names_after_lags())
 
     @property
     def sources(self) -> tuple[str, ...]:

@@ -17,8 +17,8 @@ of the text (dual numbers), together with f and in the same compiled code.
 
 theta' begins at ``start``, and goes to the estimate in the course of the first 10 n usable samples: a parameter that
 enters nonlinearly needs a start from which linear steps lead to it. Where f or a derivative is not finite at theta'
-(the root of a negative number), the sample is linearised at ``start`` instead; where it is not finite there either, it
-is not used.
+(the root of a negative number), or f is out of all proportion to the readings so far, the sample is linearised at
+``start`` instead; where it is not finite there either, it is not used.
 
 A missing output is replaced by its prediction among the lags, for at most as many samples as the longest lag; samples
 that need a missing input are not used. A gap in time breaks the lags as in `ARX`.
@@ -30,7 +30,7 @@ most.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -39,11 +39,11 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.engine.settings import input_names
 from driftfit.models.arx import GAP
-from driftfit.models.base import Model
-from driftfit.models.formulas import Formula, check_inputs, compiled, parse, start_values
+from driftfit.models.fault_codes import possible
+from driftfit.models.formulas import Formula, compiled, parse, start_values
 from driftfit.models.functions import equation_text
+from driftfit.models.inputs import NamedInputs
 from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
 
 SETTLING = 10.0
@@ -51,7 +51,7 @@ SETTLING = 10.0
 
 
 @dataclass(frozen=True)
-class Equation(Model):
+class Equation(NamedInputs):
     """y = f(inputs, lags; theta), given as text; see `driftfit.models.equation`.
 
     Parameters
@@ -79,29 +79,12 @@ class Equation(Model):
         if callable(self.equation):
             self._set("equation", equation_text(self.equation))
         formula = parse(self.equation)
-        if self.inputs is None:
-            self._set("inputs", formula.inputs)
-        else:
-            self._set("inputs", input_names("Equation", "inputs", self.inputs))
-        if absent := [name for name in formula.inputs if name not in self.input_names]:
-            raise ValueError(f"Equation: inputs must hold {', '.join(absent)}, which the equation uses.")
+        self._check_inputs(formula.inputs)
         self._set("start", start_values("Equation", self.start, formula.parameters))
-
-    def bind(self, inputs: int | Sequence[str]) -> Equation:
-        check_inputs(self, inputs)
-        return self
 
     @property
     def formula(self) -> Formula:
         return parse(self.equation)
-
-    @property
-    def m(self) -> int:
-        return len(self.input_names)
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        return self.inputs or ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -183,7 +166,7 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
     def regress(s: State, l: int) -> None:
         age(s, l)
         evaluate(s, l)
-        if not finite(s, l):
+        if not (finite(s, l) and possible(s, s.value[l], l)):
             for i in range(n):
                 s.point[i, l] = s.first_point[i, l]
             evaluate(s, l)

@@ -283,14 +283,6 @@ def _product(x: str, times: int) -> str:
     return " * ".join([x] * times) if times else "1.0"
 
 
-def check_inputs(model: Any, inputs: int | Sequence[str]) -> None:
-    """Raise ValueError unless there are as many inputs as the equations of a model name."""
-    count = inputs if isinstance(inputs, int) else len(inputs)
-    if count != model.m:
-        names = ", ".join(model.input_names)
-        raise ValueError(f"{type(model).__name__}: {model.m} inputs ({names}), but u has {count} columns.")
-
-
 def start_values(model: str, given: Any, names: Sequence[str]) -> Any:
     """``start`` of a model of equations: one number for all, or (name, number) pairs from a mapping or such pairs.
 

@@ -5,7 +5,7 @@ With the gradient at a point theta',
     phi_t = d f / d theta (theta'),     y_t - shift_t = phi_t' theta_t + v_t,     shift_t = f(theta') - phi_t' theta'
 
 ``regress`` calls `subtract` once s.phi is known, and trackers see y_t - shift_t; ``push`` calls `restore`, after which
-s.y_hat is a prediction of y_t again.
+s.y_hat is a prediction of y_t again. A reading out of all proportion is refused (`driftfit.models.fault_codes`).
 """
 
 from __future__ import annotations
@@ -16,9 +16,14 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import State, kernel
+from driftfit.models.fault_codes import UNJUDGED, judge
 
-MEMORY: Mapping[str, Any] = {"shift": 0.0, "measured": np.nan, "without": 0.0, "usable": 0.0, "started": 0.0}
-"""The shift; y_t; successive samples without an output; usable samples; whether there was a complete regressor."""
+MEMORY: Mapping[str, Any] = {
+    "shift": 0.0, "measured": np.nan, "without": 0.0, "usable": 0.0, "started": 0.0, "last_row": np.nan,
+    "moved_on": 1.0, **UNJUDGED,
+}  # fmt: skip
+"""The shift; y_t; successive samples without an output; usable samples with a regressor unlike the one before; whether
+there was a complete regressor; a sum over the last regressor, and whether it was another one."""
 
 
 @kernel
@@ -33,6 +38,10 @@ def along(s: State, l: int) -> float:
 @kernel
 def subtract(s: State, shift: float, complete: bool, l: int) -> None:
     """y - shift takes the place of y; before the first complete regressor no time passes."""
+    y_hat = shift
+    for i in range(s.phi.shape[0]):
+        y_hat += s.phi[i, l] * s.theta[i, l]
+    judge(s, y_hat, l)
     s.shift[l] = shift
     s.measured[l] = s.y[l]
     s.y[l] -= shift
@@ -48,7 +57,17 @@ def informed(s: State, l: int) -> bool:
 
 @kernel
 def restore(s: State, seen: bool, l: int) -> None:
-    """The prediction becomes one of y, and the sample is counted."""
+    """The prediction becomes one of y, and the sample is counted.
+
+    A plant at rest repeats its regressor, and says nothing of most parameters however long it rests: the linearisation
+    must not go to an estimate that is still the prior.
+    """
     s.y_hat[l] += s.shift[l]
     s.without[l] = 0.0 if seen else s.without[l] + 1.0
-    s.usable[l] += s.ok[l]
+    row = 0.0
+    for i in range(s.phi.shape[0]):
+        row += (i + 1.0) * s.phi[i, l]
+    used = s.ok[l] > 0.0
+    s.moved_on[l] = 0.0 if used & (row == s.last_row[l]) else 1.0
+    s.last_row[l] = row if used else s.last_row[l]
+    s.usable[l] += s.ok[l] * s.moved_on[l]

@@ -23,7 +23,7 @@ Every tracker of linear regressions follows theta by the linearisation of y_hat 
 parameters that drift. In contrast to least squares in an `ARX` model they are not biased by coloured noise, and their
 covariance is that of the prediction error estimate.
 
-theta' is theta with the zeros of C and F_j drawn towards 0 while one of them is unstable. Signals that are absurd
+theta' is theta with the zeros of C, D and F_j drawn towards 0 while one of them is unstable. Signals that are absurd
 beside the readings (`driftfit.models.polynomials.steps.BEYOND`), which a theta that one reading spoiled computes, are
 not used: e and v are bounded, and w begins anew, from y if there is one input. The start needs care, because
 the gradient with respect to F is 0 at theta = 0, and e means nothing before A and B are known: the first 4 n usable
@@ -44,16 +44,16 @@ sample are computed from the theta that has learned from it. Cost per sample: O(
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, Step
-from driftfit.engine.settings import input_names, numbers, whole
-from driftfit.models.base import Model
+from driftfit.engine.settings import whole
+from driftfit.models.inputs import LinearisedTransfer
 from driftfit.models.linearised import MEMORY
 from driftfit.models.polynomials.instruments import MORE, instrumental_steps
 from driftfit.models.polynomials.steps import EACH, OWN, Places, U, Y, places, steps, taking_inputs
@@ -63,7 +63,7 @@ FORGOTTEN = 40.0
 
 
 @dataclass(frozen=True)
-class PolynomialModel(Model):
+class PolynomialModel(LinearisedTransfer):
     """A(z) y = sum_j B_j(z) / F_j(z) u_j + C(z) / D(z) e, the general transfer function with one output.
 
     `ARMAX`, `OE` and `BoxJenkins` are its best-known cases.
@@ -98,78 +98,27 @@ class PolynomialModel(Model):
     inputs: int | tuple[str, ...] | None = None
     offset: bool = False
     point: tuple[float, ...] | None = None
+    per_input = ("nb", "nf", "nk")
 
     def __post_init__(self) -> None:
-        kind, counts = type(self).__name__, set()
         for name in ("na", "nc", "nd"):
-            self._set(name, whole(kind, name, getattr(self, name), 0))
-        for name in ("nb", "nf", "nk"):
-            value = getattr(self, name)
-            if isinstance(value, Sequence | np.ndarray):
-                self._set(name, tuple(whole(kind, name, one, 0) for one in value))
-                counts.add(len(value))
-            else:
-                self._set(name, whole(kind, name, value, 0))
-        if isinstance(self.inputs, str):
-            self._set("inputs", (self.inputs,))
-        elif isinstance(self.inputs, int | np.integer):
-            self._set("inputs", whole(kind, "inputs", self.inputs, 0))
-        elif self.inputs is not None:
-            self._set("inputs", input_names(kind, "inputs", self.inputs))
-        elif len(counts) == 1:
-            self._set("inputs", next(iter(counts)))
-        elif self.nb == 0 and not counts:
-            self._set("inputs", 0)
-        given = self.inputs if isinstance(self.inputs, int) or self.inputs is None else len(self.inputs)
-        if len(counts | ({given} if given is not None else set())) > 1:
-            raise ValueError(
-                f"{kind}: nb={self.nb!r}, nf={self.nf!r}, nk={self.nk!r} and inputs={self.inputs!r} imply different "
-                "numbers of inputs."
-            )
+            self._set(name, whole(type(self).__name__, name, getattr(self, name), 0))
+        self._check_inputs()
         if self.inputs is not None and self.n == 0:
-            raise ValueError(f"{kind}: there is nothing to estimate; give an order of at least 1.")
-        if self.point is not None:
-            self._set("point", numbers(kind, "point", self.point, ndim=1))
-            if self.inputs is not None and len(self.point) != self.n:
-                raise ValueError(
-                    f"{kind}: point must have {self.n} entries, {', '.join(self.names)}; got {self.point!r}."
-                )
-
-    def bind(self, inputs: int | Sequence[str]) -> PolynomialModel:
-        count = inputs if isinstance(inputs, int) else len(inputs)
-        if self.inputs is None:
-            if count == 0:
-                raise ValueError(f"{type(self).__name__}: nb={self.nb!r} needs an input, but there is no u; give nb=0.")
-        elif count != self.m:
-            raise ValueError(
-                f"{type(self).__name__}: the model has {self.m} inputs (nb={self.nb!r}, inputs={self.inputs!r}), "
-                f"but u has {count} columns."
-            )
-        elif isinstance(inputs, int) or not isinstance(self.inputs, int):
-            return self
-        return replace(self, inputs=inputs if isinstance(inputs, int) else tuple(inputs))
-
-    @property
-    def m(self) -> int:
-        return 1 if self.inputs is None else self.inputs if isinstance(self.inputs, int) else len(self.inputs)
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        return self.inputs if isinstance(self.inputs, tuple) else ()
+            raise ValueError(f"{type(self).__name__}: there is nothing to estimate; give an order of at least 1.")
+        self._check_point()
 
     @property
     def orders(self) -> tuple[tuple[int, int, int], ...]:
         """(nb, nf, nk) of every input."""
-        each = (one if isinstance(one, tuple) else (one,) * self.m for one in (self.nb, self.nf, self.nk))
-        return tuple(zip(*each, strict=True))
+        return tuple(zip(*(self.for_each_input(name) for name in ("nb", "nf", "nk")), strict=True))
 
     @property
     def names(self) -> tuple[str, ...]:
-        inputs = self.input_names or tuple(f"u{j + 1}" if self.m > 1 else "" for j in range(self.m))
         names = [f"a{i + 1}" for i in range(self.na)]
-        names += [_named("b", i, u) for u, (nb, _, _) in zip(inputs, self.orders, strict=True) for i in range(nb)]
+        names += [f"b{i + 1}{u}" for u, (nb, _, _) in zip(self.suffixes, self.orders, strict=True) for i in range(nb)]
         names += [f"c{i + 1}" for i in range(self.nc)] + [f"d{i + 1}" for i in range(self.nd)]
-        names += [_named("f", i, u) for u, (_, nf, _) in zip(inputs, self.orders, strict=True) for i in range(nf)]
+        names += [f"f{i + 1}{u}" for u, (_, nf, _) in zip(self.suffixes, self.orders, strict=True) for i in range(nf)]
         return (*names, "offset") if self.offset else tuple(names)
 
     @property
@@ -183,10 +132,6 @@ class PolynomialModel(Model):
         if self.point is not None:
             return 0.0
         return FORGOTTEN * self.n if self.nc or self.nd or any(nf for _, nf, _ in self.orders) else 0.0
-
-    @property
-    def recursive(self) -> bool:
-        return True
 
     @property
     def reach(self) -> int:
@@ -236,9 +181,6 @@ class PolynomialModel(Model):
         if not (tracker.instruments and self.instruments):
             return self.steps
         return instrumental_steps(self._places, self.point is not None)
-
-    def held_at(self, theta: Array) -> PolynomialModel:
-        return replace(self, point=tuple(np.asarray(theta, dtype=float).tolist()))
 
     @property
     def apply(self) -> Step | None:
@@ -290,10 +232,6 @@ def _product(one: Array, other: Array) -> Array:
     for i in range(one.shape[-1]):
         found[..., i : i + other.shape[-1]] += one[..., i : i + 1] * other
     return found
-
-
-def _named(letter: str, i: int, u: str) -> str:
-    return f"{letter}{i + 1}[{u}]" if u else f"{letter}{i + 1}"
 
 
 @dataclass(frozen=True, repr=False)

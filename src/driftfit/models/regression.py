@@ -10,8 +10,8 @@ output is skipped: time passes, but nothing is learned. Cost per sample: O(n).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -19,12 +19,12 @@ import numpy as np
 
 from driftfit.engine.drivers import ModelSteps
 from driftfit.engine.kernel import Array, State, kernel, nothing
-from driftfit.engine.settings import input_names, output_names, whole
-from driftfit.models.base import Model
+from driftfit.engine.settings import output_names
+from driftfit.models.inputs import CountedInputs
 
 
 @dataclass(frozen=True)
-class Regression(Model):
+class Regression(CountedInputs):
     """Regression on the rows of u.
 
     Parameters
@@ -43,15 +43,10 @@ class Regression(Model):
     intercept: bool = False
     ny: int | tuple[str, ...] = 1
     shared: bool = False
+    inputs_setting = "regressors"
 
     def __post_init__(self) -> None:
-        given = self.regressors
-        if isinstance(given, str):
-            self._set("regressors", (given,))
-        elif isinstance(given, int | np.integer):
-            self._set("regressors", whole("Regression", "regressors", given, 0))
-        elif given is not None:
-            self._set("regressors", input_names("Regression", "regressors", given))
+        self._check_inputs()
         if not isinstance(self.ny, int):
             self._set("ny", output_names("Regression", self.ny))
         if self.shared and len(self.outputs) == 1:
@@ -59,27 +54,17 @@ class Regression(Model):
         if self.regressors is not None and self.n == 0:
             raise ValueError("Regression: there is nothing to estimate with 0 regressors and no intercept.")
 
-    def bind(self, inputs: int | Sequence[str]) -> Regression:
-        count = inputs if isinstance(inputs, int) else len(inputs)
-        if self.regressors is None:
-            return replace(self, regressors=count if isinstance(inputs, int) else tuple(inputs))
-        if count != self.m:
-            raise ValueError(f"Regression: {self.m} regressors were declared, but u has {count} columns.")
-        if isinstance(self.regressors, int) and not isinstance(inputs, int):
-            return replace(self, regressors=tuple(inputs))
-        return self
-
     @property
     def m(self) -> int:
         if self.regressors is None:
             raise ValueError(
                 "Regression: give the number of regressors, as in Regression(3) or Regression(['income'])."
             )
-        return self.regressors if isinstance(self.regressors, int) else len(self.regressors)
+        return super().m
 
     @property
     def input_names(self) -> tuple[str, ...]:
-        return self.regressors if isinstance(self.regressors, tuple) and not self.shared else ()
+        return () if self.shared else super().input_names
 
     @property
     def names(self) -> tuple[str, ...]:

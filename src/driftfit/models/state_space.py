@@ -37,10 +37,10 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.engine.settings import input_names
-from driftfit.models.base import Model
-from driftfit.models.formulas import Formula, Writer, check_inputs, parse, start_values, written
+from driftfit.models.fault_codes import UNJUDGED, judge
+from driftfit.models.formulas import Formula, Writer, parse, start_values, written
 from driftfit.models.functions import CLOCK, system_text
+from driftfit.models.inputs import NamedInputs
 
 TIME = "dt"
 
@@ -95,7 +95,7 @@ def system_of(text: str) -> System:
 
 
 @dataclass(frozen=True)
-class StateSpace(Model):
+class StateSpace(NamedInputs):
     """Equations with hidden states, given as text; see `driftfit.models.state_space`. Follow it with `JointKalman`.
 
     Parameters
@@ -124,17 +124,8 @@ class StateSpace(Model):
         if not isinstance(self.equations, str) and isinstance(self.equations, Sequence):
             self._set("equations", system_text(self.equations))
         system = system_of(self.equations)
-        if self.inputs is None:
-            self._set("inputs", system.inputs)
-        else:
-            self._set("inputs", input_names("StateSpace", "inputs", self.inputs))
-        if absent := [name for name in system.inputs if name not in self.input_names]:
-            raise ValueError(f"StateSpace: inputs must hold {', '.join(absent)}, which the equations use.")
+        self._check_inputs(system.inputs)
         self._set("start", start_values("StateSpace", self.start, self.names))
-
-    def bind(self, inputs: int | Sequence[str]) -> StateSpace:
-        check_inputs(self, inputs)
-        return self
 
     @property
     def system(self) -> System:
@@ -144,14 +135,6 @@ class StateSpace(Model):
     def hidden(self) -> tuple[str, ...]:
         """Names of the states; empty if the equations have none."""
         return self.system.hidden
-
-    @property
-    def m(self) -> int:
-        return len(self.input_names)
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        return self.inputs or ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -178,7 +161,7 @@ class StateSpace(Model):
         return {
             "y_lag": np.full(depth, np.nan), "u_lag": np.full((max(self.m, 1), depth), np.nan),
             "u_known": np.zeros((max(self.m, 1), depth)), "point": np.zeros(n), "next": np.zeros(n),
-            "slopes": np.zeros((max(len(self.hidden), 1), n)), "value": 0.0, "without": 0.0, "clock": -1.0,
+            "slopes": np.zeros((max(len(self.hidden), 1), n)), "value": 0.0, "without": 0.0, "clock": -1.0, **UNJUDGED,
         }  # fmt: skip
 
     @property
@@ -271,6 +254,7 @@ def _steps(equations: str, inputs: tuple[str, ...]) -> ModelSteps:
 
     @kernel
     def regress(s: State, l: int) -> None:
+        judge(s, np.nan, l)
         s.clock[l] += s.dt[l]
         for i in range(reach, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]

@@ -60,7 +60,8 @@ class Fleet(KeyedResults):
         return {key: self._whole(k) for key, k in self._series.items()}
 
     def states(self) -> dict[Hashable, bytes]:
-        """Where every series ended, as bytes that continue it: ``track(..., by=.., warm_start=fleet.states())``.
+        """The final state of every series, as bytes from which it can be continued: ``track(..., by=..,
+        warm_start=fleet.states())``.
 
         Each is what `driftfit.Live.from_bytes` reads, too.
         """

@@ -17,8 +17,8 @@ import numpy as np
 from driftfit.data import storage
 from driftfit.data.known import Known
 from driftfit.data.record import Labels, Records
-from driftfit.engine.drivers import repeat_tile
 from driftfit.engine.kernel import Array
+from driftfit.engine.tiles import repeat_tile
 from driftfit.models.base import Model
 from driftfit.run.program import Program, State, kept, programs_of, state_of
 from driftfit.run.public_class import Plain
@@ -124,8 +124,8 @@ class KeyedResults(Plain):
             yield self._programs[j], state_of(lane.tile, lane.lane)
 
     def undetermined(self) -> Iterator[tuple[Program, dict[str, Array]]]:
-        """Of `ends` those whose record does not determine every parameter."""
-        found: dict[int, Array] = {}  # by tile, because looking at each lane alone takes as long as running it
+        """The entries of `ends` whose record does not determine every parameter."""
+        found: dict[int, Array] = {}  # tile by tile, because examining each lane separately takes as long as running it
         for j in self._index.values():
             lane = self._lanes[j]
             assert lane is not None

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.record import Record
-from driftfit.engine.drivers import output_type
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
+from driftfit.engine.tiles import output_type
 from driftfit.models.regression import Regression
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.columns import Columns

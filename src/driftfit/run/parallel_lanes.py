@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.record import Records
-from driftfit.engine.drivers import repeat_tile
 from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.tiles import repeat_tile
 from driftfit.run.program import Program, State, progress, tile_of
 from driftfit.run.result import Lane
 from driftfit.run.states.layout import words_of

@@ -19,8 +19,9 @@ from rich.progress import Progress
 from driftfit.data import storage
 from driftfit.data.record import Record
 from driftfit.data.signals import check_ready
-from driftfit.engine.drivers import Drivers, TrackerSteps, drivers, held_in, make_tile, output_type, repeat_tile
+from driftfit.engine.drivers import Drivers, TrackerSteps, drivers
 from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.tiles import held_in, make_tile, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.collected_samples import COLLECTED, collecting
@@ -49,7 +50,9 @@ def progress_bar() -> Progress:
 
 @contextmanager
 def progress(what: str, total: int, shown: bool) -> Iterator[Callable[[int], None]]:
-    """A progress bar that is called with what has been done; making one that is not shown would take a millisecond."""
+    """A function that advances a progress bar. The bar is only made when it is shown, because making it takes a
+    millisecond.
+    """
     if not shown:
         yield lambda count: None
         return
@@ -65,7 +68,7 @@ class Program:
     model: Model
     tracker: Tracker
     output: str | None = None
-    """Which of several outputs it belongs to, in one of several lanes."""
+    """The index of its output, if each of several outputs has a lane."""
     shared: Model | None = None
     """The model of outputs that share one theta: ``model`` takes them one after the other, as rows of an instant."""
 
@@ -77,7 +80,7 @@ class Program:
             )
 
     def __reduce__(self) -> Any:
-        """A copy, or a program sent to another process, consists of its fields."""
+        """Copies, and programs sent to another process, are made from the fields."""
         return Program, (self.model, self.tracker, self.output, self.shared)
 
     @property
@@ -180,7 +183,7 @@ class Program:
         return found
 
     def lanes(self, count: int) -> Array:
-        """A tile with this program in every lane, at its start; not to be changed, since it is made once."""
+        """A tile with this program in every lane, at its start. It is made once and must not be changed."""
         if count not in self._wide:
             self._wide[count] = tile_of([self] * count)
         return self._wide[count]
@@ -254,7 +257,7 @@ def _copy(results: Array, out: Array) -> None:
 
 
 def put_columns(given: Array, into: Array) -> None:
-    """Copy (T, ..), whose rows may be short and far apart."""
+    """Copy an array (T, ..) whose rows may be short and far apart."""
     T = len(into)
     given, into = given.reshape(T, -1), into.reshape(T, -1)
     if into.shape[1] >= SHORT:
@@ -338,7 +341,7 @@ def state_of(tile: Array, lane: int = 0) -> dict[str, Array]:
 
 
 def shown(trackers: Sequence[Tracker]) -> str:
-    """The tracker of all outputs, or of each."""
+    """The text for one tracker shared by all outputs, or for the tracker of each."""
     return repr(trackers[0]) if len(set(trackers)) == 1 else ", ".join(map(repr, trackers))
 
 
@@ -376,7 +379,7 @@ def programs_of(model: Model, tracker: Any, inputs: int | Sequence[str]) -> tupl
 
 @lru_cache(maxsize=64)
 def _programs(model: Model, tracker: Tracker, inputs: int | tuple[str, ...]) -> tuple[Program, ...]:
-    """Kept for the next record: settings are equal by value."""
+    """The programs are cached for the next record, since settings are compared by value."""
     return (Program(model.bind(inputs), check_ready(tracker)),)
 
 

@@ -163,7 +163,7 @@ class Track(Plain, Columns):
         return Lane(self.program.run(tile, self.record), tile)
 
     def stores(self) -> tuple[str, ...]:
-        """Names of these fields."""
+        """Names of the fields that ``keep="std"`` stores."""
         return names_of(self._lane.out)
 
     def __len__(self) -> int:
@@ -237,7 +237,8 @@ class Track(Plain, Columns):
     def band(self, level: float = 0.95, conformal: bool = False) -> tuple[Array, Array]:
         """(low, high), each (T, n): pointwise bands of theta at this level, under the tracker's own model.
 
-        With ``conformal`` they are as much wider as bands of the output had to be so far (`output_band`).
+        With ``conformal`` they are widened by the factor by which bands of the output had to be widened so far
+        (`output_band`).
         """
         half = quantile(level) * self.std
         if conformal:

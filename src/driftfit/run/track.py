@@ -74,7 +74,7 @@ def parts(
 
 
 class Kept(NamedTuple):
-    """What is stored of every sample, in which precision, and what is known of events beforehand."""
+    """What is stored for every sample, in which precision, and the known prior probabilities of events."""
 
     keep: str = "std"
     dtype: Any = "float64"
@@ -131,7 +131,7 @@ def _prepared(
 
 
 def _any_of(tracker: Any) -> list[Any]:
-    """A tracker by which a fleet without a series knows its parameters."""
+    """Some tracker: a fleet without a series needs one for the names of its parameters."""
     some = tracker.values() if isinstance(tracker, Mapping) else [tracker] if isinstance(tracker, Tracker) else tracker
     return [next(iter(some))]
 

@@ -45,18 +45,22 @@ class End(NamedTuple):
     zone: str | None = None
 
     def end(self) -> End:
-        """Itself: a run continues from it."""
+        """The end itself, so that it can be used in place of a run."""
         return self
 
     def to_bytes(self) -> bytes:
-        """What `Live.from_bytes` and ``warm_start=`` continue from: a few hundred bytes more than the state itself."""
+        """The end as bytes for `Live.from_bytes` and ``warm_start=``: a few hundred bytes more than the state
+        itself.
+        """
         lanes = [one.pack(one.tile(state)) for one, state in zip(self.programs, self.states, strict=True)]
         extra = {"last": self.last, "awaits": self.awaits, "dt": self.dt, "zone": self.zone}
         return storage.compact(*written(self.programs, lanes, extra))
 
     @classmethod
     def from_bytes(cls, data: bytes) -> End:
-        """From the bytes of an end or of a stream (``live.to_bytes()``); ValueError if they are damaged or foreign."""
+        """The end from bytes, or from those of a stream (``live.to_bytes()``); ValueError if they are damaged or of
+        another kind.
+        """
         header, arrays = storage.expand(data, KINDS)
         model, trackers, extra = read(header)
         programs = programs_of(model, by_output(model, trackers), model.m)
@@ -66,7 +70,7 @@ class End(NamedTuple):
         return cls(programs, states, *(extra[name] for name in ("last", "awaits", "dt", "zone")))
 
 
-UNSAID: Mapping[str, Any] = {
+ABSENT: Mapping[str, Any] = {
     "dt": None, "zone": None, "limits": None, "last": None, "ignored": 0, "lag": 0, "awaits": 0, "cold": False,
     "windows": (), "alarms": (),
 }  # fmt: skip
@@ -81,7 +85,7 @@ def written(
     model = programs[0].whole
     header: dict[str, Any] = {"kind": KINDS[len(model.outputs) > 1], "model": storage.describe(model)}
     header |= {"tracker": described[0] if len(described) == 1 else described, "fields": programs[0].layout.text}
-    header |= {"extra": {name: value for name, value in extra.items() if value != UNSAID[name]}}
+    header |= {"extra": {name: value for name, value in extra.items() if value != ABSENT[name]}}
     return header, {f"state{lane}": np.frombuffer(data, np.uint8) for lane, data in enumerate(lanes)}
 
 
@@ -89,7 +93,7 @@ def read(header: Mapping[str, Any]) -> tuple[Model, tuple[Tracker, ...], dict[st
     """(the model, the tracker of each output, everything else) from a header that `written` made."""
     given = header["tracker"]
     trackers = tuple(storage.rebuild(one, Tracker) for one in (given if isinstance(given, list) else [given]))
-    return storage.rebuild(header["model"], Model), trackers, {**UNSAID, **header["extra"]}
+    return storage.rebuild(header["model"], Model), trackers, {**ABSENT, **header["extra"]}
 
 
 def by_output(model: Model, trackers: Sequence[Tracker]) -> Any:

@@ -77,16 +77,16 @@ def check_path(path: str | PathLike[str]) -> Path:
 def page(run: Track, title: str | None = None, alarms: Alarms | None = None, labels: Array | None = None) -> str:
     """The page as HTML text."""
     facts, known = summarise(run), Evidence(run)
-    said, health = judged(known, LEVEL), diagnosis(known)
+    truth, health = judged(known, LEVEL), diagnosis(known)
     heading = title or _heading(run)
     sections = [
         f"<h1>{escape(heading)}</h1>",
         f'<p class="soft">{escape(_subtitle(run, facts))}</p>',
-        _verdict(said, health),
+        _verdict(truth, health),
         *([section("Faults and alarms", faults(run, alarms, labels))] if alarms or labels is not None else []),
         section("Parameters over time", picture(parameter_figure(run), run, PARAMETERS)),
-        section("Parameters", _parameter_table(facts, said) + _system_table(run)),
-        section("Predictions", _comparison(said) + picture(_signals(run), run, SIGNALS)),
+        section("Parameters", _parameter_table(facts, truth) + _system_table(run)),
+        section("Predictions", _comparison(truth) + picture(_signals(run), run, SIGNALS)),
         section("Diagnostics", _checks(health) + picture(health.plot(), run, DIAGNOSTICS)),
         section("Settings and omitted data", _settings(run, facts)),
         section("How to read this", READING),
@@ -111,20 +111,20 @@ def _subtitle(run: Track, facts: Summary) -> str:
     return ", ".join(part for part in parts if part)
 
 
-def _verdict(said: Verdict, health: Diagnosis) -> str:
+def _verdict(truth: Verdict, health: Diagnosis) -> str:
     count = len(health.sentences)
     state = (
         "All diagnostics are within their limits."
         if health.ok
         else (f"{count} of {len(health.checks)} diagnostics {'is' if count == 1 else 'are'} out of bounds, see below.")
     )
-    lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*said.sentences, state))
+    lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*truth.sentences, state))
     return f'<div class="verdict">{lines}</div>'
 
 
-def _parameter_table(facts: Summary, said: Verdict) -> str:
+def _parameter_table(facts: Summary, truth: Verdict) -> str:
     heads = ("parameter", "now", "95 % band", "range of the path", "p, constant", "moves")
-    tests = {moved.name: moved for moved in said.parameters}
+    tests = {moved.name: moved for moved in truth.parameters}
     rows = []
     for row in facts.rows:
         test = tests.get(row.name)
@@ -156,12 +156,12 @@ def _system_table(run: Track) -> str:
     return table("The system behind the parameters: steady-state gain; a pole below 1 is stable.", heads, rows)
 
 
-def _comparison(said: Verdict) -> str:
-    rows = [("this run", f"{said.rms:.5g}", "", "")]
-    for rival in said.rivals:
-        ratio = f"{rival.rms / said.rms:.3f}" if said.rms > 0.0 else ""
+def _comparison(truth: Verdict) -> str:
+    rows = [("this run", f"{truth.rms:.5g}", "", "")]
+    for rival in truth.rivals:
+        ratio = f"{rival.rms / truth.rms:.3f}" if truth.rms > 0.0 else ""
         rows.append((rival.name, f"{rival.rms:.5g}", ratio, escape(p_text(rival.p))))
-    caption = f"One-step prediction error, root mean square, on {said.scored} samples that all could predict."
+    caption = f"One-step prediction error, root mean square, on {truth.scored} samples that all could predict."
     return table(caption, ("", "error", "over this run", "p, no better"), rows)
 
 

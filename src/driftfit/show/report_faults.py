@@ -33,7 +33,7 @@ def faults(run: Track, alarms: Alarms | None, labels: Array | None) -> str:
     wrong = None if labels is None else _checked(run, labels)
     parts = [] if wrong is None else [_labels(run, alarms, wrong)]
     if alarms is not None:
-        parts += [_said(alarms, wrong), _alarms(alarms), picture(alarms.plot(wrong), run, PICTURE)]
+        parts += [_score(alarms, wrong), _alarms(alarms), picture(alarms.plot(wrong), run, PICTURE)]
     return "".join(parts)
 
 
@@ -94,7 +94,7 @@ def _labels(run: Track, alarms: Alarms | None, wrong: Array) -> str:
     return table(f"Labelled as wrong.{_more(rows)}", heads, rows[:LISTED], (1, 3))
 
 
-def _said(alarms: Alarms, wrong: Array | None) -> str:
+def _score(alarms: Alarms, wrong: Array | None) -> str:
     text = (
         f"Alarm: {alarms.kind}, one false alarm in {alarms.every:g} samples. {len(alarms.onsets)} alarms; "
         f"A record without a fault is as extreme as this one with probability {p_text(alarms.p)}."

@@ -47,21 +47,21 @@ def page_of_many(
     """The page as HTML text; ``failed`` gives the reasons of missing results; ``labels`` by key are true for faults."""
     if not runs:
         raise ValueError("report: no series has a result to report.")
-    said, health = verdicts_and_diagnoses(runs, LEVEL)
+    verdicts, health = verdicts_and_diagnoses(runs, LEVEL)
     heading = title or (", ".join(map(key_text, runs)) if len(runs) < NAMED else f"{len(runs)} series")
     samples, used = sum(map(len, runs.values())), sum(int(run.ok.sum()) for run in runs.values())
     counted = f"{len(runs)} series, {samples} samples, {used} used, {samples - used} skipped"
-    shown = [row for row in said.rows[:PICTURED] if row.drifts] or list(said.rows[:1])
+    shown = [row for row in verdicts.rows[:PICTURED] if row.drifts] or list(verdicts.rows[:1])
     return document(
         heading,
         [
             f"<h1>{escape(heading)}</h1>",
             f'<p class="soft">{escape(counted)}</p>',
-            _verdict(said, health),
+            _verdict(verdicts, health),
             *([section("Faults and alarms", many_faults(runs, alarms, labels or {}))] if alarms or labels else []),
-            section("All series", _rows(said, health)),
+            section("All series", _rows(verdicts, health)),
             section(
-                "The series that move most clearly" if said.drifting else "The clearest",
+                "The series that move most clearly" if verdicts.drifting else "The clearest",
                 "".join(_pictured(row, runs[row.key]) for row in shown),
             ),
             section("Diagnostics", _health(health)),
@@ -71,30 +71,30 @@ def page_of_many(
     )
 
 
-def _verdict(said: ManyVerdicts, health: ManyDiagnoses) -> str:
+def _verdict(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
     out = sum(not one.ok for one in health.of.values())
     state = f"{out} of {len(health)} have diagnostics out of bounds." if out else "All diagnostics are within limits."
     if not any(np.isfinite(check.value) for one in health.of.values() for check in one.checks):
         state = "No diagnostic can be computed."
-    lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*said.sentences, state))
+    lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*verdicts.sentences, state))
     return f'<div class="verdict">{lines}</div>'
 
 
-def _rows(said: ManyVerdicts, health: ManyDiagnoses) -> str:
+def _rows(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
     rows = []
-    for row in said.rows[:LISTED]:
+    for row in verdicts.rows[:LISTED]:
         out = len(health[row.key].sentences)
-        numbers = (escape(p_text(row.said.p)), escape(p_text(row.q)))
-        errors = (f"{row.said.rms:.4g}", f"{row.said.rivals[1].rms:.4g}", "yes" if row.pays else "")
+        numbers = (escape(p_text(row.verdict.p)), escape(p_text(row.q)))
+        errors = (f"{row.verdict.rms:.4g}", f"{row.verdict.rivals[1].rms:.4g}", "yes" if row.pays else "")
         marked = f'<span class="bad">{out}</span>' if out else "0"
         rows.append((escape(key_text(row.key)), escape(row.change), *numbers, *errors, marked))
     heads = ("", "what moves", "p", "q", "error", "of constants", "pays", "out of bounds")
-    more = f" The first {LISTED} of {len(said)}." if len(said) > LISTED else ""
+    more = f" The first {LISTED} of {len(verdicts)}." if len(verdicts) > LISTED else ""
     return table(f"The clearest first.{more}", heads, rows, (1,))
 
 
 def _pictured(row: Judgement, run: Track) -> str:
-    text = escape(" ".join(row.said.sentences))
+    text = escape(" ".join(row.verdict.sentences))
     shown = picture(parameter_figure(run), run, PARAMETERS)
     return f'<div class="one"><h3>{escape(key_text(row.key))}</h3><p>{text}</p>{shown}</div>'
 

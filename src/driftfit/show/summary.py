@@ -9,6 +9,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.judge.compare import Comparison, compare
+from driftfit.models.fault_codes import refusals
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.by_output import ByOutput
@@ -95,7 +96,8 @@ def summarise(run: Track) -> Summary:
     tracker = shortened(repr(run.tracker))
     return Summary(
         repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
-        _signals(run), _span(run), counts(run.labels.dropped), (*remarks, *_missing(run), *run.tracker.remarks(run)),
+        _signals(run), _span(run), counts(run.labels.dropped),
+        (*remarks, *_missing(run), *refusals(run.state), *run.tracker.remarks(run)),
     )  # fmt: skip
 
 

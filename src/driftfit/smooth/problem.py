@@ -10,8 +10,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, output_type
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.tiles import output_type
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.program import BLOCK, lanes_of, put_fields
 from driftfit.run.result import Track

@@ -16,7 +16,7 @@ from driftfit.smooth.smoothed import Smoothed
 
 
 class SmoothedShared(Smoothed):
-    """Shared parameters of a record, each from all of it.
+    """Shared parameters of a record, each estimated from the complete record.
 
     As `Smoothed`, with ``theta``, ``std``, ``slope`` (T, n), ``rank`` (T,) and ``residual``, ``loo``, ``leverage``
     (T, ny). ``rows`` is the path of the T ny rows.

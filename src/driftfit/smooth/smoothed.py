@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Smoothed:
-    """Parameters of a record, each from all of it.
+    """Parameters of a record, each estimated from the complete record.
 
     Attributes
     ----------

@@ -4,7 +4,8 @@ K random-walk filters run side by side. Filter k lets parameter i drift by ``q_k
 sample, where r is the present noise variance and c_i the mean square of regressor i, so ratio_k w_ki is the share of r
 that the drift of one parameter adds to the output per sample, whatever the units. The first ratio is 0. In the common
 ladder of ratios all weights w are 1; in a second one they are learned from the record
-(`driftfit.trackers.parts.modes.weights`); and, with up to eight parameters, each has a ladder on which it alone drifts.
+(`driftfit.trackers.parts.modes.weights`); the filters of a third follow a trend
+(`driftfit.trackers.parts.modes.trend`); and, with up to eight parameters, each has a ladder on which it alone drifts.
 The filters are the modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each
@@ -15,8 +16,9 @@ of the parameters (`driftfit.trackers.parts.modes.ladder`), or more noise. Readi
 last value are left out too (`driftfit.trackers.parts.frozen`). If innovations are correlated, the previous one is an
 additional regressor (`driftfit.trackers.parts.modes.coloured`).
 
-The results are the mean and covariance of the mixture. The one-step variance excludes the outlier level, so its band is
-for samples that are not outliers.
+The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
+estimates themselves (`driftfit.trackers.parts.modes.filters`). The one-step variance excludes the outlier level, so its
+band is for samples that are not outliers.
 
 The start is exact diffuse least squares without drift, in which regressors out of proportion count less too, until
 there are enough residuals to estimate r. Fault codes among these samples are found then, and least squares repeated
@@ -28,8 +30,8 @@ Use it if nothing is known; if q and r are known, `Kalman` is as good and far ch
 in a few hundred samples; ``groups`` tells it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the ladder of ratios, its transitions, the noise
-levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 13 + 3 n
-for up to eight parameters, and 13 for more.
+levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 16 + 3 n
+for up to eight parameters, and 16 for more.
 """
 
 from __future__ import annotations
@@ -338,14 +340,14 @@ class AdaptiveKalman(Tracker):
         lane, names = run.state, np.array(run.names)
         never = np.isinf(lane["var"])
         lately = ~never & ~learned(lane)
-        said = []
+        facts = []
         if never.any():
-            said.append(
+            facts.append(
                 ("Not learned", f"{', '.join(names[never])}: never varied separately from the others; std is inf")
             )
         if lately.any():
-            said.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
-        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane), *colour(lane))
+            facts.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
+        return (*facts, *proportion(lane), *held_readings(lane), *resolution(lane), *colour(lane))
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])

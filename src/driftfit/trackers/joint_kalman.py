@@ -37,12 +37,12 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
-from driftfit.engine.settings import covariance, matrix, near, numbers, one_of, vector
-from driftfit.models.base import Model
+from driftfit.engine.settings import one_of
 from driftfit.models.state_space import StateSpace, equations_of
-from driftfit.trackers.base import Tracker
+from driftfit.trackers.kalman import drift_matrix
 from driftfit.trackers.parts.diffuse import corrected, symmetric_product
 from driftfit.trackers.parts.varying_drift import read_drift
+from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
 MOST = 1000.0
 """Times that equations are repeated for one gap, at most."""
@@ -56,15 +56,6 @@ def at_estimate(s: State, l: int) -> None:
     """The equations are evaluated at z."""
     for i in range(s.theta.shape[0]):
         s.point[i, l] = s.theta[i, l]
-
-
-@kernel
-def spread(s: State, l: int) -> None:
-    """P <- P + q dt d."""
-    time = s.dt[l] * s.drift[l]
-    for i in range(s.theta.shape[0]):
-        for j in range(i + 1):
-            s.P[i, j, l] += s.q[i, j, l] * (s.drift_root[i, l] * s.drift_root[j, l]) * time
 
 
 @kernel
@@ -86,7 +77,7 @@ def _repeated(move: Step, timed: bool) -> Step:
         while left > 0.5:
             move(s, l)
             left -= 1.0
-        spread(s, l)
+        drift_matrix(s, l)
 
     step: Step = predict
     return step
@@ -249,7 +240,7 @@ def _unscented(equations: str, inputs: tuple[str, ...], n: int, hidden: int, tim
 
 
 @dataclass(frozen=True)
-class JointKalman(Tracker):
+class JointKalman(StateSpaceTracker):
     """Extended or unscented Kalman filter of parameters and hidden states, for `StateSpace`.
 
     Parameters
@@ -278,80 +269,21 @@ class JointKalman(Tracker):
     theta0: Any = None
     method: str = "unscented"
 
-    required: ClassVar[tuple[str, ...]] = ("q", "r", "p0")
-    drift_per_parameter: ClassVar[bool] = True
-    follows_states: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = ("g", "W", "L", "moved", "shown")
 
-    @property
-    def beyond(self) -> str:
-        return "moves hidden states"
-
     def __post_init__(self) -> None:
-        for name in ("q", "p0"):
-            self._set(name, named_variances("JointKalman", name, getattr(self, name)))
-        if self.r is not None:
-            self._set("r", numbers("JointKalman", "r", self.r, ndim=0, low=0.0, strict=True))
-        if self.theta0 is not None:
-            self._set("theta0", numbers("JointKalman", "theta0", self.theta0))
+        self._check()
         one_of("JointKalman", "method", self.method, ("extended", "unscented"))
 
-    @classmethod
-    def own_model(cls, na: int, nb: int, nk: int) -> Model:
-        terms = [f"theta.a{i + 1} * (-y[-{i + 1}])" for i in range(na)]
-        terms += [f"theta.b{i + 1} * " + (f"u[-{nk + i}]" if nk + i else "u") for i in range(nb)]
-        return StateSpace(f"y = {' + '.join(terms)}", start=0.0)
-
-    def state(self, n: int) -> Mapping[str, Any]:
-        raise ValueError("JointKalman follows a StateSpace model.")
-
-    def state_for(self, model: Model) -> Mapping[str, Any]:
-        if not isinstance(model, StateSpace):
-            raise ValueError(f"JointKalman follows a StateSpace model; got {type(model).__name__}.")
+    def state_of(self, model: StateSpace, prior: Mapping[str, Any]) -> Mapping[str, Any]:
         n, hidden = model.n, max(len(model.hidden), 1)
-        q, p0 = (by_name("JointKalman", name, getattr(self, name), model) for name in ("q", "p0"))
         own: dict[str, Array] = {"W": np.zeros((hidden, n))}
         if self.method == "unscented":
             own = {"L": np.zeros((n, n)), "moved": np.zeros((hidden, 2 * n + 1)), "shown": np.zeros(2 * n + 1)}
-        return {
-            "theta": model.begins if self.theta0 is None else vector("JointKalman", "theta0", self.theta0, n),
-            "P": matrix("JointKalman", "p0", p0, n), "q": matrix("JointKalman", "q", q, n), "r": self.r,
-            "g": np.zeros(n), "drift_root": np.ones(n), **own,
-        }  # fmt: skip
+        return {**prior, "g": np.zeros(n), "drift_root": np.ones(n), **own}
 
-    @property
-    def steps(self) -> TrackerSteps:
-        raise ValueError("JointKalman follows a StateSpace model.")
-
-    def steps_for(self, model: Model) -> TrackerSteps:
-        if not isinstance(model, StateSpace):
-            raise ValueError(f"JointKalman follows a StateSpace model; got {type(model).__name__}.")
+    def steps_of(self, model: StateSpace) -> TrackerSteps:
         given = model.equations, model.input_names
         if self.method == "extended":
             return _extended(*given, len(model.hidden), model.system.timed)
         return _unscented(*given, model.n, len(model.hidden), model.system.timed)
-
-
-def named_variances(owner: str, name: str, given: Any) -> Any:
-    """A covariance as a setting: numbers, or pairs of a name and a variance."""
-    if isinstance(given, Mapping) or _pairs(given):
-        return tuple((key, numbers(owner, name, one, ndim=0, low=0.0)) for key, one in dict(given).items())
-    return None if given is None else covariance(owner, name, given)
-
-
-def by_name(owner: str, name: str, given: Any, model: Model) -> Any:
-    """Such a setting for a model: pairs become variances (n,), 0 for names that it does not have."""
-    if not _pairs(given):
-        return given
-    for key, _ in given:
-        if key not in model.names:
-            raise ValueError(f"{owner}: {name} names {key!r}; {near(key, model.names)}")
-    found: Array = np.array([dict(given).get(one, 0.0) for one in model.names])
-    return found
-
-
-def _pairs(given: Any) -> bool:
-    """Whether it is a mapping as plain data: pairs of a name and a number."""
-    return isinstance(given, tuple | list) and all(
-        isinstance(one, tuple | list) and len(one) == 2 and isinstance(one[0], str) for one in given
-    )

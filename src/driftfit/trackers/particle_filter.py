@@ -32,31 +32,22 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.settings import matrix, near, numbers, vector, whole
-from driftfit.models.base import Model
+from driftfit.engine.settings import near, whole
 from driftfit.models.state_space import StateSpace
-from driftfit.trackers.base import Tracker
-from driftfit.trackers.joint_kalman import JointKalman, by_name, named_variances
-from driftfit.trackers.particles.steps import steps
+from driftfit.trackers.state_space.particle_steps import steps
+from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
 
 @dataclass(frozen=True)
-class ParticleFilter(Tracker):
+class ParticleFilter(StateSpaceTracker):
     """Rao-Blackwellised particle filter of parameters and hidden states, for `StateSpace`.
 
     Parameters
     ----------
     particles : int
         Their number.
-    q : number, (n,), (n, n), or mapping from name
-        Variance that each parameter and state gains per nominal sample. A mapping gives 0 to those it does not name.
-    r : number
-        Noise variance of the output; positive.
-    p0 : number, (n,), (n, n), or mapping from name
-        Covariance of parameters and states before the first sample. A mapping gives 0, certainty, to those that it does
-        not name.
-    theta0 : (n,) or None
-        Their mean. None: the ``start`` of the model.
+    q, r, p0, theta0
+        As for `JointKalman`.
     sampled : names or None
         Parameters and states that are drawn. None: all states.
     seed : int
@@ -76,65 +67,36 @@ class ParticleFilter(Tracker):
     sampled: tuple[str, ...] | None = None
     seed: int = 0
 
-    required: ClassVar[tuple[str, ...]] = ("particles", "q", "r", "p0")
+    required: ClassVar[tuple[str, ...]] = ("particles", *StateSpaceTracker.required)
     width: ClassVar[int] = 1
     outputs: ClassVar[tuple[str, ...]] = ("log_density",)
     density: ClassVar[str] = "log_density"
-    drift_per_parameter: ClassVar[bool] = True
-    follows_states: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
         "W", "gain", "shown", "spread", "fit", "column", "cloud_after", "own_after", "log_density"
     )  # fmt: skip
 
-    @property
-    def beyond(self) -> str:
-        return "moves hidden states"
-
     def __post_init__(self) -> None:
         name = "ParticleFilter"
+        self._check()
         if self.particles is not None:
             self._set("particles", whole(name, "particles", self.particles, 1))
-        for one in ("q", "p0"):
-            self._set(one, named_variances(name, one, getattr(self, one)))
-        if self.r is not None:
-            self._set("r", numbers(name, "r", self.r, ndim=0, low=0.0, strict=True))
-        if self.theta0 is not None:
-            self._set("theta0", numbers(name, "theta0", self.theta0))
         if self.sampled is not None:
             given = (self.sampled,) if isinstance(self.sampled, str) else self.sampled
             self._set("sampled", tuple(str(one) for one in given))
         self._set("seed", whole(name, "seed", self.seed, 0))
 
-    @classmethod
-    def own_model(cls, na: int, nb: int, nk: int) -> Model | None:
-        return JointKalman.own_model(na, nb, nk)
-
-    def state(self, n: int) -> Mapping[str, Any]:
-        raise ValueError("ParticleFilter follows a StateSpace model.")
-
-    def state_for(self, model: Model) -> Mapping[str, Any]:
-        if not isinstance(model, StateSpace):
-            raise ValueError(f"ParticleFilter follows a StateSpace model; got {type(model).__name__}.")
-        n, name = model.n, "ParticleFilter"
-        count = 1 if self.particles is None else self.particles
-        q, p0 = (matrix(name, one, by_name(name, one, getattr(self, one), model), n) for one in ("q", "p0"))
-        theta = model.begins if self.theta0 is None else vector(name, "theta0", self.theta0, n)
+    def state_of(self, model: StateSpace, prior: Mapping[str, Any]) -> Mapping[str, Any]:
+        n, count = model.n, 1 if self.particles is None else self.particles
         return {
-            "theta": theta, "P": p0, "q": q, "r": self.r, "drift_root": np.ones(n), "seed": self.seed, "drawn": 0,
-            "cloud": np.repeat(theta[None], count, axis=0), "own": np.repeat(p0[None], count, axis=0),
+            **prior, "drift_root": np.ones(n), "seed": self.seed, "drawn": 0,
+            "cloud": np.repeat(prior["theta"][None], count, axis=0), "own": np.repeat(prior["P"][None], count, axis=0),
             "weight": np.full(count, 1.0 / count), "W": np.zeros((max(len(model.hidden), 1), n)),
             "gain": np.zeros((count, n)), "shown": np.zeros(count), "spread": np.zeros(count), "fit": np.zeros(count),
             "column": np.zeros(n), "cloud_after": np.zeros((count, n)), "own_after": np.zeros((count, n, n)),
             "log_density": 0.0,
         }  # fmt: skip
 
-    @property
-    def steps(self) -> TrackerSteps:
-        raise ValueError("ParticleFilter follows a StateSpace model.")
-
-    def steps_for(self, model: Model) -> TrackerSteps:
-        if not isinstance(model, StateSpace):
-            raise ValueError(f"ParticleFilter follows a StateSpace model; got {type(model).__name__}.")
+    def steps_of(self, model: StateSpace) -> TrackerSteps:
         chosen = model.hidden if self.sampled is None else self.sampled
         for one in chosen:
             if one not in model.names:

@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.data.record import Record
-from driftfit.engine.drivers import output_type
 from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.tiles import output_type
 from driftfit.models.base import Model
 from driftfit.run.program import Program, spread, tile_of
 from driftfit.run.result import burn_in

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.arguments import check_roles
+from driftfit.data.limits import FAR, absurd
 from driftfit.data.record import Reading
 from driftfit.engine.settings import one_of, whole
 from driftfit.models.base import Model
@@ -125,6 +126,7 @@ def _tuned(
     """Tune on a checked record."""
     if order_by is not None:
         task = along(task, tracker, order_by)
+    _warn_of_fault_codes(task)
     knobs = find_knobs(task, tracker, groups, bounds)
     f = Counted(Criterion(task, knobs, method, h))
     search = Search(f, knobs, minimise(f, knobs))
@@ -142,6 +144,22 @@ def _tuned(
     )
     _warn(tuned)
     return tuned
+
+
+def _warn_of_fault_codes(task: Task) -> None:
+    """Warn of readings that decide the likelihood alone."""
+    for record in task.records:
+        m = record.u.shape[1]
+        columns = {"y": record.y} | {f"u{j + 1}" if m > 1 else "u": record.u[:, j] for j in range(m)}
+        for name, x in columns.items():
+            if x.ndim == 1 and len(places := absurd(x)):
+                warnings.warn(
+                    f"tune: {name} is {x[places[0]]:.6g} at sample {places[0]}, more than {FAR:.0f} times its "
+                    f"usual deviation ({len(places)} such values): they decide the likelihood alone. If fault codes, "
+                    f'give limits={{"{name}": (low, high)}}.',
+                    UserWarning,
+                    stacklevel=4,
+                )
 
 
 def _warn(tuned: Tuned) -> None:

@@ -35,9 +35,10 @@ import scipy
 from driftfit.data.clock import Clock
 from driftfit.data.labels import inputs_for
 from driftfit.data.record import time_text
-from driftfit.engine.drivers import as_compiled, one_or_all
+from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, whole
+from driftfit.engine.tiles import as_compiled
 from driftfit.run.program import state_of
 from driftfit.run.result import Track
 from driftfit.use.prediction import within

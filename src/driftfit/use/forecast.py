@@ -12,9 +12,14 @@ lags (L,), a the entries of theta that multiply them, C_ll and C_tl the covarian
 for normal errors. The last two terms are the product da' dl, which matters while parameters are uncertain. C_ll and
 C_tl follow from the same line, sample by sample; the drift of theta enters when it happens. Cost O(h (n + L)^2). While
 an unstable system is still likely, the outputs have tails that no variance describes; the bands are then those of the
-central part. With several outputs, their noises are assumed to be independent. A Hammerstein-Wiener model is fitted to
-w = F(y), so its errors are those of w: r sum_{0<j<h} psi_j^2 is added to phi' P phi + r, with psi the response of
-1 / A(z) to one noise, and everything is divided by the slope F'(y_hat).
+central part. With several outputs, their noises are assumed to be independent. Other models feed errors back
+through the response psi of y to one noise, C / (A D) for polynomial models and 1 / A for Hammerstein-Wiener models:
+
+    Var_h       = S_h' P S_h + r sum_{j<h} (psi_j^2 + var psi_j),     S_h = sum_{j<h} psi_j phi_{h-j}
+
+with phi the gradient of one step and var psi that of the delta method: while D is hardly known, most of the variance
+is there. A Hammerstein-Wiener model is fitted to w = F(y), so its errors are those of w, and everything is divided by
+the slope F'(y_hat).
 """
 
 from __future__ import annotations
@@ -26,15 +31,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.data.labels import inputs_for
-from driftfit.engine.arrays import as_numbers
-from driftfit.engine.drivers import as_compiled, one_or_all
+from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import whole
+from driftfit.engine.settings import as_numbers, whole
+from driftfit.engine.tiles import as_compiled
 from driftfit.models.base import Model
 from driftfit.run.live.live import Live
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, state_of
 from driftfit.run.result import Track
+from driftfit.use.delta_method import spread
 
 
 class Forecast(NamedTuple):
@@ -105,6 +111,7 @@ def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
     update = program.drivers().updater(tile, model.m)
     noise = lane["r"] * lane["scale"] if "r" in lane else np.nan
     result = Forecast(np.empty((h, len(now))), np.empty((h, len(now))), np.empty(h), np.empty(h))
+    slopes, covs = np.full((h, len(now)), np.nan), np.full((h, len(now), len(now)), np.nan)
     for k in range(h):
         look[...] = tile
         y_hat, _, s, _ = update(as_compiled(look), np.nan, one_or_all(inputs[k]))
@@ -117,11 +124,26 @@ def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
         if lagged is not None:
             P = tracker.cov(lane)[None]
             result.y_std[k] = lagged.step(lane["phi"], lane["theta"][None], P, np.array([s]))[0]
+        elif tracker.covariance and len(lane["phi"]) == len(now):
+            slopes[k], covs[k] = lane["phi"], tracker.cov(lane)
     if lagged is not None or tracker.output_error:  # an output error is never fed back
         return result._replace(y_std=np.sqrt(result.y_std))
-    response = model.noise_response(now, h)
-    later = noise * model.noise_factor(now, result.y_hat[0]) * (np.cumsum(response**2) - response[0] ** 2)
+    noise *= model.noise_factor(now, result.y_hat[0])
+    later = _fed_back(model, now, slopes, covs, float(noise))
     return result._replace(y_std=np.sqrt(result.y_std + later) / model.output_slope(now, result.y_hat))
+
+
+def _fed_back(model: Model, theta: Array, slopes: Array, covs: Array, noise: float) -> Array:
+    """What noise and errors of theta, fed back through the noise model, add to the variances (h,) of one step."""
+    h = len(slopes)
+    response = model.noise_response(theta, h)
+    later = noise * (np.cumsum(response**2) - response[0] ** 2)
+    if not np.isfinite(covs).all():
+        return np.asarray(later)
+    (_,), (off,) = spread(lambda many: np.array([model.noise_response(one, h) for one in many]), theta[None], covs[:1])
+    total = np.stack([np.convolve(response, column)[:h] for column in slopes.T], axis=1)
+    more = np.einsum("ki,kij,kj->k", total, covs, total) - np.einsum("ki,kij,kj->k", slopes, covs, slopes)
+    return np.asarray(later + noise * np.cumsum(off**2) + more)
 
 
 def _of_outputs(live: Live, h: int, u: Any) -> Forecast:

@@ -25,9 +25,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.data.clock import Clock, instants
-from driftfit.engine.arrays import as_numbers
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import one_of, whole
+from driftfit.engine.settings import as_numbers, one_of, whole
 from driftfit.run.result import Track
 
 

@@ -220,9 +220,9 @@ class Partition:
                 else Outputs(programs, found.records.only(j), own, {}, {}).values()
             )
             for run, of in zip(runs, self.task.suffixes, strict=True):
-                said = verdict(run)
-                most = min(said.parameters, key=lambda one: one.p)
-                for name, value in zip(VERDICT, (said.drifts, said.p, said.pays, most.name), strict=True):
+                truth = verdict(run)
+                most = min(truth.parameters, key=lambda one: one.p)
+                for name, value in zip(VERDICT, (truth.drifts, truth.p, truth.pays, most.name), strict=True):
                     columns[f"{name}{of}"].append(value)
         return columns
 

@@ -19,8 +19,8 @@ def java() -> tuple[str | None, int | None]:
     path = shutil.which("java", path=os.path.join(home, "bin")) if home else shutil.which("java")
     if path is None:
         return None, None
-    said = subprocess.run([path, "-version"], capture_output=True, text=True, check=False).stderr
-    found = re.search(r'version "(\d+)', said)
+    printed = subprocess.run([path, "-version"], capture_output=True, text=True, check=False).stderr
+    found = re.search(r'version "(\d+)', printed)
     return path, int(found[1]) if found else None
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import MISSING, Field, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
@@ -13,7 +13,16 @@ import typer
 
 from driftfit.cli.parts.arguments import listed, parse_interval, parse_model, parse_tracker, parse_units
 from driftfit.cli.parts.program import helpful, progress
-from driftfit.cli.parts.reading import Part, Rows, rows_of
+from driftfit.cli.parts.reading import (
+    Part,
+    Rows,
+    decimal_from,
+    limits_from,
+    rows_from,
+    rows_of,
+    separator_from,
+    stretch,
+)
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
@@ -115,7 +124,12 @@ class Given:
     def part(self) -> Part:
         """Which part of the files is used, and how the files are read."""
         names = [*self.outputs, *self.inputs]
-        return Part.of(self.first, self.last, self.rows, self.separator, self.decimal, self.limits, self.exclude, names)
+        return Part(
+            first=self.first, last=self.last, rows=rows_from(self.rows),
+            separator=separator_from(self.separator), decimal=decimal_from(self.decimal),
+            limits=tuple(limits_from(entry, names) for entry in self.limits or []),
+            exclude=tuple(map(stretch, self.exclude or [])),
+        )  # fmt: skip
 
     def signals(self, rows: Rows | None = None) -> dict[str, Any]:
         """The arguments of `track` other than model and tracker; ``rows`` are the data if they were read already."""
@@ -186,24 +200,37 @@ def saved(path: Path) -> Any:
 
 
 def reads(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command whose first argument is a `Given` all its options on the command line."""
-    hints = get_type_hints(Given, include_extras=True)
-    shared = [
-        inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=_default(f), annotation=hints[f.name])
-        for f in fields(Given)
-    ]
-    own = list(inspect.signature(command, eval_str=True).parameters.values())[1:]
-    own = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own]
+    """Give a command, whose first argument is a `Given`, all its options on the command line.
+
+    An argument that is a dataclass of options stands for its fields.
+    """
+    groups: dict[str, Any] = {}
+    options: list[inspect.Parameter] = []
+    for one in inspect.signature(command, eval_str=True).parameters.values():
+        if is_dataclass(one.annotation):
+            groups[one.name] = one.annotation
+            options += _options_of(one.annotation)
+        else:
+            options.append(one.replace(kind=inspect.Parameter.KEYWORD_ONLY))
 
     def run(**typed: Any) -> None:
         with helpful():
-            command(Given(**{f.name: typed.pop(f.name) for f in fields(Given)}), **typed)
+            grouped = {name: kind(**{f.name: typed.pop(f.name) for f in fields(kind)}) for name, kind in groups.items()}
+            command(**grouped, **typed)
 
-    vars(run)["__signature__"] = inspect.Signature([*shared, *own])
-    run.__annotations__ = {one.name: one.annotation for one in (*shared, *own)}
+    vars(run)["__signature__"] = inspect.Signature(options)
+    run.__annotations__ = {one.name: one.annotation for one in options}
     run.__name__, run.__doc__ = command.__name__, command.__doc__
     return run
 
 
-def _default(field: Field[Any]) -> Any:
-    return inspect.Parameter.empty if field.default is MISSING else field.default
+def _options_of(group: Any) -> list[inspect.Parameter]:
+    """The options that the fields of a dataclass are."""
+    hints = get_type_hints(group, include_extras=True)
+    return [
+        inspect.Parameter(
+            f.name, inspect.Parameter.KEYWORD_ONLY, annotation=hints[f.name],
+            default=inspect.Parameter.empty if f.default is MISSING else f.default,
+        )
+        for f in fields(group)
+    ]  # fmt: skip

@@ -38,20 +38,6 @@ class Part:
     limits: tuple[tuple[str, Range], ...] = ()
     exclude: tuple[tuple[str, str], ...] = ()
 
-    @classmethod
-    def of(
-        cls, first: str | None, last: str | None, rows: str | None, separator: str | None, decimal: str,
-        limits: Sequence[str] | None, exclude: Sequence[str] | None, names: Sequence[str],
-    ) -> Part:  # fmt: skip
-        """From the options of the command line."""
-        if decimal not in (".", ","):
-            raise ValueError(f"--decimal {decimal}: the decimal sign must be a point or a comma.")
-        sign = "\t" if separator in ("tab", "\\t") else separator
-        if sign is not None and len(sign) != 1:
-            raise ValueError(f"--separator {separator}: the separator must be one character, such as ';', or tab.")
-        ranges = tuple(_limits(entry, names) for entry in limits or [])
-        return cls(first, last, _rows(rows), sign, decimal, ranges, tuple(map(stretch, exclude or [])))
-
     @property
     def whole(self) -> bool:
         """Whether the files are read without any restriction."""
@@ -100,7 +86,7 @@ class Rows(NamedTuple):
         return np.asarray(order[~again])
 
 
-def _limits(entry: str, names: Sequence[str]) -> tuple[str, Range]:
+def limits_from(entry: str, names: Sequence[str]) -> tuple[str, Range]:
     """``flow=0:80`` as a name and its range."""
     name, _, bounds = entry.partition("=")
     low, colon, high = bounds.partition(":")
@@ -123,7 +109,23 @@ def stretch(entry: str, option: str = "--exclude") -> tuple[str, str]:
     return first.strip(), last.strip()
 
 
-def _rows(text: str | None) -> tuple[int, int | None]:
+def decimal_from(text: str) -> str:
+    """The decimal sign."""
+    if text not in (".", ","):
+        raise ValueError(f"--decimal {text}: the decimal sign must be a point or a comma.")
+    return text
+
+
+def separator_from(text: str | None) -> str | None:
+    """The separator of cells, one character; None: it is detected."""
+    sign = "\t" if text in ("tab", "\\t") else text
+    if sign is not None and len(sign) != 1:
+        raise ValueError(f"--separator {text}: the separator must be one character, such as ';', or tab.")
+    return sign
+
+
+def rows_from(text: str | None) -> tuple[int, int | None]:
+    """``100:500`` as the first and the last row, None: to the end."""
     if text is None:
         return 1, None
     first, colon, last = text.partition(":")

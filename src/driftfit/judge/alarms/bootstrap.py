@@ -4,7 +4,9 @@ Every simulated record has its own reference. The residuals x of the reference a
 (sums of fitted residuals in their order vary too little), they get the variances h of the model, and scale and
 variances are estimated from them again; so is the error of theta, from its covariance. A record of regressors and
 residuals drawn together follows, whose scores are those of the model that was estimated from its own reference. The
-limits so allow for everything that is estimated: a stream carries these errors for ever.
+limits therefore allow for everything that is estimated: a stream keeps these errors for as long as it runs. Whether the
+variance changes at all is seldom certain, so alpha and beta of each record are drawn from those that the reference
+leaves plausible.
 
 With a deviate c as statistic the logarithm of the rate of onsets falls nearly as a straight line in c^2. A limit that
 is rarer than the simulated records can show is found along that line, which also gives the probability of an extreme.
@@ -21,10 +23,12 @@ import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.calibration import limit_of
-from driftfit.judge.alarms.frozen import Rows, noise_models
+from driftfit.judge.alarms.frozen import GARCH, Rows, noise_models, plausible
 from driftfit.judge.alarms.side_by_side import Records, statistics_of
 from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.live.likelihood_ratio import (
+    ALPHA,
+    BETA,
     CLIP,
     LEVELS,
     SCALE,
@@ -58,7 +62,9 @@ def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> 
     z = scipy.special.ndtri(sobol.random_base2(int(np.ceil(np.log2(records))))[:records] * (1.0 - 1e-9) + 5e-10)
     known, later = (_blocks(rng, (records, length), N, block) for rng, length in zip(draws[:2], (N, T), strict=True))
     signs = draws[2].integers(0, 2, (records, N + T)) * 2.0 - 1.0
-    w = _played(frozen, rows.x[np.hstack([known, later])] * signs, N)
+    drawn = np.tile(frozen.numbers, (records, 1))
+    drawn[:, [ALPHA, BETA]] = _variances(frozen, rows.x, np.random.default_rng([seed, 4]).random(records))
+    w = _played(drawn, rows.x[np.hstack([known, later])] * signs, N)
     numbers, _ = noise_models(w[:, :N], 0)
     w, h = w[:, N:] / numbers[:, SCALE, None], np.empty((records, T))
     for one, own, level in zip(w, numbers, h, strict=True):
@@ -77,8 +83,8 @@ def together(parts: Sequence[Records]) -> Records:
 def drawn_in_blocks(frozen: Frozen, x: Array) -> bool:
     """Whether the size of the residuals is correlated even after the GARCH part, so that they are drawn in blocks.
 
-    In blocks, a short window has no other sums of squares than those of the reference, whose largest is then the
-    largest of all.
+    With blocks, the sums of squares of a short window are those that occur in the reference, so that none exceeds its
+    largest.
     """
     g = np.clip(x, -frozen.numbers[CLIP], frozen.numbers[CLIP])
     return whiteness(g * g - np.mean(g * g)).p <= CORRELATED
@@ -91,12 +97,20 @@ def _blocks(rng: np.random.Generator, shape: tuple[int, int], N: int, block: int
     return np.asarray((first[..., None] + np.arange(block)).reshape(R, -1)[:, :T] % N)
 
 
-def _played(frozen: Frozen, x: Array, N: int) -> Array:
-    """Residuals (R, N + T) with the variances of the model, which start again after the N of the reference."""
+def _variances(frozen: Frozen, x: Array, chance: Array) -> Array:
+    """alpha and beta (R, 2) of the records, drawn from those that the reference leaves plausible; ``chance`` (R,)."""
+    w = np.empty(len(x))
+    played(x, frozen.numbers, w)
+    which = np.searchsorted(np.cumsum(plausible(w, frozen.numbers)), chance)
+    return np.asarray(GARCH[:, np.minimum(which, GARCH.shape[1] - 1)].T)
+
+
+def _played(numbers: Array, x: Array, N: int) -> Array:
+    """Residuals (R, N + T) with the variances of each model, which start again after the N of the reference."""
     w = np.empty(x.shape)
-    for one, into in zip(x, w, strict=True):
-        played(one[:N], frozen.numbers, into[:N])
-        played(one[N:], frozen.numbers, into[N:])
+    for one, own, into in zip(x, numbers, w, strict=True):
+        played(one[:N], own, into[:N])
+        played(one[N:], own, into[N:])
     return w
 
 

@@ -22,8 +22,8 @@
   inputs, its parameters at ``at``, its innovations redrawn) and tracked; onsets exceed the limit at the given rate. Any
   kind can be calibrated in this way, with ``calibrate=True``: it is slower, and does not rely on the std.
 
-The result is in ``said.rule`` (`driftfit.run.live.rule.AlarmRule`), a small frozen object: `Live.detect`
-watches a stream by it, and ``other.detect(said.rule)`` another record.
+The result is in ``run.detect(...).rule`` (`driftfit.run.live.rule.AlarmRule`), a small frozen object: `Live.detect`
+watches a stream by it, and ``other.detect(rule)`` another record.
 
 docs/alarms.md compares the kinds. A tracker that estimates its own drift mistakes a fault for drift and follows it:
 its innovations are soon normal again, so "innovation" gives an alarm, if at all, in the first samples of the fault.
@@ -31,8 +31,8 @@ its innovations are soon normal again, so "innovation" gives an alarm, if at all
 ``p`` is the probability that a record without a fault is as extreme as this one: from the same rates (the smallest of
 the columns, 1 - P(first within) exp(-samples rate), times their number), or the share of the simulated records.
 
-Only the calibration looks ahead. Verified by ``benchmarks/alarm_rates.py``. Cost: O(T), and as many runs as
-50 every / T for a calibration.
+Only the calibration looks ahead. Verified by ``benchmarks/alarm_rates.py``. Cost: O(T), and 50 every / T runs
+for a calibration.
 """
 
 from __future__ import annotations
@@ -263,11 +263,11 @@ def detect(
         own, begin = rule_of(null, asked, reference, seed)
         made.append((statistic_of(null, own, begin), begin))
     limits = limit_of(made, asked.every)
-    said = judged(run, replace(rule, limits=tuple(limits.tolist()), simulated=True), first)
-    extreme = highest(said.statistic, first)
+    alarms = judged(run, replace(rule, limits=tuple(limits.tolist()), simulated=True), first)
+    extreme = highest(alarms.statistic, first)
     as_far = [np.max(highest(*one) / limits) >= np.max(extreme / limits) for one in made]
     p = (1.0 + sum(as_far)) / (1.0 + len(made)) if np.isfinite(extreme).any() else float("nan")
-    return replace(said, p=p)
+    return replace(alarms, p=p)
 
 
 def asked_for(kind: str, every: float, window: int = 50, hold: int = 0) -> AlarmRule:

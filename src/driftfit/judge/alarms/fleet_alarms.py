@@ -120,9 +120,9 @@ class ManyAlarms(Printed):
         for row in self.rows:
             if not row.onsets:
                 continue
-            said = row.alarms
+            alarms = row.alarms
             for t in row.onsets:
-                cells = (key_text(row.key), *said.span(t), said.cause(t), said.p, row.q, row.faulty)
+                cells = (key_text(row.key), *alarms.span(t), alarms.cause(t), alarms.p, row.q, row.faulty)
                 for column, cell in zip(columns.values(), cells, strict=True):
                     column.append(cell)
         return polars.DataFrame(columns, strict=False)
@@ -172,9 +172,9 @@ def alarms(
     else:
         judge, failed = lambda key: _judged(runs[key], kind, each[key], settings), {}
 
-    said = on_all_cores([key for key in runs if key not in failed], judge, "alarms")
-    good = {key: one for key, one in said.items() if isinstance(one, Judged)}
-    errors = failed | {key: one for key, one in said.items() if isinstance(one, ValueError)}
+    alarms = on_all_cores([key for key in runs if key not in failed], judge, "alarms")
+    good = {key: one for key, one in alarms.items() if isinstance(one, Judged)}
+    errors = failed | {key: one for key, one in alarms.items() if isinstance(one, ValueError)}
     if not good:
         raise next(iter(errors.values()))
     q = discoveries(np.array([one.p for one in good.values()]))
@@ -198,12 +198,12 @@ class Judged(NamedTuple):
 def _judged(run: Track, kind: str, reference: Any, settings: dict[str, Any]) -> Judged | ValueError:
     """The alarms of a series by its own limits, or why there are none."""
     try:
-        said = detect(run, kind, reference=reference, **settings)
+        alarms = detect(run, kind, reference=reference, **settings)
     except ValueError as error:
         return error
-    begun = tuple(map(int, said.onsets))
-    first = f"{run.time_text(begun[0])}, {said.cause(begun[0])}" if begun else ""
-    return Judged(said.rule, said.start, said.p, begun, first)
+    begun = tuple(map(int, alarms.onsets))
+    first = f"{run.time_text(begun[0])}, {alarms.cause(begun[0])}" if begun else ""
+    return Judged(alarms.rule, alarms.start, alarms.p, begun, first)
 
 
 def _by_groups(

@@ -106,9 +106,8 @@ def noise_models(w: Array, n: int) -> tuple[Array, Array]:
     numbers[:, INSIDE] = np.mean(np.where(np.abs(x) < CLIPPED, x * x, 0.0), axis=1)
     chance = GAIN * np.var(square, axis=1) / numbers[:, INSIDE] ** 2
     for one, own, by_chance, level in zip(x, numbers, chance, h, strict=True):
-        total = np.zeros((1, GARCH.shape[1]))
-        losses(one, CLIPPED, own[V], own[INSIDE], GARCH, np.ones(total.shape), total)
-        total[0, 0] -= by_chance
+        total = _losses(one, own)
+        total[0] -= by_chance
         own[[ALPHA, BETA]] = GARCH[:, np.argmin(total)]
         levels(one, own, level)
     numbers[:, SCALE] *= _scales(w / (numbers[:, SCALE, None] * np.sqrt(h)), n)
@@ -119,6 +118,24 @@ def noise_models(w: Array, n: int) -> tuple[Array, Array]:
     raw = np.clip(x, -WIDE, WIDE) ** 2
     numbers[:, RAW], numbers[:, SPREAD] = raw.mean(axis=1), raw.var(axis=1)
     return numbers, h
+
+
+def plausible(x: Array, numbers: Array) -> Array:
+    """Probabilities (C,) of the candidates `GARCH` for residuals x (N,) in units of their scale: constant noise is as
+    probable before as all others together, and the quasi-likelihood counts by as much as the tails allow."""
+    square, count = np.clip(x, -CLIPPED, CLIPPED) ** 2, len(PERSISTENCE) * len(REACTION)
+    total = _losses(x, numbers) * numbers[INSIDE] ** 2 / np.var(square)
+    before = np.where(np.arange(len(total)) == 0, count, np.arange(len(total)) <= count)
+    share = before * np.exp(total.min() - total)
+    return np.asarray(share / share.sum())
+
+
+def _losses(x: Array, numbers: Array) -> Array:
+    """`losses` (C,) of residuals x (N,) in units of their scale for the candidates."""
+    total = np.zeros((1, GARCH.shape[1]))
+    losses(x, CLIPPED, numbers[V], numbers[INSIDE], GARCH, np.ones(total.shape), total)
+    found: Array = total[0]
+    return found
 
 
 def _covariance(phi: Array, x: Array) -> Array:

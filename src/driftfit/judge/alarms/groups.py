@@ -44,9 +44,9 @@ class Look(NamedTuple):
     extreme: Array
     """(c,)"""
     samples: int
-    """Those with a statistic."""
+    """Number of samples with a statistic."""
     like: Hashable
-    """Equal for like series."""
+    """A key that is equal for series that are alike."""
 
 
 def look(run: Track, asked: AlarmRule, reference: Reference) -> Look:

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import scipy
 
-from driftfit.engine.drivers import output_type
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import plain
+from driftfit.engine.tiles import output_type
 from driftfit.judge.alarms.bootstrap import RECORDS, limits, simulated
 from driftfit.judge.alarms.frozen import Rows, frozen_model
 from driftfit.judge.alarms.onsets import (

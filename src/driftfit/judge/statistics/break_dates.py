@@ -51,8 +51,8 @@ def add(M: Array, row: Array, sign: float) -> None:
 def _dates(X: Array, y: Array, ar: Array, dates: Array, loglik: Array, sums: Array, row: Array) -> None:
     """log L of the dates from ``dates`` (2, 1) on, a date and the next; rows of X (N, n) from p on.
 
-    Room for two matrices that are zero and a row, (2, 2 n + 1, 2 n + 1) and (2 n + 1,): arrays that are made in
-    compiled code take seconds to compile.
+    The scratch space is two matrices that are zero and a row, (2, 2 n + 1, 2 n + 1) and (2 n + 1,): arrays that are
+    made in compiled code take seconds to compile.
     """
     N, n, p = X.shape[0], X.shape[1], ar.shape[0]
     M, L, here, following = sums[0], sums[1], dates[0], dates[1]

@@ -68,12 +68,12 @@ def _cost(G: Array, ends: Array, s: int, t: int, p: int, total: Array, seen: Arr
 
 
 class Space(NamedTuple):
-    """Room to work in, which is allocated outside of compiled code: that takes seconds to compile."""
+    """Scratch space, allocated outside of compiled code, in which an allocation takes seconds to compile."""
 
     total: Array
     """Sums of the blocks of every segment, (m, k, k)."""
     M: Array
-    """Those of one, (k, k)."""
+    """Sums of the blocks of one segment, (k, k)."""
     seen: Array
     """See `_cost`, (m, 2)."""
     alive: Array
@@ -85,7 +85,7 @@ class Space(NamedTuple):
 
     @classmethod
     def of(cls, m: int, k: int) -> Space:
-        """For m blocks of k columns."""
+        """Scratch space for m blocks of k columns."""
         seen = np.zeros((m, 2), np.int64)
         seen[:, 0] = np.arange(m)
         alive, expired, value = np.zeros(m, np.int64), np.full(m, -1), np.full(m, -np.inf)

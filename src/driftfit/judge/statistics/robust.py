@@ -156,6 +156,7 @@ def huber(Q: Array, y: Array, theta: Array, residual: Array) -> float:
         level += y[t] * y[t]
     level = 1e-12 * np.sqrt(level / max(N, 1))
     for round in range(ROUNDS):
+        # weighted normal equations, and their solution by Cholesky
         for i in range(n + 1):
             for j in range(n + 1):
                 M[i, j] = 0.0
@@ -167,6 +168,7 @@ def huber(Q: Array, y: Array, theta: Array, residual: Array) -> float:
                 M[n, i] += w * Q[t, i] * y[t]
         cholesky(M, n)
         solved(M, step)
+        # residuals, and the largest change of a fitted value
         moved = 0.0
         for t in range(N):
             fitted, change = 0.0, 0.0
@@ -181,6 +183,7 @@ def huber(Q: Array, y: Array, theta: Array, residual: Array) -> float:
         scale = scale_of(size)
         if not scale > level or (round > 0 and moved < 1e-8 * scale):
             break
+        # Huber's weights psi(e) / e for the next round
         for t in range(N):
             large = abs(residual[t])
             weight[t] = CLIP * scale / large if large > CLIP * scale else 1.0

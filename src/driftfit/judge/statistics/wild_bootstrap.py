@@ -10,7 +10,8 @@ from a few rows at the end of a record is useless there, so the tests of `driftf
 ends out. F takes the variance of the noise from the whole record, and random signs keep the variance of every row. Near
 the ends the residuals themselves would count the change as noise. Every row there is a date, and about MIDDLE between.
 
-For scores without correlation and records of at least LEAST rows: with fewer the signs know too little of tails.
+For scores without correlation and records of at least LEAST rows: with fewer rows, random signs represent the tails too
+poorly.
 
 Source: Hansen (2000), a fixed-regressor bootstrap; Liu (1988) for signs; Besag and Clifford (1991) for sequential
 p-values. Departure: the ends. Cost: O(DRAWS (N n + MIDDLE n^2)), without a change a fifth of that.
@@ -44,6 +45,7 @@ def _share_above(X: Array, psi: Array, c: Array, dates: Array, roots: Array, sha
             if at < m and dates[at] == t:
                 S[at] = whole
                 at += 1
+            # xorshift: one random number decides the sign and, near the ends, the row that is drawn
             state ^= state << np.uint64(13)
             state ^= state >> np.uint64(7)
             state ^= state << np.uint64(17)
@@ -54,6 +56,7 @@ def _share_above(X: Array, psi: Array, c: Array, dates: Array, roots: Array, sha
             signed = value if (state >> np.uint64(32)) & np.uint64(1) else -value
             for i in range(n):
                 whole[i] += X[t, i] * signed
+        # S*_b = S_b - A_b A_T^-1 S_T, and its quadratic form F_b
         best = 0.0
         for b in range(m):
             total = 0.0
@@ -66,6 +69,7 @@ def _share_above(X: Array, psi: Array, c: Array, dates: Array, roots: Array, sha
                     z += roots[b, i, j] * S[b, j]
                 total += z * z
             best = max(best, total)
+        # sequential: stop as soon as enough draws exceed the observed supremum
         above += 1 if best >= found else 0
         if above == ABOVE:
             return above / (draw + 1)

@@ -5,7 +5,7 @@
 
 so that log w_k(t) = a log w_k(t-1) + log p_k(y_t) up to a constant that is common to all: an exponentially weighted sum
 of log-likelihoods. The averaged prediction is the mean of the mixture, and its variance that of the mixture. A sample
-that one structure cannot predict changes no weights: nothing is learned, and nothing forgotten. The weight of a
+that one structure cannot predict changes no weights: nothing is learned or forgotten. The weight of a
 regressor is that of all structures that contain it.
 
 Source: Raftery, Karny and Ettler (2010), Technometrics 52(1), equations 15 to 17. Cost: O(T K).

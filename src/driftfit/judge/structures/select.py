@@ -39,8 +39,8 @@ from rich.text import Text
 from driftfit.data.arguments import check_roles
 from driftfit.data.record import Reading
 from driftfit.data.signals import check_ready
-from driftfit.engine.arrays import factor
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import factor
 from driftfit.judge.plots import plot_selection
 from driftfit.judge.statistics.paired import newey_west
 from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of, price

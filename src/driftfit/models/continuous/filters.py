@@ -322,7 +322,7 @@ def steps(o: Orders) -> ModelSteps:
         settled = (s.usable[l] >= SETTLING * parameters) & (s.elapsed[l] >= SETTLING)
         s.span[l] = s.dt[l] * s.per_sample[l] if s.begun[l] > 0.0 else 0.0
         s.cuts[l] = min(np.ceil(s.fastest[l] * s.span[l] / STEP), MOST)
-        s.elapsed[l] += s.span[l]
+        s.elapsed[l] += s.span[l] * s.moved_on[l]
         if settled & (not held):
             follow(s, l)
         complete = drive(s, l)

@@ -33,18 +33,18 @@ they change. Cost per sample: O(m n + n^2) times the steps of `driftfit.models.c
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, Step
-from driftfit.engine.settings import input_names, numbers, whole
-from driftfit.models.base import Model
+from driftfit.engine.settings import numbers, whole
 from driftfit.models.continuous.filters import STIFF, Orders, late_inputs, steps
 from driftfit.models.continuous.sampling import sampled
+from driftfit.models.inputs import LinearisedTransfer
 from driftfit.models.linearised import MEMORY
 
 HIGHEST = 4
@@ -59,7 +59,7 @@ PER_SAMPLE = 0.2
 
 
 @dataclass(frozen=True)
-class ContinuousTransfer(Model):
+class ContinuousTransfer(LinearisedTransfer):
     """y(t) = sum_j B_j(s) / A(s) u_j(t - delay) + e, for samples at any times.
 
     Parameters
@@ -97,6 +97,7 @@ class ContinuousTransfer(Model):
     offset: bool = False
     inputs: int | tuple[str, ...] | None = None
     point: tuple[float, ...] | None = None
+    fewest = 1
 
     def __post_init__(self) -> None:
         kind = "ContinuousTransfer"
@@ -112,40 +113,13 @@ class ContinuousTransfer(Model):
                 self._set(name, numbers(kind, name, getattr(self, name), ndim=0, low=0.0, strict=True))
         if self.cutoff is not None and 2.0 * self.poles * self.cutoff * self.dt > STIFF:
             raise ValueError(f"{kind}: cutoff * dt must be at most {STIFF / 2.0 / self.poles:g}; got {self.cutoff!r}.")
-        if isinstance(self.inputs, int | np.integer):
-            self._set("inputs", whole(kind, "inputs", self.inputs, 1))
-        elif self.inputs is not None:
-            self._set(
-                "inputs", input_names(kind, "inputs", [self.inputs] if isinstance(self.inputs, str) else self.inputs)
-            )
-        if self.point is not None:
-            self._set("point", numbers(kind, "point", self.point, ndim=1))
-            if self.inputs is not None and len(self.point) != self.n:
-                raise ValueError(f"{kind}: point must have {self.n} entries; got {self.point!r}.")
-
-    def bind(self, inputs: int | Sequence[str]) -> ContinuousTransfer:
-        count = inputs if isinstance(inputs, int) else len(inputs)
-        if count == 0 or (self.inputs is not None and count != self.m):
-            raise ValueError(
-                f"ContinuousTransfer: the model has {self.inputs or 'at least 1'} inputs, but u has {count} columns."
-            )
-        if self.inputs is not None and (isinstance(inputs, int) or not isinstance(self.inputs, int)):
-            return self
-        return replace(self, inputs=inputs if isinstance(inputs, int) else tuple(inputs))
-
-    @property
-    def m(self) -> int:
-        return 1 if self.inputs is None else self.inputs if isinstance(self.inputs, int) else len(self.inputs)
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        return self.inputs if isinstance(self.inputs, tuple) else ()
+        self._check_inputs()
+        self._check_point()
 
     @property
     def names(self) -> tuple[str, ...]:
-        inputs = self.input_names or tuple(f"u{j + 1}" if self.m > 1 else "" for j in range(self.m))
         names = [f"a{i + 1}" for i in range(self.poles)]
-        names += [f"b{i + 1}[{u}]" if u else f"b{i + 1}" for u in inputs for i in range(self.zeros + 1)]
+        names += [f"b{i + 1}{u}" for u in self.suffixes for i in range(self.zeros + 1)]
         return (*names, "offset") if self.offset else tuple(names)
 
     @property
@@ -168,10 +142,6 @@ class ContinuousTransfer(Model):
     @property
     def settling(self) -> float:
         return 0.0 if self.point is not None else max(FORGOTTEN * self.n, TIMES / (self.rate * self.dt))
-
-    @property
-    def recursive(self) -> bool:
-        return True
 
     @property
     def instruments(self) -> bool:
@@ -212,9 +182,6 @@ class ContinuousTransfer(Model):
     @property
     def apply(self) -> Step | None:
         return late_inputs(self._orders(False))
-
-    def held_at(self, theta: Array) -> ContinuousTransfer:
-        return replace(self, point=tuple(np.asarray(theta, dtype=float).tolist()))
 
     def transfers(self, theta: Array) -> tuple[Array, list[tuple[Array, Array]]]:
         """As every model in powers of z^-1: those of the system sampled at nominal times."""

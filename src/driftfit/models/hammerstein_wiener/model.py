@@ -376,10 +376,10 @@ class HammersteinWiener(Model):
             if isinstance(basis, Polynomial) and basis.degree > 1 and size and not 1.0 / UNIT <= size <= UNIT:
                 powers = np.abs(seen[:, None] ** [1, basis.degree])
                 lost = int(np.sum(powers[:, 1] >= DIGITS * np.maximum(powers[:, 0], 1.0)))
-                said = f", and {lost} samples, whose powers span more than 13 digits, are missing" if lost else ""
+                unusable = f", and {lost} samples, whose powers span more than 13 digits, are missing" if lost else ""
                 warn(
                     f"{what} has a root mean square of {size:g}: raw powers of data far from unit size are badly "
-                    f"scaled{said}; scale it, or use Legendre({basis.degree}, ({seen.min():g}, {seen.max():g})).",
+                    f"scaled{unusable}; scale it, or use Legendre({basis.degree}, ({seen.min():g}, {seen.max():g})).",
                     UserWarning,
                 )
 

@@ -29,7 +29,7 @@ class Structure(NamedTuple):
 
     @property
     def products_in(self) -> int:
-        """How many products b c there are."""
+        """The number of products b c."""
         return sum(nb * (n_in - 1) for nb, n_in in zip(self.nb, self.n_in, strict=True))
 
     @property

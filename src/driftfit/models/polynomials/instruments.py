@@ -4,22 +4,23 @@ With xi_j = y - c - sum_(k != j) w_k, the response to input j with the noise, an
 
     e = L_j (F_j xi_j - B_j u_j)  =  xi'_j,t - sum_i f_i xi'_j,t-i - sum_i b_i u'_j,t-nk-i+1,    xi'_j = L_j xi_j, ..
 
-is linear in b_j and f_j: no linearisation. Its regressors contain noise, so the instruments have the response w_j
+is linear in b_j and f_j: no linearisation. At theta' it is the prediction error, which is computed as such, because the
+sum above is not it while the filters change. Its regressors contain noise, so the instruments have the response w_j
 without noise in the place of xi_j,
 
     phi   = [u'_j lags, 1/C e lags, 1/C v lags, xi'_j lags, D/C 1]
     zeta  = [u'_j lags, 1/C e lags, 1/C v lags, w'_j  lags, D/C 1]        w'_j = L_j w_j
 
 zeta is the gradient of the prediction (`driftfit.models.polynomial`), so that at the true parameters the estimate is
-efficient. If the model of the noise is wrong, B and F are still consistent: w depends on the inputs alone. With several
-inputs each is linear given the others, and the mean of their e is taken.
+efficient. If the model of the noise is wrong, B and F are still consistent: w depends on the inputs alone.
 
-theta' follows theta with the share `FOLLOWING` of the distance at each sample, or is held (``point``), which is one
-iteration of the method for a whole record. Before the filters are known, the first samples are an ARX regression.
+B and F of theta' follow theta with the share `FOLLOWING` of the distance at each sample, C and D at once; or theta' is
+held (``point``), which is one iteration of the method for a whole record. Before the filters are known, the first
+samples are an ARX regression; C and D enter after 10 n samples, and until then the instruments are the regressors.
 
 Source: Young, Recursive Estimation and Time-Series Analysis (2011), chapter 7: RIV, and SRIV without C and D; Young and
 Jakeman, Int. J. Control 29 (1979). Departures: noise and plant are estimated by one recursion, where the source has one
-for each, which are independent asymptotically; filters that grow in the course of time.
+for each, which are independent asymptotically; filters that grow in the course of time; the late C and D.
 """
 
 from __future__ import annotations
@@ -35,7 +36,6 @@ from driftfit.models.polynomials.steps import (
     EACH,
     OWN,
     SETTLING,
-    UF,
     Places,
     V,
     W,
@@ -51,7 +51,12 @@ XI, XI_C, XI_F, MORE = range(4)
 """Rows for every input, behind all others: xi_j, D/C of it, and D/(C F_j) of it."""
 
 FOLLOWING = 0.05
-"""Share of the distance to theta that the point of the filters moves at a sample."""
+"""Share of the distance to theta that B and F of the point move at a sample."""
+
+WAITING = 10.0
+"""Samples for each parameter before C and D enter. Until then the errors of B and F are larger than the noise; a noise
+model that learns from them has zeros of C at the unit circle, where the gradient is huge and its bands are too narrow.
+"""
 
 
 @kernel
@@ -64,35 +69,12 @@ def at_followed(s: State, l: int) -> None:
 @lru_cache
 def _regressors(p: Places) -> Any:
     """``regressors(s, y_hat, l)``: s.phi and s.zeta; returns the prediction at the point."""
-    m, n, nb, nc, nd, nf, nk, at_b, at_f = p.m, p.n, p.nb, p.nc, p.nd, p.nf, p.nk, p.at_b, p.at_f
-    at_c, at_d, at_offset, rows = p.at_c, p.at_d, p.at_offset, OWN + EACH * p.m
+    m, n, nf, at_f, rows = p.m, p.n, p.nf, p.at_f, OWN + EACH * p.m
     gradient = gradient_of(p)
 
     @kernel
-    def without_present(s: State, j: int, l: int) -> float:
-        """xi'_j of the present sample, but for xi_j itself."""
-        raw, total = rows + MORE * j + XI, 0.0
-        for i in range(nd):
-            total -= s.point[at_d + i, l] * s.signals[raw, i + 1, l]
-        for i in range(nc):
-            total -= s.damped[at_c + i, l] * s.signals[raw + XI_C, i + 1, l]
-        for i in range(nf[j]):
-            total += s.damped[at_f[j] + i, l] * s.signals[raw + XI_F, i + 1, l]
-        return total
-
-    @kernel
-    def explained(s: State, j: int, l: int) -> float:
-        """sum_i f_i xi'_j,t-i + sum_i b_i u'_j,t-nk-i+1 at the point."""
-        total = 0.0
-        for i in range(nf[j]):
-            total += s.point[at_f[j] + i, l] * s.signals[rows + MORE * j + XI_F, i + 1, l]
-        for i in range(nb[j]):
-            total += s.point[at_b[j] + i, l] * s.signals[OWN + EACH * j + UF, nk[j] + i, l]
-        return total
-
-    @kernel
     def regressors(s: State, y_hat: float, l: int) -> float:
-        settled, found = s.usable[l] >= SETTLING * n, 0.0
+        settled = s.usable[l] >= SETTLING * n
         gradient(s, l)
         for i in range(n):
             s.zeta[i, l] = s.phi[i, l] if abs(s.phi[i, l]) < np.inf else 0.0
@@ -100,12 +82,7 @@ def _regressors(p: Places) -> Any:
             for i in range(nf[j]):
                 lag = s.signals[rows + MORE * j + XI_F, i + 1, l]
                 s.phi[at_f[j] + i, l] = lag if settled else s.phi[at_f[j] + i, l]
-            base = explained(s, j, l) - without_present(s, j, l)
-            base += s.point[at_offset, l] if at_offset >= 0 else 0.0
-            for k in range(m):
-                base += s.signals[OWN + EACH * k + W, 0, l] if k != j else 0.0
-            found += base / m
-        return found if settled else y_hat
+        return y_hat
 
     return regressors
 
@@ -113,16 +90,17 @@ def _regressors(p: Places) -> Any:
 @lru_cache
 def instrumental_steps(p: Places, held: bool) -> ModelSteps:
     """The compiled steps for a tracker with instruments, s.zeta."""
-    m, n, nf, at_f, rows = p.m, p.n, p.nf, p.at_f, OWN + EACH * p.m
+    m, n, nf, at_c, at_f, rows = p.m, p.n, p.nf, p.at_c, p.at_f, OWN + EACH * p.m
     colour, _ = filters(p)
     place = staying if held else at_followed
-    push_signals = pushing(p, place)
+    push_signals = pushing(p, place, WAITING)
 
     @kernel
     def push(s: State, l: int) -> None:
         share = FOLLOWING if s.usable[l] >= SETTLING * n else 1.0
         for i in range(n):
-            s.followed[i, l] += share * (s.theta[i, l] - s.followed[i, l])
+            of_noise = (i >= at_c) & (i < at_f[0])
+            s.followed[i, l] += (1.0 if of_noise else share) * (s.theta[i, l] - s.followed[i, l])
         push_signals(s, l)
         for j in range(m):
             own = rows + MORE * j
@@ -134,4 +112,4 @@ def instrumental_steps(p: Places, held: bool) -> ModelSteps:
                 x += s.damped[at_f[j] + i, l] * s.signals[own + XI_F, i + 1, l]
             s.signals[own + XI_F, 0, l] = filtered(s, x, raw, 0, l)
 
-    return ModelSteps(regressing(p, place, _regressors(p)), push)
+    return ModelSteps(regressing(p, place, _regressors(p), WAITING), push)

@@ -19,6 +19,9 @@ from driftfit.models.linearised import along, informed, restore, subtract
 SETTLING = 4.0
 """Samples for each parameter, at the start, that are a pseudolinear regression."""
 
+ENTRY = 2.0
+"""Samples for each parameter before C and D enter."""
+
 STABLE = 0.9999
 """Largest reflection coefficient of a filter that is used."""
 
@@ -141,6 +144,21 @@ def contract(s: State, first: int, order: int, sign: float, l: int) -> None:
 
 
 @kernel
+def bound(s: State, first: int, order: int, sign: float, l: int) -> None:
+    """An unstable polynomial in s.point becomes a stable one, which is not 1.
+
+    D bounds what the model takes for noise. It must not be C, as it would be if both were 1: e and v would then be the
+    same, and their parameters could not be learned again.
+    """
+    if not stable(s, first, order, sign, l):
+        total = 0.0
+        for i in range(order):
+            total += abs(s.point[first + i, l])
+        for i in range(order):
+            s.point[first + i, l] *= CONTRACTION / total if total < LARGEST else 0.0
+
+
+@kernel
 def at_theta(s: State, l: int) -> None:
     """The point of the linearisation is the last estimate."""
     for i in range(s.theta.shape[0]):
@@ -177,24 +195,27 @@ def filters(p: Places) -> tuple[Any, Any]:
 
 
 @lru_cache
-def point(p: Places, place: Step) -> Any:
-    """The point of the linearisation, which ``place`` gives, with C and F made stable."""
-    n, at_c, at_f, nc, nf, m = p.n, p.at_c, p.at_f, p.nc, p.nf, p.m
+def point(p: Places, place: Step, waiting: float = ENTRY) -> Any:
+    """The point of the linearisation, which ``place`` gives, with C, D and F made stable."""
+    n, at_c, at_d, at_f, nc, nd, nf, m = p.n, p.at_c, p.at_d, p.at_f, p.nc, p.nd, p.nf, p.m
 
     @kernel
     def linearise(s: State, l: int) -> None:
         place(s, l)
         if nc > 0:
             contract(s, at_c, nc, 1.0, l)
+        if nd > 0:
+            bound(s, at_d, nd, -1.0, l)
         for j in range(m):
             if nf[j] > 0:
                 contract(s, at_f[j], nf[j], -1.0, l)
         # the filters of the gradient reach their full length in the course of time
-        inner = 1.0 - 1.0 / max(s.usable[l] / (SETTLING * n), 1.0)
+        inner = 1.0 - 1.0 / max((s.usable[l] - (waiting - ENTRY) * n) / (SETTLING * n), 1.0)
         scale = inner
         for i in range(nc):
             s.damped[at_c + i, l] = scale * s.point[at_c + i, l]
             scale *= inner
+        inner = 1.0 - 1.0 / max(s.usable[l] / (SETTLING * n), 1.0)
         for j in range(m):
             scale = inner
             for i in range(nf[j]):
@@ -348,9 +369,9 @@ def ageing(p: Places) -> Any:
 
 
 @lru_cache
-def regressing(p: Places, place: Step, regressors: Any) -> Step:
+def regressing(p: Places, place: Step, regressors: Any, waiting: float = ENTRY) -> Step:
     """``regress``; ``regressors(s, y_hat, l)`` fills s.phi, and returns the prediction at the point."""
-    n, age, linearise, take_inputs = p.n, ageing(p), point(p, place), taking_inputs(p)
+    n, age, linearise, take_inputs = p.n, ageing(p), point(p, place, waiting), taking_inputs(p)
     predict, _ = predictions(p)
 
     @kernel
@@ -371,11 +392,12 @@ def regressing(p: Places, place: Step, regressors: Any) -> Step:
 
 
 @lru_cache
-def pushing(p: Places, place: Step) -> Step:
-    """``push``."""
+def pushing(p: Places, place: Step, waiting: float = ENTRY) -> Step:
+    """``push``; C and D enter after ``waiting`` samples for each parameter."""
     na, n, m, held = p.na, p.n, p.m, place is staying
     at_offset, first_f = p.at_offset, p.nf[0] if p.m == 1 else 0
-    linearise, (predict, noise), (colour, whitened) = point(p, place), predictions(p), filters(p)
+    first_noise = waiting * n
+    linearise, (predict, noise), (colour, whitened) = point(p, place, waiting), predictions(p), filters(p)
 
     @kernel
     def remember(s: State, y: float, known: bool, v: float, e: float, l: int) -> None:
@@ -419,7 +441,7 @@ def pushing(p: Places, place: Step) -> Step:
         # what is left of an interpolated sample is rounding, and no regressor
         e = e if abs(e) > ROUNDING * (abs(s.measured[l]) + abs(fitted)) else 0.0
         e = within(s, e, l)
-        begun = s.usable[l] >= 0.5 * SETTLING * n
+        begun = s.usable[l] >= first_noise
         v = within(s, e + noise(s, l), l) if begun else 0.0
         known = seen | (predicted & ((na == 0) | (s.without[l] < na)))
         restore(s, seen, l)

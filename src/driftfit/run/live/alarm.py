@@ -108,7 +108,8 @@ class LiveAlarm:
         Parameters
         ----------
         rows : (T,) of the driver's output
-            Of "glr" and "cusum" with the samples as well (`driftfit.run.collected_samples.COLLECTED`).
+            For "glr" and "cusum" the rows must contain the samples as well
+            (`driftfit.run.collected_samples.COLLECTED`).
         lane : int
         noise : (T,)
             Factors of the noise variance.
@@ -145,7 +146,7 @@ class LiveAlarm:
         self.samples += 1
 
     def _show(self, statistic: Array, findings: Array) -> None:
-        """Make these the last statistic."""
+        """Store the last statistic."""
         self.statistic = statistic.copy()
         if self.rule.kind in FROZEN:
             self._findings[...] = findings
@@ -200,7 +201,7 @@ class LiveAlarm:
         count, window = len(self._scores), self.rule.window
         every = np.concatenate([np.array(self._scores), g[fine]])
         self._scores.extend(g[fine].tolist())
-        # row k is the statistic when k scores have been added; the first is that of before
+        # row k is the statistic after k further scores; the first row is the statistic before them
         after = np.tile(self.statistic, (int(fine.sum()) + 1, 1))
         first = max(window - count, 1)
         if first < len(after):

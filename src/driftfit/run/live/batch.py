@@ -38,7 +38,7 @@ class Batch(Columns):
     """
 
     def __init__(self, out: Array, rows_per_instant: int = 1) -> None:
-        """``out`` is what the driver wrote."""
+        """``out`` is the array that the driver filled."""
         self._out, self._rows_per_instant = out, rows_per_instant
 
     @property
@@ -65,7 +65,7 @@ def row_of(tile: Array, dtype: np.dtype[Any]) -> Array:
 
 
 def with_ignored(out: Array, before: Array, taken: Array) -> Array:
-    """The rows of the samples that were ``taken``, and for each other sample the state that it found.
+    """The rows of the samples that were ``taken``; every other sample gets the state before it.
 
     ``before`` is the row of the state before the first sample.
     """

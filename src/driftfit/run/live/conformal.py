@@ -34,11 +34,11 @@ STEP = 0.05
 MOST = 100.0
 """Largest factor, and the inverse of the least."""
 MUCH = 2.0
-"""A factor above this is warned of."""
+"""A warning is issued for a factor above this."""
 
 
 def quantile(level: float, name: str = "band") -> float:
-    """The z of a two-sided normal band; ValueError for a level that is none."""
+    """The normal quantile z of a two-sided band; ValueError unless the level is between 0 and 1."""
     if not 0.0 < level < 1.0:
         raise ValueError(f"{name}: level must be between 0 and 1, such as 0.95; got {level!r}.")
     return NormalDist().inv_cdf(0.5 + level / 2.0)

@@ -15,11 +15,11 @@ from driftfit.run.program import Program
 
 KNOWN = ("interval", "noise", "drift")
 ORDINARY, HELD = (1.0, 1.0, 1.0), (0.0, np.inf, 1.0)
-"""Known factors of a sample by default, and of one while the stream is held."""
+"""The known factors of a sample: the default, and those while the stream is held."""
 
 
 class Operated(ABC):
-    """The operator's hand on a stream: a hold, resets."""
+    """Interventions of an operator: holding a stream, and resetting parameters."""
 
     programs: tuple[Program, ...]
     _tile: Array

@@ -8,8 +8,9 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-from driftfit.engine.drivers import INPUTS, tile_type
+from driftfit.engine.drivers import INPUTS
 from driftfit.engine.kernel import Array, Driver, Step
+from driftfit.engine.tiles import tile_type
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 
@@ -55,7 +56,7 @@ def _compiled(step: Step) -> Driver:
 
 
 def check_applied(expected: int) -> None:
-    """Raise an error for a next sample while the input of the last one is outstanding."""
+    """Raise an error if a sample arrives while the input of the previous one is still outstanding."""
     if expected != NOTHING:
         raise ValueError(
             "Live.update: the input of the last sample has not been given yet: apply(u) after update(y), or "
@@ -64,7 +65,7 @@ def check_applied(expected: int) -> None:
 
 
 def check_expected(expected: int) -> None:
-    """Raise an error for an input for which no sample is waiting."""
+    """Raise an error if an input arrives although no sample is waiting for it."""
     if expected == NOTHING:
         raise ValueError(
             "Live.apply: no sample is waiting for its input. The order is update(y) without u, then apply(u), once per "

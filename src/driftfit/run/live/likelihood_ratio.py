@@ -182,6 +182,7 @@ def compare(total: Array, L: int, frozen: Frozen, work: Array, findings: Array) 
     variance(total, frozen, work)
     rank = factor(work, n)
     z, u, g = work[2 * n], work[2 * n + 1], work[2 * n + 2]
+    # with V = F F': z = F^-1 S and u = F^-1 U, so that S' V^-1 S = z'z
     solve(work, n, total[:n], z)
     solve(work, n, total[n : 2 * n], u)
     square = 0.0
@@ -190,6 +191,7 @@ def compare(total: Array, L: int, frozen: Frozen, work: Array, findings: Array) 
     findings[JOINT] = cube_deviate(square / rank, 0.5 * rank) if rank > 0 else np.nan
     best, findings[ONE] = -1.0, np.nan
     for j in range(n):
+        # a change of parameter j alone: (g'z)^2 / g'g, its size g'u / g'g
         solve(work, n, work[n + j, :n], g)
         length, score, raw = 0.0, 0.0, 0.0
         for i in range(n):
@@ -202,6 +204,7 @@ def compare(total: Array, L: int, frozen: Frozen, work: Array, findings: Array) 
             findings[STD] = np.sqrt(numbers[RAW] / (numbers[V] * length))
     if best >= 0.0:
         findings[ONE] = np.sqrt(best)
+    # the variance of the noise: sum g^2 against L v, as a deviate
     findings[NOISE], findings[WINDOW] = np.nan, L
     if numbers[LONGEST] >= L:
         ratio = total[2 * n] / (L * numbers[V])
@@ -298,18 +301,21 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> bool:
         return False
     if row[n + 3] > GAP:
         counts[SINCE] = 0.0
+    # residual and regressors, scaled to the noise variance of weight 1
     root = 1.0 / np.sqrt(row[n + 2])
     e = row[n]
     for i in range(n):
         e -= row[i] * frozen.theta[i]
         past[p, i] = row[i] * root / frozen.unit[i]
     past[p, n] = e * root
+    # whitened by the autoregression, and divided by the present standard deviation
     scale = numbers[SCALE] * np.sqrt(counts[LEVEL])
     for i in range(n + 1):
         value = past[p, i]
         for lag in range(p):
             value -= frozen.ar[lag] * past[p - 1 - lag, i]
         phi[i] = value / np.sqrt(counts[LEVEL]) if i < n else value / scale
+    # shift the lags; after a gap they must first be filled again
     for lag in range(p):
         for i in range(n + 1):
             past[lag, i] = past[lag + 1, i]
@@ -319,6 +325,7 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> bool:
     x, clip = min(WIDE, max(-WIDE, phi[n])), numbers[CLIP]
     g = min(clip, max(-clip, x))
     enter_scores(phi[:n], g, x, memory.sample)
+    # the GARCH recursion for h at the next sample
     fed = numbers[ALPHA] * g * g / numbers[V] + numbers[BETA]
     counts[LEVEL] = 1.0 - numbers[ALPHA] - numbers[BETA] + fed * counts[LEVEL]
     return True

@@ -18,9 +18,10 @@ from driftfit.data.arguments import check_roles
 from driftfit.data.clock import instant
 from driftfit.data.labels import by_name, order_of
 from driftfit.data.signals import noise_of
-from driftfit.engine.arrays import as_numbers, factor
-from driftfit.engine.drivers import as_compiled, one_or_all
+from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import as_numbers, factor
+from driftfit.engine.tiles import as_compiled
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.live.alarm import LiveAlarm
@@ -30,6 +31,7 @@ from driftfit.run.live.interventions import HELD, Operated
 from driftfit.run.live.late_input import INPUT, LATER, NOTHING
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.live.stream import Stream
+from driftfit.run.live_output import LiveOutput
 from driftfit.run.program import Program, state_of
 from driftfit.run.warm_start import Run
 from driftfit.trackers.base import Tracker
@@ -54,7 +56,7 @@ class Live(Operated, Stream):
 
     With several outputs y and all that `update` returns are (ny,); ``theta`` and ``std`` are (ny, n), or (n,) where the
     outputs share one theta. A stream can be copied, pickled and sent to another process, as well as saved: it continues
-    as if never stopped.
+    as if never stopped. ``live["level"]`` has what is known of one of several outputs, (n,).
 
     Parameters
     ----------
@@ -126,6 +128,17 @@ class Live(Operated, Stream):
         found = tuple(one.names for one in self.programs)
         return found[0] if len(found) == 1 else found
 
+    def __getitem__(self, output: str | int) -> LiveOutput:
+        """One of several outputs that each have their own theta, by name or index; KeyError for any other."""
+        outputs = self.model.outputs if len(self.programs) > 1 else ()
+        if output not in outputs and output not in range(len(outputs)):
+            there = f"there are {', '.join(outputs)}" if outputs else "this stream has one theta, live.theta"
+            raise KeyError(f"there is no output {output!r}; {there}.")
+        return LiveOutput(self, output if isinstance(output, int) else outputs.index(output))
+
+    __iter__ = None
+    """A stream is no sequence: `update` processes its samples."""
+
     @overload
     def update(
         self, y: float | None, u: Any = LATER, time: Any = None, weight: float = 1.0, drift: Any = 1.0, prob: Any = None
@@ -142,15 +155,15 @@ class Live(Operated, Stream):
     ) -> Any:
         """Process one sample and return (y_hat, e, s, ok), numbers, or arrays (ny,) for several outputs.
 
-        ``y`` is a number, or of several outputs (ny,) or a mapping from their names; None, NaN or inf if it is missing.
-        ``u`` is a number for one input, a sequence of m otherwise ((ny, m) where outputs share one theta), or a mapping
-        from the names of the inputs; None if it is missing. If ``u`` is left out, it comes with
-        `apply`, before the next sample; ValueError for a model that has inputs and needs them at once. With ``time``,
-        the interval since the last sample scales the drift; a time that is not after the last is counted in ``ignored``
-        and leaves the state unchanged. ``weight`` divides the noise variance of this sample (0: do not use it); it is
-        one number, or one for each output,
-        ``drift`` multiplies the drift before it: one number, or one for each parameter (random-walk trackers) or change
-        (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its changes or joint events at this sample.
+        ``y`` is a number, or for several outputs an array (ny,) or a mapping from their names; None, NaN or inf if it
+        is missing. ``u`` is a number for one input, a sequence of m otherwise ((ny, m) where outputs share one theta),
+        or a mapping from the names of the inputs; None if it is missing. If ``u`` is left out, it comes with `apply`,
+        before the next sample; ValueError for a model that has inputs and needs them at once. With ``time``, the
+        interval since the last sample scales the drift; a time that is not after the last is counted in ``ignored`` and
+        leaves the state unchanged. ``weight`` divides the noise variance of this sample (0: do not use it); it is one
+        number, or one for each output, ``drift`` multiplies the drift before it: one number, or one for each parameter
+        (random-walk trackers) or change (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its changes or
+        joint events at this sample.
         """
         if prob is not None or type(drift) is not float:
             return self._update_with_extra(y, u, time, weight, drift, prob)
@@ -394,10 +407,10 @@ class Live(Operated, Stream):
         return None if time is None else time[0]
 
     def driven_on(self, inputs: Array) -> tuple[list[tuple[Program, Array]], Array]:
-        """(each program with a copy of its state to be driven on, inputs (h, m) then).
+        """(each program with a copy of its state that a forecast may advance, the inputs (h, m) for it).
 
-        What `apply` is to bring is the first of the inputs. There is no copy where outputs are regressors of each
-        other.
+        While `apply` is outstanding, its input is the first of the inputs. Outputs that are regressors of each other
+        are left out.
         """
         apart = [(one if self._single else one.alone, lane) for lane, one in enumerate(self.programs)]
         copies = [(one, one.resting(self.lane(lane))) for one, lane in apart if one is not None]
@@ -448,7 +461,7 @@ class Live(Operated, Stream):
 
     @property
     def regressors(self) -> Array:
-        """Those of the last sample, (n,)."""
+        """The regressors of the last sample, (n,)."""
         phi: Array = self._tile["phi"][0, :, 0].copy()
         return phi
 
@@ -458,6 +471,6 @@ class Live(Operated, Stream):
         return values[0] if len(values) == 1 else values
 
     def _by_lane(self, found: Callable[[Tracker, dict[str, Array]], Array]) -> Array:
-        """What each tracker finds in its lane; without the first axis if there is one theta."""
+        """The results of a function of each tracker and its lane, stacked; a single result if there is one theta."""
         parts = [found(tracker, self.lane(lane)) for lane, tracker in enumerate(self.trackers)]
         return parts[0] if len(parts) == 1 else np.array(parts)

@@ -1,4 +1,4 @@
-"""What a stream keeps besides its tile: time, limits, late inputs, windows, alarms, and its files."""
+"""What a stream stores in addition to its tile: time, limits, late inputs, windows and alarms; and its files."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 from driftfit.data import storage
 from driftfit.data.clock import Clock, Pace, instant
 from driftfit.data.limits import Gate
-from driftfit.engine.drivers import as_compiled
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
+from driftfit.engine.tiles import as_compiled
 from driftfit.models.base import Model
 from driftfit.run.live.alarm import LiveAlarm, check_rule
 from driftfit.run.live.batch import Batched
@@ -23,7 +23,7 @@ from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import programs_of, state_of, tile_of
 from driftfit.run.public_class import Plain
 from driftfit.run.result import burn_in
-from driftfit.run.warm_start import KINDS, UNSAID, End, Run, by_output, carried, ended, read, restore, written
+from driftfit.run.warm_start import ABSENT, KINDS, End, Run, by_output, carried, ended, read, restore, written
 from driftfit.trackers.base import Tracker
 
 
@@ -206,7 +206,7 @@ class Stream(Batched, Plain, storage.Kept):
 
     def __reduce__(self) -> Any:
         header, arrays = self._written()
-        header["extra"] = {**UNSAID, **header["extra"]}
+        header["extra"] = {**ABSENT, **header["extra"]}
         return type(self)._again, ("the copy", (self.model, self.trackers), header, arrays)
 
     @classmethod
@@ -214,7 +214,7 @@ class Stream(Batched, Plain, storage.Kept):
         cls, source: str, settings: tuple[Model, tuple[Tracker, ...]], header: Mapping[str, Any],
         arrays: Mapping[str, Array],
     ) -> Self:  # fmt: skip
-        """The stream from its state."""
+        """The stream that continues from a stored state."""
         (model, trackers), extra = settings, header["extra"]
         limits, outside = extra["limits"] or ([], [])
         make: Any = cls

@@ -26,14 +26,16 @@ class Advanced:
         self.programs, self.records, self.jobs = programs, records, jobs
 
     def column(self, name: str) -> Array:
-        """A field of the driver's output at every sample: (N, ..), or (N, ny, ..) of several outputs."""
+        """A field of the driver's output at every sample: (N, ..), or (N, ny, ..) for several outputs."""
         shape, ny = self.jobs[0].out[name].shape[1:-1], self.records.ny
         into = np.empty((len(self.records.y), ny, int(np.prod(shape))))
         self.columns([name], into)
         return into.reshape(-1, *((ny,) if self.records.outputs else ()), *shape)
 
     def columns(self, names: Sequence[str], into: Array) -> None:
-        """Write fields of the output at every sample side by side ``into`` (N, k), or (N, ny, k) of several outputs."""
+        """Write fields of the output at every sample next to each other ``into`` (N, k), or (N, ny, k) for several
+        outputs.
+        """
         into = into[:, None] if into.ndim == 2 else into
         for job in self.jobs:
             lanes, L = np.flatnonzero(job.live), len(job.lanes)

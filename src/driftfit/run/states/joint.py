@@ -84,11 +84,14 @@ class Joint:
         return words
 
     def made_by(self, tag: bytes, text: str) -> bool:
-        """Whether a state with this fingerprint is of these programs in a version with other fields (`Layout.text`)."""
+        """Whether a state with this fingerprint belongs to these programs in a version with other fields
+        (`Layout.text`).
+        """
         return tag == self._tag([one.layout.tag_with(text) for one in self.programs])
 
     def matched(self, words: Array, text: str) -> Array:
-        """The words (W,) of a state in a version with other fields; those that it has not are as at the start.
+        """The words (W,) of a state in a version with other fields; words that are absent have their values at the
+        start.
 
         ValueError if a field has another shape.
         """

@@ -53,7 +53,7 @@ def sort_out(series: Array, time: Array, waited: Array, newest: Array, hold: Any
     hold : number or timedelta64
         Not negative.
     """
-    if not hold and not waited.any() and (ends := _all_in_order(series, time, newest)) is not None:
+    if not hold and not waited.any() and (ends := all_in_order(series, time, newest)) is not None:
         after = newest.copy()
         after[series[ends]] = time[ends]
         return Fates(np.arange(len(time)), np.full(len(time), RELEASED), after)
@@ -78,10 +78,10 @@ def ended(fate: Array, over: Array) -> Array:
     return np.where((fate == WAITING) & over, RELEASED, fate)
 
 
-def _all_in_order(series: Array, time: Array, newest: Array) -> Array | None:
+def all_in_order(series: Array, time: Array, newest: Array) -> Array | None:
     """The last row of every series if all rows are sorted and each is after the one before; None otherwise.
 
-    Most rows arrive so, and to see it takes a fifth of the time of sorting and deciding on each.
+    Most rows arrive in this order, and checking it takes a fifth of the time of sorting the rows and deciding on each.
     """
     if not len(time) or time.dtype.kind != "f" or not np.isfinite(time).all() or (series[1:] < series[:-1]).any():
         return None
@@ -150,7 +150,7 @@ class HoldBack:
         return self.time[own], self.rows[own]
 
     def put(self, one: int, time: Array, rows: Array) -> None:
-        """Make these the rows of a series that wait."""
+        """Replace the waiting rows of a series."""
         own = [np.full(len(time), one), time, rows]
         self._keep(np.flatnonzero(self.series != one), own)
 
@@ -167,7 +167,7 @@ class HoldBack:
         return waiting, sort_out(*every, waited, newest, self.hold)
 
     def _keep(self, which: Array, more: Sequence[Array]) -> None:
-        """Let these rows, and more, be all that wait, sorted by series and time."""
+        """Store these rows, and more, as all that wait, sorted by series and time."""
         if not len(which) and not len(more[0]) and not len(self):
             return
         every = [np.concatenate([old[which], new]) for old, new in zip(self._columns(), more, strict=True)]

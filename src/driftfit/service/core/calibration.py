@@ -24,8 +24,8 @@ def rules_of(settings: UnitSettings, rows: Array) -> dict[str, Any]:
         every = alarm.every * len(alarm.on)  # together they begin one false alarm in ``every`` samples
         reference = None if kind == "probability" else len(rows)
         try:
-            said = run.detect(kind, every=every, reference=reference, window=alarm.window, hold=alarm.hold)
-            rules.append(describe(said.rule))
+            alarms = run.detect(kind, every=every, reference=reference, window=alarm.window, hold=alarm.hold)
+            rules.append(describe(alarms.rule))
         except Exception as error:
             refused.append(f"{kind}: {error}")
     return {"do": "calibrated", "rules": rules, "on": list(alarm.on), "refused": refused, "samples": len(rows)}

@@ -4,7 +4,7 @@
     unit       number, name, section and topic of every unit
     program    models and trackers that states were made with, by the fingerprint of the states
     snapshot   the last stored state of a unit, and the number up to which it knows the samples
-    result     what the trackers said, in the order in which they said it; sinks and the page read from here
+    result     the results of the trackers, in the order in which they arose; sinks and the page read from here
     block      the results of one unit in pieces, with least, largest and mean of every column, for the page
     event      alarms, failures, operator's actions
     position   where sources continue, and how far sinks have come

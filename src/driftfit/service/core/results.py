@@ -1,4 +1,4 @@
-"""Results as columns: what trackers said of the samples of one section, from the engine to sinks, history and page.
+"""Results as columns: the estimates at the samples of one section, from the engine to sinks, history and page.
 
 The values of a sample are
 

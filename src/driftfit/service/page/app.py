@@ -106,7 +106,7 @@ class Page:
         """The units that drift most, or those whose name contains ``search``."""
         search = request.query_params.get("search", "").lower()[:200]
         if not search:
-            return Said({"units": self.feed.fleet, "count": len(self.feed.names.names)})
+            return Answer({"units": self.feed.fleet, "count": len(self.feed.names.names)})
         feed, found = self.feed, []
         for number, name in feed.names.names.items():
             if search in name.lower() and number in feed.latest:
@@ -114,7 +114,7 @@ class Page:
                 found.append(feed.line(number, row, feed.drift(number, row), 0.0) | {"age": None})
             if len(found) == 200:
                 break
-        return Said({"units": found, "count": len(found)})
+        return Answer({"units": found, "count": len(found)})
 
     async def unit(self, request: Request) -> Response:
         """Everything about a unit now."""
@@ -135,7 +135,7 @@ class Page:
                 "theta": dict(zip(names, map(finite, row[8]), strict=False)),
                 "std": dict(zip(names, map(finite, row[9]), strict=False)),
             }  # fmt: skip
-        return Said({"unit": name, "about": about, "now": now, "state": state})
+        return Answer({"unit": name, "about": about, "now": now, "state": state})
 
     async def history(self, request: Request) -> Response:
         """Least, largest and mean of each column of a range, in at most ``points`` parts."""
@@ -145,7 +145,7 @@ class Page:
         number = self.number(name)
         recent = await self.feed.recent(number)
         found = await run_in_threadpool(history.reduced, self.feed.journal, number, recent, start, stop, points)
-        return Said({"unit": name, "columns": history.names_of(self.feed.names.about[name]), **found})
+        return Answer({"unit": name, "columns": history.names_of(self.feed.names.about[name]), **found})
 
     async def export(self, request: Request) -> Response:
         """All columns of a range, as CSV or an Arrow file."""
@@ -182,16 +182,16 @@ class Page:
         names = self.feed.names.names
         found = [{"number": n, "unit": names[u], "at": at, "kind": kind, "detail": json.loads(detail)}
                  for n, u, at, kind, detail in rows]  # fmt: skip
-        return Said({"events": found})
+        return Answer({"events": found})
 
     async def status(self, request: Request) -> Response:
         """Numbers of the service."""
-        return Said(self.feed.status | {"viewers": self.sockets.count, "healthy": self.feed.healthy})
+        return Answer(self.feed.status | {"viewers": self.sockets.count, "healthy": self.feed.healthy})
 
     async def me(self, request: Request) -> Response:
         """Who asks."""
         user = request.scope["user"]
-        return Said({"name": user.name, "role": user.role, "login": bool(self.options.user)})
+        return Answer({"name": user.name, "role": user.role, "login": bool(self.options.user)})
 
     async def samples(self, request: Request) -> Response:
         """Take samples; the answer comes when they are in the journal."""
@@ -220,8 +220,8 @@ class Page:
         try:
             answer = await self.feed.ask(header, body)
         except (OSError, asyncio.IncompleteReadError):
-            return Said({"error": "the engine does not answer"}, 503)
-        return Said(answer, answer.pop("status", 200))
+            return Answer({"error": "the engine does not answer"}, 503)
+        return Answer(answer, answer.pop("status", 200))
 
     def operator(self, request: Request) -> str:
         """The name of the user, who must be an operator."""
@@ -246,7 +246,7 @@ class Page:
             fits = await run_in_threadpool(password_fits, password, stored)
         if found is None or not fits:
             raise HTTPException(401, "name or password is wrong")
-        response = Said({"name": name, "role": found.role})
+        response = Answer({"name": name, "role": found.role})
         secure = bool(self.options.certificate) or self.options.behind_proxy
         response.set_cookie(
             COOKIE, self.sessions.new(name), max_age=int(SESSION), httponly=True, samesite="strict", secure=secure
@@ -255,7 +255,7 @@ class Page:
 
     async def logout(self, request: Request) -> Response:
         """End the session in this browser."""
-        response = Said({})
+        response = Answer({})
         response.delete_cookie(COOKIE)
         return response
 
@@ -270,7 +270,7 @@ class Page:
         return JSONResponse({"healthy": healthy, "problem": problem}, 200 if healthy else 503)
 
 
-class Said(JSONResponse):
+class Answer(JSONResponse):
     """JSON by msgspec, which writes NaN as null."""
 
     def render(self, content: Any) -> bytes:

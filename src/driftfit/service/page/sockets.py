@@ -65,16 +65,13 @@ class Sockets:
 
     async def _message(self, view: dict[str, Any]) -> dict[str, Any]:
         feed = self.feed
-        status = feed.status
-        said = {
-            "samples": status.get("samples"), "units": status.get("units"), "problem": status.get("problem"),
-            "alive": feed.healthy, "p99": status.get("p99"),
-        }  # fmt: skip
+        status = {name: feed.status.get(name) for name in ("samples", "units", "problem", "p99")}
+        status["alive"] = feed.healthy
         if view["view"] != "unit":
-            return {"view": "fleet", "status": said, "units": feed.fleet}
+            return {"view": "fleet", "status": status, "units": feed.fleet}
         number = feed.find(view["unit"])
         if number is None:
-            return {"view": "unit", "unit": view["unit"], "status": said, "missing": True}
+            return {"view": "unit", "unit": view["unit"], "status": status, "missing": True}
         unit, after = view["unit"], view["at"]
         recent = await feed.recent(number)
         rows = [row for row in recent if row[0] > after]
@@ -84,4 +81,4 @@ class Sockets:
         if unit == view["unit"] and rows:
             view["at"] = max(row[0] for row in rows)
         on = rows[-1][10] if rows else None
-        return {"view": "unit", "unit": unit, "status": said, "columns": columns, "alarm": on}
+        return {"view": "unit", "unit": unit, "status": status, "columns": columns, "alarm": on}

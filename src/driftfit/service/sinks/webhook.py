@@ -64,12 +64,12 @@ class _Webhook(Writer):
         self.sent.clear()
 
     def _send(self, event: Event) -> None:
-        said = message(event)
+        content = message(event)
         if self.options.body == "json":
-            headers, data = {"Content-Type": "application/json"}, json.dumps(said)
+            headers, data = {"Content-Type": "application/json"}, json.dumps(content)
         else:  # in a header only characters of ASCII arrive everywhere
             title = event.unit.encode("ascii", "replace").decode()
-            headers, data = {"Content-Type": "text/plain; charset=utf-8", "Title": title}, str(said["text"])
+            headers, data = {"Content-Type": "text/plain; charset=utf-8", "Title": title}, str(content["text"])
         headers |= {"User-Agent": "driftfit", "Idempotency-Key": f"{event.number}-{event.kind}"}
         if self.options.token is not None:
             headers["Authorization"] = f"Bearer {self.options.token.value}"

@@ -12,15 +12,15 @@ theta_t = e_t + M_t theta_{t+1}, with M_t as a product of n steps, so O(n^2) for
 walk has no direction of time: the same recursion runs from the last sample backwards, and where the two meet U and z
 are the sums of both (`driftfit.smooth.parts.halves`).
 
-Test: beside z runs the information of a record that the constant path 1 / (rms of each regressor) produces without
-noise. The largest difference of its solution from that path estimates the relative error of all solutions with these
-regressors, weights and drifts. The result is accepted if it is small, no step cancelled more than six digits (f), and
-no sample has a leverage so close to 1 that its leave-one-out residual is lost. Otherwise
-`driftfit.smooth.parts.two_filters` solves the problem; drift far above the noise and collinear regressors fail the
-test.
+Test: together with z, the recursion carries the information of a second record, which the constant path 1 / (rms of
+each regressor) produces without noise. The largest difference of its solution from that path estimates the relative
+error of all solutions with these regressors, weights and drifts. The result is accepted if it is small, no step
+cancelled more than six digits (f), and no sample has a leverage so close to 1 that its leave-one-out residual is lost.
+Otherwise `driftfit.smooth.parts.two_filters` solves the problem; drift far above the noise and collinear regressors
+fail the test.
 
 Sources: Kalaba and Tesfatsion (1989); Higham (2002), section 1.3, for problems of known solution. Cost: O(T n^3),
-mostly means at O(T n^2); beside the results memory of (n^2 + 2 n) / 64 numbers per sample.
+mostly means at O(T n^2); in addition to the results, (n^2 + 2 n) / 64 numbers per sample are stored.
 """
 
 from __future__ import annotations

@@ -50,8 +50,8 @@ class Found(NamedTuple):
 def workspace(n: int) -> Array:
     """Scratch space, to be copied: a record, so that the compiler knows n. The last axis is the half.
 
-    Beside z, b and theta are those of the problem whose solution is the constant path ``truth``; ``error`` is the
-    largest distance of its solution from that.
+    ``known_z``, ``known_b`` and ``known`` are z, b and theta of a second problem, whose solution is the constant path
+    ``truth``; ``error`` is the largest distance of the computed solution from it.
     """
     both = {"U": (n, n), "C": (n, n), "g": (n,), "v": (n,), "r": (n,), "f": (), "product": (), "a": (BLOCK, n, n)}
     both |= {"z": (n,), "known_z": (n,), "b": (BLOCK, n), "known_b": (BLOCK, n), "theta": (n,), "known": (n,)}
@@ -122,7 +122,7 @@ def add(s: State, samples: Any, t: int, h: int) -> None:
 def step(s: State, samples: Any, K: int, k: int, row: int) -> float:
     """Step k of both halves; a and b of its increments go to a row of the scratch space. Returns the smallest f.
 
-    Of U there is the lower triangle.
+    Only the lower triangle of U is stored.
     """
     n, T = s.q.shape[0], samples.phi.shape[0]
     least = 1.0

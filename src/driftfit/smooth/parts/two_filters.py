@@ -27,8 +27,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.engine.drivers import WIDTH, make_tile
 from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.tiles import WIDTH, make_tile
 from driftfit.smooth.parts.walk import Path, Walk
 from driftfit.trackers.parts import information
 
@@ -194,6 +194,7 @@ def _filters() -> Driver:
         """
         s = work[0]
         T, n = samples.shape[0], s.d.shape[0]
+        # information before the first sample, for the forward filter only
         s.H[:] = s.G
         for k in range(rows.shape[0]):
             for i in range(n):
@@ -201,6 +202,7 @@ def _filters() -> Driver:
             absorb(s.S, s.d, s.row, rows[k, n], 0)
         cost = 0.0
         for t in range(T):
+            # time update: the increment before the sample in this filter's direction of time
             if drift_root.shape[0] > 0:
                 for l in range(2):
                     for i in range(n):
@@ -212,6 +214,7 @@ def _filters() -> Driver:
                 spread(s.S, s.d, s.H, drift[t if l == 0 else T - t], s.pivot, l)
             if trend.shape[0] > 0:
                 shear(s.S, trend[T - t], 1)
+            # store the information without the sample, then rotate the sample in
             for l in range(2):
                 at = t if l == 0 else T - 1 - t
                 block, lane = blocks[at // width], at % width
@@ -246,6 +249,7 @@ def _meet() -> Driver:
         for b in range(blocks.shape[0]):
             block, first = blocks[b], b * width
             count = min(width, T - first)
+            # information from the samples before: (S-, d-)
             k = 0
             for i in range(n):
                 for l in range(width):
@@ -253,6 +257,7 @@ def _meet() -> Driver:
                     for j in range(i, n):
                         s.S[i, j, l] = block.S[0, k + j - i, l]
                 k += n - i
+            # rotate in the rows of (S+, d+), the information from the samples after
             k = 0
             for i in range(n):
                 for l in range(width):
@@ -260,12 +265,14 @@ def _meet() -> Driver:
                         s.row[j, l] = block.S[1, k + j - i, l] if j >= i else 0.0
                     absorb(s.S, s.d, s.row, block.d[1, i, l], l)
                 k += n - i
+            # rotate in the sample itself: rho and the cosine c give residual and leverage
             for l in range(count):
                 for i in range(n):
                     s.row[i, l] = samples[first + l, i]
                 s.y[l] = samples[first + l, n]
             for l in range(width):
                 s.rho[l], s.c[l] = absorb(s.S, s.d, s.row, s.y[l], l)
+            # theta = S^-1 d, and its variances from R = S^-1
             for l in range(width):
                 solve(s.S, s.d, s.x, l)
                 invert(s.S, s.R, l)

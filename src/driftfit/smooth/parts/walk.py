@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.engine.arrays import as_numbers
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import as_numbers
 from driftfit.trackers.base import RandomWalk
 
 NONE = np.zeros((0, 0))

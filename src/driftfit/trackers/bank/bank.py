@@ -38,10 +38,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
+from driftfit.engine.settings import as_numbers, covariance, factor, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.bank import change as changes_
 from driftfit.trackers.bank import reduction as reductions
@@ -407,17 +406,19 @@ class Bank(Tracker):
         hypotheses = run.hypotheses
         kinds = [event.kind for event in hypotheses.found()]
         wrong = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
-        said = [("Events", f"{kinds.count('change')} changes{wrong}; see run.hypotheses.events()")]
+        facts = [("Events", f"{kinds.count('change')} changes{wrong}; see run.hypotheses.events()")]
         faults = int(run.state["counters"][FAULTS])
         if faults:
-            said.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
+            facts.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
         if hypotheses.impossible:
-            said.append(("Impossible", f"{hypotheses.impossible} samples that every hypothesis ruled out, left unused"))
+            facts.append(
+                ("Impossible", f"{hypotheses.impossible} samples that every hypothesis ruled out, left unused")
+            )
         lane = run.state
         if (never := np.isinf(lane["var"])).any():
             names = ", ".join(np.array(run.names)[never])
-            said.append(("Not learned", f"{names}: never varied separately from the others; std is inf"))
-        return (*said, *(resolution(lane) if self.all_sensors[0].r is None else ()))
+            facts.append(("Not learned", f"{names}: never varied separately from the others; std is inf"))
+        return (*facts, *(resolution(lane) if self.all_sensors[0].r is None else ()))
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
         """Which entries of theta the regressors have distinguished so far, (n,) bool."""

@@ -4,36 +4,36 @@ Every part of the compiled routine is given the table alone (`driftfit.trackers.
 Rows of leaves, events of all tables, and parameters are counted as in `driftfit.trackers.bank.leaves.leaf_matrix`.
 With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m sensors, the fields are
 
-    parents, leaves         the leaves before and after the tree has grown, one a column
-    history, history_2      what leaves remember of their events, one a row (`machine.ancestry`); the counter FLIPPED
-                            says which of the two is valid
-    parent, event           of every leaf: the column it came from, and the joint event that made it
-    group, start, order     which leaves become one: a number for every leaf, members in the order of their groups
-    slots                   a table of hashes for numbering groups
+    parents, leaves         the leaves before and after the tree has grown, one per column
+    history, history_2      the events of every leaf, one leaf per row (`machine.ancestry`); the counter FLIPPED tells
+                            which of the two is valid
+    parent, event           for every leaf the column of its parent, and the joint event that created it
+    group, start, order     the leaves that are merged: a group number for every leaf, members in the order of groups
+    slots                   a hash table for numbering groups
     prior                   p(next joint event | leaf), (H, leaves)
     walks, relative_walks   covariances that changes add in a nominal sample; in units of r / (mean square of phi_i)
-    fixed_walks             the first of these for theta, where `machine.framed` writes them in other coordinates
+    fixed_walks             `walks` for theta, where `machine.framed` writes `walks` in other coordinates
     drift                   factors of the drift of every change at this sample
     Q                       covariances that changes add in this interval, and a spare row
     maps, maps_nominal      changes that forget (`leaves.forget`), for this interval and for a nominal one
-    places                  theta0 and what else changes need to know (`leaves.forget`)
-    sensors                 the columns of `leaves.forecast`, a row for every sensor
-    transition, initial     the Markov chain of joint events, from a row to a column; the distribution of the first
-    given, given_chain      what the user says of this sample: prior of the joint events; chain of the changes
-    chain, row              of this sample: the chain, and the prior of the events that all leaves have in common
+    places                  theta0 and the other vectors that changes need (`leaves.forget`)
+    sensors                 the columns of `leaves.forecast`, one row per sensor
+    transition, initial     Markov chain of the joint events, from row to column; distribution of the first event
+    given, given_chain      the user's prior of the joint events at this sample, and the user's chain of the changes
+    chain, row              the chain at this sample, and the prior of the events that all leaves have in common
     loss, reduction, bases  losses of decisions; settings of the reduction; limits of the codes of leaves
-    stamps, decided         when the undecided events were; what was decided at this sample
-    components              of the predictive density (`reducing.lookahead`)
-    root, samples           for growing the tree again (`reducing.refilter`)
-    ring                    recent samples for events of a stream
-    new_events              what an event adds to a history
-    gap, path               what may have happened since the last used sample (`machine.gaps`)
-    lag_prob, newest        marginals of the events of all levels; of those that are reported
-    C, m, z, g              of the columns that a sample meets: covariance, mean, regressor, C z
-    expected                their z'C z and z'm
-    scores                  their unit of covariance or log density; then two rows to spare
-    scratch, from_g, spare  rows to work in: all of them, those from g on, and those that hold none of the above
-    said                    what a likelihood of the user's own says of each leaf (`leaves.own_sensor`)
+    stamps, decided         times of the undecided events; the decisions made at this sample
+    components              components of the predictive density (`reducing.lookahead`)
+    root, samples           the start and the samples from which the tree is grown again (`reducing.refilter`)
+    ring                    recent samples, for the events of a stream
+    new_events              the entries that an event adds to a history
+    gap, path               changes that may have happened since the last used sample (`machine.gaps`)
+    lag_prob, newest        marginals of the events of all levels; of the levels that are reported
+    C, m, z, g              for the columns that a sample updates: covariance, mean, regressor, C z
+    expected                z'C z and z'm of these columns
+    scores                  the unit of their covariance, or their log density; then two spare rows
+    scratch, from_g, spare  scratch rows: all of them, those from g on, and those that contain none of the above
+    answers                 results of a user's own likelihood for each leaf (`leaves.own_sensor`)
     spare_lags, narrow      spare rows, as many as output lags; spare rows of eight columns
 """
 
@@ -49,27 +49,29 @@ from driftfit.trackers.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
     LEAVES, PARENTS, GROUPS, TREE_LEVELS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED,
     OPEN, REFUSED, FAULTS, AGAIN, TAKEN, CHAINED, ALIKE, WIDE, PARTED, COUNT,
 ) = range(22)  # fmt: skip
-"""Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY where
+"""Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY if
 it begins with the next sample. OPEN levels have passed since the last used sample
 (`driftfit.trackers.bank.machine.gaps`); REFUSED samples in a row were too far from what was expected, FAULTS in all;
-AGAIN says that the present one was just refused; TAKEN steps of its interval are in the table of a gap already. Of the
-present sample: CHAINED that the user gave a chain of changes, ALIKE that all leaves have one prior, WIDE that its level
-is another than that of one nominal interval, PARTED that leaves are continued as two (`machine.gaps.chain_gap`).
+AGAIN is 1 if the present one was just refused; TAKEN steps of its interval are already in the table of a gap. Four
+counters are flags of the present sample: CHAINED if the user gave a chain of changes, ALIKE if all leaves have the same
+prior, WIDE if its level is not that of one nominal interval, PARTED if leaves are continued as two
+(`machine.gaps.chain_gap`).
 """
 WAITING, READY = 0, -1
 (
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
     SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SHIFT, READING, LOWEST, HIGHEST, DOUBTS, ENTERS, SIZE,
 ) = range(28)  # fmt: skip
-"""Numbers of the present sample: what comes in, and what goes out. MOST is the largest mean square that a leaf's own
-prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`). FREEDOM is that of an estimated noise
-variance before the tree grows: the residuals until then; inf for a variance that is given. The reading is y + SHIFT
-(`driftfit.trackers.parts.resolution`). READING is the last one that counted, LAST the same less the present shift;
-LOWEST and HIGHEST are the limits of all that counted. DOUBTS is the recent number of refused samples within them.
-ENTERS is not 0 if the regressor is the first along a direction (`machine.late_direction`): its length along it.
+"""Numbers of the present sample: inputs and results. MOST is the largest mean square that a leaf's own
+prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`). FREEDOM is the degrees of freedom of an
+estimated noise variance before the tree grows, the number of residuals until then; inf for a variance that is given.
+The reading is y + SHIFT (`driftfit.trackers.parts.resolution`). READING is the last accepted reading, LAST the same
+minus the present shift; LOWEST and HIGHEST are the limits of all accepted readings. DOUBTS is the recent number of
+refused samples within them. ENTERS is the length of the regressor along a direction in which it is the first
+(`machine.late_direction`), else 0.
 """
 NEVER = 1e9
-"""Levels since the last change of a leaf that has none, or more."""
+"""The number of levels since the last change, for a leaf without a change."""
 HEAD = 4
 """Entries of the report before its arrays: evidence, probability of a change in the window, mass kept, leaves."""
 SAMPLE_HEAD = 3
@@ -77,7 +79,7 @@ SAMPLE_HEAD = 3
 many nominal intervals had passed.
 """
 MOST_REPORTED = 8
-"""Levels in a report: all, or where more are remembered the newest and the oldest."""
+"""Largest number of levels in a report; if more are remembered, it holds the newest and the oldest."""
 
 MATRICES = (
     "parents", "leaves", "history", "history_2", "prior", "walks", "fixed_walks", "relative_walks", "maps",
@@ -89,7 +91,7 @@ WHOLE = ("parent", "event", "start", "order", "group", "slots")
 """Arrays of whole numbers."""
 REPORTED = ("newest", "decided")
 """Arrays that are part of the report."""
-WINDOWS = ("C", "m", "z", "g", "from_g", "expected", "scores", "spare", "spare_lags", "narrow", "said")
+WINDOWS = ("C", "m", "z", "g", "from_g", "expected", "scores", "spare", "spare_lags", "narrow", "answers")
 """Rows of the scratch that have names."""
 OUTSIDE = {
     "report": VECTOR, "phi": VECTOR, "powers": VECTOR, "theta": VECTOR, "cov": MATRIX, "counters": COUNTS,

@@ -35,7 +35,7 @@ from driftfit.trackers.bank.sensor import Sensor, table_of
 
 SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
-SAID = 3
+ANSWERS = 3
 """Numbers that a likelihood of the user's own returns for each leaf."""
 RING = 256
 """Samples of which a stream remembers probabilities, for events."""
@@ -71,7 +71,7 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
     forgets = any(one.forgets for one in bank.all_changes)
     more = na + (tri + 2 * n if forgets else 0)
     parents, children = _room(max(shape.parents * twice, K // H), Hd, Hm)
-    more += SAID if any(sensor.kind == "own" for sensor in bank.all_sensors) else 0
+    more += ANSWERS if any(sensor.kind == "own" for sensor in bank.all_sensors) else 0
     if bank.form == "sqrt":
         parents, more = parents + WIDTH, more + n + -(-(2 * tri + 4 * n) * WIDTH // children)
     remembered, links = _whole_vectors(W * (H + 1)), _whole_vectors(K + 1)
@@ -127,7 +127,7 @@ def windows(n: int, na: int, rows: int) -> dict[str, tuple[int, int]]:
     return {
         "C": (0, tri), "m": (tri, n), "z": (tri + n, n), "g": (g, n), "from_g": (g, rows - g), "expected": (g + n, 2),
         "scores": (scores, 3), "spare": (scores + 1, rows - scores - 1), "spare_lags": (rows - na, na),
-        "narrow": (scores + 3, rows - scores - 3), "said": (rows - na - SAID, SAID),
+        "narrow": (scores + 3, rows - scores - 3), "answers": (rows - na - ANSWERS, ANSWERS),
     }  # fmt: skip
 
 
@@ -168,7 +168,7 @@ def path_of(H: int, Hd: int, wide: int) -> Array:
 
 
 def _closed(Hd: int, wide: int) -> Array:
-    """The table of a gap (`driftfit.trackers.bank.machine.gaps.gap`) where there is none."""
+    """The table of a gap (`driftfit.trackers.bank.machine.gaps.gap`) while there is no gap."""
     table = np.zeros((Hd, wide + WIDTH))
     table[0, wide + SINCE] = 1.0
     return table
@@ -188,7 +188,7 @@ def _whole_vectors(size: int) -> int:
 
 
 def _padded(x: Array, least: int) -> Array:
-    """With zeros up to one of few sizes."""
+    """The array, extended with zeros to one of a few sizes."""
     size = least
     while size < len(x):
         size *= 2

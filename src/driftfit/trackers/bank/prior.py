@@ -26,8 +26,8 @@ def shares(owner: str, what: str, given: Sequence[Any]) -> Array:
     if open_ones:
         p[open_ones[0]] = 1.0 - p.sum()
     if p.min() < -TOLERANCE or abs(p.sum() - 1.0) > TOLERANCE:
-        said = ", ".join("open" if one.prob is None else f"{one.prob:g}" for one in given)
-        raise ValueError(f"{owner}: prior probabilities of {what} must sum to 1; got {said}. Leave one of them open.")
+        listed = ", ".join("open" if one.prob is None else f"{one.prob:g}" for one in given)
+        raise ValueError(f"{owner}: prior probabilities of {what} must sum to 1; got {listed}. Leave one of them open.")
     p = np.maximum(p, 0.0)
     return np.asarray(p / p.sum())
 

@@ -1,4 +1,4 @@
-"""The machines of a bank, and the steps that run them."""
+"""The two forms of the compiled routine of a bank, and the steps that call it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from driftfit.trackers.bank.substitute import substituted
 
 @cache
 def _factored() -> Machine:
-    """The machine of `advance` with the parts substituted that work on covariances."""
+    """The compiled routine of `advance`, with the parts that work on covariances replaced."""
     (machine,) = substituted([bank], square_root_form.PARTS)
     return machine  # type: ignore[no-any-return]
 
@@ -26,7 +26,7 @@ def _factored() -> Machine:
 def steps_of(factored: bool, own: tuple[Callable[..., Any], ...]) -> TrackerSteps:
     """The steps for leaves that keep factors or covariances, which also know where the user's ``own`` likelihoods are.
 
-    Both forms have the same steps; drivers call one machine or the other by the same symbol.
+    Both forms have the same steps; drivers call the routine of either form by the same symbol.
     """
     machine = _factored() if factored else bank
     steps = STEPS._replace(machines=(*STEPS.machines, machine), instead=((bank, machine),) if factored else ())

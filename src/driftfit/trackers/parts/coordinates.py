@@ -16,8 +16,12 @@ the rest of phi,
 
 and every filter estimates z_j from the rest of the innovation: m_j = e, C_jj = h + var v, C_ij = -g_i. This is the
 limit of any prior of z_j whose variance grows without bound, also for a rho_j close to rounding: nothing is divided by
-it. The same rule applies if a sample carries so much more information on z_j than all earlier ones that a covariance
-would keep no digits of the difference (`outgrown`).
+it.
+
+The same change of coordinates is made if a sample carries so much more information on z_j than all earlier ones that a
+covariance would keep no digits of the rest (`outgrown`). The prior of z_j is finite then, and correlated with the
+others: they take the sample as always, C_ib - g_i g_b / s, and row j follows from them and from their correlation
+-g r / s with v (`driftfit.trackers.bank.machine.entering` derives both). It is exact at any ratio.
 
 Source: the square-root form is Bierman's (1977); filters in fixed coordinates of it are ours. Cost per sample: O(n^2)
 for x; O(n^3) where a column enters.
@@ -43,9 +47,8 @@ from driftfit.trackers.parts.diffuse import (
 )
 
 OUTGROWN = 1e12
-"""Largest information that one sample may add to a coordinate, as a multiple of the earlier information: above it the
-earlier information is dropped. That moves the estimate of this coordinate by less than a millionth of its standard
-deviation, and those of others by up to their correlation with it (0.09 standard deviations at a correlation of 0.2).
+"""Smallest information that one sample adds to a coordinate, as a multiple of the earlier information, at which the
+regressor becomes a coordinate: a covariance in the old ones would keep four of sixteen digits of the rest.
 """
 
 ROUNDING = 1e-15

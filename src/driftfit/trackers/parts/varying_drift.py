@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.settings import as_numbers, factor
 
 
 @kernel

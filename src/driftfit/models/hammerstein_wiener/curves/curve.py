@@ -182,12 +182,12 @@ class Functions(Basis):
         return self.labels or super().names
 
     def __repr__(self) -> str:
-        """With the places of the functions, from which they are imported again."""
-        said: dict[str, Any] = {name: _place(getattr(self, name)) for name in ("values", "slopes")}
-        said |= {} if self.n == 1 else {"n": self.n}
-        said |= {} if self.numbers == (0.0,) else {"numbers": self.numbers}
-        said |= {} if self.labels is None else {"labels": self.labels}
-        return f"Functions({', '.join(f'{name}={value!r}' for name, value in said.items())})"
+        """The expression with the modules and names of the functions, from which they are imported again."""
+        given: dict[str, Any] = {name: _place(getattr(self, name)) for name in ("values", "slopes")}
+        given |= {} if self.n == 1 else {"n": self.n}
+        given |= {} if self.numbers == (0.0,) else {"numbers": self.numbers}
+        given |= {} if self.labels is None else {"labels": self.labels}
+        return f"Functions({', '.join(f'{name}={value!r}' for name, value in given.items())})"
 
     def settings(self) -> dict[str, Any]:
         return super().settings() | {name: _place(getattr(self, name)) for name in ("values", "slopes")}

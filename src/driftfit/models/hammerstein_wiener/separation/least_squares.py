@@ -234,6 +234,22 @@ def gradient(J: Array, rho: Array, right: Array) -> None:
         right[x] = total
 
 
+@shared
+def inverse(N: Array, C: Array, right: Array, step: Array, out: Array) -> None:
+    """out = N^-1, column by column and symmetric; C, right and step are scratch. NaN from where N has no factor."""
+    n = N.shape[0]
+    for x in range(n):
+        right[:] = 0.0
+        right[x] = 1.0
+        if not solve(N, 0.0, right, C, step):
+            break
+        for z in range(n):
+            out[z, x] = step[z]
+    for x in range(n):
+        for z in range(x):
+            out[z, x] = out[x, z]
+
+
 @Driver
 def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: Array, cov: Array, cost: Array) -> None:
     """Refine zeta (T, n_z) in place; fill cov (T, n_z, n_z) and cost (T,), NaN where P is no finite covariance.
@@ -250,6 +266,7 @@ def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: 
         cost[t] = np.nan
         if not factor(P[t], scale, L):
             continue
+        # the weighted residual L^-1 (theta - g(zeta)) at the start
         now = zeta[t]
         residual(theta[t], now, orders, sizes, rho)
         whiten(L, scale, rho)
@@ -258,6 +275,7 @@ def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: 
             best += rho[i] * rho[i]
         damping = 0.0
         for _ in range(STEPS):
+            # Gauss-Newton: N step = J' rho, with more damping until the cost does not rise
             equations(now, orders, sizes, L, scale, J, N)
             gradient(J, rho, right)
             better = False
@@ -276,6 +294,7 @@ def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: 
                 damping = max(10.0 * damping, 1e-3)
             if not better:
                 break
+            # accept the step, and restore |c| = 1
             gain = best - value
             best = value
             now[:] = moved
@@ -284,16 +303,8 @@ def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: 
             damping = 0.0 if damping < 1e-3 else 0.1 * damping
             if gain <= 1e-12 * best or gain == 0.0:
                 break
+        # the covariance is N^-1 at the minimum, column by column, projected onto |c| = 1
         cost[t] = best
         equations(now, orders, sizes, L, scale, J, N)
-        for x in range(n_x):
-            right[:] = 0.0
-            right[x] = 1.0
-            if not solve(N, 0.0, right, C, step):
-                break
-            for z in range(n_x):
-                cov[t, z, x] = step[z]
-        for x in range(n_x):
-            for z in range(x):
-                cov[t, z, x] = cov[t, x, z]
+        inverse(N, C, right, step, cov[t])
         project(now, orders[0], sizes, cov[t], right, step)

@@ -74,10 +74,12 @@ def rank_one(M: Array, W: Array, left: Array, right: Array) -> float:
     m, p = M.shape
     by_rows = m <= p
     k, length = (m, p) if by_rows else (p, m)
+    # one-sided Jacobi on the shorter side: rows become orthogonal, their lengths the singular values
     for i in range(k):
         for x in range(length):
             W[i, x] = M[i, x] if by_rows else M[x, i]
     orthogonal(W[:k, :length])
+    # the two largest singular values
     best, top, second = 0, -1.0, 0.0
     for i in range(k):
         square = 0.0
@@ -93,6 +95,7 @@ def rank_one(M: Array, W: Array, left: Array, right: Array) -> float:
         left[:] = 0.0
         return 0.0 if top == 0.0 else np.nan
     sigma = np.sqrt(top)
+    # the right singular vector of unit length, and left = M right
     for i in range(p):
         total = 0.0
         if by_rows:

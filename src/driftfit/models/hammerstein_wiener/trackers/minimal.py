@@ -64,7 +64,9 @@ class Minimal(Tracker):
 
     @classmethod
     def own_model(cls, na: int, nb: int, nk: int) -> HammersteinWiener:
-        """With a bend in the input block, whose c_2 is 0 on linear records, where there are lags to tell it from b."""
+        """A model with a bend in the input block, if there are lags that distinguish c_2 from b; on linear records c_2
+        is 0.
+        """
         return HammersteinWiener(na, nb, nk, input=PiecewiseLinear([0.0]) if nb > 1 else None)
 
     @property

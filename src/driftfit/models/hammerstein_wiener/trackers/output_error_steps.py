@@ -1,5 +1,5 @@
-"""The machine behind `driftfit.models.hammerstein_wiener.trackers.output_error`: one sample on plain arrays, compiled
-once for all orders.
+"""The compiled routine of `driftfit.models.hammerstein_wiener.trackers.output_error`: one sample on plain arrays,
+compiled once for all orders.
 
 S is the covariance of [w, xi], of which the lower triangle is kept; its first n_w = max(na, 1) entries are the last
 outputs of the linear block. ``own`` holds the numbers named below. The model's values for the present input and output
@@ -67,7 +67,7 @@ variance and the slope of F at this sample; from V_POWER on the usual power of v
 """
 
 AT_BLOCKS, AT_THETA, AT_PHI, AT_Q, AT_W, AT_S, AT_SCRATCH, AT_OWN, AT_P, ADDRESSES = range(10)
-"""Addresses that the machine is given."""
+"""Addresses that are passed to the routine."""
 
 
 @part

@@ -17,9 +17,9 @@ export const ask = async (path, body) => {
     throw new Error("The service does not answer; the page tries again every few seconds.");
   });
   if (answer.status === 401) location.href = "/login";
-  const said = await answer.json();
-  if (!answer.ok) throw new Error(said.error ?? `status ${answer.status}`);
-  return said;
+  const content = await answer.json();
+  if (!answer.ok) throw new Error(content.error ?? `status ${answer.status}`);
+  return content;
 };
 const short = (v) => (v === null || v === undefined ? "–" : Number.isInteger(v) ? v.toLocaleString() : Math.abs(v) >= 1e5 || (v && Math.abs(v) < 1e-3)
   ? v.toExponential(2) : v.toPrecision(4));

@@ -1,7 +1,7 @@
-"""Functions that a compiled machine calls by address; a step looks the address up by symbol.
+"""Functions that a compiled routine calls by address; a step looks the address up by symbol.
 
-A machine is compiled once; the user's function that it calls is not yet known then. So the function is
-compiled as a separate machine, a step looks up its address at run time, and `call` calls it.
+The routine of a bank is compiled once, when the user's function that it calls is not known yet. The function is
+therefore compiled as a separate routine, a step looks up its address at run time, and `call` calls it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _KIND = ir.FunctionType(ir.VoidType(), [ir.DoubleType()] * NUMBERS + [ir.IntType
 
 
 def _address_of(context: Any, machine: Any) -> Any:
-    """The address of a machine in this process."""
+    """The address of a compiled routine in this process."""
 
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         known = builder.module.globals.get(machine.symbol)

@@ -34,6 +34,7 @@ def expect(t: Any, L: int) -> tuple[float, float]:
     for j in range(Hm):
         frozen = sensors[j, FROZEN] > 0.0
         possible = not frozen or abs(last) < np.inf
+        # p(sensor j | leaf), summed over the changes
         for l in range(L):
             share[l] = 0.0
         if possible:
@@ -42,12 +43,14 @@ def expect(t: Any, L: int) -> tuple[float, float]:
                     share[l] += prior[e, l]
         for l in range(L):
             shares[j, l] = w[l] * share[l]
+        # its contribution to the mean: z'm + offset, or the last output
         for l in range(L):
             share[l] = shares[j, l] * (last if frozen and possible else y[l] + sensors[j, VALUE])
         mean += total(share, L)
     for j in range(Hm):
         mass += total(shares[j], L)
     mean = mean / mass if mass != 1.0 else mean
+    # second moment about the mean: the variance within each component, and the distance of its mean
     r, noise = t.sample[R], t.sample[IN_NOISE]
     for j in range(Hm):
         if sensors[j, FROZEN] > 0.0 and abs(last) < np.inf:

@@ -200,9 +200,11 @@ def average(t: Any, L: int, Hd: int, Hm: int) -> None:
     for c in range(Hd):
         for l in range(L):
             chance[l] = 0.0
+        # p_c, summed over the sensors
         for j in range(Hm):
             for l in range(L):
                 chance[l] += t.prior[c * Hm + j, l]
+        # m_c and C_c
         for k in range(tri):
             for l in range(L):
                 one[k, l] = maps[c, KEEP] * B[FIRST + n + k, l] + Q[c, k]
@@ -211,6 +213,7 @@ def average(t: Any, L: int, Hd: int, Hm: int) -> None:
                 mean[i, l] = places[MEAN, i] if maps[c, RESET] > 0.0 else B[FIRST + i, l]
         apply(t, one, mean, 0, L, c, work)
         add_moments(t, one, mean, chance, L)
+    # central second moment; then the mean itself instead of its distance from the leaf's
     at = 0
     for i in range(n):
         for j in range(i + 1):

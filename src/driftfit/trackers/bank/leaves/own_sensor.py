@@ -10,8 +10,8 @@ variance a,
 
     K = C z / (h + a),     m+ = m + K (y - y_hat),     C+ = C - K (C z)'
 
-so C remains a covariance whatever the function returns; a = inf teaches nothing about theta (it counts as `LARGEST`
-times h + r). ``clean`` goes into the leaf's output lags, if the sensor ``cleans``.
+so C remains a covariance whatever the function returns; with a = inf nothing is learned about theta (the variance is
+then `LARGEST` times h + r). ``clean`` goes into the leaf's output lags, if the sensor ``cleans``.
 
 The function is compiled by itself, in a second or two, and the compiled routine of a bank calls it by its address
 (`driftfit.trackers.bank.leaves.callback`); the routine is not recompiled.
@@ -40,7 +40,7 @@ LOG_P, NOISE, CLEAN = range(3)
 
 
 @shared
-def judge(t: Any, which: float, at: int, l: int, y: float, r: float, said: Array) -> None:
+def judge(t: Any, which: float, at: int, l: int, y: float, r: float, answers: Array) -> None:
     """Evaluate function ``which`` for the leaf in column at + l, with the noise variance in the units of C; r is that
     of the nominal sensor.
     """
@@ -49,26 +49,26 @@ def judge(t: Any, which: float, at: int, l: int, y: float, r: float, said: Array
     h = expected[0, l]
     shift = t.sample[SHIFT]
     readings = y + shift, expected[1, l] + shift
-    call(t.own_likelihoods, (which, *readings, h * unit, r * unit, t.sample[READING]), said.ctypes.data)
+    call(t.own_likelihoods, (which, *readings, h * unit, r * unit, t.sample[READING]), answers.ctypes.data)
     most = LARGEST * (h + r)
-    said[NOISE] = max(said[NOISE] / unit, LEAST * r) if said[NOISE] < most * unit else most
-    said[LOG_P] = said[LOG_P] if said[LOG_P] < np.inf else -np.inf
-    said[CLEAN] = said[CLEAN] if abs(said[CLEAN]) < np.inf else y
+    answers[NOISE] = max(answers[NOISE] / unit, LEAST * r) if answers[NOISE] < most * unit else most
+    answers[LOG_P] = answers[LOG_P] if answers[LOG_P] < np.inf else -np.inf
+    answers[CLEAN] = answers[CLEAN] if abs(answers[CLEAN]) < np.inf else y
 
 
 @shared
 def judge_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
-    """Evaluate the function for every leaf, three numbers for each in `said`, and replace h by h + a; h is kept in the
-    first row of `scores`.
+    """Evaluate the function for every leaf, three numbers for each in `answers`, and replace h by h + a; h is kept in
+    the first row of `scores`.
 
     The columns up to a whole SIMD vector hold no leaf; their variance must not be zero, since it is divided by.
     """
-    said = t.said.reshape(t.said.shape[0] * t.said.shape[1])
+    answers = t.answers.reshape(t.answers.shape[0] * t.answers.shape[1])
     for l in range(-(-columns // WIDTH) * WIDTH):
         noise = r
         if l < columns:
-            judge(t, which, at, l, y, r, said[3 * l : 3 * l + 3])
-            noise = said[3 * l + NOISE]
+            judge(t, which, at, l, y, r, answers[3 * l : 3 * l + 3])
+            noise = answers[3 * l + NOISE]
         t.scores[0, l] = t.expected[0, l]
         t.expected[0, l] += noise
 
@@ -76,19 +76,19 @@ def judge_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -
 @shared
 def weigh_all(t: Any, columns: int) -> None:
     """Restore h, which `judge_all` kept, and put the log densities in its place."""
-    said = t.said.reshape(t.said.shape[0] * t.said.shape[1])
+    answers = t.answers.reshape(t.answers.shape[0] * t.answers.shape[1])
     for l in range(-(-columns // WIDTH) * WIDTH):
         t.expected[0, l] = t.scores[0, l]
         if l < columns:
-            t.scores[0, l] = said[3 * l + LOG_P]
+            t.scores[0, l] = answers[3 * l + LOG_P]
 
 
 @shared
 def clean_all(t: Any, at: int, columns: int) -> None:
     """Store the output that the function returns as the newest lag."""
-    lag, said = FIRST + t.n + t.n * (t.n + 1) // 2, t.said.reshape(t.said.shape[0] * t.said.shape[1])
+    lag, answers = FIRST + t.n + t.n * (t.n + 1) // 2, t.answers.reshape(t.answers.shape[0] * t.answers.shape[1])
     for l in range(columns):
-        t.leaves[lag, at + l] = said[3 * l + CLEAN]
+        t.leaves[lag, at + l] = answers[3 * l + CLEAN]
 
 
 @kernel
@@ -103,8 +103,8 @@ def entry_of(functions: tuple[Callable[..., Any], ...]) -> tuple[Any, Any]:
     chosen = _chosen(functions)
 
     def likelihoods(which: float, y: float, y_hat: float, h: float, r: float, last: float, out: int) -> None:
-        said = floats(out, 1, 3)
-        said[0, 0], said[0, 1], said[0, 2] = chosen(which, y, y_hat, h, r, last)
+        answers = floats(out, 1, 3)
+        answers[0, 0], answers[0, 1], answers[0, 2] = chosen(which, y, y_hat, h, r, last)
 
     likelihoods.__annotations__ = {name: "float" for name in ("which", "y", "y_hat", "h", "r", "last")}
     entry = machine(likelihoods)

@@ -7,9 +7,9 @@ reset, stabilised forgetting) and no leaf has separate output lags. Change i the
     M (Q_i + diag(sizes_i r / c)) M'
 
 to a covariance; exponential and directional forgetting are the same in z as in theta, and leave a direction without
-information as it is. A regressor outside the span of the earlier ones determines column j of every leaf from its
-innovation; it changes no weight. The covariances of the gap and of the mixture are mapped in the same way: C_j. = -C x
-and C_jj = x' C x + v.
+information as it is. A regressor outside the span of the earlier ones, or with far more information on z_j than they
+had, determines z_j in every leaf (`driftfit.trackers.bank.machine.entering`); it changes no weight. The mixture and the
+covariances of the gap, which leaves share, are updated in the same way, with the gain of the mixture.
 
 A bank runs this way if its start is not determined well enough for a covariance when the first residuals are available;
 other banks use phi and theta, at lower cost. Cost per sample: O(n^3) for each change.
@@ -23,6 +23,7 @@ from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine,
 from driftfit.trackers.bank.layout import LEAVES, MEMORY_AT, ROW, ROWS, memory_at
 from driftfit.trackers.bank.leaves.forget import GROWTH, PER_CAP
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S
+from driftfit.trackers.bank.machine.entering import enter_mean, enter_packed, gain_of
 from driftfit.trackers.parts.coordinates import (
     OUTGROWN,
     frame,
@@ -31,13 +32,13 @@ from driftfit.trackers.parts.coordinates import (
     new_row,
     unseen_variance,
 )
-from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, Y
+from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, WORK, Y
 
 FIELDS = ("walks", "fixed_walks", "relative_walks", "leaves", "gap", "path", "prior", "places")
 WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR, PLACES = (ROW[name] for name in FIELDS)
 """Rows of the table."""
 (
-    AT_MEMORY, AT_TABLE, AT_COUNTERS, AT_S, AT_W, AT_C, AT_X, AT_D, AT_P, AT_G, AT_NOW, ADDRESSES,
+    AT_MEMORY, AT_TABLE, AT_COUNTERS, AT_S, AT_W, AT_C, AT_X, AT_D, AT_P, AT_WORK, AT_NOW, ADDRESSES,
 ) = range(12)  # fmt: skip
 """Addresses of fields that the routines here are given."""
 
@@ -67,21 +68,6 @@ def walk(M: Array, places: tuple[int, int, int], S: Array, c: Array, unit: float
 
 
 @shared
-def enter_packed(M: Array, at: int, step: int, x: Array, j: int, sign: float, noise: float, g: Array) -> None:
-    """Fill row j of a covariance whose lower triangle begins at ``at`` with stride ``step``."""
-    n, h = len(x), noise
-    for a in range(n):
-        g[a] = 0.0
-        for b in range(n):
-            k = a * (a + 1) // 2 + b if b <= a else b * (b + 1) // 2 + a
-            g[a] += M[at + k * step] * x[b]
-        h += x[a] * g[a]
-    for b in range(n):
-        k = j * (j + 1) // 2 + b if b <= j else b * (b + 1) // 2 + j
-        M[at + k * step] = h if b == j else -sign * g[b]
-
-
-@shared
 def mean_noise(M: Array, table: Array, leaves: int, unknown: bool) -> float:
     """Mean of the noise variance over the leaves; 1 if it is known."""
     B, columns, mean = table[3 * COLUMNS] // 8, table[3 * COLUMNS + 2], 0.0
@@ -92,38 +78,46 @@ def mean_noise(M: Array, table: Array, leaves: int, unknown: bool) -> float:
 
 
 @shared
-def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, g: Array) -> None:
-    """Add the direction to all leaves and to the covariances of the gap."""
-    n, j, sign, noise = len(x), int(now[ENTERING]), now[OK], now[NOISE]
+def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, known: int, work: Array) -> None:
+    """The sample in all leaves; each has its own gain."""
+    n, noise = len(x), now[NOISE]
     B, columns = table[3 * COLUMNS] // 8, table[3 * COLUMNS + 2]
-    for leaf in range(many[LEAVES]):
-        at, e = B + leaf, now[Y]
-        for i in range(n):
-            e -= x[i] * M[at + (FIRST + i) * columns]
-        enter_packed(M, at + (FIRST + n) * columns, columns, x, j, sign, noise, g)
-        M[at + (FIRST + j) * columns] = sign * e
-    gap, columns = table[3 * GAP] // 8, table[3 * GAP + 2]
-    for i in range(1, table[3 * GAP + 1]):
-        enter_packed(M, gap + i * columns, 1, x, j, sign, 0.0, g)
-    path, columns, H = table[3 * PATH] // 8, table[3 * PATH + 2], table[3 * PRIOR + 1]
-    for i in range(2 * H, table[3 * PATH + 1] - 1):
-        enter_packed(M, path + i * columns, 1, x, j, sign, 0.0, g)
-    M[table[3 * PLACES] // 8 + PER_CAP * n + j] = 1.0 / (GROWTH * noise)
+    for leaf in range(B, B + many[LEAVES]):
+        m, C = leaf + FIRST * columns, leaf + (FIRST + n) * columns
+        left = gain_of(M, C, columns, x, noise, known, work)
+        enter_mean(M, m, columns, x, now, left, work)
+        enter_packed(M, C, columns, x, now, noise, left, work)
+    M[table[3 * PLACES] // 8 + PER_CAP * n + int(now[ENTERING])] = 1.0 / (GROWTH * noise)
 
 
 @shared
-def enter_mixture(z: Array, P: Array, x: Array, now: Array, noise: float, g: Array) -> None:
-    n, j, sign = len(x), int(now[ENTERING]), now[OK]
-    h, e = noise, now[Y]
-    for a in range(n):
-        g[a] = 0.0
-        for b in range(n):
-            g[a] += (P[a, b] if b <= a else P[b, a]) * x[b]
-        h += x[a] * g[a]
-        e -= x[a] * z[a]
-    for b in range(n):
-        P[max(j, b), min(j, b)] = h if b == j else -sign * g[b]
-    z[j] = sign * e
+def enter_gap(M: Array, table: Array, x: Array, now: Array, left: float, work: Array) -> None:
+    """The covariances of the gap, with the gain that is in ``work``: leaves share them."""
+    gap, columns = table[3 * GAP] // 8, table[3 * GAP + 2]
+    for i in range(1, table[3 * GAP + 1]):
+        enter_packed(M, gap + i * columns, 1, x, now, 0.0, left, work)
+    path, columns, H = table[3 * PATH] // 8, table[3 * PATH + 2], table[3 * PRIOR + 1]
+    for i in range(2 * H, table[3 * PATH + 1] - 1):
+        enter_packed(M, path + i * columns, 1, x, now, 0.0, left, work)
+
+
+@shared
+def enter_mixture(z: Array, P: Array, C: Array, x: Array, now: Array, noise: float, known: int, work: Array) -> float:
+    """The sample in the mixture, whose covariance is packed in C meanwhile; its gain stays in ``work``."""
+    n, k = len(x), 0
+    for i in range(n):
+        for j in range(i + 1):
+            C[k] = P[i, j]
+            k += 1
+    left = gain_of(C, 0, 1, x, noise, known, work)
+    enter_mean(z, 0, 1, x, now, left, work)
+    enter_packed(C, 0, 1, x, now, noise, left, work)
+    k = 0
+    for i in range(n):
+        for j in range(i + 1):
+            P[i, j] = C[k]
+            k += 1
+    return left  # type: ignore[no-any-return]
 
 
 @machine
@@ -141,15 +135,20 @@ def machine_walks(fields: int, unit: float, size: int, n: int, L: int, l: int) -
 
 
 @machine
-def machine_enter(fields: int, unknown: int, size: int, counters: int, n: int, L: int, l: int) -> None:
-    """`enter_leaves` and `enter_mixture` for lane l of L, from the addresses of fields."""
+def machine_enter(fields: int, unknown: int, known: int, size: int, counters: int, n: int, L: int, l: int) -> None:
+    """A sample with which a coordinate enters, for lane l of L, from the addresses of fields; ``known`` is 0 if nothing
+    was known of that coordinate.
+    """
     at = wholes(fields, 1, ADDRESSES)
     t, m = wholes(at[0, AT_TABLE], 3 * ROWS, L)[:, l], floats(at[0, AT_MEMORY], size, L)[:, l]
     many, now = wholes(at[0, AT_COUNTERS], counters, L)[:, l], floats(at[0, AT_NOW], NOW, L)[:, l]
-    x, g = floats(at[0, AT_X], n, L)[:, l], floats(at[0, AT_G], n, L)[:, l]
-    noise = now[NOISE] * mean_noise(m, t, many[LEAVES], unknown > 0)
-    enter_leaves(m, t, many, x, now, g)
-    enter_mixture(floats(at[0, AT_D], n, L)[:, l], cubes(at[0, AT_P], n, n, L)[:, :, l], x, now, noise, g)
+    x, work = floats(at[0, AT_X], n, L)[:, l], cubes(at[0, AT_WORK], WORK, n, L)[:, :, l]
+    z, P, C = (
+        floats(at[0, AT_D], n, L)[:, l], cubes(at[0, AT_P], n, n, L)[:, :, l], floats(at[0, AT_W], n * n, L)[:, l]
+    )  # fmt: skip
+    left = enter_mixture(z, P, C, x, now, now[NOISE] * mean_noise(m, t, many[LEAVES], unknown > 0), known, work)
+    enter_gap(m, t, x, now, left, work)
+    enter_leaves(m, t, many, x, now, known, work)
 
 
 @machine
@@ -194,7 +193,7 @@ def write_walks(s: State, l: int) -> None:
     # packed here: what a function packs is gone when it returns
     fields = packed((
         memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
-        s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data,
+        s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data,
     ))  # fmt: skip
     machine_walks(fields, unit, s.table[MEMORY_AT, 2, 0], n, L, l)
 
@@ -206,7 +205,7 @@ def outgrown(s: State, l: int) -> int:
     s.at_start[NOISE, l] = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
     fields = packed((
         memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
-        s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data,
+        s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data,
     ))  # fmt: skip
     machine_outgrown(fields, s.unknown[l], s.table[MEMORY_AT, 2, 0], s.counters.shape[0], n, L, l)
     return int(s.at_start[ENTERING, l])
@@ -218,8 +217,7 @@ def enter_bank(s: State, column: int, l: int) -> None:
     outside these coordinates (`driftfit.trackers.bank.machine.late_direction`) the rest.
     """
     n, L = s.d.shape
-    for i in range(column, n):
-        s.x[i, l] = 0.0
+    known = 1 if s.S[column, column, l] != 0.0 else 0
     sign = new_row(s, s.phi, column, l)
     s.root[l] = 1
     if s.framed[l] == 0:
@@ -228,9 +226,11 @@ def enter_bank(s: State, column: int, l: int) -> None:
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column
     fields = packed((
         memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
-        s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data,
+        s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data,
     ))  # fmt: skip
-    machine_enter(fields, s.unknown[l], s.table[MEMORY_AT, 2, 0], s.counters.shape[0], n, L, l)
+    machine_enter(fields, s.unknown[l], known, s.table[MEMORY_AT, 2, 0], s.counters.shape[0], n, L, l)
+    for i in range(column, n):
+        s.x[i, l] = 0.0
 
 
 @kernel

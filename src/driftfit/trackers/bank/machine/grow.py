@@ -237,6 +237,7 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
     With ``own``, parent l takes only joint event l; ``last`` is the value that a frozen sensor repeats.
     """
     sensors = t.sensors
+    # every parent under every change: C-, g = C- z, h = z'C- z, z'm
     columns = int(ahead(t.n, t, K, own, phi))
     if t.output_lags > 0:
         widen_by_lags(t, t.parents, K, columns)
@@ -245,6 +246,7 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
         if t.unknown > 0:
             inherit(t, K, NU, at, columns)
             inherit(t, K, S, at, columns)
+        # measurement update and log density under sensor j
         if sensors[j, FROZEN] > 0.0:
             leave(t, at, columns)
             frozen(t, at, columns, y, last, sensors[j, STUCK])
@@ -259,11 +261,13 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
             else:
                 gaussian(t.scores, columns)
         if t.output_lags > 0:
+            # output lags of the children, and the covariance of lags that are predictions
             own_lags = sensors[j, CLEANS] > 0.0
             remember(t, K, at, columns, y - sensors[j, VALUE], own_lags)
             if own_lags and sensors[j, OWN] > 0.0:
                 clean_all(t, at, columns)
             shift_covariance(t, t.parents, K, at, columns, own_lags)
+        # prior probability of the event, ancestry, and codes for the reduction
         weigh(t, K, at, columns, j, own)
         encode(t, K, at, columns, j)
     return columns * len(sensors)

@@ -92,7 +92,9 @@ def determine(t: Any, L: int) -> None:
 
 @kernel
 def nearest(s: State, l: int) -> None:
-    """P without the directions that are not determined: a change then moves theta no further than data demand."""
+    """P without the directions that are not determined, so that a change moves theta no further than the data
+    require.
+    """
     n = s.theta.shape[0]
     for k in range(n):
         h = 0.0

@@ -51,7 +51,7 @@ from driftfit.trackers.bank.machine.late_direction import begin_within, point_al
 from driftfit.trackers.parts.coordinates import FRAME, unseen_variance, whiten_within
 from driftfit.trackers.parts.diffuse import enter, measurement, prediction, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
-from driftfit.trackers.parts.resolution import resolve
+from driftfit.trackers.parts.resolution import lasting, resolve
 from driftfit.trackers.rls import learn_scale
 
 GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift"], ROW["own_likelihoods"]
@@ -61,9 +61,9 @@ GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift
 def keep(o: State, s: State, l: int) -> None:
     """Store the report of events."""
     size, L = o.report.shape
-    said = floats(report_at(s), size, L)
+    report = floats(report_at(s), size, L)
     for k in range(size):
-        o.report[k, l] = said[k, l]
+        o.report[k, l] = report[k, l]
 
 
 @kernel
@@ -183,9 +183,16 @@ def run(s: State, l: int) -> None:
 
 
 @kernel
+def repeated(s: State, l: int) -> float:
+    """The factor of the noise variance for a repeated reading of a coarse meter, in units of the last innovation's."""
+    known = s.coarse[l] > 0.0 and s.s[l] < np.inf
+    return 1.0 + lasting(s, l) / max(s.coarse[l], s.s[l]) if known else 1.0
+
+
+@kernel
 def hand_over(s: State, l: int) -> None:
     """Write the numbers of this sample for the compiled routine."""
-    s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
+    s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l] * repeated(s, l), s.dt[l]
     s.sample[IN_TIME, l], s.sample[SHIFT, l] = s.dt[l] * s.drift[l], s.shift[l]
     s.sample[IN_OK, l], s.sample[IN_SEEN, l] = s.ok[l], s.seen[l]
     s.sample[R, l], s.sample[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])

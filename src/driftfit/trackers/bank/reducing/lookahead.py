@@ -59,11 +59,13 @@ def density_parts(t: Any, L: int, top: float, mass: float, phi: Array, samples: 
         if t.group[l] < 0:
             continue
         unit = B[S, l] / (B[NU, l] - 2.0) if t.unknown > 0 else 1.0
+        # forecast of the output under every change c
         for c in range(len(t.walks)):
             mean, wide = 0.0, width(B, l, n, na, phi, maps[c, KEEP], Q[c])
             for i in range(n):
                 z = B[lags + i, l] if i < na else phi[i]
                 mean += z * (theta0[i] if maps[c, RESET] > 0.0 else B[FIRST + i, l])
+            # and every sensor j: weight, mean and standard deviation of one component
             for j in range(Hm):
                 e = c * Hm + j
                 chance = (P[0, e] if same else P[t.event[l], e]) * B[WEIGHT, l] / mass

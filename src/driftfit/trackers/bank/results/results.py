@@ -107,8 +107,8 @@ class Hypotheses:
         Row t belongs to the event first visible in sample t; NaN at the end, where later samples are missing.
         """
         if lag not in self.lags:
-            said = ", ".join(str(k) for k in self.lags)
-            raise ValueError(f"prob: lag must be one of {said} for this reduction; got {lag}.")
+            allowed = ", ".join(str(k) for k in self.lags)
+            raise ValueError(f"prob: lag must be one of {allowed} for this reduction; got {lag}.")
         p = np.full((len(self.run), len(self.names)), np.nan)
         p[: max(len(p) - lag, 0)] = self.lag_prob[lag:, self.lags.index(lag)]
         return p

@@ -6,7 +6,8 @@
 
 In the common ladder all parameters drift; its top is the rung of ratio 1, and those above are for noise that is small
 compared with the drift. In a second ladder the parameters have learned weights
-(`driftfit.trackers.parts.modes.weights`). Each parameter has a short ladder of its own, on which it alone drifts: the
+(`driftfit.trackers.parts.modes.weights`), and the filters of a third follow a trend
+(`driftfit.trackers.parts.modes.trend`). Each parameter has a short ladder of its own, on which it alone drifts: the
 change of one parameter neither has to be learned first nor makes the others uncertain. Groups have theirs instead.
 
 T moves one rung up or down, and leads to each mode from all others with the same small probability a_j:
@@ -36,6 +37,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.trackers.parts.modes.rows import sum_of_row
+from driftfit.trackers.parts.modes.trend import TREND, move_along, no_trend
 
 LADDER = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
 """Drift ratios of the modes in which all parameters drift."""
@@ -72,9 +74,9 @@ def ladders(n: int, groups: Any) -> tuple[Array, Array, Array, Array]:
     the modes with learned weights, 0 for others."""
     single = groups is None and 1 < n <= MOST_ALONE
     masks = [np.isin(np.arange(n), one).astype(float) for one in (range(n) if single else groups or ())]
-    rungs = [LADDER, LEARNED, *((ALONE if single else GROUP) for _ in masks)]
+    rungs = [LADDER, LEARNED, TREND, *((ALONE if single else GROUP) for _ in masks)]
     ratio, learned, moves, arrive = [], [], [], []
-    for which, (ladder, mask) in enumerate(zip(rungs, [np.ones(n), np.ones(n), *masks], strict=True)):
+    for which, (ladder, mask) in enumerate(zip(rungs, [*np.ones((3, n)), *masks], strict=True)):
         for k, rung in enumerate(ladder):
             ratio.append(rung * mask)
             learned.append(rung if which == 1 else 0.0)
@@ -86,7 +88,7 @@ def ladders(n: int, groups: Any) -> tuple[Array, Array, Array, Array]:
             elif which == 0:
                 arrive.append(REST * (1.0 if k == 0 else 0.3 if k < TOP else 0.0))
             else:
-                arrive.append(ACROSS / len(ladder) / (1 if which == 1 else len(masks)))
+                arrive.append(ACROSS / len(ladder) / (1 if which <= 2 else len(masks)))
     return np.array(ratio).T, np.array(moves).T, np.array(arrive), np.array(learned)
 
 
@@ -125,6 +127,7 @@ def filters(n: int, groups: Any) -> dict[str, Any]:
         "m": np.zeros((n, K)),
         "m_next": np.zeros((n, K)),
         "C": np.zeros((n, n, K)),
+        **no_trend(n, len(LADDER) + len(LEARNED)),
         "Z": np.zeros((n, n)),
         "rare": 1.0,
         "leapt": 0.0,
@@ -169,7 +172,8 @@ def learn_rate(s: State, l: int) -> None:
 
 @partial(kernel, inline=False)
 def mix(s: State, l: int) -> None:
-    """Interaction: every filter continues from the mixture of its predecessors; mu becomes that of the next sample.
+    """Interaction: every filter continues from the mixture of its predecessors, moved by its slope; mu becomes that of
+    the next sample.
 
     Means are taken relative to that of the mixture, d, so that moments may be added before the mean is subtracted.
     """
@@ -195,6 +199,7 @@ def mix(s: State, l: int) -> None:
     for a in range(n):
         for j in range(K):
             s.m[a, j, l] = s.d[a, l] + s.m_next[a, j, l]
+    move_along(s, l)
 
 
 @kernel

@@ -11,9 +11,9 @@ from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.models.state_space import equations_of
 from driftfit.trackers.joint_kalman import moves_are_finite
-from driftfit.trackers.particles.draws import normal, uniform
 from driftfit.trackers.parts.diffuse import LEFT
 from driftfit.trackers.parts.varying_drift import read_drift
+from driftfit.trackers.state_space.draws import normal, uniform
 
 HALF_LOG_2_PI = 0.9189385332046727
 MOST = 1000.0
@@ -193,7 +193,8 @@ def weigh(s: State, l: int) -> None:
         top = max(top, fit)
     total = 0.0
     for p in range(count):
-        s.fit[p, l] = exp(s.fit[p, l] - top) if s.fit[p, l] > top - 700.0 else 0.0
+        far = s.fit[p, l] - top  # and not fit > top - 700, which is false for the largest where that is rounding
+        s.fit[p, l] = exp(far) if far > -700.0 else 0.0
         total += s.fit[p, l]
     for p in range(count):
         s.weight[p, l] = s.fit[p, l] / total

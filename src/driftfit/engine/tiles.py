@@ -1,0 +1,171 @@
+"""Tiles: the records in which a driver keeps the state of a model and a tracker, with the lanes as their last axis.
+
+Fields that every record has: ``phi`` (n,), the signals ``y``, ``u`` (m,), ``dt`` (nominal intervals since the last
+sample; 0 means that nothing may happen), ``noise`` and ``drift`` (known factors of the noise variance and of the drift
+at this sample, 1 unless given), ``valid`` (phi is complete), ``seen`` (y is there), ``ok`` (both), the results
+``y_hat``, ``e``, ``s``, ``var`` (n,), and ``scale``, the estimate of the noise variance where P is relative to it (1
+elsewhere); and ``used_noise``, which only the replay for a smoother writes. Models and trackers add their own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numba
+import numpy as np
+from numba import types
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.tracker_part import BOUNDARY
+
+WIDTH = 32
+"""Lanes of a fleet's tile. It must be a constant of the type: a run-time lane count is not vectorised."""
+
+OPEN = ("report", "memory", "flat")
+"""Fields at the end of a record whose lengths are no part of its type for compiled code, which is the same for all
+lengths: it finds them by their addresses, one after the other from that of the first.
+"""
+
+_TILE_TYPES: dict[Any, types.Type] = {}
+"""Record types by their fields, one for each kind of tile that was compiled."""
+
+
+def _common(n: int) -> dict[str, Any]:
+    """Fields that every record has besides u, with their values before the first sample."""
+    zero = 0.0
+    return {
+        "phi": np.zeros(n), "y": zero, "dt": 1.0, "noise": 1.0, "drift": 1.0, "interval": 1.0,
+        "valid": zero, "seen": zero, "ok": zero, "y_hat": zero, "e": zero, "s": zero, "var": np.zeros(n), "scale": 1.0,
+        "used_noise": 1.0,
+    }  # fmt: skip
+
+
+def held_in(record: np.dtype[Any], own: Collection[str] = ()) -> list[str]:
+    """The fields of a record that hold something: a tracker's ``own``, the model's, the common and the open ones."""
+    first, second, *rest = _common(0)
+    behind = [first, second, "u", *rest, *OPEN]
+    names = [name for name in record.names or () if name not in (BOUNDARY, "padding")]
+    return sorted(names, key=lambda name: 0 if name in own or name not in behind else 1 + behind.index(name))
+
+
+def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mapping[str, Any]]) -> Array:
+    """A tile of ``len(trackers)`` lanes: an array of one record, its fields set to the given starts.
+
+    ``model`` and each entry of ``trackers`` map field names to start values without the lane axis; the shapes of the
+    values are the shapes of the fields. All trackers must have the same fields.
+    """
+    L, inputs = len(trackers), {"u": np.zeros(max(m, 1))}
+    starts = [{**start, **_common(n), **model, **inputs, **start} for start in trackers]
+    fields: list[Any] = []
+    for name, value in starts[0].items():
+        kind = np.int64 if np.asarray(value).dtype.kind in "iub" else np.float64
+        fields.append((name, kind, (*np.shape(value), L)))
+    opened = [field for name in OPEN for field in fields if field[0] == name]
+    fields = [field for field in fields if field not in opened]
+    own = trackers[0].keys() | _common(n).keys()
+    seen = [field for field in fields if field[0] in own]
+    others = [field for field in fields if field[0] not in own]
+    fields = [*seen, _padding(BOUNDARY, seen, L), *others]
+    tile = _aligned(_followed_by(np.dtype([*fields, _padding("padding", fields, L)], align=True), opened), 1)
+    for l, start in enumerate(starts):
+        for name, value in start.items():
+            tile[name][0, ..., l] = value
+    if opened:
+        tile[BOUNDARY][0, 0] = tile[opened[0][0]].ctypes.data - tile[BOUNDARY].ctypes.data
+    return tile
+
+
+def _padding(name: str, fields: Sequence[Any], L: int) -> tuple[str, type, tuple[int, int]]:
+    """A field of padding, after which others begin on a cache line, so that no load of a vector of lanes crosses two.
+
+    It has as many rows for every L: a packed state of one lane is read into tiles of any width.
+    """
+    words = np.dtype(list(fields)).itemsize // (8 * L)
+    return name, np.float64, (8 - words % 8, L)
+
+
+def _followed_by(dtype: np.dtype[Any], fields: Sequence[Any]) -> np.dtype[Any]:
+    """A record type with further fields of numbers behind it, in whole cache lines."""
+    names, offsets, end = list(dtype.names or ()), [at for _, at, *_ in (dtype.fields or {}).values()], dtype.itemsize
+    formats: list[Any] = [dtype[name] for name in names]
+    for name, kind, shape in fields:
+        names.append(name)
+        formats.append((kind, shape))
+        offsets.append(end)
+        end += 8 * math.prod(shape)
+    size = -(-end // 64) * 64
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size}, align=True)
+
+
+def as_compiled(tile: Array) -> Array:
+    """The tile as compiled code takes it: of its open fields (`OPEN`) only the beginning."""
+    if OPEN[0] not in (tile.dtype.names or ()):
+        return tile
+    return np.ndarray(tile.shape, _beginning(tile.dtype), tile)
+
+
+@lru_cache(maxsize=256)
+def _beginning(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """The type of a record up to the first entry of its open fields."""
+    fields: Mapping[str, Any] = dtype.fields or {}
+    (first, at, *_), names = fields[OPEN[0]], [name for name in fields if name not in OPEN]
+    beginning = np.dtype(
+        {"names": names, "formats": [dtype[name] for name in names],
+         "offsets": [fields[name][1] for name in names], "itemsize": at}, align=True,
+    )  # fmt: skip
+    return _followed_by(beginning, [(OPEN[0], first.base, (1, first.shape[-1]))])
+
+
+def repeat_tile(tile: Array, count: int) -> Array:
+    """``count`` copies of a tile, aligned like it: ``tiles[k : k + 1]`` is a tile."""
+    tiles = _aligned(tile.dtype, count)
+    # as bytes: copying records field by field takes ten times as long
+    tiles.view(np.uint8).reshape(count, -1)[...] = tile.view(np.uint8)
+    return tiles
+
+
+def _aligned(dtype: np.dtype[Any], count: int) -> Array:
+    """``count`` records, all zero, the first at the start of a cache line."""
+    raw = np.zeros(dtype.itemsize * count + 64, np.uint8)
+    return np.ndarray(count, dtype, raw, -raw.ctypes.data % 64)
+
+
+def output_type(tile: Array, outputs: Sequence[str] = (), keep: str = "std", dtype: Any = np.float64) -> np.dtype[Any]:
+    """The record that is kept of one sample of a tile; in double precision, and not of theta alone, a driver writes it.
+
+    P when ``keep`` is "cov"; the fields of the tile that ``outputs`` names; then theta, var, y_hat, e, s, ok; of
+    "theta" that alone. What is not common comes first: Numba takes a record that continues another one for the same
+    type, with a warning.
+    """
+    return _output_type(tile.dtype, tuple(outputs), keep, np.dtype(dtype))
+
+
+@lru_cache(maxsize=256)
+def _output_type(tile: np.dtype[Any], outputs: tuple[str, ...], keep: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
+    n, L = tile["theta"].shape
+    names = ("theta",) if keep == "theta" else (*outputs, "theta", "var", "y_hat", "e", "s", "ok")
+    fields: list[Any] = [("P", dtype, (n, n, L))] if keep == "cov" else []
+    for name in names:
+        own = tile[name].base
+        fields.append((name, dtype if own.kind == "f" else own, tile[name].shape))
+    return np.dtype(fields, align=True)
+
+
+def tile_type(tile: Array) -> types.Type:
+    """The compiler's type of a tile; finding it takes a millisecond, so it is kept for tiles of the same kind."""
+    flags, dtype = tile.flags, tile.dtype
+    key = (
+        dtype,
+        dtype.isalignedstruct,
+        tile.ndim,
+        flags.c_contiguous,
+        flags.f_contiguous,
+        flags.writeable,
+        flags.aligned,
+    )
+    if key not in _TILE_TYPES:
+        _TILE_TYPES[key] = numba.typeof(as_compiled(tile))
+    return _TILE_TYPES[key]

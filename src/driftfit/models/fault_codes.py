@@ -1,0 +1,83 @@
+"""Readings out of all proportion to those before, for models whose prediction is not linear in theta.
+
+A linear model recovers from a reading of 9999 where the output is near 10, as its tracker forgets. A prediction that
+bends may not: the reading takes the estimate to where the gradient is wrong or zero, and no later sample brings it
+back. Therefore such a model counts a reading as missing if
+
+    (y - m)^2 > (REACH p)^2 v    and    (y - y')^2 > (REACH p)^2 v    and    (y - y_hat)^2 > (REACH p)^2 v
+
+with m and v the mean and variance of the readings so far, y' the last one that was accepted, and y_hat the prediction
+if there is one. p is 1, and doubles with every strange reading after another one: readings that keep coming are a
+change of level. A reading that repeats the last one to the last bit says nothing new, and does not double it: fault
+codes come in runs.
+
+The first readings are accepted unchecked, because there is nothing to compare them with; ``limits=`` of `track` and
+`Live` tells what a sensor can read. Inputs are not judged: a large one may be a test.
+
+Source: the rule of `driftfit.trackers.parts.outlying_readings`, which judges sooner, because its tracker knows the
+variance of the noise. Cost per sample: a few comparisons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.drivers import LARGEST
+from driftfit.engine.kernel import State, kernel
+
+REACH = 30.0
+"""Standard deviations of the readings beyond which one is strange."""
+FIRST = 10.0
+"""Readings that are accepted unchecked."""
+MEMORY = 1000.0
+"""Memory of their mean and variance, in readings."""
+LONGEST = 1e12
+"""Upper bound of p."""
+
+UNJUDGED: Mapping[str, Any] = {
+    "usual": 0.0, "usual_spread": 0.0, "judged": 0.0, "accepted": np.nan, "raw": np.nan, "forbearance": 1.0,
+    "refused": 0.0,
+}  # fmt: skip
+"""m; v; the number of readings in them; y'; the last reading of all; p; how many were refused."""
+
+
+@kernel
+def judge(s: State, y_hat: float, l: int) -> None:
+    """Refuse a strange reading; y_hat is NaN where there is no prediction."""
+    y = s.y[l]
+    seen, fresh = abs(y) < LARGEST, y != s.raw[l]
+    apart, off = (y - s.accepted[l]) ** 2, (y - y_hat) ** 2
+    near = min(apart, off) if off >= 0.0 else apart
+    near = min((y - s.usual[l]) ** 2, near)
+    reach = REACH * REACH * s.usual_spread[l]
+    strange = seen & (s.judged[l] >= FIRST) & (near > reach)
+    out = strange & (near > reach * s.forbearance[l] * s.forbearance[l])
+    longer = min(2.0 * s.forbearance[l], LONGEST) if fresh else s.forbearance[l]
+    s.forbearance[l] = longer if strange else (1.0 if seen else s.forbearance[l])
+    s.raw[l] = y if seen else s.raw[l]
+    s.refused[l] += 1.0 if out else 0.0
+    s.y[l] = np.nan if out else y
+    if seen & (not out):
+        s.accepted[l] = y
+        if fresh | (s.judged[l] < 1.0):
+            s.judged[l] += 1.0
+            share = 1.0 / min(s.judged[l], MEMORY)
+            away = y - s.usual[l]
+            s.usual[l] += share * away
+            s.usual_spread[l] += share * ((1.0 - share) * away * away - s.usual_spread[l])
+
+
+@kernel
+def possible(s: State, value: float, l: int) -> bool:
+    """Whether the readings so far do not make a value of the output absurd."""
+    reach = REACH * REACH * s.usual_spread[l]
+    return (s.judged[l] < FIRST) | ((value - s.usual[l]) ** 2 <= reach)  # type: ignore[no-any-return]
+
+
+def refusals(lane: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    """Its remark in a summary: nothing if all readings were accepted."""
+    count = int(lane["refused"]) if "refused" in lane else 0
+    return (("Refused", f"{count} readings out of all proportion to those before"),) if count else ()
