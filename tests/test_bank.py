@@ -227,3 +227,16 @@ def test_lags_that_were_predicted_are_uncertain():
         lags = np.r_[x if own else y[t], lags[0]]
         V = np.array([[wide + R, cross[0]], [cross[0], V[0, 0]]]) if own else np.diag([0.0, V[0, 0]])
         np.testing.assert_allclose(run.theta[t], m, atol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:.*transition:UserWarning")
+@pytest.mark.parametrize("seed", [23, 29])
+def test_merged_leaves_whose_noise_differs_have_a_variance(seed):
+    """Matching moments leaves them fewer than two degrees of freedom, whose expected noise variance is negative."""
+    rng = np.random.default_rng(seed)
+    u, v, y = rng.normal(size=60), 0.3 * rng.normal(size=60), np.zeros(60)
+    for t in range(2, 60):
+        y[t] = 1.1 * y[t - 1] - 0.5 * y[t - 2] + u[t - 1] + 0.5 * u[t - 2] + v[t] + 0.7 * v[t - 1]
+    run = track(ARX(2, 2), Bank(sensors=[Sensor.nominal(), Sensor.outlier(), Sensor.frozen(prob=0.002)]), y, u)
+    assert (run.var[10:] > 0.0).all()
+    assert (run.innovation_var[10:] > 0.0).all()

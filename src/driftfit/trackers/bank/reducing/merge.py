@@ -25,6 +25,9 @@ from driftfit.trackers.bank.leaves.lags import merge_covariance
 from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
 from driftfit.trackers.bank.machine.ancestry import average
 
+LEAST_FREEDOM = 2.5
+"""Leaves whose noise differs by orders of magnitude would have fewer, and with 2 or fewer no expected variance."""
+
 
 @shared
 def digamma(x: float) -> float:
@@ -106,7 +109,7 @@ def match(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
     pool(t, members, share, to, X)
     merge_covariance(t, members, share, to)
     if unknown:
-        A[NU, to] = freedom(s - math.log(g), B[NU, best])
+        A[NU, to] = max(freedom(s - math.log(g), B[NU, best]), LEAST_FREEDOM)
         A[S, to] = A[NU, to] / g
 
 
