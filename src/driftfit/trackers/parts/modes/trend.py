@@ -1,4 +1,4 @@
-"""Filters that follow a trend: their means move by a slope at every sample that is used.
+"""Filters that follow a trend: their means move by a slope at every sample that corrects them.
 
     m <- m + b,      b <- b + beta (g a e - f b),      beta = rho^(1/2) / 2
 
@@ -35,7 +35,7 @@ FADING, LOST = 0.1, 2.0
 def no_trend(n: int, first: int) -> dict[str, Any]:
     """Fields before the first sample; ``first`` is the first filter that follows a trend."""
     return {
-        "slope": np.zeros((n, len(TREND))),
+        "slopes": np.zeros((n, len(TREND))),
         "corrected": np.zeros((n, len(TREND))),
         "bend": 0.5 * np.sqrt(TREND),
         "trend": first,
@@ -45,27 +45,28 @@ def no_trend(n: int, first: int) -> dict[str, Any]:
 @kernel
 def bend_slopes(s: State, l: int) -> None:
     """Correct the slopes as the means will be corrected, while C is still that before the sample."""
-    for i in range(s.slope.shape[0]):
-        for j in range(s.slope.shape[1]):
+    for i in range(s.slopes.shape[0]):
+        for j in range(s.slopes.shape[1]):
             k = s.trend[l] + j
             before = max(s.C[i, i, k, l], 1e-300)
             removed = min(1.0, max(s.h[k, l] * s.gain[i, k, l] * s.gain[i, k, l] / before, 0.0))
             s.corrected[i, j, l] += min(1.0, 2.0 * removed) * (before - s.corrected[i, j, l])
             fading = FADING + LOST * (1.0 - min(1.0, s.corrected[i, j, l] / before))
             step = s.gain[i, k, l] * s.step[k, l]
-            s.slope[i, j, l] += s.bend[j, l] * (step - fading * s.slope[i, j, l])
+            s.slopes[i, j, l] += s.bend[j, l] * (step - fading * s.slopes[i, j, l])
 
 
 @kernel
 def move_along(s: State, l: int) -> None:
-    """Every filter that follows a trend moves by its slope."""
-    for i in range(s.slope.shape[0]):
-        for j in range(s.slope.shape[1]):
-            s.m[i, s.trend[l] + j, l] += s.slope[i, j, l]
+    """Every filter that follows a trend moves by its slope, in the coordinates that the sample corrected."""
+    for i in range(s.slopes.shape[0]):
+        for j in range(s.slopes.shape[1]):
+            k = s.trend[l] + j
+            s.m[i, k, l] += s.slopes[i, j, l] if s.gain[i, k, l] != 0.0 else 0.0
 
 
 @kernel
 def level_slopes(s: State, i: int, l: int) -> None:
     """Forget the slopes of a coordinate that has a new meaning."""
-    for j in range(s.slope.shape[1]):
-        s.slope[i, j, l], s.corrected[i, j, l] = 0.0, 0.0
+    for j in range(s.slopes.shape[1]):
+        s.slopes[i, j, l], s.corrected[i, j, l] = 0.0, 0.0
