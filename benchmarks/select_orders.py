@@ -66,6 +66,6 @@ def main(records: int = 60, lengths: tuple[int, ...] = (200, 600, 2000)) -> None
 
 if __name__ == "__main__":
     if "--quick" in sys.argv:
-        main(3, (200,))
+        main(1, (200,))
     else:
         main(*map(int, sys.argv[1:2]))
