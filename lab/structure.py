@@ -43,7 +43,7 @@ LAYERS = (
     ("smooth", "tune", "judge", "use", "models.hammerstein_wiener.results", "trackers.bank.results"),
     ("show",),
     # the facade binds verbs to results
-    ("", "results", "fleets", "streams", "tracking", "checks", "extend"),
+    ("", "results", "fleets", "streams", "tracking", "checks", "extend", "parsing"),
     ("demo", "embedded", "bridges", "service", "cli", "__main__"),
 )
 """Folders and modules by layer, the lowest first; the longest prefix of a module's name counts."""

@@ -9,9 +9,9 @@ import numpy as np
 import typer
 
 from driftfit.cli.compiled.cache import stored
-from driftfit.cli.parts.arguments import parse_model, parse_tracker
 from driftfit.cli.parts.program import app, helpful, progress, say
 from driftfit.engine.disk_cache import contents, folder
+from driftfit.parsing.settings import parse_model, parse_tracker
 from driftfit.run.parallel_lanes import FEWEST
 from driftfit.show.parts.text import facts
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_type_hints
 import numpy as np
 import typer
 
-from driftfit.cli.parts.arguments import listed, parse_interval, parse_model, parse_tracker, parse_units
+from driftfit.cli.parts.arguments import listed, parse_interval, parse_units
 from driftfit.cli.parts.program import helpful, progress
 from driftfit.cli.parts.reading import (
     Part,
@@ -25,6 +25,7 @@ from driftfit.cli.parts.reading import (
 )
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
+from driftfit.parsing.settings import parse_model, parse_tracker
 from driftfit.trackers.base import Tracker
 
 Names = list[str] | None
