@@ -66,7 +66,7 @@ def test_files_and_warm_starts_of_records_and_streams(case, tmp_path):
         live.update(y[t], u[t], time=time[t])
         np.testing.assert_array_equal(live.theta, whole.theta[t])
     same(track(model, TRACKER, y[60:], u[60:], time=time[60:], warm_start=live), whole, slice(60, None))
-    with pytest.raises(ValueError, match=r"is not a run of these outputs|the run before followed"):
+    with pytest.raises(ValueError, match=r"is not a run of these outputs|the earlier run followed"):
         track(model, TRACKER, y, u, warm_start=track(Regression(1), TRACKER, y[:, 0], y[:, 1]))
     if kind is Outputs:
         one = whole["flow"]

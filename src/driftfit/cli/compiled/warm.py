@@ -36,7 +36,7 @@ def warm(
 
     with helpful():
         if inputs < 0:
-            raise ValueError(f"--inputs {inputs}: at least 0.")
+            raise ValueError(f"--inputs {inputs}: the number of inputs must be at least 0.")
         start, before = time.perf_counter(), contents()
         rng = np.random.default_rng(0)
         y, u = rng.normal(size=SAMPLES), rng.normal(size=(SAMPLES, inputs)) if inputs else None

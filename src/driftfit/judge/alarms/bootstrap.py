@@ -1,12 +1,12 @@
 """Limits of the "glr" and "cusum" alarms by a bootstrap of the reference.
 
-Every simulated record has its own reference. The residuals x of the reference are drawn in blocks, with random signs
-(sums of fitted residuals in their order vary too little), they get the variances h of the model, and scale and
-variances are estimated from them again; so is the error of theta, from its covariance. A record of regressors and
-residuals drawn together follows, whose scores are those of the model that was estimated from its own reference. The
-limits therefore allow for everything that is estimated: a stream keeps these errors for as long as it runs. Whether the
-variance changes at all is seldom certain, so alpha and beta of each record are drawn from those that the reference
-leaves plausible.
+Every simulated record has its own reference. Its residuals x are drawn from those of the observed reference, in blocks
+and with random signs (sums of fitted residuals in their order vary too little). They are given the variances h of the
+model, and scale and variances are estimated from them again; an error of theta is drawn from its covariance. In the
+record that follows, regressors and residuals are drawn together, and its scores are those of the model that was
+estimated from its own reference. The limits therefore allow for everything that is estimated: a stream keeps these
+errors for as long as it runs. Whether the variance changes at all is seldom certain, so alpha and beta of each record
+are drawn from those that the reference leaves plausible.
 
 With a deviate c as statistic the logarithm of the rate of onsets falls nearly as a straight line in c^2. A limit that
 is rarer than the simulated records can show is found along that line, which also gives the probability of an extreme.

@@ -51,7 +51,7 @@ LOWEST = -1e300
 
 
 class SimulatedRecords(NamedTuple):
-    """R simulated records of T samples: what the reference of each knows, and its whitened scores."""
+    """R simulated records of T samples: what was estimated from the reference of each, and its whitened scores."""
 
     cov: Array
     """(R, n, n)"""

@@ -114,7 +114,7 @@ class Selection(Printed):
         found = self._structure(name).model
         if found is None:
             raise ValueError(
-                "select: a subset of regressors is not a model by itself; regressors(name) says what it holds."
+                "select: a subset of regressors is not a model by itself; regressors(name) lists its regressors."
             )
         return found
 
@@ -146,7 +146,7 @@ class Selection(Printed):
         """When the structure changed, with dates; ``change`` is the probability of a change at a sample.
 
         See `driftfit.judge.structures.switches`. ValueError for structures that are not made of the same regressors, or
-        a probability that is none.
+        a change that is not a probability below one half.
         """
         if not 0.0 < change < 0.5:
             raise ValueError(f"switches: change must be between 0 and 0.5; got {change!r}.")

@@ -10,8 +10,8 @@ and so, with the covariance C of the former, z_j = x'z - sum_{i<j} x_i z_i has
 
     C_jb = cov(rho, b) - sum_{i<j} x_i C_ib,      C_jj = var(rho) - sum_{i<j} x_i (cov(rho, i) + C_ji)
 
-No difference of large numbers is left in them, however large x_j^2 C_jj is beside r. If nothing was known of z_j, s is
-infinite: K is 0 for the other coordinates, and x'K is 1.
+No difference of large numbers is left in them, however large x_j^2 C_jj is compared with r. If nothing was known of
+z_j, s is infinite: K is 0 for the other coordinates, and x'K is 1.
 
 Source: ours; the limit is that of Durbin and Koopman, Time Series Analysis by State Space Methods (2012), section 5.2.
 Cost: O(n^2).
