@@ -10,7 +10,9 @@ import polars as pl
 import pytest
 
 from driftfit import ARX, RLS, Kalman, Live, Regression, track
-from driftfit.data.clock import NEAR, Clock, instant, median_interval
+from driftfit.data.clock import NEAR, Clock
+from driftfit.data.times.gaps import median_interval
+from driftfit.data.times.instants import instant
 from driftfit.data.times.periods import span
 from driftfit.engine.settings import DataWarning
 

@@ -23,7 +23,7 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from driftfit.data.clock import instant
+from driftfit.data.times.instants import instant
 from driftfit.data.times.periods import span
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near

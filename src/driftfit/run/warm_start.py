@@ -13,8 +13,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from driftfit.data import storage
-from driftfit.data.clock import Clock, instant
+from driftfit.data.clock import Clock
 from driftfit.data.record import Labels
+from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import warn
 from driftfit.models.base import Model

@@ -15,9 +15,9 @@ from typing import Any, overload
 import numpy as np
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.clock import instant
 from driftfit.data.labels import by_name, order_of
 from driftfit.data.signals import noise_of
+from driftfit.data.times.instants import instant
 from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, factor
