@@ -1,4 +1,5 @@
-"""Time: calendars count as nominal steps, records and streams count alike, and what is lost to dt is said."""
+"""Time: calendars count as nominal steps, records and streams count alike, and samples that a wrong dt costs are
+reported."""
 
 from __future__ import annotations
 
