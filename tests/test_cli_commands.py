@@ -114,7 +114,7 @@ def test_numbers_with_commas_and_groups(tmp_path):
         rows_of([str(tmp_path / "n.csv")], ["a"], "t", [], Part(decimal=","))
 
 
-def test_valid_ranges_and_stretches_left_out(table):
+def test_valid_ranges_and_intervals_left_out(table):
     y, _, _ = simulate()
     y[(y < -2.0) | (y > 2.0)] = np.nan
     assert np.array_equal(theta(*SIGNALS, "--limits", "flow=-2:2"), expected(y=y).theta[:, 1])

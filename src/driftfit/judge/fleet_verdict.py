@@ -140,7 +140,7 @@ class ManyVerdicts(Printed):
 
     @property
     def table(self) -> Any:
-        """One row a run, as a polars table."""
+        """One row per run, as a polars table."""
         import polars
 
         return polars.DataFrame(
@@ -210,7 +210,7 @@ class ManyDiagnoses(Printed):
 
     @property
     def table(self) -> Any:
-        """One row a run with every number, as a polars table."""
+        """One row per run with every number, as a polars table."""
         import polars
 
         rows = [{"key": key_text(key)} | {c.name: c.value for c in one.checks} for key, one in self.of.items()]

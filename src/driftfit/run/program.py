@@ -63,7 +63,7 @@ def progress(what: str, total: int, shown: bool) -> Iterator[Callable[[int], Non
 
 @dataclass(frozen=True)
 class Program:
-    """A bound model and the tracker that estimates its parameters; what follows from them is found once."""
+    """A bound model and the tracker that estimates its parameters; what follows from the two is computed once."""
 
     model: Model
     tracker: Tracker

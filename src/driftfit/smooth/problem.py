@@ -27,7 +27,7 @@ def note_noise(s: State, l: int) -> None:
 
 
 @lru_cache
-def attentive(steps: TrackerSteps) -> TrackerSteps:
+def collecting_for_smoother(steps: TrackerSteps) -> TrackerSteps:
     """Steps that store the factor of the noise variance when the tracker runs, and the tracker's ``smoother_fields``.
 
     A model may make it larger than the factor that the user gave (measurement noise that enters through a curve).
@@ -46,15 +46,16 @@ def attentive(steps: TrackerSteps) -> TrackerSteps:
 def replay(run: Track) -> dict[str, Array]:
     """Run the tracker over its record again and return the samples as it received them, field by field, (T, .., 1).
 
-    The fields are phi, y, dt, valid, ok, e, used_noise (the factor of the noise variance), and what the tracker notes.
+    The fields are phi, y, dt, valid, ok, e, used_noise (the factor of the noise variance), and the tracker's
+    ``smoother_fields``.
     """
     program, T = run.program, len(run)
     tile = program.tile()
     own = (*COLLECTED, "used_noise", *run.tracker.smoother_fields)
     block = np.empty(min(BLOCK, T), output_type(tile, own))
     seen = {name: np.empty((T, *block[name].shape[1:]), block[name].dtype) for name in (*own, "ok", "e")}
-    loop = program.drivers(steps=attentive(program.steps)).run
-    for a in range(0, T, BLOCK):  # results that stay in the cache: the rest of them is not needed
+    loop = program.drivers(steps=collecting_for_smoother(program.steps)).run
+    for a in range(0, T, BLOCK):  # a block that stays in the cache; only some of its fields are kept
         part = slice(a, min(a + BLOCK, T))
         rows = block[: part.stop - a]
         loop(tile, *lanes_of(run.record.part(part)), rows)

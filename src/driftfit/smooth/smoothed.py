@@ -109,8 +109,8 @@ class Smoothed:
 
     @property
     def _fold(self) -> float:
-        """What errors of rounding that readings share multiply variances by
-        (`driftfit.trackers.parts.coarse.shared_rounding`), with the r phi' V phi of the used samples.
+        """The factor by which variances grow because readings share errors of rounding
+        (`driftfit.trackers.parts.coarse.shared_rounding`), from the mean r phi' V phi of the used samples.
         """
         common, used = self.run.state.get("common", 0.0), self.walk.weight > 0.0
         undecided = self.r * float(np.mean(self.leverage[used] / self.walk.weight[used])) if common > 0.0 else 0.0

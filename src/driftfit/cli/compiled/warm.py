@@ -9,9 +9,9 @@ import numpy as np
 import typer
 
 from driftfit.cli.compiled.cache import stored
-from driftfit.cli.parts.arguments import parse_model, parse_tracker
 from driftfit.cli.parts.program import app, helpful, progress, say
 from driftfit.engine.disk_cache import contents, folder
+from driftfit.parsing.settings import parse_model, parse_tracker
 from driftfit.run.parallel_lanes import FEWEST
 from driftfit.show.parts.text import facts
 
@@ -36,7 +36,7 @@ def warm(
 
     with helpful():
         if inputs < 0:
-            raise ValueError(f"--inputs {inputs}: at least 0.")
+            raise ValueError(f"--inputs {inputs}: the number of inputs must be at least 0.")
         start, before = time.perf_counter(), contents()
         rng = np.random.default_rng(0)
         y, u = rng.normal(size=SAMPLES), rng.normal(size=(SAMPLES, inputs)) if inputs else None
