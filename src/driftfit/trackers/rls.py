@@ -44,18 +44,18 @@ from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.coarse.shared_rounding import folded, nothing_shared, share_rounding, spanned_folded
+from driftfit.trackers.parts.contradictions import contradictions, judged_measurement
 from driftfit.trackers.parts.diffuse import (
-    MACHINES,
     SCRATCH,
     enter,
     hand_over,
     knowing,
     knowing_nothing,
-    measurement,
     reform,
     take_in,
     wander,
 )
+from driftfit.trackers.parts.judged_start import START_MACHINES, judging, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
 
@@ -116,7 +116,7 @@ def learn_variance(s: State, l: int) -> None:
 @kernel
 def correct(s: State, l: int) -> None:
     resolve(s, l)
-    measurement(s, l)
+    judged_measurement(s, l)
     learn_variance(s, l)
 
 
@@ -151,7 +151,7 @@ def forgotten(s: State, l: int) -> float:
 @kernel
 def correct_direction(s: State, l: int) -> None:
     resolve(s, l)
-    measurement(s, l)
+    judged_measurement(s, l)
     gain = forgotten(s, l)
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):
@@ -190,8 +190,19 @@ def begin_direction(s: State, l: int) -> None:
     spanned_folded(s, l)
 
 
-EXPONENTIAL = TrackerSteps(forget, correct, folded, begin, machines=MACHINES)
-DIRECTIONAL = TrackerSteps(nothing, correct_direction, folded, begin_direction, machines=MACHINES)
+@kernel
+def restart(s: State, l: int) -> None:
+    """As before the first sample."""
+    s.squares[l], s.count[l], s.scale[l] = 0.0, 0.0, np.nan
+    s.readings_in[l], s.levels[l], s.middle[l], s.spread[l], s.stayed[l] = 0.0, 1.0, 0.0, 0.0, np.nan
+    for i in range(s.theta.shape[0]):
+        s.per_cap[i, l] = 0.0
+
+
+EXPONENTIAL = TrackerSteps(forget, correct, folded, judging(begin, restart), machines=START_MACHINES)
+DIRECTIONAL = TrackerSteps(
+    nothing, correct_direction, folded, judging(begin_direction, restart), machines=START_MACHINES
+)
 
 
 @dataclass(frozen=True)
@@ -241,8 +252,9 @@ class RLS(Tracker):
     def state(self, n: int) -> Mapping[str, Any]:
         P = np.zeros((n, n)) if self.p0 is None else matrix("RLS", "p0", self.p0, n)
         first = self.c_max * np.diag(P)
+        theta0 = vector("RLS", "theta0", self.theta0, n)
         return {
-            "theta": vector("RLS", "theta0", self.theta0, n),
+            "theta": theta0,
             "P": P,
             "forgetting": self.forgetting,
             "log_forgetting": np.log(np.asarray(self.forgetting)),
@@ -253,13 +265,14 @@ class RLS(Tracker):
             "discounted": 0.0,
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            **unjudged(theta0, diffuse=self.p0 is None),
         }
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         return {**self.state(model.n), "discounted": model.settling}
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return resolution(run.state)
+        return (*contradictions(run.state), *resolution(run.state))
 
     @property
     def steps(self) -> TrackerSteps:
