@@ -71,7 +71,7 @@ from driftfit.trackers.parts.diffuse import (
 )
 from driftfit.trackers.parts.judged_start import START_MACHINES, judging, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve
-from driftfit.trackers.rls import fade, learn_variance, no_scale
+from driftfit.trackers.rls import fade, follow_variance, learn_variance, no_scale
 
 FOLLOWING = 0.05
 """Share of the distance to theta that the auxiliary model moves at a sample: it lags by twenty samples."""
@@ -158,6 +158,7 @@ def learning(refined: bool) -> Step:
             s.P[i, i, l] = max(left, LEFT * s.P[i, i, l])
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
         learn_variance(s, l)
+        follow_variance(s, l)
 
     step: Step = learn
     return step
@@ -300,6 +301,8 @@ class InstrumentalVariables(Tracker):
             "r": 1.0,
             "c_max": self.c_max,
             "discounted": 0.0,
+            "recent": 0.0,
+            "quieter": 1.0,
             "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),

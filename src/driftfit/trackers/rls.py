@@ -59,6 +59,12 @@ from driftfit.trackers.parts.judged_start import START_MACHINES, judging, unjudg
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
 
+RECENT, RECENT_SHARE = 20.0, 0.125
+"""Memory of the present noise variance: samples, and share of those so far."""
+LARGE = 25.0
+"""A square above this multiple of it counts as this multiple."""
+
+
 @kernel
 def growth(s: State, l: int) -> float:
     """The factor by which forgetting multiplies P."""
@@ -70,7 +76,8 @@ def growth(s: State, l: int) -> float:
     for i in range(s.theta.shape[0]):
         # rounding can make a variance negative, which must not grow past the cap
         grown = max(grown, abs(s.P[i, i, l]) * s.per_cap[i, l])
-    factor: float = 1.0 / min(1.0, max(faded, grown))
+    factor: float = s.quieter[l] / min(1.0, max(faded, grown))
+    s.quieter[l] = 1.0
     return factor
 
 
@@ -114,10 +121,24 @@ def learn_variance(s: State, l: int) -> None:
 
 
 @kernel
+def follow_variance(s: State, l: int) -> None:
+    """While a start is forgotten, P and the scale are in units of the present noise variance."""
+    if (s.ok[l] > 0.0) & (s.count[l] > 0.0) & (s.count[l] < s.discounted[l]):
+        square = s.e[l] * s.e[l]
+        before = s.recent[l] if s.recent[l] > 0.0 else square
+        share = 1.0 / min(s.count[l], max(RECENT, RECENT_SHARE * s.count[l]))
+        s.recent[l] = before + share * (min(square, LARGE * before) - before)
+        ratio = before / s.recent[l] if s.recent[l] > 0.0 else 1.0
+        s.quieter[l] *= ratio
+        s.squares[l] /= ratio
+
+
+@kernel
 def correct(s: State, l: int) -> None:
     resolve(s, l)
     judged_measurement(s, l)
     learn_variance(s, l)
+    follow_variance(s, l)
 
 
 @kernel
@@ -132,6 +153,7 @@ def begin(s: State, l: int) -> None:
     enter(s, l)
     if s.s[l] < np.inf:
         learn_variance(s, l)
+        follow_variance(s, l)
     spanned_folded(s, l)
     # the cap applies from the first direction on: regressors may lack excitation before they span everything
     for i in range(n):
@@ -193,7 +215,7 @@ def begin_direction(s: State, l: int) -> None:
 @kernel
 def restart(s: State, l: int) -> None:
     """As before the first sample."""
-    s.squares[l], s.count[l], s.scale[l] = 0.0, 0.0, np.nan
+    s.squares[l], s.count[l], s.scale[l], s.recent[l], s.quieter[l] = 0.0, 0.0, np.nan, 0.0, 1.0
     s.readings_in[l], s.levels[l], s.middle[l], s.spread[l], s.stayed[l] = 0.0, 1.0, 0.0, 0.0, np.nan
     for i in range(s.theta.shape[0]):
         s.per_cap[i, l] = 0.0
@@ -263,6 +285,8 @@ class RLS(Tracker):
             "c_max": self.c_max,
             "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
             "discounted": 0.0,
+            "recent": 0.0,
+            "quieter": 1.0,
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
             **unjudged(theta0, diffuse=self.p0 is None),
