@@ -83,10 +83,10 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
     weight = np.divide(1.0, seen["used_noise"][:, 0], out=np.zeros(len(ok)), where=ok)
     drift = dt * run.known.drift
     phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0]
+    fields = {name: seen[name][..., 0] for name in tracker.smoother_fields} or run.state
+    weight[tracker.left_out(fields, phi, y, ok)] = 0.0
     if own and tracker.smoother_fields:
-        fields = {name: seen[name][..., 0] for name in tracker.smoother_fields}
         q, r_of = tracker.estimated_variances(run.model, fields, seen["e"][:, 0], drift)
-        weight[tracker.left_out(fields, phi, y, ok)] = 0.0
         phi, y = tracker.regression(fields, phi, y)
         drift_root, weight, time, drift = np.sqrt(q), weight / r_of, drift, np.ones(len(drift))
     trend = dt if prior.slopes else NONE

@@ -44,19 +44,25 @@ from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.coarse.shared_rounding import folded, nothing_shared, share_rounding, spanned_folded
+from driftfit.trackers.parts.contradictions import contradictions, judged_measurement
 from driftfit.trackers.parts.diffuse import (
-    MACHINES,
     SCRATCH,
     enter,
     hand_over,
     knowing,
     knowing_nothing,
-    measurement,
     reform,
     take_in,
     wander,
 )
+from driftfit.trackers.parts.judged_start import START_MACHINES, judging, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
+
+
+RECENT, RECENT_SHARE = 20.0, 0.125
+"""Memory of the present noise variance: samples, and share of those so far."""
+LARGE = 25.0
+"""A square above this multiple of it counts as this multiple."""
 
 
 @kernel
@@ -70,7 +76,8 @@ def growth(s: State, l: int) -> float:
     for i in range(s.theta.shape[0]):
         # rounding can make a variance negative, which must not grow past the cap
         grown = max(grown, abs(s.P[i, i, l]) * s.per_cap[i, l])
-    factor: float = 1.0 / min(1.0, max(faded, grown))
+    factor: float = s.quieter[l] / min(1.0, max(faded, grown))
+    s.quieter[l] = 1.0
     return factor
 
 
@@ -114,10 +121,24 @@ def learn_variance(s: State, l: int) -> None:
 
 
 @kernel
+def follow_variance(s: State, l: int) -> None:
+    """While a start is forgotten, P and the scale are in units of the present noise variance."""
+    if (s.ok[l] > 0.0) & (s.count[l] > 0.0) & (s.count[l] < s.discounted[l]):
+        square = s.e[l] * s.e[l]
+        before = s.recent[l] if s.recent[l] > 0.0 else square
+        share = 1.0 / min(s.count[l], max(RECENT, RECENT_SHARE * s.count[l]))
+        s.recent[l] = before + share * (min(square, LARGE * before) - before)
+        ratio = before / s.recent[l] if s.recent[l] > 0.0 else 1.0
+        s.quieter[l] *= ratio
+        s.squares[l] /= ratio
+
+
+@kernel
 def correct(s: State, l: int) -> None:
     resolve(s, l)
-    measurement(s, l)
+    judged_measurement(s, l)
     learn_variance(s, l)
+    follow_variance(s, l)
 
 
 @kernel
@@ -132,6 +153,7 @@ def begin(s: State, l: int) -> None:
     enter(s, l)
     if s.s[l] < np.inf:
         learn_variance(s, l)
+        follow_variance(s, l)
     spanned_folded(s, l)
     # the cap applies from the first direction on: regressors may lack excitation before they span everything
     for i in range(n):
@@ -151,7 +173,7 @@ def forgotten(s: State, l: int) -> float:
 @kernel
 def correct_direction(s: State, l: int) -> None:
     resolve(s, l)
-    measurement(s, l)
+    judged_measurement(s, l)
     gain = forgotten(s, l)
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):
@@ -190,8 +212,19 @@ def begin_direction(s: State, l: int) -> None:
     spanned_folded(s, l)
 
 
-EXPONENTIAL = TrackerSteps(forget, correct, folded, begin, machines=MACHINES)
-DIRECTIONAL = TrackerSteps(nothing, correct_direction, folded, begin_direction, machines=MACHINES)
+@kernel
+def restart(s: State, l: int) -> None:
+    """As before the first sample."""
+    s.squares[l], s.count[l], s.scale[l], s.recent[l], s.quieter[l] = 0.0, 0.0, np.nan, 0.0, 1.0
+    s.readings_in[l], s.levels[l], s.middle[l], s.spread[l], s.stayed[l] = 0.0, 1.0, 0.0, 0.0, np.nan
+    for i in range(s.theta.shape[0]):
+        s.per_cap[i, l] = 0.0
+
+
+EXPONENTIAL = TrackerSteps(forget, correct, folded, judging(begin, restart), machines=START_MACHINES)
+DIRECTIONAL = TrackerSteps(
+    nothing, correct_direction, folded, judging(begin_direction, restart), machines=START_MACHINES
+)
 
 
 @dataclass(frozen=True)
@@ -241,8 +274,9 @@ class RLS(Tracker):
     def state(self, n: int) -> Mapping[str, Any]:
         P = np.zeros((n, n)) if self.p0 is None else matrix("RLS", "p0", self.p0, n)
         first = self.c_max * np.diag(P)
+        theta0 = vector("RLS", "theta0", self.theta0, n)
         return {
-            "theta": vector("RLS", "theta0", self.theta0, n),
+            "theta": theta0,
             "P": P,
             "forgetting": self.forgetting,
             "log_forgetting": np.log(np.asarray(self.forgetting)),
@@ -251,15 +285,18 @@ class RLS(Tracker):
             "c_max": self.c_max,
             "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
             "discounted": 0.0,
+            "recent": 0.0,
+            "quieter": 1.0,
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            **unjudged(theta0, diffuse=self.p0 is None),
         }
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         return {**self.state(model.n), "discounted": model.settling}
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return resolution(run.state)
+        return (*contradictions(run.state), *resolution(run.state))
 
     @property
     def steps(self) -> TrackerSteps:
