@@ -58,7 +58,6 @@ from driftfit.trackers.parts.diffuse import (
 from driftfit.trackers.parts.judged_start import START_MACHINES, judging, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
-
 RECENT, RECENT_SHARE = 20.0, 0.125
 """Memory of the present noise variance: samples, and share of those so far."""
 LARGE = 25.0
