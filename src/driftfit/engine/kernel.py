@@ -83,6 +83,7 @@ def kernel(function: Callable[..., Any], inline: bool = True) -> Any:
     follows IEEE rules instead of raising, the GIL is released, and there is no fast-math.
     """
     made = internals.as_part(_compiled(function, forceinline=inline, **internals.STEP), internals.StepDispatcher)
+    made.for_constants = inline
     return _again(made, lambda other: kernel(other, inline))
 
 
