@@ -135,3 +135,15 @@ def test_on_line_the_noise_is_not_learned_from_the_errors_of_an_unknown_plant(tr
         inside.append(error[-1] < 1.96 * run.std[-1])
     assert np.median(error, axis=0)[2:6].max() < 0.12
     assert np.mean(inside) > 0.85
+
+
+def test_estimates_that_went_astray_are_not_silent():
+    """A slow room with disturbances of its own, which an output error model takes for noise of the reading."""
+    rng, T = np.random.default_rng(0), 800
+    heat, out = np.repeat((rng.uniform(size=T // 8) < 0.4) * 60.0, 8), 7.0 + np.cumsum(0.3 * rng.normal(size=T))
+    u, y = np.c_[heat, out], np.full(T, 18.0)
+    for t in range(1, T):
+        y[t] = 0.97 * y[t - 1] + 0.003 * u[t - 1, 0] + 0.005 * u[t - 1, 1] + 0.4 + 0.09 * rng.normal()
+    with pytest.warns(UserWarning, match=r"the estimates went astray\. Disturbances that pass through the plant"):
+        track(OE((1, 1), (1, 1)), InstrumentalVariables(0.995), y, u)
+    track(ARX(1, (1, 1), intercept=True), InstrumentalVariables(0.995), y, u)  # and no warning

@@ -11,6 +11,9 @@ and is not used. If y is farther from m than y_hat, the lag of the reading is th
 condition does not hold where parameters are hardly known; the third not after a test to which the output responds. A
 change of gain or level within the usual range of the readings is never strange.
 
+An estimate that went astray predicts what is strange, too, and must be corrected. Inputs are therefore blamed for at
+most `LAGS` samples in a row, and for one sample in ten in the long run.
+
 A strange input stays in the regressors, as a lag or in what a model simulates, and may matter less there. In the `LAGS`
 samples after one that an input was to blame for, one with phi' P phi > r, which would teach more than all before it, is
 therefore not used either.
@@ -47,6 +50,8 @@ LASTING, LONGEST = 4.0, 1e12
 """The patience from which on a strange input is accepted as a lag too; its upper bound."""
 LAGS = 50.0
 """Samples in which a strange input may still be in the regressors."""
+SELDOM = 0.1
+"""Share of samples that inputs may be blamed for in the long run."""
 QUICK, SLOW, SLOWEST = 2.0, 2.0 ** (1.0 / 4.0), 2.0 ** (1.0 / 16.0)
 """Factors of the patience: for readings, for predictions, and if the strange value stays."""
 ALIKE, SINKING = 1.01, 0.8
@@ -57,7 +62,7 @@ def no_contradictions() -> dict[str, Any]:
     """Fields before the first reading."""
     return {
         "y_mean": 0.0, "y_spread": 0.0, "y_count": 0.0, "y_last": np.nan, "patience": 1.0, "y_strange": np.nan,
-        "far": 0.0, "left_out": 0.0, "shift": 0.0, "lagging": 0.0,
+        "far": 0.0, "left_out": 0.0, "distrusted": 0.0, "shift": 0.0, "lagging": 0.0,
     }  # fmt: skip
 
 
@@ -80,10 +85,19 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
     reach, patience = REACH * REACH * s.y_spread[l], s.patience[l]
     judged = (s.ok[l] > 0.0) & (s.y_count[l] >= FIRST)
     strange = judged & (e * e > reach) & (e * e > SURE * SURE * v) & (min(off, out) < 0.5 * abs(e))
-    beyond = strange & (e * e > reach * patience * patience)
+    trusted = (off > out) | (s.distrusted[l] < LAGS)
+    beyond = strange & trusted & (e * e > reach * patience * patience)
     lasting = strange & (not beyond) & (patience > LASTING)
-    lagging = judged & (not lasting) & (s.lagging[l] > 0.0) & (v > 2.0 * s.r[l] * s.noise[l] * s.scale[l])
+    lagging = (
+        judged
+        & (not lasting)
+        & (s.lagging[l] > 0.0)
+        & (s.distrusted[l] < LAGS)
+        & (v > 2.0 * s.r[l] * s.noise[l] * s.scale[l])
+    )
     left = beyond | lagging
+    more = 1.0 if left & (off <= out) else -SELDOM
+    s.distrusted[l] = min(max(s.distrusted[l] + more, 0.0), 2.0 * LAGS) if s.ok[l] > 0.0 else s.distrusted[l]
     of_reading = SLOWEST if y == s.y_strange[l] else QUICK
     of_prediction = (1.0 if out * ALIKE < s.far[l] else SLOWEST) if out < ALIKE * s.far[l] else SLOW
     grown = min((of_reading if off > out else of_prediction) * patience, LONGEST)
@@ -104,7 +118,11 @@ def leave_out_contradiction(s: State, y_hat: float, v: float, l: int) -> None:
     A single lane skips what would change nothing; side by side, lanes are faster without a branch.
     """
     y, shown = s.y[l] + s.shift[l], y_hat + s.shift[l]
-    quiet = ((y - shown) ** 2 <= REACH * REACH * s.y_spread[l]) & (s.patience[l] <= 1.0) & (s.lagging[l] <= 0.0)
+    quiet = (
+        ((y - shown) ** 2 <= REACH * REACH * s.y_spread[l])
+        & (s.patience[l] <= 1.0)
+        & (s.lagging[l] + s.distrusted[l] <= 0.0)
+    )
     if (s.theta.shape[1] > 1) or (not quiet):
         judge(s, y, shown, v, l)
     learn_range(s, y, s.ok[l], l)
