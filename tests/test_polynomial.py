@@ -236,7 +236,7 @@ def test_units_are_those_of_the_signals_and_fault_codes_leave_no_trace():
 
 
 def test_least_squares_forgets_its_start():
-    """With an offset and two inputs the first regressors are poor, and RLS(1.0) used to keep what they said."""
+    """With an offset and two inputs the first regressors are poor, and RLS(1.0) used to keep the estimate from them."""
     truth, inside, off = np.array([1.0, 0.5, 0.3, 0.5, 0.8, 1.5, -0.7, 0.9, 2.0]), [], []
     model = BoxJenkins([2, 1], 1, 1, [2, 1], nk=[1, 2], offset=True)
     for seed in range(12):

@@ -160,7 +160,7 @@ def test_one_copy_of_a_part_serves_all_constants():
 def test_functions_with_other_options_are_typed_by_themselves():
     strict, loose, again = Flags(), Flags(), Flags()
     loose.fastmath = True
-    again.fastmath = False  # the default, said aloud
+    again.fastmath = False  # the default, given explicitly
     assert strict != loose, "Flags._values no longer holds the options: a user's fast-math could enter our code."
     assert strict == again
     assert hash(strict) == hash(again), "Equal options differ."
@@ -188,7 +188,7 @@ def test_pass_managers_are_freed():
 
 def test_object_code_is_loaded_and_freed():
     code = internals.emit(first, (VECTOR,))
-    assert code.lasting, "Code is said to hold addresses of this process: nothing would be kept on disk."
+    assert code.lasting, "Code is marked as holding addresses of this process: nothing would be kept on disk."
     entry = internals.load(code)
     assert entry(np.full(1, 7.0)) == 7.0, "codegen._tm.emit_object, LLVM's ORC or _dynfunc.make_function changed."
     assert internals.load(internals.Code(*code))(np.full(1, 8.0)) == 8.0

@@ -238,7 +238,6 @@ def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
     """
     codegen = cpu_target.target_context.codegen()
     create, restore, set_env = codegen.create_library, codegen.unserialize_library, codegen.set_env
-    build = codegen._pass_builder
 
     def create_fragment(called: str, **options: Any) -> Any:
         return kind(codegen, called, **options) if called == name else create(called, **options)
@@ -250,15 +249,8 @@ def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
         if codegen._engine.is_symbol_defined(env_name):
             set_env(env_name, env)
 
-    def build_once(**options: Any) -> Any:
-        key = tuple(sorted(options.items()))
-        if key not in _builders:
-            _builders[key] = build(**options)
-        return _builders[key]
-
     ours = {
         "create_library": create_fragment, "unserialize_library": restore_fragment, "set_env": set_env_of_emitted,
-        "_pass_builder": build_once,
     }  # fmt: skip
     before = {key: vars(codegen)[key] for key in ours if key in vars(codegen)}
     try:
@@ -268,10 +260,6 @@ def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
         for key in ours:
             del vars(codegen)[key]
         vars(codegen).update(before)
-
-
-_builders: dict[Any, Any] = {}
-"""The builders of LLVM's passes, by their options: Numba makes one per function, of which LLVM frees only a part."""
 
 
 # ---- typing ---------------------------------------------------------------------------------------------------------
@@ -309,7 +297,8 @@ types.Record.__repr__ = lambda self: self.name  # written out for every pass ove
 # ---- memory ---------------------------------------------------------------------------------------------------------
 
 # llvmlite 0.50 frees no pass manager: both classes inherit the `_dispose` that does nothing. They were three fifths of
-# all memory that a compilation left behind.
+# all memory that a compilation left behind. Builders of passes leave 2 kB each; they must not be kept for a second run
+# though: every run adds observers to its builder that end with the run, and each of them delays all later passes.
 for _manager in (passes.ModulePassManager, passes.FunctionPassManager):
     if _manager._dispose is passes.ffi.ObjectRef._dispose:
         _manager._dispose = passes.NewPassManager._dispose

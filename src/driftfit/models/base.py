@@ -59,6 +59,11 @@ class Model(Settings, ABC):
         return len(self.names)
 
     @property
+    def width(self) -> int:
+        """Series that share a tile in a fleet; 1 where the regression is a routine that takes one lane at a time."""
+        return 32
+
+    @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs; several outputs are run by `driftfit.run.outputs`."""
         return ("y",)

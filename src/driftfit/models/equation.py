@@ -41,8 +41,8 @@ from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.models.arx import GAP
 from driftfit.models.fault_codes import possible
-from driftfit.models.formulas import Formula, compiled, parse, start_values
-from driftfit.models.functions import equation_text
+from driftfit.models.formulas.functions import equation_text
+from driftfit.models.formulas.text import Formula, compiled, parse, start_values
 from driftfit.models.inputs import NamedInputs
 from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
 
@@ -58,7 +58,7 @@ class Equation(NamedInputs):
     ----------
     equation : str, or a function
         Such as ``"y = theta.k * sqrt(p1 - p2) - theta.c"``; or a plain Python function of u, theta and y that returns
-        the output, and has its name (`driftfit.models.functions`).
+        the output, and has its name (`driftfit.models.formulas.functions`).
     start : mapping from parameter to number, or a number for all
         Where the linearisation begins; 1 for those that are not named. It is no prior: give that to the tracker, as
         ``theta0`` and ``p0``.

@@ -185,6 +185,11 @@ class Kalman(Tracker):
         return self.laws is None
 
     @property
+    def width(self) -> int:  # type: ignore[override]
+        """The square root is updated by a routine that takes one lane at a time."""
+        return 1 if self.form == "sqrt" else super().width
+
+    @property
     def steps(self) -> TrackerSteps:
         if self.laws is not None:
             return laws_filter.STEPS

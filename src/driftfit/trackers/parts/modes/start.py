@@ -176,7 +176,8 @@ def faults(fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Arra
     rows, n = np.flatnonzero(ok[:start]), phi.shape[1]
     found = np.zeros(len(y), bool)
     if fields["left_out"][start - 1] > 0.0:
-        samples = np.column_stack([phi[rows], y[rows], np.ones((len(rows), 2)), y[rows]])
+        readings = y[rows] + fields["shift"][rows]
+        samples = np.column_stack([phi[rows], y[rows], np.ones((len(rows), 2)), readings])
         doubtful(samples, n)
         found[rows] = samples[:, n + NOISE] < 0.0
     return found
