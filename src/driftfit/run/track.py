@@ -224,9 +224,9 @@ def warn_astray(run: Track | KeyedResults) -> None:
     error, varies = float(np.nanmedian(np.abs(e))), float(np.nanstd(y)) if np.isfinite(y).any() else 0.0
     if varies > 0.0 and error > ASTRAY * varies:
         warn(
-            f"{type(run.model).__name__} with {type(run.tracker).__name__}: half the prediction errors in the "
-            f"second half of the record are above {error:.3g}, but y varies by {varies:.3g}: the estimates went "
-            "astray. Disturbances that pass through the plant call for ARX or ARMAX, large means for offset=True or deviations "
+            f"{type(run.model).__name__} with {type(run.tracker).__name__}: half the prediction errors in the second "
+            f"half of the record are above {error:.3g}, but y varies by {varies:.3g}: the estimates went astray. "
+            "Disturbances that pass through the plant call for ARX or ARMAX, large means for offset=True or deviations "
             "from them; gradients (RLS) are more robust than instruments.",
             UserWarning,
         )

@@ -59,7 +59,6 @@ from driftfit.models.base import Model
 from driftfit.trackers import rls
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.coarse.shared_rounding import folded
-from driftfit.trackers.parts.contradictions import contradictions, leave_out_contradiction
 from driftfit.trackers.parts.diffuse import (
     LEFT,
     SCRATCH,
@@ -69,7 +68,8 @@ from driftfit.trackers.parts.diffuse import (
     product_with,
     symmetric_product,
 )
-from driftfit.trackers.parts.judged_start import START_MACHINES, judging, unjudged
+from driftfit.trackers.parts.faults.contradictions import contradictions, leave_out_contradiction
+from driftfit.trackers.parts.faults.judged_start import START_MACHINES, judging, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve
 from driftfit.trackers.rls import fade, follow_variance, learn_variance, no_scale, no_settling, settling_of
 

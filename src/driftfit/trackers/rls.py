@@ -46,7 +46,6 @@ from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.coarse.shared_rounding import folded, nothing_shared, share_rounding, spanned_folded
-from driftfit.trackers.parts.contradictions import contradictions, judged_measurement
 from driftfit.trackers.parts.diffuse import (
     SCRATCH,
     enter,
@@ -57,7 +56,8 @@ from driftfit.trackers.parts.diffuse import (
     take_in,
     wander,
 )
-from driftfit.trackers.parts.judged_start import START_MACHINES, judging, unjudged
+from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
+from driftfit.trackers.parts.faults.judged_start import START_MACHINES, judging, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
 RECENT, RECENT_SHARE = 20.0, 0.125
@@ -141,6 +141,7 @@ def follow_variance(s: State, l: int) -> None:
         share = 1.0 / min(s.count[l], max(RECENT, RECENT_SHARE * s.count[l]))
         s.recent[l] = before + share * (min(square, LARGE * before) - before)
         least = s.recent[l] if s.least[l] <= 0.0 else min(s.least[l], s.recent[l])
+        least = least if s.count[l] >= RECENT else 0.0
         ratio = s.least[l] / least if (s.least[l] > 0.0) & (least > 0.0) else 1.0
         s.least[l] = least
         s.quieter[l] *= ratio

@@ -22,7 +22,7 @@ p, the patience, is 1, and doubles with every strange reading after another one:
 is accepted. It takes seven samples for a factor of 1000. Where the prediction is strange it doubles in four samples,
 and in 16 where the strange value stays, because fault codes come in runs. It stays 1 while a strange prediction sinks
 back, as what a model simulates does. The first `FIRST` readings are not
-judged; those of a diffuse start are judged together (`driftfit.trackers.parts.judged_start`).
+judged; those of a diffuse start are judged together (`driftfit.trackers.parts.faults.judged_start`).
 
 Source: ours; see `driftfit.trackers.parts.outlying_readings` for the rule of a tracker that learns its own noise. Cost
 per sample: some twenty operations.
