@@ -3,7 +3,7 @@
 A reading of 9999 where the output is near 10, or an input of 9999 where it is near 1, says nothing about the system,
 and least squares would believe it before all others. In both cases reading and prediction are apart, and one of them
 is where no reading has been. With m and v the mean and variance of the readings so far, e = y - y_hat and s the
-variance of e by the tracker, a sample is strange if
+variance of e by the tracker, times the mean of e^2 / s so far, a sample is strange if
 
     e^2 > (REACH p)^2 v    and    e^2 > SURE^2 s    and    min(|y - m|, |y_hat - m|) < |e| / 2
 
@@ -46,6 +46,8 @@ FIRST = 10.0
 """Number of first readings that are accepted, for comparison with later ones."""
 MEMORY = 1000.0
 """Memory of the mean and variance of the readings, in readings."""
+ENOUGH, FAR = 4.0, 100.0
+"""Samples for a mean of e^2 / s; a larger multiple of it counts as this one."""
 LASTING, LONGEST = 4.0, 1e12
 """The patience from which on a strange input is accepted as a lag too; its upper bound."""
 LAGS = 50.0
@@ -62,7 +64,7 @@ def no_contradictions() -> dict[str, Any]:
     """Fields before the first reading."""
     return {
         "y_mean": 0.0, "y_spread": 0.0, "y_count": 0.0, "y_last": np.nan, "patience": 1.0, "y_strange": np.nan,
-        "far": 0.0, "left_out": 0.0, "distrusted": 0.0, "shift": 0.0, "lagging": 0.0,
+        "far": 0.0, "left_out": 0.0, "distrusted": 0.0, "misfit": 0.0, "misfits": 0.0, "shift": 0.0, "lagging": 0.0,
     }  # fmt: skip
 
 
@@ -83,8 +85,8 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
     """Whether the sample is used: s.ok and s.seen; and the patience."""
     e, off, out = y - shown, abs(y - s.y_mean[l]), abs(shown - s.y_mean[l])
     reach, patience = REACH * REACH * s.y_spread[l], s.patience[l]
-    judged = (s.ok[l] > 0.0) & (s.y_count[l] >= FIRST)
-    strange = judged & (e * e > reach) & (e * e > SURE * SURE * v) & (min(off, out) < 0.5 * abs(e))
+    judged = (s.ok[l] > 0.0) & (s.y_count[l] >= FIRST) & (s.misfits[l] >= ENOUGH)
+    strange = judged & (e * e > reach) & (e * e > SURE * SURE * v * s.misfit[l]) & (min(off, out) < 0.5 * abs(e))
     trusted = (off > out) | (s.distrusted[l] < LAGS)
     beyond = strange & trusted & (e * e > reach * patience * patience)
     lasting = strange & (not beyond) & (patience > LASTING)
@@ -126,6 +128,12 @@ def leave_out_contradiction(s: State, y_hat: float, v: float, l: int) -> None:
     if (s.theta.shape[1] > 1) or (not quiet):
         judge(s, y, shown, v, l)
     learn_range(s, y, s.ok[l], l)
+    measured = (v > 0.0) & (v < np.inf)
+    square = (y - shown) ** 2 / v if measured else 0.0
+    used = s.ok[l] if measured else 0.0
+    s.misfits[l] = min(s.misfits[l] + used, MEMORY)
+    bounded = min(square, FAR * s.misfit[l]) if s.misfits[l] > ENOUGH else square
+    s.misfit[l] += used * (bounded - s.misfit[l]) / max(s.misfits[l], 1.0)
 
 
 @kernel

@@ -96,6 +96,9 @@ def settle(s: State, l: int) -> None:
     """The start is over: the readings of the samples that it used are the range of later ones."""
     n = s.theta.shape[0]
     s.start_over[l] = 1
+    known = s.scale[l] > 0.0  # it is NaN without residuals
+    s.misfits[l] = max(s.start_count[l] - s.start_faults[l] - s.rank[l], 0.0) if known else 0.0
+    s.misfit[l] = squares_left(s, l) / (max(s.misfits[l], 1.0) * s.r[l] * s.scale[l]) if known else 0.0
     for at in range(s.start_count[l]):
         learn_range(s, s.start_rows[at, n + READING, l], 1.0 if s.start_rows[at, n + NOISE, l] > 0.0 else 0.0, l)
 
