@@ -202,6 +202,16 @@ class Model(Settings, ABC):
         """Number of first samples whose regressors are poor, because they depend on theta, and should be forgotten."""
         return 0.0
 
+    @property
+    def settling_memory(self) -> float:
+        """Memory of the first of them, in samples."""
+        return 0.1 * self.settling
+
+    @property
+    def unequal_start(self) -> bool:
+        """Whether first innovations are far larger, because a model of the noise is not known yet."""
+        return False
+
     def held_at(self, theta: Array) -> Model | None:
         """This model with its linearisation held at theta (n,), so that a run is a linear regression; None without."""
         return None

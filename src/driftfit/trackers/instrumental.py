@@ -59,7 +59,6 @@ from driftfit.models.base import Model
 from driftfit.trackers import rls
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.coarse.shared_rounding import folded
-from driftfit.trackers.parts.contradictions import contradictions, leave_out_contradiction
 from driftfit.trackers.parts.diffuse import (
     LEFT,
     SCRATCH,
@@ -69,9 +68,10 @@ from driftfit.trackers.parts.diffuse import (
     product_with,
     symmetric_product,
 )
-from driftfit.trackers.parts.judged_start import START_MACHINES, judging, unjudged
+from driftfit.trackers.parts.faults.contradictions import contradictions, leave_out_contradiction
+from driftfit.trackers.parts.faults.judged_start import START_MACHINES, judging, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve
-from driftfit.trackers.rls import fade, follow_variance, learn_variance, no_scale
+from driftfit.trackers.rls import fade, follow_variance, learn_variance, no_scale, no_settling, settling_of
 
 FOLLOWING = 0.05
 """Share of the distance to theta that the auxiliary model moves at a sample: it lags by twenty samples."""
@@ -300,9 +300,7 @@ class InstrumentalVariables(Tracker):
             "log_forgetting": np.log(np.asarray(self.forgetting)),
             "r": 1.0,
             "c_max": self.c_max,
-            "discounted": 0.0,
-            "recent": 0.0,
-            "quieter": 1.0,
+            **no_settling(),
             "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
@@ -325,7 +323,7 @@ class InstrumentalVariables(Tracker):
         return steps(model.output_lags)
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
-        return {**self.state(model.n), "discounted": model.settling}
+        return {**self.state(model.n), **settling_of(model)}
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         super().widen(lane, p)

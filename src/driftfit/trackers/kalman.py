@@ -39,7 +39,6 @@ from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.laws import filter as laws_filter
 from driftfit.trackers.laws.law import OWNER, Law, laws_of, table_of
 from driftfit.trackers.parts import square_root
-from driftfit.trackers.parts.contradictions import contradictions, judged_measurement
 from driftfit.trackers.parts.diffuse import (
     SCRATCH,
     drifted,
@@ -48,8 +47,9 @@ from driftfit.trackers.parts.diffuse import (
     knowing_nothing,
     spanned_variance,
 )
+from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
+from driftfit.trackers.parts.faults.judged_start import START_MACHINES, faults, judging, unjudged
 from driftfit.trackers.parts.information import triangular_root
-from driftfit.trackers.parts.judged_start import START_MACHINES, faults, judging, unjudged
 from driftfit.trackers.parts.varying_drift import read_drift
 
 

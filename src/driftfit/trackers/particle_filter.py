@@ -34,7 +34,7 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.settings import near, whole
 from driftfit.models.state_space import StateSpace
-from driftfit.trackers.parts.contradictions import contradictions, no_contradictions
+from driftfit.trackers.parts.faults.contradictions import contradictions, no_contradictions
 from driftfit.trackers.state_space.particle_steps import steps
 from driftfit.trackers.state_space.tracker import StateSpaceTracker
 

@@ -14,8 +14,10 @@ forgetting would let P grow without bound. It stops when a variance is ``c_max``
 regressors first had full rank (before that: when they last spanned a new direction), which does not depend on units.
 
 A model that is linearised poorly at first has its first samples forgotten, also for lambda = 1: up to sample k = N of
-`Model.settling` the memory is at most max(N / 10, k / 4) samples, the lambda(t) -> 1 of Ljung and Soderstrom (1983),
-section 5.6.
+`Model.settling` the memory is at most `Model.settling_memory` samples or k / 4, if that is more: the lambda(t) -> 1 of
+Ljung and Soderstrom (1983), section 5.6. If the model has one of the noise, P and the scale are in units of the least
+variance of e so far, of max(20, k / 8) samples: those before the noise was known have large innovations, and would
+outweigh all later ones.
 
 Directional forgetting (kind="directional") forgets only in the direction of a sample, after it has been used:
 
@@ -44,7 +46,6 @@ from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.coarse.shared_rounding import folded, nothing_shared, share_rounding, spanned_folded
-from driftfit.trackers.parts.contradictions import contradictions, judged_measurement
 from driftfit.trackers.parts.diffuse import (
     SCRATCH,
     enter,
@@ -55,7 +56,8 @@ from driftfit.trackers.parts.diffuse import (
     take_in,
     wander,
 )
-from driftfit.trackers.parts.judged_start import START_MACHINES, judging, unjudged
+from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
+from driftfit.trackers.parts.faults.judged_start import START_MACHINES, judging, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
 RECENT, RECENT_SHARE = 20.0, 0.125
@@ -64,13 +66,24 @@ LARGE = 25.0
 """A square above this multiple of it counts as this multiple."""
 
 
+def no_settling() -> dict[str, Any]:
+    """Fields of a start that is not forgotten, before the first sample."""
+    return {"discounted": 0.0, "first_memory": 0.0, "unequal": 0.0, "recent": 0.0, "least": 0.0, "quieter": 1.0}
+
+
+def settling_of(model: Model) -> dict[str, Any]:
+    """Those that a model gives."""
+    N = model.settling
+    return {"discounted": N, "first_memory": model.settling_memory, "unequal": N if model.unequal_start else 0.0}
+
+
 @kernel
 def growth(s: State, l: int) -> float:
     """The factor by which forgetting multiplies P."""
     dt, used = s.dt[l], s.count[l]
     faded = s.forgetting[l] if dt == 1.0 else exp(dt * s.log_forgetting[l])
     early = (used < s.discounted[l]) & (s.ok[l] > 0.0)
-    faded = min(faded, 1.0 - 1.0 / max(0.1 * s.discounted[l], 0.25 * used)) if early else faded
+    faded = min(faded, 1.0 - 1.0 / max(s.first_memory[l], 0.25 * used)) if early else faded
     grown = 0.0
     for i in range(s.theta.shape[0]):
         # rounding can make a variance negative, which must not grow past the cap
@@ -121,13 +134,16 @@ def learn_variance(s: State, l: int) -> None:
 
 @kernel
 def follow_variance(s: State, l: int) -> None:
-    """While a start is forgotten, P and the scale are in units of the present noise variance."""
-    if (s.ok[l] > 0.0) & (s.count[l] > 0.0) & (s.count[l] < s.discounted[l]):
+    """While a start is forgotten, P and the scale are in units of the least noise variance so far."""
+    if (s.ok[l] > 0.0) & (s.count[l] > 0.0) & (s.count[l] < s.unequal[l]):
         square = s.e[l] * s.e[l]
         before = s.recent[l] if s.recent[l] > 0.0 else square
         share = 1.0 / min(s.count[l], max(RECENT, RECENT_SHARE * s.count[l]))
         s.recent[l] = before + share * (min(square, LARGE * before) - before)
-        ratio = before / s.recent[l] if s.recent[l] > 0.0 else 1.0
+        least = s.recent[l] if s.least[l] <= 0.0 else min(s.least[l], s.recent[l])
+        least = least if s.count[l] >= RECENT else 0.0
+        ratio = s.least[l] / least if (s.least[l] > 0.0) & (least > 0.0) else 1.0
+        s.least[l] = least
         s.quieter[l] *= ratio
         s.squares[l] /= ratio
 
@@ -214,7 +230,7 @@ def begin_direction(s: State, l: int) -> None:
 @kernel
 def restart(s: State, l: int) -> None:
     """As before the first sample."""
-    s.squares[l], s.count[l], s.scale[l], s.recent[l], s.quieter[l] = 0.0, 0.0, np.nan, 0.0, 1.0
+    s.squares[l], s.count[l], s.scale[l], s.recent[l], s.least[l], s.quieter[l] = 0.0, 0.0, np.nan, 0.0, 0.0, 1.0
     s.readings_in[l], s.levels[l], s.middle[l], s.spread[l], s.stayed[l] = 0.0, 1.0, 0.0, 0.0, np.nan
     for i in range(s.theta.shape[0]):
         s.per_cap[i, l] = 0.0
@@ -283,16 +299,14 @@ class RLS(Tracker):
             "g": np.zeros(n),
             "c_max": self.c_max,
             "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
-            "discounted": 0.0,
-            "recent": 0.0,
-            "quieter": 1.0,
+            **no_settling(),
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
             **unjudged(theta0, diffuse=self.p0 is None),
         }
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
-        return {**self.state(model.n), "discounted": model.settling}
+        return {**self.state(model.n), **settling_of(model)}
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
         return (*contradictions(run.state), *resolution(run.state))

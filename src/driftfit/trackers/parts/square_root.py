@@ -19,10 +19,10 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps, diagonal
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.contradictions import leave_out_contradiction
 from driftfit.trackers.parts.diffuse import drifted, prediction, scale_drift, spanned_variance, take_in
+from driftfit.trackers.parts.faults.contradictions import leave_out_contradiction
+from driftfit.trackers.parts.faults.judged_start import START_MACHINES, judging
 from driftfit.trackers.parts.information import absorb, invert, solve, spread, triangular_root
-from driftfit.trackers.parts.judged_start import START_MACHINES, judging
 from driftfit.trackers.parts.varying_drift import read_drift
 
 

@@ -2,8 +2,8 @@
 
 Any first samples are fitted exactly, so that a fault code among them would decide the estimate. The start goes on in
 its square-root form until there are `RESIDUALS` more samples than directions. If some of them are doubtful
-(`driftfit.trackers.parts.first_samples`), it goes on until the others have `SURE` residuals, or the store is full. If
-the estimate from all samples then contradicts these, the start is repeated without the doubtful ones.
+(`driftfit.trackers.parts.faults.first_samples`), it goes on until the others have `SURE` residuals, or the store is
+full. If the estimate from all samples then contradicts these, the start is repeated without the doubtful ones.
 
 Samples are stored with the time since the one before that is stored, so that drift and forgetting are repeated too.
 
@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, Step, cubes, kernel, machine, nothing
-from driftfit.trackers.parts.contradictions import REACH, learn_range, leave_out_contradiction, no_contradictions
 from driftfit.trackers.parts.diffuse import BEFORE, MACHINES, prediction, reform
-from driftfit.trackers.parts.first_samples import NOISE, READING, SPAN, WORSE, Y, doubt, doubtful
+from driftfit.trackers.parts.faults.contradictions import REACH, learn_range, leave_out_contradiction, no_contradictions
+from driftfit.trackers.parts.faults.first_samples import NOISE, READING, SPAN, WORSE, Y, doubt, doubtful
 
 RESIDUALS = 4
 """Number of residuals after which the first samples are judged."""
@@ -96,6 +96,9 @@ def settle(s: State, l: int) -> None:
     """The start is over: the readings of the samples that it used are the range of later ones."""
     n = s.theta.shape[0]
     s.start_over[l] = 1
+    known = s.scale[l] > 0.0  # it is NaN without residuals
+    s.misfits[l] = max(s.start_count[l] - s.start_faults[l] - s.rank[l], 0.0) if known else 0.0
+    s.misfit[l] = squares_left(s, l) / (max(s.misfits[l], 1.0) * s.r[l] * s.scale[l]) if known else 0.0
     for at in range(s.start_count[l]):
         learn_range(s, s.start_rows[at, n + READING, l], 1.0 if s.start_rows[at, n + NOISE, l] > 0.0 else 0.0, l)
 
@@ -120,12 +123,8 @@ def trust_all(s: State, l: int) -> None:
 
 
 @lru_cache
-def judging(begin: Step, restart: Step = nothing) -> Step:
-    """``begin`` of a tracker whose first samples are judged; ``restart`` sets its own fields as before the first."""
-
-    @partial(kernel, inline=False)
-    def one(s: State, l: int) -> None:
-        begin(s, l)
+def reconsidering(one: Step, restart: Step) -> Any:
+    """``reconsider(s, found, l)``: the start repeated without the doubtful samples, if they contradict the others."""
 
     @partial(kernel, inline=False)
     def repeat(s: State, every: bool, l: int) -> None:
@@ -148,7 +147,6 @@ def judging(begin: Step, restart: Step = nothing) -> Step:
 
     @partial(kernel, inline=False)
     def reconsider(s: State, found: int, l: int) -> None:
-        """Repeat the start without the doubtful samples, if they contradict the others."""
         y, y_hat, e, v, noise, shift = s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l]
         dt, drift, n, last = s.dt[l], s.drift[l], s.theta.shape[0], s.start_count[l] - 1
         with_all = squares_left(s, l)
@@ -163,6 +161,19 @@ def judging(begin: Step, restart: Step = nothing) -> Step:
         s.dt[l], s.drift[l] = dt, drift
         for i in range(n):
             s.phi[i, l] = s.start_rows[last, i, l]
+
+    return reconsider
+
+
+@lru_cache
+def judging(begin: Step, restart: Step = nothing) -> Step:
+    """``begin`` of a tracker whose first samples are judged; ``restart`` sets its own fields as before the first."""
+
+    @partial(kernel, inline=False)
+    def one(s: State, l: int) -> None:
+        begin(s, l)
+
+    reconsider = reconsidering(one, restart)
 
     @kernel
     def start(s: State, l: int) -> None:
