@@ -268,6 +268,15 @@ def fold(x: Array, low: float, high: float) -> Array:
     return low + width - np.abs((x - low) % (2.0 * width) - width)
 
 
+def ar_noise(rng: Generator) -> Case:
+    """Noise of a first-order autoregression beside gains that drift."""
+    v, n = rng.normal(size=T) * NOISE, np.zeros(T)
+    for t in range(1, T):
+        n[t] = 0.7 * n[t - 1] + v[t]
+    case = regression(rng, *walk(rng, rng.normal(size=3), 0.02), v=n)
+    return with_(case, known=n - v)
+
+
 def with_(case: Case, **changed: Any) -> Case:
     """A case with some fields replaced."""
     return Case(**{**vars(case), **changed})

@@ -205,9 +205,19 @@ def test_select_compares_models(table):
 def test_warm_and_cache(table):
     printed = run("warm", "--model", "arx:1,1", *KALMAN)
     assert "Folder" in printed
+    assert "without" not in printed
     printed = run("cache")
     assert "of this version and processor" in printed
     assert "at least 0" in fails("cache", "--prune", "--days", "-1")
+
+
+def test_warm_compiles_what_users_call(monkeypatch):
+    called = []
+    for verb in ("summary", "verdict", "diagnose", "detect", "report"):
+        monkeypatch.setattr(Track, verb, lambda self, *_, verb=verb, **__: called.append(verb))
+    printed = run("warm", "--model", "arx:1,1", "--tracker", "rls", "-p", "forgetting=0.99")
+    assert called == ["summary", "verdict", "diagnose", "detect", "report"]
+    assert "without smooth: RLS does not describe a random walk" in printed
 
 
 def test_picture_of_the_system(table):

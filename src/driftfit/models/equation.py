@@ -184,6 +184,7 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
         restore(s, seen, l)
         s.y_lag[0, l] = s.measured[l] if seen else (s.y_hat[l] if known else np.nan)
         share = min(1.0, s.usable[l] / (SETTLING * n)) if predicted & (s.ok[l] > 0.0) else 0.0
+        share = share if (s.moved_on[l] > 0.0) | (s.usable[l] >= SETTLING * n) else 0.0
         for i in range(n):
             moved = s.point[i, l] + share * (s.theta[i, l] - s.point[i, l])
             s.point[i, l] = moved if abs(moved) < LARGEST else s.first_point[i, l]

@@ -181,6 +181,10 @@ class HammersteinWiener(Model):
         return replace(self, name=inputs[0] if count == 1 else tuple(inputs))
 
     @property
+    def width(self) -> int:
+        return 1
+
+    @property
     def m(self) -> int:
         return max(len(x) if several(x) else 1 for x in (self.input, self.nb, self.nk))
 
