@@ -11,7 +11,7 @@ Run: python benchmarks/alarm_rates.py [records per line, 20; 0: only fleets] [fl
 """
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -124,39 +124,45 @@ WATCHED: dict[str, dict[str, Any]] = {
 }
 
 
-def fleets(count: int) -> Table:
+def fleets(count: int, watched: Mapping[str, Mapping[str, Any]], rates: Sequence[float] = (100.0, 1000.0)) -> Table:
     """Fleets watched together."""
     title = f"{count} fleets of {SERIES} series of {LONG} samples, {FAULTY} with a fault, false discovery rate 0.05"
     table = Table(box=SIMPLE_HEAD, show_edge=False, title=title)
     for head in ("alarm, first 500 as reference", "set", "false alarms", "expected", "said wrongly", "faults found"):
         table.add_column(head, justify="left" if head.startswith("alarm") else "right")
-    for name, settings in WATCHED.items():
-        for every in (100.0, 1000.0):
+    for name, settings in watched.items():
+        for every in rates:
             runs = [watched_fleet(s, every=every, **settings) for s in range(count)]
             begun, expected, wrong, found = np.sum(runs, axis=0)
-            told = (f"{begun:.0f}", f"{expected:.0f}", f"{wrong / count:.3f}", f"{100.0 * found / count:.0f} %")
-            table.add_row(name, f"{every:g}", *told)
+            cells = (f"{begun:.0f}", f"{expected:.0f}", f"{wrong / count:.3f}", f"{100.0 * found / count:.0f} %")
+            table.add_row(name, f"{every:g}", *cells)
     return table
 
 
-def main(records: int = 20, of_fleets: int = 20, T: int = T, rates: Sequence[float] = (500.0, 5000.0)) -> None:
+def main(records: int = 20, of_fleets: int = 20) -> None:
     if records:
-        table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Samples for one false alarm, {records} records of {T}")
-        for head in ("alarm", "set", "measured", "from", "to"):
-            table.add_column(head, justify="left" if head == "alarm" else "right")
-        for name, alarms in LINES:
-            for every in rates:
-                found = np.array([alarms(seed, every, T) for seed in range(records)])
-                begun, samples = found.sum(axis=0)
-                spread = 2.0 * found[:, 0].std() * np.sqrt(records)
-                ends = (f"{samples / max(begun + spread, 0.5):.0f}", f"{samples / max(begun - spread, 0.5):.0f}")
-                table.add_row(name, f"{every:g}", f"{samples / max(begun, 0.5):.0f}", *ends)
-        Console(width=110).print(table)
-    Console(width=120).print(fleets(of_fleets))
+        Console(width=110).print(alone(records))
+    Console(width=120).print(fleets(of_fleets, WATCHED))
+
+
+def alone(records: int, T: int = T, rates: Sequence[float] = (500.0, 5000.0)) -> Table:
+    """Records watched one by one."""
+    table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Samples for one false alarm, {records} records of {T}")
+    for head in ("alarm", "set", "measured", "from", "to"):
+        table.add_column(head, justify="left" if head == "alarm" else "right")
+    for name, alarms in LINES:
+        for every in rates:
+            found = np.array([alarms(seed, every, T) for seed in range(records)])
+            begun, samples = found.sum(axis=0)
+            spread = 2.0 * found[:, 0].std() * np.sqrt(records)
+            ends = (f"{samples / max(begun + spread, 0.5):.0f}", f"{samples / max(begun - spread, 0.5):.0f}")
+            table.add_row(name, f"{every:g}", f"{samples / max(begun, 0.5):.0f}", *ends)
+    return table
 
 
 if __name__ == "__main__":
     if "--quick" in sys.argv:
-        main(1, 1, QUICK, (500.0,))
+        Console(width=110).print(alone(1, QUICK, (500.0,)))
+        Console(width=120).print(fleets(1, {name: WATCHED[name] for name in ("band", "glr")}, (100.0,)))
     else:
         main(*map(int, sys.argv[1:3]))

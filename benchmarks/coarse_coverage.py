@@ -2,9 +2,10 @@
 
 theta is constant, the noise is 0.3, and readings are rounded to a quantum. An input keeps its value for ``held``
 samples; with one parameter the regressor is 1 + u / 2, or 1 where inputs are held for the whole record. A band is
-counted at samples 500 and 1000 where it is finite; it is NaN as long as no residual tells the noise. In brackets: the
-share of bands that are not finite, where there are any. The second table has one parameter at the last sample, and the
-same bands with and without what readings share.
+counted at samples 500 and 1000 where it is finite; it is NaN as long as there is no residual from which to estimate the
+noise. In brackets: the share of bands that are not finite, where there are any. The second table has one parameter at
+the last sample, and the same bands with and without what readings share.
+
 Run: python benchmarks/coarse_coverage.py [records, 40 by default] [--quick]
 """
 
@@ -51,7 +52,7 @@ def shared(records: int) -> None:
 
 
 def main(records: int = 40, quick: bool = False) -> None:
-    warnings.simplefilter("ignore")  # the trackers say themselves which regressors do not move
+    warnings.simplefilter("ignore")  # the trackers themselves warn of regressors that do not move
     print(f"{'quantum':>7} {'held':>5} {'n':>2}  " + "  ".join(f"{name:>16}" for name in TRACKERS))
     for quantum in (0.0, 0.5, 1.0, 2.0, 5.0):
         for held in (1, 20, 200, T):

@@ -4,7 +4,7 @@
     python -m benchmarks.embedded_single --quick    two records of 500 samples, of two trackers
 
 The records are those of the self-test: a system whose gain doubles, with missing data, an outage and constant inputs.
-The second table asks whether a difference comes from the precision or from the start: an `OutputError` is told outputs
+The second table asks whether a difference comes from the precision or from the start: an `OutputError` is given outputs
 in other units, once from its default start and once from estimates in these units, and the double-precision build also
 gets readings that are wrong by one part in ten million.
 """

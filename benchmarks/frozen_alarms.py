@@ -1,4 +1,4 @@
-"""Alarms on a frozen reference model: real rates of false alarms, and delays beside other detectors.
+"""Alarms on a frozen reference model: real rates of false alarms, and delays compared with other detectors.
 
     y_t = 2 u_t + 1 + v_t,    u_t ~ N(0, 1), v_t of standard deviation 1
 
@@ -10,7 +10,7 @@ The rivals get what they need: the residuals of least squares on the reference, 
 (squared for the noise), and limits that were fitted to records without a fault. "GLR, textbook" is the likelihood ratio
 of that regressor over the last 8, 16, .., 256 samples, which does not allow for the errors of the reference.
 
-river and ruptures are compared if they are installed (ruptures sees the whole record and has no delay: the share of
+river and ruptures are compared if they are installed (ruptures is given the whole record and has no delay: the share of
 faults that it dates within 50 samples). Run: python benchmarks/frozen_alarms.py [records, 24 by default; twice
 as many for the rates, eight times under GARCH] [--quick]
 """
@@ -210,7 +210,7 @@ def calibrated(rival: Rival, kind: str, low: float, high: float, records: int) -
 
 
 def breaks(x: Array, power: Array, limit: float) -> Iterator[int]:
-    """Dates of ruptures, which sees the whole record."""
+    """Dates of ruptures, which is given the whole record."""
     import ruptures
 
     return iter(ruptures.Pelt(model="l2", min_size=8, jump=8).fit(x).predict(pen=limit)[:-1])

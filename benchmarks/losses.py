@@ -1,8 +1,8 @@
 """Why rows of the accuracy scoreboard beat AdaptiveKalman: its error with a part taken out, over its error.
 
-"one ratio" gives all filters the drift ratio of the scenario (without drift: no filter is entered but the one without),
-so that nothing has to be learned about it; "one noise level" leaves the outliers only; "groups" tells it which
-parameter is fast. Medians over the twenty scored runs. Run: python -m benchmarks.losses
+"one ratio" gives all filters the drift ratio of the scenario (in a scenario without drift, the only filter is the one
+without drift), so that nothing has to be learned about it; "one noise level" leaves the outliers only; with "groups" it
+knows which parameter is fast. Medians over the twenty scored runs. Run: python -m benchmarks.losses
 """
 
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Time and accuracy beside river's linear models, in its own `evaluate.progressive_val_score`.
+"""Time and accuracy compared with river's linear models, in its own `evaluate.progressive_val_score`.
 
 Every model predicts each sample and then learns it, behind river's StandardScaler. Microseconds per sample are
 processor time, the least of repeated runs after one that compiles; they contain the scaler, the metric and the

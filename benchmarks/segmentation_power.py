@@ -1,4 +1,4 @@
-"""How many jumps can be found in correlated noise: `segment` beside generalised least squares that knows the noise.
+"""How many jumps can be found in correlated noise: `segment` and generalised least squares that knows the noise.
 
 400 samples, noise 0.5 with v_t = a v_(t-1) + w_t, a mean with jumps of 0.8 at 133 and 266. Rows for each a:
 

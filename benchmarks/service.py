@@ -68,7 +68,7 @@ def payload(first, count, rng):
 
 
 def journal(options, folder):
-    """Group commit: SQLite in WAL mode with FULL, beside an append-only file with fsync."""
+    """Group commit: SQLite in WAL mode with FULL, and an append-only file with fsync."""
     for group in (1, 100, 1000):
         blob = os.urandom(30 * group)
         db = sqlite3.connect(folder / f"g{group}.db", isolation_level=None)

@@ -1,8 +1,8 @@
 """How often 95 % bands contain the truth: under the settings that `tune` found, averaged over settings, and adaptive.
 
-y = u' theta + v with two white inputs, r = 1 and random walks theta with variances q a sample; a drift for each
-parameter is estimated. *error* is the root mean square error of the estimates over that of the filter, or smoother,
-that knows q and r. The first 20 samples are left out.
+y = u' theta + v with two white inputs, r = 1 and random walks theta with variances q per sample; each parameter has its
+own drift, which is estimated. *error* is the root mean square error of the estimates over that of the filter, or
+smoother, that knows q and r. The first 20 samples are left out.
 
 Run: python benchmarks/settings_coverage.py [--records 40] [--quick]
 """

@@ -1,4 +1,4 @@
-"""Speed of exact smoothing against statsmodels and a banded solve, and its growth with the record; memory beside it.
+"""Speed of exact smoothing against statsmodels and a banded solve, and its growth with the record; and its memory.
 
     python benchmarks/smoother.py            about two minutes
     python benchmarks/smoother.py --quick
@@ -90,7 +90,7 @@ def peak(function, *arguments):
 
 
 def memory(T=10_000):
-    """Peak memory in bytes a sample."""
+    """Peak memory in bytes per sample."""
     phi, y = record(T)
     run = track(Regression(N), FLS(MU), y, phi)
     smoothed = {}

@@ -1,4 +1,4 @@
-"""Accuracy of exact smoothing against eighty-digit arithmetic, beside a banded solve and a large P0.
+"""Accuracy of exact smoothing against eighty-digit arithmetic, with a banded solve and a large P0 for comparison.
 
     python benchmarks/smoother_accuracy.py       about 20 seconds
 

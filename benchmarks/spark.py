@@ -1,4 +1,4 @@
-"""Fleets on Spark: rows per second of batch and streams, beside the floor and beside the obvious ways.
+"""Fleets on Spark: rows per second of batch and streams, compared with the floor and with the obvious ways.
 
 All on local[2] in one run, with n = 4, forty rows per unit, and results written nowhere ("noop"), so that what is
 measured is Spark's shuffle, the passage to Python and back, and the step. Seconds by the clock depend on what else the
@@ -8,8 +8,8 @@ machine does, so the CPU of Java and of the Python workers is counted too:
     spark.track    a row of results per sample
     summary        a row per unit
     applyInPandas  one `track` per unit, and statsmodels' recursive least squares per unit
-    spark.follow   a stream with one or twenty rows per unit and batch: seconds and CPU per batch, beside a stream whose
-                   rows are shuffled, passed to Python and written; and the state in bytes
+    spark.follow   a stream with one or twenty rows per unit and batch: seconds and CPU per batch, and those of a stream
+                   whose rows are shuffled, passed to Python and written; and the state in bytes
 
     python -m benchmarks.spark             1,000 to 50,000 units
     python -m benchmarks.spark streams     a part: step, batch, streams, equal
@@ -263,7 +263,7 @@ def equal(session: Any, folder: Path, units: int) -> None:
     t = np.concatenate([np.cumsum(rng.choice([0.0, 1.0, 1.0, 1.0, 1.0, 3.0], size)) for size in length])
     y, u = np.where(rng.random(len(t)) < 0.03, np.nan, rng.normal(size=len(t))), rng.normal(size=len(t))
     table = pl.DataFrame({"unit": [f"meter {k:07d}" for k in unit], "t": t, "y": y, "u": u})
-    table = table.sort("unit", "t", "y", "u")  # which row stands at a repeated time
+    table = table.sort("unit", "t", "y", "u")  # which row is used at a repeated time
     path = folder / "equal.parquet"
     table.sample(fraction=1.0, shuffle=True, seed=1).write_parquet(path)
     found = bridge.track(session.read.parquet(str(path)), MODEL, TRACKER, **COLUMNS)

@@ -117,7 +117,7 @@ def end(session: int) -> None:
 
 
 def disturb(folder: Path, kills: list[str], files: int, patience: float) -> list[str]:
-    """Run the driver to its end, and kill what ``kills`` says on the way; returns what was killed and when."""
+    """Run the driver to its end, with the ``kills`` on the way; returns what was killed and when."""
     random.seed(0)
     result, driver, began = [], start(folder), time.monotonic()
     marks = [round((k + 1) * files / (len(kills) + 1)) for k in range(len(kills))]

@@ -1,17 +1,17 @@
-"""How often constants are said to move, and how often moving parameters are found.
+"""How often constants are reported to move, and how often moving parameters are found.
 
 The level is 5 %. A regression on two inputs and an intercept, and ARX(2, 2); noise that is steady, has outliers (5 %
 are ten times as large), is heavy-tailed (Student's t, 3 degrees of freedom), or changes its variance (four times the
 deviation in the last 30 %); and inputs that become three times as large half-way; or noise that is an autoregression
 with 0.6 or 0.9, beside inputs that are autoregressions with 0.8. "joint" is the share of records whose parameters are
-said to move; "mean square", "break" and "stretch" are the three tests in it, each by itself at 5 %; "at 0.1 %" is joint
-at that level; "named" the share in which at least one parameter is named; "finds 0.5" the share in which a step of half
-a noise deviation in one coefficient, half-way, is found.
+reported to move; "mean square", "break" and "interval" are the three tests in it, each by itself at 5 %; "at 0.1 %" is
+joint at that level; "named" the share in which at least one parameter is named; "finds 0.5" the share in which a step
+of half a noise deviation in one coefficient, half-way, is found.
 
 Then faults of a mean in 1000 samples of noise 0.5, beside an input: how many of the records they are found in, and the
 largest p of all, by their size.
 
-Run: python benchmarks/verdict_error_rate.py [records a cell, 300 by default] [--quick]
+Run: python benchmarks/verdict_error_rate.py [records per cell, 300 by default] [--quick]
 """
 
 import sys
@@ -66,7 +66,7 @@ def rates(records: int, lengths: tuple[int, ...]) -> Table:
         "joint",
         "mean square",
         "break",
-        "stretch",
+        "interval",
         "wild",
         "at 0.1 %",
         "named",

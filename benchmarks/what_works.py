@@ -11,7 +11,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -114,7 +114,10 @@ def exported(model: Any, tracker: Any) -> bool:
     return True
 
 
-def cells_of(name: str, model: Any, tracker: Any, open_tracker: Any, reasons: dict[str, list[str]]) -> list[str]:
+def cells_of(
+    name: str, model: Any, tracker: Any, open_tracker: Any, reasons: dict[str, list[str]],
+    columns: Sequence[str] = COLUMNS,
+) -> list[str]:  # fmt: skip
     """A row of the table; the reasons of its "no" are added to ``reasons``."""
     y, u = record(isinstance(tracker, DynamicGLM))
     run = track(model, tracker, y, u)
@@ -125,7 +128,7 @@ def cells_of(name: str, model: Any, tracker: Any, open_tracker: Any, reasons: di
         "simulate": lambda: run.simulate(np.ones(5)), "gains": run.dc_gain, "C": lambda: exported(model, tracker),
     }  # fmt: skip
     cells = []
-    for column in COLUMNS:
+    for column in columns:
         try:
             if column == "tune" and open_tracker is None:
                 raise ValueError("it has no numbers that tune finds")

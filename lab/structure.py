@@ -1,7 +1,7 @@
 """The structure of the library, from its source: modules, layers, imports that point up, circles, lines by folder.
 
     python -m lab structure                        the present source
-    python -m lab structure --before REVISION      beside another revision of the repository
+    python -m lab structure --before REVISION      next to another revision of the repository
     python -m lab structure --picture FILE.png     and a picture of both
 
 Every import counts: also those inside functions, and those for types only. A module of an old revision has the layer of
@@ -43,7 +43,7 @@ LAYERS = (
     ("smooth", "tune", "judge", "use", "models.hammerstein_wiener.results", "trackers.bank.results"),
     ("show",),
     # the facade binds verbs to results
-    ("", "results", "fleets", "streams", "tracking", "checks", "extend"),
+    ("", "results", "fleets", "streams", "tracking", "checks", "extend", "parsing"),
     ("demo", "embedded", "bridges", "service", "cli", "__main__"),
 )
 """Folders and modules by layer, the lowest first; the longest prefix of a module's name counts."""

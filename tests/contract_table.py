@@ -1,12 +1,16 @@
 """What the contract tests need to know of a tracker that they have never seen: numbers for its required settings."""
 
-from dataclasses import fields
+from dataclasses import MISSING, fields
 
 VALUES = {"q": 1e-3, "r": 0.1, "p0": 10.0, "forgetting": 0.98, "mu": 1.0, "particles": 4}
 """By the name of the setting, not of the tracker; 1 / (1 - forgetting) is 50 samples."""
 
 SLOW = {"q": 1e-6, "r": 0.01, "p0": 10.0, "forgetting": 0.995, "mu": 1500.0, "particles": 4}
 """For long runs of systems with noise of standard deviation 0.1 that drift slowly."""
+
+
+def no_default(field):
+    return field.init and field.default is MISSING and field.default_factory is MISSING
 
 
 def ready(kind, values=VALUES, **settings):
@@ -17,9 +21,10 @@ def ready(kind, values=VALUES, **settings):
         settings = {"q_w": values["r"]} | settings
     if any(field.name == "r" and field.default == 1.0 for field in fields(kind)):  # a dispersion: here the noise
         settings = {"r": values["r"]} | settings
-    unknown = set(kind.required) - values.keys() - settings.keys()
+    needed = dict.fromkeys([*kind.required, *(one.name for one in fields(kind) if no_default(one))])
+    unknown = needed.keys() - values.keys() - settings.keys()
     assert not unknown, f"{kind.__name__}: give the required settings {sorted(unknown)} a value in contract_table.py"
-    return kind(**{name: values[name] for name in kind.required if name not in settings} | settings)
+    return kind(**{name: values[name] for name in needed if name not in settings} | settings)
 
 
 def forms(kind):

@@ -57,7 +57,7 @@ def same(a, b):
 
 
 def rows_of(text):
-    """What a printed table says, line by line: the words of each."""
+    """The words of each line of a printed table."""
     return [line.split() for line in str(text).splitlines() if line.split()]
 
 

@@ -127,7 +127,8 @@ def test_frozen_readings_are_left_out():
 
 
 def test_a_reading_that_repeats_by_chance_is_not_reported_as_frozen():
-    """Level of a tank in steps of 0.001, forty records of 800: one in twenty said so before runs were asked for."""
+    """Level of a tank in steps of 0.001, forty records of 800: one in twenty was reported before repeats had to form
+    runs."""
     result = 0
     for seed in range(40):
         rng = np.random.default_rng(seed)

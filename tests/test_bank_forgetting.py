@@ -154,7 +154,7 @@ def test_prediction_does_not_depend_on_the_sample_being_there():
 
 
 @pytest.mark.parametrize(
-    ("build", "says"),
+    ("build", "message"),
     [
         (lambda: Change(forget=0.9, kind="stabilised"), "anchor="),
         (lambda: Change(forget=0.9, anchor=1.0), "belong together"),
@@ -165,8 +165,8 @@ def test_prediction_does_not_depend_on_the_sample_being_there():
         (lambda: bank(Change(forget=0.9), reduce=FirstFloor(2)), "random walks only"),
     ],
 )
-def test_what_does_not_go_together(build, says):
-    with pytest.raises(ValueError, match=says):
+def test_what_does_not_go_together(build, message):
+    with pytest.raises(ValueError, match=message):
         build()
 
 

@@ -62,7 +62,7 @@ def test_a_gap_is_weighed_as_all_that_may_have_happened(reduce, times, gap, clos
 
 
 def test_an_interval_is_a_gap():
-    """Nothing seen for nine samples, or the tenth an interval of ten: the same but for the drift of a jump's sample."""
+    """Nine samples without an output, or one interval of ten: the same but for the drift of a jump's sample."""
     one, other = (ended(10, times, Beam(6)) for times in (False, True))
     np.testing.assert_allclose(one.theta[-1], other.theta[-1], rtol=1e-3)
     np.testing.assert_allclose(one.std[-1], other.std[-1], rtol=1e-3)
@@ -103,7 +103,7 @@ def test_a_stream_in_a_gap_says_what_the_record_says(sensors, tmp_path):
     assert event.span.first <= 35 <= event.span.last
     assert event.first == time[event.span.first] <= time[35] <= event.last
     assert event.level == 0.95
-    for streamed in found:  # none yet, where the stream is too short to say
+    for streamed in found:  # none yet if the stream is too short
         assert streamed.date == pytest.approx(time[streamed.span.date])
 
 

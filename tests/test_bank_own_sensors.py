@@ -142,7 +142,7 @@ def test_nonsense_of_a_function_is_survived():
 
 
 @pytest.mark.parametrize(
-    ("build", "says"),
+    ("build", "message"),
     [
         (lambda: Sensor.own(lambda y, y_hat, h, r, last: (0.0, r, y)), "by name"),
         (lambda: Sensor.own(record), "takes 1 arguments"),
@@ -151,6 +151,6 @@ def test_nonsense_of_a_function_is_survived():
         (lambda: Sensor.own(laplace, prob=2.0), "within"),
     ],
 )
-def test_what_is_no_likelihood_is_named(build, says):
-    with pytest.raises(ValueError, match=says):
+def test_what_is_no_likelihood_is_named(build, message):
+    with pytest.raises(ValueError, match=message):
         build()

@@ -19,7 +19,7 @@ P = [[0.99, 0.01], [0.2, 0.8]]
 
 
 @pytest.mark.parametrize(
-    ("build", "says"),
+    ("build", "message"),
     [
         (lambda: Bank([Change(0.0, prob=0.9), Change(0.5, prob=0.2)]), ["sum to 1", "0.9, 0.2"]),
         (lambda: Bank([Change(0.0), Change(0.5)]), ["only one", "leave prob= open"]),
@@ -57,10 +57,10 @@ P = [[0.99, 0.01], [0.2, 0.8]]
         (lambda: Live(Regression(2), Bank([Change([0.1, 0.2, 0.3])])), ["(3,)", "2 parameters"]),
     ],
 )  # fmt: skip
-def test_wrong_settings_are_named(build, says):
+def test_wrong_settings_are_named(build, message):
     with pytest.raises(ValueError) as error:
         build()
-    for word in says:
+    for word in message:
         assert word in str(error.value), error.value
 
 
@@ -72,12 +72,12 @@ def test_a_frozen_sensor_wants_to_persist():
 def test_priors_per_sample_are_checked():
     y, u = np.ones(3), np.ones((3, 1))
     bank = Bank(TWO, KNOWN, p0=1.0)
-    for prob, says in (
+    for prob, message in (
         ([[0.5, 0.6]] * 3, "row 0"),
         (np.ones((3, 5)) / 5.0, "2 columns"),
         ([[0.9, 0.1], [1.2, -0.2], [1.0, 0.0]], "row 1"),
     ):
-        with pytest.raises(ValueError, match=re.escape(says)):
+        with pytest.raises(ValueError, match=re.escape(message)):
             track(Regression(1), bank, y, u, prob=prob)
     with pytest.raises(ValueError, match="are for a Bank"):
         track(Regression(1), RLS(0.9), y, u, prob=[[0.5, 0.5]] * 3)

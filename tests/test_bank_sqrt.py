@@ -1,4 +1,4 @@
-"""Banks that keep factors of covariances: what the covariances say, and digits and signs where those lose them."""
+"""Banks that keep factors of covariances: the results of covariances, and digits and signs where those lose them."""
 
 from dataclasses import replace
 from decimal import Decimal, localcontext
@@ -194,7 +194,7 @@ def test_every_leaf_stays_positive_for_long(settings):
 
 
 def test_the_covariance_form_does_lose_its_digits():
-    """So that the test above says something."""
+    """So that the test above can fail."""
     y, u = collinear(12_000, 2)
     bank = Bank([Change(0.0), Change(1.0, prob=0.01)], [Sensor.nominal(1e-10)], reduce=GPB(2), p0=1e8)
     one, other = both(Regression(2), bank, y, u)

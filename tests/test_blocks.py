@@ -213,7 +213,7 @@ def test_a_weak_first_function_warns_of_the_gauge():
 
 
 def test_what_is_undetermined_stays_finite():
-    """All b near zero: c is anybody's guess, the quality says so."""
+    """All b near zero: c is undetermined, and the quality shows it."""
     model = model_of(1, 2, 3, 2)
     theta = np.zeros((2, model.n))
     theta[1] = 1e-9 * np.random.default_rng(2).normal(size=model.n)

@@ -99,7 +99,7 @@ def test_search_and_reference_have_every_public_name(site, pages):
 
 
 def test_every_algorithm_has_its_mathematics_and_its_source(site, pages):
-    """What a module says of its equations is in the book, and each public tracker is among them."""
+    """The equations of a module's docstring are in the book, and each public tracker is among them."""
     text = (site / "algorithms" / "index.html").read_text()
     places = pages[site / "algorithms" / "index.html"].places
     assert len([place for place in places if place.startswith("math-")]) > 50

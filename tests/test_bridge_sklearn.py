@@ -1,4 +1,4 @@
-"""The scikit-learn estimator keeps that package's promises, and says the same as `track`."""
+"""The scikit-learn estimator keeps that package's promises, and agrees with `track`."""
 
 import pickle
 

@@ -71,7 +71,7 @@ def bold(s, l):
 
 @kernel
 def hindsight(s, l):
-    """Reports what it knows after the output was seen."""
+    """Reports what it knows after the output was observed."""
     follow(s, l)
     s.y_hat[l] = prediction(s, l)
 

@@ -114,7 +114,7 @@ def test_numbers_with_commas_and_groups(tmp_path):
         rows_of([str(tmp_path / "n.csv")], ["a"], "t", [], Part(decimal=","))
 
 
-def test_valid_ranges_and_stretches_left_out(table):
+def test_valid_ranges_and_intervals_left_out(table):
     y, _, _ = simulate()
     y[(y < -2.0) | (y > 2.0)] = np.nan
     assert np.array_equal(theta(*SIGNALS, "--limits", "flow=-2:2"), expected(y=y).theta[:, 1])
@@ -205,9 +205,19 @@ def test_select_compares_models(table):
 def test_warm_and_cache(table):
     printed = run("warm", "--model", "arx:1,1", *KALMAN)
     assert "Folder" in printed
+    assert "without" not in printed
     printed = run("cache")
     assert "of this version and processor" in printed
     assert "at least 0" in fails("cache", "--prune", "--days", "-1")
+
+
+def test_warm_compiles_what_users_call(monkeypatch):
+    called = []
+    for verb in ("summary", "verdict", "diagnose", "detect", "report"):
+        monkeypatch.setattr(Track, verb, lambda self, *_, verb=verb, **__: called.append(verb))
+    printed = run("warm", "--model", "arx:1,1", "--tracker", "rls", "-p", "forgetting=0.99")
+    assert called == ["summary", "verdict", "diagnose", "detect", "report"]
+    assert "without smooth: RLS does not describe a random walk" in printed
 
 
 def test_picture_of_the_system(table):

@@ -1,4 +1,5 @@
-"""Time: calendars count as nominal steps, records and streams count alike, and what is lost to dt is said."""
+"""Time: calendars count as nominal steps, records and streams count alike, and samples that a wrong dt costs are
+reported."""
 
 from __future__ import annotations
 
@@ -10,7 +11,9 @@ import polars as pl
 import pytest
 
 from driftfit import ARX, RLS, Kalman, Live, Regression, track
-from driftfit.data.clock import NEAR, Clock, instant, median_interval
+from driftfit.data.clock import NEAR, Clock
+from driftfit.data.times.gaps import median_interval
+from driftfit.data.times.instants import instant
 from driftfit.data.times.periods import span
 from driftfit.engine.settings import DataWarning
 

@@ -51,7 +51,7 @@ def test_prediction_and_gradient_are_exact_at_uneven_times():
 
 @pytest.mark.parametrize("tracker", [RLS(1.0), InstrumentalVariables(1.0)], ids=["RLS", "instruments"])
 def test_jittered_samples_give_the_parameters_in_seconds_on_line_and_off_line(tracker):
-    """12 records: off line within bands, and scattered as the bands say."""
+    """12 records: off line within bands, with the scatter that the bands state."""
     score = []
     for seed in range(12):
         y, u, time = record(1500, seed)

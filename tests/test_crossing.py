@@ -121,7 +121,7 @@ def test_the_output_passes_as_its_forecast_says():
 
 
 @pytest.mark.parametrize(
-    ("tracker", "arguments", "says"),
+    ("tracker", "arguments", "message"),
     [
         (TRACKER, {"what": "gains", "below": 1.0}, "there is no 'gains'; did you mean gain"),
         (TRACKER, {"what": "gain"}, "give one limit"),
@@ -131,9 +131,9 @@ def test_the_output_passes_as_its_forecast_says():
         (AugmentedFLS(10.0), {"what": "gain", "below": 1.0}, "AugmentedFLS carries no covariance"),
     ],
 )
-def test_what_cannot_be_asked(tracker, arguments, says):
+def test_what_cannot_be_asked(tracker, arguments, message):
     y, u = record()
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         track(Regression(["gain", "other"]), tracker, y, u).crossing(**arguments)
 
 

@@ -58,7 +58,7 @@ def test_python_blocks_print_what_the_page_says(page, tmp_path, monkeypatch):
 
 
 def shown() -> list[object]:
-    """Each script with what the pages say that it prints, the parts of one script together."""
+    """Each script with its output as the pages show it, the parts of one script together."""
     result: dict[str, list[str]] = {}
     for page in PAGES:
         for found in SCRIPT.finditer(page.read_text()):

@@ -2,7 +2,7 @@
 
 Commands are the lines of sh blocks, of indented and text blocks that begin with one, and `python ..` or `driftfit ..`
 in the text. What other tests run is looked up there. Scripts on real records, which are no part of the project, are
-loaded, and must be called as they say themselves.
+loaded, and must be called in the way that they state.
 """
 
 import contextlib

@@ -62,7 +62,7 @@ def test_every_prefix_of_the_filter_and_every_window_is_the_smoother():
             window = live.smooth()
             np.testing.assert_allclose(window.theta, part.theta[-5:], atol=1e-10)
             np.testing.assert_allclose(window.std, part.std[-5:], rtol=1e-9)
-    live.update(1.0, [1.0, 0.0])  # a sample of which nothing is said drifts as the settings say
+    live.update(1.0, [1.0, 0.0])  # a sample without a factor drifts as the settings state
     usual = track(TWO, FLS(1.0), np.append(y, 1.0), np.vstack([phi, [1.0, 0.0]]), drift=np.vstack([drift, [1.0, 1.0]]))
     np.testing.assert_array_equal(live.theta, usual.theta[-1])
 

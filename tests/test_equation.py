@@ -5,9 +5,9 @@ import pandas as pd
 import pytest
 
 from driftfit import AdaptiveKalman, Equation, Kalman, Live, Regression, track
-from driftfit.cli.parts.expressions import read
 from driftfit.models.base import Model
-from driftfit.models.formulas import parse
+from driftfit.models.formulas.text import parse
+from driftfit.parsing.expressions import read
 from driftfit.smooth.problem import replay
 
 EVERYTHING = (

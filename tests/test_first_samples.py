@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from driftfit import ARX, AdaptiveKalman, Regression, track
+from driftfit import ARX, AdaptiveKalman, Equation, Regression, track
+from driftfit.smooth.problem import walk_of
 
 T, THETA = 600, (1.1, -0.5, 1.0, 0.5)
 PLANT = ARX(2, 2)
@@ -96,3 +97,18 @@ def test_a_scale_that_rests_on_a_few_fault_codes_is_lost_again():
     u[:8] = 9999.0
     run = track(Regression(1, intercept=True), AdaptiveKalman(), y, u)
     np.testing.assert_allclose(run.theta[-1], [2.0, 5.0], atol=0.05)
+
+
+def test_a_smoother_leaves_out_the_same_samples():
+    """With a linearised model y is judged as it was measured, not without the part that the linearisation explains."""
+    curve = Equation("y = theta.c + theta.k * u + 0.5 * theta.k * theta.k * u * u")
+    counts = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        u = rng.normal(size=300)
+        y = 3.0 + u + 0.5 * u * u + 0.1 * rng.normal(size=300)
+        y[rng.choice(np.arange(1, 10), rng.integers(1, 5), replace=False)] = 9999.0
+        run = track(curve, AdaptiveKalman(), y, u)
+        counts.append((left_out(run), np.sum(run.ok & (walk_of(run).weight == 0.0))))
+    assert sum(count > 0 for count, _ in counts) >= 5
+    assert all(count == found for count, found in counts)

@@ -1,4 +1,4 @@
-"""Fleets: every lane says, bit for bit, what its series says alone."""
+"""Fleets: every lane gives, bit for bit, the results of its series alone."""
 
 from __future__ import annotations
 

@@ -33,15 +33,15 @@ def test_decimal_commas_dots_between_thousands_and_days_first(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("t;y\n1;1,5\n2;2.5\n", "row 1 of column 'y' holds '1,5'"),  # both kinds in one column
         ("t;y\n1;1,5\n2;1,2,3\n", "row 1 of column 'y' holds '1,5'"),
         ('t,y\n1,"1,065.26"\n', "holds '1,065.26', which is not a number"),
     ],
 )
-def test_numbers_that_are_neither_are_named(tmp_path, text, says):
-    with pytest.raises(ValueError, match=re.escape(says)):
+def test_numbers_that_are_neither_are_named(tmp_path, text, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
         read_columns(written(tmp_path, text), ["y"])
 
 

@@ -98,18 +98,18 @@ def test_tune_and_select_match_names():
 
 
 @pytest.mark.parametrize(
-    ("columns", "says"),
+    ("columns", "message"),
     [
         ({"a": "c"}, "has the inputs b, a, but u has the columns c, b; 'a' is missing; 'c' is none of them"),
         ({"a": "x", "b": "y"}, "'b' is missing"),
     ],
 )
-def test_names_that_do_not_match_are_refused(columns, says):
+def test_names_that_do_not_match_are_refused(columns, message):
     y, X = record()
     renamed = X.rename(columns=columns)
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         track(NAMED, TRACKER, y, renamed)
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         track(NAMED, TRACKER, "flow", list(renamed), data=renamed.assign(flow=y))
     with pytest.raises(ValueError, match=r"'c' is none of them.*select columns"):
         track(NAMED, TRACKER, y, X.assign(c=1.0))

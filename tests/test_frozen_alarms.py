@@ -9,7 +9,7 @@ from driftfit import ARX, AugmentedFLS, Kalman, Live, Regression, track
 from driftfit.judge.alarms.bootstrap import START
 from driftfit.judge.alarms.frozen import frozen_model, noise_model, noise_models
 from driftfit.judge.alarms.onsets import onsets
-from driftfit.judge.alarms.side_by_side import Records, statistics_of
+from driftfit.judge.alarms.side_by_side import SimulatedRecords, statistics_of
 from driftfit.run.live.likelihood_ratio import (
     ALPHA,
     BETA,
@@ -135,7 +135,7 @@ def test_records_side_by_side_have_the_statistics_of_each(cusum):
     root = 0.05 * rng.normal(size=(R, n, n))
     phi, g = rng.normal(size=(R, T, n)), np.clip(rng.normal(size=(R, T)), -2.5, 2.5)
     phi[2, :, 1] = 0.0
-    records = Records(root @ root.transpose(0, 2, 1), numbers, phi, g)
+    records = SimulatedRecords(root @ root.transpose(0, 2, 1), numbers, phi, g)
     for k, found in enumerate(statistics_of(records, cusum)):
         model = Frozen(np.zeros(n), np.ones(n), np.zeros(0), records.cov[k], numbers[k])
         findings = np.empty((T, CUSUM + n + 1))

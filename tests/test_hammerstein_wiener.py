@@ -58,7 +58,7 @@ def seen_by(model, y, u):
 
 
 def rows(model, y, u):
-    """phi and z as the model's equations say, a list of columns at a time; NaN where a lag lies before the record."""
+    """phi and z by the equations of the model, a list of columns at a time; NaN where a lag lies before the record."""
     T = len(y)
 
     def late(x, k):
@@ -361,7 +361,7 @@ def test_what_does_not_fit_warns_and_names_the_remedy():
     with pytest.warns(UserWarning, match=r"samples of u lie outside .* BSpline and are missing"):
         run = track(HammersteinWiener(1, 1, input=BSpline(2, (-1, 0, 1))), Still(), y, u)
     assert np.flatnonzero(~run.ok[2:]).tolist() == [t - 1 for t in np.flatnonzero(np.abs(u[:-1]) > 1) if t > 0]
-    for wrong, says in (
+    for wrong, message in (
         (lambda: PiecewiseLinear([0.0, 1.0, 1.0]), "strictly increasing"),
         (lambda: Legendre(3, (1, 1)), "low below high"),
         (lambda: HammersteinWiener(1, 0), "nb must be a whole number of at least 1"),
@@ -370,7 +370,7 @@ def test_what_does_not_fit_warns_and_names_the_remedy():
         (lambda: HammersteinWiener(1, 1, output_noise=0.0), "output_noise"),
         (lambda: HammersteinWiener(1, 1).bind(2), "1 input"),
     ):
-        with pytest.raises(ValueError, match=says):
+        with pytest.raises(ValueError, match=message):
             wrong()
 
 
@@ -416,7 +416,7 @@ def test_an_absurd_output_spoils_no_prediction():
 
 
 def test_forecasts_have_the_unit_of_the_output():
-    """The spread of what came, h samples ahead, is what the forecast said: constants known, equation noise.
+    """The spread of outputs h samples ahead is that of the forecast: constants known, equation noise.
 
     Of records whose future stays in the range of their past: nothing is believed of the curve beyond it.
     """

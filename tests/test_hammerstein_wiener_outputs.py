@@ -93,7 +93,8 @@ def test_a_shared_curve_is_better_than_each_alone():
 
 
 def test_shared_curves_are_the_nearest_of_rank_one():
-    """Two inputs with curves of different size, by alternating least squares on what the names say."""
+    """Two inputs with curves of different size, by alternating least squares on the products that the names
+    describe."""
     model = HammersteinWiener(1, (2, 1), input=[Polynomial(3), Polynomial(2)], ny=("flow", "level"))
     rng = np.random.default_rng(0)
     u = rng.uniform(-1.0, 1.0, (80, 2))
@@ -124,12 +125,12 @@ def test_shared_curves_are_the_nearest_of_rank_one():
 
 def test_settings_that_several_outputs_cannot_have_are_refused():
     y, u = record(60)
-    for wrong, says in (
+    for wrong, message in (
         (lambda: HammersteinWiener(1, 1, output=[None, Polynomial(2)]), "bases of one kind and size"),
         (lambda: HammersteinWiener(1, 1, output=[None, None], ny=3), "3 outputs, but one entry for each"),
         (lambda: HammersteinWiener(1, 1, output_noise=[0.1, 0.0], ny=2), "output_noise"),
         (lambda: shared_curves(track(TANK.alone("flow"), K, y[:, 0], u)), "several outputs"),
         (lambda: shared_curves(track(TANK, ExtendedKalman(q=0.0, r=1.0), y, u)), "products"),
     ):
-        with pytest.raises(ValueError, match=says):
+        with pytest.raises(ValueError, match=message):
             wrong()

@@ -12,14 +12,14 @@ LAMBDA = 0.97
 
 def twin(y, u, weights):
     """Rows (theta, var, e, s) of ARX(2, 2): every sample solves sum w zeta phi' theta = sum w zeta y again."""
-    T, n = len(y), 4
+    T, n, measured = len(y), 4, y
     A, S, b = np.zeros((n, n)), np.zeros((n, n)), np.zeros(n)
     x, auxiliary, largest, squares, used = [0.0, 0.0], np.zeros(n), 0.0, [], 0
     rows = np.full((T, 2 * n + 2), np.nan)
     for t in range(T):
-        largest = max(largest, abs(y[t]) if np.isfinite(y[t]) else 0.0)
         if t < 2:
             continue
+        largest = max(largest, abs(measured[t - 1])) if t > 2 and np.isfinite(measured[t - 1]) else largest
         phi = np.array([y[t - 1], y[t - 2], u[t - 1], u[t - 2]])
         A, S, b = LAMBDA * A, LAMBDA * S, LAMBDA * b
         instruments = np.array([*x, *phi[2:]])

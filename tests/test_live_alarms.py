@@ -1,4 +1,4 @@
-"""Alarms, forecasts and systems on a stream: what `Track` says of the record, bit for bit, also across a file."""
+"""Alarms, forecasts and systems on a stream: those of `Track` on the record, bit for bit, also across a file."""
 
 import pickle
 from datetime import UTC, datetime, timedelta

@@ -62,10 +62,10 @@ def test_it_finds_the_structure_and_finds_it_again_after_a_change():
 
 
 def test_candidates_that_cannot_be_weighed_are_refused():
-    for arguments, says in (
+    for arguments, message in (
         (([], K), "at least one model"), ((CANDIDATES, K, 0.0), "forgetting must be in"),
         ((CANDIDATES, AugmentedFLS(mu=1.0)), "with one variance"), ((CANDIDATES, Bank()), "with one variance"),
         (([HammersteinWiener(1, 1, ny=2)], AdaptiveKalman()), "one output"),
     ):  # fmt: skip
-        with pytest.raises(ValueError, match=says):
+        with pytest.raises(ValueError, match=message):
             LiveSelection(*arguments)

@@ -1,5 +1,7 @@
 """Many runs judged at once: false discovery control, the table, the page; outputs of one record."""
 
+import math
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +12,13 @@ from scipy import stats
 from support import THETA, arx_record, rows_of
 
 from driftfit import ARX, Kalman, Regression, track
-from driftfit.judge import on_all_cores
+from driftfit.judge.cores import on_all_cores
+from driftfit.judge.cores.processes import Processes, available
 from driftfit.judge.fleet_verdict import discoveries, verdicts
 
 K = Kalman(q=1e-4, r=0.01)
 MOVED = (1, 4)
+MAP = Processes.map
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +102,42 @@ def test_progress_is_shown_where_it_takes_long(fleet, monkeypatch, patience, sho
     monkeypatch.setattr(on_all_cores, "PATIENCE", patience)
     assert len(fleet.verdict()) == 7
     assert len(started) == shown
+
+
+def test_processes_judge_as_threads_do(fleet, monkeypatch):
+    here = fleet.verdict()
+    monkeypatch.setattr(on_all_cores, "WORTH", 0.0)
+    monkeypatch.setattr(on_all_cores, "cores", lambda: 2)
+    sent = []
+    monkeypatch.setattr(Processes, "map", lambda self, *what: sent.append(what) or MAP(self, *what))
+    there = fleet.verdict()
+    assert sent
+    assert repr(there.rows) == repr(here.rows)
+
+
+def test_what_a_process_cannot_do_is_done_here():
+    with Processes(1) as processes:
+        (process,) = processes._all
+        assert processes.map(os.getpid, [(), ()]) == [process.pid] * 2
+        assert processes.map(lambda x: -x, [(1,), (2,)]) == [-1, -2]
+        with pytest.raises(ValueError, match="math"):
+            processes.map(math.sqrt, [(4.0,), (-1.0,)])
+        assert processes.map(os.getpid, [()]) == [process.pid]
+        process.kill()
+        process.wait()
+        assert processes.map(os.getpid, [()]) == [os.getpid()]
+    assert process.stdin.closed
+
+
+def test_a_program_that_is_not_python_is_not_started(monkeypatch):
+    for path, allowed in (
+        ("/usr/bin/python3.11", True),
+        (r"pypy3", True),
+        ("/opt/matlab/bin/MATLAB", False),
+        ("", False),
+    ):
+        monkeypatch.setattr("sys.executable", path)
+        assert available() == allowed
 
 
 def test_diagnoses_are_counted(fleet):

@@ -33,7 +33,7 @@ def record(T=400, seed=0, noise=0.0):
 
 
 def naive_ekf(model, phi, z, q, r, p0, xi, inflation):
-    """The filter as its equations say, with full matrices and the Joseph form."""
+    """The filter by its equations, with full matrices and the Joseph form."""
     P = p0 * np.eye(len(xi))
     path = []
     for x, value in zip(phi, z, strict=True):
@@ -113,7 +113,7 @@ def test_the_extended_filter_of_several_inputs_is_its_naive_twin():
 
 
 def naive_output_error(y, u, q, r, p0, xi, q_w=1e-6, p_w=0.5):
-    """The output-error filter of `TWO` as its equations say, with full matrices; state (w, xi).
+    """The output-error filter of `TWO` by its equations, with full matrices; state (w, xi).
 
     The first ten outputs are not used."""
     x, P = np.r_[0.0, xi], np.diag(np.r_[p_w, np.full(9, p0)])

@@ -47,10 +47,8 @@ PAIRS = [
         ParticleFilter(50, q=Q, r=0.01, p0=P0),
     )),
 ]  # fmt: skip
-BEYOND = {("equation", AdaptiveKalman): ["at rest, then moved"], ("hidden", ParticleFilter): ["at rest, then moved"]}
-"""What is known to go wrong after outputs of exactly 0: the first noise is 0 too, and s goes to where the tangent is
-flat; copies of one path remain of the particles.
-"""
+BEYOND = {("hidden", ParticleFilter): ["at rest, then moved"]}
+"""What is known to go wrong: copies of one path remain of the particles, of which the summary tells."""
 NAMES = [f"{name}, {type(tracker).__name__}" for name, tracker in PAIRS]
 
 

@@ -74,9 +74,9 @@ def test_warm_starts_that_do_not_fit():
     first = track(MODEL, KINDS[0], y, u, time=np.arange(200.0))
     with pytest.raises(ValueError, match="was made by Kalman, this one is by RLS"):
         track(MODEL, KINDS[1], y, u, warm_start=first)
-    with pytest.raises(ValueError, match=r"the run before followed ARX\(na=1"):
+    with pytest.raises(ValueError, match=r"the earlier run followed ARX\(na=1"):
         track(ARX(2, 0), KINDS[0], y, warm_start=first)
-    with pytest.raises(ValueError, match=r"begins at 199.0, not after the end of the run before, 199.0"):
+    with pytest.raises(ValueError, match=r"begins at 199.0, not after the end of the earlier run, 199.0"):
         track(MODEL, KINDS[0], y, u, time=np.arange(200.0) + 199.0, warm_start=first)
 
 

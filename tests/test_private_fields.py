@@ -6,10 +6,18 @@ from pathlib import Path
 import pytest
 
 HOME = Path(__file__).parent.parent
-TESTS = sorted([*HOME.glob("tests/**/*.py"), *HOME.glob("lab/tests/**/*.py")])
-
-
-SETTERS = ("setattr", "delattr", "__setattr__", "__delattr__")
+INSIDE = HOME / "tests/contract/test_numba_internals.py"
+"""Its subject is the private side of Numba."""
+TESTS = sorted({*HOME.glob("tests/**/*.py"), *HOME.glob("lab/tests/**/*.py")} - {INSIDE})
+SETTERS = ("setattr", "delattr", "__setattr__", "__delattr__", "object", "setitem", "delitem", "patch")
+"""Calls that set what their first arguments name, of pytest and of unittest.mock too."""
+CHANGERS = (
+    "add", "append", "clear", "discard", "extend", "fill", "insert", "itemset", "pop", "popitem", "put", "remove",
+    "resize", "reverse", "setdefault", "setfield", "sort", "update",
+)  # fmt: skip
+"""Methods that change their object."""
+FILLERS = ("copyto", "fill_diagonal", "place", "put", "putmask", "shuffle")
+"""Functions of NumPy that change their first argument."""
 
 
 def is_private(name):
@@ -18,40 +26,99 @@ def is_private(name):
     return last.startswith("_") and not last.endswith("__")
 
 
-def set_by_name(node):
-    """Whether a call sets or deletes a private field that it names: ``setattr``, or pytest's monkeypatch."""
-    called = getattr(node.func, "attr", getattr(node.func, "id", ""))
-    texts = [part for one in node.args[:2] for part in getattr(one, "values", [one])]  # also those of an f-string
-    names = [one.value for one in texts if isinstance(one, ast.Constant) and isinstance(one.value, str)]
-    return called in SETTERS and any(map(is_private, names))
+def texts(node):
+    """The text of a constant, and the constant parts of an f-string."""
+    parts = getattr(node, "values", [node])
+    return [one.value for one in parts if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+
+
+def called(node):
+    return getattr(node.func, "attr", getattr(node.func, "id", ""))
+
+
+def within(node, known):
+    """Whether a place is a private field, a part of one, or a part of what one of the ``known`` names stands for."""
+    while isinstance(node, ast.Attribute | ast.Subscript | ast.Call):
+        if isinstance(node, ast.Attribute):
+            if is_private(node.attr):
+                return True
+            node = node.value
+        elif isinstance(node, ast.Subscript):
+            fields = getattr(node.value, "attr", "") == "__dict__" or (
+                isinstance(node.value, ast.Call) and called(node.value) == "vars"
+            )
+            if fields and any(map(is_private, texts(node.slice))):
+                return True
+            node = node.value
+        else:
+            if called(node) == "getattr" and any(map(is_private, texts(node.args[1]))):
+                return True
+            if called(node) not in ("getattr", "vars"):
+                return False
+            node = node.args[0]
+    return isinstance(node, ast.Name) and node.id in known
+
+
+def changes(node, known):
+    """Whether a call changes a private field."""
+    name, given = called(node), node.args
+    if name in SETTERS and (any(is_private(text) for one in given[:2] for text in texts(one)) or
+                            any(within(one, known) for one in given[:1])):  # fmt: skip
+        return True
+    if name in FILLERS and given and within(given[0], known):
+        return True
+    return name in CHANGERS and isinstance(node.func, ast.Attribute) and within(node.func.value, known)
 
 
 def written(text):
-    """Lines that assign to a private field of anything but the object itself, or to a part of one."""
-    found = []
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Call) and set_by_name(node):
+    """Lines that change a private field, or a part of one, also under another name."""
+    tree, known, found = ast.parse(text), set(), []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign) and within(node.value, known):
+            known |= {one.id for one in node.targets if isinstance(one, ast.Name)}
+    for node in ast.walk(tree):
+        stored = isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store | ast.Del)
+        if (stored and within(node, known)) or (isinstance(node, ast.Call) and changes(node, known)):
             found.append(node.lineno)
-        if isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store | ast.Del):
-            place = node
-            while isinstance(place, ast.Attribute | ast.Subscript):
-                of_itself = isinstance(place.value, ast.Name) and place.value.id in ("self", "cls")
-                if isinstance(place, ast.Attribute) and is_private(place.attr) and not of_itself:
-                    found.append(node.lineno)
-                    break
-                place = place.value
-    return found
+    return sorted(set(found))
+
+
+WRITES = """
+live._tile['theta'][0] = 1.0
+live._tile += 1
+del live._tile.x
+self._tile = 0
+setattr(live, '_tile', 0)
+patch.setattr('a.b._c', 0)
+object.__setattr__(run, '_x', 1)
+patch.object(live, '_tile', 0)
+patch.setitem(live._cache, 'a', 0)
+live._tile['theta'].fill(0.0)
+live._alarms.append(1)
+np.copyto(live._tile, 0.0)
+live.__dict__['_tile'] = 0
+vars(live)['_tile'] = 0
+getattr(live, '_tile')[0] = 1
+tile = live._tile
+tile['theta'][:] = 0.0
+""".strip().splitlines()
+READS = """
+setattr(live, 'tile', '_')
+patch.setattr('a._b.c', 0)
+patch.setattr(a, '__len__', f)
+live.tile = _x
+x = live._tile[0]
+y = live._run(3)
+y[0] = 1.0
+seen.append(live._tile)
+live.__dict__['tile'] = 0
+""".strip().splitlines()
 
 
 def test_what_writes_private_fields_is_found():
-    assert written("live._tile['theta'][0] = 1.0\nlive._tile += 1\ndel live._tile.x") == [1, 2, 3]
-    assert written("setattr(live, '_tile', 0)\npatch.setattr('a.b._c', 0)\nobject.__setattr__(run, '_x', 1)") == [
-        1,
-        2,
-        3,
-    ]
-    assert written("setattr(live, 'tile', '_')\npatch.setattr('a._b.c', 0)\npatch.setattr(a, '__len__', f)") == []
-    assert written("self._tile = live._tile\nlive.tile = _x\nx = live._tile[0]") == []
+    lines = written("\n".join(WRITES))
+    assert [line for k, line in enumerate(WRITES, 1) if k not in lines] == ["tile = live._tile"]
+    assert [READS[k - 1] for k in written("\n".join(READS))] == []
 
 
 @pytest.mark.parametrize("path", TESTS, ids=lambda path: path.relative_to(HOME).as_posix())

@@ -173,7 +173,7 @@ MODEL, TRACKER = "ARX(na=2, nb=2)", "Kalman(q=0.001, r=0.01)"
 
 
 @pytest.mark.parametrize(
-    ("call", "says"),
+    ("call", "message"),
     [
         (lambda: track(ARX, K, Y, U), "track: model is the class ARX itself; create an instance: ARX(na=...)."),
         (lambda: track(ARX(2, 2), Kalman, Y, U), "class Kalman itself; create an instance: Kalman(q=..., r=...)."),
@@ -198,8 +198,8 @@ MODEL, TRACKER = "ARX(na=2, nb=2)", "Kalman(q=0.001, r=0.01)"
         (lambda: detect("band", Y), "detect: the run comes first, as in detect(run, 'band'); got 'band'."),
     ],
 )  # fmt: skip
-def test_classes_and_swapped_arguments_are_named(call, says):
-    with pytest.raises(TypeError, match=re.escape(says)):
+def test_classes_and_swapped_arguments_are_named(call, message):
+    with pytest.raises(TypeError, match=re.escape(message)):
         call()
 
 

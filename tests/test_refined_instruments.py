@@ -119,3 +119,31 @@ def test_what_cannot_be_refined_says_so():
         PolynomialModel(0, 1, 1, 1, 1, inputs=1, point=(0.5,))
     with pytest.warns(UserWarning, match="after 1 passes a parameter still moves"):
         track(BJ, RLS(1.0), y, u).refine(passes=1)
+
+
+@pytest.mark.parametrize("tracker", [RLS(1.0), InstrumentalVariables(1.0)], ids=["RLS", "instruments"])
+def test_on_line_the_noise_is_not_learned_from_the_errors_of_an_unknown_plant(tracker):
+    """The Box-Jenkins system of MATLAB's page on bj, where errors of C and D had medians of .4 to 1."""
+    theta = np.array([1.0, 0.5, -1.0, 0.2, -1.5, -0.7, 1.5, -0.7])
+    error, inside = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        u, e = rng.choice([-1.0, 1.0], 1000), np.sqrt(0.1) * rng.normal(size=1000)
+        y = signal.lfilter([0.0, 1.0, 0.5], [1.0, -1.5, 0.7], u)
+        run = track(BoxJenkins(2, 2, 2, 2), tracker, y + signal.lfilter([1.0, -1.0, 0.2], [1.0, 1.5, 0.7], e), u)
+        error.append(np.abs(run.theta[-1] - theta))
+        inside.append(error[-1] < 1.96 * run.std[-1])
+    assert np.median(error, axis=0)[2:6].max() < 0.12
+    assert np.mean(inside) > 0.85
+
+
+def test_estimates_that_went_astray_are_not_silent():
+    """A slow room with disturbances of its own, which an output error model takes for noise of the reading."""
+    rng, T = np.random.default_rng(0), 800
+    heat, out = np.repeat((rng.uniform(size=T // 8) < 0.4) * 60.0, 8), 7.0 + np.cumsum(0.3 * rng.normal(size=T))
+    u, y = np.c_[heat, out], np.full(T, 18.0)
+    for t in range(1, T):
+        y[t] = 0.97 * y[t - 1] + 0.003 * u[t - 1, 0] + 0.005 * u[t - 1, 1] + 0.4 + 0.09 * rng.normal()
+    with pytest.warns(UserWarning, match=r"the estimates went astray\. Disturbances that pass through the plant"):
+        track(OE((1, 1), (1, 1)), InstrumentalVariables(0.995), y, u)
+    track(ARX(1, (1, 1), intercept=True), InstrumentalVariables(0.995), y, u)  # and no warning

@@ -1,4 +1,4 @@
-"""The report: one page that needs nothing else, says what the judges say, and escapes what users name."""
+"""The report: one page that needs nothing else, reports what the verbs find, and escapes what users name."""
 
 import re
 from html.parser import HTMLParser

@@ -1,4 +1,4 @@
-"""Valid ranges and stretches to leave out: what is outside is missing, and counted, in every way of running."""
+"""Valid ranges and intervals to leave out: what is outside is missing, and counted, in every way of running."""
 
 from __future__ import annotations
 
@@ -55,17 +55,17 @@ def test_ranges_include_their_ends_and_zero():
 
 
 @pytest.mark.parametrize(
-    ("limits", "says"),
+    ("limits", "message"),
     [
         ({"z": (0, 1)}, "there is no signal 'z'"), ({1: (0, 1)}, "there is no signal 1"),
         ({"y": (1, 0)}, "lower limit of"), ({"y": 3}, "must be \\(low, high\\)"), ({"y": ("a", 1)}, "must be"),
         ({"y": (0, float("nan"))}, "lower limit of"),
     ],
 )  # fmt: skip
-def test_wrong_limits_are_named(limits, says):
-    with pytest.raises(ValueError, match=says):
+def test_wrong_limits_are_named(limits, message):
+    with pytest.raises(ValueError, match=message):
         track(MODEL, TRACKER, *signals(), limits=limits)
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         Live(MODEL, TRACKER, limits=limits)
 
 
@@ -137,42 +137,42 @@ ENDS = {
 
 
 @pytest.mark.parametrize("kind", ENDS)
-def test_a_stretch_is_left_out(kind):
-    time, stretch, rows = ENDS[kind]
+def test_an_interval_is_left_out(kind):
+    time, interval, rows = ENDS[kind]
     y, u = signals()
     axis = pd.date_range("2024-03-01", periods=T, freq="h").to_numpy() if isinstance(time, str) else time
     more = {} if axis is None else {"time": axis, "dt": "1h" if isinstance(time, str) else 2}
-    run = track(MODEL, TRACKER, y, u, exclude=[stretch], **more)
+    run = track(MODEL, TRACKER, y, u, exclude=[interval], **more)
     same(run, track(MODEL, TRACKER, *holes(y, u, rows, rows), **more))
     assert run.labels.missing == {"excluded": len(rows)}
-    # nothing of the stretch reaches a lag, so the sample after it is skipped as well
+    # nothing of the interval reaches a lag, so the sample after it is skipped as well
     after = [t for t in (rows[-1] + 1,) if t < T]
     assert not run.ok[[*rows, *after]].any()
     wild = y.copy()
     wild[list(rows)] = 1e6
-    same(track(MODEL, TRACKER, wild, u, exclude=[stretch], **more), run)
+    same(track(MODEL, TRACKER, wild, u, exclude=[interval], **more), run)
 
 
 def test_dates_without_a_zone_are_in_that_of_the_table():
     y, u = signals()
     table = pd.DataFrame({"y": y, "u": u, "t": pd.date_range("2024-03-01", periods=T, freq="h", tz="Asia/Tokyo")})
-    for stretch in (
+    for interval in (
         ("2024-03-02", "2024-03-02"),
         (datetime(2024, 3, 2), pd.Timestamp("2024-03-02 14:59", tz="UTC")),
     ):
-        run = track(MODEL, TRACKER, "y", "u", data=table, time="t", dt="1h", exclude=[stretch])
+        run = track(MODEL, TRACKER, "y", "u", data=table, time="t", dt="1h", exclude=[interval])
         assert np.flatnonzero(np.isnan(run.u[:, 0])).tolist() == list(range(24, 48))
 
 
 @pytest.mark.parametrize(
-    ("exclude", "says"),
+    ("exclude", "message"),
     [
         ([(5, 3)], "must not end before"), ((3, 5), "each interval must be"), (["ab"], "each interval must be"),
         ([("x", 5)], "must be a number"), ([(1, 2, 3)], "each interval must be"),
     ],
 )  # fmt: skip
-def test_wrong_stretches_are_named(exclude, says):
-    with pytest.raises(ValueError, match=says):
+def test_wrong_intervals_are_named(exclude, message):
+    with pytest.raises(ValueError, match=message):
         track(MODEL, TRACKER, *signals(), exclude=exclude)
 
 

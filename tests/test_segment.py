@@ -100,7 +100,7 @@ def test_the_penalty_grows_with_the_record_and_its_parameters():
 
 
 def test_parameters_and_standard_errors_of_segments():
-    """A gain that changes, of a regression with times; y of a thousand times the size says the same."""
+    """A gain that changes, of a regression with times; y of a thousand times the size gives the same dates."""
     rng = np.random.default_rng(2)
     u, t = rng.normal(size=(500, 2)), np.arange(500)
     y = np.where(t < 300, 1.0, 2.0) * u[:, 0] - u[:, 1] + 0.3 * rng.normal(size=500)

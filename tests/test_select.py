@@ -102,7 +102,7 @@ def test_average_is_the_recursion_written_out(selection):
 
 
 def test_an_average_forgets_nothing_over_missing_samples(record):
-    """Weights after an outage are those before it; where outputs are seen again they go on."""
+    """Weights after an outage are those before it; they continue once outputs are observed again."""
     y, u = record[0].copy(), record[1]
     y[200:260] = np.nan
     got = select(ORDERS, y, u, tracker=K).average(0.9)

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from driftfit import ARX, AdaptiveKalman, Bank, Change, Kalman, Sensor
 from driftfit.cli import app
-from driftfit.cli.parts.arguments import parse_model
+from driftfit.parsing.settings import parse_model
 from driftfit.service.settings.config import ProblemsError, parse, read
 from driftfit.service.settings.matching import Pattern
 from driftfit.service.settings.options import Secret

@@ -13,7 +13,7 @@ ONES = np.ones(10)
 
 
 @pytest.mark.parametrize(
-    ("build", "says"),
+    ("build", "message"),
     [
         (lambda: Kalman(q=-1.0, r=1.0), ["Kalman", "q", "at least 0", "-1.0"]),
         (lambda: Kalman(q=[0.1, -0.2], r=1.0), ["q", "at least 0", "-0.2"]),
@@ -52,10 +52,10 @@ ONES = np.ones(10)
         (lambda: Live(Regression(), RLS(0.9)), ["the number of regressors", "Regression(3)"]),
     ],
 )
-def test_wrong_settings_are_named(build, says):
+def test_wrong_settings_are_named(build, message):
     with pytest.raises(ValueError) as error:
         build()
-    for word in says:
+    for word in message:
         assert word in str(error.value)
 
 

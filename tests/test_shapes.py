@@ -16,7 +16,7 @@ Y, U = arx_record(40, 1)
 
 
 @pytest.mark.parametrize(
-    ("given", "says"),
+    ("given", "message"),
     [
         ({"y": np.ones((40, 2))}, ["y", "one axis", "(40, 2)"]),
         ({"y": 3.0}, ["y", "one axis", "()"]),
@@ -41,10 +41,10 @@ Y, U = arx_record(40, 1)
         ({"keep": "all"}, ["keep", "'std', 'cov'", "'all'"]),
     ],
 )
-def test_wrong_shapes_are_named(given, says):
+def test_wrong_shapes_are_named(given, message):
     with pytest.raises(ValueError) as error:
         track(ARX(2, 2), K, **({"y": Y, "u": U} | given))
-    for word in says:
+    for word in message:
         assert word in str(error.value)
 
 

@@ -1,4 +1,4 @@
-"""Simulated systems: their truth is true, and the drift laws do what their formulas say."""
+"""Simulated systems: their truth is true, and the drift laws follow their formulas."""
 
 import numpy as np
 import pytest

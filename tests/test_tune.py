@@ -12,7 +12,7 @@ from driftfit.tune.search import Counted, Search
 
 
 def walks(seed, std=(0.1, 0.1), noise=0.5, T=200):
-    """Random walks seen through white regressors."""
+    """Random walks observed through white regressors."""
     rng = np.random.default_rng(seed)
     theta = paths([RandomWalk(0.0, s) for s in std], T, rng)
     u = rng.normal(size=(T, len(std)))
@@ -266,7 +266,7 @@ def test_frontier():
 
 
 @pytest.mark.parametrize(
-    ("tracker", "options", "says"),
+    ("tracker", "options", "message"),
     [
         (Kalman(q=1.0, r=1.0), {}, "leaves nothing open"),
         (AugmentedFLS(), {}, "use 'h-step'"),
@@ -283,9 +283,9 @@ def test_frontier():
         (FLS(), {"y": np.full(200, np.nan)}, "no usable sample"),
     ],
 )
-def test_bad_input(tracker, options, says):
+def test_bad_input(tracker, options, message):
     y, u = walks(0)
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         tune(Regression(2), tracker, options.pop("y", y), options.pop("u", u), **options)
 
 

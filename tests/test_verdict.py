@@ -113,7 +113,7 @@ def test_where_a_path_is_tied_to_zero_it_says_nothing():
 
 
 def test_quadratic_forms_are_those_of_plain_numpy():
-    """Q of one stretch, by solving with its covariance."""
+    """Q of one interval, by solving with its covariance."""
     rng = np.random.default_rng(0)
     root = rng.normal(size=(36, 36))
     cov, S = (root @ root.T).reshape(12, 3, 12, 3), rng.normal(size=(12, 3))
@@ -271,7 +271,7 @@ def test_the_interval_holds_the_date():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_parameters_that_cannot_be_distinguished_are_named_as_a_group(seed):
-    """Regressors with correlation 0.999: one of the two moves, and which one nobody can tell."""
+    """Regressors with correlation 0.999: one of the two moves, and the record does not tell which."""
     rng = np.random.default_rng(seed)
     u = rng.normal(size=(400, 3)) @ [[1.0, 0.999, 0.0], [0.0, 0.045, 0.0], [0.0, 0.0, 1.0]]
     y = u.sum(axis=1) + 0.5 * u[:, 0] * (np.arange(400) >= 250) + 0.5 * rng.normal(size=400)

@@ -184,7 +184,7 @@ than its own, and values below 2 in size are insignificant."""
 
 
 def draw(name: str, cells: Sequence[Cell], T: int) -> Figure:
-    """Ratios to the oracle of every row, one panel a model; under them one path of the first run."""
+    """Ratios to the oracle of every row, one panel per model; under them one path of the first run."""
     figure = new_figure(11.0, 8.5)
     grid = figure.add_gridspec(2, len(cells), height_ratios=[2.2, 1.0])
     for i, cell in enumerate(cells):

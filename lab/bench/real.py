@@ -111,7 +111,7 @@ def one_step(record: Record, outcome: Outcome) -> float:
 
 
 def start(record: Record) -> int:
-    """Samples until estimates are looked at: max(50, 5 n), or half of what there is."""
+    """Samples until estimates are evaluated: max(50, 5 n), or half of what there is."""
     return min(max(50, 5 * record.model.n), len(record.y) // 2)
 
 

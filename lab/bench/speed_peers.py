@@ -1,4 +1,4 @@
-"""The jobs of other packages in the contests of speed: one function a package and task, ``make(signals) -> Job``.
+"""The jobs of other packages in the contests of speed: one function per package and task, ``make(signals) -> Job``.
 
 All run theta_t = theta_(t-1) + w, w ~ N(0, Q I), y = phi' theta + v, v ~ N(0, R), theta before the first sample
 N(0, P0 I), in double precision. Each raises ImportError where its package is absent.

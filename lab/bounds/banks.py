@@ -1,6 +1,6 @@
 """Banks drawn at random, whose arrays are apart in memory, with NaN in between.
 
-An address beyond its array gives NaN, or is seen to have been written to. Every reduction, kind of change, sensor,
+An address beyond its array gives NaN, or is found to have been written to. Every reduction, kind of change, sensor,
 prior and form is drawn, one output and two, and records that have outages, gaps in time, fault codes, repeated readings
 and regressors that begin late.
 """
@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from lab.bounds.checks import Noted
+from lab.bounds.checks import Violations
 
 APART = 64
 """Entries between the arrays of a bank."""
 
 
 def heavy(y: float, y_hat: float, h: float, r: float, last: float) -> tuple[float, float, float]:
-    """A sensor of one's own, with Laplacian noise."""
+    """A user-defined sensor, with Laplacian noise."""
     width, far = 2.0 * math.sqrt(h + r), abs(y - y_hat)
     return -math.log(2.0 * width) - far / width, r * max(1.0, far / math.sqrt(r)), y_hat
 
@@ -162,7 +162,7 @@ def faults(run: Any) -> list[str]:
     return wrong if proper else [*wrong, "not probabilities"]
 
 
-def run_banks(seeds: range, quick: bool, noted: Noted) -> int:
+def run_banks(seeds: range, quick: bool, violations: Violations) -> int:
     """Run the banks of these seeds; returns how many had a violation or wrong numbers."""
     from driftfit import track
 
@@ -179,7 +179,7 @@ def run_banks(seeds: range, quick: bool, noted: Noted) -> int:
         each = list(run.values()) if len(model.outputs) > 1 else [run]
         for one in each:
             one.hypotheses.found()
-        wrong = noted.take() + [result for one in each for result in faults(one)]
+        wrong = violations.take() + [result for one in each for result in faults(one)]
         if wrong:
             bad += 1
             print(f"bank {seed}: {bank!r}\n    " + "\n    ".join(wrong), flush=True)

@@ -28,8 +28,8 @@ def settings() -> dict[str, str]:
 
 
 @dataclass
-class Noted:
-    """What was out of bounds since it was last asked."""
+class Violations:
+    """The violations since they were last taken."""
 
     places: dict[str, tuple[int, int]] = field(default_factory=dict)
     """By file and line: an index, and the length of its array."""
@@ -45,7 +45,7 @@ class Noted:
         return result
 
 
-def watch() -> Noted:
+def watch() -> Violations:
     """Insert checks into all code that this process compiles from now on."""
     import llvmlite.binding as llvm
     from llvmlite import ir
@@ -53,18 +53,18 @@ def watch() -> Noted:
 
     from driftfit.engine import simd
 
-    i64, noted = ir.IntType(64), Noted()
+    i64, violations = ir.IntType(64), Violations()
     kind = ir.FunctionType(ir.VoidType(), [ir.IntType(8).as_pointer(), i64, i64])
 
     @ctypes.CFUNCTYPE(None, ctypes.c_char_p, ctypes.c_int64, ctypes.c_int64)
     def note(place: bytes, index: int, size: int) -> None:
-        noted.places.setdefault(place.decode(), (index, size))
+        violations.places.setdefault(place.decode(), (index, size))
 
-    noted.kept.append(note)
+    violations.kept.append(note)
     llvm.add_symbol(SYMBOL, ctypes.cast(note, ctypes.c_void_p).value)
 
     def check(context: Any, builder: Any, bad: Any, index: Any, size: Any) -> None:
-        noted.checks += 1
+        violations.checks += 1
         place = context.insert_const_string(builder.module, _line())
         called = cgutils.get_or_insert_function(builder.module, kind, SYMBOL)
         with cgutils.if_unlikely(builder, bad):
@@ -89,7 +89,7 @@ def watch() -> Noted:
     config.reload_config = lambda: None  # it would see that the variables are gone
     cgutils.do_boundscheck = checked
     simd._place = place
-    return noted
+    return violations
 
 
 def _line() -> str:

@@ -9,18 +9,18 @@ from typing import Any
 import pytest
 
 from lab.bounds.banks import run_banks
-from lab.bounds.checks import Noted, watch
+from lab.bounds.checks import Violations, watch
 
 
 class EveryTest:
     """Fails a test in which something was out of bounds."""
 
-    def __init__(self, noted: Noted) -> None:
-        self.noted = noted
+    def __init__(self, violations: Violations) -> None:
+        self.violations = violations
 
     def _judged(self) -> Iterator[None]:
         result = yield
-        wrong = self.noted.take()
+        wrong = self.violations.take()
         if wrong:
             pytest.fail("out of bounds: " + "; ".join(wrong), pytrace=False)
         return result
@@ -36,14 +36,14 @@ class EveryTest:
 
 def main(first: int, banks: int, quick: bool, tests: list[str]) -> int:
     """Returns 1 if anything was found."""
-    noted, bad = watch(), 0
+    violations, bad = watch(), 0
     if banks:
-        bad = run_banks(range(first, first + banks), quick, noted)
+        bad = run_banks(range(first, first + banks), quick, violations)
         print(f"{banks} banks, {bad} at fault", flush=True)
     if not tests:
         return int(bad > 0)
-    failed = pytest.main(["-n", "0", "-p", "no:cacheprovider", *tests], plugins=[EveryTest(noted)])
-    print(f"tests: exit status {int(failed)}; {noted.checks} checks were compiled, the rest was on disk")
+    failed = pytest.main(["-n", "0", "-p", "no:cacheprovider", *tests], plugins=[EveryTest(violations)])
+    print(f"tests: exit status {int(failed)}; {violations.checks} checks were compiled, the rest was on disk")
     return int(bad > 0 or failed != 0)
 
 

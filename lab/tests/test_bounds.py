@@ -1,4 +1,4 @@
-"""Compiled code with checks says which index is out of bounds; faults to plant are lines of the source."""
+"""Compiled code with checks names the index that is out of bounds; faults to plant are lines of the source."""
 
 import os
 import subprocess

@@ -127,7 +127,7 @@ def test_no_verdict_is_left_out():
 
 
 class Made:
-    """Tables of banks whose values are 1 but where said, by (table, row, column)."""
+    """Tables of banks whose values are 1 except where given, by (table, row, column)."""
 
     def __init__(self, **result):
         self.said = {tuple(key.split("|")): value for key, value in result.items()}

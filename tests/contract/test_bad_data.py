@@ -90,7 +90,7 @@ def test_a_sample_of_weight_0_is_not_used(model, tracker):
 
 
 def test_a_regressor_that_wakes_up_late(model, tracker):
-    """Silence before every direction was seen: exponential forgetting must not run away meanwhile."""
+    """Inputs of zero before every direction was excited: exponential forgetting must not run away meanwhile."""
     y, u = np.zeros((2, 20_000))
     u[2] = 1.0  # shows two of the four directions
     y[-200:], u[-200:] = arx_record(200, 6, noise=0.01)

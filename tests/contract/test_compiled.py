@@ -84,10 +84,10 @@ from driftfit.engine.kernel import Driver
 def plus(y):
     return y[0] + 1.0
 
-with warnings.catch_warnings(record=True) as said:
+with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     one, other = Driver(plus)(np.zeros(1)), Driver(plus)(np.zeros(2)[::2])
-    print(one, other, len(said), "NUMBA_CACHE_DIR" in str(said[0].message))
+    print(one, other, len(caught), "NUMBA_CACHE_DIR" in str(caught[0].message))
 """
 
 

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 import pytest
 from numba import types
+from numba.core import postproc
 from numba.core.compiler import Flags
 from numba.core.registry import cpu_target
 from numba.core.typing.templates import AbstractTemplate
@@ -117,8 +118,33 @@ def test_passes_for_what_is_not_used_are_left_out():
         return {name.split("_", 1)[1] for name in times}
 
     every, ours = passes(numba.njit(first)), passes(internals.under_ieee(first))
-    assert every - ours == UNUSED | {"native_lowering"}, "DefaultPassBuilder or the names of its passes changed."
-    assert ours - every == {"short_lowering"}
+    replaced = {"native_lowering", "ir_legalization"}
+    assert every - ours == UNUSED | replaced, "DefaultPassBuilder or the names of its passes changed."
+    assert ours - every == {"short_lowering", "legalization"}
+
+
+def test_lifetimes_of_variables_are_not_searched(monkeypatch):
+    def larger(x, y):
+        return x if x > y else y
+
+    searched = []
+    search = postproc.analysis.compute_dead_maps
+    monkeypatch.setattr(postproc.analysis, "compute_dead_maps", lambda *given: searched.append(given) or search(*given))
+    internals.emit(larger, (types.float64, types.float64))
+    assert not searched, "PostProcessor.run is not what analyses a function: a tenth of compiling in Python is lost."
+    numba.njit(larger).compile((types.float64, types.float64))
+    assert searched, "Functions of users are analysed in our way."
+
+
+def test_declarations_are_looked_for_once_and_put_back():
+    context = cpu_target.target_context
+    parts = context, context.typing_context, context.codegen()
+    before = [{**vars(one)} for one in parts]
+    with internals.known_once():
+        assert vars(context).keys() > before[0].keys()
+        assert context.get_abi_sizeof(context.get_data_type(types.float64)) == 8
+        context.refresh()
+    assert [vars(one).keys() for one in parts] == [one.keys() for one in before], "Methods are not put back."
 
 
 def test_operations_are_typed_once(monkeypatch):
@@ -160,7 +186,7 @@ def test_one_copy_of_a_part_serves_all_constants():
 def test_functions_with_other_options_are_typed_by_themselves():
     strict, loose, again = Flags(), Flags(), Flags()
     loose.fastmath = True
-    again.fastmath = False  # the default, said aloud
+    again.fastmath = False  # the default, given explicitly
     assert strict != loose, "Flags._values no longer holds the options: a user's fast-math could enter our code."
     assert strict == again
     assert hash(strict) == hash(again), "Equal options differ."
@@ -188,7 +214,7 @@ def test_pass_managers_are_freed():
 
 def test_object_code_is_loaded_and_freed():
     code = internals.emit(first, (VECTOR,))
-    assert code.lasting, "Code is said to hold addresses of this process: nothing would be kept on disk."
+    assert code.lasting, "Code is marked as holding addresses of this process: nothing would be kept on disk."
     entry = internals.load(code)
     assert entry(np.full(1, 7.0)) == 7.0, "codegen._tm.emit_object, LLVM's ORC or _dynfunc.make_function changed."
     assert internals.load(internals.Code(*code))(np.full(1, 8.0)) == 8.0

@@ -44,7 +44,7 @@ def band(phi: Array, mu: float) -> Array:
         for j in range(i, n):
             ab[n - (j - i), :, j] = phi[:, i] * phi[:, j]
     ab[n] += neighbours[:, None]
-    ab[0, 1:] = -mu  # for n = 1 the diagonal beside the main one, else n places away from it
+    ab[0, 1:] = -mu  # for n = 1 the diagonal next to the main one, else n places away from it
     return ab.reshape(n + 1, L * n)
 
 

@@ -109,7 +109,7 @@ def bound(low: float, high: float, limit: float, actual: float) -> Claim:
 
 
 def effort(row: Mapping[str, float]) -> Claim:
-    """Remark 4: nanoseconds a sample of the filter and of both separations."""
+    """Remark 4: nanoseconds per sample of the filter and of both separations."""
     less, able = row["average"] < row["svd"], row["svd"] <= 10.0 * row["filter"]
     return Claim(
         "AVE needs less computation than SVD, which still can run on line (remark 4)",

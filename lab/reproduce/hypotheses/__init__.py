@@ -24,7 +24,7 @@ from lab.reproduce.hypotheses.contests import Contest, contests
 from lab.reproduce.hypotheses.scores import HEADS, Measured, measure
 
 QUICK, COSTLY = 4, 300
-"""Records of a quick run, and the leaf updates a sample above which it leaves a row out."""
+"""Records of a quick run, and the leaf updates per sample above which it leaves a row out."""
 RUNS = 50
 """Records behind the reference values of smoothing and of unknown noise; four times as many are run."""
 Row = tuple[float, ...]

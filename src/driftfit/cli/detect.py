@@ -13,7 +13,7 @@ from rich.text import Text
 
 from driftfit.cli.parts.options import Given, reads
 from driftfit.cli.parts.program import app, say
-from driftfit.cli.parts.reading import moment, stretch
+from driftfit.cli.parts.reading import interval_from, moment
 from driftfit.cli.track import Plot, Report
 from driftfit.judge.alarms.detect import Alarms
 from driftfit.results import Track
@@ -22,7 +22,7 @@ from driftfit.show.report import check_path
 
 @dataclass(frozen=True)
 class AlarmOptions:
-    """The options that say what an alarm is."""
+    """The options that define an alarm."""
 
     kind: Annotated[str, typer.Option(help="glr, cusum, band, innovation or probability.")] = "glr"
     every: Annotated[float, typer.Option(help="Samples in which one false alarm may begin.")] = 10_000.0
@@ -76,7 +76,7 @@ def detect(
         _write(alarms, write_to)
     if plot is not None:
         if not isinstance(run, Track):
-            raise ValueError("--plot: alarms are drawn for one series; --report has those of a fleet.")
+            raise ValueError("--plot: alarms are drawn for one series; use --report for a fleet.")
         alarms.plot(faulty).savefig(plot, dpi=150)
     if report is not None:
         run.report(report, alarms=alarms, **({} if faulty is None else {"labels": faulty}))
@@ -92,7 +92,7 @@ def parse_reference(given: list[str] | None, run: Any) -> Any:
         raise ValueError("--reference: several references are only for bands, such as --reference gain=0.9:1.1.")
     if given[0].strip().isdigit():
         return int(given[0])
-    first, last = stretch(given[0], "--reference")
+    first, last = interval_from(given[0], "--reference")
     axis, zone = (run.time, run.labels.zone) if isinstance(run, Track) else (np.arange(1), None)
     return moment(first, axis, zone), moment(last, axis, zone, end=True)
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from driftfit.cli.parts.arguments import parse_model, parse_tracker
 from driftfit.cli.parts.program import app, helpful, say
+from driftfit.parsing.settings import parse_model, parse_tracker
 from driftfit.show.parts.text import facts
 
 export = typer.Typer(no_args_is_help=True, help="Write a tracker in another language.")

@@ -19,7 +19,7 @@ from driftfit.results import Track
 from driftfit.show.parts.text import table_of
 
 SHOWN = 40
-"""Most rows that are printed."""
+"""Largest number of rows that are printed."""
 
 
 @app.command()

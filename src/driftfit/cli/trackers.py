@@ -7,8 +7,8 @@ from rich.table import Table
 from rich.text import Text
 
 from driftfit import trackers as known
-from driftfit.cli.parts.arguments import default, given_fields
 from driftfit.cli.parts.program import app, out, say
+from driftfit.parsing.settings import default, given_fields
 
 
 @app.command()

@@ -8,10 +8,10 @@ import numpy as np
 import typer
 from rich.text import Text
 
-from driftfit.cli.parts.arguments import given_fields
 from driftfit.cli.parts.options import Given, reads
 from driftfit.cli.parts.program import app, progress, say
 from driftfit.cli.track import Plot
+from driftfit.parsing.settings import given_fields
 from driftfit.show.parts.text import facts, shortened, table_of
 
 

@@ -1,4 +1,5 @@
-"""Check the types of the arguments model and tracker; the message names a class that was passed, or a wrong order."""
+"""Check the types of the arguments model and tracker; messages recognise a class in place of an instance, and a wrong
+order."""
 
 from __future__ import annotations
 

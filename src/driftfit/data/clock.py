@@ -17,19 +17,15 @@ intervals as its record does.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from functools import cached_property
 from typing import Any, NoReturn
-from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from driftfit.data.times.periods import EXAMPLES, periods
+from driftfit.data.times.instants import zone_name
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import warn
-from driftfit.models.arx import GAP
 
 LABEL = "label"
 CALENDARS = ("month", "business")
@@ -53,9 +49,6 @@ DURATIONS = {
 
 NEAR = 0.1
 """A number of calendar steps this close to an integer is rounded to it."""
-
-LOOK = 20
-"""Number of samples after which a stream warns if most of them cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +97,7 @@ class Clock:
         if self.kind == "number":
             return self.count
         if self.duration is not None:
-            return _written(self.duration)
+            return duration_text(self.duration)
         name = "month" if self.kind == "month" else "business day"
         text = name if self.count == 1.0 else f"{self.count:g} {name}s"
         return f"{text} except {', '.join(self.holidays)}" if self.holidays else text
@@ -248,72 +241,6 @@ UNSET = Clock("unset")
 """The clock if no dt was given."""
 
 
-def instant(time: Any) -> Any:
-    """One time as a float, or as datetime64 in UTC if it is a date."""
-    if isinstance(time, int | float | np.number) and not isinstance(time, np.timedelta64):
-        return float(time)
-    if hasattr(time, "to_datetime64"):  # a pandas time, in UTC if it has a zone
-        return time.to_datetime64()
-    if isinstance(time, datetime) and time.tzinfo is not None:
-        time = time.astimezone(UTC).replace(tzinfo=None)
-    if isinstance(time, str):
-        return _of_texts([time])[0]
-    return _by_days(np.asarray(time, dtype="datetime64" if isinstance(time, np.datetime64) else "datetime64[us]"))[()]
-
-
-def instants(time: Any) -> tuple[Array, str | None]:
-    """(times (T,) as floats or as datetime64 in UTC, their zone) of an array or a sequence."""
-    axis = np.asarray(time)
-    if axis.dtype.kind in "iuf":
-        return axis.astype(float), None
-    if axis.dtype.kind == "M":
-        return _by_days(axis), None
-    if axis.dtype.kind in "UT" or (axis.dtype.kind == "O" and axis.size and isinstance(axis.flat[0], str)):
-        return _of_texts(axis.ravel().tolist()).reshape(axis.shape), None
-    if axis.dtype.kind == "O" and axis.size and isinstance(axis.flat[0], datetime) and axis.flat[0].tzinfo is not None:
-        zone = zone_name(axis.flat[0].tzinfo)
-        flat = [one.astimezone(UTC).replace(tzinfo=None) for one in axis.flat]
-        return np.array(flat, dtype="datetime64[us]").reshape(axis.shape), zone
-    return np.asarray(time, dtype="datetime64[us]"), None
-
-
-def _of_texts(texts: Sequence[str]) -> Array:
-    """Dates in the form of ISO 8601, or beginnings of periods."""
-    found = periods(texts)
-    days = [_date_of_text(text) for text in texts] if found is None else found
-    for text, day in zip(texts, days, strict=True):
-        if np.isnat(day) and text.strip().lower() != "nat":
-            raise ValueError(
-                f"time: {text!r} is not a date; write 2024-01-31, 2024-01-31 12:00:00, or a period as in {EXAMPLES}."
-            )
-    return np.asarray(days, dtype="datetime64[us]")
-
-
-def _date_of_text(text: str) -> np.datetime64:
-    try:
-        return np.datetime64(text, "us")
-    except ValueError:
-        return np.datetime64("NaT", "us")
-
-
-def zone_name(zone: Any) -> str:
-    """The name of a time zone, from a tzinfo or text; a fixed offset of whole hours has a name, others become UTC."""
-    name = next((str(getattr(zone, key)) for key in ("key", "zone") if getattr(zone, key, None)), str(zone))
-    try:
-        ZoneInfo(name)
-        return name
-    except (ValueError, OSError, KeyError):  # no zone has this name
-        pass
-    offset = re.fullmatch(r"(?:UTC)?([+-]\d\d):00", name)
-    return f"Etc/GMT{-int(offset[1]):+d}" if offset and int(offset[1]) else "UTC"
-
-
-def _by_days(axis: Array) -> Array:
-    """Dates in units of at most a day, because nothing can be divided by a month."""
-    coarse = np.datetime_data(axis.dtype)[0] in ("Y", "M", "W", "generic")
-    return axis.astype("datetime64[D]") if coarse else axis
-
-
 def _of_duration(length: np.timedelta64, given: Any) -> Clock:
     if not length > np.timedelta64(0):
         raise ValueError(f"dt must be positive; got {given!r}.")
@@ -384,71 +311,10 @@ def _refuse(given: Any) -> NoReturn:
     )
 
 
-def _written(length: np.timedelta64) -> str:
+def duration_text(length: np.timedelta64) -> str:
     """A duration as an integer multiple of the largest possible unit."""
     for name, one in (("d", 86400), ("h", 3600), ("min", 60), ("s", 1)):
         if length % np.timedelta64(one, "s") == np.timedelta64(0, "s"):
             return f"{length // np.timedelta64(one, 's')}{name}"
     size = next(size for size in ("ms", "us", "ns") if length % _delta(1, size) == _delta(0, size))
     return f"{length // _delta(1, size)}{size}"
-
-
-def median_interval(time: Array, zone: str | None = None) -> tuple[str, str]:
-    """(the median interval of a record in words, the dt that fits it best)."""
-    middle = np.sort(np.diff(time))[(len(time) - 1) // 2]
-    if time.dtype.kind != "M":
-        return f"{middle:g}", f"dt={middle:g}"
-    best, name = max(0.9, float(np.mean(np.abs(np.diff(time) / middle - 1.0) < 1e-3))), _written(middle)
-    for step in ("business day", "month", "quarter", "year"):
-        fit = float(np.mean(Clock.of(step, zone).steps(time)[1:] == 1.0))
-        best, name = (fit, step) if fit > best else (best, name)
-    return _written(middle), f"dt={name!r}"
-
-
-def broken(gaps: Array, first: Array, reach: int) -> Array:
-    """Which samples have a gap within the ``reach`` intervals that their lags span; series begin at ``first``."""
-    total, places = np.concatenate([[0], np.cumsum(gaps > GAP)]), np.arange(len(gaps))
-    begin = np.repeat(first, np.diff(np.append(first, len(gaps))))
-    return np.asarray(total[places + 1] > total[np.maximum(places + 1 - reach, begin)])
-
-
-def warn_of_gaps(clock: Clock, time: Array, gaps: Array, first: Array, reach: int, zone: str | None = None) -> None:
-    """Warn if most samples cannot be used because of dt, or if weekends cost a record of working days.
-
-    ``time`` and ``gaps`` (N,) contain one series after the other, each beginning at its ``first`` sample.
-    """
-    N = len(gaps)
-    if reach * int(np.count_nonzero(gaps > GAP)) <= 0.1 * N:
-        return
-    lost = int(broken(gaps, first, reach).sum())
-    longest = int(np.argmax(np.diff(np.append(first, N))))
-    axis = time[first[longest] : np.append(first, N)[longest + 1]]
-    middle, better = median_interval(axis, zone)
-    weekdays = "business" in better and clock.kind == "duration"
-    if lost > 0.5 * N or weekdays:
-        warn(
-            f"{lost} of {N} samples cannot be used: the median interval is {middle}, dt is "
-            f"{1 if clock.plain is None else clock.plain}, and lags do not reach across gaps above {GAP} dt. "
-            f"Give {better}, or dt='label' if samples are one step apart regardless of their times."
-        )
-
-
-class Pace:
-    """Counts the gaps of a stream, and warns once if most of its samples cannot be used because of dt."""
-
-    def __init__(self, clock: Clock, reach: int) -> None:
-        self._clock, self._reach = clock, reach
-        self._count = self._gaps = 0
-
-    def see(self, interval: float) -> None:
-        """Count the nominal interval before a sample."""
-        if not self._reach or self._count > LOOK:
-            return
-        self._count += 1
-        self._gaps += interval > GAP
-        if self._count == LOOK and self._gaps > LOOK // 2:
-            warn(
-                f"{self._gaps} of the first {LOOK} samples came after a gap: the last interval is {interval:g} times "
-                f"dt={1 if self._clock.plain is None else self._clock.plain}, and lags do not reach across gaps above "
-                f"{GAP} dt. Give dt= the interval between samples, or dt='label' if times are only labels."
-            )

@@ -14,7 +14,7 @@ import narwhals as nw
 import numpy as np
 import polars as pl
 
-from driftfit.data.clock import zone_name
+from driftfit.data.times.instants import zone_name
 from driftfit.data.times.periods import EXAMPLES, periods
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, near

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.data.clock import instants, zone_name
 from driftfit.data.signals import as_inputs
+from driftfit.data.times.instants import instants, zone_name
 from driftfit.engine.kernel import Array
 
 PLAIN = (np.ndarray, list, tuple, float, int)

@@ -23,13 +23,13 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from driftfit.data.clock import instant
+from driftfit.data.times.instants import instant
 from driftfit.data.times.periods import span
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
 FAR, FEWEST = 300.0, 20
-"""Usual deviations beyond which a value looks like a fault code, and how many values it takes to say so."""
+"""Usual deviations beyond which a value looks like a fault code, and the number of values that this judgement needs."""
 
 
 class Limits:

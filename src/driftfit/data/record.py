@@ -15,11 +15,13 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from driftfit.data.clock import LABEL, Clock, instants, warn_of_gaps
+from driftfit.data.clock import LABEL, Clock
 from driftfit.data.known import Known
 from driftfit.data.labels import held, ordered, times_of, together
 from driftfit.data.limits import Limits, marked, within_each
 from driftfit.data.signals import as_inputs, as_output, intervals, noise_of
+from driftfit.data.times.gaps import warn_of_gaps
+from driftfit.data.times.instants import instants
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, factor
 from driftfit.models.base import Model

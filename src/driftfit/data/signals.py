@@ -6,7 +6,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from driftfit.data.clock import Clock, instants
+from driftfit.data.clock import Clock
+from driftfit.data.times.instants import instants
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, as_numbers, factor, missing_settings
 

@@ -33,8 +33,8 @@ def read_records(
     ------
     ValueError
         For a column that does not exist (with near matches), a cell that is not a number (with row and value), a file
-        that cannot be read, or a single series without a usable row. Where there are units, those without one have a
-        reason, and there may be none with one.
+        that cannot be read, or a single series without a usable row. With ``by``, a unit without a usable row is left
+        out and has a reason; all units may be left out.
     """
     data, reading = _dated(data, by, reading)
     inputs, weights, drift, time = _names("u", u), reading.weights, reading.drift, reading.time

@@ -66,29 +66,29 @@ HORIZON = 8
 
 
 @dataclass(frozen=True)
-class Record:
+class Quarters:
     """Quarters as years (1959.25 is 1959 Q2), log real money (T,), and log real income and the rate (T, 2)."""
 
     time: Array
     y: Array
     u: Array
 
-    def until(self, year: float) -> Record:
+    def until(self, year: float) -> Quarters:
         """The quarters before a time."""
         early = self.time < year
-        return Record(self.time[early], self.y[early], self.u[early])
+        return Quarters(self.time[early], self.y[early], self.u[early])
 
 
-def read_record() -> Record:
+def read_record() -> Quarters:
     """The record that is shipped with the package."""
     with resources.as_file(resources.files("driftfit") / "demo" / "us_money_demand.csv") as path:
         data = read_columns(path, ["year", "quarter", "m1", "cpi", "realgdp", "tbilrate"])
     money, income = np.log(data["m1"] / data["cpi"]), np.log(data["realgdp"])
     time = data["year"] + (data["quarter"] - 1.0) / 4.0
-    return Record(time, money - money[0], np.column_stack([income - income[0], data["tbilrate"]]))
+    return Quarters(time, money - money[0], np.column_stack([income - income[0], data["tbilrate"]]))
 
 
-def fit(record: Record, drifting: tuple[int, ...], ratio: float) -> Track:
+def fit(record: Quarters, drifting: tuple[int, ...], ratio: float) -> Track:
     """The run with q_i = ratio r / mean(phi_i^2) for the drifting coefficients and the maximum likelihood r.
 
     With q in units of r the likelihood is maximised over r in closed form: r is the mean of e^2 / s at r = 1.
@@ -102,7 +102,7 @@ def fit(record: Record, drifting: tuple[int, ...], ratio: float) -> Track:
     return _run(record, q * r, r)
 
 
-def _run(record: Record, q: Array, r: float) -> Track:
+def _run(record: Quarters, q: Array, r: float) -> Track:
     return track(MODEL, Kalman(q=q, r=r), record.y, record.u, time=record.time, dt=0.25)
 
 
@@ -130,7 +130,7 @@ class Search:
         return max(run.loglik for run in self.runs[which].values()) - self.still.loglik
 
 
-def search(record: Record) -> Search:
+def search(record: Quarters) -> Search:
     """Fit every choice at every ratio."""
     runs = {which: {ratio: fit(record, drifting, ratio) for ratio in RATIOS} for which, drifting in CHOICES.items()}
     return Search(fit(record, (), 0.0), runs)
@@ -203,7 +203,7 @@ def caveat(found: Search, early: Search) -> str:
     )
 
 
-def free(record: Record) -> Track:
+def free(record: Quarters) -> Track:
     """The run of the tracker that needs no settings: every coefficient may drift, and nothing is searched."""
     return track(MODEL, AdaptiveKalman(), record.y, record.u, time=record.time, dt=0.25)
 

@@ -83,6 +83,7 @@ def kernel(function: Callable[..., Any], inline: bool = True) -> Any:
     follows IEEE rules instead of raising, the GIL is released, and there is no fast-math.
     """
     made = internals.as_part(_compiled(function, forceinline=inline, **internals.STEP), internals.StepDispatcher)
+    made.for_constants = inline
     return _again(made, lambda other: kernel(other, inline))
 
 
@@ -134,6 +135,11 @@ class Machine(types.ExternalFunction):
     """
 
     identity: str
+
+    @property
+    def key(self) -> str:
+        """By which Numba compares types: the symbol alone, since hashing the signature too takes 5 us."""
+        return self.symbol  # type: ignore[no-any-return]
 
     @property
     def dispatcher(self) -> Any:

@@ -238,7 +238,6 @@ def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
     """
     codegen = cpu_target.target_context.codegen()
     create, restore, set_env = codegen.create_library, codegen.unserialize_library, codegen.set_env
-    build = codegen._pass_builder
 
     def create_fragment(called: str, **options: Any) -> Any:
         return kind(codegen, called, **options) if called == name else create(called, **options)
@@ -250,28 +249,51 @@ def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
         if codegen._engine.is_symbol_defined(env_name):
             set_env(env_name, env)
 
-    def build_once(**options: Any) -> Any:
-        key = tuple(sorted(options.items()))
-        if key not in _builders:
-            _builders[key] = build(**options)
-        return _builders[key]
+    with (
+        known_once(),
+        replaced(
+            codegen, create_library=create_fragment, unserialize_library=restore_fragment, set_env=set_env_of_emitted
+        ),
+    ):
+        yield
 
-    ours = {
-        "create_library": create_fragment, "unserialize_library": restore_fragment, "set_env": set_env_of_emitted,
-        "_pass_builder": build_once,
-    }  # fmt: skip
-    before = {key: vars(codegen)[key] for key in ours if key in vars(codegen)}
+
+@contextmanager
+def replaced(owner: Any, **ours: Any) -> Iterator[None]:
+    """While it lasts, attributes of an object are ours."""
+    before = {key: vars(owner)[key] for key in ours if key in vars(owner)}
     try:
-        vars(codegen).update(ours)
+        vars(owner).update(ours)
         yield
     finally:
         for key in ours:
-            del vars(codegen)[key]
-        vars(codegen).update(before)
+            del vars(owner)[key]
+        vars(owner).update(before)
 
 
-_builders: dict[Any, Any] = {}
-"""The builders of LLVM's passes, by their options: Numba makes one per function, of which LLVM frees only a part."""
+@contextmanager
+def known_once() -> Iterator[None]:
+    """While it lasts, Numba looks for declarations and for a bug of LLVM once, instead of before each function, and at
+    every second call in it; only intrinsics declare more while they are compiled. Sizes of types are found once too.
+    """
+    context = cpu_target.target_context
+    if "refresh" in vars(context):
+        yield
+        return
+    context.refresh()
+    codegen, size = context.codegen(), cache(context.get_abi_sizeof)
+    codegen._check_llvm_bugs()
+
+    def look_again() -> None:
+        for registry in list(context._registries):
+            context.install_registry(registry)
+
+    with (
+        replaced(context, refresh=look_again, get_abi_sizeof=size),
+        replaced(context.typing_context, refresh=lambda: None),
+        replaced(codegen, _check_llvm_bugs=lambda: None),
+    ):
+        yield
 
 
 # ---- typing ---------------------------------------------------------------------------------------------------------
@@ -297,11 +319,18 @@ def _remembered(find: Callable[..., Any]) -> Callable[..., Any]:
     return get_call_type
 
 
+def _same_options(one: Any, other: Any) -> bool:
+    """Whether two sets of options are equal; one that was not given has its default."""
+    if type(one) is not type(other):
+        return False
+    given, others = one._values, other._values
+    return given == others or all(getattr(one, key) == getattr(other, key) for key in given.keys() | others.keys())
+
+
 _PLAIN = types.Number, types.Boolean, types.Array, types.BaseTuple, types.Literal, int  # no code, which must be let go
-_equal = Flags.__eq__
 _NAMES = hash(tuple(sorted(Flags.options)))  # what Numba's own hash amounts to: it sorts names, not values
 types.Function.get_call_type = _remembered(types.Function.get_call_type)
-Flags.__eq__ = lambda one, other: (type(one) is type(other) and one._values == other._values) or _equal(one, other)
+Flags.__eq__ = _same_options
 Flags.__hash__ = lambda self: _NAMES
 types.Record.__repr__ = lambda self: self.name  # written out for every pass over a function, and read by nobody
 
@@ -309,7 +338,8 @@ types.Record.__repr__ = lambda self: self.name  # written out for every pass ove
 # ---- memory ---------------------------------------------------------------------------------------------------------
 
 # llvmlite 0.50 frees no pass manager: both classes inherit the `_dispose` that does nothing. They were three fifths of
-# all memory that a compilation left behind.
+# all memory that a compilation left behind. Builders of passes leave 2 kB each; they must not be kept for a second run
+# though: every run adds observers to its builder that end with the run, and each of them delays all later passes.
 for _manager in (passes.ModulePassManager, passes.FunctionPassManager):
     if _manager._dispose is passes.ffi.ObjectRef._dispose:
         _manager._dispose = passes.NewPassManager._dispose
@@ -431,7 +461,8 @@ def _loader() -> Any:
 
 def publish(dispatcher: Any, arguments: tuple[Any, ...], symbol: str) -> Any:
     """Compile a function, or find it on disk, and let code call it by a symbol; returns the owner of the code."""
-    dispatcher.compile(arguments)
+    with known_once():
+        dispatcher.compile(arguments)
     made = next(iter(dispatcher.overloads.values()))
     llvm.add_symbol(symbol, made.library.get_pointer_to_function(made.fndesc.llvm_cfunc_wrapper_name))
     return made.library

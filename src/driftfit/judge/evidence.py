@@ -15,7 +15,7 @@ from driftfit.run.result import Track
 
 @dataclass(frozen=True)
 class Evidence:
-    """Each part is computed when it is first asked for; ``lags`` and ``burn`` are those of `Track.verdict`."""
+    """Each part is computed when it is first needed; ``lags`` and ``burn`` are those of `Track.verdict`."""
 
     run: Track
     lags: int | None = None

@@ -22,9 +22,9 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.engine.kernel import Array
+from driftfit.judge.cores.on_all_cores import on_all_cores
 from driftfit.judge.diagnose import Diagnosis, diagnose, diagnosis
 from driftfit.judge.evidence import Evidence
-from driftfit.judge.on_all_cores import on_all_cores
 from driftfit.judge.verdict import Verdict, judged, p_text, verdict
 from driftfit.show.parts.text import Printed, key_text, table_of
 
@@ -140,7 +140,7 @@ class ManyVerdicts(Printed):
 
     @property
     def table(self) -> Any:
-        """One row a run, as a polars table."""
+        """One row per run, as a polars table."""
         import polars
 
         return polars.DataFrame(
@@ -210,7 +210,7 @@ class ManyDiagnoses(Printed):
 
     @property
     def table(self) -> Any:
-        """One row a run with every number, as a polars table."""
+        """One row per run with every number, as a polars table."""
         import polars
 
         rows = [{"key": key_text(key)} | {c.name: c.value for c in one.checks} for key, one in self.of.items()]
@@ -232,20 +232,20 @@ def verdicts(
     runs: Mapping[Hashable, Track], level: float, lags: int | None = None, burn: int | None = None
 ) -> ManyVerdicts:
     """Judge runs by key; see `driftfit.judge.verdict.verdict` for the settings and errors."""
-    return ranked(on_all_cores(runs, lambda key: verdict(runs[key], level, lags, burn), "verdict"), level)
+    return ranked(on_all_cores(runs, lambda key: (runs[key], level, lags, burn), verdict, "verdict"), level)
 
 
 def verdicts_and_diagnoses(runs: Mapping[Hashable, Track], level: float) -> tuple[ManyVerdicts, ManyDiagnoses]:
     """The verdicts and the diagnoses, which share the test of constancy of each run."""
-
-    def both(key: Hashable) -> tuple[Verdict, Diagnosis]:
-        known = Evidence(runs[key])
-        return judged(known, level), diagnosis(known)
-
-    pairs = on_all_cores(runs, both, "report")
+    pairs = on_all_cores(runs, lambda key: (runs[key], level), _both, "report")
     return ranked({key: one for key, (one, _) in pairs.items()}, level), ManyDiagnoses(
         {k: d for k, (_, d) in pairs.items()}
     )
+
+
+def _both(run: Track, level: float) -> tuple[Verdict, Diagnosis]:
+    known = Evidence(run)
+    return judged(known, level), diagnosis(known)
 
 
 def ranked(verdicts: Mapping[Hashable, Verdict], level: float) -> ManyVerdicts:
@@ -262,4 +262,4 @@ def ranked(verdicts: Mapping[Hashable, Verdict], level: float) -> ManyVerdicts:
 
 def diagnoses(runs: Mapping[Hashable, Track]) -> ManyDiagnoses:
     """Diagnose runs by key."""
-    return ManyDiagnoses(on_all_cores(runs, lambda key: diagnose(runs[key]), "diagnosis"))
+    return ManyDiagnoses(on_all_cores(runs, lambda key: (runs[key],), diagnose, "diagnosis"))

@@ -3,20 +3,21 @@
     Y_t = Theta_t' phi_t + v_t,   v_t ~ N(0, R / w_t);    Theta | R ~ MN(M, V, R),   R ~ IW(nu, S)
 
 Outputs on the same regressors share V, whatever R is, and their estimates are those of each output alone. So the lanes
-of a run have M, V and the innovations e_t (ny,) with q_t = phi' V phi + 1 / w, and what is added is
+of a run have M, V and the innovations e_t (ny,) with q_t = phi' V phi + 1 / w. The joint noise adds to them
 
     y_t | past ~ t_(nu - ny + 1),   log p = lgamma((nu+1)/2) - lgamma((nu-ny+1)/2) - ny/2 log(pi q) - 1/2 log |S|
                                             - (nu+1)/2 log(1 + e' S^-1 e / q)
     S <- lambda S + e e' / q,   nu <- lambda nu + 1,   R_t = S / nu,   cov(Theta) = R (x) V
 
-from the improper prior |R|^(-(ny+1)/2) on, nu = 0 and S = 0. The diagonal of R_t is what each output estimates of its
-own noise; the rest is what their noises have in common. With it the outputs can be followed as one: `JointNoise.rows`
-are regressions whose noises are independent with one variance, so that a `Bank` has one tree of events for all outputs.
+beginning with the improper prior |R|^(-(ny+1)/2), nu = 0 and S = 0. The diagonal of R_t is what each output estimates
+of its own noise; the rest is what their noises have in common. With it the outputs can be followed as one:
+`JointNoise.rows` are regressions whose noises are independent with one variance, so that a `Bank` has one tree of
+events for all outputs.
 
 A sample at which an output is missing has the marginal density of the others and leaves S as it is; afterwards V is not
 quite the same for all, and every innovation is divided by its own q.
 
-Source: West and Harrison (1997), section 16.4; Geisser (1965) for the density. Cost: one replay of the run, O(ny^3) a
+Source: West and Harrison (1997), section 16.4; Geisser (1965) for the density. Cost: one replay of the run, O(ny^3) per
 sample.
 """
 
@@ -45,7 +46,7 @@ class JointNoise:
     ----------
     run : a run with several outputs, each with its own theta, of a tracker that estimates its noise (`RLS`, `FLS`)
     memory : number of samples, or None
-        What is remembered of the noise: lambda = 1 - 1 / memory for each sample. None: all of it.
+        Samples over which the noise is estimated: lambda = 1 - 1 / memory for each sample. None: all samples.
 
     Attributes
     ----------
@@ -130,7 +131,7 @@ def _relative(run: Outputs) -> tuple[Array, Array]:
     out = run.replayed(store, ("scale", "phi", "valid"))
     first = np.array([float((one.start or {}).get("scale", np.nan)) for one in run.values()])
     if not (out["phi"] == out["phi"][..., :1]).all():
-        raise ValueError("joint_noise: takes outputs on the same regressors, as those of ARX or Regression are.")
+        raise ValueError("joint_noise: needs outputs with the same regressors, such as those of ARX or Regression.")
     before = np.concatenate([first[None], out["scale"][:-1]])
     with np.errstate(invalid="ignore", divide="ignore"):
         begun = np.isnan(before) & (out["e"] != 0.0)  # the sample that gave the first scale

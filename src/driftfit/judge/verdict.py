@@ -18,7 +18,7 @@ constancy, the test of the parameter still rejects it when the parameters named 
 (`driftfit.judge.statistics.attribution`), and its values before and after differ by more than chance explains.
 
 A model without enough lags has correlated noise, which is hard to tell from a drifting intercept. The order of an
-autoregression of the noise is found from the record, ``lags=`` sets it, and the verdict says so. A parameter that
+autoregression of the noise is found from the record, ``lags=`` sets it, and the verdict reports it. A parameter that
 wanders as fast as the noise itself is mistaken for such noise. Do not use the verdict for fast smooth oscillations: a
 parameter that swings many times within the record leaves little trace in a cumulated score. Cost: three constant fits,
 O(T n^2).

@@ -59,6 +59,11 @@ class Model(Settings, ABC):
         return len(self.names)
 
     @property
+    def width(self) -> int:
+        """Series that share a tile in a fleet; 1 where the regression is a routine that takes one lane at a time."""
+        return 32
+
+    @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs; several outputs are run by `driftfit.run.outputs`."""
         return ("y",)
@@ -196,6 +201,16 @@ class Model(Settings, ABC):
     def settling(self) -> float:
         """Number of first samples whose regressors are poor, because they depend on theta, and should be forgotten."""
         return 0.0
+
+    @property
+    def settling_memory(self) -> float:
+        """Memory of the first of them, in samples."""
+        return 0.1 * self.settling
+
+    @property
+    def unequal_start(self) -> bool:
+        """Whether first innovations are far larger, because a model of the noise is not known yet."""
+        return False
 
     def held_at(self, theta: Array) -> Model | None:
         """This model with its linearisation held at theta (n,), so that a run is a linear regression; None without."""

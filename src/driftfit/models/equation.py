@@ -41,8 +41,8 @@ from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.models.arx import GAP
 from driftfit.models.fault_codes import possible
-from driftfit.models.formulas import Formula, compiled, parse, start_values
-from driftfit.models.functions import equation_text
+from driftfit.models.formulas.functions import equation_text
+from driftfit.models.formulas.text import Formula, compiled, parse, start_values
 from driftfit.models.inputs import NamedInputs
 from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
 
@@ -58,7 +58,7 @@ class Equation(NamedInputs):
     ----------
     equation : str, or a function
         Such as ``"y = theta.k * sqrt(p1 - p2) - theta.c"``; or a plain Python function of u, theta and y that returns
-        the output, and has its name (`driftfit.models.functions`).
+        the output, and has its name (`driftfit.models.formulas.functions`).
     start : mapping from parameter to number, or a number for all
         Where the linearisation begins; 1 for those that are not named. It is no prior: give that to the tracker, as
         ``theta0`` and ``p0``.
@@ -184,6 +184,7 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
         restore(s, seen, l)
         s.y_lag[0, l] = s.measured[l] if seen else (s.y_hat[l] if known else np.nan)
         share = min(1.0, s.usable[l] / (SETTLING * n)) if predicted & (s.ok[l] > 0.0) else 0.0
+        share = share if (s.moved_on[l] > 0.0) | (s.usable[l] >= SETTLING * n) else 0.0
         for i in range(n):
             moved = s.point[i, l] + share * (s.theta[i, l] - s.point[i, l])
             s.point[i, l] = moved if abs(moved) < LARGEST else s.first_point[i, l]

@@ -68,6 +68,6 @@ def restore(s: State, seen: bool, l: int) -> None:
     for i in range(s.phi.shape[0]):
         row += (i + 1.0) * s.phi[i, l]
     used = s.ok[l] > 0.0
-    s.moved_on[l] = 0.0 if used & (row == s.last_row[l]) else 1.0
+    s.moved_on[l] = 0.0 if used & ((row == s.last_row[l]) | (row == 0.0)) else 1.0
     s.last_row[l] = row if used else s.last_row[l]
     s.usable[l] += s.ok[l] * s.moved_on[l]

@@ -30,7 +30,7 @@ the gradient with respect to F is 0 at theta = 0, and e means nothing before A a
 samples are a pseudolinear regression (psi is the regression vector itself; for one input, w is y without its
 autoregressive part; C and D enter after 2 n samples), and after N samples the filters of psi have zeros and poles at
 1 - 4 n / N of their distance from 0. The bias of the start fades with the memory of the tracker; `RLS`, also with
-lambda = 1, has a short one during the first 40 n samples (`Model.settling`).
+lambda = 1, has a short one during the first 80 n samples, without C and D 40 n (`Model.settling`).
 
 A missing output is replaced by its prediction, for at most na outputs in a row if there are lags of it, and its e is
 0. A missing input makes the samples unusable that have it in psi directly; in w its last value is held. A gap in time
@@ -56,10 +56,10 @@ from driftfit.engine.settings import whole
 from driftfit.models.inputs import LinearisedTransfer
 from driftfit.models.linearised import MEMORY
 from driftfit.models.polynomials.instruments import MORE, instrumental_steps
-from driftfit.models.polynomials.steps import EACH, OWN, Places, U, Y, places, steps, taking_inputs
+from driftfit.models.polynomials.steps import EACH, OWN, SETTLING, Places, U, Y, places, steps, taking_inputs
 
-FORGOTTEN = 40.0
-"""Samples for each parameter that a tracker without drift should forget again: those of the start, ten times over."""
+FORGOTTEN = 80.0
+"""Samples for each parameter that a tracker without drift should forget again: twenty times the start."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,17 @@ class PolynomialModel(LinearisedTransfer):
     def settling(self) -> float:
         if self.point is not None:
             return 0.0
-        return FORGOTTEN * self.n if self.nc or self.nd or any(nf for _, nf, _ in self.orders) else 0.0
+        if self.nc or self.nd:
+            return FORGOTTEN * self.n
+        return 0.5 * FORGOTTEN * self.n if any(nf for _, nf, _ in self.orders) else 0.0
+
+    @property
+    def settling_memory(self) -> float:
+        return SETTLING * self.n
+
+    @property
+    def unequal_start(self) -> bool:
+        return bool(self.nc or self.nd)
 
     @property
     def reach(self) -> int:

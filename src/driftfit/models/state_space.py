@@ -38,8 +38,8 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.models.fault_codes import UNJUDGED, judge
-from driftfit.models.formulas import Formula, Writer, parse, start_values, written
-from driftfit.models.functions import CLOCK, system_text
+from driftfit.models.formulas.functions import CLOCK, system_text
+from driftfit.models.formulas.text import Formula, Writer, parse, start_values, written
 from driftfit.models.inputs import NamedInputs
 
 TIME = "dt"
@@ -103,7 +103,7 @@ class StateSpace(NamedInputs):
     equations : str, or two functions
         A line for each hidden state, and last one for the output. Or a list of two plain Python functions of x, u,
         theta, y, t and dt: the first returns the states by name, as ``{"soc": x.soc - dt * u.i}``, the second returns
-        the output, and has its name (`driftfit.models.functions`).
+        the output, and has its name (`driftfit.models.formulas.functions`).
     start : mapping from name to number, or a number for all
         Parameters and states before the first sample; 1 for parameters that are not named, 0 for states. It is the
         mean of the tracker's prior, unless that has its own.

@@ -1,4 +1,4 @@
-"""What a run reports of its samples, as columns: the common part of records, streams and several outputs.
+"""The results of a run as columns, a row for each sample: the common part of records, streams and several outputs.
 
 Where several outputs measure one theta, ``Regression(n, ny=2, shared=True)``, an instant holds a row for each of them.
 Its rows are successive samples between which no time passes: correcting with one row after the other equals the

@@ -1,4 +1,4 @@
-"""One output of a stream of several: what is known of it now."""
+"""One output of a stream with several outputs: its present estimates."""
 
 from __future__ import annotations
 

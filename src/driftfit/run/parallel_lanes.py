@@ -36,9 +36,6 @@ BLOCK = 256
 FEWEST = 10
 """Fewer series than this are run one by one: a tile of 32 lanes costs as much as about ten single lanes."""
 
-LARGEST = 10
-"""With more parameters than this loops over lanes stay scalar and are slower than single lanes (docs/design.md)."""
-
 SHOWN = 1_000_000
 """Samples above which a progress bar appears."""
 
@@ -108,7 +105,7 @@ def _groups(programs: Sequence[Program]) -> list[list[int]]:
 
 def width_of(program: Program, count: int, ny: int = 1) -> int:
     """Lanes of the tiles for ``count`` series with ny outputs."""
-    wide = 1 if count * ny < FEWEST or program.model.n > LARGEST else program.tracker.width
+    wide = 1 if count * ny < FEWEST else program.width
     return ny if wide < 2 * ny else wide
 
 

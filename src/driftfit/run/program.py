@@ -34,6 +34,11 @@ CHUNK = 1_000_000
 BLOCK = 4096
 """Samples of a block of results of which only a part is kept."""
 
+MOST = 14
+"""With more parameters than this loops over lanes are slower than single lanes (docs/design.md): the compiler does not
+unroll a loop over that many, and the rows of a covariance of 16 lie in the same lines of the cache.
+"""
+
 SHORT = 32
 """Rows of fewer numbers are copied column by column: NumPy takes 30 ns for each row."""
 
@@ -63,7 +68,7 @@ def progress(what: str, total: int, shown: bool) -> Iterator[Callable[[int], Non
 
 @dataclass(frozen=True)
 class Program:
-    """A bound model and the tracker that estimates its parameters; what follows from them is found once."""
+    """A bound model and the tracker that estimates its parameters; what follows from the two is computed once."""
 
     model: Model
     tracker: Tracker
@@ -181,6 +186,11 @@ class Program:
             found = drivers(self.model.steps_for(self.steps), self.steps if steps is None else steps, keep)
             self._drivers[keep, steps] = found
         return found
+
+    @property
+    def width(self) -> int:
+        """The number of lanes of a tile of many series, or of many settings."""
+        return 1 if self.model.n > MOST else min(self.model.width, self.tracker.width)
 
     def lanes(self, count: int) -> Array:
         """A tile with this program in every lane, at its start. It is made once and must not be changed."""

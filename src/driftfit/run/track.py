@@ -28,6 +28,8 @@ Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
 
 PART = 64_000_000
 """Bytes of results that `parts` holds at a time; a table of them takes some three times as much."""
+ASTRAY = 1.0
+"""Median prediction error, in deviations of the output, above which estimates went astray."""
 
 Result = Track | Fleet | Outputs
 """The result of `track`, which depends on the number of series, of settings and of outputs."""
@@ -51,6 +53,7 @@ def track(
     else:
         run = _one(task.programs, task.records, keep, warm_start, dtype)
     warn_unlearned(run)
+    warn_astray(run)
     return run  # type: ignore[no-any-return]
 
 
@@ -210,6 +213,23 @@ def _one(programs: Sequence[Program], records: Records, keep: str, before: Run |
         lanes = [Lane(out, tile, lane) for lane in range(records.ny)]
         return Outputs(programs, replace(records, known=record.known), lanes, {}, dict(enumerate(starts)))
     return Track(program, record, Lane(out, tile), *starts)
+
+
+def warn_astray(run: Track | KeyedResults) -> None:
+    """Warn of a model linearised at its estimates whose predictions are no longer of the size of the output."""
+    if not isinstance(run, Track) or not run.model.settling > 0.0 or len(run) < 2.0 * run.model.settling:
+        return
+    late = slice(len(run) // 2, None)
+    e, y = run.innovation[late], run.record.y[late]
+    error, varies = float(np.nanmedian(np.abs(e))), float(np.nanstd(y)) if np.isfinite(y).any() else 0.0
+    if varies > 0.0 and error > ASTRAY * varies:
+        warn(
+            f"{type(run.model).__name__} with {type(run.tracker).__name__}: half the prediction errors in the second "
+            f"half of the record are above {error:.3g}, but y varies by {varies:.3g}: the estimates went astray. "
+            "Disturbances that pass through the plant call for ARX or ARMAX, large means for offset=True or deviations "
+            "from them; gradients (RLS) are more robust than instruments.",
+            UserWarning,
+        )
 
 
 def warn_unlearned(run: Track | KeyedResults) -> None:

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from driftfit.data import storage
-from driftfit.data.clock import Clock, instant
+from driftfit.data.clock import Clock
 from driftfit.data.record import Labels
+from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import warn
 from driftfit.models.base import Model
@@ -136,7 +137,7 @@ class Run(Protocol):
 
 
 def ended(run: Run | bytes) -> End:
-    """The end of a run, or of that whose bytes are given."""
+    """The end of a run, or the end that the given bytes hold."""
     return End.from_bytes(run) if isinstance(run, bytes) else run.end()
 
 
@@ -153,11 +154,11 @@ def carried(run: Run | bytes | None, programs: Sequence[Program]) -> tuple[State
 def _carried(before: Program, state: State, now: Program) -> State:
     if type(now.tracker) is not type(before.tracker):
         raise ValueError(
-            f"warm_start: the run before was made by {type(before.tracker).__name__}, this one is by "
+            f"warm_start: the earlier run was made by {type(before.tracker).__name__}, this one is by "
             f"{type(now.tracker).__name__}; start from its estimates instead, with theta0= and p0=."
         )
     if not now.model.follows(before.model):
-        raise ValueError(f"warm_start: the run before followed {before.model!r}, this one follows {now.model!r}.")
+        raise ValueError(f"warm_start: the earlier run followed {before.model!r}, this one follows {now.model!r}.")
     old, new = before.tracker.state_for(before.model), now.tracker.state_for(now.model)
     changed = {name for name, value in new.items() if not _same(old.get(name), value)}
     return {name: value for name, value in state.items() if name not in changed and name not in _LEFT}
@@ -174,5 +175,5 @@ def first_interval(run: Run | bytes, time: Any, labels: Labels) -> float:
         return 1.0
     interval = Clock.of(labels.dt, labels.zone).since(instant(last), instant(time))
     if not interval >= 0.0:
-        raise ValueError(f"warm_start: the record begins at {time}, not after the end of the run before, {last}.")
+        raise ValueError(f"warm_start: the record begins at {time}, not after the end of the earlier run, {last}.")
     return interval

@@ -6,6 +6,7 @@ once to collect them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -27,7 +28,7 @@ def note_noise(s: State, l: int) -> None:
 
 
 @lru_cache
-def attentive(steps: TrackerSteps) -> TrackerSteps:
+def collecting_for_smoother(steps: TrackerSteps) -> TrackerSteps:
     """Steps that store the factor of the noise variance when the tracker runs, and the tracker's ``smoother_fields``.
 
     A model may make it larger than the factor that the user gave (measurement noise that enters through a curve).
@@ -43,18 +44,24 @@ def attentive(steps: TrackerSteps) -> TrackerSteps:
     return steps._replace(store=collect_all, note=note_noise)
 
 
-def replay(run: Track) -> dict[str, Array]:
+USED = ("phi", "y", "dt", "ok", "used_noise")
+"""Fields that every smoother needs."""
+
+
+def replay(run: Track, names: Sequence[str] = (*USED, "valid", "e")) -> dict[str, Array]:
     """Run the tracker over its record again and return the samples as it received them, field by field, (T, .., 1).
 
-    The fields are phi, y, dt, valid, ok, e, used_noise (the factor of the noise variance), and what the tracker notes.
+    The fields are phi, y, dt, valid, ok, e, used_noise (the factor of the noise variance), and the tracker's
+    ``smoother_fields``.
     """
     program, T = run.program, len(run)
     tile = program.tile()
     own = (*COLLECTED, "used_noise", *run.tracker.smoother_fields)
     block = np.empty(min(BLOCK, T), output_type(tile, own))
-    seen = {name: np.empty((T, *block[name].shape[1:]), block[name].dtype) for name in (*own, "ok", "e")}
-    loop = program.drivers(steps=attentive(program.steps)).run
-    for a in range(0, T, BLOCK):  # results that stay in the cache: the rest of them is not needed
+    wanted = (*names, *run.tracker.smoother_fields)
+    seen = {name: np.empty((T, *block[name].shape[1:]), block[name].dtype) for name in wanted}
+    loop = program.drivers(steps=collecting_for_smoother(program.steps)).run
+    for a in range(0, T, BLOCK):  # a block that stays in the cache; only some of its fields are kept
         part = slice(a, min(a + BLOCK, T))
         rows = block[: part.stop - a]
         loop(tile, *lanes_of(run.record.part(part)), rows)
@@ -71,15 +78,15 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
     drift_root = run.known.extra if own and run.known.extra.size else NONE
     if prior is None:
         prior = free(run.model.n) if tracker.smoother_fields else tracker.random_walk(run.model)
-    seen = replay(run)
+    seen = replay(run, (*USED, "e") if tracker.smoother_fields else USED)
     dt, ok = seen["dt"][:, 0], seen["ok"][:, 0] > 0.0
     weight = np.divide(1.0, seen["used_noise"][:, 0], out=np.zeros(len(ok)), where=ok)
     drift = dt * run.known.drift
-    phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0].copy()
+    phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0]
+    fields = {name: seen[name][..., 0] for name in tracker.smoother_fields} or run.state
+    weight[tracker.left_out(fields, phi, y, ok)] = 0.0
     if own and tracker.smoother_fields:
-        fields = {name: seen[name][..., 0] for name in tracker.smoother_fields}
         q, r_of = tracker.estimated_variances(run.model, fields, seen["e"][:, 0], drift)
-        weight[tracker.left_out(fields, phi, y, ok)] = 0.0
         phi, y = tracker.regression(fields, phi, y)
         drift_root, weight, time, drift = np.sqrt(q), weight / r_of, drift, np.ones(len(drift))
     trend = dt if prior.slopes else NONE

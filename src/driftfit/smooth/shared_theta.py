@@ -12,6 +12,7 @@ from typing import Any, Self
 
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
+from driftfit.smooth.parts.walk import Walk
 from driftfit.smooth.smoothed import Smoothed
 
 
@@ -32,9 +33,14 @@ class SmoothedShared(Smoothed):
     def __init__(self, rows: Smoothed, run: Track) -> None:
         self.rows, self._ny = rows, len(run.outputs)
         self.run: Any = run
-        self.walk, self._path, self.order_by = rows.walk, rows._path, None
+        self._walk, self._path, self.order_by, self.weight = rows._walk, rows._path, None, rows.weight
         self.theta, self.rank = self._last(rows.theta), self._last(rows.rank)
         self.cost, self.method, self.r = rows.cost, rows.method, rows.r
+
+    @property
+    def walk(self) -> Walk:
+        """The problem of the rows."""
+        return self.rows.walk
 
     def _last(self, values: Array) -> Array:
         """The values of each instant after all its rows."""

@@ -13,7 +13,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
 from driftfit.run.result import Track
 from driftfit.smooth import exact
-from driftfit.smooth.parts.walk import Path, Walk, ordered
+from driftfit.smooth.parts.walk import NONE, Path, Walk, ordered
 from driftfit.smooth.plots import plot_smoothed
 from driftfit.smooth.problem import walk_of
 
@@ -50,12 +50,15 @@ class Smoothed:
         The method of the solver, which tests its own result.
     walk : Walk
         The problem that was solved.
+    weight : (T,)
+        Weights of the samples in it; 0 for those that were not used.
 
     Bands are valid under the random-walk model and its drift; they do not account for a wrong drift.
     """
 
     def __init__(self, walk: Walk, path: Path, run: Track, order_by: Any = None) -> None:
-        self.walk = walk
+        self._walk: Walk | None = walk
+        self.weight = walk.weight
         self.run = run
         self._path = path
         self.order_by = order_by
@@ -75,6 +78,7 @@ class Smoothed:
         walk = walk_of(run)
         smoothed = cls(walk, solve(walk, keep, order_by), run, order_by)
         unknown = np.isinf(smoothed._path.var)
+        smoothed._lighten()
         if undetermined == "raise" and unknown.any():
             names = ", ".join(
                 name for name, one in zip(run.names, np.any(unknown, axis=0).tolist(), strict=True) if one
@@ -88,9 +92,19 @@ class Smoothed:
             smoothed.theta[unknown] = np.nan
         return smoothed
 
+    def _lighten(self) -> None:
+        """Keep standard deviations where the variances were, and of the problem the weights alone."""
+        self.std = self._std(self._path.var)
+        self._path, self._walk = self._path._replace(var=NONE), None
+
     def __repr__(self) -> str:
-        run = self.run
-        return f"Smoothed path of {len(run)} samples, {self.walk.used} used: {run.model!r}, {run.tracker!r}"
+        run, used = self.run, int(np.count_nonzero(self.weight))
+        return f"Smoothed path of {len(run)} samples, {used} used: {run.model!r}, {run.tracker!r}"
+
+    @property
+    def walk(self) -> Walk:
+        """The problem that was solved; collected from the record again, as `smooth` did, if it was not given."""
+        return walk_of(self.run) if self._walk is None else self._walk
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -104,17 +118,22 @@ class Smoothed:
 
     @cached_property
     def std(self) -> Array:
-        var = self.r * self._fold * self._path.var
+        return self._std(self._path.var.copy())
+
+    def _std(self, var: Array) -> Array:
+        """Standard deviations from variances relative to the noise, in their place."""
+        var *= self.r * self._fold
         return np.sqrt(var, out=var)
 
     @property
     def _fold(self) -> float:
-        """What errors of rounding that readings share multiply variances by
-        (`driftfit.trackers.parts.coarse.shared_rounding`), with the r phi' V phi of the used samples.
+        """The factor by which variances grow because readings share errors of rounding
+        (`driftfit.trackers.parts.coarse.shared_rounding`), from the mean r phi' V phi of the used samples.
         """
-        common, used = self.run.state.get("common", 0.0), self.walk.weight > 0.0
-        undecided = self.r * float(np.mean(self.leverage[used] / self.walk.weight[used])) if common > 0.0 else 0.0
-        return 1.0 + len(self.run.names) * float(common) / undecided if undecided > 0.0 else 1.0
+        found, used = self.run.ended_with("common"), self.weight > 0.0
+        common = 0.0 if found is None else float(found)
+        undecided = self.r * float(np.mean(self.leverage[used] / self.weight[used])) if common > 0.0 else 0.0
+        return 1.0 + len(self.run.names) * common / undecided if undecided > 0.0 else 1.0
 
     @property
     def slope(self) -> Array:
@@ -127,7 +146,7 @@ class Smoothed:
         return np.sqrt(self.r * self._of_slopes(self._path.slope_var))
 
     def _of_slopes(self, values: Array) -> Array:
-        if not len(self.walk.trend):
+        if not values.size:
             raise ValueError("slope: theta is a plain random walk here; use FLS(mu, differences=2).")
         return values
 
@@ -147,16 +166,16 @@ class Smoothed:
 
     @cached_property
     def press(self) -> float:
-        terms = self.walk.weight * self.loo**2
+        terms = self.weight * self.loo**2
         return float(np.nanmean(terms)) if np.isfinite(terms).any() else float("nan")
 
     @cached_property
     def alone(self) -> int:
-        return int(np.count_nonzero((self.walk.weight > 0.0) & np.isnan(self.loo)))
+        return int(np.count_nonzero((self.weight > 0.0) & np.isnan(self.loo)))
 
     def _scaled(self, values: Array) -> Array:
         """Values in units of y; NaN where there is no sample."""
-        weight = np.where(self.walk.weight > 0.0, self.walk.weight, np.nan)
+        weight = np.where(self.weight > 0.0, self.weight, np.nan)
         scaled: Array = values / np.sqrt(weight)
         return scaled
 
@@ -213,7 +232,7 @@ def solve(walk: Walk, keep: str, order_by: Any = None) -> Path:
 def noise_variance(walk: Walk, path: Path) -> float:
     """J / (N - rank); NaN, with a warning, if there are no degrees of freedom from which to estimate it."""
     free = walk.used - (int(path.rank.max()) if walk.p0 is None else 0)
-    least = 1e-28 * float(np.sum(walk.weight * walk.y**2))
+    least = 1e-28 * float(np.einsum("t,t,t->", walk.weight, walk.y, walk.y))
     if free <= 0 or path.cost <= least:
         warnings.warn(
             f"smooth: {walk.used} samples of rank {path.rank.max()} leave no residual from which to estimate the "

@@ -22,8 +22,8 @@ band is for samples that are not outliers.
 
 The start is exact diffuse least squares without drift, in which regressors out of proportion count less too, until
 there are enough residuals to estimate r. Fault codes among these samples are found then, and least squares repeated
-without them (`driftfit.trackers.parts.first_samples`). Every filter starts from generalised least squares with its own
-drift over the same samples (`driftfit.trackers.parts.modes.start`), in the directions that the regressors span by then.
+without them (`driftfit.trackers.parts.faults.first_samples`). Every filter starts from generalised least squares with
+its own drift over the same samples (`driftfit.trackers.parts.modes.start`), in the directions that the regressors span.
 Scaling inputs or outputs changes only the units.
 
 Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Which parameters drift is learned

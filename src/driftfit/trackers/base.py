@@ -142,7 +142,9 @@ class Tracker(Settings, ABC):
         return phi, y
 
     def left_out(self, fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
-        """Which of the used samples, ok (T,), it left out later; ``fields`` as in `estimated_variances`."""
+        """Which of the used samples, ok (T,), it left out later; ``fields`` as in `estimated_variances`, or, without
+        smoother fields, those of the last state.
+        """
         return np.zeros(len(y), bool)
 
     def estimated_variances(

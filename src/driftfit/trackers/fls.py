@@ -48,10 +48,11 @@ from driftfit.trackers.parts.diffuse import (
     enter,
     knowing,
     knowing_nothing,
+    measurement,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve
 from driftfit.trackers.parts.varying_drift import read_drift
-from driftfit.trackers.rls import correct, learn_variance, no_scale
+from driftfit.trackers.rls import learn_variance, no_scale
 
 
 @kernel
@@ -61,6 +62,13 @@ def drift(s: State, l: int) -> None:
     for i in range(s.theta.shape[0]):
         s.P[i, i, l] += s.q[i, l] * (s.drift_root[i, l] * s.drift_root[i, l]) * time
     s.begun[l] = 1.0 if s.dt[l] > 0.0 else s.begun[l]
+
+
+@kernel
+def correct(s: State, l: int) -> None:
+    resolve(s, l)
+    measurement(s, l)
+    learn_variance(s, l)
 
 
 @kernel

@@ -14,7 +14,7 @@ In an ARX model the noise of an output is in the regressors of the next samples.
 with them, and least squares is biased however long the record. Instruments are correlated with the regressors, but not
 with the noise: the inputs themselves, and the outputs of an auxiliary model instead of past outputs
 
-    x_t = zeta_t' a_t,  |x_t| <= the largest output so far;   a_{t+1} = a_t + 0.05 (theta_t - a_t)
+    x_t = zeta_t' a_t,  |x_t| <= the largest output before;   a_{t+1} = a_t + 0.05 (theta_t - a_t)
     zeta_t = [x_{t-1} .. x_{t-na}, the other regressors]
 
 that is driven by the inputs alone, and follows theta at a distance. The first 10 n samples are used as in least
@@ -61,7 +61,6 @@ from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.coarse.shared_rounding import folded
 from driftfit.trackers.parts.diffuse import (
     LEFT,
-    MACHINES,
     SCRATCH,
     knowing,
     knowing_nothing,
@@ -69,8 +68,10 @@ from driftfit.trackers.parts.diffuse import (
     product_with,
     symmetric_product,
 )
+from driftfit.trackers.parts.faults.contradictions import contradictions, leave_out_contradiction
+from driftfit.trackers.parts.faults.judged_start import START_MACHINES, judging, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve
-from driftfit.trackers.rls import fade, learn_variance, no_scale
+from driftfit.trackers.rls import fade, follow_variance, learn_variance, no_scale, no_settling, settling_of
 
 FOLLOWING = 0.05
 """Share of the distance to theta that the auxiliary model moves at a sample: it lags by twenty samples."""
@@ -84,7 +85,7 @@ LEAST = 0.5
 MOST = 1e6
 """The most that it may be beside 1 / w + zeta' C zeta, with refined instruments."""
 
-start_of_rls = rls.begin
+start_of_rls, restart_of_rls = rls.begin, rls.restart
 
 
 @kernel
@@ -140,6 +141,7 @@ def learning(refined: bool) -> Step:
         if refined and not abs(common) < MOST * v:
             symmetric(s, l)
             common = noise + weigh_instruments(s, l)
+        leave_out_contradiction(s, y_hat, v * s.scale[l], l)
         e, learned = s.y[l] - y_hat, (s.ok[l] > 0.0) & (common >= LEAST * noise) & (common < LARGEST) & (v < LARGEST)
         gain, v_used = (1.0 / common if learned else 0.0), (v if learned else 0.0)
         along = 1.0 / v if learned else 0.0
@@ -156,6 +158,7 @@ def learning(refined: bool) -> Step:
             s.P[i, i, l] = max(left, LEFT * s.P[i, i, l])
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
         learn_variance(s, l)
+        follow_variance(s, l)
 
     step: Step = learn
     return step
@@ -181,13 +184,13 @@ def auxiliary(na: int) -> tuple[Any, Any]:
         for i in range(na, n):
             x += s.phi[i, l] * s.auxiliary[i, l]
             s.zeta[i, l] = s.phi[i, l]
-        s.largest[l] = max(s.largest[l], abs(s.y[l]))
         s.x[l] = max(-s.largest[l], min(s.largest[l], x))
         s.learned[l] += s.ok[l]
 
     @kernel
     def follow(s: State, l: int) -> None:
         """The auxiliary model follows theta, and its output is the first of its lags."""
+        s.largest[l] = max(s.largest[l], abs(s.y[l])) if s.seen[l] > 0.0 else s.largest[l]
         share = FOLLOWING if s.learned[l] >= s.settling[l] else 1.0
         for i in range(s.theta.shape[0]):
             s.auxiliary[i, l] += share * (s.theta[i, l] - s.auxiliary[i, l])
@@ -219,7 +222,15 @@ def steps(na: int | None) -> TrackerSteps:
         symmetric(s, l)
         follow(s, l)
 
-    return TrackerSteps(forget, correct, folded, begin, machines=MACHINES, instruments=na is None)
+    @kernel
+    def restart(s: State, l: int) -> None:
+        restart_of_rls(s, l)
+        s.learned[l], s.largest[l], s.x[l] = 0.0, 0.0, 0.0
+        for i in range(s.theta.shape[0]):
+            s.auxiliary[i, l], s.x_lag[i, l] = s.start_theta[i, l], 0.0
+
+    start = judging(begin, restart)
+    return TrackerSteps(forget, correct, folded, start, machines=START_MACHINES, instruments=na is None)
 
 
 @dataclass(frozen=True)
@@ -289,10 +300,11 @@ class InstrumentalVariables(Tracker):
             "log_forgetting": np.log(np.asarray(self.forgetting)),
             "r": 1.0,
             "c_max": self.c_max,
-            "discounted": 0.0,
+            **no_settling(),
             "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            **unjudged(theta0, diffuse=self.p0 is None),
         }
 
     @property
@@ -311,7 +323,7 @@ class InstrumentalVariables(Tracker):
         return steps(model.output_lags)
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
-        return {**self.state(model.n), "discounted": model.settling}
+        return {**self.state(model.n), **settling_of(model)}
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         super().widen(lane, p)
@@ -319,4 +331,4 @@ class InstrumentalVariables(Tracker):
         np.einsum("ii->i", lane["G"])[:] += p / scale if scale > 0.0 else p
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return resolution(run.state)
+        return (*contradictions(run.state), *resolution(run.state))

@@ -41,6 +41,7 @@ from driftfit.engine.settings import one_of
 from driftfit.models.state_space import StateSpace, equations_of
 from driftfit.trackers.kalman import drift_matrix
 from driftfit.trackers.parts.diffuse import corrected, symmetric_product
+from driftfit.trackers.parts.faults.contradictions import contradictions, leave_out_contradiction, no_contradictions
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
@@ -59,6 +60,33 @@ def at_estimate(s: State, l: int) -> None:
 
 
 @kernel
+def keep_states(s: State, l: int) -> None:
+    """Keep what a move changes."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        s.theta_before[i, l] = s.theta[i, l]
+        for j in range(i + 1):
+            s.P_before[i, j, l] = s.P[i, j, l]
+
+
+@kernel
+def judged(s: State, y_hat: float, v: float, l: int) -> None:
+    """One correction, unless the sample contradicts all before it.
+
+    If an input is to blame, the states do not move with it.
+    """
+    ok, n = s.ok[l], s.theta.shape[0]
+    leave_out_contradiction(s, y_hat, v, l)
+    corrected(s, y_hat, v, l)
+    if (s.ok[l] < ok) & (s.seen[l] > 0.0):
+        for i in range(n):
+            s.theta[i, l] = s.theta_before[i, l]
+            for j in range(i + 1):
+                s.P[i, j, l] = s.P_before[i, j, l]
+        drift_matrix(s, l)
+
+
+@kernel
 def unusable(s: State, l: int) -> None:
     """There is no prediction."""
     s.valid[l], s.ok[l], s.y_hat[l], s.e[l], s.s[l] = 0.0, 0.0, 0.0, 0.0, 1.0
@@ -74,6 +102,7 @@ def _repeated(move: Step, timed: bool) -> Step:
     def predict(s: State, l: int) -> None:
         left = 1.0 if timed else min(max(1.0, s.dt[l]), MOST)
         left = left if s.dt[l] > 0.0 else 0.0
+        keep_states(s, l)
         while left > 0.5:
             move(s, l)
             left -= 1.0
@@ -134,7 +163,7 @@ def _extended(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool)
         for i in range(s.theta.shape[0]):
             finite = finite & (abs(s.phi[i, l]) < LARGEST)
         if finite:
-            corrected(s, s.value[l], symmetric_product(s, l) + s.r[l] * s.noise[l], l)
+            judged(s, s.value[l], symmetric_product(s, l) + s.r[l] * s.noise[l], l)
         else:
             unusable(s, l)
 
@@ -232,7 +261,7 @@ def _unscented(equations: str, inputs: tuple[str, ...], n: int, hidden: int, tim
                 g += other * (s.shown[j, l] - s.shown[n + j, l]) * s.L[i, j, l]
             s.g[i, l] = g
         if finite:
-            corrected(s, y_hat, v + s.r[l] * s.noise[l], l)
+            judged(s, y_hat, v + s.r[l] * s.noise[l], l)
         else:
             unusable(s, l)
 
@@ -269,7 +298,7 @@ class JointKalman(StateSpaceTracker):
     theta0: Any = None
     method: str = "unscented"
 
-    scratch: ClassVar[tuple[str, ...]] = ("g", "W", "L", "moved", "shown")
+    scratch: ClassVar[tuple[str, ...]] = ("g", "W", "L", "moved", "shown", "theta_before", "P_before")
 
     def __post_init__(self) -> None:
         self._check()
@@ -278,12 +307,16 @@ class JointKalman(StateSpaceTracker):
     def state_of(self, model: StateSpace, prior: Mapping[str, Any]) -> Mapping[str, Any]:
         n, hidden = model.n, max(len(model.hidden), 1)
         own: dict[str, Array] = {"W": np.zeros((hidden, n))}
+        before = {"theta_before": np.zeros(n), "P_before": np.zeros((n, n))}
         if self.method == "unscented":
             own = {"L": np.zeros((n, n)), "moved": np.zeros((hidden, 2 * n + 1)), "shown": np.zeros(2 * n + 1)}
-        return {**prior, "g": np.zeros(n), "drift_root": np.ones(n), **own}
+        return {**prior, "g": np.zeros(n), "drift_root": np.ones(n), **own, **before, **no_contradictions()}
 
     def steps_of(self, model: StateSpace) -> TrackerSteps:
         given = model.equations, model.input_names
         if self.method == "extended":
             return _extended(*given, len(model.hidden), model.system.timed)
         return _unscented(*given, model.n, len(model.hidden), model.system.timed)
+
+    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
+        return contradictions(run.state)

@@ -40,15 +40,15 @@ from driftfit.trackers.laws import filter as laws_filter
 from driftfit.trackers.laws.law import OWNER, Law, laws_of, table_of
 from driftfit.trackers.parts import square_root
 from driftfit.trackers.parts.diffuse import (
-    MACHINES,
     SCRATCH,
     drifted,
     enter,
     knowing,
     knowing_nothing,
-    measurement,
     spanned_variance,
 )
+from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
+from driftfit.trackers.parts.faults.judged_start import START_MACHINES, faults, judging, unjudged
 from driftfit.trackers.parts.information import triangular_root
 from driftfit.trackers.parts.varying_drift import read_drift
 
@@ -75,8 +75,9 @@ def begin(s: State, l: int) -> None:
     spanned_variance(s, l)
 
 
-INDEPENDENT = TrackerSteps(drift, measurement, diagonal, begin, read_extra=read_drift, machines=MACHINES)
-TOGETHER = TrackerSteps(drift_matrix, measurement, diagonal, begin, read_extra=read_drift, machines=MACHINES)
+START = judging(begin)
+INDEPENDENT = TrackerSteps(drift, judged_measurement, diagonal, START, read_extra=read_drift, machines=START_MACHINES)
+TOGETHER = INDEPENDENT._replace(predict=drift_matrix)
 
 
 @dataclass(frozen=True)
@@ -161,9 +162,9 @@ class Kalman(Tracker):
         return {**start, "r": self.r}
 
     def state(self, n: int) -> Mapping[str, Any]:
-        together = np.ndim(self.q) == 2
+        together, theta0 = np.ndim(self.q) == 2, vector("Kalman", "theta0", self.theta0, n)
         return {
-            "theta": vector("Kalman", "theta0", self.theta0, n),
+            "theta": theta0,
             "P": np.zeros((n, n)) if self.p0 is None else matrix("Kalman", "p0", self.p0, n),
             "q": matrix("Kalman", "q", self.q, n) if together else vector("Kalman", "q", self.q, n),
             "r": self.r,
@@ -171,6 +172,7 @@ class Kalman(Tracker):
             "drift_root": np.ones(n),
             "G": triangular_root(matrix("Kalman", "q", self.q, n)),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            **unjudged(theta0, diffuse=self.p0 is None),
             **(self._root(n) if self.form == "sqrt" else {}),
         }
 
@@ -183,6 +185,11 @@ class Kalman(Tracker):
         return self.laws is None
 
     @property
+    def width(self) -> int:  # type: ignore[override]
+        """The square root is updated by a routine that takes one lane at a time."""
+        return 1 if self.form == "sqrt" else super().width
+
+    @property
     def steps(self) -> TrackerSteps:
         if self.laws is not None:
             return laws_filter.STEPS
@@ -193,6 +200,12 @@ class Kalman(Tracker):
     @property
     def beyond(self) -> str:
         return "" if self.laws is None else "has laws by which theta moves"
+
+    def left_out(self, fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
+        return faults(fields, phi, y, ok) if self.laws is None else super().left_out(fields, phi, y, ok)
+
+    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
+        return contradictions(run.state)
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         super().widen(lane, p)

@@ -34,6 +34,7 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.settings import near, whole
 from driftfit.models.state_space import StateSpace
+from driftfit.trackers.parts.faults.contradictions import contradictions, no_contradictions
 from driftfit.trackers.state_space.particle_steps import steps
 from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
@@ -93,7 +94,7 @@ class ParticleFilter(StateSpaceTracker):
             "weight": np.full(count, 1.0 / count), "W": np.zeros((max(len(model.hidden), 1), n)),
             "gain": np.zeros((count, n)), "shown": np.zeros(count), "spread": np.zeros(count), "fit": np.zeros(count),
             "column": np.zeros(n), "cloud_after": np.zeros((count, n)), "own_after": np.zeros((count, n, n)),
-            "log_density": 0.0,
+            "log_density": 0.0, **no_contradictions(),
         }  # fmt: skip
 
     def steps_of(self, model: StateSpace) -> TrackerSteps:
@@ -111,3 +112,6 @@ class ParticleFilter(StateSpaceTracker):
     def place(self, lane: Mapping[str, Any], which: Any, values: Any) -> None:
         super().place(lane, which, values)
         lane["cloud"][:, list(which)] = values
+
+    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
+        return contradictions(run.state)

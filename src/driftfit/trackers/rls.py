@@ -14,8 +14,10 @@ forgetting would let P grow without bound. It stops when a variance is ``c_max``
 regressors first had full rank (before that: when they last spanned a new direction), which does not depend on units.
 
 A model that is linearised poorly at first has its first samples forgotten, also for lambda = 1: up to sample k = N of
-`Model.settling` the memory is at most max(N / 10, k / 4) samples, the lambda(t) -> 1 of Ljung and Soderstrom (1983),
-section 5.6.
+`Model.settling` the memory is at most `Model.settling_memory` samples or k / 4, if that is more: the lambda(t) -> 1 of
+Ljung and Soderstrom (1983), section 5.6. If the model has one of the noise, P and the scale are in units of the least
+variance of e so far, of max(20, k / 8) samples: those before the noise was known have large innovations, and would
+outweigh all later ones.
 
 Directional forgetting (kind="directional") forgets only in the direction of a sample, after it has been used:
 
@@ -45,18 +47,34 @@ from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.coarse.shared_rounding import folded, nothing_shared, share_rounding, spanned_folded
 from driftfit.trackers.parts.diffuse import (
-    MACHINES,
     SCRATCH,
     enter,
     hand_over,
     knowing,
     knowing_nothing,
-    measurement,
     reform,
     take_in,
     wander,
 )
+from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
+from driftfit.trackers.parts.faults.judged_start import START_MACHINES, judging, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
+
+RECENT, RECENT_SHARE = 20.0, 0.125
+"""Memory of the present noise variance: samples, and share of those so far."""
+LARGE = 25.0
+"""A square above this multiple of it counts as this multiple."""
+
+
+def no_settling() -> dict[str, Any]:
+    """Fields of a start that is not forgotten, before the first sample."""
+    return {"discounted": 0.0, "first_memory": 0.0, "unequal": 0.0, "recent": 0.0, "least": 0.0, "quieter": 1.0}
+
+
+def settling_of(model: Model) -> dict[str, Any]:
+    """Those that a model gives."""
+    N = model.settling
+    return {"discounted": N, "first_memory": model.settling_memory, "unequal": N if model.unequal_start else 0.0}
 
 
 @kernel
@@ -65,12 +83,13 @@ def growth(s: State, l: int) -> float:
     dt, used = s.dt[l], s.count[l]
     faded = s.forgetting[l] if dt == 1.0 else exp(dt * s.log_forgetting[l])
     early = (used < s.discounted[l]) & (s.ok[l] > 0.0)
-    faded = min(faded, 1.0 - 1.0 / max(0.1 * s.discounted[l], 0.25 * used)) if early else faded
+    faded = min(faded, 1.0 - 1.0 / max(s.first_memory[l], 0.25 * used)) if early else faded
     grown = 0.0
     for i in range(s.theta.shape[0]):
         # rounding can make a variance negative, which must not grow past the cap
         grown = max(grown, abs(s.P[i, i, l]) * s.per_cap[i, l])
-    factor: float = 1.0 / min(1.0, max(faded, grown))
+    factor: float = s.quieter[l] / min(1.0, max(faded, grown))
+    s.quieter[l] = 1.0
     return factor
 
 
@@ -114,10 +133,27 @@ def learn_variance(s: State, l: int) -> None:
 
 
 @kernel
+def follow_variance(s: State, l: int) -> None:
+    """While a start is forgotten, P and the scale are in units of the least noise variance so far."""
+    if (s.ok[l] > 0.0) & (s.count[l] > 0.0) & (s.count[l] < s.unequal[l]):
+        square = s.e[l] * s.e[l]
+        before = s.recent[l] if s.recent[l] > 0.0 else square
+        share = 1.0 / min(s.count[l], max(RECENT, RECENT_SHARE * s.count[l]))
+        s.recent[l] = before + share * (min(square, LARGE * before) - before)
+        least = s.recent[l] if s.least[l] <= 0.0 else min(s.least[l], s.recent[l])
+        least = least if s.count[l] >= RECENT else 0.0
+        ratio = s.least[l] / least if (s.least[l] > 0.0) & (least > 0.0) else 1.0
+        s.least[l] = least
+        s.quieter[l] *= ratio
+        s.squares[l] /= ratio
+
+
+@kernel
 def correct(s: State, l: int) -> None:
     resolve(s, l)
-    measurement(s, l)
+    judged_measurement(s, l)
     learn_variance(s, l)
+    follow_variance(s, l)
 
 
 @kernel
@@ -132,6 +168,7 @@ def begin(s: State, l: int) -> None:
     enter(s, l)
     if s.s[l] < np.inf:
         learn_variance(s, l)
+        follow_variance(s, l)
     spanned_folded(s, l)
     # the cap applies from the first direction on: regressors may lack excitation before they span everything
     for i in range(n):
@@ -151,7 +188,7 @@ def forgotten(s: State, l: int) -> float:
 @kernel
 def correct_direction(s: State, l: int) -> None:
     resolve(s, l)
-    measurement(s, l)
+    judged_measurement(s, l)
     gain = forgotten(s, l)
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):
@@ -190,8 +227,19 @@ def begin_direction(s: State, l: int) -> None:
     spanned_folded(s, l)
 
 
-EXPONENTIAL = TrackerSteps(forget, correct, folded, begin, machines=MACHINES)
-DIRECTIONAL = TrackerSteps(nothing, correct_direction, folded, begin_direction, machines=MACHINES)
+@kernel
+def restart(s: State, l: int) -> None:
+    """As before the first sample."""
+    s.squares[l], s.count[l], s.scale[l], s.recent[l], s.least[l], s.quieter[l] = 0.0, 0.0, np.nan, 0.0, 0.0, 1.0
+    s.readings_in[l], s.levels[l], s.middle[l], s.spread[l], s.stayed[l] = 0.0, 1.0, 0.0, 0.0, np.nan
+    for i in range(s.theta.shape[0]):
+        s.per_cap[i, l] = 0.0
+
+
+EXPONENTIAL = TrackerSteps(forget, correct, folded, judging(begin, restart), machines=START_MACHINES)
+DIRECTIONAL = TrackerSteps(
+    nothing, correct_direction, folded, judging(begin_direction, restart), machines=START_MACHINES
+)
 
 
 @dataclass(frozen=True)
@@ -241,8 +289,9 @@ class RLS(Tracker):
     def state(self, n: int) -> Mapping[str, Any]:
         P = np.zeros((n, n)) if self.p0 is None else matrix("RLS", "p0", self.p0, n)
         first = self.c_max * np.diag(P)
+        theta0 = vector("RLS", "theta0", self.theta0, n)
         return {
-            "theta": vector("RLS", "theta0", self.theta0, n),
+            "theta": theta0,
             "P": P,
             "forgetting": self.forgetting,
             "log_forgetting": np.log(np.asarray(self.forgetting)),
@@ -250,16 +299,17 @@ class RLS(Tracker):
             "g": np.zeros(n),
             "c_max": self.c_max,
             "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
-            "discounted": 0.0,
+            **no_settling(),
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            **unjudged(theta0, diffuse=self.p0 is None),
         }
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
-        return {**self.state(model.n), "discounted": model.settling}
+        return {**self.state(model.n), **settling_of(model)}
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return resolution(run.state)
+        return (*contradictions(run.state), *resolution(run.state))
 
     @property
     def steps(self) -> TrackerSteps:

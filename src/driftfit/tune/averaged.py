@@ -1,4 +1,4 @@
-"""Estimates and bands that allow for what a record leaves open about the settings.
+"""Estimates and bands that account for the uncertainty of estimated settings.
 
     p(theta_t | y) = integral p(theta_t | y, s) p(s | y) ds,      p(s | y) proportional to p(y | s) p(s)
 
@@ -9,8 +9,8 @@ is flat in the standard deviation of the drift relative to that of the noise, wh
 range of the search.
 
 The integral is a mean over draws from the posterior. They come from a differential evolution Markov chain (ter Braak
-2006), which has nothing to be adjusted: the 32 chains move along differences of each other, and their steps are
-evaluated together, as lanes of one compiled run. If r has a closed form it is drawn from its inverse gamma posterior.
+2006), which needs no adjustment: the 32 chains move along differences of each other, and their steps are evaluated
+together, as lanes of one compiled run. If r has a closed form it is drawn from its inverse gamma posterior.
 
 Cost: `STEPS` x 32 runs of the record in lanes, then a run and a smoother for each draw.
 """
@@ -136,7 +136,7 @@ def _draws(f: Callable[[Array], Array], knobs: Knobs, best: Array, draws: int, r
     kept = []
     for step in range(STEPS):
         others = np.array([rng.choice(np.delete(np.arange(CHAINS), k), 2, replace=False) for k in range(CHAINS)])
-        size = 1.0 if step % 10 == 9 else 2.38 / np.sqrt(2.0 * p)  # 1: from one peak to another
+        size = 1.0 if step % 10 == 9 else 2.38 / np.sqrt(2.0 * p)  # with 1 a chain jumps from one peak to another
         proposed = _within(
             at + size * (at[others[:, 0]] - at[others[:, 1]]) + JITTER * rng.standard_normal((CHAINS, p)), knobs
         )

@@ -108,7 +108,7 @@ def storing(store: Any) -> Any:
 
 def score(task: Task, trackers: Sequence[Tracker], h: int = 1) -> Scores:
     """Run the records under each tracker (all of one class and one form of settings)."""
-    width = trackers[0].width
+    width = Program(task.model, trackers[0]).width
     parts = []
     for a in range(0, len(trackers), width):
         some = list(trackers[a : a + width])

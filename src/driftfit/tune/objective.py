@@ -67,7 +67,7 @@ def _smoothed_score(task: Task, tracker: Tracker, method: str) -> float:
     squares, count, free, used = 0.0, 0, 0.0, 0
     for run in run_task(task, tracker):
         path = Smoothed.of(run)
-        weight = path.walk.weight
+        weight = path.weight
         terms = weight * path.loo**2 if method == "loo" else np.zeros(0)
         squares += float(np.nansum(terms)) if method == "loo" else path.measurement_cost
         count += int(np.isfinite(terms).sum())

@@ -108,7 +108,9 @@ def still(task: Task, scored_by: Tracker) -> tuple[Array, float]:
     scores = score(task, [scored_by])
     power, variance = scores.power[:, 0], float(scores.sigma2()[0])
     if not np.any(power > 0.0):
-        raise ValueError("tune: the record has no usable sample with a regressor other than zero: nothing to tune on.")
+        raise ValueError(
+            "tune: the record has no usable sample with a regressor other than zero: there is nothing to tune on."
+        )
     return power, variance if 0.0 < variance < np.inf else 1.0
 
 

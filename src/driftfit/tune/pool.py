@@ -3,8 +3,9 @@
     theta_i ~ N(mean, cov)          the parameters of unit i at its first sample
     y_i     from the model of the fleet with theta_i, and the drift and noise of its tracker
 
-Each unit was tracked from no knowledge, so its record says N(t_i, P_i) of theta_i, the smoothed first sample,
-and nothing of the record is lost (models are linear and Gaussian given the regressors). Mean and covariance maximise
+Each unit was tracked from a diffuse start, so the likelihood of its record, as a function of theta_i, is N(t_i, P_i)
+with the smoothed first sample: no information is lost (models are linear and Gaussian given the regressors). Mean and
+covariance maximise
 
     L = sum_i log N(t_i; mean, cov + P_i) - 1/2 log det sum_i (cov + P_i)^-1         (restricted likelihood)
 
@@ -16,8 +17,8 @@ variance of the estimated mean,
 The result shrinks each unit towards the others, by as much as its own record leaves open and no more; units with short
 records gain most. ``tracker`` starts from N(mean, cov + V), the prediction for a unit that the fleet does not have yet.
 
-Use it for units of one make. It assumes that theta_i are normal about one mean: look at ``theta`` for groups. The
-uncertainty of cov itself is left out: with forty units bands of 95 % cover some 90 %.
+Use it for units of the same type. It assumes that theta_i are normal about one mean: look at ``theta`` for groups. The
+uncertainty of cov itself is left out: with forty units bands of 95 % cover about 90 %.
 
 Source: Harville, Maximum likelihood approaches to variance component estimation, J. American Statistical Association 72
 (1977); Laird and Ware, Random-effects models for longitudinal data, Biometrics 38 (1982). Cost: O(units n^3) for each

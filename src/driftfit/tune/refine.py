@@ -6,7 +6,7 @@ linear regression, and the record is run until the estimate settles:
 
     theta'  <-  the estimate of the run that is linearised at theta',   until it moves by less than a share of its std
 
-by half the way, and half of that, while the prediction error at the new point is larger.
+where a step is halved as long as the prediction error at the new point is larger.
 
 `RLS(1.0)` is then the Gauss-Newton method of prediction errors (maximum likelihood for Gaussian noise), and
 `InstrumentalVariables(1.0)` the iterative refined instrumental variable method (Young's RIV, SRIV and SRIVC). The
@@ -34,7 +34,7 @@ from driftfit.trackers.rls import RLS
 R = TypeVar("R", bound=Track)
 
 CLOSE = 0.01
-"""Share of its standard deviation that no parameter may move by at the last pass."""
+"""The passes end when every parameter moves by less than this share of its standard deviation."""
 
 LEAST = 0.01
 """Least share of a step that is tried."""
@@ -51,7 +51,7 @@ def refine(run: R, passes: int = 20, drifting: bool = False) -> R:
     run : Track
         Of a model that is linearised.
     passes : int
-        At most so many runs. If the estimate still moves at the last, a warning says so.
+        Largest number of runs. A warning is issued if the estimate still moves in the last one.
     drifting : bool
         Hold the linearisation at the mean of the second half of the path, and not at its end.
 
@@ -101,7 +101,7 @@ def _at(run: R, point: Array, tracker: Tracker | None = None) -> R:
 def _downhill(run: Track, point: Array, goal: Array) -> Array | None:
     """The first point on the way back from the goal that predicts better; None if there is none.
 
-    Of a tracker for parameters that drift it is the goal, because no point has an error of its own.
+    For a tracker of parameters that drift it is the goal itself, because no single point has a prediction error.
     """
     if not isinstance(run.tracker, RLS | InstrumentalVariables):
         return goal

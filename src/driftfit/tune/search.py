@@ -89,7 +89,7 @@ def _refine(f: Objective, knobs: Knobs, x: Array) -> Array:
     free = np.flatnonzero(np.isfinite(x))
     if not free.size:
         return x
-    # one grid cell around the best grid point, so that the search cannot end in another valley
+    # one grid cell around the best grid point, so that the search cannot end in another minimum
     reach = 1.0 / DECADE if len(x) == 1 else np.inf
     low, high = np.maximum(knobs.low[free], x[free] - reach), np.minimum(knobs.high[free], x[free] + reach)
 

@@ -26,6 +26,7 @@ import numpy as np
 from driftfit.data.arguments import check_roles
 from driftfit.data.limits import FAR, absurd
 from driftfit.data.record import Reading
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, whole
 from driftfit.models.base import Model
 from driftfit.run.track import records_of
@@ -37,6 +38,9 @@ from driftfit.tune.outputs import TunedOutputs, tune_outputs
 from driftfit.tune.parametrisation import find_knobs
 from driftfit.tune.search import Counted, Search, minimise
 from driftfit.tune.tuned import METHODS, Tuned
+
+RESPONSE = 20
+"""Samples within which a test and its response are absurd."""
 
 
 def tune(
@@ -126,7 +130,7 @@ def _tuned(
     """Tune on a checked record."""
     if order_by is not None:
         task = along(task, tracker, order_by)
-    _warn_of_fault_codes(task)
+    task = _without_fault_codes(task)
     knobs = find_knobs(task, tracker, groups, bounds)
     f = Counted(Criterion(task, knobs, method, h))
     search = Search(f, knobs, minimise(f, knobs))
@@ -146,20 +150,39 @@ def _tuned(
     return tuned
 
 
-def _warn_of_fault_codes(task: Task) -> None:
-    """Warn of readings that decide the likelihood alone."""
+def _without_fault_codes(task: Task) -> Task:
+    """The task with absurd values as missing ones, which would decide the likelihood of all settings alone.
+
+    An input near which the output is absurd too is a test: both are kept.
+    """
+    records = []
     for record in task.records:
-        m = record.u.shape[1]
-        columns = {"y": record.y} | {f"u{j + 1}" if m > 1 else "u": record.u[:, j] for j in range(m)}
-        for name, x in columns.items():
-            if x.ndim == 1 and len(places := absurd(x)):
-                warnings.warn(
-                    f"tune: {name} is {x[places[0]]:.6g} at sample {places[0]}, more than {FAR:.0f} times its "
-                    f"usual deviation ({len(places)} such values): they decide the likelihood alone. If fault codes, "
-                    f'give limits={{"{name}": (low, high)}}.',
-                    UserWarning,
-                    stacklevel=4,
+        if record.y.ndim == 1 and record.u.ndim == 2:
+            signals = np.column_stack([record.y, record.u])
+            places = [absurd(x) for x in signals.T]
+            of_inputs = np.concatenate([np.empty(0, int), *places[1:]])
+            for k, found in enumerate(places):
+                others = places[0] if k else of_inputs
+                apart = np.abs(found[:, None] - others).min(axis=1, initial=RESPONSE + 1)
+                _leave_out(
+                    signals[:, k], "y" if k == 0 else f"u{k}" if len(places) > 2 else "u", found[apart > RESPONSE]
                 )
+            record = replace(record, y=signals[:, 0].copy(), u=signals[:, 1:].copy())
+        records.append(record)
+    return task._replace(records=tuple(records))
+
+
+def _leave_out(x: Array, name: str, places: Array) -> None:
+    """Make values of a signal missing, and warn of it."""
+    if len(places):
+        warnings.warn(
+            f"tune: {name} is {x[places[0]]:.6g} at sample {places[0]}, more than {FAR:.0f} times its usual deviation "
+            f"({len(places)} such values), and no other signal is near it: they count as missing here. If they are "
+            f'fault codes, give limits={{"{name}": (low, high)}}, to `track` too.',
+            UserWarning,
+            stacklevel=5,
+        )
+        x[places] = np.nan
 
 
 def _warn(tuned: Tuned) -> None:

@@ -45,7 +45,7 @@ from driftfit.judge.verdict import verdict
 from driftfit.models.base import Model
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Lane, Track
-from driftfit.run.states.joint import Joint
+from driftfit.run.states.joint_layout import JointLayout
 from driftfit.trackers.base import Tracker
 
 OUTPUTS = ("samples", "summary", "verdict", "states")
@@ -176,7 +176,7 @@ class Partition:
             last[0], states = self._going.last[0], dict(self._going.words)
             sums.counts[0], sums.squares[0] = (part[0] for part in self._going.sums)
         rows = _usable(code, time, last, sums.counts)
-        good = there & np.array([isinstance(one, Joint) for one in joints])
+        good = there & np.array([isinstance(one, JointLayout) for one in joints])
         some = series_of(task, table, code, rows, time, good)
         found = continued(task, table, some, joints, states, last) if len(some.rows) else None
         if found is not None:

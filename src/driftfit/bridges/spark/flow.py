@@ -42,7 +42,7 @@ from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import state_of
 from driftfit.run.states import late
 from driftfit.run.states.advance import Advanced
-from driftfit.run.states.joint import Joint
+from driftfit.run.states.joint_layout import JointLayout
 from driftfit.run.states.layout import tag_of, unpacked
 from driftfit.run.warm_start import End, carried
 
@@ -133,7 +133,7 @@ class Flow:
         lanes = found.lanes()
         for j, k in enumerate(some.keys.tolist()):
             joint, count = known.joints[k], int(some.length[j])
-            assert isinstance(joint, Joint)
+            assert isinstance(joint, JointLayout)
             rows = [(job.out[:count], lane) for job, lane in lanes[j * ny : (j + 1) * ny]]
             causes, known.watch[k] = watched(self.rules, joint, known.watch[k], int(earlier[k]), rows)
             for name, values in alarms_of(schema, causes).items():
@@ -183,7 +183,7 @@ class Known(NamedTuple):
     time: Array
     there: Array
     settings: list[str | None]
-    joints: list[Joint | str]
+    joints: list[JointLayout | str]
     words: dict[int, Array]
     arrived: dict[int, bytes]
     """States as they came, which are unpacked if a sample follows."""
@@ -248,7 +248,7 @@ class Known(NamedTuple):
         for k in keys.tolist():
             if k in self.arrived and k not in self.words:
                 joint = self.joints[k]
-                assert isinstance(joint, Joint)
+                assert isinstance(joint, JointLayout)
                 self.words[k] = joint.unpack(self.arrived[k])
         return self.words
 
@@ -257,11 +257,11 @@ class Known(NamedTuple):
         if k in self.arrived and k not in self.words:
             return self.arrived[k]
         joint = self.joints[k]
-        assert isinstance(joint, Joint)
+        assert isinstance(joint, JointLayout)
         return joint.pack(self.words[k]) if k in self.words else joint.start
 
 
-def migrated(task: Task, now: Joint, state: bytes, settings: str | None, origins: Sequence[Origin]) -> Array:
+def migrated(task: Task, now: JointLayout, state: bytes, settings: str | None, origins: Sequence[Origin]) -> Array:
     """The words of a state that other settings of the tracker or another version made.
 
     What depends on settings begins with the new ones, all else is carried over; fields are matched by their names.

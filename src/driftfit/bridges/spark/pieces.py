@@ -18,7 +18,7 @@ from driftfit.run.live.rule import FROZEN, AlarmRule
 from driftfit.run.program import Program
 from driftfit.run.result import burn_in
 from driftfit.run.states.advance import Advanced
-from driftfit.run.states.joint import Joint
+from driftfit.run.states.joint_layout import JointLayout
 
 ARROW = {
     "double": pa.float64(), "boolean": pa.bool_(), "bigint": pa.int64(), "string": pa.string(), "binary": pa.binary(),
@@ -52,7 +52,7 @@ class Piece(NamedTuple):
     first: Array
     """(U,): the first row of each unit."""
     settings: Sequence[str | None]
-    joints: Sequence[Joint | str]
+    joints: Sequence[JointLayout | str]
     reasons: Sequence[str | None]
     """Why a unit has no result."""
     last: Array
@@ -85,7 +85,7 @@ def add(sums: Sums, some: Series, found: Advanced) -> None:
     sums.counts[some.keys, SAMPLES] += some.length
 
 
-def why(joints: Sequence[Joint | str], there: Array, sums: Sums) -> list[str | None]:
+def why(joints: Sequence[JointLayout | str], there: Array, sums: Sums) -> list[str | None]:
     """The reason why each unit has no result; None where it has one."""
     reasons: list[str | None] = [one if isinstance(one, str) else None for one in joints]
     for k in np.flatnonzero(~there | (sums.counts[:, SAMPLES] == 0)).tolist():
@@ -191,7 +191,11 @@ def alarms_of(schema: Mapping[str, str], causes: Sequence[Sequence[str | None]])
 
 
 def watched(
-    rules: Sequence[AlarmRule | None], joint: Joint, watch: str | None, earlier: int, rows: Sequence[tuple[Array, int]]
+    rules: Sequence[AlarmRule | None],
+    joint: JointLayout,
+    watch: str | None,
+    earlier: int,
+    rows: Sequence[tuple[Array, int]],
 ) -> tuple[list[list[str | None]], str]:
     """(the cause of the alarm of each watched output at every sample, what `watched` continues from).
 

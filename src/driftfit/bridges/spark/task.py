@@ -20,7 +20,7 @@ from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.run.program import Program, programs_of
 from driftfit.run.states.advance import Advanced, advance
-from driftfit.run.states.joint import Joint
+from driftfit.run.states.joint_layout import JointLayout
 from driftfit.trackers.base import Tracker
 
 ROWS = 64_000
@@ -80,18 +80,18 @@ class Task:
         return tuple(self.u[int(j)] for j in sorted_[0])
 
     @cached_property
-    def _made(self) -> dict[str | None, Joint | str]:
+    def _made(self) -> dict[str | None, JointLayout | str]:
         return {}
 
     def __reduce__(self) -> Any:
         """Without what was made here."""
         return _task, ({name: getattr(self, name) for name in self.__dataclass_fields__},)
 
-    def joint_of(self, settings: str | None, tracker: Any) -> Joint:
+    def joint_of(self, settings: str | None, tracker: Any) -> JointLayout:
         """The programs of a unit with these settings (JSON); ValueError if they are not complete."""
-        return Joint(programs_of(self.model, _with(tracker, settings), self.order))
+        return JointLayout(programs_of(self.model, _with(tracker, settings), self.order))
 
-    def joint_for(self, settings: str | None) -> Joint | str:
+    def joint_for(self, settings: str | None) -> JointLayout | str:
         """The programs of a unit with these settings (JSON) of its own, or why there are none."""
         if settings not in self._made:
             try:

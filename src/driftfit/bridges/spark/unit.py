@@ -22,7 +22,7 @@ from driftfit.data.known import INTERVAL
 from driftfit.engine.kernel import Array
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.states import late
-from driftfit.run.states.joint import Joint
+from driftfit.run.states.joint_layout import JointLayout
 from driftfit.run.states.layout import tag_of
 
 HEAD = Struct(f"<{len(COUNTS)}q8s8sqq")
@@ -57,7 +57,7 @@ class Unit:
     before: Any = None
 
     @property
-    def joint(self) -> Joint:
+    def joint(self) -> JointLayout:
         """The programs of the unit."""
         found = self.task.joint_for(None)
         if isinstance(found, str):

@@ -21,7 +21,7 @@ def cache(
     """Show where compiled code is stored and how much of it there is, or prune it."""
     with helpful():
         if days < 0.0:
-            raise ValueError(f"--days {days:g}: at least 0.")
+            raise ValueError(f"--days {days:g}: the number of days must be at least 0.")
         gone = prune(days) if remove else None
         there = contents()
         say(

@@ -11,20 +11,21 @@ from typing import Annotated, Any, get_type_hints
 import numpy as np
 import typer
 
-from driftfit.cli.parts.arguments import listed, parse_interval, parse_model, parse_tracker, parse_units
+from driftfit.cli.parts.arguments import listed, parse_interval, parse_units
 from driftfit.cli.parts.program import helpful, progress
 from driftfit.cli.parts.reading import (
     Part,
     Rows,
     decimal_from,
+    interval_from,
     limits_from,
     rows_from,
     rows_of,
     separator_from,
-    stretch,
 )
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
+from driftfit.parsing.settings import parse_model, parse_tracker
 from driftfit.trackers.base import Tracker
 
 Names = list[str] | None
@@ -128,7 +129,7 @@ class Given:
             first=self.first, last=self.last, rows=rows_from(self.rows),
             separator=separator_from(self.separator), decimal=decimal_from(self.decimal),
             limits=tuple(limits_from(entry, names) for entry in self.limits or []),
-            exclude=tuple(map(stretch, self.exclude or [])),
+            exclude=tuple(map(interval_from, self.exclude or [])),
         )  # fmt: skip
 
     def signals(self, rows: Rows | None = None) -> dict[str, Any]:

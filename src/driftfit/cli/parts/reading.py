@@ -101,7 +101,7 @@ def limits_from(entry: str, names: Sequence[str]) -> tuple[str, Range]:
     return name.strip(), found
 
 
-def stretch(entry: str, option: str = "--exclude") -> tuple[str, str]:
+def interval_from(entry: str, option: str = "--exclude") -> tuple[str, str]:
     """``2024-03-01..2024-03-04`` as a pair of ends."""
     first, dots, last = entry.partition("..")
     if not (dots and first.strip() and last.strip()):

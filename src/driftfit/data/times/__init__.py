@@ -1,1 +1,1 @@
-"""How times are written."""
+"""Times: periods and instants as they are written, and gaps between samples."""

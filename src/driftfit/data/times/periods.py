@@ -70,7 +70,7 @@ def _months(year: int, before: int, count: int) -> tuple[date, date]:
 
 
 def periods(texts: Sequence[str | None]) -> Array | None:
-    """Beginnings of periods, datetime64 (T,), NaT where a text is none; None if the first one is not a period."""
+    """Beginnings of periods, datetime64 (T,), NaT where a text is not a period; None if the first one is not."""
     known = next((text for text in texts if text is not None), None)
     if known is None or span(known) is None:
         return None

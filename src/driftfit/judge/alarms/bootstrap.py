@@ -1,12 +1,12 @@
 """Limits of the "glr" and "cusum" alarms by a bootstrap of the reference.
 
-Every simulated record has its own reference. The residuals x of the reference are drawn in blocks, with random signs
-(sums of fitted residuals in their order vary too little), they get the variances h of the model, and scale and
-variances are estimated from them again; so is the error of theta, from its covariance. A record of regressors and
-residuals drawn together follows, whose scores are those of the model that was estimated from its own reference. The
-limits therefore allow for everything that is estimated: a stream keeps these errors for as long as it runs. Whether the
-variance changes at all is seldom certain, so alpha and beta of each record are drawn from those that the reference
-leaves plausible.
+Every simulated record has its own reference. Its residuals x are drawn from those of the observed reference, in blocks
+and with random signs (sums of fitted residuals in their order vary too little). They are given the variances h of the
+model, and scale and variances are estimated from them again; an error of theta is drawn from its covariance. In the
+record that follows, regressors and residuals are drawn together, and its scores are those of the model that was
+estimated from its own reference. The limits therefore allow for everything that is estimated: a stream keeps these
+errors for as long as it runs. Whether the variance changes at all is seldom certain, so alpha and beta of each record
+are drawn from those that the reference leaves plausible.
 
 With a deviate c as statistic the logarithm of the rate of onsets falls nearly as a straight line in c^2. A limit that
 is rarer than the simulated records can show is found along that line, which also gives the probability of an extreme.
@@ -24,7 +24,7 @@ import scipy
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.calibration import limit_of
 from driftfit.judge.alarms.frozen import GARCH, Rows, noise_models, plausible
-from driftfit.judge.alarms.side_by_side import Records, statistics_of
+from driftfit.judge.alarms.side_by_side import SimulatedRecords, statistics_of
 from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.live.likelihood_ratio import (
     ALPHA,
@@ -53,7 +53,7 @@ STEP = 8.0
 """Factor between the two rates that determine the line."""
 
 
-def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> Records:
+def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> SimulatedRecords:
     """Records without a change; fewer records are the first of more."""
     (N, n), T = rows.phi.shape, SAMPLES + START
     draws = [np.random.default_rng([seed, k]) for k in range(3)]
@@ -72,12 +72,12 @@ def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> 
     phi = rows.phi[later] / np.sqrt(h)[..., None]
     clip, k = numbers[:, CLIP, None], numbers[:, K, None]
     g = np.clip(w / np.sqrt(h), -clip, clip) - k * np.einsum("rti,ri->rt", phi, z @ root.T)
-    return Records(np.broadcast_to(frozen.cov, (records, n, n)), numbers, phi, g)
+    return SimulatedRecords(np.broadcast_to(frozen.cov, (records, n, n)), numbers, phi, g)
 
 
-def together(parts: Sequence[Records]) -> Records:
+def together(parts: Sequence[SimulatedRecords]) -> SimulatedRecords:
     """The records of several references in one."""
-    return Records(*map(np.concatenate, zip(*parts, strict=True)))
+    return SimulatedRecords(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def drawn_in_blocks(frozen: Frozen, x: Array) -> bool:
@@ -114,7 +114,7 @@ def _played(numbers: Array, x: Array, N: int) -> Array:
     return w
 
 
-def limits(records: Records, cusum: bool, every: float) -> tuple[Array, Array]:
+def limits(records: SimulatedRecords, cusum: bool, every: float) -> tuple[Array, Array]:
     """Limits (c,) of "glr" or "cusum" for one onset in ``every`` samples; growth (c,) of their square with its log."""
     parts = [(one, START) for one in statistics_of(records, cusum)]
     base = min(every, max(SAMPLES * len(parts) / SEEN, STEP * OFTEN))

@@ -10,7 +10,7 @@
 
 * glr, cusum: the model of the reference is estimated once and kept (`driftfit.judge.alarms.frozen`), so no tracker can
   absorb a fault before it is noticed; the tracker gives the regressors only. Limits by a bootstrap of the reference
-  (`driftfit.judge.alarms.bootstrap`). They tell which parameter moved, by how much and since when: `Alarms.change`.
+  (`driftfit.judge.alarms.bootstrap`). They show which parameter moved, by how much and since when: `Alarms.change`.
 * band: z such that a Gaussian sequence begins to exceed it once in ``every`` times c samples, for c parameters watched.
   Successive errors of an estimate have the correlation 1 / (1 + d), d = mean (theta_t - theta_(t-1))^2 / var_t, since
   a step of the filter has the variance that it removes. The rate holds for a parameter at the very edge of its band, if
@@ -209,6 +209,7 @@ def detect(
 
     Parameters
     ----------
+    run : Track
         The run to be watched.
     kind : "glr", "cusum", "band", "innovation" or "probability", or an AlarmRule
         See the module. A rule, ``alarms.rule`` of another run, contains its limits and settings.
@@ -233,7 +234,8 @@ def detect(
     records : int
         Simulated records of that bootstrap, at least 8: fewer take less time, and give limits that are less accurate.
     start : int or None
-        With a rule: the first sample that is judged. None: after the start of the run, or at once after a warm start.
+        With a rule: the first sample that is judged. None: the first after the start of the run, or the very first
+        after a warm start.
 
     Warns
     -----

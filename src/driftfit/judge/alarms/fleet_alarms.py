@@ -23,7 +23,7 @@ kilobytes for each series; its statistics are computed again when `Watch.alarms`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -34,8 +34,8 @@ from rich.text import Text
 from driftfit.engine.settings import numbers
 from driftfit.judge.alarms.detect import Alarms, asked_for, detect, judged
 from driftfit.judge.alarms.groups import Look, chance, in_doubt, look, with_limits
+from driftfit.judge.cores.on_all_cores import on_all_cores
 from driftfit.judge.fleet_verdict import SHOWN, discoveries
-from driftfit.judge.on_all_cores import on_all_cores
 from driftfit.judge.verdict import p_text
 from driftfit.run.live.rule import FROZEN, AlarmRule
 from driftfit.show.parts.text import Printed, facts, key_text, table_of
@@ -167,14 +167,11 @@ def alarms(
 
     each = {key: reference[key] if own else reference for key in runs}
     settings = {"every": every * len(runs)} | settings
-    if kind in FROZEN and "records" not in settings:
-        judge, failed = _by_groups(runs, kind, each, level, settings)
-    else:
-        judge, failed = lambda key: _judged(runs[key], kind, each[key], settings), {}
-
-    alarms = on_all_cores([key for key in runs if key not in failed], judge, "alarms")
-    good = {key: one for key, one in alarms.items() if isinstance(one, Judged)}
-    errors = failed | {key: one for key, one in alarms.items() if isinstance(one, ValueError)}
+    settled = _by_groups(runs, kind, each, level, settings) if kind in FROZEN and "records" not in settings else {}
+    rest = [key for key in runs if key not in settled]
+    alarms = settled | on_all_cores(rest, lambda key: (runs[key], kind, each[key], settings), _judged, "alarms")
+    good = {key: one for key in runs if isinstance(one := alarms[key], Judged)}
+    errors = {key: one for key in runs if isinstance(one := alarms[key], ValueError)}
     if not good:
         raise next(iter(errors.values()))
     q = discoveries(np.array([one.p for one in good.values()]))
@@ -208,25 +205,24 @@ def _judged(run: Track, kind: str, reference: Any, settings: dict[str, Any]) -> 
 
 def _by_groups(
     runs: Mapping[Hashable, Track], kind: str, each: dict[Hashable, Any], level: float, settings: dict[str, Any]
-) -> tuple[Callable[[Hashable], Judged | ValueError], dict[Hashable, ValueError]]:
-    """How to judge a series, by the limits of its group where they suffice; and the series that cannot be judged."""
+) -> dict[Hashable, Judged | ValueError]:
+    """The series that the limits of their groups show to be without a fault, and those that cannot be judged."""
     asked = asked_for(kind, **{name: settings[name] for name in ("every", "window", "hold") if name in settings})
 
-    def first_look(key: Hashable) -> Look | ValueError:
-        try:
-            return look(runs[key], asked, each[key])
-        except ValueError as error:
-            return error
-
-    seen = on_all_cores(runs, first_look, "reference models")
+    seen = on_all_cores(runs, lambda key: (runs[key], asked, each[key]), _first_look, "reference models")
     looks = {key: one for key, one in seen.items() if isinstance(one, Look)}
     rules = with_limits(runs, looks, each, int(settings.get("seed", 0)))
     p = {key: chance(runs[key], rules[key], one) for key, one in looks.items()}
     q = dict(zip(p, discoveries(np.array(list(p.values()))), strict=True))
+    quiet = (key for key, one in looks.items() if not in_doubt(p[key], q[key], level, one, asked.every))
+    settled: dict[Hashable, Judged | ValueError] = {
+        key: Judged(rules[key], looks[key].start, p[key], (), "") for key in quiet
+    }
+    return settled | {key: one for key, one in seen.items() if isinstance(one, ValueError)}
 
-    def judge(key: Hashable) -> Judged | ValueError:
-        if in_doubt(p[key], q[key], level, looks[key], asked.every):
-            return _judged(runs[key], kind, each[key], settings)
-        return Judged(rules[key], looks[key].start, p[key], (), "")
 
-    return judge, {key: one for key, one in seen.items() if isinstance(one, ValueError)}
+def _first_look(run: Track, asked: AlarmRule, reference: Any) -> Look | ValueError:
+    try:
+        return look(run, asked, reference)
+    except ValueError as error:
+        return error

@@ -25,7 +25,7 @@ from driftfit.judge.alarms.bootstrap import RECORDS, drawn_in_blocks, limits, si
 from driftfit.judge.alarms.frozen import Rows
 from driftfit.judge.alarms.reference import in_samples
 from driftfit.judge.alarms.statistics import Reference, chance_of, findings_of, highest, modelled
-from driftfit.judge.on_all_cores import on_all_cores
+from driftfit.judge.cores.on_all_cores import on_all_cores
 from driftfit.run.live.likelihood_ratio import ALPHA, K
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.result import Track
@@ -71,11 +71,10 @@ def with_limits(
     for key, one in looks.items():
         groups.setdefault(one.like, []).append(key)
 
-    def limits_of(like: Hashable) -> tuple[Array, Array]:
-        chosen = [(runs[key], looks[key].rule, reference[key]) for key in _spread(groups[like])]
-        return _limits_of(chosen, seed)
+    def chosen(like: Hashable) -> tuple[list[tuple[Track, AlarmRule, Reference]], int]:
+        return [(runs[key], looks[key].rule, reference[key]) for key in _spread(groups[like])], seed
 
-    found = on_all_cores(groups, limits_of, "limits")
+    found = on_all_cores(groups, chosen, _limits_of, "limits")
     return {
         key: replace(looks[key].rule, limits=plain(found[like][0]), growth=plain(found[like][1]))
         for like, members in groups.items()

@@ -30,7 +30,7 @@ def in_samples(run: Track, reference: Any) -> Any:
     return reference
 
 
-def stretch(run: Track, reference: Any) -> tuple[int, int]:
+def normal_samples(run: Track, reference: Any) -> tuple[int, int]:
     """(first, end) of the normal samples, without the start of the run; ValueError if there are too few.
 
     ``reference`` is a number of first samples, or (from, to) in samples, without the last.
@@ -55,7 +55,7 @@ def stretch(run: Track, reference: Any) -> tuple[int, int]:
 
 def first_third(run: Track) -> tuple[int, int]:
     """(first, end) of the samples that are taken as normal where no reference was given."""
-    return stretch(run, len(run) // 3)
+    return normal_samples(run, len(run) // 3)
 
 
 def _place(run: Track, given: Any) -> int:

@@ -50,8 +50,8 @@ ONE, JOINT, NOISE = range(3)
 LOWEST = -1e300
 
 
-class Records(NamedTuple):
-    """R simulated records of T samples: what the reference of each knows, and its whitened scores."""
+class SimulatedRecords(NamedTuple):
+    """R simulated records of T samples: what was estimated from the reference of each, and its whitened scores."""
 
     cov: Array
     """(R, n, n)"""
@@ -81,7 +81,7 @@ class Work(NamedTuple):
     """The statistics of the last window of each length."""
 
 
-def statistics_of(records: Records, cusum: bool) -> list[Array]:
+def statistics_of(records: SimulatedRecords, cusum: bool) -> list[Array]:
     """(T, c) for each record: "one", "parameters", "noise"; or with ``cusum`` those of n parameters and the noise."""
     R, T, n = records.phi.shape
     made: list[Array] = []

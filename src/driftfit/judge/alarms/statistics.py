@@ -25,7 +25,7 @@ from driftfit.judge.alarms.onsets import (
     power_limit,
     power_rate,
 )
-from driftfit.judge.alarms.reference import burn, first_third, stretch
+from driftfit.judge.alarms.reference import burn, first_third, normal_samples
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.live.likelihood_ratio import CUSUM, memory_of, scan
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
@@ -75,7 +75,7 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
         raise ValueError(
             f'detect: the reference of "{rule.kind}" must be a number of samples, such as reference=500, or (from, to).'
         )
-    first, start = first_third(run) if reference is None else stretch(run, reference)
+    first, start = first_third(run) if reference is None else normal_samples(run, reference)
     samples = samples_of(run)
     phi, rest = (part[first:start] for part in samples)
     y, ok, noise = rest[:, 0], (rest[:, 1] > 0.0) & (rest[:, 3] > 0.0), rest[:, 2]
@@ -105,7 +105,7 @@ def _band(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule,
     if isinstance(reference, Mapping):
         names, (low, high), known, start = tuple(reference), _edges(reference), slice(burn(run), None), burn(run)
     else:
-        first, start = stretch(run, reference)
+        first, start = normal_samples(run, reference)
         names, known = run.names, slice(first, start)
         low, high = run.theta[known].min(axis=0), run.theta[known].max(axis=0)
     rule = replace(rule, names=names, low=tuple(low.tolist()), high=tuple(high.tolist()))
@@ -146,7 +146,7 @@ def _innovation(run: Track, rule: AlarmRule, reference: Reference) -> tuple[Alar
             'detect: the reference of "innovation" must be a number of samples, such as reference=500, or (from, to).'
         )
     if reference is not None:
-        first, start = stretch(run, reference)
+        first, start = normal_samples(run, reference)
         g = rule.scores(run.innovation[first:start], run.innovation_std[first:start])
         rule = replace(rule, normal=tuple(np.sort(np.abs(g[np.isfinite(g)])).tolist()))
     power, mean = power_limit(rule.window, 2.0 * rule.every), mean_limit(rule.window, 2.0 * rule.every)

@@ -45,7 +45,7 @@ def deviation(x: Array) -> float:
 
 LEAST = 0.5 / 1.6449
 """Smallest scale as a share of the size that nine of ten residuals do not reach, 1.6449 for a Gaussian of variance 1:
-where more than half of the readings of a coarse meter are the same, the median of the sizes says nothing.
+where more than half of the readings of a coarse meter are the same, the median of the sizes is no scale.
 """
 
 

@@ -21,7 +21,7 @@ from scipy import signal, special
 from driftfit.engine.kernel import Array
 
 if TYPE_CHECKING:
-    from driftfit.judge.structures.candidates import Predicted, Structure
+    from driftfit.judge.structures.candidates import Candidate, Predicted
 
 
 class Average(NamedTuple):
@@ -46,7 +46,7 @@ class Average(NamedTuple):
 
 
 def averaged(
-    structures: list[Structure], predictions: list[Predicted], y: Array, scored: Array, forgetting: float,
+    structures: list[Candidate], predictions: list[Predicted], y: Array, scored: Array, forgetting: float,
     regressors: tuple[str, ...],
 ) -> Average:  # fmt: skip
     """Average predictions; ``scored`` (T,) marks the samples that count."""

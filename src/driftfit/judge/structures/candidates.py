@@ -36,7 +36,7 @@ Term = tuple[str, int, int]
 """("y", 0, lag), ("u", input, lag) or ("1", 0, 0)."""
 
 
-class Structure(NamedTuple):
+class Candidate(NamedTuple):
     """A candidate: a model, columns of the union (None: the model runs by itself), or columns without a model."""
 
     name: str
@@ -93,7 +93,7 @@ class Pool:
             [np.arange(len(record)) >= start for record, start in zip(self.records, starts, strict=True)]
         )
 
-    def predict(self, tracker: Tracker, structures: Sequence[Structure]) -> list[Predicted]:
+    def predict(self, tracker: Tracker, structures: Sequence[Candidate]) -> list[Predicted]:
         """Run structures and return their predictions."""
         found: dict[int, Predicted] = {}
         columns = [k for k, s in enumerate(structures) if s.columns is not None]
@@ -115,7 +115,7 @@ class Pool:
                 found[k] = joined([predicted(run) for run in runs])
         return [found[k] for k in range(len(structures))]
 
-    def _families(self, tracker: Tracker, structures: Sequence[Structure]) -> list[dict[int, Model]]:
+    def _families(self, tracker: Tracker, structures: Sequence[Candidate]) -> list[dict[int, Model]]:
         """The models that are no columns, by their place: those that share a driver, and each of the others."""
         families: dict[Any, dict[int, Model]] = {}
         for k, structure in enumerate(structures):
@@ -130,7 +130,7 @@ class Pool:
             found += [models] if together else [{k: model} for k, model in models.items()]
         return found
 
-    def _lanes(self, tracker: Tracker, structures: Sequence[Structure], size: int) -> list[Predicted]:
+    def _lanes(self, tracker: Tracker, structures: Sequence[Candidate], size: int) -> list[Predicted]:
         """Run structures of at most ``size`` columns in drivers of that size."""
         count, T, R = len(structures), len(self.gaps), len(self.records)
         u = np.zeros((count * T, size))
@@ -185,13 +185,13 @@ def predicted(run: Track) -> Predicted:
     return Predicted(run.prediction, np.where(known, s, np.nan), run.log_density)
 
 
-def pool_of(models: Sequence[Model], names: Sequence[str], records: Sequence[Record]) -> tuple[Pool, list[Structure]]:
+def pool_of(models: Sequence[Model], names: Sequence[str], records: Sequence[Record]) -> tuple[Pool, list[Candidate]]:
     """The records with the union of the models' regressors, and the models as structures; models are bound."""
     linear = [model for model in models if _terms(model) is not None]
     if not linear:
         T = sum(map(len, records))
         empty = Pool(tuple(records), np.zeros((T, 0)), (), np.ones(T))
-        return empty, [Structure(name, model.n, model, None) for name, model in zip(names, models, strict=True)]
+        return empty, [Candidate(name, model.n, model, None) for name, model in zip(names, models, strict=True)]
     union = _union(linear)
     order = {term: i for i, term in enumerate(_terms(union) or ())}
     seen = np.concatenate([constant_least_squares(union, record) for record in records])
@@ -201,7 +201,7 @@ def pool_of(models: Sequence[Model], names: Sequence[str], records: Sequence[Rec
     for name, model in zip(names, models, strict=True):
         terms = _terms(model)
         columns = None if terms is None else tuple(order[term] for term in terms)
-        structures.append(Structure(name, model.n, model, columns))
+        structures.append(Candidate(name, model.n, model, columns))
     return pool, structures
 
 

@@ -1,13 +1,13 @@
 """Orders and bases chosen on line: candidates tracked in parallel, each weighted by its recent predictions.
 
-    log w_k <- a log w_k + log p_k(y_t | past),      p_k from before the sample, a just below 1
+    log w_k <- a log w_k + log p_k(y_t | past),      p_k predicted before the sample, a just below 1
 
 A candidate that predicts better gains weight; old predictions are forgotten, so that the choice may change: a valve
-that begins to stick, an order that a new load asks for. Useless parameters cost weight without a penalty, because each
-density is that of a prediction made before its output was observed. A sample that one candidate cannot use moves no
-weights. The tracker should follow: parameters that a tiny q has frozen cost nothing when they are useless, and take
-long to come right when a candidate becomes true. Over the same samples the weights are those of
-``select(..).average(a)``.
+that begins to stick, an order that a new load requires. Useless parameters cost weight without a penalty, because each
+density is that of a prediction made before its output was observed. A sample that one candidate cannot use changes no
+weights. The tracker should be able to follow changes: parameters that a tiny q has frozen cost nothing while they are
+useless, but take long to become correct once their candidate is the right one. Over the same samples the weights are
+those of ``select(..).average(a)``.
 
 Source: Raftery, Karny and Ettler (2010), Technometrics 52(1); the choice of r, m, p, q and bases on line is left open
 by Feng and Hong (2021), section 6. Cost: that of the candidates.
@@ -40,14 +40,15 @@ class LiveSelection(Kept):
     tracker : Tracker
         How their parameters are followed, with a variance; its settings fit every number of parameters.
     forgetting : number in (0, 1]
-        The weight of a log-likelihood one sample later: 1 / (1 - forgetting) samples are weighed. A smaller one finds a
-        change sooner and is led astray by noise more often.
+        The weight of a log-likelihood one sample later: the memory is 1 / (1 - forgetting) samples. A smaller one finds
+        a change sooner, and is misled by noise more often.
     dt : as for `Live`
 
     Raises
     ------
     ValueError
-        No candidate, several outputs, a tracker that has no variance or weighs hypotheses, or a forgetting outside.
+        If there is no candidate, a model has several outputs, the tracker has no variance or weighs hypotheses, or the
+        forgetting is not in (0, 1].
     """
 
     _kind: ClassVar[str] = "selection"
@@ -71,7 +72,8 @@ class LiveSelection(Kept):
         self._logs, self._residuals = np.zeros((2, len(self.streams)))
 
     def update(self, y: float, u: Any = None, **known: Any) -> float:
-        """Take one sample in; the prediction of y from before it, averaged over the candidates by their weights.
+        """Process one sample; returns the prediction of y made before it, averaged over the candidates by their
+        weights.
 
         ``u`` and what is ``known`` (time, weight, drift) are as for `Live.update`.
         """

@@ -43,7 +43,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import factor
 from driftfit.judge.plots import plot_selection
 from driftfit.judge.statistics.paired import newey_west
-from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of, price
+from driftfit.judge.structures.candidates import Candidate, Pool, Predicted, pool_of, price
 from driftfit.judge.structures.several_outputs import pools_of
 from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
@@ -96,7 +96,7 @@ class Selection(Printed):
     scored: int
     tracker: Tracker
     pool: Pool = field(repr=False, compare=False)
-    structures: tuple[Structure, ...] = field(repr=False, compare=False)
+    structures: tuple[Candidate, ...] = field(repr=False, compare=False)
     predictions: tuple[Predicted, ...] = field(repr=False, compare=False)
     judged: Array = field(repr=False, compare=False)
 
@@ -114,7 +114,7 @@ class Selection(Printed):
         found = self._structure(name).model
         if found is None:
             raise ValueError(
-                "select: a subset of regressors is not a model by itself; regressors(name) says what it holds."
+                "select: a subset of regressors is not a model by itself; regressors(name) lists its regressors."
             )
         return found
 
@@ -126,7 +126,7 @@ class Selection(Printed):
             return structure.model.names
         return tuple(self.pool.names[i] for i in structure.columns)
 
-    def _structure(self, name: str | None) -> Structure:
+    def _structure(self, name: str | None) -> Candidate:
         wanted = self.best if name is None else name
         for structure in self.structures:
             if structure.name == wanted:
@@ -146,7 +146,7 @@ class Selection(Printed):
         """When the structure changed, with dates; ``change`` is the probability of a change at a sample.
 
         See `driftfit.judge.structures.switches`. ValueError for structures that are not made of the same regressors, or
-        a probability that is none.
+        a change that is not a probability below one half.
         """
         if not 0.0 < change < 0.5:
             raise ValueError(f"switches: change must be between 0 and 0.5; got {change!r}.")
@@ -288,7 +288,7 @@ def select(
 
 
 def _selected(
-    pool: Pool, structures: list[Structure], tracker: Tracker, search: tuple[Sequence[str], int | None] | None
+    pool: Pool, structures: list[Candidate], tracker: Tracker, search: tuple[Sequence[str], int | None] | None
 ) -> Selection:
     """Compare structures, or with ``search`` = (keep, most) subsets of the regressors of the first."""
     if search is None:
@@ -312,7 +312,7 @@ def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
     return model.bind(inputs)
 
 
-def _judged(pool: Pool, tracker: Tracker, structures: list[Structure], predictions: list[Predicted]) -> Selection:
+def _judged(pool: Pool, tracker: Tracker, structures: list[Candidate], predictions: list[Predicted]) -> Selection:
     """Rank structures on the samples that all could predict."""
     y, starts = pool.y, pool.starts(max(s.n for s in structures))
     judged = pool.after(starts)

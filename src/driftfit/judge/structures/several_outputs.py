@@ -15,11 +15,11 @@ import numpy as np
 from driftfit.data.record import Reading
 from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_least_squares, constant_outputs
-from driftfit.judge.structures.candidates import Pool, Structure
+from driftfit.judge.structures.candidates import Candidate, Pool
 from driftfit.models.base import Model
 from driftfit.run.result import Track
 
-Candidates = tuple[Pool, list[Structure]]
+Candidates = tuple[Pool, list[Candidate]]
 
 
 def pools_of(models: Sequence[Model], y: Any, u: Any, reading: Reading, data: Any, by: Any) -> dict[str, Candidates]:
@@ -46,4 +46,4 @@ def _pool(models: Sequence[Model], candidates: Sequence[Sequence[Track]]) -> Can
     names, records = tuple(columns), tuple(replace(run.record, time=None) for run in candidates[0])
     pool = Pool(records, np.column_stack(list(columns.values())), names, np.min(gaps, axis=0))
     places = [tuple(names.index(name) for name in runs[0].names) for runs in candidates]
-    return pool, [Structure(repr(one), len(at), one, at) for one, at in zip(models, places, strict=True)]
+    return pool, [Candidate(repr(one), len(at), one, at) for one, at in zip(models, places, strict=True)]

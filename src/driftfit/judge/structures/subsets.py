@@ -14,7 +14,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.judge.structures.candidates import Pool, Predicted, Structure, price
+from driftfit.judge.structures.candidates import Candidate, Pool, Predicted, price
 from driftfit.trackers.base import Tracker
 
 ALL = 5
@@ -22,8 +22,8 @@ ALL = 5
 
 
 def subsets(
-    pool: Pool, tracker: Tracker, full: Structure, keep: Sequence[str], most: int | None
-) -> tuple[list[Structure], list[Predicted]]:
+    pool: Pool, tracker: Tracker, full: Candidate, keep: Sequence[str], most: int | None
+) -> tuple[list[Candidate], list[Predicted]]:
     """Subsets of the regressors of one model: all, or those that a search visits."""
     if full.columns is None:
         raise ValueError("select: subsets of regressors need an ARX or Regression; otherwise give a list of models.")
@@ -48,7 +48,7 @@ class Tried:
 
     def __init__(self, pool: Pool, tracker: Tracker) -> None:
         self.pool, self.tracker = pool, tracker
-        self.structures: list[Structure] = []
+        self.structures: list[Candidate] = []
         self.predictions: list[Predicted] = []
         self._place: dict[frozenset[int], int] = {}
         starts = zip(pool.starts(len(pool.names)), pool.records, strict=True)
@@ -59,7 +59,7 @@ class Tried:
         """logliks of subsets, after the start, (k,)."""
         new = [s for s in dict.fromkeys(map(frozenset, subsets)) if s not in self._place]
         structures = [
-            Structure(" ".join(self.pool.names[i] for i in sorted(s)), len(s), None, tuple(sorted(s))) for s in new
+            Candidate(" ".join(self.pool.names[i] for i in sorted(s)), len(s), None, tuple(sorted(s))) for s in new
         ]
         for subset, structure, found in zip(new, structures, self.pool.predict(self.tracker, structures), strict=True):
             self._place[subset] = len(self.structures)

@@ -1,4 +1,4 @@
-"""When did the structure change? A delay that drifts, an order that a new load asks for, with dates.
+"""When did the structure change? A delay that drifts, an order that a new load requires, with dates.
 
     P(k_t = j | k_(t-1) = i) = 1 - change if i = j, change / (K - 1) otherwise         K structures
     p(y_t | k_t, past)                                                             their predictions, from `select`
@@ -27,10 +27,10 @@ import numpy as np
 from driftfit.engine.kernel import Array
 
 WINDOW = 200
-"""Samples on either side of a switch that date it."""
+"""Samples on either side of a switch from which its date is estimated."""
 
 LATE, EARLY = 100, 50
-"""How many samples before and after the most probable sequence's date the date is looked for."""
+"""Samples before and after the date in the most probable sequence among which the date is searched."""
 
 
 class Switch(NamedTuple):

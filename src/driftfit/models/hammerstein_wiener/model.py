@@ -154,7 +154,7 @@ class HammersteinWiener(Model):
         if len({(basis.kind, basis.n, basis.parameters.size) for basis in self.outs}) > 1:
             raise ValueError(
                 f"HammersteinWiener: outputs that run together have bases of one kind and size; got {self.output!r}. "
-                "Others are models of their own."
+                "Use a separate model for any other output."
             )
         if self.output_noise is not None:
             ndim = 1 if several(self.output_noise) else 0
@@ -179,6 +179,10 @@ class HammersteinWiener(Model):
         if isinstance(inputs, int) or self.name is not None:
             return self
         return replace(self, name=inputs[0] if count == 1 else tuple(inputs))
+
+    @property
+    def width(self) -> int:
+        return 1
 
     @property
     def m(self) -> int:
@@ -362,7 +366,7 @@ class HammersteinWiener(Model):
                 continue
             with np.errstate(invalid="ignore", over="ignore"):
                 total = float(data.sum())
-            seen = data if abs(total) < LARGEST else data[np.abs(data) < LARGEST]  # mostly all are there
+            seen = data if abs(total) < LARGEST else data[np.abs(data) < LARGEST]  # usually no value is missing
             low, high = basis.expected
             outside = int(np.sum((seen < low) | (seen > high))) if low > -np.inf or high < np.inf else 0
             if outside:

@@ -1,8 +1,8 @@
 """The memory of a Hammerstein-Wiener model's compiled steps: numbers and arrays one after the other in one field.
 
 The field ``blocks`` (size, L) begins with the numbers named below. `places_of` returns the orders and where the arrays
-begin. The compiled routines of the steps get the address of ``blocks`` for one lane, in which element i is stored L
-numbers after element i - 1. The places are constants of these routines, so that their loops can be unrolled.
+begin. The compiled routines of the steps are given the address of ``blocks`` for one lane, in which element i is stored
+L numbers after element i - 1. The places are constants of these routines, so that their loops can be unrolled.
 
     now, next (n)             regressors of this sample except those of its output, and of the next
     f_past  (nb + nk, n_in)   functions of the inputs t, t - 1, .., of a dead zone with the thresholds known then;

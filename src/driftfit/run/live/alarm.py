@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.data.clock import instant
 from driftfit.data.storage import describe, rebuild
+from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array, Driver
 from driftfit.run.live.change import Change, change_of
 from driftfit.run.live.likelihood_ratio import memory_of, scan

@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.data.clock import LOOK, Clock, Pace, instant
+from driftfit.data.clock import Clock
 from driftfit.data.known import NOISE, Known
 from driftfit.data.labels import times_of
 from driftfit.data.limits import Gate
 from driftfit.data.record import Reading, Records
+from driftfit.data.times.gaps import LOOK, Pace
+from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.run.columns import SCALARS, Columns

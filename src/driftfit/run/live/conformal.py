@@ -78,7 +78,7 @@ class ConformalFactor:
         return float(self.square**0.5)
 
     def update(self, e: float, s: float) -> float:
-        """Take the innovation and its variance, NaN for a sample that was not used; returns the factor."""
+        """Update by an innovation and its variance, NaN for a sample that was not used; returns the factor."""
         if isfinite(e) and isfinite(s):
             outside = e * e > self.z * self.z * self.square * s
             square = self.square * (self._up if outside else self._down)
@@ -101,7 +101,7 @@ def widened(e: Array, s: Array, level: float, name: str) -> Array:
         warnings.warn(
             f"{name}: outputs are outside their {level:.0%} bands so often that the bands are widened by a factor "
             f"above {MUCH:g} after {t} samples, and up to {found.max():.1f}: the model or the noise is not what the "
-            "tracker assumes; run.diagnose() says which.",
+            "tracker assumes; run.diagnose() shows which.",
             stacklevel=3,
         )
     return found

@@ -30,7 +30,7 @@ class Operated(ABC):
         """The fields of the record, or of that of one of several outputs, as views."""
 
     def hold(self, on: bool = True) -> None:
-        """Stop learning, or with ``hold(False)`` resume: for work on the plant, a test, a sensor being cleaned.
+        """Stop learning, or with ``hold(False)`` resume: for work on the plant, a test, or while a sensor is cleaned.
 
         While held, samples enter the lags and are predicted, but are not used (``ok`` is False), and no time passes
         for the parameters and their covariance. Being held is part of the state that `save` writes.
@@ -70,7 +70,7 @@ class Operated(ABC):
             raise ValueError("Live.reset: give p= (the variance of their possible change), theta=, or both.")
         if self._windows:
             raise ValueError(
-                "Live.reset: smoothing with lag= does not support resets; keep a second stream without lag=."
+                "Live.reset: smoothing with lag= does not support resets; use a second stream without lag=."
             )
         count = len(chosen)
         if p is not None:

@@ -15,9 +15,9 @@ from typing import Any, overload
 import numpy as np
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.clock import instant
 from driftfit.data.labels import by_name, order_of
 from driftfit.data.signals import noise_of
+from driftfit.data.times.instants import instant
 from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, factor
@@ -56,7 +56,7 @@ class Live(Operated, Stream):
 
     With several outputs y and all that `update` returns are (ny,); ``theta`` and ``std`` are (ny, n), or (n,) where the
     outputs share one theta. A stream can be copied, pickled and sent to another process, as well as saved: it continues
-    as if never stopped. ``live["level"]`` has what is known of one of several outputs, (n,).
+    as if never stopped. ``live["level"]`` shows one of several outputs, whose estimates are (n,).
 
     Parameters
     ----------
@@ -161,9 +161,9 @@ class Live(Operated, Stream):
         before the next sample; ValueError for a model that has inputs and needs them at once. With ``time``, the
         interval since the last sample scales the drift; a time that is not after the last is counted in ``ignored`` and
         leaves the state unchanged. ``weight`` divides the noise variance of this sample (0: do not use it); it is one
-        number, or one for each output, ``drift`` multiplies the drift before it: one number, or one for each parameter
-        (random-walk trackers) or change (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its changes or
-        joint events at this sample.
+        number, or one for each output, ``drift`` multiplies the drift before the sample: one number, or one for each
+        parameter (random-walk trackers) or change (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its
+        changes or joint events at this sample.
         """
         if prob is not None or type(drift) is not float:
             return self._update_with_extra(y, u, time, weight, drift, prob)

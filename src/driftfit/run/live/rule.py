@@ -151,7 +151,7 @@ def check_fits(rule: AlarmRule, tracker: Tracker, names: Sequence[str]) -> None:
     if rule.kind in FROZEN and len(names) != len(own):
         raise ValueError(
             f"detect: the reference model has {len(own)} parameters, {', '.join(own)}; this run has {len(names)}. "
-            "Make a rule from a run of the same model."
+            "Make the rule from a run of the same model."
         )
     absent = [name for name in rule.names if name not in names] if rule.kind == "band" else []
     if absent:

@@ -9,8 +9,10 @@ from typing import Any, Self
 import numpy as np
 
 from driftfit.data import storage
-from driftfit.data.clock import Clock, Pace, instant
+from driftfit.data.clock import Clock
 from driftfit.data.limits import Gate
+from driftfit.data.times.gaps import Pace
+from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.engine.tiles import as_compiled

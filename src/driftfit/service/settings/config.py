@@ -12,11 +12,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from driftfit.cli.parts.arguments import parse_model
 from driftfit.data.clock import Clock
 from driftfit.data.signals import check_ready
 from driftfit.engine.settings import near
 from driftfit.models.base import Model
+from driftfit.parsing.settings import parse_model
 from driftfit.run.live.rule import KINDS
 from driftfit.run.program import Program
 from driftfit.service.settings.matching import Pattern

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from driftfit.cli.parts.arguments import parse_tracker
+from driftfit.parsing.settings import parse_tracker
 from driftfit.trackers.base import Tracker
 
 

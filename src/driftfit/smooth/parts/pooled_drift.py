@@ -2,7 +2,7 @@
 
 A tracker that adapts reports a drift q_t (n,) for every sample. Even averaged over its modes given all samples, it
 fluctuates where the drift is constant, because it was estimated from the same noise, and a smoother that takes it as
-given follows the noise and states bands that are too narrow. Two shapes of q over time are therefore compared, each at
+given follows the noise and reports bands that are too narrow. Two shapes of q over time are therefore compared, each at
 a few scales,
 
     as estimated    q_t
@@ -12,8 +12,8 @@ by the likelihood L of the record, which integrates theta out (`driftfit.smooth.
 
     q = sum_k p_k q_k,    p_k proportional to L_k exp(-penalty_k)
 
-The smoother is applied to this q, and its variances grow by what the paths theta_k of the single drifts differ from its
-path theta,
+The smoother is applied to this q, and its variances grow by the spread of the paths theta_k under the single drifts
+about its path theta,
 
     sum_k p_k (theta_k - theta) (theta_k - theta)'
 

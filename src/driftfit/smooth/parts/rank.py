@@ -10,6 +10,9 @@ import numpy as np
 from driftfit.engine.kernel import Array, Driver
 from driftfit.trackers.parts import diffuse
 
+FAR = 1e250
+"""Sums of squares between this and its inverse have lost nothing to overflow or underflow."""
+
 
 @Driver
 def column_scale(phi: Array, weight: Array) -> Array:
@@ -20,7 +23,20 @@ def column_scale(phi: Array, weight: Array) -> Array:
         if weight[t] > 0.0:
             count += 1
             for i in range(n):
+                squares[i] += phi[t, i] ** 2
+    ordinary = True
+    for i in range(n):
+        ordinary = ordinary and 1.0 / FAR < squares[i] < FAR
+        scale[i] = np.sqrt(squares[i] / count) if ordinary else 1.0
+    if ordinary:
+        return scale
+    # squares of very large or small numbers, or of zeros: in a unit in which the largest is about 1
+    for t in range(T):
+        if weight[t] > 0.0:
+            for i in range(n):
                 top[i] = max(top[i], abs(phi[t, i]))
+    for i in range(n):
+        squares[i], scale[i] = 0.0, 1.0
     for i in range(n):
         if top[i] > 0.0:
             scale[i] = 2.0 ** -max(-1000.0, min(1000.0, np.floor(np.log2(top[i]))))  # exact in the products

@@ -217,7 +217,7 @@ class Bank(Tracker):
         return self._alike or bool(np.allclose(P, product, rtol=1e-12, atol=1e-15))
 
     def _frames(self, na: int) -> bool:
-        """Whether it may run in the coordinates of its start (`driftfit.trackers.bank.machine.framed`)."""
+        """Whether the bank may run in the coordinates of its start (`driftfit.trackers.bank.machine.framed`)."""
         anywhere = not any(one.reset or one.kind == "stabilised" for one in self.all_changes)
         return (
             anywhere and na == 0 and self.form == "covariance" and not isinstance(self.reduction, reductions.FirstFloor)

@@ -9,7 +9,7 @@ square of regressor i, a change of one standard deviation then moves the output 
 noise. r / c_i is the variance that a single sample leaves of parameter i alone, so `size` is in units of that
 uncertainty. The formulas of forgetting are in `driftfit.trackers.bank.leaves.forget`.
 
-With one change and one sensor the bank is the filter of that change: Change(q) is `Kalman`, Change(0) least squares,
+With one change and one sensor the bank is a single filter: Change(q) is `Kalman`, Change(0) least squares,
 Change(forget=lam) is `RLS`, Change(forget=lam, kind="directional") `RLS` with directional forgetting.
 """
 

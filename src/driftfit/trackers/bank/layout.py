@@ -99,10 +99,10 @@ OUTSIDE = {
 }  # fmt: skip
 """Arrays that are fields of the state themselves."""
 NUMBERS = ("n", "output_lags", "unknown", "independent", "plain", "walks_only", "apart", "own_likelihoods")
-"""n; the number of separate output lags of leaves; whether the noise is unknown, events are independent; whether all
-leaves have one regressor, all changes are walks and all sensors differ in their noise alone; whether all changes are
-walks; whether what may have happened since the last used sample is one level; and the address of the user's own
-likelihoods, while the compiled routine runs.
+"""n; the number of separate output lags of leaves; whether the noise is unknown, and whether events are independent;
+whether all leaves have one regressor, all changes are walks and all sensors differ in their noise alone; whether all
+changes are walks; whether what may have happened since the last used sample is one level; and the address of the user's
+own likelihoods, while the compiled routine runs.
 """
 BASES = ("memory", *(f"{name}_at" for name in OUTSIDE))
 """Rows with addresses: of the field `memory`, in which most arrays lie one after the other, so that banks of all
@@ -126,7 +126,7 @@ table_at = TABLE.at
 
 @kernel
 def report_at(s: Any) -> int:
-    """Where the field `report` begins, the first of those whose length is no part of the compiled type."""
+    """Where the field `report` begins, the first of those whose length is not part of the compiled type."""
     return open_at(s)  # type: ignore[no-any-return]
 
 

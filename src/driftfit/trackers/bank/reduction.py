@@ -86,8 +86,8 @@ class Decide(Reduction):
     max_depth, tau, wait_cost
         For "auto": the bound of the depth, the risk that is small enough, and the cost of a sample of delay.
     ahead : int
-        For ``wait_cost``: how many samples ahead the rule looks. 1 decides at once where one sample tells little,
-        also if some more would tell all.
+        For ``wait_cost``: how many samples ahead the rule looks. With 1 the rule decides at once if one more sample
+        tells little, even if several would tell all.
     force : bool
         Allow depth 1 with outliers, which always prefers "outlier" and so never adapts.
     """

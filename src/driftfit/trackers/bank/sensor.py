@@ -2,8 +2,8 @@
 
     nominal, outlier    y = phi' theta + e,   e ~ N(0, factor r)
     offset              y = phi' theta + value + e
-    frozen              y ~ N(last output seen, r_f), nothing learned
-    own                 a density of your own, of y given the forecast of a leaf (`Sensor.own`)
+    frozen              y ~ N(last output observed, r_f), nothing learned
+    own                 a density that you define, of y given the forecast of a leaf (`Sensor.own`)
 
 An *innovation* outlier drives the plant: y stays in the regressors of later samples. An *additive* one affects only the
 reading: a leaf with this hypothesis puts its own prediction into its output lags, and so does one with a frozen sensor.
@@ -139,8 +139,8 @@ class Sensor(Settings):
     def own(
         cls, likelihood: Callable[..., Any], prob: float = 0.01, scale: float = 1.0, cleans: bool = False
     ) -> Sensor:
-        """A likelihood of your own: a plain function ``likelihood(y, y_hat, h, r, last)`` of numbers, which Numba
-        compiles, returning three: ``log_p, noise, clean``.
+        """A likelihood that you define: a plain function ``likelihood(y, y_hat, h, r, last)`` of numbers, which Numba
+        compiles and which returns three, ``log_p, noise, clean``.
 
         Parameters
         ----------
@@ -159,8 +159,8 @@ class Sensor(Settings):
         cleans : bool
             Whether ``clean`` takes the place of y in the leaf's output lags.
 
-        Cost: the function once for every leaf and sample; about a minute of compiling on each computer. Saved runs keep
-        the function's name, and import it again.
+        Cost: one call of the function per leaf and sample; about a minute of compiling on each computer. Saved runs
+        keep the function's name, and import it again.
         """
         scale = numbers("Sensor.own", "scale", scale, ndim=0, low=0.0, strict=True)
         return cls("own", prob=prob, factor=scale * scale, likelihood=likelihood, own_lags=bool(cleans))
@@ -193,7 +193,7 @@ def table_of(sensors: Sequence[Sensor]) -> Array:
 
 
 def _function(given: Any) -> Any:
-    """A function of a module, or where it is."""
+    """A function, or the place from which it can be imported."""
     if isinstance(given, str):
         module, _, name = given.partition(":")
         given = getattr(import_module(module), name)

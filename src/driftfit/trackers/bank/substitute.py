@@ -11,15 +11,15 @@ from driftfit.engine.kernel import Machine, machine
 
 
 def substituted(functions: Sequence[Any], others: Mapping[Any, Any]) -> tuple[Any, ...]:
-    """Functions or machines, recompiled with some of the functions that they call replaced.
+    """Compiled functions, recompiled with some of the functions that they call replaced.
 
-    ``others`` maps each function to its replacement, which also applies to indirect calls. So a second form of a
-    machine is the first with some parts replaced, and is compiled only where it is asked for.
+    ``others`` maps each function to its replacement, which also applies to indirect calls. So the second form of a
+    compiled routine is the first with some parts replaced, and is compiled only if it is needed.
 
     Raises
     ------
     ValueError
-        If something whose place is taken is called nowhere.
+        If nothing calls a function that is to be replaced.
     """
     found = {id(old): (old, new, new is old) for old, new in others.items()}
     made = tuple(_replaced(function, found) for function in functions)

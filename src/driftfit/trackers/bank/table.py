@@ -12,6 +12,7 @@ Passing the arrays themselves costs the compiler most of its time: each one is n
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -34,7 +35,8 @@ class TableType(types.Type):
 
     def __init__(self, name: str, rows: Mapping[str, tuple[int, str, int]]) -> None:
         self.rows = dict(rows)
-        super().__init__(name=f"driftfit.Table({name}, {self.rows})")
+        digest = hashlib.sha256(str(self.rows).encode()).hexdigest()  # the rows themselves are 4 kB of every symbol
+        super().__init__(name=f"driftfit.Table({name}, {digest[:16]})")
 
 
 @register_model(TableType)

@@ -82,8 +82,10 @@ def knowing(n: int) -> dict[str, Any]:
 def product_with(entry: Any) -> Any:
     """A kernel that fills s.g = P x from the lower triangle of P and returns x' P x, for x_i = entry(s, i, l).
 
-    With more than NARROW parameters a row is read once, for its own entry of P x and those of its columns, and summed
-    in eight parts: a sum in order waits for each of its additions.
+    Each loop does one thing, here and in `corrected`: the compiler unrolls a loop over parameters, and vectorises the
+    loop over lanes around it, only while the body has at most some 300 / n instructions. With more than NARROW
+    parameters a row is read once, for its own entry of P x and those of its columns, and summed in eight parts: a sum
+    in order waits for each of its additions.
     """
 
     @kernel
@@ -93,6 +95,9 @@ def product_with(entry: Any) -> Any:
             g = 0.0
             for j in range(i + 1):
                 g += s.P[i, j, l] * entry(s, j, l)
+            s.g[i, l] = g
+        for i in range(n):
+            g = s.g[i, l]
             for j in range(i + 1, n):
                 g += s.P[j, i, l] * entry(s, j, l)
             s.g[i, l] = g
@@ -164,9 +169,11 @@ def corrected(s: State, y_hat: float, v: float, l: int) -> None:
     for i in range(s.theta.shape[0]):
         k = gain * s.g[i, l]
         s.theta[i, l] += k * e
+        s.P[i, i, l] = max(s.P[i, i, l] - k * s.g[i, l], LEFT * s.P[i, i, l])
+    for i in range(s.theta.shape[0]):
+        k = gain * s.g[i, l]
         for j in range(i):
             s.P[i, j, l] -= k * s.g[j, l]
-        s.P[i, i, l] = max(s.P[i, i, l] - k * s.g[i, l], LEFT * s.P[i, i, l])
     s.y_hat[l] = y_hat
     s.e[l] = e
     s.s[l] = v

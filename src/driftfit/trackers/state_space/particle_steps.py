@@ -12,6 +12,7 @@ from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.models.state_space import equations_of
 from driftfit.trackers.joint_kalman import moves_are_finite
 from driftfit.trackers.parts.diffuse import LEFT
+from driftfit.trackers.parts.faults.contradictions import leave_out_contradiction
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.state_space.draws import normal, uniform
 
@@ -140,6 +141,26 @@ def resample(s: State, l: int) -> None:
                     s.own[p, i, j, l] = s.own_after[p, i, j, l]
 
 
+@kernel
+def keep_particles(s: State, l: int) -> None:
+    """Keep the particles as they are before a move, where `resample` needs room later."""
+    for p in range(s.weight.shape[0]):
+        for i in range(s.theta.shape[0]):
+            s.cloud_after[p, i, l] = s.cloud[p, i, l]
+            for j in range(i + 1):
+                s.own_after[p, i, j, l] = s.own[p, i, j, l]
+
+
+@kernel
+def restore_particles(s: State, l: int) -> None:
+    for p in range(s.weight.shape[0]):
+        for i in range(s.theta.shape[0]):
+            s.cloud[p, i, l] = s.cloud_after[p, i, l]
+            for j in range(i + 1):
+                s.own[p, i, j, l] = s.own_after[p, i, j, l]
+    mixture(s, l)
+
+
 @lru_cache
 def _forecast(equations: str, inputs: tuple[str, ...]) -> Any:
     """``forecast(s, l)``: value, variance and gain of every particle, and of the mixture; whether there is one."""
@@ -228,6 +249,7 @@ def steps(
     def predict(s: State, l: int) -> None:
         n, time = s.theta.shape[0], s.dt[l] * s.drift[l]
         if s.dt[l] > 0.0:
+            keep_particles(s, l)
             for p in range(s.weight.shape[0]):
                 move(s, p, l)
                 for i in range(n):
@@ -241,7 +263,11 @@ def steps(
     def correct(s: State, l: int) -> None:
         s.e[l], s.log_density[l] = 0.0, 0.0
         if forecast(s, l):
+            ok = s.ok[l]
+            leave_out_contradiction(s, s.y_hat[l], s.s[l], l)
             s.e[l] = s.y[l] - s.y_hat[l]
+            if (s.ok[l] < ok) & (s.seen[l] > 0.0):
+                restore_particles(s, l)  # an input is to blame: states do not move with it
             if s.ok[l] > 0.0:
                 weigh(s, l)
                 learn(s, l)

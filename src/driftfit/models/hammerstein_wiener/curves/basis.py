@@ -8,7 +8,7 @@
     Sigmoid(centres, width)      tanh((x - m_k) / width) + tanh(m_k / width)
     DeadZone(u_max)              ([u>=p1] + [u<=p2]) u, -[u>=p1], -[u<=p2],  coefficients (1, p1, p2)
     Saturation(u_max)            [p2<u<p1] u, [u>=p1], [u<=p2],  coefficients (1, p1, p2)
-    Functions(values, slopes, n) any two compilable functions of your own
+    Functions(values, slopes, n) two functions that you write and Numba compiles
 
 No basis contains a constant: constants of the input and of the output block cannot be distinguished, and a model has
 one ``intercept`` for both. Scaling and range are settings, never estimated from the data.

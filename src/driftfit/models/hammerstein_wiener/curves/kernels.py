@@ -1,7 +1,7 @@
-"""The compiled functions of all bases that the library brings, behind one for every kind.
+"""The compiled functions of all bases of the library, and one function that calls that of each kind.
 
 `every` fills ``out`` (n,) and ``slopes`` (n,) with the functions and their derivatives at x; p[0] is the code of the
-kind; the rest are its numbers, which are the arguments of the parts. Steps call it as the machine `evaluate`, with
+kind; the rest are its numbers, which are the arguments of the parts. Steps call it by the symbol `evaluate`, with the
 addresses of p, out and slopes, whose elements are ``stride`` numbers apart: it is compiled once.
 
 B-splines after Piegl and Tiller, The NURBS Book (1997), section 2.5; the scratch that their recursion needs is at the

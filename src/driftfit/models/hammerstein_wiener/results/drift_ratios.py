@@ -8,7 +8,7 @@ at that time: nothing looks ahead. Without the Jacobian F' the likelihood prefer
 
 Use it if there is no record to which `tune` could fit a ratio, or if the ratio changes. The filters are one grid,
 `track` with a list, which distributes them over the cores. Cost: that of the filters. As lanes of one tile seven
-filters take 1.2 times as long as separately at n = 7, and 1.6 times at n = 14: lanes pay if the model's step
+filters take 1.2 times as long as separately at n = 7, and 1.6 times at n = 14: lanes pay only if the model's step
 vectorises over them, as that of an `ARX` does.
 """
 

@@ -102,8 +102,8 @@ def reflected(a: Array) -> Array:
 
 
 def believed(y: Array) -> tuple[Array, Array]:
-    """Least and largest output up to each sample, (T,), as `driftfit.models.hammerstein_wiener.output_curve` believes
-    them.
+    """Least and largest accepted output up to each sample, (T,), by the rule of
+    `driftfit.models.hammerstein_wiener.output_curve`.
     """
     known = np.abs(y) < LARGEST
     seen = y[known]
@@ -115,7 +115,7 @@ def believed(y: Array) -> tuple[Array, Array]:
         bottom, top = bottom - margin, top + margin
         low[2:], high[2:] = np.maximum(seen[2:], bottom), np.minimum(seen[2:], top)
         low[:2], high[:2] = np.nan, np.nan
-    last = np.cumsum(known)  # of the known ones, how many up to each sample
+    last = np.cumsum(known)  # the number of known outputs up to each sample
     none = [np.nan]
     return (
         np.concatenate([none, np.fmin.accumulate(low)])[last],

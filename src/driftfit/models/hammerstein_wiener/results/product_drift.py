@@ -111,8 +111,8 @@ def renewed(live: Live, q: Any) -> Live:
 
     Returns
     -------
-    Live, which continues from the state of the given one; you may drop that one. Cost: that of making a `Live`, about a
-    millisecond; the compiled steps are the same.
+    Live, which continues from the state of the given one; that one is no longer needed. Cost: that of making a `Live`,
+    about a millisecond; the compiled steps are the same.
     """
     model, tracker = live.model, live.tracker
     if not isinstance(model, HammersteinWiener) or not isinstance(tracker, Kalman) or np.ndim(tracker.q) != 2:

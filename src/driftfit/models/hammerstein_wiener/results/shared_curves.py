@@ -44,7 +44,9 @@ def shared_curves(run: Any, method: str = "svd-joint") -> dict[str, Blocks]:
     runs = list(run.values()) if isinstance(run, KeyedResults) else []
     model = runs[0].model if len(runs) > 1 else None
     if not isinstance(model, HammersteinWiener) or any(one.names != one.model.names for one in runs):
-        raise ValueError("shared_curves: takes a run of the products of a HammersteinWiener with several outputs.")
+        raise ValueError(
+            "shared_curves: needs a run of the products of a HammersteinWiener model with several outputs."
+        )
     structure, ny = model.structure, len(runs)
     weights = np.stack([_weight(one.innovation_std) for one in runs], axis=1)
     stacked = HammersteinWiener(0, [ny * nb for nb in structure.nb], input=list(model.bases))

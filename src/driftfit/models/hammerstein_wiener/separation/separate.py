@@ -2,7 +2,7 @@
 
     [b, BC] (nb, n_in) = b c'        [a, AD] (na, n_out) = a (1, d_2 ..)'
 
-    "average"    c_k = mean_j BC_jk / b_j,   b_j = (b_j + sum_k BC_jk / c_k) / n_in,   a and d read off
+    "average"    c_k = mean_j BC_jk / b_j,   b_j = (b_j + sum_k BC_jk / c_k) / n_in,   a and d taken from theta
     "svd"        the nearest matrices of rank one: c = v_1, b = sigma_1 u_1; d = w_1 / w_1[0], a = tau_1 t_1 w_1[0]
     "svd-joint"  b, c as "svd"; a, d the nearest array of rank one to [[1, d], [a, AD]] whose corner is 1, by
                  alternating least squares: a = (a0 + AD d) / (1 + d'd), d = (d0 + AD' a) / (1 + a'a)

@@ -138,10 +138,10 @@ class OutputError(Minimal):
     def steps_for(self, model: Model) -> TrackerSteps:
         structure_of("OutputError", model)
         if len(model.outputs) > 1:
-            raise ValueError("OutputError: follows one output at a time; track each by itself.")
+            raise ValueError("OutputError: follows one output at a time; track each output by itself.")
         assert isinstance(model, HammersteinWiener)
         machine = output_error(model.out.kind, model.places)
-        for one in (model.out.evaluate, machine):  # the machine calls the other
+        for one in (model.out.evaluate, machine):  # the first routine calls the second
             one.load()
         return _steps(machine)
 

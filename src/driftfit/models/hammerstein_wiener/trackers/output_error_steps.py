@@ -50,9 +50,9 @@ from driftfit.trackers.parts.diffuse import LEFT
 FLATTEST = 0.05
 """Least slope of F that the filter divides by."""
 REACH = 3.0
-"""Times the largest w of the outputs seen: w is held within that."""
+"""w is limited to this many times the largest w of the observed outputs."""
 TINY = 1e-300
-"""Smallest variance of a missing input: a sample without an input is marked, also if b is 0."""
+"""Smallest variance of a missing input, so that a sample without an input is marked even if b is 0."""
 WIDEST = 1e3
 """Largest standard deviation of w as a multiple of that: an unstable estimate must not grow without bound in an outage.
 The cross-covariances shrink along."""

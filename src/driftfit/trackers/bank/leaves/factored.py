@@ -15,7 +15,7 @@ vectors of eight, which are rows of narrow matrices, eight numbers wide, from co
 
 Source: Bierman (1977), chapters 5 and 6 (Agee and Turner 1972; Thornton 1976 for Gram-Schmidt); the order of operations
 in `add` after Fletcher and Powell (1974), which keeps digits where c p^2 is much larger than D_j. Cost: O(n^2) for the
-first two, O(n^2) a vector for the third.
+first two, O(n^2) per vector for the third.
 """
 
 from __future__ import annotations

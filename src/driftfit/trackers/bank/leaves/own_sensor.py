@@ -1,4 +1,4 @@
-"""Sensors with a likelihood of the user's own: `driftfit.Sensor.own`.
+"""Sensors with a likelihood that the user writes: `driftfit.Sensor.own`.
 
 A plain function of numbers evaluates a reading y for one leaf,
 
@@ -61,7 +61,8 @@ def judge_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -
     """Evaluate the function for every leaf, three numbers for each in `answers`, and replace h by h + a; h is kept in
     the first row of `scores`.
 
-    The columns up to a whole SIMD vector hold no leaf; their variance must not be zero, since it is divided by.
+    The columns up to a whole SIMD vector hold no leaf; their variance must not be zero, because numbers are divided by
+    it.
     """
     answers = t.answers.reshape(t.answers.shape[0] * t.answers.shape[1])
     for l in range(-(-columns // WIDTH) * WIDTH):

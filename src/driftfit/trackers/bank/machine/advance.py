@@ -99,10 +99,10 @@ from driftfit.trackers.bank.reducing.selection import (
 )
 
 FAULTS_IN_A_ROW = 3
-"""So many samples in a row, at most, are taken for fault codes."""
+"""Largest number of successive samples that are taken for fault codes."""
 DOUBTED, FORGOTTEN = 3.0, 0.98
-"""So many recent samples with an ordinary reading, at most; and the share of this number that is left after a sample
-that counts."""
+"""Largest number of recently refused samples with an ordinary reading; and the share of that number that is left after
+a sample that is accepted."""
 
 
 @shared

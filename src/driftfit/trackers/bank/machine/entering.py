@@ -10,8 +10,8 @@ and so, with the covariance C of the former, z_j = x'z - sum_{i<j} x_i z_i has
 
     C_jb = cov(rho, b) - sum_{i<j} x_i C_ib,      C_jj = var(rho) - sum_{i<j} x_i (cov(rho, i) + C_ji)
 
-No difference of large numbers is left in them, however large x_j^2 C_jj is beside r. If nothing was known of z_j, s is
-infinite: K is 0 for the other coordinates, and x'K is 1.
+No difference of large numbers is left in them, however large x_j^2 C_jj is compared with r. If nothing was known of
+z_j, s is infinite: K is 0 for the other coordinates, and x'K is 1.
 
 Source: ours; the limit is that of Durbin and Koopman, Time Series Analysis by State Space Methods (2012), section 5.2.
 Cost: O(n^2).
@@ -27,19 +27,26 @@ K, G = SIZE, STD
 
 
 @shared
+def product(M: Array, at: int, step: int, x: Array, work: Array, row: int) -> float:
+    """C x in ``work[row]`` for the C whose lower triangle begins at ``at`` with stride ``step``; returns x'C x."""
+    h = 0.0
+    for a in range(len(x)):
+        work[row, a] = 0.0
+        for b in range(len(x)):
+            k = a * (a + 1) // 2 + b if b <= a else b * (b + 1) // 2 + a
+            work[row, a] += M[at + k * step] * x[b]
+        h += x[a] * work[row, a]
+    return h
+
+
+@shared
 def gain_of(M: Array, at: int, step: int, x: Array, noise: float, known: int, work: Array) -> float:
     """K = C x / s in ``work[K]`` for the C whose lower triangle begins at ``at`` with stride ``step``; returns
     1 - x'K = noise / s. Both are 0 if s is infinite (``known`` is 0) or only rounding.
     """
-    n, h = len(x), 0.0
-    for a in range(n):
-        work[K, a] = 0.0
-        for b in range(n):
-            k = a * (a + 1) // 2 + b if b <= a else b * (b + 1) // 2 + a
-            work[K, a] += M[at + k * step] * x[b]
-        h += x[a] * work[K, a]
+    h = product(M, at, step, x, work, K)
     share = 1.0 / (h + noise) if known > 0 and h > 0.0 else 0.0
-    for a in range(n):
+    for a in range(len(x)):
         work[K, a] *= share
     return noise * share
 
@@ -50,13 +57,8 @@ def enter_packed(M: Array, at: int, step: int, x: Array, now: Array, noise: floa
     ``step`` and v with variance ``noise``; x'K = 1 - left. z_j becomes sum_{k>=j} x_k z_k: its error is that of x'z
     without those of z_i, i < j.
     """
-    n, j, sign, h = len(x), int(now[ENTERING]), now[OK], 0.0
-    for a in range(n):
-        work[G, a] = 0.0
-        for b in range(n):
-            k = a * (a + 1) // 2 + b if b <= a else b * (b + 1) // 2 + a
-            work[G, a] += M[at + k * step] * x[b]
-        h += x[a] * work[G, a]
+    n, j, sign = len(x), int(now[ENTERING]), now[OK]
+    h = product(M, at, step, x, work, G)
     k = at
     for a in range(n):
         for b in range(a + 1):

@@ -200,7 +200,7 @@ def write_walks(s: State, l: int) -> None:
 
 @kernel
 def outgrown(s: State, l: int) -> int:
-    """The coordinate whose earlier information a covariance would lose beside that of this sample, or -1."""
+    """The coordinate whose earlier information a covariance would lose next to that of this sample, or -1."""
     n, L = s.d.shape
     s.at_start[NOISE, l] = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
     fields = packed((

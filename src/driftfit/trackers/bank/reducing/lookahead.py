@@ -3,15 +3,15 @@
     ER_s = int min_k sum_e L[e, k] f_e(y) dy,   f_e(y) = sum over leaves with oldest event e, and next events e',
            w_l P[e_l, e'] N(y; z'm_l + b_e', r_e' / s + z'(C_l + Q_e') z)
 
-A minimum of averages is at most the average of minima, so ER_s <= R*: waiting never costs information, only time. Of
-several samples y is the mean, which knows less than all of them: the risk is at most ER_s where they have one regressor
-and nothing happens between them. One sample alone may decide nothing where ten decide all; a rule that looks one sample
-ahead then never begins to wait.
+A minimum of averages is at most the average of minima, so ER_s <= R*: waiting never costs information, only time. For
+several samples y is their mean, which contains less information than all of them: the risk is at most ER_s if they have
+one regressor and nothing happens between them. One sample alone may decide nothing where ten decide all; a rule that
+looks one sample ahead then never begins to wait.
 
 The integral runs over nodes at mean +- 6 standard deviations of every component, by the trapezoidal rule on the union
-of them. The next regressors are not known; the last one before the open events is used instead. One that the
-leaves have already been fitted to, as the present one, promises too little: they agree about it. Cost: components x
-nodes x s; used only while a decision is open.
+of them. The next regressors are not known; the last one before the open events is used instead. A regressor to which
+the leaves have already been fitted, such as the present one, would promise too little, because the leaves agree about
+it. Cost: components x nodes x s; used only while a decision is open.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ KIND, LEAVES, DEPTH, TAU, WAIT, CAP, PRIOR, AHEAD = range(8)
 
 
 FEW = 64
-"""Up to so many entries are compared pairwise; for more, and for ties, the bound is searched."""
+"""Largest number of entries that are compared pairwise; for more, and for ties, the bound is searched."""
 
 
 @kernel

@@ -18,7 +18,7 @@ from driftfit.engine.kernel import Array
 
 
 class Shifts(Protocol):
-    """Anything that states how far parameters moved: a smoothed path."""
+    """Anything from which the change of parameters can be read: a smoothed path."""
 
     @property
     def names(self) -> tuple[str, ...]: ...

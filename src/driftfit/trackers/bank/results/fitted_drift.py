@@ -2,9 +2,9 @@
 
     max_f sum_t log N(y_t; phi_t' m_t, c s_t),   Q_t = D Q_0 D,   D = diag(f_i)^(1/2)   between events,   f_i >= 1
 
-The drift of `Bank()` is a guess, too small where parameters walk all the time: between events a path would be taken for
-certain. c = 1, or where the noise variance is unknown the mean of e_t^2 / s_t: the bank's estimate contains drift that
-its own hypotheses do not explain. All covariances are multiplied by c.
+The drift of `Bank()` is a guess, which is too small if parameters walk all the time: between events the path would be
+taken as certain. c = 1, or where the noise variance is unknown the mean of e_t^2 / s_t: the bank's estimate contains
+drift that its own hypotheses do not explain. All covariances are multiplied by c.
 
 A bank whose drift is too small explains a random walk by changes, and the fit then underestimates the drift. So a
 change of prior probability p is kept if, with the drift fitted to those that are left, it multiplies the likelihood by
@@ -34,7 +34,7 @@ from driftfit.trackers.bank.results.given_steps import Problem, forward, solve
 WIDER = 1e7
 """Largest factor of a drift."""
 STARTS = (1.0, 1e2, 1e4)
-"""Factors at which the search begins: the likelihood may be flat where a drift is too small to be seen."""
+"""Factors at which the search begins: the likelihood may be flat where a drift is too small to be detected."""
 AWAY = np.arange(-7.0, 8.0)
 """Values at which the likelihood of a factor is computed, as natural logarithms."""
 LIKELY = 0.01
@@ -51,7 +51,7 @@ class FittedDrift:
     problem : the regression given all events
     base (T, n, n) : covariances of the steps where nothing else happens
     changes : the samples of changes, and their prior probabilities
-    unknown : whether the noise variance is
+    unknown : whether the noise variance is unknown
     """
 
     def __init__(self, problem: Problem, base: Array, changes: Mapping[int, float], unknown: bool) -> None:

@@ -25,8 +25,7 @@ from driftfit.trackers.parts.modes.noise_levels import level_chain
 
 SMOOTHER_FIELDS = (
     "joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight", "white",
-    "explained", "calm",
-    "left_out",
+    "explained", "calm", "left_out", "shift",
 )  # fmt: skip
 """Fields that are stored at every sample."""
 
@@ -46,7 +45,7 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
         o.white[i, l] = s.white[i, l]
     o.r[l], o.leverage[l], o.coarse[l], o.alike[l] = s.r[l], s.leverage[l], s.coarse[l], s.alike[l]
     o.leapt[l], o.weighed[l], o.settled[l], o.explained[l] = s.leapt[l], s.weighed[l], s.settled[l], s.explained[l]
-    o.calm[l], o.left_out[l] = s.calm[l], s.left_out[l]
+    o.calm[l], o.left_out[l], o.shift[l] = s.calm[l], s.left_out[l], s.shift[l]
 
 
 def given_all(after: Array, stay: Array, change: Array, rate: Array, moves: Array) -> Array:

@@ -10,8 +10,8 @@ with nu the number of residuals, and p_k Student's density of the samples given 
 filters start with probabilities proportional to p_k, and with r the mean of S_k / nu. Parameters that move from the
 first sample on are therefore neither taken for noise nor for estimates that many samples agree on.
 
-Before that the samples are judged together (`driftfit.trackers.parts.first_samples`). If some are fault codes, least
-squares, scales and proportions start again without them; while it cannot be decided, the start goes on.
+Before that the samples are judged together (`driftfit.trackers.parts.faults.first_samples`). If some are fault codes,
+least squares, scales and proportions start again without them; while it cannot be decided, the start goes on.
 
 Source: marginal likelihood under an inverse-gamma variance, West and Harrison, Bayesian Forecasting and Dynamic Models
 (1997), section 4.5. Cost: O(K n^2) for each sample of the start, once.
@@ -27,7 +27,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, State, cubes, exp, kernel, log, machine
 from driftfit.trackers.parts.diffuse import take_in
 from driftfit.trackers.parts.excitation import learn_information, learn_scales
-from driftfit.trackers.parts.first_samples import NOISE, READING, SPAN, WORSE, Y, doubt, doubtful
+from driftfit.trackers.parts.faults.first_samples import NOISE, READING, SPAN, WORSE, Y, doubt, doubtful
 from driftfit.trackers.parts.modes.filters import absorb, project, wander
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
 from driftfit.trackers.parts.modes.weights import MORE, WINDOW
@@ -176,7 +176,8 @@ def faults(fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Arra
     rows, n = np.flatnonzero(ok[:start]), phi.shape[1]
     found = np.zeros(len(y), bool)
     if fields["left_out"][start - 1] > 0.0:
-        samples = np.column_stack([phi[rows], y[rows], np.ones((len(rows), 2)), y[rows]])
+        readings = y[rows] + fields["shift"][rows]
+        samples = np.column_stack([phi[rows], y[rows], np.ones((len(rows), 2)), readings])
         doubtful(samples, n)
         found[rows] = samples[:, n + NOISE] < 0.0
     return found

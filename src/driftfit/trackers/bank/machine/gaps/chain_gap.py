@@ -7,21 +7,22 @@ During a gap the chain continues. For a leaf whose last event is s,
     stay[s, e]     the part of it in which the change was that of e at every sample of the gap
     held[c]        sum Q_c over the gap, mean[s] = E sum Q over the gap
 
-A sample that can be used after k others that could not finds each leaf, weight w, split into two:
+When a sample can be used after k others that could not, each leaf, of weight w, is split into two:
 
     one mode c       w kappa,         C + held[c],                                    stay[s, .] / kappa
     all else         w (1 - kappa),   C + (mean[s] - kappa held[c]) / (1 - kappa),   the rest of reach
 
-(c the mode of largest kappa, the sum of stay[s, e] over its events e) and both grow a level as always, with the chain
-from the events that they end in. So a jump in the gap after which all is as before has a separate leaf, and so has a
-mode that lasted. That is exact in the probabilities of both courses and of what they end in, and in the first two
-moments of the parameters given either; the information of the sample about courses within the second is lost. An
-interval of dt nominal samples is a gap of dt - 1 and a level.
+(c the mode of largest kappa, the sum of stay[s, e] over its events e) and both grow a level as usual, with the chain
+from the events in which they end. So a jump within the gap, after which the course is the normal one again, has a
+separate leaf, and so has a mode that lasted. That is exact in the probabilities of both courses and of what they end
+in, and in the first two moments of the parameters given either; the information of the sample about courses within the
+second is lost. An interval of dt nominal samples is a gap of dt - 1 and a level.
 
 Reductions that number leaves by their last events, `Decide` and `GPB`, have room for as many leaves as there are
 numbers, and twice that here. So at most two leaves have one number: of a leaf that was parted by an earlier gap, and
-whose twin is still there, one leaf continues with the moments of both courses. Without that rule a `Decide` whose
-leaves came to be in one branch, parted again at every gap, and no decision removed any: they outgrew their table.
+whose twin is still there, one leaf continues with the moments of both courses. Without that rule the leaves of a
+`Decide` that were all in one branch were split again at every gap, no decision removed any, and they outgrew their
+table.
 
 Only random walks, and not under `IMM`, which has one leaf for every event and mixes it from all of them at every
 sample, nor under `FirstFloor`, which grows the tree again from samples alone; both widen by the mean. Cost: O(H^3 + H

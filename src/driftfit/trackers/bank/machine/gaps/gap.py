@@ -13,9 +13,9 @@ where D is the mean of all changes of the interval and M that of those after its
 samples has r_0 = p_0^dt, and dt (1 - p_0) changes on average. The next used sample grows one level with the
 probabilities a and the covariances A. Its event stands for the whole gap.
 
-That is exact in the probability of any change, in the first two moments of the parameters after the gap given the
-first change, and wholly where at most one change falls into a gap; the ordinary course, a drift, is not taken back for
-the samples at which another change was in its place. Priors that follow a Markov chain describe changes that last:
+That is exact in the probability of any change and in the first two moments of the parameters after the gap given the
+first change, and entirely exact if at most one change falls into a gap; the drift of the normal course is not removed
+for the samples at which another change took its place. Priors that follow a Markov chain describe changes that last:
 there the chain continues and leaves receive the mean of all changes.
 
 Cost: O(H n^2) for each sample that is not used.

@@ -16,14 +16,14 @@ from driftfit.run.program import Program, State, tile_of
 from driftfit.run.states.layout import fields_of, packed, unpacked
 
 
-class Joint:
+class JointLayout:
     """The programs of a series; all of one model and one kind of tracker."""
 
     def __init__(self, programs: Sequence[Program]) -> None:
         self.programs = tuple(programs)
 
     def __repr__(self) -> str:
-        return f"Joint({', '.join(map(repr, self.programs))})"
+        return f"JointLayout({', '.join(map(repr, self.programs))})"
 
     @cached_property
     def size(self) -> int:

@@ -1,17 +1,17 @@
-"""The breaks of a record in correlated noise: the autoregression is estimated again for all that are compared.
+"""The breaks of a record in correlated noise: the autoregression is estimated again for each set that is compared.
 
     N log sigma^2(breaks),   sigma^2 = min over a, theta of segments of mean (v_t - sum_k a_k v_(t-k))^2
     v_t = y_t - phi_t' theta_(segment of t)
 
 Jumps of the coefficients and correlation of the noise explain the same residuals. `driftfit.judge.statistics.noise`
-alternates between the two, and stays with the explanation that it began with. Here it proposes breaks, from little
-correlation, from much and from what is between. Of the proposed breaks, single ones and neighbouring pairs are removed
-while log sigma^2 with a new autoregression increases by less than the thresholds of
+alternates between the two, and stays with the explanation that it began with. Here it proposes breaks, beginning with
+little, with much and with intermediate correlation. Of the proposed breaks, single ones and neighbouring pairs are
+removed while log sigma^2 with a new autoregression increases by less than the thresholds of
 `driftfit.judge.segments.thresholds`; what remains is dated again. The p rows after a break, which contain coefficients
-of two segments, are used here: in correlated noise they hold a large part of what is known of a break.
+of two segments, are used here: in correlated noise they contain a large part of the information on a break.
 
-A removal is compared on the rows between the neighbours of what is removed. They give the products of v at the lags of
-a that the rest of the record is added to.
+A removal is compared on the rows between the neighbours of what is removed. Their products of v at the lags of a are
+added to those of the rest of the record.
 
 Source: Chakar, Lebarbier, Levy-Leduc and Robin (2017) for the model. Cost: O(N (n^2 + p)) per round of removals.
 """

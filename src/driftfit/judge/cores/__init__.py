@@ -1,0 +1,1 @@
+"""Judge many runs at once, in threads or in processes."""

@@ -1,0 +1,111 @@
+"""Processes that judge runs, because Python code in threads runs on one core at a time.
+
+Each is a new interpreter that imports the package and reads batches from its input until that is closed. Unlike the
+workers of ``multiprocessing``, it does not run the script of the user again, so that no script needs a guard against
+that. Whatever cannot be done there is done here instead, in a thread: a model of the user's own script cannot be sent,
+and a process may be killed for its memory. An error is then raised here, where it can be read.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from queue import SimpleQueue
+from typing import IO, Any, Self
+
+SERVE = "from driftfit.judge.cores.processes import serve; serve()"
+LENGTH = 8
+"""Bytes of the number that says how long a message is."""
+
+Process = subprocess.Popen[bytes]
+
+
+def available() -> bool:
+    """Whether ``sys.executable`` is Python; in a program that embeds or freezes Python it is that program."""
+    return Path(sys.executable or "").stem.lower().startswith(("python", "pypy"))
+
+
+class Processes:
+    """A number of processes, as a context: they end with it."""
+
+    def __init__(self, count: int) -> None:
+        path = os.pathsep.join(filter(None, sys.path))
+        self._all = [
+            subprocess.Popen(
+                [sys.executable, "-c", SERVE],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                env=os.environ | {"PYTHONPATH": path},
+            )
+            for _ in range(count)
+        ]
+        self._idle: SimpleQueue[Process] = SimpleQueue()
+        for process in self._all:
+            self._idle.put(process)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self._all:
+            process.kill()
+        for process in self._all:
+            process.wait()
+            for stream in (process.stdin, process.stdout):
+                with suppress(OSError):  # what was not sent to a process that has ended
+                    _open(stream).close()
+
+    def map(self, judge: Callable[..., Any], batch: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """``judge(*arguments)`` for each arguments of the batch, in a process that is idle, or else here."""
+        process = self._idle.get()
+        try:
+            _send(_open(process.stdin), pickle.dumps((judge, batch), pickle.HIGHEST_PROTOCOL))
+            found = pickle.loads(_received(_open(process.stdout)))
+        except (OSError, EOFError, pickle.PickleError, AttributeError, TypeError):
+            found = None
+        finally:
+            self._idle.put(process)
+        return [judge(*arguments) for arguments in batch] if found is None else list(found)
+
+
+def serve() -> None:
+    """Judge what is read until the input ends; the answer is None where that raises an exception."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is answered by the process that asked
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what a model prints does not mix with the answers
+    while True:
+        try:
+            message = _received(sys.stdin.buffer)
+        except EOFError:
+            return
+        try:
+            judge, batch = pickle.loads(message)
+            answer = pickle.dumps([judge(*arguments) for arguments in batch], pickle.HIGHEST_PROTOCOL)
+        except Exception:
+            answer = pickle.dumps(None)
+        _send(answers, answer)
+
+
+def _open(stream: IO[bytes] | None) -> IO[bytes]:
+    assert stream is not None
+    return stream
+
+
+def _send(stream: Any, message: bytes) -> None:
+    stream.write(len(message).to_bytes(LENGTH, "little"))
+    stream.write(message)
+    stream.flush()
+
+
+def _received(stream: Any) -> bytes:
+    length = stream.read(LENGTH)
+    if len(length) < LENGTH:
+        raise EOFError
+    message: bytes = stream.read(int.from_bytes(length, "little"))
+    return message

@@ -1,0 +1,1 @@
+"""Formulas of models, from text or from plain Python functions."""

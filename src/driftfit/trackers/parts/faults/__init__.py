@@ -1,0 +1,1 @@
+"""Fault codes: samples that contradict all others."""

@@ -1,0 +1,150 @@
+"""Samples that contradict everything before: fault codes and spikes in the output or in an input.
+
+A reading of 9999 where the output is near 10, or an input of 9999 where it is near 1, says nothing about the system,
+and least squares would believe it before all others. In both cases reading and prediction are apart, and one of them
+is where no reading has been. With m and v the mean and variance of the readings so far, e = y - y_hat and s the
+variance of e by the tracker, times the mean of e^2 / s so far, a sample is strange if
+
+    e^2 > (REACH p)^2 v    and    e^2 > SURE^2 s    and    min(|y - m|, |y_hat - m|) < |e| / 2
+
+and is not used. If y is farther from m than y_hat, the lag of the reading is that of a missing one, too. The second
+condition does not hold where parameters are hardly known; the third not after a test to which the output responds. A
+change of gain or level within the usual range of the readings is never strange.
+
+An estimate that went astray predicts what is strange, too, and must be corrected. Inputs are therefore blamed for at
+most `LAGS` samples in a row, and for one sample in ten in the long run.
+
+A strange input stays in the regressors, as a lag or in what a model simulates, and may matter less there. In the `LAGS`
+samples after one that an input was to blame for, one with phi' P phi > r, which would teach more than all before it, is
+therefore not used either.
+
+p, the patience, is 1, and doubles with every strange reading after another one: what persists is a change of level, and
+is accepted. It takes seven samples for a factor of 1000. Where the prediction is strange it doubles in four samples,
+and in 16 where the strange value stays, because fault codes come in runs. It stays 1 while a strange prediction sinks
+back, as what a model simulates does. The first `FIRST` readings are not
+judged; those of a diffuse start are judged together (`driftfit.trackers.parts.faults.judged_start`).
+
+Source: ours; see `driftfit.trackers.parts.outlying_readings` for the rule of a tracker that learns its own noise. Cost
+per sample: some twenty operations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, State, kernel
+from driftfit.trackers.parts.diffuse import corrected, prediction, symmetric_product
+
+REACH = 10.0
+"""Standard deviations of the readings."""
+SURE = 5.0
+"""Standard deviations of the prediction."""
+FIRST = 10.0
+"""Number of first readings that are accepted, for comparison with later ones."""
+MEMORY = 1000.0
+"""Memory of the mean and variance of the readings, in readings."""
+ENOUGH, FAR = 4.0, 100.0
+"""Samples for a mean of e^2 / s; a larger multiple of it counts as this one."""
+LASTING, LONGEST = 4.0, 1e12
+"""The patience from which on a strange input is accepted as a lag too; its upper bound."""
+LAGS = 50.0
+"""Samples in which a strange input may still be in the regressors."""
+SELDOM = 0.1
+"""Share of samples that inputs may be blamed for in the long run."""
+QUICK, SLOW, SLOWEST = 2.0, 2.0 ** (1.0 / 4.0), 2.0 ** (1.0 / 16.0)
+"""Factors of the patience: for readings, for predictions, and if the strange value stays."""
+ALIKE, SINKING = 1.01, 0.8
+"""A strange prediction stays if its distance is that of those before, up to this factor; of which so much is kept."""
+
+
+def no_contradictions() -> dict[str, Any]:
+    """Fields before the first reading."""
+    return {
+        "y_mean": 0.0, "y_spread": 0.0, "y_count": 0.0, "y_last": np.nan, "patience": 1.0, "y_strange": np.nan,
+        "far": 0.0, "left_out": 0.0, "distrusted": 0.0, "misfit": 0.0, "misfits": 0.0, "shift": 0.0, "lagging": 0.0,
+    }  # fmt: skip
+
+
+@kernel
+def learn_range(s: State, y: float, used: float, l: int) -> None:
+    """Mean and variance of the readings; one that repeats the last has nothing new."""
+    fresh = used if (y != s.y_last[l]) | (s.y_count[l] < 1.0) else 0.0
+    s.y_count[l] += fresh
+    share = fresh / min(max(s.y_count[l], 1.0), MEMORY)
+    away = y - s.y_mean[l]
+    s.y_mean[l] += share * away
+    s.y_spread[l] += share * ((1.0 - share) * away * away - s.y_spread[l])
+    s.y_last[l] = y if used > 0.0 else s.y_last[l]
+
+
+@kernel
+def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
+    """Whether the sample is used: s.ok and s.seen; and the patience."""
+    e, off, out = y - shown, abs(y - s.y_mean[l]), abs(shown - s.y_mean[l])
+    reach, patience = REACH * REACH * s.y_spread[l], s.patience[l]
+    judged = (s.ok[l] > 0.0) & (s.y_count[l] >= FIRST) & (s.misfits[l] >= ENOUGH)
+    strange = judged & (e * e > reach) & (e * e > SURE * SURE * v * s.misfit[l]) & (min(off, out) < 0.5 * abs(e))
+    trusted = (off > out) | (s.distrusted[l] < LAGS)
+    beyond = strange & trusted & (e * e > reach * patience * patience)
+    lasting = strange & (not beyond) & (patience > LASTING)
+    lagging = (
+        judged
+        & (not lasting)
+        & (s.lagging[l] > 0.0)
+        & (s.distrusted[l] < LAGS)
+        & (v > 2.0 * s.r[l] * s.noise[l] * s.scale[l])
+    )
+    left = beyond | lagging
+    more = 1.0 if left & (off <= out) else -SELDOM
+    s.distrusted[l] = min(max(s.distrusted[l] + more, 0.0), 2.0 * LAGS) if s.ok[l] > 0.0 else s.distrusted[l]
+    of_reading = SLOWEST if y == s.y_strange[l] else QUICK
+    of_prediction = (1.0 if out * ALIKE < s.far[l] else SLOWEST) if out < ALIKE * s.far[l] else SLOW
+    grown = min((of_reading if off > out else of_prediction) * patience, LONGEST)
+    left_over = 0.0 if lasting else max(s.lagging[l] - 1.0, 0.0)
+    s.lagging[l] = LAGS if beyond & (off <= out) else left_over
+    s.patience[l] = grown if strange else (1.0 if s.ok[l] > 0.0 else patience)
+    s.y_strange[l] = y if strange else s.y_strange[l]
+    s.far[l] = max(out, SINKING * s.far[l]) if strange else 0.0
+    s.left_out[l] += 1.0 if left else 0.0
+    s.seen[l] = 0.0 if beyond & (off > out) else s.seen[l]
+    s.ok[l] = 0.0 if left else s.ok[l]
+
+
+@kernel
+def leave_out_contradiction(s: State, y_hat: float, v: float, l: int) -> None:
+    """Leave out a sample that contradicts all before, given its prediction and the variance of that.
+
+    A single lane skips what would change nothing; side by side, lanes are faster without a branch.
+    """
+    y, shown = s.y[l] + s.shift[l], y_hat + s.shift[l]
+    quiet = (
+        ((y - shown) ** 2 <= REACH * REACH * s.y_spread[l])
+        & (s.patience[l] <= 1.0)
+        & (s.lagging[l] + s.distrusted[l] <= 0.0)
+    )
+    if (s.theta.shape[1] > 1) or (not quiet):
+        judge(s, y, shown, v, l)
+    learn_range(s, y, s.ok[l], l)
+    measured = (v > 0.0) & (v < np.inf)
+    square = (y - shown) ** 2 / v if measured else 0.0
+    used = s.ok[l] if measured else 0.0
+    s.misfits[l] = min(s.misfits[l] + used, MEMORY)
+    bounded = min(square, FAR * s.misfit[l]) if s.misfits[l] > ENOUGH else square
+    s.misfit[l] += used * (bounded - s.misfit[l]) / max(s.misfits[l], 1.0)
+
+
+@kernel
+def judged_measurement(s: State, l: int) -> None:
+    """One correction with noise variance s.r, unless the sample contradicts all before it."""
+    y_hat, v = prediction(s, l), symmetric_product(s, l) + s.r[l] * s.noise[l]
+    leave_out_contradiction(s, y_hat, v * s.scale[l], l)
+    corrected(s, y_hat, v, l)
+
+
+def contradictions(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
+    """Its remark in a summary: nothing if all samples were accepted."""
+    count = int(lane["left_out"]) if "left_out" in lane else 0
+    return (("Left out", f"{count} samples out of all proportion to those before"),) if count else ()

@@ -1,0 +1,213 @@
+"""The diffuse start of trackers that believe what they are given: their first samples are judged together.
+
+Any first samples are fitted exactly, so that a fault code among them would decide the estimate. The start goes on in
+its square-root form until there are `RESIDUALS` more samples than directions. If some of them are doubtful
+(`driftfit.trackers.parts.faults.first_samples`), it goes on until the others have `SURE` residuals, or the store is
+full. If the estimate from all samples then contradicts these, the start is repeated without the doubtful ones.
+
+Samples are stored with the time since the one before that is stored, so that drift and forgetting are repeated too.
+
+Cost: that of the diffuse start for a few samples more, and O(n N^2) once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, State, Step, cubes, kernel, machine, nothing
+from driftfit.trackers.parts.diffuse import BEFORE, MACHINES, prediction, reform
+from driftfit.trackers.parts.faults.contradictions import REACH, learn_range, leave_out_contradiction, no_contradictions
+from driftfit.trackers.parts.faults.first_samples import NOISE, READING, SPAN, WORSE, Y, doubt, doubtful
+
+RESIDUALS = 4
+"""Number of residuals after which the first samples are judged."""
+SURE = 12
+"""The same for those that are not doubtful, if some are."""
+MORE = 16
+"""Samples that are stored beyond the number of parameters."""
+AGED = READING + 1
+"""Entry of a stored sample: intervals of forgetting; `SPAN` are those of drift."""
+
+
+def unjudged(theta: Array, diffuse: bool) -> dict[str, Any]:
+    """Fields before the first sample, for a start at theta (n,); with a proper prior nothing is judged."""
+    n = len(theta)
+    return {
+        "start_rows": np.zeros((n + MORE, n + AGED + 1)), "start_count": 0, "start_over": 0 if diffuse else 1,
+        "start_theta": theta, "start_time": 0.0, "start_drift": 0.0, "start_faults": 0.0, **no_contradictions(),
+    }  # fmt: skip
+
+
+@machine
+def machine_doubt_first(samples: int, rows: int, columns: int, count: int, n: int, L: int, l: int) -> None:
+    """`doubt` for lane l of L, from the address of the samples."""
+    doubt(cubes(samples, rows, columns, L)[:, :, l], count, n)
+
+
+START_MACHINES = (*MACHINES, machine_doubt_first)
+"""The routines that a start calls; see `TrackerSteps`."""
+
+
+@kernel
+def keep(s: State, l: int) -> None:
+    """Store the sample."""
+    n, at = s.theta.shape[0], s.start_count[l]
+    s.start_time[l] += s.dt[l]
+    s.start_drift[l] += s.dt[l] * s.drift[l]
+    if (s.ok[l] > 0.0) & (at < s.start_rows.shape[0]):
+        for i in range(n):
+            s.start_rows[at, i, l] = s.phi[i, l]
+        s.start_rows[at, n + Y, l], s.start_rows[at, n + SPAN, l] = s.y[l], s.start_drift[l]
+        s.start_rows[at, n + NOISE, l], s.start_rows[at, n + READING, l] = s.noise[l], s.y[l] + s.shift[l]
+        s.start_rows[at, n + AGED, l] = s.start_time[l]
+        s.start_time[l], s.start_drift[l] = 0.0, 0.0
+        s.start_count[l] += 1
+
+
+@kernel
+def as_before(s: State, l: int) -> None:
+    """The state of the diffuse start before the first sample."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        s.theta[i, l], s.d[i, l], s.F[i, l], s.var[i, l] = s.start_theta[i, l], 0.0, 1.0, np.inf
+        for j in range(n):
+            s.S[i, j, l], s.R[i, j, l] = 0.0, 1.0 if i == j else 0.0
+    s.volume[l], s.rank[l] = 0.0, 0
+
+
+@kernel
+def squares_left(s: State, l: int) -> float:
+    """Sum of squares of the residuals of the samples that are not doubtful."""
+    n, squares = s.theta.shape[0], 0.0
+    for at in range(s.start_count[l]):
+        e, noise = s.start_rows[at, n + Y, l], s.start_rows[at, n + NOISE, l]
+        for i in range(n):
+            e -= s.start_rows[at, i, l] * s.theta[i, l]
+        squares += e * e / noise if noise > 0.0 else 0.0
+    return squares
+
+
+@kernel
+def settle(s: State, l: int) -> None:
+    """The start is over: the readings of the samples that it used are the range of later ones."""
+    n = s.theta.shape[0]
+    s.start_over[l] = 1
+    known = s.scale[l] > 0.0  # it is NaN without residuals
+    s.misfits[l] = max(s.start_count[l] - s.start_faults[l] - s.rank[l], 0.0) if known else 0.0
+    s.misfit[l] = squares_left(s, l) / (max(s.misfits[l], 1.0) * s.r[l] * s.scale[l]) if known else 0.0
+    for at in range(s.start_count[l]):
+        learn_range(s, s.start_rows[at, n + READING, l], 1.0 if s.start_rows[at, n + NOISE, l] > 0.0 else 0.0, l)
+
+
+@kernel
+def doubtful_samples(s: State, l: int) -> int:
+    """Mark the doubtful samples, and count them."""
+    n, L, found = s.theta.shape[0], s.theta.shape[1], 0
+    machine_doubt_first(
+        s.start_rows.ctypes.data, s.start_rows.shape[0], s.start_rows.shape[1], s.start_count[l], n, L, l
+    )
+    for at in range(s.start_count[l]):
+        found += 1 if s.start_rows[at, n + NOISE, l] < 0.0 else 0
+    return found
+
+
+@kernel
+def trust_all(s: State, l: int) -> None:
+    n = s.theta.shape[0]
+    for at in range(s.start_count[l]):
+        s.start_rows[at, n + NOISE, l] = abs(s.start_rows[at, n + NOISE, l])
+
+
+@lru_cache
+def reconsidering(one: Step, restart: Step) -> Any:
+    """``reconsider(s, found, l)``: the start repeated without the doubtful samples, if they contradict the others."""
+
+    @partial(kernel, inline=False)
+    def repeat(s: State, every: bool, l: int) -> None:
+        """The start again, with every sample or without the doubtful ones."""
+        n, waited, drift = s.theta.shape[0], 0.0, 0.0
+        as_before(s, l)
+        restart(s, l)
+        for at in range(s.start_count[l]):
+            waited += s.start_rows[at, n + AGED, l]
+            drift += s.start_rows[at, n + SPAN, l]
+            noise = s.start_rows[at, n + NOISE, l]
+            if every or noise > 0.0:
+                for i in range(n):
+                    s.phi[i, l] = s.start_rows[at, i, l]
+                s.y[l], s.noise[l] = s.start_rows[at, n + Y, l], abs(noise)
+                s.shift[l] = s.start_rows[at, n + READING, l] - s.y[l]
+                s.dt[l], s.drift[l] = waited, drift / waited if waited > 0.0 else 0.0
+                one(s, l)
+                waited, drift = 0.0, 0.0
+
+    @partial(kernel, inline=False)
+    def reconsider(s: State, found: int, l: int) -> None:
+        y, y_hat, e, v, noise, shift = s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l]
+        dt, drift, n, last = s.dt[l], s.drift[l], s.theta.shape[0], s.start_count[l] - 1
+        with_all = squares_left(s, l)
+        repeat(s, False, l)
+        if with_all > WORSE * squares_left(s, l):
+            s.left_out[l] += found
+            s.start_faults[l] = found
+        else:
+            repeat(s, True, l)
+            trust_all(s, l)
+        s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l] = y, y_hat, e, v, noise, shift
+        s.dt[l], s.drift[l] = dt, drift
+        for i in range(n):
+            s.phi[i, l] = s.start_rows[last, i, l]
+
+    return reconsider
+
+
+@lru_cache
+def judging(begin: Step, restart: Step = nothing) -> Step:
+    """``begin`` of a tracker whose first samples are judged; ``restart`` sets its own fields as before the first."""
+
+    @partial(kernel, inline=False)
+    def one(s: State, l: int) -> None:
+        begin(s, l)
+
+    reconsider = reconsidering(one, restart)
+
+    @kernel
+    def start(s: State, l: int) -> None:
+        if s.start_over[l] > 0:
+            y_hat, v = prediction(s, l), np.inf
+            if (s.y[l] - y_hat) ** 2 > REACH * REACH * s.y_spread[l]:
+                reform(s, l)  # which says what the variance of the prediction is
+                v = (s.at_start[BEFORE, l] + s.r[l] * s.noise[l]) * s.scale[l]
+            leave_out_contradiction(s, y_hat, v, l)
+            one(s, l)
+        else:
+            keep(s, l)
+            one(s, l)
+            spare, found = s.start_count[l] - s.rank[l], 0
+            full = s.start_count[l] >= s.start_rows.shape[0]
+            if (s.ok[l] > 0.0) & (spare >= RESIDUALS):
+                found = doubtful_samples(s, l)
+            ready = (spare >= RESIDUALS) & ((found == 0) | (spare - found >= (RESIDUALS if full else SURE)))
+            if (s.ok[l] > 0.0) & (found > 0) & ready:
+                reconsider(s, found, l)
+            if ready | full:
+                settle(s, l)
+            s.root[l] = s.root[l] if s.start_over[l] > 0 else 1
+
+    step: Step = start
+    return step
+
+
+def faults(lane: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
+    """Which of the samples (T,) of a record were left out of its start, given the state after it."""
+    found, n = np.zeros(len(y), bool), phi.shape[1]
+    if lane["start_faults"] > 0.0:
+        rows = np.flatnonzero(ok)[: int(lane["start_count"])]
+        samples = np.column_stack([phi[rows], y[rows], np.ones((len(rows), 2)), y[rows]])
+        doubtful(samples, n)
+        found[rows] = samples[:, n + NOISE] < 0.0
+    return found

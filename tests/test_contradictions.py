@@ -1,0 +1,131 @@
+"""One fault code, in y or in an input, at any place and of any size, does a tracker that forgets nothing no harm."""
+
+import numpy as np
+import pytest
+
+from driftfit import (
+    ARX,
+    OE,
+    RLS,
+    InstrumentalVariables,
+    JointKalman,
+    Kalman,
+    Live,
+    ParticleFilter,
+    Regression,
+    StateSpace,
+    track,
+)
+
+T, THETA = 500, (1.1, -0.5, 1.0, 0.5)
+PLANT = ARX(2, 2)
+LINES = StateSpace("y = theta.a1 * y[-1] + theta.a2 * y[-2] + theta.b1 * u[-1] + theta.b2 * u[-2]", start=0.0)
+PRIOR = {"q": 1e-7, "r": 0.01, "p0": 1.0}
+DIFFUSE = [
+    RLS(0.99), RLS(1.0), RLS(0.99, kind="directional"), Kalman(q=1e-7, r=0.01), Kalman(q=1e-7, r=0.01, form="sqrt"),
+    InstrumentalVariables(0.99),
+]  # fmt: skip
+PAIRS = [
+    *((PLANT, one) for one in DIFFUSE), (PLANT, Kalman(**PRIOR)),
+    (LINES, JointKalman(**PRIOR)), (LINES, ParticleFilter(20, **PRIOR)),
+]  # fmt: skip
+CODES = (99.0, 9999.0, -1e6, 1e9)
+
+
+def plant(scale=1.0, seed=0):
+    rng = np.random.default_rng(seed)
+    u, y = rng.normal(size=T), np.zeros(T)
+    for t in range(2, T):
+        y[t] = THETA[0] * y[t - 1] + THETA[1] * y[t - 2] + THETA[2] * u[t - 1] + THETA[3] * u[t - 2]
+        y[t] += 0.1 * rng.normal()
+    return scale * y, u
+
+
+def broken(places, scale=1.0):
+    """y and u (cases, T), each with one code at one place of one signal; the first is whole."""
+    y, u = plant(scale)
+    rows = [(y, u)]
+    for at in places:
+        for code in CODES:
+            bad = [y.copy(), u.copy()]
+            bad[0][at] = code * scale
+            rows.append((bad[0], u))
+            bad[1][at] = code
+            rows.append((y, bad[1]))
+    return [np.stack(part) for part in zip(*rows, strict=True)]
+
+
+def named(pair):
+    return f"{type(pair[0]).__name__}, {pair[1]!r}"
+
+
+@pytest.mark.parametrize("pair", PAIRS, ids=named)
+def test_a_fault_code_in_the_middle_does_no_harm(pair):
+    fleet = track(*pair, *broken([15, 100, 350]), by="row")
+    whole = fleet[0].theta
+    for k in range(1, len(fleet)):
+        away = np.abs(fleet[k].theta - whole)[:, :4].max(1)
+        assert away[200] < 0.03 if k < 17 else away[400] < 0.02, k
+        assert away[-1] < 0.01, k
+        assert fleet[k].state["left_out"] + fleet[k].state.get("refused", 0.0) > 0.0, k
+
+
+@pytest.mark.parametrize("tracker", DIFFUSE, ids=repr)
+@pytest.mark.parametrize("scale", [1.0, 1e-6])
+def test_a_fault_code_at_the_start_does_no_harm_in_any_unit(tracker, scale):
+    if scale != 1.0 and isinstance(tracker, Kalman):
+        pytest.skip("q and r are in units")
+    fleet = track(PLANT, tracker, *broken([0, 2, 3, 5, 8], scale), by="row")
+    unit = np.array([1.0, 1.0, scale, scale])
+    for k in range(1, len(fleet)):
+        away = np.abs(fleet[k].theta - fleet[0].theta) / unit
+        assert away[60].max() < 0.02, k
+        assert away[-1].max() < 0.001, k
+
+
+def test_what_is_left_out_is_counted_and_the_smoother_leaves_it_out_too():
+    for at in (3, 300):
+        y, u = plant()
+        y[at] = 9999.0
+        run = track(PLANT, Kalman(q=1e-7, r=0.01), y, u)
+        assert run.state["left_out"] == (3.0 if at == 3 else 1.0)  # at the start as a lag, too
+        assert "samples out of all proportion" in str(run.summary())
+        assert np.abs(run.smooth().theta - THETA).max() < 0.05
+    assert track(PLANT, Kalman(q=1e-7, r=0.01), *plant()).state["left_out"] == 0.0
+
+
+def test_a_stream_leaves_out_the_same():
+    y, u = plant()
+    y[3], u[200] = 9999.0, -1e6
+    run, live = track(PLANT, RLS(0.99), y, u), Live(PLANT, RLS(0.99))
+    for one in zip(y, u, strict=True):
+        live.update(*one)
+    np.testing.assert_array_equal(live.theta, run.theta[-1])
+    assert run.state["left_out"] == 5.0
+
+
+@pytest.mark.parametrize("tracker", [RLS(0.98), Kalman(q=1e-4, r=0.01)], ids=repr)
+def test_what_is_no_fault_is_learned_from(tracker):
+    """A large test, a gain that changes, and a new level a hundred deviations away, which costs a few samples."""
+    rng = np.random.default_rng(3)
+    u = 0.01 * rng.normal(size=T)
+    u[200], u[300:] = 10.0, rng.normal(size=200)
+    noise = 0.1 * rng.normal(size=T)
+    run = track(Regression(1), tracker, 2.0 * u + noise, u)
+    assert run.state["left_out"] == 0.0
+    assert abs(run.theta[200, 0] - 2.0) < 0.05
+    u = rng.normal(size=T)
+    run = track(Regression(1), tracker, np.where(np.arange(T) < 250, 2.0, -4.0) * u + noise, u)
+    assert run.state["left_out"] == 0.0
+    run = track(Regression(0, intercept=True), tracker, np.where(np.arange(T) < 250, 0.0, 10.0) + noise)
+    assert 0.0 < run.state["left_out"] <= 5.0
+    assert abs(run.theta[-1, 0] - 10.0) < 0.1
+
+
+def test_an_input_with_a_run_of_codes_and_a_simulated_output():
+    y, u = plant()
+    u[250:260] = 9999.0
+    for model, tracker, allowed in ((PLANT, RLS(1.0), 0.01), (OE(2, 2), InstrumentalVariables(0.99), 0.05)):
+        run = track(model, tracker, y, u)
+        whole = track(model, tracker, *plant())
+        assert np.abs(run.theta[-1] - whole.theta[-1]).max() < allowed
