@@ -26,7 +26,7 @@ the same while a strange prediction decays, as the output of a simulation does. 
 judged here; those of a diffuse start are judged together (`driftfit.trackers.parts.faults.judged_start`).
 
 Source: ours; see `driftfit.trackers.parts.outlying_readings` for the rule of a tracker that learns its own noise. Cost
-per sample: some twenty operations.
+per sample: five operations, and some thirty for one in eight and for strange ones.
 """
 
 from __future__ import annotations
@@ -45,8 +45,10 @@ SURE = 5.0
 """Standard deviations of the prediction."""
 FIRST = 10.0
 """Number of first readings that are accepted, for comparison with later ones."""
-MEMORY = 1000.0
-"""Memory of the mean and variance of the readings, in readings."""
+MEMORY = 125.0
+"""Memory of the mean and variance of the readings, and of the mean of e^2 / s, in samples that are learned from."""
+ALL, EVERY = 64.0, 8.0
+"""These are learned from so many first samples, and then from every eighth: ranges change slowly."""
 ENOUGH, FAR = 4.0, 100.0
 """Samples from which on the mean of e^2 / s is used; the largest multiple of it by which a sample enters it."""
 LASTING, LONGEST = 4.0, 1e12
@@ -67,6 +69,7 @@ def no_contradictions() -> dict[str, Any]:
     return {
         "y_mean": 0.0, "y_spread": 0.0, "y_count": 0.0, "y_last": np.nan, "patience": 1.0, "y_strange": np.nan,
         "far": 0.0, "left_out": 0.0, "distrusted": 0.0, "misfit": 0.0, "misfits": 0.0, "shift": 0.0, "lagging": 0.0,
+        "y_wait": 0.0,
     }  # fmt: skip
 
 
@@ -116,26 +119,33 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
 
 
 @kernel
+def learn_misfit(s: State, square: float, v: float, used: float, l: int) -> None:
+    """Mean of e^2 / s, from e^2 and s."""
+    measured = (v > 0.0) & (v < np.inf)
+    part = square / v if measured else 0.0
+    new = used if measured else 0.0
+    s.misfits[l] = min(s.misfits[l] + new, MEMORY)
+    bounded = min(part, FAR * s.misfit[l]) if s.misfits[l] > ENOUGH else part
+    s.misfit[l] += new * (bounded - s.misfit[l]) / max(s.misfits[l], 1.0)
+
+
+@kernel
 def leave_out_contradiction(s: State, y_hat: float, v: float, l: int) -> None:
     """Leave out a sample that contradicts all before, given its prediction and the variance of that.
 
     A single lane skips what would change nothing; several lanes are faster without a branch.
     """
-    y, shown = s.y[l] + s.shift[l], y_hat + s.shift[l]
-    quiet = (
-        ((y - shown) ** 2 <= REACH * REACH * s.y_spread[l])
-        & (s.patience[l] <= 1.0)
-        & (s.lagging[l] + s.distrusted[l] <= 0.0)
-    )
-    if (s.theta.shape[1] > 1) or (not quiet):
-        judge(s, y, shown, v, l)
-    learn_range(s, y, s.ok[l], l)
-    measured = (v > 0.0) & (v < np.inf)
-    square = (y - shown) ** 2 / v if measured else 0.0
-    used = s.ok[l] if measured else 0.0
-    s.misfits[l] = min(s.misfits[l] + used, MEMORY)
-    bounded = min(square, FAR * s.misfit[l]) if s.misfits[l] > ENOUGH else square
-    s.misfit[l] += used * (bounded - s.misfit[l]) / max(s.misfits[l], 1.0)
+    square, alone = (s.y[l] - y_hat) ** 2, s.theta.shape[1] == 1
+    quiet = (square <= REACH * REACH * s.y_spread[l]) & (s.patience[l] <= 1.0) & (s.lagging[l] + s.distrusted[l] <= 0.0)
+    if not (alone and quiet):
+        judge(s, s.y[l] + s.shift[l], y_hat + s.shift[l], v, l)
+    used = s.ok[l]
+    due = (s.y_count[l] < ALL) | (s.misfits[l] < ALL) | (s.y_wait[l] >= EVERY)
+    s.y_wait[l] = 1.0 if due else s.y_wait[l] + used
+    if due or not alone:
+        learned = used if due else 0.0
+        learn_range(s, s.y[l] + s.shift[l], learned, l)
+        learn_misfit(s, square, v, learned, l)
 
 
 @kernel
