@@ -29,7 +29,7 @@ import itertools
 import sys
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from types import FunctionType, MappingProxyType
 from typing import Any, NamedTuple
@@ -256,6 +256,17 @@ def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def at_level_two() -> Iterator[None]:
+    """While it lasts, LLVM optimises at its second level at most, which is for long code: the third takes longer and
+    made an `AdaptiveKalman` a quarter slower. Lanes of a short step need the third.
+    """
+    codegen = cpu_target.target_context.codegen()
+    build, level = codegen._pass_builder, min(2, numba.config.OPT)
+    with replaced(codegen, _pass_builder=lambda **options: build(**{"opt": level, **options})):
+        yield
+
+
 # ---- memory ---------------------------------------------------------------------------------------------------------
 
 # llvmlite 0.50 frees no pass manager: both classes inherit the `_dispose` that does nothing. They were three fifths of
@@ -316,7 +327,7 @@ class Code(NamedTuple):
 
 def emit(function: FunctionType, arguments: tuple[Any, ...], from_python: bool = True) -> Code:
     """Compile a function for one signature, with all that it inlines, to object code."""
-    with compiler_lock:
+    with compiler_lock, nullcontext() if from_python else at_level_two():
         options = {"no_cfunc_wrapper": True, "no_cpython_wrapper": not from_python}
         dispatcher = as_part(under_ieee(function, **options), WholeDispatcher)
         dispatcher.compile(arguments)
@@ -382,7 +393,7 @@ def _loader() -> Any:
 
 def publish(dispatcher: Any, arguments: tuple[Any, ...], symbol: str) -> Any:
     """Compile a function, or find it on disk, and let code call it by a symbol; returns the owner of the code."""
-    with known_once():
+    with compiler_lock, known_once(), at_level_two():
         dispatcher.compile(arguments)
     made = next(iter(dispatcher.overloads.values()))
     llvm.add_symbol(symbol, made.library.get_pointer_to_function(made.fndesc.llvm_cfunc_wrapper_name))
