@@ -128,7 +128,7 @@ def fleets(count: int, watched: Mapping[str, Mapping[str, Any]], rates: Sequence
     """Fleets watched together."""
     title = f"{count} fleets of {SERIES} series of {LONG} samples, {FAULTY} with a fault, false discovery rate 0.05"
     table = Table(box=SIMPLE_HEAD, show_edge=False, title=title)
-    for head in ("alarm, first 500 as reference", "set", "false alarms", "expected", "said wrongly", "faults found"):
+    for head in ("alarm, first 500 as reference", "set", "false alarms", "expected", "wrong, share", "faults found"):
         table.add_column(head, justify="left" if head.startswith("alarm") else "right")
     for name, settings in watched.items():
         for every in rates:

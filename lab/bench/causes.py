@@ -26,15 +26,15 @@ CAUSES: dict[str, str] = {
         "uses the whole record."
     ),
     "missing_data": (
-        "This is the cost of learning: with the ratio of the scenario on every rung the error falls by 2 %, and with "
+        "This is the cost of learning: with the scenario's drift ratio throughout the error falls by 2 %, and with "
         "a single noise level as well by 3 %."
     ),
     "lost_excitation": (
-        "This is the cost of learning: with the ratio of the scenario on every rung the error falls by 2 %, and with a "
+        "This is the cost of learning: with the scenario's drift ratio throughout the error falls by 2 %, and with a "
         "single noise level as well by no more."
     ),
     "collinear_inputs": (
-        "This is the cost of learning: with the ratio of the scenario on every rung the error falls by 3 %, and with "
+        "This is the cost of learning: with the scenario's drift ratio throughout the error falls by 3 %, and with "
         "a single noise level as well by 5 %."
     ),
 }
