@@ -7,7 +7,7 @@ from support import arx_record, rows_of
 
 from driftfit import ARX, AugmentedFLS, Kalman, Live, Regression, track
 from driftfit.judge.alarms.bootstrap import START
-from driftfit.judge.alarms.frozen import frozen_model, noise_model
+from driftfit.judge.alarms.frozen import frozen_model, noise_model, noise_models
 from driftfit.judge.alarms.onsets import onsets
 from driftfit.judge.alarms.side_by_side import SimulatedRecords, statistics_of
 from driftfit.run.live.likelihood_ratio import (
@@ -196,8 +196,9 @@ def test_a_change_is_found_named_and_sized(unit, name, size):
 
 def test_the_noise_model_of_a_reference():
     rng = np.random.default_rng(1)
-    constant, _ = noise_model(rng.standard_t(3, size=2000), 2)
-    assert constant[ALPHA] == constant[BETA] == 0.0
+    constant, h = noise_model(rng.standard_t(3, size=2000), 2)
+    assert constant[ALPHA] < 0.02
+    assert np.std(h) < 0.1
     changing, h = noise_model(noise_of("GARCH", 2000, rng), 2)
     assert 0.03 <= changing[ALPHA] <= 0.15
     assert 0.8 <= changing[ALPHA] + changing[BETA] < 1.0
@@ -212,6 +213,16 @@ def test_the_noise_model_of_a_reference():
     assert len(rows.x) == 2000 - 5  # a gap of three and the lag after it, and the first row
     unexcited, _ = frozen_model(np.column_stack([phi[:, 0], phi[:, 0]]), phi[:, 0] + e, ok)
     assert np.linalg.eigvalsh(unexcited.cov)[-1] > 100.0  # nothing is known of their difference
+
+
+def test_a_short_reference_leaves_bursts_possible():
+    """With 300 samples the most likely model is constant noise in two thirds of the references."""
+    rng = np.random.default_rng(2)
+    changing, _ = noise_models(np.array([noise_of("GARCH", 300, rng) for _ in range(40)]), 0)
+    constant, _ = noise_models(rng.normal(size=(40, 300)), 0)
+    assert 0.04 < np.median(changing[:, ALPHA]) < 0.15
+    assert np.quantile(changing[:, ALPHA], 0.1) > 0.005
+    assert np.median(constant[:, ALPHA]) < 0.03
 
 
 def test_the_chance_of_an_extreme_and_the_default_reference():

@@ -3,10 +3,12 @@
     y_t = phi_t' theta + e_t,    e an autoregression whose variance may follow a GARCH(1, 1)
 
 theta solves the Huber equations of the reference, on rows that are whitened and divided by sqrt(h). The order of the
-autoregression minimises BIC, and the GARCH part is kept if it raises the quasi-likelihood of the clipped residuals by
-more than chance explains. Each is estimated again, given the others, ROUNDS times.
+autoregression minimises BIC. alpha and beta of the GARCH part are averages over candidates, weighted by how probable
+the quasi-likelihood of the clipped residuals leaves each: a short reference seldom shows whether the variance changes,
+and the most likely model is then constant noise. Each is estimated again, given the others, ROUNDS times.
 
-Source: Huber (1964); Bollerslev (1986). Cost: O(N n^2) for N samples, ten times, and 36 passes for the GARCH part.
+Source: Huber (1964); Bollerslev (1986); averages instead of a choice are Leamer's (1978).
+Cost: O(N n^2) for N samples, ten times, and 36 passes for the GARCH part.
 """
 
 from __future__ import annotations
@@ -42,14 +44,15 @@ CLIPPED = 2.5
 """Scores are residuals clipped at this many scales."""
 ORDER = 6
 ROUNDS = 3
-GAIN = 4.0
-"""Gain of the quasi-likelihood, twice its logarithm, for which the GARCH part is kept, per variance of g^2 / inside:
-the larger the tails, the larger the gain by chance.
-"""
 PERSISTENCE, REACTION = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98), (0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
 GARCH = np.array([(0.0, 0.0), *((a, both - a) for both in PERSISTENCE for a in REACTION if a < both)])
 GARCH = np.ascontiguousarray(np.vstack([GARCH, np.repeat(GARCH[-1:], -len(GARCH) % WIDTH, axis=0)]).T)
 """alpha and beta of the candidates (2, C), constant noise first, the last repeated to fill a vector."""
+PRIOR = np.where(np.arange(GARCH.shape[1]) <= len(PERSISTENCE) * len(REACTION), 1.0 / (1.0 - GARCH.sum(axis=0)), 0.0)
+PRIOR[0] = PRIOR[1:].sum()
+"""How probable each candidate is before the reference, in relation (C,): constant noise as all others together, and
+those in proportion to their time constant, since short references show long bursts least and long bursts alarm most.
+"""
 SHARE = 8
 """The noise is judged by windows of at most this part of the reference."""
 UNSEEN = 1e-6
@@ -104,11 +107,8 @@ def noise_models(w: Array, n: int) -> tuple[Array, Array]:
     square = np.clip(x, -CLIPPED, CLIPPED) ** 2
     numbers[:, V] = square.mean(axis=1)
     numbers[:, INSIDE] = np.mean(np.where(np.abs(x) < CLIPPED, x * x, 0.0), axis=1)
-    chance = GAIN * np.var(square, axis=1) / numbers[:, INSIDE] ** 2
-    for one, own, by_chance, level in zip(x, numbers, chance, h, strict=True):
-        total = _losses(one, own)
-        total[0] -= by_chance
-        own[[ALPHA, BETA]] = GARCH[:, np.argmin(total)]
+    for one, own, level in zip(x, numbers, h, strict=True):
+        own[[ALPHA, BETA]] = averaged(plausible(one, own))
         levels(one, own, level)
     numbers[:, SCALE] *= _scales(w / (numbers[:, SCALE, None] * np.sqrt(h)), n)
     x = w / (numbers[:, SCALE, None] * np.sqrt(h))
@@ -121,13 +121,20 @@ def noise_models(w: Array, n: int) -> tuple[Array, Array]:
 
 
 def plausible(x: Array, numbers: Array) -> Array:
-    """Probabilities (C,) of the candidates `GARCH` for residuals x (N,) in units of their scale: constant noise is as
-    probable before as all others together, and the quasi-likelihood counts by as much as the tails allow."""
-    square, count = np.clip(x, -CLIPPED, CLIPPED) ** 2, len(PERSISTENCE) * len(REACTION)
+    """Probabilities (C,) of the candidates `GARCH` for residuals x (N,) in units of their scale; the quasi-likelihood
+    counts by as much as the tails allow."""
+    square = np.clip(x, -CLIPPED, CLIPPED) ** 2
     total = _losses(x, numbers) * numbers[INSIDE] ** 2 / np.var(square)
-    before = np.where(np.arange(len(total)) == 0, count, np.arange(len(total)) <= count)
-    share = before * np.exp(total.min() - total)
+    share = PRIOR * np.exp(total.min() - total)
     return np.asarray(share / share.sum())
+
+
+def averaged(share: Array) -> tuple[float, float]:
+    """alpha and beta from the probabilities (C,) of the candidates: the mean of alpha, and the mean of alpha + beta
+    weighted by alpha too, as constant noise has no persistence."""
+    reaction = GARCH[0] * share
+    alpha = float(reaction.sum())
+    return alpha, float(reaction @ GARCH.sum(axis=0)) / alpha - alpha if alpha > 0.0 else 0.0
 
 
 def _losses(x: Array, numbers: Array) -> Array:
