@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
+from driftfit.engine.compile_notice import compiling
 from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
 from driftfit.engine.tiles import as_compiled, tile_type
@@ -216,8 +217,9 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     """
     ready = model.ready
     ready(1)
-    for machine in tracker.machines:
-        machine.load()
+    with compiling():
+        for machine in tracker.machines:
+            machine.load()
     driver = partial(Driver, instead=tracker.instead)
     part = whole_record if tracker.reads_model else tracker_part
     advance = _advance(tracker)

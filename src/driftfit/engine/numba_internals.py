@@ -143,6 +143,11 @@ def store_by(dispatcher: Any, read: Callable[[Any], Any], write: Callable[[Any, 
 class Fragment(JITCodeLibrary):
     """Code that other functions inline: neither optimised nor emitted; that is done by the function that inlines it."""
 
+    def _optimize_functions(self, module: Any) -> None:
+        """Passes over single functions, at one level: what is stored does not depend on who asked for it first."""
+        with at_level_two():
+            super()._optimize_functions(module)
+
     def _optimize_final_module(self) -> None:
         """Left to the function that inlines it."""
 
@@ -159,6 +164,7 @@ class Fragment(JITCodeLibrary):
 class WholeFragment(Fragment):
     """Code that is optimised together with everything that it inlines."""
 
+    _optimize_functions = JITCodeLibrary._optimize_functions
     _optimize_final_module = JITCodeLibrary._optimize_final_module
 
     def get_pointer_to_function(self, name: str) -> int:
