@@ -44,9 +44,9 @@ def tracked(data: pl.DataFrame) -> Fleet:
     return track(model, Kalman(q=1e-5, r=0.01), y="flow", u="pressure", data=data, by="pump")
 
 
-def peak(whose: int = resource.RUSAGE_SELF) -> float:
+def peak() -> float:
     """Megabytes."""
-    return resource.getrusage(whose).ru_maxrss / 1024.0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 def processor() -> float:
@@ -67,14 +67,13 @@ def main(units: int) -> None:
         "processor a series, ms",
         "peak, MB",
         "of the verdicts, MB",
-        "a process, MB",
         "drifting found",
     )
     for head in heads:
         table.add_column(head, justify="right")
     table.add_row(
         f"{elapsed:.1f}", f"{spent:.1f}", f"{1e3 * spent / units:.2f}", f"{peak():.0f}",
-        f"{peak() - before:.0f}", f"{peak(resource.RUSAGE_CHILDREN):.0f}", f"{len(result.drifting)}",
+        f"{peak() - before:.0f}", f"{len(result.drifting)}",
     )  # fmt: skip
     Console(width=110).print(table)
 

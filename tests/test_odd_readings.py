@@ -48,7 +48,7 @@ PAIRS = [
     )),
 ]  # fmt: skip
 BEYOND = {("hidden", ParticleFilter): ["at rest, then moved"]}
-"""What is known to go wrong: copies of one path remain of the particles, of which the summary tells."""
+"""What is known to go wrong: copies of one path remain of the particles."""
 NAMES = [f"{name}, {type(tracker).__name__}" for name, tracker in PAIRS]
 
 
