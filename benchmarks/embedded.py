@@ -124,7 +124,7 @@ def exported(folder: Path, single: bool) -> list[str]:
     return [sizes.stdout.splitlines()[1].split()[0], *map(str, count)]
 
 
-def beside_hand_written(folder: Path, n: int, T: int, repeats: int) -> tuple[float, float]:
+def against_hand_written(folder: Path, n: int, T: int, repeats: int) -> tuple[float, float]:
     """Nanoseconds per update, the best of the repeats: exported, and filter.c; both must give the same numbers."""
     (folder / "loop.c").write_text(LOOP)
     ours, other = str(folder / "ours.so"), str(folder / "other.so")
@@ -216,22 +216,22 @@ def main(quick: Annotated[bool, typer.Option(help="One size, few samples, few tr
             table.add_row(name, str(n), *state_and_cost(ARX(n // 2, n - n // 2), tracker))
     out.print(table)
     out.print("bytes of state and code, and per update; first in double precision, then in single (-DTRACKER_SINGLE)")
-    ratios = Table(title="\nCycles per update on a Cortex-M4F, beside filter.c", show_edge=False)
+    ratios = Table(title="\nCycles per update on a Cortex-M4F, compared with filter.c", show_edge=False)
     for head in ("n", *("by hand", "Kalman", "ratio", "fixed rate", "ratio") * 2):
         ratios.add_column(head, justify="right", no_wrap=True)
     for n in sizes if quick else range(2, 9):
         ratios.add_row(*against_filter(n))
     out.print(ratios)
-    beside = Table(title="\nOn this computer, beside filter.c", show_edge=False)
+    timed = Table(title="\nOn this computer, compared with filter.c", show_edge=False)
     for head in ("n", "exported, ns", "by hand, ns", "ratio", "at most 1.3"):
-        beside.add_column(head, justify="right")
+        timed.add_column(head, justify="right")
     for n in sizes:
         with tempfile.TemporaryDirectory() as place:
             export_c(ARX(n // 2, n - n // 2), KALMAN, place)
-            ours, other = beside_hand_written(Path(place), n, T, repeats)
+            ours, other = against_hand_written(Path(place), n, T, repeats)
         kept = "yes" if ours <= 1.3 * other else "no"
-        beside.add_row(str(n), f"{ours:.1f}", f"{other:.1f}", f"{ours / other:.2f}", kept)
-    out.print(beside)
+        timed.add_row(str(n), f"{ours:.1f}", f"{other:.1f}", f"{ours / other:.2f}", kept)
+    out.print(timed)
 
 
 if __name__ == "__main__":

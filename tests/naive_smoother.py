@@ -1,6 +1,7 @@
 """Slow and obvious twins of the smoothers: dense least squares, and the same in eighty digits."""
 
 from decimal import Decimal, getcontext
+from fractions import Fraction
 
 import numpy as np
 
@@ -113,3 +114,25 @@ def exact_normal_equations(A, b):
     right = [sum(v * Decimal(float(c)) for v, c in zip(column, b, strict=True)) for column in columns]
     C = inverse([[sum(u * v for u, v in zip(p, q, strict=True)) for q in columns] for p in columns])
     return np.array(apply(C, right), dtype=float), np.array([C[i][i] for i in range(len(C))], dtype=float)
+
+
+def inverse_of_normal(phi, mu):
+    """The inverse of the normal matrix of flexible least squares in rational numbers, (T n, T n)."""
+    T, n = phi.shape
+    N, steps = T * n, [(i, i + n) for i in range((T - 1) * n)]
+    rows = [[Fraction(0)] * N + [Fraction(int(i == j)) for j in range(N)] for i in range(N)]
+    for t in range(T):
+        for i in range(n):
+            for j in range(n):
+                rows[t * n + i][t * n + j] += Fraction(phi[t, i]) * Fraction(phi[t, j])
+    for i, j in steps:
+        for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+            rows[a][b] += sign * Fraction(mu)
+    for c in range(N):
+        pivot = next(r for r in range(c, N) if rows[r][c])
+        rows[c], rows[pivot] = rows[pivot], rows[c]
+        rows[c] = [x / rows[c][c] for x in rows[c]]
+        for r in range(N):
+            if r != c and rows[r][c]:
+                rows[r] = [x - rows[r][c] * z for x, z in zip(rows[r], rows[c], strict=True)]
+    return np.array([[float(x) for x in row[N:]] for row in rows])

@@ -1,7 +1,6 @@
 """The exact smoother against dense solutions, and its invariances. Tolerances are relative to the largest value."""
 
 import tracemalloc
-from fractions import Fraction
 
 import naive_smoother as naive
 import numpy as np
@@ -481,30 +480,8 @@ def test_lag_covariances_keep_their_digits_at_tiny_weights():
     phi = np.round(np.random.default_rng(0).normal(size=(7, 2)), 3)
     y = np.random.default_rng(1).normal(size=7)
     for mu in (1e-12, 1e-9, 1e-3, 1.0):
-        C = inverse_of_normal(phi, mu)
+        C = naive.inverse_of_normal(phi, mu)
         found = exact.smooth(walk(phi, y, mu), "cov")
         for t in range(6):
             lag = C[2 * t : 2 * t + 2, 2 * t + 2 : 2 * t + 4]
             np.testing.assert_allclose(found.lag_cov[t], lag, atol=1e-12 * np.abs(lag).max(), rtol=1e-7)
-
-
-def inverse_of_normal(phi, mu):
-    """The inverse of the normal matrix of flexible least squares in rational numbers, (T n, T n)."""
-    T, n = phi.shape
-    N, steps = T * n, [(i, i + n) for i in range((T - 1) * n)]
-    rows = [[Fraction(0)] * N + [Fraction(int(i == j)) for j in range(N)] for i in range(N)]
-    for t in range(T):
-        for i in range(n):
-            for j in range(n):
-                rows[t * n + i][t * n + j] += Fraction(phi[t, i]) * Fraction(phi[t, j])
-    for i, j in steps:
-        for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
-            rows[a][b] += sign * Fraction(mu)
-    for c in range(N):
-        pivot = next(r for r in range(c, N) if rows[r][c])
-        rows[c], rows[pivot] = rows[pivot], rows[c]
-        rows[c] = [x / rows[c][c] for x in rows[c]]
-        for r in range(N):
-            if r != c and rows[r][c]:
-                rows[r] = [x - rows[r][c] * z for x, z in zip(rows[r], rows[c], strict=True)]
-    return np.array([[float(x) for x in row[N:]] for row in rows])

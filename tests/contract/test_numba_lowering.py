@@ -1,6 +1,6 @@
 """Fields of records, variables and loops in compiled code: as Numba has them, in a fraction of the instructions.
 
-Canaries: if one fails, `Lower` in Numba changed, on which `driftfit.engine.numba_lowering` leans.
+Canaries: if one fails, `Lower` in Numba changed, on which `driftfit.engine.compile_time.lowering` leans.
 """
 
 import numba

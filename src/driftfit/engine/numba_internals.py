@@ -1,4 +1,4 @@
-"""What uses private parts of Numba and llvmlite. No other module but `numba_lowering` imports `numba.core` or llvmlite.
+"""What uses private parts of Numba and llvmlite. Only this module and the folder `compile_time` import them.
 
 Each section names the private parts that it uses, and the reason. `tests/contract/test_numba_internals.py` has a canary
 for each, which names in one sentence what broke. Tried with the versions in `TRIED`.
@@ -10,8 +10,6 @@ for each, which names in one sentence what broke. Tried with the versions in `TR
     code to link   JITCodeLibrary, CPUDispatcher,   a part is typed and turned into LLVM's language only, not emitted;
                    get_call_template, codegen's     one copy serves all constants
                    factories
-    typing         Function.get_call_type, _impl_keys,  the types of Numba's own operations are found once
-                   Flags._values, Record.__repr__
     memory         _reset_overloads,                what the compiler made of a part is let go
                    remove_user_function, _dispose
     object code    codegen._tm, llvmlite's ORC,     drivers are kept as object code and freed with the last reference
@@ -31,7 +29,7 @@ import itertools
 import sys
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from types import FunctionType, MappingProxyType
 from typing import Any, NamedTuple
@@ -45,18 +43,18 @@ from llvmlite.binding import newpassmanagers as passes
 from numba import _dynfunc, njit, types
 from numba.core.caching import _Cache
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompileResult, Flags
+from numba.core.compiler import CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import lookup_environment
 from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
-from numba.core.targetconfig import ConfigStack
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 
-from driftfit.engine.numba_lowering import Pipeline
+from driftfit.engine.compile_time.lookups import known_once, replaced
+from driftfit.engine.compile_time.lowering import Pipeline
 
 __all__ = ["AttributeTemplate", "dumps", "ir"]
 
@@ -259,80 +257,14 @@ def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
 
 
 @contextmanager
-def replaced(owner: Any, **ours: Any) -> Iterator[None]:
-    """While it lasts, attributes of an object are ours."""
-    before = {key: vars(owner)[key] for key in ours if key in vars(owner)}
-    try:
-        vars(owner).update(ours)
-        yield
-    finally:
-        for key in ours:
-            del vars(owner)[key]
-        vars(owner).update(before)
-
-
-@contextmanager
-def known_once() -> Iterator[None]:
-    """While it lasts, Numba looks for declarations and for a bug of LLVM once, instead of before each function, and at
-    every second call in it; only intrinsics declare more while they are compiled. Sizes of types are found once too.
+def at_level_two() -> Iterator[None]:
+    """While it lasts, LLVM optimises at its second level at most, which is for long code: the third takes longer and
+    made an `AdaptiveKalman` a quarter slower. Lanes of a short step need the third.
     """
-    context = cpu_target.target_context
-    if "refresh" in vars(context):
+    codegen = cpu_target.target_context.codegen()
+    build, level = codegen._pass_builder, min(2, numba.config.OPT)
+    with replaced(codegen, _pass_builder=lambda **options: build(**{"opt": level, **options})):
         yield
-        return
-    context.refresh()
-    codegen, size = context.codegen(), cache(context.get_abi_sizeof)
-    codegen._check_llvm_bugs()
-
-    def look_again() -> None:
-        for registry in list(context._registries):
-            context.install_registry(registry)
-
-    with (
-        replaced(context, refresh=look_again, get_abi_sizeof=size),
-        replaced(context.typing_context, refresh=lambda: None),
-        replaced(codegen, _check_llvm_bugs=lambda: None),
-    ):
-        yield
-
-
-# ---- typing ---------------------------------------------------------------------------------------------------------
-
-# Numba tries dozens of templates for every operation of every function, and compares compile options one by one for
-# each: a fifth of the time of compiling. What it found for an operation, types and options is remembered.
-
-
-def _remembered(find: Callable[..., Any]) -> Callable[..., Any]:
-    """The types of a call of one of Numba's own operations, as ``find`` gives them."""
-    known: dict[Any, tuple[Any, Any]] = {}
-
-    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-        if kws or not all(isinstance(one, _PLAIN) for one in args):
-            return find(self, context, args, kws)
-        key = self, context, tuple(args), ConfigStack.top_or_none()
-        if key not in known:
-            found = find(self, context, args, kws)
-            known[key] = found, self._impl_keys[found.args]
-        found, self._impl_keys[found.args] = known[key]  # options of another function may have changed the latter
-        return found
-
-    return get_call_type
-
-
-def _same_options(one: Any, other: Any) -> bool:
-    """Whether two sets of options are equal; one that was not given has its default."""
-    if type(one) is not type(other):
-        return False
-    given, others = one._values, other._values
-    return given == others or all(getattr(one, key) == getattr(other, key) for key in given.keys() | others.keys())
-
-
-_PLAIN = types.Number, types.Boolean, types.Array, types.BaseTuple, types.Literal, int  # no code, which must be let go
-_NAMES = hash(tuple(sorted(Flags.options)))  # what Numba's own hash amounts to: it sorts names, not values
-types.Function.get_call_type = _remembered(types.Function.get_call_type)
-Flags.__eq__ = _same_options
-Flags.__hash__ = lambda self: _NAMES
-types.Record.__repr__ = lambda self: self.name  # written out for every pass over a function, and read by nobody
 
 
 # ---- memory ---------------------------------------------------------------------------------------------------------
@@ -395,7 +327,7 @@ class Code(NamedTuple):
 
 def emit(function: FunctionType, arguments: tuple[Any, ...], from_python: bool = True) -> Code:
     """Compile a function for one signature, with all that it inlines, to object code."""
-    with compiler_lock:
+    with compiler_lock, nullcontext() if from_python else at_level_two():
         options = {"no_cfunc_wrapper": True, "no_cpython_wrapper": not from_python}
         dispatcher = as_part(under_ieee(function, **options), WholeDispatcher)
         dispatcher.compile(arguments)
@@ -461,7 +393,7 @@ def _loader() -> Any:
 
 def publish(dispatcher: Any, arguments: tuple[Any, ...], symbol: str) -> Any:
     """Compile a function, or find it on disk, and let code call it by a symbol; returns the owner of the code."""
-    with known_once():
+    with compiler_lock, known_once(), at_level_two():
         dispatcher.compile(arguments)
     made = next(iter(dispatcher.overloads.values()))
     llvm.add_symbol(symbol, made.library.get_pointer_to_function(made.fndesc.llvm_cfunc_wrapper_name))

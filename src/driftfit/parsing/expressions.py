@@ -1,7 +1,7 @@
 """Models and trackers written as in Python: ``ARX(2, [2, 2], intercept=True)``, ``Kalman(q=1e-4, r=0.1)``.
 
-The text is read as a syntax tree of calls and literals, and nothing of it is evaluated: the only names are those of
-the library's settings, and arguments are numbers, texts, None, lists, tuples, mappings or such calls.
+The text is parsed into a syntax tree of calls and literals and never evaluated: only classes of the library may be
+called, with numbers, texts, None, lists, tuples, mappings or such calls as arguments.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CONSTRUCTORS = {("Sensor", "nominal")}
 
 
 def read(text: str, kind: type[Kind], main: Mapping[str, type[Any]]) -> Kind:
-    """The model or tracker that a text describes; ``main`` are the classes that it may begin with.
+    """The model or tracker that a text describes; ``main`` are the models or trackers that may be at its beginning.
 
     ValueError with the reason if it is wrong.
     """

@@ -44,7 +44,7 @@ def lookup(what: str, name: str, known: dict[str, type[Kind]]) -> type[Kind]:
 def parse_model(text: str, outputs: Sequence[str] = ()) -> Model:
     """``arx:2,2,nk=1,intercept`` as ARX(2, 2, nk=1, intercept=True), with these names if there are several outputs.
 
-    An expression such as ``ARX(2, 2)`` is read too.
+    An expression such as ``ARX(2, 2)`` is read as well. ValueError with the reason if the text is wrong.
     """
     if "(" in text:
         return _with_outputs(expressions.read(text, Model, models.found()), outputs)  # type: ignore[type-abstract]

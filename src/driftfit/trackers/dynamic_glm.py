@@ -18,9 +18,9 @@ distribution after it is taken to be Gaussian again is the only approximation (a
 after some ten samples for each parameter; a single zero or one after a wide prior leaves a skewed distribution, of
 which the band is a rough picture. The log-likelihood is that of the predictive distributions, integrated over eta.
 
-``r`` is the dispersion of quasi-likelihood: 2 says that counts vary twice as much as the family says, and widens bands
-by the root of it. Readings that the family excludes (negative counts, a yes beyond 1) are not used. A known exposure is
-a regressor, its logarithm, whose parameter is held at 1: theta0 = 1 with p0 = 0 and q = 0.
+``r`` is the dispersion of quasi-likelihood: with 2 the variance of the counts is twice that of the family, and bands
+are wider by the square root of 2. Readings that the family excludes (negative counts, a yes beyond 1) are not used.
+A known exposure is a regressor, its logarithm, whose parameter is held at 1: theta0 = 1 with p0 = 0 and q = 0.
 
 Source: West, Harrison, Migon, Dynamic generalized linear models and Bayesian forecasting, J. American Statistical
 Association 80 (1985); Opper, A Bayesian approach to on-line learning (1998), for the update. Departure from the first:

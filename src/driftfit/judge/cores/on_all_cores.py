@@ -1,7 +1,8 @@
 """Judge many runs on all cores, in threads where that takes seconds and in processes where it takes longer.
 
-A verdict is half Python, which only one thread runs at a time, so that a second thread gains little. A process runs it
-on a core of its own, for the price of starting (about a second) and of sending it the runs (a tenth of a verdict).
+Half of the time of a verdict is spent in Python, which only one thread executes at a time, so a second thread gains
+little. A process has a core of its own; the price is its start (about a second) and sending it the runs (a tenth of the
+time of a verdict).
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ Result = TypeVar("Result")
 PATIENCE = 2.0
 """Seconds after which a progress bar appears."""
 FIRST = 5
-"""Runs that are judged alone: one compiles, and the others tell how long one takes."""
+"""Runs that are judged first, one by one: one compiles, and the others show how long a run takes."""
 WORTH = 5.0
-"""Seconds of work from which processes are started."""
+"""Processes are started for more seconds of work than this."""
 BATCH = 0.2
 """Seconds of work that are sent to a process at once."""
 
@@ -30,9 +31,9 @@ BATCH = 0.2
 def on_all_cores(
     keys: Iterable[Hashable], arguments: Callable[[Hashable], tuple[Any, ...]], judge: Callable[..., Result], what: str
 ) -> dict[Hashable, Result]:
-    """``judge(*arguments(key))`` for each key, in their order; the first few alone, so that only one thread compiles.
+    """``judge(*arguments(key))`` for each key, in their order; the first few one by one: one thread compiles.
 
-    Processes find ``judge`` by its name, so it is a function of a module.
+    Processes find ``judge`` by its name, so it must be a function of a module.
     """
     keys = list(keys)
     found = [judge(*arguments(key)) for key in keys[:1]]

@@ -1,9 +1,9 @@
-"""Processes that judge runs, because Python code in threads runs on one core at a time.
+"""Processes that judge runs, because threads execute Python code on one core at a time.
 
-Each is a new interpreter that imports the package and reads batches from its input until that is closed. Unlike the
-workers of ``multiprocessing``, it does not run the script of the user again, so that no script needs a guard against
-that. Whatever cannot be done there is done here instead, in a thread: a model of the user's own script cannot be sent,
-and a process may be killed for its memory. An error is then raised here, where it can be read.
+Each process is a new interpreter that imports the package and reads batches from its input until that is closed. Unlike
+the workers of ``multiprocessing``, it does not run the user's script again, so scripts need no guard against that. A
+batch that fails there is judged in a thread of this process instead: a model that the user's script defines cannot be
+sent, and a process may be killed for its memory. An error is then raised here, where the user can read it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import IO, Any, Self
 
 SERVE = "from driftfit.judge.cores.processes import serve; serve()"
 LENGTH = 8
-"""Bytes of the number that says how long a message is."""
+"""Bytes of the number before each message, its length."""
 
 Process = subprocess.Popen[bytes]
 
@@ -62,7 +62,7 @@ class Processes:
                     _open(stream).close()
 
     def map(self, judge: Callable[..., Any], batch: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """``judge(*arguments)`` for each arguments of the batch, in a process that is idle, or else here."""
+        """``judge(*arguments)`` for each entry of the batch, in an idle process, or here if that fails."""
         process = self._idle.get()
         try:
             _send(_open(process.stdin), pickle.dumps((judge, batch), pickle.HIGHEST_PROTOCOL))
@@ -75,8 +75,8 @@ class Processes:
 
 
 def serve() -> None:
-    """Judge what is read until the input ends; the answer is None where that raises an exception."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is answered by the process that asked
+    """Judge batches until the input ends; the answer to one that raises an exception is None."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the process that sends the batches
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a model prints does not mix with the answers
     while True:

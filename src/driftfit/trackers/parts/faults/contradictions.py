@@ -1,28 +1,29 @@
-"""Samples that contradict everything before: fault codes and spikes in the output or in an input.
+"""Samples that contradict all samples before them: fault codes and spikes in the output or in an input.
 
-A reading of 9999 where the output is near 10, or an input of 9999 where it is near 1, says nothing about the system,
-and least squares would believe it before all others. In both cases reading and prediction are apart, and one of them
-is where no reading has been. With m and v the mean and variance of the readings so far, e = y - y_hat and s the
-variance of e by the tracker, times the mean of e^2 / s so far, a sample is strange if
+A reading of 9999 where the output is near 10, or an input of 9999 where it is near 1, carries no information about the
+system, but least squares gives it more weight than all others. In both cases the reading and its prediction are far
+apart, and one of the two is far outside the range of the readings so far. With m and v the mean and variance of these
+readings, e = y - y_hat, and s the tracker's variance of e times the mean of e^2 / s so far, a sample is strange if
 
     e^2 > (REACH p)^2 v    and    e^2 > SURE^2 s    and    min(|y - m|, |y_hat - m|) < |e| / 2
 
-and is not used. If y is farther from m than y_hat, the lag of the reading is that of a missing one, too. The second
-condition does not hold where parameters are hardly known; the third not after a test to which the output responds. A
-change of gain or level within the usual range of the readings is never strange.
+and is not used. If y is farther from m than y_hat, its lag also counts as missing. The second condition does not hold
+where parameters are hardly known, and the third not after a test signal to which the output responds. A change of gain
+or level within the usual range of the readings is never strange.
 
-An estimate that went astray predicts what is strange, too, and must be corrected. Inputs are therefore blamed for at
-most `LAGS` samples in a row, and for one sample in ten in the long run.
+If instead y_hat is farther from m, an input is probably at fault. An estimate that went astray also gives strange
+predictions, however, and must be corrected; so inputs are blamed for at most `LAGS` samples in a row, and for one
+sample in ten in the long run.
 
-A strange input stays in the regressors, as a lag or in what a model simulates, and may matter less there. In the `LAGS`
-samples after one that an input was to blame for, one with phi' P phi > r, which would teach more than all before it, is
-therefore not used either.
+A strange input stays in the regressors, as a lag or in what a model simulates, where its effect may be smaller. In the
+`LAGS` samples after one for which an input was blamed, a sample with phi' P phi > r, which would change the estimate
+more than all samples before it, is therefore not used either.
 
-p, the patience, is 1, and doubles with every strange reading after another one: what persists is a change of level, and
-is accepted. It takes seven samples for a factor of 1000. Where the prediction is strange it doubles in four samples,
-and in 16 where the strange value stays, because fault codes come in runs. It stays 1 while a strange prediction sinks
-back, as what a model simulates does. The first `FIRST` readings are not
-judged; those of a diffuse start are judged together (`driftfit.trackers.parts.faults.judged_start`).
+The patience p begins at 1 and doubles with every strange reading that follows another one: a value that persists is a
+change of level and is accepted; one of 1000 standard deviations after seven samples. Where the prediction is strange,
+p doubles in four samples, and in 16 where the strange value repeats itself, because fault codes come in runs. It stays
+the same while a strange prediction decays, as the output of a simulation does. The first `FIRST` readings are not
+judged here; those of a diffuse start are judged together (`driftfit.trackers.parts.faults.judged_start`).
 
 Source: ours; see `driftfit.trackers.parts.outlying_readings` for the rule of a tracker that learns its own noise. Cost
 per sample: some twenty operations.
@@ -47,17 +48,18 @@ FIRST = 10.0
 MEMORY = 1000.0
 """Memory of the mean and variance of the readings, in readings."""
 ENOUGH, FAR = 4.0, 100.0
-"""Samples for a mean of e^2 / s; a larger multiple of it counts as this one."""
+"""Samples from which on the mean of e^2 / s is used; the largest multiple of it by which a sample enters it."""
 LASTING, LONGEST = 4.0, 1e12
-"""The patience from which on a strange input is accepted as a lag too; its upper bound."""
+"""The patience from which on the lag of a strange input is accepted as well; the upper bound of the patience."""
 LAGS = 50.0
 """Samples in which a strange input may still be in the regressors."""
 SELDOM = 0.1
 """Share of samples that inputs may be blamed for in the long run."""
 QUICK, SLOW, SLOWEST = 2.0, 2.0 ** (1.0 / 4.0), 2.0 ** (1.0 / 16.0)
-"""Factors of the patience: for readings, for predictions, and if the strange value stays."""
+"""Factors of the patience: for readings, for predictions, and if the strange value repeats itself."""
 ALIKE, SINKING = 1.01, 0.8
-"""A strange prediction stays if its distance is that of those before, up to this factor; of which so much is kept."""
+"""A strange prediction repeats itself if its distance from m is that of the ones before, up to `ALIKE`. The latter is
+the largest of them, of which `SINKING` is kept with every sample."""
 
 
 def no_contradictions() -> dict[str, Any]:
@@ -117,7 +119,7 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
 def leave_out_contradiction(s: State, y_hat: float, v: float, l: int) -> None:
     """Leave out a sample that contradicts all before, given its prediction and the variance of that.
 
-    A single lane skips what would change nothing; side by side, lanes are faster without a branch.
+    A single lane skips what would change nothing; several lanes are faster without a branch.
     """
     y, shown = s.y[l] + s.shift[l], y_hat + s.shift[l]
     quiet = (
@@ -145,6 +147,6 @@ def judged_measurement(s: State, l: int) -> None:
 
 
 def contradictions(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
-    """Its remark in a summary: nothing if all samples were accepted."""
+    """The line of a summary: none if all samples were accepted."""
     count = int(lane["left_out"]) if "left_out" in lane else 0
     return (("Left out", f"{count} samples out of all proportion to those before"),) if count else ()

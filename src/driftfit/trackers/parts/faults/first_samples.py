@@ -1,20 +1,20 @@
-"""Fault codes among the first samples, before a scale is known that they could be compared with.
+"""Fault codes among the first samples, before a scale is known with which they could be compared.
 
-Least squares fit any first samples, so one reading of 9999, or one in an input, would decide estimates, scales and
-noise for hundreds of samples. When there are enough samples for a start they are judged together. A value is far if it
-is more than `FAR` times the median absolute deviation of its column away from the median, where readings that repeat
-count once. A sample is doubtful if
+Least squares fits any first samples, so one reading of 9999, or one in an input, would determine estimates, scales and
+noise for hundreds of samples. The first samples are therefore judged together, when there are enough of them for a
+start. A value is far if it is more than `FAR` times the median absolute deviation of its column away from the median;
+readings that repeat the one before count once. A sample is doubtful if
 
-    its reading is far, and no regressor is unusual: a fault code, it seems;
-    or a regressor is far, and the reading is not: a fault code of an input, or of an output that is a lag now.
+    its reading is far and no regressor is unusual: probably a fault code;
+    or a regressor is far and the reading is not: a fault code of an input, or of an earlier output, which is now a lag.
 
-A large output after a large input is neither. A value is unusual if it is far, or if it differs where most are equal,
-as after a step of an input; a lag that is the same fault code is not. If half of the samples or more are doubtful, it
-is a change of level, and none is.
+A large output after a large input is neither. A regressor is unusual if it is far, or if it differs where most are
+equal, as after a step of an input; a lag with the same fault code as the reading is not unusual. If half of the
+samples or more are doubtful, the level has changed, and no sample is doubtful.
 
-A large input and a slow response look the same, and are the most informative samples of all. Doubtful samples are
-therefore left out only if the others contradict them: if least squares of all samples leave the others residuals with
-more than `WORSE` times the sum of squares that least squares of the others alone leave.
+A large input with a slow response looks the same, and its samples are the most informative of all. Doubtful samples
+are therefore left out only if the others contradict them: if least squares on all samples leaves the other samples a
+sum of squared residuals more than `WORSE` times as large as least squares on these alone.
 
 Source: the median absolute deviation as a scale is Hampel's (1974); the rule is ours. Cost: O(n N^2) for N samples,
 once.
@@ -29,8 +29,8 @@ FAR = 30.0
 WORSE = 10.0
 """Ratio of sums of squares from which samples contradict each other."""
 Y, SPAN, NOISE, READING = range(4)
-"""Entries of a sample after its regressor: output, intervals of drift since the one before, noise factor, which is
-negative if the sample is doubtful, and the output as it was measured."""
+"""Entries of a sample after its regressor: the output, intervals of drift since the previous sample, the noise factor
+(negative if the sample is doubtful), and the output as it was measured."""
 
 
 @shared

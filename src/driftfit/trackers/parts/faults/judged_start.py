@@ -1,13 +1,14 @@
-"""The diffuse start of trackers that believe what they are given: their first samples are judged together.
+"""The diffuse start of trackers that do not judge outliers by themselves: the first samples are judged together.
 
-Any first samples are fitted exactly, so that a fault code among them would decide the estimate. The start goes on in
-its square-root form until there are `RESIDUALS` more samples than directions. If some of them are doubtful
-(`driftfit.trackers.parts.faults.first_samples`), it goes on until the others have `SURE` residuals, or the store is
-full. If the estimate from all samples then contradicts these, the start is repeated without the doubtful ones.
+A diffuse start fits the first samples exactly, so a fault code among them would determine the estimate. The start
+continues in its square-root form until there are `RESIDUALS` more samples than directions of theta that they span. If
+some of them are doubtful (`driftfit.trackers.parts.faults.first_samples`), it continues until the others have `SURE`
+residuals, or the store is full. If the estimate from all samples then contradicts the others, the start is repeated
+without the doubtful ones.
 
-Samples are stored with the time since the one before that is stored, so that drift and forgetting are repeated too.
+Samples are stored with the time since the previous stored one, so that drift and forgetting are repeated as well.
 
-Cost: that of the diffuse start for a few samples more, and O(n N^2) once.
+Cost: that of the diffuse start for a few more samples, and O(n N^2) once for N stored samples.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ from driftfit.trackers.parts.faults.first_samples import NOISE, READING, SPAN, W
 RESIDUALS = 4
 """Number of residuals after which the first samples are judged."""
 SURE = 12
-"""The same for those that are not doubtful, if some are."""
+"""The number of residuals without doubtful samples after which they are judged if some are doubtful."""
 MORE = 16
 """Samples that are stored beyond the number of parameters."""
 AGED = READING + 1
-"""Entry of a stored sample: intervals of forgetting; `SPAN` are those of drift."""
+"""Entry of a stored sample: intervals of forgetting; those of drift are at `SPAN`."""
 
 
 def unjudged(theta: Array, diffuse: bool) -> dict[str, Any]:
@@ -167,7 +168,7 @@ def reconsidering(one: Step, restart: Step) -> Any:
 
 @lru_cache
 def judging(begin: Step, restart: Step = nothing) -> Step:
-    """``begin`` of a tracker whose first samples are judged; ``restart`` sets its own fields as before the first."""
+    """The first steps ``begin`` of a tracker, with its samples judged; ``restart`` sets its fields as before them."""
 
     @partial(kernel, inline=False)
     def one(s: State, l: int) -> None:
@@ -180,7 +181,7 @@ def judging(begin: Step, restart: Step = nothing) -> Step:
         if s.start_over[l] > 0:
             y_hat, v = prediction(s, l), np.inf
             if (s.y[l] - y_hat) ** 2 > REACH * REACH * s.y_spread[l]:
-                reform(s, l)  # which says what the variance of the prediction is
+                reform(s, l)  # gives the variance of the prediction
                 v = (s.at_start[BEFORE, l] + s.r[l] * s.noise[l]) * s.scale[l]
             leave_out_contradiction(s, y_hat, v, l)
             one(s, l)

@@ -10,8 +10,8 @@ it is used in another way. Addresses and loops have the form that Numba gives th
 on it: one lane of twelve parameters took 160 instead of 127 ns while a loop computed its next number before it tested
 for its end.
 
-Together with `numba_internals` this is all that leans on Numba's inside: `Lower` and the names of its methods, the
-passes of `DefaultPassBuilder`, and functions that build code for arrays.
+Private parts: `Lower` and the names of its methods, the passes of `DefaultPassBuilder`, and functions that build code
+for arrays.
 """
 
 from __future__ import annotations
