@@ -7,10 +7,11 @@ from typer.testing import CliRunner
 
 import driftfit
 from driftfit import ARX, Kalman, Regression, Track, cli, track, trackers
-from driftfit.cli.parts import arguments
+from driftfit.cli.parts.arguments import parse_interval
 from driftfit.data.files import read_columns
 from driftfit.models.hammerstein_wiener.curves.basis import BSpline, DeadZone, Legendre, PiecewiseLinear, Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.parsing import settings
 from driftfit.show.export import as_table
 
 runner = CliRunner()
@@ -211,39 +212,39 @@ def test_wrong_endings_are_refused_before_the_work(file, tmp_path):
 
 @pytest.mark.parametrize("name", ["AugmentedFLS", "augmentedfls", "augmented-fls", "augmented_FLS"])
 def test_tracker_names(name):
-    assert type(arguments.parse_tracker(name, ["mu=1"])).__name__ == "AugmentedFLS"
+    assert type(settings.parse_tracker(name, ["mu=1"])).__name__ == "AugmentedFLS"
 
 
 def test_values():
-    kalman = arguments.parse_tracker("kalman", ["q=1e-4, 0", "r=0.1", "p0=none", "theta0=-1"])
+    kalman = settings.parse_tracker("kalman", ["q=1e-4, 0", "r=0.1", "p0=none", "theta0=-1"])
     assert kalman == Kalman(q=(1e-4, 0.0), r=0.1, p0=None, theta0=-1.0)
-    assert arguments.parse_model("ARX:2,1/2,nk=0/1,intercept") == ARX(2, (1, 2), (0, 1), intercept=True)
-    assert arguments.parse_model("arx: na=2, nb=0") == ARX(2, 0)
-    assert arguments.parse_model("ARX(2, [1, 2], nk=[0, 1])") == ARX(2, (1, 2), (0, 1))
-    assert arguments.parse_model("ARX(1, 1)", ["a", "b"]).outputs == ("a", "b")
-    assert arguments.parse_tracker("Kalman(q=1e-4, r=0.1)", []) == Kalman(q=1e-4, r=0.1)
+    assert settings.parse_model("ARX:2,1/2,nk=0/1,intercept") == ARX(2, (1, 2), (0, 1), intercept=True)
+    assert settings.parse_model("arx: na=2, nb=0") == ARX(2, 0)
+    assert settings.parse_model("ARX(2, [1, 2], nk=[0, 1])") == ARX(2, (1, 2), (0, 1))
+    assert settings.parse_model("ARX(1, 1)", ["a", "b"]).outputs == ("a", "b")
+    assert settings.parse_tracker("Kalman(q=1e-4, r=0.1)", []) == Kalman(q=1e-4, r=0.1)
     for wrong in ("Kalman(q=1)", "__import__('os')", "ARX(open('f'))", "ARX(*[1])", "ARX(na=oops)"):
         with pytest.raises(ValueError, match=r"not a model|there is no|not allowed|not a number"):
-            arguments.parse_model(wrong)
+            settings.parse_model(wrong)
     with pytest.raises(ValueError, match="leave -p r=2 out"):
-        arguments.parse_tracker("Kalman(q=1)", ["r=2"])
+        settings.parse_tracker("Kalman(q=1)", ["r=2"])
     for words, basis in (
         ("polynomial/3", Polynomial(3)), ("Legendre/4/-2/2.5", Legendre(4, (-2, 2.5))),
         ("piecewise-linear/-1/0/1", PiecewiseLinear([-1, 0, 1])), ("bspline/2/-1/0/1", BSpline(2, [-1, 0, 1])),
         ("dead-zone/3", DeadZone(3)),
         ("dead-zone/3/0.1/average", DeadZone(3, 0.1, "average")),
     ):  # fmt: skip
-        model = arguments.parse_model(f"hammerstein-wiener:1,2,input={words}")
+        model = settings.parse_model(f"hammerstein-wiener:1,2,input={words}")
         assert model == HammersteinWiener(1, 2, input=basis)
-    assert arguments.parse_model("arx:1,intercept=false,start=zero") == ARX(1, start="zero")
-    assert arguments.parse_model("regression:intercept").bind(["a"]) == Regression(["a"], intercept=True)
+    assert settings.parse_model("arx:1,intercept=false,start=zero") == ARX(1, start="zero")
+    assert settings.parse_model("regression:intercept").bind(["a"]) == Regression(["a"], intercept=True)
 
 
 def test_intervals():
-    assert arguments.parse_interval(None) is None
-    assert arguments.parse_interval("0.25") == 0.25
+    assert parse_interval(None) is None
+    assert parse_interval("0.25") == 0.25
     for text, seconds in (("10ms", 0.01), ("1s", 1), ("15min", 900), ("1h", 3600), ("1d", 86400), ("2w", 1209600)):
-        assert arguments.parse_interval(text) / np.timedelta64(1, "s") == seconds
+        assert parse_interval(text) / np.timedelta64(1, "s") == seconds
 
 
 def test_trackers_are_all_listed_with_their_settings():
@@ -251,7 +252,7 @@ def test_trackers_are_all_listed_with_their_settings():
     assert result.exit_code == 0
     for name, kind in trackers.found().items():
         assert name in result.output
-        for field in arguments.given_fields(kind):
+        for field in settings.given_fields(kind):
             assert f"{field.name}=" in result.output
 
 

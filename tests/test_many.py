@@ -235,7 +235,7 @@ def test_clear_series_are_judged_by_the_limits_of_their_group_and_the_others_by_
     assert len(clear) >= 3
     for k in clear:
         assert min(result[k].p, full[k].p) > 0.05
-        np.testing.assert_allclose(result[k].limits, full[k].limits, rtol=0.15)
+        np.testing.assert_allclose(result[k].limits, full[k].limits, rtol=0.2)
     with pytest.raises(ValueError, match="at least 100 usable samples"):
         fleet.detect("glr", reference=80)
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 from numba import types
@@ -48,13 +48,13 @@ def known_once() -> Iterator[None]:
     codegen, size = context.codegen(), cache(context.get_abi_sizeof)
     codegen._check_llvm_bugs()
 
-    def look_again() -> None:
-        for registry in list(context._registries):
-            context.install_registry(registry)
+    def look_again(at: Any) -> None:
+        for registry in list(at._registries):
+            at.install_registry(registry)
 
     with (
-        replaced(context, refresh=look_again, get_abi_sizeof=size),
-        replaced(context.typing_context, refresh=lambda: None),
+        replaced(context, refresh=partial(look_again, context), get_abi_sizeof=size),
+        replaced(context.typing_context, refresh=partial(look_again, context.typing_context)),
         replaced(codegen, _check_llvm_bugs=lambda: None),
     ):
         yield

@@ -38,7 +38,8 @@ def padded(tracker: Tracker, n: int, N: int) -> Mapping[str, Any]:
     if "S" in state:
         absent = np.arange(n, N)
         state["S"][absent, absent] = 1.0
-        state["rank"] = state["rank"] + (N - n if state["rank"] < N else 0)
+        state["absent"] = np.array(N - n if state["rank"] < N else 0)
+        state["rank"] = state["rank"] + state["absent"]
     return state
 
 

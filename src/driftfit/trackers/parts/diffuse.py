@@ -70,8 +70,21 @@ def knowing_nothing(n: int, worst: float = WORST) -> dict[str, Any]:
     square = np.zeros((n, n))
     return {
         "S": square, "d": np.zeros(n), "R": np.eye(n), "H": square, "pivot": np.zeros(n), "work": np.zeros((WORK, n)),
-        "at_start": np.zeros(NOW), "F": np.ones(n), "volume": 0.0, "rank": 0, "root": 1, "worst": worst,
+        "at_start": np.zeros(NOW), "F": np.ones(n), "volume": 0.0, "rank": 0, "root": 1, "worst": worst, "absent": 0,
     }  # fmt: skip
+
+
+@kernel
+def know_nothing(s: State, l: int) -> None:
+    """As before the first sample; the last ``absent`` parameters are known (`driftfit.trackers.parts.common_size`)."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        s.d[i, l], s.F[i, l] = 0.0, 1.0
+        for j in range(n):
+            s.S[i, j, l], s.R[i, j, l] = 0.0, 1.0 if i == j else 0.0
+    for i in range(n - s.absent[l], n):
+        s.S[i, i, l] = 1.0
+    s.volume[l], s.rank[l] = 0.0, s.absent[l]
 
 
 def knowing(n: int) -> dict[str, Any]:

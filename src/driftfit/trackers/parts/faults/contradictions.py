@@ -45,10 +45,14 @@ SURE = 5.0
 """Standard deviations of the prediction."""
 FIRST = 10.0
 """Number of first readings that are accepted, for comparison with later ones."""
-MEMORY = 125.0
-"""Memory of the mean and variance of the readings, and of the mean of e^2 / s, in samples that are learned from."""
+JUDGED = 6.0
+"""After a prior for n parameters this many more than n, if that is more: before that s may say nothing about e."""
+MEMORY = 1000.0
+"""Memory of the mean and variance of the readings, and of the mean of e^2 / s, in samples."""
 ALL, EVERY = 64.0, 8.0
-"""These are learned from so many first samples, and then from every eighth: ranges change slowly."""
+"""These are learned from so many first samples, and then from every eighth, which counts as eight."""
+NEW = 3.0
+"""A sample whose innovation is above so many standard deviations of the readings is learned from in any case."""
 ENOUGH, FAR = 4.0, 100.0
 """Samples from which on the mean of e^2 / s is used; the largest multiple of it by which a sample enters it."""
 LASTING, LONGEST = 4.0, 1e12
@@ -64,9 +68,10 @@ ALIKE, SINKING = 1.01, 0.8
 the largest of them, of which `SINKING` is kept with every sample."""
 
 
-def no_contradictions() -> dict[str, Any]:
-    """Fields before the first reading."""
+def no_contradictions(n: int = 0) -> dict[str, Any]:
+    """Fields before the first reading; n is the number of parameters of which a prior may say too little."""
     return {
+        "y_first": max(FIRST, n + JUDGED),
         "y_mean": 0.0, "y_spread": 0.0, "y_count": 0.0, "y_last": np.nan, "patience": 1.0, "y_strange": np.nan,
         "far": 0.0, "left_out": 0.0, "distrusted": 0.0, "misfit": 0.0, "misfits": 0.0, "shift": 0.0, "lagging": 0.0,
         "y_wait": 0.0,
@@ -90,7 +95,7 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
     """Whether the sample is used: s.ok and s.seen; and the patience."""
     e, off, out = y - shown, abs(y - s.y_mean[l]), abs(shown - s.y_mean[l])
     reach, patience = REACH * REACH * s.y_spread[l], s.patience[l]
-    judged = (s.ok[l] > 0.0) & (s.y_count[l] >= FIRST) & (s.misfits[l] >= ENOUGH)
+    judged = (s.ok[l] > 0.0) & (s.y_count[l] >= s.y_first[l]) & (s.misfits[l] >= ENOUGH)
     strange = judged & (e * e > reach) & (e * e > SURE * SURE * v * s.misfit[l]) & (min(off, out) < 0.5 * abs(e))
     trusted = (off > out) | (s.distrusted[l] < LAGS)
     beyond = strange & trusted & (e * e > reach * patience * patience)
@@ -121,7 +126,7 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
 @kernel
 def learn_misfit(s: State, square: float, v: float, used: float, l: int) -> None:
     """Mean of e^2 / s, from e^2 and s."""
-    measured = (v > 0.0) & (v < np.inf)
+    measured = (v > 0.0) & (v < np.inf) & (s.y_count[l] > s.y_first[l] - JUDGED)
     part = square / v if measured else 0.0
     new = used if measured else 0.0
     s.misfits[l] = min(s.misfits[l] + new, MEMORY)
@@ -140,10 +145,12 @@ def leave_out_contradiction(s: State, y_hat: float, v: float, l: int) -> None:
     if not (alone and quiet):
         judge(s, s.y[l] + s.shift[l], y_hat + s.shift[l], v, l)
     used = s.ok[l]
-    due = (s.y_count[l] < ALL) | (s.misfits[l] < ALL) | (s.y_wait[l] >= EVERY)
-    s.y_wait[l] = 1.0 if due else s.y_wait[l] + used
+    waited = s.y_wait[l] + used
+    regular = (s.y_count[l] < ALL) | (s.misfits[l] < ALL) | (waited >= EVERY)
+    due = regular | (square > NEW * NEW * s.y_spread[l])
+    s.y_wait[l] = 0.0 if regular else waited
     if due or not alone:
-        learned = used if due else 0.0
+        learned = used * (waited if regular else 1.0) if due else 0.0
         learn_range(s, s.y[l] + s.shift[l], learned, l)
         learn_misfit(s, square, v, learned, l)
 

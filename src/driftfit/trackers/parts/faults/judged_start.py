@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, Step, cubes, kernel, machine, nothing
-from driftfit.trackers.parts.diffuse import BEFORE, MACHINES, prediction, reform
+from driftfit.trackers.parts.diffuse import BEFORE, MACHINES, know_nothing, prediction, reform
 from driftfit.trackers.parts.faults.contradictions import REACH, learn_range, leave_out_contradiction, no_contradictions
 from driftfit.trackers.parts.faults.first_samples import NOISE, READING, SPAN, WORSE, Y, doubt, doubtful
 
@@ -39,7 +39,8 @@ def unjudged(theta: Array, diffuse: bool) -> dict[str, Any]:
     n = len(theta)
     return {
         "start_rows": np.zeros((n + MORE, n + AGED + 1)), "start_count": 0, "start_over": 0 if diffuse else 1,
-        "start_theta": theta, "start_time": 0.0, "start_drift": 0.0, "start_faults": 0.0, **no_contradictions(),
+        "start_theta": theta, "start_time": 0.0, "start_drift": 0.0, "start_faults": 0.0,
+        **no_contradictions(0 if diffuse else n),
     }  # fmt: skip
 
 
@@ -54,12 +55,24 @@ START_MACHINES = (*MACHINES, machine_doubt_first)
 
 
 @kernel
+def room(s: State, l: int) -> int:
+    """Number of samples that are stored at most."""
+    return s.start_rows.shape[0] - s.absent[l]
+
+
+@kernel
+def spare_samples(s: State, l: int) -> int:
+    """Number of stored samples beyond the directions that they span."""
+    return s.start_count[l] - (s.rank[l] - s.absent[l])
+
+
+@kernel
 def keep(s: State, l: int) -> None:
     """Store the sample."""
     n, at = s.theta.shape[0], s.start_count[l]
     s.start_time[l] += s.dt[l]
     s.start_drift[l] += s.dt[l] * s.drift[l]
-    if (s.ok[l] > 0.0) & (at < s.start_rows.shape[0]):
+    if (s.ok[l] > 0.0) & (at < room(s, l)):
         for i in range(n):
             s.start_rows[at, i, l] = s.phi[i, l]
         s.start_rows[at, n + Y, l], s.start_rows[at, n + SPAN, l] = s.y[l], s.start_drift[l]
@@ -74,10 +87,8 @@ def as_before(s: State, l: int) -> None:
     """The state of the diffuse start before the first sample."""
     n = s.theta.shape[0]
     for i in range(n):
-        s.theta[i, l], s.d[i, l], s.F[i, l], s.var[i, l] = s.start_theta[i, l], 0.0, 1.0, np.inf
-        for j in range(n):
-            s.S[i, j, l], s.R[i, j, l] = 0.0, 1.0 if i == j else 0.0
-    s.volume[l], s.rank[l] = 0.0, 0
+        s.theta[i, l], s.var[i, l] = s.start_theta[i, l], np.inf
+    know_nothing(s, l)
 
 
 @kernel
@@ -98,7 +109,7 @@ def settle(s: State, l: int) -> None:
     n = s.theta.shape[0]
     s.start_over[l] = 1
     known = s.scale[l] > 0.0  # it is NaN without residuals
-    s.misfits[l] = max(s.start_count[l] - s.start_faults[l] - s.rank[l], 0.0) if known else 0.0
+    s.misfits[l] = max(spare_samples(s, l) - s.start_faults[l], 0.0) if known else 0.0
     s.misfit[l] = squares_left(s, l) / (max(s.misfits[l], 1.0) * s.r[l] * s.scale[l]) if known else 0.0
     for at in range(s.start_count[l]):
         learn_range(s, s.start_rows[at, n + READING, l], 1.0 if s.start_rows[at, n + NOISE, l] > 0.0 else 0.0, l)
@@ -188,8 +199,8 @@ def judging(begin: Step, restart: Step = nothing) -> Step:
         else:
             keep(s, l)
             one(s, l)
-            spare, found = s.start_count[l] - s.rank[l], 0
-            full = s.start_count[l] >= s.start_rows.shape[0]
+            spare, found = spare_samples(s, l), 0
+            full = s.start_count[l] >= room(s, l)
             if (s.ok[l] > 0.0) & (spare >= RESIDUALS):
                 found = doubtful_samples(s, l)
             ready = (spare >= RESIDUALS) & ((found == 0) | (spare - found >= (RESIDUALS if full else SURE)))

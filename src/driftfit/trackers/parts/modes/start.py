@@ -25,7 +25,7 @@ from functools import partial
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, exp, kernel, log, machine
-from driftfit.trackers.parts.diffuse import take_in
+from driftfit.trackers.parts.diffuse import know_nothing, take_in
 from driftfit.trackers.parts.excitation import learn_information, learn_scales
 from driftfit.trackers.parts.faults.first_samples import NOISE, READING, SPAN, WORSE, Y, doubt, doubtful
 from driftfit.trackers.parts.modes.filters import absorb, project, wander
@@ -93,11 +93,11 @@ def forget(s: State, l: int) -> None:
     """As before the first sample, but for the readings that `driftfit.trackers.parts.resolution` compares."""
     n = s.theta.shape[0]
     for i in range(n):
-        s.theta[i, l], s.d[i, l], s.F[i, l], s.c[i, l], s.active[i, l] = s.m[i, 0, l], 0.0, 1.0, 0.0, 0.0
+        s.theta[i, l], s.c[i, l], s.active[i, l] = s.m[i, 0, l], 0.0, 0.0
         for j in range(n):
-            s.S[i, j, l], s.information[i, j, l] = 0.0, 0.0
-            s.R[i, j, l] = 1.0 if i == j else 0.0
-    s.volume[l], s.rank[l], s.squares[l], s.count[l], s.scale[l] = 0.0, 0, 0.0, 0.0, np.nan
+            s.information[i, j, l] = 0.0
+    know_nothing(s, l)
+    s.squares[l], s.count[l], s.scale[l] = 0.0, 0.0, np.nan
     s.seen_samples[l], s.power[l], s.middle[l], s.spread[l], s.readings[l], s.patience[l] = 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
 
 
