@@ -57,13 +57,15 @@ START_MACHINES = (*MACHINES, machine_doubt_first)
 @kernel
 def room(s: State, l: int) -> int:
     """Number of samples that are stored at most."""
-    return s.start_rows.shape[0] - s.absent[l]
+    most: int = s.start_rows.shape[0] - s.absent[l]
+    return most
 
 
 @kernel
 def spare_samples(s: State, l: int) -> int:
     """Number of stored samples beyond the directions that they span."""
-    return s.start_count[l] - (s.rank[l] - s.absent[l])
+    spare: int = s.start_count[l] - (s.rank[l] - s.absent[l])
+    return spare
 
 
 @kernel
