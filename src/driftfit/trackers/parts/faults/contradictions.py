@@ -26,7 +26,7 @@ the same while a strange prediction decays, as the output of a simulation does. 
 judged here; those of a diffuse start are judged together (`driftfit.trackers.parts.faults.judged_start`).
 
 Source: ours; see `driftfit.trackers.parts.outlying_readings` for the rule of a tracker that learns its own noise. Cost
-per sample: five operations, and some thirty for one in eight and for strange ones.
+per sample: some twenty operations.
 """
 
 from __future__ import annotations
@@ -49,10 +49,6 @@ JUDGED = 6.0
 """After a prior for n parameters this many more than n, if that is more: before that s may say nothing about e."""
 MEMORY = 1000.0
 """Memory of the mean and variance of the readings, and of the mean of e^2 / s, in samples."""
-ALL, EVERY = 64.0, 8.0
-"""These are learned from so many first samples, and then from every eighth, which counts as eight."""
-NEW = 3.0
-"""A sample whose innovation is above so many standard deviations of the readings is learned from in any case."""
 ENOUGH, FAR = 4.0, 100.0
 """Samples from which on the mean of e^2 / s is used; the largest multiple of it by which a sample enters it."""
 LASTING, LONGEST = 4.0, 1e12
@@ -74,7 +70,6 @@ def no_contradictions(n: int = 0) -> dict[str, Any]:
         "y_first": max(FIRST, n + JUDGED),
         "y_mean": 0.0, "y_spread": 0.0, "y_count": 0.0, "y_last": np.nan, "patience": 1.0, "y_strange": np.nan,
         "far": 0.0, "left_out": 0.0, "distrusted": 0.0, "misfit": 0.0, "misfits": 0.0, "shift": 0.0, "lagging": 0.0,
-        "y_wait": 0.0,
     }  # fmt: skip
 
 
@@ -144,15 +139,8 @@ def leave_out_contradiction(s: State, y_hat: float, v: float, l: int) -> None:
     quiet = (square <= REACH * REACH * s.y_spread[l]) & (s.patience[l] <= 1.0) & (s.lagging[l] + s.distrusted[l] <= 0.0)
     if not (alone and quiet):
         judge(s, s.y[l] + s.shift[l], y_hat + s.shift[l], v, l)
-    used = s.ok[l]
-    waited = s.y_wait[l] + used
-    regular = (s.y_count[l] < ALL) | (s.misfits[l] < ALL) | (waited >= EVERY)
-    due = regular | (square > NEW * NEW * s.y_spread[l])
-    s.y_wait[l] = 0.0 if regular else waited
-    if due or not alone:
-        learned = used * (waited if regular else 1.0) if due else 0.0
-        learn_range(s, s.y[l] + s.shift[l], learned, l)
-        learn_misfit(s, square, v, learned, l)
+    learn_range(s, s.y[l] + s.shift[l], s.ok[l], l)
+    learn_misfit(s, square, v, s.ok[l], l)
 
 
 @kernel
