@@ -38,7 +38,7 @@ def replaced(owner: Any, **ours: Any) -> Iterator[None]:
 @contextmanager
 def known_once() -> Iterator[None]:
     """While it lasts, Numba looks for declarations and for a bug of LLVM once, instead of before each function, and at
-    every second call in it; only intrinsics declare more while they are compiled. Sizes of types are found once too.
+    every second call in it; of known declarations only new ones are installed. Sizes of types are found once too.
     """
     context = cpu_target.target_context
     if "refresh" in vars(context):
