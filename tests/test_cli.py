@@ -226,7 +226,7 @@ def test_values():
     for wrong in ("Kalman(q=1)", "__import__('os')", "ARX(open('f'))", "ARX(*[1])", "ARX(na=oops)"):
         with pytest.raises(ValueError, match=r"not a model|there is no|not allowed|not a number"):
             settings.parse_model(wrong)
-    with pytest.raises(ValueError, match="leave -p r=2 out"):
+    with pytest.raises(ValueError, match="leave r=2 out"):
         settings.parse_tracker("Kalman(q=1)", ["r=2"])
     for words, basis in (
         ("polynomial/3", Polynomial(3)), ("Legendre/4/-2/2.5", Legendre(4, (-2, 2.5))),

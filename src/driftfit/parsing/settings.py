@@ -58,18 +58,18 @@ def parse_model(text: str, outputs: Sequence[str] = ()) -> Model:
         key = key.strip()
         if not is_named and key not in known:
             if not re.fullmatch(r"[\d./]+", key):
-                raise ValueError(f"--model {text}: {key!r} is neither a number nor a setting; {near(key, known)}")
+                raise ValueError(f"model {text}: {key!r} is neither a number nor a setting; {near(key, known)}")
             if position >= len(places):
-                raise ValueError(f"--model {text}: too many numbers; {kind.__name__} takes {', '.join(known)}.")
+                raise ValueError(f"model {text}: too many numbers; {kind.__name__} takes {', '.join(known)}.")
             key, value = places[position], key
-        add_setting(f"--model {text}", settings, known, key, parse_value(value, "/") if value else True)
+        add_setting(f"model {text}", settings, known, key, parse_value(value, "/") if value else True)
     if len(outputs) > 1:
         if "ny" not in known:
-            raise ValueError(f"--model {text}: {kind.__name__} has one output, but --y names {', '.join(outputs)}.")
+            raise ValueError(f"model {text}: {kind.__name__} has one output, but y names {', '.join(outputs)}.")
         if settings.get("ny", len(outputs)) != len(outputs):
-            raise ValueError(f"--model {text}: ny={settings['ny']}, but --y names {', '.join(outputs)}.")
+            raise ValueError(f"model {text}: ny={settings['ny']}, but y names {', '.join(outputs)}.")
         settings["ny"] = tuple(outputs)
-    return build(f"--model {text}", kind, settings)
+    return build(f"model {text}", kind, settings)
 
 
 def _with_outputs(model: Model, outputs: Sequence[str]) -> Model:
@@ -78,7 +78,7 @@ def _with_outputs(model: Model, outputs: Sequence[str]) -> Model:
         return model
     if len(model.outputs) not in (1, len(outputs)) or "ny" not in {field.name for field in given_fields(type(model))}:
         raise ValueError(
-            f"--model {model!r} has outputs {', '.join(model.outputs)}, but --y names {', '.join(outputs)}."
+            f"model {model!r} has outputs {', '.join(model.outputs)}, but y names {', '.join(outputs)}."
         )
     return replace(model, ny=tuple(outputs))  # type: ignore[type-var]  # every model is a dataclass
 
@@ -87,11 +87,11 @@ def own_tracker(place: str) -> type[Tracker]:
     """The class that ``module:Class`` names; modules in the current folder are found."""
     module, _, name = place.partition(":")
     if not module or not name:
-        raise ValueError(f"--with {place}: name the module and the class, such as --with mine:MyTracker.")
+        raise ValueError(f"tracker {place}: name the module and the class, such as mine:MyTracker.")
     sys.path.insert(0, "")
     kind = getattr(import_module(module), name, None)
     if not (isinstance(kind, type) and issubclass(kind, Tracker)):
-        raise ValueError(f"--with {place}: {module} has no Tracker of the name {name}.")
+        raise ValueError(f"tracker {place}: {module} has no Tracker of the name {name}.")
     return kind
 
 
@@ -99,7 +99,7 @@ def parse_tracker(name: str, given: Sequence[str], own: str | None = None) -> Tr
     """A tracker from its name, or its place in a user's module, and ``key=value`` settings; or from an expression."""
     if "(" in name:
         if given:
-            raise ValueError(f"--tracker {name} has its settings in the brackets; leave -p {given[0]} out.")
+            raise ValueError(f"tracker {name} has its settings in the brackets; leave {given[0]} out.")
         return expressions.read(name, Tracker, trackers.found())  # type: ignore[type-abstract]
     kind = own_tracker(own) if own else lookup("tracker", name, trackers.found())
     known = [field.name for field in given_fields(kind)]
@@ -107,14 +107,14 @@ def parse_tracker(name: str, given: Sequence[str], own: str | None = None) -> Tr
     for entry in given:
         key, is_named, value = entry.partition("=")
         if not is_named or not value.strip():
-            raise ValueError(f"-p {entry}: give a setting as name=value, such as -p {known[0]}=1e-4.")
+            raise ValueError(f"setting {entry} of the tracker: write name=value, such as {known[0]}=1e-4.")
         others = [other for other, at in trackers.found().items() if key.strip() in {f.name for f in given_fields(at)}]
         if key.strip() not in known and others:
             raise ValueError(
-                f"-p {entry}: {kind.__name__} has no setting {key.strip()!r}; that is one of {', '.join(others)}."
+                f"setting {entry}: {kind.__name__} has no setting {key.strip()!r}; that is one of {', '.join(others)}."
             )
-        add_setting(f"-p {entry}", settings, known, key.strip(), parse_value(value, ","))
-    return build(f"--with {own}" if own else f"--tracker {name}", kind, settings)
+        add_setting(f"setting {entry}", settings, known, key.strip(), parse_value(value, ","))
+    return build(f"tracker {own or name}", kind, settings)
 
 
 def add_setting(where: str, settings: dict[str, Any], known: Any, key: str, value: Any) -> None:
