@@ -77,9 +77,7 @@ def _with_outputs(model: Model, outputs: Sequence[str]) -> Model:
     if len(outputs) < 2 or model.outputs == tuple(outputs):
         return model
     if len(model.outputs) not in (1, len(outputs)) or "ny" not in {field.name for field in given_fields(type(model))}:
-        raise ValueError(
-            f"model {model!r} has outputs {', '.join(model.outputs)}, but y names {', '.join(outputs)}."
-        )
+        raise ValueError(f"model {model!r} has outputs {', '.join(model.outputs)}, but y names {', '.join(outputs)}.")
     return replace(model, ny=tuple(outputs))  # type: ignore[type-var]  # every model is a dataclass
 
 

@@ -37,10 +37,10 @@ LEAST = 1e-8
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """The result of `diagnose_blocks`; each field (samples,), ``quality`` (samples, 2), ``weakest`` (samples, n).
+    """The result of `diagnose_blocks`; each field (samples,), ``quality`` (samples, 2), ``unexcited`` (samples, n).
 
-    ``at`` are the diagnosed samples; ``weakest`` is the direction of theta with the least excitation, in units of
-    scaled columns.
+    ``at`` are the diagnosed samples; ``unexcited`` is how much of each scaled column, 0 to 1, is in the directions of
+    theta whose excitation is at most ``limit``.
     """
 
     names: tuple[str, ...]
@@ -53,7 +53,7 @@ class Diagnostics:
     trace: Array
     condition: Array
     memory: Array
-    weakest: Array
+    unexcited: Array
     limit: float
 
     @property
@@ -63,9 +63,7 @@ class Diagnostics:
 
     def dull(self, k: int = -1) -> tuple[str, ...]:
         """Names of the columns that sample ``at[k]`` does not distinguish; empty if all are excited."""
-        if self.excitation[k] > self.limit:
-            return ()
-        share = np.abs(self.weakest[k])
+        share = self.unexcited[k]
         return tuple(name for name, part in zip(self.names, share, strict=True) if part > 0.2 * share.max())
 
 
@@ -85,7 +83,7 @@ def diagnose_blocks(run: Track, window: int | None = None, every: int = 1, limit
     seen = replay(run)
     phi = np.where(seen["ok"][:, :1] > 0.0, seen["phi"][..., 0], 0.0)
     at = np.arange(every - 1, len(run), every)
-    excitation, weakest = excitation_of(phi, at, span)
+    excitation, unexcited = excitation_of(phi, at, span, limit)
     found = blocks_of(run)
     slope = np.array([_least_slope(model, found.d[t], run.y[max(t - span + 1, 0) : t + 1]) for t in at])
     trace, condition, largest = _covariance(run, at)
@@ -95,23 +93,26 @@ def diagnose_blocks(run: Track, window: int | None = None, every: int = 1, limit
         nis = run.innovation[at] ** 2 / run.innovation_std[at] ** 2
         memory = np.divide(largest + drift, drift)
     return Diagnostics(
-        model.names, at, excitation, nis, found.quality[at], slope, found.radius[at], trace, condition, memory, weakest,
+        model.names, at, excitation, nis, found.quality[at], slope, found.radius[at], trace, condition, memory, unexcited,
         limit,
     )  # fmt: skip
 
 
-def excitation_of(phi: Array, at: Array, span: int) -> tuple[Array, Array]:
-    """Smallest eigenvalue of the scaled Gram matrix of each window, and its eigenvector."""
+def excitation_of(phi: Array, at: Array, span: int, limit: float) -> tuple[Array, Array]:
+    """Smallest eigenvalue of the scaled Gram matrix of each window, and the part of each column in the eigenvectors of
+    eigenvalues up to the limit: together they are one space, whatever basis of it is computed.
+    """
     n = phi.shape[1]
-    least, weakest = np.zeros(len(at)), np.zeros((len(at), n))
+    least, unexcited = np.zeros(len(at)), np.zeros((len(at), n))
     for k, t in enumerate(at):
         rows = phi[max(t - span + 1, 0) : t + 1]
         G = rows.T @ rows
         size = np.sqrt(np.diag(G))
         scale = np.where(size > 0.0, 1.0 / np.where(size > 0.0, size, 1.0), 0.0)
         values, vectors = np.linalg.eigh(G * scale * scale[:, None])
-        least[k], weakest[k] = max(values[0], 0.0), vectors[:, 0]
-    return least, weakest
+        least[k] = max(values[0], 0.0)
+        unexcited[k] = np.linalg.norm(vectors[:, values <= limit], axis=1)
+    return least, unexcited
 
 
 def _least_slope(model: HammersteinWiener, d: Array, y: Array) -> float:

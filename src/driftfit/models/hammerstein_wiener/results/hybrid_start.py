@@ -104,7 +104,7 @@ def _sufficient(model: HammersteinWiener, first: Tracker, y: Array, u: Array, li
         seen = replay(run)
         phi = np.where(seen["ok"][:, :1] > 0.0, seen["phi"][..., 0], 0.0)
         at = np.arange(3 * n, len(run))
-        found = np.flatnonzero(excitation_of(phi, at, 3 * n)[0] > limit)
+        found = np.flatnonzero(excitation_of(phi, at, 3 * n, limit)[0] > limit)
         if found.size:
             return int(at[found[0]])
     raise ValueError(
