@@ -93,8 +93,8 @@ def diagnose_blocks(run: Track, window: int | None = None, every: int = 1, limit
         nis = run.innovation[at] ** 2 / run.innovation_std[at] ** 2
         memory = np.divide(largest + drift, drift)
     return Diagnostics(
-        model.names, at, excitation, nis, found.quality[at], slope, found.radius[at], trace, condition, memory, unexcited,
-        limit,
+        model.names, at, excitation, nis, found.quality[at], slope, found.radius[at], trace, condition, memory,
+        unexcited, limit,
     )  # fmt: skip
 
 
