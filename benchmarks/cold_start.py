@@ -5,8 +5,8 @@
 Each tracker runs in a process of its own over a record of 200 samples, twice: with an empty cache of compiled code, and
 with what the first run left there. Printed are seconds from the call of `track` to its result by the clock and of
 processor time (on a busy machine the former says little), without the import of the library, which is a column of its
-own. ``--quick`` takes the Kalman filter alone. ``candidates`` are selections over structures of a record of 600
-samples: 27 ARX orders and delays, and 18 Hammerstein-Wiener orders and bases.
+own. ``--quick`` takes the Kalman filter alone. Selections are over structures of a record of 600 samples, 27 ARX orders
+and delays and 18 Hammerstein-Wiener orders and bases, and over the same ARX structures on a stream.
 """
 
 from __future__ import annotations
@@ -31,16 +31,20 @@ SELECTIONS = {
     "output=[Polynomial(2)]), y, u",
 }
 """Candidates, and the rest of the arguments of `select`."""
+STREAMS = {
+    "27 ARX, live": "grid(ARX, na=[1, 2, 3], nb=[1, 2, 3], nk=[0, 1, 2]), Kalman(q=1e-4, r=0.1)",
+}
+"""Arguments of `LiveSelection`, which processes one sample."""
 WANTED = {
     "Kalman": 4.0, "AdaptiveKalman": 8.0, "HammersteinWiener": 10.0, "Bank": 15.0, "27 ARX, Kalman": 5.0, "27 ARX": 5.0,
-    "18 Hammerstein-W.": 30.0,
+    "18 Hammerstein-W.": 30.0, "27 ARX, live": 5.0,
 }  # fmt: skip
 """Seconds that a first result may take on two cores."""
 PROGRAM = """
 import json, time
 start = time.perf_counter()
 import numpy as np
-from driftfit import ARX, AdaptiveKalman, Bank, HammersteinWiener, Kalman, grid, select, track
+from driftfit import ARX, AdaptiveKalman, Bank, HammersteinWiener, Kalman, LiveSelection, grid, select, track
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 rng = np.random.default_rng(0)
 y, u = rng.standard_normal(LENGTH), rng.standard_normal(LENGTH)
@@ -53,7 +57,10 @@ print(json.dumps([ready - start, time.perf_counter() - ready, time.process_time(
 def once(name: str, cache: str) -> tuple[float, float, float]:
     """Seconds of the import, of the first result, and of the processor for it."""
     settings = {**os.environ, "NUMBA_CACHE_DIR": cache}
-    call = f"track({TRACKERS[name]}, y, u)" if name in TRACKERS else f"select({SELECTIONS[name]})"
+    calls = {one: f"track({given}, y, u)" for one, given in TRACKERS.items()}
+    calls |= {one: f"select({given})" for one, given in SELECTIONS.items()}
+    calls |= {one: f"LiveSelection({given}).update(y[0], u[0])" for one, given in STREAMS.items()}
+    call = calls[name]
     program = PROGRAM.replace("CALL", call).replace("LENGTH", "200" if name in TRACKERS else "600")
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", program], env=settings, capture_output=True, text=True, check=True
@@ -72,4 +79,4 @@ def main(names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(["Kalman"] if "--quick" in sys.argv else sys.argv[1:] or [*TRACKERS, *SELECTIONS])
+    main(["Kalman"] if "--quick" in sys.argv else sys.argv[1:] or [*TRACKERS, *SELECTIONS, *STREAMS])

@@ -31,13 +31,16 @@ typedef struct {
 void run(filter *f, long T, const double *y, const double *u, row *out)
 {
     for (long t = 0; t < T; t++) {
-        double phi[N], g[N], y_hat = 0.0, s = f->r;
+        double lags[N], phi[N], g[N], y_hat = 0.0, s = f->r;
         int valid = 1, seen = fabs(y[t]) < LARGEST;
 
+        for (int i = 0; i < NA; i++)
+            lags[i] = f->y_lag[i];
+        for (int i = 0; i < NB; i++)
+            lags[NA + i] = f->u_lag[i];
         for (int i = 0; i < N; i++) {
-            double value = i < NA ? f->y_lag[i] : f->u_lag[i - NA];
-            int finite = fabs(value) < LARGEST;
-            phi[i] = finite ? value : 0.0;
+            int finite = fabs(lags[i]) < LARGEST;
+            phi[i] = finite ? lags[i] : 0.0;
             valid = valid && finite;
         }
         int ok = valid && seen;

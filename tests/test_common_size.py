@@ -16,15 +16,15 @@ TRACKERS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def record():
-    """Regressors with an offset, one that is 0 at first, missing and wrong readings; y drifts."""
+@pytest.fixture(scope="module", params=[0.0, 0.5], ids=["", "coarse"])
+def record(request):
+    """Regressors with an offset, one that is 0 at first, missing and wrong readings; y drifts; meters may be coarse."""
     rng = np.random.default_rng(0)
     phi = rng.standard_normal((300, 1)) + 3.0
     phi[:7] = 0.0
     y = phi[:, 0] * (1.0 + np.cumsum(0.05 * rng.standard_normal(300))) + 0.3 * rng.standard_normal(300)
     y[50:60], phi[200], y[100], y[150:] = np.nan, np.nan, 900.0, y[150:] + 5.0
-    return y, phi
+    return (np.round(y / request.param) * request.param if request.param else y), phi
 
 
 @pytest.mark.parametrize("tracker", TRACKERS, ids=repr)

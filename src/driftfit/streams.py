@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
+from driftfit.judge.structures import shared_streams
 from driftfit.models.hammerstein_wiener.separation.paths import Groups, Separator
 from driftfit.run.live import live
 from driftfit.trackers.bank.results.live_results import LiveHypotheses
@@ -46,3 +47,7 @@ class Live(live.Live, public=True):
     def system(self) -> LiveSystem:
         """The present `ARX` system: poles, gains, responses with bands; see `driftfit.use.live_system`."""
         return LiveSystem(self)
+
+
+class SharedStream(Live, shared_streams.SharedStream, public=True):
+    """A candidate of `LiveSelection`, with the verbs of a stream."""

@@ -35,11 +35,10 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import one_of, output_names, whole
+from driftfit.models.base import GAP, Model
 from driftfit.models.doubted_lags import doubted, no_doubts, shift_doubts
 from driftfit.models.inputs import CountedInputs
-
-GAP = 1.5
-"""Intervals longer than this many nominal ones break the lags."""
+from driftfit.models.run_time_arx import ONE, PAST, RunTimeARX
 
 
 @dataclass(frozen=True)
@@ -130,6 +129,18 @@ class ARX(CountedInputs):
 
     def steps_for(self, tracker: TrackerSteps) -> ModelSteps:
         return _steps(self.na, self.lags, self.intercept, True) if tracker.doubts and self.na > 0 else self.steps
+
+    @property
+    def family(self) -> Any:
+        """ARX models of one output with as many inputs differ only in their orders."""
+        return None if len(self.outputs) > 1 else ("ARX", self.m)
+
+    def as_large_as(self, family: Sequence[Model]) -> Model:
+        memories = [one.memory() for one in family]
+        length, depth = max(len(one["y_lag"]) for one in memories), max(one["u_lag"].shape[1] for one in memories)
+        lags = [j * depth + nk + i for j, (nb, nk) in enumerate(self.lags) for i in range(nb)]
+        picks = (*(PAST,) * self.na, *lags, *((ONE,) if self.intercept else ()))
+        return RunTimeARX(self, self.na, picks, (max(one.n for one in family), length, depth))
 
     @property
     def apply(self) -> Step | None:
@@ -236,7 +247,7 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, doubts: 
     @kernel
     def push(s: State, l: int) -> None:
         if doubts:
-            shift_doubts(s, 0, l, l, l, 1, 1)
+            shift_doubts(s, 0, l, l, l, 1, 1, na)
         for i in range(na - 1, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]
         # a prediction of infinite variance carries no information (a diffuse start) and must not become a lag
@@ -336,7 +347,7 @@ def _joint_steps(
         for o in range(ny):
             lane = o * series + l % series  # of output o of the same series
             if doubts:
-                shift_doubts(s, o, l, lane, l % series, series, ny)
+                shift_doubts(s, o, l, lane, l % series, series, ny, na)
             for i in range(na - 1, 0, -1):
                 s.y_lag[o, i, l] = s.y_lag[o, i - 1, l]
             informed = (s.s[lane] != np.inf) | (s.noise[lane] == np.inf)

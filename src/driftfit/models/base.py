@@ -12,6 +12,9 @@ from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import Settings
 
+GAP = 1.5
+"""Intervals longer than this many nominal ones break the lags."""
+
 
 class Model(Settings, ABC):
     """How signals become ``y_t = phi_t' theta_t + v_t``.

@@ -91,9 +91,9 @@ def judge(s: State, o: int, i: int, l: int, first: int, step: int, ny: int) -> N
 
 
 @kernel
-def learn_share(s: State, o: int, l: int) -> None:
+def learn_share(s: State, o: int, l: int, na: int) -> None:
     """The last lag of output o is dropped: which kind of outlier it was counts for later ones."""
-    last = s.doubt.shape[1] - 1
+    last = na - 1
     p, d, share = s.suspect[o, last, l], s.doubt[o, last, l], s.false_share[o, l]
     if p > 0.0:
         moved = (1.0 - d) * p * (1.0 - share) / (1.0 - p * share)
@@ -102,15 +102,14 @@ def learn_share(s: State, o: int, l: int) -> None:
 
 
 @kernel
-def shift_doubts(s: State, o: int, l: int, own: int, first: int, step: int, ny: int) -> None:
-    """Judge the lags of output o by this sample, and move them by one.
+def shift_doubts(s: State, o: int, l: int, own: int, first: int, step: int, ny: int, na: int) -> None:
+    """Judge the na lags of output o by this sample, and move them by one.
 
     ``own`` is the lane of that output; the lanes of all ny outputs are ``first``, first + step, ..
     """
-    na = s.doubt.shape[1]
     for i in range(na):
         judge(s, o, i, l, first, step, ny)
-    learn_share(s, o, l)
+    learn_share(s, o, l, na)
     for i in range(na - 1, 0, -1):
         s.doubt[o, i, l], s.suspect[o, i, l] = s.doubt[o, i - 1, l], s.suspect[o, i - 1, l]
         s.aside[o, i, l], s.blur[o, i, l] = s.aside[o, i - 1, l], s.blur[o, i - 1, l]

@@ -39,7 +39,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.models.arx import GAP
+from driftfit.models.base import GAP
 from driftfit.models.fault_codes import possible
 from driftfit.models.formulas.functions import equation_text
 from driftfit.models.formulas.text import Formula, compiled, parse, start_values

@@ -99,7 +99,7 @@ class Program:
         model = None if self.output is None else self.model.alone(self.output)
         return None if model is None else Program(model, self.tracker)
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters."""
         if self.output is None:

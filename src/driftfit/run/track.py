@@ -26,8 +26,10 @@ from driftfit.trackers.base import Tracker
 Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
 """One tracker for all, or one per setting of a grid or per series."""
 
-PART = 64_000_000
-"""Bytes of results that `parts` holds at a time; a table of them takes some three times as much."""
+PART = 16_000_000
+"""Bytes of results that `parts` holds at a time; a table of them and the writer of Parquet take some six times as much.
+With four times as many a series costs a quarter more, in memory that the process touches for the first time.
+"""
 ASTRAY = 1.0
 """Median prediction error, in deviations of the output, above which estimates went astray."""
 

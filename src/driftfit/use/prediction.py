@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.models.arx import GAP
+from driftfit.models.base import GAP
 from driftfit.run.result import Track
 
 

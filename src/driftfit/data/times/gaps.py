@@ -7,7 +7,7 @@ import numpy as np
 from driftfit.data.clock import Clock, duration_text
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import warn
-from driftfit.models.arx import GAP
+from driftfit.models.base import GAP
 
 LOOK = 20
 """Number of samples after which a stream warns if most of them cannot be used."""

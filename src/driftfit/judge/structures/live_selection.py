@@ -10,7 +10,8 @@ useless, but take long to become correct once their candidate is the right one. 
 those of ``select(..).average(a)``.
 
 Source: Raftery, Karny and Ettler (2010), Technometrics 52(1); the choice of r, m, p, q and bases on line is left open
-by Feng and Hong (2021), section 6. Cost: that of the candidates.
+by Feng and Hong (2021), section 6. Cost: that of the candidates; those of one kind share compiled steps, whose number
+of parameters is that of the largest (`driftfit.judge.structures.shared_streams`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import scipy
 from driftfit.data.arguments import check_roles
 from driftfit.data.storage import Kept
 from driftfit.engine.kernel import Array
+from driftfit.judge.structures.shared_streams import SharedStream, share
 from driftfit.models.base import Model
 from driftfit.run.live.live import Live
 from driftfit.trackers.base import Tracker
@@ -65,11 +67,17 @@ class LiveSelection(Kept):
             )
         if not 0.0 < forgetting <= 1.0:
             raise ValueError(f"LiveSelection: forgetting must be in (0, 1]; got {forgetting!r}.")
-        self._follow([Live(model, tracker, dt=dt) for model in models], forgetting)
+        self._follow([SharedStream(model, tracker, dt=dt) for model in models], forgetting)
 
-    def _follow(self, streams: Sequence[Live], forgetting: float) -> None:
+    def _follow(self, streams: Sequence[SharedStream], forgetting: float) -> None:
+        share(streams)
         self.streams, self.forgetting = tuple(streams), float(forgetting)
         self._logs, self._residuals = np.zeros((2, len(self.streams)))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """A copy shares compiled steps too."""
+        self.__dict__.update(state)
+        share(self.streams)
 
     def update(self, y: float, u: Any = None, **known: Any) -> float:
         """Process one sample; returns the prediction of y made before it, averaged over the candidates by their
@@ -122,6 +130,7 @@ class LiveSelection(Kept):
     def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
         found = cls.__new__(cls)
         count = len(arrays["logs"])
-        found._follow([Live.from_bytes(arrays[f"stream{k}"].tobytes()) for k in range(count)], header["forgetting"])
+        streams = [SharedStream.from_bytes(arrays[f"stream{k}"].tobytes()) for k in range(count)]
+        found._follow(streams, header["forgetting"])
         found._logs, found._residuals = np.array(arrays["logs"]), np.array(arrays["residuals"])
         return found

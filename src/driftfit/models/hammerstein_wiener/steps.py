@@ -20,7 +20,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, Step, floats, kernel, machine, part, shared
-from driftfit.models.arx import GAP
+from driftfit.models.base import GAP
 from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, input_values, level_of, output_values, usable
 from driftfit.models.hammerstein_wiener.output_curve import believe, inverting, laying, locating, refining
 from driftfit.models.hammerstein_wiener.regressor_rows import (

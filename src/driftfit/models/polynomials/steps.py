@@ -13,7 +13,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, SMALLEST, ModelSteps
 from driftfit.engine.kernel import State, Step, kernel
-from driftfit.models.arx import GAP
+from driftfit.models.base import GAP
 from driftfit.models.linearised import along, informed, restore, subtract
 
 SETTLING = 4.0

@@ -99,9 +99,13 @@ class Live(Operated, Stream):
         self._interval = tile["interval"][0]
         self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
         if self._single:
-            self._update = self.program.drivers().updater(tile, self._m)
+            self._update = self._stepper()
             self._seen, self._scratch_seen = as_compiled(tile), as_compiled(self._scratch)  # views
         self._expect(self._awaits)
+
+    def _stepper(self) -> Any:
+        """The compiled step of one output."""
+        return self.program.drivers().updater(self._tile, self._m)
 
     def _expect(self, what: int) -> None:
         super()._expect(what)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.faults.judged_start import AGED
 
 SIZES = (6, 12, 24)
 """Numbers of parameters of shared drivers, so that a search meets few of them."""
@@ -47,3 +48,18 @@ def _embedded(small: Any, large: Any) -> Any:
     """The large array with the small one as its beginning along each axis."""
     large[tuple(slice(size) for size in small.shape)] = small
     return large
+
+
+def places(name: str, own: tuple[int, ...], wide: tuple[int, ...], absent: int) -> Any:
+    """Which entries (..) of a wide field of shape ``wide`` are those of the field of shape ``own``, both without lanes.
+
+    They are the first along each axis, except factors of the likelihood, which are stored from the rank before the
+    first sample on, and what follows the regressors in the samples of a diffuse start.
+    """
+    axes = [np.arange(size) for size in own]
+    if name == "F":
+        axes[0] += absent
+    if name == "start_rows":
+        columns = axes[1]
+        columns[columns >= own[1] - (AGED + 1)] += absent
+    return np.arange(np.prod(wide, dtype=int)).reshape(wide)[np.ix_(*axes)]

@@ -97,7 +97,7 @@ def in_common(s: State, noise: float, l: int) -> float:
 @kernel
 def share_rounding(s: State, per_noise: float, l: int) -> None:
     """Take in a sample after its correction; ``per_noise`` is s.s in units of the noise variance, s.scale."""
-    n, ok = s.theta.shape[0], s.ok[l]
+    n, ok = s.theta.shape[0] - s.absent[l], s.ok[l]
     kept = 1.0 - ok * max(1.0 - s.noise[l] / per_noise, 0.0) / n
     N = kept * s.readings_in[l] + ok
     weight = ok / max(N, 1.0)
@@ -114,8 +114,8 @@ def share_rounding(s: State, per_noise: float, l: int) -> None:
 @kernel
 def share_among_filters(s: State, l: int) -> None:
     """The same for a mixture of filters with covariance s.P, which has the mean and variance of its readings."""
-    n, h = s.theta.shape[0], 0.0
-    for i in range(n):
+    n, h = s.theta.shape[0] - s.absent[l], 0.0
+    for i in range(s.theta.shape[0]):
         for j in range(i + 1):
             h += s.white[i, l] * s.white[j, l] * s.P[i, j, l] * (1.0 if i == j else 2.0)
     h = max(h, 0.0)
@@ -124,7 +124,7 @@ def share_among_filters(s: State, l: int) -> None:
     mean = s.undecided[l]
     s.common[l] = in_common(s, s.r[l], l) if (s.coarse[l] > 0.0) & (mean > 0.0) else 0.0
     s.fold[l] = 1.0 + n * s.common[l] / mean if s.common[l] > 0.0 else 1.0
-    for i in range(n):
+    for i in range(s.theta.shape[0]):
         s.var[i, l] *= s.fold[l]
 
 
