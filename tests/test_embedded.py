@@ -19,6 +19,7 @@ from driftfit import (
     RLS,
     AdaptiveKalman,
     Bank,
+    ContinuousTransfer,
     ExtendedKalman,
     HammersteinWiener,
     Kalman,
@@ -58,6 +59,7 @@ OTHERS = {
     "second differences": (ARX(1, 1), FLS(100.0, differences=2)),
     "two inputs": (ARX(2, [2, 1], nk=[1, 0], intercept=True), Kalman(q=1e-4, r=0.1)),
     "no input": (ARX(2, 0), Kalman(q=1e-4, r=0.1)),
+    "continuous time": (ContinuousTransfer(2, 1, dt=0.1, offset=True), RLS(0.99)),
     "one parameter": (Regression(1), Kalman(q=1e-4, r=0.1)),
     "polynomials": (HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2)), Kalman(q=1e-4, r=0.1, p0=1.0)),
 }

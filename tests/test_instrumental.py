@@ -112,3 +112,16 @@ def test_a_widened_parameter_is_learned_again():
 def test_models_that_do_not_say_where_past_outputs_are_get_refused():
     with pytest.raises(ValueError, match="HammersteinWiener does not say which of its regressors are past outputs"):
         Live(HammersteinWiener(1, 1), InstrumentalVariables(LAMBDA))
+
+
+def test_the_start_is_forgotten_without_forgetting():
+    """The first samples are least squares, whose bias in strong white noise would last for thousands of samples."""
+    theta = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        u, x = rng.normal(size=1500), np.zeros(1500)
+        for t in range(2, 1500):
+            x[t] = 1.5 * x[t - 1] - 0.7 * x[t - 2] + u[t - 1] + 0.5 * u[t - 2]
+        y = x + 2.0 * rng.normal(size=1500)
+        theta.append(track(ARX(2, 2), InstrumentalVariables(1.0), y, u).theta[-1])
+    assert np.abs(np.median(theta, axis=0) - [1.5, -0.7, 1.0, 0.5]).max() < 0.08

@@ -65,8 +65,8 @@ class Calls(Expressions):
         if function in (np.sqrt, math.sqrt):
             self.ops[-1]["square root"] += 1
             return Value("real", f"R_SQRT({one.text})")
-        if function in (np.cos, np.sin):
-            self.ops[-1]["sine"] += 1
+        if function in (np.cos, np.sin, np.ceil):
+            self.ops[-1]["compare" if function is np.ceil else "sine"] += 1
             return Value("real", f"R({function.__name__}({one.text}))")
         if function in (np.int64, int):
             return Value("long", f"((int64_t){one.text})")

@@ -18,7 +18,8 @@ with the noise: the inputs themselves, and the outputs of an auxiliary model ins
     zeta_t = [x_{t-1} .. x_{t-na}, the other regressors]
 
 that is driven by the inputs alone, and follows theta at a distance. The first 10 n samples are used as in least
-squares, to have an auxiliary model; their bias fades with the memory.
+squares, to have an auxiliary model. Without a prior they are forgotten again, also for lambda = 1: until sample 40 n
+the memory is 10 n samples at most. Otherwise their bias would fade as 1 / t only.
 
 `OE` and `BoxJenkins`, and models in continuous time, have instruments of their own, filtered so that the estimate is
 efficient if the model of the noise is right: refined instrumental variables
@@ -78,6 +79,9 @@ FOLLOWING = 0.05
 
 LEAST_SQUARES = 10.0
 """Samples for each parameter, at the start, that are used as in least squares."""
+
+FORGOTTEN = 40.0
+"""Samples for each parameter until which these are forgotten again."""
 
 LEAST = 0.5
 """Least share of its noise variance that 1 / w + phi' G zeta may be."""
@@ -323,7 +327,10 @@ class InstrumentalVariables(Tracker):
         return steps(model.output_lags)
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
-        return {**self.state(model.n), **settling_of(model)}
+        n, first = model.n, settling_of(model)
+        if self.p0 is None and model.output_lags and not model.instruments:
+            first |= {"discounted": FORGOTTEN * n, "first_memory": LEAST_SQUARES * n}
+        return {**self.state(n), **first}
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         super().widen(lane, p)

@@ -50,9 +50,10 @@ from driftfit.models.linearised import MEMORY
 HIGHEST = 4
 """The largest number of poles."""
 
-FORGOTTEN, TIMES = 40.0, 400.0
-"""Samples for each parameter, and times 1 / lambda, that a tracker without drift should forget again: ten times those
-before the regressors are the gradient."""
+FORGOTTEN, TIMES = 40.0, 100.0
+"""Samples for each parameter, and times 1 / lambda for each pole, that a tracker without drift should forget again. The
+regressors are the gradient after 60; while the start is forgotten bands are those of a fading memory, too wide by up to
+the root of two."""
 
 PER_SAMPLE = 0.2
 """Rate of the first filter in inverse nominal samples, unless another one is given."""
@@ -141,7 +142,7 @@ class ContinuousTransfer(LinearisedTransfer):
 
     @property
     def settling(self) -> float:
-        return 0.0 if self.point is not None else max(FORGOTTEN * self.n, TIMES / (self.rate * self.dt))
+        return 0.0 if self.point is not None else max(FORGOTTEN * self.n, TIMES * self.poles / (self.rate * self.dt))
 
     @property
     def instruments(self) -> bool:
