@@ -241,6 +241,24 @@ def test_parameters_that_follow_a_line_are_not_behind():
     assert error(AdaptiveKalman()) < 0.95 * min(map(error, fixed))
 
 
+@pytest.mark.parametrize("rows", ["all", "every second is missing", "every second", "uneven", "half the interval"])
+def test_a_slope_is_one_of_time_whatever_the_rows(rows):
+    """The filters that follow a trend have the same slope per nominal interval, and one takes over."""
+    rng = np.random.default_rng(4)
+    time = 0.5 * np.arange(1200.0) if rows == "half the interval" else np.arange(600.0)
+    u = rng.normal(size=len(time))
+    y = (1.0 + 0.02 * time) * u + 0.1 * rng.normal(size=len(time))
+    if rows == "every second is missing":
+        y[1::2] = np.nan
+    kept = {"every second": time % 2 == 0, "uneven": rng.random(600) < 0.5}.get(rows, time >= 0.0)
+    run = track(Regression(1), AdaptiveKalman(), y[kept], u[kept], time=time[kept])
+    follows = slice(int(run.state["trend"]), int(run.state["trend"]) + 3)
+    slopes = run.state["slopes"][0] / run.state["S"][0, 0]
+    share = run.state["mu"][follows]
+    assert share.sum() > 0.7
+    assert abs(slopes @ share / share.sum() - 0.02) < 0.005
+
+
 def test_a_slope_is_not_followed_where_there_is_no_excitation():
     theta, y, u = ramps(3)
     u[600:, 0] = 0.0

@@ -33,7 +33,7 @@ from driftfit.trackers.parts.information import triangular_root
 def smooth(walk: Walk, keep: str = "std") -> Path:
     """Solve the problem; keep="cov" adds the covariances of every sample and of neighbouring samples."""
     if len(walk.trend):
-        return slopes.smooth(walk, keep)
+        return spread(walk, slopes.smooth(walk, keep))
     n = walk.phi.shape[1]
     scale = column_scale(walk.phi, walk.weight)
     rank, unseen = ranks(walk.phi, walk.weight, scale)

@@ -90,10 +90,11 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
         phi, y = tracker.regression(fields, phi, y)
         drift_root, weight, time, drift = np.sqrt(q), weight / r_of, drift, np.ones(len(drift))
     trend = dt if prior.slopes else NONE
+    moving = dt * np.minimum(run.known.drift, 1.0)
     if prior.at_first_sample or prior.p0 is None:
         first = int(np.argmax(dt > 0.0)) + 1
-        drift[:first], trend[:first] = 0.0, 0.0
+        drift[:first], trend[:first], moving[:first] = 0.0, 0.0, 0.0
     r = 1.0 if prior.r is None else prior.r
     p0 = None if prior.p0 is None else prior.p0 / r
     walk = Walk(phi, y, weight, drift, prior.q / r, prior.theta0, p0, prior.r, drift_root, trend)
-    return average_drift(walk, time) if own and tracker.smoother_fields else walk
+    return average_drift(walk, time, moving) if own and tracker.smoother_fields else walk

@@ -272,7 +272,6 @@ class AdaptiveKalman(Tracker):
             "e_k": np.zeros(K),
             "step": np.zeros(K),
             "h": np.zeros(K),
-            "waited": 0.0,
             "weighted": np.zeros(K),
             "mean_prior": np.zeros(K),
             "inverse": np.zeros((J, K)),

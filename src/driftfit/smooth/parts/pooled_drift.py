@@ -34,11 +34,15 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.smooth.parts.elimination import smooth_and_weigh
 from driftfit.smooth.parts.rank import column_scale
+from driftfit.smooth.parts.slope_drift import compared
+from driftfit.smooth.parts.slopes import smooth as smooth_slopes
 from driftfit.smooth.parts.walk import Walk
 
 JUMP = 10.0
 """q_t above this many times the mean of the others is a jump."""
 SCALES = (1.0 / 3.0, 1.0, 3.0, 9.0)
+TRENDS = 3.0
+"""Penalty of slopes that walk, in units of the log-likelihood."""
 PRICE, SHARE = 5.0, 200.0
 """Penalty of the drift as estimated: PRICE + T / SHARE in units of the log-likelihood."""
 ROUNDS = 20
@@ -61,11 +65,11 @@ def pooled(rate: Array) -> Array:
     return found
 
 
-def average_drift(walk: Walk, time: Array) -> Walk:
-    """The walk with the average of the drifts, where ``time`` (T,) are the intervals of drift before each sample, and
-    with the paths of the single drifts.
+def average_drift(walk: Walk, time: Array, trend: Array) -> Walk:
+    """The walk with the average of the drifts, and with the paths of the single drifts.
 
-    It is returned unchanged if the likelihood cannot be computed accurately.
+    ``time`` (T,) are the intervals of drift before each sample, and ``trend`` (T,) those of motion along a slope. The
+    walk is returned unchanged if the likelihood cannot be computed accurately.
     """
     q, span = walk.drift_root**2, time[:, None]
     rate = np.divide(q, span, out=np.zeros_like(q), where=span > 0.0)
@@ -79,8 +83,25 @@ def average_drift(walk: Walk, time: Array) -> Walk:
                 return walk
             paths.append(solved[0].theta)
             log_p[k, j] = solved[1] - price
-    p = np.exp(log_p - log_p.max())
+    best = int(np.argmax(log_p))
+    likeliest = walk._replace(drift_root=np.sqrt(SCALES[best % len(SCALES)] * shapes[best // len(SCALES)][0]))
+    rates, better = compared(likeliest, trend, size, paths[best][0])
+    p = np.append(log_p, log_p.max() + better - TRENDS)
+    p = np.exp(p - p.max())
     p /= p.sum()
-    share, which = p @ np.array(SCALES), np.flatnonzero(p >= LEAST)
-    root = np.sqrt(share[0] * shapes[0][0] + share[1] * shapes[1][0])
-    return walk._replace(drift_root=root, paths=np.stack([paths[k] for k in which]), belief=p.ravel()[which])
+    which = np.flatnonzero(p >= LEAST)
+    walks, slopes = p[: log_p.size], p[log_p.size :]
+    for k in which[which >= log_p.size]:
+        paths.append(smooth_slopes(sloped(walk, trend, rates[k - log_p.size])).theta)
+    kept = np.stack([*(paths[k] for k in which if k < log_p.size), *paths[log_p.size :]])
+    if slopes.sum() > 0.5:
+        found = sloped(walk, trend, slopes @ rates / slopes.sum())
+    else:
+        share = walks.reshape(log_p.shape) @ np.array(SCALES) / walks.sum()
+        found = walk._replace(drift_root=np.sqrt(share[0] * shapes[0][0] + share[1] * shapes[1][0]))
+    return found._replace(paths=kept, belief=p[which])
+
+
+def sloped(walk: Walk, trend: Array, rate: Array) -> Walk:
+    """The problem with slopes that drift by ``rate`` (n,) per nominal interval instead of levels."""
+    return walk._replace(trend=trend, drift_root=np.sqrt(trend[:, None] * rate))

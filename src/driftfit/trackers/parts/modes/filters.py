@@ -31,7 +31,7 @@ from driftfit.trackers.parts.diffuse import LEFT
 from driftfit.trackers.parts.modes.ladder import TOP, leap
 from driftfit.trackers.parts.modes.noise_levels import OUTLIER
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
-from driftfit.trackers.parts.modes.trend import bend_slopes, level_slopes
+from driftfit.trackers.parts.modes.trend import bend_slopes, level_slopes, move_along
 from driftfit.trackers.parts.resolution import lasting
 
 LEAST = 1e-100
@@ -62,6 +62,7 @@ def predict(s: State, l: int) -> None:
         for k in range(s.modes[l]):
             s.prior[k, l] = s.mu[k, l]
         wander(s, s.r[l] * time, l)
+        move_along(s, s.dt[l] * min(s.drift[l], 1.0), l)
 
 
 @partial(kernel, inline=False)

@@ -37,7 +37,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.trackers.parts.modes.rows import sum_of_row
-from driftfit.trackers.parts.modes.trend import TREND, move_along, no_trend
+from driftfit.trackers.parts.modes.trend import TREND, no_trend
 
 LADDER = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
 """Drift ratios of the modes in which all parameters drift."""
@@ -172,8 +172,7 @@ def learn_rate(s: State, l: int) -> None:
 
 @partial(kernel, inline=False)
 def mix(s: State, l: int) -> None:
-    """Interaction: every filter continues from the mixture of its predecessors, moved by its slope; mu becomes that of
-    the next sample.
+    """Interaction: every filter continues from the mixture of its predecessors; mu becomes that of the next sample.
 
     Means are taken relative to that of the mixture, d, so that moments may be added before the mean is subtracted.
     """
@@ -199,7 +198,6 @@ def mix(s: State, l: int) -> None:
     for a in range(n):
         for j in range(K):
             s.m[a, j, l] = s.d[a, l] + s.m_next[a, j, l]
-    move_along(s, l)
 
 
 @kernel
