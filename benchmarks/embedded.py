@@ -84,8 +84,8 @@ int main(void) {
 }
 """
 KALMAN = Kalman(q=1e-4, r=0.01, p0=1.0)
-FIRST, LAST = 16, 20
-"""The samples between are counted, as the difference of two programs."""
+FIRST, LAST = 32, 36
+"""The samples between are counted, as the difference of two programs; those before are judged one by one."""
 
 
 def emulated(folder: Path, sources: list[str], flags: list[str]) -> tuple[int, int] | None:

@@ -5,6 +5,7 @@ import pytest
 
 from driftfit import (
     ARX,
+    FLS,
     OE,
     RLS,
     InstrumentalVariables,
@@ -23,7 +24,7 @@ LINES = StateSpace("y = theta.a1 * y[-1] + theta.a2 * y[-2] + theta.b1 * u[-1] +
 PRIOR = {"q": 1e-7, "r": 0.01, "p0": 1.0}
 DIFFUSE = [
     RLS(0.99), RLS(1.0), RLS(0.99, kind="directional"), Kalman(q=1e-7, r=0.01), Kalman(q=1e-7, r=0.01, form="sqrt"),
-    InstrumentalVariables(0.99),
+    InstrumentalVariables(0.99), FLS(1e5),
 ]  # fmt: skip
 PAIRS = [
     *((PLANT, one) for one in DIFFUSE), (PLANT, Kalman(**PRIOR)),
@@ -73,14 +74,25 @@ def test_a_fault_code_in_the_middle_does_no_harm(pair):
 @pytest.mark.parametrize("tracker", DIFFUSE, ids=repr)
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
 def test_a_fault_code_at_the_start_does_no_harm_in_any_unit(tracker, scale):
-    if scale != 1.0 and isinstance(tracker, Kalman):
-        pytest.skip("q and r are in units")
+    if scale != 1.0 and isinstance(tracker, Kalman | FLS):
+        pytest.skip("q, r and mu are in units")
     fleet = track(PLANT, tracker, *broken([0, 2, 3, 5, 8], scale), by="row")
     unit = np.array([1.0, 1.0, scale, scale])
     for k in range(1, len(fleet)):
         away = np.abs(fleet[k].theta - fleet[0].theta) / unit
         assert away[60].max() < 0.02, k
         assert away[-1].max() < 0.001, k
+
+
+@pytest.mark.parametrize("tracker", DIFFUSE, ids=repr)
+def test_two_fault_codes_among_the_first_ten_samples_do_no_harm(tracker):
+    """They are in six of the first eight equations, so the start waits for more."""
+    y, u = plant()
+    two = y.copy()
+    two[[2, 7]] = 9999.0
+    fleet = track(PLANT, tracker, np.stack([y, two]), np.stack([u, u]), by="row")
+    assert np.abs(fleet[1].theta - fleet[0].theta)[60].max() < 0.02
+    assert fleet[1].state["left_out"] == 6.0
 
 
 def test_what_is_left_out_is_counted_and_the_smoother_leaves_it_out_too():

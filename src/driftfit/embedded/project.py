@@ -237,18 +237,18 @@ def _face(made: Translation, memory: set[str]) -> str:
 
 
 def _after_the_start(made: Translation) -> str:
-    """The operations of a sample after the start, if the start takes more."""
+    """The operations of an ordinary sample after the start, if others take more."""
     ordinary = _counted(_ordinary(made.unit))
     differs = ordinary != _counted(made.entry.operations)
-    return f" After the start a sample takes at most\n  {ordinary}." if differs else ""
+    return f" An ordinary sample after the start takes at\n  most {ordinary}." if differs else ""
 
 
 def _ordinary(unit: Unit) -> Counter[str]:
-    """Operations of a sample after the start: those that only the start calls are left out."""
+    """Operations of an ordinary sample after the start: those of routines that only others call are left out."""
     operations = {function.name: function.operations for function in unit.functions.values()}
     if "advance" not in operations:
         return operations["sample"]
-    parts = (operations.get(name, Counter()) for name in ("regress", "clean", "advance", "push"))
+    parts = (operations.get(name, Counter()) for name in ("regress", "clean", "odd_or_rooted", "advance", "push"))
     return sum(parts, Counter[str]())
 
 

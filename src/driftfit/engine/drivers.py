@@ -89,6 +89,12 @@ def unknown(s: State, l: int) -> None:
 
 
 @kernel
+def rooted(s: State, l: int) -> int:
+    """Whether the state is in square-root form."""
+    return s.root[l]  # type: ignore[no-any-return]
+
+
+@kernel
 def nothing_more(o: State, s: State, l: int) -> None:
     """Store nothing but the common fields."""
 
@@ -103,19 +109,20 @@ class TrackerSteps(NamedTuple):
 
     ``predict`` is the time update (``s.dt`` nominal intervals have passed; if 0, nothing may change), ``correct`` the
     measurement update. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use ``s.ok`` (0 or 1)
-    as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers that start from no
-    knowledge at all (`driftfit.trackers.parts.diffuse`), and ``machines`` are the routines that it calls by symbol;
-    ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms of a
-    tracker share the code of a driver. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's
-    ``outputs`` name from the record ``s`` to the stored record ``o``. ``read_extra(s, known, t, l)`` reads the extra
-    columns of ``known``, those after interval, noise and drift, for trackers that take more factors.
-    ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when a run is replayed for a smoother.
-    With ``doubts`` the model weighs lags that the tracker doubts; with ``instruments`` a model that has its own writes
-    them to s.zeta (n,), a field of the tracker. Steps see the fields of the tracker and those that every record has but
-    for ``u``, so that they are compiled once for all models (`driftfit.engine.tracker_part`); with ``reads_model`` they
-    see those of the model too. ``outlined`` steps are compiled apart from the drivers, which call them
-    (`driftfit.engine.outlined`): for trackers that take so long that a call costs nothing. ``note`` comes before all of
-    them and may write what they change later.
+    as a factor of its gain. ``begin`` takes the place of both, and of ``report``, where ``apart(s, l)`` is 1: while
+    ``s.root`` is 1, for trackers that start from no knowledge at all (`driftfit.trackers.parts.diffuse`), unless the
+    tracker has other reasons, too (`driftfit.trackers.parts.faults.contradictions`). ``apart`` comes first, and
+    ``machines`` are the routines that ``begin`` calls by symbol; ``instead`` names machines that steps call, each with
+    the one that is called in its place, so that two forms of a tracker share the code of a driver. ``report`` fills
+    ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs`` name from the record ``s`` to the stored record
+    ``o``. ``read_extra(s, known, t, l)`` reads the extra columns of ``known``, those after interval, noise and drift,
+    for trackers that take more factors. ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when
+    a run is replayed for a smoother. With ``doubts`` the model weighs lags that the tracker doubts; with
+    ``instruments`` a model that has its own writes them to s.zeta (n,), a field of the tracker. Steps see the fields
+    of the tracker and those that every record has but for ``u``, so that they are compiled once for all models
+    (`driftfit.engine.tracker_part`); with ``reads_model`` they see those of the model too. ``outlined`` steps are
+    compiled apart from the drivers, which call them (`driftfit.engine.outlined`): for trackers that take so long that
+    a call costs nothing. ``note`` comes before all of them and may write what they change later.
     """
 
     predict: Step
@@ -132,6 +139,7 @@ class TrackerSteps(NamedTuple):
     reads_model: bool = False
     outlined: bool = False
     note: Step = nothing
+    apart: Any = rooted
 
 
 @kernel
@@ -167,8 +175,8 @@ def one_or_all(u: Array) -> Any:
 
 
 def _advance(tracker: TrackerSteps) -> Any:
-    """predict, correct, report for all lanes of a tile; lanes in square-root form take ``begin`` instead."""
-    predict, correct, report, begin, *_ = tracker
+    """predict, correct, report for all lanes of a tile; lanes for which ``apart`` is 1 take ``begin`` instead."""
+    predict, correct, report, begin, apart = *tracker[:4], tracker.apart
 
     @kernel
     def advance(s: State) -> None:
@@ -184,7 +192,7 @@ def _advance(tracker: TrackerSteps) -> Any:
     def start(s: State) -> None:
         alone = s.theta.shape[1] == 1  # a constant, for which there is no code of the others
         for l in range(s.theta.shape[1]):
-            if alone or s.root[l] > 0:
+            if alone or apart(s, l) > 0:
                 begin(s, l)
             else:
                 predict(s, l)
@@ -197,7 +205,7 @@ def _advance(tracker: TrackerSteps) -> Any:
     def advance_or_start(s: State) -> None:
         some = 0
         for l in range(s.theta.shape[1]):
-            some = max(some, s.root[l])
+            some = max(some, apart(s, l))
         if some > 0:
             started(s)
         else:

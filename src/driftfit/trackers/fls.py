@@ -42,17 +42,17 @@ from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.parts import second_differences
 from driftfit.trackers.parts.coarse.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.diffuse import (
-    MACHINES,
     SCRATCH,
     drifted,
     enter,
     knowing,
     knowing_nothing,
-    measurement,
 )
+from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
+from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve
 from driftfit.trackers.parts.varying_drift import read_drift
-from driftfit.trackers.rls import learn_variance, no_scale
+from driftfit.trackers.rls import forget_variance, learn_variance, no_scale
 
 
 @kernel
@@ -67,7 +67,7 @@ def drift(s: State, l: int) -> None:
 @kernel
 def correct(s: State, l: int) -> None:
     resolve(s, l)
-    measurement(s, l)
+    judged_measurement(s, l)
     learn_variance(s, l)
 
 
@@ -80,6 +80,13 @@ def begin(s: State, l: int) -> None:
     if s.s[l] < np.inf:
         learn_variance(s, l)
     spanned_folded(s, l)
+
+
+@kernel
+def restart(s: State, l: int) -> None:
+    """As before the first sample."""
+    forget_variance(s, l)
+    s.begun[l] = 0.0
 
 
 def price(mu: Any) -> Any:
@@ -159,6 +166,7 @@ class FLS(Tracker):
             "begun": 0.0,
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            **unjudged(theta0, diffuse=self.p0 is None),
         }
 
     @property
@@ -169,8 +177,11 @@ class FLS(Tracker):
     def steps(self) -> TrackerSteps:
         return second_differences.STEPS if self.differences == 2 else STEPS
 
+    def left_out(self, fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
+        return faults(fields, phi, y, ok) if self.differences == 1 else super().left_out(fields, phi, y, ok)
+
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return resolution(run.state)
+        return (*contradictions(run.state), *resolution(run.state))
 
     def cov(self, lane: Mapping[str, Array]) -> Array:
         n = len(lane["theta"])
@@ -188,4 +199,4 @@ class FLS(Tracker):
         return RandomWalk(q, None, theta0, p0, at_first_sample=True, slopes=self.differences == 2)
 
 
-STEPS = TrackerSteps(drift, correct, folded, begin, read_extra=read_drift, machines=MACHINES)
+STEPS = judged(begin, TrackerSteps(drift, correct, folded, read_extra=read_drift), restart)

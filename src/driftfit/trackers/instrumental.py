@@ -65,12 +65,11 @@ from driftfit.trackers.parts.diffuse import (
     SCRATCH,
     knowing,
     knowing_nothing,
-    prediction,
     product_with,
     symmetric_product,
 )
-from driftfit.trackers.parts.faults.contradictions import contradictions, leave_out_contradiction
-from driftfit.trackers.parts.faults.judged_start import START_MACHINES, judging, unjudged
+from driftfit.trackers.parts.faults.contradictions import add_to_block, contradictions
+from driftfit.trackers.parts.faults.judged_start import judged, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve
 from driftfit.trackers.rls import fade, follow_variance, learn_variance, no_scale, no_settling, settling_of
 
@@ -122,6 +121,10 @@ def instrument(s: State, i: int, l: int) -> float:
     return s.zeta[i, l]  # type: ignore[no-any-return]
 
 
+along_instruments = product_with(instrument)
+"""s.g = C zeta; returns zeta' C zeta."""
+
+
 @kernel
 def symmetric(s: State, l: int) -> None:
     """G = C, to which refined instruments bring it in the limit."""
@@ -134,19 +137,18 @@ def symmetric(s: State, l: int) -> None:
 @lru_cache
 def learning(refined: bool) -> Step:
     """The correction; with refined instruments the covariance is that of least squares on them."""
-    product = product_with(instrument) if refined else symmetric_product
+    product = along_instruments if refined else symmetric_product
 
     @kernel
     def learn(s: State, l: int) -> None:
         n = s.theta.shape[0]
-        noise, y_hat = s.noise[l], prediction(s, l)
+        noise, y_hat = s.noise[l], s.y_hat[l]
         v = product(s, l) + noise  # s.g = C phi, or C zeta
         common = noise + weigh_instruments(s, l)
         if refined and not abs(common) < MOST * v:
             symmetric(s, l)
             common = noise + weigh_instruments(s, l)
-        leave_out_contradiction(s, y_hat, v * s.scale[l], l)
-        e, learned = s.y[l] - y_hat, (s.ok[l] > 0.0) & (common >= LEAST * noise) & (common < LARGEST) & (v < LARGEST)
+        e, learned = s.e[l], (s.ok[l] > 0.0) & (common >= LEAST * noise) & (common < LARGEST) & (v < LARGEST)
         gain, v_used = (1.0 / common if learned else 0.0), (v if learned else 0.0)
         along = 1.0 / v if learned else 0.0
         for i in range(n):
@@ -161,6 +163,7 @@ def learning(refined: bool) -> Step:
             left = s.P[i, i, l] - (2.0 * k * s.g[i, l] - k * k * v_used)
             s.P[i, i, l] = max(left, LEFT * s.P[i, i, l])
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
+        add_to_block(s, along * e * e, l)
         learn_variance(s, l)
         follow_variance(s, l)
 
@@ -233,8 +236,8 @@ def steps(na: int | None) -> TrackerSteps:
         for i in range(s.theta.shape[0]):
             s.auxiliary[i, l], s.x_lag[i, l] = s.start_theta[i, l], 0.0
 
-    start = judging(begin, restart)
-    return TrackerSteps(forget, correct, folded, start, machines=START_MACHINES, instruments=na is None)
+    later = TrackerSteps(forget, correct, folded, instruments=na is None)
+    return judged(begin, later, restart, along_instruments if na is None else symmetric_product)
 
 
 @dataclass(frozen=True)

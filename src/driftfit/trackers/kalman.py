@@ -48,7 +48,7 @@ from driftfit.trackers.parts.diffuse import (
     spanned_variance,
 )
 from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
-from driftfit.trackers.parts.faults.judged_start import START_MACHINES, faults, judging, unjudged
+from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
 from driftfit.trackers.parts.information import triangular_root
 from driftfit.trackers.parts.varying_drift import read_drift
 
@@ -75,9 +75,8 @@ def begin(s: State, l: int) -> None:
     spanned_variance(s, l)
 
 
-START = judging(begin)
-INDEPENDENT = TrackerSteps(drift, judged_measurement, diagonal, START, read_extra=read_drift, machines=START_MACHINES)
-TOGETHER = INDEPENDENT._replace(predict=drift_matrix)
+INDEPENDENT = judged(begin, TrackerSteps(drift, judged_measurement, diagonal, read_extra=read_drift))
+TOGETHER = judged(begin, TrackerSteps(drift_matrix, judged_measurement, diagonal, read_extra=read_drift))
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ from driftfit.trackers.parts.diffuse import (
     wander,
 )
 from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
-from driftfit.trackers.parts.faults.judged_start import START_MACHINES, judging, unjudged
+from driftfit.trackers.parts.faults.judged_start import judged, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
 RECENT, RECENT_SHARE = 20.0, 0.125
@@ -228,18 +228,23 @@ def begin_direction(s: State, l: int) -> None:
 
 
 @kernel
+def forget_variance(s: State, l: int) -> None:
+    """What `learn_variance` learned, as before the first sample."""
+    s.squares[l], s.count[l], s.scale[l] = 0.0, 0.0, np.nan
+    s.readings_in[l], s.levels[l], s.middle[l], s.spread[l], s.stayed[l] = 0.0, 1.0, 0.0, 0.0, np.nan
+
+
+@kernel
 def restart(s: State, l: int) -> None:
     """As before the first sample."""
-    s.squares[l], s.count[l], s.scale[l], s.recent[l], s.least[l], s.quieter[l] = 0.0, 0.0, np.nan, 0.0, 0.0, 1.0
-    s.readings_in[l], s.levels[l], s.middle[l], s.spread[l], s.stayed[l] = 0.0, 1.0, 0.0, 0.0, np.nan
+    forget_variance(s, l)
+    s.recent[l], s.least[l], s.quieter[l] = 0.0, 0.0, 1.0
     for i in range(s.theta.shape[0]):
         s.per_cap[i, l] = 0.0
 
 
-EXPONENTIAL = TrackerSteps(forget, correct, folded, judging(begin, restart), machines=START_MACHINES)
-DIRECTIONAL = TrackerSteps(
-    nothing, correct_direction, folded, judging(begin_direction, restart), machines=START_MACHINES
-)
+EXPONENTIAL = judged(begin, TrackerSteps(forget, correct, folded), restart)
+DIRECTIONAL = judged(begin_direction, TrackerSteps(nothing, correct_direction, folded), restart)
 
 
 @dataclass(frozen=True)

@@ -171,8 +171,10 @@ def prediction(s: State, l: int) -> float:
 
 
 @kernel
-def corrected(s: State, y_hat: float, v: float, l: int) -> None:
+def corrected(s: State, y_hat: float, v: float, l: int) -> float:
     """Correct theta and P from s.g = P h and the variance v of the innovation, and report s.y_hat, s.e, s.s.
+
+    Returns 1 / v, or 0 if the sample is not used.
 
     Only one triangle is updated: P - outer(k, P phi) rounds asymmetrically, and forgetting lets the antisymmetric part
     grow until it ruins a run of ten thousand steps that looked healthy at five hundred.
@@ -190,6 +192,7 @@ def corrected(s: State, y_hat: float, v: float, l: int) -> None:
     s.y_hat[l] = y_hat
     s.e[l] = e
     s.s[l] = v
+    return gain  # type: ignore[no-any-return]
 
 
 @kernel

@@ -19,9 +19,9 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps, diagonal
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.diffuse import drifted, prediction, scale_drift, spanned_variance, take_in
-from driftfit.trackers.parts.faults.contradictions import leave_out_contradiction
-from driftfit.trackers.parts.faults.judged_start import START_MACHINES, judging
+from driftfit.trackers.parts.diffuse import drifted, scale_drift, spanned_variance, take_in
+from driftfit.trackers.parts.faults.contradictions import add_to_block
+from driftfit.trackers.parts.faults.judged_start import judged
 from driftfit.trackers.parts.information import absorb, invert, solve, spread, triangular_root
 from driftfit.trackers.parts.varying_drift import read_drift
 
@@ -81,10 +81,8 @@ def innovation_variance(s: State, l: int) -> float:
 
 @kernel
 def correct(s: State, l: int) -> None:
-    s.y_hat[l] = prediction(s, l)
-    s.e[l] = s.y[l] - s.y_hat[l]
     s.s[l] = innovation_variance(s, l) + s.r[l] * s.noise[l]
-    leave_out_contradiction(s, s.y_hat[l], s.s[l], l)
+    add_to_block(s, s.e[l] * s.e[l] / s.s[l], l)
     rotate_in(s, l)
     read_out(s, l)
 
@@ -97,4 +95,4 @@ def begin(s: State, l: int) -> None:
     s.root[l] = 1 if s.rank[l] < s.theta.shape[0] else 0
 
 
-STEPS = TrackerSteps(grow, correct, diagonal, judging(begin), read_extra=read_drift, machines=START_MACHINES)
+STEPS = judged(begin, TrackerSteps(grow, correct, diagonal, read_extra=read_drift), variance=innovation_variance)

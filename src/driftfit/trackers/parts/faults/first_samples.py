@@ -10,7 +10,7 @@ readings that repeat the one before count once. A sample is doubtful if
 
 A large output after a large input is neither. A regressor is unusual if it is far, or if it differs where most are
 equal, as after a step of an input; a lag with the same fault code as the reading is not unusual. If half of the
-samples or more are doubtful, the level has changed, and no sample is doubtful.
+samples or more are doubtful and more cannot be waited for, the level has changed, and no sample is doubtful.
 
 A large input with a slow response looks the same, and its samples are the most informative of all. Doubtful samples
 are therefore left out only if the others contradict them: if least squares on all samples leaves the other samples a
@@ -58,8 +58,11 @@ def median(samples: Array, N: int, reading: int, column: int, center: float, apa
 
 
 @shared
-def doubt(samples: Array, N: int, n: int) -> None:
-    """Give a negative noise factor to those of N samples (.., n + 4) that are doubtful, a positive one to the rest."""
+def doubt(samples: Array, N: int, n: int, last: bool) -> None:
+    """Give a negative noise factor to those of N samples (.., n + 4) that are doubtful, a positive one to the rest.
+
+    Half of them or more are kept as doubtful while further samples can be waited for, which is until ``last``.
+    """
     noise, reading = n + NOISE, n + READING
     usual = median(samples, N, reading, reading, 0.0, 0.0)
     limit = FAR * median(samples, N, reading, reading, usual, 1.0)
@@ -82,7 +85,7 @@ def doubt(samples: Array, N: int, n: int) -> None:
         counts = fresh(samples, k, reading)
         all_fresh += 1 if counts else 0
         count += 1 if counts and samples[k, noise] < 0.0 else 0
-    if 2 * count >= all_fresh:
+    if last and 2 * count >= all_fresh:
         for k in range(N):
             samples[k, noise] = abs(samples[k, noise])
 
@@ -90,4 +93,4 @@ def doubt(samples: Array, N: int, n: int) -> None:
 @Driver
 def doubtful(samples: Array, n: int) -> None:
     """`doubt`, for Python."""
-    doubt(samples, len(samples), n)
+    doubt(samples, len(samples), n, True)

@@ -13,15 +13,24 @@ Cost: that of the diffuse start for a few more samples, and O(n N^2) once for N 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, cubes, kernel, machine, nothing
-from driftfit.trackers.parts.diffuse import BEFORE, MACHINES, know_nothing, prediction, reform
-from driftfit.trackers.parts.faults.contradictions import REACH, learn_range, leave_out_contradiction, no_contradictions
+from driftfit.trackers.parts.diffuse import BEFORE, MACHINES, know_nothing, reform, symmetric_product
+from driftfit.trackers.parts.faults.contradictions import (
+    add_to_block,
+    close_block,
+    examine,
+    learn_reading,
+    no_contradictions,
+    odd,
+    odd_or_rooted,
+)
 from driftfit.trackers.parts.faults.first_samples import NOISE, READING, SPAN, WORSE, Y, doubt, doubtful
 
 RESIDUALS = 4
@@ -45,9 +54,9 @@ def unjudged(theta: Array, diffuse: bool) -> dict[str, Any]:
 
 
 @machine
-def machine_doubt_first(samples: int, rows: int, columns: int, count: int, n: int, L: int, l: int) -> None:
+def machine_doubt_first(samples: int, rows: int, columns: int, count: int, last: int, n: int, L: int, l: int) -> None:
     """`doubt` for lane l of L, from the address of the samples."""
-    doubt(cubes(samples, rows, columns, L)[:, :, l], count, n)
+    doubt(cubes(samples, rows, columns, L)[:, :, l], count, n, last > 0)
 
 
 START_MACHINES = (*MACHINES, machine_doubt_first)
@@ -111,19 +120,20 @@ def settle(s: State, l: int) -> None:
     n = s.theta.shape[0]
     s.start_over[l] = 1
     known = s.scale[l] > 0.0  # it is NaN without residuals
-    s.misfits[l] = max(spare_samples(s, l) - s.start_faults[l], 0.0) if known else 0.0
-    s.misfit[l] = squares_left(s, l) / (max(s.misfits[l], 1.0) * s.r[l] * s.scale[l]) if known else 0.0
+    s.ratios[l] = max(spare_samples(s, l) - s.start_faults[l], 0.0) if known else 0.0
+    s.mean_ratio[l] = squares_left(s, l) / (max(s.ratios[l], 1.0) * s.r[l] * s.scale[l]) if known else 0.0
     for at in range(s.start_count[l]):
-        learn_range(s, s.start_rows[at, n + READING, l], 1.0 if s.start_rows[at, n + NOISE, l] > 0.0 else 0.0, l)
+        if s.start_rows[at, n + NOISE, l] > 0.0:
+            learn_reading(s, s.start_rows[at, n + READING, l], l)
+    close_block(s, l)
 
 
 @kernel
 def doubtful_samples(s: State, l: int) -> int:
     """Mark the doubtful samples, and count them."""
-    n, L, found = s.theta.shape[0], s.theta.shape[1], 0
-    machine_doubt_first(
-        s.start_rows.ctypes.data, s.start_rows.shape[0], s.start_rows.shape[1], s.start_count[l], n, L, l
-    )
+    n, L, rows, found = s.theta.shape[0], s.theta.shape[1], s.start_rows.shape[0], 0
+    last = 1 if s.start_count[l] >= room(s, l) else 0
+    machine_doubt_first(s.start_rows.ctypes.data, rows, s.start_rows.shape[1], s.start_count[l], last, n, L, l)
     for at in range(s.start_count[l]):
         found += 1 if s.start_rows[at, n + NOISE, l] < 0.0 else 0
     return found
@@ -179,25 +189,44 @@ def reconsidering(one: Step, restart: Step) -> Any:
     return reconsider
 
 
-@lru_cache
-def judging(begin: Step, restart: Step = nothing) -> Step:
-    """The first steps ``begin`` of a tracker, with its samples judged; ``restart`` sets its fields as before them."""
+def judged(
+    begin: Step, steps: TrackerSteps, restart: Step = nothing, variance: Callable[..., float] = symmetric_product
+) -> TrackerSteps:
+    """Steps whose samples are judged, first together, then one by one.
+
+    ``begin`` is the start in square-root form, ``steps`` what follows it, ``restart`` sets the fields of the tracker as
+    before the first sample, and ``variance`` is phi' P phi after the time update.
+    """
 
     @partial(kernel, inline=False)
     def one(s: State, l: int) -> None:
         begin(s, l)
 
-    reconsider = reconsidering(one, restart)
+    reconsider, predict, correct, report = reconsidering(one, restart), steps.predict, steps.correct, steps.report
+
+    @kernel
+    def later(s: State, l: int) -> None:
+        """A sample after the start: in square-root form, or not ordinary."""
+        unusual = odd(s, s.e[l], l)
+        if s.root[l] > 0:
+            y_hat, e = s.y_hat[l], s.e[l]
+            if unusual:
+                reform(s, l)  # gives the variance of the prediction
+                examine(s, y_hat, s.at_start[BEFORE, l] + s.r[l] * s.noise[l], l)
+            one(s, l)
+            add_to_block(s, e * e / (s.at_start[BEFORE, l] + s.r[l] * s.noise[l]), l)
+        else:
+            predict(s, l)
+            examine(s, s.y_hat[l], variance(s, l) + s.r[l] * s.noise[l], l)
+            correct(s, l)
+            report(s, l)
+        if unusual:
+            close_block(s, l)
 
     @kernel
     def start(s: State, l: int) -> None:
         if s.start_over[l] > 0:
-            y_hat, v = prediction(s, l), np.inf
-            if (s.y[l] - y_hat) ** 2 > REACH * REACH * s.y_spread[l]:
-                reform(s, l)  # gives the variance of the prediction
-                v = (s.at_start[BEFORE, l] + s.r[l] * s.noise[l]) * s.scale[l]
-            leave_out_contradiction(s, y_hat, v, l)
-            one(s, l)
+            later(s, l)
         else:
             keep(s, l)
             one(s, l)
@@ -212,8 +241,7 @@ def judging(begin: Step, restart: Step = nothing) -> Step:
                 settle(s, l)
             s.root[l] = s.root[l] if s.start_over[l] > 0 else 1
 
-    step: Step = start
-    return step
+    return steps._replace(begin=start, machines=START_MACHINES, apart=odd_or_rooted)
 
 
 def faults(lane: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:

@@ -43,7 +43,7 @@ as many digits of the estimates."""
 @machine
 def machine_doubt(samples: int, count: int, n: int, L: int, l: int) -> None:
     """`doubt` for lane l of L, from the address of the samples."""
-    doubt(cubes(samples, WINDOW, 2 * n + MORE, L)[:, :, l], count, n)
+    doubt(cubes(samples, WINDOW, 2 * n + MORE, L)[:, :, l], count, n, True)
 
 
 @kernel
