@@ -2,7 +2,11 @@
 
 Each is simulated with state noise, and followed by the extended and the unscented filter. Printed are the root mean
 square error of the parameters and states in the second half of the record, and the share of 95 % bands that cover.
+Run: python examples/hidden_states.py [FOLDER], which takes battery.png, epidemic.png and vehicle.png.
 """
+
+import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -99,7 +103,32 @@ def vehicle(rng):
     )
 
 
+def draw(plant, folder):
+    """A picture of a plant: parameters and states with bands, dashed the truth."""
+    import matplotlib.pyplot as plt
+
+    model, q, r, p0, y, u, truth = plant(np.random.default_rng(0))
+    run = track(model, JointKalman(q=q, r=r, p0=p0), y, u)
+    figure, axes = plt.subplots(len(truth), sharex=True, figsize=(8, 2 * len(truth)), layout="constrained")
+    for ax, (name, path) in zip(axes, truth.items(), strict=True):
+        k = run.names.index(name)
+        low, high = (run.theta[:, k] + sign * 1.96 * run.std[:, k] for sign in (-1.0, 1.0))
+        ax.fill_between(np.arange(len(y)), low, high, color="tab:blue", alpha=0.25, label="95 % band")
+        ax.plot(run.theta[:, k], color="tab:blue", label="estimate")
+        ax.plot(path, "k--", lw=1, label="truth")
+        late = slice(len(y) // 20, None)  # the band of the prior is far wider
+        edges = min(low[late].min(), path.min()), max(high[late].max(), path.max())
+        room = 0.05 * (edges[1] - edges[0])
+        ax.set(ylabel=name, xlim=(0, len(y)), ylim=(edges[0] - room, edges[1] + room))
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    axes[-1].set_xlabel("sample")
+    figure.savefig(Path(folder) / f"{plant.__name__}.png", dpi=80)
+    plt.close(figure)
+
+
 if __name__ == "__main__":
+    for plant in (battery, epidemic, vehicle) if len(sys.argv) > 1 else ():
+        draw(plant, sys.argv[1])
     print(f"{'':22}{'start':>10}{'extended':>12}{'unscented':>12}{'in band: extended':>20}{'unscented':>12}")
     for plant in (battery, epidemic, vehicle):
         found = {}

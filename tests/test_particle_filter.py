@@ -104,3 +104,12 @@ def test_what_it_cannot_follow_is_refused():
         ParticleFilter(0)
     with pytest.raises(ValueError, match="particles"):
         Live(SMOOTH, ParticleFilter(**GAUSSIAN))
+
+
+def test_a_state_without_drift_is_not_drawn():
+    """Drawn, it would move at the first sample alone, and with it what is learned of the parameters."""
+    y, u = smooth(150, 0)
+    still = {**GAUSSIAN, "q": {"b": 1e-3, "c": 1e-3}}
+    exact = track(SMOOTH, JointKalman(**still, method="extended"), y, u)
+    run = track(SMOOTH, ParticleFilter(200, **still), y, u)
+    np.testing.assert_allclose(run.theta, exact.theta, rtol=1e-9, atol=1e-12)

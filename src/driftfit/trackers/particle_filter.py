@@ -50,7 +50,7 @@ class ParticleFilter(StateSpaceTracker):
     q, r, p0, theta0
         As for `JointKalman`.
     sampled : names or None
-        Parameters and states that are drawn. None: all states.
+        Parameters and states that are drawn. None: all states that have drift (``q``).
     seed : int
         Of the random numbers.
 
@@ -98,12 +98,19 @@ class ParticleFilter(StateSpaceTracker):
         }  # fmt: skip
 
     def steps_of(self, model: StateSpace) -> TrackerSteps:
-        chosen = model.hidden if self.sampled is None else self.sampled
+        chosen = self._drifting(model) if self.sampled is None else self.sampled
         for one in chosen:
             if one not in model.names:
                 raise ValueError(f"ParticleFilter: sampled names {one!r}; {near(one, model.names)}")
         places = tuple(sorted(model.names.index(one) for one in chosen))
         return steps(model.equations, model.input_names, len(model.hidden), model.system.timed, places)
+
+    def _drifting(self, model: StateSpace) -> tuple[str, ...]:
+        """States with drift: one that has none would be drawn once, at the first sample, and copies remain."""
+        if self.q is None:
+            return model.hidden
+        variance = np.diag(self.drift_of(model))
+        return tuple(name for name in model.hidden if variance[model.names.index(name)] > 0.0)
 
     def widen(self, lane: Mapping[str, Any], p: Any) -> None:
         super().widen(lane, p)

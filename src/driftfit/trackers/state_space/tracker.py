@@ -57,12 +57,17 @@ class StateSpaceTracker(Tracker):
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         owner, system, n = type(self).__name__, self._system(model), model.n
-        q, p0 = (matrix(owner, name, _variances_of(owner, name, getattr(self, name), model), n) for name in ("q", "p0"))
+        p0 = matrix(owner, "p0", _variances_of(owner, "p0", self.p0, model), n)
         theta = system.begins if self.theta0 is None else vector(owner, "theta0", self.theta0, n)
-        return self.state_of(system, {"theta": theta, "P": p0, "q": q, "r": self.r})
+        return self.state_of(system, {"theta": theta, "P": p0, "q": self.drift_of(system), "r": self.r})
 
     def steps_for(self, model: Model) -> TrackerSteps:
         return self.steps_of(self._system(model))
+
+    def drift_of(self, model: StateSpace) -> Array:
+        """q as a matrix (n, n)."""
+        owner = type(self).__name__
+        return matrix(owner, "q", _variances_of(owner, "q", self.q, model), model.n)
 
     @abstractmethod
     def state_of(self, model: StateSpace, prior: Mapping[str, Any]) -> Mapping[str, Any]:
