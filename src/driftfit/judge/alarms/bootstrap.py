@@ -24,6 +24,7 @@ import scipy
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.calibration import limit_of
 from driftfit.judge.alarms.frozen import GARCH, Rows, noise_models, plausible
+from driftfit.judge.alarms.onsets import onsets
 from driftfit.judge.alarms.side_by_side import SimulatedRecords, statistics_of
 from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.live.likelihood_ratio import (
@@ -65,7 +66,9 @@ def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> 
     drawn = np.tile(frozen.numbers, (records, 1))
     drawn[:, [ALPHA, BETA]] = _variances(frozen, rows.x, np.random.default_rng([seed, 4]).random(records))
     w = _played(drawn, rows.x[np.hstack([known, later])] * signs, N)
-    numbers, _ = noise_models(w[:, :N], 0)
+    numbers, _ = noise_models(w[:, :N], n)
+    w *= np.sqrt(N / max(N - n, 1))  # what follows has not been fitted
+    z *= np.sqrt(N / max(N - n - 1, 1))  # nor are its regressors those of the reference
     w, h = w[:, N:] / numbers[:, SCALE, None], np.empty((records, T))
     for one, own, level in zip(w, numbers, h, strict=True):
         levels(one, own, level)
@@ -114,11 +117,22 @@ def _played(numbers: Array, x: Array, N: int) -> Array:
     return w
 
 
-def limits(records: SimulatedRecords, cusum: bool, every: float) -> tuple[Array, Array]:
-    """Limits (c,) of "glr" or "cusum" for one onset in ``every`` samples; growth (c,) of their square with its log."""
+def limits(records: SimulatedRecords, cusum: bool, every: float) -> tuple[Array, Array, float]:
+    """Limits (c,) of "glr" or "cusum" for one onset in ``every`` samples; growth (c,) of their square with its log; and
+    the standard deviation of the log of the rate that a stream has with these limits, since it keeps the errors of its
+    reference.
+
+    Each record has such errors of its own, so its number of onsets varies by more than that of a Poisson variable; that
+    onsets come in groups makes the result somewhat too large. The exponent of a rate, and so its error, grows with the
+    square of the limit.
+    """
     parts = [(one, START) for one in statistics_of(records, cusum)]
     base = min(every, max(SAMPLES * len(parts) / SEEN, STEP * OFTEN))
     often = max(base / STEP, OFTEN)
     near, nearer = limit_of(parts, base), limit_of(parts, often)
     growth = np.maximum(near**2 - nearer**2, 0.1) / np.log(base / often)
-    return np.sqrt(near**2 + growth * np.log(every / base)), growth
+    found = np.sqrt(near**2 + growth * np.log(every / base))
+    begun = np.array([len(onsets(np.asarray((one[START:] > near).any(axis=1)))) for one, _ in parts], float)
+    mean = max(float(begun.mean()), 1e-9)
+    beyond = np.log1p(max(float(begun.var(ddof=1)) - mean, 0.0) / mean**2)
+    return found, growth, float(np.sqrt(beyond) * np.mean(found**2) / np.mean(near**2))

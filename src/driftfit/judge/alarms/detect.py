@@ -63,6 +63,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+FAR = 2.5
+"""The real rate is printed if false alarms may be this many times as frequent as set."""
+
+
 class Score(NamedTuple):
     """Alarms compared with labels of faults."""
 
@@ -168,6 +172,7 @@ class Alarms(Printed):
         limits = (f"{name} {self.rule.limit_text(j)}" for j, name in enumerate(self.names))
         yield facts(
             ("Alarm", f"{self.kind}, one false alarm in {self.every:g} samples"),
+            *self._real_rate(),
             ("Limits", f"{', '.join(limits)}{' (by simulation)' if self.rule.simulated else ''}"),
             ("Samples", f"{judged} judged from sample {self.start} on; {expected:.2g} false alarms expected"),
             ("Alarms", f"{len(self.onsets)}"),
@@ -185,6 +190,14 @@ class Alarms(Printed):
         yield table
         if len(self.onsets) > 20:
             yield Text(f" and {len(self.onsets) - 20} more", "dim")
+
+    def _real_rate(self) -> list[tuple[str, str]]:
+        """The line on the real rate, if it may be far above the one that is set."""
+        low, high = self.rule.real_rate
+        if low > self.every / FAR:
+            return []
+        least, most = (float(f"{one:.2g}") for one in (low, high))
+        return [("Rate", f"one in {least:.10g} to {most:.10g} samples in 95 % of streams with such a reference")]
 
     def plot(self, labels: Any = None, ax: Any = None) -> Figure:
         """Statistics over their limits, alarms marked; labels (T,) are shaded. ``ax`` as for `Track.plot`."""

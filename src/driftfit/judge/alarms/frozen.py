@@ -146,11 +146,16 @@ def _losses(x: Array, numbers: Array) -> Array:
 
 
 def _covariance(phi: Array, x: Array) -> Array:
-    """Covariance (n, n) of a Huber fit, in units of the scale; large in directions that were not excited."""
-    psi = np.clip(x, -OF_FIT, OF_FIT)
+    """Covariance (n, n) of a Huber fit, in units of the scale; large in directions that were not excited.
+
+    Residuals of a fit are smaller than errors, which Huber (1981, section 7.6) corrects by ``fitted``.
+    """
+    (N, n), psi = phi.shape, np.clip(x, -OF_FIT, OF_FIT)
+    inside = np.mean(np.abs(x) < OF_FIT)
+    fitted = N / max(N - n, 1) * (1.0 + n / N * (1.0 - inside) / inside) ** 2
     values, vectors = np.linalg.eigh(phi.T @ phi)
     information = np.maximum(values, UNSEEN * values.max())
-    factor = np.mean(psi * psi) / np.mean(np.abs(x) < OF_FIT) ** 2
+    factor = fitted * np.mean(psi * psi) / inside**2
     return np.ascontiguousarray(factor * (vectors / information) @ vectors.T)
 
 

@@ -76,7 +76,7 @@ def with_limits(
 
     found = on_all_cores(groups, chosen, _limits_of, "limits")
     return {
-        key: replace(looks[key].rule, limits=plain(found[like][0]), growth=plain(found[like][1]))
+        key: replace(looks[key].rule, limits=plain(found[like][0]), growth=plain(found[like][1]), unsure=found[like][2])
         for like, members in groups.items()
         for key in members
     }
@@ -88,8 +88,8 @@ def _spread(members: Sequence[Hashable]) -> list[Hashable]:
     return [members[k * len(members) // few] for k in range(few)]
 
 
-def _limits_of(chosen: Sequence[tuple[Track, AlarmRule, Reference]], seed: int) -> tuple[Array, Array]:
-    """Limits and their growth, from RECORDS or a few more records simulated from the chosen runs."""
+def _limits_of(chosen: Sequence[tuple[Track, AlarmRule, Reference]], seed: int) -> tuple[Array, Array, float]:
+    """`limits`, from RECORDS or a few more records simulated from the chosen runs."""
     each, parts = -(-RECORDS // len(chosen)), []
     for k, (run, asked, reference) in enumerate(chosen):
         rule, rows, *_ = modelled(run, asked, in_samples(run, reference))

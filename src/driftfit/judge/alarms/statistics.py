@@ -65,8 +65,8 @@ def _frozen(run: Track, rule: AlarmRule, reference: Reference, seed: int, record
     """The model of the reference, and limits by its bootstrap."""
     rule, rows, start, _ = modelled(run, rule, reference)
     made = simulated(rule.reference, rows, seed, records)
-    found, growth = limits(made, rule.kind == "cusum", rule.every)
-    return replace(rule, limits=plain(found), growth=plain(growth)), start
+    found, growth, unsure = limits(made, rule.kind == "cusum", rule.every)
+    return replace(rule, limits=plain(found), growth=plain(growth), unsure=unsure), start
 
 
 def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, Rows, int, Samples]:

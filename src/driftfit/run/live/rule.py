@@ -65,6 +65,8 @@ class AlarmRule(Settings):
         That model, as `driftfit.run.live.likelihood_ratio.Frozen`.
     growth : (c,)
         Growth of the squares of the limits with log(every).
+    unsure : number
+        Standard deviation of the log of the real rate of false alarms, which errors of the reference leave.
     """
 
     kind: str
@@ -80,6 +82,7 @@ class AlarmRule(Settings):
     parameters: tuple[str, ...] = ()
     frozen: tuple[Any, ...] = ()
     growth: tuple[float, ...] = ()
+    unsure: float = 0.0
 
     def __repr__(self) -> str:
         limits = ", ".join(f"{name} {limit:.4g}" for name, limit in zip(self.names, self.limits, strict=True))
@@ -90,6 +93,16 @@ class AlarmRule(Settings):
         """The frozen model of "glr" and "cusum", as arrays."""
         shapes = Frozen(-1, -1, -1, (len(self.parameters),) * 2, -1)  # type: ignore[arg-type]
         return Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(self.frozen, shapes, strict=True)))
+
+    @property
+    def real_rate(self) -> tuple[float, float]:
+        """Samples in which one false alarm begins, least and most, for 95 % of the streams with such a reference.
+
+        The rate is lognormal, and its mean over references is the one that is set.
+        """
+        away = self.unsure * 1.959963984540054
+        middle = 0.5 * self.unsure**2
+        return self.every * float(np.exp(middle - away)), self.every * float(np.exp(middle + away))
 
     @property
     def entries(self) -> list[int]:
