@@ -19,13 +19,13 @@ A strange input stays in the regressors, as a lag or in what a model simulates, 
 `LAGS` samples after one for which an input was blamed, a sample with phi' P phi > r, which would change the estimate
 more than all samples before it, is therefore not used either.
 
-The patience p begins at 1 and doubles with every strange reading that follows another one: a value that persists is a
+The factor p begins at 1 and doubles with every strange reading that follows another one: a value that persists is a
 change of level and is accepted; one of 1000 standard deviations after seven samples. Where the prediction is strange,
 p doubles in four samples, and in 16 where the strange value repeats itself, because fault codes come in runs. It stays
 the same while a strange prediction decays, as the output of a simulation does. The first `FIRST` readings are not
 judged here; those of a diffuse start are judged together (`driftfit.trackers.parts.faults.judged_start`).
 
-Nearly every sample is ordinary: no input was blamed lately, and e^2 <= (REACH)^2 v. Ordinary samples are added to a
+Nearly every sample is ordinary: no input was blamed lately, and e^2 <= REACH^2 v. Ordinary samples are added to a
 block, a sum of y - m, of its square and of e^2 / s. Before a sample that is not ordinary is judged, the block is
 closed: its sums enter the means. It is also closed when it has a quarter as many samples as there were readings before.
 
@@ -61,13 +61,13 @@ BLOCK, GROWING, SAME = 32.0, 0.25, 1e-12
 """Samples of a block at least, and per reading before; share of their mean square below which their variance is
 rounding."""
 LASTING, LONGEST = 4.0, 1e12
-"""The patience from which on the lag of a strange input is accepted as well; the upper bound of the patience."""
+"""The factor p from which on the lag of a strange input is accepted as well; its upper bound."""
 LAGS = 50.0
 """Samples in which a strange input may still be in the regressors."""
 SELDOM = 0.1
 """Share of samples that inputs may be blamed for in the long run."""
 QUICK, SLOW, SLOWEST = 2.0, 2.0 ** (1.0 / 4.0), 2.0 ** (1.0 / 16.0)
-"""Factors of the patience: for readings, for predictions, and if the strange value repeats itself."""
+"""Growth of the factor p: for readings, for predictions, and if the strange value repeats itself."""
 ALIKE, SINKING = 1.01, 0.8
 """A strange prediction repeats itself if its distance from m is that of the ones before, up to `ALIKE`. The latter is
 the largest of them, of which `SINKING` is kept with every sample."""
@@ -147,14 +147,14 @@ def close_block(s: State, l: int) -> None:
 
 @kernel
 def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
-    """Whether the sample is used: s.ok and s.seen; and the patience."""
+    """Whether the sample is used: s.ok and s.seen; and s.widening, the factor p."""
     e, off, out = y - shown, abs(y - s.y_mean[l]), abs(shown - s.y_mean[l])
-    reach, patience = REACH * REACH * s.y_variance[l], s.widening[l]
+    reach, widening = REACH * REACH * s.y_variance[l], s.widening[l]
     judged = (s.ok[l] > 0.0) & (s.y_count[l] >= s.judged_from[l]) & (s.ratios[l] >= ENOUGH)
     strange = judged & (e * e > reach) & (e * e > SURE * SURE * v * s.mean_ratio[l]) & (min(off, out) < 0.5 * abs(e))
     trusted = (off > out) | (s.distrusted[l] < LAGS)
-    beyond = strange & trusted & (e * e > reach * patience * patience)
-    lasting = strange & (not beyond) & (patience > LASTING)
+    beyond = strange & trusted & (e * e > reach * widening * widening)
+    lasting = strange & (not beyond) & (widening > LASTING)
     lagging = (
         judged
         & (not lasting)
@@ -167,10 +167,10 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
     s.distrusted[l] = min(max(s.distrusted[l] + more, 0.0), 2.0 * LAGS) if s.ok[l] > 0.0 else s.distrusted[l]
     of_reading = SLOWEST if y == s.y_strange[l] else QUICK
     of_prediction = (1.0 if out * ALIKE < s.farthest[l] else SLOWEST) if out < ALIKE * s.farthest[l] else SLOW
-    grown = min((of_reading if off > out else of_prediction) * patience, LONGEST)
+    grown = min((of_reading if off > out else of_prediction) * widening, LONGEST)
     left_over = 0.0 if lasting else max(s.lagging[l] - 1.0, 0.0)
     s.lagging[l] = LAGS if beyond & (off <= out) else left_over
-    s.widening[l] = grown if strange else (1.0 if s.ok[l] > 0.0 else patience)
+    s.widening[l] = grown if strange else (1.0 if s.ok[l] > 0.0 else widening)
     s.y_strange[l] = y if strange else s.y_strange[l]
     s.farthest[l] = max(out, SINKING * s.farthest[l]) if strange else 0.0
     s.left_out[l] += 1.0 if left else 0.0
