@@ -22,8 +22,9 @@ cheaper and has no covariance. `run.smooth()` computes the whole path that minim
 
 Source: Kalaba and Tesfatsion, Time-varying linear regression via flexible least squares (1989), whose matrix recursion
 is used in covariance form. Departures: an exact diffuse start (`driftfit.trackers.parts.diffuse`), which needs no
-penalty on the first point and no large matrix; the minimum-norm solution about theta0 until the regressors span. Cost:
-O(n^2).
+penalty on the first point and no large matrix; the minimum-norm solution about theta0 until the regressors span;
+samples that contradict all before are left out (`driftfit.trackers.parts.faults.contradictions`), so that J is without
+them. Cost: O(n^2).
 """
 
 from __future__ import annotations
