@@ -49,8 +49,9 @@ class Labels:
     dt: float | str | None = None
 
     def __post_init__(self) -> None:
-        for name in ("u", "by"):  # lists, if they come from JSON
-            object.__setattr__(self, name, tuple(getattr(self, name)))
+        for name in ("u", "by"):
+            if type(given := getattr(self, name)) is not tuple:  # lists, if they come from JSON
+                object.__setattr__(self, name, tuple(given))
 
     def unit(self, power: int, j: int | None) -> str:
         """The unit of y to the power 0 or 1, divided by that of input j; empty if it is unknown or 1."""
@@ -217,6 +218,8 @@ class Records:
 
     def labels_of(self, k: int) -> Labels:
         """The labels of series k."""
+        if not self.dropped and not self.missing:
+            return self.labels
         key = self.keys[k]
         counted = {"dropped": self.dropped.get(key), "missing": self.missing.get(key)}
         found: Any = {name: counts for name, counts in counted.items() if counts}

@@ -209,7 +209,8 @@ class Driver:
 
     def __call__(self, *given: Any) -> Any:
         """Run on arrays and numbers. Whether arrays are read-only is not part of the signature."""
-        kind = tuple(_kind(a) for a in given)
+        # the properties on which the type of an argument depends; a list is made faster than what a generator yields
+        kind = tuple([(a.dtype, a.ndim, a.flags.num & LAYOUT) if isinstance(a, _ARRAY) else type(a) for a in given])
         found = self._entries.get(kind)
         if found is None:  # the compiler's own types take half a millisecond to make and compare
             found = self._entries[kind] = self.entry(*(_type(a) for a in given))
@@ -250,13 +251,7 @@ class Driver:
 
 LAYOUT = 0x0001 | 0x0002 | 0x0100
 """NumPy's flags that are part of the compiler's type of an array: rows contiguous, columns contiguous, aligned."""
-
-
-def _kind(value: Any) -> Any:
-    """The properties on which the type of an argument depends."""
-    if not isinstance(value, np.ndarray):
-        return type(value)
-    return value.dtype, value.ndim, value.flags.num & LAYOUT
+_ARRAY = np.ndarray
 
 
 def _type(value: Any) -> types.Type:
@@ -279,11 +274,15 @@ class _Entries:
 
     def __init__(self) -> None:
         self._owners: OrderedDict[Any, ref[Driver]] = OrderedDict()
+        self._last: Any = None
         self.lock = Lock()
 
     def used(self, entry: Any, owner: Driver) -> None:
         """Mark an entry point as used, and release the least recently used ones."""
+        if entry is self._last:
+            return
         with self.lock:
+            self._last = entry
             self._owners.setdefault(entry, ref(owner))
             self._owners.move_to_end(entry)
             while len(self._owners) > MOST_ENTRIES:

@@ -121,15 +121,15 @@ def _beginning(dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 def repeat_tile(tile: Array, count: int) -> Array:
     """``count`` copies of a tile, aligned like it: ``tiles[k : k + 1]`` is a tile."""
-    tiles = _aligned(tile.dtype, count)
+    tiles = _aligned(tile.dtype, count, np.empty)
     # as bytes: copying records field by field takes ten times as long
     tiles.view(np.uint8).reshape(count, -1)[...] = tile.view(np.uint8)
     return tiles
 
 
-def _aligned(dtype: np.dtype[Any], count: int) -> Array:
-    """``count`` records, all zero, the first at the start of a cache line."""
-    raw = np.zeros(dtype.itemsize * count + 64, np.uint8)
+def _aligned(dtype: np.dtype[Any], count: int, make: Any = np.zeros) -> Array:
+    """``count`` records, all zero unless ``make`` does not set them, the first at the start of a cache line."""
+    raw = make(dtype.itemsize * count + 64, np.uint8)
     return np.ndarray(count, dtype, raw, -raw.ctypes.data % 64)
 
 
