@@ -17,6 +17,7 @@ import pytest
 from numba import types
 from numba.core import postproc
 from numba.core.compiler import Flags
+from numba.core.errors import TypingError
 from numba.core.registry import cpu_target
 from numba.core.typing.templates import AbstractTemplate
 
@@ -146,6 +147,30 @@ def test_declarations_are_looked_for_once_and_put_back():
         assert context.get_abi_sizeof(context.get_data_type(types.float64)) == 8
         context.refresh()
     assert [vars(one).keys() for one in parts] == [one.keys() for one in before], "Methods are not put back."
+
+
+def test_timers_and_colours_are_left_out():
+    heard, timed = [], []
+    with known_once(), numba.core.event.install_listener("numba:compile", Count(heard)):
+        with numba.core.event.install_timer("numba:llvm_lock", timed.append):
+            internals.emit(first, (VECTOR,))
+        assert str(TypingError("plain")) == "plain", "termcolor() is no longer what colours the message of every error."
+    assert not timed, "event.install_timer is not what times a compilation: every call of LLVM is told to all timers."
+    assert len(heard) == 1, "Listeners to compilations, such as the tests that count them, hear nothing."
+
+
+def test_instructions_leave_nothing_for_the_garbage_collector():
+    def left():
+        return sum(issubclass(type(one), internals.ir.Instruction) for one in gc.get_objects())
+
+    gc.collect()
+    gc.disable()
+    try:
+        before = left()
+        internals.emit(first, (VECTOR,), from_python=False)
+        assert left() <= before + 20, "llvmlite's instructions keep each other until they are searched for."
+    finally:
+        gc.enable()
 
 
 def test_operations_are_typed_once(monkeypatch):

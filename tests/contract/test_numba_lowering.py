@@ -5,9 +5,13 @@ Canaries: if one fails, `Lower` in Numba changed, on which `driftfit.engine.comp
 
 import numba
 import numpy as np
+import pytest
+from numba import types
+from numba.core.errors import LoweringError
 from numba.core.registry import cpu_target
 
 from driftfit.engine import numba_internals as internals
+from driftfit.engine.compile_time.lowering import Short
 from driftfit.engine.kernel import Driver, kernel
 
 RECORD = np.dtype(
@@ -116,3 +120,15 @@ def test_the_code_is_short(monkeypatch):
 
     ours = internals.as_part(internals.under_ieee(entries, **internals.STEP), internals.StepDispatcher)
     assert length(ours) < 0.4 * length(numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)(entries))
+
+
+def test_an_error_names_its_line(monkeypatch):
+    def broken(self, inst):
+        raise LoweringError("a reason")
+
+    def twice(x):
+        return 2.0 * x
+
+    monkeypatch.setattr(Short, "lower_inst", broken)
+    with pytest.raises(LoweringError, match=r"(?s)a reason.*lowering .* at .*test_numba_lowering\.py"):
+        internals.emit(twice, (types.float64,))

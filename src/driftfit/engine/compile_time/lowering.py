@@ -17,6 +17,7 @@ for arrays.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 from numba import types
@@ -24,8 +25,9 @@ from numba.core import cgutils, ir
 from numba.core.cgutils import alloca_once
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
+from numba.core.errors import LoweringError
 from numba.core.ir_utils import enforce_no_dels, enforce_no_phis
-from numba.core.lowering import Lower
+from numba.core.lowering import Lower, new_error_context
 from numba.core.postproc import PostProcessor, VariableLifetime
 from numba.core.transforms import canonicalize_cfg
 from numba.core.typed_passes import IRLegalization, NativeLowering
@@ -110,12 +112,30 @@ class Short(Lower):
         super().pre_block(block)
 
     def lower_block(self, block: Any) -> None:
-        """Lower a block, without what only ends the life of a variable that owns nothing."""
-        if self._short:
-            kept = [one for one in block.body if not (isinstance(one, ir.Del) and self._is_plain(one.value))]
-            block = block.copy()
-            block.body = kept
-        super().lower_block(block)
+        """Lower a block, without what only ends the life of a variable that owns nothing. Where an error arose is said
+        when one has arisen: Numba prepares it for every instruction.
+        """
+        if not self._short:
+            super().lower_block(block)
+            return
+        self.pre_block(block)
+        try:
+            for one in block.body:
+                if not (isinstance(one, ir.Del) and self._is_plain(one.value)):
+                    self.loc = one.loc
+                    self.lower_inst(one)
+        except Exception:
+            where = {"inst": one, "loc": self.loc, "errcls_": partial(LoweringError, loc=self.loc)}
+            with new_error_context('lowering "{inst}" at {loc}', **where):
+                raise
+        self.post_block(block)
+
+    def lower(self) -> None:
+        """Lower a function. Instructions and their block refer to each other until the garbage collector finds them."""
+        super().lower()
+        for function in self.module.functions:
+            for block in function.blocks:
+                block.instructions.clear()
 
     def lower_inst(self, inst: Any) -> Any:
         """Lower one instruction, or remember it for later."""
