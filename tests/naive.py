@@ -7,6 +7,8 @@ and returns (y_hat, e, s). A twin of a model turns signals into those calls.
 import numpy as np
 from scipy.linalg import null_space
 
+from driftfit.trackers.parts.modes.trend import FADING, GROWN, LOST, SHORTEST
+
 LARGEST = 1e100
 SMALL = 1e-9
 
@@ -200,3 +202,14 @@ class ARX:
         self.y = [y if y is not None else fill, *self.y][: self.na]
         self.u = [past[: nb + nk] for past, (nb, nk) in zip(self.u, self.lags, strict=True)]
         return tracker.theta, tracker.var(), y_hat, e, s, bool(complete and y is not None and np.isfinite(noise))
+
+
+def moved_along(lane, walked, time=1.0):
+    """Means (n, K) of the filters of `AdaptiveKalman` after an interval; ``walked`` (n, K) is what it adds to C_ii."""
+    m, memory = lane["m"].copy(), time / np.sqrt(max(float(lane["apart"]), SHORTEST))
+    for j, bend in enumerate(lane["bend"]):
+        k = int(lane["trend"]) + j
+        variance = np.maximum(np.diagonal(lane["C"][..., k]) + walked[:, k], 1e-300)
+        fading = FADING + LOST * (1.0 - np.minimum(1.0, GROWN * lane["corrected"][:, j] / variance))
+        m[:, k] += lane["slopes"][:, j] * time * (1.0 / (1.0 + 0.5 * bend * fading * memory))
+    return m

@@ -126,7 +126,7 @@ def test_states_survive_other_settings_and_another_version(model):
     old = ByHand(model, hold=0.0)
     old.batch(first)
     layout = old.flow.task.joint_for(None).programs[0].layout
-    names = [name for name in reversed(layout.text.split()) if not name.startswith("far:")]
+    names = [name for name in reversed(layout.text.split()) if not name.startswith("farthest:")]
     text = " ".join([*names, "gone:f2"])
     assert len(names) == len(layout.text.split()) - 1
 

@@ -8,6 +8,7 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
+from naive import moved_along
 
 from driftfit import AdaptiveKalman, Bank, Change, Live, Regression, Sensor, track
 from driftfit.trackers.parts.modes.filters import UNSURE
@@ -59,11 +60,13 @@ def test_each_filter_of_adaptive_kalman_keeps_them_too(near, seed):
     live = Live(Regression(N), AdaptiveKalman())
     for t in range(PARTED):
         live.update(y[t], u[t])
-    lane = {name: np.array(live.lane()[name]) for name in ("S", "m", "C", "mu", "ratio", "c", "r")}
+    lane = {name: np.array(live.lane()[name]) for name in live.lane()}
     live.update(y[PARTED], u[PARTED])
     after = live.lane()
     noise = float(after["noise"] * after["leverage"] * max(after["r"], after["coarse"]))
     weights, means, covs = lane["mu"] / lane["mu"].sum(), [], []
+    walks = lane["r"] * lane["ratio"] / lane["c"][:, None]
+    moved = moved_along(lane, lane["S"] ** 2 @ walks)
     with localcontext() as context:
         context.prec = 80
         inverse = EXACT(np.eye(N))
@@ -73,9 +76,8 @@ def test_each_filter_of_adaptive_kalman_keeps_them_too(near, seed):
             )
         for k in range(len(weights)):
             C = np.tril(lane["C"][..., k]) + np.tril(lane["C"][..., k], -1).T
-            walked = np.diag(lane["r"] * lane["ratio"][:, k] / lane["c"])
-            P = inverse @ EXACT(C) @ inverse.T + EXACT(walked)
-            m, P = taken(inverse @ EXACT(lane["m"][:, k]), P, y[PARTED], u[PARTED], noise)
+            P = inverse @ EXACT(C) @ inverse.T + EXACT(np.diag(walks[:, k]))
+            m, P = taken(inverse @ EXACT(moved[:, k]), P, y[PARTED], u[PARTED], noise)
             means.append(m), covs.append(P)
         mean = EXACT(weights) @ np.array(means)
         P = sum(Decimal(w) * (C + np.outer(m - mean, m - mean)) for w, m, C in zip(weights, means, covs, strict=True))

@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from naive import moved_along
 from scipy import stats
 
 from driftfit import (
@@ -335,11 +336,11 @@ def naive_density(lane, phi, y):
     chain = (1.0 - OUTLIER) * lane["nu"][:-1] @ level_chain()
     levels = np.append(chain, OUTLIER)
     leverage = max(1.0, np.max(phi**2 / (LEVERAGE * c)))
-    total = 0.0
+    m, total = moved_along(lane, S**2 @ (lane["ratio"] * r / c[:, None])), 0.0
     for k, weight in enumerate(lane["mu"]):
         lower = np.tril(lane["C"][:, :, k])
         C = lower + np.tril(lower, -1).T + (S * (lane["ratio"][:, k] * r / c)) @ S.T
-        e, h = y - x @ lane["m"][:, k], x @ C @ x
+        e, h = y - x @ m[:, k], x @ C @ x
         for j, p in enumerate(levels):
             scale = np.sqrt(h + leverage * max(lane["level"][j] * r, lane["coarse"]))
             law = stats.cauchy if j == len(levels) - 1 else stats.norm

@@ -48,7 +48,7 @@ def rewrite(path, change_header=None, change_arrays=None):
         path.write_bytes(storage.compact(header, arrays))
     else:
         with open(path, "wb") as file:
-            np.savez(file, header=np.array(json.dumps(header)), **arrays)
+            np.savez(file, header=np.array(json.dumps(header | {"arrays": [*arrays]})), **arrays)
 
 
 def test_a_missing_file_is_a_missing_file(tmp_path):

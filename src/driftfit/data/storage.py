@@ -102,7 +102,8 @@ def read(path: str | PathLike[str], *kinds: str) -> tuple[dict[str, Any], dict[s
 
 
 def _put(file: Any, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
-    text = json.dumps({"format": FORMAT, **header}, default=_encode)
+    # the names of the arrays, because the check sums of a zip cover what it holds, not what that is called
+    text = json.dumps({"format": FORMAT, "arrays": [*arrays], **header}, default=_encode)
     np.savez(file, header=np.array(text), **cast(Any, dict(arrays)))
 
 
@@ -150,6 +151,8 @@ def _take(file: Any, name: str, kinds: Sequence[str]) -> tuple[dict[str, Any], d
             with np.load(BytesIO(data), allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
             header = dict(json.loads(str(arrays.pop("header")), object_hook=_decode))
+            if header.pop("arrays", [*arrays]) != [*arrays]:
+                raise ValueError("its arrays have other names than those that were written")
     except Exception as error:  # zipfile, NumPy and JSON raise a dozen kinds of errors for damaged files
         raise ValueError(f"{name} is not a driftfit file, or it is damaged ({error}).") from None
     if header.get("format", 0) > reads:

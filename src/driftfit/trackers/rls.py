@@ -68,7 +68,10 @@ LARGE = 25.0
 
 def no_settling() -> dict[str, Any]:
     """Fields of a start that is not forgotten, before the first sample."""
-    return {"discounted": 0.0, "first_memory": 0.0, "unequal": 0.0, "recent": 0.0, "least": 0.0, "quieter": 1.0}
+    return {
+        "discounted": 0.0, "first_memory": 0.0, "faded_at": 0.0,
+        "unequal": 0.0, "recent": 0.0, "least": 0.0, "quieter": 1.0,
+    }  # fmt: skip
 
 
 def settling_of(model: Model) -> dict[str, Any]:
@@ -82,7 +85,9 @@ def growth(s: State, l: int) -> float:
     """The factor by which forgetting multiplies P."""
     dt, used = s.dt[l], s.count[l]
     faded = s.forgetting[l] if dt == 1.0 else exp(dt * s.log_forgetting[l])
-    early = (used < s.discounted[l]) & (s.ok[l] > 0.0)
+    # once for each sample that was used, in the next interval: whether that has an output is not known in advance
+    early = (used < s.discounted[l]) & (used > s.faded_at[l]) & (dt > 0.0)
+    s.faded_at[l] = used if early else s.faded_at[l]
     faded = min(faded, 1.0 - 1.0 / max(s.first_memory[l], 0.25 * used)) if early else faded
     grown = 0.0
     for i in range(s.theta.shape[0]):
@@ -238,7 +243,7 @@ def forget_variance(s: State, l: int) -> None:
 def restart(s: State, l: int) -> None:
     """As before the first sample."""
     forget_variance(s, l)
-    s.recent[l], s.least[l], s.quieter[l] = 0.0, 0.0, 1.0
+    s.recent[l], s.least[l], s.quieter[l], s.faded_at[l] = 0.0, 0.0, 1.0, 0.0
     for i in range(s.theta.shape[0]):
         s.per_cap[i, l] = 0.0
 

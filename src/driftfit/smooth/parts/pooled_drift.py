@@ -85,7 +85,7 @@ def average_drift(walk: Walk, time: Array, trend: Array) -> Walk:
             log_p[k, j] = solved[1] - price
     best = int(np.argmax(log_p))
     likeliest = walk._replace(drift_root=np.sqrt(SCALES[best % len(SCALES)] * shapes[best // len(SCALES)][0]))
-    rates, better = compared(likeliest, trend, size, paths[best][0])
+    rates, better = compared(likeliest, trend, paths[best][0])
     p = np.append(log_p, log_p.max() + better - TRENDS)
     p = np.exp(p - p.max())
     p /= p.sum()
