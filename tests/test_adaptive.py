@@ -217,7 +217,7 @@ def test_a_signal_far_from_zero_is_learned_next_to_an_intercept_and_one_at_rest_
         scaled = phi / np.sqrt(c)
         G = (fade ** np.arange(len(phi))[::-1, None] * scaled).T @ scaled
         var = 0.01 * np.diag(np.linalg.inv(phi.T @ phi))
-        lane = {"information": np.tril(G), "c": c, "var": var, "r": 0.01, "seen_samples": float(len(phi))}
+        lane = {"information": np.tril(G), "c": c, "var": var, "r": 0.01, "power_samples": float(len(phi))}
         assert learned(lane).tolist() == [rests == 0] * 2
 
 

@@ -169,7 +169,7 @@ def test_a_fixed_rate_changes_no_bit(tmp_path, name):
 def test_numbers_that_are_only_zero_or_one_are_integers_in_c(tmp_path):
     export_c(ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=1.0), tmp_path, fixed_rate=True)
     header, source = ((tmp_path / f"tracker.{end}").read_text() for end in "hc")
-    assert set(re.findall(r"    int (\w+);", header)) == {"started", "dt", "valid", "seen", "ok"}
+    assert set(re.findall(r"    int (\w+);", header)) == {"started", "dt", "valid", "observed", "ok"}
     assert "(s->dt > " not in source  # 0 or 1: never a gap
 
 

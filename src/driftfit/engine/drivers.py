@@ -70,7 +70,7 @@ def clean(s: State, l: int) -> None:
     finite = abs(y) < LARGEST
     s.y[l] = y if finite & (abs(y) > SMALLEST) else 0.0
     s.valid[l] = valid
-    s.seen[l] = 1.0 if finite else 0.0
+    s.observed[l] = 1.0 if finite else 0.0
     s.ok[l] = valid if finite & (noise < np.inf) else 0.0
 
 

@@ -251,7 +251,7 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, doubts: 
         for i in range(na - 1, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]
         # a prediction of infinite variance carries no information (a diffuse start) and must not become a lag
-        y, y_hat, filled, seen = s.y[l], s.y_hat[l], s.filled[l], s.seen[l] > 0.0
+        y, y_hat, filled, seen = s.y[l], s.y_hat[l], s.filled[l], s.observed[l] > 0.0
         known = (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf)) & (filled < na)
         fill = y_hat if known else np.nan
         s.filled[l] = 0.0 if seen else filled + 1.0
@@ -352,8 +352,8 @@ def _joint_steps(
                 s.y_lag[o, i, l] = s.y_lag[o, i - 1, l]
             informed = (s.s[lane] != np.inf) | (s.noise[lane] == np.inf)
             fill = s.y_hat[lane] if s.valid[lane] > 0.0 and informed and s.filled[o, l] < na else np.nan
-            s.filled[o, l] = 0.0 if s.seen[lane] > 0.0 else s.filled[o, l] + 1.0
+            s.filled[o, l] = 0.0 if s.observed[lane] > 0.0 else s.filled[o, l] + 1.0
             if na > 0:
-                s.y_lag[o, 0, l] = s.y[lane] if s.seen[lane] > 0.0 else fill
+                s.y_lag[o, 0, l] = s.y[lane] if s.observed[lane] > 0.0 else fill
 
     return ModelSteps(regress, push)

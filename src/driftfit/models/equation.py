@@ -178,7 +178,7 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
 
     @kernel
     def push(s: State, l: int) -> None:
-        seen = s.seen[l] > 0.0
+        seen = s.observed[l] > 0.0
         predicted = informed(s, l)
         known = predicted & (s.without[l] < reach)
         restore(s, seen, l)

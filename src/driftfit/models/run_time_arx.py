@@ -105,7 +105,7 @@ def _steps(m: int, doubts: bool) -> ModelSteps:
         for i in range(s.y_lag.shape[0] - 1, 0, -1):
             if i < na:
                 s.y_lag[i, l] = s.y_lag[i - 1, l]
-        y, y_hat, filled, seen = s.y[l], s.y_hat[l], s.filled[l], s.seen[l] > 0.0
+        y, y_hat, filled, seen = s.y[l], s.y_hat[l], s.filled[l], s.observed[l] > 0.0
         known = (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf)) & (filled < na)
         fill = y_hat if known else np.nan
         s.filled[l] = 0.0 if seen else filled + 1.0

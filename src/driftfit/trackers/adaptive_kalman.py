@@ -350,4 +350,4 @@ class AdaptiveKalman(Tracker):
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])
-        return never & bool(lane["settled"] and lane["seen_samples"] >= window(len(never)))
+        return never & bool(lane["settled"] and lane["power_samples"] >= window(len(never)))

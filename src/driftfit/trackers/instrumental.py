@@ -197,7 +197,7 @@ def auxiliary(na: int) -> tuple[Any, Any]:
     @kernel
     def follow(s: State, l: int) -> None:
         """The auxiliary model follows theta, and its output is the first of its lags."""
-        s.largest[l] = max(s.largest[l], abs(s.y[l])) if s.seen[l] > 0.0 else s.largest[l]
+        s.largest[l] = max(s.largest[l], abs(s.y[l])) if s.observed[l] > 0.0 else s.largest[l]
         share = FOLLOWING if s.learned[l] >= s.settling[l] else 1.0
         for i in range(s.theta.shape[0]):
             s.auxiliary[i, l] += share * (s.theta[i, l] - s.auxiliary[i, l])

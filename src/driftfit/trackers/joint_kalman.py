@@ -78,7 +78,7 @@ def judged(s: State, y_hat: float, v: float, l: int) -> None:
     ok, n = s.ok[l], s.theta.shape[0]
     leave_out_contradiction(s, y_hat, v, l)
     corrected(s, y_hat, v, l)
-    if (s.ok[l] < ok) & (s.seen[l] > 0.0):
+    if (s.ok[l] < ok) & (s.observed[l] > 0.0):
         for i in range(n):
             s.theta[i, l] = s.theta_before[i, l]
             for j in range(i + 1):

@@ -46,19 +46,19 @@ class SharedStream(Live):
     def _stepper(self) -> Any:
         return self._in_wide
 
-    def _in_wide(self, seen: Array, y: float, u: Any) -> Any:
+    def _in_wide(self, compiled: Array, y: float, u: Any) -> Any:
         """The compiled step, on the state of the stream or on the copy of it with which `predict` works."""
         if self._wide is None:
             self.within(self.program)
         wide = self._wide
         assert wide is not None
-        if seen is not self._seen:
+        if compiled is not self._compiled:
             wide.take(self._scratch, wide.scratch)
-            return wide.step(wide.scratch_seen, y, u)
+            return wide.step(wide.compiled_scratch, y, u)
         if not self._away:
             wide.take(self._own, wide.tile)
             self._away, self._interval = True, wide.tile["interval"][0]
-        return wide.step(wide.seen, y, u)
+        return wide.step(wide.compiled, y, u)
 
     def _return(self) -> None:
         if self._away:
@@ -86,7 +86,7 @@ class _Wide:
         self.tile = wide.tile(padded(program.tracker, n, N))
         self.scratch = self.tile.copy()
         self.step = wide.drivers().updater(self.tile, wide.model.m)
-        self.seen, self.scratch_seen = as_compiled(self.tile), as_compiled(self.scratch)
+        self.compiled, self.compiled_scratch = as_compiled(self.tile), as_compiled(self.scratch)
         self._absent = N - n if "S" in storage.fields(own) else 0
         names = [name for name in storage.fields(own) if not (self._absent and name in ("rank", "absent"))]
         self._from = np.concatenate([_rows(own, name, own, 0) for name in names])

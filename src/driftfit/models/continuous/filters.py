@@ -344,7 +344,7 @@ def steps(o: Orders) -> ModelSteps:
 
     @kernel
     def push(s: State, l: int) -> None:
-        seen = s.seen[l] > 0.0
+        seen = s.observed[l] > 0.0
         predicted = informed(s, l)
         restore(s, seen, l)
         y = s.measured[l] if seen else (s.y_hat[l] if predicted else s.expected[l])

@@ -238,7 +238,7 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
             else:
                 push_lane(s.blocks.ctypes.data + at, L)
         s.y_hat[l] = s.blocks[PREDICTED, l]
-        s.blocks[SEEN, l], s.blocks[OK, l] = s.seen[l], s.ok[l]
+        s.blocks[SEEN, l], s.blocks[OK, l] = s.observed[l], s.ok[l]
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 

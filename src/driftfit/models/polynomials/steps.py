@@ -428,7 +428,7 @@ def pushing(p: Places, place: Step, waiting: float = ENTRY) -> Step:
 
     @kernel
     def push(s: State, l: int) -> None:
-        seen = s.seen[l] > 0.0
+        seen = s.observed[l] > 0.0
         predicted = informed(s, l)
         # w and e of this sample are those of the theta that has learned from it
         enlarge(s, s.measured[l], 0, l)

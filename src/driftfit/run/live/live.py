@@ -100,7 +100,7 @@ class Live(Operated, Stream):
         self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
         if self._single:
             self._update = self._stepper()
-            self._seen, self._scratch_seen = as_compiled(tile), as_compiled(self._scratch)  # views
+            self._compiled, self._compiled_scratch = as_compiled(tile), as_compiled(self._scratch)  # views
         self._expect(self._awaits)
 
     def _stepper(self) -> Any:
@@ -183,7 +183,7 @@ class Live(Operated, Stream):
             if type(u) is not float or self._m != 1:
                 u = self._floats(u)
         if time is None:
-            return self._update(self._seen, y, u)
+            return self._update(self._compiled, y, u)
         return self._update_at(y, u, time)
 
     def _floats(self, u: Any) -> Any:
@@ -209,7 +209,7 @@ class Live(Operated, Stream):
         resting = self._interval[0]
         if resting:  # 0 while the stream is held: no time passes
             self._interval[0] = interval
-        step: Step = self._update(self._seen, y, u)
+        step: Step = self._update(self._compiled, y, u)
         self._interval[0] = resting
         return step
 
@@ -267,7 +267,7 @@ class Live(Operated, Stream):
         known = HELD if resting == HELD else known
         if self._single:
             self._rest(known)
-            step = self._update(self._seen, float(y[0]), one_or_all(u))
+            step = self._update(self._compiled, float(y[0]), one_or_all(u))
             if self._watching or self._windows:
                 self._keep(step[1:2], step[2:3], np.reshape(known, (3, 1)), time)
         else:
@@ -301,7 +301,7 @@ class Live(Operated, Stream):
     def _update_later(self, y: float) -> Step:
         """A sample without known factors, whose input comes with `apply`."""
         self._placing()
-        step: Step = self._update(self._seen, y, one_or_all(self._unknown))
+        step: Step = self._update(self._compiled, y, one_or_all(self._unknown))
         self._expect(INPUT)
         return step
 
@@ -315,7 +315,7 @@ class Live(Operated, Stream):
         inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
         self._put(self._scratch, inputs)
         if self._single:
-            y_hat, _, s, _ = self._update(self._scratch_seen, np.nan, one_or_all(inputs))
+            y_hat, _, s, _ = self._update(self._compiled_scratch, np.nan, one_or_all(inputs))
         else:
             missing = np.full(len(self.model.outputs), np.nan)
             y_hat, _, s, _ = self._passed(self._scratch, missing, inputs, self.resting)

@@ -34,9 +34,10 @@ PARTS = 8
 
 @Driver
 def log_likelihood(samples: Array, level: Array, slope: Array, trend: Array, m: Array, P: Array, total: Array) -> None:
-    """log L of equal parts of the record, added to total (k,), of rows (phi, y, weight) (T, n + 2) with drifts ``level`` (T, n) and ``slope`` (n,) per nominal interval.
+    """log L of the equal parts of a record, added to total (k,).
 
-    m (2 n,) and P (2 n, 2 n) are mean and covariance before the first sample; both are overwritten.
+    Of rows (phi, y, weight) (T, n + 2), with drifts ``level`` (T, n) and ``slope`` (n,) per nominal interval; m (2 n,)
+    and P (2 n, 2 n) are mean and covariance before the first sample, and are overwritten.
     """
     T, n = level.shape
     g, parts = np.zeros(2 * n), len(total)
@@ -75,7 +76,7 @@ def compared(walk: Walk, trend: Array, start: Array) -> tuple[Array, Array]:
     """(rates (k, n) of the drift of slopes per nominal interval, log of their likelihood over that of ``walk`` (k,)).
 
     ``trend`` (T,) are the nominal intervals, and ``start`` (n,) is an estimate of theta at the first sample. Regressors
-    are in units of their weighted root mean squares, in which one with a fault code counts as little as in the estimate.
+    are in units of their weighted root mean squares: one with a fault code counts as little as in the estimate.
     """
     used, level = walk.weight > 0.0, walk.drift_root**2
     n, power = len(start), walk.weight @ walk.phi**2 / walk.weight.sum()

@@ -308,7 +308,7 @@ class Bank(Tracker):
         return {  # memory first, where a cache line begins
             **packed(arrays, numbers),
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
-            "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
+            "power_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
             "scale": scale, "count": count, "squares": squares, "sample": sample,
             "counters": counters, **unresolved(),
             **(knowing_nothing(n, WORST if self._frames(na) else ALMOST_ANY) if self.p0 is None else knowing(n)),
@@ -427,7 +427,7 @@ class Bank(Tracker):
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])
         begun = lane["counters"][SETTLED] > 0
-        return never & bool(begun and lane["seen_samples"] >= window(len(never)))
+        return never & bool(begun and lane["power_samples"] >= window(len(never)))
 
     @property
     def steps(self) -> TrackerSteps:

@@ -53,7 +53,7 @@ def window(n: int) -> int:
 def no_excitation(n: int) -> dict[str, Any]:
     """Fields before the first sample."""
     return {
-        "seen_samples": 0.0,
+        "power_samples": 0.0,
         "power": 0.0,
         "c": np.zeros(n),
         "active": np.zeros(n),
@@ -71,11 +71,11 @@ def bounded(square: float, mean: float, count: float) -> float:
 @kernel
 def learn_scales(s: State, l: int) -> None:
     """Update the mean squares of the regressors, over samples at which they were excited, and of y."""
-    s.seen_samples[l] += s.ok[l]
+    s.power_samples[l] += s.ok[l]
     y = reading(s, l)
-    square = bounded(y * y, s.power[l], s.seen_samples[l])
+    square = bounded(y * y, s.power[l], s.power_samples[l])
     active = s.ok[l] if square > DULL * s.power[l] else 0.0
-    s.power[l] += active * (square - s.power[l]) / min(max(s.seen_samples[l], 1.0), MEMORY)
+    s.power[l] += active * (square - s.power[l]) / min(max(s.power_samples[l], 1.0), MEMORY)
     for i in range(s.theta.shape[0]):
         square = bounded(s.phi[i, l] * s.phi[i, l], s.c[i, l], s.active[i, l])
         share = s.theta[i, l] * s.phi[i, l]
@@ -106,5 +106,5 @@ def learned(lane: Mapping[str, Array]) -> Array:
     G = lower + np.tril(lower, -1).T
     own: Array = 1.0 / np.diag(np.linalg.inv(G + 1e-9 * np.eye(n)))
     var, noise = np.where(np.isfinite(lane["var"]), lane["var"], 0.0), float(lane["r"])
-    share = window(n) / max(float(lane["seen_samples"]), window(n))
+    share = window(n) / max(float(lane["power_samples"]), window(n))
     return (own > 1.0) | (var * own * lane["c"] > LITTLE * share * noise)

@@ -41,7 +41,7 @@ def not_frozen() -> dict[str, Any]:
 @kernel
 def leave_out_frozen(s: State, l: int) -> None:
     """Leave out a reading that is more likely frozen than not; s.y_hat and s.s must have been computed."""
-    if s.seen[l] > 0.0:
+    if s.observed[l] > 0.0:
         repeats = same_reading(s, s.before[l], l)
         s.before[l] = reading(s, l)
         frozen = 0.0
@@ -58,7 +58,7 @@ def leave_out_frozen(s: State, l: int) -> None:
             frozen = prior / (prior + (1.0 - prior) * chance)
         s.frozen[l] = frozen
         if frozen > 0.5:
-            s.ok[l], s.seen[l] = 0.0, 0.0
+            s.ok[l], s.observed[l] = 0.0, 0.0
             s.held[l] += 1.0
         s.in_a_row[l] = s.in_a_row[l] + 1.0 if frozen > 0.5 else 0.0
         s.frozen_readings[l] += 0.0 if s.in_a_row[l] < 2.0 else 2.0 if s.in_a_row[l] == 2.0 else 1.0

@@ -55,13 +55,13 @@ def leave_out(s: State, l: int) -> None:
     e = e if s.valid[l] > 0.0 else away
     reach = REACH * REACH * s.spread[l]
     limit = reach * s.patience[l] * s.patience[l]
-    judged = (s.seen[l] > 0.0) & (s.readings[l] >= FIRST)
+    judged = (s.observed[l] > 0.0) & (s.readings[l] >= FIRST)
     strange = judged & (away > reach) & (e > reach)
     out = judged & (away > limit) & (e > limit)
     s.strange[l] = 1.0 if strange else 0.0
     s.left_out[l] += 1.0 if out else 0.0
     s.ok[l] = 0.0 if out else s.ok[l]
-    s.seen[l] = 0.0 if out else s.seen[l]
+    s.observed[l] = 0.0 if out else s.observed[l]
 
 
 @kernel
@@ -71,9 +71,9 @@ def learn_proportion(s: State, l: int, outlier: float) -> None:
     A reading that repeats the last one has nothing new: a plant at standstill keeps its scale.
     """
     odd = max(s.strange[l], outlier)
-    if s.seen[l] > 0.0 or odd > 0.0:
+    if s.observed[l] > 0.0 or odd > 0.0:
         s.patience[l] = min(1.0 + odd * (2.0 * s.patience[l] - 1.0), LONGEST)
-    if s.seen[l] > 0.0 and (s.fresh[l] > 0.0 or s.readings[l] < 1.0):
+    if s.observed[l] > 0.0 and (s.fresh[l] > 0.0 or s.readings[l] < 1.0):
         s.readings[l] += 1.0
         share = 1.0 / min(s.readings[l], MEMORY)
         away = reading(s, l) - s.middle[l]

@@ -63,7 +63,7 @@ def same_reading(s: State, other: float, l: int) -> bool:
 @kernel
 def resolve(s: State, l: int) -> None:
     """Process a reading."""
-    y, seen, quantum = reading(s, l), s.seen[l], s.quantum[l]
+    y, seen, quantum = reading(s, l), s.observed[l], s.quantum[l]
     step = abs(y - s.reading[l])  # NaN at the first reading, which neither moves nor repeats
     repeated = seen if same_reading(s, s.reading[l], l) else 0.0
     moved = seen - repeated if step >= 0.0 else 0.0

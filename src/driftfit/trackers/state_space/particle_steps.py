@@ -266,7 +266,7 @@ def steps(
             ok = s.ok[l]
             leave_out_contradiction(s, s.y_hat[l], s.s[l], l)
             s.e[l] = s.y[l] - s.y_hat[l]
-            if (s.ok[l] < ok) & (s.seen[l] > 0.0):
+            if (s.ok[l] < ok) & (s.observed[l] > 0.0):
                 restore_particles(s, l)  # an input is to blame: states do not move with it
             if s.ok[l] > 0.0:
                 weigh(s, l)

@@ -147,7 +147,7 @@ def close_block(s: State, l: int) -> None:
 
 @kernel
 def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
-    """Whether the sample is used: s.ok and s.seen; and s.widening, the factor p."""
+    """Whether the sample is used: s.ok and s.observed; and s.widening, the factor p."""
     e, off, out = y - shown, abs(y - s.y_mean[l]), abs(shown - s.y_mean[l])
     reach, widening = REACH * REACH * s.y_variance[l], s.widening[l]
     judged = (s.ok[l] > 0.0) & (s.y_count[l] >= s.judged_from[l]) & (s.ratios[l] >= ENOUGH)
@@ -174,7 +174,7 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
     s.y_strange[l] = y if strange else s.y_strange[l]
     s.farthest[l] = max(out, SINKING * s.farthest[l]) if strange else 0.0
     s.left_out[l] += 1.0 if left else 0.0
-    s.seen[l] = 0.0 if beyond & (off > out) else s.seen[l]
+    s.observed[l] = 0.0 if beyond & (off > out) else s.observed[l]
     s.ok[l] = 0.0 if left else s.ok[l]
 
 

@@ -98,7 +98,8 @@ def forget(s: State, l: int) -> None:
             s.information[i, j, l] = 0.0
     know_nothing(s, l)
     s.squares[l], s.count[l], s.scale[l] = 0.0, 0.0, np.nan
-    s.seen_samples[l], s.power[l], s.middle[l], s.spread[l], s.readings[l], s.patience[l] = 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
+    s.power_samples[l], s.power[l] = 0.0, 0.0
+    s.middle[l], s.spread[l], s.readings[l], s.patience[l] = 0.0, 0.0, 0.0, 1.0
 
 
 @partial(kernel, inline=False)
@@ -157,14 +158,14 @@ def reconsider(s: State, enough: int, l: int) -> bool:
     if some:
         y, y_hat, e, v, noise, shift = s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l]
         ok, fresh, leverage = s.ok[l], s.fresh[l], s.leverage[l]
-        s.ok[l], s.seen[l], s.leverage[l] = 1.0, 1.0, 1.0
+        s.ok[l], s.observed[l], s.leverage[l] = 1.0, 1.0, 1.0
         alone = repeat(s, False, l)
         ready = s.count[l] >= enough
         if repeat(s, True, l) > WORSE * alone and ready:
             repeat(s, False, l)
             drop(s, l)
         s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l] = y, y_hat, e, v, noise, shift
-        s.ok[l], s.seen[l], s.fresh[l], s.leverage[l] = ok, ok, fresh, leverage
+        s.ok[l], s.observed[l], s.fresh[l], s.leverage[l] = ok, ok, fresh, leverage
         for i in range(n):
             s.phi[i, l] = s.samples[rows - 1, i, l]
     return ready
