@@ -79,7 +79,7 @@ def twin(y, u, p0, forgetting):
         psi = np.array([old["yf"], old["uf"], old["ef"]]) if usable >= SETTLING * n else phi
         if t > 0:
             e = y[t] - phi @ theta
-            early = 1.0 - 1.0 / max(SETTLING * n, 0.25 * usable) if usable < FORGOTTEN * n else 1.0
+            early = 1.0 - 1.0 / max(SETTLING * n, 0.25 * usable) if 0 < usable < FORGOTTEN * n else 1.0
             P = P / min(forgetting, early) * quieter
             k = P @ psi / (1.0 + psi @ P @ psi)
             theta, P, quieter = theta + k * e, P - np.outer(k, psi @ P), 1.0

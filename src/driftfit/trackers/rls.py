@@ -15,10 +15,10 @@ regressors first had full rank (before that: when they last spanned a new direct
 
 A model that is linearised poorly at first has its first samples forgotten, also for lambda = 1: up to sample k = N of
 `Model.settling` the memory is at most `Model.settling_memory` samples or k / 4, if that is more: the lambda(t) -> 1 of
-Ljung and Soderstrom (1983), section 5.6. If the model has one of the noise, P and the scale are in units of the
-variance of e in max(20, k / 8) samples when it was least so far: those before the noise was known have large
-innovations, and would outweigh all later ones. Because the least of many estimates is too small, the unit falls only to
-2.5 times an estimate.
+Ljung and Soderstrom (1983), section 5.6. If the model has one of the noise, P and the scale are in units of the least
+variance of e so far, of max(20, k / 8) samples: those before the noise was known have large innovations, and would
+outweigh all later ones. The least of many estimates is too small, and so are bands in the first hundred samples; a unit
+that falls to 1.6 or 2.5 times an estimate mends these, but leaves more records of Box-Jenkins models astray.
 
 Directional forgetting (kind="directional") forgets only in the direction of a sample, after it has been used:
 
@@ -63,8 +63,6 @@ from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
 RECENT, RECENT_SHARE = 20.0, 0.125
 """Memory of the present noise variance: samples, and share of those so far."""
-CLEARLY = 2.5
-"""The least variance so far falls to this multiple of the present one: the least of many estimates is too small."""
 LARGE = 25.0
 """A square above this multiple of it counts as this multiple."""
 
@@ -148,7 +146,7 @@ def follow_variance(s: State, l: int) -> None:
         before = s.recent[l] if s.recent[l] > 0.0 else square
         share = 1.0 / min(s.count[l], max(RECENT, RECENT_SHARE * s.count[l]))
         s.recent[l] = before + share * (min(square, LARGE * before) - before)
-        least = s.recent[l] if s.least[l] <= 0.0 else min(s.least[l], CLEARLY * s.recent[l])
+        least = s.recent[l] if s.least[l] <= 0.0 else min(s.least[l], s.recent[l])
         least = least if s.count[l] >= RECENT else 0.0
         ratio = s.least[l] / least if (s.least[l] > 0.0) & (least > 0.0) else 1.0
         s.least[l] = least
