@@ -16,16 +16,17 @@ RECORDS = 10
 
 
 def battery(rng):
-    """A cell is cycled for eight hours: its ohmic resistance drifts, and its capacity, 2 Ah, is not known."""
+    """A cell is cycled for eight hours: its ohmic resistance drifts, and so does its capacity, from 2 Ah."""
     T = 3000
     R0 = 0.06 + np.cumsum(1e-4 * rng.normal(size=T))
+    capacity = 2.0 + np.cumsum(2e-3 * rng.normal(size=T))
     i = np.repeat(rng.uniform(-3.0, 3.0, T // 20), 20)
     charge, v1, rows = 0.6, 0.0, []
     for t in range(T):
         i[t] = -abs(i[t]) if charge < 0.1 else abs(i[t]) if charge > 0.9 else i[t]
-        charge -= 10 * i[t] / 3600 / 2.0
+        charge -= 10 * i[t] / 3600 / capacity[t]
         v1 += 10 * (0.02 * i[t] - v1) / 60 + 1e-4 * rng.normal()
-        rows.append([2.0, R0[t], charge, 3.2 + 0.5 * charge + 0.4 * charge**3 - R0[t] * i[t] - v1])
+        rows.append([capacity[t], R0[t], charge, 3.2 + 0.5 * charge + 0.4 * charge**3 - R0[t] * i[t] - v1])
     *truth, v = np.array(rows).T
     model = StateSpace(
         """
@@ -35,7 +36,7 @@ def battery(rng):
         """,
         start={"charge": 0.5, "capacity": 2.3, "R1": 0.03, "R0": 0.06},
     )
-    q = {"R0": 1e-8, "v1": 1e-8}
+    q = {"capacity": 4e-6, "R0": 1e-8, "v1": 1e-8}
     p0 = {"charge": 0.04, "capacity": 0.25, "R1": 1e-4, "R0": 1e-3, "v1": 1e-4}
     return (
         model,

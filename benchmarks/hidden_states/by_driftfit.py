@@ -22,7 +22,7 @@ def battery() -> tuple[Any, dict[str, Any]]:
         start={"charge": 0.5, "capacity": 2.3, "R1": 0.03, "R0": 0.06},
     )
     p0 = {"charge": 0.04, "capacity": 0.25, "R1": 1e-4, "R0": 1e-3, "v1": 1e-4}
-    return model, {"q": {"R0": 1e-8, "v1": 1e-8}, "r": 1e-4, "p0": p0}
+    return model, {"q": {"capacity": 4e-6, "R0": 1e-8, "v1": 1e-8}, "r": 1e-4, "p0": p0}
 
 
 def epidemic() -> tuple[Any, dict[str, Any]]:

@@ -34,7 +34,7 @@ def battery() -> Any:
 
     begins = jnp.array([2.3, 0.03, 0.06, 0.5, 0.0])
     P0 = jnp.diag(jnp.array([0.25, 1e-4, 1e-3, 0.04, 1e-4]))
-    Q = jnp.diag(jnp.array([0.0, 0.0, 1e-8, 0.0, 1e-8]))
+    Q = jnp.diag(jnp.array([4e-6, 0.0, 1e-8, 0.0, 1e-8]))
     return ParamsNLGSSM(begins, P0, f, Q, h, 1e-4 * jnp.eye(1))
 
 

@@ -39,7 +39,7 @@ def battery() -> Any:
     ekf = Cell(5, 1)
     ekf.x = np.array([2.3, 0.03, 0.06, 0.5, 0.0])
     ekf.P = np.diag([0.25, 1e-4, 1e-3, 0.04, 1e-4])
-    ekf.Q = np.diag([0.0, 0.0, 1e-8, 0.0, 1e-8])
+    ekf.Q = np.diag([4e-6, 0.0, 1e-8, 0.0, 1e-8])
     ekf.R = np.array([[1e-4]])
 
     def step(y: float, i: float) -> Any:

@@ -39,7 +39,7 @@ def battery() -> Any:
     ukf = UnscentedKalmanFilter(5, 1, 1.0, hx, fx, JulierSigmaPoints(5, kappa=0.0))
     ukf.x = np.array([2.3, 0.03, 0.06, 0.5, 0.0])
     ukf.P = np.diag([0.25, 1e-4, 1e-3, 0.04, 1e-4])
-    ukf.Q = np.diag([0.0, 0.0, 1e-8, 0.0, 1e-8])
+    ukf.Q = np.diag([4e-6, 0.0, 1e-8, 0.0, 1e-8])
     ukf.R = np.array([[1e-4]])
 
     def step(y: float, i: float) -> Any:

@@ -38,7 +38,7 @@ def battery(u: Any) -> Any:
             return dists.IndepProd(*(dists.Normal(m, s) for m, s in zip(means, scales, strict=True)))
 
         def PX(self, t: int, xp: Any) -> Any:  # noqa: N802
-            scales = 0.0, 0.0, 1e-4, 0.0, 1e-4
+            scales = 2e-3, 0.0, 1e-4, 0.0, 1e-4
             return dists.IndepProd(*(dists.Normal(m, s) for m, s in zip(self.moved(t, xp), scales, strict=True)))
 
         def PY(self, t: int, xp: Any, x: Any) -> Any:  # noqa: N802
