@@ -210,7 +210,7 @@ class Driver:
     def __call__(self, *given: Any) -> Any:
         """Run on arrays and numbers. Whether arrays are read-only is not part of the signature."""
         # the properties on which the type of an argument depends; a list is made faster than what a generator yields
-        kind = tuple([(a.dtype, a.ndim, a.flags.num & LAYOUT) if isinstance(a, _ARRAY) else type(a) for a in given])
+        kind = tuple([(a.dtype, a.ndim, a.flags.num & LAYOUT) if isinstance(a, np.ndarray) else type(a) for a in given])
         found = self._entries.get(kind)
         if found is None:  # the compiler's own types take half a millisecond to make and compare
             found = self._entries[kind] = self.entry(*(_type(a) for a in given))
@@ -251,7 +251,6 @@ class Driver:
 
 LAYOUT = 0x0001 | 0x0002 | 0x0100
 """NumPy's flags that are part of the compiler's type of an array: rows contiguous, columns contiguous, aligned."""
-_ARRAY = np.ndarray
 
 
 def _type(value: Any) -> types.Type:

@@ -4,8 +4,8 @@ Numba tries dozens of templates for every operation of every function, and compa
 a fifth of the time of compiling. What it found for an operation, types and options is remembered, by replacing
 `Function.get_call_type` and the comparison of `Flags`. Before each function, and at every second call in it, it looks
 for declarations of new types and functions; `known_once` looks once. What it tries in vain ends in an error with a
-message in colours, two thousand times for a driver; and every call of LLVM tells one timer for each function that is
-being compiled.
+message in colours, two thousand times for a driver; and every call of LLVM notifies one timer for each function that
+is being compiled.
 
 Private parts: `Function.get_call_type` and `_impl_keys`, `Flags._values`, `Record.__repr__`, `refresh` of the target
 and typing contexts, `_registries`, `_check_llvm_bugs`, `termcolor`, `event._registered`.
@@ -63,7 +63,7 @@ def known_once() -> Iterator[None]:
         replaced(codegen, _check_llvm_bugs=lambda: None),
         replaced(termcolor(), **dict.fromkeys(("code", "errmsg", "filename", "indicate", "highlight"), str)),
         replaced(event, start_event=_if_heard(event.start_event), end_event=_if_heard(event.end_event)),
-        replaced(event, install_timer=lambda kind, told: nullcontext()),
+        replaced(event, install_timer=lambda kind, callback: nullcontext()),
     ):
         yield
 

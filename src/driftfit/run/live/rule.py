@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -100,7 +101,7 @@ class AlarmRule(Settings):
 
         The rate is lognormal, and its mean over references is the one that is set.
         """
-        away = self.unsure * 1.959963984540054
+        away = self.unsure * NormalDist().inv_cdf(0.975)
         middle = 0.5 * self.unsure**2
         return self.every * float(np.exp(middle - away)), self.every * float(np.exp(middle + away))
 
