@@ -27,12 +27,13 @@ HISTORIES, NEGLIGIBLE = 200, 16.0
 @Driver
 def best_histories(phi: Array, y: Array, r: Array, moves: Array, logs: Array, theta: Array) -> None:
     """theta (T, n) from histories of events: ``moves`` (J, n + 1) are variances of a jump and the factor of the noise,
-    ``logs`` (J,) the log probabilities of the events."""
+    ``logs`` (J, J) the log probabilities of the events (columns) after each event (rows); the first precedes all."""
     T, n = phi.shape
     J, most = len(moves), HISTORIES
     m, P, w = np.zeros((most, n)), np.zeros((most, n, n)), np.zeros(most)
     m_next, P_next, w_next = np.zeros((most, n)), np.zeros((most, n, n)), np.zeros(most)
     e, g, score = np.zeros(most), np.zeros(n), np.zeros(most * J)
+    last, last_next = np.zeros(most, np.int64), np.zeros(most, np.int64)
     for i in range(n):
         P[0, i, i] = 1e6
     alive = 1
@@ -47,7 +48,7 @@ def best_histories(phi: Array, y: Array, r: Array, moves: Array, logs: Array, th
                 v = h + r[t] * moves[j, n]
                 for i in range(n):
                     v += moves[j, i] * phi[t, i] ** 2
-                score[b * J + j] = w[b] + logs[j] - 0.5 * (np.log(v) + e[b] ** 2 / v)
+                score[b * J + j] = w[b] + logs[last[b], j] - 0.5 * (np.log(v) + e[b] ** 2 / v)
         order, kept, total = np.argsort(-score[: alive * J]), 0, 0.0
         for at in order[:most]:
             lost = score[order[0]] - score[at]
@@ -65,14 +66,14 @@ def best_histories(phi: Array, y: Array, r: Array, moves: Array, logs: Array, th
                 for k in range(n):
                     P_next[kept, i, k] = P[b, i, k] - g[i] * g[k] / v
                 P_next[kept, i, i] += moves[j, i]
-            w_next[kept] = -lost
+            w_next[kept], last_next[kept] = -lost, j
             total += np.exp(-lost)
             kept += 1
         alive = kept
         for i in range(n):
             theta[t, i] = 0.0
         for b in range(alive):
-            m[b], P[b], w[b] = m_next[b], P_next[b], w_next[b] - np.log(total)
+            m[b], P[b], w[b], last[b] = m_next[b], P_next[b], w_next[b] - np.log(total), last_next[b]
             for i in range(n):
                 theta[t, i] += np.exp(w[b]) * m[b, i]
 
@@ -86,15 +87,16 @@ KNOWN: dict[str, tuple[str, float, list[list[float]]]] = {
 """Scenario, probability of a jump, and the variances of the parameters' jumps."""
 
 
-def events(rate: float, jumps: Array, outliers: bool) -> tuple[Array, Array]:
-    """Moves and log probabilities of what may happen at a sample."""
+def events(rate: float, jumps: Array, outliers: tuple[float, float] = (0.0, 1.0)) -> tuple[Array, Array]:
+    """Moves and log probabilities of what may happen at a sample, whatever happened before; ``outliers`` are their
+    probability and their variance in units of the noise."""
     still = np.concatenate([np.zeros((1, jumps.shape[1])), jumps])
     prob = np.array([1.0 - rate, *np.full(len(jumps), rate / len(jumps))])
     moves = np.column_stack([still, np.ones(len(still))])
-    if not outliers:
-        return moves, np.log(prob)
-    far = np.column_stack([still, np.full(len(still), 100.0)])
-    return np.concatenate([moves, far]), np.log(np.concatenate([0.98 * prob, 0.02 * prob]))
+    if outliers[0] > 0.0:
+        far = np.column_stack([still, np.full(len(still), outliers[1])])
+        moves, prob = np.concatenate([moves, far]), np.concatenate([(1.0 - outliers[0]) * prob, outliers[0] * prob])
+    return moves, np.tile(np.log(prob), (len(prob), 1))
 
 
 def main() -> None:
@@ -110,7 +112,7 @@ def main() -> None:
             phi, theta = np.ascontiguousarray(case.u), np.empty(case.u.shape)
             c = np.mean(phi**2, axis=0)
             row = [track(case.model, AdaptiveKalman(), case.y, case.u).theta]
-            for outliers in (False, True):
+            for outliers in ((0.0, 1.0), (0.02, 100.0)):
                 best_histories(phi, case.y, case.r, *events(rate, np.array(jumps, float), outliers), theta)
                 row.insert(-1, theta.copy())
             ratios.append([error(case, path, c) / error(case, oracle(case, phi), c) for path in row])
