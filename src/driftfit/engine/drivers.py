@@ -237,9 +237,12 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
         # nothing looks at types and bounds after this; contiguous, because every layout would be compiled separately
-        y, u, known = (np.ascontiguousarray(array, dtype=np.float64) for array in (y, u, known))
-        _check_shapes(tile, len(out), y, u, known)
-        ready(tile["theta"].shape[2])
+        y = np.ascontiguousarray(y, dtype=np.float64)
+        u = np.ascontiguousarray(u, dtype=np.float64)
+        known = np.ascontiguousarray(known, dtype=np.float64)
+        _, m, L = tile["u"].shape
+        _check_shapes(m, L, len(out), y, u, known)
+        ready(L)
         run(as_compiled(tile), y, u, known, out)
 
     return Drivers(checked, *_updates(driver, sample))
@@ -346,9 +349,8 @@ def _updates(driver: Callable[[Any], Driver], sample: Any) -> tuple[Driver, Driv
     return update, update_one
 
 
-def _check_shapes(tile: Array, T: int, y: Array, u: Array, known: Array) -> None:
-    m, L = tile["u"].shape[1:]
-    wanted = (T, L), (T, m if u.shape[1:2] != (0,) else 0, L), (1 if len(known) == 1 else T, max(3, known.shape[1]), L)
-    given = y.shape, u.shape, known.shape
-    if given != wanted:
+def _check_shapes(m: int, L: int, T: int, y: Array, u: Array, known: Array) -> None:
+    rows, columns, lanes = known.shape
+    if y.shape != (T, L) or u.shape not in ((T, m, L), (T, 0, L)) or rows not in (1, T) or columns < 3 or lanes != L:
+        given, wanted = (y.shape, u.shape, known.shape), ((T, L), (T, m, L), (T, max(3, columns), L))
         raise ValueError(f"run: y, u and known have shapes {given}, but this tile and {T} samples need {wanted}.")
