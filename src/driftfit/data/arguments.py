@@ -21,7 +21,8 @@ def check_roles(owner: str, model: Any, tracker: Any, several: bool = False) -> 
     Raises TypeError for anything else, and unless ``model`` is a `Model`. The message says what was passed, and what to
     write instead.
     """
-    if _fit(type(model), type(tracker)):
+    kinds: tuple[type, type] = type(model), type(tracker)
+    if _fit(*kinds):
         return True
     if _is(model, Tracker) and _is(tracker, Model):
         raise TypeError(

@@ -140,4 +140,5 @@ def _noise_of_outputs(weights: Any, T: int, ny: int) -> Array:
         return np.repeat(np.broadcast_to(noise_of(given, T), T)[:, None], ny, axis=1)
     if given.shape != (T, ny):
         raise ValueError(f"weights must be one number, ({T},) or ({T}, {ny}); got shape {given.shape}.")
-    return noise_of(given.ravel(), given.size).reshape(T, ny)
+    noise: Array = noise_of(given.ravel(), given.size).reshape(T, ny)
+    return noise

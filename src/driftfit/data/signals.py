@@ -59,7 +59,7 @@ def noise_of(weights: Any, T: int | None = None) -> Any:
     if type(weights) is float and weights > 0.0:
         return 1.0 / weights
     with np.errstate(divide="ignore"):
-        return np.asarray(1.0 / given)
+        return np.divide(1.0, given)
 
 
 def intervals(time: Any, dt: Any, T: int) -> tuple[Array, Array]:

@@ -32,7 +32,7 @@ CHUNK = 1_000_000
 """Samples between two updates of the progress bar."""
 
 BLOCK = 4096
-"""Samples of a block of results of which only a part is kept."""
+"""Samples of a block of results that are kept in single precision."""
 
 MOST = 14
 """With more parameters than this loops over lanes are slower than single lanes (docs/design.md): the compiler does not
@@ -246,18 +246,29 @@ class Program:
         return out
 
     def fill(self, tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
-        """Run a tile over samples. What is not kept of their results is written to a block that stays in the cache."""
+        """Run a tile over samples. Results that are kept in single precision are first written to a block that stays in
+        the cache.
+        """
         keep, rows = _driven(tile.dtype, self.tracker.outputs, out.dtype)
-        run = self.drivers(keep).run
+        run, alone = self.drivers(keep).run, out.dtype.names == ("theta",)
         if out.dtype == rows:
             run(tile, y, u, known, out)
             return
-        block = np.empty(min(BLOCK, len(out)), rows)
+        last = np.empty(1, rows)
+        if alone and out.dtype["theta"].base == np.float64:
+            run(tile, y, u, known, last, out["theta"])
+            return
+        block = np.empty(min(BLOCK, len(out)), rows["theta"] if alone else rows)
         for a in range(0, len(out), BLOCK):
             part = slice(a, min(a + BLOCK, len(out)))
             results = block[: part.stop - a]
-            run(tile, y[part], u[part], known if len(known) == 1 else known[part], results)
-            _copy(results, out[part])
+            given = y[part], u[part], known if len(known) == 1 else known[part]
+            if alone:
+                run(tile, *given, last, results)
+                out["theta"][part] = results
+            else:
+                run(tile, *given, results)
+                _copy(results, out[part])
 
 
 @lru_cache(maxsize=256)

@@ -205,7 +205,7 @@ def _one(programs: Sequence[Program], records: Records, keep: str, before: Run |
     out = program.run(tile, record, keep, dtype)
     if records.outputs:
         lanes = [Lane(out, tile, lane) for lane in range(records.ny)]
-        return Outputs(programs, replace(records, known=record.known), lanes, {}, dict(enumerate(starts)))
+        return Outputs(programs, records._replace(known=record.known), lanes, {}, dict(enumerate(starts)))
     return Track(program, record, Lane(out, tile), *starts)
 
 
