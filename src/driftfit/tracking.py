@@ -183,5 +183,6 @@ def track(
         if warm_start is not None or prob is not None:
             raise ValueError("track: to= cannot be combined with warm_start= or prob=.")
         return write_parts(plain.parts(model, tracker, y, u, reading, data=data, by=by, keep=keep, dtype=dtype), to)
-    more: Any = {"keep": keep, "dtype": dtype, "warm_start": warm_start, "prob": prob}
-    return plain.track(model, tracker, y, u, reading, data=data, by=by, **more)
+    return plain.track(
+        model, tracker, y, u, reading, data=data, by=by, keep=keep, dtype=dtype, warm_start=warm_start, prob=prob
+    )

@@ -4,6 +4,7 @@ order."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from inspect import signature
 from typing import Any
 
@@ -14,13 +15,15 @@ from driftfit.trackers.base import Tracker
 ARTICLE = {Model: "a model, such as ARX(2, 2) or Regression(3)", Tracker: "a tracker, such as AdaptiveKalman()"}
 
 
-def check_roles(owner: str, model: Any, tracker: Any, several: bool = False) -> None:
-    """Raise TypeError unless ``model`` is a `Model` and ``tracker`` a `Tracker` (``several``: or a list or mapping).
+def check_roles(owner: str, model: Any, tracker: Any, several: bool = False) -> bool:
+    """Whether ``tracker`` is one `Tracker`, and not, with ``several``, a list or mapping of them.
 
-    The message says what was passed, and what to write instead.
+    Raises TypeError for anything else, and unless ``model`` is a `Model`. The message says what was passed, and what to
+    write instead.
     """
-    if isinstance(model, Model) and isinstance(tracker, Tracker):
-        return
+    kinds: tuple[type, type] = type(model), type(tracker)
+    if _fit(*kinds):
+        return True
     if _is(model, Tracker) and _is(tracker, Model):
         raise TypeError(
             f"{owner}: model and tracker are in the wrong order; the model comes first: "
@@ -32,6 +35,13 @@ def check_roles(owner: str, model: Any, tracker: Any, several: bool = False) -> 
     for one in given if listed else [tracker]:
         for own in one.values() if several and isinstance(one, Mapping) else [one]:
             check_role(owner, "tracker", own, Tracker)
+    return False
+
+
+@lru_cache(maxsize=256)
+def _fit(model: type, tracker: type) -> bool:
+    """Whether these are a model and a tracker; asked once for each pair, because abstract classes answer slowly."""
+    return issubclass(model, Model) and issubclass(tracker, Tracker)
 
 
 def check_role(owner: str, name: str, value: Any, kind: type[Settings]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -29,9 +30,11 @@ class Known:
     @classmethod
     def of(cls, interval: Any = 1.0, noise: Any = 1.0, drift: Any = 1.0) -> Known:
         """The columns made of numbers or of arrays (T,)."""
+        if type(interval) is type(noise) is type(drift) is float:
+            return row_of(interval, noise, drift)
         parts = (interval, noise, drift)
-        if not (np.ndim(interval) or np.ndim(noise) or np.ndim(drift)):  # a row for all samples
-            return cls(np.array([[float(interval), float(noise), float(drift)]]))
+        if not (np.ndim(interval) or np.ndim(noise) or np.ndim(drift)):
+            return row_of(float(interval), float(noise), float(drift))
         return cls(np.stack(np.broadcast_arrays(*(np.atleast_1d(np.asarray(part, float)) for part in parts)), axis=1))
 
     def __len__(self) -> int:
@@ -116,3 +119,11 @@ class Known:
         columns = np.moveaxis(self.over(T).columns, 1, 2).flatten().reshape(T * ny, -1)
         columns[np.arange(T * ny) % ny > 0, INTERVAL] = 0.0
         return Known(columns)
+
+
+@lru_cache(maxsize=256)
+def row_of(interval: float, noise: float, drift: float) -> Known:
+    """A row that holds for every sample; it is made once and cannot be written to."""
+    columns = np.array([[interval, noise, drift]])
+    columns.flags.writeable = False
+    return Known(columns)

@@ -28,6 +28,10 @@ class Held(NamedTuple):
     index: Any = None
 
 
+NOTHING = Held(None)
+"""What was not passed."""
+
+
 def held(what: str, given: Any) -> Held:
     """Values (T,) or (T, m) with their names, from anything that a user may pass."""
     if given is None or isinstance(given, PLAIN):
@@ -65,9 +69,13 @@ def _names(given: Sequence[Any]) -> tuple[str, ...]:
 
 def together(**parts: Held) -> None:
     """ValueError if the indices of signals of one length differ, because their rows then do not match."""
-    with_index = [(name, part) for name, part in parts.items() if part.index is not None]
-    for name, part in with_index[1:]:
-        first, other = with_index[0]
+    first, other = "", NOTHING
+    for name, part in parts.items():
+        if part.index is None:
+            continue
+        if other.index is None:
+            first, other = name, part
+            continue
         if len(part.index) != len(other.index) or part.index.equals(other.index):
             continue
         row = int(np.argmax(np.asarray(part.index != other.index)))
@@ -89,11 +97,17 @@ class Times(NamedTuple):
     labels: bool = False
 
 
+WITHOUT = Times()
+"""Samples that have no times."""
+
+
 def times_of(time: Any, parts: Sequence[Held]) -> Times:
     """The times that a user passed, or the first index of dates among the signals."""
     if time is None:
-        index = next((part.index for part in parts if dated(part.index)), None)
-        return Times() if index is None else _dates(index)._replace(labels=True)
+        for part in parts:
+            if part.index is not None and dated(part.index):
+                return _dates(part.index)._replace(labels=True)
+        return WITHOUT
     if dated(time):
         return _dates(time)
     if isinstance(time, np.ndarray | list | tuple):
@@ -142,8 +156,10 @@ def order_of(owner: str, wanted: Sequence[str], given: Sequence[str], what: str 
 
 def ordered(model: Any, u: Array, names: Sequence[str]) -> tuple[Array, tuple[str, ...]]:
     """The columns of u (T, m) and their names, in the order of the inputs of a model, if both have names."""
+    if not names:
+        return u, ()
     wanted = model.input_names
-    if not wanted or not names or tuple(names) == wanted:
+    if not wanted or tuple(names) == wanted:
         return u, tuple(names)
     return np.ascontiguousarray(u[:, order_of(type(model).__name__, wanted, names)]), wanted
 

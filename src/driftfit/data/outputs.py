@@ -55,7 +55,7 @@ def of_rows(model: Model, y: Any, u: Any, reading: Reading) -> tuple[Model, Reco
     found = []
     for k, one in enumerate(outputs):
         time = axes[k] if axes is not None and axes.ndim > 1 else axes
-        found.append(of_arrays(model, one, None if inputs is None else inputs[k], replace(reading, time=time))[1])
+        found.append(of_arrays(model, one, None if inputs is None else inputs[k], reading._replace(time=time))[1])
     return model, _joined(found)
 
 
@@ -95,7 +95,7 @@ def of_table(
     own = [] if isinstance(weights, str) or np.ndim(weights) == 0 else list(weights)
     own = [own[j] for j in place] if len(own) == ny else own
     read, failed = read_records(
-        data, given[0], [*given[1:], *inputs, *own], by, replace(reading, weights=1.0 if own else weights)
+        data, given[0], [*given[1:], *inputs, *own], by, reading._replace(weights=1.0 if own else weights)
     )
     N, end = len(read.y), ny - 1 + len(inputs)
     outputs, signals, factors = np.split(read.u, [ny - 1, end], axis=1)
@@ -109,7 +109,7 @@ def of_table(
         noise = _noise_of_outputs(np.where(np.isfinite(factors), factors, 1.0), N, ny)
     labels = replace(read.labels, y="y", u=names)
     both, known = np.column_stack([read.y, outputs]), read.known.for_outputs(noise)
-    return model, replace(read, y=both, u=signals, known=known, labels=labels, outputs=model.outputs), failed
+    return model, read._replace(y=both, u=signals, known=known, labels=labels, outputs=model.outputs), failed
 
 
 def named_outputs(model: Model, names: Sequence[str]) -> tuple[Model, list[int]]:
@@ -140,4 +140,5 @@ def _noise_of_outputs(weights: Any, T: int, ny: int) -> Array:
         return np.repeat(np.broadcast_to(noise_of(given, T), T)[:, None], ny, axis=1)
     if given.shape != (T, ny):
         raise ValueError(f"weights must be one number, ({T},) or ({T}, {ny}); got shape {given.shape}.")
-    return noise_of(given.ravel(), given.size).reshape(T, ny)
+    noise: Array = noise_of(given.ravel(), given.size).reshape(T, ny)
+    return noise

@@ -6,11 +6,12 @@ several settings: a lane reads ``length`` samples, beginning at ``first``.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC
 from datetime import time as clock
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -23,7 +24,7 @@ from driftfit.data.signals import as_inputs, as_output, intervals, noise_of
 from driftfit.data.times.gaps import warn_of_gaps
 from driftfit.data.times.instants import instants
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import as_numbers, factor
+from driftfit.engine.settings import as_numbers, axes, factor
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 
@@ -64,6 +65,13 @@ class Labels:
 
 
 PLAIN = Labels()
+_NONE: Mapping[Any, Any] = {}
+
+
+@lru_cache(maxsize=256)
+def labels_of_series(y: str, u: tuple[str, ...], time: str | None, zone: str | None, dt: float | str | None) -> Labels:
+    """The labels of one series, of which nothing has been left out yet; made once for all series with the same."""
+    return Labels(y, u, time, zone=zone, dt=dt)
 
 
 def time_text(time: Any, zone: str | None) -> str:
@@ -76,8 +84,7 @@ def time_text(time: Any, zone: str | None) -> str:
     return f"{text.replace(tzinfo=UTC).astimezone(ZoneInfo(zone)):%Y-%m-%d %H:%M:%S %Z}"
 
 
-@dataclass(frozen=True)
-class Reading:
+class Reading(NamedTuple):
     """How signals are to be read: the further arguments of `driftfit.run.track.track`, described there."""
 
     time: Any = None
@@ -118,8 +125,7 @@ class Record:
         return replace(self, y=self.y[rows], u=self.u[rows], known=self.known.part(rows), time=time)
 
 
-@dataclass(frozen=True)
-class Records:
+class Records(NamedTuple):
     """Series in flat arrays of N samples.
 
     ``y`` (N,), ``u`` (N, m), ``known`` of N samples or one row, ``time`` (N,) or None; series k is ``length[k]``
@@ -138,9 +144,9 @@ class Records:
     known: Known
     time: Array | None = None
     labels: Labels = PLAIN
-    dropped: Mapping[Hashable, Mapping[str, int]] = field(default_factory=dict)
+    dropped: Mapping[Hashable, Mapping[str, int]] = _NONE
     drifts: Array | None = None
-    missing: Mapping[Hashable, Mapping[str, int]] = field(default_factory=dict)
+    missing: Mapping[Hashable, Mapping[str, int]] = _NONE
     outputs: tuple[str, ...] = ()
 
     @property
@@ -150,7 +156,8 @@ class Records:
 
     def part(self, k: int) -> Record:
         """Series k; its arrays are views."""
-        rows = slice(int(self.first[k]), int(self.first[k] + self.length[k]))
+        begin = self.first.item(k)
+        rows = slice(begin, begin + self.length.item(k))
         time = None if self.time is None else self.time[rows]
         return Record(self.y[rows], self.u[rows], self.known.part(rows), time, self.labels_of(k))
 
@@ -159,8 +166,7 @@ class Records:
         first, length = self.first[a:b], self.length[a:b]
         low = int(first.min())
         rows = slice(low, int((first + length).max()))
-        return replace(
-            self,
+        return self._replace(
             keys=self.keys[a:b],
             first=first - low,
             length=length,
@@ -174,8 +180,7 @@ class Records:
         """Records that contain only series k; their arrays are views."""
         one = self.part(k)
         first, length = np.zeros(1, dtype=int), np.array([len(one)])
-        return replace(
-            self,
+        return self._replace(
             keys=self.keys[k : k + 1],
             first=first,
             length=length,
@@ -195,9 +200,9 @@ class Records:
         time = None if self.time is None else np.repeat(self.time, ny)
         y, u = np.ascontiguousarray(self.y).ravel(), np.ascontiguousarray(self.u).reshape(N * ny, -1)
         known, first, length = self.known.in_rows(N), self.first * ny, self.length * ny
-        return replace(self, first=first, length=length, y=y, u=u, known=known, time=time, outputs=())
+        return self._replace(first=first, length=length, y=y, u=u, known=known, time=time, outputs=())
 
-    def for_trackers(self, model: Model, trackers: Sequence[Tracker], prob: Any = None) -> Records:
+    def for_trackers(self, model: Model, trackers: Iterable[Tracker], prob: Any = None) -> Records:
         """The same series with everything that is known of the samples as columns of ``known``, in the form that these
         trackers read.
         """
@@ -206,7 +211,7 @@ class Records:
         columns, *others = (one.extra_columns(model, len(self.y), prob, self.drifts) for one in dict.fromkeys(trackers))
         if any(not np.array_equal(columns, other, equal_nan=True) for other in others):
             raise ValueError("track: a drift for each change is for one Bank at a time; the trackers here have others.")
-        return replace(self, known=self.known.with_extra(columns), drifts=None)
+        return self._replace(known=self.known.with_extra(columns), drifts=None)
 
     def repeated(self, keys: tuple[Hashable, ...]) -> Records:
         """The only series under several keys, without copying it."""
@@ -214,7 +219,7 @@ class Records:
             {key: counts.get(self.keys[0], {}) for key in keys} for counts in (self.dropped, self.missing)
         )
         first, length = np.repeat(self.first, len(keys)), np.repeat(self.length, len(keys))
-        return replace(self, keys=keys, first=first, length=length, dropped=dropped, missing=missing)
+        return self._replace(keys=keys, first=first, length=length, dropped=dropped, missing=missing)
 
     def labels_of(self, k: int) -> Labels:
         """The labels of series k."""
@@ -231,8 +236,9 @@ class Records:
         Warns if most samples cannot be used because of dt, with lags of ``reach`` samples, or those of the model.
         """
         u, names = ordered(model, self.u, self.labels.u)
-        found = self if u is self.u else replace(self, u=u, labels=replace(self.labels, u=names))
-        found = found._restricted(names or model.input_names, reading)
+        found = self if u is self.u else self._replace(u=u, labels=replace(self.labels, u=names))
+        if reading.limits or reading.exclude:
+            found = found._restricted(names or model.input_names, reading)
         if self.time is not None and len(self.known) > 1:
             clock, zone = Clock.of(self.labels.dt), self.labels.zone
             gaps = self.known.interval.reshape(len(self.known), -1)[:, 0]
@@ -241,8 +247,6 @@ class Records:
 
     def _restricted(self, inputs: Sequence[str], reading: Reading) -> Records:
         """Replace values outside valid ranges or in excluded intervals by NaN, and count them."""
-        if not reading.limits and not reading.exclude:
-            return self
         y, u, keys = self.y.copy(), self.u.copy(), self.keys
         N, m = len(y), u.shape[-1]
         owner = np.repeat(np.arange(len(keys)), self.length)
@@ -255,27 +259,29 @@ class Records:
         y[out_y.reshape(y.shape)] = np.nan
         u[out_u] = np.nan
         y[excluded], u[excluded] = np.nan, np.nan
-        return replace(self, y=y, u=u, missing=missing)
+        return self._replace(y=y, u=u, missing=missing)
+
+
+FIRST = np.zeros(1, dtype=int)
+"""Where a single series begins."""
 
 
 def one_series(y: Any, u: Any, reading: Reading) -> Records:
     """One series; y (T,), u (T,), (T, m) or None."""
-    signals = {"y": held("y", y), "u": held("u", u)}
-    factors = {"weights": held("weights", reading.weights), "drift": held("drift", reading.drift)}
-    together(**signals, **factors)
-    output = as_output(signals["y"].values)
+    given_y, given_u = held("y", y), held("u", u)
+    weights, drift = held("weights", reading.weights), held("drift", reading.drift)
+    together(y=given_y, u=given_u, weights=weights, drift=drift)
+    output = as_output(given_y.values)
     T = len(output)
-    times = times_of(reading.time, list(signals.values()) if reading.indexed else ())
+    times = times_of(reading.time, (given_y, given_u) if reading.indexed else ())
     dt = LABEL if times.labels and reading.dt is None else reading.dt
     axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
-    drift = factors["drift"].values
-    common, drifts = (1.0, as_numbers("drift", drift)) if np.ndim(drift) == 2 else (drift, None)
-    known = Known.of(gaps, noise_of(factors["weights"].values, T), factor("drift", common, T))
-    labels = Labels(
-        (signals["y"].names or ("y",))[0], signals["u"].names, times.name, zone=times.zone, dt=Clock.of(dt).plain
-    )
-    inputs = as_inputs(signals["u"].values, T)
-    return Records((0,), np.array([0]), np.array([T]), output, inputs, known, axis, labels, drifts=drifts)
+    common, drifts = (1.0, as_numbers("drift", drift.values)) if axes(drift.values) == 2 else (drift.values, None)
+    known = Known.of(gaps, noise_of(weights.values, T), factor("drift", common, T))
+    name = given_y.names[0] if given_y.names else "y"
+    labels = labels_of_series(name, given_u.names, times.name, times.zone, Clock.of(dt).plain)
+    inputs = as_inputs(given_u.values, T)
+    return Records((0,), FIRST, np.array((T,)), output, inputs, known, axis, labels, drifts=drifts)
 
 
 def rows(y: Any, u: Any, reading: Reading) -> Records:
@@ -333,7 +339,7 @@ def _known_of_rows(units: int, T: int, time: Any, dt: Any, weights: Any, drift: 
     return Known.of(*flat), None if axis is None else axis.ravel()
 
 
-def drift_of(value: Any, T: int | None = None) -> Array:
+def drift_of(value: Any, T: int | None = None) -> Any:
     """Known factors of the drift."""
     return factor("drift", value, T)
 

@@ -53,13 +53,13 @@ def as_inputs(u: Any, T: int) -> Array:
     return array
 
 
-def noise_of(weights: Any, T: int | None = None) -> Array:
+def noise_of(weights: Any, T: int | None = None) -> Any:
     """Factor of the noise variance, 1 / w; a weight of 0 makes it infinite, which makes the sample unusable."""
     given = factor("weights", weights, T)
     if type(weights) is float and weights > 0.0:
-        return np.asarray(1.0 / weights)
+        return 1.0 / weights
     with np.errstate(divide="ignore"):
-        return np.asarray(1.0 / given)
+        return np.divide(1.0, given)
 
 
 def intervals(time: Any, dt: Any, T: int) -> tuple[Array, Array]:

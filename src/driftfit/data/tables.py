@@ -9,7 +9,6 @@ used. Rows without a unit or without a time never become samples; they are count
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -77,8 +76,8 @@ def _dated(data: Any, by: Any, reading: Reading) -> tuple[Any, Reading]:
     if name in data.columns:
         return data, reading
     stamps = index.to_timestamp() if hasattr(index, "to_timestamp") else index
-    return data.set_axis(stamps).reset_index(names=name), replace(
-        reading, time=name, dt=LABEL if reading.dt is None else reading.dt
+    return data.set_axis(stamps).reset_index(names=name), reading._replace(
+        time=name, dt=LABEL if reading.dt is None else reading.dt
     )
 
 

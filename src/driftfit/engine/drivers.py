@@ -38,6 +38,10 @@ INPUTS = types.Array(types.float64, 1, "A", readonly=True)
 """The compiler's type of the inputs of one sample."""
 
 
+NOWHERE = np.empty((0, 0, 0))
+"""The array for theta alone, where all results are kept."""
+
+
 def no_preparation(L: int) -> None:
     """Steps that call nothing by symbol need none."""
 
@@ -219,7 +223,8 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     """Build the drivers of a (model, tracker) pair.
 
     ``run(tile, y, u, known, out)`` takes y (T, L), u (T, m, L) and `known` (T, 3, L), or one row of it that holds for
-    every sample (extra columns go to ``read_extra``), and fills out (T,) of `output_type`. ``update(tile, y, u)`` does
+    every sample (extra columns go to ``read_extra``), and fills out (T,) of `output_type`; where theta (T, n, L) is
+    given too, it fills that, and the one row of out holds the last sample. ``update(tile, y, u)`` does
     one sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u (`Drivers.updater`); both
     take what is known from the fields ``interval``, ``noise`` and ``drift`` of the record and return (y_hat, e, s, ok).
     """
@@ -235,12 +240,20 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     keep_more = covariance if keep == "cov" else nothing_more
     run = _run(driver, sample, tracker.read_extra, _stored(tracker.store, keep_more), part)
 
-    def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
+    def checked(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE) -> None:
         # nothing looks at types and bounds after this; contiguous, because every layout would be compiled separately
-        y, u, known = (np.ascontiguousarray(array, dtype=np.float64) for array in (y, u, known))
-        _check_shapes(tile, len(out), y, u, known)
-        ready(tile["theta"].shape[2])
-        run(as_compiled(tile), y, u, known, out)
+        y = np.ascontiguousarray(y, dtype=np.float64)
+        u = np.ascontiguousarray(u, dtype=np.float64)
+        known = np.ascontiguousarray(known, dtype=np.float64)
+        _, m, L = tile["u"].shape
+        if theta is NOWHERE:
+            _check_shapes(m, L, len(out), y, u, known)
+        else:
+            _check_shapes(m, L, len(theta), y, u, known)
+            if len(out) != 1 or theta.shape[1:] != tile["theta"].shape[1:]:
+                raise ValueError(f"run: out must have one row beside theta, which has shape {theta.shape}.")
+        ready(L)
+        run(as_compiled(tile), y, u, known, out, theta)
 
     return Drivers(checked, *_updates(driver, sample))
 
@@ -284,11 +297,13 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, stored: 
     """The loop over the samples of a record."""
 
     @driver
-    def run(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
+    def run(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array) -> None:
         s = tile[0]
         n, L = s.theta.shape
         given = u.shape[1] > 0
         changing = 1 if known.shape[0] > 1 else 0
+        alone = theta.shape[0] > 0
+        kept = 0 if alone else 1
         for t in range(y.shape[0]):
             for l in range(L):
                 s.y[l] = y[t, l]
@@ -304,7 +319,7 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, stored: 
                     for l in range(L):
                         s.u[j, l] = u[t, j, l]
             sample(s)
-            o = out[t]
+            o = out[t * kept]
             for i in range(n):
                 for l in range(L):
                     o.theta[i, l] = s.theta[i, l]
@@ -317,6 +332,10 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, stored: 
                 o.s[l] = s.s[l]
                 o.ok[l] = s.ok[l]
             stored(o, part(s))
+            if alone:
+                for i in range(n):
+                    for l in range(L):
+                        theta[t, i, l] = s.theta[i, l]
 
     return run
 
@@ -346,9 +365,8 @@ def _updates(driver: Callable[[Any], Driver], sample: Any) -> tuple[Driver, Driv
     return update, update_one
 
 
-def _check_shapes(tile: Array, T: int, y: Array, u: Array, known: Array) -> None:
-    m, L = tile["u"].shape[1:]
-    wanted = (T, L), (T, m if u.shape[1:2] != (0,) else 0, L), (1 if len(known) == 1 else T, max(3, known.shape[1]), L)
-    given = y.shape, u.shape, known.shape
-    if given != wanted:
+def _check_shapes(m: int, L: int, T: int, y: Array, u: Array, known: Array) -> None:
+    rows, columns, lanes = known.shape
+    if y.shape != (T, L) or u.shape not in ((T, m, L), (T, 0, L)) or rows not in (1, T) or columns < 3 or lanes != L:
+        given, wanted = (y.shape, u.shape, known.shape), ((T, L), (T, m, L), (T, max(3, columns), L))
         raise ValueError(f"run: y, u and known have shapes {given}, but this tile and {T} samples need {wanted}.")

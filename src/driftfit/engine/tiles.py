@@ -102,7 +102,7 @@ def _followed_by(dtype: np.dtype[Any], fields: Sequence[Any]) -> np.dtype[Any]:
 
 def as_compiled(tile: Array) -> Array:
     """The tile as compiled code takes it: of its open fields (`OPEN`) only the beginning."""
-    if OPEN[0] not in (tile.dtype.names or ()):
+    if OPEN[0] not in (tile.dtype.fields or ()):  # of the names all would be compared
         return tile
     return np.ndarray(tile.shape, _beginning(tile.dtype), tile)
 
@@ -140,11 +140,15 @@ def output_type(tile: Array, outputs: Sequence[str] = (), keep: str = "std", dty
     "theta" that alone. What is not common comes first: Numba takes a record that continues another one for the same
     type, with a warning.
     """
-    return _output_type(tile.dtype, tuple(outputs), keep, np.dtype(dtype))
+    return output_record(tile.dtype, tuple(outputs), keep, dtype)
 
 
 @lru_cache(maxsize=256)
-def _output_type(tile: np.dtype[Any], outputs: tuple[str, ...], keep: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
+def output_record(
+    tile: np.dtype[Any], outputs: tuple[str, ...], keep: str = "std", precision: Any = np.float64
+) -> np.dtype[Any]:
+    """The same, given the record of the tile."""
+    dtype = np.dtype(precision)
     n, L = tile["theta"].shape
     names = ("theta",) if keep == "theta" else (*outputs, "theta", "var", "y_hat", "e", "s", "ok")
     fields: list[Any] = [("P", dtype, (n, n, L))] if keep == "cov" else []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -145,7 +144,7 @@ def _begun(
             starts |= zip(lanes, carried(run, [programs[j] for j in lanes]), strict=True)
             if records.time is not None:
                 factors[first] = first_interval(run, records.time[first], records.labels)
-    return starts, replace(records, known=records.known.begun(factors)) if factors else records
+    return starts, records._replace(known=records.known.begun(factors)) if factors else records
 
 
 def _parts(key: Hashable) -> tuple[Hashable, ...]:

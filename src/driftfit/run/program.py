@@ -21,7 +21,7 @@ from driftfit.data.record import Record
 from driftfit.data.signals import check_ready
 from driftfit.engine.drivers import Drivers, TrackerSteps, drivers
 from driftfit.engine.kernel import Array, Driver
-from driftfit.engine.tiles import held_in, make_tile, output_type, repeat_tile
+from driftfit.engine.tiles import held_in, make_tile, output_record, output_type
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.collected_samples import COLLECTED, collecting
@@ -32,7 +32,7 @@ CHUNK = 1_000_000
 """Samples between two updates of the progress bar."""
 
 BLOCK = 4096
-"""Samples of a block of results of which only a part is kept."""
+"""Samples of a block of results that are kept in single precision."""
 
 MOST = 14
 """With more parameters than this loops over lanes are slower than single lanes (docs/design.md): the compiler does not
@@ -140,6 +140,11 @@ class Program:
         """The tile of one lane at its start."""
         return _started([self])
 
+    @cached_property
+    def _bytes(self) -> bytes:
+        """The bytes of that tile, which are copied faster than its fields. A single lane needs no alignment."""
+        return self._begin.tobytes()
+
     def schema(self, arrays: bool = False) -> dict[str, str]:
         """Columns and types of the results at a sample, which `to_table` writes after the signals, before any data.
 
@@ -180,7 +185,6 @@ class Program:
 
     def drivers(self, keep: str = "std", steps: TrackerSteps | None = None) -> Drivers:
         """The compiled loops; ``steps`` replace the tracker's own, to inspect the run."""
-        keep = "std" if keep == "theta" else keep
         found = self._drivers.get((keep, steps))
         if found is None:
             found = drivers(self.model.steps_for(self.steps), self.steps if steps is None else steps, keep)
@@ -204,7 +208,7 @@ class Program:
 
     def tile(self, state: State | None = None) -> Array:
         """A tile of one lane at its start, or with the given fields."""
-        tile = repeat_tile(self._begin, 1)
+        tile = np.ndarray((1,), self._begin.dtype, bytearray(self._bytes))
         if state is not None:
             put(tile, 0, state)
         return tile
@@ -215,7 +219,7 @@ class Program:
 
     def written(self, tile: Array, T: int, keep: str = "std", dtype: Any = np.float64) -> Array:
         """An array for the results of T samples of a tile."""
-        return np.empty(T, output_type(tile, self.tracker.outputs, keep, dtype))
+        return np.empty(T, output_record(tile.dtype, self.tracker.outputs, keep, dtype))
 
     def loop(self, tile: Array, T: int, keep: str, dtype: Any, collected: bool) -> tuple[Any, Array]:
         """(the routine that runs tiles like this one, an array for the results of T samples).
@@ -242,18 +246,36 @@ class Program:
         return out
 
     def fill(self, tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
-        """Run a tile over samples. What is not kept of their results is written to a block that stays in the cache."""
-        keep, _ = kept(out.dtype)
-        run, rows = self.drivers(keep).run, output_type(tile, self.tracker.outputs, "std" if keep == "theta" else keep)
+        """Run a tile over samples. Results that are kept in single precision are first written to a block that stays in
+        the cache.
+        """
+        keep, rows = _driven(tile.dtype, self.tracker.outputs, out.dtype)
+        run, alone = self.drivers(keep).run, out.dtype.names == ("theta",)
         if out.dtype == rows:
             run(tile, y, u, known, out)
             return
-        block = np.empty(min(BLOCK, len(out)), rows)
+        last = np.empty(1, rows)
+        if alone and out.dtype["theta"].base == np.float64:
+            run(tile, y, u, known, last, out["theta"])
+            return
+        block = np.empty(min(BLOCK, len(out)), rows["theta"] if alone else rows)
         for a in range(0, len(out), BLOCK):
             part = slice(a, min(a + BLOCK, len(out)))
             results = block[: part.stop - a]
-            run(tile, y[part], u[part], known if len(known) == 1 else known[part], results)
-            _copy(results, out[part])
+            given = y[part], u[part], known if len(known) == 1 else known[part]
+            if alone:
+                run(tile, *given, last, results)
+                out["theta"][part] = results
+            else:
+                run(tile, *given, results)
+                _copy(results, out[part])
+
+
+@lru_cache(maxsize=256)
+def _driven(tile: np.dtype[Any], outputs: tuple[str, ...], out: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:
+    """(what the driver of a tile keeps, the record that it writes), for results of which ``out`` is kept."""
+    keep = "cov" if kept(out)[0] == "cov" else "std"
+    return keep, output_record(tile, outputs, keep)
 
 
 def _copy(results: Array, out: Array) -> None:

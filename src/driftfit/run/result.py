@@ -147,13 +147,18 @@ class Track(Plain, Columns):
     def ended_with(self, name: str) -> Array | None:
         """One field of `state`, without the others; None if the state does not have it."""
         tile = self._lane.tile
-        return tile[name][0, ..., self._lane.lane] if name in (tile.dtype.names or ()) else None
+        return tile[name][0, ..., self._lane.lane] if name in (tile.dtype.fields or ()) else None
 
     @property
     def undetermined(self) -> Array:
         """Which parameters the record does not determine, (n,) bool: their std after the last sample is inf."""
+        return np.isinf(self.last_var)
+
+    @property
+    def last_var(self) -> Array:
+        """Variances of the parameters after the last sample, (n,): a view."""
         var: Array = self._lane.tile["var"][0, :, self._lane.lane]
-        return np.isinf(var)
+        return var
 
     def in_rows(self, name: str) -> Array:
         """A field of the driver's output; replays the record, once, if only theta was kept."""

@@ -43,17 +43,17 @@ def track(
     prob: Any = None,
 ) -> Result:  # fmt: skip
     """Track the parameters of a model; arguments as for `driftfit.track`, with time and others in a `Reading`."""
-    task = _task(model, tracker, y, u, reading, data, by, Kept(keep, dtype, prob))
-    if task.many and warm_start is not None and not isinstance(warm_start, Mapping | Fleet):
+    programs, records, failed, many = _task(model, tracker, y, u, reading, data, by, Kept(keep, dtype, prob))
+    if many and warm_start is not None and not isinstance(warm_start, Mapping | Fleet):
         raise ValueError(
             "warm_start: with by= or a grid pass the result of such a run, or a mapping from key to its end or bytes; "
             f"got {warm_start!r}."
         )
     run: Any
-    if task.many:
-        run = run_fleet(task.programs, task.records, keep, task.failed, warm_start, dtype)
+    if many:
+        run = run_fleet(programs, records, keep, failed, warm_start, dtype)
     else:
-        run = _one(task.programs, task.records, keep, warm_start, dtype)
+        run = _one(programs, records, keep, warm_start, dtype)
     warn_unlearned(run)
     warn_astray(run)
     return run  # type: ignore[no-any-return]
@@ -64,18 +64,18 @@ def parts(
     by: str | Sequence[str] | None = None, keep: str = "std", dtype: Any = "float64",
 ) -> Iterator[Fleet]:  # fmt: skip
     """`track` for many series, some of them at a time, so that their results need little memory."""
-    task = _task(model, tracker, y, u, reading, data, by, Kept(keep, dtype))
-    if not task.many:
+    programs, records, failed, many = _task(model, tracker, y, u, reading, data, by, Kept(keep, dtype))
+    if not many:
         raise ValueError("track: to= is for many series: give by=, or several trackers.")
-    programs, records, ny = task.programs, task.records, task.records.ny
+    ny = records.ny
     if not records.keys:
-        yield run_fleet(programs, records, keep, task.failed, dtype=dtype)
+        yield run_fleet(programs, records, keep, failed, dtype=dtype)
         return
     row = programs[0].written(programs[0].tile(), 0, keep, dtype).dtype.itemsize * ny
     upto = np.cumsum(records.length) * row // PART
     bounds = [0, *(np.flatnonzero(np.diff(upto)) + 1).tolist(), len(records.keys)]
     for k, (a, b) in enumerate(pairwise(bounds)):
-        yield run_fleet(programs[a * ny : b * ny], records.some(a, b), keep, {} if k else task.failed, dtype=dtype)
+        yield run_fleet(programs[a * ny : b * ny], records.some(a, b), keep, {} if k else failed, dtype=dtype)
 
 
 class Kept(NamedTuple):
@@ -86,19 +86,12 @@ class Kept(NamedTuple):
     prob: Any = None
 
 
-class Task(NamedTuple):
-    """Checked series, the program of each output of each of them, and units without data with the reasons."""
-
-    programs: list[Program]
-    records: Records
-    failed: Mapping[Hashable, str]
-    many: bool
-
-
 def _task(
     model: Model, tracker: Trackers, y: Any, u: Any, reading: Reading | None, data: Any, by: Any, kept: Kept
-) -> Task:
-    check_roles("track", model, tracker, several=True)
+) -> tuple[list[Program], Records, Mapping[Hashable, str], bool]:
+    """(the program of each output of each series, the checked series, units without data with the reasons, whether the
+    result is a fleet)."""
+    alone = check_roles("track", model, tracker, several=True)
     one_of("track", "keep", kept.keep, ("std", "cov", "theta"))
     if kept.dtype != "float64":  # the default, whose name NumPy would look up for a microsecond
         one_of("track", "dtype", np.dtype(kept.dtype).name, ("float64", "float32"))
@@ -107,14 +100,16 @@ def _task(
     reading = Reading() if reading is None else reading
     model, records, failed = records_of(model, y, u, reading, data, by)
     records = records.for_model(model, reading)
-    many = by is not None or _is_grid(tracker, records)
+    # several trackers, other than one for each output
+    grid = not alone and not (isinstance(tracker, Mapping) and bool(records.outputs))
+    many = grid or by is not None
     if kept.prob is not None and (many or len(model.outputs) > 1):
         raise ValueError("track: prob= is for one series and one tracker.")
-    if by is None and many:
+    if grid and by is None:
         records = records.repeated(tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker))))  # type: ignore[arg-type]
-    trackers = _per_series(tracker, records) or _any_of(tracker)
+    trackers = (_per_series(tracker, records) if grid else [tracker] * len(records.keys)) or _any_of(tracker)
     programs, records = _prepared(model, trackers, records, kept.keep, kept.prob)
-    return Task(programs, records, failed, many)
+    return programs, records, failed, many
 
 
 def _prepared(
@@ -122,16 +117,20 @@ def _prepared(
 ) -> tuple[list[Program], Records]:
     """(the program of each output of each series, the records as these take them)."""
     inputs = records.labels.u or records.u.shape[-1]
-    made = {id(one): programs_of(model, one, inputs) for one in {id(one): one for one in trackers}.values()}
-    programs = [program for one in trackers for program in made[id(one)]]
-    for one in programs if keep == "cov" else ():
-        if not one.tracker.covariance:
-            raise ValueError(f"track: {type(one.tracker).__name__} carries no covariance to keep; use keep='std'.")
-    for lane, one in enumerate(programs[: records.ny]):
-        if one.shared is None:
+    made: dict[int, tuple[Program, ...]] = {}
+    programs: list[Program] = []
+    for one in trackers:
+        if id(one) not in made:
+            made[id(one)] = programs_of(model, one, inputs)
+        programs += made[id(one)]
+    for program in programs if keep == "cov" else ():
+        if not program.tracker.covariance:
+            raise ValueError(f"track: {type(program.tracker).__name__} carries no covariance to keep; use keep='std'.")
+    for lane, program in enumerate(programs[: records.ny]):
+        if program.shared is None:
             y = records.y[:, lane] if records.outputs else records.y
-            (one.model if one.alone is None else one.alone.model).inspect(y, records.u)
-    records = records.for_trackers(programs[0].model, [one.tracker for one in programs], prob)
+            (program.model if program.alone is None else program.alone.model).inspect(y, records.u)
+    records = records.for_trackers(programs[0].model, (program.tracker for program in programs), prob)
     return programs, records.in_rows() if model.shared else records
 
 
@@ -139,11 +138,6 @@ def _any_of(tracker: Any) -> list[Any]:
     """Some tracker: a fleet without a series needs one for the names of its parameters."""
     some = tracker.values() if isinstance(tracker, Mapping) else [tracker] if isinstance(tracker, Tracker) else tracker
     return [next(iter(some))]
-
-
-def _is_grid(tracker: Trackers, records: Records) -> bool:
-    """Whether several trackers are given, other than one for each output."""
-    return not isinstance(tracker, Tracker) and not (isinstance(tracker, Mapping) and bool(records.outputs))
 
 
 def track_one(
@@ -185,10 +179,8 @@ def records_of(
 
 
 def _per_series(tracker: Trackers, records: Records) -> list[Any]:
-    """The tracker of each series: one for all its outputs, or one for each by its name."""
+    """The tracker of each series, of several that are given: one for all its outputs, or one for each by its name."""
     keys = records.keys
-    if not _is_grid(tracker, records):
-        return [tracker] * len(keys)
     if isinstance(tracker, Mapping):
         absent = [key for key in keys if key not in tracker]
         if absent:
@@ -213,13 +205,14 @@ def _one(programs: Sequence[Program], records: Records, keep: str, before: Run |
     out = program.run(tile, record, keep, dtype)
     if records.outputs:
         lanes = [Lane(out, tile, lane) for lane in range(records.ny)]
-        return Outputs(programs, replace(records, known=record.known), lanes, {}, dict(enumerate(starts)))
+        return Outputs(programs, records._replace(known=record.known), lanes, {}, dict(enumerate(starts)))
     return Track(program, record, Lane(out, tile), *starts)
 
 
 def warn_astray(run: Track | KeyedResults) -> None:
     """Warn of a model linearised at its estimates whose predictions are no longer of the size of the output."""
-    if not isinstance(run, Track) or not run.model.settling > 0.0 or len(run) < 2.0 * run.model.settling:
+    settling = run.model.settling
+    if not settling > 0.0 or not isinstance(run, Track) or len(run) < 2.0 * settling:
         return
     late = slice(len(run) // 2, None)
     e, y = run.innovation[late], run.record.y[late]
@@ -237,9 +230,11 @@ def warn_astray(run: Track | KeyedResults) -> None:
 def warn_unlearned(run: Track | KeyedResults) -> None:
     """Warn of the parameters that `Tracker.unlearned` marks."""
     if isinstance(run, Track):
-        ends = [(run.program, run.state)] if run.undetermined.any() else []
+        ends = [(run.program, run.state)] if np.inf in run.last_var.tolist() else []
     else:
         ends = list(run.undetermined())
+    if not ends:
+        return
     found, counts, owners = 0, Counter[str](), []
     for program, state in ends:
         missed = [name for name, left in zip(program.names, program.tracker.unlearned(state), strict=True) if left]

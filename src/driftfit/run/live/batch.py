@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -161,7 +160,7 @@ class Batched(ABC):
         records, taken = self._arrived(records, time)
         if resting == HELD:
             columns = np.broadcast_to(np.reshape(HELD, (3, 1)), (3, len(self.model.outputs)))
-            records = replace(records, known=Known(columns[None, :, 0] if records.y.ndim == 1 else columns[None]))
+            records = records._replace(known=Known(columns[None, :, 0] if records.y.ndim == 1 else columns[None]))
         out = np.empty(rows * len(records.y), self._row_type)
         if len(out):
             record = (records.in_rows() if self.model.shared else records).part(0)
@@ -198,13 +197,13 @@ class Batched(ABC):
             known = records.known if records.known.constant else Known(records.known.columns[taken])
             if len(axis):
                 self._last, known = instant(axis[-1]), known.changed(interval=gaps)
-            records = replace(
-                records, y=records.y[taken], u=records.u[taken], known=known, time=axis, length=np.array([len(axis)])
+            records = records._replace(
+                y=records.y[taken], u=records.u[taken], known=known, time=axis, length=np.array([len(axis)])
             )
         if self._gate is not None:
             alone = records.y.ndim == 1
             y, u = self._gate.sample(records.y[:, None] if alone else records.y, records.u)
-            records = replace(records, y=y.reshape(records.y.shape), u=u)
+            records = records._replace(y=y.reshape(records.y.shape), u=u)
         return records, taken
 
     def _drive(self, y: Array, u: Array, known: Array, out: Array, time: Any = None) -> None:
