@@ -10,7 +10,7 @@ from scipy.linalg import solveh_banded
 from driftfit import ARX, FLS, RLS, AugmentedFLS, HammersteinWiener, Kalman, Regression, track
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 from driftfit.smooth import exact
-from driftfit.smooth.parts.walk import Walk
+from driftfit.smooth.parts.walk import DRIFT, WEIGHT, Walk, Y, room_for_signals
 from driftfit.smooth.problem import walk_of
 
 SIZES = [(1, 1), (1, 2), (1, 40), (2, 2), (2, 7), (2, 40), (4, 7), (4, 40)]
@@ -28,7 +28,9 @@ def walk(phi, y, mu=1.0, weight=None, drift=1.0, theta0=0.0, p0=None):
     steps = np.zeros(L) + drift
     steps[0] = 0.0
     q = np.diag(np.zeros(n) + 1.0 / np.asarray(mu))
-    return Walk.of(phi, y, 1.0 if weight is None else weight, steps, q, np.zeros(n) + theta0, p0, None)
+    signals = room_for_signals(L, n)
+    signals[:, Y], signals[:, WEIGHT], signals[:, DRIFT] = y, 1.0 if weight is None else weight, steps
+    return Walk(np.ascontiguousarray(phi), signals, q, np.zeros(n) + theta0, p0, None)
 
 
 def close(a, b, tol):
@@ -199,12 +201,14 @@ def test_the_problem_is_collected_again_where_it_is_asked_for():
         assert np.array_equal(getattr(smoothed, name), getattr(kept, name), equal_nan=True), name
     assert all(np.array_equal(a, b) for a, b in zip(smoothed.walk, walk, strict=True) if isinstance(a, np.ndarray))
     assert np.array_equal(smoothed.weight, walk.weight)
+    fast = track(Regression(3), FLS(1e-4), y, phi)  # the fast method fails at the end
+    assert np.array_equal(fast.smooth().theta, exact.smooth(walk_of(fast)).theta)
     kept = run.smooth("cov")
     for t in (0, 60, 199):
         np.testing.assert_allclose(smoothed.cov(t), kept.cov(t), rtol=1e-9)
 
 
-@pytest.mark.parametrize(("n", "mu", "method"), [(1, 30.0, "fast"), (3, 30.0, "fast"), (3, 1e-6, "safe")])
+@pytest.mark.parametrize(("n", "mu", "method"), [(1, 30.0, "fast"), (3, 30.0, "fast"), (3, 1e-4, "safe")])
 def test_the_solution_may_take_the_place_of_the_problem(n, mu, method):
     """Also where the fast method finds out at the end that it failed, and the problem is needed again."""
     phi, y = record(200, n)

@@ -59,7 +59,7 @@ def blocks(run: Track) -> Iterator[tuple[int, Array]]:
     """
     program, T = run.program, len(run)
     tile = program.tile()
-    names = (*COLLECTED, "used_noise", "ok", "e", *run.tracker.smoother_fields)
+    names = (*run.tracker.smoother_fields, *COLLECTED, "used_noise", "ok", "e")
     block = np.empty(min(ROWS, T), output_type(tile, names, "own"))
     loop = program.drivers("own", collecting_for_smoother(program.steps)).run
     y, u, known = lanes_of(run.record)

@@ -86,8 +86,10 @@ class Smoothed:
     """
 
     def __init__(self, path: Path, data: Data, run: Track, walk: Walk | None = None, order_by: Any = None) -> None:
-        """``walk``: the problem, if it is not the one that `walk_of` collects from the run."""
+        """``walk``: the problem, if it is not the one that `walk_of` collects from the run; its path has rho and c."""
         self._walk = walk
+        if walk is not None:
+            self._fit = Fit(walk.weight, path.rho, path.c)
         self.run = run
         self._path, self._data = path, data
         self.order_by = order_by
@@ -174,7 +176,7 @@ class Smoothed:
         """
         found = self.run.ended_with("common")
         common = 0.0 if found is None else float(found)
-        undecided = self.r * self._path.spread / self._data.used if common > 0.0 else 0.0
+        undecided = self.r * self._path.spread / max(self._data.used, 1) if common > 0.0 else 0.0
         return 1.0 + len(self.run.names) * common / undecided if undecided > 0.0 else 1.0
 
     @property

@@ -7,7 +7,7 @@ theta_0 ~ N(theta0, r p0),           p0 = None: nothing is known
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,15 +51,6 @@ class Walk(NamedTuple):
     """(K, T, n): paths under other drifts that are possible too; empty if the drift is known."""
     belief: Array = NONE
     """(K,): their probabilities."""
-
-    @classmethod
-    def of(
-        cls, phi: Array, y: Any, weight: Any, drift: Any, q: Array, theta0: Array, p0: Array | None, r: float | None
-    ) -> Self:
-        """A problem with separate signals, each (T,) or a number."""
-        signals = room_for_signals(*phi.shape)
-        signals[:, Y], signals[:, WEIGHT], signals[:, DRIFT] = y, weight, drift
-        return cls(np.ascontiguousarray(phi), signals, q, theta0, p0, r)
 
     @property
     def y(self) -> Array:
