@@ -26,7 +26,7 @@ Y, WEIGHT, DRIFT = 0, 1, 2
 class Walk(NamedTuple):
     """T samples of a regression whose n parameters are random walks; q and p0 are relative to the noise variance.
 
-    ``phi`` and ``signals`` together are as large as a path and its variances, which may take their place
+    ``phi`` and ``signals`` have room for a path and its variances, which may take their place
     (`driftfit.smooth.exact.smooth`).
     """
 
