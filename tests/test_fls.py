@@ -51,8 +51,8 @@ def test_filter_is_the_last_point_of_the_smoother_of_every_prefix(mu):
     phi[:3] = np.outer([1.0, -2.0, 0.5], phi[0])
     run = track(Regression(2), FLS(mu, theta0=[0.5, 2.0]), y, phi)
     for k in range(1, 31):
-        drift = np.append(0.0, np.ones(k - 1))
-        problem = Walk(phi[:k], y[:k], np.ones(k), drift, np.eye(2) / mu, np.array([0.5, 2.0]), None, None)
+        signals = np.column_stack([y[:k], np.ones(k), np.append(0.0, np.ones(k - 1))])
+        problem = Walk(phi[:k], signals, np.eye(2) / mu, np.array([0.5, 2.0]), None, None)
         np.testing.assert_allclose(run.theta[k - 1], exact.smooth(problem).theta[-1], rtol=1e-10, atol=1e-10)
 
 

@@ -8,6 +8,7 @@ from driftfit.engine.kernel import exp, log
 from driftfit.engine.simd import (
     WIDTH,
     below,
+    entry,
     equal,
     exp_of,
     fill,
@@ -17,10 +18,14 @@ from driftfit.engine.simd import (
     log_of,
     lower,
     only,
+    pair,
+    put_pair,
     reaches,
     row_sums,
     store,
     sum_of,
+    times,
+    two,
 )
 from driftfit.trackers.bank.reducing.merge import digamma
 
@@ -76,6 +81,22 @@ def test_the_operations_on_vectors():
     np.testing.assert_array_equal(out[:7], expected)
     np.testing.assert_allclose(out[7], x[1:, :WIDTH].sum(1), rtol=1e-14)
     np.testing.assert_allclose(out[8], a.sum(), rtol=1e-14)
+
+
+@njit(error_model="numpy")
+def in_pairs(x, out):
+    for k in range(x.shape[0]):
+        both = times(pair(x, k), two(2.0, -1.0))
+        put_pair(out, k, higher(only(both, pair(x, k)), two(0.5, entry(both, 0))))
+
+
+def test_pairs_are_the_entries_of_the_last_axis():
+    x = RNG.normal(size=(6, 2))
+    out = np.zeros((2, 3, 2))
+    in_pairs(x, out)
+    both = x * [2.0, -1.0]
+    least = np.column_stack([np.full(6, 0.5), both[:, 0]])
+    np.testing.assert_array_equal(out.reshape(6, 2), np.maximum(np.where(x > 0.0, both, 0.0), least))
 
 
 def test_a_part_of_a_compiled_routine_says_that_it_cannot_be_called():

@@ -87,11 +87,12 @@ class Track(result.Track, Exported, public=True):
     ) -> Smoothed | EventSmoothed:
         """Every theta_t estimated from the whole record, past and future: the exact fixed-interval smoother.
 
-        The regressors that the filter used are held fixed. keep="cov" also stores the covariances, n * n numbers for
-        each sample and each pair of neighbours. ``order_by`` (T,): theta changes with this variable instead of with
-        time; the samples are sorted by it, smoothed in that order, and returned in time order. ``undetermined``: the
-        value of parameters that the record does not determine, whose std is inf: "min_norm", the solution nearest to
-        theta0; "nan"; or "raise". A `Bank` is smoothed given its events
+        The regressors that the filter used are held fixed. keep="fit" also stores what residuals and leverages are
+        made of; otherwise the problem is solved again when they are read. keep="cov" also stores the covariances,
+        n * n numbers for each sample and each pair of neighbours. ``order_by`` (T,): theta changes with this variable
+        instead of with time; the samples are sorted by it, smoothed in that order, and returned in time order.
+        ``undetermined``: the value of parameters that the record does not determine, whose std is inf: "min_norm", the
+        solution nearest to theta0; "nan"; or "raise". A `Bank` is smoothed given its events
         (`driftfit.trackers.bank.results.decided_path.EventSmoothed`). ValueError for other trackers that do not
         describe a random walk in Gaussian noise. Of outputs that share one theta, theta is (T, n) and residuals are
         (T, ny).

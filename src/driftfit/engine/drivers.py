@@ -223,10 +223,11 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     """Build the drivers of a (model, tracker) pair.
 
     ``run(tile, y, u, known, out)`` takes y (T, L), u (T, m, L) and `known` (T, 3, L), or one row of it that holds for
-    every sample (extra columns go to ``read_extra``), and fills out (T,) of `output_type`; where theta (T, n, L) is
-    given too, it fills that, and the one row of out holds the last sample. ``update(tile, y, u)`` does
-    one sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u (`Drivers.updater`); both
-    take what is known from the fields ``interval``, ``noise`` and ``drift`` of the record and return (y_hat, e, s, ok).
+    every sample (extra columns go to ``read_extra``), and fills out (T,) of `output_type`, with keep="own" only with
+    what the tracker's ``store`` writes; where theta (T, n, L) is given too, it fills that, and the one row of out holds
+    the last sample. ``update(tile, y, u)`` does one sample of a tile of one lane with u (m,), ``update_one`` the same
+    for a single float u (`Drivers.updater`); both take what is known from the fields ``interval``, ``noise`` and
+    ``drift`` of the record and return (y_hat, e, s, ok).
     """
     ready = model.ready
     ready(1)
@@ -238,7 +239,8 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     advance = _advance(tracker)
     sample = _sample(model, tracker.note, outlined(advance) if tracker.outlined else advance, part)
     keep_more = covariance if keep == "cov" else nothing_more
-    run = _run(driver, sample, tracker.read_extra, _stored(tracker.store, keep_more), part)
+    common = nothing_common if keep == "own" else write_common
+    run = _run(driver, sample, tracker.read_extra, _written(common, tracker.store, keep_more, part), part)
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE) -> None:
         # nothing looks at types and bounds after this; contiguous, because every layout would be compiled separately
@@ -258,16 +260,39 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     return Drivers(checked, *_updates(driver, sample))
 
 
-def _stored(store: Any, keep_more: Any) -> Any:
-    """What a tracker and the caller want to keep of a sample."""
+@kernel
+def write_common(o: State, s: State) -> None:
+    """The results of every tracker."""
+    n, L = s.theta.shape
+    for i in range(n):
+        for l in range(L):
+            o.theta[i, l] = s.theta[i, l]
+    for i in range(n):
+        for l in range(L):
+            o.var[i, l] = s.var[i, l]
+    for l in range(L):
+        o.y_hat[l] = s.y_hat[l]
+        o.e[l] = s.e[l]
+        o.s[l] = s.s[l]
+        o.ok[l] = s.ok[l]
+
+
+@kernel
+def nothing_common(o: State, s: State) -> None:
+    """Only the tracker's own results are written."""
+
+
+def _written(common: Any, store: Any, keep_more: Any, part: Any) -> Any:
+    """What is kept of a sample."""
 
     @kernel
-    def stored(o: State, s: State) -> None:
+    def write(o: State, s: State) -> None:
+        common(o, s)
         for l in range(s.theta.shape[1]):
-            store(o, s, l)
-            keep_more(o, s, l)
+            store(o, part(s), l)
+            keep_more(o, part(s), l)
 
-    return stored
+    return write
 
 
 def _sample(model: ModelSteps, note: Step, advance: Any, part: Any) -> Any:
@@ -293,13 +318,13 @@ def _sample(model: ModelSteps, note: Step, advance: Any, part: Any) -> Any:
     return sample
 
 
-def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, stored: Any, part: Any) -> Driver:
+def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: Any, part: Any) -> Driver:
     """The loop over the samples of a record."""
 
     @driver
     def run(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array) -> None:
         s = tile[0]
-        n, L = s.theta.shape
+        L = s.theta.shape[1]
         given = u.shape[1] > 0
         changing = 1 if known.shape[0] > 1 else 0
         alone = theta.shape[0] > 0
@@ -319,21 +344,9 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, stored: 
                     for l in range(L):
                         s.u[j, l] = u[t, j, l]
             sample(s)
-            o = out[t * kept]
-            for i in range(n):
-                for l in range(L):
-                    o.theta[i, l] = s.theta[i, l]
-            for i in range(n):
-                for l in range(L):
-                    o.var[i, l] = s.var[i, l]
-            for l in range(L):
-                o.y_hat[l] = s.y_hat[l]
-                o.e[l] = s.e[l]
-                o.s[l] = s.s[l]
-                o.ok[l] = s.ok[l]
-            stored(o, part(s))
+            write(out[t * kept], s)
             if alone:
-                for i in range(n):
+                for i in range(s.theta.shape[0]):
                     for l in range(L):
                         theta[t, i, l] = s.theta[i, l]
 

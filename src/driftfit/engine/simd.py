@@ -1,4 +1,4 @@
-"""SIMD vectors of eight numbers, or four, for compiled routines that work on short rows.
+"""SIMD vectors of eight numbers, or four, or two, for compiled routines that work on short rows.
 
 A compiler that vectorises a loop of unknown length puts checks before it and a remainder after it, which cost more than
 the loop where rows have a dozen entries. A loop over vectors has neither:
@@ -23,7 +23,7 @@ from driftfit.engine.numba_internals import ir, named_intrinsic
 WIDTH = 8
 _I64 = ir.IntType(64)
 _VECTOR8, _WHOLE = ir.VectorType(ir.DoubleType(), WIDTH), ir.VectorType(_I64, WIDTH)
-_VECTOR4 = ir.VectorType(ir.DoubleType(), 4)
+_VECTOR4, _VECTOR2 = (ir.VectorType(ir.DoubleType(), count) for count in (4, 2))
 
 
 class Vector8(types.Type):
@@ -40,6 +40,13 @@ class Vector4(types.Type):
         super().__init__(name="driftfit.Vector4")
 
 
+class Vector2(types.Type):
+    """A vector of two floats: two chains of operations that are the same, with arrays whose last axis is the chain."""
+
+    def __init__(self) -> None:
+        super().__init__(name="driftfit.Vector2")
+
+
 @register_model(Vector8)
 class _Model8(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
@@ -52,7 +59,13 @@ class _Model4(models.PrimitiveModel):
         super().__init__(manager, kind, _VECTOR4)
 
 
-vector8, vector4 = Vector8(), Vector4()
+@register_model(Vector2)
+class _Model2(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, _VECTOR2)
+
+
+vector8, vector4, vector2 = Vector8(), Vector4(), Vector2()
 
 
 def _named(name: str, build: Any) -> Any:
@@ -105,6 +118,45 @@ def _fill_four(context: Any, value: Any) -> Any:
     return vector4(types.float64), build
 
 
+def _pair_place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
+    """The address of pair ``at`` of an array, counted over all its axes but the last."""
+    inside = context.make_array(kind)(context, builder, array)
+    first = builder.gep(inside.data, [builder.shl(at, ir.Constant(_I64, 1))])
+    return builder.bitcast(first, _VECTOR2.as_pointer())
+
+
+def _pair(context: Any, array: Any, at: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return builder.load(_pair_place(context, builder, signature.args[0], *given), align=8)
+
+    return vector2(array, types.intp), build
+
+
+def _put_pair(context: Any, array: Any, at: Any, value: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        builder.store(given[2], _pair_place(context, builder, signature.args[0], *given[:2]), align=8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, vector2), build
+
+
+def _two_of(context: Any, first: Any, second: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        made = ir.Constant(_VECTOR2, ir.Undefined)
+        for k in range(2):
+            made = builder.insert_element(made, given[k], ir.Constant(ir.IntType(32), k))
+        return made
+
+    return vector2(types.float64, types.float64), build
+
+
+def _one_of_two(context: Any, pair: Any, k: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return builder.extract_element(given[0], builder.trunc(given[1], ir.IntType(32)))
+
+    return types.float64(vector2, types.intp), build
+
+
 def _gather(context: Any, array: Any, row: Any, order: Any, k: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         where = context.make_array(signature.args[2])(context, builder, given[2])
@@ -152,17 +204,17 @@ def _pick(sign: str) -> Any:
         def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
             return builder.select(builder.fcmp_ordered(sign, *given), *given)
 
-        return vector8(vector8, vector8), build
+        return a(a, a), build
 
     return typed
 
 
 def _only(context: Any, a: Any, b: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        zero = ir.Constant(_VECTOR8, [0.0] * WIDTH)
+        zero = ir.Constant(given[0].type, [0.0] * given[0].type.count)
         return builder.select(builder.fcmp_ordered(">", given[1], zero), given[0], zero)
 
-    return vector8(vector8, vector8), build
+    return a(a, a), build
 
 
 def _power_of_two(context: Any, a: Any) -> Any:
@@ -279,6 +331,10 @@ reached = _named("reached", _reached)
 """How many entries of the first are at least those of the second."""
 load_four, fill_four = _named("load_four", _load_four), _named("fill_four", _fill_four)
 """The same for vectors of four."""
+pair, put_pair = _named("pair", _pair), _named("put_pair", _put_pair)
+"""Pair ``at`` of an array whose last axis is 2, counted over its other axes; and write it there."""
+two, entry = _named("two", _two_of), _named("entry", _one_of_two)
+"""A pair of two numbers; and entry k of a pair."""
 sum_of = _named("sum_of", _sum)
 """The sum of the eight entries, added in pairs."""
 lower, higher = (_named(name, _pick(sign)) for name, sign in (("lower", "<"), ("higher", ">")))

@@ -137,8 +137,8 @@ def output_type(tile: Array, outputs: Sequence[str] = (), keep: str = "std", dty
     """The record that is kept of one sample of a tile; in double precision, and not of theta alone, a driver writes it.
 
     P when ``keep`` is "cov"; the fields of the tile that ``outputs`` names; then theta, var, y_hat, e, s, ok; of
-    "theta" that alone. What is not common comes first: Numba takes a record that continues another one for the same
-    type, with a warning.
+    "theta" that alone, and of "own" none of these. What is not common comes first: Numba takes a record that continues
+    another one for the same type, with a warning.
     """
     return output_record(tile.dtype, tuple(outputs), keep, dtype)
 
@@ -150,7 +150,8 @@ def output_record(
     """The same, given the record of the tile."""
     dtype = np.dtype(precision)
     n, L = tile["theta"].shape
-    names = ("theta",) if keep == "theta" else (*outputs, "theta", "var", "y_hat", "e", "s", "ok")
+    common = {"theta": ("theta",), "own": ()}.get(keep, ("theta", "var", "y_hat", "e", "s", "ok"))
+    names = common if keep == "theta" else (*outputs, *common)
     fields: list[Any] = [("P", dtype, (n, n, L))] if keep == "cov" else []
     for name in names:
         own = tile[name].base

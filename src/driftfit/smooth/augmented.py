@@ -28,7 +28,7 @@ from driftfit.engine.kernel import Array, Driver
 from driftfit.engine.settings import numbers, one_of, vector, whole
 from driftfit.run.result import Track
 from driftfit.smooth.exact import smooth
-from driftfit.smooth.parts.walk import constants
+from driftfit.smooth.parts.walk import WEIGHT, Y, constants
 from driftfit.smooth.problem import walk_of
 from driftfit.trackers.augmented_fls import AugmentedFLS
 
@@ -101,16 +101,14 @@ def augmented(
         if power and lam**l < tol:
             return AugmentedPath(theta, l - 1, change)
         w = lam**l if power else lam
-        change = sweep(theta, before, walk.phi, walk.y, walk.weight, mu, w, printed == "printed")
+        change = sweep(theta, before, walk.phi, walk.signals, mu, w, printed == "printed")
         if not power and change < tol:
             break
     return AugmentedPath(theta, l, change)
 
 
 @Driver
-def sweep(
-    theta: Array, before: Array, phi: Array, y: Array, weight: Array, mu: float, w: float, printed: bool
-) -> float:
+def sweep(theta: Array, before: Array, phi: Array, signals: Array, mu: float, w: float, printed: bool) -> float:
     """One sweep in place; returns the largest change."""
     T, n = phi.shape
     b = np.empty(n)
@@ -126,11 +124,11 @@ def sweep(
             else:
                 b[i] = w * past[i] + (1.0 - w) * theta[t + 1, i]
         price = mu if end and not printed else 2.0 * mu
-        error, power = y[t], 0.0
+        error, power, weight = signals[t, Y], 0.0, signals[t, WEIGHT]
         for i in range(n):
             error -= phi[t, i] * b[i]
             power += phi[t, i] * phi[t, i]
-        gain = weight[t] * error / (price + weight[t] * power)
+        gain = weight * error / (price + weight * power)
         for i in range(n):
             new = b[i] + gain * phi[t, i]
             if printed and t == T - 1:

@@ -22,6 +22,8 @@ Departure: the rule for undetermined directions.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from driftfit.smooth.parts import elimination, slopes, two_filters
@@ -30,16 +32,23 @@ from driftfit.smooth.parts.walk import Path, Walk
 from driftfit.trackers.parts.information import triangular_root
 
 
-def smooth(walk: Walk, keep: str = "std") -> Path:
-    """Solve the problem; keep="cov" adds the covariances of every sample and of neighbouring samples."""
+def smooth(walk: Walk, keep: str = "fit", again: Callable[[], Walk] | None = None) -> Path:
+    """Solve the problem.
+
+    The path has theta and its variances with keep="std", rho and c too with "fit", and the covariances of every sample
+    and of neighbouring samples too with "cov"; the safe method adds rho and c anyway. With ``again``, phi and signals
+    of the problem may be overwritten by the solution, and ``again()`` gives the problem a second time if the fast
+    method fails.
+    """
     if len(walk.trend):
         return spread(walk, slopes.smooth(walk, keep))
     n = walk.phi.shape[1]
-    scale = column_scale(walk.phi, walk.weight)
-    rank, unseen = ranks(walk.phi, walk.weight, scale)
-    simple = keep == "std" and walk.p0 is None and rank[-1] == n and np.array_equal(walk.q, np.diag(np.diag(walk.q)))
-    found = elimination.smooth(walk, scale) if simple else None
+    scale = column_scale(walk.phi, walk.signals)
+    rank, unseen = ranks(walk.phi, walk.signals, scale)
+    simple = keep != "cov" and walk.p0 is None and rank[-1] == n and np.array_equal(walk.q, np.diag(np.diag(walk.q)))
+    found = elimination.smooth(walk, scale, keep, again is not None) if simple else None
     if found is None:
+        walk = again() if simple and again is not None else walk
         G = triangular_root(walk.q * np.outer(scale, scale))
         found = two_filters.smooth(walk, scale, G, two_filters.start(walk, scale, unseen), keep)
     return spread(walk, found)._replace(rank=rank)

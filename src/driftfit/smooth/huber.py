@@ -25,9 +25,9 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
 from driftfit.run.result import Track
 from driftfit.smooth import exact
-from driftfit.smooth.parts.walk import Path, Walk
+from driftfit.smooth.parts.walk import WEIGHT, Path, Walk
 from driftfit.smooth.problem import walk_of
-from driftfit.smooth.smoothed import Smoothed
+from driftfit.smooth.smoothed import Data, Smoothed
 
 EFFICIENT = 1.345
 """delta in standard deviations: 95 % efficiency on Gaussian residuals."""
@@ -72,7 +72,7 @@ def huber(run: Track, delta: float | None = None, tol: float = 1e-12, max_steps:
     walk = walk_of(run)
     path = exact.smooth(walk)
     if delta is None:
-        delta = EFFICIENT * spread_of(Smoothed(walk, path, run))
+        delta = EFFICIENT * spread_of(Smoothed(path, Data.of(walk), run, walk))
     elif delta != np.inf:
         delta = numbers("huber", "delta", delta, ndim=0, low=0.0, strict=True)
     root = np.sqrt(walk.weight)
@@ -80,15 +80,15 @@ def huber(run: Track, delta: float | None = None, tol: float = 1e-12, max_steps:
     for _ in range(max_steps):
         size = root * np.abs(walk.residual(path.theta))
         held = np.divide(delta, size, out=np.ones_like(size), where=size > delta)
-        dynamic = path.cost - float(np.nansum((path.rho * path.c) ** 2))
+        dynamic = path.cost - path.measurement_cost
         costs.append(2.0 * float(np.sum(scipy.special.huber(delta, size))) + dynamic)
         if costs[-2] - costs[-1] <= tol * costs[-1]:
             break
-        weighted = walk._replace(weight=walk.weight * held)
+        weighted = walk.changed(WEIGHT, walk.weight * held)
         path = exact.smooth(weighted)
     return Huber(
-        Smoothed(weighted, path, run), delta, np.where(walk.weight > 0.0, held, 0.0), np.array(costs[1:]),
-        certificate(walk, path, delta),
+        Smoothed(path, Data.of(weighted), run, weighted), delta, np.where(walk.weight > 0.0, held, 0.0),
+        np.array(costs[1:]), certificate(walk, path, delta),
     )  # fmt: skip
 
 

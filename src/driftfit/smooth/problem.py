@@ -6,19 +6,20 @@ once to collect them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.kernel import Array, Driver, State, kernel
 from driftfit.engine.tiles import output_type
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.program import BLOCK, lanes_of, put_fields
+from driftfit.run.program import lanes_of, put_fields
 from driftfit.run.result import Track
 from driftfit.smooth.parts.pooled_drift import average_drift
-from driftfit.smooth.parts.walk import NONE, Walk, free
+from driftfit.smooth.parts.walk import DRIFT, NONE, WEIGHT, Walk, Y, free, room_for_signals
 from driftfit.trackers.base import RandomWalk
 
 
@@ -40,33 +41,74 @@ def collecting_for_smoother(steps: TrackerSteps) -> TrackerSteps:
         collect(o, s, l)
         store(o, s, l)
         o.used_noise[l] = s.used_noise[l]
+        o.ok[l] = s.ok[l]
+        o.e[l] = s.e[l]
 
     return steps._replace(store=collect_all, note=note_noise)
 
 
-USED = ("phi", "y", "dt", "ok", "used_noise")
-"""Fields that every smoother needs."""
+ROWS = 1024
+"""Samples of a block of a replay."""
 
 
-def replay(run: Track, names: Sequence[str] = (*USED, "valid", "e")) -> dict[str, Array]:
-    """Run the tracker over its record again and return the samples as it received them, field by field, (T, .., 1).
+def blocks(run: Track) -> Iterator[tuple[int, Array]]:
+    """Run the tracker over its record again; (first sample, samples as the tracker received them) of each block.
 
-    The fields are phi, y, dt, valid, ok, e, used_noise (the factor of the noise variance), and the tracker's
-    ``smoother_fields``.
+    The fields are phi, y, dt, valid, used_noise (the factor of the noise variance), ok, e, and the tracker's
+    ``smoother_fields``. A block stays in the cache, and the next one takes its place.
     """
     program, T = run.program, len(run)
     tile = program.tile()
-    own = (*COLLECTED, "used_noise", *run.tracker.smoother_fields)
-    block = np.empty(min(BLOCK, T), output_type(tile, own))
-    wanted = (*names, *run.tracker.smoother_fields)
-    seen = {name: np.empty((T, *block[name].shape[1:]), block[name].dtype) for name in wanted}
-    loop = program.drivers(steps=collecting_for_smoother(program.steps)).run
-    for a in range(0, T, BLOCK):  # a block that stays in the cache; only some of its fields are kept
-        part = slice(a, min(a + BLOCK, T))
+    names = (*run.tracker.smoother_fields, *COLLECTED, "used_noise", "ok", "e")
+    block = np.empty(min(ROWS, T), output_type(tile, names, "own"))
+    loop = program.drivers("own", collecting_for_smoother(program.steps)).run
+    y, u, known = lanes_of(run.record)
+    for a in range(0, T, ROWS):
+        part = slice(a, min(a + ROWS, T))
         rows = block[: part.stop - a]
-        loop(tile, *lanes_of(run.record.part(part)), rows)
-        put_fields(rows, seen, a)
+        loop(tile, y[part], u[part], known if len(known) == 1 else known[part], rows)
+        yield a, rows
+
+
+def put_in_place(rows: Array, into: dict[str, Array], names: Sequence[str], first: int, T: int) -> None:
+    """Copy fields of a block to arrays (T, ..), which are made for the first one."""
+    for name in () if into else names:
+        into[name] = np.empty((T, *rows[name].shape[1:]), rows[name].dtype)
+    put_fields(rows, into, first)
+
+
+def replay(run: Track) -> dict[str, Array]:
+    """The samples of a run as its tracker received them, field by field, (T, .., 1); see `blocks`."""
+    seen: dict[str, Array] = {}
+    for first, rows in blocks(run):
+        put_in_place(rows, seen, rows.dtype.names or (), first, len(run))
     return seen
+
+
+def collected(run: Track) -> tuple[Array, Array, dict[str, Array]]:
+    """phi and signals of a run for a `Walk`, and, if the tracker has ``smoother_fields``, these and e."""
+    own = run.tracker.smoother_fields
+    phi, signals = np.empty((len(run), run.model.n)), room_for_signals(len(run), run.model.n)
+    seen: dict[str, Array] = {}
+    for first, rows in blocks(run):
+        fields: Mapping[str, Any] = rows.dtype.fields or {}
+        places = [fields[name][1] // 8 for name in ("phi", "y", "used_noise", "ok", "dt")]
+        take(rows.view(np.float64).reshape(len(rows), -1), *places, phi[first:], signals[first:])
+        put_in_place(rows, seen, ("e", *own) if own else (), first, len(run))
+    return phi, signals, {name: values[..., 0] for name, values in seen.items()}
+
+
+@Driver
+def take(
+    rows: Array, at_phi: int, at_y: int, at_noise: int, at_ok: int, at_dt: int, phi: Array, signals: Array
+) -> None:
+    """Copy columns of a block to phi and signals."""
+    for t in range(rows.shape[0]):
+        for i in range(phi.shape[1]):
+            phi[t, i] = rows[t, at_phi + i]
+        signals[t, Y] = rows[t, at_y]
+        signals[t, WEIGHT] = 1.0 / rows[t, at_noise] if rows[t, at_ok] > 0.0 else 0.0
+        signals[t, DRIFT] = rows[t, at_dt]
 
 
 def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
@@ -78,23 +120,23 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
     drift_root = run.known.extra if own and run.known.extra.size else NONE
     if prior is None:
         prior = free(run.model.n) if tracker.smoother_fields else tracker.random_walk(run.model)
-    seen = replay(run, (*USED, "e") if tracker.smoother_fields else USED)
-    dt, ok = seen["dt"][:, 0], seen["ok"][:, 0] > 0.0
-    weight = np.divide(1.0, seen["used_noise"][:, 0], out=np.zeros(len(ok)), where=ok)
-    drift = dt * run.known.drift
-    phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0]
-    fields = {name: seen[name][..., 0] for name in tracker.smoother_fields} or run.state
-    weight[tracker.left_out(fields, phi, y, ok)] = 0.0
-    if own and tracker.smoother_fields:
-        q, r_of = tracker.estimated_variances(run.model, fields, seen["e"][:, 0], drift)
-        phi, y = tracker.regression(fields, phi, y)
-        drift_root, weight, time, drift = np.sqrt(q), weight / r_of, drift, np.ones(len(drift))
+    phi, signals, fields = collected(run)
+    weight, drift = signals[:, WEIGHT], signals[:, DRIFT]
+    weight[tracker.left_out(fields.__getitem__ if fields else run.ended_with, phi, signals[:, Y], weight)] = 0.0
+    dt = drift.copy() if prior.slopes or fields else NONE
+    first = int(np.argmax(drift > 0.0)) + 1
+    drift *= run.known.drift
+    if own and fields:
+        q, r_of = tracker.estimated_variances(run.model, fields, fields["e"], drift)
+        phi, signals[:, Y] = tracker.regression(fields, phi, signals[:, Y])
+        time, drift_root = drift.copy(), np.sqrt(q)
+        weight /= r_of
+        drift[:] = 1.0
     trend = dt if prior.slopes else NONE
-    moving = dt * np.minimum(run.known.drift, 1.0)
+    moving = dt * np.minimum(run.known.drift, 1.0) if len(dt) else NONE
     if prior.at_first_sample or prior.p0 is None:
-        first = int(np.argmax(dt > 0.0)) + 1
         drift[:first], trend[:first], moving[:first] = 0.0, 0.0, 0.0
     r = 1.0 if prior.r is None else prior.r
     p0 = None if prior.p0 is None else prior.p0 / r
-    walk = Walk(phi, y, weight, drift, prior.q / r, prior.theta0, p0, prior.r, drift_root, trend)
-    return average_drift(walk, time, moving) if own and tracker.smoother_fields else walk
+    walk = Walk(phi, signals, prior.q / r, prior.theta0, p0, prior.r, drift_root, trend)
+    return average_drift(walk, time, moving) if own and fields else walk

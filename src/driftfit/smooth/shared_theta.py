@@ -33,9 +33,10 @@ class SmoothedShared(Smoothed):
     def __init__(self, rows: Smoothed, run: Track) -> None:
         self.rows, self._ny = rows, len(run.outputs)
         self.run: Any = run
-        self._walk, self._path, self.order_by, self.weight = rows._walk, rows._path, None, rows.weight
+        self._walk, self._path, self._data, self.order_by = rows._walk, rows._path, rows._data, None
         self.theta, self.rank = self._last(rows.theta), self._last(rows.rank)
         self.cost, self.method, self.r = rows.cost, rows.method, rows.r
+        self.measurement_cost = rows.measurement_cost
 
     @property
     def walk(self) -> Walk:
@@ -83,9 +84,9 @@ class SmoothedShared(Smoothed):
     def alone(self) -> int:
         return self.rows.alone
 
-    @cached_property
-    def measurement_cost(self) -> float:
-        return self.rows.measurement_cost
+    @property
+    def weight(self) -> Array:
+        return self.rows.weight
 
     def cov(self, t: int) -> Array:
         """Covariance (n, n) of theta at sample t; entries of undetermined parameters are inf on the diagonal."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from functools import cached_property
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
@@ -22,6 +23,31 @@ ALONE = 1e-12
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+class Data(NamedTuple):
+    """What is known of a problem before its solution takes its place."""
+
+    used: int
+    """Number of samples with a positive weight."""
+    power: float
+    """Sum of weight y^2."""
+    r: float | None
+    diffuse: bool
+
+    @classmethod
+    def of(cls, walk: Walk) -> Self:
+        """The data of a problem."""
+        power = float(np.einsum("t,t,t->", walk.weight, walk.y, walk.y)) if walk.r is None else np.nan
+        return cls(walk.used, power, walk.r, walk.p0 is None)
+
+
+class Fit(NamedTuple):
+    """What residuals and leverages are made of, each (T,)."""
+
+    weight: Array
+    rho: Array
+    c: Array
 
 
 class Smoothed:
@@ -53,37 +79,49 @@ class Smoothed:
     weight : (T,)
         Weights of the samples in it; 0 for those that were not used.
 
+    Only theta, std and rank are kept. The first of residual, loo, leverage, press, alone and weight that is read
+    solves the problem again, and keeps (T,) numbers for all of them; keep="fit" of `Track.smooth` has them at once.
+
     Bands are valid under the random-walk model and its drift; they do not account for a wrong drift.
     """
 
-    def __init__(self, walk: Walk, path: Path, run: Track, order_by: Any = None) -> None:
-        self._walk: Walk | None = walk
-        self.weight = walk.weight
+    def __init__(self, path: Path, data: Data, run: Track, walk: Walk | None = None, order_by: Any = None) -> None:
+        """``walk``: the problem, if it is not the one that `walk_of` collects from the run; its path has rho and c."""
+        self._walk = walk
+        if walk is not None:
+            self._fit = Fit(walk.weight, path.rho, path.c)
         self.run = run
-        self._path = path
+        self._path, self._data = path, data
         self.order_by = order_by
         self.theta = path.theta
         self.rank = path.rank
-        self.cost = path.cost
+        self.cost, self.measurement_cost = path.cost, path.measurement_cost
         self.method = path.method
-        self.r = noise_variance(walk, path) if walk.r is None else walk.r
+        self.r = noise_variance(data, path) if data.r is None else data.r
 
     @classmethod
     def of(cls, run: Track, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Smoothed:
         """Smooth a run."""
         if run.start is not None:
             raise ValueError("smooth: a run with a warm start cannot be smoothed; track the whole record.")
-        one_of("smooth", "keep", keep, ("std", "cov"))
+        one_of("smooth", "keep", keep, ("std", "fit", "cov"))
         one_of("smooth", "undetermined", undetermined, ("min_norm", "nan", "raise"))
         walk = walk_of(run)
-        smoothed = cls(walk, solve(walk, keep, order_by), run, order_by)
-        unknown = np.isinf(smoothed._path.var)
-        smoothed._lighten()
+        data, slopes = Data.of(walk), len(walk.trend) > 0
+        weight = walk.weight.copy() if keep != "std" else NONE
+        path = solve(walk, keep, order_by, lambda: walk_of(run))
+        del walk
+        smoothed = cls(path, data, run, order_by=order_by)
+        if keep != "std":
+            smoothed._fit = Fit(weight, path.rho, path.c)
+        unknown = NONE if undetermined == "min_norm" else np.isinf(path.var)
+        smoothed.std = smoothed._std(path.var)
+        smoothed._path = path._replace(var=NONE, rho=NONE, c=NONE)
         if undetermined == "raise" and unknown.any():
             names = ", ".join(
                 name for name, one in zip(run.names, np.any(unknown, axis=0).tolist(), strict=True) if one
             )
-            size = len(run.names) * (2 if len(walk.trend) else 1)
+            size = len(run.names) * (2 if slopes else 1)
             raise ValueError(
                 f"smooth: the record does not determine {names} (rank {smoothed.rank.max()} of {size}); "
                 'leave them out of the model, or take the solution nearest to theta0 with undetermined="min_norm".'
@@ -92,19 +130,25 @@ class Smoothed:
             smoothed.theta[unknown] = np.nan
         return smoothed
 
-    def _lighten(self) -> None:
-        """Keep standard deviations where the variances were, and of the problem the weights alone."""
-        self.std = self._std(self._path.var)
-        self._path, self._walk = self._path._replace(var=NONE), None
-
     def __repr__(self) -> str:
-        run, used = self.run, int(np.count_nonzero(self.weight))
-        return f"Smoothed path of {len(run)} samples, {used} used: {run.model!r}, {run.tracker!r}"
+        run = self.run
+        return f"Smoothed path of {len(run)} samples, {self._data.used} used: {run.model!r}, {run.tracker!r}"
 
     @property
     def walk(self) -> Walk:
         """The problem that was solved; collected from the record again, as `smooth` did, if it was not given."""
         return walk_of(self.run) if self._walk is None else self._walk
+
+    @cached_property
+    def _fit(self) -> Fit:
+        """What residuals and leverages are made of; the problem is solved again unless it was kept."""
+        walk = self.walk
+        path = solve(walk, "fit", self.order_by)
+        return Fit(walk.weight.copy(), path.rho, path.c)
+
+    @property
+    def weight(self) -> Array:
+        return self._fit.weight
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -130,9 +174,9 @@ class Smoothed:
         """The factor by which variances grow because readings share errors of rounding
         (`driftfit.trackers.parts.coarse.shared_rounding`), from the mean r phi' V phi of the used samples.
         """
-        found, used = self.run.ended_with("common"), self.weight > 0.0
+        found = self.run.ended_with("common")
         common = 0.0 if found is None else float(found)
-        undecided = self.r * float(np.mean(self.leverage[used] / self.weight[used])) if common > 0.0 else 0.0
+        undecided = self.r * self._path.spread / max(self._data.used, 1) if common > 0.0 else 0.0
         return 1.0 + len(self.run.names) * common / undecided if undecided > 0.0 else 1.0
 
     @property
@@ -152,17 +196,17 @@ class Smoothed:
 
     @cached_property
     def leverage(self) -> Array:
-        leverage: Array = 1.0 - self._path.c**2
+        leverage: Array = 1.0 - self._fit.c**2
         return leverage
 
     @cached_property
     def residual(self) -> Array:
-        return self._scaled(self._path.rho * self._path.c)
+        return self._scaled(self._fit.rho * self._fit.c)
 
     @cached_property
     def loo(self) -> Array:
-        c = np.where(self._path.c > ALONE, self._path.c, np.nan)
-        return self._scaled(self._path.rho / c)
+        c = np.where(self._fit.c > ALONE, self._fit.c, np.nan)
+        return self._scaled(self._fit.rho / c)
 
     @cached_property
     def press(self) -> float:
@@ -178,10 +222,6 @@ class Smoothed:
         weight = np.where(self.weight > 0.0, self.weight, np.nan)
         scaled: Array = values / np.sqrt(weight)
         return scaled
-
-    @cached_property
-    def measurement_cost(self) -> float:
-        return float(np.nansum((self._path.rho * self._path.c) ** 2))
 
     @property
     def dynamic_cost(self) -> float:
@@ -215,27 +255,29 @@ class Smoothed:
         return plot_smoothed(self.run, self.theta, *self.band(level), ax)
 
 
-def solve(walk: Walk, keep: str, order_by: Any = None) -> Path:
-    """The smoothed path in time order; with ``order_by`` theta is a random walk along that variable instead of time."""
+def solve(walk: Walk, keep: str, order_by: Any = None, again: Callable[[], Walk] | None = None) -> Path:
+    """The smoothed path in time order; with ``order_by`` theta is a random walk along that variable instead of time.
+
+    ``again`` as for `driftfit.smooth.exact.smooth`.
+    """
     if order_by is None:
-        return exact.smooth(walk, keep)
+        return exact.smooth(walk, keep, again)
     arranged, order = ordered(walk, order_by)
     path, back = exact.smooth(arranged, keep), np.argsort(order)
-    slopes = ("slope", "slope_var") if len(walk.trend) else ()
-    in_time = {name: getattr(path, name)[back] for name in ("theta", "var", "rho", "c", "rank", *slopes)}
+    slopes, fit = ("slope", "slope_var") if len(walk.trend) else (), ("rho", "c") if len(path.c) else ()
+    in_time = {name: getattr(path, name)[back] for name in ("theta", "var", "rank", *fit, *slopes)}
     cov = path.cov[back] if len(path.cov) else path.cov
     nowhere = ~np.isfinite(np.asarray(order_by, float))
     in_time["theta"][nowhere] = in_time["var"][nowhere] = np.nan
     return path._replace(**in_time, cov=cov)
 
 
-def noise_variance(walk: Walk, path: Path) -> float:
+def noise_variance(data: Data, path: Path) -> float:
     """J / (N - rank); NaN, with a warning, if there are no degrees of freedom from which to estimate it."""
-    free = walk.used - (int(path.rank.max()) if walk.p0 is None else 0)
-    least = 1e-28 * float(np.einsum("t,t,t->", walk.weight, walk.y, walk.y))
-    if free <= 0 or path.cost <= least:
+    free = data.used - (int(path.rank.max()) if data.diffuse else 0)
+    if free <= 0 or path.cost <= 1e-28 * data.power:
         warnings.warn(
-            f"smooth: {walk.used} samples of rank {path.rank.max()} leave no residual from which to estimate the "
+            f"smooth: {data.used} samples of rank {path.rank.max()} leave no residual from which to estimate the "
             "noise; the path has no bands.",
             RuntimeWarning,
             stacklevel=4,

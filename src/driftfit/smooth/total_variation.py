@@ -25,7 +25,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
 from driftfit.run.result import Track
 from driftfit.smooth import exact
-from driftfit.smooth.parts.walk import Walk, constants
+from driftfit.smooth.parts.walk import DRIFT, Walk, constants
 from driftfit.smooth.problem import walk_of
 
 SMOOTHING = 1e-6
@@ -75,14 +75,14 @@ def total_variation(run: Track, penalty: float, tol: float = 1e-4, max_steps: in
     fixed = walk_of(run, constants(run.model.n))
     walk = fixed._replace(q=np.eye(run.model.n))
     open_ = fixed.drift > 0.0
-    theta = exact.smooth(fixed).theta
+    theta = exact.smooth(fixed, "std").theta
     penalty_max = float(2.0 * np.linalg.norm(walk.pull(walk.residual(theta))[open_], axis=1).max(initial=0.0))
-    theta = exact.smooth(walk).theta
+    theta = exact.smooth(walk, "std").theta
     eta = SMOOTHING * max(float(np.abs(theta).max()), 1e-300)
     costs, pull, gap = [], np.inf, np.inf
     for _ in range(max_steps):
         length = np.sqrt(jump_sizes(theta, open_) ** 2 + eta**2)
-        theta = exact.smooth(walk._replace(drift=np.where(open_, 2.0 * length / price, 0.0))).theta
+        theta = exact.smooth(walk.changed(DRIFT, np.where(open_, 2.0 * length / price, 0.0)), "std").theta
         cost, pull, gap = judge(walk, theta, open_, price)
         costs.append(cost + price * float(np.sum(np.sqrt(jump_sizes(theta, open_) ** 2 + eta**2)[open_])))
         if pull <= 1.001 and gap <= tol:
@@ -115,6 +115,6 @@ def refitted(fixed: Walk, jumps: Array) -> Array:
     """Least squares between the jumps."""
     parts = []
     for a, b in zip([0, *jumps], [*jumps, len(fixed.y)], strict=True):
-        rows = {name: getattr(fixed, name)[a:b] for name in ("phi", "y", "weight", "drift")}
-        parts.append(exact.smooth(fixed._replace(**rows)).theta)
+        part = fixed._replace(phi=fixed.phi[a:b], signals=fixed.signals[a:b])
+        parts.append(exact.smooth(part, "std").theta)
     return np.concatenate(parts)

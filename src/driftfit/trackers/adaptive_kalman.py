@@ -37,7 +37,7 @@ for up to eight parameters, and 16 for more.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -310,8 +310,8 @@ class AdaptiveKalman(Tracker):
         running = fields["settled"] > 0
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
 
-    def left_out(self, fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
-        return faults(fields, phi, y, ok)
+    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
+        return faults(field, phi, y, ok)
 
     def estimated_variances(
         self, model: Model, fields: Mapping[str, Array], e: Array, time: Array

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -141,9 +141,9 @@ class Tracker(Settings, ABC):
         """phi (T, n) and y (T,) as the tracker used them; ``fields`` as in `estimated_variances`."""
         return phi, y
 
-    def left_out(self, fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
-        """Which of the used samples, ok (T,), it left out later; ``fields`` as in `estimated_variances`, or, without
-        smoother fields, those of the last state.
+    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
+        """Which of the used samples, ok (T,) not 0, it left out later; ``field`` gives a field by its name, as
+        `estimated_variances` takes them, or, without smoother fields, one of the last state.
         """
         return np.zeros(len(y), bool)
 

@@ -29,7 +29,7 @@ them. Cost: O(n^2).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -178,8 +178,8 @@ class FLS(Tracker):
     def steps(self) -> TrackerSteps:
         return second_differences.STEPS if self.differences == 2 else STEPS
 
-    def left_out(self, fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
-        return faults(fields, phi, y, ok) if self.differences == 1 else super().left_out(fields, phi, y, ok)
+    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
+        return faults(field, phi, y, ok) if self.differences == 1 else super().left_out(field, phi, y, ok)
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
         return (*contradictions(run.state), *resolution(run.state))

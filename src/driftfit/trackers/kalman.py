@@ -25,7 +25,7 @@ O(n^2).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
@@ -200,8 +200,8 @@ class Kalman(Tracker):
     def beyond(self) -> str:
         return "" if self.laws is None else "has laws by which theta moves"
 
-    def left_out(self, fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
-        return faults(fields, phi, y, ok) if self.laws is None else super().left_out(fields, phi, y, ok)
+    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
+        return faults(field, phi, y, ok) if self.laws is None else super().left_out(field, phi, y, ok)
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
         return contradictions(run.state)

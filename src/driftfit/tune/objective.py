@@ -66,7 +66,7 @@ def _smoothed_score(task: Task, tracker: Tracker, method: str) -> float:
     """Mean square of the leave-one-out residuals of the smoothed paths, or the rotation-invariant variant of it."""
     squares, count, free, used = 0.0, 0, 0.0, 0
     for run in run_task(task, tracker):
-        path = Smoothed.of(run)
+        path = Smoothed.of(run, "fit")
         weight = path.weight
         terms = weight * path.loo**2 if method == "loo" else np.zeros(0)
         squares += float(np.nansum(terms)) if method == "loo" else path.measurement_cost

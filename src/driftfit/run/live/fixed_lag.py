@@ -17,11 +17,14 @@ from driftfit.data.storage import fields
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.smooth.parts import slopes, two_filters
-from driftfit.smooth.parts.walk import Walk
+from driftfit.smooth.parts.walk import Walk, room_for_signals
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.information import triangular_root
 
 SAMPLES = ("phi", "y", "weight", "drift", "drift_root", "trend")
+"""What is saved of the samples of a window."""
+ARRAYS = ("phi", "signals", "drift_root", "trend")
+"""The arrays in which they are stored."""
 
 
 class FixedLag(NamedTuple):
@@ -45,8 +48,8 @@ class Window:
         n, r = model.n, 1.0 if prior.r is None else prior.r
         p0 = None if prior.p0 is None else prior.p0 / r
         self.walk = Walk(
-            np.zeros((lag + 1, n)), np.zeros(lag + 1), np.zeros(lag + 1), np.zeros(lag + 1),
-            prior.q / r, prior.theta0, p0, prior.r, np.ones((lag + 1, n)), np.zeros((lag + 1) * prior.slopes),
+            np.zeros((lag + 1, n)), room_for_signals(lag + 1, n), prior.q / r, prior.theta0, p0, prior.r,
+            np.ones((lag + 1, n)), np.zeros((lag + 1) * prior.slopes),
         )  # fmt: skip
         G = triangular_root(self.walk.q)
         self.G = slopes.root(G) if prior.slopes else G
@@ -66,7 +69,7 @@ class Window:
 
     def _first(self, count: int) -> Walk:
         """The smoothing problem of the first ``count`` samples of the window."""
-        walk = self.walk._replace(**{name: getattr(self.walk, name)[:count] for name in SAMPLES})
+        walk = self.walk._replace(**{name: getattr(self.walk, name)[:count] for name in ARRAYS})
         return slopes.expanded(walk) if len(self.walk.trend) else walk
 
     def push(self, tile: Array, known: tuple[float, float, float], lane: int = 0) -> None:
@@ -74,7 +77,7 @@ class Window:
         s, walk = tile[0], self.walk
         if self.count == len(walk.y):
             self._filter(1, np.zeros((0, len(self.G))), np.zeros(0))
-            for name in SAMPLES:
+            for name in ARRAYS:
                 values = getattr(walk, name)
                 values[:-1] = values[1:]
             self.count -= 1

@@ -28,7 +28,7 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.smooth.parts.halves import BLOCK, Found, Samples, inwards, outwards, workspace
+from driftfit.smooth.parts.halves import BLOCK, Found, Samples, Sums, inwards, outwards, workspace
 from driftfit.smooth.parts.walk import Path, Walk
 
 ERROR = 1e-10
@@ -37,20 +37,18 @@ ERROR = 1e-10
 CANCELLED = 1e-6
 """Smallest f: below it U has lost more than six digits in one step."""
 
-LEVERAGE = 1e-5
-"""Smallest 1 - h: below it 1 - h has lost more than five digits."""
 
-
-def smooth(walk: Walk, scale: Array) -> Path | None:
+def smooth(walk: Walk, scale: Array, keep: str = "std", spent: bool = False) -> Path | None:
     """Solve a problem with a diagonal q and a diffuse start of full rank; None if the result is not accurate enough.
 
-    ``scale`` (n,) is the size of each regressor.
+    ``scale`` (n,) is the size of each regressor. With keep="fit" the path has rho and c. A ``spent`` problem is
+    overwritten by its solution.
     """
-    solved = smooth_and_weigh(walk, scale)
+    solved = smooth_and_weigh(walk, scale, keep, spent)
     return None if solved is None else solved[0]
 
 
-def smooth_and_weigh(walk: Walk, scale: Array) -> tuple[Path, float] | None:
+def smooth_and_weigh(walk: Walk, scale: Array, keep: str = "std", spent: bool = False) -> tuple[Path, float] | None:
     """The same, and the log of the diffuse likelihood of y given q, drift and weights, up to a constant.
 
     With U of the middle sample, -2 log L = J + log |U| - sum log f, since each f is 1 / (1 + g U_ii).
@@ -58,26 +56,30 @@ def smooth_and_weigh(walk: Walk, scale: Array) -> tuple[Path, float] | None:
     T, n = walk.phi.shape
     K = T // 2 + 1
     work = workspace(n).copy()
-    work["q"], work["truth"] = np.diag(walk.q), 1.0 / scale
+    work["q"], work["truth"] = np.diag(walk.q)[:, None], 1.0 / scale[:, None]
     drift_root = np.ascontiguousarray(walk.drift_root if len(walk.drift_root) else np.ones((1, n)))
-    samples = Samples(walk.phi, walk.y, walk.weight, walk.drift, drift_root)
+    samples = Samples(np.ascontiguousarray(walk.phi), np.ascontiguousarray(walk.signals), drift_root)
     kept = np.empty((-(-K // BLOCK), n + 2, n, 2))
     least, logs = inwards(work, samples, K, kept)
-    lower = work["U"][0].sum(axis=-1)
-    U = np.tril(lower) + np.tril(lower, -1).T
+    U = work["U"][0].sum(axis=-1)
+    U += np.tril(U, -1).T
     C = inverse(U)
     if C is None or least < CANCELLED:
         return None
     volume = float(np.linalg.slogdet(U)[1]) - logs
     work["C"][0], work["theta"][0] = C[..., None], (C @ work["z"][0].sum(axis=-1))[:, None]
     work["known"][0] = (C @ work["known_z"][0].sum(axis=-1))[:, None]
-    found = Found(np.empty((T, n)), np.empty((T, n)), np.empty(T), np.empty(T))
-    cost = outwards(work, samples, K, kept, found)
-    error = float((work["error"][0] * scale).max())
-    if not (error <= ERROR and found.c.min() > np.sqrt(LEVERAGE) and found.var.min() > 0.0):
+    theta, var = (samples.signals, samples.phi) if spent else (np.empty((T, n)), np.empty((T, n)))
+    of_fit = T if keep == "fit" else 0
+    found = Found(theta, var, np.empty(of_fit), np.empty(of_fit))
+    sums = Sums(*outwards(work, samples, K, kept, found))
+    error = float((work["error"][0] * scale[:, None]).max())
+    if not (error <= ERROR and sums.doubtful == 0):
         return None
     empty = np.zeros((0, n, n))
-    return Path(*found, cost, empty, empty, "fast"), -0.5 * (cost + volume)
+    theta = np.ascontiguousarray(theta[:, :n])
+    path = Path(theta, var, found.rho, found.c, sums.cost, sums.measurement_cost, sums.spread, empty, empty, "fast")
+    return path, -0.5 * (sums.cost + volume)
 
 
 def inverse(U: Array) -> Array | None:

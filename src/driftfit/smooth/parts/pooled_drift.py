@@ -74,7 +74,7 @@ def average_drift(walk: Walk, time: Array, trend: Array) -> Walk:
     q, span = walk.drift_root**2, time[:, None]
     rate = np.divide(q, span, out=np.zeros_like(q), where=span > 0.0)
     shapes = ((q, PRICE + len(q) / SHARE), (pooled(rate) * span, 0.0))
-    size = column_scale(walk.phi, walk.weight)
+    size = column_scale(walk.phi, walk.signals)
     paths, log_p = [], np.full((len(shapes), len(SCALES)), -np.inf)
     for k, (one, price) in enumerate(shapes):
         for j, scale in enumerate(SCALES):

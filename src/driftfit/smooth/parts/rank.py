@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
+from driftfit.smooth.parts.walk import WEIGHT
 from driftfit.trackers.parts import diffuse
 
 FAR = 1e250
@@ -15,12 +16,15 @@ FAR = 1e250
 
 
 @Driver
-def column_scale(phi: Array, weight: Array) -> Array:
-    """Root mean square of each column of phi over the samples that are used; 1 for columns of zeros."""
+def column_scale(phi: Array, signals: Array) -> Array:
+    """Root mean square of each column of phi over the samples that are used; 1 for columns of zeros.
+
+    ``signals`` are those of a `driftfit.smooth.parts.walk.Walk`.
+    """
     T, n = phi.shape
     top, squares, scale, count = np.zeros(n), np.zeros(n), np.ones(n), 0
     for t in range(T):  # row by row, because a column takes a cache line for each number
-        if weight[t] > 0.0:
+        if signals[t, WEIGHT] > 0.0:
             count += 1
             for i in range(n):
                 squares[i] += phi[t, i] ** 2
@@ -32,7 +36,7 @@ def column_scale(phi: Array, weight: Array) -> Array:
         return scale
     # squares of very large or small numbers, or of zeros: in a unit in which the largest is about 1
     for t in range(T):
-        if weight[t] > 0.0:
+        if signals[t, WEIGHT] > 0.0:
             for i in range(n):
                 top[i] = max(top[i], abs(phi[t, i]))
     for i in range(n):
@@ -41,7 +45,7 @@ def column_scale(phi: Array, weight: Array) -> Array:
         if top[i] > 0.0:
             scale[i] = 2.0 ** -max(-1000.0, min(1000.0, np.floor(np.log2(top[i]))))  # exact in the products
     for t in range(T):
-        if weight[t] > 0.0:
+        if signals[t, WEIGHT] > 0.0:
             for i in range(n):
                 squares[i] += (phi[t, i] * scale[i]) ** 2
     for i in range(n):
@@ -49,12 +53,12 @@ def column_scale(phi: Array, weight: Array) -> Array:
     return scale
 
 
-def ranks(phi: Array, weight: Array, scale: Array) -> tuple[Array, Array]:
+def ranks(phi: Array, signals: Array, scale: Array) -> tuple[Array, Array]:
     """Rank of the scaled regressors up to each sample, (T,), and a basis of their null space, (n, n - rank)."""
     n = len(scale)
-    rank = np.empty(len(phi), np.int64)
+    rank = np.full(len(phi), n, np.int16)
     S, R = np.zeros((n, n)), np.eye(n)
-    compiled_ranks()(S, R, np.zeros((diffuse.WORK, n)), phi, scale, weight, rank)
+    compiled_ranks()(S, R, np.zeros((diffuse.WORK, n)), phi, scale, signals, rank)
     return rank, R[:, np.diag(S) == 0.0]
 
 
@@ -63,11 +67,13 @@ def compiled_ranks() -> Any:
     refresh, outside, turn_in, row = diffuse.refresh, diffuse.outside, diffuse.turn_in, diffuse.ROW
 
     @Driver
-    def run(S: Array, R: Array, work: Array, phi: Array, scale: Array, weight: Array, rank: Array) -> None:
+    def run(S: Array, R: Array, work: Array, phi: Array, scale: Array, signals: Array, rank: Array) -> None:
         n, known = len(scale), 0
         scaled, values = np.empty(n), np.zeros(n)
         for t in range(phi.shape[0]):
-            if weight[t] > 0.0 and known < n:
+            if known == n:
+                break
+            if signals[t, WEIGHT] > 0.0:
                 for i in range(n):
                     scaled[i] = phi[t, i] / scale[i]
                 entering, _, _ = outside(scaled, S, work)

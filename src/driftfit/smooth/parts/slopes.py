@@ -34,7 +34,7 @@ from driftfit.trackers.parts.information import triangular_root
 def smooth(walk: Walk, keep: str = "std") -> Path:
     """Solve a problem with slopes."""
     n = walk.phi.shape[1]
-    scale = column_scale(walk.phi, walk.weight)
+    scale = column_scale(walk.phi, walk.signals)
     double = np.tile(scale, 2)
     time = np.cumsum(walk.trend)
     rank, begin = start(walk, double, time)
@@ -66,7 +66,7 @@ def start(walk: Walk, double: Array, time: Array) -> tuple[Array, Start]:
     """Rank up to each sample, and the information before the first one."""
     span = max(float(time[-1]), 1.0)
     at_first = np.hstack([walk.phi, walk.phi * (time / span)[:, None]])
-    rank, unseen = ranks(at_first, walk.weight, double)
+    rank, unseen = ranks(at_first, walk.signals, double)
     n = len(double) // 2
     hidden = np.zeros(len(double), bool)
     if rank[-1] == 2 * n:

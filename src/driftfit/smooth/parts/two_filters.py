@@ -52,16 +52,22 @@ def smooth(walk: Walk, scale: Array, G: Array, begin: Start, keep: str = "std") 
     cross, hidden = np.outer(scale, scale), begin.hidden
     scaled = walk._replace(phi=walk.phi / scale)
     found, blocks = meeting(scaled, G, begin.rows, begin.values, keep)
-    found.rho[walk.weight == 0.0] = np.nan
+    used = walk.weight > 0.0
+    found.rho[~used] = np.nan
     lag_cov = gains(scaled, G, blocks) @ found.cov[1:] if keep == "cov" else found.cov
+    c = found.c[used]
     return found._replace(
         theta=found.theta / scale, var=np.where(hidden, np.inf, found.var / scale**2),
-        cov=found.cov / cross, lag_cov=lag_cov / cross,
+        measurement_cost=float(np.sum((found.rho[used] * c) ** 2)),
+        spread=float(np.sum((1.0 - c**2) / walk.weight[used])), cov=found.cov / cross, lag_cov=lag_cov / cross,
     )  # fmt: skip
 
 
 def meeting(walk: Walk, G: Array, rows: Array, values: Array, keep: str = "std") -> tuple[Path, Array]:
-    """Run both filters from ``rows theta_1 = values`` with G G' = q, and combine them; also return their blocks."""
+    """Run both filters from ``rows theta_1 = values`` with G G' = q, and combine them; also return their blocks.
+
+    Of the path, only the part of the cost that is measured, and the spread, are left open.
+    """
     T, n = walk.phi.shape
     blocks = np.zeros(-(-T // WIDTH), block_type(n))
     pair = workspace(n, 2).copy()
@@ -71,7 +77,7 @@ def meeting(walk: Walk, G: Array, rows: Array, values: Array, keep: str = "std")
     R = np.empty((T if keep == "cov" else 0, n, n))
     _meet()(workspace(n, WIDTH).copy(), _weighted(walk), blocks, theta, var, rho, c, R)
     cov = R @ R.swapaxes(1, 2)
-    return Path(theta, var, rho, c, cost, cov, cov, "safe"), blocks
+    return Path(theta, var, rho, c, cost, np.nan, np.nan, cov, cov, "safe"), blocks
 
 
 def filter_both(pair: Array, walk: Walk, rows: Array, values: Array, blocks: Array) -> float:

@@ -19,17 +19,22 @@ NONE = np.zeros((0, 0))
 """No parameter has its own drift, and none has a slope."""
 
 
+Y, WEIGHT, DRIFT = 0, 1, 2
+"""Columns of the signals of a `Walk`."""
+
+
 class Walk(NamedTuple):
-    """T samples of a regression whose n parameters are random walks; q and p0 are relative to the noise variance."""
+    """T samples of a regression whose n parameters are random walks; q and p0 are relative to the noise variance.
+
+    ``phi`` and ``signals`` have room for a path and its variances, which may take their place
+    (`driftfit.smooth.exact.smooth`).
+    """
 
     phi: Array
     """(T, n), finite."""
-    y: Array
-    """(T,), finite."""
-    weight: Array
-    """(T,): 0 for samples that are not used."""
-    drift: Array
-    """(T,): nominal intervals of drift before each sample."""
+    signals: Array
+    """(T, max(n, 3)): y, finite; weight, 0 for samples that are not used; drift, the nominal intervals of drift before
+    each sample; the columns `Y`, `WEIGHT` and `DRIFT`."""
     q: Array
     """(n, n), drift covariance per nominal interval."""
     theta0: Array
@@ -46,6 +51,27 @@ class Walk(NamedTuple):
     """(K, T, n): paths under other drifts that are possible too; empty if the drift is known."""
     belief: Array = NONE
     """(K,): their probabilities."""
+
+    @property
+    def y(self) -> Array:
+        """(T,)"""
+        return self.signals[:, Y]
+
+    @property
+    def weight(self) -> Array:
+        """(T,)"""
+        return self.signals[:, WEIGHT]
+
+    @property
+    def drift(self) -> Array:
+        """(T,)"""
+        return self.signals[:, DRIFT]
+
+    def changed(self, column: int, values: Array) -> Walk:
+        """The problem with other values (T,) of one of its signals."""
+        signals = self.signals.copy()
+        signals[:, column] = values
+        return self._replace(signals=signals)
 
     @property
     def used(self) -> int:
@@ -78,6 +104,11 @@ class Walk(NamedTuple):
         return moves
 
 
+def room_for_signals(T: int, n: int) -> Array:
+    """Zeros of the shape of the signals of T samples of n parameters."""
+    return np.zeros((T, max(n, DRIFT + 1)))
+
+
 def constants(n: int) -> RandomWalk:
     """Constant parameters with a diffuse start."""
     return RandomWalk(np.zeros((n, n)), None, np.zeros(n), None, at_first_sample=True)
@@ -96,18 +127,22 @@ class Path(NamedTuple):
     var: Array
     """(T, n): inf for parameters that the record does not determine."""
     rho: Array
-    """(T,): NaN for samples that were not used."""
+    """(T,): NaN for samples that were not used; empty if it was not kept."""
     c: Array
-    """(T,): sqrt(1 - leverage)."""
+    """(T,): sqrt(1 - leverage); empty if it was not kept."""
     cost: float
     """The minimum of J."""
+    measurement_cost: float
+    """The part of J that is the sum of weight_t (y_t - phi_t' theta_t)^2."""
+    spread: float
+    """Sum of phi_t' C_t phi_t over the used samples, with C_t the covariance of theta_t."""
     cov: Array
     """(T, n, n), or empty."""
     lag_cov: Array
     """(T - 1, n, n), of theta_t and theta_{t+1}, or empty."""
     method: str
     """"fast" or "safe"."""
-    rank: Array = np.zeros(0, np.int64)
+    rank: Array = np.zeros(0, np.int16)
     """(T,): rank of the regressors up to each sample."""
     slope: Array = NONE
     """(T, n), per nominal interval; empty if theta has no slope."""
@@ -124,18 +159,12 @@ def ordered(walk: Walk, by: Any) -> tuple[Walk, Array]:
     if value.shape != walk.y.shape:
         raise ValueError(f"order_by has shape {value.shape}, but the record has {len(walk.y)} samples.")
     order = np.argsort(value, kind="stable")
-    weight = np.where(np.isfinite(value), walk.weight, 0.0)
-    drift = np.ones(len(order))
-    drift[:1] = 0.0 if walk.p0 is None else 1.0
-    trend = drift.copy() if len(walk.trend) else NONE
+    signals = walk.signals[order]
+    signals[:, WEIGHT] *= np.isfinite(value)[order]
+    signals[:, DRIFT] = 1.0
+    signals[:1, DRIFT] = 0.0 if walk.p0 is None else 1.0
+    trend = signals[:, DRIFT].copy() if len(walk.trend) else NONE
     arranged = walk._replace(
-        phi=walk.phi[order],
-        y=walk.y[order],
-        weight=weight[order],
-        drift=drift,
-        drift_root=NONE,
-        trend=trend,
-        paths=NONE,
-        belief=NONE,
+        phi=walk.phi[order], signals=signals, drift_root=NONE, trend=trend, paths=NONE, belief=NONE
     )
     return arranged, order

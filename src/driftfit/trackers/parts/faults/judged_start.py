@@ -13,7 +13,7 @@ Cost: that of the diffuse start for a few more samples, and O(n N^2) once for N 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any
 
@@ -244,11 +244,11 @@ def judged(
     return steps._replace(begin=start, machines=START_MACHINES, apart=odd_or_rooted)
 
 
-def faults(lane: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
-    """Which of the samples (T,) of a record were left out of its start, given the state after it."""
+def faults(field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
+    """Which of the samples (T,) of a record were left out of its start, given the fields of the state after it."""
     found, n = np.zeros(len(y), bool), phi.shape[1]
-    if lane["start_faults"] > 0.0:
-        rows = np.flatnonzero(ok)[: int(lane["start_count"])]
+    if field("start_faults") > 0.0:
+        rows = np.flatnonzero(ok)[: int(field("start_count"))]
         samples = np.column_stack([phi[rows], y[rows], np.ones((len(rows), 2)), y[rows]])
         doubtful(samples, n)
         found[rows] = samples[:, n + NOISE] < 0.0

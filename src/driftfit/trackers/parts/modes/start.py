@@ -19,8 +19,9 @@ Source: marginal likelihood under an inverse-gamma variance, West and Harrison, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -171,13 +172,13 @@ def reconsider(s: State, enough: int, l: int) -> bool:
     return ready
 
 
-def faults(fields: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:
+def faults(field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
     """Which samples (T,) of the start `reconsider` left out."""
-    start = int(np.argmax(fields["settled"] > 0)) + 1
+    start = int(np.argmax(field("settled") > 0)) + 1
     rows, n = np.flatnonzero(ok[:start]), phi.shape[1]
     found = np.zeros(len(y), bool)
-    if fields["left_out"][start - 1] > 0.0:
-        readings = y[rows] + fields["shift"][rows]
+    if field("left_out")[start - 1] > 0.0:
+        readings = y[rows] + field("shift")[rows]
         samples = np.column_stack([phi[rows], y[rows], np.ones((len(rows), 2)), readings])
         doubtful(samples, n)
         found[rows] = samples[:, n + NOISE] < 0.0
