@@ -18,78 +18,120 @@ of the record instead of those of a stationary one. Cost: O(m^2 n^3) for m posit
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-from driftfit.engine.kernel import Array, Driver
-from driftfit.judge.statistics.robust import cholesky
+from driftfit.engine.kernel import Array, Driver, shared
+from driftfit.engine.simd import WIDTH, fill, load, minus, only, over, plus, store, times
+from driftfit.judge.statistics.robust import cholesky_of_eight
 
 TIED = 1e-9
 """A variance below this share of the largest of the path is rounding."""
 
 
-def _scan(S: Array, cov: Array, Q: Array, left: Array, right: Array) -> None:
-    """Q, and 1 - rho if a or b moves by one position; S (m + 1, n) from 0 on, cov (m + 1, n, m + 1, n).
+class Path(NamedTuple):
+    """A path of n components at m + 1 positions, the first of them 0, in columns with room for a vector (W in all)."""
+
+    S: Array
+    """(n, W)"""
+    cov: Array
+    """Cov(S_ai, S_bj) in row n i + j and column a W + b, (n n, (m + 1) W)."""
+    var: Array
+    """Var(S_b), (n n, W)."""
+    step: Array
+    """Var(S_b - S_(b-1)), (n n, W)."""
+
+    @classmethod
+    def of(cls, S: Array, cov: Array) -> Path:
+        """The path S (m, n) with its covariance (m, n, m, n)."""
+        (m, n), W = S.shape, len(S) + 1 + WIDTH
+        path, full = np.zeros((n, W)), np.zeros((n, n, m + 1, W))
+        path[:, 1 : m + 1], full[:, :, 1:, 1 : m + 1] = S.T, cov.transpose(1, 3, 0, 2)
+        at = np.arange(m + 1)
+        var, step = np.zeros((2, n, n, W))
+        var[:, :, at] = full[:, :, at, at]
+        both = full[:, :, at[:-1], at[1:]]
+        step[:, :, at[1:]] = var[:, :, at[1:]] + var[:, :, at[:-1]] - both - both.swapaxes(0, 1)
+        return cls(path, full.reshape(n * n, -1), var.reshape(n * n, W), step.reshape(n * n, W))
+
+
+@shared
+def _changes(path: Path, a: int, b: int, M: Array) -> None:
+    """[Var(S_b - S_a), S_b - S_a] of the positions b .. b + 7, entry (i, j) in row (n + 1) i + j.
 
     A component whose change has no variance (a regressor of the fit ties the path to zero there) does not count: the
     quotient would be that of two rounding errors.
     """
-    m, n = S.shape[0] - 1, S.shape[1]
-    M, z, size = np.zeros((n + 1, n + 1)), np.zeros(n), np.zeros(n)
+    S, cov, var, _ = path
+    n, W = S.shape
+    k = n + 1
     for i in range(n):
-        for b in range(m + 1):
-            size[i] = max(size[i], cov[b, i, b, i])
+        for j in range(i + 1):
+            both = plus(load(cov, n * i + j, a * W + b), load(cov, n * j + i, a * W + b))
+            alone = plus(load(var, n * i + j, b), fill(var[n * i + j, a]))
+            store(M, k * i + j, 0, minus(alone, both))
+        store(M, k * n + i, 0, minus(load(S, i, b), fill(S[i, a])))
+    store(M, k * n + n, 0, fill(0.0))
+    for i in range(n):
+        largest = 0.0
+        for t in range(W):
+            largest = max(largest, var[n * i + i, t])
+        some = minus(load(M, k * i + i, 0), fill(TIED * largest))
+        for j in range(k):
+            row = k * max(i, j) + min(i, j)
+            store(M, row, 0, only(load(M, row, 0), some))
+
+
+@shared
+def _share(M: Array, z: Array, step: Array, at: int, each: bool) -> None:
+    """The trace of Var(S_b - S_a)^-1 times the variance of a step, into the last row of z (n + 1, 8).
+
+    ``each``: the steps to the positions at .. at + 7; otherwise that to ``at``.
+    """
+    n = z.shape[0] - 1
+    k, total = n + 1, fill(0.0)
+    for j in range(n):
+        for i in range(n):
+            value = load(step, n * i + j, at) if each else fill(step[n * i + j, at])
+            for l in range(i):
+                value = minus(value, times(load(M, k * i + l, 0), load(z, l, 0)))
+            store(z, i, 0, only(over(value, load(M, k * i + i, 0)), load(M, k * i + i, 0)))
+        for i in range(n - 1, j - 1, -1):
+            value = load(z, i, 0)
+            for l in range(i + 1, n):
+                value = minus(value, times(load(M, k * l + i, 0), load(z, l, 0)))
+            store(z, i, 0, only(over(value, load(M, k * i + i, 0)), load(M, k * i + i, 0)))
+        total = plus(total, load(z, j, 0))
+    store(z, n, 0, total)
+
+
+@Driver
+def _scan(path: Path, Q: Array, left: Array, right: Array, M: Array, z: Array) -> None:
+    """Q, and 1 - rho if a or b moves by one position, (m + 1, W) each, valid for b > a; M, z: scratch."""
+    n, m = path.S.shape[0], Q.shape[0] - 1
+    half = fill(0.5 / n)
     for a in range(m):
-        for b in range(a + 1, m + 1):
+        for b in range(a + 1, m + 1, WIDTH):
+            _changes(path, a, b, M)
+            cholesky_of_eight(M, n)
+            total = fill(0.0)
             for i in range(n):
-                for j in range(i + 1):
-                    M[i, j] = cov[b, i, b, j] + cov[a, i, a, j] - cov[a, i, b, j] - cov[b, i, a, j]
-                M[n, i] = S[b, i] - S[a, i]
-            for i in range(n):
-                if not M[i, i] > TIED * size[i]:
-                    M[n, i] = 0.0
-                    for j in range(n):
-                        M[max(i, j), min(i, j)] = 0.0
-            M[n, n] = 0.0
-            cholesky(M, n)
-            total = 0.0
-            for i in range(n):
-                total += M[n, i] * M[n, i]
-            Q[a, b] = total
-            for side in range(2):
-                x = a if side == 0 else b - 1
-                y = x + 1
-                share = 0.0
-                for j in range(n):
-                    # column j of the factor's inverse times the variance of the position that is added or removed
-                    for i in range(n):
-                        z[i] = cov[y, i, y, j] + cov[x, i, x, j] - cov[x, i, y, j] - cov[y, i, x, j]
-                    for i in range(n):
-                        for k in range(i):
-                            z[i] -= M[i, k] * z[k]
-                        z[i] = z[i] / M[i, i] if M[i, i] > 0.0 else 0.0
-                    for i in range(n - 1, j - 1, -1):
-                        for k in range(i + 1, n):
-                            z[i] -= M[k, i] * z[k]
-                        z[i] = z[i] / M[i, i] if M[i, i] > 0.0 else 0.0
-                    share += z[j]
-                if side == 0:
-                    left[a, b] = 0.5 * share / n
-                else:
-                    right[a, b] = 0.5 * share / n
-
-
-_run = Driver(_scan)
+                total = plus(total, times(load(M, (n + 1) * n + i, 0), load(M, (n + 1) * n + i, 0)))
+            store(Q, a, b, total)
+            _share(M, z, path.step, a + 1, False)
+            store(left, a, b, times(half, load(z, n, 0)))
+            _share(M, z, path.step, b, True)
+            store(right, a, b, times(half, load(z, n, 0)))
 
 
 def scanned(S: Array, cov: Array) -> tuple[Array, Array, Array]:
-    """Q, and 1 - rho if a or b moves by one position, (m + 1, m + 1) each, of a path S (m, n)."""
+    """Q, and 1 - rho if a or b moves by one position, (m + 1, m + 1) each for b > a, of a path S (m, n)."""
     m, n = S.shape
-    path, full = np.zeros((m + 1, n)), np.zeros((m + 1, n, m + 1, n))
-    path[1:], full[1:, :, 1:] = S, cov
-    Q, left, right = np.zeros((3, m + 1, m + 1))
-    _run(path, full, Q, left, right)
+    found = np.zeros((3, m + 1, m + 1 + WIDTH))
+    _scan(Path.of(S, cov), *found, np.zeros(((n + 1) ** 2, WIDTH)), np.zeros((n + 1, WIDTH)))
+    Q, left, right = found[:, :, : m + 1]
     return Q, left, right
 
 
