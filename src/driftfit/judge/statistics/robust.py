@@ -284,10 +284,16 @@ def robust_fit(phi: Array, y: Array) -> Fit:
     """Constant coefficients with bounded influence of outliers in y; phi (N, n), y (N,)."""
     size = np.sqrt(np.mean(phi * phi, axis=0))
     size[size == 0.0] = 1.0  # an idle column, whose parameter is 0
-    Q, R = orthonormal(phi / size)
-    theta, residual, scale = np.zeros(phi.shape[1]), np.empty((1, len(y) + WIDTH)), np.empty(1)
+    fit = fit_in(orthonormal(phi / size), y)
+    return fit._replace(theta=fit.theta / size)
+
+
+def fit_in(basis: tuple[Array, Array], y: Array) -> Fit:
+    """The same in a basis that `orthonormal` made."""
+    Q, R = basis
+    theta, residual, scale = np.zeros(Q.shape[1]), np.empty((1, len(y) + WIDTH)), np.empty(1)
     _run(columns_of(Q, y), theta, residual, scale)
-    return clipped(np.linalg.lstsq(R, theta, rcond=1e-12)[0] / size, residual[0, : len(y)], float(scale[0]))
+    return clipped(np.linalg.lstsq(R, theta, rcond=1e-12)[0], residual[0, : len(y)], float(scale[0]))
 
 
 def clipped(theta: Array, residual: Array, scale: float) -> Fit:

@@ -18,17 +18,35 @@ of the record instead of those of a stationary one. Cost: O(m^2 n^3) for m posit
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 
-from driftfit.engine.kernel import Array, Driver, shared
-from driftfit.engine.simd import WIDTH, fill, load, minus, only, over, plus, store, times
+from driftfit.engine.kernel import Array, Driver, kernel, shared
+from driftfit.engine.simd import (
+    WIDTH,
+    exp_of,
+    fill,
+    higher,
+    load,
+    lower,
+    minus,
+    only,
+    over,
+    plus,
+    reaches,
+    root,
+    store,
+    sum_of,
+    times,
+)
 from driftfit.judge.statistics.robust import cholesky_of_eight
 
 TIED = 1e-9
 """A variance below this share of the largest of the path is rounding."""
+ERF = (0.3275911, 0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429)
+DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 class Path(NamedTuple):
@@ -126,13 +144,55 @@ def _scan(path: Path, Q: Array, left: Array, right: Array, M: Array, z: Array) -
             store(right, a, b, times(half, load(z, n, 0)))
 
 
-def scanned(S: Array, cov: Array) -> tuple[Array, Array, Array]:
-    """Q, and 1 - rho if a or b moves by one position, (m + 1, m + 1) each for b > a, of a path S (m, n)."""
+def scanned(S: Array, cov: Array) -> Array:
+    """Q, and 1 - rho if a or b moves by one position, (3, m + 1, W), valid for a < b <= m, of a path S (m, n)."""
     m, n = S.shape
     found = np.zeros((3, m + 1, m + 1 + WIDTH))
     _scan(Path.of(S, cov), *found, np.zeros(((n + 1) ** 2, WIDTH)), np.zeros((n + 1, WIDTH)))
-    Q, left, right = found[:, :, : m + 1]
-    return Q, left, right
+    return found
+
+
+@kernel
+def _kappa(x: Any) -> Any:
+    """x nu(sqrt(2 x)), at most 1, of each entry; the error function is that of Abramowitz and Stegun, 7.1.26."""
+    half = root(times(higher(x, fill(1e-12)), fill(0.5)))
+    bell = exp_of(times(fill(-0.5), times(half, half)))
+    t = over(fill(1.0), plus(fill(1.0), times(half, fill(ERF[0] / math.sqrt(2.0)))))
+    series = times(t, plus(fill(ERF[4]), times(t, fill(ERF[5]))))
+    series = times(t, plus(fill(ERF[2]), times(t, plus(fill(ERF[3]), series))))
+    inside = times(fill(0.5), minus(fill(1.0), times(times(t, plus(fill(ERF[1]), series)), bell)))
+    nu = over(over(inside, half), plus(times(half, plus(fill(0.5), inside)), times(bell, fill(DENSITY))))
+    return lower(times(higher(x, fill(0.0)), nu), fill(1.0))
+
+
+@Driver
+def _largest(Q: Array, left: Array, right: Array, at: Array, n: int, least: int, apart: bool, found: Array) -> None:
+    """The largest Q of one break and of an interval, -1 without one, and the sum of its kappa: found (2, 2).
+
+    Q of intervals that are not allowed becomes negative.
+    """
+    m = Q.shape[0] - 1
+    found[:, 0] = -1.0
+    for a in range(m):
+        which = 0 if a == 0 else 1
+        for b in range(Q.shape[1]):
+            length = at[b] - at[a] if a < b < m else 0
+            if length < least or length > at[m] - least:
+                Q[a, b] = -1.0
+                continue
+            if apart:
+                k = max(min(length, at[m] - length), least)
+                Q[a, b] = (k - 0.5 * (n + 3)) * np.log1p(Q[a, b] / k)
+            found[which, 0] = max(found[which, 0], Q[a, b])
+    for a in range(m):
+        which, total = 0 if a == 0 else 1, fill(0.0)
+        c = fill(found[which, 0])
+        for b in range(a + 1, m, WIDTH):
+            kappa = _kappa(times(c, lower(load(right, a, b), fill(1.0))))
+            if which == 1:
+                kappa = times(kappa, _kappa(times(c, lower(load(left, a, b), fill(1.0)))))
+            total = plus(total, times(kappa, reaches(load(Q, a, b), fill(0.0))))
+        found[which, 1] += sum_of(total)
 
 
 def suprema(S: Array, cov: Array, rows: Array, least: int, apart: bool) -> tuple[float, float]:
@@ -143,40 +203,15 @@ def suprema(S: Array, cov: Array, rows: Array, least: int, apart: bool) -> tuple
     of k rows is Hotelling's T^2, which is far from chi-square for small k, and (k - (n + 3) / 2) log(1 + Q / k) is used
     (Bartlett, 1938). For the same residuals Q is at most k.
     """
-    m, n = S.shape
-    Q, left, right = scanned(S, cov)
-    at = np.concatenate([[0], rows])
-    length = at[None, :] - at[:, None]
-    allowed = (length >= least) & (length <= rows[-1] - least)
-    if apart:
-        k = np.maximum(np.minimum(length, rows[-1] - length), least)
-        Q = (k - 0.5 * (n + 3)) * np.log1p(Q / k)
-    single, double = allowed.copy(), allowed
-    single[1:] = False
-    double[0] = double[:, m] = False
-    single[:, m] = False
-    return _tail(Q[single], n, right[single]), _tail(Q[double], n, left[double], right[double])
+    n, found = S.shape[1], np.zeros((2, 2))
+    _largest(*scanned(S, cov), np.concatenate([[0], rows]), n, least, apart, found)
+    single, double = (_chance(c, n, places) for c, places in found.tolist())
+    return single, double
 
 
-def _tail(Q: Array, n: int, *moved: Array) -> float:
-    """P(max Q > its largest) for chi-squares with 1 - rho = moved between neighbours."""
-    if not Q.size:
-        return float("nan")
-    c = float(Q.max())
-    places = np.ones(len(Q))
-    for one in moved:
-        places *= _kappa(c * np.minimum(one, 1.0))
-    return float(min(1.0, scipy.special.gammaincc(0.5 * n, 0.5 * c) * max(1.0, places.sum())))
-
-
-def _kappa(x: Array) -> Array:
-    """x nu(sqrt(2 x))."""
-    half = np.sqrt(np.maximum(x, 1e-12) / 2.0)
-    density = np.exp(-0.5 * half * half) / np.sqrt(2.0 * np.pi)
-    above = scipy.special.ndtr(half)
-    nu = (above - 0.5) / half / (half * above + density)
-    kappa: Array = np.minimum(1.0, np.maximum(x, 0.0) * nu)
-    return kappa
+def _chance(c: float, n: int, places: float) -> float:
+    """P(max Q > c) for chi-squares at so many independent places; NaN if there is none."""
+    return float(min(1.0, scipy.special.gammaincc(0.5 * n, 0.5 * c) * max(1.0, places))) if c >= 0.0 else float("nan")
 
 
 def together(mean: float, *suprema: float) -> float:
