@@ -21,7 +21,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.judge.alarms.variances import losses, variances
 from driftfit.judge.statistics.robust import CLIP as OF_FIT
-from driftfit.judge.statistics.robust import medians, robust_fit
+from driftfit.judge.statistics.robust import median, medians, robust_fit
 from driftfit.run.live.likelihood_ratio import (
     ALPHA,
     BETA,
@@ -82,12 +82,9 @@ def frozen_model(phi: Array, y: Array, ok: Array) -> tuple[Frozen, Rows]:
         numbers, h = noise_model(w[:, 0], len(theta))
         root = np.ones(len(y))
         root[used] = np.sqrt(h)
-    used, white = _whitened(rows, ok, ar)
-    w = white[:, -1] - white[:, :-1] @ theta
-    numbers, h = noise_model(w, len(theta))
-    x = w / (numbers[SCALE] * np.sqrt(h))
-    cov = _covariance(white[:, :-1] / np.sqrt(h)[:, None], x)
-    return Frozen(theta / unit, unit, np.ascontiguousarray(ar), cov, numbers), Rows(white[:, :-1], x)
+    x, white = w[:, 0] / (numbers[SCALE] * np.sqrt(h)), _whitened(rows[:, :-1], ok, ar)[1]
+    cov = _covariance(white / np.sqrt(h)[:, None], x)
+    return Frozen(theta / unit, unit, np.ascontiguousarray(ar), cov, numbers), Rows(white, x)
 
 
 def noise_model(w: Array, n: int) -> tuple[Array, Array]:
@@ -163,7 +160,7 @@ def _whitened(rows: Array, ok: Array, ar: Array) -> tuple[Array, Array]:
 
 def _autoregression(e: Array, ok: Array) -> Array:
     """Coefficients of the order up to ORDER with the smallest BIC; outliers are limited to three scales."""
-    limit = 3.0 * 1.4826 * float(np.median(np.abs(e[ok])))
+    limit = 3.0 * 1.4826 * median(np.abs(e[ok]))
     e, most = np.clip(e, -limit, limit), min(ORDER, len(e) // 20)
     used, _ = _whitened(e[:, None], ok, np.zeros(most))
     N, lags = len(used), [e[used - lag] for lag in range(1, most + 1)]

@@ -27,6 +27,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, Driver, kernel, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, minus, plus, store, times
 from driftfit.judge.statistics.noise import HELD
+from driftfit.judge.statistics.robust import cholesky
 
 DRAWS, ABOVE = 399, 20
 LEAST = 300
@@ -55,8 +56,8 @@ class Dates(NamedTuple):
 
     rows: Array
     """(m,): rows before each."""
-    roots: Array
-    """(m, n, n): M_b^(-1/2)."""
+    factors: Array
+    """(m, n, n): Cholesky factor of M_b = A_b - A_b A_T^-1 A_b, with reciprocals on the diagonal, 0 if it is flat."""
     shares: Array
     """(m, n, n): A_b A_T^-1."""
 
@@ -87,37 +88,69 @@ def _played(X: Array, psi: Array, c: Array, dates: Dates, signs: Array, state: A
 
 
 @shared
+def _observed(X: Array, psi: Array, inverse: Array, dates: Dates, A: Array, S: Array) -> None:
+    """The factors and shares at the dates, and the observed path, eight times, in S; inverse: A_T^-1, A (n, n): 0."""
+    (N, n), m, at = X.shape, dates.rows.shape[0], 0
+    for i in range(n):
+        store(S, m * n + i, 0, fill(0.0))
+    for t in range(N):
+        if at < m and dates.rows[at] == t:
+            share, M = dates.shares[at], dates.factors[at]
+            for i in range(n):
+                store(S, at * n + i, 0, load(S, m * n + i, 0))
+                for j in range(n):
+                    share[i, j] = 0.0
+                    for l in range(n):
+                        share[i, j] += A[i, l] * inverse[l, j]
+            for i in range(n):
+                for j in range(i + 1):
+                    M[i, j] = A[i, j]
+                    for l in range(n):
+                        M[i, j] -= share[i, l] * A[l, j]
+            cholesky(M, n)
+            for i in range(n):
+                M[i, i] = 1.0 / M[i, i] if M[i, i] > 0.0 else 0.0
+            at += 1
+        for i in range(n):
+            store(S, m * n + i, 0, plus(load(S, m * n + i, 0), fill(X[t, i] * psi[t])))
+            for j in range(n):
+                A[i, j] += X[t, i] * X[t, j]
+
+
+@shared
 def _largest(dates: Dates, S: Array, z: Array) -> None:
-    """The suprema of F of eight paths into row 0 of z (n + 1, 8)."""
+    """The suprema of F of eight paths into row n of z (n + 1, 8)."""
     m, n = dates.rows.shape[0], z.shape[0] - 1
-    store(z, 0, 0, fill(0.0))
+    store(z, n, 0, fill(0.0))
     for b in range(m):
         # S*_b = S_b - A_b A_T^-1 S_T, and its quadratic form F_b
+        total = fill(0.0)
         for i in range(n):
             value = load(S, b * n + i, 0)
             for j in range(n):
                 value = minus(value, times(fill(dates.shares[b, i, j]), load(S, m * n + j, 0)))
-            store(z, 1 + i, 0, value)
-        total = fill(0.0)
-        for i in range(n):
-            value = fill(0.0)
-            for j in range(n):
-                value = plus(value, times(fill(dates.roots[b, i, j]), load(z, 1 + j, 0)))
+            for j in range(i):
+                value = minus(value, times(fill(dates.factors[b, i, j]), load(z, j, 0)))
+            value = times(value, fill(dates.factors[b, i, i]))
+            store(z, i, 0, value)
             total = plus(total, times(value, value))
-        store(z, 0, 0, higher(total, load(z, 0, 0)))
+        store(z, n, 0, higher(total, load(z, n, 0)))
 
 
 @Driver
-def _share_above(X: Array, psi: Array, c: Array, dates: Dates, signs: Array, found: float, S: Array, z: Array) -> float:
-    """p-value of the supremum found; S, z: scratch."""
+def _p_value(X: Array, psi: Array, c: Array, inverse: Array, dates: Dates, signs: Array, S: Array, z: Array) -> float:
+    """The share of the draws; inverse: A_T^-1, S, z: scratch."""
+    n = X.shape[1]
+    _observed(X, psi, inverse, dates, np.zeros((n, n)), S)
+    _largest(dates, S, z)
+    found, above = z[n, 0], 0
     state = np.uint64(88172645463325252)
-    above = 0
     for first in range(0, DRAWS, WIDTH):
         state = _played(X, psi, c, dates, signs, state, S)
         _largest(dates, S, z)
         # sequential: stop as soon as enough draws exceed the observed supremum
         for draw in range(first, min(first + WIDTH, DRAWS)):
-            above += 1 if z[0, draw - first] >= found else 0
+            above += 1 if z[n, draw - first] >= found else 0
             if above == ABOVE:
                 return above / (draw + 1)
     return (above + 1) / (DRAWS + 1)
@@ -133,15 +166,7 @@ def wild_supremum(X: Array, residual: Array, level: Array) -> float:
     if N < LEAST:
         return float("nan")
     psi, edge = np.clip(residual, -HELD * level, HELD * level), np.arange(n + 2, END + n)
-    dates = np.unique(np.concatenate([edge, np.linspace(END + n, N - END - n, MIDDLE).astype(int), N - edge]))
-    A = np.cumsum(np.einsum("ti,tj->tij", X, X), axis=0)[dates - 1]
-    whole = X.T @ X
-    shares = A @ np.linalg.inv(whole)
-    values, vectors = np.linalg.eigh(A - shares @ A)
-    good = values > 1e-9 * values.max(axis=1, keepdims=True)
-    roots = np.where(good, 1.0 / np.sqrt(np.where(good, values, 1.0)), 0.0)[:, :, None] * np.swapaxes(vectors, 1, 2)
-    path = np.cumsum(X * psi[:, None], axis=0)[dates - 1] - shares @ (X.T @ psi)
-    F = np.sum(np.einsum("bij,bj->bi", roots, path) ** 2, axis=1)
-    given = Dates(dates, *map(np.ascontiguousarray, (roots, shares)))
-    scratch = np.empty(((len(dates) + 1) * n, WIDTH)), np.empty((n + 1, WIDTH))
-    return float(_share_above(np.ascontiguousarray(X), psi, level, given, SIGNS, F.max(), *scratch))
+    rows = np.unique(np.concatenate([edge, np.linspace(END + n, N - END - n, MIDDLE).astype(int), N - edge]))
+    m, inverse = len(rows), np.ascontiguousarray(np.linalg.inv(X.T @ X))
+    dates, scratch = Dates(rows, *np.empty((2, m, n, n))), (np.empty(((m + 1) * n, WIDTH)), np.empty((n + 1, WIDTH)))
+    return float(_p_value(np.ascontiguousarray(X), psi, level, inverse, dates, SIGNS, *scratch))
