@@ -68,7 +68,8 @@ class Space(NamedTuple):
 def _extend(G: Array, ends: Array, t: int, p: int, k: int, space: Space) -> None:
     """Add block t - 1 to the segments from every start, the last of which begins with it.
 
-    In a segment after a break, each of its first p rows counts as one, whatever its value is.
+    In a segment after a break, each of its first p rows counts as one, whatever its value is, and so does each row of a
+    later block that begins among them.
     """
     begin, settled = ends[t - 2] if t > 1 else 0, t
     while settled > 1 and begin - ends[settled - 2] < p:
@@ -78,13 +79,13 @@ def _extend(G: Array, ends: Array, t: int, p: int, k: int, space: Space) -> None
             block = G[0, t - 1, i, j]
             for s in range(settled):
                 space.total[k * i + j, s] += block
-    for s in range(settled, t):
-        lacking = p - (begin - ends[s - 1])
-        if s == t - 1:
-            for i in range(k):
-                for j in range(i + 1):
-                    space.total[k * i + j, s] += G[1, t - 1, i, j]
-        space.seen[0, s] += min(lacking, ends[t - 1] - begin)
+    for s in range(settled, t - 1):
+        space.seen[0, s] += ends[t - 1] - begin
+    if settled < t:
+        for i in range(k):
+            for j in range(i + 1):
+                space.total[k * i + j, t - 1] += G[1, t - 1, i, j]
+        space.seen[0, t - 1] += min(p, ends[t - 1] - begin)
 
 
 @shared
