@@ -6,7 +6,7 @@ from support import arx_record, damaged
 
 from driftfit import ARX, RLS, Kalman, Regression, track
 from driftfit.judge.compare import compare
-from driftfit.judge.constant_fit import constant_least_squares
+from driftfit.judge.constant_fit import constant_errors, constant_least_squares
 
 
 def test_constants_are_those_of_rls_from_a_diffuse_start():
@@ -32,3 +32,17 @@ def test_constants_of_regressors_that_are_the_same():
     assert got["e"][20:, 0] == pytest.approx(twin.innovation[20:], rel=1e-6, abs=1e-8)
     assert np.abs(got["theta"]).max() < 100.0
     assert compare(run).constant_arx < 2.0 * np.std(y)
+
+
+def test_collinear_regressors_lose_nothing():
+    """An intercept that occurs three times, as with its lags: errors of least squares on the past of each sample."""
+    u = np.random.default_rng(3).normal(size=(120, 3))
+    phi, y = (
+        np.column_stack([np.ones((120, 3)), u]),
+        1.0 + u @ [1.0, 0.5, -0.5] + np.random.default_rng(4).normal(size=120),
+    )
+    past = [np.linalg.lstsq(phi[:t], y[:t], rcond=1e-9)[0] for t in range(10, 120)]
+    expected = y[10:] - np.sum(phi[10:] * past, axis=1)
+    for order in (range(6), (3, 0, 4, 1, 5, 2)):
+        got = constant_errors(phi[:, order], y, np.ones(120))
+        assert got[10:] == pytest.approx(expected, abs=1e-10)

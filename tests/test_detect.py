@@ -9,7 +9,7 @@ from support import Doubtful, arx_record, rows_of
 
 from driftfit import ARX, AugmentedFLS, HammersteinWiener, Kalman, Regression, track
 from driftfit.engine.kernel import kernel
-from driftfit.judge.alarms.calibration import _least, begun_over, innovations, null_records, residuals
+from driftfit.judge.alarms.calibration import _least, begun_over, innovations, limits_of, null_records, residuals
 from driftfit.judge.alarms.detect import Alarms
 from driftfit.judge.alarms.onsets import (
     chance,
@@ -157,6 +157,13 @@ def test_simulated_limit_is_the_least_above_which_onsets_are_few(allowed):
     assert (begun[limits >= limit] <= allowed).all()
     below = np.flatnonzero(limits < limit)
     assert not len(below) or begun[below[-1]] > allowed
+
+
+def test_limits_of_several_rates_are_those_of_each():
+    rng = np.random.default_rng(6)
+    made = [(np.abs(np.cumsum(rng.normal(size=(300, 2)), axis=0)), 20) for _ in range(3)]
+    together = limits_of(made, 200.0, 25.0, 4.0)
+    assert np.array_equal(together, [limits_of(made, every)[0] for every in (200.0, 25.0, 4.0)])
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,9 @@ def test_records_side_by_side_have_the_statistics_of_each(cusum):
     phi, g = rng.normal(size=(R, T, n)), np.clip(rng.normal(size=(R, T)), -2.5, 2.5)
     phi[2, :, 1] = 0.0
     records = SimulatedRecords(root @ root.transpose(0, 2, 1), numbers, phi, g)
-    for k, found in enumerate(statistics_of(records, cusum)):
+    together = statistics_of(records, cusum)
+    assert np.array_equal(statistics_of(records, cusum, START), together[:, START:])
+    for k, found in enumerate(together):
         model = Frozen(np.zeros(n), np.ones(n), np.zeros(0), records.cov[k], numbers[k])
         findings = np.empty((T, CUSUM + n + 1))
         scan(np.column_stack([phi[k], g[k], np.ones((T, 3))]), model, memory_of(n, 0), findings)

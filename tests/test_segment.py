@@ -26,23 +26,35 @@ def cost(phi, y):
     return float(np.sum((y - phi @ np.linalg.lstsq(phi, y, rcond=None)[0]) ** 2))
 
 
-@pytest.mark.parametrize("price", [1.0, 6.0, 30.0])
-def test_the_partition_is_the_cheapest_of_all(price):
-    """Against dynamic programming over all pairs, without pruning."""
+def summed(phi, y, starts, s, t, p):
+    """The cost of blocks s .. t - 1: after a break, rows of the first p and of blocks that begin there count as one."""
+    rows, counted = [], 0
+    for b in range(s, t):
+        lacking = p - (starts[b] - starts[s]) if s > 0 else 0
+        first = starts[b] + (0 if lacking <= 0 else p if b == s else starts[b + 1] - starts[b])
+        counted += min(first, starts[b + 1]) - starts[b]
+        rows += range(first, starts[b + 1])
+    return cost(phi[rows], y[rows]) + counted
+
+
+@pytest.mark.parametrize(("price", "width", "p"), [(1.0, 1, 0), (6.0, 1, 0), (30.0, 1, 0), (0.3, 3, 10), (2.0, 5, 3)])
+def test_the_partition_is_the_cheapest_of_all(price, width, p):
+    """Against dynamic programming over all pairs of blocks, without bounds."""
     rng = np.random.default_rng(int(price))
     phi = np.column_stack([rng.normal(size=60), np.ones(60)])
     y = phi @ [1.0, 2.0] + np.repeat(rng.normal(size=6), 10) * phi[:, 0] * 2.0 + rng.normal(size=60)
+    starts = np.arange(0, 61, width)
     F, last = [-price], [0]
-    for t in range(1, 61):
-        options = [(F[s] + cost(phi[s:t], y[s:t]) + price, s) for s in range(max(t - 4, 0)) if np.isfinite(F[s])]
-        best = min(options, default=(np.inf, 0))
+    for t in range(1, len(starts)):
+        some = [s for s in range(t) if starts[t] - starts[s] >= 5 and np.isfinite(F[s])]
+        best = min(((F[s] + summed(phi, y, starts, s, t, p) + price, s) for s in some), default=(np.inf, 0))
         F.append(best[0])
         last.append(best[1])
-    expected, t = [], 60
+    expected, t = [], len(starts) - 1
     while last[t] > 0:
         t = last[t]
-        expected.append(t)
-    assert partition(phi, y, np.arange(1, 61), price, 5).tolist() == expected[::-1]
+        expected.append(starts[t])
+    assert partition(phi, y, starts[1:], price, 5, p).tolist() == expected[::-1]
     assert len(expected) > 0 or price == 30.0
 
 

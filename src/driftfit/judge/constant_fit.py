@@ -37,13 +37,17 @@ FLAT = 1e-11
 
 @shared
 def rotate(R: Array, row: Array, size: Array, theta: Array) -> None:
-    """Rotate ``row`` = [phi, y] into R (n, n + 1) = [R, z] and solve for theta; row is overwritten. size: (n,)."""
+    """Rotate ``row`` = [phi, y] into R (n, n + 1) = [R, z] and solve for theta; row is overwritten.
+
+    size (n,): sum of the squares of every regressor. An entry that is rounding does not rotate: where regressors are
+    collinear, as lags of an intercept are, it would turn a row by any angle into an equation that is not used.
+    """
     n = theta.shape[0]
     for i in range(n):
-        size[i] = np.hypot(size[i], row[i])
+        size[i] += row[i] * row[i]
     for i in range(n):
-        if row[i] != 0.0:
-            length = np.hypot(R[i, i], row[i])
+        if row[i] * row[i] > FLAT * FLAT * size[i]:
+            length = np.sqrt(R[i, i] * R[i, i] + row[i] * row[i])  # numbers below `LARGEST` do not overflow
             c, s = R[i, i] / length, row[i] / length
             for j in range(i, n + 1):
                 above, below = R[i, j], row[j]
@@ -53,7 +57,7 @@ def rotate(R: Array, row: Array, size: Array, theta: Array) -> None:
         total = R[i, n]
         for j in range(i + 1, n):
             total -= R[i, j] * theta[j]
-        theta[i] = total / R[i, i] if R[i, i] > FLAT * size[i] else 0.0
+        theta[i] = total / R[i, i] if R[i, i] > FLAT * np.sqrt(size[i]) else 0.0
 
 
 @kernel

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -95,7 +95,7 @@ class ARX(CountedInputs):
         """(nb, nk) of every input."""
         return tuple(zip(self.for_each_input("nb"), self.for_each_input("nk"), strict=True))
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         return (*(f"a{i + 1}" for i in range(self.na)), *self._names_after_lags())
 

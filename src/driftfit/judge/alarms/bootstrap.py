@@ -17,15 +17,16 @@ Source: Kunsch (1989) for blocks; Wu (1986) for signs. Cost: half a second at n 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import scipy
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.alarms.calibration import limit_of
+from driftfit.judge.alarms.calibration import limits_of
 from driftfit.judge.alarms.frozen import GARCH, Rows, noise_models, plausible
-from driftfit.judge.alarms.onsets import onsets
 from driftfit.judge.alarms.side_by_side import SimulatedRecords, statistics_of
+from driftfit.judge.alarms.variances import residuals, variances
 from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.live.likelihood_ratio import (
     ALPHA,
@@ -36,8 +37,6 @@ from driftfit.run.live.likelihood_ratio import (
     SHORT,
     Frozen,
     K,
-    levels,
-    played,
 )
 
 RECORDS, SAMPLES = 64, 1000
@@ -59,23 +58,30 @@ def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> 
     (N, n), T = rows.phi.shape, SAMPLES + START
     draws = [np.random.default_rng([seed, k]) for k in range(3)]
     block = int(np.clip(N // 20, 20, 200)) if drawn_in_blocks(frozen, rows.x) else 1
-    root, sobol = np.linalg.cholesky(frozen.cov), scipy.stats.qmc.Sobol(n, rng=np.random.default_rng([seed, 3]))
-    z = scipy.special.ndtri(sobol.random_base2(int(np.ceil(np.log2(records))))[:records] * (1.0 - 1e-9) + 5e-10)
+    root = np.linalg.cholesky(frozen.cov)
     known, later = (_blocks(rng, (records, length), N, block) for rng, length in zip(draws[:2], (N, T), strict=True))
     signs = draws[2].integers(0, 2, (records, N + T)) * 2.0 - 1.0
     drawn = np.tile(frozen.numbers, (records, 1))
     drawn[:, [ALPHA, BETA]] = _variances(frozen, rows.x, np.random.default_rng([seed, 4]).random(records))
-    w = _played(drawn, rows.x[np.hstack([known, later])] * signs, N)
+    x = rows.x[np.hstack([known, later])] * signs
+    w = np.hstack([residuals(x[:, :N], drawn), residuals(x[:, N:], drawn)])
     numbers, _ = noise_models(w[:, :N], n)
     w *= np.sqrt(N / max(N - n, 1))  # what follows has not been fitted
-    z *= np.sqrt(N / max(N - n - 1, 1))  # nor are its regressors those of the reference
-    w, h = w[:, N:] / numbers[:, SCALE, None], np.empty((records, T))
-    for one, own, level in zip(w, numbers, h, strict=True):
-        levels(one, own, level)
+    z = _normal(n, records, seed) * np.sqrt(N / max(N - n - 1, 1))  # nor are its regressors those of the reference
+    w = w[:, N:] / numbers[:, SCALE, None]
+    h = variances(w, numbers)
     phi = rows.phi[later] / np.sqrt(h)[..., None]
     clip, k = numbers[:, CLIP, None], numbers[:, K, None]
     g = np.clip(w / np.sqrt(h), -clip, clip) - k * np.einsum("rti,ri->rt", phi, z @ root.T)
     return SimulatedRecords(np.broadcast_to(frozen.cov, (records, n, n)), numbers, phi, g)
+
+
+@lru_cache(64)
+def _normal(n: int, records: int, seed: int) -> Array:
+    """Normal numbers (records, n) that fill space evenly."""
+    sobol = scipy.stats.qmc.Sobol(n, rng=np.random.default_rng([seed, 3]))
+    drawn = sobol.random_base2(int(np.ceil(np.log2(records))))[:records]
+    return np.asarray(scipy.special.ndtri(drawn * (1.0 - 1e-9) + 5e-10))
 
 
 def together(parts: Sequence[SimulatedRecords]) -> SimulatedRecords:
@@ -102,19 +108,9 @@ def _blocks(rng: np.random.Generator, shape: tuple[int, int], N: int, block: int
 
 def _variances(frozen: Frozen, x: Array, chance: Array) -> Array:
     """alpha and beta (R, 2) of the records, drawn from those that the reference leaves plausible; ``chance`` (R,)."""
-    w = np.empty(len(x))
-    played(x, frozen.numbers, w)
-    which = np.searchsorted(np.cumsum(plausible(w, frozen.numbers)), chance)
+    numbers = frozen.numbers[None]
+    which = np.searchsorted(np.cumsum(plausible(residuals(x[None], numbers), numbers)), chance)
     return np.asarray(GARCH[:, np.minimum(which, GARCH.shape[1] - 1)].T)
-
-
-def _played(numbers: Array, x: Array, N: int) -> Array:
-    """Residuals (R, N + T) with the variances of each model, which start again after the N of the reference."""
-    w = np.empty(x.shape)
-    for one, own, into in zip(x, numbers, w, strict=True):
-        played(one[:N], own, into[:N])
-        played(one[N:], own, into[N:])
-    return w
 
 
 def limits(records: SimulatedRecords, cusum: bool, every: float) -> tuple[Array, Array, float]:
@@ -126,13 +122,14 @@ def limits(records: SimulatedRecords, cusum: bool, every: float) -> tuple[Array,
     onsets come in groups makes the result somewhat too large. The exponent of a rate, and so its error, grows with the
     square of the limit.
     """
-    parts = [(one, START) for one in statistics_of(records, cusum)]
-    base = min(every, max(SAMPLES * len(parts) / SEEN, STEP * OFTEN))
+    statistic = statistics_of(records, cusum, START)
+    base = min(every, max(SAMPLES * len(statistic) / SEEN, STEP * OFTEN))
     often = max(base / STEP, OFTEN)
-    near, nearer = limit_of(parts, base), limit_of(parts, often)
+    near, nearer = limits_of([(one, 0) for one in statistic], base, often)
     growth = np.maximum(near**2 - nearer**2, 0.1) / np.log(base / often)
     found = np.sqrt(near**2 + growth * np.log(every / base))
-    begun = np.array([len(onsets(np.asarray((one[START:] > near).any(axis=1)))) for one, _ in parts], float)
+    active = np.logical_or.reduce([statistic[..., j] > limit for j, limit in enumerate(near)])
+    begun = active[:, 0] + np.sum(active[:, 1:] & ~active[:, :-1], axis=1)
     mean = max(float(begun.mean()), 1e-9)
     beyond = np.log1p(max(float(begun.var(ddof=1)) - mean, 0.0) / mean**2)
     return found, growth, float(np.sqrt(beyond) * np.mean(found**2) / np.mean(near**2))

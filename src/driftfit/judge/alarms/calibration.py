@@ -15,13 +15,12 @@ alarms, so the rate is known to about 1 / sqrt(TIMES).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
-from driftfit.judge.alarms.onsets import onsets
 from driftfit.judge.statistics.robust import core
 from driftfit.models.arx import ARX
 from driftfit.models.regression import Regression
@@ -105,8 +104,9 @@ def _last_known(U: Array) -> Array:
     return np.where(np.isfinite(U[place]), U[place], 0.0)
 
 
-def limit_of(made: Iterable[tuple[Array, int]], every: float) -> Array:
-    """Limits (c,) that the columns of the statistics together begin to exceed once in ``every`` samples.
+def limits_of(made: Iterable[tuple[Array, int]], *every: float) -> list[Array]:
+    """For each of the numbers ``every``: limits (c,) that the columns of the statistics together begin to exceed once
+    in that many samples.
 
     ``made`` contains (statistic (T, c), first sample judged) of records. All columns have the same rate, which is the
     largest possible one: columns that exceed at the same time begin only one alarm.
@@ -114,12 +114,16 @@ def limit_of(made: Iterable[tuple[Array, int]], every: float) -> Array:
     parts: list[Array] = []
     for statistic, start in made:
         parts += [np.full((1, statistic.shape[1]), -np.inf), statistic[start:]]
-    joined = np.ascontiguousarray(np.concatenate(parts).T)  # -inf before each record
+    joined = np.concatenate([part.T for part in parts], axis=1)  # -inf before each record
     joined[~np.isfinite(joined)] = -np.inf
-    columns, samples = joined.shape
-    allowed = (samples - len(parts) // 2) / every
+    samples = joined.shape[1] - len(parts) // 2
+    rates = [begun_over(column, samples / min(every)) for column in joined]
+    return [_together(joined, rates, samples / one) for one in every]
 
-    rates = [begun_over(column, allowed) for column in joined]
+
+def _together(joined: Array, rates: Sequence[tuple[Array, Array]], allowed: float) -> Array:
+    """Limits (c,) with ``allowed`` onsets of all columns together."""
+    columns = len(joined)
 
     def limits(share: float) -> Array:
         return np.array([_least(*rate, share) for rate in rates])
@@ -127,7 +131,8 @@ def limit_of(made: Iterable[tuple[Array, int]], every: float) -> Array:
     low, high = allowed / columns, allowed
     for _ in range(STEPS if columns > 1 else 0):
         middle = 0.5 * (low + high)
-        begun = len(onsets(np.any(joined > limits(middle)[:, None], axis=0)))
+        active = np.logical_or.reduce([column > limit for column, limit in zip(joined, limits(middle), strict=True)])
+        begun = int(np.sum(active[1:] & ~active[:-1]))
         low, high = (middle, high) if begun <= allowed else (low, middle)
     return limits(low)
 
@@ -141,7 +146,7 @@ def begun_over(values: Array, allowed: float) -> tuple[Array, Array]:
     makes a difference is counted.
     """
     before, after = values[:-1], values[1:]
-    for share in (HIGHEST, 1.0):
+    for share in (HIGHEST, 4.0 * HIGHEST, 1.0):
         lower = int((1.0 - share) * len(after))
         high = after >= np.partition(after, lower)[lower]
         rising = high & (after > before)

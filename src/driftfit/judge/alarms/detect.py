@@ -48,7 +48,7 @@ from rich.text import Text
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, one_of, whole
 from driftfit.judge.alarms.bootstrap import RECORDS
-from driftfit.judge.alarms.calibration import limit_of, null_records
+from driftfit.judge.alarms.calibration import limits_of, null_records
 from driftfit.judge.alarms.onsets import held, onsets
 from driftfit.judge.alarms.reference import burn, in_samples
 from driftfit.judge.alarms.statistics import Reference, chance_of, findings_of, highest, rule_of, statistic_of
@@ -277,7 +277,7 @@ def detect(
     for null in null_records(run, asked.every, at, seed):
         own, begin = rule_of(null, asked, reference, seed)
         made.append((statistic_of(null, own, begin), begin))
-    limits = limit_of(made, asked.every)
+    (limits,) = limits_of(made, asked.every)
     alarms = judged(run, replace(rule, limits=tuple(limits.tolist()), simulated=True), first)
     extreme = highest(alarms.statistic, first)
     as_far = [np.max(highest(*one) / limits) >= np.max(extreme / limits) for one in made]

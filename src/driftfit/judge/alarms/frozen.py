@@ -19,9 +19,9 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
-from driftfit.judge.alarms.side_by_side import losses
+from driftfit.judge.alarms.variances import losses, variances
 from driftfit.judge.statistics.robust import CLIP as OF_FIT
-from driftfit.judge.statistics.robust import medians, robust_fit
+from driftfit.judge.statistics.robust import median, medians, robust_fit
 from driftfit.run.live.likelihood_ratio import (
     ALPHA,
     BETA,
@@ -37,7 +37,6 @@ from driftfit.run.live.likelihood_ratio import (
     Frozen,
     K,
     V,
-    levels,
 )
 
 CLIPPED = 2.5
@@ -83,12 +82,9 @@ def frozen_model(phi: Array, y: Array, ok: Array) -> tuple[Frozen, Rows]:
         numbers, h = noise_model(w[:, 0], len(theta))
         root = np.ones(len(y))
         root[used] = np.sqrt(h)
-    used, white = _whitened(rows, ok, ar)
-    w = white[:, -1] - white[:, :-1] @ theta
-    numbers, h = noise_model(w, len(theta))
-    x = w / (numbers[SCALE] * np.sqrt(h))
-    cov = _covariance(white[:, :-1] / np.sqrt(h)[:, None], x)
-    return Frozen(theta / unit, unit, np.ascontiguousarray(ar), cov, numbers), Rows(white[:, :-1], x)
+    x, white = w[:, 0] / (numbers[SCALE] * np.sqrt(h)), _whitened(rows[:, :-1], ok, ar)[1]
+    cov = _covariance(white / np.sqrt(h)[:, None], x)
+    return Frozen(theta / unit, unit, np.ascontiguousarray(ar), cov, numbers), Rows(white, x)
 
 
 def noise_model(w: Array, n: int) -> tuple[Array, Array]:
@@ -100,16 +96,15 @@ def noise_model(w: Array, n: int) -> tuple[Array, Array]:
 def noise_models(w: Array, n: int) -> tuple[Array, Array]:
     """The same for R references of N residuals each, w (R, N): numbers (R, k) and h (R, N)."""
     R, N = w.shape
-    numbers, h = np.zeros((R, NORMAL + 1)), np.empty((R, N))
+    numbers = np.zeros((R, NORMAL + 1))
     numbers[:, CLIP], numbers[:, NORMAL], numbers[:, LONGEST] = CLIPPED, N, max(N // SHARE, 8)
     numbers[:, SCALE] = _scales(w, n)
     x = w / numbers[:, SCALE, None]
     square = np.clip(x, -CLIPPED, CLIPPED) ** 2
     numbers[:, V] = square.mean(axis=1)
     numbers[:, INSIDE] = np.mean(np.where(np.abs(x) < CLIPPED, x * x, 0.0), axis=1)
-    for one, own, level in zip(x, numbers, h, strict=True):
-        own[[ALPHA, BETA]] = averaged(plausible(one, own))
-        levels(one, own, level)
+    numbers[:, [ALPHA, BETA]] = averaged(plausible(x, numbers))
+    h = variances(x, numbers)
     numbers[:, SCALE] *= _scales(w / (numbers[:, SCALE, None] * np.sqrt(h)), n)
     x = w / (numbers[:, SCALE, None] * np.sqrt(h))
     square = np.clip(x, -CLIPPED, CLIPPED) ** 2
@@ -121,28 +116,22 @@ def noise_models(w: Array, n: int) -> tuple[Array, Array]:
 
 
 def plausible(x: Array, numbers: Array) -> Array:
-    """Probabilities (C,) of the candidates `GARCH` for residuals x (N,) in units of their scale; the quasi-likelihood
-    counts by as much as the tails allow."""
-    square = np.clip(x, -CLIPPED, CLIPPED) ** 2
-    total = _losses(x, numbers) * numbers[INSIDE] ** 2 / np.var(square)
-    share = PRIOR * np.exp(total.min() - total)
-    return np.asarray(share / share.sum())
+    """Probabilities (R, C) of the candidates `GARCH` for residuals x (R, N) in units of their scale; the
+    quasi-likelihood counts by as much as the tails allow."""
+    total = np.zeros((len(x), GARCH.shape[1]))
+    losses(x, numbers, GARCH, np.empty((1, GARCH.shape[1])), total)
+    total *= (numbers[:, INSIDE] ** 2 / np.var(np.clip(x, -CLIPPED, CLIPPED) ** 2, axis=1))[:, None]
+    share = PRIOR * np.exp(total.min(axis=1, keepdims=True) - total)
+    return np.asarray(share / share.sum(axis=1, keepdims=True))
 
 
-def averaged(share: Array) -> tuple[float, float]:
-    """alpha and beta from the probabilities (C,) of the candidates: the mean of alpha, and the mean of alpha + beta
-    weighted by alpha too, as constant noise has no persistence."""
+def averaged(share: Array) -> Array:
+    """alpha and beta (R, 2) from the probabilities (R, C) of the candidates: the mean of alpha, and the mean of
+    alpha + beta weighted by alpha too, as constant noise has no persistence."""
     reaction = GARCH[0] * share
-    alpha = float(reaction.sum())
-    return alpha, float(reaction @ GARCH.sum(axis=0)) / alpha - alpha if alpha > 0.0 else 0.0
-
-
-def _losses(x: Array, numbers: Array) -> Array:
-    """`losses` (C,) of residuals x (N,) in units of their scale for the candidates."""
-    total = np.zeros((1, GARCH.shape[1]))
-    losses(x, CLIPPED, numbers[V], numbers[INSIDE], GARCH, np.ones(total.shape), total)
-    found: Array = total[0]
-    return found
+    alpha, both = reaction.sum(axis=1), reaction @ GARCH.sum(axis=0)
+    some = alpha > 0.0
+    return np.column_stack([alpha, np.where(some, both / np.where(some, alpha, 1.0) - alpha, 0.0)])
 
 
 def _covariance(phi: Array, x: Array) -> Array:
@@ -171,7 +160,7 @@ def _whitened(rows: Array, ok: Array, ar: Array) -> tuple[Array, Array]:
 
 def _autoregression(e: Array, ok: Array) -> Array:
     """Coefficients of the order up to ORDER with the smallest BIC; outliers are limited to three scales."""
-    limit = 3.0 * 1.4826 * float(np.median(np.abs(e[ok])))
+    limit = 3.0 * 1.4826 * median(np.abs(e[ok]))
     e, most = np.clip(e, -limit, limit), min(ORDER, len(e) // 20)
     used, _ = _whitened(e[:, None], ok, np.zeros(most))
     N, lags = len(used), [e[used - lag] for lag in range(1, most + 1)]

@@ -33,8 +33,9 @@ import numpy as np
 import scipy
 
 from driftfit.engine.kernel import Array, Driver, shared
+from driftfit.engine.simd import WIDTH, fill, load, minus, plus, store, times
 from driftfit.judge.statistics.partition import partition
-from driftfit.judge.statistics.robust import cholesky, deviation, huber, median
+from driftfit.judge.statistics.robust import cholesky, columns_of, deviation, huber, median, moments, ones
 
 HELD = 3.0
 """y is limited to this many noise levels around the fit."""
@@ -73,47 +74,49 @@ class Noise(NamedTuple):
 
 
 @shared
-def lagged(v: Array, limit: float, k: int) -> float:
-    """sum v_t v_(t-k), with v limited to +-limit."""
-    total = 0.0
-    for t in range(k, v.shape[0]):
-        total += min(max(v[t], -limit), limit) * min(max(v[t - k], -limit), limit)
-    return total
+def lagged(v: Array, r: Array) -> None:
+    """Add sum v_t v_(t-k) to r_k for all lags k = 0 .. P of r (P + 1,), which are vectorised."""
+    N = v.shape[0]
+    for t in range(N):
+        for k in range(min(r.shape[0], N - t)):
+            r[k] += v[t] * v[t + k]
 
 
-def _windows(Q: Array, y: Array, starts: Array, ends: Array, residual: Array, level: Array, r: Array) -> None:
+def _windows(columns: Array, starts: Array, ends: Array, residual: Array, level: Array, r: Array) -> None:
     """Robust fits of windows: residual (N,) of the nearest centre, level (W,), sums at lags 0 .. P in r (W, P + 1)."""
-    n, W, P = Q.shape[1], starts.shape[0], r.shape[1] - 1
+    n, W = columns.shape[0] - 1, starts.shape[0]
     theta = np.zeros(n)
     for w in range(W):
         a, b = starts[w], ends[w]
-        own = np.empty(b - a)
-        level[w] = huber(Q[a:b], y[a:b], theta, own) * np.sqrt((b - a) / max(b - a - n, 1.0))
+        own = np.empty((1, b - a + WIDTH))
+        level[w] = huber(columns, a, b, theta, own) * np.sqrt((b - a) / max(b - a - n, 1.0))
         first = a if w == 0 else (a + ends[w - 1]) // 2
         final = b if w == W - 1 else (starts[w + 1] + b) // 2
         for t in range(first, final):
-            residual[t] = own[t - a]
-        for k in range(P + 1):
-            r[w, k] = lagged(own, HELD * level[w], k)
+            residual[t] = own[0, t - a]
+        limit = HELD * level[w]
+        for t in range(b - a):
+            own[0, t] = min(max(own[0, t], -limit), limit)
+        lagged(own[0, : b - a], r[w])
 
 
-def _segments(Q: Array, y: Array, X: Array, z: Array, bounds: Array, order: Array, out: Array) -> None:
-    """Robust fits of segments on the white rows X, z, those that are mixed left out.
+def _segments(Q: Array, y: Array, columns: Array, bounds: Array, order: Array, out: Array) -> None:
+    """Robust fits of segments on the white rows, ``columns``, those that are mixed left out.
 
     ``out`` (3, N) are the residual of y on Q, that of the neighbouring segment where a break is near and it is smaller,
-    and the leverage of X.
+    and the leverage of the white rows.
     """
     residual, near, leverage = out[0], out[1], out[2]
     N, n = Q.shape
     K = bounds.shape[0] - 1
-    theta, own = np.zeros((K, n)), np.empty(N)
+    theta, own = np.zeros((K, n)), np.empty((1, N + WIDTH))
     for k in range(K):
         a, b = bounds[k], bounds[k + 1]
         first = min(a + order[0], b - 1)
-        huber(X[first:b], z[first:b], theta[k], own[first:b])
-        lever(X[first:b], leverage[first:b])
-        for t in range(a, first):
-            leverage[t] = 0.0
+        huber(columns, first, b, theta[k], own)
+        lever(columns, first, b, own)
+        for t in range(a, b):
+            leverage[t] = own[0, t - first] if t >= first else 0.0
     for k in range(K):
         a, b = bounds[k], bounds[k + 1]
         for t in range(a, b):
@@ -131,30 +134,29 @@ def _segments(Q: Array, y: Array, X: Array, z: Array, bounds: Array, order: Arra
 
 
 @shared
-def lever(X: Array, h: Array) -> None:
-    """h_t = x_t' (X' X)^-1 x_t."""
-    N, n = X.shape
-    M, z = np.zeros((n + 1, n + 1)), np.zeros(n)
-    for t in range(N):
-        for i in range(n):
-            for j in range(i + 1):
-                M[i, j] += X[t, i] * X[t, j]
+def lever(columns: Array, first: int, last: int, h: Array) -> None:
+    """h_t = x_t' (X' X)^-1 x_t of the rows first .. last of `columns_of`, h (1, N + 8)."""
+    n = columns.shape[0] - 1
+    M, sums = np.zeros((n + 1, n + 1)), np.empty(((n + 1) * n, WIDTH))
+    ones(h, last - first)
+    moments(columns, first, last, h, sums, M)
     cholesky(M, n)
-    for t in range(N):
-        h[t] = 0.0
+    for t in range(first, last, WIDTH):
+        total = fill(0.0)
         for i in range(n):
-            z[i] = X[t, i]
+            z = load(columns, i, t)
             for j in range(i):
-                z[i] -= M[i, j] * z[j]
-            z[i] = z[i] / M[i, i] if M[i, i] > 0.0 else 0.0
-            h[t] += z[i] * z[i]
+                z = minus(z, times(fill(M[i, j]), load(sums, j, 0)))
+            z = times(z, fill(1.0 / M[i, i] if M[i, i] > 0.0 else 0.0))
+            store(sums, i, 0, z)
+            total = plus(total, times(z, z))
+        store(h, 0, t - first, total)
 
 
-def _pooled(v: Array, bounds: Array, limit: Array, r: Array) -> None:
+def _pooled(v: Array, bounds: Array, r: Array) -> None:
     """Sums at lags 0 .. P of products within segments, r (P + 1,)."""
     for k in range(bounds.shape[0] - 1):
-        for lag in range(r.shape[0]):
-            r[lag] += lagged(v[bounds[k] : bounds[k + 1]], limit[0], lag)
+        lagged(v[bounds[k] : bounds[k + 1]], r)
 
 
 NEAR = 20
@@ -180,7 +182,7 @@ def begun(
     spans = _spans(N, n)
     P = max(order or 0, min(ORDER, N // 20, (spans[1][0] - spans[0][0]) // 6))
     residual, level, r = np.empty(N), np.empty(len(spans[0])), np.zeros((len(spans[0]), P + 1))
-    _fit_windows(Q, y, *spans, residual, level, r)
+    _fit_windows(columns_of(Q, y), *spans, residual, level, r)
     g = np.linalg.eigvalsh(0.5 * (Q[1:].T @ Q[:-1] + Q[:-1].T @ Q[1:]) / N)
     width = int(spans[1][0] - spans[0][0])
     c = _level(spans, level, N)
@@ -235,7 +237,7 @@ class Search(NamedTuple):
         Q, y, N = self.Q, self.y, len(self.y)
         z = whitened(X[:, :0], y / self.c, ar)[1]
         fits = np.empty((3, N))
-        _fit_segments(Q, y, X, z, np.concatenate([[0], breaks, [N]]), np.array([len(ar)]), fits)
+        _fit_segments(Q, y, columns_of(X, z), np.concatenate([[0], breaks, [N]]), np.array([len(ar)]), fits)
         residual, near, leverage = fits
         ar = self.correlation(near, breaks)
         c = self.c * deviation(near / self.c)
@@ -252,7 +254,7 @@ class Search(NamedTuple):
         """The autoregression of v within segments."""
         N, r, v = len(v), np.zeros(self.P + 1), v / self.c
         limit = HELD * deviation(v)
-        _lags(v, np.concatenate([[0], breaks, [N]]), np.array([limit]), r)
+        _lags(np.clip(v, -limit, limit), np.concatenate([[0], breaks, [N]]), r)
         if not r[0] > 0.0:
             return r[:0]
         ar = _chosen(_partial(r[None], self.g, N / (len(breaks) + 1.0))[0], N, self.order)
@@ -265,7 +267,8 @@ class Search(NamedTuple):
         if longest <= self.P:
             return ar
         w, r = whitened(np.zeros((N, 0)), v, ar)[1], np.zeros(longest + 1)
-        _lags(w, np.concatenate([[0], breaks, [N]]), np.array([HELD * deviation(w)]), r)
+        limit = HELD * deviation(w)
+        _lags(np.clip(w, -limit, limit), np.concatenate([[0], breaks, [N]]), r)
         later = r[self.P + 1 :] / r[0] if r[0] > 0.0 else np.zeros(longest - self.P)
         best = int(np.argmax(np.abs(later)))
         b = float(np.clip(later[best], -LARGEST, LARGEST))

@@ -6,10 +6,8 @@ C comes from a Cholesky factor of [phi, y]' [phi, y], summed block by block from
 sums. For p rows after a break, rows whitened by an autoregression of order p belong to two segments; each of these rows
 counts as one, whatever its value is.
 
-A start s with F(s) + C(s, t) - p >= F(t) can never be the last break of a longer record and is dropped (as soon as
-segments from t on are long enough to be allowed), so that the cost is O(T) if breaks occur regularly, and O(T^2) in the
-number of blocks if there are none. Breaks can only be between blocks. Source: Killick, Fearnhead and Eckley (2012),
-PELT.
+Breaks can only be between blocks. Cost: that of adding each block to all segments that contain it, eight starts at a
+time, O(m^2 n^2) for m blocks; C itself is computed for those starts that may be best. Source: Jackson et al. (2005).
 """
 
 from __future__ import annotations
@@ -19,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, shared
-from driftfit.judge.statistics.robust import cholesky
+from driftfit.engine.simd import WIDTH, load, plus, store
+from driftfit.judge.statistics.robust import cholesky_of_eight
 
 
 def _sum(phi: Array, y: Array, ends: Array, p: Array, G: Array) -> None:
@@ -40,56 +39,65 @@ def _sum(phi: Array, y: Array, ends: Array, p: Array, G: Array) -> None:
         start = ends[b]
 
 
-@shared
-def _cost(G: Array, ends: Array, s: int, t: int, p: int, total: Array, seen: Array, M: Array) -> float:
-    """C(s, t), with one for each row after a break that belongs to two segments.
-
-    The blocks up to t that are new are added to total[s] (k, k); seen[s] (2,) is up to where they have been, and the
-    number of those rows.
-    """
-    k = M.shape[0]
-    start = ends[s - 1] if s > 0 else 0
-    for b in range(seen[s, 0], t):
-        begin = ends[b - 1] if b > 0 else 0
-        free = 0 if s == 0 else p - (begin - start)
-        if free <= 0 or begin == start:
-            block = G[1 if free > 0 else 0, b]
-            for i in range(k):
-                for j in range(i + 1):
-                    total[s, i, j] += block[i, j]
-            seen[s, 1] += max(0, min(free, ends[b] - begin))
-        else:
-            seen[s, 1] += ends[b] - begin
-    seen[s, 0] = t
-    for i in range(k):
-        for j in range(i + 1):
-            M[i, j] = total[s, i, j]
-    return cholesky(M, k - 1) + seen[s, 1]  # type: ignore[no-any-return]
-
-
 class Space(NamedTuple):
-    """Scratch space, allocated outside of compiled code, in which an allocation takes seconds to compile."""
+    """Scratch space, allocated outside of compiled code, in which an allocation takes seconds to compile.
+
+    Starts are in columns, up to a multiple of eight.
+    """
 
     total: Array
-    """Sums of the blocks of every segment, (m, k, k)."""
+    """Sums of the blocks of the segment that begins at each start, (k k, m): entry (i, j) in row k i + j."""
     M: Array
-    """Sums of the blocks of one segment, (k, k)."""
+    """The sums of eight starts, (k k, 8)."""
     seen: Array
-    """See `_cost`, (m, 2)."""
-    alive: Array
-    """Starts that can be the last break, (m,)."""
-    expired: Array
-    """The end at which a start ceased to be one, or -1, (m,)."""
+    """Rows after each start that belong to two segments, (1, m)."""
+    F: Array
+    """F of each start, (1, m)."""
     value: Array
-    """The total with each start, at the end where it was computed last, (m,)."""
+    """The total with each start, at the end where it was computed last, (1, m)."""
 
     @classmethod
     def of(cls, m: int, k: int) -> Space:
         """Scratch space for m blocks of k columns."""
-        seen = np.zeros((m, 2), np.int64)
-        seen[:, 0] = np.arange(m)
-        alive, expired, value = np.zeros(m, np.int64), np.full(m, -1), np.full(m, -np.inf)
-        return cls(np.zeros((m, k, k)), np.zeros((k, k)), seen, alive, expired, value)
+        m += -m % WIDTH
+        F, value = np.full((2, 1, m), -np.inf)  # below what they may be, until they are known
+        return cls(np.zeros((k * k, m)), np.zeros((k * k, WIDTH)), np.zeros((1, m)), F, value)
+
+
+@shared
+def _extend(G: Array, ends: Array, t: int, p: int, k: int, space: Space) -> None:
+    """Add block t - 1 to the segments from every start, the last of which begins with it.
+
+    In a segment after a break, each of its first p rows counts as one, whatever its value is, and so does each row of a
+    later block that begins among them.
+    """
+    begin, settled = ends[t - 2] if t > 1 else 0, t
+    while settled > 1 and begin - ends[settled - 2] < p:
+        settled -= 1  # starts less than p rows before the block
+    for i in range(k):
+        for j in range(i + 1):
+            block = G[0, t - 1, i, j]
+            for s in range(settled):
+                space.total[k * i + j, s] += block
+    for s in range(settled, t - 1):
+        space.seen[0, s] += ends[t - 1] - begin
+    if settled < t:
+        for i in range(k):
+            for j in range(i + 1):
+                space.total[k * i + j, t - 1] += G[1, t - 1, i, j]
+        space.seen[0, t - 1] += min(p, ends[t - 1] - begin)
+
+
+@shared
+def _costs(space: Space, first: int, k: int) -> None:
+    """F(s) + C(s, t) of the eight starts from ``first`` on."""
+    total, M, seen, F, value = space
+    for i in range(k):
+        for j in range(i + 1):
+            store(M, k * i + j, 0, load(total, k * i + j, first))
+    cholesky_of_eight(M, k - 1)
+    cost = plus(load(M, k * k - 1, 0), load(seen, 0, first))
+    store(value, 0, first, plus(load(F, 0, first), cost))
 
 
 def _partition(G: Array, ends: Array, penalty: float, least: int, p: int, F: Array, last: Array, space: Space) -> None:
@@ -98,36 +106,29 @@ def _partition(G: Array, ends: Array, penalty: float, least: int, p: int, F: Arr
     The cost of a segment never falls as it grows, so its value at an earlier end is a bound, and where that exceeds
     the best total so far it is not computed again.
     """
-    total, M, seen, alive, expired, value = space
+    k, value = G.shape[2], space.value
     count, chosen = 0, -1
     F[0] = -penalty
     for t in range(1, G.shape[1] + 1):
-        end = ends[t - 1]
-        if abs(F[t - 1]) < np.inf:
-            alive[count] = t - 1
-            count += 1
-        best, bound = np.inf, np.inf
+        space.F[0, t - 1] = F[t - 1]
+        _extend(G, ends, t, p, k, space)
+        while count < t and ends[t - 1] - (ends[count - 1] if count > 0 else 0) >= least:
+            count += 1  # starts of segments that are long enough
+        best = np.inf
         if chosen >= 0:
-            bound = value[chosen] = F[chosen] + _cost(G, ends, chosen, t, p, total, seen, M)
-        for a in range(count):
-            s = alive[a]
-            start = ends[s - 1] if s > 0 else 0
-            if end - start >= least and value[s] <= bound:
-                if seen[s, 0] < t:
-                    value[s] = F[s] + _cost(G, ends, s, t, p, total, seen, M)
-                if value[s] < best:
-                    best, bound, chosen = value[s], min(value[s], bound), s
+            _costs(space, chosen - chosen % WIDTH, k)
+            best = value[0, chosen]
+        for first in range(0, count, WIDTH):
+            nearest = np.inf
+            for s in range(first, min(first + WIDTH, count)):
+                nearest = min(nearest, value[0, s])
+            if nearest <= best:
+                _costs(space, first, k)
+                for s in range(first, min(first + WIDTH, count)):
+                    if value[0, s] < best:
+                        best, chosen = value[0, s], s
         F[t] = best + penalty
         last[t] = chosen if best < np.inf else -1
-        kept = 0
-        for a in range(count):
-            s = alive[a]
-            if expired[s] < 0 and value[s] - p >= F[t]:
-                expired[s] = end
-            if expired[s] < 0 or end - expired[s] < least:
-                alive[kept] = s
-                kept += 1
-        count = kept
 
 
 _blocks = Driver(_sum)

@@ -11,9 +11,11 @@ Source: Davies (1980), algorithm AS 155, without its error control. Error below 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.kernel import Array, Driver, shared
 
 TERMS = 65536
 """Largest number of terms of the sum."""
@@ -22,33 +24,16 @@ SMALL = 1e-3
 """Weights below this share of the largest are replaced by their mean."""
 
 
-def tail(weights: Array, x: float) -> float:
-    """P(sum w_j chi2_1 > x) for weights (k,), not negative; NaN where they are not finite."""
-    weights = np.asarray(weights, float)
-    largest = float(weights.max(initial=0.0))
-    if not (np.isfinite(x) and np.isfinite(largest) and np.isfinite(weights.min(initial=0.0))):
-        return float("nan")
-    if largest <= 0.0:
-        return float(x <= 0.0)
-    kept = weights > SMALL * largest
-    w = weights[kept]
-    x, w = (x - float(weights.sum() - w.sum())) / largest, w / largest
-    if x <= 0.0:
-        return 1.0
-    total = np.zeros(1)
-    _invert(np.append(w, np.zeros(-len(w) % 4)), np.array([x]), total)
-    return min(max(0.5 + float(total[0]), 0.0), 1.0)
-
-
-def _inverted(w: Array, x: Array, total: Array) -> None:
+@shared
+def _inverted(w: Array, x: float) -> Any:
     """The sum, until its terms have vanished: `TOGETHER` terms side by side, which are vectorised.
 
     Four weights at a time: the angle of their product is between -2 pi and 0, so that of its root has a negative
     imaginary part. w (k,) with k a multiple of four; the last weights may be 0.
     """
     v, c, d = np.zeros(TOGETHER), np.zeros(TOGETHER), np.zeros(TOGETHER)
-    step = 2.0 * np.pi / (x[0] + w.sum() + 60.0)
-    turn, half = np.sin(step * x[0]), np.sin(0.5 * step * x[0])
+    total, step = 0.0, 2.0 * np.pi / (x + w.sum() + 60.0)
+    turn, half = np.sin(step * x), np.sin(0.5 * step * x)
     for first in range(0, TERMS, TOGETHER):
         for i in range(TOGETHER):
             v[i], c[i], d[i] = 2.0 * (first + i + 0.5) * step, 1.0, 0.0
@@ -67,20 +52,47 @@ def _inverted(w: Array, x: Array, total: Array) -> None:
                 p = p if imaginary <= 0.0 else -p
                 c[i], d[i] = c[i] * p + d[i] * q, d[i] * p - c[i] * q
         # the sine and cosine of every term from those of the first, by the formulas of addition
-        angle = (first + 0.5) * step * x[0]
+        angle = (first + 0.5) * step * x
         sine, cosine = np.sin(angle), np.cos(angle)
         for i in range(TOGETHER):
             k, square = first + i + 0.5, c[i] * c[i] + d[i] * d[i]
-            total[0] -= (sine * c[i] + cosine * d[i]) / (square * np.pi * k)
+            total -= (sine * c[i] + cosine * d[i]) / (square * np.pi * k)
             if square * k * k > 1e17:
-                return
+                return total
             sine, cosine = (
                 sine - (2.0 * half * half * sine - turn * cosine),
                 cosine - (2.0 * half * half * cosine + turn * sine),
             )
+    return total
 
 
-_invert = Driver(_inverted)
+@Driver
+def _tail(weights: Array, w: Array, x: float) -> float:
+    """`tail`, but for rounding between 0 and 1; w (k + 4,) is zero."""
+    largest, rest, kept = 0.0, 0.0, 0
+    for one in weights:
+        if not abs(one) < np.inf:
+            return np.nan
+        largest = max(largest, one)
+    if not abs(x) < np.inf:
+        return np.nan
+    if largest <= 0.0:
+        return 1.0 if x <= 0.0 else 0.0
+    for one in weights:
+        if one > SMALL * largest:
+            w[kept] = one / largest
+            kept += 1
+        else:
+            rest += one
+    x = (x - rest) / largest
+    return 0.5 + _inverted(w[: kept + -kept % 4], x) if x > 0.0 else 1.0
+
+
+def tail(weights: Array, x: float) -> float:
+    """P(sum w_j chi2_1 > x) for weights (k,), not negative; NaN where they are not finite."""
+    weights = np.ascontiguousarray(weights, float)
+    found = _tail(weights, np.zeros(len(weights) + 4), float(x))
+    return float(found if np.isnan(found) else min(max(found, 0.0), 1.0))
 
 
 def quantile(weights: Array, p: float) -> float:

@@ -15,6 +15,21 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, shared
+from driftfit.engine.simd import (
+    WIDTH,
+    fill,
+    higher,
+    load,
+    lower,
+    minus,
+    only,
+    over,
+    plus,
+    root,
+    store,
+    sum_of,
+    times,
+)
 
 CLIP = 1.5
 ROUNDS = 30
@@ -94,6 +109,33 @@ def cholesky(M: Array, n: int) -> float:
 
 
 @shared
+def cholesky_of_eight(M: Array, n: int) -> None:
+    """`cholesky` of eight matrices of n + 1 columns side by side: entry (i, j) of M in row (n + 1) i + j of (.., 8).
+
+    The last row becomes the remaining last entries.
+    """
+    k = n + 1
+    for j in range(n):
+        pivot = own = load(M, j * k + j, 0)
+        for i in range(j):
+            entry = load(M, j * k + i, 0)
+            pivot = minus(pivot, times(entry, entry))
+        above = minus(pivot, times(fill(FLAT), own))
+        diagonal = only(root(higher(pivot, fill(0.0))), above)
+        store(M, j * k + j, 0, diagonal)
+        for r in range(j + 1, k):
+            total = load(M, r * k + j, 0)
+            for i in range(j):
+                total = minus(total, times(load(M, r * k + i, 0), load(M, j * k + i, 0)))
+            store(M, r * k + j, 0, only(over(total, diagonal), diagonal))
+    left = load(M, n * k + n, 0)
+    for i in range(n):
+        entry = load(M, n * k + i, 0)
+        left = minus(left, times(entry, entry))
+    store(M, n * k + n, 0, higher(left, fill(0.0)))
+
+
+@shared
 def solved(M: Array, theta: Array) -> None:
     """theta (n,) from M (n + 1, n + 1) after `cholesky`."""
     n = theta.shape[0]
@@ -133,7 +175,7 @@ def scale_of(x: Array) -> float:
     N = x.shape[0]
     high = selected(x, 9 * N // 10)
     k = N // 2
-    half = selected(x, k)
+    half = selected(x[: 9 * N // 10 + 1], k)
     if N % 2 == 0:
         below = x[0]
         for i in range(1, k):
@@ -143,55 +185,89 @@ def scale_of(x: Array) -> float:
     return scale
 
 
-@shared
-def huber(Q: Array, y: Array, theta: Array, residual: Array) -> float:
-    """Fit y (N,) on Q (N, n): fills theta (n,) and residual (N,), returns the scale."""
+def columns_of(Q: Array, y: Array) -> Array:
+    """[Q, y] (n + 1, N + 8) as `huber` reads it: a row for each regressor and one for y, with room for a vector."""
     N, n = Q.shape
-    M, step, weight, size = np.empty((n + 1, n + 1)), np.empty(n), np.empty(N), np.empty(N)
+    columns = np.zeros((n + 1, N + WIDTH))
+    columns[:n, :N], columns[n, :N] = Q.T, y
+    return columns
+
+
+@shared
+def moments(columns: Array, first: int, last: int, weight: Array, sums: Array, M: Array) -> None:
+    """M = [Q, y]' W Q of the rows first .. last, lower triangle (n + 1, n); weight (1, ..) begins at the first of them.
+
+    sums: scratch ((n + 1) n, 8).
+    """
+    k, n = columns.shape[0], M.shape[0] - 1
+    for i in range(k * n):
+        store(sums, i, 0, fill(0.0))
+    for t in range(first, last, WIDTH):
+        for i in range(k):
+            left = times(load(weight, 0, t - first), load(columns, i, t))
+            for j in range(min(i + 1, n)):
+                store(sums, i * n + j, 0, plus(load(sums, i * n + j, 0), times(left, load(columns, j, t))))
+    for i in range(k):
+        for j in range(min(i + 1, n)):
+            M[i, j] = sum_of(load(sums, i * n + j, 0))
+
+
+@shared
+def ones(weight: Array, N: int) -> None:
+    """1 for each of N rows, and 0 for those that fill the last vector."""
+    for t in range(N + WIDTH):
+        weight[0, t] = 1.0 if t < N else 0.0
+
+
+@shared
+def huber(columns: Array, first: int, last: int, theta: Array, residual: Array) -> float:
+    """Fit y on Q in rows first .. last of `columns_of`: fills theta (n,), residual (1, N + 8), returns the scale."""
+    N, n = last - first, theta.shape[0]
+    M, step, size = np.zeros((n + 1, n + 1)), np.empty(n), np.empty((1, N + WIDTH))
+    weight, sums = np.empty((1, N + WIDTH)), np.empty(((n + 1) * n, WIDTH))
     scale, level = 0.0, 0.0
+    ones(weight, N)
     for i in range(n):
         theta[i] = 0.0
-    for t in range(N):
-        weight[t] = 1.0
-        level += y[t] * y[t]
+    for t in range(first, last):
+        level += columns[n, t] * columns[n, t]
     level = 1e-12 * np.sqrt(level / max(N, 1))
     for round in range(ROUNDS):
         # weighted normal equations, and their solution by Cholesky
-        for i in range(n + 1):
-            for j in range(n + 1):
-                M[i, j] = 0.0
-        for t in range(N):
-            w = weight[t]
-            for i in range(n):
-                for j in range(i + 1):
-                    M[i, j] += w * Q[t, i] * Q[t, j]
-                M[n, i] += w * Q[t, i] * y[t]
+        moments(columns, first, last, weight, sums, M)
         cholesky(M, n)
         solved(M, step)
         # residuals, and the largest change of a fitted value
-        moved = 0.0
-        for t in range(N):
-            fitted, change = 0.0, 0.0
+        store(sums, 0, 0, fill(0.0))
+        for t in range(0, N, WIDTH):
+            fitted, change = fill(0.0), fill(0.0)
             for i in range(n):
-                fitted += Q[t, i] * step[i]
-                change += Q[t, i] * (step[i] - theta[i])
-            residual[t] = y[t] - fitted
-            size[t] = abs(residual[t])
-            moved = max(moved, abs(change))
+                own = load(columns, i, first + t)
+                fitted = plus(fitted, times(own, fill(step[i])))
+                change = plus(change, times(own, fill(step[i] - theta[i])))
+            e = minus(load(columns, n, first + t), fitted)
+            store(residual, 0, t, e)
+            store(size, 0, t, higher(e, minus(fill(0.0), e)))
+            change = only(higher(change, minus(fill(0.0), change)), load(weight, 0, t))
+            store(sums, 0, 0, higher(load(sums, 0, 0), change))
+        moved = 0.0
+        for i in range(WIDTH):
+            moved = max(moved, sums[0, i])
         for i in range(n):
             theta[i] = step[i]
-        scale = scale_of(size)
+        scale = scale_of(size[0, :N])
         if not scale > level or (round > 0 and moved < 1e-8 * scale):
             break
         # Huber's weights psi(e) / e for the next round
-        for t in range(N):
-            large = abs(residual[t])
-            weight[t] = CLIP * scale / large if large > CLIP * scale else 1.0
+        for t in range(0, N, WIDTH):
+            e = load(residual, 0, t)
+            bounded = over(fill(CLIP * scale), higher(e, minus(fill(0.0), e)))
+            store(weight, 0, t, only(lower(bounded, fill(1.0)), load(weight, 0, t)))
     return scale
 
 
-def _fit(Q: Array, y: Array, theta: Array, residual: Array, scale: Array) -> None:
-    scale[0] = huber(Q, y, theta, residual)
+def _fit(columns: Array, theta: Array, residual: Array, scale: Array) -> None:
+    scale[0] = huber(columns, 0, columns.shape[1] - WIDTH, theta, residual)
 
 
 _run = Driver(_fit)
@@ -208,10 +284,16 @@ def robust_fit(phi: Array, y: Array) -> Fit:
     """Constant coefficients with bounded influence of outliers in y; phi (N, n), y (N,)."""
     size = np.sqrt(np.mean(phi * phi, axis=0))
     size[size == 0.0] = 1.0  # an idle column, whose parameter is 0
-    Q, R = orthonormal(phi / size)
-    theta, residual, scale = np.zeros(phi.shape[1]), np.empty(len(y)), np.empty(1)
-    _run(Q, np.ascontiguousarray(y), theta, residual, scale)
-    return clipped(np.linalg.lstsq(R, theta, rcond=1e-12)[0] / size, residual, float(scale[0]))
+    fit = fit_in(orthonormal(phi / size), y)
+    return fit._replace(theta=fit.theta / size)
+
+
+def fit_in(basis: tuple[Array, Array], y: Array) -> Fit:
+    """The same in a basis that `orthonormal` made."""
+    Q, R = basis
+    theta, residual, scale = np.zeros(Q.shape[1]), np.empty((1, len(y) + WIDTH)), np.empty(1)
+    _run(columns_of(Q, y), theta, residual, scale)
+    return clipped(np.linalg.lstsq(R, theta, rcond=1e-12)[0], residual[0, : len(y)], float(scale[0]))
 
 
 def clipped(theta: Array, residual: Array, scale: float) -> Fit:

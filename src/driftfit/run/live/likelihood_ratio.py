@@ -33,7 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.drivers import SMALLEST
-from driftfit.engine.kernel import Array, Driver, exp, kernel, log, shared
+from driftfit.engine.kernel import Array, Driver, exp, kernel, log, part
 
 LEVELS, BLOCKS, SHORT = 6, 12, 8
 """Levels of blocks of 1, 2, 4, .. samples; blocks that each keeps; blocks of the shorter window."""
@@ -95,7 +95,7 @@ def size_of(n: int) -> int:
     return 2 * n + 2 + n * (n + 1) // 2
 
 
-@shared
+@part
 def enter(sums: Array, sample: Array, count: int) -> None:
     """Add a sample as a block of level 0, and every block that it completes; ``count`` samples with this one."""
     levels, blocks, size = sums.shape
@@ -114,14 +114,14 @@ def cube_root(x: float) -> float:
     return exp(log(x) / 3.0) if x > SMALLEST else 0.0
 
 
-@shared
+@part
 def cube_deviate(ratio: float, shape: float) -> float:
     """A gamma variable of this shape over its mean as a normal deviate (Wilson and Hilferty 1931)."""
     z: float = (cube_root(ratio) - (1.0 - 1.0 / (9.0 * shape))) * 3.0 * np.sqrt(shape)
     return z
 
 
-@shared
+@part
 def variance(total: Array, frozen: Frozen, work: Array) -> None:
     """V of the sums of a window in work[:n], G in work[n:2n], symmetric."""
     n = frozen.theta.shape[0]
@@ -143,7 +143,7 @@ def variance(total: Array, frozen: Frozen, work: Array) -> None:
             work[i, j] = v * work[n + i, j] + k * k * value
 
 
-@shared
+@part
 def factor(work: Array, n: int) -> int:
     """Cholesky factor of work[:n] in place, a column of zeros where there is no direction left; returns the rank."""
     rank = 0
@@ -164,7 +164,7 @@ def factor(work: Array, n: int) -> int:
     return rank
 
 
-@shared
+@part
 def solve(work: Array, n: int, given: Array, into: Array) -> None:
     """into = factor^-1 given."""
     for i in range(n):
@@ -174,7 +174,7 @@ def solve(work: Array, n: int, given: Array, into: Array) -> None:
         into[i] = value / work[i, i] if work[i, i] > 0.0 else 0.0
 
 
-@shared
+@part
 def compare(total: Array, L: int, frozen: Frozen, work: Array, findings: Array) -> None:
     """The statistics of one window into findings."""
     n = frozen.theta.shape[0]
@@ -213,7 +213,7 @@ def compare(total: Array, L: int, frozen: Frozen, work: Array, findings: Array) 
         findings[RATIO] = np.sqrt(total[2 * n + 1] / (L * numbers[RAW]))
 
 
-@shared
+@part
 def windows(memory: Memory, frozen: Frozen, count: int) -> None:
     """Compare the windows that end with a block that the last sample completed."""
     sums, work, size = memory.sums, memory.work, memory.sums.shape[2]
@@ -234,7 +234,7 @@ def windows(memory: Memory, frozen: Frozen, count: int) -> None:
             compare(total, blocks << j, frozen, work, memory.last[j, kind])
 
 
-@shared
+@part
 def accumulate(sample: Array, frozen: Frozen, cusum: Array) -> None:
     """One step of the CUSUM of every parameter, the last row that of the noise; columns are up and down."""
     n = frozen.theta.shape[0]
@@ -251,7 +251,7 @@ def accumulate(sample: Array, frozen: Frozen, cusum: Array) -> None:
             cusum[j, side] = max(0.0, cusum[j, side] + step / var)
 
 
-@shared
+@part
 def enter_scores(phi: Array, g: float, x: float, sample: Array) -> None:
     """The sums of a single sample: phi g, phi x, g^2, x^2, phi phi'."""
     n, at = phi.shape[0], 2 * phi.shape[0] + 2
@@ -263,7 +263,7 @@ def enter_scores(phi: Array, g: float, x: float, sample: Array) -> None:
     sample[2 * n], sample[2 * n + 1] = g * g, x * x
 
 
-@shared
+@part
 def judge(memory: Memory, frozen: Frozen, findings: Array) -> None:
     """Add the sample whose sums are in memory.sample, and write its statistics."""
     n = frozen.theta.shape[0]
@@ -289,7 +289,7 @@ def judge(memory: Memory, frozen: Frozen, findings: Array) -> None:
         findings[CUSUM + j] = np.sqrt(2.0 * max(memory.cusum[j, 0], memory.cusum[j, 1]))
 
 
-@shared
+@part
 def enter_row(row: Array, frozen: Frozen, memory: Memory) -> bool:
     """Scores of a row [phi, y, ok, noise, dt] into memory.sample; whether it can be used."""
     n, p = frozen.theta.shape[0], frozen.ar.shape[0]
@@ -339,25 +339,3 @@ def scan(rows: Array, frozen: Frozen, memory: Memory, findings: Array) -> None:
             judge(memory, frozen, memory.findings)
         for i in range(findings.shape[1]):
             findings[t, i] = memory.findings[i]
-
-
-@Driver
-def levels(x: Array, numbers: Array, h: Array) -> None:
-    """The variances h (T,) of residuals x (T,) in units of their scale."""
-    alpha, beta, v, clip = numbers[ALPHA], numbers[BETA], numbers[V], numbers[CLIP]
-    level = 1.0
-    for t in range(x.shape[0]):
-        h[t] = level
-        g = min(clip, max(-clip, x[t] / np.sqrt(level)))
-        level = 1.0 - alpha - beta + (alpha * g * g / v + beta) * level
-
-
-@Driver
-def played(x: Array, numbers: Array, w: Array) -> None:
-    """Residuals w (T,) in units of their scale whose standardised values are x (T,): the inverse of `levels`."""
-    alpha, beta, v, clip = numbers[ALPHA], numbers[BETA], numbers[V], numbers[CLIP]
-    level = 1.0
-    for t in range(x.shape[0]):
-        w[t] = x[t] * np.sqrt(level)
-        g = min(clip, max(-clip, x[t]))
-        level = 1.0 - alpha - beta + (alpha * g * g / v + beta) * level
