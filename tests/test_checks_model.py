@@ -30,14 +30,15 @@ from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 CURVED = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(3), intercept=True, output_noise=0.1)
 SYSTEM = (-0.3, 0.5, 0.2, 0.1, 0.2, 0.1, 0.04, -0.03, -0.06, 0.1)
 SPACE = "x = x[-1] + dt * (theta.a * tanh(u) - theta.b * x[-1]) \n y = sqrt(1 + x * x) + 0.1 * u[-1]"
+# of four parameters where they can, so that they share the compiled steps of the tracker
 READY = {
-    "ARX": (ARX(1, [2, 1], nk=[1, 2], intercept=True), None), "Regression": (Regression(2, intercept=True), None),
-    "HammersteinWiener": (CURVED, SYSTEM), "ARMAX": (ARMAX(1, 1, 1), (0.5, 1.0, 0.3)), "OE": (OE(1, 1), (1.0, 0.5)),
-    "BoxJenkins": (BoxJenkins(2, 1, 1, 2, offset=True), (1.0, 0.5, 0.5, 0.9, 1.5, -0.7, 3.0)),
+    "ARX": (ARX(1, [1, 1], nk=[1, 2], intercept=True), None), "Regression": (Regression(3, intercept=True), None),
+    "HammersteinWiener": (CURVED, SYSTEM), "ARMAX": (ARMAX(1, 1, 1, offset=True), (0.5, 1.0, 0.3, 3.0)),
+    "OE": (OE(2, 2), (1.0, 0.5, 0.9, -0.2)), "BoxJenkins": (BoxJenkins(1, 1, 1, 1), (1.0, 0.5, 0.9, 0.7)),
     "PolynomialModel": (PolynomialModel(1, [1, 1], nf=[1, 0], nk=[1, 2]), (0.5, 1.0, 0.5, 0.3)),
-    "ContinuousTransfer": (ContinuousTransfer(2, 1, delay=1, dt=0.5, inputs=1, offset=True), (1.5, 1.0, 0.5, 2.0, 0.1)),
+    "ContinuousTransfer": (ContinuousTransfer(2, 1, delay=1, dt=0.5, inputs=1), (1.5, 1.0, 0.5, 2.0)),
     "StateSpace": (StateSpace(SPACE), (0.5, 0.3, 0.2)),
-    "Equation": (Equation("y = theta.g * tanh(theta.s * u[-1]) + theta.a * y[-1]"), (1.0, 0.5, 0.4)),
+    "Equation": (Equation("y = theta.g * tanh(theta.s * u[-1]) + theta.a * y[-1] + theta.c"), (1.0, 0.5, 0.4, 0.3)),
 }  # fmt: skip
 
 

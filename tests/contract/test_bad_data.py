@@ -108,7 +108,7 @@ ANYTHING = st.one_of(
 @pytest.mark.parametrize("kind", list(found().values()), ids=list(found()))
 @given(samples=st.lists(st.tuples(ANYTHING, ANYTHING), min_size=1, max_size=25))
 @example(samples=[(1.0, 1e-170)])
-@settings(max_examples=150)
+@settings(max_examples=50)
 def test_no_sequence_of_numbers_poisons_a_stream(kind, samples):
     live = Live(model_of(kind, Regression(1)), ready(kind))
     for y, u in samples:

@@ -8,7 +8,7 @@ from support import arx_record, damaged, same
 
 from driftfit import AdaptiveKalman, Bank, Live, Sensor, track
 
-LONG = 100_000
+LONG = 30_000
 
 
 def records(T):

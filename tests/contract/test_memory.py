@@ -27,13 +27,13 @@ def test_a_stream_does_not_grow(model, tracker):
         feed(1)
         gc.collect()
         before = tracemalloc.get_traced_memory()[0]
-        feed(100)
+        feed(20)
         gc.collect()
         grown = tracemalloc.get_traced_memory()[0] - before
         peak = tracemalloc.get_traced_memory()[1] - before
     finally:
         tracemalloc.stop()
-    assert grown < 20_000  # one number kept per update would be 800_000
+    assert grown < 20_000  # one number kept per update would be 160_000
     assert peak < 100_000
 
 
