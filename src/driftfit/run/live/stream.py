@@ -62,7 +62,7 @@ class Stream(Batched, Plain, storage.Kept):
     def __repr__(self) -> str:
         settings = ", ".join(dict.fromkeys(map(repr, self.trackers)))
         last = "" if self._last is None else f" at {self._last}"
-        return f"Live{last}: {self.model!r}, {settings}"
+        return f"{type(self).__name__}{last}: {self.model!r}, {settings}"
 
     @property
     def trackers(self) -> tuple[Tracker, ...]:
