@@ -132,10 +132,10 @@ def settle(s: State, l: int) -> None:
 
 
 @kernel
-def learn(s: State, l: int, odd: float) -> None:
+def learn(s: State, l: int, outlier: float) -> None:
     """Update excitation and the proportion of readings."""
     learn_information(s, l)
-    learn_proportion(s, l, odd)
+    learn_proportion(s, l, outlier)
 
 
 @partial(kernel, inline=False)
@@ -150,7 +150,7 @@ def follow(s: State, entering: int, l: int) -> None:
         s.e[l], s.s[l] = s.y[l] - s.y_hat[l], np.inf
     leave_out(s, l)
     leave_out_frozen(s, l)
-    s.odd[l], s.weighed[l] = 0.0, 0
+    s.outlier[l], s.weighed[l] = 0.0, 0
     column = entering if entering >= 0 else outgrown(s, l)
     if s.ok[l] > 0.0 and column >= 0:
         enter_filters(s, column, l)
@@ -162,7 +162,7 @@ def follow(s: State, entering: int, l: int) -> None:
         learn_noise(s, l)
     learn_colour(s, l)
     learn_scales(s, l)
-    learn(s, l, s.odd[l])
+    learn(s, l, s.outlier[l])
 
 
 @kernel

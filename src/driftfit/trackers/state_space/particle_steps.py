@@ -201,8 +201,8 @@ def weigh(s: State, l: int) -> None:
         top = max(top, fit)
     total = 0.0
     for p in range(count):
-        far = s.fit[p, l] - top  # and not fit > top - 700, which is false for the largest where that is rounding
-        s.fit[p, l] = exp(far) if far > -700.0 else 0.0
+        below = s.fit[p, l] - top  # and not fit > top - 700, which is false for the largest where that is rounding
+        s.fit[p, l] = exp(below) if below > -700.0 else 0.0
         total += s.fit[p, l]
     for p in range(count):
         s.weight[p, l] = s.fit[p, l] / total

@@ -2,13 +2,13 @@
 
 Least squares fits any first samples, so one reading of 9999, or one in an input, would determine estimates, scales and
 noise for hundreds of samples. The first samples are therefore judged together, when there are enough of them for a
-start. A value is far if it is more than `FAR` times the median absolute deviation of its column away from the median;
-readings that repeat the one before count once. A sample is doubtful if
+start. A value is outlying if it is more than `OUTLYING` times the median absolute deviation of its column away from the
+median; readings that repeat the one before count once. A sample is doubtful if
 
-    its reading is far and no regressor is unusual: probably a fault code;
-    or a regressor is far and the reading is not: a fault code of an input, or of an earlier output, which is now a lag.
+    its reading is outlying and no regressor is unusual: probably a fault code;
+    or a regressor is outlying and the reading is not: a fault code of an input, or of an earlier output, now a lag.
 
-A large output after a large input is neither. A regressor is unusual if it is far, or if it differs where most are
+A large output after a large input is neither. A regressor is unusual if it is outlying, or if it differs where most are
 equal, as after a step of an input; a lag with the same fault code as the reading is not unusual. If half of the
 samples or more are doubtful and more cannot be waited for, the level has changed, and no sample is doubtful.
 
@@ -26,7 +26,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, shared
 
-FAR = 30.0
+OUTLYING = 30.0
 """Median absolute deviations; 20 standard deviations of normal data."""
 WORSE = 10.0
 """Ratio of sums of squares from which samples contradict each other."""
@@ -70,20 +70,20 @@ def doubt(samples: Array, N: int, last: bool) -> None:
     Half of them or more are kept as doubtful while further samples can be waited for, which is until ``last``.
     """
     usual = median(samples, N, READING, 0.0, 0.0)
-    limit = FAR * median(samples, N, READING, usual, 1.0)
+    limit = OUTLYING * median(samples, N, READING, usual, 1.0)
     for k in range(N):
         doubtful = limit > 0.0 and abs(samples[k, READING] - usual) > limit
         samples[k, NOISE] = -abs(samples[k, NOISE]) if doubtful else abs(samples[k, NOISE])
     for i in range(PHI, samples.shape[1]):
         center = median(samples, N, i, 0.0, 0.0)
-        most = FAR * median(samples, N, i, center, 1.0)
+        most = OUTLYING * median(samples, N, i, center, 1.0)
         for k in range(N):
             if abs(samples[k, i] - center) > most:
-                far = abs(samples[k, READING] - usual) > limit
+                outlying = abs(samples[k, READING] - usual) > limit
                 code = samples[k, READING] != 0.0 and abs(samples[k, i]) == abs(samples[k, READING])
-                if far and not code:
+                if outlying and not code:
                     samples[k, NOISE] = abs(samples[k, NOISE])
-                elif most > 0.0 and not far:
+                elif most > 0.0 and not outlying:
                     samples[k, NOISE] = -abs(samples[k, NOISE])
     count, all_fresh = 0, 0
     for k in range(N):

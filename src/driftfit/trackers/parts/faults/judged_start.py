@@ -26,11 +26,11 @@ from driftfit.trackers.parts.diffuse import BEFORE, MACHINES, know_nothing, refo
 from driftfit.trackers.parts.faults.contradictions import (
     add_to_block,
     close_block,
-    examine,
+    judge_unusual,
     learn_reading,
+    needs_begin,
+    needs_judging,
     no_contradictions,
-    odd,
-    odd_or_rooted,
 )
 from driftfit.trackers.parts.faults.first_samples import NOISE, PHI, READING, RESIDUALS, SPAN, SURE, WORSE, doubtful
 from driftfit.trackers.parts.faults.stored_samples import doubtful_samples, machine_doubt, recall, squares_left, store
@@ -163,17 +163,17 @@ def judged(
     @kernel
     def later(s: State, l: int) -> None:
         """A sample after the start: in square-root form, or not ordinary."""
-        unusual = odd(s, s.e[l], l)
+        unusual = needs_judging(s, s.e[l], l)
         if s.root[l] > 0:
             y_hat, e = s.y_hat[l], s.e[l]
             if unusual:
                 reform(s, l)  # gives the variance of the prediction
-                examine(s, y_hat, s.at_start[BEFORE, l] + s.r[l] * s.noise[l], l)
+                judge_unusual(s, y_hat, s.at_start[BEFORE, l] + s.r[l] * s.noise[l], l)
             one(s, l)
             add_to_block(s, e * e / (s.at_start[BEFORE, l] + s.r[l] * s.noise[l]), l)
         else:
             predict(s, l)
-            examine(s, s.y_hat[l], variance(s, l) + s.r[l] * s.noise[l], l)
+            judge_unusual(s, s.y_hat[l], variance(s, l) + s.r[l] * s.noise[l], l)
             correct(s, l)
             report(s, l)
         if unusual:
@@ -197,7 +197,7 @@ def judged(
                 settle(s, l)
             s.root[l] = s.root[l] if s.start_over[l] > 0 else 1
 
-    return steps._replace(begin=start, machines=START_MACHINES, apart=odd_or_rooted)
+    return steps._replace(begin=start, machines=START_MACHINES, apart=needs_begin)
 
 
 def faults(lane: Mapping[str, Array], phi: Array, y: Array, ok: Array) -> Array:

@@ -96,7 +96,7 @@ def forget(s: State, l: int) -> None:
     know_nothing(s, l)
     s.squares[l], s.count[l], s.scale[l] = 0.0, 0.0, np.nan
     s.power_samples[l], s.power[l] = 0.0, 0.0
-    s.middle[l], s.spread[l], s.readings[l], s.patience[l] = 0.0, 0.0, 0.0, 1.0
+    s.middle[l], s.spread[l], s.readings[l], s.widening[l] = 0.0, 0.0, 0.0, 1.0
 
 
 @partial(kernel, inline=False)
