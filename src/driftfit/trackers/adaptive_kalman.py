@@ -27,7 +27,7 @@ its own drift over the same samples (`driftfit.trackers.parts.modes.start`), in 
 Scaling inputs or outputs changes only the units.
 
 Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Which parameters drift is learned
-in a few hundred samples; ``groups`` tells it from the start.
+in a few hundred samples; ``groups`` specifies it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the ladder of ratios, its transitions, the noise
 levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 16 + 3 n

@@ -11,7 +11,7 @@ filters start with probabilities proportional to p_k, and with r the mean of S_k
 first sample on are therefore neither taken for noise nor for estimates that many samples agree on.
 
 Before that the samples are judged together (`driftfit.trackers.parts.faults.first_samples`). If some are fault codes,
-least squares, scales and proportions start again without them; while it cannot be decided, the start goes on.
+least squares, scales and proportions start again without them; until that can be decided, the start continues.
 
 Source: marginal likelihood under an inverse-gamma variance, West and Harrison, Bayesian Forecasting and Dynamic Models
 (1997), section 4.5. Cost: O(K n^2) for each sample of the start, once.
