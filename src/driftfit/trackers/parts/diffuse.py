@@ -178,11 +178,10 @@ def reduce_covariance(s: State, gain: float, l: int) -> None:
     grow until it ruins a run of ten thousand steps that looked healthy at five hundred.
     """
     for i in range(s.g.shape[0]):
-        s.P[i, i, l] = max(s.P[i, i, l] - gain * s.g[i, l] * s.g[i, l], LEFT * s.P[i, i, l])
-    for i in range(s.g.shape[0]):
         k = gain * s.g[i, l]
         for j in range(i):
             s.P[i, j, l] -= k * s.g[j, l]
+        s.P[i, i, l] = max(s.P[i, i, l] - k * s.g[i, l], LEFT * s.P[i, i, l])
 
 
 @kernel
