@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"```(\w*)\n(.*?)```", re.S)
-SCRIPT = re.compile(r"Printed by `(examples/\w+\.py)`:\n\n```text\n(.*?)```", re.S)
+SCRIPT = re.compile(r"Printed by\s`(examples/\w+\.py)`:\n\n```text\n(.*?)```", re.S)
 
 
 def squeezed(text: str) -> list[str]:

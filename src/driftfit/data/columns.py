@@ -121,7 +121,7 @@ DAY_FIRST = r"^(\d{1,2})([./-])(\d{1,2})[./-](\d{4})(?:[ T]+(\d{1,2}:\d{2}(?::\d
 def _year_first(text: pl.Series, where: str) -> pl.Series:
     """Dates that end with the year as 2024-01-31; other columns as they are.
 
-    With dots the day is first. With another separator a number above 12 tells which of the two it is; ValueError if
+    With dots the day is first. With another separator a number above 12 shows which of the two it is; ValueError if
     there is none.
     """
     known = text.drop_nulls()
@@ -132,7 +132,7 @@ def _year_first(text: pl.Series, where: str) -> pl.Series:
     if not dots and not (first > 12).any() and not (second > 12).any():
         raise ValueError(
             f"{where}: the dates of column {text.name!r}, such as {known[0]!r}, may have the day or the month first, "
-            "and none of them tells which; write them as 2024-01-31."
+            "and none of them shows which; write them as 2024-01-31."
         )
     day, month = (first, second) if dots or (first > 12).any() else (second, first)
     parts = pl.DataFrame({

@@ -248,7 +248,7 @@ def _ordinary(unit: Unit) -> Counter[str]:
     operations = {function.name: function.operations for function in unit.functions.values()}
     if "advance" not in operations:
         return operations["sample"]
-    parts = (operations.get(name, Counter()) for name in ("regress", "clean", "odd_or_rooted", "advance", "push"))
+    parts = (operations.get(name, Counter()) for name in ("regress", "clean", "needs_begin", "advance", "push"))
     return sum(parts, Counter[str]())
 
 

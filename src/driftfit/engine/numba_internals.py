@@ -236,7 +236,7 @@ def as_part(dispatcher: Any, kind: type[PartDispatcher] = PartDispatcher) -> Any
 
 @contextmanager
 def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
-    """While it lasts, what is compiled under this name becomes a fragment; of nested ones the inner stands.
+    """Within it, what is compiled under this name becomes a fragment; where they are nested, the inner one applies.
 
     Only for whoever holds `compiler_lock`: Numba's factories are replaced for all threads.
     """
@@ -357,7 +357,7 @@ def emit(function: FunctionType, arguments: tuple[Any, ...], from_python: bool =
 class Linked:
     """Code in this process, at ``address``. Numba's loader never frees anything; this one does with the last reference.
 
-    ``outside`` maps symbols that the code calls to what they stand for: another symbol, or linked code.
+    ``outside`` maps symbols that the code calls to what they refer to: another symbol, or linked code.
     """
 
     def __init__(self, code: Code, outside: Mapping[str, Any] = MappingProxyType({})) -> None:

@@ -46,7 +46,7 @@ def outlined(step: Any) -> Any:
 
 
 def called_by(code: internals.Code, instead: Mapping[str, str]) -> dict[str, Any] | None:
-    """What the symbols stand for that code calls; None if the code of an outlined step is neither in this process nor
+    """What the symbols that code calls refer to; None if the code of an outlined step is neither in this process nor
     on disk, and its source is not known here: the driver that calls it must be compiled again.
 
     ``instead`` maps symbols of machines to those that are called in their place, by the outlined steps too.

@@ -32,12 +32,13 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import LARGEST, ModelSteps, TrackerSteps
+from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import one_of, output_names, whole
 from driftfit.models.base import GAP, Model
-from driftfit.models.doubted_lags import doubted, no_doubts, shift_doubts
 from driftfit.models.inputs import CountedInputs
+from driftfit.models.lags.doubted_lags import doubted, no_doubts, shift_doubts
+from driftfit.models.lags.output_lags import take_output, wait_for_lags
 from driftfit.models.run_time_arx import ONE, PAST, RunTimeARX
 
 
@@ -140,7 +141,7 @@ class ARX(CountedInputs):
         length, depth = max(len(one["y_lag"]) for one in memories), max(one["u_lag"].shape[1] for one in memories)
         lags = [j * depth + nk + i for j, (nb, nk) in enumerate(self.lags) for i in range(nb)]
         picks = (*(PAST,) * self.na, *lags, *((ONE,) if self.intercept else ()))
-        return RunTimeARX(self, self.na, picks, (max(one.n for one in family), length, depth))
+        return RunTimeARX(self, max(one.n for one in family), self.na, picks, (length, depth))
 
     @property
     def apply(self) -> Step | None:
@@ -236,13 +237,7 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, doubts: 
                 s.phi[at[j] + i, l] = s.u_lag[j, nk[j] + i, l]
         if intercept:
             s.phi[n, l] = 1.0
-        # "drop": no time passes for the tracker until every lag has been filled once
-        before, dt, complete = s.started[l], s.dt[l], 1.0
-        for i in range(s.phi.shape[0]):
-            complete = complete if abs(s.phi[i, l]) < LARGEST else 0.0
-        started = 1.0 if complete > 0.0 else before
-        s.started[l] = started
-        s.dt[l] = dt if started > 0.0 else 0.0
+        wait_for_lags(s, l)
 
     @kernel
     def push(s: State, l: int) -> None:
@@ -250,13 +245,7 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, doubts: 
             shift_doubts(s, 0, l, l, l, 1, 1, na)
         for i in range(na - 1, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]
-        # a prediction of infinite variance carries no information (a diffuse start) and must not become a lag
-        y, y_hat, filled, seen = s.y[l], s.y_hat[l], s.filled[l], s.observed[l] > 0.0
-        known = (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf)) & (filled < na)
-        fill = y_hat if known else np.nan
-        s.filled[l] = 0.0 if seen else filled + 1.0
-        if na > 0:
-            s.y_lag[0, l] = y if seen else fill
+        take_output(s, na, l)
 
     return ModelSteps(regress, push)
 
@@ -335,11 +324,7 @@ def _joint_steps(
                 s.phi[at[j] + i, l] = s.u_lag[j, nk[j] + i, l]
         if intercept:
             s.phi[n, l] = 1.0
-        started = 1.0
-        for i in range(s.phi.shape[0]):
-            started = started if abs(s.phi[i, l]) < LARGEST else s.started[l]
-        s.started[l] = started
-        s.dt[l] = s.dt[l] if started > 0.0 else 0.0
+        wait_for_lags(s, l)
 
     @kernel
     def push(s: State, l: int) -> None:

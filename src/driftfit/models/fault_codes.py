@@ -12,7 +12,7 @@ change of level. A reading that repeats the last one to the last bit says nothin
 codes come in runs.
 
 The first readings are accepted unchecked, because there is nothing to compare them with; ``limits=`` of `track` and
-`Live` tells what a sensor can read. Inputs are not judged: a large one may be a test.
+`Live` gives the range of a sensor. Inputs are not judged: a large one may be a test.
 
 Source: the rule of `driftfit.trackers.parts.outlying_readings`, which judges sooner, because its tracker knows the
 variance of the noise. Cost per sample: a few comparisons.

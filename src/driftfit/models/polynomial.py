@@ -24,8 +24,8 @@ parameters that drift. In contrast to least squares in an `ARX` model they are n
 covariance is that of the prediction error estimate.
 
 theta' is theta with the zeros of C, D and F_j drawn towards 0 while one of them is unstable. Signals that are absurd
-beside the readings (`driftfit.models.polynomials.steps.BEYOND`), which a theta that one reading spoiled computes, are
-not used: e and v are bounded, and w begins anew, from y if there is one input. The start needs care, because
+beside the readings (`driftfit.models.polynomials.steps.BEYOND`), which a theta that one wrong reading changed computes,
+are not used: e and v are bounded, and w starts again, from y if there is one input. The start needs care, because
 the gradient with respect to F is 0 at theta = 0, and e means nothing before A and B are known: the first 4 n usable
 samples are a pseudolinear regression (psi is the regression vector itself; for one input, w is y without its
 autoregressive part; C and D enter after 2 n samples), and after N samples the filters of psi have zeros and poles at

@@ -9,50 +9,40 @@ constants of the compiled routines. Bits are those of the `ARX`; a sample takes 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import LARGEST, ModelSteps, TrackerSteps
+from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import State, kernel
-from driftfit.models.base import GAP, Model
-from driftfit.models.doubted_lags import doubted, no_doubts, shift_doubts
+from driftfit.models.base import GAP
+from driftfit.models.lags.doubted_lags import doubted, no_doubts, shift_doubts
+from driftfit.models.lags.output_lags import take_output, wait_for_lags
+from driftfit.models.wider import Wider
 
 PAST, ONE, ABSENT = -1, -2, -3
 """Regressors that are no lags of inputs: a past output (these are the first), the constant, and 0."""
 
 
 @dataclass(frozen=True)
-class RunTimeARX(Model):
-    """A bound ARX model with the number of parameters and the memory of a larger one.
+class RunTimeARX(Wider):
+    """A bound `ARX` in the record of a larger one.
 
-    ``na`` and ``picks`` (n,) are its orders; ``room`` is (parameters, lags of the output, lags of each input).
+    ``na`` and ``picks`` (n,) are its orders; ``room`` is (lags of the output, lags of each input).
     """
 
-    model: Model
     na: int
     picks: tuple[int, ...]
-    room: tuple[int, int, int]
-
-    def bind(self, inputs: int | Sequence[str]) -> RunTimeARX:
-        return self
-
-    @property
-    def m(self) -> int:
-        return self.model.m
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return (*self.model.names, *(f"absent{i + 1}" for i in range(self.room[0] - len(self.picks))))
+    room: tuple[int, int]
 
     def memory(self) -> Mapping[str, Any]:
-        own, (size, length, depth) = self.model.memory(), self.room
+        own, (length, depth) = self.model.memory(), self.room
         unknown = own["y_lag"][0]
         lags = {"y_lag": np.full(length, unknown), "u_lag": np.full((len(own["u_lag"]), depth), unknown)}
-        picks = np.array((*self.picks, *(ABSENT,) * (size - len(self.picks))))
+        picks = np.array((*self.picks, *(ABSENT,) * (self.size - len(self.picks))))
         return {**own, **lags, "picks": picks, "na": np.array(self.na)}
 
     @property
@@ -60,7 +50,7 @@ class RunTimeARX(Model):
         return _steps(self.m, False)
 
     def memory_for(self, tracker: TrackerSteps) -> Mapping[str, Any]:
-        return {**self.memory(), **no_doubts(1, self.room[1])} if tracker.doubts else self.memory()
+        return {**self.memory(), **no_doubts(1, self.room[0])} if tracker.doubts else self.memory()
 
     def steps_for(self, tracker: TrackerSteps) -> ModelSteps:
         return _steps(self.m, tracker.doubts)
@@ -85,17 +75,13 @@ def _steps(m: int, doubts: bool) -> ModelSteps:
                 lag = s.u_lag[j, i - 1, l]
                 s.u_lag[j, i, l] = np.nan if broken else lag
             s.u_lag[j, 0, l] = s.u[j, l]
-        before, dt, complete = s.started[l], s.dt[l], 1.0
         for i in range(s.phi.shape[0]):
             pick = s.picks[i, l]
             if pick >= 0:
                 s.phi[i, l] = s.u_lag[pick // depth, pick % depth, l]
             elif pick != PAST:
                 s.phi[i, l] = 1.0 if pick == ONE else 0.0
-            complete = complete if abs(s.phi[i, l]) < LARGEST else 0.0
-        started = 1.0 if complete > 0.0 else before
-        s.started[l] = started
-        s.dt[l] = dt if started > 0.0 else 0.0
+        wait_for_lags(s, l)
 
     @kernel
     def push(s: State, l: int) -> None:
@@ -105,11 +91,6 @@ def _steps(m: int, doubts: bool) -> ModelSteps:
         for i in range(s.y_lag.shape[0] - 1, 0, -1):
             if i < na:
                 s.y_lag[i, l] = s.y_lag[i - 1, l]
-        y, y_hat, filled, seen = s.y[l], s.y_hat[l], s.filled[l], s.observed[l] > 0.0
-        known = (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf)) & (filled < na)
-        fill = y_hat if known else np.nan
-        s.filled[l] = 0.0 if seen else filled + 1.0
-        if na > 0:
-            s.y_lag[0, l] = y if seen else fill
+        take_output(s, na, l)
 
     return ModelSteps(regress, push)

@@ -27,7 +27,7 @@ its own drift over the same samples (`driftfit.trackers.parts.modes.start`), in 
 Scaling inputs or outputs changes only the units.
 
 Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Which parameters drift is learned
-in a few hundred samples; ``groups`` tells it from the start.
+in a few hundred samples; ``groups`` specifies it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the ladder of ratios, its transitions, the noise
 levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 16 + 3 n
@@ -61,6 +61,8 @@ from driftfit.trackers.parts.coordinates import (
 )
 from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, prediction, spanned_variance
 from driftfit.trackers.parts.excitation import learn_information, learn_scales, learned, no_excitation, window
+from driftfit.trackers.parts.faults.first_samples import RESIDUALS
+from driftfit.trackers.parts.faults.stored_samples import machine_doubt
 from driftfit.trackers.parts.frozen import held_readings, leave_out_frozen, not_frozen
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.filters import (
@@ -75,7 +77,7 @@ from driftfit.trackers.parts.modes.filters import (
 from driftfit.trackers.parts.modes.ladder import filters, mix
 from driftfit.trackers.parts.modes.noise_levels import any_level, finest, learn_noise, noise_prior
 from driftfit.trackers.parts.modes.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
-from driftfit.trackers.parts.modes.start import begin_with_drift, faults, machine_doubt, reconsider, take_start
+from driftfit.trackers.parts.modes.start import begin_with_drift, faults, reconsider, take_start
 from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
 from driftfit.trackers.parts.outlying_readings import (
     bound_leverage,
@@ -86,10 +88,6 @@ from driftfit.trackers.parts.outlying_readings import (
 )
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
-RESIDUALS = 4
-"""Number of residuals before the filters start."""
-SURE = 12
-"""The same while first samples are doubtful: of those that are not."""
 LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi * math.sqrt(3.0))))
 """log(gamma((nu + 1) / 2) / gamma(nu / 2) / sqrt(pi nu)) of Student's density, for nu = 1, 2, 3."""
 
@@ -134,10 +132,10 @@ def settle(s: State, l: int) -> None:
 
 
 @kernel
-def learn(s: State, l: int, odd: float) -> None:
+def learn(s: State, l: int, outlier: float) -> None:
     """Update excitation and the proportion of readings."""
     learn_information(s, l)
-    learn_proportion(s, l, odd)
+    learn_proportion(s, l, outlier)
 
 
 @partial(kernel, inline=False)
@@ -152,7 +150,7 @@ def follow(s: State, entering: int, l: int) -> None:
         s.e[l], s.s[l] = s.y[l] - s.y_hat[l], np.inf
     leave_out(s, l)
     leave_out_frozen(s, l)
-    s.odd[l], s.weighed[l] = 0.0, 0
+    s.outlier[l], s.weighed[l] = 0.0, 0
     column = entering if entering >= 0 else outgrown(s, l)
     if s.ok[l] > 0.0 and column >= 0:
         enter_filters(s, column, l)
@@ -164,7 +162,7 @@ def follow(s: State, entering: int, l: int) -> None:
         learn_noise(s, l)
     learn_colour(s, l)
     learn_scales(s, l)
-    learn(s, l, s.odd[l])
+    learn(s, l, s.outlier[l])
 
 
 @kernel
@@ -201,7 +199,7 @@ def begin(s: State, l: int) -> None:
         take_start(s, l)
         if s.s[l] < np.inf:
             s.density[l] = start_density(s.e[l], s.s[l], residuals)
-        ready = s.count[l] >= RESIDUALS and reconsider(s, SURE, l)
+        ready = s.count[l] >= RESIDUALS and reconsider(s, l)
         spanned_variance(s, l)
         if ready:
             settle(s, l)

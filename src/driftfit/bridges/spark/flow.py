@@ -93,7 +93,7 @@ class Flow:
         known.newest[good] = fates.newest[good]
         silent = known.silent(self.expired)
         over, stays = silent[known.code[order]], known.kind[order] == WAITED
-        # a unit that cannot run stays as it is: what waits goes on waiting, and the rest is refused
+        # a unit that cannot run stays as it is: what waits continues to wait, and the rest is refused
         other = np.where(stays & ~over, late.WAITING, REFUSED)
         fate = np.where(good[known.code[order]], late.ended(fates.fate, over), other)
         released = order[fate == late.RELEASED]

@@ -55,7 +55,7 @@ def follow(
     expire : number, duration or None
         Units without a row in a batch whose newest time is so far behind the newest of all before that batch end with
         it: samples that wait are processed, and the states are kept with the kind "expired". Rows that come later begin
-        the unit anew.
+        the unit again.
     initial : pyspark.sql.DataFrame or None
         States to begin with: ``track(..., outputs="states")``, or those of another stream, ``Store.states()``.
     migrate : bool

@@ -217,7 +217,7 @@ def watched(
 
 
 def _alarm(rule: AlarmRule, program: Program, state: Mapping[str, Any] | None, earlier: int) -> LiveAlarm:
-    """An alarm from its state without the rule, or one that has not seen so many earlier samples."""
+    """An alarm from its state without the rule, or a new one after so many earlier samples."""
     if state is None:
         return LiveAlarm(rule, program.tracker, program.names, max(burn_in(program.model.n) - earlier, 0))
     return LiveAlarm.of({**state, "rule": describe(rule)}, program.tracker, program.names)

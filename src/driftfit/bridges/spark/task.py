@@ -177,7 +177,7 @@ def times(column: pa.ChunkedArray) -> Array:
 
 
 def chunks(batches: Iterator[pa.RecordBatch], by: Sequence[str], parts: bool) -> Iterator[tuple[pa.Table, bool]]:
-    """(some rows, whether their only unit goes on in the next): cut where a unit ends, about `ROWS` rows each.
+    """(some rows, whether their only unit continues in the next): cut where a unit ends, about `ROWS` rows each.
 
     A unit with more rows is cut into such parts, or with ``parts=False`` kept together.
     """

@@ -30,18 +30,13 @@ class SharedStream(Live):
     _away = False
     """Whether the state is in the wide record."""
 
-    @property
-    def _tile(self) -> Array:
+    def _state_tile(self) -> Array:
         self._return()
-        return self._own
-
-    @_tile.setter
-    def _tile(self, tile: Array) -> None:
-        self._own = tile
+        return self._tile
 
     def within(self, wide: Program) -> None:
         """Process samples in records of this program from now on, which compiles its step."""
-        self._wide = _Wide(self._tile, self.program, wide)
+        self._wide = _Wide(self._state_tile(), self.program, wide)
 
     def _stepper(self) -> Any:
         return self._in_wide
@@ -56,15 +51,15 @@ class SharedStream(Live):
             wide.take(self._scratch, wide.scratch)
             return wide.step(wide.compiled_scratch, y, u)
         if not self._away:
-            wide.take(self._own, wide.tile)
+            wide.take(self._tile, wide.tile)
             self._away, self._interval = True, wide.tile["interval"][0]
         return wide.step(wide.compiled, y, u)
 
     def _return(self) -> None:
         if self._away:
             assert self._wide is not None
-            self._wide.give(self._own)
-            self._away, self._interval = False, self._own["interval"][0]
+            self._wide.give(self._tile)
+            self._away, self._interval = False, self._tile["interval"][0]
 
     def predict(self, u: Any = None) -> tuple[Any, Any]:
         self._return()

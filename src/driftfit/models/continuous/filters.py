@@ -34,7 +34,7 @@ MOST = 2000.0
 """Steps for one interval, at most: the rest of a longer gap is left out."""
 
 STIFF = 50.0
-"""Fastest pole of a filter, in inverse nominal intervals: a faster one cannot be seen."""
+"""Fastest pole of a filter, in inverse nominal intervals: a faster one cannot be observed."""
 
 MARGIN = 1.0 + 1e-6
 """By how much the criterion of stability must be met by a filter that is used."""

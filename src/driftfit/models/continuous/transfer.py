@@ -72,7 +72,7 @@ class ContinuousTransfer(LinearisedTransfer):
     delay : int
         Whole nominal samples between input and response, beyond the hold.
     dt : number
-        Length of a nominal sample, in the unit of time that the parameters shall have. With ``time=`` in that unit, and
+        Length of a nominal sample, in the unit of time of the parameters. With ``time=`` in that unit, and
         ``dt=`` of `track`, it is the same number.
     cutoff : number or None
         lambda, rate of the first filter, in radians per unit of time: somewhat above the fastest pole. None: 0.2 / dt.

@@ -277,7 +277,7 @@ class HammersteinWiener(Model):
 
     def as_large_as(self, family: Sequence[Model]) -> Model:
         room = max(np.size(one.memory()["blocks"]) for one in family)
-        return RunTimeOrders(self, self.family, self.places, max(one.n for one in family), room)
+        return RunTimeOrders(self, max(one.n for one in family), self.family, self.places, room)
 
     @property
     def apply(self) -> Step | None:

@@ -7,7 +7,7 @@ of the compiled routines. Bits are the same; a sample takes longer.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -16,7 +16,6 @@ import numpy as np
 
 from driftfit.engine.drivers import ModelSteps
 from driftfit.engine.kernel import State, floats, kernel, machine, wholes
-from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, level_of
 from driftfit.models.hammerstein_wiener.output_curve import refining
 from driftfit.models.hammerstein_wiener.step_memory import (
@@ -42,33 +41,20 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     Y,
 )
 from driftfit.models.hammerstein_wiener.steps import regress_work
+from driftfit.models.wider import Wider
 
 
 @dataclass(frozen=True)
-class RunTimeOrders(Model):
-    """A model with the number of parameters and the memory of a larger one.
+class RunTimeOrders(Wider):
+    """A bound `HammersteinWiener` in the record of a larger one.
 
     ``kinds`` are the compiled functions of its bases, that of the output last; ``places`` its orders, and where the
-    arrays in its memory begin.
+    arrays in its memory begin; ``room`` is the size of the memory.
     """
 
-    model: Model
     kinds: tuple[Kind, ...]
     places: tuple[int, ...]
-    size: int
     room: int
-
-    def bind(self, inputs: int | Sequence[str]) -> RunTimeOrders:
-        return self
-
-    @property
-    def m(self) -> int:
-        return self.model.m
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        own = self.model.names
-        return (*own, *(f"absent{i + 1}" for i in range(self.size - len(own))))
 
     def memory(self) -> Mapping[str, Any]:
         own = self.model.memory()["blocks"]

@@ -417,7 +417,7 @@ def pushing(p: Places, place: Step, waiting: float = ENTRY) -> Step:
 
     @kernel
     def possible(s: State, fitted: float, l: int) -> float:
-        """The fitted value of an output, after responses that contradict it have begun anew."""
+        """The fitted value of an output, after responses that contradict it have started again."""
         for j in range(m):
             w = s.signals[OWN + EACH * j + W, 0, l]
             if not credible(s, w, 0, l):

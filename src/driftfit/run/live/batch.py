@@ -106,6 +106,10 @@ class Batched(ABC):
     def _settle(self, resting: tuple[float, float, float], extra: bool) -> None:
         """Set the known factors of samples that give none; ``extra`` if others than these three were given."""
 
+    def _state_tile(self) -> Array:
+        """The tile, with the present state in it."""
+        return self._tile
+
     @property
     def _rows_per_instant(self) -> int:
         return len(self.model.outputs) if self.model.shared else 1
@@ -118,7 +122,7 @@ class Batched(ABC):
     @cached_property
     def _row_type(self) -> np.dtype[Any]:
         """What the loop writes for one row."""
-        return self.programs[0].written(self._tile, 0).dtype
+        return self.programs[0].written(self._state_tile(), 0).dtype
 
     def update_many(
         self, y: Any, u: Any = None, time: Any = None, weights: Any = 1.0, drift: Any = 1.0, prob: Any = None
@@ -156,7 +160,7 @@ class Batched(ABC):
             return Batch(np.empty(0, self._row_type), rows)
         records = self._records(y, u, Reading(weights=weights, drift=drift, indexed=False), prob)
         resting, extra = self.resting, records.known.columns.shape[1] > len(HELD)
-        before = None if time is None else row_of(self._tile, self._row_type)
+        before = None if time is None else row_of(self._state_tile(), self._row_type)
         records, taken = self._arrived(records, time)
         if resting == HELD:
             columns = np.broadcast_to(np.reshape(HELD, (3, 1)), (3, len(self.model.outputs)))
@@ -209,19 +213,19 @@ class Batched(ABC):
     def _drive(self, y: Array, u: Array, known: Array, out: Array, time: Any = None) -> None:
         """Drive the tile over rows, of which ``time`` has the times, and let alarms and windows see each of them."""
         if not self._windows and not any(alarm.rule.kind in FROZEN for _, alarm in self._watching):
-            self._loop(self._tile, y, u, known, out)
+            self._loop(self._state_tile(), y, u, known, out)
             for lane, alarm in self._watching:
                 noise = np.broadcast_to(known[:, NOISE, min(lane, known.shape[2] - 1)], len(y))
                 alarm.take_many(out, lane, noise, time)
             return
         for t in range(len(y)):
             row, own = slice(t, t + 1), known[t : t + 1] if len(known) > 1 else known
-            self._loop(self._tile, y[row], u[row], own, out[row])
+            self._loop(self._state_tile(), y[row], u[row], own, out[row])
             self._keep(out["e"][t], out["s"][t], own[0], None if time is None else instant(time[t]))
 
     def _keep(self, e: Sequence[float], s: Sequence[float], known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""
         for lane, alarm in self._watching:
-            alarm.take(self._tile, lane, float(e[lane]), float(s[lane]), time)
+            alarm.take(self._state_tile(), lane, float(e[lane]), float(s[lane]), time)
         for lane, window in enumerate(self._windows):
-            window.push(self._tile, (known[0, lane], known[1, lane], known[2, lane]), lane)
+            window.push(self._state_tile(), (known[0, lane], known[1, lane], known[2, lane]), lane)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ class Operated(ABC):
     """Interventions of an operator: holding a stream, and resetting parameters."""
 
     programs: tuple[Program, ...]
-    _tile: Array
+    _state_tile: Callable[[], Array]
     _windows: list[Window]
 
     @abstractmethod
@@ -40,7 +40,7 @@ class Operated(ABC):
     @property
     def held(self) -> bool:
         """Whether `hold` is on."""
-        return bool(self._tile["noise"][0, 0] == np.inf)
+        return bool(self._state_tile()["noise"][0, 0] == np.inf)
 
     @property
     def resting(self) -> tuple[float, float, float]:
@@ -103,4 +103,4 @@ class Operated(ABC):
     def _rest(self, known: tuple[float, float, float]) -> None:
         """Set the known factors of every sample that gives none."""
         for name, value in zip(KNOWN, known, strict=True):
-            self._tile[name] = value
+            self._state_tile()[name] = value

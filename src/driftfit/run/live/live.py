@@ -90,7 +90,7 @@ class Live(Operated, Stream):
 
     def _open(self) -> None:
         """Compile the step."""
-        tile = self._tile
+        tile = self._state_tile()
         self._scratch = tile.copy()
         self._bytes, self._scratch_bytes = tile.view(np.uint8), self._scratch.view(np.uint8)
         self._m = self._rows.m
@@ -105,7 +105,7 @@ class Live(Operated, Stream):
 
     def _stepper(self) -> Any:
         """The compiled step of one output."""
-        return self.program.drivers().updater(self._tile, self._m)
+        return self.program.drivers().updater(self._state_tile(), self._m)
 
     def _expect(self, what: int) -> None:
         super()._expect(what)
@@ -324,7 +324,7 @@ class Live(Operated, Stream):
     def pass_by(self, y: Array, u: Any) -> None:
         """Let one nominal sample of several outputs pass: y goes to the lags and is not used."""
         resting = self.resting
-        self._passed(self._tile, y, self._inputs(u), (1.0, np.inf, 1.0))
+        self._passed(self._state_tile(), y, self._inputs(u), (1.0, np.inf, 1.0))
         self._rest(resting)
 
     def _passed(self, tile: Array, y: Array, u: Array, known: Factors) -> Steps:
@@ -340,7 +340,7 @@ class Live(Operated, Stream):
         They are (lag + 1, ny, n) for outputs that each have their own theta. Row 0 equals the result of `Track.smooth`
         at that sample for a record that ends now.
         """
-        found = [window.smooth(self._tile, lane) for lane, window in self._windowed()]
+        found = [window.smooth(self._state_tile(), lane) for lane, window in self._windowed()]
         if len(found) > 1:
             return FixedLag(*(np.stack(part, axis=1) for part in zip(*found, strict=True)))
         ny = self._rows_per_instant
@@ -403,7 +403,7 @@ class Live(Operated, Stream):
 
     def lane(self, lane: int = 0) -> dict[str, Array]:
         """The fields of the record, or of that of one of several outputs, as views."""
-        return state_of(self._tile, lane)
+        return state_of(self._state_tile(), lane)
 
     def before(self, steps: float) -> Any:
         """The time so many nominal intervals before the last sample; None where samples have no times."""
@@ -466,12 +466,12 @@ class Live(Operated, Stream):
     @property
     def regressors(self) -> Array:
         """The regressors of the last sample, (n,)."""
-        phi: Array = self._tile["phi"][0, :, 0].copy()
+        phi: Array = self._state_tile()["phi"][0, :, 0].copy()
         return phi
 
     def _of_lanes(self, name: str) -> Array:
         """A field (n,) of the one theta, or (ny, n)."""
-        values: Array = self._tile[name][0].T.copy()
+        values: Array = self._state_tile()[name][0].T.copy()
         return values[0] if len(values) == 1 else values
 
     def _by_lane(self, found: Callable[[Tracker, dict[str, Array]], Array]) -> Array:

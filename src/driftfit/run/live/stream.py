@@ -62,7 +62,7 @@ class Stream(Batched, Plain, storage.Kept):
     def __repr__(self) -> str:
         settings = ", ".join(dict.fromkeys(map(repr, self.trackers)))
         last = "" if self._last is None else f" at {self._last}"
-        return f"Live{last}: {self.model!r}, {settings}"
+        return f"{type(self).__name__}{last}: {self.model!r}, {settings}"
 
     @property
     def trackers(self) -> tuple[Tracker, ...]:
@@ -118,7 +118,7 @@ class Stream(Batched, Plain, storage.Kept):
     def _placing(self) -> Any:
         """The routine that stores an input; ValueError for a model that needs it at once."""
         if self._place is None:
-            self._place = applier(self._rows, self.trackers[0], self._tile)
+            self._place = applier(self._rows, self.trackers[0], self._state_tile())
         return self._place
 
     def _expect(self, what: int) -> None:
@@ -143,7 +143,7 @@ class Stream(Batched, Plain, storage.Kept):
             If no sample is waiting for its input, or u does not have m numbers.
         """
         check_expected(self._awaits)
-        self._put(self._tile, self._within(self._inputs(u)))
+        self._put(self._state_tile(), self._within(self._inputs(u)))
         self._expect(NOTHING)
 
     def _put(self, tile: Array, inputs: Array) -> None:
@@ -182,7 +182,7 @@ class Stream(Batched, Plain, storage.Kept):
 
     def end(self) -> End:
         """The present state of the stream, from which another run can continue (`warm_start`)."""
-        lanes = (state_of(self._tile, lane) for lane in range(len(self.programs)))
+        lanes = (state_of(self._state_tile(), lane) for lane in range(len(self.programs)))
         states = tuple({name: np.array(value) for name, value in lane.items()} for lane in lanes)
         return End(tuple(self.programs), states, self._last, self._awaits, self.dt, self._clock.zone)
 
@@ -199,7 +199,8 @@ class Stream(Batched, Plain, storage.Kept):
             "cold": self._cold, "windows": tuple(window.plain() for window in self._windows),
             "alarms": tuple([lane, alarm.plain()] for lane, alarm in self._watching),
         }  # fmt: skip
-        return written(self.programs, [one.pack(self._tile, lane) for lane, one in enumerate(self.programs)], extra)
+        tile = self._state_tile()
+        return written(self.programs, [one.pack(tile, lane) for lane, one in enumerate(self.programs)], extra)
 
     @classmethod
     def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
@@ -231,10 +232,10 @@ class Stream(Batched, Plain, storage.Kept):
             (lane, LiveAlarm.of(state, trackers[lane], live.programs[lane].names)) for lane, state in extra["alarms"]
         ]
         if "fields" in header:
-            restore(source, live.programs, header, arrays, live._tile)
+            restore(source, live.programs, header, arrays, live._state_tile())
         else:  # an .npz of arrays, as states were written before they were packed
-            fields = {name: live._tile[name][0] for name in storage.fields(live._tile)}
+            fields = {name: live._state_tile()[name][0] for name in storage.fields(live._state_tile())}
             several = len(model.outputs) > 1
-            storage.restore(source, trackers[0], arrays, "state_", fields if several else state_of(live._tile))
+            storage.restore(source, trackers[0], arrays, "state_", fields if several else state_of(live._state_tile()))
         live._expect(extra["awaits"])
         return live

@@ -104,7 +104,7 @@ def parse(text: str, name: str = "configuration") -> Config:
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ProblemsError([f"{name}: {error}. One key = value per line; texts stand in quotes."]) from None
+        raise ProblemsError([f"{name}: {error}. One key = value per line; texts are in quotes."]) from None
     return _Reader(data, Lines(text), name).config()
 
 

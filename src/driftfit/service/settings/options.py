@@ -44,7 +44,7 @@ class Secret:
             return cls(os.environ[given["env"]])
         if isinstance(given, dict) and given.keys() == {"file"}:
             return cls(Path(given["file"]).read_text(encoding="utf-8").strip())
-        raise ValueError('passwords do not stand in the file: write { env = "NAME" } or { file = "PATH" }.')
+        raise ValueError('passwords are not written in the file: write { env = "NAME" } or { file = "PATH" }.')
 
 
 @dataclass(frozen=True)

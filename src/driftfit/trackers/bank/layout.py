@@ -5,7 +5,7 @@ Rows of leaves, events of all tables, and parameters are counted as in `driftfit
 With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m sensors, the fields are
 
     parents, leaves         the leaves before and after the tree has grown, one per column
-    history, history_2      the events of every leaf, one leaf per row (`machine.ancestry`); the counter FLIPPED tells
+    history, history_2      the events of every leaf, one leaf per row (`machine.ancestry`); the counter FLIPPED says
                             which of the two is valid
     parent, event           for every leaf the column of its parent, and the joint event that created it
     group, start, order     the leaves that are merged: a group number for every leaf, members in the order of groups

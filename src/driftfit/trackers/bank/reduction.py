@@ -87,7 +87,7 @@ class Decide(Reduction):
         For "auto": the bound of the depth, the risk that is small enough, and the cost of a sample of delay.
     ahead : int
         For ``wait_cost``: how many samples ahead the rule looks. With 1 the rule decides at once if one more sample
-        tells little, even if several would tell all.
+        changes little, even if several would decide.
     force : bool
         Allow depth 1 with outliers, which always prefers "outlier" and so never adapts.
     """

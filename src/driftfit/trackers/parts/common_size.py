@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.faults.judged_start import AGED
 
 SIZES = (6, 12, 24)
 """Numbers of parameters of shared drivers, so that a search meets few of them."""
@@ -54,12 +53,9 @@ def places(name: str, own: tuple[int, ...], wide: tuple[int, ...], absent: int) 
     """Which entries (..) of a wide field of shape ``wide`` are those of the field of shape ``own``, both without lanes.
 
     They are the first along each axis, except factors of the likelihood, which are stored from the rank before the
-    first sample on, and what follows the regressors in the samples of a diffuse start.
+    first sample on.
     """
     axes = [np.arange(size) for size in own]
     if name == "F":
         axes[0] += absent
-    if name == "start_rows":
-        columns = axes[1]
-        columns[columns >= own[1] - (AGED + 1)] += absent
     return np.arange(np.prod(wide, dtype=int)).reshape(wide)[np.ix_(*axes)]

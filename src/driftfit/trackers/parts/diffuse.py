@@ -171,27 +171,31 @@ def prediction(s: State, l: int) -> float:
 
 
 @kernel
-def corrected(s: State, y_hat: float, v: float, l: int) -> float:
-    """Correct theta and P from s.g = P h and the variance v of the innovation, and report s.y_hat, s.e, s.s.
-
-    Returns 1 / v, or 0 if the sample is not used.
+def reduce_covariance(s: State, gain: float, l: int) -> None:
+    """P <- P - gain g g' with s.g.
 
     Only one triangle is updated: P - outer(k, P phi) rounds asymmetrically, and forgetting lets the antisymmetric part
     grow until it ruins a run of ten thousand steps that looked healthy at five hundred.
     """
-    e = s.y[l] - y_hat
-    gain = s.ok[l] / v
-    for i in range(s.theta.shape[0]):
-        k = gain * s.g[i, l]
-        s.theta[i, l] += k * e
-        s.P[i, i, l] = max(s.P[i, i, l] - k * s.g[i, l], LEFT * s.P[i, i, l])
-    for i in range(s.theta.shape[0]):
+    for i in range(s.g.shape[0]):
         k = gain * s.g[i, l]
         for j in range(i):
             s.P[i, j, l] -= k * s.g[j, l]
-    s.y_hat[l] = y_hat
-    s.e[l] = e
-    s.s[l] = v
+        s.P[i, i, l] = max(s.P[i, i, l] - k * s.g[i, l], LEFT * s.P[i, i, l])
+
+
+@kernel
+def corrected(s: State, y_hat: float, v: float, l: int) -> float:
+    """Correct theta and P from s.g = P h and the variance v of the innovation, and report s.y_hat, s.e, s.s.
+
+    Returns 1 / v, or 0 if the sample is not used.
+    """
+    e = s.y[l] - y_hat
+    gain = s.ok[l] / v
+    for i in range(s.theta.shape[0]):
+        s.theta[i, l] += gain * s.g[i, l] * e
+    reduce_covariance(s, gain, l)
+    s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
     return gain  # type: ignore[no-any-return]
 
 

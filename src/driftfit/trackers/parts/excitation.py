@@ -11,7 +11,7 @@ codes. The scale of y is kept likewise, and with it the noise variance of a fail
 
 Parameter i is being learned while 1 / (G^-1)_ii, the information that no other parameter can explain, is above that of
 one sample, or is more than a tenth of what as many samples carried on average until now, 1 / var_i from all of them.
-The second holds for regressors far from zero beside an intercept, of which a sample never tells much.
+The second holds for regressors far from zero beside an intercept, about which one sample never says much.
 
 Cost per sample: O(n^2); the flag inverts G when it is requested.
 """

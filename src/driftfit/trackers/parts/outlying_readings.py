@@ -7,9 +7,9 @@ of a missing output) if
 
     (y - m)^2 > (REACH p)^2 v    and    e^2 > (REACH p)^2 v
 
-so never if the model predicted it. p, the patience, is 1, and doubles with every consecutive sample that is so far off
-or an outlier: persistent readings are a change of level, and are accepted. A change of level by a factor of 1000 costs
-seven samples.
+so never if the model predicted it. The factor p, ``widening``, is 1, and doubles with every consecutive sample that is
+so far off or an outlier: persistent readings are a change of level, and are accepted. A change of level by a factor of
+1000 costs seven samples.
 
 A regressor out of proportion to its mean square c is not left out, because it may be a test or a flood, and so contain
 the most information. It counts as at most LEVERAGE ordinary samples: the noise variance of its sample is multiplied by
@@ -17,7 +17,7 @@ the most information. It counts as at most LEVERAGE ordinary samples: the noise 
     max(1, max_i phi_i^2 / (LEVERAGE c_i))
 
 Source: bounded leverage is Mallows's, see Hampel, Ronchetti, Rousseeuw and Stahel, Robust Statistics (1986), section
-6.3; patience is ours. Cost per sample: O(n).
+6.3; the factor p is ours. Cost per sample: O(n).
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ FIRST = 10.0
 MEMORY = 1000.0
 """Memory of the mean and variance of the readings, in readings."""
 LONGEST = 1e12
-"""Upper bound of the patience."""
+"""Upper bound of the factor p."""
 
 
 def no_proportion() -> dict[str, Any]:
     """Fields before the first reading."""
     return {
-        "middle": 0.0, "spread": 0.0, "readings": 0.0, "patience": 1.0, "strange": 0.0, "left_out": 0.0,
+        "middle": 0.0, "spread": 0.0, "readings": 0.0, "widening": 1.0, "strange": 0.0, "left_out": 0.0,
         "leverage": 1.0,
     }  # fmt: skip
 
@@ -54,7 +54,7 @@ def leave_out(s: State, l: int) -> None:
     away, e = (reading(s, l) - s.middle[l]) ** 2, (s.y[l] - s.y_hat[l]) ** 2
     e = e if s.valid[l] > 0.0 else away
     reach = REACH * REACH * s.spread[l]
-    limit = reach * s.patience[l] * s.patience[l]
+    limit = reach * s.widening[l] * s.widening[l]
     judged = (s.observed[l] > 0.0) & (s.readings[l] >= FIRST)
     strange = judged & (away > reach) & (e > reach)
     out = judged & (away > limit) & (e > limit)
@@ -66,13 +66,13 @@ def leave_out(s: State, l: int) -> None:
 
 @kernel
 def learn_proportion(s: State, l: int, outlier: float) -> None:
-    """Update mean and variance of the accepted readings, and the patience, given the probability of an outlier.
+    """Update mean and variance of the accepted readings, and the factor p, given the probability of an outlier.
 
     A reading that repeats the last one has nothing new: a plant at standstill keeps its scale.
     """
-    odd = max(s.strange[l], outlier)
-    if s.observed[l] > 0.0 or odd > 0.0:
-        s.patience[l] = min(1.0 + odd * (2.0 * s.patience[l] - 1.0), LONGEST)
+    probable = max(s.strange[l], outlier)
+    if s.observed[l] > 0.0 or probable > 0.0:
+        s.widening[l] = min(1.0 + probable * (2.0 * s.widening[l] - 1.0), LONGEST)
     if s.observed[l] > 0.0 and (s.fresh[l] > 0.0 or s.readings[l] < 1.0):
         s.readings[l] += 1.0
         share = 1.0 / min(s.readings[l], MEMORY)

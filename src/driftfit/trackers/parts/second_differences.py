@@ -30,11 +30,11 @@ from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.coarse.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.diffuse import (
-    LEFT,
     MACHINES,
     hand_over,
     knowing_nothing,
     prediction,
+    reduce_covariance,
     symmetric_product,
     take_in_row,
     wander,
@@ -101,14 +101,8 @@ def measurement(s: State, l: int) -> None:
     for i in range(n):
         s.theta[i, l] += gain * s.g[i, l] * e
         s.slope[i, l] += gain * s.g[n + i, l] * e
-    for i in range(2 * n):
-        k = gain * s.g[i, l]
-        for j in range(i):
-            s.P[i, j, l] -= k * s.g[j, l]
-        s.P[i, i, l] = max(s.P[i, i, l] - k * s.g[i, l], LEFT * s.P[i, i, l])
-    s.y_hat[l] = y_hat
-    s.e[l] = e
-    s.s[l] = v
+    reduce_covariance(s, gain, l)
+    s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
 
 
 @kernel

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, TrackerSteps
-from driftfit.engine.kernel import State, exp, kernel, log
+from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.models.state_space import equations_of
 from driftfit.trackers.joint_kalman import moves_are_finite
 from driftfit.trackers.parts.diffuse import LEFT
@@ -116,6 +116,16 @@ def mixture(s: State, l: int) -> None:
 
 
 @kernel
+def copy_particles(cloud: Array, own: Array, into_cloud: Array, into_own: Array, l: int) -> None:
+    """Copy means (p, i) and lower triangles (p, i, j) of all particles."""
+    for p in range(cloud.shape[0]):
+        for i in range(cloud.shape[1]):
+            into_cloud[p, i, l] = cloud[p, i, l]
+            for j in range(i + 1):
+                into_own[p, i, j, l] = own[p, i, j, l]
+
+
+@kernel
 def resample(s: State, l: int) -> None:
     """Systematic resampling, once the weights are worth fewer than half of the particles."""
     n, count, squares = s.theta.shape[0], s.weight.shape[0], 0.0
@@ -135,30 +145,7 @@ def resample(s: State, l: int) -> None:
                     s.own_after[p, i, j, l] = s.own[source, i, j, l]
         for p in range(count):
             s.weight[p, l] = 1.0 / count
-            for i in range(n):
-                s.cloud[p, i, l] = s.cloud_after[p, i, l]
-                for j in range(i + 1):
-                    s.own[p, i, j, l] = s.own_after[p, i, j, l]
-
-
-@kernel
-def keep_particles(s: State, l: int) -> None:
-    """Keep the particles as they are before a move, where `resample` needs room later."""
-    for p in range(s.weight.shape[0]):
-        for i in range(s.theta.shape[0]):
-            s.cloud_after[p, i, l] = s.cloud[p, i, l]
-            for j in range(i + 1):
-                s.own_after[p, i, j, l] = s.own[p, i, j, l]
-
-
-@kernel
-def restore_particles(s: State, l: int) -> None:
-    for p in range(s.weight.shape[0]):
-        for i in range(s.theta.shape[0]):
-            s.cloud[p, i, l] = s.cloud_after[p, i, l]
-            for j in range(i + 1):
-                s.own[p, i, j, l] = s.own_after[p, i, j, l]
-    mixture(s, l)
+        copy_particles(s.cloud_after, s.own_after, s.cloud, s.own, l)
 
 
 @lru_cache
@@ -214,8 +201,8 @@ def weigh(s: State, l: int) -> None:
         top = max(top, fit)
     total = 0.0
     for p in range(count):
-        far = s.fit[p, l] - top  # and not fit > top - 700, which is false for the largest where that is rounding
-        s.fit[p, l] = exp(far) if far > -700.0 else 0.0
+        below = s.fit[p, l] - top  # and not fit > top - 700, which is false for the largest where that is rounding
+        s.fit[p, l] = exp(below) if below > -700.0 else 0.0
         total += s.fit[p, l]
     for p in range(count):
         s.weight[p, l] = s.fit[p, l] / total
@@ -249,7 +236,8 @@ def steps(
     def predict(s: State, l: int) -> None:
         n, time = s.theta.shape[0], s.dt[l] * s.drift[l]
         if s.dt[l] > 0.0:
-            keep_particles(s, l)
+            # `resample` needs this room later
+            copy_particles(s.cloud, s.own, s.cloud_after, s.own_after, l)
             for p in range(s.weight.shape[0]):
                 move(s, p, l)
                 for i in range(n):
@@ -267,7 +255,9 @@ def steps(
             leave_out_contradiction(s, s.y_hat[l], s.s[l], l)
             s.e[l] = s.y[l] - s.y_hat[l]
             if (s.ok[l] < ok) & (s.observed[l] > 0.0):
-                restore_particles(s, l)  # an input is to blame: states do not move with it
+                # an input is to blame: states do not move with it
+                copy_particles(s.cloud_after, s.own_after, s.cloud, s.own, l)
+                mixture(s, l)
             if s.ok[l] > 0.0:
                 weigh(s, l)
                 learn(s, l)

@@ -6,7 +6,6 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
-from driftfit.trackers.adaptive_kalman import RESIDUALS
 from driftfit.trackers.bank.layout import (
     COUNT,
     COUNTERS_AT,
@@ -51,6 +50,7 @@ from driftfit.trackers.bank.machine.late_direction import begin_within, point_al
 from driftfit.trackers.parts.coordinates import FRAME, unseen_variance, whiten_within
 from driftfit.trackers.parts.diffuse import enter, measurement, prediction, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
+from driftfit.trackers.parts.faults.first_samples import RESIDUALS
 from driftfit.trackers.parts.resolution import lasting, resolve
 from driftfit.trackers.rls import learn_scale
 

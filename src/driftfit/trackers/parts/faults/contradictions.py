@@ -54,7 +54,7 @@ JUDGED = 6.0
 """After a prior for n parameters this many more than n, if that is more: before that s may say nothing about e."""
 MEMORY = 1000.0
 """Memory of the mean and variance of the readings, and of the mean of e^2 / s, in samples."""
-ENOUGH, FAR, FEW = 4.0, 100.0, 4.0
+ENOUGH, CLIP, BLOCK_CLIP = 4.0, 100.0, 4.0
 """Samples from which on the mean of e^2 / s is used; the largest multiples of it by which a sample, and the mean of a
 block, enter it."""
 BLOCK, GROWING, SAME = 32.0, 0.25, 1e-12
@@ -105,7 +105,7 @@ def learn_reading(s: State, y: float, l: int) -> None:
 def learn_ratio(s: State, ratio: float, count: float, l: int) -> None:
     """Mean of e^2 / s, with ``count`` more that have the mean ``ratio``."""
     s.ratios[l] = min(s.ratios[l] + count, MEMORY)
-    bounded = min(ratio, max(FAR / count, FEW) * s.mean_ratio[l]) if s.ratios[l] > ENOUGH else ratio
+    bounded = min(ratio, max(CLIP / count, BLOCK_CLIP) * s.mean_ratio[l]) if s.ratios[l] > ENOUGH else ratio
     s.mean_ratio[l] += count * (bounded - s.mean_ratio[l]) / max(s.ratios[l], 1.0)
 
 
@@ -179,25 +179,28 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
 
 
 @partial(kernel, inline=False)
-def examine(s: State, y_hat: float, v: float, l: int) -> None:
+def judge_unusual(s: State, y_hat: float, v: float, l: int) -> None:
     """Judge a sample that is not ordinary, given its prediction and the variance of that in units of the scale."""
     close_block(s, l)
     judge(s, s.y[l] + s.shift[l], y_hat + s.shift[l], v * s.scale[l], l)
 
 
 @kernel
-def odd(s: State, e: float, l: int) -> bool:
-    """Whether a sample with innovation e has to be judged."""
+def needs_judging(s: State, e: float, l: int) -> bool:
+    """Whether a sample with innovation e is not ordinary, or the block is full."""
     return ((e * e > s.ordinary[l]) & (s.ok[l] > 0.0)) | (s.block_left[l] <= 0)  # type: ignore[no-any-return]
 
 
 @kernel
-def odd_or_rooted(s: State, l: int) -> int:
-    """Whether the lane needs the steps of a start; s.y_hat and s.e, which do not depend on the time update."""
+def needs_begin(s: State, l: int) -> int:
+    """Whether ``begin`` takes the sample: in square-root form, or not ordinary.
+
+    It reports s.y_hat and s.e, which do not depend on the time update.
+    """
     y_hat = prediction(s, l)
     e = s.y[l] - y_hat
     s.y_hat[l], s.e[l] = y_hat, e
-    return max(s.root[l], 1 if odd(s, e, l) else 0)  # type: ignore[no-any-return]
+    return max(s.root[l], 1 if needs_judging(s, e, l) else 0)  # type: ignore[no-any-return]
 
 
 @kernel
@@ -212,9 +215,9 @@ def judged_measurement(s: State, l: int) -> None:
 def leave_out_contradiction(s: State, y_hat: float, v: float, l: int) -> None:
     """Leave out a sample that contradicts all before, for trackers that take so long that a comparison is nothing."""
     e = s.y[l] - y_hat
-    unusual = odd(s, e, l)
+    unusual = needs_judging(s, e, l)
     if unusual:
-        examine(s, y_hat, v, l)
+        judge_unusual(s, y_hat, v, l)
     add_to_block(s, e * e / v, l)
     if unusual:
         close_block(s, l)

@@ -2,13 +2,13 @@
 
 Least squares fits any first samples, so one reading of 9999, or one in an input, would determine estimates, scales and
 noise for hundreds of samples. The first samples are therefore judged together, when there are enough of them for a
-start. A value is far if it is more than `FAR` times the median absolute deviation of its column away from the median;
-readings that repeat the one before count once. A sample is doubtful if
+start. A value is outlying if it is more than `OUTLYING` times the median absolute deviation of its column away from the
+median; readings that repeat the one before count once. A sample is doubtful if
 
-    its reading is far and no regressor is unusual: probably a fault code;
-    or a regressor is far and the reading is not: a fault code of an input, or of an earlier output, which is now a lag.
+    its reading is outlying and no regressor is unusual: probably a fault code;
+    or a regressor is outlying and the reading is not: a fault code of an input, or of an earlier output, now a lag.
 
-A large output after a large input is neither. A regressor is unusual if it is far, or if it differs where most are
+A large output after a large input is neither. A regressor is unusual if it is outlying, or if it differs where most are
 equal, as after a step of an input; a lag with the same fault code as the reading is not unusual. If half of the
 samples or more are doubtful and more cannot be waited for, the level has changed, and no sample is doubtful.
 
@@ -22,35 +22,41 @@ once.
 
 from __future__ import annotations
 
+import numpy as np
+
 from driftfit.engine.kernel import Array, Driver, shared
 
-FAR = 30.0
+OUTLYING = 30.0
 """Median absolute deviations; 20 standard deviations of normal data."""
 WORSE = 10.0
 """Ratio of sums of squares from which samples contradict each other."""
-Y, SPAN, NOISE, READING = range(4)
-"""Entries of a sample after its regressor: the output, intervals of drift since the previous sample, the noise factor
-(negative if the sample is doubtful), and the output as it was measured."""
+RESIDUALS = 4
+"""Number of residuals after which the first samples are judged."""
+SURE = 12
+"""The same while some samples are doubtful: residuals of the others."""
+Y, SPAN, NOISE, READING, PHI = range(5)
+"""Entries of a sample: the output, intervals of drift since the previous sample, the noise factor (negative if the
+sample is doubtful), the output as it was measured, and the first entry of the regressor."""
 
 
 @shared
-def fresh(samples: Array, k: int, reading: int) -> bool:
+def fresh(samples: Array, k: int) -> bool:
     """Whether the reading of sample k is not that of the sample before."""
-    return k == 0 or samples[k, reading] != samples[max(k - 1, 0), reading]
+    return k == 0 or samples[k, READING] != samples[max(k - 1, 0), READING]
 
 
 @shared
-def median(samples: Array, N: int, reading: int, column: int, center: float, apart: float) -> float:
+def median(samples: Array, N: int, column: int, center: float, apart: float) -> float:
     """The upper median of a column over fresh readings, or, with apart = 1, of its distances from center."""
     found, count = 0.0, 0
     for k in range(N):
-        count += 1 if fresh(samples, k, reading) else 0
+        count += 1 if fresh(samples, k) else 0
     for k in range(N):
         value = abs(samples[k, column] - center) if apart > 0.0 else samples[k, column]
         less, same = 0, 0
         for other in range(N):
             x = abs(samples[other, column] - center) if apart > 0.0 else samples[other, column]
-            counts = fresh(samples, other, reading)
+            counts = fresh(samples, other)
             less += 1 if counts and x < value else 0
             same += 1 if counts and x == value else 0
         found = value if less <= count // 2 and count // 2 < less + same else found
@@ -58,39 +64,46 @@ def median(samples: Array, N: int, reading: int, column: int, center: float, apa
 
 
 @shared
-def doubt(samples: Array, N: int, n: int, last: bool) -> None:
-    """Give a negative noise factor to those of N samples (.., n + 4) that are doubtful, a positive one to the rest.
+def doubt(samples: Array, N: int, last: bool) -> None:
+    """Give a negative noise factor to those of N samples (.., PHI + n) that are doubtful, a positive one to the rest.
 
     Half of them or more are kept as doubtful while further samples can be waited for, which is until ``last``.
     """
-    noise, reading = n + NOISE, n + READING
-    usual = median(samples, N, reading, reading, 0.0, 0.0)
-    limit = FAR * median(samples, N, reading, reading, usual, 1.0)
+    usual = median(samples, N, READING, 0.0, 0.0)
+    limit = OUTLYING * median(samples, N, READING, usual, 1.0)
     for k in range(N):
-        doubtful = limit > 0.0 and abs(samples[k, reading] - usual) > limit
-        samples[k, noise] = -abs(samples[k, noise]) if doubtful else abs(samples[k, noise])
-    for i in range(n):
-        center = median(samples, N, reading, i, 0.0, 0.0)
-        most = FAR * median(samples, N, reading, i, center, 1.0)
+        doubtful = limit > 0.0 and abs(samples[k, READING] - usual) > limit
+        samples[k, NOISE] = -abs(samples[k, NOISE]) if doubtful else abs(samples[k, NOISE])
+    for i in range(PHI, samples.shape[1]):
+        center = median(samples, N, i, 0.0, 0.0)
+        most = OUTLYING * median(samples, N, i, center, 1.0)
         for k in range(N):
             if abs(samples[k, i] - center) > most:
-                far = abs(samples[k, reading] - usual) > limit
-                code = samples[k, reading] != 0.0 and abs(samples[k, i]) == abs(samples[k, reading])
-                if far and not code:
-                    samples[k, noise] = abs(samples[k, noise])
-                elif most > 0.0 and not far:
-                    samples[k, noise] = -abs(samples[k, noise])
+                outlying = abs(samples[k, READING] - usual) > limit
+                code = samples[k, READING] != 0.0 and abs(samples[k, i]) == abs(samples[k, READING])
+                if outlying and not code:
+                    samples[k, NOISE] = abs(samples[k, NOISE])
+                elif most > 0.0 and not outlying:
+                    samples[k, NOISE] = -abs(samples[k, NOISE])
     count, all_fresh = 0, 0
     for k in range(N):
-        counts = fresh(samples, k, reading)
+        counts = fresh(samples, k)
         all_fresh += 1 if counts else 0
-        count += 1 if counts and samples[k, noise] < 0.0 else 0
+        count += 1 if counts and samples[k, NOISE] < 0.0 else 0
     if last and 2 * count >= all_fresh:
         for k in range(N):
-            samples[k, noise] = abs(samples[k, noise])
+            samples[k, NOISE] = abs(samples[k, NOISE])
 
 
 @Driver
-def doubtful(samples: Array, n: int) -> None:
+def judge(samples: Array) -> None:
     """`doubt`, for Python."""
-    doubt(samples, len(samples), n, True)
+    doubt(samples, len(samples), True)
+
+
+def doubtful(phi: Array, y: Array, reading: Array) -> Array:
+    """Which of all samples (T,) of a start are doubtful, given their regressors, outputs and readings."""
+    samples = np.column_stack([y, np.ones((len(y), 2)), reading, phi])
+    judge(samples)
+    found: Array = samples[:, NOISE] < 0.0
+    return found

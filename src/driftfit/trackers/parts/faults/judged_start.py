@@ -6,7 +6,8 @@ some of them are doubtful (`driftfit.trackers.parts.faults.first_samples`), it c
 residuals, or the store is full. If the estimate from all samples then contradicts the others, the start is repeated
 without the doubtful ones.
 
-Samples are stored with the time since the previous stored one, so that drift and forgetting are repeated as well.
+Samples (`driftfit.trackers.parts.faults.stored_samples`) are stored with the time since the previous stored one, so
+that drift and forgetting are repeated as well.
 
 Cost: that of the diffuse start for a few more samples, and O(n N^2) once for N stored samples.
 """
@@ -20,77 +21,62 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, State, Step, cubes, kernel, machine, nothing
+from driftfit.engine.kernel import Array, State, Step, kernel, nothing
 from driftfit.trackers.parts.diffuse import BEFORE, MACHINES, know_nothing, reform, symmetric_product
 from driftfit.trackers.parts.faults.contradictions import (
     add_to_block,
     close_block,
-    examine,
+    judge_unusual,
     learn_reading,
+    needs_begin,
+    needs_judging,
     no_contradictions,
-    odd,
-    odd_or_rooted,
 )
-from driftfit.trackers.parts.faults.first_samples import NOISE, READING, SPAN, WORSE, Y, doubt, doubtful
+from driftfit.trackers.parts.faults.first_samples import NOISE, PHI, READING, RESIDUALS, SPAN, SURE, WORSE, doubtful
+from driftfit.trackers.parts.faults.stored_samples import doubtful_samples, machine_doubt, recall, squares_left, store
 
-RESIDUALS = 4
-"""Number of residuals after which the first samples are judged."""
-SURE = 12
-"""The number of residuals without doubtful samples after which they are judged if some are doubtful."""
 MORE = 16
 """Samples that are stored beyond the number of parameters."""
-AGED = READING + 1
-"""Entry of a stored sample: intervals of forgetting; those of drift are at `SPAN`."""
 
 
 def unjudged(theta: Array, diffuse: bool) -> dict[str, Any]:
     """Fields before the first sample, for a start at theta (n,); with a proper prior nothing is judged."""
     n = len(theta)
     return {
-        "start_rows": np.zeros((n + MORE, n + AGED + 1)), "start_count": 0, "start_over": 0 if diffuse else 1,
-        "start_theta": theta, "start_time": 0.0, "start_drift": 0.0, "start_faults": 0.0,
+        "samples": np.zeros((n + MORE, PHI + n)), "ages": np.zeros(n + MORE), "remembered": 0, "waited": 0.0,
+        "age": 0.0, "start_over": 0 if diffuse else 1, "start_theta": theta, "start_faults": 0.0,
         **no_contradictions(0 if diffuse else n),
     }  # fmt: skip
 
 
-@machine
-def machine_doubt_first(samples: int, rows: int, columns: int, count: int, last: int, n: int, L: int, l: int) -> None:
-    """`doubt` for lane l of L, from the address of the samples."""
-    doubt(cubes(samples, rows, columns, L)[:, :, l], count, n, last > 0)
-
-
-START_MACHINES = (*MACHINES, machine_doubt_first)
+START_MACHINES = (*MACHINES, machine_doubt)
 """The routines that a start calls; see `TrackerSteps`."""
 
 
 @kernel
 def room(s: State, l: int) -> int:
     """Number of samples that are stored at most."""
-    most: int = s.start_rows.shape[0] - s.absent[l]
+    most: int = s.samples.shape[0] - s.absent[l]
     return most
 
 
 @kernel
 def spare_samples(s: State, l: int) -> int:
     """Number of stored samples beyond the directions that they span."""
-    spare: int = s.start_count[l] - (s.rank[l] - s.absent[l])
+    spare: int = s.remembered[l] - (s.rank[l] - s.absent[l])
     return spare
 
 
 @kernel
 def keep(s: State, l: int) -> None:
-    """Store the sample."""
-    n, at = s.theta.shape[0], s.start_count[l]
-    s.start_time[l] += s.dt[l]
-    s.start_drift[l] += s.dt[l] * s.drift[l]
-    if (s.ok[l] > 0.0) & (at < room(s, l)):
-        for i in range(n):
-            s.start_rows[at, i, l] = s.phi[i, l]
-        s.start_rows[at, n + Y, l], s.start_rows[at, n + SPAN, l] = s.y[l], s.start_drift[l]
-        s.start_rows[at, n + NOISE, l], s.start_rows[at, n + READING, l] = s.noise[l], s.y[l] + s.shift[l]
-        s.start_rows[at, n + AGED, l] = s.start_time[l]
-        s.start_time[l], s.start_drift[l] = 0.0, 0.0
-        s.start_count[l] += 1
+    """Store the sample, also with the intervals of forgetting since the last one in ``ages``."""
+    s.age[l] += s.dt[l]
+    s.waited[l] += s.dt[l] * s.drift[l]
+    if (s.ok[l] > 0.0) & (s.remembered[l] < room(s, l)):
+        store(s, l)
+        s.ages[s.remembered[l], l] = s.age[l]
+        s.age[l], s.waited[l] = 0.0, 0.0
+        s.remembered[l] += 1
 
 
 @kernel
@@ -103,47 +89,22 @@ def as_before(s: State, l: int) -> None:
 
 
 @kernel
-def squares_left(s: State, l: int) -> float:
-    """Sum of squares of the residuals of the samples that are not doubtful."""
-    n, squares = s.theta.shape[0], 0.0
-    for at in range(s.start_count[l]):
-        e, noise = s.start_rows[at, n + Y, l], s.start_rows[at, n + NOISE, l]
-        for i in range(n):
-            e -= s.start_rows[at, i, l] * s.theta[i, l]
-        squares += e * e / noise if noise > 0.0 else 0.0
-    return squares
-
-
-@kernel
 def settle(s: State, l: int) -> None:
     """The start is over: the readings of the samples that it used are the range of later ones."""
-    n = s.theta.shape[0]
     s.start_over[l] = 1
     known = s.scale[l] > 0.0  # it is NaN without residuals
     s.ratios[l] = max(spare_samples(s, l) - s.start_faults[l], 0.0) if known else 0.0
     s.mean_ratio[l] = squares_left(s, l) / (max(s.ratios[l], 1.0) * s.r[l] * s.scale[l]) if known else 0.0
-    for at in range(s.start_count[l]):
-        if s.start_rows[at, n + NOISE, l] > 0.0:
-            learn_reading(s, s.start_rows[at, n + READING, l], l)
+    for at in range(s.remembered[l]):
+        if s.samples[at, NOISE, l] > 0.0:
+            learn_reading(s, s.samples[at, READING, l], l)
     close_block(s, l)
 
 
 @kernel
-def doubtful_samples(s: State, l: int) -> int:
-    """Mark the doubtful samples, and count them."""
-    n, L, rows, found = s.theta.shape[0], s.theta.shape[1], s.start_rows.shape[0], 0
-    last = 1 if s.start_count[l] >= room(s, l) else 0
-    machine_doubt_first(s.start_rows.ctypes.data, rows, s.start_rows.shape[1], s.start_count[l], last, n, L, l)
-    for at in range(s.start_count[l]):
-        found += 1 if s.start_rows[at, n + NOISE, l] < 0.0 else 0
-    return found
-
-
-@kernel
 def trust_all(s: State, l: int) -> None:
-    n = s.theta.shape[0]
-    for at in range(s.start_count[l]):
-        s.start_rows[at, n + NOISE, l] = abs(s.start_rows[at, n + NOISE, l])
+    for at in range(s.remembered[l]):
+        s.samples[at, NOISE, l] = abs(s.samples[at, NOISE, l])
 
 
 @lru_cache
@@ -153,26 +114,22 @@ def reconsidering(one: Step, restart: Step) -> Any:
     @partial(kernel, inline=False)
     def repeat(s: State, every: bool, l: int) -> None:
         """The start again, with every sample or without the doubtful ones."""
-        n, waited, drift = s.theta.shape[0], 0.0, 0.0
+        age, waited = 0.0, 0.0
         as_before(s, l)
         restart(s, l)
-        for at in range(s.start_count[l]):
-            waited += s.start_rows[at, n + AGED, l]
-            drift += s.start_rows[at, n + SPAN, l]
-            noise = s.start_rows[at, n + NOISE, l]
-            if every or noise > 0.0:
-                for i in range(n):
-                    s.phi[i, l] = s.start_rows[at, i, l]
-                s.y[l], s.noise[l] = s.start_rows[at, n + Y, l], abs(noise)
-                s.shift[l] = s.start_rows[at, n + READING, l] - s.y[l]
-                s.dt[l], s.drift[l] = waited, drift / waited if waited > 0.0 else 0.0
+        for at in range(s.remembered[l]):
+            age += s.ages[at, l]
+            waited += s.samples[at, SPAN, l]
+            if every or s.samples[at, NOISE, l] > 0.0:
+                recall(s, at, l)
+                s.dt[l], s.drift[l] = age, waited / age if age > 0.0 else 0.0
                 one(s, l)
-                waited, drift = 0.0, 0.0
+                age, waited = 0.0, 0.0
 
     @partial(kernel, inline=False)
     def reconsider(s: State, found: int, l: int) -> None:
         y, y_hat, e, v, noise, shift = s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l]
-        dt, drift, n, last = s.dt[l], s.drift[l], s.theta.shape[0], s.start_count[l] - 1
+        dt, drift = s.dt[l], s.drift[l]
         with_all = squares_left(s, l)
         repeat(s, False, l)
         if with_all > WORSE * squares_left(s, l):
@@ -181,10 +138,9 @@ def reconsidering(one: Step, restart: Step) -> Any:
         else:
             repeat(s, True, l)
             trust_all(s, l)
+        recall(s, s.remembered[l] - 1, l)
         s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l] = y, y_hat, e, v, noise, shift
         s.dt[l], s.drift[l] = dt, drift
-        for i in range(n):
-            s.phi[i, l] = s.start_rows[last, i, l]
 
     return reconsider
 
@@ -207,17 +163,17 @@ def judged(
     @kernel
     def later(s: State, l: int) -> None:
         """A sample after the start: in square-root form, or not ordinary."""
-        unusual = odd(s, s.e[l], l)
+        unusual = needs_judging(s, s.e[l], l)
         if s.root[l] > 0:
             y_hat, e = s.y_hat[l], s.e[l]
             if unusual:
                 reform(s, l)  # gives the variance of the prediction
-                examine(s, y_hat, s.at_start[BEFORE, l] + s.r[l] * s.noise[l], l)
+                judge_unusual(s, y_hat, s.at_start[BEFORE, l] + s.r[l] * s.noise[l], l)
             one(s, l)
             add_to_block(s, e * e / (s.at_start[BEFORE, l] + s.r[l] * s.noise[l]), l)
         else:
             predict(s, l)
-            examine(s, s.y_hat[l], variance(s, l) + s.r[l] * s.noise[l], l)
+            judge_unusual(s, s.y_hat[l], variance(s, l) + s.r[l] * s.noise[l], l)
             correct(s, l)
             report(s, l)
         if unusual:
@@ -231,9 +187,9 @@ def judged(
             keep(s, l)
             one(s, l)
             spare, found = spare_samples(s, l), 0
-            full = s.start_count[l] >= room(s, l)
+            full = s.remembered[l] >= room(s, l)
             if (s.ok[l] > 0.0) & (spare >= RESIDUALS):
-                found = doubtful_samples(s, l)
+                found = doubtful_samples(s, 1 if full else 0, l)
             ready = (spare >= RESIDUALS) & ((found == 0) | (spare - found >= (RESIDUALS if full else SURE)))
             if (s.ok[l] > 0.0) & (found > 0) & ready:
                 reconsider(s, found, l)
@@ -241,15 +197,13 @@ def judged(
                 settle(s, l)
             s.root[l] = s.root[l] if s.start_over[l] > 0 else 1
 
-    return steps._replace(begin=start, machines=START_MACHINES, apart=odd_or_rooted)
+    return steps._replace(begin=start, machines=START_MACHINES, apart=needs_begin)
 
 
 def faults(field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
     """Which of the samples (T,) of a record were left out of its start, given the fields of the state after it."""
-    found, n = np.zeros(len(y), bool), phi.shape[1]
+    found = np.zeros(len(y), bool)
     if field("start_faults") > 0.0:
-        rows = np.flatnonzero(ok)[: int(field("start_count"))]
-        samples = np.column_stack([phi[rows], y[rows], np.ones((len(rows), 2)), y[rows]])
-        doubtful(samples, n)
-        found[rows] = samples[:, n + NOISE] < 0.0
+        rows = np.flatnonzero(ok)[: int(field("remembered"))]
+        found[rows] = doubtful(phi[rows], y[rows], y[rows])
     return found

@@ -71,7 +71,7 @@ def whiten_noise(s: State, l: int) -> None:
 def learn_colour(s: State, l: int) -> None:
     """Update c, and store the past of the next sample; s.theta is still the prediction."""
     c, v = s.colour_used[l], s.past_y[l]
-    ordinary = s.weighed[l] * (1.0 - s.odd[l])
+    ordinary = s.weighed[l] * (1.0 - s.outlier[l])
     for i in range(s.theta.shape[0]):
         v -= s.past[i, l] * s.theta[i, l]
         s.past[i, l] = ordinary * s.white[i, l]

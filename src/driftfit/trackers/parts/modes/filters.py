@@ -197,7 +197,7 @@ def weigh(s: State, l: int) -> None:
             s.joint[j, k, l] *= share
             s.row[k, l] = s.joint[j, k, l]
         s.nu[j, l] = sum_of_row(s, l)
-    s.odd[l] = s.nu[J - 1, l] + (s.mu[TOP, l] - s.joint[J - 1, TOP, l] if s.rare[l] < 1.0 else 0.0)
+    s.outlier[l] = s.nu[J - 1, l] + (s.mu[TOP, l] - s.joint[J - 1, TOP, l] if s.rare[l] < 1.0 else 0.0)
     # an outlier says nothing about the level: the chain keeps its state
     for j in range(J - 1):
         s.nu[j, l] += s.nu[J - 1, l] * s.nu_prior[j, l] / (1.0 - OUTLIER)

@@ -21,7 +21,7 @@ when nothing changes. All but that move down have the factor calm <= 1, learned 
 what never changed in thousands of samples is expected to change less often (`learn_rate`).
 
 The top filter may also *leap*: if a move as large as the innovation, in directions 1 / c_i and up to LEAP standard
-deviations of the output (times patience, `driftfit.trackers.parts.outlying_readings`), at this regressor and at one of
+deviations of the output (times p of `driftfit.trackers.parts.outlying_readings`), at this regressor and at one of
 mean square c_i, explains the sample better by more than a factor 1 / RARE, its covariance grows by that move.
 
 Source: Blom and Bar-Shalom (1988); the ladders and their transitions are ours. Cost per sample: O(K n^2) for K modes,
@@ -203,7 +203,7 @@ def mix(s: State, l: int) -> None:
 @kernel
 def leap(s: State, l: int, noise: float) -> None:
     """Let the top filter explain the innovation by a jump of any size, if that is more likely."""
-    most = LEAP * s.patience[l]
+    most = LEAP * s.widening[l]
     square, v, unit = s.e_k[TOP, l] * s.e_k[TOP, l], s.h[TOP, l] + noise, 0.0
     for i in range(s.theta.shape[0]):
         own = s.ratio[i, TOP, l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0

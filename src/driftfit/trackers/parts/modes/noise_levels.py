@@ -48,7 +48,7 @@ def any_level() -> dict[str, Any]:
         "log_level": np.log(LEVELS),
         "nu": np.array([START, *np.full(J - 2, (1.0 - START) / (J - 2)), 0.0]),
         "nu_prior": np.zeros(J),
-        "odd": 0.0,
+        "outlier": 0.0,
         "fit": 1.0,
     }
 
@@ -108,8 +108,8 @@ def learn_noise(s: State, l: int) -> None:
     s.fit[l] += (surprise + ordinary * (1.0 - s.fit[l])) / SETTLED
     step = 1.0 / min(s.count[l] + 1.0, MEMORY)
     move = step * (surprise + level)
-    if s.patience[l] > IN_A_ROW:
-        move += RISE * s.odd[l]
+    if s.widening[l] > IN_A_ROW:
+        move += RISE * s.outlier[l]
     fall = log(max(s.fit[l], 1e-6) / MISFIT) / SETTLED if (s.fit[l] < MISFIT) & (s.count[l] < EARLY) else 0.0
     s.fit[l] *= exp(-fall)
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move)) + fall), finest(s, l))

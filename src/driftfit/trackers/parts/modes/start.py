@@ -11,7 +11,7 @@ filters start with probabilities proportional to p_k, and with r the mean of S_k
 first sample on are therefore neither taken for noise nor for estimates that many samples agree on.
 
 Before that the samples are judged together (`driftfit.trackers.parts.faults.first_samples`). If some are fault codes,
-least squares, scales and proportions start again without them; while it cannot be decided, the start goes on.
+least squares, scales and proportions start again without them; until that can be decided, the start continues.
 
 Source: marginal likelihood under an inverse-gamma variance, West and Harrison, Bayesian Forecasting and Dynamic Models
 (1997), section 4.5. Cost: O(K n^2) for each sample of the start, once.
@@ -25,13 +25,22 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, cubes, exp, kernel, log, machine
+from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.trackers.parts.diffuse import know_nothing, take_in
 from driftfit.trackers.parts.excitation import learn_information, learn_scales
-from driftfit.trackers.parts.faults.first_samples import NOISE, READING, SPAN, WORSE, Y, doubt, doubtful
+from driftfit.trackers.parts.faults.first_samples import (
+    NOISE,
+    PHI,
+    SPAN,
+    SURE,
+    WORSE,
+    Y,
+    doubtful,
+)
+from driftfit.trackers.parts.faults.stored_samples import doubtful_samples, recall, squares_left, store
 from driftfit.trackers.parts.modes.filters import absorb, project, wander
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
-from driftfit.trackers.parts.modes.weights import MORE, WINDOW
+from driftfit.trackers.parts.modes.weights import WINDOW
 from driftfit.trackers.parts.outlying_readings import bound_leverage, learn_proportion
 from driftfit.trackers.parts.resolution import reading, same_reading
 from driftfit.trackers.rls import learn_scale
@@ -41,24 +50,12 @@ LOOSE = 1e4
 as many digits of the estimates."""
 
 
-@machine
-def machine_doubt(samples: int, count: int, n: int, L: int, l: int) -> None:
-    """`doubt` for lane l of L, from the address of the samples."""
-    doubt(cubes(samples, WINDOW, 2 * n + MORE, L)[:, :, l], count, n, True)
-
-
 @kernel
 def keep(s: State, l: int) -> None:
     """Store a sample of the start, where those of `driftfit.trackers.parts.modes.weights` will be."""
-    n, at = s.theta.shape[0], s.remembered[l]
     if s.ok[l] > 0.0:
-        if at < WINDOW:
-            for i in range(n):
-                s.samples[at, i, l] = s.phi[i, l]
-            s.samples[at, n + Y, l] = s.y[l]
-            s.samples[at, n + SPAN, l] = s.waited[l]
-            s.samples[at, n + NOISE, l] = s.noise[l]
-            s.samples[at, n + READING, l] = reading(s, l)
+        if s.remembered[l] < WINDOW:
+            store(s, l)
         s.remembered[l] += 1
         s.waited[l] = 0.0
 
@@ -100,7 +97,7 @@ def forget(s: State, l: int) -> None:
     know_nothing(s, l)
     s.squares[l], s.count[l], s.scale[l] = 0.0, 0.0, np.nan
     s.power_samples[l], s.power[l] = 0.0, 0.0
-    s.middle[l], s.spread[l], s.readings[l], s.patience[l] = 0.0, 0.0, 0.0, 1.0
+    s.middle[l], s.spread[l], s.readings[l], s.widening[l] = 0.0, 0.0, 0.0, 1.0
 
 
 @partial(kernel, inline=False)
@@ -109,38 +106,29 @@ def repeat(s: State, every: bool, l: int) -> float:
 
     Returns the sum of squares of the residuals of those that are not doubtful.
     """
-    n, rows, last, squares = s.theta.shape[0], s.remembered[l], np.nan, 0.0
+    last = np.nan
     forget(s, l)
-    for at in range(rows):
-        s.noise[l] = abs(s.samples[at, n + NOISE, l])
-        if every or s.samples[at, n + NOISE, l] > 0.0:
-            for i in range(n):
-                s.phi[i, l] = s.samples[at, i, l]
-            s.y[l] = s.samples[at, n + Y, l]
-            s.shift[l] = s.samples[at, n + READING, l] - s.y[l]
+    for at in range(s.remembered[l]):
+        if every or s.samples[at, NOISE, l] > 0.0:
+            recall(s, at, l)
             s.fresh[l] = 0.0 if same_reading(s, last, l) else 1.0
             last = reading(s, l)
             learn_scales(s, l)
             take_first(s, l)
-    for at in range(rows):
-        if s.samples[at, n + NOISE, l] > 0.0:
-            e = s.samples[at, n + Y, l]
-            for i in range(n):
-                e -= s.samples[at, i, l] * s.theta[i, l]
-            squares += e * e / s.samples[at, n + NOISE, l]
-    return squares
+    return squares_left(s, l)  # type: ignore[no-any-return]
 
 
 @kernel
 def drop(s: State, l: int) -> None:
     """Remove the doubtful samples."""
-    n, rows, left, waited = s.theta.shape[0], s.remembered[l], 0, 0.0
+    rows, columns = s.remembered[l], PHI + s.theta.shape[0]
+    left, waited = 0, 0.0
     for at in range(rows):
-        waited += s.samples[at, n + SPAN, l]
-        if s.samples[at, n + NOISE, l] > 0.0:
-            for i in range(n + READING + 1):
+        waited += s.samples[at, SPAN, l]
+        if s.samples[at, NOISE, l] > 0.0:
+            for i in range(columns):
                 s.samples[left, i, l] = s.samples[at, i, l]
-            s.samples[left, n + SPAN, l] = waited
+            s.samples[left, SPAN, l] = waited
             left, waited = left + 1, 0.0
     s.waited[l] += waited
     s.left_out[l] += rows - left
@@ -148,40 +136,32 @@ def drop(s: State, l: int) -> None:
 
 
 @partial(kernel, inline=False)
-def reconsider(s: State, enough: int, l: int) -> bool:
-    """Whether the filters may start: not while samples are doubtful, and the others have not ``enough`` residuals."""
-    n, L = s.theta.shape[0], s.theta.shape[1]
-    ready, some, rows = True, False, s.remembered[l]
+def reconsider(s: State, l: int) -> bool:
+    """Whether the filters may start: not while samples are doubtful, and the others have not `SURE` residuals."""
+    ready, found, rows = True, 0, s.remembered[l]
     if rows <= WINDOW:
-        machine_doubt(s.samples.ctypes.data, rows, n, L, l)
-        for at in range(rows):
-            some = some or s.samples[at, n + NOISE, l] < 0.0
-    if some:
+        found = doubtful_samples(s, 1, l)
+    if found > 0:
         y, y_hat, e, v, noise, shift = s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l]
         ok, fresh, leverage = s.ok[l], s.fresh[l], s.leverage[l]
         s.ok[l], s.observed[l], s.leverage[l] = 1.0, 1.0, 1.0
         alone = repeat(s, False, l)
-        ready = s.count[l] >= enough
+        ready = s.count[l] >= SURE
         if repeat(s, True, l) > WORSE * alone and ready:
             repeat(s, False, l)
             drop(s, l)
+        recall(s, rows - 1, l)
         s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l] = y, y_hat, e, v, noise, shift
         s.ok[l], s.observed[l], s.fresh[l], s.leverage[l] = ok, ok, fresh, leverage
-        for i in range(n):
-            s.phi[i, l] = s.samples[rows - 1, i, l]
     return ready
 
 
 def faults(field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
     """Which samples (T,) of the start `reconsider` left out."""
     start = int(np.argmax(field("settled") > 0)) + 1
-    rows, n = np.flatnonzero(ok[:start]), phi.shape[1]
-    found = np.zeros(len(y), bool)
+    rows, found = np.flatnonzero(ok[:start]), np.zeros(len(y), bool)
     if field("left_out")[start - 1] > 0.0:
-        readings = y[rows] + field("shift")[rows]
-        samples = np.column_stack([phi[rows], y[rows], np.ones((len(rows), 2)), readings])
-        doubtful(samples, n)
-        found[rows] = samples[:, n + NOISE] < 0.0
+        found[rows] = doubtful(phi[rows], y[rows], y[rows] + field("shift")[rows])
     return found
 
 
@@ -189,7 +169,7 @@ def faults(field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Arra
 def whitened(s: State, at: int, l: int) -> None:
     """x of a stored sample, which is in the span of the columns that are not free."""
     for j in range(s.theta.shape[0]):
-        u = s.samples[at, j, l]
+        u = s.samples[at, PHI + j, l]
         for i in range(j):
             u -= s.S[i, j, l] * s.x[i, l]
         s.x[j, l] = u / s.S[j, j, l] if s.S[j, j, l] > 0.0 else 0.0
@@ -206,11 +186,11 @@ def run_again(s: State, l: int) -> None:
             s.C[i, i, k, l] *= LOOSE
     for at in range(s.remembered[l]):
         if at > 0:
-            wander(s, s.samples[at, n + SPAN, l], l)
+            wander(s, s.samples[at, SPAN, l], l)
         whitened(s, at, l)
         project(s, l)
         for k in range(K):
-            e, v = s.samples[at, n + Y, l] - s.e_k[k, l], s.h[k, l] + abs(s.samples[at, n + NOISE, l])
+            e, v = s.samples[at, Y, l] - s.e_k[k, l], s.h[k, l] + abs(s.samples[at, NOISE, l])
             s.weighted[k, l] += e * e / v
             s.mu_next[k, l] += log(v)
             s.step[k, l], s.h[k, l] = e / v, 1.0 / v

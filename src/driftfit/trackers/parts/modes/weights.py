@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, kernel, machine, shared
+from driftfit.trackers.parts.faults.first_samples import PHI
 from driftfit.trackers.parts.modes.rows import sum_of_row
 
 BLOCK, WINDOW = 50, 100
@@ -37,80 +38,82 @@ FLOOR = 0.01
 """Smallest weight."""
 TINY = 1e-300
 
-E, PRECISION, SPAN, MORE = 0, 1, 2, 3
-"""Entries of a stored sample after its regressor and gain: the innovation over its variance, the inverse variance
-(both in units of r), and the intervals of drift."""
-ASSUMED, SLOPE, WEIGHT, ADJOINT, SHIFT, CURVATURE = 0, 1, 2, 3, 4, 5
-"""Rows (n,) of the estimation: p, b, the weights, r, N k; then A, and N."""
+E, PRECISION, SPAN = range(3)
+"""Entries of a stored sample before its regressor: the innovation over its variance, the inverse variance (both in
+units of r), and the intervals of drift."""
+ASSUMED, SLOPE, WEIGHT, ADJOINT, SHIFT, A, N = range(7)
+"""Rows (n,) of the estimation: p, b, the weights, r, N k; then the rows of A and of N by turns, so that they are in the
+same place for any number of parameters (`driftfit.trackers.parts.common_size`)."""
 
 
 def no_weights(n: int) -> dict[str, Any]:
     """Fields before the first sample."""
     return {
-        "samples": np.zeros((WINDOW, 2 * n + MORE)),
+        "samples": np.zeros((WINDOW, PHI + n)),
+        "gains": np.zeros((WINDOW, n)),
         "remembered": 0,
-        "scores": np.zeros((CURVATURE + 2 * n, n)),
+        "scores": np.zeros((A + 2 * n, n)),
         "weight": np.ones(n),
     }
 
 
 @shared
-def step_back(past: Array, at: int, t: Array) -> None:
+def step_back(past: Array, gains: Array, at: int, t: Array) -> None:
     """One backward step of r and N."""
     n = t.shape[1]
-    N = CURVATURE + n
-    move, more = past[at, 2 * n + E], past[at, 2 * n + PRECISION]
+    move, more = past[at, E], past[at, PRECISION]
     for i in range(n):
         total = 0.0
         for j in range(n):
-            total += t[N + i, j] * past[at, n + j]
+            total += t[N + 2 * i, j] * gains[at, j]
         t[SHIFT, i] = total
     for i in range(n):
-        move -= past[at, n + i] * t[ADJOINT, i]
-        more += past[at, n + i] * t[SHIFT, i]
+        move -= gains[at, i] * t[ADJOINT, i]
+        more += gains[at, i] * t[SHIFT, i]
     for i in range(n):
-        t[ADJOINT, i] += past[at, i] * move
+        x = past[at, PHI + i]
+        t[ADJOINT, i] += x * move
         for j in range(i + 1):
-            t[N + i, j] += past[at, i] * past[at, j] * more - past[at, i] * t[SHIFT, j] - t[SHIFT, i] * past[at, j]
-            t[N + j, i] = t[N + i, j]
+            other = past[at, PHI + j]
+            t[N + 2 * i, j] += x * other * more - x * t[SHIFT, j] - t[SHIFT, i] * other
+            t[N + 2 * j, i] = t[N + 2 * i, j]
 
 
 @shared
-def look_back(past: Array, newest: int, t: Array) -> None:
+def look_back(past: Array, gains: Array, newest: int, t: Array) -> None:
     """Add the sums of the oldest block."""
     n = t.shape[1]
-    A, N = CURVATURE, CURVATURE + n
     for i in range(n):
         t[ADJOINT, i] = 0.0
         t[SLOPE, i] *= FADE
         for j in range(n):
-            t[N + i, j] = 0.0
-            t[A + i, j] *= FADE
+            t[N + 2 * i, j] = 0.0
+            t[A + 2 * i, j] *= FADE
     for back in range(WINDOW):
         at = (newest + WINDOW - back) % WINDOW
-        step_back(past, at, t)
+        step_back(past, gains, at, t)
         if back >= WINDOW - BLOCK:
-            span = past[at, 2 * n + SPAN]
+            span = past[at, SPAN]
             for i in range(n):
-                t[SLOPE, i] += span * (t[ADJOINT, i] * t[ADJOINT, i] - t[N + i, i])
+                t[SLOPE, i] += span * (t[ADJOINT, i] * t[ADJOINT, i] - t[N + 2 * i, i])
                 for j in range(n):
-                    square = span * span * t[N + i, j] * t[N + i, j]
-                    t[A + i, j] += square
+                    square = span * span * t[N + 2 * i, j] * t[N + 2 * i, j]
+                    t[A + 2 * i, j] += square
                     t[SLOPE, i] += square * t[ASSUMED, j]
 
 
 @shared
 def solve(t: Array) -> None:
     """Compute the weights from the sums."""
-    n, A = t.shape[1], CURVATURE
+    n = t.shape[1]
     for i in range(n):
-        t[WEIGHT, i] = max(t[SLOPE, i], 0.0) / (t[A + i, i] + TINY)
+        t[WEIGHT, i] = max(t[SLOPE, i], 0.0) / (t[A + 2 * i, i] + TINY)
     for _ in range(SWEEPS):
         for i in range(n):
             rest = t[SLOPE, i]
             for j in range(n):
-                rest -= t[A + i, j] * t[WEIGHT, j]
-            t[WEIGHT, i] = max(0.0, t[WEIGHT, i] + rest / (t[A + i, i] + TINY))
+                rest -= t[A + 2 * i, j] * t[WEIGHT, j]
+            t[WEIGHT, i] = max(0.0, t[WEIGHT, i] + rest / (t[A + 2 * i, i] + TINY))
     most = 0.0
     for i in range(n):
         most = max(most, t[WEIGHT, i])
@@ -119,10 +122,10 @@ def solve(t: Array) -> None:
 
 
 @machine
-def machine_weights(past: int, newest: int, scores: int, n: int, L: int, l: int) -> None:
+def machine_weights(past: int, gains: int, newest: int, scores: int, n: int, L: int, l: int) -> None:
     """A pass for lane l of L, from the addresses of fields."""
-    t = cubes(scores, CURVATURE + 2 * n, n, L)[:, :, l]
-    look_back(cubes(past, WINDOW, 2 * n + MORE, L)[:, :, l], newest, t)
+    t, k = cubes(scores, A + 2 * n, n, L)[:, :, l], cubes(gains, WINDOW, n, L)[:, :, l]
+    look_back(cubes(past, WINDOW, PHI + n, L)[:, :, l], k, newest, t)
     solve(t)
 
 
@@ -145,11 +148,11 @@ def remember(s: State, at: int, l: int) -> None:
         gain, unit = 0.0, np.sqrt(s.c[i, l])
         for j in range(i, n):
             gain += s.R[i, j, l] * s.d[j, l]
-        s.samples[at, i, l] = s.white[i, l] / unit if unit > 0.0 else 0.0
-        s.samples[at, n + i, l] = gain * unit
-    s.samples[at, 2 * n + E, l] = e * np.sqrt(s.r[l])
-    s.samples[at, 2 * n + PRECISION, l] = precision * s.r[l]
-    s.samples[at, 2 * n + SPAN, l] = s.dt[l] * s.drift[l]
+        s.samples[at, PHI + i, l] = s.white[i, l] / unit if unit > 0.0 else 0.0
+        s.gains[at, i, l] = gain * unit
+    s.samples[at, E, l] = e * np.sqrt(s.r[l])
+    s.samples[at, PRECISION, l] = precision * s.r[l]
+    s.samples[at, SPAN, l] = s.dt[l] * s.drift[l]
 
 
 @kernel
@@ -164,7 +167,7 @@ def learn_weights(s: State, l: int) -> None:
             for k in range(s.modes[l]):
                 s.row[k, l] = s.mean_prior[k, l] * s.ratio[i, k, l]
             s.scores[ASSUMED, i, l] = sum_of_row(s, l)
-        machine_weights(s.samples.ctypes.data, at, s.scores.ctypes.data, n, L, l)
+        machine_weights(s.samples.ctypes.data, s.gains.ctypes.data, at, s.scores.ctypes.data, n, L, l)
         for i in range(n):
             s.weight[i, l] = s.scores[WEIGHT, i, l]
             for k in range(s.modes[l]):

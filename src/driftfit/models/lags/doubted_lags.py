@@ -8,8 +8,8 @@ probability d of the first. Its regressor is the mean, and the doubt adds V to t
 
     phi_i = y + d (y_hat - y),    V = sum_i a_i^2 (d (1 - d) (y_hat - y)^2 + d s)
 
-d begins at p pi, with p the probability of an outlier by the tracker (field ``odd``) and pi the share of outliers of
-this record that were additive, which is estimated. Every later sample with the lag in its regressor changes it,
+d begins at p pi, with p the probability of an outlier by the tracker (field ``outlier``) and pi the share of outliers
+of this record that were additive, which is estimated. Every later sample with the lag in its regressor changes it,
 
     d / (1 - d)  <-  d / (1 - d)  f(e_1; s_1) / f(e_0; s_0)
 
@@ -113,10 +113,10 @@ def shift_doubts(s: State, o: int, l: int, own: int, first: int, step: int, ny: 
     for i in range(na - 1, 0, -1):
         s.doubt[o, i, l], s.suspect[o, i, l] = s.doubt[o, i - 1, l], s.suspect[o, i - 1, l]
         s.aside[o, i, l], s.blur[o, i, l] = s.aside[o, i - 1, l], s.blur[o, i - 1, l]
-    odd, seen, known = s.odd[own], s.observed[own] > 0.0, s.s[own] < np.inf
-    doubt = s.false_share[o, l] * odd
+    outlier, seen, known = s.outlier[own], s.observed[own] > 0.0, s.s[own] < np.inf
+    doubt = s.false_share[o, l] * outlier
     some = seen & known & (doubt > SMALLEST)
-    s.suspect[o, 0, l] = odd if some else 0.0
+    s.suspect[o, 0, l] = outlier if some else 0.0
     s.doubt[o, 0, l] = doubt if some else (0.0 if seen else 1.0)
     s.aside[o, 0, l] = s.y_hat[own] - s.y[own] if some else 0.0
     s.blur[o, 0, l] = s.s[own] if known & (some | (not seen)) else 0.0
