@@ -21,7 +21,7 @@ from driftfit.data.record import Record
 from driftfit.data.signals import check_ready
 from driftfit.engine.drivers import Drivers, TrackerSteps, drivers
 from driftfit.engine.kernel import Array, Driver
-from driftfit.engine.tiles import held_in, make_tile, output_record, output_type
+from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.collected_samples import COLLECTED, collecting
@@ -142,7 +142,7 @@ class Program:
 
     @cached_property
     def _bytes(self) -> bytes:
-        """The bytes of that tile, which are copied faster than its fields. A single lane needs no alignment."""
+        """The bytes of that tile, which are copied faster than its fields."""
         return self._begin.tobytes()
 
     def schema(self, arrays: bool = False) -> dict[str, str]:
@@ -208,7 +208,10 @@ class Program:
 
     def tile(self, state: State | None = None) -> Array:
         """A tile of one lane at its start, or with the given fields."""
-        tile = np.ndarray((1,), self._begin.dtype, bytearray(self._bytes))
+        if OPEN[0] in (self._begin.dtype.fields or ()):  # a bank, which reads its memory as vectors
+            tile = repeat_tile(self._begin, 1)
+        else:  # a single lane needs no alignment
+            tile = np.ndarray((1,), self._begin.dtype, bytearray(self._bytes))
         if state is not None:
             put(tile, 0, state)
         return tile
