@@ -11,6 +11,7 @@ from test_bank import record as jumping
 
 from driftfit import ARX, Bank, Beam, Kalman, Regression, Sensor, Track, track
 from driftfit.fleets import Fleet
+from driftfit.run.program import Program
 
 K = Kalman(q=1e-4, r=0.01)
 NAMES = ("theta", "std", "prediction", "innovation", "innovation_std", "ok", "log_density")
@@ -100,3 +101,13 @@ def test_what_is_refused():
         track(ARX(2, 2), K, y, u, keep="all")
     with pytest.raises(ValueError, match="keep='theta' is for models of one output"):
         track(ARX(1, 1, ny=2), K, np.stack([y, y], axis=1), u, keep="theta")
+
+
+def test_a_driver_refuses_theta_of_another_shape():
+    program = Program(Regression(2).bind(2), Kalman(q=1e-3, r=0.1))
+    tile, signals = program.tile(), (np.zeros((5, 1)), np.zeros((5, 2, 1)), np.ones((1, 3, 1)))
+    for rows, shape in ((1, (5, 3, 1)), (5, (5, 2, 1))):
+        with pytest.raises(ValueError, match="one row beside theta"):
+            program.drivers().run(tile, *signals, program.written(tile, rows), np.empty(shape))
+    with pytest.raises(ValueError, match="5 samples"):
+        program.drivers().run(tile, signals[0][:4], *signals[1:], program.written(tile, 1), np.empty((5, 2, 1)))
