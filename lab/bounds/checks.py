@@ -84,11 +84,20 @@ def watch() -> Violations:
         check(context, builder, beyond, last, size)
         return builder.bitcast(builder.gep(inside.data, [at]), simd._VECTOR8.as_pointer())
 
+    unchecked = simd._pair_place
+
+    def pair_place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
+        shape, size = context.make_array(kind)(context, builder, array).shape, ir.Constant(i64, 1)
+        for k in range(kind.ndim - 1):
+            size = builder.mul(size, builder.extract_value(shape, k))
+        check(context, builder, builder.icmp_unsigned(">=", at, size), at, size)
+        return unchecked(context, builder, kind, array, at)
+
     for name in settings():  # processes that a test starts have no checks, and must not store their code in this folder
         del os.environ[name]
     config.reload_config = lambda: None  # it would see that the variables are gone
     cgutils.do_boundscheck = checked
-    simd._place = place
+    simd._place, simd._pair_place = place, pair_place
     return violations
 
 
