@@ -166,3 +166,11 @@ def test_segments_shorter_than_the_correlation_of_the_noise_have_no_standard_err
     for part in found.segments:
         assert np.isfinite(part.theta).all()
         assert np.isnan(part.std).all() == (part in short)
+
+
+def test_dates_before_the_first_white_row_take_no_rows_from_the_end():
+    """The likelihood of every date by itself, and of a range of dates that begins before the order of the noise."""
+    rng = np.random.default_rng(5)
+    x, y, ar = rng.normal(size=(40, 1)), rng.normal(size=40), np.array([0.5, 0.2, -0.1, 0.1])
+    alone = [date_loglik(x, y, ar, date, date)[0] for date in range(1, 20)]
+    np.testing.assert_allclose(date_loglik(x, y, ar, 1, 19), alone, rtol=1e-10)

@@ -68,7 +68,7 @@ def _dates(X: Array, y: Array, ar: Array, dates: Array, loglik: Array, sums: Arr
         for i in range(2 * n):
             if L[i, i] > 0.0:
                 loglik[place] -= np.log(L[i, i])
-        for t in range(here[0], min(here[0] + p + 1, N)):
+        for t in range(max(here[0], p), min(here[0] + p + 1, N)):
             whiten(X, y, ar, t, here, row)
             add(M, row, -1.0)
             whiten(X, y, ar, t, following, row)
