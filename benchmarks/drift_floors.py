@@ -159,32 +159,34 @@ def bursts() -> tuple[Array, Array]:
 
 
 ONE, TWO, ALL = "one parameter walks", "two parameters walk", "all walk alike"
-KNOWN: dict[str, tuple[str, str, tuple[float, float]]] = {
-    "one_of_eight": ("one", ONE, (0.0, 0.0)),
-    "few_of_twelve": ("two", TWO, (0.0, 0.0)),
-    "bias_beside_ar": ("one", ONE, (0.0, 0.0)),
-    "armax": ("two", f"{TWO}; c", (0.0, 0.7)),
-    "quantised": ("one", ONE, (0.0, 0.0)),
-    "closed_loop": ("one", ONE, (0.0, 0.0)),
-    "near_unit_root": ("one", ONE, (0.0, 0.0)),
-    "start_up": ("ends", f"{ALL}, until some date", (0.0, 0.0)),
-    "frozen_coarse": ("all", ALL, (0.0, 0.0)),
-    "very_slow": ("all", ALL, (0.0, 0.0)),
-    "little_noise": ("all", ALL, (0.0, 0.0)),
-    "correlated": ("direction", "one common walk", (0.0, 0.0)),
-    "counts": ("one", ONE, (0.0, 0.0)),
-    "mean_reverting": ("all", ALL, (0.0, 0.0)),
-    "t3_noise": ("all", ALL, (0.0, 0.0)),
-    "garch": ("all", ALL, (0.0, 0.0)),
-    "missing_blocks": ("all", ALL, (0.0, 0.0)),
-    "scales": ("all", ALL, (0.0, 0.0)),
-    "integrated": ("slopes", "all slopes walk alike", (0.0, 0.0)),
-    "short": ("all", ALL, (0.0, 0.0)),
-    "intercept": ("one", ONE, (0.0, 0.0)),
-    "steady": ("all", ALL, (0.0, 0.0)),
-    "ar_noise": ("all", f"{ALL}; a", (0.7, 0.0)),
+KNOWN = {
+    "one_of_eight": ("one", ONE),
+    "few_of_twelve": ("two", TWO),
+    "bias_beside_ar": ("one", ONE),
+    "armax": ("two", f"{TWO}; c"),
+    "quantised": ("one", ONE),
+    "closed_loop": ("one", ONE),
+    "near_unit_root": ("one", ONE),
+    "start_up": ("ends", f"{ALL}, until some date"),
+    "frozen_coarse": ("all", ALL),
+    "very_slow": ("all", ALL),
+    "little_noise": ("all", ALL),
+    "correlated": ("direction", "one common walk"),
+    "counts": ("one", ONE),
+    "mean_reverting": ("all", ALL),
+    "t3_noise": ("all", ALL),
+    "garch": ("all", ALL),
+    "missing_blocks": ("all", ALL),
+    "scales": ("all", ALL),
+    "integrated": ("slopes", "all slopes walk alike"),
+    "short": ("all", ALL),
+    "intercept": ("one", ONE),
+    "steady": ("all", ALL),
+    "ar_noise": ("all", f"{ALL}; a"),
 }
-"""Kind of drift, in words, and coefficients of the noise."""
+"""Kind of drift, in words."""
+COLOURED = {"armax": (0.0, 0.7), "ar_noise": (0.7, 0.0)}
+"""Coefficients of noise that is not white."""
 EVENTS = {
     "jumps_and_faults": (events(0.005, 0.49 * np.ones((1, 3)), (0.03, 200.0)), "all jump; outliers"),
     "one_sided_jump": (events(0.002, np.eye(4)), "one of 4 jumps"),
@@ -201,7 +203,7 @@ def ratios(name: str, seed: int) -> list[float]:
     phi = np.ascontiguousarray(Record(case.model.bind(u.shape[1]), case.y, u).phi)
     c = np.nanmean(phi**2, axis=0)
     if name in KNOWN:
-        kind, _, noise = KNOWN[name]
+        kind, noise = KNOWN[name][0], COLOURED.get(name, (0.0, 0.0))
         paths = [*mixture(case, phi, [kind], noise)]
         walks = kind not in ("slopes", "ends") and not any(noise)
         paths.append(ignorant(case, phi) if walks else np.full(phi.shape, np.nan))
