@@ -126,7 +126,7 @@ class TrackerSteps(NamedTuple):
     of the tracker and those that every record has but for ``u``, so that they are compiled once for all models
     (`driftfit.engine.tracker_part`); with ``reads_model`` they see those of the model too. ``outlined`` steps are
     compiled apart from the drivers, which call them (`driftfit.engine.outlined`): for trackers that take so long that
-    a call costs nothing. ``note`` comes before all of them and may write what they change later.
+    a call costs nothing; ``begin`` always is. ``note`` comes before all of them and may write what they change later.
     """
 
     predict: Step
@@ -204,6 +204,8 @@ def _advance(tracker: TrackerSteps) -> Any:
                 report(s, l)
 
     started = kernel(start, inline=False)  # seldom run: the lane loop is better without it
+    if not tracker.outlined:  # else it is called together with the rest
+        started = outlined(started)
 
     @kernel
     def advance_or_start(s: State) -> None:
