@@ -59,6 +59,8 @@ AT_S, AT_D, AT_R, AT_P, AT_THETA, AT_PHI, AT_WORK, AT_NOW, AT_VAR, ADDRESSES = r
 """Addresses that `machine_learn` is given."""
 
 
+PASSES = 4
+"""Times that a direction is made orthogonal to others at most."""
 NARROW = 40
 """Parameters up to which a row of P is summed in order."""
 SCRATCH = ("H", "pivot", "work", "at_start")
@@ -208,9 +210,12 @@ def measurement(s: State, l: int) -> None:
 
 @shared
 def refresh(S: Array, R: Array, work: Array) -> None:
-    """R = S^-1 on the rows of S; its free columns are orthogonal to all regressors so far; and the norms of both."""
-    n = len(S)
+    """R = S^-1 on the rows of S; its free columns are orthogonal to all regressors so far; and, if there are any, the
+    norms of both.
+    """
+    n, free = len(S), 0
     for j in range(n):
+        free += 1 if S[j, j] == 0.0 else 0
         R[j, j] = 1.0 / S[j, j] if S[j, j] > 0.0 else 1.0
         squares = 0.0
         for i in range(j, -1, -1):
@@ -221,6 +226,8 @@ def refresh(S: Array, R: Array, work: Array) -> None:
                     t -= S[i, k] * R[k, j]
                 R[i, j] = t / S[i, i] if S[i, i] > 0.0 else 0.0
         work[SIZE, j] = np.sqrt(squares)
+    if free == 0:
+        return
     for i in range(n):
         squares = 0.0
         for k in range(i, n):
@@ -293,6 +300,9 @@ def unseen(S: Array, R: Array, Q: Array, age: float) -> float:
     """Q = an orthonormal basis of the directions without information, one column for each free column; returns log det
     N' N.
 
+    In very different units these are nearly parallel, and one pass leaves rounding: it is repeated until a column keeps
+    most of its length.
+
     If theta consists of levels and slopes, both refer to the first sample, ``age`` ago; otherwise the age is 0.
     """
     n = len(S)
@@ -302,9 +312,12 @@ def unseen(S: Array, R: Array, Q: Array, age: float) -> float:
             for i in range(n):
                 Q[i, j] = R[i, j] if i <= j else 0.0
             sheared(Q[:, j], -age)
-            for _ in range(4):  # in very different units these are nearly parallel, and one pass leaves rounding
+            passes = 0
+            while passes < PASSES:
+                earlier = 0
                 for k in range(j):
                     if S[k, k] == 0.0:
+                        earlier = 1
                         dot = 0.0
                         for i in range(n):
                             dot += Q[i, k] * Q[i, j]
@@ -318,6 +331,8 @@ def unseen(S: Array, R: Array, Q: Array, age: float) -> float:
                 for i in range(n):
                     Q[i, j] /= top * np.sqrt(squares)
                 volume += log(squares) + 2.0 * log(top)
+                enough = earlier == 0 or (passes > 0 and top * top * squares > 0.5)
+                passes = PASSES if enough else passes + 1
     return volume
 
 

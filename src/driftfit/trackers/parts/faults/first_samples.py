@@ -48,7 +48,7 @@ def fresh(samples: Array, k: int) -> bool:
 @shared
 def median(samples: Array, N: int, column: int, center: float, apart: float) -> float:
     """The upper median of a column over fresh readings, or, with apart = 1, of its distances from center."""
-    found, count = 0.0, 0
+    count = 0
     for k in range(N):
         count += 1 if fresh(samples, k) else 0
     for k in range(N):
@@ -59,8 +59,9 @@ def median(samples: Array, N: int, column: int, center: float, apart: float) -> 
             counts = fresh(samples, other)
             less += 1 if counts and x < value else 0
             same += 1 if counts and x == value else 0
-        found = value if less <= count // 2 and count // 2 < less + same else found
-    return found
+        if less <= count // 2 and count // 2 < less + same:
+            return value
+    return 0.0
 
 
 @shared

@@ -1,15 +1,15 @@
 """The diffuse start of trackers that do not judge outliers by themselves: the first samples are judged together.
 
 A diffuse start fits the first samples exactly, so a fault code among them would determine the estimate. The start
-continues in its square-root form until there are `RESIDUALS` more samples than directions of theta that they span. If
-some of them are doubtful (`driftfit.trackers.parts.faults.first_samples`), it continues until the others have `SURE`
-residuals, or the store is full. If the estimate from all samples then contradicts the others, the start is repeated
-without the doubtful ones.
+therefore lasts until there are `RESIDUALS` more samples than directions of theta that they span. If some of them are
+doubtful (`driftfit.trackers.parts.faults.first_samples`), it lasts until the others have `SURE` residuals, or the store
+is full. If the estimate from all samples then contradicts the others, the start is repeated without the doubtful ones.
+It is in square-root form until a covariance is accurate enough.
 
 Samples (`driftfit.trackers.parts.faults.stored_samples`) are stored with the time since the previous stored one, so
 that drift and forgetting are repeated as well.
 
-Cost: that of the diffuse start for a few more samples, and O(n N^2) once for N stored samples.
+Cost: O(n) more for each of a few samples, and O(n N^2) once for N stored samples.
 """
 
 from __future__ import annotations
@@ -92,6 +92,7 @@ def as_before(s: State, l: int) -> None:
 def settle(s: State, l: int) -> None:
     """The start is over: the readings of the samples that it used are the range of later ones."""
     s.start_over[l] = 1
+    s.block_left[l] = s.block_size[l]  # what was added to the block is learned from the stored samples
     known = s.scale[l] > 0.0  # it is NaN without residuals
     s.ratios[l] = max(spare_samples(s, l) - s.start_faults[l], 0.0) if known else 0.0
     s.mean_ratio[l] = squares_left(s, l) / (max(s.ratios[l], 1.0) * s.r[l] * s.scale[l]) if known else 0.0
@@ -161,6 +162,16 @@ def judged(
     reconsider, predict, correct, report = reconsidering(one, restart), steps.predict, steps.correct, steps.report
 
     @kernel
+    def sample(s: State, l: int) -> None:
+        """A sample of the start: in square-root form until a covariance is accurate enough."""
+        if s.root[l] > 0:
+            one(s, l)
+        else:
+            predict(s, l)
+            correct(s, l)
+            report(s, l)
+
+    @kernel
     def later(s: State, l: int) -> None:
         """A sample after the start: in square-root form, or not ordinary."""
         unusual = needs_judging(s, s.e[l], l)
@@ -185,7 +196,7 @@ def judged(
             later(s, l)
         else:
             keep(s, l)
-            one(s, l)
+            sample(s, l)
             spare, found = spare_samples(s, l), 0
             full = s.remembered[l] >= room(s, l)
             if (s.ok[l] > 0.0) & (spare >= RESIDUALS):
@@ -195,7 +206,6 @@ def judged(
                 reconsider(s, found, l)
             if ready | full:
                 settle(s, l)
-            s.root[l] = s.root[l] if s.start_over[l] > 0 else 1
 
     return steps._replace(begin=start, machines=START_MACHINES, apart=needs_begin)
 
