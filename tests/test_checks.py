@@ -16,7 +16,7 @@ from driftfit.engine.drivers import TrackerSteps, nothing_extra, unknown
 from driftfit.engine.kernel import kernel, nothing
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import INDEPENDENT
-from driftfit.trackers.parts.diffuse import prediction
+from driftfit.trackers.parts.covariance import prediction
 
 
 def steps(predict, correct) -> TrackerSteps:

@@ -7,7 +7,7 @@ from driftfit import HammersteinWiener, Kalman, Live, Regression, track
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 from driftfit.run.parallel_lanes import FEWEST, width_of
 from driftfit.run.program import MOST, Program
-from driftfit.trackers.parts.diffuse import NARROW
+from driftfit.trackers.parts.covariance import NARROW
 
 N = NARROW + 3
 

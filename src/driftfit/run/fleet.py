@@ -41,8 +41,8 @@ class Fleet(KeyedResults):
     @cached_property
     def _series(self) -> dict[Hashable, int]:
         """The number of each series that has a result."""
-        ny = self.records.ny
-        return {key: k for k, key in enumerate(self.records.keys) if self._lanes[k * ny] is not None}
+        done = self._lanes.done[:: self.records.ny].tolist()
+        return {key: k for k, key in enumerate(self.records.keys) if done[k]}
 
     def __getitem__(self, key: Hashable) -> Any:
         if key in self._series:
@@ -120,12 +120,12 @@ def run_fleet(
         return Fleet(programs, records, [], failed or {}, {})
     starts, records = _begun(programs, records, before or {})
     lanes = run_lanes(programs, records, keep, starts, dtype)
-    series = lanes[:: records.ny]
-    absent = {key: "interrupted before it was run" for key, lane in zip(records.keys, series, strict=True) if not lane}
+    done = lanes.done[:: records.ny].tolist()
+    series = zip(records.keys, done, strict=True)
+    absent = {key: "interrupted before it was run" for key, finished in series if not finished}
     if absent:
         warnings.warn(
-            f"interrupted: {len(series) - len(absent)} of {len(series)} series are finished; "
-            "the others are listed in fleet.failed.",
+            f"interrupted: {sum(done)} of {len(done)} series are finished; the others are listed in fleet.failed.",
             stacklevel=3,
         )
     return Fleet(programs, records, lanes, {**(failed or {}), **absent}, starts)

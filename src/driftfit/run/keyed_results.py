@@ -22,7 +22,7 @@ from driftfit.engine.tiles import repeat_tile
 from driftfit.models.base import Model
 from driftfit.run.program import Program, State, kept, programs_of, state_of
 from driftfit.run.public_class import Plain
-from driftfit.run.result import Lane, Track, names_of
+from driftfit.run.result import Lane, Lanes, Track, names_of
 from driftfit.trackers.base import Tracker
 
 
@@ -42,18 +42,17 @@ class KeyedResults(Plain):
         self,
         programs: Sequence[Program],
         records: Records,
-        lanes: Sequence[Lane | None],
+        lanes: Lanes | Sequence[Lane | None],
         failed: Mapping[Hashable, str],
         starts: Mapping[int, State],
     ) -> None:
         self.records = records
         self.failed = dict(failed)
         self._programs = tuple(programs)
-        self._lanes = [
-            lane and lane._replace(out=lane.out[: records.length[j // records.ny]]) for j, lane in enumerate(lanes)
-        ]
+        self._lanes = lanes if isinstance(lanes, Lanes) else Lanes.of(lanes)
         self._starts = dict(starts)
-        self._index = {key: j for j, key in enumerate(self._named()) if lanes[j] is not None}
+        done = self._lanes.done.tolist()
+        self._index = {key: j for j, key in enumerate(self._named()) if done[j]}
 
     def __reduce__(self) -> Any:
         """A copy does not contain other series of a tile."""
@@ -96,7 +95,9 @@ class KeyedResults(Plain):
     @property
     def nbytes(self) -> int:
         """Bytes of the results of all series."""
-        return sum(lane.out.nbytes // lane.tile["theta"].shape[-1] for lane in self._lanes if lane)
+        length = self._lanes.length
+        each = ((out, tile["theta"].shape[-1], length[lanes].sum()) for out, tile, lanes, _ in self._lanes.tiles)
+        return sum(out.dtype.itemsize // L * int(samples) for out, L, samples in each)
 
     def __len__(self) -> int:
         return len(self._index)
@@ -125,14 +126,9 @@ class KeyedResults(Plain):
 
     def undetermined(self) -> Iterator[tuple[Program, dict[str, Array]]]:
         """The entries of `ends` whose record does not determine every parameter."""
-        found: dict[int, Array] = {}  # tile by tile, because examining each lane separately takes as long as running it
-        for j in self._index.values():
-            lane = self._lanes[j]
-            assert lane is not None
-            if id(lane.tile) not in found:
-                found[id(lane.tile)] = np.isinf(lane.tile["var"][0]).any(axis=0)
-            if found[id(lane.tile)][lane.lane]:
-                yield self._programs[j], state_of(lane.tile, lane.lane)
+        for _, tile, lanes, places in self._lanes.tiles:
+            for k in np.flatnonzero(np.isinf(tile["var"][0]).any(axis=0)[places]).tolist():
+                yield self._programs[lanes[k]], state_of(tile, places[k])
 
     def stack(self, name: str) -> Array:
         """One result of every lane in natural order, (lanes, T, ...), NaN after the end of a series.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
 from os import PathLike
@@ -44,6 +45,45 @@ class Lane(NamedTuple):
         for name in names_of(out):
             out[name][..., 0] = self.written(name)
         return Lane(out, tile)
+
+
+class Lanes:
+    """The results of many lanes: a `Lane`, or None, made when it is asked for; a million of them would take a second.
+
+    ``tiles`` are (output of the driver, end state, numbers of the lanes that have a result, their places in the tile),
+    ``length`` the number of samples of each lane.
+    """
+
+    def __init__(self, tiles: Sequence[tuple[Array, Array, Array, Array]], length: Array) -> None:
+        self.tiles, self.length = tiles, length
+        self._tile, self._place = np.full(len(length), -1), np.zeros(len(length), int)
+        for k, (_, _, lanes, places) in enumerate(tiles):
+            self._tile[lanes], self._place[lanes] = k, places
+
+    @classmethod
+    def of(cls, lanes: Sequence[Lane | None]) -> Self:
+        """Lanes that exist."""
+        some = [(j, lane) for j, lane in enumerate(lanes) if lane]
+        tiles = [(lane.out, lane.tile, np.array([j]), np.array([lane.lane])) for j, lane in some]
+        return cls(tiles, np.array([len(lane.out) if lane else 0 for lane in lanes], int))
+
+    @property
+    def done(self) -> Array:
+        """Which lanes have a result."""
+        return self._tile >= 0
+
+    def __len__(self) -> int:
+        return len(self.length)
+
+    def __getitem__(self, j: int) -> Lane | None:
+        k = self._tile.item(j)
+        if k < 0:
+            return None
+        out, tile, _, _ = self.tiles[k]
+        return Lane(out[: self.length.item(j)], tile, self._place.item(j))
+
+    def __iter__(self) -> Iterator[Lane | None]:
+        return map(self.__getitem__, range(len(self)))
 
 
 KINDS = ("track", "shared outputs")

@@ -59,7 +59,8 @@ from driftfit.trackers.parts.coordinates import (
     whiten,
     whiten_within,
 )
-from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, prediction, spanned_variance
+from driftfit.trackers.parts.covariance import prediction
+from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, spanned_variance
 from driftfit.trackers.parts.excitation import learn_information, learn_scales, learned, no_excitation, window
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
 from driftfit.trackers.parts.faults.stored_samples import machine_doubt

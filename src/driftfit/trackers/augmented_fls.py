@@ -30,7 +30,7 @@ from driftfit.engine.drivers import TrackerSteps, unknown
 from driftfit.engine.kernel import State, kernel, nothing
 from driftfit.engine.settings import numbers, vector
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.diffuse import prediction
+from driftfit.trackers.parts.covariance import prediction
 
 
 @kernel

@@ -40,7 +40,7 @@ from driftfit.engine.kernel import State, exp, kernel, log, shared
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import drift_matrix
-from driftfit.trackers.parts.diffuse import LEFT, prediction, symmetric_product
+from driftfit.trackers.parts.covariance import LEFT, prediction, symmetric_product
 from driftfit.trackers.parts.varying_drift import read_drift
 
 FAMILIES = ("gaussian", "poisson", "negative binomial", "logistic")

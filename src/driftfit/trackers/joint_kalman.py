@@ -40,7 +40,7 @@ from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import one_of
 from driftfit.models.state_space import StateSpace, equations_of
 from driftfit.trackers.kalman import drift_matrix
-from driftfit.trackers.parts.diffuse import corrected, symmetric_product
+from driftfit.trackers.parts.covariance import corrected, symmetric_product
 from driftfit.trackers.parts.faults.contradictions import contradictions, leave_out_contradiction, no_contradictions
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.state_space.tracker import StateSpaceTracker

@@ -150,7 +150,7 @@ class Pool:
         begun = {k * R + r: starts[s.n] for k, s in enumerate(structures) if s.n in starts for r in range(R)}
         lanes = run_lanes([program] * len(first), records, "std", begun)
         runs = [Track(program, records.part(k), lane) for k, lane in enumerate(lanes) if lane is not None]
-        if len(runs) < len(lanes):
+        if not lanes.done.all():
             raise KeyboardInterrupt
         return [joined([predicted(run) for run in runs[k * R : (k + 1) * R]]) for k in range(count)]
 

@@ -44,7 +44,7 @@ from driftfit.engine.kernel import (
     wholes,
 )
 from driftfit.trackers.laws.law import COSINE, DECAY, KIND, LEVEL, NOISE, OWNER, RATE, ROWS, SLOPE, VISIBLE
-from driftfit.trackers.parts.diffuse import LEFT
+from driftfit.trackers.parts.covariance import LEFT
 from driftfit.trackers.parts.varying_drift import read_drift
 
 DETERMINED = 1e-9

@@ -33,7 +33,7 @@ from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.products import Structure
 from driftfit.models.hammerstein_wiener.trackers.minimal import Minimal, minimal_memory, structure_of
 from driftfit.trackers.kalman import drift, drift_matrix
-from driftfit.trackers.parts.diffuse import corrected, product_with
+from driftfit.trackers.parts.covariance import corrected, product_with
 from driftfit.trackers.parts.varying_drift import read_drift
 
 

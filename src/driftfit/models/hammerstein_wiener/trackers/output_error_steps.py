@@ -45,7 +45,7 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     TRIAL_BEND,
     Places,
 )
-from driftfit.trackers.parts.diffuse import LEFT
+from driftfit.trackers.parts.covariance import LEFT
 
 FLATTEST = 0.05
 """Least slope of F that the filter divides by."""

@@ -20,7 +20,8 @@ Cost: O(n^2).
 from __future__ import annotations
 
 from driftfit.engine.kernel import Array, shared
-from driftfit.trackers.parts.diffuse import ENTERING, LEFT, OK, SIZE, STD, Y
+from driftfit.trackers.parts.covariance import LEFT
+from driftfit.trackers.parts.diffuse import ENTERING, OK, SIZE, STD, Y
 
 K, G = SIZE, STD
 """Rows of ``work`` here: the gain, and a covariance times the regressor."""

@@ -28,7 +28,7 @@ from driftfit.trackers.bank.leaves.forget import KEEP, KIND, MEAN, RESET, apply
 from driftfit.trackers.bank.leaves.lags import plausible, shift_covariance, widen_by_lags
 from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
 from driftfit.trackers.bank.leaves.own_sensor import clean_all, judge_all, weigh_all
-from driftfit.trackers.parts.diffuse import LEFT
+from driftfit.trackers.parts.covariance import LEFT
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
 FLOOR = 1e-12

@@ -48,7 +48,8 @@ from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_ba
 from driftfit.trackers.bank.machine.grow import FLOOR
 from driftfit.trackers.bank.machine.late_direction import begin_within, point_along
 from driftfit.trackers.parts.coordinates import FRAME, unseen_variance, whiten_within
-from driftfit.trackers.parts.diffuse import enter, measurement, prediction, spanned_variance, wander
+from driftfit.trackers.parts.covariance import measurement, prediction
+from driftfit.trackers.parts.diffuse import enter, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
 from driftfit.trackers.parts.resolution import lasting, resolve

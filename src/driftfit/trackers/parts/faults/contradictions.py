@@ -42,7 +42,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.diffuse import corrected, prediction, symmetric_product
+from driftfit.trackers.parts.covariance import corrected, prediction, symmetric_product
 
 REACH = 10.0
 """Standard deviations of the readings."""

@@ -52,7 +52,7 @@ def median(samples: Array, N: int, column: int, center: float, apart: float) -> 
     for k in range(N):
         count += 1 if fresh(samples, k) else 0
     for k in range(N):
-        value = abs(samples[k, column] - center) if apart > 0.0 else samples[k, column]
+        value: float = abs(samples[k, column] - center) if apart > 0.0 else samples[k, column]
         less, same = 0, 0
         for other in range(N):
             x = abs(samples[other, column] - center) if apart > 0.0 else samples[other, column]

@@ -22,7 +22,8 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel, nothing
-from driftfit.trackers.parts.diffuse import BEFORE, MACHINES, know_nothing, reform, symmetric_product
+from driftfit.trackers.parts.covariance import symmetric_product
+from driftfit.trackers.parts.diffuse import BEFORE, MACHINES, know_nothing, reform
 from driftfit.trackers.parts.faults.contradictions import (
     add_to_block,
     close_block,

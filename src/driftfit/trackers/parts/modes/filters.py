@@ -27,7 +27,7 @@ import numpy as np
 
 from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
-from driftfit.trackers.parts.diffuse import LEFT
+from driftfit.trackers.parts.covariance import LEFT
 from driftfit.trackers.parts.modes.ladder import TOP, leap
 from driftfit.trackers.parts.modes.noise_levels import OUTLIER
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
