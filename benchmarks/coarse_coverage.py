@@ -76,4 +76,5 @@ def main(records: int = 40, quick: bool = False) -> None:
 
 if __name__ == "__main__":
     counts = [int(given) for given in sys.argv[1:] if given.isdigit()]
-    main(*counts, quick="--quick" in sys.argv)
+    quick = "--quick" in sys.argv
+    main(*(counts or ([4] if quick else [])), quick=quick)
