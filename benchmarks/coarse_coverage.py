@@ -6,7 +6,7 @@ counted at samples 500 and 1000 where it is finite; it is NaN as long as there i
 noise. In brackets: the share of bands that are not finite, where there are any. The second table has one parameter at
 the last sample, and the same bands with and without what readings share.
 
-Run: python benchmarks/coarse_coverage.py [records, 40 by default] [--quick]
+Run: python benchmarks/coarse_coverage.py [records, 40 by default] [--quick, with 4]
 """
 
 import sys
