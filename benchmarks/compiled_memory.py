@@ -2,7 +2,8 @@
 
 ARX(na, nb) of different orders, each with its own record type, tracked by a Kalman filter; first compiled, then found
 on disk, in separate processes with separate caches. "all kept": nothing is freed, including llvmlite's pass managers,
-as it was before there was a bound. Run: python benchmarks/compiled_memory.py [--quick]
+as it was before there was a bound. With --quick both use the cache that is there already.
+Run: python benchmarks/compiled_memory.py [--quick]
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def main(quick: bool) -> None:
     with tempfile.TemporaryDirectory() as cache:
         for way in WAYS[1:] if quick else WAYS:
             place = cache if way != "all kept" else os.path.join(cache, "apart")
-            environment = {**os.environ, "NUMBA_CACHE_DIR": place}
+            environment = {**os.environ} if quick else {**os.environ, "NUMBA_CACHE_DIR": place}
             command = [sys.executable, __file__, "--worker", way, str(count)]
             result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
             table.add_row(way, *result.split(), "")

@@ -29,7 +29,7 @@ MODELS = {
 
 def main() -> None:
     quick = "--quick" in sys.argv
-    records = 10 if quick else 400
+    records = 5 if quick else 400
     print("Share of outputs within 95 % bands, 1 to 10 steps after a record of T samples")
     print(f"{'':24}  n" + "".join(f"{f'T = {T}':>14}" for T in LENGTHS))
     for name, (model, plant, numerator, denominator) in list(MODELS.items())[: 2 if quick else None]:

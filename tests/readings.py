@@ -1,4 +1,4 @@
-"""A record with one bad reading at every position: what a tracker and a model make of it, as one fleet."""
+"""A record with one bad reading at every position: what a tracker and a model make of it, as a fleet."""
 
 import numpy as np
 from support import arx_record
@@ -23,13 +23,19 @@ def records(T, positions, values=VALUES):
     return Y, U, cases
 
 
-def failures(model, tracker, positions, T, values=VALUES):
-    """What went wrong, a line for each record: (place, value, signal, what)."""
+def failures(model, tracker, positions, T, values=VALUES, at_once=None):
+    """What went wrong, a line for each record: (place, value, signal, what).
+
+    Records run side by side in lanes, or few at a time one after another, which compiles less.
+    """
     Y, U, cases = records(T, positions, values)
-    fleet = track(model, tracker, Y, U, by="row")
+    at_once = at_once or len(Y)
+    fleets = [
+        track(model, tracker, Y[k : k + at_once], U[k : k + at_once], by="row") for k in range(0, len(Y), at_once)
+    ]
     found = []
     for k, (t, value, in_y) in enumerate(cases, 1):
-        run = fleet[k]
+        run = fleets[k // at_once][k % at_once]
         s, ok = run.innovation_std, run.ok
         wrong = []
         if not np.isfinite(run.theta).all():

@@ -37,7 +37,7 @@ def test_draws_have_the_posterior_of_a_fine_grid():
 
 
 def test_bands_cover_where_those_of_the_best_settings_do_not():
-    means = np.mean([scores(200, (1e-3, 1e-3), seed) for seed in range(12)], axis=0)
+    means = np.mean([scores(200, (1e-3, 1e-3), seed) for seed in range(8)], axis=0)
     plain, mean, _, smoothed, smoothed_mean = means[:, 0]
     assert plain < 0.9
     assert smoothed < 0.87

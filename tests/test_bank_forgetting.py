@@ -5,7 +5,7 @@ import pytest
 from support import same
 from test_bank import N, R, record
 
-from driftfit import RLS, Bank, Regression, track
+from driftfit import RLS, Bank, Kalman, Regression, track
 from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.reduction import GPB, IMM, Beam, FirstFloor
 from driftfit.trackers.bank.sensor import Sensor
@@ -176,3 +176,26 @@ def test_what_forgets_has_events_but_no_smoothed_path():
     assert [event.shift for event in run.hypotheses.events()] == [{}]
     with pytest.raises(ValueError, match="only random walks can be smoothed"):
         run.smooth()
+
+
+def test_members_of_the_family_are_banks_of_one_hypothesis():
+    y, u = record(100, 5)
+    walk = track(Regression(N), bank(Change(0.01)), y, u)
+    assert same(walk.theta, track(Regression(N), Kalman(0.01, R, p0=2.0), y, u).theta)
+    constant = track(Regression(N), bank(Change()), y, u)
+    assert same(constant.theta, track(Regression(N), Kalman(0.0, R, p0=2.0), y, u).theta)
+    exponential = track(Regression(N), bank(Change(forget=0.9)), y, u)
+    rls = track(Regression(N), RLS(0.9, p0=2.0 / R), y, u)
+    np.testing.assert_allclose(exponential.theta, rls.theta, atol=1e-10)
+
+
+def test_a_reset_starts_again():
+    """A change that resets, certain at one sample, forgets what was before it."""
+    y, u = record(60, 6, ())
+    one = bank(Change(), Change(2.0, reset=True, prob=0.01))
+    prob = np.tile([1.0, 0.0], (60, 1))
+    prob[30] = 0.0, 1.0
+    run = track(Regression(N), one, y, u, prob=prob)
+    fresh = track(Regression(N), Kalman(0.0, R, p0=2.0), y[30:], u[30:])
+    np.testing.assert_allclose(run.theta[30:], fresh.theta, atol=1e-12)
+    np.testing.assert_allclose(run.std[30:], fresh.std, atol=1e-12)

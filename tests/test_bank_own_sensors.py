@@ -125,7 +125,7 @@ def test_stream_fleet_and_file_say_the_same(tmp_path):
     assert live.tracker == bank
     fleet = track(ARX(1, 1), bank, np.stack([y, y]), np.stack([u, u]), by="row")
     assert same(fleet[1].theta, run.theta)
-    both = track(ARX(1, 1, ny=2), Bank(sensors=SENSORS), np.stack([y, y], axis=1), u)
+    both = track(Regression(N, ny=2), Bank(sensors=SENSORS), np.stack([y, y], axis=1), np.column_stack([u, y]))
     assert np.isfinite(both.theta).all()
     assert np.isfinite(run.smooth().theta).all()
 

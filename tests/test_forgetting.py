@@ -1,13 +1,11 @@
-"""The forgetting family: directional forgetting, and its members as banks of one hypothesis."""
+"""Directional forgetting. The members of the family as banks of one hypothesis are in test_bank_forgetting.py."""
 
 import numpy as np
 import pytest
 from support import same
-from test_bank import N, R, record
+from test_bank import N, record
 
-from driftfit import RLS, Bank, Kalman, Regression, track
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.sensor import Sensor
+from driftfit import RLS, Regression, track
 
 LAM = 0.9
 
@@ -41,27 +39,3 @@ def test_directional_forgetting_of_one_is_least_squares_and_forgets_nothing_in_s
     y[60:], u[60:] = np.nan, 1.0
     missing = track(Regression(N), RLS(LAM, kind="directional"), y, u)
     assert same(missing.state["P"], P)
-
-
-def test_members_of_the_family_are_banks_of_one_hypothesis():
-    y, u = record(100, 5)
-    known = [Sensor.nominal(R)]
-    walk = track(Regression(N), Bank([Change(0.01)], known, p0=2.0), y, u)
-    assert same(walk.theta, track(Regression(N), Kalman(0.01, R, p0=2.0), y, u).theta)
-    constant = track(Regression(N), Bank([Change()], known, p0=2.0), y, u)
-    assert same(constant.theta, track(Regression(N), Kalman(0.0, R, p0=2.0), y, u).theta)
-    exponential = track(Regression(N), Bank([Change(forget=LAM)], known, p0=2.0), y, u)
-    rls = track(Regression(N), RLS(LAM, p0=2.0 / R), y, u)
-    np.testing.assert_allclose(exponential.theta, rls.theta, atol=1e-10)
-
-
-def test_a_reset_starts_again():
-    """A change that resets, certain at one sample, forgets what was before it."""
-    y, u = record(60, 6, ())
-    bank = Bank([Change(), Change(2.0, reset=True, prob=0.01)], [Sensor.nominal(R)], p0=2.0)
-    prob = np.tile([1.0, 0.0], (60, 1))
-    prob[30] = 0.0, 1.0
-    run = track(Regression(N), bank, y, u, prob=prob)
-    fresh = track(Regression(N), Kalman(0.0, R, p0=2.0), y[30:], u[30:])
-    np.testing.assert_allclose(run.theta[30:], fresh.theta, atol=1e-12)
-    np.testing.assert_allclose(run.std[30:], fresh.std, atol=1e-12)

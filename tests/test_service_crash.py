@@ -15,7 +15,6 @@ import pytest
 
 pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
 
-import service_process
 from service_support import MODEL, TRACKER, UNIT, configured, opened, record
 
 from driftfit import track
@@ -25,6 +24,8 @@ KILLS, UNITS, T = 20, 4, 2500
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that begin as copies")
 def test_twenty_kills(tmp_path, monkeypatch):
+    import service_process  # compiles: not while tests are collected
+
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # of the process that is copied
     data = [record(T, seed) for seed in range(UNITS)]
     rows = {"pump": [], "t": [], "y": [], "u": []}

@@ -218,7 +218,10 @@ def test_a_sample_that_alone_excites_a_direction_cannot_be_left_out():
 
 class TestInvariances:
     phi, y = record(40, 2, 9)
-    base = exact.smooth(walk(phi, y, 3.0)).theta
+
+    @property
+    def base(self):
+        return exact.smooth(walk(self.phi, self.y, 3.0)).theta
 
     def test_time_reversal(self):
         close(exact.smooth(walk(self.phi[::-1], self.y[::-1], 3.0)).theta[::-1], self.base, 1e-10)

@@ -10,9 +10,9 @@ from driftfit import Live, track
 
 
 def test_a_stream_does_not_grow(model, tracker):
-    y, u = (signal.tolist() for signal in arx_record(1000, 1))
+    y, u = (signal.tolist() for signal in arx_record(400, 1))
     live = Live(model, tracker)
-    weights = [1.0] * 999 + [2.0]
+    weights = [1.0] * 399 + [2.0]
 
     def feed(times):
         for _ in range(times):
@@ -33,7 +33,7 @@ def test_a_stream_does_not_grow(model, tracker):
         peak = tracemalloc.get_traced_memory()[1] - before
     finally:
         tracemalloc.stop()
-    assert grown < 20_000  # one number kept per update would be 80_000
+    assert grown < 20_000  # one number kept per update would be 32_000; processes of pytest allocate a little too
     assert peak < 100_000
 
 
