@@ -40,6 +40,8 @@ def record(T, seed, noise="steady", n=3):
 def test_tail_of_equal_weights_is_chi_square(weights, law):
     for p in (0.9, 0.5, 0.05, 1e-4):
         assert tail(weights, law.ppf(1.0 - p)) == pytest.approx(p, abs=1e-6)
+    for x in (1e3, 1e5, 1e6, 1e7, 1e9, 1e15, 1e200):  # the statistic of a step that is large compared with the noise
+        assert tail(weights, x) == 0.0
 
 
 def test_tail_of_unequal_weights_is_what_a_simulation_says():

@@ -225,7 +225,8 @@ class Verdict(Printed):
             yield Text(f" {sentence}")
         table = table_of("Parameters", "", "L", "p", "p own", "moves", "before", "after", "+-", "from")
         for m in self.parameters:
-            shown = (f"{m.statistic:.2f}", p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
+            L = f"{m.statistic:.2f}" if m.statistic < 1e6 else f"{m.statistic:.3g}"
+            shown = (L, p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
             change = (f"{m.before:.3g}", f"{m.after:.3g}", f"{m.std:.2g}", m.when) if m.moves else ("",) * 4
             table.add_row(Text(m.name), *shown, *change)
         yield table
