@@ -42,7 +42,7 @@ from driftfit.models.regression import Regression
 from driftfit.run.result import Track
 from driftfit.run.track import track
 from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, panels, time_label
-from driftfit.show.parts.text import Printed, table_of
+from driftfit.show.parts.text import Printed, digits, table_of
 from driftfit.trackers.rls import RLS
 
 if TYPE_CHECKING:
@@ -120,7 +120,8 @@ class Segmentation(Printed):
         names = self.run.model.names
         table = table_of("Segments, from sample", "", "samples", *(text for name in names for text in (name, "+-")))
         for part in self.segments:
-            numbers = (f"{value:.4g}" for pair in zip(part.theta, part.std, strict=True) for value in pair)
+            pairs = zip(part.theta, part.std, strict=True)
+            numbers = (cell for value, std in pairs for cell in (digits(value, std), f"{std:.4g}"))
             table.add_row(str(part.start), str(part.stop - part.start), *numbers)
         yield table
         correlated = f"; autoregression of the noise {', '.join(f'{a:.2f}' for a in self.ar)}" if self.ar else ""
