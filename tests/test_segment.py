@@ -174,3 +174,19 @@ def test_dates_before_the_first_white_row_take_no_rows_from_the_end():
     x, y, ar = rng.normal(size=(40, 1)), rng.normal(size=40), np.array([0.5, 0.2, -0.1, 0.1])
     alone = [date_loglik(x, y, ar, date, date)[0] for date in range(1, 20)]
     np.testing.assert_allclose(date_loglik(x, y, ar, 1, 19), alone, rtol=1e-10)
+
+
+def test_a_segment_of_which_nine_of_ten_outputs_are_zero_has_the_band_of_least_squares():
+    """Huber's scale vanishes there, and its band did: coefficients of 1e-8 +- 1e-9 for a valve that opens sometimes."""
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=(400, 2))
+    y = -1.0 + 2.0 * u[:, 0] + u[:, 1] + 0.3 * rng.normal(size=400)
+    y[200:] = np.maximum(y[200:] - 1.0, 0.0)
+    found = segment(y, u)
+    assert any(np.mean(y[part.start : part.stop] == 0.0) > 0.9 for part in found.segments)
+    for part in found.segments:
+        X = np.column_stack([u, np.ones(400)])[part.start : part.stop]
+        plain = np.linalg.lstsq(X, y[part.start : part.stop])[0]
+        assert (part.std > 1e-3).all()
+        if np.mean(y[part.start : part.stop] == 0.0) > 0.9:
+            assert (np.abs(part.theta - plain) < 2.0 * part.std).all()

@@ -57,6 +57,25 @@ def test_stationary_null_is_the_published_table(n, published):
     assert quantile(np.tile(BRIDGE, n), 0.05) == pytest.approx(published, abs=0.012)
 
 
+def test_constancy_has_no_unit():
+    phi, y = record(240, 3)
+    p = constancy(phi, y).p_joint
+    for unit in (1e-12, 1e-9, 1e9):
+        assert constancy(phi, y * unit).p_joint == pytest.approx(p, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", [12, 24, 29])
+def test_counts_of_which_nine_of_ten_are_zero_decide_nothing_and_raise_nothing(seed):
+    """The scale of Huber's fit vanishes, and with it the information matrix, which could not be inverted."""
+    rng, later = np.random.default_rng(seed), np.arange(400) >= 200
+    phi = np.column_stack([rng.normal(size=400), np.ones(400)])
+    steady, risen = (rng.poisson(rate, size=400).astype(float) for rate in (0.05, np.where(later, 0.2, 0.05)))
+    for y in (steady, risen):
+        p = constancy(phi, y).p_joint
+        assert np.isnan(p) or 0.0 <= p <= 1.0
+    assert np.isnan(constancy(phi, steady).p_joint)
+
+
 @pytest.mark.parametrize("noise", ["steady", "changing"])
 def test_null_is_that_of_a_naive_simulation(noise):
     """Multiplying the scores by independent signs of mean zero, with regressors fixed, gives the same p-values."""

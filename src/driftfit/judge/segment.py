@@ -36,7 +36,7 @@ from driftfit.judge.segments.joint_autoregression import jointly
 from driftfit.judge.statistics.break_dates import dated
 from driftfit.judge.statistics.constancy import shortest as shortest_of
 from driftfit.judge.statistics.noise import HELD, Noise, begun, whitened
-from driftfit.judge.statistics.robust import orthonormal, robust_fit
+from driftfit.judge.statistics.robust import clipped, orthonormal, robust_fit
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
@@ -237,7 +237,8 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
 def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, Array]:
     """theta and its standard errors, Huber's for noise that is white after whitening.
 
-    A segment too short for that has plain least squares, and errors that are not known.
+    A segment too short for that has plain least squares, and errors that are not known. Where more than nine of ten
+    readings lie on one plane, as zeros of rare counts do, Huber's scale vanishes, and least squares takes its place.
     """
     c, n = found.level[a:b], phi.shape[1]
     if b - a - len(found.ar) <= n:
@@ -245,6 +246,9 @@ def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, 
     X, z = whitened(phi / c[:, None], y / c, found.ar)
     X, z = X[len(found.ar) :], z[len(found.ar) :]
     fit = robust_fit(X, z)
+    if not fit.scale > 1e-10 * np.sqrt(np.mean(z**2)):  # most of it lies on one plane: the rest would not count
+        theta = np.linalg.lstsq(X, z, rcond=None)[0]
+        fit = clipped(theta, z - X @ theta, np.inf)
     N = len(X)
     variance = float(fit.psi @ fit.psi) / max(N - n, 1) / max(float(np.mean(fit.inside)), 0.1) ** 2
     return fit.theta, np.sqrt(np.maximum(variance * np.diag(np.linalg.pinv(X.T @ X)), 0.0))

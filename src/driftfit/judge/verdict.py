@@ -152,7 +152,10 @@ class Verdict(Printed):
         if self.drifts is None:
             least = least_rows(len(self.parameters))
             short = f"{self.samples} samples can be used, and at least {least} are needed."
-            alike = "its regressors do not distinguish the parameters, or explain the output without error."
+            alike = (
+                "its regressors do not distinguish the parameters, or explain nine of ten outputs without error, as "
+                "those of rare counts."
+            )
             return f"The record cannot show whether parameters move: {short if self.samples < least else alike}"
         if self.drifts:
             return f"The parameters move: constants are rejected with {p_equals(self.p)} (level {self.level:g})."
