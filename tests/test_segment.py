@@ -190,3 +190,21 @@ def test_a_segment_of_which_nine_of_ten_outputs_are_zero_has_the_band_of_least_s
         assert (part.std > 1e-3).all()
         if np.mean(y[part.start : part.stop] == 0.0) > 0.9:
             assert (np.abs(part.theta - plain) < 2.0 * part.std).all()
+
+
+def test_standard_errors_have_the_units_of_their_regressors():
+    """Of inputs of 1e5 and 1e-7 one had an error of 1e-17 of its size: its direction counted as lost rank."""
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=(400, 2))
+    y = 3.0 + np.where(np.arange(400) < 200, 1.0, 1.6) * u[:, 0] + 0.5 * u[:, 1] + 0.4 * rng.normal(size=400)
+    runs = [
+        track(Regression(2, intercept=True), RLS(1.0), y, u * unit) for unit in ([1.0, 1.0], [1e5, 1e-7], [1e9, 1e-9])
+    ]
+    first, *others = (
+        np.array(
+            [moved.std for moved in run.verdict().parameters[:1]] + [x for s in run.segment().segments for x in s.std]
+        )
+        for run in runs
+    )
+    for unit, other in zip(([1e5, 1e-7, 1.0], [1e9, 1e-9, 1.0]), others, strict=True):
+        np.testing.assert_allclose(other * np.array([unit[0], *unit, *unit]), first, rtol=1e-6)

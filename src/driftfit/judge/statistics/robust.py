@@ -310,6 +310,20 @@ def clipped(theta: Array, residual: Array, scale: float) -> Fit:
     return Fit(theta, residual, scale, psi, (np.abs(residual) <= CLIP * scale).astype(float))
 
 
+def inverted(M: Array) -> Array:
+    """Pseudo-inverse of moments M (n, n) of regressors, whose units may be far apart: a small one is no lost rank."""
+    size = np.sqrt(np.diag(M))
+    size[size == 0.0] = 1.0
+    return np.asarray(np.linalg.pinv(M / size / size[:, None]) / size / size[:, None])
+
+
+def least_squares(X: Array, y: Array) -> Array:
+    """theta (n,) of least norm in units of the regressors X (N, n), which may be far apart."""
+    size = np.sqrt(np.mean(X * X, axis=0))
+    size[size == 0.0] = 1.0
+    return np.asarray(np.linalg.lstsq(X / size, y, rcond=None)[0] / size)
+
+
 def core(z: Array) -> float:
     """Mean square of z (N,) within three of its robust deviations, 1 for a Gaussian of variance 1; NaN below ten."""
     z = z[np.isfinite(z)]
