@@ -31,6 +31,17 @@ def test_coarse_readings_bound_the_noise(tracker):
         np.testing.assert_allclose(scaled.innovation_std[300:] / unit, run.innovation_std[300:], rtol=1e-6)
 
 
+@pytest.mark.parametrize("tracker", [AdaptiveKalman(), RLS(0.99), FLS(1e3), Bank()], ids=lambda one: type(one).__name__)
+def test_bands_of_coarse_meters_have_the_unit_of_the_readings_before_their_step_is_known(tracker):
+    rng = np.random.default_rng(5)
+    u = np.column_stack([rng.normal(size=(200, 2)), np.ones(200)])
+    y = np.round(u @ [1.0, 3.0, 5.0] + 0.1 * rng.normal(size=200))
+    run = track(MODEL, tracker, y, u)
+    assert run.state["coarse"] > 0.0
+    for unit in (2.0**-20, 2.0**10):
+        np.testing.assert_allclose(track(MODEL, tracker, y * unit, u).std[20:] / unit, run.std[20:], rtol=1e-6)
+
+
 def test_bands_of_theta_hold_for_a_coarse_meter():
     covered = []
     for seed in range(6):

@@ -174,3 +174,37 @@ def test_dates_before_the_first_white_row_take_no_rows_from_the_end():
     x, y, ar = rng.normal(size=(40, 1)), rng.normal(size=40), np.array([0.5, 0.2, -0.1, 0.1])
     alone = [date_loglik(x, y, ar, date, date)[0] for date in range(1, 20)]
     np.testing.assert_allclose(date_loglik(x, y, ar, 1, 19), alone, rtol=1e-10)
+
+
+def test_a_segment_of_which_nine_of_ten_outputs_are_zero_has_the_band_of_least_squares():
+    """Huber's scale vanishes there, and its band did: coefficients of 1e-8 +- 1e-9 for a valve that opens sometimes."""
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=(400, 2))
+    y = -1.0 + 2.0 * u[:, 0] + u[:, 1] + 0.3 * rng.normal(size=400)
+    y[200:] = np.maximum(y[200:] - 1.0, 0.0)
+    found = segment(y, u)
+    assert any(np.mean(y[part.start : part.stop] == 0.0) > 0.9 for part in found.segments)
+    for part in found.segments:
+        X = np.column_stack([u, np.ones(400)])[part.start : part.stop]
+        plain = np.linalg.lstsq(X, y[part.start : part.stop])[0]
+        assert (part.std > 1e-3).all()
+        if np.mean(y[part.start : part.stop] == 0.0) > 0.9:
+            assert (np.abs(part.theta - plain) < 2.0 * part.std).all()
+
+
+def test_standard_errors_have_the_units_of_their_regressors():
+    """Of inputs of 1e5 and 1e-7 one had an error of 1e-17 of its size: its direction counted as lost rank."""
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=(400, 2))
+    y = 3.0 + np.where(np.arange(400) < 200, 1.0, 1.6) * u[:, 0] + 0.5 * u[:, 1] + 0.4 * rng.normal(size=400)
+    runs = [
+        track(Regression(2, intercept=True), RLS(1.0), y, u * unit) for unit in ([1.0, 1.0], [1e5, 1e-7], [1e9, 1e-9])
+    ]
+    first, *others = (
+        np.array(
+            [moved.std for moved in run.verdict().parameters[:1]] + [x for s in run.segment().segments for x in s.std]
+        )
+        for run in runs
+    )
+    for unit, other in zip(([1e5, 1e-7, 1.0], [1e9, 1e-9, 1.0]), others, strict=True):
+        np.testing.assert_allclose(other * np.array([unit[0], *unit, *unit]), first, rtol=1e-6)

@@ -10,6 +10,7 @@ from support import THETA, arx_record, damaged, rows_of, same
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track
 from driftfit.judge.compare import compare, persistence
+from driftfit.show.parts.text import digits
 
 K = Kalman(q=1e-3, r=0.1)
 
@@ -187,3 +188,15 @@ def test_a_track_says_what_it_is():
     assert repr(run).startswith("Track of 100 samples, 98 used: ARX(")
     assert len(run) == 100
     assert run.time.tolist() == list(range(100))
+
+
+def test_numbers_have_the_digits_that_their_standard_deviation_determines():
+    """Prices, and temperatures in kelvin: 29998.6 +- 0.8 read 3e+04, and so did both ends of its band."""
+    for value, std, text in (
+        (29998.62, 0.789, "29998.6"), (-295.1534, 0.002, "-295.153"), (1.0042, 0.02, "1.004"),
+        (1.5e12, 1.0, "1500000000000"),
+        (0.0, 1.0, "0"), (3e4, np.inf, "3e+04"), (3e4, np.nan, "3e+04"), (np.nan, 1.0, "nan"), (3e4, 0.0, "3e+04"),
+    ):  # fmt: skip
+        assert digits(value, std) == text
+    assert digits(30.04, 0.8, 3) == "30"
+    assert digits(29998.62, 0.8, 3) == "29998.6"

@@ -40,6 +40,8 @@ def record(T, seed, noise="steady", n=3):
 def test_tail_of_equal_weights_is_chi_square(weights, law):
     for p in (0.9, 0.5, 0.05, 1e-4):
         assert tail(weights, law.ppf(1.0 - p)) == pytest.approx(p, abs=1e-6)
+    for x in (1e3, 1e5, 1e6, 1e7, 1e9, 1e15, 1e200):  # the statistic of a step that is large compared with the noise
+        assert tail(weights, x) == 0.0
 
 
 def test_tail_of_unequal_weights_is_what_a_simulation_says():
@@ -53,6 +55,25 @@ def test_tail_of_unequal_weights_is_what_a_simulation_says():
 def test_stationary_null_is_the_published_table(n, published):
     """Hansen (1992), table 1, 5 %; his numbers are simulated."""
     assert quantile(np.tile(BRIDGE, n), 0.05) == pytest.approx(published, abs=0.012)
+
+
+def test_constancy_has_no_unit():
+    phi, y = record(240, 3)
+    p = constancy(phi, y).p_joint
+    for unit in (1e-12, 1e-9, 1e9):
+        assert constancy(phi, y * unit).p_joint == pytest.approx(p, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", [12, 24, 29])
+def test_counts_of_which_nine_of_ten_are_zero_decide_nothing_and_raise_nothing(seed):
+    """The scale of Huber's fit vanishes, and with it the information matrix, which could not be inverted."""
+    rng, later = np.random.default_rng(seed), np.arange(400) >= 200
+    phi = np.column_stack([rng.normal(size=400), np.ones(400)])
+    steady, risen = (rng.poisson(rate, size=400).astype(float) for rate in (0.05, np.where(later, 0.2, 0.05)))
+    for y in (steady, risen):
+        p = constancy(phi, y).p_joint
+        assert np.isnan(p) or 0.0 <= p <= 1.0
+    assert np.isnan(constancy(phi, steady).p_joint)
 
 
 @pytest.mark.parametrize("noise", ["steady", "changing"])

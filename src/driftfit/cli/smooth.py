@@ -14,7 +14,7 @@ from driftfit.cli.parts.options import Given, reads
 from driftfit.cli.parts.program import app, progress, say
 from driftfit.cli.track import Plot
 from driftfit.engine.settings import missing_settings
-from driftfit.show.parts.text import facts, table_of
+from driftfit.show.parts.text import digits, facts, table_of
 from driftfit.tune.tune import tune
 from driftfit.tune.tuned import Tuned
 
@@ -45,7 +45,7 @@ def smooth(
     say(facts(("Model", repr(run.model)), ("Tracker", repr(run.tracker)), ("Samples", str(len(run)))))
     table = table_of("Parameters from the whole record", "at", *run.names)
     for t in np.unique(np.linspace(0, len(run) - 1, PLACES).astype(int)):
-        cells = (f"{v:.4g} +- {s:.2g}" for v, s in zip(smoothed.theta[t], smoothed.std[t], strict=True))
+        cells = (f"{digits(v, s)} +- {s:.2g}" for v, s in zip(smoothed.theta[t], smoothed.std[t], strict=True))
         table.add_row(Text(run.time_text(int(t))), *cells)
     say(table)
     say(Text(" +- one standard deviation", "dim"))

@@ -25,7 +25,7 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.cores.on_all_cores import on_all_cores
 from driftfit.judge.diagnose import Diagnosis, diagnose, diagnosis
 from driftfit.judge.evidence import Evidence
-from driftfit.judge.verdict import Verdict, judged, p_text, verdict
+from driftfit.judge.verdict import Verdict, change, judged, p_text, verdict
 from driftfit.show.parts.text import Printed, key_text, table_of
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class Judgement:
         more = f" and {len(moved) - 1} more" if len(moved) > 1 else ""
         if not moved:
             return ""
-        return f"{moved[0].name} {moved[0].before:.3g} to {moved[0].after:.3g} at {moved[0].when}{more}"
+        return f"{moved[0].name} {change(moved[0], 3)} at {moved[0].when}{more}"
 
 
 @dataclass(frozen=True)

@@ -36,13 +36,13 @@ from driftfit.judge.segments.joint_autoregression import jointly
 from driftfit.judge.statistics.break_dates import dated
 from driftfit.judge.statistics.constancy import shortest as shortest_of
 from driftfit.judge.statistics.noise import HELD, Noise, begun, whitened
-from driftfit.judge.statistics.robust import orthonormal, robust_fit
+from driftfit.judge.statistics.robust import clipped, inverted, least_squares, orthonormal, robust_fit
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
 from driftfit.run.track import track
 from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, panels, time_label
-from driftfit.show.parts.text import Printed, table_of
+from driftfit.show.parts.text import Printed, digits, table_of
 from driftfit.trackers.rls import RLS
 
 if TYPE_CHECKING:
@@ -120,7 +120,8 @@ class Segmentation(Printed):
         names = self.run.model.names
         table = table_of("Segments, from sample", "", "samples", *(text for name in names for text in (name, "+-")))
         for part in self.segments:
-            numbers = (f"{value:.4g}" for pair in zip(part.theta, part.std, strict=True) for value in pair)
+            pairs = zip(part.theta, part.std, strict=True)
+            numbers = (cell for value, std in pairs for cell in (digits(value, std), f"{std:.4g}"))
             table.add_row(str(part.start), str(part.stop - part.start), *numbers)
         yield table
         correlated = f"; autoregression of the noise {', '.join(f'{a:.2f}' for a in self.ar)}" if self.ar else ""
@@ -236,23 +237,27 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
 def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, Array]:
     """theta and its standard errors, Huber's for noise that is white after whitening.
 
-    A segment too short for that has plain least squares, and errors that are not known.
+    A segment too short for that has plain least squares, and errors that are not known. Where more than nine of ten
+    readings lie on one plane, as zeros of rare counts do, Huber's scale vanishes, and least squares takes its place.
     """
     c, n = found.level[a:b], phi.shape[1]
     if b - a - len(found.ar) <= n:
-        return np.linalg.lstsq(phi / c[:, None], y / c, rcond=None)[0], np.full(n, np.nan)
+        return least_squares(phi / c[:, None], y / c), np.full(n, np.nan)
     X, z = whitened(phi / c[:, None], y / c, found.ar)
     X, z = X[len(found.ar) :], z[len(found.ar) :]
     fit = robust_fit(X, z)
+    if not fit.scale > 1e-10 * np.sqrt(np.mean(z**2)):  # most of it lies on one plane: the rest would not count
+        theta = least_squares(X, z)
+        fit = clipped(theta, z - X @ theta, np.inf)
     N = len(X)
     variance = float(fit.psi @ fit.psi) / max(N - n, 1) / max(float(np.mean(fit.inside)), 0.1) ** 2
-    return fit.theta, np.sqrt(np.maximum(variance * np.diag(np.linalg.pinv(X.T @ X)), 0.0))
+    return fit.theta, np.sqrt(np.maximum(variance * np.diag(inverted(X.T @ X)), 0.0))
 
 
 def _undivided(run: Track, phi: Array, y: Array, level: float) -> Segmentation:
     """A single segment: too few samples, regressors that do not span, or no noise at all."""
     n = phi.shape[1]
-    theta = np.linalg.lstsq(phi, y, rcond=None)[0] if len(y) else np.full(n, np.nan)
+    theta = least_squares(phi, y) if len(y) else np.full(n, np.nan)
     spread = float(np.std(y - phi @ theta)) if len(y) else float("nan")
     one = Segment(0, len(run), theta, np.full(n, np.nan))
     return Segmentation((), (one,), level, float("nan"), spread, (), run)

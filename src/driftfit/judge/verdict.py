@@ -42,7 +42,7 @@ from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
 from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.result import Track, burn_in, root_mean_square
-from driftfit.show.parts.text import Printed, facts, table_of
+from driftfit.show.parts.text import Printed, digits, facts, table_of
 
 LEVEL = 0.05
 """Error rate of the statement that the parameters move, where none is given."""
@@ -152,7 +152,10 @@ class Verdict(Printed):
         if self.drifts is None:
             least = least_rows(len(self.parameters))
             short = f"{self.samples} samples can be used, and at least {least} are needed."
-            alike = "its regressors do not distinguish the parameters, or explain the output without error."
+            alike = (
+                "its regressors do not distinguish the parameters, or explain nine of ten outputs without error, as "
+                "those of rare counts."
+            )
             return f"The record cannot show whether parameters move: {short if self.samples < least else alike}"
         if self.drifts:
             return f"The parameters move: constants are rejected with {p_equals(self.p)} (level {self.level:g})."
@@ -225,9 +228,10 @@ class Verdict(Printed):
             yield Text(f" {sentence}")
         table = table_of("Parameters", "", "L", "p", "p own", "moves", "before", "after", "+-", "from")
         for m in self.parameters:
-            shown = (f"{m.statistic:.2f}", p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
-            change = (f"{m.before:.3g}", f"{m.after:.3g}", f"{m.std:.2g}", m.when) if m.moves else ("",) * 4
-            table.add_row(Text(m.name), *shown, *change)
+            L = f"{m.statistic:.2f}" if m.statistic < 1e6 else f"{m.statistic:.3g}"
+            shown = (L, p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
+            values = (digits(m.before, m.std, 3), digits(m.after, m.std, 3), f"{m.std:.2g}", m.when)
+            table.add_row(Text(m.name), *shown, *(values if m.moves else ("",) * 4))
         yield table
         table = table_of("One-step prediction error, root mean square", "", "error", "t", "p")
         table.add_row("this run", f"{self.rms:.5g}", "", "")
@@ -242,12 +246,17 @@ def better_constants(rivals: tuple[Paired, ...]) -> Paired:
     return min(rivals[1:3], key=lambda rival: rival.rms)
 
 
+def change(moved: Moved, least: int = 4) -> str:
+    """Its values before and after, with at least so many digits."""
+    return f"{digits(moved.before, moved.std, least)} to {digits(moved.after, moved.std, least)}"
+
+
 def sentence(moved: Moved) -> str:
     """The change of one parameter in words."""
-    text = f"{moved.name} from {moved.before:.4g} to {moved.after:.4g} about {moved.when}"
+    text = f"{moved.name} from {change(moved)} about {moved.when}"
     if abs(moved.last - moved.after) > 2.0 * moved.std:
         back = "back to" if abs(moved.last - moved.before) < 0.5 * abs(moved.after - moved.before) else "then"
-        text += f", {back} {moved.last:.4g} at the end"
+        text += f", {back} {digits(moved.last, moved.std)} at the end"
     if moved.instead:
         text += f" (or {' or '.join(moved.instead)}: their steps explain the record as well)"
     return text

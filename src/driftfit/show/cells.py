@@ -14,7 +14,7 @@ from rich.text import Text
 
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.result import Track
-from driftfit.show.parts.text import html_of, key_text, table_of
+from driftfit.show.parts.text import digits, html_of, key_text, table_of
 
 SHOWN = 20
 """Rows of the table."""
@@ -28,8 +28,8 @@ def cell_of(result: Track | KeyedResults) -> str:
     table = table_of("Parameters after the last sample", "", "", "theta", "std", "[0.025", "0.975]", names=2)
     half = NormalDist().inv_cdf(0.975)
     for key, name, theta, std in islice(rows, SHOWN):
-        numbers = (theta, std, theta - half * std, theta + half * std)
-        table.add_row(Text(key), Text(name), *(f"{value:.4g}" for value in numbers))
+        band = (digits(value, std) for value in (theta - half * std, theta + half * std))
+        table.add_row(Text(key), Text(name), digits(theta, std), f"{std:.4g}", *band)
     more = [Text(f" and {count - SHOWN} more rows")] if count > SHOWN else []
     return html_of(Text(repr(result)), table, *more)
 

@@ -18,12 +18,13 @@ import numpy as np
 from driftfit.engine import __version__
 from driftfit.judge.diagnose import Diagnosis, diagnosis
 from driftfit.judge.evidence import Evidence
-from driftfit.judge.verdict import LEVEL, Verdict, judged, p_text
+from driftfit.judge.verdict import LEVEL, Verdict, change, judged, p_text
 from driftfit.models.arx import ARX
 from driftfit.run.result import Track, burn_in
 from driftfit.show.page_parts import document, picture, section, table
 from driftfit.show.page_style import READING
 from driftfit.show.parts.axes import date_axis, draw_innovation, draw_parameter, draw_prediction, new_figure, time_label
+from driftfit.show.parts.text import digits
 from driftfit.show.report_faults import faults
 from driftfit.show.summary import Summary, summarise
 from driftfit.use.system import dc_gain, largest_pole
@@ -128,12 +129,10 @@ def _parameter_table(facts: Summary, truth: Verdict) -> str:
     rows = []
     for row in facts.rows:
         test = tests.get(row.name)
-        moved = (
-            ""
-            if test is None
-            else (f"{test.before:.4g} to {test.after:.4g}, {escape(test.when)}" if test.moves else "no")
-        )
-        cells = (f"{row.theta:.4g}", f"{row.low:.4g} to {row.high:.4g}", f"{row.path_low:.4g} to {row.path_high:.4g}")
+        moved = "" if test is None else (f"{change(test)}, {escape(test.when)}" if test.moves else "no")
+        values = (row.theta, row.low, row.high, row.path_low, row.path_high)
+        theta, low, high, least, most = (digits(value, row.std) for value in values)
+        cells = (theta, f"{low} to {high}", f"{least} to {most}")
         p = "" if test is None else escape(p_text(test.p_own))
         rows.append((escape(f"{row.name} {row.unit}".strip()), *cells, p, moved))
     caption = f"After the last sample; the range is that of the path after the first {facts.burn} samples."

@@ -13,7 +13,7 @@ from driftfit.models.fault_codes import refusals
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.by_output import ByOutput
-from driftfit.show.parts.text import Printed, counts, facts, shortened, table_of
+from driftfit.show.parts.text import Printed, counts, digits, facts, shortened, table_of
 
 _RIVALS = ("tracked", "persistence", "constant LS", "constant ARX")
 
@@ -63,8 +63,9 @@ class Summary(Printed):
         heads = ("theta", "std", "[0.025", "0.975]", "lowest", "highest")
         table = table_of("Parameters after the last sample", "", *heads)
         for row in self.rows:
-            cells = (row.theta, row.std, row.low, row.high, row.path_low, row.path_high)
-            table.add_row(Text(f"{row.name}  {row.unit}".strip()), *(f"{value:.4g}" for value in cells))
+            values = (row.theta, row.low, row.high, row.path_low, row.path_high)
+            theta, *others = (digits(value, row.std) for value in values)
+            table.add_row(Text(f"{row.name}  {row.unit}".strip()), theta, f"{row.std:.4g}", *others)
         yield table
         yield Text(f" lowest, highest: range of the path after the first {self.burn} samples", "dim")
         table = table_of("One-step prediction error, root mean square", *_RIVALS, names=0)

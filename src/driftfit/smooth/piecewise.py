@@ -57,9 +57,12 @@ class Segments:
             rows = np.flatnonzero(self._ok[a:b]) + a
             root = np.sqrt(self._weight[rows])
             A, d = self._phi[rows] * root[:, None], self._y[rows] * root
+            size = np.sqrt(np.sum(A * A, axis=0))
+            size[size == 0.0] = 1.0  # in units of the regressors, which may be far apart, no rank is lost
+            A /= size
             theta, _, rank, _ = np.linalg.lstsq(A, d, rcond=None)
-            thetas.append(theta)
-            cov = np.linalg.pinv(A.T @ A, hermitian=True)
+            thetas.append(theta / size)
+            cov = np.linalg.pinv(A.T @ A, hermitian=True) / np.outer(size, size)
             if rank < n:
                 loose = np.diag(np.eye(n) - np.linalg.pinv(A) @ A) > 1e-9
                 cov[loose, loose] = np.inf

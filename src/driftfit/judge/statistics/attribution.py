@@ -25,7 +25,7 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.break_dates import date_loglik, smallest
 from driftfit.judge.statistics.constancy import Constancy, constancy, shortest
 from driftfit.judge.statistics.noise import Noise, whitened
-from driftfit.judge.statistics.robust import robust_fit
+from driftfit.judge.statistics.robust import inverted, robust_fit
 
 MOST = 12
 ALIKE = 4.0
@@ -195,7 +195,7 @@ def _sizes(X: Array, y: Array, steps: list[Step], n: int, noise: Noise | None) -
         X, y = whitened(X / c[:, None], y / c, noise.ar)
         X, y = X * c[:, None], y * c
     fit = robust_fit(X, y)
-    inverse = np.linalg.pinv(X.T @ (X * fit.inside[:, None]))
+    inverse = inverted(X.T @ (X * fit.inside[:, None]))
     scores = X * fit.psi[:, None]
     cov = inverse @ (scores.T @ scores) @ inverse
     before, after, std, last = fit.theta[:n].copy(), fit.theta[:n].copy(), np.zeros(n), fit.theta[:n].copy()

@@ -4,7 +4,9 @@
     P(Q > x) = 1/2 + sum_k Im(phi(v_k) e^(-i v_k x)) / (pi (k + 1/2)),   v_k = (k + 1/2) D
 
 The step D is so small that no part of the distribution lies beyond x + 2 pi / D; the sum stops where phi has
-vanished. Limits of score tests are such sums: a Cramer-von Mises statistic has w_j = 1 / (j pi)^2.
+vanished. Where Chernoff's bound E(e^(Q/4)) e^(-x/4), for weights of at most 1, is below e^-NOTHING, the tail is 0 and
+nothing is summed: the larger x, the smaller the step, and the sum would end long before phi has vanished. Limits of
+score tests are such sums: a Cramer-von Mises statistic has w_j = 1 / (j pi)^2.
 
 Source: Davies (1980), algorithm AS 155, without its error control. Error below 1e-6 for five weights and more.
 """
@@ -20,6 +22,7 @@ from driftfit.engine.kernel import Array, Driver, shared
 TERMS = 65536
 """Largest number of terms of the sum."""
 TOGETHER = 32
+NOTHING = 40.0
 SMALL = 1e-3
 """Weights below this share of the largest are replaced by their mean."""
 
@@ -85,6 +88,9 @@ def _tail(weights: Array, w: Array, x: float) -> float:
         else:
             rest += one
     x = (x - rest) / largest
+    # -log(1 - w / 2) / 2, whose sum is the logarithm of the expectation, is at most w log(2) / 2
+    if 0.25 * x > NOTHING + 0.34657359028 * w.sum():
+        return 0.0
     return 0.5 + _inverted(w[: kept + -kept % 4], x) if x > 0.0 else 1.0
 
 

@@ -33,6 +33,8 @@ from driftfit.engine.simd import (
 
 CLIP = 1.5
 ROUNDS = 30
+SHRINKING = 0.9
+"""A scale that in the last round is below this share of the one before vanishes."""
 INSIDE = 0.9733
 """Mean square of a Gaussian within three standard deviations."""
 
@@ -221,11 +223,15 @@ def ones(weight: Array, N: int) -> None:
 
 @shared
 def huber(columns: Array, first: int, last: int, theta: Array, residual: Array) -> float:
-    """Fit y on Q in rows first .. last of `columns_of`: fills theta (n,), residual (1, N + 8), returns the scale."""
+    """Fit y on Q in rows first .. last of `columns_of`: fills theta (n,), residual (1, N + 8), returns the scale.
+
+    If more than nine of ten readings lie on one plane, as the zeros of rare counts do, the scale shrinks from round to
+    round, and with it the influence of all other readings: it is 0 then, and theta is not an estimate for them.
+    """
     N, n = last - first, theta.shape[0]
     M, step, size = np.zeros((n + 1, n + 1)), np.empty(n), np.empty((1, N + WIDTH))
     weight, sums = np.empty((1, N + WIDTH)), np.empty(((n + 1) * n, WIDTH))
-    scale, level = 0.0, 0.0
+    scale, level, before = 0.0, 0.0, 0.0
     ones(weight, N)
     for i in range(n):
         theta[i] = 0.0
@@ -255,9 +261,11 @@ def huber(columns: Array, first: int, last: int, theta: Array, residual: Array) 
             moved = max(moved, sums[0, i])
         for i in range(n):
             theta[i] = step[i]
-        scale = scale_of(size[0, :N])
+        before, scale = scale, scale_of(size[0, :N])
         if not scale > level or (round > 0 and moved < 1e-8 * scale):
             break
+        if round == ROUNDS - 1 and scale < SHRINKING * before:
+            return 0.0
         # Huber's weights psi(e) / e for the next round
         for t in range(0, N, WIDTH):
             e = load(residual, 0, t)
@@ -300,6 +308,20 @@ def clipped(theta: Array, residual: Array, scale: float) -> Fit:
     """A fit together with its clipped residuals."""
     psi = np.clip(residual, -CLIP * scale, CLIP * scale)
     return Fit(theta, residual, scale, psi, (np.abs(residual) <= CLIP * scale).astype(float))
+
+
+def inverted(M: Array) -> Array:
+    """Pseudo-inverse of moments M (n, n) of regressors, whose units may be far apart: a small one is no lost rank."""
+    size = np.sqrt(np.diag(M))
+    size[size == 0.0] = 1.0
+    return np.asarray(np.linalg.pinv(M / size / size[:, None]) / size / size[:, None])
+
+
+def least_squares(X: Array, y: Array) -> Array:
+    """theta (n,) of least norm in units of the regressors X (N, n), which may be far apart."""
+    size = np.sqrt(np.mean(X * X, axis=0))
+    size[size == 0.0] = 1.0
+    return np.asarray(np.linalg.lstsq(X / size, y, rcond=None)[0] / size)
 
 
 def core(z: Array) -> float:

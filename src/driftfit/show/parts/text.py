@@ -7,6 +7,7 @@ from collections.abc import Hashable, Mapping
 from io import StringIO
 from typing import Any
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -66,6 +67,16 @@ def counts(dropped: Mapping[str, int]) -> str:
 def shortened(text: str) -> str:
     """Round numbers of more than six digits to six."""
     return re.sub(r"\d\.\d{6,}(e-?\d+)?", lambda found: f"{float(found[0]):.6g}", text)
+
+
+def digits(value: float, std: float, least: int = 4) -> str:
+    """A number with ``least`` significant digits, or with more if its standard deviation is below the last of them.
+
+    A price of 29998.6 +- 0.8 would otherwise read 3e+04, as would both ends of its band.
+    """
+    known = 0.0 < std < np.inf and 0.0 < abs(value) < np.inf
+    places = int(np.floor(np.log10(abs(value))) - np.floor(np.log10(std))) + 1 if known else least
+    return f"{value:.{min(max(places, least), 15)}g}"
 
 
 def facts(*pairs: tuple[str, str]) -> Table:

@@ -74,11 +74,13 @@ def averaged(variance: float, quantum: float) -> float:
 
 @kernel
 def count_levels(s: State, kept: float, known: bool, l: int) -> None:
-    """The number of levels of the prediction in the tracker's memory, of which the share ``kept`` remains."""
+    """The number of levels of the prediction in the tracker's memory, of which the share ``kept`` remains.
+
+    Until the quantum is accepted, its present candidate counts, which has the unit of y as well.
+    """
     ok = s.ok[l]
-    quantum = s.quantum[l] if s.coarse[l] > 0.0 else 1.0
     y_hat = s.y_hat[l] + s.shift[l]
-    step = abs(y_hat - s.stayed[l]) / (MOVED * quantum)  # NaN at the first sample
+    step = abs(y_hat - s.stayed[l]) / (MOVED * s.quantum[l])  # NaN at the first sample
     moved = min(step * step, 1.0) if (step > 0.0) & known else 0.0
     s.levels[l] = max(kept * s.levels[l] + ok * moved, 1.0)
     s.stayed[l] = y_hat if ok > 0.0 else s.stayed[l]
