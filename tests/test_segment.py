@@ -9,6 +9,7 @@ from driftfit import ARX, RLS, Regression, segment, track
 from driftfit.judge.statistics.break_dates import date_loglik, smallest
 from driftfit.judge.statistics.noise import penalty
 from driftfit.judge.statistics.partition import partition
+from driftfit.smooth.piecewise import piecewise
 
 AT = (133, 266)
 
@@ -208,3 +209,5 @@ def test_standard_errors_have_the_units_of_their_regressors():
     )
     for unit, other in zip(([1e5, 1e-7, 1.0], [1e9, 1e-9, 1.0]), others, strict=True):
         np.testing.assert_allclose(other * np.array([unit[0], *unit, *unit]), first, rtol=1e-6)
+    plain, far = (piecewise(run, [200]).std for run in (runs[0], runs[2]))
+    np.testing.assert_allclose(far * [1e9, 1e-9, 1.0], plain, rtol=1e-6)
