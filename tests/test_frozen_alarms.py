@@ -268,10 +268,19 @@ def test_the_chance_of_an_extreme_and_the_default_reference():
     assert loud.cause(int(loud.onsets[0])) == "offset"
 
 
+def test_a_short_record_has_a_longer_reference():
+    y, u = arx_record(240, 4)
+    assert track(ARX(2, 2), HELD, y, u).detect(records=20).start == 150
+    y[60:70] = np.nan
+    assert track(ARX(2, 2), HELD, y, u).detect(records=20).start == 162  # two more have a missing lag
+    with pytest.raises(ValueError, match=r"samples 50 to 97 contain 47 that can be used. Give a longer"):
+        track(ARX(2, 2), HELD, *arx_record(130, 4)).detect()
+
+
 def test_errors():
     y, u = arx_record(400, 4)
     run = track(ARX(2, 2), HELD, y, u)
-    with pytest.raises(ValueError, match="at least 100 usable samples"):
+    with pytest.raises(ValueError, match="100 normal samples at least; samples 50 to 90 contain 40"):
         run.detect(reference=90)
     with pytest.raises(ValueError, match="must be a number of samples"):
         run.detect("glr", reference={"b1": (0.0, 1.0)})

@@ -229,7 +229,8 @@ def detect(
     every : number
         Samples in which one false alarm may begin.
     reference : mapping from names to (low, high), a number of samples, or (from, to)
-        For "glr" and "cusum": a segment that is normal; the first third of the record if there is none.
+        For "glr" and "cusum": a segment that is normal; if there is none the first third of the record, of a short one
+        up to three quarters.
         For "band": the normal range of the parameters, or a segment of the record, whose range after the start of the
         run is the band. For "innovation": a segment that is normal. A segment is a number of first samples, or an
         interval of time without its end: dates if the record has them, otherwise numbers as in ``run.time`` (without

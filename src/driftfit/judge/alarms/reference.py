@@ -8,6 +8,7 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.run.result import burn_in
 
@@ -53,9 +54,13 @@ def normal_samples(run: Track, reference: Any) -> tuple[int, int]:
     return first, end
 
 
-def first_third(run: Track) -> tuple[int, int]:
-    """(first, end) of the samples that are taken as normal where no reference was given."""
-    return normal_samples(run, len(run) // 3)
+def first_third(run: Track, usable: Array, least: int) -> tuple[int, int]:
+    """(first, end) of the samples that are taken as normal where no reference was given: the first third of the record,
+    and up to three quarters if fewer would have less than ``least`` ``usable`` samples.
+    """
+    enough = np.flatnonzero(np.cumsum(usable[burn(run) :]) >= least)
+    needed = burn(run) + int(enough[0]) + 1 if enough.size else len(run)
+    return normal_samples(run, max(len(run) // 3, min(needed, 3 * len(run) // 4)))
 
 
 def _place(run: Track, given: Any) -> int:

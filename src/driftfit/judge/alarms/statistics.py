@@ -75,16 +75,22 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
         raise ValueError(
             f'detect: the reference of "{rule.kind}" must be a number of samples, such as reference=500, or (from, to).'
         )
-    first, start = first_third(run) if reference is None else normal_samples(run, reference)
     samples = samples_of(run)
-    phi, rest = (part[first:start] for part in samples)
-    y, ok, noise = rest[:, 0], (rest[:, 1] > 0.0) & (rest[:, 3] > 0.0), rest[:, 2]
-    n, names, least = phi.shape[1], run.model.names, max(100, 10 * phi.shape[1])
-    if run.theta.shape[1] != n or ok.sum() < least:
+    n, usable = samples[0].shape[1], (samples[1][:, 1] > 0.0) & (samples[1][:, 3] > 0.0)
+    if run.theta.shape[1] != n:
         raise ValueError(
-            f'detect: "{rule.kind}" estimates the {n} parameters of the regression from the reference, which needs at '
-            f"least {least} usable samples, and a tracker of these parameters; samples {first} to {start} contain "
-            f"{ok.sum()}, and {type(run.tracker).__name__} estimates {run.theta.shape[1]} parameters."
+            f'detect: "{rule.kind}" is for trackers of the {n} parameters of the regression; '
+            f"{type(run.tracker).__name__} estimates {run.theta.shape[1]}."
+        )
+    least = max(100, 10 * n)
+    first, start = first_third(run, usable, least) if reference is None else normal_samples(run, reference)
+    phi, rest, ok = samples[0][first:start], samples[1][first:start], usable[first:start]
+    y, noise, names = rest[:, 0], rest[:, 2], run.model.names
+    if ok.sum() < least:
+        raise ValueError(
+            f'detect: "{rule.kind}" compares with {least} normal samples at least; samples {first} to {start} contain '
+            f"{ok.sum()} that can be used. Give a longer normal segment, reference=(from, to), or choose "
+            'kind="innovation".'
         )
     if not (np.ptp(phi[ok], axis=0) == 0.0).any():
         phi, names = np.column_stack([phi, np.ones(len(phi))]), (*names, OFFSET)

@@ -260,7 +260,7 @@ def select(
         everything that `track` does not accept.
     """
     tracker = AdaptiveKalman() if tracker is None else tracker
-    candidates = list(models) if isinstance(models, Iterable) else [models]
+    candidates = list(models) if isinstance(models, Iterable) and not isinstance(models, str) else [models]
     for model in candidates:
         check_roles("select", model, tracker)
     check_ready(tracker)
