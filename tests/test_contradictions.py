@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from driftfit import (
+    ARMAX,
     ARX,
     FLS,
     OE,
     RLS,
+    BoxJenkins,
     InstrumentalVariables,
     JointKalman,
     Kalman,
@@ -82,6 +85,31 @@ def test_a_fault_code_at_the_start_does_no_harm_in_any_unit(tracker, scale):
         away = np.abs(fleet[k].theta - fleet[0].theta) / unit
         assert away[60].max() < 0.02, k
         assert away[-1].max() < 0.001, k
+
+
+@pytest.mark.parametrize("model", [Regression(1), ARX(1, 1), PLANT], ids=repr)
+@pytest.mark.parametrize("tracker", [RLS(0.99), Kalman(q=1e-7, r=0.01)], ids=repr)
+def test_no_sample_is_between_those_judged_together_and_those_judged_alone(model, tracker):
+    """With few parameters a start had fewer samples than the judging of single samples waits for."""
+    y, u = plant()
+    if model is not PLANT:
+        y = lfilter([0.0, 1.0], [1.0, -0.7], u) + 0.1 * np.random.default_rng(1).normal(size=T)
+        y[2] = y[1]  # a reading that repeats itself counts once
+    rows = np.repeat([y[:200], u[:200]], 21, axis=0).reshape(2, 21, -1)
+    rows[0, range(1, 21), range(20)] = 9999.0
+    fleet = track(model, tracker, *rows, by="row")
+    assert max(np.abs(fleet[k].theta[-1] - fleet[0].theta[-1]).max() for k in range(21)) < 0.05
+
+
+@pytest.mark.parametrize("model", [OE(1, 1), BoxJenkins(), ARMAX(1, 1, 1)], ids=repr)
+def test_models_that_compute_signals_begin_without_the_fault(model):
+    """What they compute with a wrong estimate is in later regressors, so the estimate does not wait for certainty."""
+    y, u = plant()
+    y, u = y[:200], u[:200]
+    clean = track(model, RLS(0.99), y, u).theta[-1]
+    for at in (1, 3, 8):
+        found = track(model, RLS(0.99), np.where(np.arange(200) == at, 1e7, y), u).theta[-1]
+        np.testing.assert_allclose(found, clean, atol=0.2)
 
 
 @pytest.mark.parametrize("tracker", DIFFUSE, ids=repr)

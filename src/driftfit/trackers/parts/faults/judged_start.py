@@ -25,6 +25,7 @@ from driftfit.engine.kernel import Array, State, Step, kernel, nothing
 from driftfit.trackers.parts.covariance import symmetric_product
 from driftfit.trackers.parts.diffuse import BEFORE, MACHINES, know_nothing, reform
 from driftfit.trackers.parts.faults.contradictions import (
+    FIRST,
     add_to_block,
     close_block,
     judge_unusual,
@@ -100,6 +101,8 @@ def settle(s: State, l: int) -> None:
     for at in range(s.remembered[l]):
         if s.samples[at, NOISE, l] > 0.0:
             learn_reading(s, s.samples[at, READING, l], l)
+    # samples are judged alone from now on, also if some of these readings repeat others
+    s.judged_from[l] = min(s.judged_from[l], max(s.y_count[l], 0.5 * FIRST))
     close_block(s, l)
 
 
@@ -132,14 +135,17 @@ def reconsidering(one: Step, restart: Step) -> Any:
     def reconsider(s: State, found: int, l: int) -> None:
         y, y_hat, e, v, noise, shift = s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l]
         dt, drift = s.dt[l], s.drift[l]
+        if s.start_faults[l] > 0.0:
+            repeat(s, True, l)
         with_all = squares_left(s, l)
         repeat(s, False, l)
-        if with_all > WORSE * squares_left(s, l):
-            s.left_out[l] += found
-            s.start_faults[l] = found
-        else:
+        contradicted = with_all > WORSE * squares_left(s, l)
+        if not contradicted:
             repeat(s, True, l)
             trust_all(s, l)
+        left = found if contradicted else 0
+        s.left_out[l] += left - s.start_faults[l]
+        s.start_faults[l] = left
         recall(s, s.remembered[l] - 1, l)
         s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l] = y, y_hat, e, v, noise, shift
         s.dt[l], s.drift[l] = dt, drift
@@ -202,8 +208,9 @@ def judged(
             full = s.remembered[l] >= room(s, l)
             if (s.ok[l] > 0.0) & (spare >= RESIDUALS):
                 found = doubtful_samples(s, 1 if full else 0, l)
-            ready = (spare >= RESIDUALS) & ((found == 0) | (spare - found >= (RESIDUALS if full else SURE)))
-            if (s.ok[l] > 0.0) & (found > 0) & ready:
+            enough = spare - found >= (RESIDUALS if full else SURE) if found > 0 else s.remembered[l] >= FIRST
+            ready = (spare >= RESIDUALS) & enough
+            if found > 0:  # also before it is decided, because models compute later regressors with these estimates
                 reconsider(s, found, l)
             if ready | full:
                 settle(s, l)
