@@ -117,8 +117,8 @@ class Segmentation(Printed):
         text = self.run.time_text
         for one in self.breaks:
             yield Text(f" {text(one.at)}, from {text(self._sample(one.first))} to {text(self._sample(one.last))}")
-        names = self.run.model.names
-        table = table_of("Segments, from sample", "", "samples", *(text for name in names for text in (name, "+-")))
+        heads = (text for name in names for text in (name, "+-"))
+        table = table_of("Segments, from sample", "", "samples", *heads, group=2)
         for part in self.segments:
             pairs = zip(part.theta, part.std, strict=True)
             numbers = (cell for value, std in pairs for cell in (digits(value, std), f"{std:.4g}"))
