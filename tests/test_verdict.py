@@ -491,3 +491,14 @@ def test_the_unit_of_y_changes_no_p_value(unit):
     one, other = constancy(phi, y), constancy(phi, unit * y)
     assert one.lags == other.lags > 1
     assert [other.p_joint, *other.p_own] == pytest.approx([one.p_joint, *one.p_own], rel=1e-8)
+
+
+@pytest.mark.parametrize("slope", [0.0, 2.0])
+def test_rounding_errors_are_not_compared(slope):
+    """Outputs that constants explain without error, of which some predictors are wrong by 1e-16, others by 2e-16."""
+    x = np.column_stack([np.ones(200), np.random.default_rng(5).normal(size=200)])
+    for y in (x @ [1.0, slope], np.zeros(200)):
+        result = track(Regression(2), Kalman(q=0.0, r=1.0), y, x).verdict()
+        assert result.pays is False
+        assert result.constants.p == 0.5
+        assert "predict the output without error" in str(result)

@@ -38,6 +38,7 @@ from driftfit.judge.plots import Health, draw_diagnosis
 from driftfit.judge.statistics.paired import paired
 from driftfit.judge.statistics.robust import core
 from driftfit.judge.statistics.whiteness import Whiteness, crossing, whiteness
+from driftfit.judge.verdict import p_text
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
@@ -72,6 +73,12 @@ class Check:
         """Whether the value is within its limits, or not known."""
         return not (self.value < self.low or self.value > self.high)
 
+    @property
+    def text(self) -> str:
+        """The value as it is printed; p-values are combined from 1e-12 on, so that smaller ones have no meaning."""
+        least = self.name.endswith("(p)") and self.value < 1e-4
+        return p_text(self.value) if least else f"{self.value:.4g}"
+
 
 @dataclass(frozen=True)
 class Diagnosis(Printed):
@@ -105,7 +112,7 @@ class Diagnosis(Printed):
         for check in self.checks:
             limits = ("" if np.isinf(limit) else f"{limit:.4g}" for limit in (check.low, check.high))
             verdict = "not known" if np.isnan(check.value) else "" if check.ok else "out of bounds"
-            table.add_row(check.name, f"{check.value:.4g}", *limits, verdict)
+            table.add_row(check.name, check.text, *limits, verdict)
         yield table
         for sentence in self.sentences or ("Everything is within its limits.",):
             yield Text(f" {sentence}")

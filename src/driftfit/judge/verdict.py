@@ -33,6 +33,7 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.regressors import Rows
@@ -49,6 +50,9 @@ LEVEL = 0.05
 RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
 CORRELATED = 1e-3
 """If the p-value of whiteness of the residuals of segments is below this, they are reported as correlated."""
+
+ROUNDING = 1e-12
+"""A prediction that is wrong by less than this share of the largest output is exact."""
 
 
 @dataclass(frozen=True)
@@ -193,8 +197,10 @@ class Verdict(Printed):
                 f"Predictions cannot be compared: {self.scored} samples remain after the first {self.burn}, and "
                 f"at least {COMPARED} are needed; a smaller burn= leaves out fewer."
             )
-        change = 100.0 * (self.rms / steady.rms - 1.0)
         who = "constants" if steady is self.rivals[1] else "constants with lags"
+        if not steady.rms > 0.0:
+            return f"Tracking them cannot pay here: {who} predict the output without error."
+        change = 100.0 * (self.rms / steady.rms - 1.0)
         size = f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
         if self.pays:
             return f"Tracking them pays: the one-step error is {size} than that of {who} ({p_equals(steady.p)})."
@@ -236,6 +242,11 @@ class Verdict(Printed):
             table.add_row(rival.name, f"{rival.rms:.5g}", f"{rival.t:.2f}", p_text(rival.p))
         yield table
         yield facts(("Samples", f"{self.samples} tested, {self.scored} scored"))
+
+
+def rounded(error: Array, y: Array) -> Array:
+    """Errors (N,) of predictions of y (N,), 0 where they are those of the arithmetic: these are not compared."""
+    return np.where(np.abs(error) > ROUNDING * np.max(np.abs(y), initial=0.0), error, 0.0)
 
 
 def better_constants(rivals: tuple[Paired, ...]) -> Paired:
@@ -305,8 +316,9 @@ def judged(known: Evidence, level: float) -> Verdict:
     names = enumerate(run.model.names)
     moved = tuple(_moved(run, rows, test, steps, (i, name)) for i, name in names)
     at, similar = alike(rows.phi, test) if drifts and not any(m.moves for m in moved) else (0, ())
-    own, *others, scored = known.errors
-    rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))
+    scored = known.errors.scored
+    own, *others = (rounded(error[scored], run.y[scored]) for error in known.errors[:-1])
+    rivals = tuple(paired(name, error, own) for name, error in zip(RIVALS, others, strict=True))
     return Verdict(
         drifts=drifts,
         pays=None if np.isnan(rivals[1].p) else bool(better_constants(rivals).p < level),
@@ -316,7 +328,7 @@ def judged(known: Evidence, level: float) -> Verdict:
         parameters=moved,
         alike=tuple(run.model.names[i] for i in similar),
         since=run.time_text(int(rows.at[at])) if similar else "",
-        rms=root_mean_square(own[scored]),
+        rms=root_mean_square(own),
         rivals=rivals,
         samples=len(rows.y),
         scored=int(scored.sum()),
