@@ -41,6 +41,7 @@ from driftfit.judge.statistics.attribution import Attribution, alike, attribute
 from driftfit.judge.statistics.constancy import Constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
+from driftfit.judge.statistics.robust import EXACT
 from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, digits, facts, table_of
@@ -50,9 +51,6 @@ LEVEL = 0.05
 RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
 CORRELATED = 1e-3
 """If the p-value of whiteness of the residuals of segments is below this, they are reported as correlated."""
-
-ROUNDING = 1e-12
-"""A prediction that is wrong by less than this share of the largest output is exact."""
 
 
 @dataclass(frozen=True)
@@ -246,7 +244,7 @@ class Verdict(Printed):
 
 def rounded(error: Array, y: Array) -> Array:
     """Errors (N,) of predictions of y (N,), 0 where they are those of the arithmetic: these are not compared."""
-    return np.where(np.abs(error) > ROUNDING * np.max(np.abs(y), initial=0.0), error, 0.0)
+    return np.where(np.abs(error) <= EXACT * np.max(np.abs(y), initial=0.0), 0.0, error)
 
 
 def better_constants(rivals: tuple[Paired, ...]) -> Paired:
