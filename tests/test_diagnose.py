@@ -23,7 +23,7 @@ def test_a_true_model_has_no_faults():
     assert not found
     assert diagnosis.ok
     assert diagnosis.sentences == ()
-    assert "Everything is within its limits" in str(diagnosis)
+    assert "All diagnostics are within their limits." in str(diagnosis)
 
 
 def test_numbers_are_what_plain_numpy_gives():
@@ -138,3 +138,23 @@ def test_a_tracker_that_may_move_is_not_accused_on_short_constant_records():
             accused += not run.diagnose()["constancy (p)"].ok
     assert dearer >= 3
     assert accused <= 1
+
+
+def test_what_is_not_known_does_not_count_as_within_limits():
+    """A record without an output, and one that is too short for most numbers."""
+    x = np.column_stack([np.ones(60), np.random.default_rng(1).normal(size=60)])
+    y = x @ [1.0, 2.0] + np.random.default_rng(2).normal(size=60)
+    for samples, output, text in (
+        (60, np.full(60, np.nan), "none of the numbers"),
+        (12, y, "the others are not known"),
+    ):
+        diagnosis = track(Regression(2), Kalman(q=0.0, r=1.0), output[:samples], x[:samples]).diagnose()
+        assert diagnosis.ok
+        assert text in str(diagnosis)
+
+
+def test_rounding_errors_are_not_diagnosed():
+    """Errors of 1e-15 of a sensor that stands still repeat, and are no sign that lags are missing."""
+    x = np.column_stack([np.ones(200), np.random.default_rng(5).normal(size=200)])
+    diagnosis = track(Regression(2), AdaptiveKalman(), np.full(200, 5.0), x).diagnose()
+    assert diagnosis.ok

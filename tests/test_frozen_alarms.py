@@ -297,3 +297,11 @@ def test_an_idle_input_leaves_the_alarm_as_it_is():
     idle = track(Regression(2, intercept=True), Kalman(q=0.0, r=0.25), y, np.c_[u, np.zeros(1600)])
     begun = idle.detect(every=1000.0, reference=800).onsets
     assert 1200 <= begun[begun >= 1200][0] < 1250
+
+
+@pytest.mark.parametrize("slope", [0.0, 2.0])
+def test_a_reference_without_noise_is_refused_in_words(slope):
+    """A sensor that stood still, and outputs that were computed: rounding errors are no measure of a change."""
+    x = np.column_stack([np.ones(300), np.random.default_rng(0).normal(size=300)])
+    with pytest.raises(ValueError, match="the reference has none"):
+        track(Regression(2), Kalman(q=0.0, r=1.0), x @ [5.0, slope], x).detect("glr", reference=(50, 200))

@@ -32,3 +32,14 @@ def test_paired_is_the_textbook_formula():
     assert got.t == pytest.approx(d.mean() / np.sqrt(v / 300), rel=1e-12)
     assert got.p == pytest.approx(stats.norm.sf(got.t), rel=1e-9)
     assert got.rms == pytest.approx(np.sqrt(np.mean(rival**2)))
+
+
+def test_paired_where_every_difference_is_the_same_and_in_any_unit():
+    """Persistence on a ramp is wrong by one step at every sample."""
+    better, worse = (
+        paired("persistence", *pair) for pair in ((np.ones(50), np.zeros(50)), (np.zeros(50), np.ones(50)))
+    )
+    assert (better.t, better.p, worse.t, worse.p) == (np.inf, 0.0, -np.inf, 1.0)
+    assert paired("itself", np.ones(50), np.ones(50))[2:] == (0.0, 0.5)
+    own, rival = np.random.default_rng(3).normal(size=(2, 300))
+    assert paired("rival", 1e-90 * rival, 1e-90 * own)[2:] == pytest.approx(paired("rival", rival, own)[2:], rel=1e-9)

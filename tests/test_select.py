@@ -211,3 +211,11 @@ def test_orders_and_basis_of_a_hammerstein_wiener_model():
     run = track(selection.model(), Kalman(q=1e-8, r=4e-4), w, u)
     assert not run.verdict().drifts
     assert run.verdict().rms == pytest.approx(0.02, rel=3.3 / np.sqrt(2.0 * 350))  # of 350 residuals
+
+
+@pytest.mark.parametrize("level", [5.0, np.nan])
+def test_a_record_that_compares_nothing_says_so(level):
+    """A sensor that stands still, and one that is missing."""
+    selection = select(ARX(2, 2), np.full(300, level), np.random.default_rng(0).normal(size=300))
+    assert "nothing can be compared" in str(selection)
+    assert selection.simplest in {row.name for row in selection.rows}

@@ -10,7 +10,7 @@ from support import THETA, arx_record, damaged, rows_of, same
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track
 from driftfit.judge.compare import compare, persistence
-from driftfit.show.parts.text import digits
+from driftfit.show.parts.text import WIDTH, digits, printed, table_of
 
 K = Kalman(q=1e-3, r=0.1)
 
@@ -200,3 +200,18 @@ def test_numbers_have_the_digits_that_their_standard_deviation_determines():
         assert digits(value, std) == text
     assert digits(30.04, 0.8, 3) == "30"
     assert digits(29998.62, 0.8, 3) == "29998.6"
+
+
+@pytest.mark.parametrize("group", [1, 2])
+def test_a_table_of_more_columns_than_fit_continues_below(group):
+    heads = [f"number{i}" for i in range(20)]
+    table = table_of("Numbers", "", "samples", *heads, group=group)
+    table.add_row("first", "50", *(f"{i}.{i:05d}" for i in range(20)))
+    text = printed(table)
+    lines = [line.split() for line in text.splitlines()]
+    assert all(head in text and f"{i}.{i:05d}" in text for i, head in enumerate(heads))
+    assert max(map(len, text.splitlines())) <= WIDTH
+    tables = [line[1:] for line in lines if line[:1] == ["first"]]
+    assert len(tables) > 2
+    assert group == 1 or [len(row) % 2 for row in tables] == [1] + [0] * (len(tables) - 1)
+    assert len(printed(table_of("Numbers", "", *heads[:8])).splitlines()) == 4

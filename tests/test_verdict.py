@@ -498,3 +498,26 @@ def test_readings_of_a_coarse_meter_that_mostly_repeat_still_have_a_noise_level(
         found += constancy(X, np.round(flow - closed) + held).p_joint < 1e-4 if seed < 10 else 0
     assert accused <= 6
     assert found == 10
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_the_unit_of_y_changes_no_p_value(unit):
+    """Noise with lags and a gain that wanders, as an instrument reads it in volts, and in nanovolts."""
+    rng = np.random.default_rng(3)
+    u, v = rng.normal(size=(600, 2)), np.append(0.0, signal.lfilter([1.0], [1.0, -0.5], rng.normal(size=599)))
+    y = u @ [1.0, -0.5] + np.cumsum(0.02 * rng.normal(size=600)) * u[:, 0] + v + 2.0
+    phi = np.column_stack([np.ones(600), u])
+    one, other = constancy(phi, y), constancy(phi, unit * y)
+    assert one.lags == other.lags > 1
+    assert [other.p_joint, *other.p_own] == pytest.approx([one.p_joint, *one.p_own], rel=1e-8)
+
+
+@pytest.mark.parametrize("slope", [0.0, 2.0])
+def test_rounding_errors_are_not_compared(slope):
+    """Outputs that constants explain without error, of which some predictors are wrong by 1e-16, others by 2e-16."""
+    x = np.column_stack([np.ones(200), np.random.default_rng(5).normal(size=200)])
+    for y in (x @ [1.0, slope], np.zeros(200)):
+        result = track(Regression(2), Kalman(q=0.0, r=1.0), y, x).verdict()
+        assert result.pays is False
+        assert result.constants.p == 0.5
+        assert "predict the output without error" in str(result)

@@ -38,6 +38,7 @@ from driftfit.judge.plots import Health, draw_diagnosis
 from driftfit.judge.statistics.paired import paired
 from driftfit.judge.statistics.robust import core
 from driftfit.judge.statistics.whiteness import Whiteness, crossing, whiteness
+from driftfit.judge.verdict import p_text, rounded
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
@@ -72,6 +73,12 @@ class Check:
         """Whether the value is within its limits, or not known."""
         return not (self.value < self.low or self.value > self.high)
 
+    @property
+    def text(self) -> str:
+        """The value as it is printed; p-values are combined from 1e-12 on, so that smaller ones have no meaning."""
+        least = self.name.endswith("(p)") and self.value < 1e-4
+        return p_text(self.value) if least else f"{self.value:.4g}"
+
 
 @dataclass(frozen=True)
 class Diagnosis(Printed):
@@ -97,6 +104,18 @@ class Diagnosis(Printed):
         """A sentence for every number that is out of bounds, with a suggestion."""
         return tuple(check.advice for check in self.checks if not check.ok)
 
+    @property
+    def nothing(self) -> str:
+        """The sentence where no number is out of bounds, which says how many of them are not known."""
+        unknown = sum(bool(np.isnan(check.value)) for check in self.checks)
+        known = len(self.checks) - unknown
+        if not unknown:
+            return "All diagnostics are within their limits."
+        if not known:
+            return "Nothing could be diagnosed: the record determines none of the numbers."
+        are = "is within its limits" if known == 1 else "are within their limits"
+        return f"{known} of {len(self.checks)} diagnostics {are}; the others are not known."
+
     def __getitem__(self, name: str) -> Check:
         return next(check for check in self.checks if check.name == name)
 
@@ -105,9 +124,9 @@ class Diagnosis(Printed):
         for check in self.checks:
             limits = ("" if np.isinf(limit) else f"{limit:.4g}" for limit in (check.low, check.high))
             verdict = "not known" if np.isnan(check.value) else "" if check.ok else "out of bounds"
-            table.add_row(check.name, f"{check.value:.4g}", *limits, verdict)
+            table.add_row(check.name, check.text, *limits, verdict)
         yield table
-        for sentence in self.sentences or ("Everything is within its limits.",):
+        for sentence in self.sentences or (self.nothing,):
             yield Text(f" {sentence}")
 
     def plot(self, ax: Any = None) -> Figure:
@@ -144,11 +163,12 @@ def diagnosis(known: Evidence) -> Diagnosis:
 def standardised(run: Track) -> tuple[Array, Whiteness]:
     """Standardised innovations after the start, NaN where there are none, and their whiteness."""
     start = burn_in(run.model.n)
+    e = run.innovation if run.model.implicit else rounded(run.innovation, run.y[run.ok])
     with np.errstate(divide="ignore", invalid="ignore"):
-        z = run.innovation / run.innovation_std
+        z = e / run.innovation_std
     z = np.where(run.ok & np.isfinite(z) & (np.arange(len(run)) >= min(start, len(run) // 2)), z, np.nan)
     # without a covariance there is no scale, but correlation does not need one
-    return z, whiteness(z if np.isfinite(z).any() else np.where(run.ok, run.innovation, np.nan))
+    return z, whiteness(z if np.isfinite(z).any() else np.where(run.ok, e, np.nan))
 
 
 def _whiteness(white: Whiteness) -> Check:

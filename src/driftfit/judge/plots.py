@@ -46,6 +46,8 @@ def draw_diagnosis(diagnosis: Health, ax: Any = None) -> Figure:
     for axis in (*axes[::2], axes[5]):
         axis.set_xlabel(time_label(diagnosis.run))
         date_axis(axis, diagnosis.run)
+        if len(diagnosis.run) > 1 and not np.isfinite(axis.dataLim.intervalx).all():  # nothing is known
+            axis.set_xlim(diagnosis.run.time[0], diagnosis.run.time[-1])
     return figure
 
 
@@ -71,6 +73,7 @@ def _correlations(axis: Axes, diagnosis: Health) -> None:
     axis.fill_between(lags, -1.96 * diagnosis.white.std, 1.96 * diagnosis.white.std, color=GREY, alpha=0.3, lw=0)
     axis.axhline(0.0, color=GREY, lw=0.8)
     axis.set_xlabel("lag, samples", fontsize=9)
+    axis.locator_params(axis="x", integer=True)
     _titled(axis, "correlation of innovations", diagnosis.fine("whiteness (p)"))
 
 

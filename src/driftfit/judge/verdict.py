@@ -33,6 +33,7 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.regressors import Rows
@@ -40,6 +41,7 @@ from driftfit.judge.statistics.attribution import Attribution, alike, attribute
 from driftfit.judge.statistics.constancy import Constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
+from driftfit.judge.statistics.robust import EXACT
 from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, digits, facts, table_of
@@ -196,8 +198,10 @@ class Verdict(Printed):
                 f"Predictions cannot be compared: {self.scored} samples remain after the first {self.burn}, and "
                 f"at least {COMPARED} are needed; a smaller burn= leaves out fewer."
             )
-        change = 100.0 * (self.rms / steady.rms - 1.0)
         who = "constants" if steady is self.rivals[1] else "constants with lags"
+        if not steady.rms > 0.0:
+            return f"Tracking them cannot pay here: {who} predict the output without error."
+        change = 100.0 * (self.rms / steady.rms - 1.0)
         size = f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
         if self.pays:
             return f"Tracking them pays: the one-step error is {size} than that of {who} ({p_equals(steady.p)})."
@@ -239,6 +243,11 @@ class Verdict(Printed):
             table.add_row(rival.name, f"{rival.rms:.5g}", f"{rival.t:.2f}", p_text(rival.p))
         yield table
         yield facts(("Samples", f"{self.samples} tested, {self.scored} scored"))
+
+
+def rounded(error: Array, y: Array) -> Array:
+    """Errors (N,) of predictions of y (N,), 0 where they are those of the arithmetic: these are not compared."""
+    return np.where(np.abs(error) <= EXACT * np.max(np.abs(y), initial=0.0), 0.0, error)
 
 
 def better_constants(rivals: tuple[Paired, ...]) -> Paired:
@@ -308,8 +317,9 @@ def judged(known: Evidence, level: float) -> Verdict:
     names = enumerate(run.model.names)
     moved = tuple(_moved(run, rows, test, steps, (i, name)) for i, name in names)
     at, similar = alike(rows.phi, test) if drifts and not any(m.moves for m in moved) else (0, ())
-    own, *others, scored = known.errors
-    rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))
+    scored = known.errors.scored
+    own, *others = (rounded(error[scored], run.y[scored]) for error in known.errors[:-1])
+    rivals = tuple(paired(name, error, own) for name, error in zip(RIVALS, others, strict=True))
     return Verdict(
         drifts=drifts,
         pays=None if np.isnan(rivals[1].p) else bool(better_constants(rivals).p < level),
@@ -319,7 +329,7 @@ def judged(known: Evidence, level: float) -> Verdict:
         parameters=moved,
         alike=tuple(run.model.names[i] for i in similar),
         since=run.time_text(int(rows.at[at])) if similar else "",
-        rms=root_mean_square(own[scored]),
+        rms=root_mean_square(own),
         rivals=rivals,
         samples=len(rows.y),
         scored=int(scored.sum()),

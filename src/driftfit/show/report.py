@@ -115,7 +115,7 @@ def _subtitle(run: Track, facts: Summary) -> str:
 def _verdict(truth: Verdict, health: Diagnosis) -> str:
     count = len(health.sentences)
     state = (
-        "All diagnostics are within their limits."
+        health.nothing
         if health.ok
         else (f"{count} of {len(health.checks)} diagnostics {'is' if count == 1 else 'are'} out of bounds, see below.")
     )
@@ -169,7 +169,7 @@ def _checks(health: Diagnosis) -> str:
     for check in health.checks:
         low, high = ("" if np.isinf(limit) else f"{limit:.4g}" for limit in (check.low, check.high))
         state = '<span class="good">ok</span>' if check.ok else '<span class="bad">out of bounds</span>'
-        rows.append((check.name, f"{check.value:.4g}", low, high, "not known" if np.isnan(check.value) else state))
+        rows.append((check.name, escape(check.text), low, high, "not known" if np.isnan(check.value) else state))
     text = "".join(f"<li>{escape(sentence)}</li>" for sentence in health.sentences)
     listed = table("Numbers with their limits.", ("check", "value", "from", "to", ""), rows)
     return listed + (f"<ul>{text}</ul>" if text else "")

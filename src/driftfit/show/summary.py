@@ -67,7 +67,10 @@ class Summary(Printed):
             theta, *others = (digits(value, row.std) for value in values)
             table.add_row(Text(f"{row.name}  {row.unit}".strip()), theta, f"{row.std:.4g}", *others)
         yield table
-        yield Text(f" lowest, highest: range of the path after the first {self.burn} samples", "dim")
+        path = (
+            f"range of the path after the first {self.burn} samples" if self.samples > self.burn else "the last values"
+        )
+        yield Text(f" lowest, highest: {path}", "dim")
         table = table_of("One-step prediction error, root mean square", *_RIVALS, names=0)
         c = self.comparison
         table.add_row(*(f"{value:.5g}" for value in (c.tracked, c.persistence, c.constant_ls, c.constant_arx)))

@@ -26,6 +26,7 @@ from driftfit.judge.alarms.onsets import (
     power_rate,
 )
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
+from driftfit.judge.statistics.robust import EXACT, robust_fit
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.live.likelihood_ratio import CUSUM, memory_of, scan
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
@@ -95,6 +96,11 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
     if not (np.ptp(phi[ok], axis=0) == 0.0).any():
         phi, names = np.column_stack([phi, np.ones(len(phi))]), (*names, OFFSET)
     root = np.sqrt(np.where(ok, noise, 1.0))
+    if not robust_fit(phi[ok], y[ok]).scale > EXACT * np.sqrt(np.mean(y[ok] ** 2)):
+        raise ValueError(
+            f'detect: "{rule.kind}" measures changes in units of the noise, and the reference has none: constant '
+            f"parameters explain the outputs of samples {first} to {start} without error."
+        )
     frozen, known = frozen_model(phi / root[:, None], y / root, ok)
     rule = replace(
         rule,

@@ -48,7 +48,7 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.bandwidth import plugged_in, rule_of_thumb
 from driftfit.judge.statistics.noise import HELD, Noise, noise, whitened
 from driftfit.judge.statistics.quadratic import tail
-from driftfit.judge.statistics.robust import Fit, clipped, fit_in, orthonormal, robust_fit
+from driftfit.judge.statistics.robust import EXACT, Fit, clipped, fit_in, orthonormal, robust_fit
 from driftfit.judge.statistics.supremum import TIED, suprema, together
 from driftfit.judge.statistics.wild_bootstrap import wild_supremum
 
@@ -60,6 +60,8 @@ CELLS = 200
 """Largest number of positions for breaks when the noise is estimated."""
 MOST_LAGS = 3
 """Largest number of lags of all regressors that are added if the regressors are not independent of the noise."""
+REGULAR = 1e-15
+"""The smallest eigenvalue of a correlation matrix that is regular."""
 EDGE = 0.05
 """Share of a record at each end in which no date is searched."""
 
@@ -114,7 +116,7 @@ def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
     if np.linalg.matrix_rank(R, 1e-9 / np.sqrt(N)) < n:
         return _nothing(N, n)
     fit = fit_in((Q, R), y)
-    if not fit.scale > 1e-10 * np.sqrt(np.mean(y * y)):
+    if not fit.scale > EXACT * np.sqrt(np.mean(y * y)):
         return _nothing(N, n)._replace(fit=fit._replace(theta=fit.theta / size))
     found = noise(Q, fit.residual, CELLS, shortest(n), lags)
     return _tested(X, size, fit, found, lags)
@@ -136,7 +138,7 @@ def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> 
     whole = np.column_stack([X, added])
     A = _profile(whole * still.inside[:, None], whole, ends)
     V = _profile(*(2 * (_summed(whole * psi[:, None], rest),)), ends)
-    if any(np.linalg.matrix_rank(M[-1], rtol=1e-12, hermitian=True) < len(M[-1]) for M in (A, V)):
+    if not full_rank(A[-1]) or not full_rank(V[-1]):
         return _nothing(N, n)
     S, inverse = np.cumsum(whole * still.psi[:, None], axis=0), np.linalg.inv(A[-1])
     null = _null(A, V, inverse)
@@ -169,6 +171,7 @@ def missing_lags(X: Array, rows: Array, found: Noise) -> Array:
     and Quinn (1979). Their coefficients are not tested; each costs one degree of freedom.
     """
     N, n = X.shape
+    least = 1e-6 * np.sqrt(N * np.mean(X * X))
     w = whitened(X[:, :0], np.clip(found.residual / found.level, -HELD, HELD), found.ar)[1]
     basis = scipy.linalg.qr(rows, mode="economic")[0]
     w = w - basis @ (basis.T @ w)
@@ -178,7 +181,7 @@ def missing_lags(X: Array, rows: Array, found: Noise) -> Array:
         lagged[: len(found.ar)] = 0.0
         lagged -= basis @ (basis.T @ lagged)
         Q, R, _ = scipy.linalg.qr(lagged, mode="economic", pivoting=True)
-        new = Q[:, np.abs(np.diag(R)) > 1e-6 * np.sqrt(N)]
+        new = Q[:, np.abs(np.diag(R)) > least]
         explained = new.T @ w
         gain = -N * np.log1p(-explained @ explained / (w @ w))
         if k > 1 and gain < 2.0 * new.shape[1] * np.log(np.log(N)):
@@ -203,6 +206,14 @@ def _alternative(found: Noise, still: Fit, added: Array) -> Array:
         v = c * whitened(np.zeros((len(v), 0)), held, found.ar)[1]
     v = v - added @ np.linalg.lstsq(added, v, rcond=None)[0]
     return clipped(still.theta, v / np.maximum(1.0 - found.leverage, 0.05), still.scale).psi
+
+
+def full_rank(M: Array) -> bool:
+    """Whether a covariance or information M (k, k) is regular, whatever the units of its rows."""
+    size = np.sqrt(np.diag(M))
+    if not (size > 0.0).all():
+        return False
+    return bool(np.linalg.matrix_rank(M / size / size[:, None], REGULAR, hermitian=True) == len(M))
 
 
 def _nothing(N: int, n: int) -> Constancy:

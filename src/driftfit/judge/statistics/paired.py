@@ -46,9 +46,9 @@ def paired(name: str, rival: Array, own: Array) -> Paired:
     rms = float(np.sqrt(np.mean(rival * rival))) if len(rival) else float("nan")
     if len(own) < LEAST:
         return Paired(name, rms, float("nan"), float("nan"))
-    d = rival * rival - own * own
-    v = newey_west(d)
-    if not v > 0.0:
-        return Paired(name, rms, 0.0, 0.5)
-    t = float(d.mean() / np.sqrt(v / len(d)))
+    unit = max(np.abs(rival).max(), np.abs(own).max()) or 1.0  # squares of squares would leave the range of numbers
+    d = (rival / unit) ** 2 - (own / unit) ** 2
+    mean, v = float(d.mean()), newey_west(d)
+    # where every sample has the same difference, v is 0
+    t = mean / math.sqrt(v / len(d)) if v > 0.0 else math.copysign(math.inf, mean) if mean else 0.0
     return Paired(name, rms, t, 0.5 * math.erfc(t / math.sqrt(2.0)))

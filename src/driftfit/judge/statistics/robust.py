@@ -66,6 +66,8 @@ where more than half of the readings of a coarse meter are the same, the median 
 """
 
 
+EXACT = 1e-12
+"""Noise below this share of the root mean square of y is rounding, and a fit without error."""
 FLAT = 1e-10
 """A pivot below this share of its diagonal entry counts as zero."""
 
@@ -237,7 +239,7 @@ def huber(columns: Array, first: int, last: int, theta: Array, residual: Array) 
         theta[i] = 0.0
     for t in range(first, last):
         level += columns[n, t] * columns[n, t]
-    level = 1e-12 * np.sqrt(level / max(N, 1))
+    level = EXACT * np.sqrt(level / max(N, 1))
     for round in range(ROUNDS):
         # weighted normal equations, and their solution by Cholesky
         moments(columns, first, last, weight, sums, M)

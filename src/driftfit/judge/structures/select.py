@@ -107,7 +107,7 @@ class Selection(Printed):
     @property
     def simplest(self) -> str:
         within = [row for row in self.rows if row.below <= row.std]
-        return min(within, key=lambda row: (row.n, row.below)).name
+        return min(within or self.rows, key=lambda row: (row.n, row.below)).name
 
     def model(self, name: str | None = None) -> Model:
         """The model of a structure, the best by default; ValueError for a subset, which is not a model by itself."""
@@ -177,6 +177,9 @@ class Selection(Printed):
         if len(self.rows) > 20:
             yield Text(f" and {len(self.rows) - 20} more", "dim")
         yield Text(" below: log-likelihood below the best, +- its standard error", "dim")
+        if not np.isfinite(self.rows[0].rms):
+            yield Text(" nothing can be compared: no output could be used, or there is nothing to predict")
+            return
         yield Text(f" best: {self.best}")
         yield Text(f" simplest within one standard error: {self.simplest}")
         yield Text(f" on {self.scored} samples that all could predict", "dim")

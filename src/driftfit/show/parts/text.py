@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Hashable, Mapping
+from copy import copy
 from io import StringIO
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -91,8 +93,17 @@ SHORT = 10
 """A cell of at most this many characters stays on one line: numbers, and p-values such as < 0.0001."""
 
 
+BETWEEN = 3
+"""Blanks between two columns of a table."""
+
+
 class Numbers(Table):
-    """A table no wider than `WIDTH` or the terminal, in which nothing is cut off: long text is wrapped at blanks."""
+    """A table no wider than `WIDTH` or the terminal, in which nothing is cut off: long text is wrapped at blanks.
+
+    A table of more columns continues below, ``group`` columns of numbers always side by side.
+    """
+
+    group: int = 1
 
     def add_row(self, *cells: Any, **options: Any) -> None:
         """Add a row; every column is at least as wide as its longest word."""
@@ -101,7 +112,28 @@ class Numbers(Table):
             _widen(column, str(cell))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        return super().__rich_console__(console, options.update(max_width=min(WIDTH, options.max_width)))
+        width = min(WIDTH, options.max_width)
+        for part in self._parts(width):
+            yield from super(Numbers, part).__rich_console__(console, options.update(max_width=width))
+
+    def _parts(self, width: int) -> list[Numbers]:
+        """The table itself, or tables below each other, with the names in each, where its columns need more room."""
+        names = next((i for i, column in enumerate(self.columns) if column.justify != "left"), 0)
+        edges = [0, *range((len(self.columns) - names) % self.group, len(self.columns) - names + 1, self.group)]
+        needs = [(column.min_width or 0) + BETWEEN for column in self.columns]
+        rows: list[list[Column]] = [[]]
+        left = room = width + 1 - sum(needs[:names])
+        for a, b in pairwise(names + edge for edge in edges):
+            if sum(needs[a:b]) > left and rows[-1]:
+                rows.append([])
+                left = room
+            rows[-1] += self.columns[a:b]
+            left -= sum(needs[a:b])
+        parts = [copy(self) for _ in rows]
+        for part, columns in zip(parts, rows, strict=True):
+            part.columns = [*self.columns[:names], *columns]
+            part.title = self.title if part is parts[0] else " "
+        return parts
 
 
 def _widen(column: Column, text: str) -> None:
@@ -109,11 +141,12 @@ def _widen(column: Column, text: str) -> None:
     column.min_width = max(column.min_width or 0, *map(cell_len, words), 0)
 
 
-def table_of(title: str, *heads: str, names: int = 1) -> Table:
+def table_of(title: str, *heads: str, names: int = 1, group: int = 1) -> Table:
     """A table of numbers over the full width; the first ``names`` columns are left-aligned, numbers right-aligned."""
     table = Numbers(
         title=f"\n {title}", title_justify="left", title_style="bold", box=SIMPLE_HEAD, show_edge=False, expand=True
     )
+    table.group = group
     for place, head in enumerate(heads):
         table.add_column(Text(head), justify="left" if place < names else "right", overflow="fold")
         _widen(table.columns[-1], head)
