@@ -477,3 +477,10 @@ def test_readings_of_a_coarse_meter_that_mostly_repeat_still_have_a_noise_level(
         found += constancy(X, np.round(flow - closed) + held).p_joint < 1e-4 if seed < 10 else 0
     assert accused <= 6
     assert found == 10
+
+
+def test_the_unit_of_the_output_does_not_decide():
+    phi, y = record(300, 12)
+    p = constancy(phi, y).p_joint
+    assert np.isfinite(p)
+    assert [constancy(phi, y * unit).p_joint for unit in (1e-12, 1e-7, 1e9)] == pytest.approx([p] * 3, rel=1e-6)

@@ -136,7 +136,8 @@ def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> 
     whole = np.column_stack([X, added])
     A = _profile(whole * still.inside[:, None], whole, ends)
     V = _profile(*(2 * (_summed(whole * psi[:, None], rest),)), ends)
-    if np.linalg.matrix_rank(A[-1], 1e-12, hermitian=True) < len(A[-1]) or np.linalg.matrix_rank(V[-1], 1e-12) < n:
+    scores = V[-1] / max(np.mean(psi * psi), np.finfo(float).tiny)
+    if np.linalg.matrix_rank(A[-1], 1e-12, hermitian=True) < len(A[-1]) or np.linalg.matrix_rank(scores, 1e-12) < n:
         return _nothing(N, n)
     S, inverse = np.cumsum(whole * still.psi[:, None], axis=0), np.linalg.inv(A[-1])
     null = _null(A, V, inverse)
