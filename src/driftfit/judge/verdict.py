@@ -193,8 +193,10 @@ class Verdict(Printed):
                 f"Predictions cannot be compared: {self.scored} samples remain after the first {self.burn}, and "
                 f"at least {COMPARED} are needed; a smaller burn= leaves out fewer."
             )
-        change = 100.0 * (self.rms / steady.rms - 1.0)
         who = "constants" if steady is self.rivals[1] else "constants with lags"
+        if steady.rms == 0.0:
+            return f"Tracking them cannot pay: {who} predict without error."
+        change = 100.0 * (self.rms / steady.rms - 1.0)
         size = f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
         if self.pays:
             return f"Tracking them pays: the one-step error is {size} than that of {who} ({p_equals(steady.p)})."

@@ -26,6 +26,7 @@ from driftfit.judge.alarms.onsets import (
     power_rate,
 )
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
+from driftfit.judge.statistics.robust import noisy, robust_fit
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.live.likelihood_ratio import CUSUM, memory_of, scan
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
@@ -86,9 +87,15 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
             f"least {least} usable samples, and a tracker of these parameters; samples {first} to {start} contain "
             f"{ok.sum()}, and {type(run.tracker).__name__} estimates {run.theta.shape[1]} parameters."
         )
-    if not (np.ptp(phi[ok], axis=0) == 0.0).any():
+    if not ((np.ptp(phi[ok], axis=0) == 0.0) & (phi[ok][0] != 0.0)).any():
         phi, names = np.column_stack([phi, np.ones(len(phi))]), (*names, OFFSET)
     root = np.sqrt(np.where(ok, noise, 1.0))
+    scaled, output = (phi / root[:, None])[ok], (y / root)[ok]
+    if not noisy(robust_fit(scaled, output), scaled, output):
+        raise ValueError(
+            f'detect: "{rule.kind}" needs the noise of the reference, but constant parameters explain samples {first} '
+            f"to {start} without error; choose another reference."
+        )
     frozen, known = frozen_model(phi / root[:, None], y / root, ok)
     rule = replace(
         rule,

@@ -66,6 +66,8 @@ where more than half of the readings of a coarse meter are the same, the median 
 
 FLAT = 1e-10
 """A pivot below this share of its diagonal entry counts as zero."""
+ROUNDING = 1e-13
+"""Residuals of this share of the terms of a fit may be rounding."""
 
 
 class Fit(NamedTuple):
@@ -294,6 +296,12 @@ def fit_in(basis: tuple[Array, Array], y: Array) -> Fit:
     theta, residual, scale = np.zeros(Q.shape[1]), np.empty((1, len(y) + WIDTH)), np.empty(1)
     _run(columns_of(Q, y), theta, residual, scale)
     return clipped(np.linalg.lstsq(R, theta, rcond=1e-12)[0], residual[0, : len(y)], float(scale[0]))
+
+
+def noisy(fit: Fit, phi: Array, y: Array) -> bool:
+    """Whether the residuals of a fit of y (N,) on phi (N, n) are more than the rounding of y and of its terms."""
+    terms = np.sqrt(np.mean(phi * phi, axis=0)) @ np.abs(fit.theta)
+    return bool(fit.scale > ROUNDING * (np.sqrt(np.mean(y * y)) + terms))
 
 
 def clipped(theta: Array, residual: Array, scale: float) -> Fit:
