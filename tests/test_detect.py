@@ -358,3 +358,13 @@ def test_chance_is_that_of_the_largest_of_many(rate):
         limit = float(np.quantile(largest, 1.0 - share))
         one = stats.chi2.sf(limit, 20) if power == 2 else 2.0 * stats.norm.sf(limit / np.sqrt(20.0))
         assert share < chance((begins, start, top), limit, one, 300) < most
+
+
+def test_a_run_that_ends_before_its_start_judges_no_sample():
+    run = track(ARX(1, 1), K, *arx_record(3, 1))
+    assert "0 judged from sample 50 on; 0 false" in str(run.detect("innovation", every=1000.0))
+
+
+def test_the_cause_of_an_alarm_whose_limit_is_zero():
+    rule = AlarmRule("band", 1000.0, ("a", "b"), (0.0, 0.0))
+    assert rule.cause(np.array([0.0, 0.1])) == 1

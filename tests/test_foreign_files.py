@@ -72,3 +72,9 @@ def test_such_a_file_is_tracked_like_any_other(tmp_path):
     path = written(tmp_path, "tag;x;y\n" + "\n".join(rows))
     run = track(Regression(1), RLS(1.0), y="y", u="x", data=path, time="tag", dt="label")
     np.testing.assert_array_equal(run.theta, track(Regression(1), RLS(1.0), y, x).theta)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_a_line_that_declares_the_separator_and_files_with_a_byte_order_mark(tmp_path, encoding):
+    for text in ("sep=|\r\nt|y\r\n1|2.5\r\n", "t;y\n1;2,5\n"):
+        np.testing.assert_array_equal(read_columns(written(tmp_path, text, encoding), ["y"])["y"], [2.5])

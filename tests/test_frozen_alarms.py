@@ -305,3 +305,17 @@ def test_a_reference_without_noise_is_refused_in_words(slope):
     x = np.column_stack([np.ones(300), np.random.default_rng(0).normal(size=300)])
     with pytest.raises(ValueError, match="the reference has none"):
         track(Regression(2), Kalman(q=0.0, r=1.0), x @ [5.0, slope], x).detect("glr", reference=(50, 200))
+
+
+def test_a_reference_without_noise_is_refused():
+    u = np.random.default_rng(1).normal(size=400)
+    for y in (np.zeros(400), np.full(400, 7.0)):
+        run = track(Regression(1), Kalman(q=0.0, r=0.25), y * u, u)
+        with pytest.raises(ValueError, match="explain samples 50 to 200 without error"):
+            run.detect(reference=200)
+
+
+def test_a_column_of_zeros_is_no_constant():
+    u = np.random.default_rng(1).normal(size=(400, 2)) * [1.0, 0.0]
+    run = track(Regression(2), Kalman(q=0.0, r=0.25), u[:, 0] + np.random.default_rng(2).normal(size=400), u)
+    assert run.detect(reference=200).rule.parameters[-1] == "offset"

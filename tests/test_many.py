@@ -236,7 +236,7 @@ def test_clear_series_are_judged_by_the_limits_of_their_group_and_the_others_by_
     for k in clear:
         assert min(result[k].p, full[k].p) > 0.05
         np.testing.assert_allclose(result[k].limits, full[k].limits, rtol=0.2)
-    with pytest.raises(ValueError, match="at least 100 usable samples"):
+    with pytest.raises(ValueError, match="100 normal samples at least"):
         fleet.detect("glr", reference=80)
 
 

@@ -358,3 +358,16 @@ def test_the_furnace():
     found = run.blocks("svd")
     assert_allclose(np.median(found.c[-200:, 1:], axis=0), THRESHOLDS, atol=0.1)
     assert_allclose(np.median(found.a[-200:], axis=0), A, atol=0.3)
+
+
+def test_a_free_run_has_the_unit_of_the_output():
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-1, 1, 400), np.zeros(400)
+    for t in range(1, 400):
+        y[t] = 0.5 * y[t - 1] + 0.5 * u[t - 1] + 0.01 * rng.normal()
+    y[0] = np.nan
+    ran = []
+    for unit in (1.0, 1e-12):
+        model = HammersteinWiener(1, 1, input=Polynomial(2), output=Legendre(2, (-2.0 * unit, 2.0 * unit)))
+        ran.append(free_run(track(model, Kalman(q=0.0, r=1e-4), unit * y, u)).y / unit)
+    assert ran[1] == pytest.approx(ran[0], abs=1e-9, nan_ok=True)

@@ -321,3 +321,10 @@ def test_a_profile_stays_within_the_range_of_the_others():
     found = Search(f, knobs, np.zeros(2))
     assert found.ridge(0)[1] == pytest.approx(300.0, rel=1e-3)
     assert found.profile(0, 0.95)[0] < 0.0 < found.profile(0, 0.95)[1]
+
+
+@pytest.mark.parametrize("T", [2, 60])
+def test_a_record_without_noise_says_so(T):
+    u = np.random.default_rng(0).normal(size=(T, 2))
+    with pytest.raises(ValueError, match="there is no noise to tune on"):
+        tune(Regression(2), Kalman(), np.zeros(T), u)

@@ -521,3 +521,23 @@ def test_rounding_errors_are_not_compared(slope):
         assert result.pays is False
         assert result.constants.p == 0.5
         assert "predict the output without error" in str(result)
+
+
+def test_the_unit_of_the_output_does_not_decide():
+    phi, y = record(300, 12)
+    p = constancy(phi, y).p_joint
+    assert np.isfinite(p)
+    assert [constancy(phi, y * unit).p_joint for unit in (1e-12, 1e-7, 1e9)] == pytest.approx([p] * 3, rel=1e-6)
+
+
+def test_noise_far_below_an_offset_is_noise_unless_it_is_rounding():
+    phi, y = record(300, 12)
+    X = np.column_stack([phi, np.ones(300)])
+    p = constancy(X, y).p_joint
+    assert constancy(X, 1.7e9 + 0.01 * y).p_joint == pytest.approx(p, rel=0.01)
+    assert np.isnan(constancy(X, 1.7e9 + X @ np.arange(4.0)).p_joint)
+
+
+def test_constants_without_error_cannot_be_beaten():
+    run = track(Regression(3), Kalman(q=1e-3, r=0.1), np.zeros(300), record(300, 12)[0])
+    assert "predict the output without error" in run.verdict().sentences[0]

@@ -1,15 +1,17 @@
 """Files: CSV and Parquet, one or many, read with polars.
 
-CSV is read as text, so that messages can name a cell that is not a number. Lines that begin with # are comments, and
-the header determines whether cells are separated by comma, semicolon or tab. Where semicolons separate cells, numbers
-may have decimal commas, and dots between thousands. Text that is not UTF-8 is taken as Windows-1252. If some of several
-files cannot be read, they are left out with a warning and kept with their reasons.
+CSV is read as text, so that messages can name a cell that is not a number. Lines that begin with # are comments. The
+header determines whether cells are separated by comma, semicolon or tab, or a line such as ``sep=;`` before it, which
+spreadsheets write. Where semicolons separate cells, numbers may have decimal commas, and dots between thousands. Text
+that is neither UTF-8 nor UTF-16 with a byte order mark is taken as Windows-1252. If some of several files cannot be
+read, they are left out with a warning and kept with their reasons.
 """
 
 from __future__ import annotations
 
 import glob
 import os
+import re
 import warnings
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
@@ -113,11 +115,13 @@ def _file(path: str, wanted: Wanted) -> nw.DataFrame[Any]:
 
 def _csv(path: str, wanted: Wanted) -> tuple[list[str], pl.DataFrame]:
     """(all column names, the wanted columns as text); the header determines whether the separator is , ; or tab."""
-    with open(path, encoding="utf-8", errors="replace") as file:
+    encoding = _encoding(path)
+    with open(path, encoding=encoding, errors="replace") as file:
         header = next((line for line in file if not line.startswith("#")), "")
-    separator = max(",;\t", key=header.count)
+    declared = re.fullmatch(r"\ufeff?sep=(.)\s*", header, re.IGNORECASE)
+    separator = declared[1] if declared else max(",;\t", key=header.count)
     options: dict[str, Any] = {"infer_schema": False, "comment_prefix": "#", "separator": separator}
-    options["encoding"] = _encoding(path)
+    options |= {"encoding": encoding, "skip_rows": 1 if declared else 0}
     names = pl.read_csv(path, n_rows=0, **options).columns
     frame = pl.read_csv(path, columns=[name for name in names if name in wanted.names], **options)
     if separator == ";":
@@ -130,6 +134,8 @@ def _encoding(path: str) -> str:
     """The encoding of a file, judged by its header and its first cells."""
     with open(path, "rb") as file:
         start = file.read(1 << 16)
+    if start.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "utf-16"
     try:
         start[: start.rfind(b"\n") + 1 or None].decode("utf-8")
     except UnicodeDecodeError:

@@ -36,7 +36,7 @@ from driftfit.judge.segments.joint_autoregression import jointly
 from driftfit.judge.statistics.break_dates import dated
 from driftfit.judge.statistics.constancy import shortest as shortest_of
 from driftfit.judge.statistics.noise import HELD, Noise, begun, whitened
-from driftfit.judge.statistics.robust import EXACT, clipped, inverted, least_squares, orthonormal, robust_fit
+from driftfit.judge.statistics.robust import clipped, inverted, least_squares, noisy, orthonormal, robust_fit
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
@@ -210,7 +210,7 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
     if max(2 * least, n + 2) > N or not (size > 0.0).all() or np.linalg.matrix_rank(rows.phi / size, 1e-9) < n:
         return _undivided(run, rows.phi, rows.y, level)
     fit = robust_fit(rows.phi, rows.y)
-    if not fit.scale > EXACT * np.sqrt(np.mean(rows.y**2)):
+    if not noisy(fit, rows.phi, rows.y):
         return _undivided(run, rows.phi, rows.y, level)
     Q = orthonormal(rows.phi / size)[0]
     search, found, starts = begun(Q, fit.residual, CELLS, least, quiet=false)

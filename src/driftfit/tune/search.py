@@ -100,7 +100,8 @@ def _refine(f: Objective, knobs: Knobs, x: Array) -> Array:
             points[2 * j + 1, i] += STEP
             points[2 * j + 2, i] -= STEP
         values = f(points)
-        slopes = (values[1::2] - values[2::2]) / (2.0 * STEP)
+        with np.errstate(invalid="ignore"):  # without an error anywhere the criterion is -inf
+            slopes = (values[1::2] - values[2::2]) / (2.0 * STEP)
         return float(values[0]), np.where(np.isfinite(slopes), slopes, 0.0)
 
     from scipy import optimize  # this import takes half a second

@@ -136,6 +136,11 @@ def _tuned(
     search = Search(f, knobs, minimise(f, knobs))
     final = score(task, [knobs.run(search.x)], h)
     sigma2 = float(final.sigma2()[0])
+    if knobs.profiled and method == "ml" and not sigma2 > 0.0:
+        raise ValueError(
+            "tune: there is no noise to tune on: parameters explain every usable sample without error, or the samples "
+            "are no more than the parameters."
+        )
     tuned = Tuned(
         tracker=knobs.build(search.x, sigma2),
         method=method,

@@ -166,7 +166,7 @@ class Alarms(Printed):
         return t + int(np.argmin(np.append(self.active[t:], False)))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        judged = len(self.active) - self.start
+        judged = max(len(self.active) - self.start, 0)
         expected = judged / self.every
         chance = "is the probability that a record without a fault is this extreme"
         limits = (f"{name} {self.rule.limit_text(j)}" for j, name in enumerate(self.names))

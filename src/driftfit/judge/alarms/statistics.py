@@ -26,7 +26,7 @@ from driftfit.judge.alarms.onsets import (
     power_rate,
 )
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
-from driftfit.judge.statistics.robust import EXACT, robust_fit
+from driftfit.judge.statistics.robust import noisy, robust_fit
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.live.likelihood_ratio import CUSUM, memory_of, scan
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
@@ -93,13 +93,14 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
             f"{ok.sum()} that can be used. Give a longer normal segment, reference=(from, to), or choose "
             'kind="innovation".'
         )
-    if not (np.ptp(phi[ok], axis=0) == 0.0).any():
+    if not ((np.ptp(phi[ok], axis=0) == 0.0) & (phi[ok][0] != 0.0)).any():
         phi, names = np.column_stack([phi, np.ones(len(phi))]), (*names, OFFSET)
     root = np.sqrt(np.where(ok, noise, 1.0))
-    if not robust_fit(phi[ok], y[ok]).scale > EXACT * np.sqrt(np.mean(y[ok] ** 2)):
+    scaled, output = (phi / root[:, None])[ok], (y / root)[ok]
+    if not noisy(robust_fit(scaled, output), scaled, output):
         raise ValueError(
             f'detect: "{rule.kind}" measures changes in units of the noise, and the reference has none: constant '
-            f"parameters explain the outputs of samples {first} to {start} without error."
+            f"parameters explain samples {first} to {start} without error. Choose another reference."
         )
     frozen, known = frozen_model(phi / root[:, None], y / root, ok)
     rule = replace(

@@ -48,7 +48,7 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.bandwidth import plugged_in, rule_of_thumb
 from driftfit.judge.statistics.noise import HELD, Noise, noise, whitened
 from driftfit.judge.statistics.quadratic import tail
-from driftfit.judge.statistics.robust import EXACT, Fit, clipped, fit_in, orthonormal, robust_fit
+from driftfit.judge.statistics.robust import Fit, clipped, fit_in, noisy, orthonormal, robust_fit
 from driftfit.judge.statistics.supremum import TIED, suprema, together
 from driftfit.judge.statistics.wild_bootstrap import wild_supremum
 
@@ -116,7 +116,7 @@ def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
     if np.linalg.matrix_rank(R, 1e-9 / np.sqrt(N)) < n:
         return _nothing(N, n)
     fit = fit_in((Q, R), y)
-    if not fit.scale > EXACT * np.sqrt(np.mean(y * y)):
+    if not noisy(fit, X, y):
         return _nothing(N, n)._replace(fit=fit._replace(theta=fit.theta / size))
     found = noise(Q, fit.residual, CELLS, shortest(n), lags)
     return _tested(X, size, fit, found, lags)

@@ -70,6 +70,8 @@ EXACT = 1e-12
 """Noise below this share of the root mean square of y is rounding, and a fit without error."""
 FLAT = 1e-10
 """A pivot below this share of its diagonal entry counts as zero."""
+ROUNDING = 1e-13
+"""Residuals of this share of the terms of a fit may be rounding."""
 
 
 class Fit(NamedTuple):
@@ -239,7 +241,7 @@ def huber(columns: Array, first: int, last: int, theta: Array, residual: Array) 
         theta[i] = 0.0
     for t in range(first, last):
         level += columns[n, t] * columns[n, t]
-    level = EXACT * np.sqrt(level / max(N, 1))
+    level = ROUNDING * np.sqrt(level / max(N, 1))
     for round in range(ROUNDS):
         # weighted normal equations, and their solution by Cholesky
         moments(columns, first, last, weight, sums, M)
@@ -264,10 +266,10 @@ def huber(columns: Array, first: int, last: int, theta: Array, residual: Array) 
         for i in range(n):
             theta[i] = step[i]
         before, scale = scale, scale_of(size[0, :N])
+        if (round == ROUNDS - 1 or (round > 0 and not scale > level)) and scale < SHRINKING * before:
+            return 0.0
         if not scale > level or (round > 0 and moved < 1e-8 * scale):
             break
-        if round == ROUNDS - 1 and scale < SHRINKING * before:
-            return 0.0
         # Huber's weights psi(e) / e for the next round
         for t in range(0, N, WIDTH):
             e = load(residual, 0, t)
@@ -304,6 +306,12 @@ def fit_in(basis: tuple[Array, Array], y: Array) -> Fit:
     theta, residual, scale = np.zeros(Q.shape[1]), np.empty((1, len(y) + WIDTH)), np.empty(1)
     _run(columns_of(Q, y), theta, residual, scale)
     return clipped(np.linalg.lstsq(R, theta, rcond=1e-12)[0], residual[0, : len(y)], float(scale[0]))
+
+
+def noisy(fit: Fit, phi: Array, y: Array) -> bool:
+    """Whether the residuals of a fit of y (N,) on phi (N, n) are more than the rounding of y and of its terms."""
+    terms = np.sqrt(np.mean(phi * phi, axis=0)) @ np.abs(fit.theta)
+    return bool(fit.scale > ROUNDING * (np.sqrt(np.mean(y * y)) + terms))
 
 
 def clipped(theta: Array, residual: Array, scale: float) -> Fit:

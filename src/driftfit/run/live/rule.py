@@ -145,7 +145,9 @@ class AlarmRule(Settings):
 
     def cause(self, statistic: Array) -> int:
         """The column (c,) that is furthest beyond its limit."""
-        ratio = np.where(np.isfinite(statistic), statistic / self._arrays[0], -np.inf)
+        with np.errstate(invalid="ignore", divide="ignore"):  # a limit is 0 where z hardly moves between samples
+            ratio = statistic / self._arrays[0]
+        ratio = np.where(np.isfinite(statistic) & ~np.isnan(ratio), ratio, -np.inf)
         return int(np.argmax(ratio))
 
     def limit_text(self, column: int) -> str:

@@ -129,14 +129,16 @@ class _Grid:
     def __init__(self, found: Blocks, y: Array) -> None:
         self.basis = found.model.out
         self.low, self.high = believed(y)
-        self.y = np.empty(0)
+        self.y, self.known = np.empty(0), False
 
     def upto(self, t: int) -> None:
         """Build the grid for the outputs before sample t, if it does not contain them."""
         low, high = float(self.low[t - 1]), float(self.high[t - 1])
-        low, high = (low, high) if np.isfinite(low) and np.isfinite(high) else (-1.0, 1.0)
-        if not self.y.size or low < self.y[0] or high > self.y[-1]:
-            margin = WIDER * max(high - low, 1e-9)
+        known = bool(np.isfinite(low) and np.isfinite(high))
+        low, high = (low, high) if known else (-1.0, 1.0)
+        if not self.y.size or known > self.known or low < self.y[0] or high > self.y[-1]:
+            self.known = known
+            margin = WIDER * max(high - low, 1e-9 * max(-low, high), 1e-30)
             bottom, top = self.basis.limits
             self.y = np.linspace(max(low - margin, bottom), min(high + margin, top), GRID)
             self.curve = self.basis.value(self.y)
