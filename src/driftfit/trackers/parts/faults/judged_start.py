@@ -1,10 +1,11 @@
 """The diffuse start of trackers that do not judge outliers by themselves: the first samples are judged together.
 
 A diffuse start fits the first samples exactly, so a fault code among them would determine the estimate. The start
-therefore lasts until there are `RESIDUALS` more samples than directions of theta that they span. If some of them are
-doubtful (`driftfit.trackers.parts.faults.first_samples`), it lasts until the others have `SURE` residuals, or the store
-is full. If the estimate from all samples then contradicts the others, the start is repeated without the doubtful ones.
-It is in square-root form until a covariance is accurate enough.
+therefore lasts until there are `RESIDUALS` more samples than directions of theta that they span, and `FIRST` samples.
+If some of them are doubtful (`driftfit.trackers.parts.faults.first_samples`), it lasts until the others have `SURE`
+residuals, or the store is full. If the estimate from all samples contradicts the others, the start is repeated without
+the doubtful ones, at every sample until that is decided: models may compute later regressors with the estimate. It is
+in square-root form until a covariance is accurate enough.
 
 Samples (`driftfit.trackers.parts.faults.stored_samples`) are stored with the time since the previous stored one, so
 that drift and forgetting are repeated as well.
