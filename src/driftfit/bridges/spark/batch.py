@@ -221,7 +221,7 @@ class Partition:
             )
             for run, of in zip(runs, self.task.suffixes, strict=True):
                 truth = verdict(run)
-                most = min(truth.parameters, key=lambda one: one.p)
+                most = min(truth.parameters, key=lambda one: (not one.moves, np.nan_to_num(one.p_own, nan=1.0)))
                 for name, value in zip(VERDICT, (truth.drifts, truth.p, truth.pays, most.name), strict=True):
                     columns[f"{name}{of}"].append(value)
         return columns
