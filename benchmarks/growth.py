@@ -36,6 +36,9 @@ from driftfit.run.program import lanes_of
 
 TRACKER = Kalman(q=1e-4, r=0.01)
 
+LEAST = 1e4
+"""Nanoseconds that are shown at least: the system may count user time in steps, and find none in a short job."""
+
 Clock = Callable[[], float]
 Case = tuple[str, str, float, list[int], Callable[[int], Callable[[], Any]], Clock]
 """(against, of, slope that the mathematics says, sizes, the job of a size, nanoseconds of which time)."""
@@ -54,7 +57,7 @@ def spent(job: Callable[[], Any], turns: int, clock: Clock) -> float:
         result = job()
         best = min(best, clock() - begun)
         del result
-    return best
+    return max(best, LEAST)
 
 
 def by_samples(T: int) -> Callable[[], Any]:
