@@ -105,7 +105,7 @@ class Diagnosis(Printed):
         return tuple(check.advice for check in self.checks if not check.ok)
 
     @property
-    def nothing(self) -> str:
+    def no_finding(self) -> str:
         """The sentence where no number is out of bounds, which says how many of them are not known."""
         unknown = sum(bool(np.isnan(check.value)) for check in self.checks)
         known = len(self.checks) - unknown
@@ -126,7 +126,7 @@ class Diagnosis(Printed):
             verdict = "not known" if np.isnan(check.value) else "" if check.ok else "out of bounds"
             table.add_row(check.name, check.text, *limits, verdict)
         yield table
-        for sentence in self.sentences or (self.nothing,):
+        for sentence in self.sentences or (self.no_finding,):
             yield Text(f" {sentence}")
 
     def plot(self, ax: Any = None) -> Figure:

@@ -41,7 +41,6 @@ from driftfit.judge.statistics.attribution import Attribution, alike, attribute
 from driftfit.judge.statistics.constancy import Constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
-from driftfit.judge.statistics.robust import EXACT
 from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, digits, facts, table_of
@@ -49,6 +48,8 @@ from driftfit.show.parts.text import Printed, digits, facts, table_of
 LEVEL = 0.05
 """Error rate of the statement that the parameters move, where none is given."""
 RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
+EXACT = 1e-12
+"""Errors of this share of the largest output are those of the arithmetic."""
 CORRELATED = 1e-3
 """If the p-value of whiteness of the residuals of segments is below this, they are reported as correlated."""
 

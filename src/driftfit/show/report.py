@@ -115,7 +115,7 @@ def _subtitle(run: Track, facts: Summary) -> str:
 def _verdict(truth: Verdict, health: Diagnosis) -> str:
     count = len(health.sentences)
     state = (
-        health.nothing
+        health.no_finding
         if health.ok
         else (f"{count} of {len(health.checks)} diagnostics {'is' if count == 1 else 'are'} out of bounds, see below.")
     )

@@ -23,6 +23,7 @@ TERMS = 65536
 """Largest number of terms of the sum."""
 TOGETHER = 32
 NOTHING = 40.0
+"""A probability below e^-40 is 0."""
 SMALL = 1e-3
 """Weights below this share of the largest are replaced by their mean."""
 

@@ -66,8 +66,6 @@ where more than half of the readings of a coarse meter are the same, the median 
 """
 
 
-EXACT = 1e-12
-"""Noise below this share of the root mean square of y is rounding, and a fit without error."""
 FLAT = 1e-10
 """A pivot below this share of its diagonal entry counts as zero."""
 ROUNDING = 1e-13

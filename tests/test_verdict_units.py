@@ -1,0 +1,59 @@
+"""The verdict in any unit, under large offsets, without noise, and on readings of which most are equal."""
+
+import numpy as np
+import pytest
+from scipy import signal
+from test_verdict import record
+
+from driftfit import Kalman, Regression, track
+from driftfit.judge.statistics.constancy import constancy
+
+
+def test_constancy_has_no_unit():
+    phi, y = record(240, 3)
+    p = constancy(phi, y).p_joint
+    for unit in (1e-12, 1e-9, 1e9):
+        assert constancy(phi, y * unit).p_joint == pytest.approx(p, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", [12, 24, 29])
+def test_counts_of_which_nine_of_ten_are_zero_decide_nothing_and_raise_nothing(seed):
+    """The scale of Huber's fit vanishes, and with it the information matrix, which could not be inverted."""
+    rng, later = np.random.default_rng(seed), np.arange(400) >= 200
+    phi = np.column_stack([rng.normal(size=400), np.ones(400)])
+    steady, risen = (rng.poisson(rate, size=400).astype(float) for rate in (0.05, np.where(later, 0.2, 0.05)))
+    for y in (steady, risen):
+        p = constancy(phi, y).p_joint
+        assert np.isnan(p) or 0.0 <= p <= 1.0
+    assert np.isnan(constancy(phi, steady).p_joint)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_the_unit_of_y_changes_no_p_value(unit):
+    """Noise with lags and a gain that wanders, as an instrument reads it in volts, and in nanovolts."""
+    rng = np.random.default_rng(3)
+    u, v = rng.normal(size=(600, 2)), np.append(0.0, signal.lfilter([1.0], [1.0, -0.5], rng.normal(size=599)))
+    y = u @ [1.0, -0.5] + np.cumsum(0.02 * rng.normal(size=600)) * u[:, 0] + v + 2.0
+    phi = np.column_stack([np.ones(600), u])
+    one, other = constancy(phi, y), constancy(phi, unit * y)
+    assert one.lags == other.lags > 1
+    assert [other.p_joint, *other.p_own] == pytest.approx([one.p_joint, *one.p_own], rel=1e-8)
+
+
+@pytest.mark.parametrize("slope", [0.0, 2.0])
+def test_rounding_errors_are_not_compared(slope):
+    """Outputs that constants explain without error, of which some predictors are wrong by 1e-16, others by 2e-16."""
+    x = np.column_stack([np.ones(200), np.random.default_rng(5).normal(size=200)])
+    for y in (x @ [1.0, slope], np.zeros(200)):
+        result = track(Regression(2), Kalman(q=0.0, r=1.0), y, x).verdict()
+        assert result.pays is False
+        assert result.constants.p == 0.5
+        assert "predict the output without error" in str(result)
+
+
+def test_noise_far_below_an_offset_is_noise_unless_it_is_rounding():
+    phi, y = record(300, 12)
+    X = np.column_stack([phi, np.ones(300)])
+    p = constancy(X, y).p_joint
+    assert constancy(X, 1.7e9 + 0.01 * y).p_joint == pytest.approx(p, rel=0.01)
+    assert np.isnan(constancy(X, 1.7e9 + X @ np.arange(4.0)).p_joint)
