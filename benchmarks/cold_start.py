@@ -5,7 +5,8 @@
 Each tracker runs in a process of its own over a record of 200 samples, twice: with an empty cache of compiled code, and
 with what the first run left there. Printed are seconds from the call of `track` to its result by the clock and of
 processor time (on a busy machine the former says little), without the import of the library, which is a column of its
-own. ``--quick`` takes the Kalman filter alone. Selections are over structures of a record of 600 samples, 27 ARX orders
+own; then the processor time of a second model of another size in the same process. ``--quick`` takes the Kalman filter
+alone. Selections are over structures of a record of 600 samples, 27 ARX orders
 and delays and 18 Hammerstein-Wiener orders and bases, and over the same ARX structures on a stream.
 """
 
@@ -18,12 +19,12 @@ import sys
 import tempfile
 
 TRACKERS = {
-    "Kalman": "ARX(2, 2), Kalman(q=1e-4, r=0.1)",
-    "AdaptiveKalman": "ARX(2, 2), AdaptiveKalman()",
-    "HammersteinWiener": "HammersteinWiener(na=2, nb=2), AdaptiveKalman()",
-    "Bank": "ARX(2, 2), Bank()",
+    "Kalman": "ARX(na=ORDER, nb=2), Kalman(q=1e-4, r=0.1)",
+    "AdaptiveKalman": "ARX(na=ORDER, nb=2), AdaptiveKalman()",
+    "HammersteinWiener": "HammersteinWiener(na=ORDER, nb=2), AdaptiveKalman()",
+    "Bank": "ARX(na=ORDER, nb=2), Bank()",
 }
-"""Names, and the model and tracker of each."""
+"""Names, and the model and tracker of each, with an order that is 2 first and then 3."""
 SELECTIONS = {
     "27 ARX, Kalman": "grid(ARX, na=[1, 2, 3], nb=[1, 2, 3], nk=[0, 1, 2]), y, u, tracker=Kalman(q=1e-4, r=0.1)",
     "27 ARX": "grid(ARX, na=[1, 2, 3], nb=[1, 2, 3], nk=[0, 1, 2]), y, u",
@@ -50,32 +51,35 @@ rng = np.random.default_rng(0)
 y, u = rng.standard_normal(LENGTH), rng.standard_normal(LENGTH)
 ready, spent = time.perf_counter(), time.process_time()
 CALL
-print(json.dumps([ready - start, time.perf_counter() - ready, time.process_time() - spent]))
+waited, done = time.perf_counter() - ready, time.process_time()
+OTHER
+print(json.dumps([ready - start, waited, done - spent, time.process_time() - done]))
 """
 
 
-def once(name: str, cache: str) -> tuple[float, float, float]:
-    """Seconds of the import, of the first result, and of the processor for it."""
+def once(name: str, cache: str) -> tuple[float, float, float, float]:
+    """Seconds of the import, of the first result, and of the processor for it and for a model of another size."""
     settings = {**os.environ, "NUMBA_CACHE_DIR": cache}
     calls = {one: f"track({given}, y, u)" for one, given in TRACKERS.items()}
     calls |= {one: f"select({given})" for one, given in SELECTIONS.items()}
     calls |= {one: f"LiveSelection({given}).update(y[0], u[0])" for one, given in STREAMS.items()}
-    call = calls[name]
-    program = PROGRAM.replace("CALL", call).replace("LENGTH", "200" if name in TRACKERS else "600")
+    first, other = (calls[name].replace("ORDER", order) for order in ("2", "3"))
+    program = PROGRAM.replace("CALL", first).replace("OTHER", other if name in TRACKERS else "").replace("LENGTH", "200" if name in TRACKERS else "600")
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", program], env=settings, capture_output=True, text=True, check=True
     )
-    imported, waited, spent = json.loads(done.stdout.splitlines()[-1])
-    return imported, waited, spent
+    imported, waited, spent, other_size = json.loads(done.stdout.splitlines()[-1])
+    return imported, waited, spent, other_size
 
 
 def main(names: list[str]) -> None:
-    print("                     import   first result   processor   wanted   again")
+    print("                     import   first result   processor   wanted   other size   again")
     for name in names:
         with tempfile.TemporaryDirectory() as cache:
-            imported, waited, spent = once(name, cache)
+            imported, waited, spent, other = once(name, cache)
             again = once(name, cache)[1]
-        print(f"{name:18} {imported:7.1f} s {waited:10.1f} s {spent:9.1f} s {WANTED[name]:6.0f} s {again:7.2f} s")
+        size = f"{other:10.1f} s" if name in TRACKERS else " " * 12
+        print(f"{name:18} {imported:7.1f} s {waited:10.1f} s {spent:9.1f} s {WANTED[name]:6.0f} s {size} {again:7.2f} s")
 
 
 if __name__ == "__main__":

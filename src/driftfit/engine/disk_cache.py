@@ -32,7 +32,14 @@ from driftfit.engine.numba_internals import dumps, target
 
 PACKAGE = Path(__file__).parent
 ENDING = ".compiled"
-MAKERS = ("kernel.py", "numba_internals.py", "compile_time/lowering.py", "compile_time/lookups.py", "simd.py")
+MAKERS = (
+    "kernel.py",
+    "numba_internals.py",
+    "compile_time/lowering.py",
+    "compile_time/lookups.py",
+    "compile_time/open_record.py",
+    "simd.py",
+)
 """Files that decide how a function is compiled, in addition to its own code."""
 
 

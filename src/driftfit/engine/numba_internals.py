@@ -51,12 +51,12 @@ from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import intrinsic
-from numba.np.arrayobj import populate_array
 
 from driftfit.engine.compile_time.lookups import known_once, replaced
 from driftfit.engine.compile_time.lowering import Pipeline
+from driftfit.engine.compile_time.open_record import OpenRecord, array_from, opened
 
-__all__ = ["AttributeTemplate", "dumps", "ir"]
+__all__ = ["AttributeTemplate", "OpenRecord", "dumps", "ir", "opened"]
 
 TRIED = {
     "numba": ("0.62.1", "0.63.1", "0.64.0", "0.65.1", "0.66.0", "0.68.1"),
@@ -419,14 +419,8 @@ def call(context: Any, builder: Any, symbol: str, arguments: tuple[Any, ...], gi
 
 def array_at(context: Any, builder: Any, array: Any, address: Any, shape: Any) -> Any:
     """The C array of a type and shape that begins at an address, while code is built."""
-    made = context.make_array(array)(context, builder)
-    kind = context.get_data_type(array.dtype)
-    strides = [context.get_constant(types.intp, context.get_abi_sizeof(kind))]
-    for length in reversed(shape[1:]):
-        strides.insert(0, builder.mul(strides[0], length))
-    data = builder.inttoptr(address, kind.as_pointer())
-    populate_array(made, data=data, shape=list(shape), strides=strides, itemsize=strides[-1], meminfo=None)
-    return made._getvalue()
+    data = builder.inttoptr(address, context.get_data_type(array.dtype).as_pointer())
+    return array_from(context, builder, array, data, shape)
 
 
 def array_of(name: str, axes: int, dtype: Any) -> Any:

@@ -1,8 +1,9 @@
-"""Steps that drivers call instead of inlining them, compiled to object code of their own for each type of record.
+"""Steps that drivers call instead of inlining them, compiled to object code of their own.
 
 A driver inlines the steps of a tracker, and the compiler optimises them again in each driver: for every model, for
 every set of stored results, for records and for streams. For a step that takes a microsecond a call costs nothing, so
-it is compiled once for each type of record that it works on, and drivers refer to it by its symbol.
+it is compiled once for each kind of record that it works on, and drivers refer to it by its symbol. Records of one lane
+are of one kind if they have the same fields, whatever the number of parameters.
 """
 
 from __future__ import annotations
@@ -29,14 +30,19 @@ LINKED: WeakValueDictionary[Any, internals.Linked] = WeakValueDictionary()
 
 
 def outlined(step: Any) -> Any:
-    """A step, which takes the record only, as drivers call it."""
+    """A step, which takes the record only, as drivers call it. For one lane it is compiled once for all sizes of the
+    record (`driftfit.engine.compile_time.open_record`), for several once for each.
+    """
 
     def typed(context: Any, record: Any) -> Any:
-        symbol = disk_cache.name_of(PREFIX.rstrip("-"), step.identity, record)
-        SOURCES[symbol] = step.py_func, record
+        known = record.fields["theta"].type.shape[-1] > 1
+        taken = record if known else internals.OpenRecord(record)
+        symbol = disk_cache.name_of(PREFIX.rstrip("-"), step.identity, taken)
+        SOURCES[symbol] = step.py_func, taken
 
         def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            return internals.call(context, builder, symbol, (record,), given)
+            argument = given if known else [internals.opened(context, builder, record, given[0])]
+            return internals.call(context, builder, symbol, (taken,), argument)
 
         return types.none(record), build
 

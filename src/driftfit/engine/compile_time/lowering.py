@@ -17,9 +17,10 @@ for arrays.
 from __future__ import annotations
 
 import math
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
+from llvmlite.ir import Constant
 from numba import types
 from numba.core import cgutils, ir
 from numba.core.cgutils import alloca_once
@@ -33,7 +34,10 @@ from numba.core.transforms import canonicalize_cfg
 from numba.core.typed_passes import IRLegalization, NativeLowering
 from numba.np.arrayobj import fix_integer_index, load_item, store_item
 
-PLAIN = types.Number, types.Boolean, types.Record, types.NoneType, types.Function, types.Module, types.Dispatcher
+from driftfit.engine.compile_time.open_record import OpenRecord, beginning, lengths, tell_fields_apart
+
+RECORDS = types.Record, OpenRecord
+PLAIN = types.Number, types.Boolean, *RECORDS, types.NoneType, types.Function, types.Module, types.Dispatcher
 """Types whose values own no memory, and whose variables need not be cleared."""
 
 
@@ -167,11 +171,11 @@ class Short(Lower):
         return find and find(expr, kind)
 
     def later_getattr(self, expr: Any, kind: Any) -> Field | Row | None:
-        if isinstance(kind, types.NestedArray) and isinstance(self.typeof(expr.value.name), types.Record):
+        if isinstance(kind, types.Array) and isinstance(self.typeof(expr.value.name), RECORDS):
             return Field(self.loadvar(expr.value.name), self.typeof(expr.value.name), expr.attr)
         field = self._later.get(expr.value.name)
         if expr.attr == "shape" and isinstance(field, Field):
-            return Row(kind, [self._whole(n) for n in _array(field).shape])
+            return Row(kind, self._shape(field))
         return None
 
     def later_build_tuple(self, expr: Any, kind: Any) -> Row | None:
@@ -199,7 +203,7 @@ class Short(Lower):
         start, stop = row.entries
         now, following, left = (alloca_once(self.builder, start.type) for _ in range(3))
         self.builder.store(start, following)
-        self.builder.store(stop if _is_zero(start) else self.builder.sub(stop, start), left)
+        self.builder.store(stop if _is(start, 0) else self.builder.sub(stop, start), left)
         return Loop(kind, stop, now, following, left)
 
     def later_iternext(self, expr: Any, kind: Any) -> Row | None:
@@ -263,9 +267,9 @@ class Short(Lower):
         if place is None:
             return super().lower_getitem(resty, expr, value, index, signature)
         array, pointer = place
-        return self.context.cast(
-            self.builder, load_item(self.context, self.builder, array, pointer), array.dtype, resty
-        )
+        entry = load_item(self.context, self.builder, array, pointer)
+        self._mark(value, self.builder.block.instructions[-1])
+        return self.context.cast(self.builder, entry, array.dtype, resty)
 
     def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
         """Write an entry."""
@@ -274,7 +278,14 @@ class Short(Lower):
             return super().lower_setitem(target_var, index_var, value_var, signature)
         array, pointer = place
         store_item(self.context, self.builder, array, self._cast(value_var.name, array.dtype), pointer)
+        self._mark(target_var, self.builder.block.instructions[-1])
         return self.context.get_dummy_value()
+
+    def _mark(self, value: Any, access: Any) -> None:
+        """Mark an instruction that reads or writes an entry of a field."""
+        field = self._later[value.name]
+        if isinstance(field.kind, OpenRecord):
+            tell_fields_apart(self.builder, field.name, access)
 
     def _place(self, value: Any, index: Any) -> tuple[Any, Any] | None:
         """The type of a field and the address of one of its entries, if a field and an entry are meant."""
@@ -285,7 +296,7 @@ class Short(Lower):
         kinds = list(kind) if isinstance(kind, types.BaseTuple) else [kind]
         if len(kinds) != array.ndim or not all(isinstance(one, types.Integer) for one in kinds):
             return None
-        return array, self._address(field, array, kinds, self._entries(index.name))
+        return array, self._address(field, kinds, self._entries(index.name))
 
     def _entries(self, name: str) -> list[Any]:
         """The values of an index."""
@@ -295,28 +306,50 @@ class Short(Lower):
         value, kind = self.loadvar(name), self.typeof(name)
         return cgutils.unpack_tuple(self.builder, value, len(kind)) if isinstance(kind, types.BaseTuple) else [value]
 
-    def _address(self, field: Field, array: Any, kinds: list[Any], entries: list[Any]) -> Any:
-        """The address of an entry; what is the same for several entries is computed once in a block."""
-        context, builder, key = self.context, self.builder, (field.record, field.name)
+    def _shape(self, field: Field) -> list[Any]:
+        """The lengths of the axes of a field; those of an open record are found once in a block."""
+        if not isinstance(field.kind, OpenRecord):
+            return [self._whole(n) for n in _array(field).shape]
+        key = field.record, field.name, "shape"
         if key not in self._made:
-            context.sentry_record_alignment(field.kind, field.name)
-            data = context.get_data_type(array.dtype)
-            self._made[key] = cgutils.get_record_member(builder, field.record, field.kind.offset(field.name), data)
-        place, step = None, math.prod(array.shape)
-        for kind, given, count in zip(kinds, entries, array.shape, strict=True):
-            step //= count
-            entry = self._from_the_beginning(kind, given, count)
-            entry = entry if step == 1 else builder.mul(entry, self._whole(step))
-            place = entry if place is None else builder.add(place, entry)
-        return builder.gep(self._made[key], [place])
+            self._made[key] = lengths(self.builder, field.record, field.kind, field.name)
+        return list(self._made[key])
 
-    def _from_the_beginning(self, kind: Any, given: Any, count: int) -> Any:
+    def _first(self, field: Field) -> Any:
+        """The address of the first entry of a field, computed once in a block."""
+        context, builder, key = self.context, self.builder, (field.record, field.name)
+        if key not in self._made and isinstance(field.kind, OpenRecord):
+            self._made[key] = beginning(context, builder, field.record, field.kind, field.name)
+        elif key not in self._made:
+            context.sentry_record_alignment(field.kind, field.name)
+            data = context.get_data_type(_array(field).dtype)
+            self._made[key] = cgutils.get_record_member(builder, field.record, field.kind.offset(field.name), data)
+        return self._made[key]
+
+    def _address(self, field: Field, kinds: list[Any], entries: list[Any]) -> Any:
+        """The address of an entry."""
+        first, shape, builder = self._first(field), self._shape(field), self.builder
+        place = None
+        for axis, (kind, given, count) in enumerate(zip(kinds, entries, shape, strict=True)):
+            entry = self._from_the_beginning(kind, given, count)
+            step = self._product(shape[axis + 1 :])
+            entry = entry if _is(step, 1) else builder.mul(entry, step)
+            place = entry if place is None else builder.add(place, entry)
+        return builder.gep(first, [place])
+
+    def _product(self, lengths: list[Any]) -> Any:
+        """The number of entries of some axes: a constant if they are."""
+        if all(isinstance(one, Constant) for one in lengths):
+            return self._whole(math.prod(one.constant for one in lengths))
+        return reduce(self.builder.mul, [one for one in lengths if not _is(one, 1)])
+
+    def _from_the_beginning(self, kind: Any, given: Any, count: Any) -> Any:
         """An index of which a negative one counts from the end."""
-        key = kind, given, count
+        key = kind, given, getattr(count, "constant", count)
         if _is_natural(given):
             return given
         if key not in self._made:
-            self._made[key] = fix_integer_index(self.context, self.builder, kind, given, self._whole(count))
+            self._made[key] = fix_integer_index(self.context, self.builder, kind, given, count)
         return self._made[key]
 
 
@@ -331,8 +364,8 @@ def _is_natural(value: Any) -> bool:
     return isinstance(known, int) and known >= 0 and value.type.width == 64
 
 
-def _is_zero(value: Any) -> bool:
-    return getattr(value, "constant", None) == 0
+def _is(value: Any, number: int) -> bool:
+    return getattr(value, "constant", None) == number
 
 
 def _analyse(self: PostProcessor, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
