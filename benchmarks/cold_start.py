@@ -64,7 +64,11 @@ def once(name: str, cache: str) -> tuple[float, float, float, float]:
     calls |= {one: f"select({given})" for one, given in SELECTIONS.items()}
     calls |= {one: f"LiveSelection({given}).update(y[0], u[0])" for one, given in STREAMS.items()}
     first, other = (calls[name].replace("ORDER", order) for order in ("2", "3"))
-    program = PROGRAM.replace("CALL", first).replace("OTHER", other if name in TRACKERS else "").replace("LENGTH", "200" if name in TRACKERS else "600")
+    program = (
+        PROGRAM.replace("CALL", first)
+        .replace("OTHER", other if name in TRACKERS else "")
+        .replace("LENGTH", "200" if name in TRACKERS else "600")
+    )
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", program], env=settings, capture_output=True, text=True, check=True
     )
@@ -79,7 +83,9 @@ def main(names: list[str]) -> None:
             imported, waited, spent, other = once(name, cache)
             again = once(name, cache)[1]
         size = f"{other:10.1f} s" if name in TRACKERS else " " * 12
-        print(f"{name:18} {imported:7.1f} s {waited:10.1f} s {spent:9.1f} s {WANTED[name]:6.0f} s {size} {again:7.2f} s")
+        print(
+            f"{name:18} {imported:7.1f} s {waited:10.1f} s {spent:9.1f} s {WANTED[name]:6.0f} s {size} {again:7.2f} s"
+        )
 
 
 if __name__ == "__main__":

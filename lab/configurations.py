@@ -290,6 +290,9 @@ def configurations() -> Iterator[tuple[str, Configuration]]:
         yield f"Bank, {name}, two outputs", of_outputs(ARX(1, 1, inputs=2, ny=2), BANKS[name], 8, 2)
     for n in (1, 3, 4, 7):
         yield f"Bank, {n} parameters", of_record(Regression(n), Bank(), 40 + n)
-    told = rng.choice([0.0, 0.01, 0.2], T)
-    yield "Bank, told priors", of_record(ARX(1, 1), SIMPLE["Bank, beam"], 50, prob=np.stack([1.0 - told, told], 1))
+    fault = rng.choice([0.0, 0.01, 0.2], T)
+    yield (
+        "Bank, probabilities per sample",
+        of_record(ARX(1, 1), SIMPLE["Bank, beam"], 50, prob=np.stack([1.0 - missing, missing], 1)),
+    )
     yield "Bank, stream of faults", of_stream(ARX(1, 1), EVERY_PART["a persistent prior, hybrid"], 51)
