@@ -64,11 +64,8 @@ def once(name: str, cache: str) -> tuple[float, float, float, float]:
     calls |= {one: f"select({given})" for one, given in SELECTIONS.items()}
     calls |= {one: f"LiveSelection({given}).update(y[0], u[0])" for one, given in STREAMS.items()}
     first, other = (calls[name].replace("ORDER", order) for order in ("2", "3"))
-    program = (
-        PROGRAM.replace("CALL", first)
-        .replace("OTHER", other if name in TRACKERS else "")
-        .replace("LENGTH", "200" if name in TRACKERS else "600")
-    )
+    length, other = ("200", other) if name in TRACKERS else ("600", "")
+    program = PROGRAM.replace("CALL", first).replace("OTHER", other).replace("LENGTH", length)
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", program], env=settings, capture_output=True, text=True, check=True
     )

@@ -291,8 +291,6 @@ def configurations() -> Iterator[tuple[str, Configuration]]:
     for n in (1, 3, 4, 7):
         yield f"Bank, {n} parameters", of_record(Regression(n), Bank(), 40 + n)
     fault = rng.choice([0.0, 0.01, 0.2], T)
-    yield (
-        "Bank, probabilities per sample",
-        of_record(ARX(1, 1), SIMPLE["Bank, beam"], 50, prob=np.stack([1.0 - missing, missing], 1)),
-    )
+    prob = np.stack([1.0 - fault, fault], 1)
+    yield "Bank, probabilities of each sample", of_record(ARX(1, 1), SIMPLE["Bank, beam"], 50, prob=prob)
     yield "Bank, stream of faults", of_stream(ARX(1, 1), EVERY_PART["a persistent prior, hybrid"], 51)
