@@ -170,44 +170,40 @@ def count(s: State, l: int) -> None:
     s.learned[l] += s.ok[l]
 
 
-@lru_cache
-def auxiliary(na: int) -> tuple[Any, Any]:
-    """The instruments of models whose first na regressors are past outputs, and the step of the auxiliary model."""
+@kernel
+def auxiliary_output(s: State, l: int) -> None:
+    """zeta, and the present output of the auxiliary model, s.x; the first regressors are past outputs."""
+    n, na, settled = s.theta.shape[0], s.output_lags[l], s.learned[l] >= s.settling[l]
+    x = 0.0
+    for i in range(na):
+        x += s.x_lag[i, l] * s.auxiliary[i, l]
+        s.zeta[i, l] = s.x_lag[i, l] if settled else s.phi[i, l]
+    for i in range(na, n):
+        x += s.phi[i, l] * s.auxiliary[i, l]
+        s.zeta[i, l] = s.phi[i, l]
+    s.x[l] = max(-s.largest[l], min(s.largest[l], x))
+    s.learned[l] += s.ok[l]
 
-    @kernel
-    def instruments(s: State, l: int) -> None:
-        """zeta, and the present output of the auxiliary model, s.x."""
-        n, settled = s.theta.shape[0], s.learned[l] >= s.settling[l]
-        x = 0.0
-        for i in range(na):
-            x += s.x_lag[i, l] * s.auxiliary[i, l]
-            s.zeta[i, l] = s.x_lag[i, l] if settled else s.phi[i, l]
-        for i in range(na, n):
-            x += s.phi[i, l] * s.auxiliary[i, l]
-            s.zeta[i, l] = s.phi[i, l]
-        s.x[l] = max(-s.largest[l], min(s.largest[l], x))
-        s.learned[l] += s.ok[l]
 
-    @kernel
-    def follow(s: State, l: int) -> None:
-        """The auxiliary model follows theta, and its output is the first of its lags."""
-        s.largest[l] = max(s.largest[l], abs(s.y[l])) if s.observed[l] > 0.0 else s.largest[l]
-        share = FOLLOWING if s.learned[l] >= s.settling[l] else 1.0
-        for i in range(s.theta.shape[0]):
-            s.auxiliary[i, l] += share * (s.theta[i, l] - s.auxiliary[i, l])
-        for i in range(na - 1, 0, -1):
-            s.x_lag[i, l] = s.x_lag[i - 1, l]
-        if na > 0:
-            s.x_lag[0, l] = s.x[l]
-
-    return instruments, follow
+@kernel
+def follow_auxiliary(s: State, l: int) -> None:
+    """The auxiliary model follows theta, and its output is the first of its lags."""
+    na = s.output_lags[l]
+    s.largest[l] = max(s.largest[l], abs(s.y[l])) if s.observed[l] > 0.0 else s.largest[l]
+    share = FOLLOWING if s.learned[l] >= s.settling[l] else 1.0
+    for i in range(s.theta.shape[0]):
+        s.auxiliary[i, l] += share * (s.theta[i, l] - s.auxiliary[i, l])
+    for i in range(na - 1, 0, -1):
+        s.x_lag[i, l] = s.x_lag[i - 1, l]
+    if na > 0:
+        s.x_lag[0, l] = s.x[l]
 
 
 @lru_cache
-def steps(na: int | None) -> TrackerSteps:
-    """The steps for models whose first na regressors are past outputs; None: for those with their own instruments."""
-    instruments, follow = (count, nothing) if na is None else auxiliary(na)
-    learn = learning(na is None)
+def steps(refined: bool) -> TrackerSteps:
+    """The steps for models whose first regressors are past outputs; refined: for those that give their own."""
+    instruments, follow = (count, nothing) if refined else (auxiliary_output, follow_auxiliary)
+    learn = learning(refined)
 
     @kernel
     def correct(s: State, l: int) -> None:
@@ -230,8 +226,8 @@ def steps(na: int | None) -> TrackerSteps:
         for i in range(s.theta.shape[0]):
             s.auxiliary[i, l], s.x_lag[i, l] = s.start_theta[i, l], 0.0
 
-    later = TrackerSteps(forget, correct, folded, instruments=na is None)
-    return judged(begin, later, restart, along_instruments if na is None else symmetric_product)
+    later = TrackerSteps(forget, correct, folded, instruments=refined)
+    return judged(begin, later, restart, along_instruments if refined else symmetric_product)
 
 
 @dataclass(frozen=True)
@@ -294,6 +290,7 @@ class InstrumentalVariables(Tracker):
             "auxiliary": theta0,
             "x": 0.0,
             "x_lag": np.zeros(n),
+            "output_lags": 0,
             "largest": 0.0,
             "learned": 0.0,
             "settling": LEAST_SQUARES * n,
@@ -311,23 +308,23 @@ class InstrumentalVariables(Tracker):
     @property
     def steps(self) -> TrackerSteps:
         """Those for a model without past outputs."""
-        return steps(0)
+        return steps(False)
 
     def steps_for(self, model: Model) -> TrackerSteps:
         if model.instruments:
-            return steps(None)
+            return steps(True)
         if model.output_lags is None:
             raise ValueError(
                 f"InstrumentalVariables: {type(model).__name__} does not say which of its regressors are past outputs "
                 "(`Model.output_lags`), so they cannot be replaced by instruments; use ARX, OE or BoxJenkins."
             )
-        return steps(model.output_lags)
+        return steps(False)
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         n, first = model.n, settling_of(model)
         if self.p0 is None and model.output_lags and not model.instruments:
             first |= {"discounted": FORGOTTEN * n, "first_memory": LEAST_SQUARES * n}
-        return {**self.state(n), **first}
+        return {**self.state(n), **first, "output_lags": model.output_lags or 0}
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         super().widen(lane, p)
