@@ -118,7 +118,7 @@ def test_the_code_is_short(monkeypatch):
         monkeypatch.undo()
         return max(text.count("\n") for text in written)
 
-    ours = internals.as_part(internals.under_ieee(entries, **internals.STEP), internals.StepDispatcher)
+    ours = internals.as_part(internals.under_ieee(entries, **internals.LINKED), internals.StepDispatcher)
     assert length(ours) < 0.4 * length(numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)(entries))
 
 

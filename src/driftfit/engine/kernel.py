@@ -47,10 +47,12 @@ Step = Callable[[State, int], None]
 """A compiled step, called with the record and a lane."""
 
 
-def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool) -> Any:
-    """Compile under IEEE rules and without the GIL; its identity names it in the cache on disk."""
+def _compiled(function: Callable[..., Any], cache: bool = False, short: bool = False, **options: bool) -> Any:
+    """Compile under IEEE rules and without the GIL; its identity names it in the cache on disk. Whether its code is
+    ``short`` is for the caller to see to.
+    """
     assert isinstance(function, FunctionType)
-    name = hashlib.sha256(f"{identity(function)}{sorted(options)}".encode()).hexdigest()
+    name = hashlib.sha256(f"{identity(function)}{sorted(options)}{'short' * short}".encode()).hexdigest()
     if cache:
         source = function
         defaults, closure = source.__defaults__, source.__closure__
@@ -75,28 +77,32 @@ def _again(dispatcher: Any, again: Callable[..., Any]) -> Any:
     return dispatcher
 
 
-def kernel(function: Callable[..., Any], inline: bool = True) -> Any:
+def kernel(function: Callable[..., Any], inline: bool = True, seldom: bool = False) -> Any:
     """Compile a step, or a function that steps call.
 
     Inlined: with a call inside the lane loop the loop stays scalar (measured: 14 ns instead of 6 a lane-step at n = 4).
-    With ``inline=False`` the compiler may choose; this is for functions that the lane loop is faster without. Division
-    follows IEEE rules instead of raising, the GIL is released, and there is no fast-math.
+    With ``inline=False`` the compiler may choose; this is for functions that the lane loop is faster without. One that
+    is ``seldom`` run is called, and compiled for size. Division follows IEEE rules instead of raising, the GIL is
+    released, and there is no fast-math.
     """
-    made = internals.as_part(_compiled(function, forceinline=inline, **internals.STEP), internals.StepDispatcher)
+    inline = inline and not seldom
+    compiled = _compiled(function, short=seldom, forceinline=inline, **internals.LINKED)
+    made = internals.as_part(compiled, internals.SeldomDispatcher if seldom else internals.StepDispatcher)
     made.for_constants = inline
-    return _again(made, lambda other: kernel(other, inline))
+    return _again(made, lambda other: kernel(other, inline, seldom))
 
 
-def shared(function: Callable[..., Any]) -> Any:
+def shared(function: Callable[..., Any], arrays: bool = False) -> Any:
     """Compile a function of arrays once for all sizes, to be called.
 
     A step is recompiled for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
     or arrays at addresses, is compiled once and found on disk after that. By default Numba inlines
     what an inlined function calls too: a bank became one function of 70,000 instructions, on which LLVM spent seven
-    times as long.
+    times as long. One that makes ``arrays``, for drivers only, says so.
     """
-    compiled = _compiled(function, cache=True, forceinline=False, **internals.STEP)  # it may own arrays
-    return _again(internals.as_part(compiled), shared)
+    options = {**internals.LINKED, "_nrt": arrays}
+    compiled = _compiled(function, cache=True, forceinline=False, **options)
+    return _again(internals.as_part(compiled), lambda other: shared(other, arrays))
 
 
 def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] = ()) -> Any:
@@ -135,6 +141,7 @@ class Machine(types.ExternalFunction):
     """
 
     identity: str
+    short: bool
 
     @property
     def key(self) -> str:
@@ -161,7 +168,8 @@ class Machine(types.ExternalFunction):
             with internals.compiler_lock:  # of two threads that need it one compiles
                 if self.symbol not in _LOADED:
                     with compiling():
-                        _LOADED[self.symbol] = internals.publish(self.dispatcher, self.sig.args, self.symbol)
+                        kinds = self.sig.args
+                        _LOADED[self.symbol] = internals.publish(self.dispatcher, kinds, self.symbol, self.short)
                     internals.forget(KEPT)
 
 
@@ -176,15 +184,18 @@ def _machine(symbol: str) -> Machine:
     return _MACHINES[symbol]
 
 
-def machine(function: Callable[..., Any]) -> Machine:
-    """Make a machine of a function of addresses, whole numbers, and arguments annotated as float."""
+def machine(function: Callable[..., Any], short: bool = False) -> Machine:
+    """Make a machine of a function of addresses, whole numbers, and arguments annotated as float.
+
+    With ``short`` it is compiled for size, with all that it calls: in half the time, and as fast where loops are short.
+    """
     assert isinstance(function, FunctionType)
-    dispatcher = _compiled(function, cache=True, no_cpython_wrapper=True)
+    dispatcher = _compiled(function, cache=True, short=short, no_cpython_wrapper=True)
     symbol = f"driftfit_{function.__name__}_{dispatcher.identity[:32]}"
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
     kinds = [types.float64 if function.__annotations__.get(name) == "float" else types.intp for name in names]
     made = Machine(symbol, types.void(*kinds))
-    made.identity = dispatcher.identity
+    made.identity, made.short = dispatcher.identity, short
     _DISPATCHERS[symbol] = dispatcher
     _MACHINES[symbol] = made
     return made

@@ -86,11 +86,9 @@ def name_for_pickle(compiled: Any, name: str) -> None:
 
 # ---- compile options ------------------------------------------------------------------------------------------------
 
-STEP = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
-"""Options of code that only compiled code calls."""
-
-LINKED = {**STEP, "_nrt": False}
-"""The same without reference counts, which took nine tenths of the time of compiling a bank: no array is made."""
+LINKED = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True, "_nrt": False}
+"""Options of code that only compiled code calls. It makes no arrays, so it needs no reference counts, which took nine
+tenths of the time of compiling a bank."""
 
 
 def under_ieee(function: Callable[..., Any], **options: bool) -> Any:
@@ -183,6 +181,30 @@ class StepFragment(WholeFragment):
             super()._optimize_final_module()
 
 
+def _be_short(module: Any, *more: str) -> None:
+    """Ask LLVM for short code of all functions of a module: loops are neither unrolled nor given vectorised copies."""
+    for one in module.functions:
+        if not one.is_declaration:
+            for attribute in ("optsize", *more):
+                one.add_function_attribute(attribute)
+
+
+class SeldomFragment(StepFragment):
+    """A step that is called, seldom run, and short."""
+
+    def _optimize_functions(self, module: Any) -> None:
+        _be_short(module, "noinline", "cold")
+        super()._optimize_functions(module)
+
+
+class ShortRoutine(JITCodeLibrary):
+    """A routine behind a symbol, with all that it calls, in short code."""
+
+    def _optimize_final_module(self) -> None:
+        _be_short(self._final_module)
+        super()._optimize_final_module()
+
+
 class PartDispatcher(CPUDispatcher):
     """A function that Numba compiles so that others inline it."""
 
@@ -222,6 +244,12 @@ class StepDispatcher(PartDispatcher):
         return self.callable(*arguments)
 
 
+class SeldomDispatcher(StepDispatcher):
+    """A step that is called and seldom run."""
+
+    library = SeldomFragment
+
+
 class WholeDispatcher(PartDispatcher):
     """A function that inlines everything that it calls."""
 
@@ -235,8 +263,8 @@ def as_part(dispatcher: Any, kind: type[PartDispatcher] = PartDispatcher) -> Any
 
 
 @contextmanager
-def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
-    """Within it, what is compiled under this name becomes a fragment; where they are nested, the inner one applies.
+def _library_of(name: str, kind: type[JITCodeLibrary]) -> Iterator[None]:
+    """Within it, what is compiled under this name is of this kind; where they are nested, the inner one applies.
 
     Only for whoever holds `compiler_lock`: Numba's factories are replaced for all threads.
     """
@@ -397,9 +425,10 @@ def _loader() -> Any:
 # ---- symbols --------------------------------------------------------------------------------------------------------
 
 
-def publish(dispatcher: Any, arguments: tuple[Any, ...], symbol: str) -> Any:
+def publish(dispatcher: Any, arguments: tuple[Any, ...], symbol: str, short: bool) -> Any:
     """Compile a function, or find it on disk, and let code call it by a symbol; returns the owner of the code."""
-    with compiler_lock, known_once(), at_level_two():
+    kind = ShortRoutine if short else JITCodeLibrary
+    with compiler_lock, _library_of(dispatcher.py_func.__qualname__, kind), at_level_two():
         dispatcher.compile(arguments)
     made = next(iter(dispatcher.overloads.values()))
     llvm.add_symbol(symbol, made.library.get_pointer_to_function(made.fndesc.llvm_cfunc_wrapper_name))

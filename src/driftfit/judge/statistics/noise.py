@@ -26,7 +26,7 @@ seasonal factor; Marriott and Pope (1954) for the bias of a mean. Cost: O(T n^2)
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -133,7 +133,7 @@ def _segments(Q: Array, y: Array, columns: Array, bounds: Array, order: Array, o
                     near[t] = e
 
 
-@shared
+@partial(shared, arrays=True)
 def lever(columns: Array, first: int, last: int, h: Array) -> None:
     """h_t = x_t' (X' X)^-1 x_t of the rows first .. last of `columns_of`, h (1, N + 8)."""
     n = columns.shape[0] - 1

@@ -13,6 +13,7 @@ Source: Davies (1980), algorithm AS 155, without its error control. Error below 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ SMALL = 1e-3
 """Weights below this share of the largest are replaced by their mean."""
 
 
-@shared
+@partial(shared, arrays=True)
 def _inverted(w: Array, x: float) -> Any:
     """The sum, until its terms have vanished: `TOGETHER` terms side by side, which are vectorised.
 

@@ -10,6 +10,7 @@ Cost: O(N n^2) per iteration, usually ten.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -223,7 +224,7 @@ def ones(weight: Array, N: int) -> None:
         weight[0, t] = 1.0 if t < N else 0.0
 
 
-@shared
+@partial(shared, arrays=True)
 def huber(columns: Array, first: int, last: int, theta: Array, residual: Array) -> float:
     """Fit y on Q in rows first .. last of `columns_of`: fills theta (n,), residual (1, N + 8), returns the scale.
 

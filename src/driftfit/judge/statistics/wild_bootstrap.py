@@ -20,6 +20,7 @@ a change a fifth of that.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,7 +63,7 @@ class Dates(NamedTuple):
     """(m, n, n): A_b A_T^-1."""
 
 
-@shared
+@partial(shared, arrays=True)
 def _played(X: Array, psi: Array, c: Array, dates: Dates, signs: Array, state: Any, S: Array) -> Any:
     """Eight paths at the dates and, last, at the end, S ((m + 1) n, 8); returns the state of the random numbers."""
     (N, n), m, at = X.shape, dates.rows.shape[0], 0

@@ -51,4 +51,4 @@ def _rebuilt(value: Any, found: dict[int, tuple[Any, Any, bool]]) -> Any:
         return value
     names, closure = source.__globals__ | new, tuple(CellType(one) for one in hold) or None
     made = FunctionType(source.__code__, names, source.__name__, source.__defaults__, closure)
-    return machine(made) if isinstance(value, Machine) else inner.again(made)
+    return machine(made, value.short) if isinstance(value, Machine) else inner.again(made)

@@ -8,6 +8,7 @@ next sample that can be used (`driftfit.trackers.bank.machine.gaps.gap`).
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 from driftfit.engine.kernel import Array, machine, shared
@@ -469,7 +470,7 @@ def remember_reading(sample: Array) -> None:
         sample[LOWEST], sample[HIGHEST] = min(sample[LOWEST], y), max(sample[HIGHEST], y)
 
 
-@machine
+@partial(machine, short=True)  # rows of a dozen leaves: copies of loops for long rows made it a tenth slower
 def bank(address: int) -> None:
     """Process one sample, given the table of a bank. A sample refused as a fault code is processed again as missing."""
     t = table_at(address)

@@ -91,7 +91,7 @@ def project(s: State, l: int) -> None:
         s.h[k, l] = max(s.h[k, l], 0.0)
 
 
-@kernel
+@partial(kernel, inline=False)
 def innovate(s: State, l: int) -> None:
     """Innovation of every filter, and prediction and variance of the mixture before the sample."""
     K, J = s.modes[l], s.nu.shape[0]
@@ -113,7 +113,7 @@ def innovate(s: State, l: int) -> None:
     s.s[l] = v
 
 
-@kernel
+@partial(kernel, inline=False)
 def likelihoods(s: State, l: int) -> float:
     """joint[j, k] = c_k nu_j N(e_k; 0, s_kj) exp(nearest / 2) (2 pi)^(1/2); returns nearest."""
     K, J = s.modes[l], s.nu.shape[0]
@@ -152,7 +152,7 @@ def as_predicted(s: State, nearest: float, l: int) -> None:
             s.row[k, l] += s.prior[k, l] * s.nu_prior[j, l] / np.sqrt(v) * exp(-0.5 * far)
 
 
-@kernel
+@partial(kernel, inline=False)
 def predictive_density(s: State, nearest: float, l: int) -> None:
     """The log density of the sample under its prediction: without a leap, with the noise of a reading that does not
     repeat, and with a tail that integrates to 1."""
@@ -177,7 +177,7 @@ def predictive_density(s: State, nearest: float, l: int) -> None:
     s.density[l] = tail + log(1.0 + exp(body - tail)) if body < tail else body + log(1.0 + exp(tail - body))
 
 
-@kernel
+@partial(kernel, inline=False)
 def weigh(s: State, l: int) -> None:
     """Joint probabilities of drift modes and noise levels after the sample, and its density before it."""
     K, J = s.modes[l], s.nu.shape[0]
@@ -251,7 +251,7 @@ def outgrown(s: State, l: int) -> int:
     return -1
 
 
-@kernel
+@partial(kernel, seldom=True)
 def enter_filters(s: State, j: int, l: int) -> None:
     """Row j of M becomes the rest of phi. The other coordinates take the sample as always, unless nothing was known of
     z_j; then z_j = y - sum_{i<j} x_i z_i - v, which is correlated with them also by v.

@@ -12,6 +12,7 @@ the next ordinary one for an outlier or a jump of the parameters; on real record
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -83,7 +84,7 @@ def noise_prior(s: State, l: int) -> None:
     s.nu_prior[J - 1, l] = OUTLIER
 
 
-@kernel
+@partial(kernel, inline=False)
 def learn_noise(s: State, l: int) -> None:
     """r follows the part of the innovations that the ordinary levels do not explain, and moves towards the level in
     use.

@@ -6,12 +6,14 @@ would unroll those of known length into single operations.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from driftfit.engine.kernel import State, kernel
 
 
-@kernel
+@partial(kernel, inline=False)
 def sum_of_row(s: State, l: int) -> float:
     """Sum of the scratch row over the filters: in eight chains, none of which waits for the others."""
     K = s.modes[l]
@@ -30,7 +32,7 @@ def sum_of_row(s: State, l: int) -> float:
     return ((a + b) + (c + d)) + ((e + f) + (g + h))
 
 
-@kernel
+@partial(kernel, inline=False)
 def least_of_row(s: State, l: int) -> float:
     """The smallest entry of the scratch row."""
     K = s.modes[l]

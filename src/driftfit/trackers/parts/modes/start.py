@@ -70,7 +70,7 @@ def take_first(s: State, l: int) -> None:
         learn_scale(s, l)
 
 
-@kernel
+@partial(kernel, seldom=True)
 def take_start(s: State, l: int) -> None:
     """A sample of the start."""
     s.waited[l] += s.dt[l] * s.drift[l]
@@ -100,7 +100,7 @@ def forget(s: State, l: int) -> None:
     s.middle[l], s.spread[l], s.readings[l], s.widening[l] = 0.0, 0.0, 0.0, 1.0
 
 
-@partial(kernel, inline=False)
+@partial(kernel, seldom=True)
 def repeat(s: State, every: bool, l: int) -> float:
     """Repeat least squares, with every sample or without the doubtful ones.
 
@@ -135,7 +135,7 @@ def drop(s: State, l: int) -> None:
     s.remembered[l] = left
 
 
-@partial(kernel, inline=False)
+@partial(kernel, seldom=True)
 def reconsider(s: State, l: int) -> bool:
     """Whether the filters may start: not while samples are doubtful, and the others have not `SURE` residuals."""
     ready, found, rows = True, 0, s.remembered[l]
@@ -197,7 +197,7 @@ def run_again(s: State, l: int) -> None:
         absorb(s, l)
 
 
-@kernel
+@partial(kernel, seldom=True)
 def begin_with_drift(s: State, least: float, l: int) -> None:
     """Estimates, r, which is at least ``least``, and probabilities of the filters, which have m = d and C = I."""
     n, K = s.theta.shape[0], s.modes[l]

@@ -20,6 +20,7 @@ arrive, is ours. Cost per sample: O(n^2).
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -155,7 +156,7 @@ def remember(s: State, at: int, l: int) -> None:
     s.samples[at, SPAN, l] = s.dt[l] * s.drift[l]
 
 
-@kernel
+@partial(kernel, inline=False)
 def learn_weights(s: State, l: int) -> None:
     """Store a sample, and update the weights at the end of a block."""
     n, L = s.d.shape
