@@ -38,19 +38,23 @@ def regressors(kind: str, y: Array, u: Array) -> Array:
 
 
 @part
-def mixed(m: Array, P: Array, mu: Array, stay: float) -> tuple[Array, Array, Array]:
-    """Interaction of K filters: all transitions to other modes have the same probability."""
-    K = len(mu)
-    prior = stay * mu + (1.0 - stay) / (K - 1) * (1.0 - mu)
-    means, covariances = np.zeros_like(m), np.zeros_like(P)
+def mix(m: Array, P: Array, mu: Array, stay: float, means: Array, covariances: Array, prior: Array) -> None:
+    """Interaction of K filters, into the last three: all transitions to other modes have the same probability."""
+    K, n = m.shape
+    move = (1.0 - stay) / (K - 1)
+    means[:], covariances[:] = 0.0, 0.0
     for j in range(K):
-        share = mu * (1.0 - stay) / (K - 1) / prior[j]
-        share[j] = mu[j] * stay / prior[j]
+        prior[j] = stay * mu[j] + move * (1.0 - mu[j])
         for i in range(K):
-            means[j] += share[i] * m[i]
+            share = mu[i] * (stay if i == j else move) / prior[j]
+            for a in range(n):
+                means[j, a] += share * m[i, a]
         for i in range(K):
-            covariances[j] += share[i] * (P[i] + np.outer(m[i] - means[j], m[i] - means[j]))
-    return means, covariances, prior
+            share = mu[i] * (stay if i == j else move) / prior[j]
+            for a in range(n):
+                for b in range(n):
+                    product = (m[i, a] - means[j, a]) * (m[i, b] - means[j, b])
+                    covariances[j, a, b] += share * (P[i, a, b] + product)
 
 
 @Driver
@@ -62,11 +66,12 @@ def bank(phi: Array, y: Array, ratios: Array, fade: float, stay: float) -> Array
     for k in range(K):
         P[k] = 1e4 * np.eye(n)
     mu, score, r, c, seen = np.full(K, 1.0 / K), np.zeros(K), 1.0, np.zeros(n), 0.0
-    out = np.zeros((T, n))
+    means, covariances, out = np.zeros((K, n)), np.zeros((K, n, n)), np.zeros((T, n))
     for t in range(T):
-        prior = mu
+        prior = mu.copy()
         if stay < 1.0:
-            m, P, prior = mixed(m, P, mu, stay)
+            mix(m, P, mu, stay, means, covariances, prior)
+            m[:], P[:] = means, covariances
         usable = np.isfinite(y[t]) and np.isfinite(phi[t]).all()
         if usable:
             seen += 1.0
