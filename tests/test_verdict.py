@@ -7,7 +7,7 @@ import pytest
 from scipy import signal, stats
 from support import THETA, arx_record, damaged
 
-from driftfit import ARX, RLS, Kalman, Regression, track
+from driftfit import ARX, RLS, AdaptiveKalman, Kalman, Regression, track
 from driftfit.judge.constant_fit import constant_errors
 from driftfit.judge.statistics.attribution import attribute, holm
 from driftfit.judge.statistics.constancy import constancy, missing_lags
@@ -510,3 +510,16 @@ def test_readings_of_a_coarse_meter_that_mostly_repeat_still_have_a_noise_level(
         found += constancy(X, np.round(flow - closed) + held).p_joint < 1e-4 if seed < 10 else 0
     assert accused <= 6
     assert found == 10
+
+
+def test_a_record_without_outputs_gives_that_as_the_reason():
+    """Not that regressors never varied, nor that a smaller burn would help, which it does not."""
+    run = track(Regression(1), AdaptiveKalman(), np.full(80, np.nan), np.arange(80.0))
+    assert "every sample has a missing output or regressor" in run.verdict().sentences[0]
+    assert "no sample could be used" in str(run.summary())
+
+
+@pytest.mark.parametrize("y", [7.0, -273.15, 1e-9])
+def test_a_constant_output_leaves_nothing_to_compare_a_change_with(y):
+    result = track(Regression(1), Kalman(q=1e-4, r=1.0), np.full(80, y), np.ones(80)).verdict(burn=0)
+    assert "constant parameters explain every output without error" in result.sentences[0]

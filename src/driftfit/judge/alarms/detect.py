@@ -186,12 +186,13 @@ class Alarms(Printed):
             ("Alarm", f"{self.kind}, one false alarm in {self.every:g} samples"),
             *self._real_rate(),
             ("Limits", f"{', '.join(limits)}{' (by simulation)' if self.rule.simulated else ''}"),
-            ("Samples", f"{judged} judged from sample {self.start} on; {expected:.2g} false alarms expected"),
-            *(
-                [("Not judged", f"{self.unseen} samples: a regressor moves that was constant in the reference")]
-                if self.unseen
-                else []
+            ("Samples", f"{judged} judged from sample {self.start} on; {expected:.2g} false alarms expected")
+            if judged
+            else (
+                "Samples",
+                f"none is judged: the run has {len(self.active)}, and the first {self.start} do not count",
             ),
+            *self._not_judged(),
             ("Alarms", f"{len(self.onsets)}"),
             *([] if np.isnan(self.p) else [("p-value", f"{p_text(self.p)} {chance}")]),
         )
@@ -207,6 +208,11 @@ class Alarms(Printed):
         yield table
         if len(self.onsets) > 20:
             yield Text(f" and {len(self.onsets) - 20} more", "dim")
+
+    def _not_judged(self) -> list[tuple[str, str]]:
+        """The line on the samples that are unlike all of the reference, if there are some."""
+        why = f"{self.unseen} samples: a regressor moves that was constant in the reference"
+        return [("Not judged", why)] if self.unseen else []
 
     def _real_rate(self) -> list[tuple[str, str]]:
         """The line on the real rate, if it may be far above the one that is set."""

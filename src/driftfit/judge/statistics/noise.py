@@ -48,6 +48,10 @@ ROUNDS = 6
 QUIET = 0.01
 """Probability that a record with constant coefficients is divided."""
 WINDOW = 50
+SMALLEST, SMALL = 1e-5, 0.01
+"""The least noise of windows, as a share of the residuals of constants, and of segments, as a share of that of windows:
+sums of squares that are accumulated over a record have no more digits, and breaks would divide rounding errors.
+"""
 
 
 class Noise(NamedTuple):
@@ -185,7 +189,7 @@ def begun(
     _fit_windows(columns_of(Q, y), *spans, residual, level, r)
     g = overlap(Q)
     width = int(spans[1][0] - spans[0][0])
-    c = _level(spans, level, N)
+    c = np.maximum(_level(spans, level, N), SMALLEST * deviation(y))
     search = Search(Q, y, c, spans, g, P, order, _grid(N, cells), least,
                     penalty(N, n, least, quiet))  # fmt: skip
     r = r[r[:, 0] > 0.0]
@@ -263,7 +267,7 @@ class Search(NamedTuple):
         _fit_segments(Q, y, columns_of(X, z), np.concatenate([[0], breaks, [N]]), np.array([len(ar)]), fits)
         residual, near, leverage = fits
         ar = self.correlation(near, breaks)
-        c = self.c * deviation(near / self.c)
+        c = self.c * max(deviation(near / self.c), SMALL)
         held = y - near + np.clip(near, -HELD * c, HELD * c)
         white = self.size(near, ar) * median(self.c / c)
         return Noise(breaks, residual, c, ar, held, near, leverage, white, self.price(ar))
@@ -306,7 +310,7 @@ class Search(NamedTuple):
         w = whitened(np.zeros((len(v), 0)), v / self.c, ar)[1]
         limit = HELD * deviation(w)
         held = np.clip(w, -limit, limit)
-        return float(np.sqrt(held @ held / len(held))) if limit > 0.0 else 1.0
+        return max(float(np.sqrt(held @ held / len(held))), SMALL) if limit > 0.0 else 1.0
 
 
 def whitened(X: Array, y: Array, ar: Array) -> tuple[Array, Array]:
