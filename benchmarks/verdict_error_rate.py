@@ -2,11 +2,12 @@
 
 The level is 5 %. A regression on two inputs and an intercept, and ARX(2, 2); noise that is steady, has outliers (5 %
 are ten times as large), is heavy-tailed (Student's t, 3 degrees of freedom), or changes its variance (four times the
-deviation in the last 30 %); and inputs that become three times as large half-way; or noise that is an autoregression
-with 0.6 or 0.9, beside inputs that are autoregressions with 0.8. "joint" is the share of records whose parameters are
-reported to move; "mean square", "break" and "interval" are the three tests in it, each by itself at 5 %; "at 0.1 %" is
-joint at that level; "named" the share in which at least one parameter is named; "finds 0.5" the share in which a step
-of half a noise deviation in one coefficient, half-way, is found.
+deviation in the last 30 %); rare counts (Poisson, 88 % are 0) and bursts (12 % of the samples, exponential); and inputs
+that become three times as large half-way; or noise that is an autoregression with 0.6 or 0.9, beside inputs that are
+autoregressions with 0.8. "joint" is the share of records whose parameters are reported to move; "mean square", "break"
+and "interval" are the three tests in it, each by itself at 5 %; "at 0.1 %" is joint at that level; "named" the share in
+which at least one parameter is named; "finds 0.5" the share in which a step of half a noise deviation in one
+coefficient, half-way, is found.
 
 Then faults of a mean in 1000 samples of noise 0.5, beside an input: how many of the records they are found in, and the
 largest p of all, by their size.
@@ -26,12 +27,26 @@ from driftfit.judge.statistics.attribution import holm
 from driftfit.judge.statistics.constancy import constancy
 
 LEVEL = 0.05
-NOISES = ("steady", "outliers", "heavy tails", "changing noise", "changing noise and inputs", "AR(0.6)", "AR(0.9)")
+NOISES = (
+    "steady",
+    "outliers",
+    "heavy tails",
+    "changing noise",
+    "changing noise and inputs",
+    "AR(0.6)",
+    "AR(0.9)",
+    "rare counts",
+    "bursts",
+)
 T_FAULT = 1000
 
 
 def noise(kind: str, rng: np.random.Generator, T: int) -> np.ndarray:
     e = rng.standard_t(3, size=T) if kind == "heavy tails" else rng.normal(size=T)
+    if kind == "rare counts":
+        return (rng.poisson(0.128, T) - 0.128) / np.sqrt(0.128)
+    if kind == "bursts":
+        e = 0.01 * e + (rng.random(T) < 0.12) * rng.exponential(2.0, T)
     if kind == "outliers":
         e *= np.where(rng.random(T) < 0.05, 10.0, 1.0)
     if kind.startswith("changing"):
@@ -73,7 +88,7 @@ def rates(records: int, lengths: tuple[int, ...]) -> Table:
         "finds 0.5",
     )
     for head in heads:
-        table.add_column(head, justify="left" if head in ("model", "noise") else "right")
+        table.add_column(head, justify="left" if head in ("model", "noise") else "right", no_wrap=head == "model")
     all_rates = []
     for model in ("regression", "arx"):
         for kind in NOISES:

@@ -192,3 +192,20 @@ def test_the_package_is_the_command(monkeypatch, capsys):
         runpy.run_module("driftfit", run_name="__main__")
     assert ended.value.code == 0
     assert capsys.readouterr().out.startswith("driftfit ")
+
+
+@pytest.mark.parametrize("name", ["flow, cold", "flow (l/min)", "flow 'a'", 'the "old" flow', "flow=2", "a;b", "$x"])
+def test_columns_of_any_name_can_be_given(folder, name):
+    """A name with a comma is quoted as in a CSV file; every other sign stands for itself."""
+    pl.read_csv("a.csv").rename({"valve": name, "flow": "level, left", "t": "t (s)"}).write_csv("named.csv")
+    written = f'"{name}"' if "," in name else name
+    settings = ("--model", "arx:1,1", "--tracker", "kalman", "-p", "q=1e-3", "-p", "r=0.1", "--time", "t (s)")
+    limits = ("--limits", f"{name}=-9:9", "--unit", f"{name}=l/min")
+    text = run("named.csv", "--y", '"level, left"', "--u", written, *settings, *limits)
+    assert f"b1[{name}]" in text
+
+
+def test_a_name_in_quotes_that_do_not_end_is_explained(folder):
+    result = CliRunner().invoke(app, ["track", "a.csv", "--y", "flow", "--u", '"valve, cold'])
+    assert result.exit_code == 2
+    assert "a name with a comma is quoted as in a CSV file" in result.stderr

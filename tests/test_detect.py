@@ -302,7 +302,7 @@ def test_probabilities_show_their_limit():
         ("band", {}, "the normal range of the parameters"),
         ("band", {"reference": {"b9": (0, 1)}}, "no parameter"),
         ("band", {"reference": {"b1": (1, 0)}}, "low <= high"),
-        ("band", {"reference": 60}, "too short"),
+        ("band", {"reference": 60}, "10 remain"),
         ("innovation", {"reference": {"b1": (0, 1)}}, "number of samples"),
         ("innovation", {"window": 2}, "window"),
         ("innovation", {"every": 1.0}, "every"),
@@ -317,7 +317,7 @@ def test_wrong_settings(kind, settings, match):
 def test_a_tracker_without_covariance_has_no_band():
     run = track(ARX(2, 2), AugmentedFLS(mu=10.0), *arx_record(400, 1))
     with pytest.raises(ValueError, match="no covariance"):
-        run.detect("band", reference={"b1": (0.0, 1.0)})
+        run.detect("band", reference={run.names[0]: (0.0, 1.0)})
 
 
 def test_a_calibration_needs_a_model_that_it_can_simulate():
@@ -360,11 +360,36 @@ def test_chance_is_that_of_the_largest_of_many(rate):
         assert share < chance((begins, start, top), limit, one, 300) < most
 
 
-def test_a_run_that_ends_before_its_start_judges_no_sample():
-    run = track(ARX(1, 1), K, *arx_record(3, 1))
-    assert "0 judged from sample 50 on; 0 false" in str(run.detect("innovation", every=1000.0))
-
-
 def test_the_cause_of_an_alarm_whose_limit_is_zero():
     rule = AlarmRule("band", 1000.0, ("a", "b"), (0.0, 0.0))
     assert rule.cause(np.array([0.0, 0.1])) == 1
+
+
+@pytest.mark.parametrize("T", [1, 2, 5, 30])
+def test_a_run_that_is_too_short_says_so(T):
+    """No sentence speaks of samples 50 to 1, of a reference of 0, or of alarms among no sample."""
+    run = track(Regression(1), Kalman(q=0.0, r=1.0), np.ones(T), np.arange(1.0, T + 1.0))
+    for given in ({}, {"reference": 20}, {"kind": "band", "reference": T}):
+        with pytest.raises(ValueError, match=rf"a run of {T} samples is too short for a reference: its first 50"):
+            run.detect(**given)
+    for alarms in (run.detect("innovation"), run.detect("band", reference={run.names[0]: (0.0, 1.0)})):
+        assert f"none is judged: the run has {T}, and the first 50 do not count" in str(alarms)
+
+
+def test_a_reference_within_the_start_of_a_run_says_what_remains():
+    run = track(Regression(1), Kalman(q=0.0, r=1.0), np.ones(300), np.arange(1.0, 301.0))
+    with pytest.raises(ValueError, match=r"samples 0 to 60 of a run of 300, whose first 50 .* 10 remain"):
+        run.detect("innovation", reference=60)
+    with pytest.raises(ValueError, match="ends at sample 400, and the run has 300"):
+        run.detect("innovation", reference=400)
+
+
+@pytest.mark.parametrize("reference", [200, (1.9, 2.1)])
+@pytest.mark.parametrize("r", [1.0, 1e12])
+def test_a_band_has_a_limit_where_the_estimate_hardly_moves(reference, r):
+    """With a limit of 0 its rounding errors were alarms, beside p = 1."""
+    u = np.random.default_rng(0).normal(size=600)
+    run = track(Regression(1), Kalman(q=0.0, r=r), 2.0 * u, u)
+    alarms = run.detect("band", reference=reference if reference == 200 else {run.names[0]: reference})
+    assert alarms.limits == pytest.approx([1.645], abs=0.01)
+    assert len(alarms.onsets) == 0

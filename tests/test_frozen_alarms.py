@@ -214,7 +214,8 @@ def test_the_noise_model_of_a_reference():
     assert frozen.theta == pytest.approx([2.0, 1e-6], abs=0.1)
     assert len(rows.x) == 2000 - 5  # a gap of three and the lag after it, and the first row
     unexcited, _ = frozen_model(np.column_stack([phi[:, 0], phi[:, 0]]), phi[:, 0] + e, ok)
-    assert np.linalg.eigvalsh(unexcited.cov)[-1] > 100.0  # nothing is known of their difference
+    assert unexcited.unseen.shape == (1, 2)  # nothing is known of their difference
+    assert unexcited.unseen[0, 0] == pytest.approx(-unexcited.unseen[0, 1])
 
 
 def test_a_short_reference_leaves_bursts_possible():
@@ -312,3 +313,18 @@ def test_a_column_of_zeros_is_no_constant():
     u = np.random.default_rng(1).normal(size=(400, 2)) * [1.0, 0.0]
     run = track(Regression(2), Kalman(q=0.0, r=0.25), u[:, 0] + np.random.default_rng(2).normal(size=400), u)
     assert run.detect(reference=200).rule.parameters[-1] == "offset"
+
+
+@pytest.mark.parametrize("kind", ["glr", "cusum"])
+@pytest.mark.parametrize("before", [0.0, 3.3])
+@pytest.mark.parametrize("size", [1.0, 1e-9])
+def test_an_input_that_was_dead_in_the_reference_raises_no_alarm_when_it_moves(kind, before, size):
+    """Its coefficient is unknown there, whatever its unit; a fault is found again when it rests."""
+    rng, T = np.random.default_rng(1), 1500
+    u = before * size + np.where((np.arange(T) >= 700) & (np.arange(T) < 1000), size * rng.normal(size=T), 0.0)
+    y = 2.0 + 5.0 * u / size + rng.normal(size=T) + 3.0 * (np.arange(T) >= 1200)
+    run = track(GAIN, HELD, y, u)
+    alarms = run.detect(kind, reference=600, records=8)
+    assert alarms.onsets[0] >= 1200
+    assert alarms.unseen == 300
+    assert "300 samples: a regressor moves that was constant" in str(alarms)

@@ -211,3 +211,26 @@ def test_standard_errors_have_the_units_of_their_regressors():
         np.testing.assert_allclose(other * np.array([unit[0], *unit, *unit]), first, rtol=1e-6)
     plain, far = (piecewise(run, [200]).std for run in (runs[0], runs[2]))
     np.testing.assert_allclose(far * [1e9, 1e-9, 1.0], plain, rtol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("change", [1.0, 1e-3])
+def test_an_exact_record_is_divided_where_it_changes_and_not_by_its_rounding(unit, change):
+    u, t = np.random.default_rng(0).normal(size=300), np.arange(300)
+    found = segment(unit * ((2.0 + change * (t >= 150)) * u + 1.0), u)
+    assert [one.at for one in found.breaks] == [150]
+    assert [one.at for one in segment(unit * (7.0 + change * (t > 100))).breaks] == [101]
+
+
+@pytest.mark.parametrize(("T", "error", "why"), [
+    (300, "0", "constant parameters explain nine of ten outputs without error"),
+    (12, "0", "12 samples can be used, and at least 20 are needed"),
+    (2, "-", "2 samples can be used"),
+])  # fmt: skip
+def test_a_record_that_is_not_divided_has_errors_that_are_numbers_and_says_why(T, error, why):
+    """An exact fit has standard errors of 0; too few samples have none."""
+    u = np.random.default_rng(0).normal(size=T)
+    text = str(segment(2.0 * u + 1.0, u))
+    assert "nan" not in text
+    assert [line.split()[3::2] for line in text.splitlines() if line.split()[1:2] == [str(T)]] == [[error, error]]
+    assert f"not searched for breaks: {why}" in text

@@ -280,7 +280,8 @@ def test_frontier():
         (FLS(), {"h": 0}, "h must be"),
         (FLS(), {"order_by": np.zeros(3)}, "order_by has shape"),
         (FLS(), {"u": np.zeros((200, 2))}, "no usable sample"),
-        (FLS(), {"y": np.full(200, np.nan)}, "no usable sample"),
+        (FLS(), {"y": np.full(200, np.nan)}, "no usable sample, because all of 200 outputs are missing"),
+        (FLS(), {"u": np.full((200, 2), np.nan)}, "no usable sample, because all inputs are missing"),
     ],
 )
 def test_bad_input(tracker, options, message):
@@ -326,5 +327,16 @@ def test_a_profile_stays_within_the_range_of_the_others():
 @pytest.mark.parametrize("T", [2, 60])
 def test_a_record_without_noise_says_so(T):
     u = np.random.default_rng(0).normal(size=(T, 2))
-    with pytest.raises(ValueError, match="there is no noise to tune on"):
+    why = "2 outputs are known, which 2 parameters" if T == 2 else "y is 0 in all of 60 samples. Is it the right column"
+    with pytest.raises(ValueError, match=f"there is no noise to tune on: {why}"):
         tune(Regression(2), Kalman(), np.zeros(T), u)
+
+
+@pytest.mark.parametrize("method", ["ml", "loo"])
+@pytest.mark.parametrize(("gain", "offset"), [(2.0, 1.0), (2e6, 1e6), (1.0 / 3.0, 0.1), (0.0, 7.0)])
+def test_rounding_is_no_noise(method, gain, offset):
+    """Of a record that is exact, only its rounding errors remain: no r is estimated from them, in any unit."""
+    u = np.random.default_rng(0).normal(size=(60, 2))
+    y = offset + gain * u[:, 0]
+    with pytest.raises(ValueError, match="y is 7 in all of 60" if gain == 0.0 else "up to rounding, as if y had been"):
+        tune(Regression(2, intercept=True), Kalman(), y, u, method=method)

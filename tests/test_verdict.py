@@ -7,7 +7,7 @@ import pytest
 from scipy import signal, stats
 from support import THETA, arx_record, damaged
 
-from driftfit import ARX, RLS, Kalman, Regression, track
+from driftfit import ARX, RLS, AdaptiveKalman, Kalman, Regression, track
 from driftfit.judge.constant_fit import constant_errors
 from driftfit.judge.statistics.attribution import attribute, holm
 from driftfit.judge.statistics.constancy import constancy, missing_lags
@@ -88,6 +88,37 @@ def test_error_rate(noise):
                   for seed in range(200)])  # fmt: skip
     assert 0.005 <= np.mean(p < 0.05) < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / 200)
     assert np.mean(p < 0.001) <= 0.01
+
+
+def rare(kind, seed, T=400):
+    """Constant rates of rare events, beside an input, in ways that say the same."""
+    rng = np.random.default_rng(seed)
+    u, counts, sales = rng.normal(size=T), rng.poisson(0.13, T), rng.poisson(4.0, T) * (rng.random(T) < 0.4)
+    y = {
+        "counts": counts,
+        "counts missed, of twenty": 20 - counts,
+        "bursts": 0.01 * rng.normal(size=T) + (rng.random(T) < 0.12) * rng.exponential(3.0, T),
+        "sales in proportion": sales * np.exp(0.5 * u),
+    }[kind]
+    return np.column_stack([u, np.ones(T)]), y.astype(float)
+
+
+@pytest.mark.parametrize("kind", ["counts", "counts missed, of twenty", "bursts", "sales in proportion"])
+def test_error_rate_of_rare_events(kind):
+    """Of 100 constant records at most 11 % are rejected, three standard errors above 5 %."""
+    p = np.array([constancy(*rare(kind, seed)).p_joint for seed in range(100)])
+    assert np.mean(p < 0.05) <= 0.11
+
+
+def test_rare_events_that_become_frequent_for_a_time_are_found():
+    """Also if nearly all of y is rare events: the change of the rate is not taken for correlated noise."""
+    for seed in range(10):
+        phi, y = rare("counts", seed)
+        y[220:330] += np.random.default_rng(seed).poisson(1.2, 110)
+        test = constancy(phi, y)
+        assert test.p_joint < 1e-3
+        assert test.noise is not None
+        assert len(test.noise.breaks) > 0
 
 
 @pytest.mark.parametrize(("m", "n", "N"), [(48, 1, 480), (24, 3, 120)])
@@ -479,3 +510,16 @@ def test_readings_of_a_coarse_meter_that_mostly_repeat_still_have_a_noise_level(
         found += constancy(X, np.round(flow - closed) + held).p_joint < 1e-4 if seed < 10 else 0
     assert accused <= 6
     assert found == 10
+
+
+def test_a_record_without_outputs_gives_that_as_the_reason():
+    """Not that regressors never varied, nor that a smaller burn would help, which it does not."""
+    run = track(Regression(1), AdaptiveKalman(), np.full(80, np.nan), np.arange(80.0))
+    assert "every sample has a missing output or regressor" in run.verdict().sentences[0]
+    assert "no sample could be used" in str(run.summary())
+
+
+@pytest.mark.parametrize("y", [7.0, -273.15, 1e-9])
+def test_a_constant_output_leaves_nothing_to_compare_a_change_with(y):
+    result = track(Regression(1), Kalman(q=1e-4, r=1.0), np.full(80, y), np.ones(80)).verdict(burn=0)
+    assert "constant parameters explain every output without error" in result.sentences[0]

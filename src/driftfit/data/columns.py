@@ -49,12 +49,25 @@ class Columns:
 
 def convert(frame: nw.DataFrame[Any], wanted: Wanted, where: str, base: int) -> Columns:
     """The wanted columns of one table as arrays; ``base`` is the number of its first row."""
+    names = plain_names(frame.columns, wanted.names)
+    if names != frame.columns:
+        frame = frame.rename(dict(zip(frame.columns, names, strict=True)))
     for name in wanted.names:
         if name not in frame.columns:
             raise ValueError(f"{where} has no column {name!r}: {near(name, frame.columns)}")
     time, zone = (None, None) if wanted.time is None else times_of_column(frame[wanted.time], where, base)
     numbers = {name: numbers_of(frame[name], where, base) for name in wanted.numbers}
     return Columns(numbers, time, zone, [_units(frame[name]) for name in wanted.by], len(frame))
+
+
+def plain_names(names: Sequence[str], wanted: Sequence[str]) -> list[str]:
+    """The names of columns; if a wanted one is absent, without blanks around them and doubled quotes of a CSV header.
+
+    Names that would be the same then stay as they are.
+    """
+    plain = [name.strip().replace('""', '"') for name in names]
+    absent = not set(wanted) <= set(names)
+    return [new if absent and plain.count(new) == 1 else old for old, new in zip(names, plain, strict=True)]
 
 
 def _is_text(series: nw.Series[Any]) -> bool:

@@ -21,7 +21,7 @@ import narwhals as nw
 import numpy as np
 import polars as pl
 
-from driftfit.data.columns import Columns, Wanted, convert
+from driftfit.data.columns import Columns, Wanted, convert, plain_names
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
@@ -122,8 +122,10 @@ def _csv(path: str, wanted: Wanted) -> tuple[list[str], pl.DataFrame]:
     separator = declared[1] if declared else max(",;\t", key=header.count)
     options: dict[str, Any] = {"infer_schema": False, "comment_prefix": "#", "separator": separator}
     options |= {"encoding": encoding, "skip_rows": 1 if declared else 0}
-    names = pl.read_csv(path, n_rows=0, **options).columns
-    frame = pl.read_csv(path, columns=[name for name in names if name in wanted.names], **options)
+    raw = pl.read_csv(path, n_rows=0, **options).columns
+    names = plain_names(raw, [name for name in wanted.names if name != FILE])
+    chosen = {old: new for old, new in zip(raw, names, strict=True) if new in wanted.names}
+    frame = pl.read_csv(path, columns=list(chosen), **options).rename(chosen)
     if separator == ";":
         frame = frame.with_columns(_with_points(frame[name]) for name in wanted.numbers if name in frame.columns)
     whole = frame.select(pl.col(name).str.strip_chars() for name in wanted.by if name in frame.columns)

@@ -20,6 +20,7 @@ from driftfit.data.known import Known
 from driftfit.data.labels import dated
 from driftfit.data.record import Labels, Reading, Records, drift_of
 from driftfit.data.signals import noise_of
+from driftfit.data.times.instants import warn_of_summer_time
 from driftfit.engine.kernel import Array
 
 
@@ -44,7 +45,7 @@ def read_records(
     columns, failed = read(data, wanted)
     keys, code = _codes(columns)
     dropped: dict[Hashable, dict[str, int]] = {}
-    order, times = _order(columns.time, code, keys, dropped)
+    order, times = _order(columns.time, columns.zone, code, keys, dropped)
     length = np.bincount(code[order], minlength=len(keys))
     failed |= {keys[k]: "no row has a time" for k in np.flatnonzero(length == 0)}
     there = np.flatnonzero(length)
@@ -108,7 +109,11 @@ def _tuples(by: Sequence[Sequence[Any]]) -> Iterator[Hashable]:
 
 
 def _order(
-    time: Array | None, code: Array, keys: Sequence[Hashable], dropped: dict[Hashable, dict[str, int]]
+    time: Array | None,
+    zone: str | None,
+    code: Array,
+    keys: Sequence[Hashable],
+    dropped: dict[Hashable, dict[str, int]],
 ) -> tuple[Array, Array | None]:
     """(the rows that become samples, unit by unit and sorted by time; their times); the other rows are counted."""
     _count(dropped, [None], np.zeros(int((code < 0).sum()), dtype=np.int64), "without a unit")
@@ -122,6 +127,7 @@ def _order(
     repeated = np.zeros(len(order), dtype=bool)
     repeated[1:] = (np.diff(code[order]) == 0) & (time[order][1:] == time[order][:-1])
     _count(dropped, keys, code[order[repeated]], "at a repeated time")
+    warn_of_summer_time(time[order[repeated]], zone)
     order = order[~repeated]
     return order, time[order]
 

@@ -36,7 +36,7 @@ from driftfit.judge.segments.joint_autoregression import jointly
 from driftfit.judge.statistics.break_dates import dated
 from driftfit.judge.statistics.constancy import shortest as shortest_of
 from driftfit.judge.statistics.noise import HELD, Noise, begun, whitened
-from driftfit.judge.statistics.robust import clipped, inverted, least_squares, noisy, orthonormal, robust_fit
+from driftfit.judge.statistics.robust import ROUNDING, clipped, inverted, least_squares, noisy, orthonormal, robust_fit
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
@@ -100,6 +100,8 @@ class Segmentation(Printed):
     noise: float
     ar: tuple[float, ...]
     run: Track = field(repr=False, compare=False)
+    undivided: str = ""
+    """Why the record was not searched for breaks; empty if it was."""
 
     @property
     def theta(self) -> Array:
@@ -121,11 +123,14 @@ class Segmentation(Printed):
         table = table_of("Segments, from sample", "", "samples", *heads, group=2)
         for part in self.segments:
             pairs = zip(part.theta, part.std, strict=True)
-            numbers = (cell for value, std in pairs for cell in (digits(value, std), f"{std:.4g}"))
+            numbers = (cell for value, std in pairs for cell in (digits(value, std), error_text(std)))
             table.add_row(str(part.start), str(part.stop - part.start), *numbers)
         yield table
         correlated = f"; autoregression of the noise {', '.join(f'{a:.2f}' for a in self.ar)}" if self.ar else ""
-        yield Text(f" noise {self.noise:.4g}{correlated}; penalty of a break {self.penalty:.1f}", "dim")
+        searched = (
+            f"not searched for breaks: {self.undivided}" if self.undivided else f"penalty of a break {self.penalty:.1f}"
+        )
+        yield Text(f" noise {self.noise:.4g}{correlated}; {searched}", "dim")
 
     def _sample(self, time: Any) -> int:
         return int(np.searchsorted(self.run.time, time))
@@ -207,11 +212,14 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
     rows = regressors(run)
     N = len(rows.y)
     size = np.sqrt(np.mean(rows.phi**2, axis=0)) if N else np.zeros(n)
-    if max(2 * least, n + 2) > N or not (size > 0.0).all() or np.linalg.matrix_rank(rows.phi / size, 1e-9) < n:
-        return _undivided(run, rows.phi, rows.y, level)
+    if max(2 * least, n + 2) > N:
+        needed = f"{N} samples can be used, and at least {max(2 * least, n + 2)} are needed"
+        return _undivided(run, rows.phi, rows.y, level, needed)
+    if not (size > 0.0).all() or np.linalg.matrix_rank(rows.phi / size, 1e-9) < n:
+        return _undivided(run, rows.phi, rows.y, level, "the regressors do not distinguish the parameters")
     fit = robust_fit(rows.phi, rows.y)
     if not noisy(fit, rows.phi, rows.y):
-        return _undivided(run, rows.phi, rows.y, level)
+        return _undivided(run, rows.phi, rows.y, level, "constant parameters explain nine of ten outputs without error")
     Q = orthonormal(rows.phi / size)[0]
     search, found, starts = begun(Q, fit.residual, CELLS, least, quiet=false)
     found = jointly(search, found, starts, false)
@@ -246,7 +254,7 @@ def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, 
     X, z = whitened(phi / c[:, None], y / c, found.ar)
     X, z = X[len(found.ar) :], z[len(found.ar) :]
     fit = robust_fit(X, z)
-    if not fit.scale > 1e-10 * np.sqrt(np.mean(z**2)):  # most of it lies on one plane: the rest would not count
+    if not noisy(fit, X, z):  # most of it lies on one plane: the rest would not count
         theta = least_squares(X, z)
         fit = clipped(theta, z - X @ theta, np.inf)
     N = len(X)
@@ -254,10 +262,22 @@ def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, 
     return fit.theta, np.sqrt(np.maximum(variance * np.diag(inverted(X.T @ X)), 0.0))
 
 
-def _undivided(run: Track, phi: Array, y: Array, level: float) -> Segmentation:
-    """A single segment: too few samples, regressors that do not span, or no noise at all."""
-    n = phi.shape[1]
-    theta = least_squares(phi, y) if len(y) else np.full(n, np.nan)
-    spread = float(np.std(y - phi @ theta)) if len(y) else float("nan")
-    one = Segment(0, len(run), theta, np.full(n, np.nan))
-    return Segmentation((), (one,), level, float("nan"), spread, (), run)
+def _undivided(run: Track, phi: Array, y: Array, level: float, why: str) -> Segmentation:
+    """A single segment, with least squares; a parameter that the record does not determine has no standard error."""
+    N, n = phi.shape
+    theta, std, spread = np.full(n, np.nan), np.full(n, np.nan), float("nan")
+    if N:
+        theta = least_squares(phi, y)
+        e = y - phi @ theta
+        e = np.where(np.abs(e) <= ROUNDING * (np.abs(y) + np.abs(phi) @ np.abs(theta)), 0.0, e)
+        spread = float(np.std(e))
+        size = np.sqrt(np.mean(phi**2, axis=0))
+        if n < N and (size > 0.0).all() and np.linalg.matrix_rank(phi / size, 1e-9) == n:
+            std = np.sqrt(e @ e / (N - n) * np.diag(inverted(phi.T @ phi)))
+    one = Segment(0, len(run), theta, std)
+    return Segmentation((), (one,), level, float("nan"), spread, (), run, why)
+
+
+def error_text(std: float) -> str:
+    """A standard error as text; one that is not known is not a number of the table."""
+    return f"{std:.4g}" if np.isfinite(std) else "-"

@@ -41,6 +41,7 @@ from driftfit.judge.statistics.attribution import Attribution, alike, attribute
 from driftfit.judge.statistics.constancy import Constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
+from driftfit.judge.statistics.robust import ROUNDING
 from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, digits, facts, table_of
@@ -48,8 +49,6 @@ from driftfit.show.parts.text import Printed, digits, facts, table_of
 LEVEL = 0.05
 """Error rate of the statement that the parameters move, where none is given."""
 RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
-EXACT = 1e-12
-"""Errors of this share of the largest output are those of the arithmetic."""
 CORRELATED = 1e-3
 """If the p-value of whiteness of the residuals of segments is below this, they are reported as correlated."""
 
@@ -156,8 +155,10 @@ class Verdict(Printed):
             least = least_rows(len(self.parameters))
             short = f"{self.samples} samples can be used, and at least {least} are needed."
             alike = (
-                "its regressors do not distinguish the parameters, or explain nine of ten outputs without error, as "
-                "those of rare counts."
+                "constant parameters explain every output without error, so there is no noise to compare a change with."
+                if self.rivals[1].rms == 0.0
+                else "its regressors do not distinguish the parameters, or explain nine of ten outputs without error, "
+                "as those of rare counts."
             )
             return f"The record cannot show whether parameters move: {short if self.samples < least else alike}"
         if self.drifts:
@@ -194,6 +195,8 @@ class Verdict(Printed):
 
     def _gain(self) -> str:
         steady = self.constants
+        if self.pays is None and not self.samples:
+            return "Predictions cannot be compared either: every sample has a missing output or regressor."
         if self.pays is None:
             return (
                 f"Predictions cannot be compared: {self.scored} samples remain after the first {self.burn}, and "
@@ -248,7 +251,7 @@ class Verdict(Printed):
 
 def rounded(error: Array, y: Array) -> Array:
     """Errors (N,) of predictions of y (N,), 0 where they are those of the arithmetic: these are not compared."""
-    return np.where(np.abs(error) <= EXACT * np.max(np.abs(y), initial=0.0), 0.0, error)
+    return np.where(np.abs(error) <= ROUNDING * np.max(np.abs(y), initial=0.0), 0.0, error)
 
 
 def better_constants(rivals: tuple[Paired, ...]) -> Paired:

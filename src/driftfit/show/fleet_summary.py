@@ -23,7 +23,7 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.compare import persistence
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.result import Track, burn_in, root_mean_square
-from driftfit.show.parts.text import Printed, counts, facts, key_text, table_of
+from driftfit.show.parts.text import Printed, counts, facts, key_text, table_of, together
 
 SHOWN = 20
 
@@ -46,6 +46,8 @@ class Unit:
     last: float
     error: float
     persistence: float
+    std: float = float("nan")
+    """Standard deviation of ``last``, which decides how many digits are printed."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +85,10 @@ class FleetSummary(Printed):
         heads = ("", "parameter", what, "start", "farthest", "last", "rms e", "persist.")
         table = table_of("Series by how much they moved", *heads, names=2)
         for unit in self.units[:SHOWN]:
-            numbers = (unit.start, unit.farthest, unit.last, unit.error, unit.persistence)
+            path = together(unit.start, unit.farthest, unit.last, std=unit.std)
             moved = f"{unit.moved:.1f}" if np.isfinite(unit.moved) else "-"
-            table.add_row(Text(key_text(unit.key)), Text(unit.parameter), moved, *(f"{value:.4g}" for value in numbers))
+            errors = (f"{error:.4g}" for error in (unit.error, unit.persistence))
+            table.add_row(Text(key_text(unit.key)), Text(unit.parameter), moved, *path, *errors)
         yield table
         if len(self.units) > SHOWN:
             yield Text(f" and {len(self.units) - SHOWN} that moved less", "dim")
@@ -147,4 +150,5 @@ def _unit(key: Hashable, run: Track, path: _Path, moved: Array) -> Unit:
     return Unit(
         key, len(run), int(run.ok.sum()), float(moved[i]), run.names[i], float(path.start[i]),
         float(path.farthest[i]), float(run.theta[-1, i]), error, last,
+        float(run.std[-1, i]),
     )  # fmt: skip

@@ -150,8 +150,10 @@ def _system_table(run: Track) -> str:
     heads = ("at", *(f"gain of {escape(str(name))}" for name in names), "largest pole")
     rows = []
     for k, t in enumerate(at):
-        gains = (f"{v:.4g} +- {s:.2g}" for v, s in zip(gain.value[k], gain.std[k], strict=True))
-        rows.append((escape(run.time_text(int(t))), *gains, f"{pole.value[k]:.4g} +- {pole.std[k]:.2g}"))
+        gains = (f"{digits(v, s)} +- {s:.2g}" for v, s in zip(gain.value[k], gain.std[k], strict=True))
+        rows.append(
+            (escape(run.time_text(int(t))), *gains, f"{digits(pole.value[k], pole.std[k])} +- {pole.std[k]:.2g}")
+        )
     return table("The system behind the parameters: steady-state gain; a pole below 1 is stable.", heads, rows)
 
 

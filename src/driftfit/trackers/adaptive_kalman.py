@@ -61,7 +61,14 @@ from driftfit.trackers.parts.coordinates import (
 )
 from driftfit.trackers.parts.covariance import prediction
 from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, spanned_variance
-from driftfit.trackers.parts.excitation import learn_information, learn_scales, learned, no_excitation, window
+from driftfit.trackers.parts.excitation import (
+    learn_information,
+    learn_scales,
+    learned,
+    no_excitation,
+    not_learned,
+    window,
+)
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
 from driftfit.trackers.parts.faults.stored_samples import machine_doubt
 from driftfit.trackers.parts.frozen import held_readings, leave_out_frozen, not_frozen
@@ -340,9 +347,7 @@ class AdaptiveKalman(Tracker):
         lately = ~never & ~learned(lane)
         facts = []
         if never.any():
-            facts.append(
-                ("Not learned", f"{', '.join(names[never])}: never varied separately from the others; std is inf")
-            )
+            facts.append(not_learned(run, names[never]))
         if lately.any():
             facts.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
         return (*facts, *proportion(lane), *held_readings(lane), *resolution(lane), *colour(lane))

@@ -35,6 +35,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import plain, warn
 from driftfit.run.result import Track
+from driftfit.show.parts.text import digits
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.kalman import Kalman
 
@@ -71,7 +72,7 @@ class Pooled:
 
     def __repr__(self) -> str:
         spread = ", ".join(
-            f"{name} {mean:.4g} +- {std:.2g}"
+            f"{name} {digits(mean, std)} +- {std:.2g}"
             for name, mean, std in zip(self.names, self.mean, self.spread, strict=True)
         )
         return f"Pooled prior of {len(self.keys)} units: {spread}"

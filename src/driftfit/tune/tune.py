@@ -41,6 +41,8 @@ from driftfit.tune.tuned import METHODS, Tuned
 
 RESPONSE = 20
 """Samples within which a test and its response are absurd."""
+ROUNDING = 1e-12
+"""Noise below this share of the largest output is that of the arithmetic."""
 
 
 def tune(
@@ -136,11 +138,8 @@ def _tuned(
     search = Search(f, knobs, minimise(f, knobs))
     final = score(task, [knobs.run(search.x)], h)
     sigma2 = float(final.sigma2()[0])
-    if knobs.profiled and method == "ml" and not sigma2 > 0.0:
-        raise ValueError(
-            "tune: there is no noise to tune on: parameters explain every usable sample without error, or the samples "
-            "are no more than the parameters."
-        )
+    if knobs.profiled and tracker.covariance and not sigma2 > (ROUNDING * _largest(task)) ** 2:
+        raise ValueError(_without_noise(task))
     tuned = Tuned(
         tracker=knobs.build(search.x, sigma2),
         method=method,
@@ -153,6 +152,36 @@ def _tuned(
     )
     _warn(tuned)
     return tuned
+
+
+def _outputs(task: Task) -> Array:
+    """Every output that is known, one after the other."""
+    y = np.concatenate([record.y.ravel() for record in task.records])
+    return np.asarray(y[np.isfinite(y)])
+
+
+def _largest(task: Task) -> float:
+    """Size of the largest output."""
+    return float(np.max(np.abs(_outputs(task)), initial=0.0))
+
+
+def _without_noise(task: Task) -> str:
+    """Why a record determines no noise variance, and what to do."""
+    y, n = _outputs(task), task.model.n
+    if len(y) <= n:
+        return (
+            f"tune: there is no noise to tune on: {len(y)} outputs are known, which {n} parameters explain without "
+            "error. Give a longer record."
+        )
+    if np.ptp(y) == 0.0:
+        return (
+            f"tune: there is no noise to tune on: y is {y[0]:.6g} in all of {len(y)} samples. Is it the right column, "
+            "and was the sensor on?"
+        )
+    return (
+        "tune: there is no noise to tune on: parameters explain every usable sample up to rounding, as if y had been "
+        "computed from the inputs. Give the settings instead, such as Kalman(q=1e-4, r=1.0)."
+    )
 
 
 def _without_fault_codes(task: Task) -> Task:

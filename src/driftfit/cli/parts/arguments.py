@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Sequence
 
@@ -9,13 +10,23 @@ import numpy as np
 
 
 def listed(given: Sequence[str] | None) -> list[str]:
-    """Names that were given in several options, or separated by commas."""
-    return [name.strip() for entry in given or [] for name in entry.split(",") if name.strip()]
+    """Names that were given in several options, or separated by commas; one with a comma is quoted, as in a CSV file.
+
+    In a shell that is ``--u '"flow, cold",temperature'``. Blanks, parentheses and other signs need no quotes here.
+    """
+    try:
+        rows = [next(csv.reader([entry], skipinitialspace=True, strict=True), []) for entry in given or []]
+    except csv.Error:
+        raise ValueError(
+            f"{', '.join(given or [])}: a name with a comma is quoted as in a CSV file, in a shell as "
+            "--u '\"flow, cold\",temperature'."
+        ) from None
+    return [name.strip() for row in rows for name in row if name.strip()]
 
 
 def parse_units(given: Sequence[str] | None) -> dict[str, str]:
     """``flow=l/min`` as a name and its unit."""
-    pairs = {entry: entry.partition("=") for entry in given or []}
+    pairs = {entry: entry.rpartition("=") for entry in given or []}
     for entry, (name, _, unit) in pairs.items():
         if not name.strip() or not unit.strip():
             raise ValueError(f"--unit {entry}: give a unit as column=unit, such as --unit flow=l/min.")

@@ -88,7 +88,7 @@ class Rows(NamedTuple):
 
 def limits_from(entry: str, names: Sequence[str]) -> tuple[str, Range]:
     """``flow=0:80`` as a name and its range."""
-    name, _, bounds = entry.partition("=")
+    name, _, bounds = entry.rpartition("=")
     low, colon, high = bounds.partition(":")
     try:
         found = float(low or "-inf"), float(high or "inf")

@@ -12,6 +12,7 @@ import numpy as np
 
 from driftfit.data.times.periods import EXAMPLES, periods
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import warn
 
 
 def instant(time: Any) -> Any:
@@ -78,3 +79,26 @@ def _by_days(axis: Array) -> Array:
     """Dates in units of at most a day, because nothing can be divided by a month."""
     coarse = np.datetime_data(axis.dtype)[0] in ("Y", "M", "W", "generic")
     return axis.astype("datetime64[D]") if coarse else axis
+
+
+def warn_of_summer_time(repeated: Array, zone: str | None) -> None:
+    """Warn if times that occur twice, and are left out, look like the hour that the end of summer time repeats.
+
+    That is a night from Saturday to Sunday in spring or autumn, as clocks are changed in every country with a rule.
+    """
+    if zone is not None or repeated.dtype.kind != "M" or not len(repeated):
+        return
+    hours = np.unique(repeated.astype("datetime64[h]"))
+    days, months = hours.astype("datetime64[D]"), hours.astype("datetime64[M]").astype(int) % 12 + 1
+    sunday = (days.astype(int) + 4) % 7 == 0
+    night = hours[sunday & np.isin((hours - days).astype(int), (1, 2, 3)) & np.isin(months, (3, 4, 9, 10, 11))]
+    if len(night):
+        count = int(np.isin(repeated.astype("datetime64[h]"), night).sum())
+        named = ", ".join(str(hour).replace("T", " ") + ":00" for hour in night[:3])
+        warn(
+            f"time: {count} row{' repeats' if count == 1 else 's repeat'} times of the hour from {named}"
+            f"{', ..' if len(night) > 3 else ''} and {'is' if count == 1 else 'are'} left out. This looks like local "
+            "time, in which the hour at the end of summer time occurs twice, and an hour in spring is missing. Give "
+            "the times in UTC, or with their zone or offset, such as 2024-10-27 02:30+01:00.",
+            UserWarning,
+        )

@@ -51,7 +51,16 @@ from driftfit.judge.alarms.bootstrap import RECORDS
 from driftfit.judge.alarms.calibration import limits_of, null_records
 from driftfit.judge.alarms.onsets import held, onsets
 from driftfit.judge.alarms.reference import burn, in_samples
-from driftfit.judge.alarms.statistics import Reference, chance_of, findings_of, highest, rule_of, statistic_of
+from driftfit.judge.alarms.statistics import (
+    Reference,
+    chance_of,
+    findings_of,
+    highest,
+    rule_of,
+    samples_of,
+    statistic_of,
+    unseen_in,
+)
 from driftfit.judge.plots import plot_alarms
 from driftfit.judge.verdict import p_text
 from driftfit.run.live.change import Change, change_of
@@ -102,6 +111,8 @@ class Alarms(Printed):
         Probability of an extreme like the largest here without a fault; NaN if nothing was judged.
     findings : (T, k)
         For "glr" and "cusum": the numbers that `change` reads; otherwise without columns.
+    unseen : int
+        For "glr" and "cusum": samples that are not judged, because a regressor moves that did not in the reference.
     """
 
     rule: AlarmRule
@@ -112,6 +123,7 @@ class Alarms(Printed):
     p: float
     run: Track = field(repr=False, compare=False)
     findings: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False, compare=False)
+    unseen: int = 0
 
     @property
     def kind(self) -> str:
@@ -166,7 +178,7 @@ class Alarms(Printed):
         return t + int(np.argmin(np.append(self.active[t:], False)))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        judged = max(len(self.active) - self.start, 0)
+        judged = max(len(self.active) - self.start - self.unseen, 0)
         expected = judged / self.every
         chance = "is the probability that a record without a fault is this extreme"
         limits = (f"{name} {self.rule.limit_text(j)}" for j, name in enumerate(self.names))
@@ -174,7 +186,13 @@ class Alarms(Printed):
             ("Alarm", f"{self.kind}, one false alarm in {self.every:g} samples"),
             *self._real_rate(),
             ("Limits", f"{', '.join(limits)}{' (by simulation)' if self.rule.simulated else ''}"),
-            ("Samples", f"{judged} judged from sample {self.start} on; {expected:.2g} false alarms expected"),
+            ("Samples", f"{judged} judged from sample {self.start} on; {expected:.2g} false alarms expected")
+            if judged
+            else (
+                "Samples",
+                f"none is judged: the run has {len(self.active)}, and the first {self.start} do not count",
+            ),
+            *self._not_judged(),
             ("Alarms", f"{len(self.onsets)}"),
             *([] if np.isnan(self.p) else [("p-value", f"{p_text(self.p)} {chance}")]),
         )
@@ -190,6 +208,11 @@ class Alarms(Printed):
         yield table
         if len(self.onsets) > 20:
             yield Text(f" and {len(self.onsets) - 20} more", "dim")
+
+    def _not_judged(self) -> list[tuple[str, str]]:
+        """The line on the samples that are unlike all of the reference, if there are some."""
+        why = f"{self.unseen} samples: a regressor moves that was constant in the reference"
+        return [("Not judged", why)] if self.unseen else []
 
     def _real_rate(self) -> list[tuple[str, str]]:
         """The line on the real rate, if it may be far above the one that is set."""
@@ -298,12 +321,15 @@ def judged(run: Track, rule: AlarmRule, start: int | None = None) -> Alarms:
     check_fits(rule, run.tracker, run.names)
     if start is None:
         start = burn(run) if run.start is None else 0
-    findings = findings_of(run, rule, start) if rule.kind in FROZEN else np.zeros((0, 0))
+    findings, unseen = np.zeros((0, 0)), 0
+    if rule.kind in FROZEN:
+        samples = samples_of(run)
+        findings, unseen = findings_of(run, rule, start, samples), unseen_in(rule, start, samples)
     statistic = findings[:, rule.entries] if rule.kind in FROZEN else statistic_of(run, rule, start)
     count = int(np.isfinite(statistic[start:]).any(axis=1).sum())
     p = chance_of(run, rule)(highest(statistic, start), count) if count else float("nan")
     active = held(rule.exceeded(statistic) & (np.arange(len(run)) >= start), rule.hold)
-    return Alarms(rule, active, onsets(active), statistic, start, p, run, findings)
+    return Alarms(rule, active, onsets(active), statistic, start, p, run, findings, unseen)
 
 
 def _warn_of_following(run: Track) -> None:

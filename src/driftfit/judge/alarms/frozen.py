@@ -54,8 +54,8 @@ those in proportion to their time constant, since short references show long bur
 """
 SHARE = 8
 """The noise is judged by windows of at most this part of the reference."""
-UNSEEN = 1e-6
-"""A direction with less than this share of the largest information has not been excited by the reference."""
+UNSEEN = 1e-12
+"""A direction with at most this share of the largest information was excited by rounding only."""
 
 
 class Rows(NamedTuple):
@@ -83,8 +83,8 @@ def frozen_model(phi: Array, y: Array, ok: Array) -> tuple[Frozen, Rows]:
         root = np.ones(len(y))
         root[used] = np.sqrt(h)
     x, white = w[:, 0] / (numbers[SCALE] * np.sqrt(h)), _whitened(rows[:, :-1], ok, ar)[1]
-    cov = _covariance(white / np.sqrt(h)[:, None], x)
-    return Frozen(theta / unit, unit, np.ascontiguousarray(ar), cov, numbers), Rows(white, x)
+    cov, unseen = _covariance(white / np.sqrt(h)[:, None], x)
+    return Frozen(theta / unit, unit, np.ascontiguousarray(ar), cov, numbers, unseen), Rows(white, x)
 
 
 def noise_model(w: Array, n: int) -> tuple[Array, Array]:
@@ -134,8 +134,10 @@ def averaged(share: Array) -> Array:
     return np.column_stack([alpha, np.where(some, both / np.where(some, alpha, 1.0) - alpha, 0.0)])
 
 
-def _covariance(phi: Array, x: Array) -> Array:
-    """Covariance (n, n) of a Huber fit, in units of the scale; large in directions that were not excited.
+def _covariance(phi: Array, x: Array) -> tuple[Array, Array]:
+    """(covariance (n, n) of a Huber fit in units of the scale, directions (k, n) that were not excited).
+
+    In these it is that of the best known one, so that it has a Cholesky factor: no sample that excites them is judged.
 
     Residuals of a fit are smaller than errors, which Huber (1981, section 7.6) corrects by ``fitted``.
     """
@@ -143,9 +145,10 @@ def _covariance(phi: Array, x: Array) -> Array:
     inside = np.mean(np.abs(x) < OF_FIT)
     fitted = N / max(N - n, 1) * (1.0 + n / N * (1.0 - inside) / inside) ** 2
     values, vectors = np.linalg.eigh(phi.T @ phi)
-    information = np.maximum(values, UNSEEN * values.max())
+    seen = values > UNSEEN * values.max()
     factor = fitted * np.mean(psi * psi) / inside**2
-    return np.ascontiguousarray(factor * (vectors / information) @ vectors.T)
+    cov = factor * (vectors / np.where(seen, values, values.max())) @ vectors.T
+    return np.ascontiguousarray(cov), np.ascontiguousarray(vectors[:, ~seen].T)
 
 
 def _whitened(rows: Array, ok: Array, ar: Array) -> tuple[Array, Array]:

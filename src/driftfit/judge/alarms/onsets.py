@@ -30,6 +30,8 @@ import scipy
 from driftfit.engine.kernel import Array
 
 NODES = 2001
+STILL = 1.645
+"""A normal variable exceeds this with a probability of 5 %."""
 
 
 Rate = Callable[[float], float]
@@ -92,8 +94,11 @@ def mean_limit(W: int, every: float) -> float:
 
 
 def normal_limit(rho: float, every: float) -> float:
-    """c for z of variance 1 whose neighbours have the correlation ``rho``, 0 <= rho < 1."""
-    return _solve(*normal_rate(rho), every)
+    """c for z of variance 1 whose neighbours have the correlation ``rho``, 0 <= rho < 1; at least `STILL`.
+
+    An estimate that hardly moves seldom begins to exceed any limit, but may be beyond it from the first sample on.
+    """
+    return max(_solve(*normal_rate(rho), every), STILL)
 
 
 def chance(rate: tuple[Rate, float, float], highest: float, beyond: float, J: int) -> float:

@@ -36,6 +36,11 @@ def normal_samples(run: Track, reference: Any) -> tuple[int, int]:
 
     ``reference`` is a number of first samples, or (from, to) in samples, without the last.
     """
+    if len(run) < burn(run) + LEAST:
+        raise ValueError(
+            f"detect: a run of {len(run)} samples is too short for a reference: its first {burn(run)} samples are its "
+            f"start, and at least {LEAST} normal ones are needed after them."
+        )
     if isinstance(reference, tuple) and len(reference) == 2:
         first, end = reference
     elif reference is None or isinstance(reference, tuple | list):
@@ -45,13 +50,15 @@ def normal_samples(run: Track, reference: Any) -> tuple[int, int]:
         )
     else:
         first, end = 0, whole("detect", "reference", reference, 1)
-    first = max(first, burn(run))
-    if not first + LEAST <= end <= len(run):
+    used = max(first, burn(run))
+    if not used + LEAST <= end <= len(run):
         raise ValueError(
-            f"detect: the reference is too short: it covers samples {first} to {end} (the run has {len(run)}, of "
-            f"which the first {burn(run)} are its start), but {LEAST} samples are needed."
+            f"detect: the reference covers samples {first} to {end} of a run of {len(run)}, whose first {burn(run)} "
+            f"are its start and do not count: {max(end - used, 0)} remain, and at least {LEAST} are needed."
+            if end <= len(run)
+            else f"detect: the reference ends at sample {end}, and the run has {len(run)}."
         )
-    return first, end
+    return used, end
 
 
 def first_third(run: Track, usable: Array, least: int) -> tuple[int, int]:

@@ -28,7 +28,7 @@ from driftfit.judge.alarms.onsets import (
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
 from driftfit.judge.statistics.robust import noisy, robust_fit
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.live.likelihood_ratio import CUSUM, memory_of, scan
+from driftfit.run.live.likelihood_ratio import CUSUM, SAME, memory_of, scan
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
@@ -190,13 +190,22 @@ def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
     return _carried(statistic)
 
 
-def findings_of(run: Track, rule: AlarmRule, start: int, samples: Samples | None = None) -> Array:
-    """The findings of "glr" and "cusum", (T, k), NaN before ``start``; ``samples`` of the run if they are known."""
-    n, (phi, rest), model = len(rule.parameters), samples or samples_of(run), rule.reference
+def findings_of(run: Track, rule: AlarmRule, start: int, samples: Samples) -> Array:
+    """The findings of "glr" and "cusum", (T, k), NaN before ``start``; ``samples`` are those of the run."""
+    n, (phi, rest), model = len(rule.parameters), samples, rule.reference
     findings = np.full((len(run), CUSUM + n + 1), np.nan)
     rows = np.column_stack([phi, np.ones((len(run), n - phi.shape[1])), rest])
     scan(rows[start:], model, memory_of(n, len(model.ar)), findings[start:])
     return findings
+
+
+def unseen_in(rule: AlarmRule, start: int, samples: Samples) -> int:
+    """Usable samples from ``start`` on that excite what the reference of "glr" or "cusum" did not."""
+    model, (phi, rest) = rule.reference, (one[start:] for one in samples)
+    rows = np.column_stack([phi, np.ones((len(phi), len(rule.parameters) - phi.shape[1]))]) / model.unit
+    terms = rows[:, None] * model.unseen
+    beyond = np.abs(terms.sum(axis=2)) > SAME * np.abs(terms).sum(axis=2)
+    return int(np.sum(beyond.any(axis=1) & (rest[:, 1] > 0.0) & (rest[:, 3] > 0.0)))
 
 
 def _carried(statistic: Array) -> Array:

@@ -32,6 +32,10 @@ To find out which parameter moves, the test uses A_T^-1 S_t, the path of the est
 appears in the scores of all parameters whose regressors are correlated with its own, but in this path only in its own
 row.
 
+Rare events, such as counts that are mostly 0, have no level in a window and no variance in a few rows. Then V_t is V_T
+in proportion to the squares of the regressors, intervals are longer, and there is no bootstrap. The size of events has
+little effect on bounded scores: for counts that are nearly all 0 the test sees how often they occur.
+
 Departures: bounded scores (Huber 1964), so that outliers do not hide a drift; the null from the record (the idea of
 Hansen 2000, with the distribution inverted instead of simulated). Cost: O(T n^2), and an eigenvalue problem of at most
 about 200 rows.
@@ -46,7 +50,7 @@ import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.bandwidth import plugged_in, rule_of_thumb
-from driftfit.judge.statistics.noise import HELD, Noise, noise, whitened
+from driftfit.judge.statistics.noise import HELD, Noise, noise, of_rare_events, whitened
 from driftfit.judge.statistics.quadratic import tail
 from driftfit.judge.statistics.robust import Fit, clipped, fit_in, noisy, orthonormal, robust_fit
 from driftfit.judge.statistics.supremum import TIED, suprema, together
@@ -60,6 +64,10 @@ CELLS = 200
 """Largest number of positions for breaks when the noise is estimated."""
 MOST_LAGS = 3
 """Largest number of lags of all regressors that are added if the regressors are not independent of the noise."""
+SKEWED, TIED_AT_END = 1.0, 0.25
+"""Skewness of the scores, and share of readings equal to the smallest or the largest one, of rare events."""
+FEW = 16.0
+"""Rows in an interval of rare events, in units of their squared skewness: that of the sum is then a quarter."""
 REGULAR = 1e-15
 """The smallest eigenvalue of a correlation matrix that is regular."""
 EDGE = 0.05
@@ -80,7 +88,8 @@ class Constancy(NamedTuple):
     p_joint: float
     """p-value of all tests of all parameters together."""
     p_each: tuple[float, float, float, float]
-    """p-values of all parameters: of the mean square, of one break, of an interval, of one break near an end."""
+    """p-values of all parameters: of the mean square, of one break, of an interval, of one break near an end (NaN for
+    coloured scores, short records and rare events)."""
     at: Array
     """(n,): the sample (of the N) at which each parameter most likely changed."""
     path: Array
@@ -118,11 +127,26 @@ def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
     fit = fit_in((Q, R), y)
     if not noisy(fit, X, y):
         return _nothing(N, n)._replace(fit=fit._replace(theta=fit.theta / size))
-    found = noise(Q, fit.residual, CELLS, shortest(n), lags)
-    return _tested(X, size, fit, found, lags)
+    rare = _rare(fit.psi, y, shortest(n))
+    found = (of_rare_events if rare else noise)(Q, fit.residual, CELLS, rare or shortest(n), lags)
+    return _tested(X, size, fit, found, lags, rare)
 
 
-def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> Constancy:
+def _rare(psi: Array, y: Array, least: int) -> int | None:
+    """Rows in the shortest interval if y (N,) counts rare events or has a bound that it often meets; otherwise None.
+
+    The squares of such scores tell nothing about the variance of a few rows: between two events they are all small.
+    The scores psi (N,) of noise that has a density have a skewness below 0.9.
+    """
+    z = psi - psi.mean()
+    skewness = np.mean(z**3) / max(np.mean(z * z) ** 1.5, 1e-300)
+    if abs(skewness) <= SKEWED and max(np.mean(y == y.min()), np.mean(y == y.max())) <= TIED_AT_END:
+        return None
+    return max(least, min(int(FEW * skewness**2), len(y) // 4))
+
+
+def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None, rare: int | None) -> Constancy:
+    """The tests of y on X; ``rare``: rows in the shortest interval of rare events, None for other noise."""
     N, n = X.shape
     still, added = fit, np.zeros((N, 0))
     if len(found.ar):
@@ -140,19 +164,21 @@ def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> 
     V = _profile(*(2 * (_summed(whole * psi[:, None], rest),)), ends)
     if not full_rank(A[-1]) or not full_rank(V[-1]):
         return _nothing(N, n)
+    if rare is not None:
+        V = _even(V[-1], _profile(whole, whole, ends))
     S, inverse = np.cumsum(whole * still.psi[:, None], axis=0), np.linalg.inv(A[-1])
     null = _null(A, V, inverse)
     own, path = _turned(null, inverse[:n]), S @ inverse[:n].T
     var = np.diag(inverse @ V[-1] @ inverse)[:n]
     S, null, V = S[:, :n], np.ascontiguousarray(null[:, :n, :, :n]), V[:, :n, :n]
-    least, apart = shortest(n), len(found.breaks) > 0
+    least, apart = rare or shortest(n), len(found.breaks) > 0
     mean = np.arange(m)[::-2][::-1]
     L, p = _each(S[ends[mean] - 1], _thinned(null, mean), np.diag(V[-1]))
     _, p_path = _each(path[ends[mean] - 1], _thinned(own, mean), var)
     alone = ((path[ends - 1, i : i + 1], own[:, i : i + 1, :, i : i + 1]) for i in range(n))
     p_own = [together(p_path[i], *suprema(*one, ends, least, apart)) for i, one in enumerate(alone)]
     joint, p_mean = _joint(S[ends[mean] - 1], _thinned(null, mean), V[-1])
-    white = len(found.ar) + rest == 0
+    white = len(found.ar) + rest == 0 and rare is None
     late = wild_supremum(X, still.residual, found.level) if white else np.nan
     p_each = (p_mean, *suprema(S[ends - 1], null, ends, least, apart), late)
     spread = np.sqrt(np.maximum(np.einsum("bibi->bi", own), 0.0))
@@ -206,6 +232,13 @@ def _alternative(found: Noise, still: Fit, added: Array) -> Array:
         v = c * whitened(np.zeros((len(v), 0)), held, found.ar)[1]
     v = v - added @ np.linalg.lstsq(added, v, rcond=None)[0]
     return clipped(still.theta, v / np.maximum(1.0 - found.leverage, 0.05), still.scale).psi
+
+
+def _even(V: Array, B: Array) -> Array:
+    """The variance V (k, k) of all scores, spread over the record as the squares of its regressors B (m, k, k) are."""
+    M = np.linalg.cholesky(V) @ np.linalg.inv(np.linalg.cholesky(B[-1]))
+    spread: Array = M @ B @ M.T
+    return spread
 
 
 def full_rank(M: Array) -> bool:

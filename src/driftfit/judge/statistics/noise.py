@@ -48,6 +48,10 @@ ROUNDS = 6
 QUIET = 0.01
 """Probability that a record with constant coefficients is divided."""
 WINDOW = 50
+SMALLEST, SMALL = 1e-5, 0.01
+"""The least noise of windows, as a share of the residuals of constants, and of segments, as a share of that of windows:
+sums of squares that are accumulated over a record have no more digits, and breaks would divide rounding errors.
+"""
 
 
 class Noise(NamedTuple):
@@ -183,11 +187,11 @@ def begun(
     P = max(order or 0, min(ORDER, N // 20, (spans[1][0] - spans[0][0]) // 6))
     residual, level, r = np.empty(N), np.empty(len(spans[0])), np.zeros((len(spans[0]), P + 1))
     _fit_windows(columns_of(Q, y), *spans, residual, level, r)
-    g = np.linalg.eigvalsh(0.5 * (Q[1:].T @ Q[:-1] + Q[:-1].T @ Q[1:]) / N)
+    g = overlap(Q)
     width = int(spans[1][0] - spans[0][0])
-    c = _level(spans, level, N)
-    search = Search(Q, y, c, spans, g, P, order, np.unique(np.linspace(0, N, min(cells, N) + 1).astype(np.int64))[1:],
-                    least, penalty(N, n, least, quiet))  # fmt: skip
+    c = np.maximum(_level(spans, level, N), SMALLEST * deviation(y))
+    search = Search(Q, y, c, spans, g, P, order, _grid(N, cells), least,
+                    penalty(N, n, least, quiet))  # fmt: skip
     r = r[r[:, 0] > 0.0]
     pacf = np.median(_partial(r, g, width), axis=0) if len(r) else np.zeros(P)
     local = _chosen(pacf, min(N, 8 * width), order)
@@ -196,6 +200,29 @@ def begun(
     if len(whole) or len(local):
         found = min(found, search.settle(whole, residual, y), key=lambda one: one[0])
     return search, found[1], (local, whole)
+
+
+def of_rare_events(Q: Array, y: Array, cells: int, least: int, order: int | None = None) -> Noise:
+    """`noise` of one level, where windows show none, because they hold too few events.
+
+    Sums of rare events are skewed, so a break must gain twice as much as in Gaussian noise.
+    """
+    (N, n), none = Q.shape, np.zeros(0, np.int64)
+    P = max(order or 0, min(ORDER, N // 20))
+    search = Search(Q, y, np.full(N, deviation(y)), _spans(N, n), overlap(Q), P, order, _grid(N, cells), least,
+                    2.0 * penalty(N, n, least, QUIET))  # fmt: skip
+    starts = [search.correlation(y, none), none[:0].astype(float)]
+    return min((search.settle(ar, y, y) for ar in starts), key=lambda one: one[0])[1]
+
+
+def _grid(N: int, cells: int) -> Array:
+    """At most so many positions for breaks, evenly spaced."""
+    return np.unique(np.linspace(0, N, min(cells, N) + 1).astype(np.int64))[1:]
+
+
+def overlap(Q: Array) -> Array:
+    """First autocorrelations (n,) of regressors Q (N, n), Q' Q = N I, in the directions that diagonalise them."""
+    return np.linalg.eigvalsh(0.5 * (Q[1:].T @ Q[:-1] + Q[:-1].T @ Q[1:]) / len(Q))
 
 
 class Search(NamedTuple):
@@ -240,7 +267,7 @@ class Search(NamedTuple):
         _fit_segments(Q, y, columns_of(X, z), np.concatenate([[0], breaks, [N]]), np.array([len(ar)]), fits)
         residual, near, leverage = fits
         ar = self.correlation(near, breaks)
-        c = self.c * deviation(near / self.c)
+        c = self.c * max(deviation(near / self.c), SMALL)
         held = y - near + np.clip(near, -HELD * c, HELD * c)
         white = self.size(near, ar) * median(self.c / c)
         return Noise(breaks, residual, c, ar, held, near, leverage, white, self.price(ar))
@@ -283,7 +310,7 @@ class Search(NamedTuple):
         w = whitened(np.zeros((len(v), 0)), v / self.c, ar)[1]
         limit = HELD * deviation(w)
         held = np.clip(w, -limit, limit)
-        return float(np.sqrt(held @ held / len(held))) if limit > 0.0 else 1.0
+        return max(float(np.sqrt(held @ held / len(held))), SMALL) if limit > 0.0 else 1.0
 
 
 def whitened(X: Array, y: Array, ar: Array) -> tuple[Array, Array]:

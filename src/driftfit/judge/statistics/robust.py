@@ -69,7 +69,7 @@ where more than half of the readings of a coarse meter are the same, the median 
 
 FLAT = 1e-10
 """A pivot below this share of its diagonal entry counts as zero."""
-ROUNDING = 1e-13
+ROUNDING = 1e-12
 """Residuals of this share of the terms of a fit may be rounding."""
 
 

@@ -20,9 +20,11 @@ d_j = g_j' V^-1 U / g_j' V^-1 g_j with U = sum phi x, and of the noise sqrt(mean
 The score CUSUM of parameter j, both signs, is C <- max(0, C + log likelihood ratio of a shift by SHIFT standard
 deviations of the noise). The CUSUM of the noise is the same for its variance. Reported is sqrt(2 C), again a deviate.
 
-A sample that cannot be used is passed over; an autoregression then waits until its lags are complete. Source: Lai
-(1998) for windowed likelihood ratios, Huber (1964) for the score, Bollerslev (1986) for h. Departures: the covariance
-of the reference within the statistic; windows of 8 and 12 blocks, of which the longer ones are compared less often.
+A sample that cannot be used is passed over, and so is one that excites a direction in which the reference says nothing,
+as an input does that was 0 or constant there: what it does to y is unknown, and would be taken for a change. An
+autoregression then waits until its lags are complete. Source: Lai (1998) for windowed likelihood ratios, Huber (1964)
+for the score, Bollerslev (1986) for h. Departures: the covariance of the reference within the statistic; windows of 8
+and 12 blocks, of which the longer ones are compared less often.
 Cost per sample: O(n^3 + p n) on average, some 2 microseconds with four parameters.
 """
 
@@ -43,6 +45,8 @@ SHIFT = 0.5
 """The shift for which the score CUSUM is designed, in standard deviations of the noise per root mean square regressor.
 """
 FLAT = 1e-9
+SAME = 1e-6
+"""A regressor that differs by less than this share from what it was in the whole reference has not changed."""
 WIDE = 30.0
 """x is limited to this for the size of a change."""
 SCALE, CLIP, K, V, KAPPA, ALPHA, BETA, INSIDE, RAW, SPREAD, LONGEST, NORMAL = range(12)
@@ -63,6 +67,8 @@ class Frozen(NamedTuple):
     ar: Array
     cov: Array
     numbers: Array
+    unseen: Array = np.zeros((0, 0))
+    """(k, n): directions of the regressors in which the reference has none, such as that of an input that was 0."""
 
 
 class Memory(NamedTuple):
@@ -290,6 +296,19 @@ def judge(memory: Memory, frozen: Frozen, findings: Array) -> None:
 
 
 @part
+def outside(phi: Array, unseen: Array) -> bool:
+    """Whether a row excites a direction that the reference did not, beyond the rounding of its terms."""
+    for i in range(unseen.shape[0]):
+        total, size = 0.0, 0.0
+        for j in range(unseen.shape[1]):
+            term = unseen[i, j] * phi[j]
+            total, size = total + term, size + abs(term)
+        if abs(total) > SAME * size:
+            return True
+    return False
+
+
+@part
 def enter_row(row: Array, frozen: Frozen, memory: Memory) -> bool:
     """Scores of a row [phi, y, ok, noise, dt] into memory.sample; whether it can be used."""
     n, p = frozen.theta.shape[0], frozen.ar.shape[0]
@@ -320,7 +339,7 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> bool:
         for i in range(n + 1):
             past[lag, i] = past[lag + 1, i]
     counts[SINCE] += 1.0
-    if counts[SINCE] <= p:
+    if counts[SINCE] <= p or outside(phi, frozen.unseen):
         return False
     x, clip = min(WIDE, max(-WIDE, phi[n])), numbers[CLIP]
     g = min(clip, max(-clip, x))

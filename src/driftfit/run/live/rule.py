@@ -62,7 +62,7 @@ class AlarmRule(Settings):
     parameters : (n,)
         Names of the parameters of the frozen model, for "glr" and "cusum"; otherwise empty. The last is OFFSET if the
         run has no constant regressor.
-    frozen : theta, unit, ar, cov, numbers
+    frozen : theta, unit, ar, cov, numbers, unseen
         That model, as `driftfit.run.live.likelihood_ratio.Frozen`.
     growth : (c,)
         Growth of the squares of the limits with log(every).
@@ -92,8 +92,9 @@ class AlarmRule(Settings):
     @property
     def reference(self) -> Frozen:
         """The frozen model of "glr" and "cusum", as arrays."""
-        shapes = Frozen(-1, -1, -1, (len(self.parameters),) * 2, -1)  # type: ignore[arg-type]
-        return Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(self.frozen, shapes, strict=True)))
+        n = len(self.parameters)
+        shapes = (-1, -1, -1, (n, n), -1, (-1, n))
+        return Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(self.frozen, shapes, strict=False)))
 
     @property
     def real_rate(self) -> tuple[float, float]:

@@ -81,6 +81,20 @@ def digits(value: float, std: float, least: int = 4) -> str:
     return f"{value:.{min(max(places, least), 15)}g}"
 
 
+def together(*values: float, std: float = float("nan"), least: int = 4) -> tuple[str, ...]:
+    """Numbers that are compared with each other, so that a difference is seen where there is one.
+
+    Each is known to ``std``, or to the smallest difference of two of them if that is less, and a number below a million
+    has all digits before its point.
+    """
+    known = np.unique([value for value in values if np.isfinite(value)])
+    gaps = np.diff(known)
+    gap = float(np.min(gaps[gaps > 1e-7 * np.abs(known).max(initial=0.0)], initial=np.inf))
+    finest = min(std, gap) if std > 0.0 else gap
+    whole = (len(f"{abs(value):.0f}") if abs(value) < 1e6 else 0 for value in values)
+    return tuple(digits(value, finest, max(least, n)) for value, n in zip(values, whole, strict=True))
+
+
 def facts(*pairs: tuple[str, str]) -> Table:
     """Names and values side by side, as plain text, since b1[flow] is not markup."""
     table = Table.grid(padding=(0, 2), pad_edge=True)

@@ -73,7 +73,7 @@ from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.bank.variants import steps_of
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing
-from driftfit.trackers.parts.excitation import window
+from driftfit.trackers.parts.excitation import not_learned, window
 from driftfit.trackers.parts.information import triangular_root
 from driftfit.trackers.parts.resolution import resolution, unresolved
 
@@ -416,8 +416,7 @@ class Bank(Tracker):
             )
         lane = run.state
         if (never := np.isinf(lane["var"])).any():
-            names = ", ".join(np.array(run.names)[never])
-            facts.append(("Not learned", f"{names}: never varied separately from the others; std is inf"))
+            facts.append(not_learned(run, np.array(run.names)[never]))
         return (*facts, *(resolution(lane) if self.all_sensors[0].r is None else ()))
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
