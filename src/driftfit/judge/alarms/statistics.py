@@ -26,6 +26,7 @@ from driftfit.judge.alarms.onsets import (
     power_rate,
 )
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
+from driftfit.judge.regressors import refuse_hidden
 from driftfit.judge.statistics.robust import noisy, robust_fit
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.live.likelihood_ratio import CUSUM, memory_of, scan
@@ -76,6 +77,7 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
         raise ValueError(
             f'detect: the reference of "{rule.kind}" must be a number of samples, such as reference=500, or (from, to).'
         )
+    refuse_hidden(f'detect "{rule.kind}"', run.model, 'kind="innovation" or "band"')
     samples = samples_of(run)
     n, usable = samples[0].shape[1], (samples[1][:, 1] > 0.0) & (samples[1][:, 3] > 0.0)
     if run.theta.shape[1] != n:
