@@ -211,3 +211,17 @@ def test_standard_errors_have_the_units_of_their_regressors():
         np.testing.assert_allclose(other * np.array([unit[0], *unit, *unit]), first, rtol=1e-6)
     plain, far = (piecewise(run, [200]).std for run in (runs[0], runs[2]))
     np.testing.assert_allclose(far * [1e9, 1e-9, 1.0], plain, rtol=1e-6)
+
+
+@pytest.mark.parametrize("offset", [1e6, 1e8])
+def test_an_offset_of_an_input_costs_no_digits(offset):
+    """Moments of [1 + e, 1] have half of the digits of its rows: errors of 1e-11 for 1e-2, and no drift found."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=400)
+    y = 3.0 * x + 0.3 * x * (np.arange(400) >= 250) + 0.1 * rng.normal(size=400)
+    plain, far = (track(Regression(1, intercept=True), RLS(1.0), y, x + shift) for shift in (0.0, offset))
+    for one, other in zip(plain.segment().segments, far.segment().segments, strict=True):
+        assert (one.start, one.std[0]) == (other.start, pytest.approx(other.std[0], rel=1e-3))
+    assert piecewise(far, [250]).std[:, 0] == pytest.approx(piecewise(plain, [250]).std[:, 0], rel=1e-3)
+    assert far.verdict().p == pytest.approx(plain.verdict().p, rel=1e-3)
+    assert far.verdict().p < 1e-6

@@ -252,7 +252,7 @@ def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, 
         fit = clipped(theta, z - X @ theta, np.inf)
     N = len(X)
     variance = float(fit.psi @ fit.psi) / max(N - n, 1) / max(float(np.mean(fit.inside)), 0.1) ** 2
-    return fit.theta, np.sqrt(np.maximum(variance * np.diag(inverted(X.T @ X)), 0.0))
+    return fit.theta, np.sqrt(np.maximum(variance * np.diag(inverted(X)), 0.0))
 
 
 def _undivided(run: Track, phi: Array, y: Array, level: float) -> Segmentation:
