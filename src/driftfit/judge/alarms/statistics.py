@@ -121,8 +121,10 @@ def _band(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule,
         names, (low, high), known, start = tuple(reference), _edges(reference), slice(burn(run), None), burn(run)
     else:
         first, start = normal_samples(run, reference)
-        names, known = run.names, slice(first, start)
-        low, high = run.theta[known].min(axis=0), run.theta[known].max(axis=0)
+        # hidden states move with the inputs, and say nothing of a fault
+        names, known = tuple(one for one in run.names if one not in (run.model.hidden or ())), slice(first, start)
+        watched = run.theta[known][:, [run.names.index(one) for one in names]]
+        low, high = watched.min(axis=0), watched.max(axis=0)
     rule = replace(rule, names=names, low=tuple(low.tolist()), high=tuple(high.tolist()))
     check_fits(rule, run.tracker, run.names)
     alike = _alike(run, rule, known)
