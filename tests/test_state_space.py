@@ -206,4 +206,4 @@ def test_a_forecast_has_the_variance_of_the_kalman_filter_and_samples_are_no_reg
     for verb in (run.segment, run.detect):
         with pytest.raises(ValueError, match="moves hidden states"):
             verb()
-    assert run.detect("band", reference=60).rule.names == ("b", "c")
+    assert run.detect("band", reference=75).rule.names == ("b", "c")
