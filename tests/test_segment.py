@@ -234,3 +234,17 @@ def test_a_record_that_is_not_divided_has_errors_that_are_numbers_and_says_why(T
     assert "nan" not in text
     assert [line.split()[3::2] for line in text.splitlines() if line.split()[1:2] == [str(T)]] == [[error, error]]
     assert f"not searched for breaks: {why}" in text
+
+
+@pytest.mark.parametrize("offset", [1e6, 1e8])
+def test_an_offset_of_an_input_costs_no_digits(offset):
+    """Moments of [1 + e, 1] have half of the digits of its rows: errors of 1e-11 for 1e-2, and no drift found."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=400)
+    y = 3.0 * x + 0.3 * x * (np.arange(400) >= 250) + 0.1 * rng.normal(size=400)
+    plain, far = (track(Regression(1, intercept=True), RLS(1.0), y, x + shift) for shift in (0.0, offset))
+    for one, other in zip(plain.segment().segments, far.segment().segments, strict=True):
+        assert (one.start, one.std[0]) == (other.start, pytest.approx(other.std[0], rel=1e-3))
+    assert piecewise(far, [250]).std[:, 0] == pytest.approx(piecewise(plain, [250]).std[:, 0], rel=1e-3)
+    assert far.verdict().p == pytest.approx(plain.verdict().p, rel=1e-3)
+    assert far.verdict().p < 1e-6

@@ -153,6 +153,9 @@ def test_payloads():
     assert decode("a", b'{"t": [1, 2], "y": [2.5, null], "site": "x"}').length == 2
     assert decode("a", b'[{"y": 1}, {"u": 2}]').columns == {"y": [1, None], "u": [None, 2]}
     assert np.isnan(decode("a", b'{"y": NaN}').columns["y"])
+    (one, other), refused = decoded("", b'{"a": {"y": [NaN, 1.5]}, "b": {"y": 2}}')
+    assert (other.columns, refused) == ({"y": 2}, [])
+    assert np.isnan(one.columns["y"][0])
     assert [number(one) for one in (1, 1.5, "2.5", True)] == [1.0, 1.5, 2.5, 1.0]
     assert all(np.isnan(number(one)) for one in (None, "x", [1], 10**400))
     assert seconds("2026-01-31T12:00:00Z", 1.0) == seconds("2026-01-31T13:00:00+01:00", 1.0) == 1769860800.0

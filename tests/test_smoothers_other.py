@@ -116,6 +116,15 @@ class TestTotalVariation:
             np.testing.assert_allclose(found.refit[a:b], found.refit[[a] * (b - a)], atol=1e-12)
         assert rms(found.theta - theta) < 0.1
 
+    def test_a_level_far_from_zero_hides_no_jump(self):
+        phi, y, _ = switching(3)
+        phi[:, 0] = 1.0
+        y = y + np.where(np.arange(120) < 60, 0.0, 2.0)
+        plain, far = (total_variation(track(Regression(2), FLS(30.0), y + c, phi), 8.0) for c in (0.0, 1e5))
+        assert plain.jumps.size > 0
+        assert far.jumps.tolist() == plain.jumps.tolist()
+        np.testing.assert_allclose(far.theta, plain.theta + np.array([1e5, 0.0]), atol=1e-3)
+
     def test_settings(self):
         phi, y = record()
         with pytest.raises(ValueError, match="penalty must be finite and above 0"):

@@ -179,3 +179,31 @@ def test_what_does_not_fit_is_refused():
     tracker = JointKalman(q=Q, r=R, p0=P0)
     assert JointKalman.from_settings(json.loads(json.dumps(tracker.settings()))) == tracker == eval(repr(tracker))
     assert eval(repr(MODEL)) == MODEL
+
+
+def test_a_forecast_has_the_variance_of_the_kalman_filter_and_samples_are_no_regression(tmp_path):
+    rng = np.random.default_rng(2)
+    u, y = rng.normal(size=80), rng.normal(size=80)
+    run = track(StateSpace(LINEAR), JointKalman(q=1e-3, r=0.5, p0=[1.0, 2.0, 3.0], method="extended"), y, u)
+    z, P, F, g = run.theta[-1], run.cov(-1), np.eye(3), np.array([0.0, 1.0, 1.0])
+    ahead = run.forecast(4, u[:4])
+    for k in range(4):
+        F[2] = [u[k], 0.0, 0.9]
+        z, P = F @ z, F @ P @ F.T + 1e-3 * np.eye(3)
+        assert ahead.y_hat[k] == pytest.approx(g @ z, rel=1e-9)
+        assert ahead.y_std[k] == pytest.approx(np.sqrt(g @ P @ g + 0.5), rel=1e-9)
+    compared = run.summary().comparison
+    assert np.isnan(compared.constant_ls)
+    assert compared.samples == 30
+    assert "all three" in str(run.summary())
+    health, truth = run.diagnose(), run.verdict()
+    assert np.isnan([health["excitation"].value, health["constancy (p)"].value]).all()
+    assert (truth.drifts, truth.pays, truth.samples, truth.scored) == (None, None, 0, 30)
+    assert np.isnan(truth.rivals[1].p)
+    assert "hidden states" in truth.sentences[0]
+    assert "constant ARX (p = " in truth.sentences[0]
+    run.report(tmp_path / "page.html")
+    for verb in (run.segment, run.detect):
+        with pytest.raises(ValueError, match="moves hidden states"):
+            verb()
+    assert run.detect("band", reference=75).rule.names == ("b", "c")

@@ -5,7 +5,8 @@
 *with lags*     the same with the last two outputs and regressors added: constants with correlated noise
 *constant ARX*  the same on ARX(2, 1 per input) with intercept
 
-All are one-step predictions. They are scored on the samples after max(50, 5 n) that all of them could predict.
+All are one-step predictions. A model with hidden states has no regressors, and is compared with the others only. They
+are scored on the samples after max(50, 5 n) that all of them could predict.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ def errors(run: Track, burn: int | None = None, steady: Array | None = None) -> 
     rows = len(run.program.whole.outputs)
     own = (tracked, y - persistence(y, rows), constant, lagged, arx["e"][:, 0])
     scored = np.arange(len(y)) >= (burn_in(run.model.n) if burn is None else burn)
-    for error in own:
+    for error in own if run.model.hidden is None else (own[0], own[1], own[4]):
         scored &= np.isfinite(error)
     return Errors(*own, scored)
 

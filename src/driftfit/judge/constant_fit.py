@@ -96,11 +96,15 @@ def _start(model: Model) -> Array:
 def constant_least_squares(model: Model, record: Record) -> Array:
     """Fit constants over a record; return (T,) records of phi, y, dt, valid, e, ok and more.
 
-    Missing lags are replaced by the predictions of these constants.
+    Missing lags are replaced by the predictions of these constants. The samples of a model with hidden states are not
+    those of a regression: none of them is usable.
     """
     tile = repeat_tile(_start(model), 1)
     out = np.empty(len(record), output_type(tile, COLLECTED))
     drivers(model.steps, STEPS).run(tile, *lanes_of(replace(record, known=record.known.common)), out)
+    if model.hidden is not None:
+        for name, value in (("ok", 0.0), ("valid", 0.0), ("y_hat", np.nan), ("e", np.nan)):
+            out[name] = value
     return out
 
 

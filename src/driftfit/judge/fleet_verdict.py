@@ -135,7 +135,11 @@ class ManyVerdicts(Printed):
         which = f"The most frequent: {', '.join(f'{name} ({count})' for name, count in names)}." if names else ""
         gain = f"Tracking pays in {pays} of {paying}." if paying else ""
         rest = len(self.rows) - tested
-        short = f"{rest} cannot be tested: they have too few samples, or regressors that do not span." if rest else ""
+        short = (
+            f"{rest} cannot be tested: they have too few samples, hidden states, or regressors that do not span."
+            if rest
+            else ""
+        )
         return tuple(filter(None, (found, which, gain, short)))
 
     @property

@@ -114,6 +114,8 @@ def _excitation(axis: Axes, diagnosis: Health) -> None:
             axis.plot(time, values[:, i], color=RED if i == 0 else BLUE, lw=1.3 if last else 0.6)
         axis.plot(time, values[:, -1] / 1e4, color=GREY, lw=0.9, ls="--")
         axis.set_yscale("log")
+    else:
+        _unknown(axis)
     _titled(axis, "excitation: eigenvalues of windows, and the limit", diagnosis.fine("excitation"))
 
 
@@ -127,7 +129,14 @@ def _paths(axis: Axes, diagnosis: Health) -> None:
         axis.axhspan(-3.0, 3.0, color=GREY, alpha=0.2, lw=0)
         if path.shape[1] <= 8:
             axis.legend(fontsize=7, ncols=2, frameon=False)
+    else:
+        _unknown(axis)
     _titled(axis, "constancy: paths of the estimates, standardised", diagnosis.fine("constancy (p)"))
+
+
+def _unknown(axis: Axes) -> None:
+    """Say that a panel is empty because there is nothing to show."""
+    axis.text(0.5, 0.5, "not known", transform=axis.transAxes, ha="center", va="center", color=GREY)
 
 
 def plot_alarms(

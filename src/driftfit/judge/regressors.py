@@ -8,6 +8,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_least_squares
+from driftfit.models.base import Model
 from driftfit.run.result import Track
 
 
@@ -20,6 +21,15 @@ class Rows(NamedTuple):
     """(N, n)"""
     y: Array
     """(N,)"""
+
+
+def refuse_hidden(verb: str, model: Model, instead: str) -> None:
+    """ValueError for a model with hidden states, whose samples are not those of a regression."""
+    if model.hidden is not None:
+        raise ValueError(
+            f"{verb}: a {type(model).__name__} moves hidden states, so there is no regression of which it could judge "
+            f"the coefficients; use {instead}."
+        )
 
 
 def regressors(run: Track, steady: Array | None = None) -> Rows:

@@ -31,7 +31,7 @@ from rich.text import Text
 from driftfit.data.record import Reading
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.judge.regressors import regressors
+from driftfit.judge.regressors import refuse_hidden, regressors
 from driftfit.judge.segments.joint_autoregression import jointly
 from driftfit.judge.statistics.break_dates import dated
 from driftfit.judge.statistics.constancy import shortest as shortest_of
@@ -207,6 +207,7 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
     for name, given in (("level", level), ("false", false)):
         if not 0.0 < given < 1.0:
             raise ValueError(f"segment: {name} must be between 0 and 1, such as 0.95; got {given!r}.")
+    refuse_hidden("segment", run.model, "run.theta, or a Regression")
     n = run.model.n
     least = shortest_of(n) if shortest is None else max(whole("segment", "shortest", shortest, 1), n + 1)
     rows = regressors(run)
@@ -259,7 +260,7 @@ def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, 
         fit = clipped(theta, z - X @ theta, np.inf)
     N = len(X)
     variance = float(fit.psi @ fit.psi) / max(N - n, 1) / max(float(np.mean(fit.inside)), 0.1) ** 2
-    return fit.theta, np.sqrt(np.maximum(variance * np.diag(inverted(X.T @ X)), 0.0))
+    return fit.theta, np.sqrt(np.maximum(variance * np.diag(inverted(X)), 0.0))
 
 
 def _undivided(run: Track, phi: Array, y: Array, level: float, why: str) -> Segmentation:

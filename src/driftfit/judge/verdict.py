@@ -117,6 +117,8 @@ class Verdict(Printed):
         Lags of correlation that were allowed for.
     burn : int
         Samples at the beginning that are not scored.
+    hidden : bool
+        Whether the model moves hidden states: it has no regression, and only its predictions are judged.
     """
 
     drifts: bool | None
@@ -134,6 +136,7 @@ class Verdict(Printed):
     correlated: bool
     lags: int
     burn: int
+    hidden: bool = False
 
     @property
     def constants(self) -> Paired:
@@ -151,6 +154,8 @@ class Verdict(Printed):
         return tuple(filter(None, (f"{self._drift()} {self._gain()}", self._which(), self._caution())))
 
     def _drift(self) -> str:
+        if self.hidden:
+            return "Whether parameters move cannot be tested: a model with hidden states is not a regression."
         if self.drifts is None:
             least = least_rows(len(self.parameters))
             short = f"{self.samples} samples can be used, and at least {least} are needed."
@@ -197,6 +202,10 @@ class Verdict(Printed):
         steady = self.constants
         if self.pays is None and not self.samples:
             return "Predictions cannot be compared either: every sample has a missing output or regressor."
+        if self.hidden and self.scored >= COMPARED:
+            rival = self.rivals[3]
+            size = _larger(self.rms, rival.rms)
+            return f"The one-step error is {size} than that of a {rival.name} ({p_equals(rival.p)})."
         if self.pays is None:
             return (
                 f"Predictions cannot be compared: {self.scored} samples remain after the first {self.burn}, and "
@@ -205,8 +214,7 @@ class Verdict(Printed):
         who = "constants" if steady is self.rivals[1] else "constants with lags"
         if not steady.rms > 0.0:
             return f"Tracking them cannot pay here: {who} predict the output without error."
-        change = 100.0 * (self.rms / steady.rms - 1.0)
-        size = f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
+        size = _larger(self.rms, steady.rms)
         if self.pays:
             return f"Tracking them pays: the one-step error is {size} than that of {who} ({p_equals(steady.p)})."
         if self.rivals[1].p < self.level:
@@ -247,6 +255,12 @@ class Verdict(Printed):
             table.add_row(rival.name, f"{rival.rms:.5g}", f"{rival.t:.2f}", p_text(rival.p))
         yield table
         yield facts(("Samples", f"{self.samples} tested, {self.scored} scored"))
+
+
+def _larger(one: float, other: float) -> str:
+    """By how much an error is larger than another."""
+    change = 100.0 * (one / other - 1.0) if other > 0.0 else 0.0
+    return f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
 
 
 def rounded(error: Array, y: Array) -> Array:
@@ -340,6 +354,7 @@ def judged(known: Evidence, level: float) -> Verdict:
         correlated=test.noise is not None and bool(whiteness(test.noise.residual).p < CORRELATED),
         lags=test.lags,
         burn=burn_in(run.model.n) if known.burn is None else known.burn,
+        hidden=run.model.hidden is not None,
     )
 
 

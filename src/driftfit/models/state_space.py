@@ -169,9 +169,10 @@ class StateSpace(NamedInputs):
         return _steps(self.equations, self.input_names)
 
     def noise_response(self, theta: Array, h: int) -> Array:
-        """1, and NaN after it, because the response depends on the operating point."""
+        """1, then 0 without lags of the output; with them it depends on the operating point and is NaN."""
         response: Array = np.eye(1, h)[0]
-        response[1:] = np.nan
+        if any(name == self.system.output for line in self.system.lines for name, _ in line.lags):
+            response[1:] = np.nan
         return response
 
 

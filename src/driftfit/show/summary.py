@@ -79,9 +79,11 @@ class Summary(Printed):
 
     @property
     def _scored(self) -> str:
-        if self.comparison.samples:
-            return f"on the {self.comparison.samples} samples after the first {self.burn} that all four could predict"
-        return f"the record has no sample after the first {self.burn} that all four could predict: nothing to compare"
+        of = self.comparison
+        which = f"after the first {self.burn} that all {'three' if of.samples and np.isnan(of.constant_ls) else 'four'}"
+        if of.samples:
+            return f"on the {of.samples} samples {which} could predict"
+        return f"the record has no sample {which} could predict: nothing to compare"
 
 
 def summarise(run: Track) -> Summary:

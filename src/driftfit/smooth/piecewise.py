@@ -51,7 +51,7 @@ class Segments:
         self._solve(r)
 
     def _solve(self, r: float | None) -> None:
-        n, thetas, covs, rest, free = self._phi.shape[1], [], [], 0.0, 0
+        thetas, covs, rest, free = [], [], 0.0, 0
         used = []
         for a, b in zip(self.bounds[:-1], self.bounds[1:], strict=True):
             rows = np.flatnonzero(self._ok[a:b]) + a
@@ -60,12 +60,15 @@ class Segments:
             size = np.sqrt(np.sum(A * A, axis=0))
             size[size == 0.0] = 1.0  # in units of the regressors, which may be far apart, no rank is lost
             A /= size
-            theta, _, rank, _ = np.linalg.lstsq(A, d, rcond=None)
+            U, long, axes = np.linalg.svd(A, full_matrices=False)
+            rank = int(np.sum(long > np.finfo(float).eps * max(A.shape) * long.max(initial=0.0)))
+            U, axes = U[:, :rank], axes[:rank].T
+            roots = axes / long[:rank]  # the moments A' A would have half of the digits
+            theta = roots @ (U.T @ d)
             thetas.append(theta / size)
-            cov = np.linalg.pinv(A.T @ A, hermitian=True) / np.outer(size, size)
-            if rank < n:
-                loose = np.diag(np.eye(n) - np.linalg.pinv(A) @ A) > 1e-9
-                cov[loose, loose] = np.inf
+            cov = roots @ roots.T / np.outer(size, size)
+            loose = np.sum(axes * axes, axis=1) < 1.0 - 1e-9
+            cov[loose, loose] = np.inf
             covs.append(cov)
             rest += float(np.sum((d - A @ theta) ** 2))
             free += len(rows) - int(rank)

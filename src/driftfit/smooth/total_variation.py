@@ -29,7 +29,9 @@ from driftfit.smooth.parts.walk import DRIFT, Walk, constants
 from driftfit.smooth.problem import walk_of
 
 SMOOTHING = 1e-6
-"""eta, relative to the size of theta."""
+"""eta, relative to the range of theta; the size of theta says nothing of its jumps."""
+ROUNDING = 1e-12
+"""eta is at least this share of the size of theta."""
 
 
 class Piecewise(NamedTuple):
@@ -78,7 +80,8 @@ def total_variation(run: Track, penalty: float, tol: float = 1e-4, max_steps: in
     theta = exact.smooth(fixed, "std").theta
     penalty_max = float(2.0 * np.linalg.norm(walk.pull(walk.residual(theta))[open_], axis=1).max(initial=0.0))
     theta = exact.smooth(walk, "std").theta
-    eta = SMOOTHING * max(float(np.abs(theta).max()), 1e-300)
+    size, spread = (float(part.max()) for part in (np.abs(theta), np.ptp(theta, axis=0)))
+    eta = max(SMOOTHING * spread, ROUNDING * size, 1e-300)
     costs, pull, gap = [], np.inf, np.inf
     for _ in range(max_steps):
         length = np.sqrt(jump_sizes(theta, open_) ** 2 + eta**2)

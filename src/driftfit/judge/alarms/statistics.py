@@ -26,6 +26,7 @@ from driftfit.judge.alarms.onsets import (
     power_rate,
 )
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
+from driftfit.judge.regressors import refuse_hidden
 from driftfit.judge.statistics.robust import noisy, robust_fit
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.live.likelihood_ratio import CUSUM, SAME, memory_of, scan
@@ -76,6 +77,7 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
         raise ValueError(
             f'detect: the reference of "{rule.kind}" must be a number of samples, such as reference=500, or (from, to).'
         )
+    refuse_hidden(f'detect "{rule.kind}"', run.model, 'kind="innovation" or "band"')
     samples = samples_of(run)
     n, usable = samples[0].shape[1], (samples[1][:, 1] > 0.0) & (samples[1][:, 3] > 0.0)
     if run.theta.shape[1] != n:
@@ -119,8 +121,10 @@ def _band(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule,
         names, (low, high), known, start = tuple(reference), _edges(reference), slice(burn(run), None), burn(run)
     else:
         first, start = normal_samples(run, reference)
-        names, known = run.names, slice(first, start)
-        low, high = run.theta[known].min(axis=0), run.theta[known].max(axis=0)
+        # hidden states move with the inputs, and say nothing of a fault
+        names, known = tuple(one for one in run.names if one not in (run.model.hidden or ())), slice(first, start)
+        watched = run.theta[known][:, [run.names.index(one) for one in names]]
+        low, high = watched.min(axis=0), watched.max(axis=0)
     rule = replace(rule, names=names, low=tuple(low.tolist()), high=tuple(high.tolist()))
     check_fits(rule, run.tracker, run.names)
     alike = _alike(run, rule, known)

@@ -195,7 +195,7 @@ def _sizes(X: Array, y: Array, steps: list[Step], n: int, noise: Noise | None) -
         X, y = whitened(X / c[:, None], y / c, noise.ar)
         X, y = X * c[:, None], y * c
     fit = robust_fit(X, y)
-    inverse = inverted(X.T @ (X * fit.inside[:, None]))
+    inverse = inverted(X * fit.inside[:, None])
     scores = X * fit.psi[:, None]
     cov = inverse @ (scores.T @ scores) @ inverse
     before, after, std, last = fit.theta[:n].copy(), fit.theta[:n].copy(), np.zeros(n), fit.theta[:n].copy()

@@ -129,7 +129,7 @@ def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
         return _nothing(N, n)._replace(fit=fit._replace(theta=fit.theta / size))
     rare = _rare(fit.psi, y, shortest(n))
     found = (of_rare_events if rare else noise)(Q, fit.residual, CELLS, rare or shortest(n), lags)
-    return _tested(X, size, fit, found, lags, rare)
+    return _tested((Q, R), X, fit._replace(theta=fit.theta / size), found, lags, rare)
 
 
 def _rare(psi: Array, y: Array, least: int) -> int | None:
@@ -145,14 +145,19 @@ def _rare(psi: Array, y: Array, least: int) -> int | None:
     return max(least, min(int(FEW * skewness**2), len(y) // 4))
 
 
-def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None, rare: int | None) -> Constancy:
-    """The tests of y on X; ``rare``: rows in the shortest interval of rare events, None for other noise."""
+def _tested(
+    basis: tuple[Array, Array], regressors: Array, fit: Fit, found: Noise, lags: int | None, rare: int | None
+) -> Constancy:
+    """The tests in the orthonormal basis: moments of regressors with a large mean would have lost their digits;
+    ``rare``: rows in the shortest interval of rare events, None for other noise.
+    """
+    X, R = basis
     N, n = X.shape
     still, added = fit, np.zeros((N, 0))
     if len(found.ar):
         c = found.level[:, None]
         rows, y = whitened(X / c, found.held / found.level, found.ar)
-        added = c * missing_lags(X / c, rows, found) if lags is None else added
+        added = c * missing_lags(regressors / c, rows, found) if lags is None else added
         X, y = rows * c, y * found.level
         still = robust_fit(np.column_stack([X, added]), y)
     psi = _alternative(found, still, added)
@@ -168,12 +173,13 @@ def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None, rar
         V = _even(V[-1], _profile(whole, whole, ends))
     S, inverse = np.cumsum(whole * still.psi[:, None], axis=0), np.linalg.inv(A[-1])
     null = _null(A, V, inverse)
-    own, path = _turned(null, inverse[:n]), S @ inverse[:n].T
-    var = np.diag(inverse @ V[-1] @ inverse)[:n]
+    each = np.linalg.solve(R, inverse[:n])
+    own, path = _turned(null, each), S @ each.T
+    var = np.diag(each @ V[-1] @ each.T)
     S, null, V = S[:, :n], np.ascontiguousarray(null[:, :n, :, :n]), V[:, :n, :n]
     least, apart = rare or shortest(n), len(found.breaks) > 0
     mean = np.arange(m)[::-2][::-1]
-    L, p = _each(S[ends[mean] - 1], _thinned(null, mean), np.diag(V[-1]))
+    L, p = _each(S[ends[mean] - 1] @ R, _turned(_thinned(null, mean), R.T), np.diag(R.T @ V[-1] @ R))
     _, p_path = _each(path[ends[mean] - 1], _thinned(own, mean), var)
     alone = ((path[ends - 1, i : i + 1], own[:, i : i + 1, :, i : i + 1]) for i in range(n))
     p_own = [together(p_path[i], *suprema(*one, ends, least, apart)) for i, one in enumerate(alone)]
@@ -184,8 +190,7 @@ def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None, rar
     spread = np.sqrt(np.maximum(np.einsum("bibi->bi", own), 0.0))
     std = np.stack([np.interp(np.arange(1, N + 1), np.append(0, ends), np.append(0.0, spread[:, i])) for i in range(n)])
     at, z = _dates(path, std.T)
-    shown = fit._replace(theta=fit.theta / size)
-    return Constancy(L, p, np.array(p_own), joint, together(*p_each), p_each, at, z, shown, found, len(found.ar) + rest)
+    return Constancy(L, p, np.array(p_own), joint, together(*p_each), p_each, at, z, fit, found, len(found.ar) + rest)
 
 
 def missing_lags(X: Array, rows: Array, found: Noise) -> Array:

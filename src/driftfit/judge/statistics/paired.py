@@ -42,9 +42,9 @@ def newey_west(d: Array) -> float:
 
 
 def paired(name: str, rival: Array, own: Array) -> Paired:
-    """Compare the one-step errors (N,) of a rival with those of a run; NaN where there are fewer than ten."""
+    """Compare the one-step errors (N,) of a rival with those of a run; NaN for fewer than ten, or no rival."""
     rms = float(np.sqrt(np.mean(rival * rival))) if len(rival) else float("nan")
-    if len(own) < LEAST:
+    if len(own) < LEAST or np.isnan(rms):
         return Paired(name, rms, float("nan"), float("nan"))
     unit = max(np.abs(rival).max(), np.abs(own).max()) or 1.0  # squares of squares would leave the range of numbers
     d = (rival / unit) ** 2 - (own / unit) ** 2

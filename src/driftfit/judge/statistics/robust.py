@@ -319,11 +319,15 @@ def clipped(theta: Array, residual: Array, scale: float) -> Fit:
     return Fit(theta, residual, scale, psi, (np.abs(residual) <= CLIP * scale).astype(float))
 
 
-def inverted(M: Array) -> Array:
-    """Pseudo-inverse of moments M (n, n) of regressors, whose units may be far apart: a small one is no lost rank."""
-    size = np.sqrt(np.diag(M))
+def inverted(X: Array) -> Array:
+    """Pseudo-inverse of the moments X' X of regressors X (N, n), whose units and offsets may be far apart.
+
+    It is computed from X itself: the moments have half of its digits.
+    """
+    size = np.sqrt(np.sum(X * X, axis=0))
     size[size == 0.0] = 1.0
-    return np.asarray(np.linalg.pinv(M / size / size[:, None]) / size / size[:, None])
+    root = np.linalg.pinv(X / size, rcond=np.finfo(float).eps * max(X.shape)) / size[:, None]
+    return np.asarray(root @ root.T)
 
 
 def least_squares(X: Array, y: Array) -> Array:

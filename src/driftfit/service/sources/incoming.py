@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import queue
 import threading
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -46,9 +48,8 @@ def decoded(topic: str, body: bytes) -> tuple[list[Samples], list[str]]:
             return [decode(topic, body)], []
         except ValueError as error:
             return [], [str(error)]
-    try:
-        parts = _BODY.decode(body)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+    parts = _payloads(body)
+    if parts is None:
         return [], ["the body is not an object with a payload for each topic, in JSON."]
     samples, refused = [], []
     for name, payload in parts.items():
@@ -57,3 +58,19 @@ def decoded(topic: str, body: bytes) -> tuple[list[Samples], list[str]]:
         except ValueError as error:
             refused.append(f"{name[:100]}: {error}")
     return samples, refused
+
+
+def _payloads(body: bytes) -> Mapping[str, Any] | None:
+    """The payload of each topic; also of JSON with NaN or Infinity, which Python's own encoder writes."""
+    try:
+        found: Mapping[str, Any] = _BODY.decode(body)
+        return found
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        pass
+    if b"NaN" not in body and b"Infinity" not in body:
+        return None
+    try:
+        parts = json.loads(body)
+        return {name: json.dumps(one).encode() for name, one in parts.items()} if isinstance(parts, dict) else None
+    except (ValueError, RecursionError):
+        return None
