@@ -10,7 +10,7 @@ from support import THETA, arx_record, damaged, rows_of, same
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track
 from driftfit.judge.compare import compare, persistence
-from driftfit.show.parts.text import WIDTH, digits, printed, table_of
+from driftfit.show.parts.text import WIDTH, digits, printed, table_of, together
 
 K = Kalman(q=1e-3, r=0.1)
 
@@ -215,3 +215,12 @@ def test_a_table_of_more_columns_than_fit_continues_below(group):
     assert len(tables) > 2
     assert group == 1 or [len(row) % 2 for row in tables] == [1] + [0] * (len(tables) - 1)
     assert len(printed(table_of("Numbers", "", *heads[:8])).splitlines()) == 4
+
+
+def test_numbers_beside_each_other_have_the_digits_that_differ():
+    """Prices of 31,234 as 3.123e+04 would all be the same; without a standard deviation their difference decides."""
+    assert together(31234.4, 31240.1, std=300.0) == ("31234", "31240")
+    assert together(31234.41, 31234.93, 31240.0, std=0.4) == ("31234.4", "31234.9", "31240")
+    assert together(31234.41, 31234.93) == ("31234.4", "31234.9")
+    assert together(4.0227, 3.485, 3.4858, std=0.05) == ("4.023", "3.485", "3.486")
+    assert together(0.1, 0.1 + 1e-15, float("nan")) == ("0.1", "0.1", "nan")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support import arx_record
 
 from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Regression, frontier, track, tune
 from driftfit.models.regression import Regression as Base
@@ -340,3 +341,24 @@ def test_rounding_is_no_noise(method, gain, offset):
     y = offset + gain * u[:, 0]
     with pytest.raises(ValueError, match="y is 7 in all of 60" if gain == 0.0 else "up to rounding, as if y had been"):
         tune(Regression(2, intercept=True), Kalman(), y, u, method=method)
+
+
+@pytest.mark.parametrize("code", [-200.0, 9999.0])
+def test_a_code_in_all_columns_is_missing_here_and_named_by_track(code):
+    """An absurd output beside an absurd input is a test, but not if both are the same number."""
+    y, u = arx_record(400, 1)
+    y, u = y + 5.0, u + 2.0
+    clean = tune(ARX(1, 1, intercept=True), Kalman(), y, u).noise
+    y[200:230], u[200:230] = code, code
+    with pytest.warns(UserWarning, match=f"tune: all signals are {code:g} at 30 samples, first at 200"):
+        assert tune(ARX(1, 1, intercept=True), Kalman(), y, u).noise == pytest.approx(clean, rel=0.3)
+    with pytest.warns(UserWarning, match=f"track: all signals are {code:g} at 30 samples, first at 200.*limits="):
+        track(ARX(1, 1, intercept=True), Kalman(q=1e-4, r=0.1), y, u)
+    track(ARX(1, 1, intercept=True), Kalman(q=1e-4, r=0.1), y, u, limits={"y": (-99.0, 99.0), "u": (-99.0, 99.0)})
+
+
+def test_signals_that_are_equal_within_their_range_hold_no_code():
+    y, u = arx_record(400, 1)
+    y[100:120], u[100:120] = 0.0, 0.0
+    y[200:220], u[200:220] = u.max(), u.max()
+    track(ARX(1, 1), Kalman(q=1e-4, r=0.1), y, u)

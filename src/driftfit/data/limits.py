@@ -109,6 +109,33 @@ def absurd(x: Array) -> Array:
     return np.flatnonzero(known & (away > FAR * float(np.median(moving))))
 
 
+def shared_code(y: Array, u: Array) -> tuple[float, Array]:
+    """(number, samples): what outputs (T, ..) and inputs (T, m) all hold at once, far from what they hold otherwise.
+
+    A logger that loses its connection writes one code into every column. The number occurs twice at least, and each
+    column is away from it by more than the range of its other values; without such a number no sample is returned.
+    """
+    signals = np.column_stack([y, u])
+    same = np.flatnonzero((signals == signals[:, :1]).all(axis=1))
+    if signals.shape[1] > 1 and len(same):
+        values, counts = np.unique(signals[same, 0], return_counts=True)
+        for value in values[counts > 1].tolist():
+            rest = np.where((signals == value) | ~np.isfinite(signals), np.nan, signals)
+            if np.isfinite(rest).any(axis=0).all():
+                low, high = np.nanmin(rest, axis=0), np.nanmax(rest, axis=0)
+                if (np.maximum(low - value, value - high) > high - low).all():
+                    return value, same[signals[same, 0] == value]
+    return float("nan"), same[:0]
+
+
+def code_text(verb: str, value: float, places: Array) -> str:
+    """What a warning says of `shared_code`."""
+    return (
+        f"{verb}: all signals are {value:.6g} at {len(places)} samples, first at {places[0]}, far from all "
+        "that they are otherwise: this looks like a code for missing values."
+    )
+
+
 def _bounds(key: Any, bounds: Any) -> tuple[float, float]:
     """(low, high) of one signal."""
     try:

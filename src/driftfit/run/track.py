@@ -12,6 +12,7 @@ import numpy as np
 
 from driftfit.data import outputs
 from driftfit.data.arguments import check_roles
+from driftfit.data.limits import code_text, shared_code
 from driftfit.data.record import Reading, Records, one_series, rows
 from driftfit.engine.settings import one_of, warn
 from driftfit.models.base import Model
@@ -56,6 +57,11 @@ def track(
         run = _one(programs, records, keep, warm_start, dtype)
     warn_unlearned(run)
     warn_astray(run)
+    value, places = shared_code(records.y, records.u)
+    if len(places):
+        warn(
+            f"{code_text('track', value, places)} Give limits=, such as limits={{'y': (low, high), 'u': (low, high)}}."
+        )
     return run  # type: ignore[no-any-return]
 
 

@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.limits import FAR, absurd
+from driftfit.data.limits import FAR, absurd, code_text, shared_code
 from driftfit.data.record import Reading
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import one_of, whole
+from driftfit.engine.settings import one_of, warn, whole
 from driftfit.models.base import Model
 from driftfit.run.track import records_of
 from driftfit.trackers.base import Tracker
@@ -193,6 +193,13 @@ def _without_fault_codes(task: Task) -> Task:
     for record in task.records:
         if record.y.ndim == 1 and record.u.ndim == 2:
             signals = np.column_stack([record.y, record.u])
+            value, codes = shared_code(record.y, record.u)
+            if len(codes):
+                signals[codes] = np.nan
+                warn(
+                    f"{code_text('tune', value, codes)} They count as missing here; give limits= to `track` too.",
+                    UserWarning,
+                )
             places = [absurd(x) for x in signals.T]
             of_inputs = np.concatenate([np.empty(0, int), *places[1:]])
             for k, found in enumerate(places):

@@ -84,13 +84,13 @@ def digits(value: float, std: float, least: int = 4) -> str:
 def together(*values: float, std: float = float("nan"), least: int = 4) -> tuple[str, ...]:
     """Numbers that are compared with each other, so that a difference is seen where there is one.
 
-    Each is known to ``std``, or to the smallest difference of two of them if that is less, and a number below a million
-    has all digits before its point.
+    Each is known to ``std``, or, where that is not known, to the smallest difference of two of them, and a number below
+    a million has all digits before its point.
     """
     known = np.unique([value for value in values if np.isfinite(value)])
     gaps = np.diff(known)
     gap = float(np.min(gaps[gaps > 1e-7 * np.abs(known).max(initial=0.0)], initial=np.inf))
-    finest = min(std, gap) if std > 0.0 else gap
+    finest = std if 0.0 < std < np.inf else gap
     whole = (len(f"{abs(value):.0f}") if abs(value) < 1e6 else 0 for value in values)
     return tuple(digits(value, finest, max(least, n)) for value, n in zip(values, whole, strict=True))
 
