@@ -5,6 +5,7 @@ import pytest
 from nist import DATA, digits
 
 from driftfit import (
+    ARX,
     FLS,
     RLS,
     AdaptiveKalman,
@@ -14,7 +15,9 @@ from driftfit import (
     HammersteinWiener,
     Kalman,
     Regression,
+    huber,
     track,
+    tune,
 )
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
@@ -182,3 +185,28 @@ def test_an_offset_of_three_million_standard_deviations_is_not_taken_for_noise()
     rms = [np.sqrt(np.mean((run.theta[50:, 0] - gain[50:]) ** 2)) for run in (plain, far)]
     assert rms[1] < 1.05 * rms[0]
     np.testing.assert_allclose(far.innovation_std[50:], plain.innovation_std[50:], rtol=0.1)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_weights_in_another_unit_alter_only_the_noise_variance(unit):
+    """Weights are often 1 / variance. Scales of the drift and of jumps left them out: `Bank()` did not see a jump, and
+    `tune` ended at a bound of its search.
+    """
+    rng = np.random.default_rng(0)
+    u, y, w = rng.normal(size=240), np.zeros(240), 10.0 ** rng.uniform(-1.0, 1.0, 240)
+    for t in range(1, 240):
+        y[t] = 0.6 * y[t - 1] + (1.0 if t < 120 else 1.8) * u[t - 1] + 0.2 * rng.normal() / np.sqrt(w[t])
+    spoilt = np.where(np.arange(240) == 60, y + 4.0, y)
+    for tracker, z in ((AdaptiveKalman(), spoilt), (Bank(), y)):
+        one, other = (track(ARX(1, 1), tracker, z, u, weights=w * k) for k in (1.0, unit))
+        np.testing.assert_allclose(other.theta, one.theta, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(other.std[3:], one.std[3:], rtol=1e-5)
+        assert other.loglik == pytest.approx(one.loglik, rel=1e-6)
+        assert abs(one.theta[-1, 1] - 1.8) < 0.1
+        np.testing.assert_allclose(other.smooth().std[100], one.smooth().std[100], rtol=1e-4)
+    one, other = (tune(ARX(1, 1), Kalman(), y, u, weights=w * k) for k in (1.0, unit))
+    assert other.loglik == pytest.approx(one.loglik, rel=1e-6)
+    assert other.tracker.r == pytest.approx(unit * one.tracker.r, rel=1e-3)
+    one, other = (huber(track(ARX(1, 1), Kalman(q=1e-3, r=0.04 * k), y, u, weights=w * k)) for k in (1.0, unit))
+    assert other.delta == pytest.approx(np.sqrt(unit) * one.delta, rel=1e-9)
+    np.testing.assert_allclose(other.path.theta, one.path.theta, rtol=1e-6)

@@ -39,7 +39,7 @@ class Huber(NamedTuple):
     path: Smoothed
     """The weighted problem at the solution."""
     delta: float
-    """The residual above which the penalty is linear, in units of y."""
+    """The residual of a sample of weight 1 above which the penalty is linear, in units of y."""
     weights: Array
     """(T,): min(1, delta / |residual|), below 1 for downweighted samples; 0 for samples that were not used."""
     costs: Array
@@ -93,8 +93,9 @@ def huber(run: Track, delta: float | None = None, tol: float = 1e-12, max_steps:
 
 
 def spread_of(smoothed: Smoothed) -> float:
-    """Standard deviation of the noise from leave-one-out residuals, half of which may be arbitrary."""
-    loo = smoothed.loo
+    """Standard deviation of the noise of weight 1 from leave-one-out residuals, half of which may be arbitrary."""
+    weight = smoothed.weight
+    loo = np.sqrt(np.where(weight > 0.0, weight, np.nan)) * smoothed.loo
     return float(np.nanmedian(np.abs(loo - np.nanmedian(loo))) / scipy.special.ndtri(0.75))
 
 

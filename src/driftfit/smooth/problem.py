@@ -127,7 +127,7 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
     first = int(np.argmax(drift > 0.0)) + 1
     drift *= run.known.drift
     if own and fields:
-        q, r_of = tracker.estimated_variances(run.model, fields, fields["e"], drift)
+        q, r_of = tracker.estimated_variances(run.model, fields, np.sqrt(weight) * fields["e"], drift)
         phi, signals[:, Y] = tracker.regression(fields, phi, signals[:, Y])
         time, drift_root = drift.copy(), np.sqrt(q)
         weight /= r_of

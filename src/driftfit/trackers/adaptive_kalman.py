@@ -142,7 +142,7 @@ def settle(s: State, l: int) -> None:
 @kernel
 def learn(s: State, l: int, outlier: float) -> None:
     """Update excitation and the proportion of readings."""
-    learn_information(s, l)
+    learn_information(s, s.leverage[l] * s.noise[l], l)
     learn_proportion(s, l, outlier)
 
 

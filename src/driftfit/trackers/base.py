@@ -152,8 +152,8 @@ class Tracker(Settings, ABC):
     ) -> tuple[Array, Array]:
         """Variances of the drift before each sample (T, n), and of its noise (T,), if the tracker estimates them.
 
-        ``fields`` (T, ..) are those that ``smoother_fields`` names, e (T,) the innovations, time (T,) the intervals of
-        drift.
+        ``fields`` (T, ..) are those that ``smoother_fields`` names, e (T,) the innovations of samples of weight 1, time
+        (T,) the intervals of drift.
         """
         raise NotImplementedError
 

@@ -85,7 +85,7 @@ def _of(model: Model, record: Record, mu: Any, differences: int) -> Frontier:
     if mu is None:
         walk = _path(model, FLS(1.0), record).walk
         used = walk.weight > 0.0
-        power = float(np.mean(np.sum(walk.phi[used] ** 2, axis=1))) if used.any() else 1.0
+        power = float(np.mean(walk.weight[used] * np.sum(walk.phi[used] ** 2, axis=1))) if used.any() else 1.0
         mu = power * np.logspace(-4.0, 5.0 * differences, 17 + 20 * differences)
     weights = np.sort(np.atleast_1d(np.asarray(mu, dtype=float)))
     paths = [_path(model, FLS(float(m), differences=differences), record) for m in weights]

@@ -66,7 +66,7 @@ class Scores(NamedTuple):
 
     @property
     def power(self) -> Array:
-        """Mean squares of the regressors, (n, S)."""
+        """Mean squares of the regressors over the factors of the noise variance, (n, S)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(self.powers / self.samples)
 
@@ -154,7 +154,8 @@ class _Sums:
         if self.model.implicit:
             terms = self.model.log_jacobian(np.moveaxis(out["theta"], 1, -1), np.broadcast_to(y, ok.shape))
             self.more += np.sum(np.where(counted, terms, 0.0), axis=0)
-        self.powers += np.sum(np.where(ok[:, None], out["phi"] ** 2, 0.0), axis=0)
+        root = np.reshape(np.sqrt(self.record.known.part(slice(a, a + len(out))).noise), (-1, 1, 1))
+        self.powers += np.sum(np.where(ok[:, None], out["phi"] / root, 0.0) ** 2, axis=0)
         self.used += ok.sum(axis=0)
 
     def _likelihood(self, out: Array, ok: Array) -> Array:

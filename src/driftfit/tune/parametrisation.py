@@ -11,9 +11,9 @@ that were left out:
     changes      Bank                q or size^2 of every change times 100^x; x from -3 to 3, of the first also zero;
                                      prior probabilities of the others, where they are given, times 10^x, x from -2
 
-p_i is the mean square of regressor i, s their sum, v the residual variance of a constant theta. A group shares one
-drift *in terms of the output*, so units of the data do not matter. T samples cannot distinguish a drift below 1 / T^2
-from none (for slopes: 1 / T^4).
+p_i is the mean square of regressor i over the factor of the noise variance, 1 / weight, s their sum, v the residual
+variance of a constant theta. A group shares one drift *in terms of the output*, so units do not matter. T samples
+cannot distinguish a drift below 1 / T^2 from none (for slopes: 1 / T^4).
 """
 
 from __future__ import annotations

@@ -405,8 +405,11 @@ class Bank(Tracker):
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
         hypotheses = run.hypotheses
         kinds = [event.kind for event in hypotheses.found()]
-        wrong = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
-        facts = [("Events", f"{kinds.count('change')} changes{wrong}; see run.hypotheses.events()")]
+        moved, wrong = kinds.count("change"), kinds.count("sensor")
+        text = f"{moved} change{'' if moved == 1 else 's'}"
+        if len(self.all_sensors) > 1:
+            text += f", {wrong} fault{'' if wrong == 1 else 's'} of the sensor"
+        facts = [("Events", f"{text}; see run.hypotheses.events()")]
         faults = int(run.state["counters"][FAULTS])
         if faults:
             facts.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))

@@ -1,7 +1,9 @@
 """Excitation: scales of the regressors, and a windowed Gram matrix that shows which parameters are being learned.
 
-    c_i <- mean of phi_i^2 over the last samples on which regressor i did anything
-    G   <- fade G + D phi phi' D,   D = diag(c)^(-1/2)
+    c_i <- mean of phi_i^2 / noise over the last samples on which regressor i did anything
+    G   <- fade G + D phi phi' D / noise,   D = diag(c)^(-1/2)
+
+noise is the factor of the noise variance of a sample, 1 / weight, so that the unit of the weights does not matter.
 
 A regressor without excitation keeps its scale, since a mean square that decays to 0 would inflate any drift measured in
 it. That is one far smaller than it was, unless its share of the output, theta_i phi_i, is still larger than five
@@ -70,14 +72,14 @@ def bounded(square: float, mean: float, count: float) -> float:
 
 @kernel
 def learn_scales(s: State, l: int) -> None:
-    """Update the mean squares of the regressors, over samples at which they were excited, and of y."""
+    """Update the mean squares of the regressors, over excited samples, and of y, in units of the noise factor."""
     s.power_samples[l] += s.ok[l]
     y = reading(s, l)
-    square = bounded(y * y, s.power[l], s.power_samples[l])
+    square = bounded(y * y / s.noise[l], s.power[l], s.power_samples[l])
     active = s.ok[l] if square > DULL * s.power[l] else 0.0
     s.power[l] += active * (square - s.power[l]) / min(max(s.power_samples[l], 1.0), MEMORY)
     for i in range(s.theta.shape[0]):
-        square = bounded(s.phi[i, l] * s.phi[i, l], s.c[i, l], s.active[i, l])
+        square = bounded(s.phi[i, l] * s.phi[i, l] / s.noise[l], s.c[i, l], s.active[i, l])
         share = s.theta[i, l] * s.phi[i, l]
         matters = (s.active[i, l] <= 0.0) | (share * share > LARGE * s.s[l])
         active = s.ok[l] if square > (LOST if matters else DULL) * s.c[i, l] else 0.0
@@ -87,16 +89,16 @@ def learn_scales(s: State, l: int) -> None:
 
 
 @kernel
-def learn_information(s: State, l: int) -> None:
-    """Windowed Gram matrix of the regressors in units of their scale: the samples that the guard against constant
-    inputs examines.
+def learn_information(s: State, noise: float, l: int) -> None:
+    """Windowed Gram matrix of the regressors in units of their scale, of samples whose noise variance has the factor
+    ``noise``: those that the guard against constant inputs examines.
     """
     n = s.theta.shape[0]
     for i in range(n):
         for j in range(i + 1):
             unit = s.c[i, l] * s.c[j, l]
             fresh = s.phi[i, l] * s.phi[j, l] / np.sqrt(unit) if unit > 0.0 else 0.0
-            fresh *= s.ok[l] / s.leverage[l]
+            fresh *= s.ok[l] / noise
             s.information[i, j, l] = s.fade[l] * s.information[i, j, l] + fresh
 
 

@@ -86,9 +86,9 @@ def bound_leverage(s: State, l: int) -> None:
     """The factor of the noise variance."""
     most = 1.0
     for i in range(s.theta.shape[0]):
-        square = s.phi[i, l] * s.phi[i, l]
+        square = s.phi[i, l] * s.phi[i, l] / s.noise[l]
         most = max(most, square / (LEVERAGE * s.c[i, l])) if s.c[i, l] > 0.0 else most
-    s.leverage[l] = most * (1.0 + s.vague[l] / s.r[l])
+    s.leverage[l] = most * (1.0 + s.vague[l] / (s.r[l] * s.noise[l]))
 
 
 def proportion(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:

@@ -209,7 +209,7 @@ def leap(s: State, l: int, noise: float) -> None:
         own = s.ratio[i, TOP, l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
         unit += own * s.white[i, l] * s.white[i, l]
     # a regressor near 0 says nothing about a move: none that would exceed the reach where regressors are as usual
-    wide = max(v, min(square, most * most * s.spread[l] * min(1.0, unit)))
+    wide = max(v, min(square, most * most * s.spread[l] * min(1.0, unit / s.noise[l])))
     better = 0.5 * square * (1.0 / v - 1.0 / wide) > 0.5 * log(wide / v) - log(RARE)
     s.rare[l], s.leapt[l], s.gained[l] = 1.0, 0.0, 0.0
     if better and unit > 0.0:

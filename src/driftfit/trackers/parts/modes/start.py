@@ -63,7 +63,7 @@ def keep(s: State, l: int) -> None:
 @kernel
 def take_first(s: State, l: int) -> None:
     """One sample of least squares, and its residual, with the noise variance s.noise."""
-    learn_information(s, l)
+    learn_information(s, s.noise[l], l)
     learn_proportion(s, l, 0.0)
     take_in(s, l)
     if s.s[l] < np.inf:
