@@ -8,6 +8,7 @@ import gc
 import operator
 import threading
 import weakref
+from functools import partial
 from pathlib import Path
 from types import FunctionType
 
@@ -111,6 +112,28 @@ def test_parts_are_linked_and_not_emitted():
     assert "cpython" not in made.library.get_llvm_str(), "no_cpython_wrapper leaves the wrapper in."
     with pytest.raises(TypeError, match="py_func"):
         doubled(np.ones(2))
+
+
+def test_what_is_seldom_run_and_short_routines_are_compiled_for_size():
+    @partial(kernel.kernel, seldom=True)
+    def halved(x):
+        return 0.5 * x
+
+    def use(y):
+        return halved(y[0])
+
+    def routine(address):
+        floats(address, 1, 1)[0, 0] += 1.0
+
+    def code(short):
+        made = internals.publish(internals.under_ieee(routine), (types.intp,), f"canary_{short}", short)
+        return made.get_llvm_str()
+
+    assert Driver(use)(np.array([1.0, 2.0])) == 0.5
+    (made,) = halved.overloads.values()
+    assert {"optsize", "noinline", "cold"} <= set(made.library.get_llvm_str().split()), "No attributes: see _be_short."
+    assert "optsize" in code(True), "ShortRoutine._optimize_final_module is no longer called before LLVM's passes."
+    assert "optsize" not in code(False)
 
 
 def test_passes_for_what_is_not_used_are_left_out():

@@ -29,6 +29,8 @@ for x; O(n^3) where a column enters.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, machine, shared
@@ -64,7 +66,7 @@ def place(phi: Array, S: Array, work: Array, now: Array) -> None:
         work[ROW, i] = 0.0
 
 
-@machine
+@partial(machine, short=True)
 def machine_place(S: int, phi: int, work: int, now: int, n: int, L: int, l: int) -> None:
     """`place` for lane l of L, from the addresses of fields."""
     place(
@@ -72,7 +74,7 @@ def machine_place(S: int, phi: int, work: int, now: int, n: int, L: int, l: int)
     )
 
 
-@machine
+@partial(machine, short=True)
 def machine_frame(S: int, R: int, Q: int, work: int, now: int, n: int, L: int, l: int) -> None:
     """R and Q for lane l of L: the inverse of M, and a basis of what no sample has determined."""
     S_l, R_l = cubes(S, n, n, L)[:, :, l], cubes(R, n, n, L)[:, :, l]
@@ -80,7 +82,7 @@ def machine_frame(S: int, R: int, Q: int, work: int, now: int, n: int, L: int, l
     floats(now, NOW, L)[VOLUME, l] = unseen(S_l, R_l, cubes(Q, n, n, L)[:, :, l], 0.0)
 
 
-@machine
+@partial(machine, short=True)
 def machine_estimate(S: int, z: int, Q: int, theta: int, work: int, n: int, L: int, l: int) -> None:
     """theta for lane l of L: M^-1 z, unchanged in the directions of Q."""
     estimate(

@@ -26,6 +26,7 @@ Departures: the decision on rank; the change of form. Cost per sample: O(n^3) un
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -289,7 +290,7 @@ def spanned(S: Array, R: Array, P: Array, var: Array) -> None:
                 var[i] = np.inf
 
 
-@machine
+@partial(machine, short=True)
 def machine_learn(fields: int, n: int, m: int, L: int, l: int) -> None:
     """`learn` and `spanned` for lane l of L, from the addresses of fields; var has m <= n entries."""
     at = wholes(fields, 1, ADDRESSES)
@@ -301,7 +302,7 @@ def machine_learn(fields: int, n: int, m: int, L: int, l: int) -> None:
     spanned(S_l, R_l, P_l, floats(at[0, AT_VAR], m, L)[:, l])
 
 
-@machine
+@partial(machine, short=True)
 def machine_wander(S: int, d: int, H: int, pivot: int, n: int, L: int, l: int, size: float) -> None:
     """`spread` for lane l of L, from the addresses of fields."""
     spread(cubes(S, n, n, L), floats(d, n, L), cubes(H, n, n, L), size, floats(pivot, n, L), l)

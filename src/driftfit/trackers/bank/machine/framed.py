@@ -17,6 +17,8 @@ other banks use phi and theta, at lower cost. Cost per sample: O(n^3) for each c
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, packed, shared, wholes
@@ -120,7 +122,7 @@ def enter_mixture(z: Array, P: Array, C: Array, x: Array, now: Array, noise: flo
     return left  # type: ignore[no-any-return]
 
 
-@machine
+@partial(machine, short=True)
 def machine_walks(fields: int, unit: float, size: int, n: int, L: int, l: int) -> None:
     """Q of every change for lane l of L, from the addresses of fields; the memory has ``size`` numbers."""
     at = wholes(fields, 1, ADDRESSES)
@@ -134,7 +136,7 @@ def machine_walks(fields: int, unit: float, size: int, n: int, L: int, l: int) -
         walk(m, places, M, c, unit, W)
 
 
-@machine
+@partial(machine, short=True)
 def machine_enter(fields: int, unknown: int, known: int, size: int, counters: int, n: int, L: int, l: int) -> None:
     """A sample with which a coordinate enters, for lane l of L, from the addresses of fields; ``known`` is 0 if nothing
     was known of that coordinate.
@@ -151,7 +153,7 @@ def machine_enter(fields: int, unknown: int, known: int, size: int, counters: in
     enter_leaves(m, t, many, x, now, known, work)
 
 
-@machine
+@partial(machine, short=True)
 def machine_outgrown(fields: int, unknown: int, size: int, counters: int, n: int, L: int, l: int) -> None:
     """The first coordinate about which this sample has `OUTGROWN` times the information of all earlier ones, or -1, in
     ``now[ENTERING]``; for lane l of L, from the addresses of fields.
