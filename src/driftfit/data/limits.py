@@ -115,9 +115,14 @@ def shared_code(y: Array, u: Array) -> tuple[float, Array]:
     A logger that loses its connection writes one code into every column. The number occurs twice at least, and each
     column is away from it by more than the range of its other values; without such a number no sample is returned.
     """
-    signals = np.column_stack([y, u])
-    same = np.flatnonzero((signals == signals[:, :1]).all(axis=1))
-    if signals.shape[1] > 1 and len(same):
+    first, *others = [*y.reshape(len(y), -1).T, *u.T]
+    if not others:
+        return float("nan"), np.zeros(0, int)
+    same = np.flatnonzero(first == others[0])
+    for other in others[1:]:
+        same = same[other[same] == first[same]]
+    if len(same) > 1:
+        signals = np.column_stack([y, u])
         values, counts = np.unique(signals[same, 0], return_counts=True)
         for value in values[counts > 1].tolist():
             rest = np.where((signals == value) | ~np.isfinite(signals), np.nan, signals)
