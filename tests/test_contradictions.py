@@ -10,6 +10,7 @@ from driftfit import (
     FLS,
     OE,
     RLS,
+    AdaptiveKalman,
     BoxJenkins,
     InstrumentalVariables,
     JointKalman,
@@ -101,15 +102,29 @@ def test_no_sample_is_between_those_judged_together_and_those_judged_alone(model
     assert max(np.abs(fleet[k].theta[-1] - fleet[0].theta[-1]).max() for k in range(21)) < 0.05
 
 
-@pytest.mark.parametrize("model", [OE(1, 1), BoxJenkins(), ARMAX(1, 1, 1)], ids=repr)
-def test_models_that_compute_signals_begin_without_the_fault(model):
+@pytest.mark.parametrize(
+    ("model", "tracker"),
+    [(one, RLS(0.99)) for one in (OE(1, 1), BoxJenkins(), ARMAX(1, 1, 1))] + [(OE(1, 1), AdaptiveKalman())],
+    ids=repr,
+)
+def test_models_that_compute_signals_begin_without_the_fault(model, tracker):
     """What they compute with a wrong estimate is in later regressors, so the estimate does not wait for certainty."""
     y, u = plant()
     y, u = y[:200], u[:200]
-    clean = track(model, RLS(0.99), y, u).theta[-1]
-    for at in (1, 3, 8):
-        found = track(model, RLS(0.99), np.where(np.arange(200) == at, 1e7, y), u).theta[-1]
+    clean = track(model, tracker, y, u).theta[-1]
+    for at in (1, 3, 6, 7, 8):
+        found = track(model, tracker, np.where(np.arange(200) == at, 1e7, y), u).theta[-1]
         np.testing.assert_allclose(found, clean, atol=0.2)
+
+
+@pytest.mark.parametrize("signal", [0, 1])
+def test_a_fault_code_at_the_very_first_reading_does_no_harm(signal):
+    """It is in one equation only, as a lag, and may leave the residuals of the others little larger."""
+    clean = np.array([plant(seed=seed) for seed in range(40)]).swapaxes(0, 1)[..., :200]
+    bad = clean.copy()
+    bad[signal, :, 0] = 9999.0
+    whole, fleet = (track(PLANT, RLS(1.0), *both, by="row") for both in (clean, bad))
+    assert max(np.abs(fleet[k].theta[-1] - whole[k].theta[-1]).max() for k in range(40)) < 0.05
 
 
 @pytest.mark.parametrize("tracker", DIFFUSE, ids=repr)

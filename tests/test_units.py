@@ -175,16 +175,18 @@ def test_certified_values(name):
         assert digits(root.theta[-1, order], certified) > {"Wampler4": 8.0, "Wampler5": 6.0}.get(name, 9.0)
 
 
-def test_an_offset_of_three_million_standard_deviations_is_not_taken_for_noise():
+@pytest.mark.parametrize("offset", [1e6, 1e9, 1e11])
+def test_an_offset_of_millions_of_standard_deviations_is_not_taken_for_noise(offset):
     """The least noise that the default assumes is a share of y^2: it must stay below the noise itself."""
     rng = np.random.default_rng(0)
     u = rng.normal(size=(400, 2))
     gain = 2.0 + np.cumsum(0.05 * rng.normal(size=400))
     y = gain * u[:, 0] + 0.5 * u[:, 1] + 0.3 * rng.normal(size=400)
-    plain, far = (track(Regression(2, intercept=True), AdaptiveKalman(), y + at, u) for at in (0.0, 1e6))
+    plain, far = (track(Regression(2, intercept=True), AdaptiveKalman(), y + at, u) for at in (0.0, offset))
     rms = [np.sqrt(np.mean((run.theta[50:, 0] - gain[50:]) ** 2)) for run in (plain, far)]
     assert rms[1] < 1.05 * rms[0]
     np.testing.assert_allclose(far.innovation_std[50:], plain.innovation_std[50:], rtol=0.1)
+    np.testing.assert_allclose(far.std[-1], plain.std[-1], rtol=0.1)
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])

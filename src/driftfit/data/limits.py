@@ -115,12 +115,12 @@ def shared_code(y: Array, u: Array) -> tuple[float, Array]:
     A logger that loses its connection writes one code into every column. The number occurs twice at least, and each
     column is away from it by more than the range of its other values; without such a number no sample is returned.
     """
-    first, *others = [*y.reshape(len(y), -1).T, *u.T]
-    if not others:
+    columns: list[Array] = [*y.reshape(len(y), -1).T, *u.T]
+    if len(columns) < 2:
         return float("nan"), np.zeros(0, int)
-    same = np.flatnonzero(first == others[0])
-    for other in others[1:]:
-        same = same[other[same] == first[same]]
+    same = np.flatnonzero(columns[0] == columns[1])
+    for column in columns[2:]:
+        same = same[column[same] == columns[0][same]]
     if len(same) > 1:
         signals = np.column_stack([y, u])
         values, counts = np.unique(signals[same, 0], return_counts=True)

@@ -88,6 +88,7 @@ from driftfit.trackers.parts.modes.smoother import SMOOTHER_FIELDS, estimated_va
 from driftfit.trackers.parts.modes.start import begin_with_drift, faults, reconsider, take_start
 from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
 from driftfit.trackers.parts.outlying_readings import (
+    FIRST,
     bound_leverage,
     learn_proportion,
     leave_out,
@@ -207,7 +208,11 @@ def begin(s: State, l: int) -> None:
         take_start(s, l)
         if s.s[l] < np.inf:
             s.density[l] = start_density(s.e[l], s.s[l], residuals)
-        ready = s.count[l] >= RESIDUALS and reconsider(s, l)
+        rank, n = s.rank[l] - s.absent[l], s.parameters[l]
+        # a column that enters late, as of signals that a model has to compute first, has no residuals yet
+        early = rank == n and s.remembered[l] <= n + RESIDUALS
+        enough = s.count[l] >= RESIDUALS and (early or s.remembered[l] >= FIRST)
+        ready = s.remembered[l] - rank >= RESIDUALS and reconsider(s, enough, l)
         spanned_variance(s, l)
         if ready:
             settle(s, l)

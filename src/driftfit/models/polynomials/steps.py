@@ -431,7 +431,7 @@ def pushing(p: Places, place: Step, waiting: float = ENTRY) -> Step:
         seen = s.observed[l] > 0.0
         predicted = informed(s, l)
         # w and e of this sample are those of the theta that has learned from it
-        enlarge(s, s.measured[l], 0, l)
+        enlarge(s, s.measured[l] if seen else np.nan, 0, l)
         linearise(s, l)
         fitted = predict(s, False, l)
         fitted = possible(s, fitted, l) if seen else fitted

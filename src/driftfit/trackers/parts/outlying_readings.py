@@ -25,6 +25,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.resolution import reading
 
@@ -33,7 +35,10 @@ REACH = 10.0
 LEVERAGE = 100.0
 """Largest weight of one regressor, in ordinary samples."""
 FIRST = 10.0
-"""Number of first readings that are accepted without a check, for comparison with later ones."""
+"""Number of first readings that are accepted without a check, for comparison with later ones; half of them where the
+regressors are ordinary and the innovation has more than `SURE` standard deviations."""
+SURE = 5.0
+"""See `FIRST`."""
 MEMORY = 1000.0
 """Memory of the mean and variance of the readings, in readings."""
 LONGEST = 1e12
@@ -50,12 +55,13 @@ def no_proportion() -> dict[str, Any]:
 
 @kernel
 def leave_out(s: State, l: int) -> None:
-    """Leave out a reading far outside the usual range; s.y_hat must be known."""
+    """Leave out a reading far outside the usual range; s.y_hat and s.s must be known, s.s inf in a new direction."""
     away, e = (reading(s, l) - s.middle[l]) ** 2, (s.y[l] - s.y_hat[l]) ** 2
     e = e if s.valid[l] > 0.0 else away
     reach = REACH * REACH * s.spread[l]
     limit = reach * s.widening[l] * s.widening[l]
-    judged = (s.observed[l] > 0.0) & (s.readings[l] >= FIRST)
+    few = (s.s[l] < np.inf) & (e > SURE * SURE * s.s[l]) & (s.leverage[l] <= 1.0) & (s.valid[l] > 0.0)
+    judged = (s.observed[l] > 0.0) & (s.readings[l] >= (0.5 * FIRST if few else FIRST))
     strange = judged & (away > reach) & (e > reach)
     out = judged & (away > limit) & (e > limit)
     s.strange[l] = 1.0 if strange else 0.0

@@ -9,12 +9,15 @@ median; readings that repeat the one before count once. A sample is doubtful if
     or a regressor is outlying and the reading is not: a fault code of an input, or of an earlier output, now a lag.
 
 A large output after a large input is neither. A regressor is unusual if it is outlying, or if it differs where most are
-equal, as after a step of an input; a lag with the same fault code as the reading is not unusual. If half of the
-samples or more are doubtful and more cannot be waited for, the level has changed, and no sample is doubtful.
+equal, as after a step of an input, and two readings or more, and most of those where it differs, are outlying; a lag
+with the same fault code as the reading is not unusual. If half of the samples or more are doubtful and more cannot be
+waited for, the level has changed, and no sample is doubtful.
 
 A large input with a slow response looks the same, and its samples are the most informative of all. Doubtful samples
-are therefore left out only if the others contradict them: if least squares on all samples leaves the other samples a
-sum of squared residuals more than `WORSE` times as large as least squares on these alone.
+are therefore left out only if the others contradict them: if least squares on all samples leaves these others a sum of
+squared residuals Q, and least squares on themselves only q with nu residuals, and
+
+    nu (Q - q) > WORSE q
 
 Source: the median absolute deviation as a scale is Hampel's (1974); the rule is ours. Cost: O(n N^2) for N samples,
 once.
@@ -28,8 +31,8 @@ from driftfit.engine.kernel import Array, Driver, shared
 
 OUTLYING = 30.0
 """Median absolute deviations; 20 standard deviations of normal data."""
-WORSE = 10.0
-"""Ratio of sums of squares from which samples contradict each other."""
+WORSE = 36.0
+"""F statistic from which samples contradict each other: six standard deviations for one sample."""
 RESIDUALS = 4
 """Number of residuals after which the first samples are judged."""
 SURE = 12
@@ -37,6 +40,12 @@ SURE = 12
 Y, SPAN, NOISE, READING, PHI = range(5)
 """Entries of a sample: the output, intervals of drift since the previous sample, the noise factor (negative if the
 sample is doubtful), the output as it was measured, and the first entry of the regressor."""
+
+
+@shared
+def contradict(every: float, alone: float, residuals: float) -> bool:
+    """Whether least squares on every sample, and on some alone, leave these sums of squares of the latter."""
+    return (every - alone) * residuals > WORSE * alone
 
 
 @shared
@@ -65,6 +74,18 @@ def median(samples: Array, N: int, column: int, center: float, apart: float) -> 
 
 
 @shared
+def answered(samples: Array, N: int, column: int, center: float, usual: float, limit: float) -> bool:
+    """Whether outlying readings go with a regressor that differs from center: two do, and most where it differs."""
+    outlying, ordinary = 0, 0
+    for k in range(N):
+        if samples[k, column] != center:
+            far = abs(samples[k, READING] - usual) > limit
+            outlying += 1 if far else 0
+            ordinary += 0 if far else 1
+    return outlying >= 2 and outlying > ordinary
+
+
+@shared
 def doubt(samples: Array, N: int, last: bool) -> None:
     """Give a negative noise factor to those of N samples (.., PHI + n) that are doubtful, a positive one to the rest.
 
@@ -78,11 +99,12 @@ def doubt(samples: Array, N: int, last: bool) -> None:
     for i in range(PHI, samples.shape[1]):
         center = median(samples, N, i, 0.0, 0.0)
         most = OUTLYING * median(samples, N, i, center, 1.0)
+        steps = most > 0.0 or answered(samples, N, i, center, usual, limit)
         for k in range(N):
             if abs(samples[k, i] - center) > most:
                 outlying = abs(samples[k, READING] - usual) > limit
                 code = samples[k, READING] != 0.0 and abs(samples[k, i]) == abs(samples[k, READING])
-                if outlying and not code:
+                if outlying and steps and not code:
                     samples[k, NOISE] = abs(samples[k, NOISE])
                 elif most > 0.0 and not outlying:
                     samples[k, NOISE] = -abs(samples[k, NOISE])

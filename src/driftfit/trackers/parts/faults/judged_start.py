@@ -35,8 +35,24 @@ from driftfit.trackers.parts.faults.contradictions import (
     needs_judging,
     no_contradictions,
 )
-from driftfit.trackers.parts.faults.first_samples import NOISE, PHI, READING, RESIDUALS, SPAN, SURE, WORSE, doubtful
-from driftfit.trackers.parts.faults.stored_samples import doubtful_samples, machine_doubt, recall, squares_left, store
+from driftfit.trackers.parts.faults.first_samples import (
+    NOISE,
+    PHI,
+    READING,
+    RESIDUALS,
+    SPAN,
+    SURE,
+    contradict,
+    doubtful,
+)
+from driftfit.trackers.parts.faults.stored_samples import (
+    doubtful_samples,
+    machine_doubt,
+    recall,
+    squares_left,
+    store,
+    without_fault,
+)
 
 MORE = 16
 """Samples that are stored beyond the number of parameters."""
@@ -140,7 +156,7 @@ def reconsidering(one: Step, restart: Step) -> Any:
             repeat(s, True, l)
         with_all = squares_left(s, l)
         repeat(s, False, l)
-        contradicted = with_all > WORSE * squares_left(s, l)
+        contradicted = contradict(with_all, squares_left(s, l), spare_samples(s, l) - found)
         if not contradicted:
             repeat(s, True, l)
             trust_all(s, l)
@@ -150,6 +166,8 @@ def reconsidering(one: Step, restart: Step) -> Any:
         recall(s, s.remembered[l] - 1, l)
         s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l] = y, y_hat, e, v, noise, shift
         s.dt[l], s.drift[l] = dt, drift
+        if contradicted:
+            without_fault(s, y_hat, l)
 
     return reconsider
 

@@ -62,3 +62,20 @@ def squares_left(s: State, l: int) -> float:
             e -= s.samples[at, PHI + i, l] * s.theta[i, l]
         squares += e * e / noise if noise > 0.0 else 0.0
     return squares
+
+
+@kernel
+def without_fault(s: State, y_hat: float, l: int) -> None:
+    """The newest sample was left out: if its reading, and not an input, is at fault, models take it for a missing one.
+
+    They would otherwise compute later regressors with it. ``y_hat`` is its prediction.
+    """
+    newest, mean, count = s.remembered[l] - 1, 0.0, 0.0
+    for at in range(newest):
+        used = 1.0 if s.samples[at, NOISE, l] > 0.0 else 0.0
+        count += used
+        mean += used * (s.samples[at, READING, l] - mean) / max(count, 1.0)
+    away = s.samples[newest, READING, l] - mean
+    out = y_hat + s.samples[newest, READING, l] - s.samples[newest, Y, l] - mean
+    if (s.samples[newest, NOISE, l] < 0.0) & (abs(away) > abs(out)):
+        s.observed[l] = 0.0

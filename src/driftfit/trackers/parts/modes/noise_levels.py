@@ -36,9 +36,10 @@ IN_A_ROW, RISE = 4.0, 0.3
 MISFIT, SETTLED, EARLY = 0.5, 20.0, 140.0
 """Among the first `EARLY` samples, if the mean of e^2 / s, with a memory of `SETTLED`, is below `MISFIT`, r falls by as
 much: drift at the start was taken for noise. Later it does not, see above."""
-FINEST = 1e-14
-"""r is never below this share of the mean square of y, the rounding of the data: a hundredth of r where y is a million
-standard deviations of the noise from zero."""
+FINEST, ROUNDING = 1e-14, 1e-26
+"""r is never below these shares of the variance of y, and of its mean square. After a jump as large as y, a covariance
+in units of a smaller r would keep no digits; the second is for rounding in the sums of a prediction, and is far below
+the noise of readings with a large offset."""
 
 
 def any_level() -> dict[str, Any]:
@@ -67,7 +68,8 @@ def level_chain() -> Array:
 @kernel
 def finest(s: State, l: int) -> float:
     """The lower bound of r."""
-    return max(FINEST * s.power[l], s.coarse[l])  # type: ignore[no-any-return]
+    least: float = max(FINEST * min(s.spread[l], s.power[l]), ROUNDING * s.power[l])
+    return max(least, s.coarse[l])  # type: ignore[no-any-return]
 
 
 @kernel

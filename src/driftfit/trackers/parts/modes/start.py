@@ -33,11 +33,17 @@ from driftfit.trackers.parts.faults.first_samples import (
     PHI,
     SPAN,
     SURE,
-    WORSE,
     Y,
+    contradict,
     doubtful,
 )
-from driftfit.trackers.parts.faults.stored_samples import doubtful_samples, recall, squares_left, store
+from driftfit.trackers.parts.faults.stored_samples import (
+    doubtful_samples,
+    recall,
+    squares_left,
+    store,
+    without_fault,
+)
 from driftfit.trackers.parts.modes.filters import absorb, project, wander
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
 from driftfit.trackers.parts.modes.weights import WINDOW
@@ -136,23 +142,33 @@ def drop(s: State, l: int) -> None:
 
 
 @partial(kernel, seldom=True)
-def reconsider(s: State, l: int) -> bool:
-    """Whether the filters may start: not while samples are doubtful, and the others have not `SURE` residuals."""
-    ready, found, rows = True, 0, s.remembered[l]
+def reconsider(s: State, enough: bool, l: int) -> bool:
+    """Whether the filters may start: if there are ``enough`` samples, and `SURE` residuals if some are doubtful.
+
+    Estimates are those without the doubtful samples before that too, because models compute later regressors with them.
+    """
+    found, before, rows = 0, 0, s.remembered[l]
     if rows <= WINDOW:
+        for at in range(rows):
+            before += 1 if s.samples[at, NOISE, l] < 0.0 else 0
         found = doubtful_samples(s, 1, l)
-    if found > 0:
-        y, y_hat, e, v, noise, shift = s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l]
-        ok, fresh, leverage = s.ok[l], s.fresh[l], s.leverage[l]
-        s.ok[l], s.observed[l], s.leverage[l] = 1.0, 1.0, 1.0
-        alone = repeat(s, False, l)
-        ready = s.count[l] >= SURE
-        if repeat(s, True, l) > WORSE * alone and ready:
-            repeat(s, False, l)
-            drop(s, l)
-        recall(s, rows - 1, l)
-        s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l] = y, y_hat, e, v, noise, shift
-        s.ok[l], s.observed[l], s.fresh[l], s.leverage[l] = ok, ok, fresh, leverage
+    if found + before == 0:
+        return enough
+    y, y_hat, e, v, noise, shift = s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l]
+    ok, observed, fresh, leverage = s.ok[l], s.observed[l], s.fresh[l], s.leverage[l]
+    s.ok[l], s.observed[l], s.leverage[l] = 1.0, 1.0, 1.0
+    alone, residuals = repeat(s, False, l), s.count[l]
+    ready = enough and (residuals >= SURE or found == 0)
+    contradicted = found > 0 and contradict(repeat(s, True, l), alone, residuals)
+    if contradicted:
+        repeat(s, False, l)
+    recall(s, rows - 1, l)
+    s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l] = y, y_hat, e, v, noise, shift
+    s.ok[l], s.observed[l], s.fresh[l], s.leverage[l] = ok, observed, fresh, leverage
+    if contradicted and ok > 0.0:
+        without_fault(s, y_hat, l)
+    if contradicted and ready:
+        drop(s, l)
     return ready
 
 
