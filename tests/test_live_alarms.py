@@ -197,8 +197,8 @@ def test_references_in_times():
     assert seconds.detect("band", reference=(960.0, 2400.0)).rule == expected.rule
     assert plain.detect("innovation", reference=400).start == 400  # a rule may be made of the whole record
     for wrong, match in (
-        (("2024-03-05", "2024-03-05 04:00"), "too short"),
-        (("2025-03-05", "2025-04-05"), "too short"),
+        (("2024-03-05", "2024-03-05 04:00"), "at least 20 are needed"),
+        (("2025-03-05", "2025-04-05"), "0 remain, and at least 20 are needed"),
         (("in March", "2024-03-05"), "'in March' is not a date"),
         ((1, 2, 3), "or an interval"),
     ):

@@ -15,6 +15,7 @@ correct but should not be learned from, give ``weights`` of 0: they then still e
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from datetime import date, datetime, timedelta
@@ -25,6 +26,7 @@ import numpy as np
 
 from driftfit.data.times.instants import instant
 from driftfit.data.times.periods import span
+from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
@@ -115,10 +117,11 @@ def shared_code(y: Array, u: Array) -> tuple[float, Array]:
     A logger that loses its connection writes one code into every column. The number occurs twice at least, and each
     column is away from it by more than the range of its other values; without such a number no sample is returned.
     """
-    columns: list[Array] = [*y.reshape(len(y), -1).T, *u.T]
+    columns: list[Array] = [*y.reshape(len(y), math.prod(y.shape[1:])).T, *u.T]
     if len(columns) < 2:
         return float("nan"), np.zeros(0, int)
     same = np.flatnonzero(columns[0] == columns[1])
+    same = same[np.abs(columns[0][same]) < LARGEST]  # larger numbers count as missing
     for column in columns[2:]:
         same = same[column[same] == columns[0][same]]
     if len(same) > 1:

@@ -200,12 +200,12 @@ class Verdict(Printed):
 
     def _gain(self) -> str:
         steady = self.constants
-        if self.pays is None and not self.samples:
-            return "Predictions cannot be compared either: every sample has a missing output or regressor."
         if self.hidden and self.scored >= COMPARED:
             rival = self.rivals[3]
             size = _larger(self.rms, rival.rms)
             return f"The one-step error is {size} than that of a {rival.name} ({p_equals(rival.p)})."
+        if self.pays is None and not self.samples:
+            return "Predictions cannot be compared either: every sample has a missing output or regressor."
         if self.pays is None:
             return (
                 f"Predictions cannot be compared: {self.scored} samples remain after the first {self.burn}, and "
