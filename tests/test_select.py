@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 from support import arx_record, damaged
 
-from driftfit import ARX, AugmentedFLS, Kalman, Regression, grid, select, track
+from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Kalman, Regression, grid, select, track
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
@@ -211,6 +211,23 @@ def test_orders_and_basis_of_a_hammerstein_wiener_model():
     run = track(selection.model(), Kalman(q=1e-8, r=4e-4), w, u)
     assert not run.verdict().drifts
     assert run.verdict().rms == pytest.approx(0.02, rel=3.3 / np.sqrt(2.0 * 350))  # of 350 residuals
+
+
+def test_few_and_many_parameters_with_the_default_tracker(record):
+    """Of few parameters each has a filter in which it drifts alone; these have no room in the record of many."""
+    y, u = record
+    plants = [ARX(1, 1), ARX(2, 5), ARX(6, 4)]
+    selection = select(plants, y, u)
+    for row in selection.rows:
+        run = track(selection.model(row.name), AdaptiveKalman(), y, u)
+        assert row.rms == pytest.approx(
+            np.sqrt(np.mean(run.innovation[100:] ** 2)), rel=0.05
+        )  # lags of its own begin earlier
+    orders = ((1, 1, None), (2, 1, None), (3, 2, Polynomial(3)))
+    blocks = [HammersteinWiener(na=na, nb=nb, input=f, output=Polynomial(2)) for na, nb, f in orders]
+    selection = select(blocks, y, u)
+    for model, found in zip(blocks, selection.predictions, strict=True):
+        np.testing.assert_array_equal(found.y_hat, track(model, AdaptiveKalman(), y, u).prediction)
 
 
 @pytest.mark.parametrize("level", [5.0, np.nan])

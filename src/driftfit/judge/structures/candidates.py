@@ -28,7 +28,7 @@ from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program
 from driftfit.run.result import Lane, Track, burn_in, track_record
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.common_size import padded, size_of
+from driftfit.trackers.parts.common_size import SIZES, fits, padded, size_of
 
 TOGETHER = 32
 
@@ -102,7 +102,9 @@ class Pool:
         size = size_of(sizes, len(self.names), len(self.gaps)) if shared else 0
         together: dict[int, list[int]] = {}
         for k in columns:
-            together.setdefault(size or structures[k].n, []).append(k)
+            n = structures[k].n
+            driver = next(one for one in (size, *SIZES, n) if fits(tracker, n, one)) if size else n
+            together.setdefault(driver, []).append(k)
         for size, same in together.items():
             for first in range(0, len(same), TOGETHER):
                 part = same[first : first + TOGETHER]
@@ -124,10 +126,16 @@ class Pool:
                 shared = tracker.pads and structure.model.family is not None
                 families.setdefault((structure.model.family if shared else k, shared), {})[k] = structure.model
         found: list[dict[int, Model]] = []
-        for models in families.values():
+        waiting = list(families.values())
+        while waiting:
+            models = waiting.pop()
             sizes = [model.n for model in models.values()]
-            together = size_of(sizes, max(sizes), len(self.gaps)) > 0
-            found += [models] if together else [{k: model} for k, model in models.items()]
+            together = len(sizes) > 1 and size_of(sizes, max(sizes), len(self.gaps)) > 0
+            N = next(iter(models.values())).as_large_as(list(models.values())).n if together else 0
+            alike = {k: model for k, model in models.items() if together and fits(tracker, model.n, N)}
+            found += [alike] if alike else [{k: model} for k, model in models.items()]
+            rest = {k: model for k, model in models.items() if alike and k not in alike}
+            waiting += [rest] if rest else []
         return found
 
     def _lanes(self, tracker: Tracker, structures: Sequence[Candidate], size: int) -> list[Predicted]:

@@ -31,6 +31,15 @@ def size_of(sizes: Sequence[int], most: int, samples: int) -> int:
     return size if len(sizes) * samples * size * size <= WORK else 0
 
 
+def fits(tracker: Tracker, n: int, N: int) -> bool:
+    """Whether the state of a tracker of n parameters has room in that of N: `AdaptiveKalman` has filters for single
+    parameters if they are few.
+    """
+    small, large = tracker.state(n), tracker.state(N)
+    pairs = [pair for name in large for pair in zip(np.shape(small[name]), np.shape(large[name]), strict=True)]
+    return n <= N and all(own <= wide for own, wide in pairs)
+
+
 def padded(tracker: Tracker, n: int, N: int) -> Mapping[str, Any]:
     """The state of a tracker of N parameters, of which those after the first n are known to be 0."""
     small, large = tracker.state(n), tracker.state(N)
