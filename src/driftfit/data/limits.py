@@ -15,7 +15,6 @@ correct but should not be learned from, give ``weights`` of 0: they then still e
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from datetime import date, datetime, timedelta
@@ -117,13 +116,15 @@ def shared_code(y: Array, u: Array) -> tuple[float, Array]:
     A logger that loses its connection writes one code into every column. The number occurs twice at least, and each
     column is away from it by more than the range of its other values; without such a number no sample is returned.
     """
-    columns: list[Array] = [*y.reshape(len(y), math.prod(y.shape[1:])).T, *u.T]
-    if len(columns) < 2:
+    if not u.shape[1]:
         return float("nan"), np.zeros(0, int)
-    same = np.flatnonzero(columns[0] == columns[1])
-    same = same[np.abs(columns[0][same]) < LARGEST]  # larger numbers count as missing
-    for column in columns[2:]:
-        same = same[column[same] == columns[0][same]]
+    first = y if y.ndim == 1 else y[:, 0]
+    same = first == u[:, 0]
+    if not same.any():  # nearly always, so it must cost little
+        return float("nan"), np.zeros(0, int)
+    same = np.flatnonzero(same & (np.abs(first) < LARGEST))  # larger numbers count as missing
+    for column in (*y.reshape(len(y), -1).T[1:], *u.T[1:]):
+        same = same[column[same] == first[same]]
     if len(same) > 1:
         signals = np.column_stack([y, u])
         values, counts = np.unique(signals[same, 0], return_counts=True)

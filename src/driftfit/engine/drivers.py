@@ -205,7 +205,7 @@ def _advance(tracker: TrackerSteps) -> Any:
 
     started = kernel(start, inline=False)  # seldom run: the lane loop is better without it
     if not tracker.outlined:  # else it is called together with the rest
-        started = outlined(started)
+        started = outlined(started, short=True)
 
     @kernel
     def advance_or_start(s: State) -> None:

@@ -197,6 +197,14 @@ class SeldomFragment(StepFragment):
         super()._optimize_functions(module)
 
 
+class ShortFragment(WholeFragment):
+    """Code that is optimised together with everything that it inlines, for size."""
+
+    def _optimize_final_module(self) -> None:
+        _be_short(self._final_module)
+        super()._optimize_final_module()
+
+
 class ShortRoutine(JITCodeLibrary):
     """A routine behind a symbol, with all that it calls, in short code."""
 
@@ -254,6 +262,12 @@ class WholeDispatcher(PartDispatcher):
     """A function that inlines everything that it calls."""
 
     library = WholeFragment
+
+
+class ShortDispatcher(PartDispatcher):
+    """A function that inlines everything that it calls, in short code."""
+
+    library = ShortFragment
 
 
 def as_part(dispatcher: Any, kind: type[PartDispatcher] = PartDispatcher) -> Any:
@@ -359,11 +373,11 @@ class Code(NamedTuple):
     """Whether it is valid in another process."""
 
 
-def emit(function: FunctionType, arguments: tuple[Any, ...], from_python: bool = True) -> Code:
-    """Compile a function for one signature, with all that it inlines, to object code."""
+def emit(function: FunctionType, arguments: tuple[Any, ...], from_python: bool = True, short: bool = False) -> Code:
+    """Compile a function for one signature, with all that it inlines, to object code; ``short``: for size."""
     with compiler_lock, nullcontext() if from_python else at_level_two():
         options = {"no_cfunc_wrapper": True, "no_cpython_wrapper": not from_python}
-        dispatcher = as_part(under_ieee(function, **options), WholeDispatcher)
+        dispatcher = as_part(under_ieee(function, **options), ShortDispatcher if short else WholeDispatcher)
         dispatcher.compile(arguments)
         made = dispatcher.overloads[arguments]
         module = made.library._final_module

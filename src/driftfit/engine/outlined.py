@@ -22,23 +22,25 @@ from driftfit.engine.compile_notice import compiling
 PREFIX = "outlined-"
 """Beginning of the symbols of outlined steps, which are the names of their files too."""
 
-SOURCES: dict[str, tuple[FunctionType, types.Type]] = {}
-"""The function and the type of its record, by symbol, of all steps that this process met while it compiled."""
+SOURCES: dict[str, tuple[FunctionType, types.Type, bool]] = {}
+"""The function, the type of its record and whether its code is short, by symbol, of all steps that this process met
+while it compiled."""
 
 LINKED: WeakValueDictionary[Any, internals.Linked] = WeakValueDictionary()
 """Outlined steps that drivers of this process use, by symbol and by the routines that are called instead of others."""
 
 
-def outlined(step: Any) -> Any:
+def outlined(step: Any, short: bool = False) -> Any:
     """A step, which takes the record only, as drivers call it. For one lane it is compiled once for all sizes of the
-    record (`driftfit.engine.compile_time.open_record`), for several once for each.
+    record (`driftfit.engine.compile_time.open_record`), and for size if it is ``short`` because it seldom runs; for
+    several lanes it is compiled once for each size.
     """
 
     def typed(context: Any, record: Any) -> Any:
         known = record.fields["theta"].type.shape[-1] > 1
         taken = record if known else internals.OpenRecord(record)
         symbol = disk_cache.name_of(PREFIX.rstrip("-"), step.identity, taken)
-        SOURCES[symbol] = step.py_func, taken
+        SOURCES[symbol] = step.py_func, taken, short and not known
 
         def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
             argument = given if known else [internals.opened(context, builder, record, given[0])]
@@ -76,14 +78,18 @@ def _found(symbol: str, instead: Mapping[str, str]) -> internals.Linked | None:
         if stored is None:
             if symbol not in SOURCES:
                 return None
-            source, record = SOURCES[symbol]
-            stored = object_code(source, symbol, (record,), from_python=False)
+            source, record, short = SOURCES[symbol]
+            stored = object_code(source, symbol, (record,), from_python=False, short=short)
         found = LINKED[key] = internals.Linked(internals.Code(*stored), instead)
     return found
 
 
 def object_code(
-    source: Callable[..., Any], name: str, arguments: tuple[types.Type, ...], from_python: bool = True
+    source: Callable[..., Any],
+    name: str,
+    arguments: tuple[types.Type, ...],
+    from_python: bool = True,
+    short: bool = False,
 ) -> internals.Code:
     """Compile a function for one signature, and store the code on disk under a name."""
     assert isinstance(source, FunctionType)
@@ -91,7 +97,7 @@ def object_code(
     twin.__qualname__ = name.removesuffix(disk_cache.ENDING).replace("-", "_")
     try:
         with compiling():
-            code = internals.emit(twin, arguments, from_python)
+            code = internals.emit(twin, arguments, from_python, short)
     except KeyError as missing:
         raise TypeError(
             f"a compiled step names the field {missing}, which its record does not have. The steps of a "

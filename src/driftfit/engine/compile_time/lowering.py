@@ -78,6 +78,7 @@ class Short(Lower):
         Numba's own are those that are used in one block only.
         """
         self._later: dict[str, Any] = {}
+        self._tables: dict[Any, Any] = {}
         self._short = not self._disable_sroa_like_opt and not self.func_ir.func_id.is_generator
         if not self._short:
             super()._find_singly_assigned_variable()
@@ -307,24 +308,31 @@ class Short(Lower):
         return cgutils.unpack_tuple(self.builder, value, len(kind)) if isinstance(kind, types.BaseTuple) else [value]
 
     def _shape(self, field: Field) -> list[Any]:
-        """The lengths of the axes of a field; those of an open record are found once in a block."""
+        """The lengths of the axes of a field."""
         if not isinstance(field.kind, OpenRecord):
             return [self._whole(n) for n in _array(field).shape]
-        key = field.record, field.name, "shape"
-        if key not in self._made:
-            self._made[key] = lengths(self.builder, field.record, field.kind, field.name)
-        return list(self._made[key])
+        return list(self._looked_up(lengths, field))
 
     def _first(self, field: Field) -> Any:
         """The address of the first entry of a field, computed once in a block."""
+        if isinstance(field.kind, OpenRecord):
+            return self._looked_up(partial(beginning, self.context), field)
         context, builder, key = self.context, self.builder, (field.record, field.name)
-        if key not in self._made and isinstance(field.kind, OpenRecord):
-            self._made[key] = beginning(context, builder, field.record, field.kind, field.name)
-        elif key not in self._made:
+        if key not in self._made:
             context.sentry_record_alignment(field.kind, field.name)
             data = context.get_data_type(_array(field).dtype)
             self._made[key] = cgutils.get_record_member(builder, field.record, field.kind.offset(field.name), data)
         return self._made[key]
+
+    def _looked_up(self, look: Any, field: Field) -> Any:
+        """What the table of an open record says of a field: once for a function that is given the record."""
+        builder, key = self.builder, (getattr(look, "func", look), field.record, field.name)
+        if getattr(field.record, "parent", None) is not builder.function.entry_basic_block:
+            return look(builder, field.record, field.kind, field.name)
+        if key not in self._tables:
+            with builder.goto_entry_block():
+                self._tables[key] = look(builder, field.record, field.kind, field.name)
+        return self._tables[key]
 
     def _address(self, field: Field, kinds: list[Any], entries: list[Any]) -> Any:
         """The address of an entry."""

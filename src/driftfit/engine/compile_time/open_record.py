@@ -35,6 +35,11 @@ class OpenRecord(types.Type):
             place += field.type.ndim
         super().__init__(f"OpenRecord({', '.join(f'{name}: {array}' for name, array in self.arrays.items())})")
 
+    @property
+    def mangling_args(self) -> tuple[str, tuple[int]]:
+        """What stands for the type in symbols: as for records, not the long name."""
+        return type(self).__name__, (self._code,)
+
     def typeof(self, name: str) -> Any:
         """The type of a field."""
         return self.arrays[name]
