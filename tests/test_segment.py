@@ -236,6 +236,15 @@ def test_a_record_that_is_not_divided_has_errors_that_are_numbers_and_says_why(T
     assert f"not searched for breaks: {why}" in text
 
 
+def test_a_record_that_is_too_short_has_the_errors_of_least_squares():
+    rng = np.random.default_rng(0)
+    X = np.column_stack([rng.normal(size=12), np.ones(12)])
+    y = X @ [2.0, 1.0] + rng.normal(size=12)
+    e = y - X @ np.linalg.lstsq(X, y)[0]
+    std = np.sqrt(e @ e / 10.0 * np.diag(np.linalg.inv(X.T @ X)))
+    np.testing.assert_allclose(np.sort(segment(y, X[:, 0]).segments[0].std), np.sort(std), rtol=1e-9)
+
+
 @pytest.mark.parametrize("offset", [1e6, 1e8])
 def test_an_offset_of_an_input_costs_no_digits(offset):
     """Moments of [1 + e, 1] have half of the digits of its rows: errors of 1e-11 for 1e-2, and no drift found."""

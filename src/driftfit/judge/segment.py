@@ -274,7 +274,7 @@ def _undivided(run: Track, phi: Array, y: Array, level: float, why: str) -> Segm
         spread = float(np.std(e))
         size = np.sqrt(np.mean(phi**2, axis=0))
         if n < N and (size > 0.0).all() and np.linalg.matrix_rank(phi / size, 1e-9) == n:
-            std = np.sqrt(e @ e / (N - n) * np.diag(inverted(phi.T @ phi)))
+            std = np.sqrt(e @ e / (N - n) * np.diag(inverted(phi)))
     one = Segment(0, len(run), theta, std)
     return Segmentation((), (one,), level, float("nan"), spread, (), run, why)
 

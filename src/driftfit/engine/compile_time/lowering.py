@@ -316,7 +316,7 @@ class Short(Lower):
     def _first(self, field: Field) -> Any:
         """The address of the first entry of a field, computed once in a block."""
         if isinstance(field.kind, OpenRecord):
-            return self._looked_up(partial(beginning, self.context), field)
+            return self._looked_up(beginning, field)
         context, builder, key = self.context, self.builder, (field.record, field.name)
         if key not in self._made:
             context.sentry_record_alignment(field.kind, field.name)
@@ -326,12 +326,12 @@ class Short(Lower):
 
     def _looked_up(self, look: Any, field: Field) -> Any:
         """What the table of an open record says of a field: once for a function that is given the record."""
-        builder, key = self.builder, (getattr(look, "func", look), field.record, field.name)
+        context, builder, key = self.context, self.builder, (look, field.record, field.name)
         if getattr(field.record, "parent", None) is not builder.function.entry_basic_block:
-            return look(builder, field.record, field.kind, field.name)
+            return look(context, builder, field.record, field.kind, field.name)
         if key not in self._tables:
             with builder.goto_entry_block():
-                self._tables[key] = look(builder, field.record, field.kind, field.name)
+                self._tables[key] = look(context, builder, field.record, field.kind, field.name)
         return self._tables[key]
 
     def _address(self, field: Field, kinds: list[Any], entries: list[Any]) -> Any:

@@ -87,7 +87,7 @@ def beginning(context: Any, builder: Any, record: Any, kind: OpenRecord, name: s
     return builder.bitcast(place, context.get_data_type(kind.typeof(name).dtype).as_pointer())
 
 
-def lengths(builder: Any, record: Any, kind: OpenRecord, name: str) -> list[Any]:
+def lengths(context: Any, builder: Any, record: Any, kind: OpenRecord, name: str) -> list[Any]:
     """The lengths of the axes of a field."""
     first, axes = kind.places[name] + 1, kind.typeof(name).ndim - 1
     return [*(entry(builder, record, first + k) for k in range(axes)), WORD(1)]
@@ -106,7 +106,7 @@ def array_from(context: Any, builder: Any, array: Any, data: Any, shape: Sequenc
 @lower_getattr_generic(OpenRecord)
 def _read(context: Any, builder: Any, kind: OpenRecord, record: Any, name: str) -> Any:
     data = beginning(context, builder, record, kind, name)
-    return array_from(context, builder, kind.arrays[name], data, lengths(builder, record, kind, name))
+    return array_from(context, builder, kind.arrays[name], data, lengths(context, builder, record, kind, name))
 
 
 def tell_fields_apart(builder: Any, name: str, access: Any) -> None:
