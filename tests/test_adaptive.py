@@ -62,6 +62,20 @@ def test_scaling_changes_nothing_but_units(kind, fy, fu):
     np.testing.assert_allclose(scaled.innovation_std[20:] / fy, run.innovation_std[20:], rtol=1e-9)
 
 
+def test_signs_of_regressors_change_nothing_and_their_order_next_to_nothing():
+    """Slopes of the filters that follow a trend fade in coordinates that depend on the order."""
+    simulated = scenarios.simulate("slow_walk", "regression", 0, T=300)
+    run = track(Regression(3), AdaptiveKalman(), simulated.y, simulated.u)
+    signs, order = np.array([-1.0, 1.0, -1.0]), [2, 0, 1]
+    turned = track(Regression(3), AdaptiveKalman(), -simulated.y, simulated.u * signs)
+    np.testing.assert_array_equal(turned.theta * -signs, run.theta)
+    np.testing.assert_array_equal(turned.std, run.std)
+    moved = track(Regression(3), AdaptiveKalman(), simulated.y, simulated.u[:, order])
+    apart = np.abs(moved.theta - run.theta[:, order])[20:] / run.std[20:, order]
+    assert apart.max() < 0.1
+    assert apart[100:].max() < 0.01
+
+
 def test_a_million_dull_samples_and_excitation_back():
     rng = np.random.default_rng(0)
     live = Live(Regression(3), AdaptiveKalman())

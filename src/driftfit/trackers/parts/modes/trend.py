@@ -16,6 +16,8 @@ share of C_ii that it removes,
 
     f_i = FADING + LOST (1 - min(1, GROWN d_i / C_ii))
 
+The C_ii depend on the order of the regressors, from which the coordinates are made: the only place where it matters.
+
 In one long interval b becomes b / (1 + x)^2, and m moves by tau b / (1 + x), with x = beta f tau / (2 w^(1/2)).
 
 Source: gains of the filter with position and slope are Kalata's (1984), for small gains; correcting the slopes of
