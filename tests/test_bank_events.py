@@ -49,7 +49,7 @@ def test_jumps_are_found_and_dated(run):
     assert table["theta1"].to_list() == [event.shift["theta1"] for event in events]
     assert table["std_theta2"].is_between(0.01, 0.3).all()
     assert table["sample"].to_list() == [event.span.date for event in events]
-    dates = np.datetime64("2026-01-01") + 2 * np.arange(150)
+    dates = np.datetime64("2026-01-01") + np.arange(150) * np.timedelta64(2, "D")
     dated = track(Regression(N), BANK, run.y, run.u, time=dates, dt=np.timedelta64(2, "D")).hypotheses.events()
     assert [event.span for event in dated] == [event.span for event in events]
     for event in dated:

@@ -145,7 +145,7 @@ def test_predictions_and_innovations_add_up():
     assert (run.innovation_std[steady] ** 2 >= 0.1).all()
 
 
-DAYS = np.datetime64("2024-01-01") + np.arange(300)
+DAYS = np.datetime64("2024-01-01") + np.arange(300) * np.timedelta64(1, "D")
 KINDS = {
     "Kalman": lambda y, u: track(ARX(2, 2), K, y, u),
     "damaged": lambda y, u: track(ARX(2, 2), K, *damaged(y, u)),

@@ -47,6 +47,7 @@ DURATIONS = {
 }
 """Seconds of a unit, or 1 if NumPy has a unit of that name."""
 
+MONTH, DAY = np.timedelta64(1, "M"), np.timedelta64(1, "D")
 NEAR = 0.1
 """A number of calendar steps this close to an integer is rounded to it."""
 
@@ -164,13 +165,13 @@ class Clock:
     def _months(self, time: Array) -> Array:
         """Months since 1970, including the fraction of the month that has passed."""
         month = time.astype("datetime64[M]")
-        start, end = (m.astype("datetime64[us]") for m in (month, month + 1))
+        start, end = (m.astype("datetime64[us]") for m in (month, month + MONTH))
         return np.asarray(month.astype(np.int64) + (time - start) / (end - start))
 
     def _business_days(self, time: Array) -> Array:
         """Business days since 1970, including the fraction of the day that has passed."""
         day = time.astype("datetime64[D]")
-        part = (time - day) / np.timedelta64(1, "D")
+        part = (time - day) / DAY
         whole = np.busday_count(np.datetime64("1970-01-01"), day, busdaycal=self._calendar)
         return np.asarray(whole + np.where(np.is_busday(day, busdaycal=self._calendar), part, 0.0))
 
@@ -231,9 +232,9 @@ class Clock:
             days = np.busday_offset(day, jump, roll="backward", busdaycal=self._calendar)
             return self._in_utc(np.asarray(days + part))
         month = local.astype("datetime64[M]")
-        first, after = (m.astype("datetime64[D]") for m in (month + jump, month + jump + 1))
-        ends = day + 1 == (month + 1).astype("datetime64[D]")  # the last day of a month stays the last day
-        there = after - 1 if ends else np.minimum(first + (day - month.astype("datetime64[D]")), after - 1)
+        first, after = (m.astype("datetime64[D]") for m in (month + jump * MONTH, month + (jump + 1) * MONTH))
+        ends = day + DAY == (month + MONTH).astype("datetime64[D]")  # the last day of a month stays the last day
+        there = after - DAY if ends else np.minimum(first + (day - month.astype("datetime64[D]")), after - DAY)
         return self._in_utc(np.asarray(there + part))
 
 
@@ -242,10 +243,10 @@ UNSET = Clock("unset")
 
 
 def _of_duration(length: np.timedelta64, given: Any) -> Clock:
-    if not length > np.timedelta64(0):
-        raise ValueError(f"dt must be positive; got {given!r}.")
     if np.datetime_data(length.dtype)[0] in ("Y", "M", "generic"):
         raise ValueError(f"dt={given!r} has no fixed length; give dt='month', dt='year', or a unit, as in dt='1s'.")
+    if not length > np.timedelta64(0, "s"):
+        raise ValueError(f"dt must be positive; got {given!r}.")
     return Clock("duration", duration=length)
 
 
