@@ -196,8 +196,10 @@ def _end(given: Any, axis: Array, zone: str | None, upper: int) -> Any:
         if axis.dtype.kind != "M":
             return float(given)
         stamp = _stamp(given, upper)
-        coarse = isinstance(stamp, np.datetime64) and np.datetime_data(stamp.dtype)[0] in ("Y", "M", "W", "D")
-        moment = _in_utc((stamp + upper).astype("datetime64[us]") if coarse else instant(stamp), stamp, zone)
+        unit = np.datetime_data(stamp.dtype)[0] if isinstance(stamp, np.datetime64) else ""
+        coarse = unit in ("Y", "M", "W", "D")
+        after = stamp + np.array(upper, f"m8[{unit}]") if coarse else instant(stamp)
+        moment = _in_utc(after.astype("datetime64[us]") if coarse else after, stamp, zone)
         return moment - np.timedelta64(1, "us") if coarse and upper else moment
     except (TypeError, ValueError):
         kind = "a date or a datetime" if axis.dtype.kind == "M" else "a number"

@@ -93,9 +93,10 @@ def follow(
 def duration(name: str, value: Any, dated: bool) -> Any:
     """A span of time in the type of times."""
     span = value if isinstance(value, int | float) and not dated else Clock.of(value).duration if value else 0
+    none = np.timedelta64(0, "us") if dated else 0
     if dated and not value:
-        return np.timedelta64(0, "us")
-    if span is None or not span >= (np.timedelta64(0, "us") if dated else 0) or (dated and isinstance(span, int | float)):
+        return none
+    if span is None or not span >= none or (dated and isinstance(span, int | float)):
         raise ValueError(
             f"spark.follow: {name} must be {'a duration, such as 10min' if dated else 'a number'}, not negative; "
             f"got {value!r}."

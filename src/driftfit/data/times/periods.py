@@ -75,5 +75,5 @@ def periods(texts: Sequence[str | None]) -> Array | None:
     if known is None or span(known) is None:
         return None
     found = {text: None if text is None else span(text) for text in set(texts)}
-    days = [np.datetime64("NaT") if (one := found[text]) is None else one[0] for text in texts]
+    days = [np.datetime64("NaT", "us") if (one := found[text]) is None else one[0] for text in texts]
     return np.array(days, dtype="datetime64[us]")
