@@ -29,6 +29,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.data.record import Reading
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.regressors import refuse_hidden, regressors
@@ -36,7 +37,7 @@ from driftfit.judge.segments.joint_autoregression import jointly
 from driftfit.judge.statistics.break_dates import dated
 from driftfit.judge.statistics.constancy import shortest as shortest_of
 from driftfit.judge.statistics.noise import HELD, Noise, begun, whitened
-from driftfit.judge.statistics.robust import ROUNDING, clipped, inverted, least_squares, noisy, orthonormal, robust_fit
+from driftfit.judge.statistics.robust import clipped, inverted, least_squares, noisy, orthonormal, robust_fit
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track

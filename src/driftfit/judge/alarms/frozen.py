@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.judge.alarms.variances import losses, variances
@@ -54,8 +55,6 @@ those in proportion to their time constant, since short references show long bur
 """
 SHARE = 8
 """The noise is judged by windows of at most this part of the reference."""
-UNSEEN = 1e-12
-"""A direction with at most this share of the largest information was excited by rounding only."""
 
 
 class Rows(NamedTuple):
@@ -145,7 +144,7 @@ def _covariance(phi: Array, x: Array) -> tuple[Array, Array]:
     inside = np.mean(np.abs(x) < OF_FIT)
     fitted = N / max(N - n, 1) * (1.0 + n / N * (1.0 - inside) / inside) ** 2
     values, vectors = np.linalg.eigh(phi.T @ phi)
-    seen = values > UNSEEN * values.max()
+    seen = values > ROUNDING * values.max()
     factor = fitted * np.mean(psi * psi) / inside**2
     cov = factor * (vectors / np.where(seen, values, values.max())) @ vectors.T
     return np.ascontiguousarray(cov), np.ascontiguousarray(vectors[:, ~seen].T)

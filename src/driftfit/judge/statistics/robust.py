@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array, Driver, shared
 from driftfit.engine.simd import (
     WIDTH,
@@ -69,8 +70,6 @@ where more than half of the readings of a coarse meter are the same, the median 
 
 FLAT = 1e-10
 """A pivot below this share of its diagonal entry counts as zero."""
-ROUNDING = 1e-12
-"""Residuals of this share of the terms of a fit may be rounding."""
 
 
 class Fit(NamedTuple):
@@ -304,7 +303,7 @@ def fit_in(basis: tuple[Array, Array], y: Array) -> Fit:
     Q, R = basis
     theta, residual, scale = np.zeros(Q.shape[1]), np.empty((1, len(y) + WIDTH)), np.empty(1)
     _run(columns_of(Q, y), theta, residual, scale)
-    return clipped(np.linalg.lstsq(R, theta, rcond=1e-12)[0], residual[0, : len(y)], float(scale[0]))
+    return clipped(np.linalg.lstsq(R, theta, rcond=ROUNDING)[0], residual[0, : len(y)], float(scale[0]))
 
 
 def noisy(fit: Fit, phi: Array, y: Array) -> bool:

@@ -26,15 +26,13 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array, State, kernel
 
 SHARE = 0.1
 """Share of the readings that repeat, and of the steps that are about as small as the least, for a quantum."""
 ENOUGH = 3.0
 """Number of steps of the size of the quantum, and of repeated readings, before it is accepted."""
-ROUNDING = 1e-12
-"""A step below this share of the reading is rounding, and the reading a repeated one."""
-
 LONGEST = 4.0
 """At most so many repeated readings in a row count."""
 

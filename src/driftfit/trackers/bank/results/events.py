@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 
 
@@ -184,7 +185,7 @@ def back_to(first: int, start: int, used: Array) -> int:
 def densest(mass: Array) -> tuple[int, int]:
     """First and last of the smallest set of neighbours with `LEVEL` of the total."""
     total = np.r_[0.0, np.cumsum(mass)]
-    wanted = LEVEL * total[-1] * (1.0 - 1e-12)
+    wanted = LEVEL * total[-1] * (1.0 - ROUNDING)
     ends = np.searchsorted(total, total[:-1] + wanted)
     first = int(np.argmin(np.where(ends <= len(mass), ends - np.arange(len(mass)), len(mass) + 1)))
     return first, int(ends[first]) - 1
