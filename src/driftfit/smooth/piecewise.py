@@ -18,6 +18,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
+from driftfit.smooth.parts.rank import column_sizes
 from driftfit.smooth.plots import plot_segments
 from driftfit.smooth.problem import replay
 from driftfit.trackers.bank.results.decided_path import faults
@@ -57,8 +58,7 @@ class Segments:
             rows = np.flatnonzero(self._ok[a:b]) + a
             root = np.sqrt(self._weight[rows])
             A, d = self._phi[rows] * root[:, None], self._y[rows] * root
-            size = np.sqrt(np.sum(A * A, axis=0))
-            size[size == 0.0] = 1.0  # in units of the regressors, which may be far apart, no rank is lost
+            size = column_sizes(A, np.sum)
             A /= size
             U, long, axes = np.linalg.svd(A, full_matrices=False)
             rank = int(np.sum(long > np.finfo(float).eps * max(A.shape) * long.max(initial=0.0)))

@@ -39,6 +39,7 @@ from driftfit.run.live.likelihood_ratio import (
     K,
     V,
 )
+from driftfit.smooth.parts.rank import column_sizes
 
 CLIPPED = 2.5
 """Scores are residuals clipped at this many scales."""
@@ -68,8 +69,7 @@ class Rows(NamedTuple):
 
 def frozen_model(phi: Array, y: Array, ok: Array) -> tuple[Frozen, Rows]:
     """Estimate the model from rows phi (N, n), y (N,), of which ok (N,) can be used."""
-    unit = np.sqrt(np.mean(phi[ok] ** 2, axis=0))
-    unit = np.where(unit > 0.0, unit, 1.0)
+    unit = column_sizes(phi[ok])
     rows = np.where(ok[:, None], np.column_stack([phi / unit, y]), 0.0)
     ar, root = np.zeros(0), np.ones(len(y))
     for _ in range(ROUNDS):

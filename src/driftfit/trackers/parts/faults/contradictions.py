@@ -131,15 +131,12 @@ def close_block(s: State, l: int) -> None:
         away, square = s.block_sum[l] / count, s.block_squares[l] / count
         ratio = s.block_ratios[l] / (count * s.scale[l])
         variance = max(square - away * away, 0.0)
+        differ = variance > ROUNDING * square
         if count == 1.0:
             learn_reading(s, s.y_mean[l] + away, l)
-        if (count > 1.0) & (variance > ROUNDING * square):
+        if (count > 1.0) & differ:
             learn_range(s, away, variance, count, l)
-        if (
-            (ratio >= 0.0)
-            & (s.y_count[l] > s.judged_from[l] - JUDGED)
-            & ((count == 1.0) | (variance > ROUNDING * square))
-        ):
+        if (ratio >= 0.0) & (s.y_count[l] > s.judged_from[l] - JUDGED) & ((count == 1.0) | differ):
             learn_ratio(s, ratio, count, l)
     known = (s.y_count[l] >= s.judged_from[l]) & (s.ratios[l] >= ENOUGH)
     calm = (s.widening[l] <= 1.0) & (s.lagging[l] + s.distrusted[l] <= 0.0)
