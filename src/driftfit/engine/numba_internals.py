@@ -54,9 +54,9 @@ from numba.extending import intrinsic
 
 from driftfit.engine.compile_time.lookups import known_once, replaced
 from driftfit.engine.compile_time.lowering import Pipeline
-from driftfit.engine.compile_time.open_record import OpenRecord, array_from, opened
+from driftfit.engine.compile_time.open_record import WORD, OpenRecord, array_from, entry_of, opened
 
-__all__ = ["AttributeTemplate", "OpenRecord", "dumps", "ir", "opened"]
+__all__ = ["WORD", "AttributeTemplate", "OpenRecord", "dumps", "entry_of", "ir", "opened"]
 
 TRIED = {
     "numba": ("0.62.1", "0.63.1", "0.64.0", "0.65.1", "0.66.0", "0.68.1"),
