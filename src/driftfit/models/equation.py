@@ -176,11 +176,11 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
 
     @kernel
     def push(s: State, l: int) -> None:
-        seen = s.observed[l] > 0.0
+        observed = s.observed[l] > 0.0
         predicted = informed(s, l)
         known = predicted & (s.without[l] < reach)
-        restore(s, seen, l)
-        s.y_lag[0, l] = s.measured[l] if seen else (s.y_hat[l] if known else np.nan)
+        restore(s, observed, l)
+        s.y_lag[0, l] = s.measured[l] if observed else (s.y_hat[l] if known else np.nan)
         share = min(1.0, s.usable[l] / (SETTLING * n)) if predicted & (s.ok[l] > 0.0) else 0.0
         share = share if (s.moved_on[l] > 0.0) | (s.usable[l] >= SETTLING * n) else 0.0
         for i in range(n):

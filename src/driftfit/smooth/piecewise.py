@@ -43,12 +43,12 @@ class Segments:
         if inner and not 0 < inner[0] <= inner[-1] < T:
             raise ValueError(f"piecewise: breaks must be samples within 1 .. {T - 1}; got {inner}.")
         self.run, self.names, self.bounds = run, run.names, np.array([0, *inner, T])
-        seen = replay(run)
-        known = seen["ok"][:, 0] > 0.0
+        replayed = replay(run)
+        known = replayed["ok"][:, 0] > 0.0
         if run.tracker.weighs:  # samples with a sensor fault carry no information about the segment
             known &= faults(run.tracker, run, Hypotheses(run).events()) == 1.0  # type: ignore[arg-type]
-        self._ok, self._phi, self._y = known, seen["phi"][..., 0], seen["y"][:, 0]
-        self._weight = 1.0 / seen["used_noise"][:, 0]
+        self._ok, self._phi, self._y = known, replayed["phi"][..., 0], replayed["y"][:, 0]
+        self._weight = 1.0 / replayed["used_noise"][:, 0]
         self._solve(r)
 
     def _solve(self, r: float | None) -> None:

@@ -40,7 +40,7 @@ class OpenRecord(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[int]]:
-        """What stands for the type in symbols: as for records, not the long name."""
+        """The name of the type in symbols: as for records, not the long one."""
         return type(self).__name__, (self._code,)
 
     def typeof(self, name: str) -> Any:

@@ -147,10 +147,10 @@ def _covariance(phi: Array, x: Array) -> tuple[Array, Array]:
     inside = np.mean(np.abs(x) < OF_FIT)
     fitted = N / max(N - n, 1) * (1.0 + n / N * (1.0 - inside) / inside) ** 2
     values, vectors = np.linalg.eigh(phi.T @ phi)
-    seen = values > ROUNDING * values.max()
+    excited = values > ROUNDING * values.max()
     factor = fitted * np.mean(psi * psi) / inside**2
-    cov = factor * (vectors / np.where(seen, values, values.max())) @ vectors.T
-    return np.ascontiguousarray(cov), np.ascontiguousarray(vectors[:, ~seen].T)
+    cov = factor * (vectors / np.where(excited, values, values.max())) @ vectors.T
+    return np.ascontiguousarray(cov), np.ascontiguousarray(vectors[:, ~excited].T)
 
 
 def _whitened(rows: Array, ok: Array, ar: Array) -> tuple[Array, Array]:

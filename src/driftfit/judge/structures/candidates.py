@@ -201,9 +201,9 @@ def pool_of(models: Sequence[Model], names: Sequence[str], records: Sequence[Rec
         return empty, [Candidate(name, model.n, model, None) for name, model in zip(names, models, strict=True)]
     union = _union(linear)
     order = {term: i for i, term in enumerate(_terms(union) or ())}
-    seen = np.concatenate([constant_least_squares(union, record) for record in records])
-    phi = np.where(seen["valid"] > 0.0, seen["phi"][..., 0], np.nan)
-    pool = Pool(tuple(records), phi, union.names, seen["dt"][:, 0].copy())
+    rows = np.concatenate([constant_least_squares(union, record) for record in records])
+    phi = np.where(rows["valid"] > 0.0, rows["phi"][..., 0], np.nan)
+    pool = Pool(tuple(records), phi, union.names, rows["dt"][:, 0].copy())
     structures = []
     for name, model in zip(names, models, strict=True):
         terms = _terms(model)

@@ -171,8 +171,8 @@ def clusters(p: Array, reach: slice, threshold: float) -> list[tuple[int, int]]:
     found = [(reach.start + a, reach.start + b) for a, b in runs(part > FAINT) if part[a:b].sum() > threshold]
     if found or not len(part) or part.sum() <= threshold:
         return found
-    seen = np.flatnonzero(part > FAINT)
-    return [(reach.start + int(seen[0]), reach.start + int(seen[-1]) + 1)] if len(seen) else []
+    likely = np.flatnonzero(part > FAINT)
+    return [(reach.start + int(likely[0]), reach.start + int(likely[-1]) + 1)] if len(likely) else []
 
 
 def back_to(first: int, start: int, used: Array) -> int:
