@@ -250,7 +250,7 @@ def choose(t: Any, L: int) -> None:
     counters, samples, kind = t.counters, t.samples, int(t.reduction[KIND])
     if kind == CUT:
         phi = t.phi
-        if t.reduction[WAIT] > 0.0:  # the last regressor before the open events stands for the next one
+        if t.reduction[WAIT] > 0.0:  # the last regressor before the open events represents the next one
             phi = samples[max(counters[STORED] - 1 - counters[HELD], 0) % len(samples), TIME + 1 :]
         decide(t, L, phi)
         counters[GROUPS] = number(t.group, L, t.order)
