@@ -1,11 +1,15 @@
 """Alarms on a frozen reference model: a naive twin of the statistics, rates, delays, and what changed."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
 from support import arx_record, rows_of
 
 from driftfit import ARX, AugmentedFLS, Kalman, Live, Regression, track
+from driftfit.data.storage import describe, rebuild
 from driftfit.judge.alarms.bootstrap import START
 from driftfit.judge.alarms.frozen import frozen_model, noise_model, noise_models
 from driftfit.judge.alarms.onsets import onsets
@@ -32,6 +36,7 @@ from driftfit.run.live.likelihood_ratio import (
     memory_of,
     scan,
 )
+from driftfit.run.live.rule import AlarmRule
 
 HELD = Kalman(q=0.0, r=1.0)
 GAIN = Regression(["gain"], intercept=True)
@@ -288,6 +293,25 @@ def test_errors():
     rule = run.detect(reference=300).rule
     with pytest.raises(ValueError, match="has 4 parameters"):
         Live(ARX(1, 1), HELD).detect(rule)
+
+
+@pytest.mark.parametrize("kind", ["glr", "cusum"])
+def test_a_rule_of_an_earlier_version_judges_as_it_did(kind):
+    """It was saved without directions that its reference did not excite."""
+    y, u = arx_record(400, 4)
+    run = track(ARX(2, 2), HELD, y, u)
+    now = run.detect(kind, reference=300, records=8)
+    saved = json.dumps(describe(replace(now.rule, frozen=now.rule.frozen[:5])))
+    earlier = run.detect(rebuild(json.loads(saved), AlarmRule), start=now.start)
+    assert len(earlier.rule.frozen) == 5
+    np.testing.assert_array_equal(earlier.statistic, now.statistic)
+    assert (earlier.p, earlier.unseen) == (now.p, 0)
+    live = Live(ARX(2, 2), HELD)
+    alarms = [live.detect(one.rule) for one in (now, earlier)]
+    for t in range(400):
+        live.update(y[t], u[t])
+    assert np.isfinite(alarms[0].statistic).all()
+    np.testing.assert_array_equal(*(one.statistic for one in alarms))
 
 
 def test_an_idle_input_leaves_the_alarm_as_it_is():

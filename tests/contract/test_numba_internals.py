@@ -115,7 +115,7 @@ def test_parts_are_linked_and_not_emitted():
 
 
 def test_what_is_seldom_run_and_short_routines_are_compiled_for_size():
-    @partial(kernel.kernel, seldom=True)
+    @partial(kernel.kernel, short=True)
     def halved(x):
         return 0.5 * x
 
@@ -132,7 +132,7 @@ def test_what_is_seldom_run_and_short_routines_are_compiled_for_size():
     assert Driver(use)(np.array([1.0, 2.0])) == 0.5
     (made,) = halved.overloads.values()
     assert {"optsize", "noinline", "cold"} <= set(made.library.get_llvm_str().split()), "No attributes: see _be_short."
-    assert "optsize" in code(True), "ShortRoutine._optimize_final_module is no longer called before LLVM's passes."
+    assert "optsize" in code(True), "Routine._optimize_final_module is no longer called before LLVM's passes."
     assert "optsize" not in code(False)
 
 
@@ -145,7 +145,7 @@ def test_passes_for_what_is_not_used_are_left_out():
     every, ours = passes(numba.njit(first)), passes(internals.under_ieee(first))
     replaced = {"native_lowering", "ir_legalization"}
     assert every - ours == UNUSED | replaced, "DefaultPassBuilder or the names of its passes changed."
-    assert ours - every == {"short_lowering", "legalization"}
+    assert ours - every == {"direct_lowering", "legalization"}
 
 
 def test_lifetimes_of_variables_are_not_searched(monkeypatch):

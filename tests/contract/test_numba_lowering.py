@@ -11,7 +11,7 @@ from numba.core.errors import LoweringError
 from numba.core.registry import cpu_target
 
 from driftfit.engine import numba_internals as internals
-from driftfit.engine.compile_time.lowering import Short
+from driftfit.engine.compile_time.lowering import Direct
 from driftfit.engine.kernel import Driver, kernel
 
 RECORD = np.dtype(
@@ -129,6 +129,6 @@ def test_an_error_names_its_line(monkeypatch):
     def twice(x):
         return 2.0 * x
 
-    monkeypatch.setattr(Short, "lower_inst", broken)
+    monkeypatch.setattr(Direct, "lower_inst", broken)
     with pytest.raises(LoweringError, match=r"(?s)a reason.*lowering .* at .*test_numba_lowering\.py"):
         internals.emit(twice, (types.float64,))

@@ -33,6 +33,10 @@ SMALLEST = 1e-38
 """Signals below this are zero. Between the two the fourth power of any ratio of signals is a number: no product of a
 regressor, a covariance that earlier regressors left, and an innovation overflows."""
 
+ROUNDING = 1e-12
+"""A result below this share of the numbers that it was computed from may be rounding: each of a few thousand operations
+adds up to 2^-53 of its terms, and decimal readings carry as much."""
+
 
 INPUTS = types.Array(types.float64, 1, "A", readonly=True)
 """The compiler's type of the inputs of one sample."""

@@ -77,19 +77,18 @@ def _again(dispatcher: Any, again: Callable[..., Any]) -> Any:
     return dispatcher
 
 
-def kernel(function: Callable[..., Any], inline: bool = True, seldom: bool = False) -> Any:
+def kernel(function: Callable[..., Any], inline: bool = True, short: bool = False) -> Any:
     """Compile a step, or a function that steps call.
 
     Inlined: with a call inside the lane loop the loop stays scalar (measured: 14 ns instead of 6 a lane-step at n = 4).
     With ``inline=False`` the compiler may choose; this is for functions that the lane loop is faster without. One that
-    is ``seldom`` run is called, and compiled for size. Division follows IEEE rules instead of raising, the GIL is
+    seldom runs is ``short``: called, and compiled for size. Division follows IEEE rules instead of raising, the GIL is
     released, and there is no fast-math.
     """
-    inline = inline and not seldom
-    compiled = _compiled(function, short=seldom, forceinline=inline, **internals.LINKED)
-    made = internals.as_part(compiled, internals.SeldomDispatcher if seldom else internals.StepDispatcher)
-    made.for_constants = inline
-    return _again(made, lambda other: kernel(other, inline, seldom))
+    inline = inline and not short
+    compiled = _compiled(function, short=short, forceinline=inline, **internals.LINKED)
+    made = internals.as_part(compiled, internals.StepDispatcher, for_constants=inline, short=short)
+    return _again(made, lambda other: kernel(other, inline, short))
 
 
 def shared(function: Callable[..., Any], arrays: bool = False) -> Any:

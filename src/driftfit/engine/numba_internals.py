@@ -54,9 +54,9 @@ from numba.extending import intrinsic
 
 from driftfit.engine.compile_time.lookups import known_once, replaced
 from driftfit.engine.compile_time.lowering import Pipeline
-from driftfit.engine.compile_time.open_record import OpenRecord, array_from, opened
+from driftfit.engine.compile_time.open_record import WORD, OpenRecord, array_from, entry_of, opened
 
-__all__ = ["AttributeTemplate", "OpenRecord", "dumps", "ir", "opened"]
+__all__ = ["WORD", "AttributeTemplate", "OpenRecord", "dumps", "entry_of", "ir", "opened"]
 
 TRIED = {
     "numba": ("0.62.1", "0.63.1", "0.64.0", "0.65.1", "0.66.0", "0.68.1"),
@@ -138,7 +138,19 @@ def store_by(dispatcher: Any, read: Callable[[Any], Any], write: Callable[[Any, 
 # ---- code to link ---------------------------------------------------------------------------------------------------
 
 
-class Fragment(JITCodeLibrary):
+class Routine(JITCodeLibrary):
+    """A routine with all that it calls."""
+
+    short = False
+    """Whether LLVM is asked for short code: loops are neither unrolled nor given vectorised copies."""
+
+    def _optimize_final_module(self) -> None:
+        if self.short:
+            _be_short(self._final_module)
+        super()._optimize_final_module()
+
+
+class Fragment(Routine):
     """Code that other functions inline: neither optimised nor emitted; that is done by the function that inlines it."""
 
     def _optimize_functions(self, module: Any) -> None:
@@ -163,7 +175,7 @@ class WholeFragment(Fragment):
     """Code that is optimised together with everything that it inlines."""
 
     _optimize_functions = JITCodeLibrary._optimize_functions
-    _optimize_final_module = JITCodeLibrary._optimize_final_module
+    _optimize_final_module = Routine._optimize_final_module
 
     def get_pointer_to_function(self, name: str) -> int:
         """None yet; asking for it is how Numba says that nothing more will be added."""
@@ -174,49 +186,33 @@ class WholeFragment(Fragment):
 class StepFragment(WholeFragment):
     """A step that inlines no other step is optimised: the speed of a loop over lanes depends on it (5 %). One that
     inlines others is optimised with the driver: at every level it took a quarter of the time, for no faster code.
+
+    A short step is called, and only its own code is short.
     """
+
+    def _optimize_functions(self, module: Any) -> None:
+        if self.short:
+            _be_short(module, "noinline", "cold")
+        super()._optimize_functions(module)
 
     def _optimize_final_module(self) -> None:
         if not any(isinstance(one, StepFragment) for one in self._linking_libraries):
-            super()._optimize_final_module()
+            JITCodeLibrary._optimize_final_module(self)
 
 
 def _be_short(module: Any, *more: str) -> None:
-    """Ask LLVM for short code of all functions of a module: loops are neither unrolled nor given vectorised copies."""
+    """Ask for short code of all functions of a module."""
     for one in module.functions:
         if not one.is_declaration:
             for attribute in ("optsize", *more):
                 one.add_function_attribute(attribute)
 
 
-class SeldomFragment(StepFragment):
-    """A step that is called, seldom run, and short."""
-
-    def _optimize_functions(self, module: Any) -> None:
-        _be_short(module, "noinline", "cold")
-        super()._optimize_functions(module)
-
-
-class ShortFragment(WholeFragment):
-    """Code that is optimised together with everything that it inlines, for size."""
-
-    def _optimize_final_module(self) -> None:
-        _be_short(self._final_module)
-        super()._optimize_final_module()
-
-
-class ShortRoutine(JITCodeLibrary):
-    """A routine behind a symbol, with all that it calls, in short code."""
-
-    def _optimize_final_module(self) -> None:
-        _be_short(self._final_module)
-        super()._optimize_final_module()
-
-
 class PartDispatcher(CPUDispatcher):
     """A function that Numba compiles so that others inline it."""
 
     library: type[Fragment] = Fragment
+    short = False
 
     for_constants = False
     """Whether constants are part of the types of a call. Numba would compile a copy for 0 and one for other numbers."""
@@ -234,7 +230,7 @@ class PartDispatcher(CPUDispatcher):
 
     def compile(self, signature: Any) -> Any:
         """The types and code of one signature."""
-        with compiler_lock, _library_of(self.py_func.__qualname__, self.library):
+        with compiler_lock, _library_of(self.py_func.__qualname__, self.library, self.short):
             made = super().compile(signature)
             _note_use(self, signature)
         return made
@@ -252,32 +248,15 @@ class StepDispatcher(PartDispatcher):
         return self.callable(*arguments)
 
 
-class SeldomDispatcher(StepDispatcher):
-    """A step that is called and seldom run."""
-
-    library = SeldomFragment
-
-
-class WholeDispatcher(PartDispatcher):
-    """A function that inlines everything that it calls."""
-
-    library = WholeFragment
-
-
-class ShortDispatcher(PartDispatcher):
-    """A function that inlines everything that it calls, in short code."""
-
-    library = ShortFragment
-
-
-def as_part(dispatcher: Any, kind: type[PartDispatcher] = PartDispatcher) -> Any:
-    """Make a function that Numba compiles only linkable into others."""
+def as_part(dispatcher: Any, kind: type[PartDispatcher] = PartDispatcher, **settings: Any) -> Any:
+    """Make a function that Numba compiles only linkable into others, with settings of a `PartDispatcher`."""
     dispatcher.__class__ = kind
+    vars(dispatcher).update(settings)
     return dispatcher
 
 
 @contextmanager
-def _library_of(name: str, kind: type[JITCodeLibrary]) -> Iterator[None]:
+def _library_of(name: str, kind: type[Routine], short: bool) -> Iterator[None]:
     """Within it, what is compiled under this name is of this kind; where they are nested, the inner one applies.
 
     Only for whoever holds `compiler_lock`: Numba's factories are replaced for all threads.
@@ -286,7 +265,11 @@ def _library_of(name: str, kind: type[JITCodeLibrary]) -> Iterator[None]:
     create, restore, set_env = codegen.create_library, codegen.unserialize_library, codegen.set_env
 
     def create_fragment(called: str, **options: Any) -> Any:
-        return kind(codegen, called, **options) if called == name else create(called, **options)
+        if called != name:
+            return create(called, **options)
+        made = kind(codegen, called, **options)
+        made.short = short
+        return made
 
     def restore_fragment(stored: Any) -> Any:
         return kind._unserialize(codegen, stored) if stored[0] == name else restore(stored)
@@ -377,7 +360,7 @@ def emit(function: FunctionType, arguments: tuple[Any, ...], from_python: bool =
     """Compile a function for one signature, with all that it inlines, to object code; ``short``: for size."""
     with compiler_lock, nullcontext() if from_python else at_level_two():
         options = {"no_cfunc_wrapper": True, "no_cpython_wrapper": not from_python}
-        dispatcher = as_part(under_ieee(function, **options), ShortDispatcher if short else WholeDispatcher)
+        dispatcher = as_part(under_ieee(function, **options), library=WholeFragment, short=short)
         dispatcher.compile(arguments)
         made = dispatcher.overloads[arguments]
         module = made.library._final_module
@@ -441,8 +424,7 @@ def _loader() -> Any:
 
 def publish(dispatcher: Any, arguments: tuple[Any, ...], symbol: str, short: bool) -> Any:
     """Compile a function, or find it on disk, and let code call it by a symbol; returns the owner of the code."""
-    kind = ShortRoutine if short else JITCodeLibrary
-    with compiler_lock, _library_of(dispatcher.py_func.__qualname__, kind), at_level_two():
+    with compiler_lock, _library_of(dispatcher.py_func.__qualname__, Routine, short), at_level_two():
         dispatcher.compile(arguments)
     made = next(iter(dispatcher.overloads.values()))
     llvm.add_symbol(symbol, made.library.get_pointer_to_function(made.fndesc.llvm_cfunc_wrapper_name))

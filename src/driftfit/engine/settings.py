@@ -18,6 +18,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 
 
@@ -100,10 +101,10 @@ def covariance(owner: str, name: str, value: Any) -> Any:
         if array.shape[0] != array.shape[1]:
             raise ValueError(f"{owner}: {name} must be square as a matrix; got shape {array.shape}.")
         spread = float(np.abs(array).max(initial=0.0))
-        if not np.allclose(array, array.T, rtol=0.0, atol=1e-12 * spread):
+        if not np.allclose(array, array.T, rtol=0.0, atol=ROUNDING * spread):
             raise ValueError(f"{owner}: {name} must be symmetric; the given matrix is not.")
         lowest = float(np.linalg.eigvalsh(array).min(initial=0.0))
-        if lowest < -1e-12 * spread:
+        if lowest < -ROUNDING * spread:
             raise ValueError(
                 f"{owner}: {name} must be positive semi-definite; the given matrix has an eigenvalue {lowest:.3g}."
             )

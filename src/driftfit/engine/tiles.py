@@ -66,9 +66,9 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
     opened = [field for name in OPEN for field in fields if field[0] == name]
     fields = [field for field in fields if field not in opened]
     own = trackers[0].keys() | _common(n).keys()
-    seen = [field for field in fields if field[0] in own]
+    tracked = [field for field in fields if field[0] in own]
     others = [field for field in fields if field[0] not in own]
-    fields = [*seen, _padding(BOUNDARY, seen, L), *others]
+    fields = [*tracked, _padding(BOUNDARY, tracked, L), *others]
     tile = _aligned(_followed_by(np.dtype([*fields, _padding("padding", fields, L)], align=True), opened), 1)
     for l, start in enumerate(starts):
         for name, value in start.items():

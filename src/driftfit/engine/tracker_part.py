@@ -26,9 +26,9 @@ open fields, which are at the end of the record, if there are any.
 def _part(record: Any) -> Any:
     """The type of the part; its last field has a name that no record has, for which Numba would take it to be one."""
     boundary = record.fields[BOUNDARY]
-    seen = {name: field for name, field in record.fields.items() if field.offset < boundary.offset} | {"end": boundary}
+    own = {name: field for name, field in record.fields.items() if field.offset < boundary.offset} | {"end": boundary}
     return types.Record(
-        [(name, {"type": one.type, "offset": one.offset, "alignment": one.alignment}) for name, one in seen.items()],
+        [(name, {"type": one.type, "offset": one.offset, "alignment": one.alignment}) for name, one in own.items()],
         boundary.offset + 8 * boundary.type.nitems,
         record.aligned,
     )

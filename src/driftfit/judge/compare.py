@@ -43,8 +43,8 @@ def persistence(y: Array, rows: int = 1) -> Array:
     """
     if rows > 1:
         return np.stack([persistence(one) for one in y.reshape(-1, rows).T], axis=1).ravel()
-    seen = np.where(np.isfinite(y), np.arange(len(y)), -1)
-    last = np.concatenate([[-1], np.maximum.accumulate(seen)[:-1]])
+    place = np.where(np.isfinite(y), np.arange(len(y)), -1)
+    last = np.concatenate([[-1], np.maximum.accumulate(place)[:-1]])
     return np.where(last >= 0, y[last], np.nan)
 
 

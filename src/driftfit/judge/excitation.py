@@ -16,6 +16,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.run.result import burn_in
+from driftfit.smooth.parts.rank import column_sizes
 
 INDEX = 100.0
 """Limit of the condition index."""
@@ -44,11 +45,10 @@ def excitation(phi: Array, window: int | None = None) -> Excitation:
     """Eigenvalues of windows of regressors phi (N, n), of max(50, 5 n) samples unless ``window`` is given."""
     N, n = phi.shape
     W = burn_in(n) if window is None else window
-    size = np.sqrt(np.mean(phi * phi, axis=0)) if N else np.ones(n)
-    scaled = phi / np.where(size > 0.0, size, 1.0)
     ends = np.arange(W, N + 1, max(W // 2, 1))
     if not len(ends):
         return Excitation(np.zeros(0, int), np.zeros((0, n)), np.full(n, np.nan))
+    scaled = phi / column_sizes(phi)
     R = np.array([scaled[end - W : end].T @ scaled[end - W : end] / W for end in ends])
     values, vectors = np.linalg.eigh(R)
     found = Excitation(ends - 1, np.maximum(values, 0.0), vectors[0, :, 0])

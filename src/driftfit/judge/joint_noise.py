@@ -117,9 +117,9 @@ class JointNoise:
         phi, y = self.phi, run.y
         rows_y, rows_u = np.full(y.shape, np.nan), np.full((len(y), ny, ny * phi.shape[1]), np.nan)
         blocks = np.einsum("ij,tk->tijk", np.eye(ny), phi).reshape(len(y), ny, -1)
-        for seen, at in _patterns(np.isfinite(y)):
-            L = np.linalg.cholesky(R[np.ix_(seen, seen)])
-            place = np.ix_(at, seen)
+        for observed, at in _patterns(np.isfinite(y)):
+            L = np.linalg.cholesky(R[np.ix_(observed, observed)])
+            place = np.ix_(at, observed)
             rows_y[place] = np.linalg.solve(L, y[place].T).T
             rows_u[place] = np.linalg.solve(L, blocks[place])
         names = tuple(name for each in run.names for name in each)
@@ -145,13 +145,13 @@ def _log_density(z: Array, q: Array, S: Array, d: Array) -> Array:
     the sample.
     """
     found, gamma = np.full(len(z), np.nan), scipy.special.gammaln
-    for seen, rows in _patterns(np.isfinite(z)):
-        at, k = rows[d[rows] > 0.0], len(seen)
+    for observed, rows in _patterns(np.isfinite(z)):
+        at, k = rows[d[rows] > 0.0], len(observed)
         if not len(at):
             continue
-        inner, e = S[np.ix_(at, seen, seen)], z[np.ix_(at, seen)]
+        inner, e = S[np.ix_(at, observed, observed)], z[np.ix_(at, observed)]
         far = np.einsum("ti,ti->t", e, np.linalg.solve(inner, e[..., None])[..., 0])
-        wide = k * np.log(np.pi) + np.linalg.slogdet(inner)[1] + np.log(q[np.ix_(at, seen)]).sum(axis=1)
+        wide = k * np.log(np.pi) + np.linalg.slogdet(inner)[1] + np.log(q[np.ix_(at, observed)]).sum(axis=1)
         ratio = gamma(0.5 * (d[at] + k)) - gamma(0.5 * d[at])
         found[at] = ratio - 0.5 * wide - 0.5 * (d[at] + k) * np.log1p(far)
     return found
@@ -161,4 +161,4 @@ def _patterns(there: Array) -> list[tuple[Array, Array]]:
     """Every pattern of observed outputs and the samples that have it; samples without an output are left out."""
     kinds, which = np.unique(there, axis=0, return_inverse=True)
     each = [(np.flatnonzero(kind), np.flatnonzero(which.ravel() == k)) for k, kind in enumerate(kinds)]
-    return [(seen, at) for seen, at in each if len(seen)]
+    return [(observed, at) for observed, at in each if len(observed)]

@@ -29,6 +29,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.data.record import Reading
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.regressors import refuse_hidden, regressors
@@ -36,7 +37,7 @@ from driftfit.judge.segments.joint_autoregression import jointly
 from driftfit.judge.statistics.break_dates import dated
 from driftfit.judge.statistics.constancy import shortest as shortest_of
 from driftfit.judge.statistics.noise import HELD, Noise, begun, whitened
-from driftfit.judge.statistics.robust import ROUNDING, clipped, inverted, least_squares, noisy, orthonormal, robust_fit
+from driftfit.judge.statistics.robust import clipped, fit_in, inverted, least_squares, noisy, orthonormal, robust_fit
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
@@ -212,21 +213,20 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
     least = shortest_of(n) if shortest is None else max(whole("segment", "shortest", shortest, 1), n + 1)
     rows = regressors(run)
     N = len(rows.y)
-    size = np.sqrt(np.mean(rows.phi**2, axis=0)) if N else np.zeros(n)
     if max(2 * least, n + 2) > N:
         needed = f"{N} samples can be used, and at least {max(2 * least, n + 2)} are needed"
         return _undivided(run, rows.phi, rows.y, level, needed)
-    if not (size > 0.0).all() or np.linalg.matrix_rank(rows.phi / size, 1e-9) < n:
+    basis = orthonormal(rows.phi)
+    if not basis.distinct:
         return _undivided(run, rows.phi, rows.y, level, "the regressors do not distinguish the parameters")
-    fit = robust_fit(rows.phi, rows.y)
+    fit = fit_in(basis, rows.y)
     if not noisy(fit, rows.phi, rows.y):
         return _undivided(run, rows.phi, rows.y, level, "constant parameters explain nine of ten outputs without error")
-    Q = orthonormal(rows.phi / size)[0]
-    search, found, starts = begun(Q, fit.residual, CELLS, least, quiet=false)
+    search, found, starts = begun(basis.Q, fit.residual, CELLS, least, quiet=false)
     found = jointly(search, found, starts, false)
     # a value limited by the fit still supports one side; without its row it does not
     used = np.abs(found.near) <= HELD * found.level
-    X, z = Q * (used / found.level)[:, None], np.where(used, found.held, 0.0) / found.level
+    X, z = basis.Q * (used / found.level)[:, None], np.where(used, found.held, 0.0) / found.level
     breaks, spans = dated(X / found.white, z / found.white, found.ar, found.breaks.tolist(), least, level)
     at = [int(rows.at[b]) for b in breaks]
     time = run.time
@@ -272,8 +272,7 @@ def _undivided(run: Track, phi: Array, y: Array, level: float, why: str) -> Segm
         e = y - phi @ theta
         e = np.where(np.abs(e) <= ROUNDING * (np.abs(y) + np.abs(phi) @ np.abs(theta)), 0.0, e)
         spread = float(np.std(e))
-        size = np.sqrt(np.mean(phi**2, axis=0))
-        if n < N and (size > 0.0).all() and np.linalg.matrix_rank(phi / size, 1e-9) == n:
+        if n < N and orthonormal(phi).distinct:
             std = np.sqrt(e @ e / (N - n) * np.diag(inverted(phi)))
     one = Segment(0, len(run), theta, std)
     return Segmentation((), (one,), level, float("nan"), spread, (), run, why)

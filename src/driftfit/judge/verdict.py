@@ -33,6 +33,7 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.evidence import Evidence
@@ -41,7 +42,6 @@ from driftfit.judge.statistics.attribution import Attribution, alike, attribute
 from driftfit.judge.statistics.constancy import Constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
-from driftfit.judge.statistics.robust import ROUNDING
 from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, digits, facts, table_of

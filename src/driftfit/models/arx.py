@@ -38,7 +38,7 @@ from driftfit.engine.settings import one_of, output_names, whole
 from driftfit.models.base import GAP, Model
 from driftfit.models.inputs import CountedInputs
 from driftfit.models.lags.doubted_lags import doubted, no_doubts, shift_doubts
-from driftfit.models.lags.output_lags import take_output, wait_for_lags
+from driftfit.models.lags.output_lags import shift_inputs, take_output, wait_for_lags
 from driftfit.models.run_time_arx import ONE, PAST, RunTimeARX
 
 
@@ -221,18 +221,13 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, doubts: 
     @kernel
     def regress(s: State, l: int) -> None:
         broken = s.dt[l] > GAP
-        depth = s.u_lag.shape[1]
         for i in range(na):
             lag = s.y_lag[i, l]
             lag = np.nan if broken else lag
             s.y_lag[i, l] = lag
             s.phi[i, l] = doubted(s, 0, i, l, lag) if doubts else lag
+        shift_inputs(s, m, l)
         for j in range(m):
-            # the present input has position 0, so lag k is entry k, and nk = 0 needs no special case
-            for i in range(depth - 1, 0, -1):
-                lag = s.u_lag[j, i - 1, l]
-                s.u_lag[j, i, l] = np.nan if broken else lag
-            s.u_lag[j, 0, l] = s.u[j, l]
             for i in range(nb[j]):
                 s.phi[at[j] + i, l] = s.u_lag[j, nk[j] + i, l]
         if intercept:
@@ -311,15 +306,12 @@ def _joint_steps(
     @kernel
     def regress(s: State, l: int) -> None:
         broken = s.dt[l] > GAP
-        depth = s.u_lag.shape[1]
         for o in range(ny):
             for i in range(na):
                 s.y_lag[o, i, l] = np.nan if broken else s.y_lag[o, i, l]
                 s.phi[o * na + i, l] = doubted(s, o, i, l, s.y_lag[o, i, l]) if doubts else s.y_lag[o, i, l]
+        shift_inputs(s, m, l)
         for j in range(m):
-            for i in range(depth - 1, 0, -1):
-                s.u_lag[j, i, l] = np.nan if broken else s.u_lag[j, i - 1, l]
-            s.u_lag[j, 0, l] = s.u[j, l]
             for i in range(nb[j]):
                 s.phi[at[j] + i, l] = s.u_lag[j, nk[j] + i, l]
         if intercept:

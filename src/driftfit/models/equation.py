@@ -44,6 +44,7 @@ from driftfit.models.fault_codes import possible
 from driftfit.models.formulas.functions import equation_text
 from driftfit.models.formulas.text import Formula, compiled, parse, start_values
 from driftfit.models.inputs import NamedInputs
+from driftfit.models.lags.output_lags import shift_inputs
 from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
 
 SETTLING = 10.0
@@ -150,10 +151,7 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
         broken = s.dt[l] > GAP
         for i in range(reach, 0, -1):
             s.y_lag[i, l] = np.nan if broken else s.y_lag[i - 1, l]
-            for j in range(m):
-                s.u_lag[j, i, l] = np.nan if broken else s.u_lag[j, i - 1, l]
-        for j in range(m):
-            s.u_lag[j, 0, l] = s.u[j, l]
+        shift_inputs(s, m, l)
 
     @kernel
     def finite(s: State, l: int) -> bool:
@@ -178,11 +176,11 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
 
     @kernel
     def push(s: State, l: int) -> None:
-        seen = s.observed[l] > 0.0
+        observed = s.observed[l] > 0.0
         predicted = informed(s, l)
         known = predicted & (s.without[l] < reach)
-        restore(s, seen, l)
-        s.y_lag[0, l] = s.measured[l] if seen else (s.y_hat[l] if known else np.nan)
+        restore(s, observed, l)
+        s.y_lag[0, l] = s.measured[l] if observed else (s.y_hat[l] if known else np.nan)
         share = min(1.0, s.usable[l] / (SETTLING * n)) if predicted & (s.ok[l] > 0.0) else 0.0
         share = share if (s.moved_on[l] > 0.0) | (s.usable[l] >= SETTLING * n) else 0.0
         for i in range(n):

@@ -48,19 +48,19 @@ UNJUDGED: Mapping[str, Any] = {
 def judge(s: State, y_hat: float, l: int) -> None:
     """Refuse a strange reading; y_hat is NaN where there is no prediction."""
     y = s.y[l]
-    seen, fresh = abs(y) < LARGEST, y != s.raw[l]
+    observed, fresh = abs(y) < LARGEST, y != s.raw[l]
     apart, off = (y - s.accepted[l]) ** 2, (y - y_hat) ** 2
     near = min(apart, off) if off >= 0.0 else apart
     near = min((y - s.usual[l]) ** 2, near)
     reach = REACH * REACH * s.usual_spread[l]
-    strange = seen & (s.judged[l] >= FIRST) & (near > reach)
+    strange = observed & (s.judged[l] >= FIRST) & (near > reach)
     out = strange & (near > reach * s.forbearance[l] * s.forbearance[l])
     longer = min(2.0 * s.forbearance[l], LONGEST) if fresh else s.forbearance[l]
-    s.forbearance[l] = longer if strange else (1.0 if seen else s.forbearance[l])
-    s.raw[l] = y if seen else s.raw[l]
+    s.forbearance[l] = longer if strange else (1.0 if observed else s.forbearance[l])
+    s.raw[l] = y if observed else s.raw[l]
     s.refused[l] += 1.0 if out else 0.0
     s.y[l] = np.nan if out else y
-    if seen & (not out):
+    if observed & (not out):
         s.accepted[l] = y
         if fresh | (s.judged[l] < 1.0):
             s.judged[l] += 1.0

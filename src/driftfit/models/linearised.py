@@ -56,14 +56,14 @@ def informed(s: State, l: int) -> bool:
 
 
 @kernel
-def restore(s: State, seen: bool, l: int) -> None:
+def restore(s: State, observed: bool, l: int) -> None:
     """The prediction becomes one of y, and the sample is counted.
 
     A plant at rest repeats its regressor, and says nothing of most parameters however long it rests: the linearisation
     must not go to an estimate that is still the prior.
     """
     s.y_hat[l] += s.shift[l]
-    s.without[l] = 0.0 if seen else s.without[l] + 1.0
+    s.without[l] = 0.0 if observed else s.without[l] + 1.0
     row = 0.0
     for i in range(s.phi.shape[0]):
         row += (i + 1.0) * s.phi[i, l]

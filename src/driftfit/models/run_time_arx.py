@@ -20,7 +20,7 @@ from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import State, kernel
 from driftfit.models.base import GAP
 from driftfit.models.lags.doubted_lags import doubted, no_doubts, shift_doubts
-from driftfit.models.lags.output_lags import take_output, wait_for_lags
+from driftfit.models.lags.output_lags import shift_inputs, take_output, wait_for_lags
 from driftfit.models.wider import Wider
 
 PAST, ONE, ABSENT = -1, -2, -3
@@ -70,11 +70,7 @@ def _steps(m: int, doubts: bool) -> ModelSteps:
                 lag = np.nan if broken else lag
                 s.y_lag[i, l] = lag
                 s.phi[i, l] = doubted(s, 0, i, l, lag) if doubts else lag
-        for j in range(m):
-            for i in range(depth - 1, 0, -1):
-                lag = s.u_lag[j, i - 1, l]
-                s.u_lag[j, i, l] = np.nan if broken else lag
-            s.u_lag[j, 0, l] = s.u[j, l]
+        shift_inputs(s, m, l)
         for i in range(s.phi.shape[0]):
             pick = s.picks[i, l]
             if pick >= 0:

@@ -276,9 +276,9 @@ def _steps(equations: str, inputs: tuple[str, ...]) -> ModelSteps:
 
     @kernel
     def push(s: State, l: int) -> None:
-        seen = s.observed[l] > 0.0
+        observed = s.observed[l] > 0.0
         known = (s.valid[l] > 0.0) & (s.without[l] < reach)
-        s.without[l] = 0.0 if seen else s.without[l] + 1.0
-        s.y_lag[0, l] = s.y[l] if seen else (s.y_hat[l] if known else np.nan)
+        s.without[l] = 0.0 if observed else s.without[l] + 1.0
+        s.y_lag[0, l] = s.y[l] if observed else (s.y_hat[l] if known else np.nan)
 
     return ModelSteps(regress, push)

@@ -14,7 +14,7 @@ from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program, State
-from driftfit.run.result import Track
+from driftfit.run.result import Lanes, Track
 from driftfit.run.warm_start import Run, carried, ended, first_interval
 
 
@@ -72,8 +72,8 @@ class Fleet(KeyedResults):
             return self._run(k)
         lanes = range(k * self.records.ny, (k + 1) * self.records.ny)
         starts = {place: self._starts[j] for place, j in enumerate(lanes) if j in self._starts}
-        some = [self._lanes[j] for j in lanes]
-        return Outputs([self._programs[j] for j in lanes], self.records.only(k), some, {}, starts)
+        programs = [self._programs[j] for j in lanes]
+        return Outputs(programs, self.records.only(k), self._lanes.part(lanes), {}, starts)
 
     def _run(self, j: int) -> Track:
         if self.records.outputs:
@@ -81,9 +81,7 @@ class Fleet(KeyedResults):
             whole = self._whole(k)
             assert isinstance(whole, Outputs)
             return whole[output]
-        lane = self._lanes[j]
-        assert lane is not None
-        return Track(self._programs[j], self.records.part(j), lane, self._starts.get(j))
+        return Track(self._programs[j], self.records.part(j), self._lanes[j], self._starts.get(j))
 
     def _absent(self, key: Hashable) -> str:
         if key in self.failed:
@@ -117,7 +115,7 @@ def run_fleet(
     interrupt (Ctrl-C) stops the fleet and returns what is finished, with a warning.
     """
     if not records.keys:
-        return Fleet(programs, records, [], failed or {}, {})
+        return Fleet(programs, records, Lanes.of({}, 0), failed or {}, {})
     starts, records = _begun(programs, records, before or {})
     lanes = run_lanes(programs, records, keep, starts, dtype)
     done = lanes.done[:: records.ny].tolist()

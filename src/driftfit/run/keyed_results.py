@@ -42,21 +42,22 @@ class KeyedResults(Plain):
         self,
         programs: Sequence[Program],
         records: Records,
-        lanes: Lanes | Sequence[Lane | None],
+        lanes: Lanes,
         failed: Mapping[Hashable, str],
         starts: Mapping[int, State],
     ) -> None:
         self.records = records
         self.failed = dict(failed)
         self._programs = tuple(programs)
-        self._lanes = lanes if isinstance(lanes, Lanes) else Lanes.of(lanes)
+        self._lanes = lanes
         self._starts = dict(starts)
         done = self._lanes.done.tolist()
         self._index = {key: j for j, key in enumerate(self._named()) if done[j]}
 
     def __reduce__(self) -> Any:
         """A copy does not contain other series of a tile."""
-        lanes = [lane and lane.alone(one) for lane, one in zip(self._lanes, self._programs, strict=False)]
+        alone = {j: self._lanes[j].alone(self._programs[j]) for j in self._index.values()}
+        lanes = Lanes.of(alone, len(self._lanes))
         return type(self), (self._programs, self.records, lanes, self.failed, self._starts)
 
     def _named(self) -> Sequence[Hashable]:
@@ -121,7 +122,6 @@ class KeyedResults(Plain):
         """The program of each lane, and its state after the last sample."""
         for j in self._index.values():
             lane = self._lanes[j]
-            assert lane is not None
             yield self._programs[j], state_of(lane.tile, lane.lane)
 
     def undetermined(self) -> Iterator[tuple[Program, dict[str, Array]]]:
@@ -163,7 +163,7 @@ class KeyedResults(Plain):
             arrays |= {f"start{j}_{name}": value for name, value in start.items()}
         groups = self._groups()
         for g, some in enumerate(groups):
-            lanes = [lane for j in some if (lane := self._lanes[j])]
+            lanes = [self._lanes[j] for j in some]
             states = [state_of(lane.tile, lane.lane) for lane in lanes]
             arrays[f"lanes{g}"] = np.array(some)
             for name in names_of(lanes[0].out):
@@ -177,7 +177,6 @@ class KeyedResults(Plain):
         groups: dict[Any, list[int]] = {}
         for j in self._index.values():
             lane = self._lanes[j]
-            assert lane is not None
             shapes = tuple((name, value.shape) for name, value in state_of(lane.tile, lane.lane).items())
             groups.setdefault((shapes, names_of(lane.out)), []).append(j)
         return list(groups.values())
@@ -199,10 +198,8 @@ class KeyedResults(Plain):
             keys, arrays["first"], arrays["length"], arrays["y"], arrays["u"], Known(arrays["known"]),
             arrays.get("time"), Labels(**header["labels"]), dropped, None, missing, outputs,
         )  # fmt: skip
-        lanes: list[Lane | None] = [None] * (len(records.keys) * records.ny)
-        for g in range(header["groups"]):
-            for j, lane in _restored(path, arrays, g, programs, records):
-                lanes[j] = lane
+        found = {j: lane for g in range(header["groups"]) for j, lane in _restored(path, arrays, g, programs, records)}
+        lanes = Lanes.of(found, len(records.keys) * records.ny)
         starts: dict[int, dict[str, Array]] = {}
         for name in arrays:
             if name.startswith("start"):

@@ -99,7 +99,7 @@ class Outputs(KeyedResults, Columns):
     def in_rows(self, name: str) -> Array:
         """A field of the driver's output, (T, ny, ..)."""
         if name not in self._stacked:
-            self._stacked[name] = np.stack([lane.written(name) for lane in self._lanes if lane], axis=1)
+            self._stacked[name] = np.stack([lane.written(name) for lane in self._lanes], axis=1)
         return self._stacked[name]
 
     @cached_property
@@ -154,7 +154,6 @@ class Outputs(KeyedResults, Columns):
     def _track(self, j: int) -> Track:
         """One output alone, as a regression whose regressors may contain the other outputs."""
         alone, u, lane = self._programs[j].alone, self.u, self._lanes[j]
-        assert lane is not None
         known, names, units = self.record.known.for_output(j), self.labels.u, dict(self.labels.units)
         if alone is None:
             found, names = self._collected, self.names[j]
@@ -183,7 +182,7 @@ class Outputs(KeyedResults, Columns):
 
     def end(self) -> End:
         """The end of the run, from which another one can continue (`warm_start`)."""
-        lanes = [state_of(lane.tile, lane.lane) for lane in self._lanes if lane]
+        lanes = [state_of(lane.tile, lane.lane) for lane in self._lanes]
         states = tuple({name: value.copy() for name, value in lane.items()} for lane in lanes)
         labels = self.labels
         return End(self._programs, states, self.time[-1] if self.timed else None, dt=labels.dt, zone=labels.zone)

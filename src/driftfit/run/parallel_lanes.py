@@ -53,7 +53,7 @@ def run_lanes(
     """Run every series by its programs, one for each of its outputs; all have one bound model.
 
     ``programs`` and the result have an entry for each output of each series, in that order; ``starts`` are the fields
-    that some of them begin with. An interrupt (Ctrl-C) stops the run: lanes that are not finished are None.
+    that some of them begin with. An interrupt (Ctrl-C) stops the run: lanes that are not finished have no result.
     """
     jobs = prepare(programs, records, keep, dtype)
     for job in jobs:
@@ -61,6 +61,11 @@ def run_lanes(
             for name, value in starts.get(k, {}).items():
                 job.tile[name][0, ..., lane] = value
     run_jobs(jobs, records)
+    return lanes_in(jobs, records)
+
+
+def lanes_in(jobs: Sequence[Job], records: Records) -> Lanes:
+    """The lanes of the jobs that are done, one for each output of each series."""
     tiles = [(job.out, job.tile, job.lanes[job.live], np.flatnonzero(job.live)) for job in jobs if job.done]
     return Lanes(tiles, np.repeat(records.length, records.ny))
 

@@ -253,25 +253,18 @@ class Program:
         the cache.
         """
         keep, rows = _driven(tile.dtype, self.tracker.outputs, out.dtype)
-        run, alone = self.drivers(keep).run, out.dtype.names == ("theta",)
-        if out.dtype == rows:
-            run(tile, y, u, known, out)
+        run, last = self.drivers(keep).run, tuple[Array, ...]()
+        if out.dtype.names == ("theta",):  # the driver writes theta, and the rest of a sample over that of the last one
+            last, out, rows = (np.empty(1, rows),), out["theta"], rows["theta"]
+        if out.dtype == rows.base:
+            run(tile, y, u, known, *last, out)
             return
-        last = np.empty(1, rows)
-        if alone and out.dtype["theta"].base == np.float64:
-            run(tile, y, u, known, last, out["theta"])
-            return
-        block = np.empty(min(BLOCK, len(out)), rows["theta"] if alone else rows)
+        block = np.empty(min(BLOCK, len(out)), rows)
         for a in range(0, len(out), BLOCK):
             part = slice(a, min(a + BLOCK, len(out)))
             results = block[: part.stop - a]
-            given = y[part], u[part], known if len(known) == 1 else known[part]
-            if alone:
-                run(tile, *given, last, results)
-                out["theta"][part] = results
-            else:
-                run(tile, *given, results)
-                _copy(results, out[part])
+            run(tile, y[part], u[part], known if len(known) == 1 else known[part], *last, results)
+            _copy(results, out[part])
 
 
 @lru_cache(maxsize=256)
@@ -283,7 +276,10 @@ def _driven(tile: np.dtype[Any], outputs: tuple[str, ...], out: np.dtype[Any]) -
 
 def _copy(results: Array, out: Array) -> None:
     """Store what ``out`` keeps of results, all at once where it keeps all."""
-    T, names = len(out), out.dtype.names or ()
+    T, names = len(out), out.dtype.names
+    if names is None:
+        out[...] = results
+        return
     if names == results.dtype.names and all(results.dtype[name].base == np.float64 for name in names):
         out.view(out.dtype[names[0]].base).reshape(T, -1)[...] = results.view(np.float64).reshape(T, -1)
         return

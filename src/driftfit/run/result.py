@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
 from os import PathLike
@@ -48,7 +48,7 @@ class Lane(NamedTuple):
 
 
 class Lanes:
-    """The results of many lanes: a `Lane`, or None, made when it is asked for; a million of them would take a second.
+    """The results of many lanes: a `Lane` is made when it is asked for; a million of them would take a second.
 
     ``tiles`` are (output of the driver, end state, numbers of the lanes that have a result, their places in the tile),
     ``length`` the number of samples of each lane.
@@ -61,11 +61,14 @@ class Lanes:
             self._tile[lanes], self._place[lanes] = k, places
 
     @classmethod
-    def of(cls, lanes: Sequence[Lane | None]) -> Self:
-        """Lanes that exist."""
-        some = [(j, lane) for j, lane in enumerate(lanes) if lane]
-        tiles = [(lane.out, lane.tile, np.array([j]), np.array([lane.lane])) for j, lane in some]
-        return cls(tiles, np.array([len(lane.out) if lane else 0 for lane in lanes], int))
+    def of(cls, lanes: Mapping[int, Lane], count: int) -> Self:
+        """Lanes that exist, by their number among ``count``."""
+        tiles = [(lane.out, lane.tile, np.array([j]), np.array([lane.lane])) for j, lane in lanes.items()]
+        return cls(tiles, np.array([len(lanes[j].out) if j in lanes else 0 for j in range(count)], int))
+
+    def part(self, numbers: Sequence[int]) -> Lanes:
+        """Some lanes, in this order."""
+        return Lanes.of({k: self[j] for k, j in enumerate(numbers)}, len(numbers))
 
     @property
     def done(self) -> Array:
@@ -75,15 +78,16 @@ class Lanes:
     def __len__(self) -> int:
         return len(self.length)
 
-    def __getitem__(self, j: int) -> Lane | None:
+    def __getitem__(self, j: int) -> Lane:
         k = self._tile.item(j)
         if k < 0:
-            return None
+            raise KeyError(j)
         out, tile, _, _ = self.tiles[k]
         return Lane(out[: self.length.item(j)], tile, self._place.item(j))
 
-    def __iter__(self) -> Iterator[Lane | None]:
-        return map(self.__getitem__, range(len(self)))
+    def __iter__(self) -> Iterator[Lane]:
+        """Those that have a result."""
+        return map(self.__getitem__, np.flatnonzero(self.done).tolist())
 
 
 KINDS = ("track", "shared outputs")

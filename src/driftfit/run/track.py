@@ -20,7 +20,7 @@ from driftfit.run.fleet import Fleet, run_fleet
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, programs_of, tile_of
-from driftfit.run.result import Lane, Track
+from driftfit.run.result import Lane, Lanes, Track
 from driftfit.run.warm_start import Run, carried, first_interval
 from driftfit.trackers.base import Tracker
 
@@ -210,7 +210,8 @@ def _one(programs: Sequence[Program], records: Records, keep: str, before: Run |
     tile = tile_of(programs, starts)
     out = program.run(tile, record, keep, dtype)
     if records.outputs:
-        lanes = [Lane(out, tile, lane) for lane in range(records.ny)]
+        each = np.arange(records.ny)
+        lanes = Lanes([(out, tile, each, each)], np.full(records.ny, len(record)))
         return Outputs(programs, records._replace(known=record.known), lanes, {}, dict(enumerate(starts)))
     return Track(program, record, Lane(out, tile), *starts)
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
+from driftfit.smooth.parts.rank import column_sizes
 from driftfit.smooth.plots import plot_segments
 from driftfit.smooth.problem import replay
 from driftfit.trackers.bank.results.decided_path import faults
@@ -42,12 +43,12 @@ class Segments:
         if inner and not 0 < inner[0] <= inner[-1] < T:
             raise ValueError(f"piecewise: breaks must be samples within 1 .. {T - 1}; got {inner}.")
         self.run, self.names, self.bounds = run, run.names, np.array([0, *inner, T])
-        seen = replay(run)
-        known = seen["ok"][:, 0] > 0.0
+        replayed = replay(run)
+        known = replayed["ok"][:, 0] > 0.0
         if run.tracker.weighs:  # samples with a sensor fault carry no information about the segment
             known &= faults(run.tracker, run, Hypotheses(run).events()) == 1.0  # type: ignore[arg-type]
-        self._ok, self._phi, self._y = known, seen["phi"][..., 0], seen["y"][:, 0]
-        self._weight = 1.0 / seen["used_noise"][:, 0]
+        self._ok, self._phi, self._y = known, replayed["phi"][..., 0], replayed["y"][:, 0]
+        self._weight = 1.0 / replayed["used_noise"][:, 0]
         self._solve(r)
 
     def _solve(self, r: float | None) -> None:
@@ -57,8 +58,7 @@ class Segments:
             rows = np.flatnonzero(self._ok[a:b]) + a
             root = np.sqrt(self._weight[rows])
             A, d = self._phi[rows] * root[:, None], self._y[rows] * root
-            size = np.sqrt(np.sum(A * A, axis=0))
-            size[size == 0.0] = 1.0  # in units of the regressors, which may be far apart, no rank is lost
+            size = column_sizes(A, np.sum)
             A /= size
             U, long, axes = np.linalg.svd(A, full_matrices=False)
             rank = int(np.sum(long > np.finfo(float).eps * max(A.shape) * long.max(initial=0.0)))

@@ -79,23 +79,23 @@ def put_in_place(rows: Array, into: dict[str, Array], names: Sequence[str], firs
 
 def replay(run: Track) -> dict[str, Array]:
     """The samples of a run as its tracker received them, field by field, (T, .., 1); see `blocks`."""
-    seen: dict[str, Array] = {}
+    found: dict[str, Array] = {}
     for first, rows in blocks(run):
-        put_in_place(rows, seen, rows.dtype.names or (), first, len(run))
-    return seen
+        put_in_place(rows, found, rows.dtype.names or (), first, len(run))
+    return found
 
 
 def collected(run: Track) -> tuple[Array, Array, dict[str, Array]]:
     """phi and signals of a run for a `Walk`, and, if the tracker has ``smoother_fields``, these and e."""
     own = run.tracker.smoother_fields
     phi, signals = np.empty((len(run), run.model.n)), room_for_signals(len(run), run.model.n)
-    seen: dict[str, Array] = {}
+    found: dict[str, Array] = {}
     for first, rows in blocks(run):
         fields: Mapping[str, Any] = rows.dtype.fields or {}
         places = [fields[name][1] // 8 for name in ("phi", "y", "used_noise", "ok", "dt")]
         take(rows.view(np.float64).reshape(len(rows), -1), *places, phi[first:], signals[first:])
-        put_in_place(rows, seen, ("e", *own) if own else (), first, len(run))
-    return phi, signals, {name: values[..., 0] for name, values in seen.items()}
+        put_in_place(rows, found, ("e", *own) if own else (), first, len(run))
+    return phi, signals, {name: values[..., 0] for name, values in found.items()}
 
 
 @Driver

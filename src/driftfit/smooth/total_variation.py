@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
 from driftfit.run.result import Track
@@ -29,9 +30,7 @@ from driftfit.smooth.parts.walk import DRIFT, Walk, constants
 from driftfit.smooth.problem import walk_of
 
 SMOOTHING = 1e-6
-"""eta, relative to the range of theta; the size of theta says nothing of its jumps."""
-ROUNDING = 1e-12
-"""eta is at least this share of the size of theta."""
+"""eta, relative to the range of theta, but not below the rounding of theta; its size says nothing of its jumps."""
 
 
 class Piecewise(NamedTuple):

@@ -124,7 +124,7 @@ def go_on(s: State, l: int) -> None:
     unseen_variance(s, l)
 
 
-@partial(kernel, seldom=True)
+@partial(kernel, short=True)
 def settle(s: State, l: int) -> None:
     """Start the filters from least squares once there are residuals to estimate r: z = M theta ~ N(d, r I)."""
     s.r[l] = max(s.scale[l], finest(s, l))

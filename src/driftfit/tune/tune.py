@@ -26,6 +26,7 @@ import numpy as np
 from driftfit.data.arguments import check_roles
 from driftfit.data.limits import FAR, absurd, code_text, shared_code
 from driftfit.data.record import Reading
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, warn, whole
 from driftfit.models.base import Model
@@ -41,8 +42,6 @@ from driftfit.tune.tuned import METHODS, Tuned
 
 RESPONSE = 20
 """Samples within which a test and its response are absurd."""
-ROUNDING = 1e-12
-"""Noise below this share of the largest output is that of the arithmetic."""
 
 
 def tune(

@@ -98,8 +98,8 @@ def remove_level(values: Any, first: int | None = None, level: float | None = No
         places, count = _finite(before, first)
         mean = float(before.values[places].mean())
         return _shift(before, np.full(len(before), mean), f"level {mean:g}, the mean of the first {count}, removed")
-    seen = np.isfinite(before.values)
-    total, number = np.cumsum(np.where(seen, before.values, 0.0)), np.cumsum(seen)
+    known = np.isfinite(before.values)
+    total, number = np.cumsum(np.where(known, before.values, 0.0)), np.cumsum(known)
     mean_before = np.concatenate([[0.0], (total / np.maximum(number, 1))[:-1]])
     return _shift(before, mean_before, "mean of all samples before removed")
 
@@ -161,15 +161,15 @@ def resample(time: Any, values: Any, dt: Any, how: str = "mean") -> Resampled:
         raise ValueError("resample: time must increase; sort the record and drop repeated times first.")
     bins = np.ceil(steps - 1e-9).astype(np.int64)
     size = int(bins[-1]) + 1
-    seen = np.isfinite(columns)
-    counts = np.stack([np.bincount(bins, column, size) for column in seen.T], axis=1)
+    known = np.isfinite(columns)
+    counts = np.stack([np.bincount(bins, column, size) for column in known.T], axis=1)
     if how == "mean":
-        sums = np.stack([np.bincount(bins, c, size) for c in np.where(seen, columns, 0.0).T], axis=1)
+        sums = np.stack([np.bincount(bins, c, size) for c in np.where(known, columns, 0.0).T], axis=1)
         grid = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
     else:
         grid = np.full((size, columns.shape[1]), np.nan)
         for j in range(columns.shape[1]):
-            grid[bins[seen[:, j]], j] = columns[seen[:, j], j]  # the last of several values
+            grid[bins[known[:, j]], j] = columns[known[:, j], j]  # the last of several values
     return Resampled(
         axis[0] + np.arange(size) * (clock.count if clock.duration is None else clock.duration),
         grid.reshape(size, *array.shape[1:]),
@@ -254,8 +254,8 @@ def feedback(y: Any, u: Any, lags: int = 5, level: float = 0.001) -> Feedback:
 def _centred(values: Any) -> Array:
     """Values minus their mean, with 0 for missing ones."""
     array = np.asarray(prepared(values))
-    seen = np.isfinite(array)
-    return np.where(seen, array - (array[seen].mean() if seen.any() else 0.0), 0.0)
+    known = np.isfinite(array)
+    return np.where(known, array - (array[known].mean() if known.any() else 0.0), 0.0)
 
 
 def _past(values: Array, lags: int) -> Array:

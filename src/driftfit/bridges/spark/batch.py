@@ -44,7 +44,7 @@ from driftfit.engine.settings import one_of
 from driftfit.judge.verdict import verdict
 from driftfit.models.base import Model
 from driftfit.run.outputs import Outputs
-from driftfit.run.result import Lane, Track
+from driftfit.run.result import Track
 from driftfit.run.states.joint_layout import JointLayout
 from driftfit.trackers.base import Tracker
 
@@ -207,12 +207,12 @@ class Partition:
         """What is judged of every output of each unit."""
         found, place = piece.found, {int(k): j for j, k in enumerate(piece.some.keys)}
         assert found is not None
-        lanes, ny = found.lanes(), len(self.task.y)
+        ny = len(self.task.y)
         columns: dict[str, list[Any]] = {f"{name}{of}": [] for of in self.task.suffixes for name in VERDICT}
         for k in which:
-            j, length = place[k], int(piece.some.length[place[k]])
+            j = place[k]
             each = range(j * ny, (j + 1) * ny)
-            own = [Lane(job.out[:length], job.tile, lane) for job, lane in (lanes[i] for i in each)]
+            own = found.lanes.part(each)
             programs = [found.programs[i] for i in each]
             runs = (
                 [Track(programs[0], found.records.part(j), own[0])]

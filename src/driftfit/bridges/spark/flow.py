@@ -130,12 +130,10 @@ class Flow:
         """The alarms at every sample, as `LiveAlarm` gives them."""
         schema, ny = alarms_schema(self.task, self.rules), len(self.task.y)
         columns: dict[str, list[Any]] = {name: [] for name in schema}
-        lanes = found.lanes()
         for j, k in enumerate(some.keys.tolist()):
-            joint, count = known.joints[k], int(some.length[j])
+            joint, lanes = known.joints[k], found.lanes.part(range(j * ny, (j + 1) * ny))
             assert isinstance(joint, JointLayout)
-            rows = [(job.out[:count], lane) for job, lane in lanes[j * ny : (j + 1) * ny]]
-            causes, known.watch[k] = watched(self.rules, joint, known.watch[k], int(earlier[k]), rows)
+            causes, known.watch[k] = watched(self.rules, joint, known.watch[k], int(earlier[k]), lanes)
             for name, values in alarms_of(schema, causes).items():
                 columns[name] += values
         return {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from driftfit.engine.kernel import Array
 from driftfit.run.live.alarm import LiveAlarm, check_rule
 from driftfit.run.live.rule import FROZEN, AlarmRule
 from driftfit.run.program import Program
-from driftfit.run.result import burn_in
+from driftfit.run.result import Lane, burn_in
 from driftfit.run.states.advance import Advanced
 from driftfit.run.states.joint_layout import JointLayout
 
@@ -195,17 +195,17 @@ def watched(
     joint: JointLayout,
     watch: str | None,
     earlier: int,
-    rows: Sequence[tuple[Array, int]],
+    lanes: Iterable[Lane],
 ) -> tuple[list[list[str | None]], str]:
     """(the cause of the alarm of each watched output at every sample, what `watched` continues from).
 
-    ``rows`` are the driver's results (T,) and the lane of each output. After ``earlier`` samples without one, an alarm
+    ``lanes`` has that of each output. After ``earlier`` samples without one, an alarm
     begins to watch.
     """
     before = json.loads(watch) if watch else [None] * len(rules)
     causes: list[list[str | None]] = []
     after: list[dict[str, Any] | None] = []
-    for rule, program, state, (out, lane) in zip(rules, joint.programs, before, rows, strict=True):
+    for rule, program, state, (out, _, lane) in zip(rules, joint.programs, before, lanes, strict=True):
         if rule is None:
             after.append(None)
             continue

@@ -21,6 +21,7 @@ from driftfit.bridges.spark.task import Task
 from driftfit.data.known import INTERVAL
 from driftfit.engine.kernel import Array
 from driftfit.run.live.rule import AlarmRule
+from driftfit.run.result import Lane
 from driftfit.run.states import late
 from driftfit.run.states.joint_layout import JointLayout
 from driftfit.run.states.layout import tag_of
@@ -173,7 +174,7 @@ class Unit:
         run(tile, np.ascontiguousarray(rows[:, :ny]), u, factors, out)
         numbers, watch = self._numbers(out), known.watch
         if any(self.rules):
-            lanes = [(out, lane) for lane in range(ny)]
+            lanes = [Lane(out, tile, lane) for lane in range(ny)]
             causes, watch = watched(self.rules, joint, watch, int(known.counts[SAMPLES]), lanes)
             numbers |= alarms_of(alarms_schema(task, self.rules), causes)
         known.counts[[SAMPLES, USED]] += T, int((out["ok"] > 0.0).any(axis=1).sum())

@@ -203,7 +203,7 @@ def saved(path: Path) -> Any:
 def reads(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command, whose first argument is a `Given`, all its options on the command line.
 
-    An argument that is a dataclass of options stands for its fields.
+    An argument that is a dataclass of options is replaced by its fields.
     """
     groups: dict[str, Any] = {}
     options: list[inspect.Parameter] = []

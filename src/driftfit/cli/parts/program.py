@@ -24,8 +24,8 @@ progress = Console(stderr=True)
 
 def _output() -> Console:
     """A console as wide as that of tables printed from Python, or as the terminal if that is narrower."""
-    seen = Console()
-    return Console(width=min(WIDTH, seen.width) if seen.is_terminal else WIDTH, highlight=False, soft_wrap=False)
+    screen = Console()
+    return Console(width=min(WIDTH, screen.width) if screen.is_terminal else WIDTH, highlight=False, soft_wrap=False)
 
 
 out = _output()

@@ -1,10 +1,10 @@
-"""Numba's passes as they are used here: without those for what no step has, and with short code for fields of records.
+"""Numba's passes as they are used here: without those for what no step has, and with direct access to fields.
 
 Numba makes an array of every field that a step names, with its shape, strides and owner in a structure on the stack,
 and then takes the structure apart again to find one entry: some forty instructions of LLVM's language for ``s.y[l]``.
 It gives every variable a place on the stack, which is loaded and cleared again, and makes a loop over a range an object
 with several such places. LLVM removes nearly all of it, but writing, reading and removing it was a third of the time of
-compiling. `Short` writes what would be left: the place of a field is known from its type, so an address is enough; a
+compiling. `Direct` writes what would be left: the place of a field is known from its type, so an address is enough; a
 variable that is assigned once is a value; and a range is two numbers. An array, a tuple or a range is made only where
 it is used in another way. Addresses and loops have the form that Numba gives them, because the choices of LLVM depend
 on it: one lane of twelve parameters took 160 instead of 127 ns while a loop computed its next number before it tested
@@ -69,7 +69,7 @@ class Loop(NamedTuple):
     left: Any
 
 
-class Short(Lower):
+class Direct(Lower):
     """Numba's step from typed code to LLVM's language, with fewer instructions for the same code."""
 
     def _find_singly_assigned_variable(self) -> None:
@@ -79,8 +79,8 @@ class Short(Lower):
         """
         self._later: dict[str, Any] = {}
         self._tables: dict[Any, Any] = {}
-        self._short = not self._disable_sroa_like_opt and not self.func_ir.func_id.is_generator
-        if not self._short:
+        self._direct = not self._disable_sroa_like_opt and not self.func_ir.func_id.is_generator
+        if not self._direct:
             super()._find_singly_assigned_variable()
             return
         self._blk_local_varmap: dict[str, Any] = {}
@@ -120,7 +120,7 @@ class Short(Lower):
         """Lower a block, without what only ends the life of a variable that owns nothing. Where an error arose is said
         when one has arisen: Numba prepares it for every instruction.
         """
-        if not self._short:
+        if not self._direct:
             super().lower_block(block)
             return
         self.pre_block(block)
@@ -144,7 +144,7 @@ class Short(Lower):
 
     def lower_inst(self, inst: Any) -> Any:
         """Lower one instruction, or remember it for later."""
-        if isinstance(inst, ir.Assign) and self._short and inst.target.name in self._once:
+        if isinstance(inst, ir.Assign) and self._direct and inst.target.name in self._once:
             later = self._put_off(inst.value, self.typeof(inst.target.name))
             if later is not None:
                 self._later[inst.target.name] = later
@@ -155,7 +155,7 @@ class Short(Lower):
 
     def storevar(self, value: Any, name: str, argidx: int | None = None) -> None:
         """Store a value in a variable; what it held before matters only if that owns memory."""
-        if not self._short or not self._is_plain(name):
+        if not self._direct or not self._is_plain(name):
             super().storevar(value, name, argidx)
         elif name in self._singly_assigned_vars:
             self._blk_local_varmap[name] = value
@@ -382,7 +382,7 @@ def _analyse(self: PostProcessor, emit_dels: bool = False, extend_lifetimes: boo
     somebody asks, which was a tenth of the time in Python.
     """
     function = self.func_ir
-    if function.is_generator or not getattr(function.func_id, "short", False):
+    if function.is_generator or not getattr(function.func_id, "direct", False):
         _analyse_all(self, emit_dels, extend_lifetimes)
         return
     function.blocks = canonicalize_cfg(function.blocks)
@@ -413,15 +413,15 @@ class Legalization(IRLegalization):
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
-class ShortLowering(NativeLowering):
-    """Numba's pass with `Short` code."""
+class DirectLowering(NativeLowering):
+    """Numba's pass with `Direct`."""
 
-    _name = "short_lowering"
+    _name = "direct_lowering"
 
     @property
     def lowering_class(self) -> Any:
         """What lowers a function."""
-        return Short
+        return Direct
 
 
 UNUSED = {
@@ -432,12 +432,12 @@ UNUSED = {
 
 
 class Pipeline(CompilerBase):
-    """Numba's passes without those, which take 6 per cent of the time of compiling, and with short code."""
+    """Numba's passes without those, which take 6 per cent of the time of compiling, and with `Direct`."""
 
     def define_pipelines(self) -> list[Any]:
         """The one way through the compiler."""
         made = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        ours = {NativeLowering: ShortLowering, IRLegalization: Legalization}
+        ours = {NativeLowering: DirectLowering, IRLegalization: Legalization}
         made.passes = [(ours.get(one, one), why) for one, why in made.passes if one.name() not in UNUSED]
-        self.state.func_id.short = True
+        self.state.func_id.direct = True
         return [made]

@@ -5,6 +5,9 @@ that run seldom the speed of that is not worth the time of compiling. They see a
 and of a table of its sizes, which the driver holds as a constant. For each field the table has the distance from the
 beginning of the record, and the lengths of its axes but for that of lanes, which is 1.
 
+The tables of banks (`driftfit.trackers.bank.table`) are not of this kind: their arrays lie in several memories, whose
+places are known when a bank runs, and their numbers in the table itself. An open record is made where code is compiled.
+
 Private parts: `AttributeTemplate`, `infer_getattr`, `make_array` and `populate_array`.
 """
 
@@ -37,7 +40,7 @@ class OpenRecord(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[int]]:
-        """What stands for the type in symbols: as for records, not the long name."""
+        """The name of the type in symbols: as for records, not the long one."""
         return type(self).__name__, (self._code,)
 
     def typeof(self, name: str) -> Any:
@@ -74,11 +77,16 @@ def opened(context: Any, builder: Any, record: Any, address: Any) -> Any:
     return made._getvalue()
 
 
-def entry(builder: Any, record: Any, place: int) -> Any:
-    """An entry of the table, which is the same whenever it is read."""
-    loaded = builder.load(builder.gep(builder.extract_value(record, 1), [WORD(place)]))
+def entry_of(builder: Any, table: Any, place: int) -> Any:
+    """An entry of a table, which is the same whenever it is read."""
+    loaded = builder.load(builder.gep(table, [WORD(place)]))
     loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
     return loaded
+
+
+def entry(builder: Any, record: Any, place: int) -> Any:
+    """An entry of the table of a record."""
+    return entry_of(builder, builder.extract_value(record, 1), place)
 
 
 def beginning(context: Any, builder: Any, record: Any, kind: OpenRecord, name: str) -> Any:

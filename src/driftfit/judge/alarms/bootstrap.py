@@ -43,7 +43,7 @@ RECORDS, SAMPLES = 64, 1000
 """Simulated records, and the samples of each that count."""
 START = SHORT << (LEVELS - 1)
 """Samples at the beginning of a record that are not counted: the longest window is not complete."""
-SEEN = 100.0
+ENOUGH = 100.0
 """Onsets in all records from which a limit is known; rarer ones are extrapolated."""
 OFTEN = 10.0
 """The smallest number of samples from one onset to the next from which a limit is extrapolated."""
@@ -123,7 +123,7 @@ def limits(records: SimulatedRecords, cusum: bool, every: float) -> tuple[Array,
     square of the limit.
     """
     statistic = statistics_of(records, cusum, START)
-    base = min(every, max(SAMPLES * len(statistic) / SEEN, STEP * OFTEN))
+    base = min(every, max(SAMPLES * len(statistic) / ENOUGH, STEP * OFTEN))
     often = max(base / STEP, OFTEN)
     near, nearer = limits_of([(one, 0) for one in statistic], base, often)
     growth = np.maximum(near**2 - nearer**2, 0.1) / np.log(base / often)

@@ -209,8 +209,8 @@ def _by_groups(
     """The series that the limits of their groups show to be without a fault, and those that cannot be judged."""
     asked = asked_for(kind, **{name: settings[name] for name in ("every", "window", "hold") if name in settings})
 
-    seen = on_all_cores(runs, lambda key: (runs[key], asked, each[key]), _first_look, "reference models")
-    looks = {key: one for key, one in seen.items() if isinstance(one, Look)}
+    first = on_all_cores(runs, lambda key: (runs[key], asked, each[key]), _first_look, "reference models")
+    looks = {key: one for key, one in first.items() if isinstance(one, Look)}
     rules = with_limits(runs, looks, each, int(settings.get("seed", 0)))
     p = {key: chance(runs[key], rules[key], one) for key, one in looks.items()}
     q = dict(zip(p, discoveries(np.array(list(p.values()))), strict=True))
@@ -218,7 +218,7 @@ def _by_groups(
     settled: dict[Hashable, Judged | ValueError] = {
         key: Judged(rules[key], looks[key].start, p[key], (), "") for key in quiet
     }
-    return settled | {key: one for key, one in seen.items() if isinstance(one, ValueError)}
+    return settled | {key: one for key, one in first.items() if isinstance(one, ValueError)}
 
 
 def _first_look(run: Track, asked: AlarmRule, reference: Any) -> Look | ValueError:

@@ -17,11 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.judge.alarms.variances import losses, variances
 from driftfit.judge.statistics.robust import CLIP as OF_FIT
-from driftfit.judge.statistics.robust import median, medians, robust_fit
+from driftfit.judge.statistics.robust import median, medians, noisy, robust_fit
 from driftfit.run.live.likelihood_ratio import (
     ALPHA,
     BETA,
@@ -38,6 +39,7 @@ from driftfit.run.live.likelihood_ratio import (
     K,
     V,
 )
+from driftfit.smooth.parts.rank import column_sizes
 
 CLIPPED = 2.5
 """Scores are residuals clipped at this many scales."""
@@ -54,8 +56,6 @@ those in proportion to their time constant, since short references show long bur
 """
 SHARE = 8
 """The noise is judged by windows of at most this part of the reference."""
-UNSEEN = 1e-12
-"""A direction with at most this share of the largest information was excited by rounding only."""
 
 
 class Rows(NamedTuple):
@@ -67,24 +67,26 @@ class Rows(NamedTuple):
     """(N,): residuals over their standard deviation at the time."""
 
 
-def frozen_model(phi: Array, y: Array, ok: Array) -> tuple[Frozen, Rows]:
-    """Estimate the model from rows phi (N, n), y (N,), of which ok (N,) can be used."""
-    unit = np.sqrt(np.mean(phi[ok] ** 2, axis=0))
-    unit = np.where(unit > 0.0, unit, 1.0)
+def frozen_model(phi: Array, y: Array, ok: Array) -> tuple[Frozen, Rows] | None:
+    """Estimate the model from rows phi (N, n), y (N,), of which ok (N,) can be used; None if they have no noise."""
+    unit = column_sizes(phi[ok])
     rows = np.where(ok[:, None], np.column_stack([phi / unit, y]), 0.0)
     ar, root = np.zeros(0), np.ones(len(y))
     for _ in range(ROUNDS):
         used, white = _whitened(rows, ok, ar)
-        theta = robust_fit(white[:, :-1] / root[used, None], white[:, -1] / root[used]).theta
-        e = rows[:, -1] - rows[:, :-1] @ theta
+        white /= root[used, None]
+        fit = robust_fit(white[:, :-1], white[:, -1])
+        if not noisy(fit, white[:, :-1], white[:, -1]):
+            return None
+        e = rows[:, -1] - rows[:, :-1] @ fit.theta
         ar = _autoregression(e, ok)
         used, w = _whitened(e[:, None], ok, ar)
-        numbers, h = noise_model(w[:, 0], len(theta))
+        numbers, h = noise_model(w[:, 0], len(unit))
         root = np.ones(len(y))
         root[used] = np.sqrt(h)
     x, white = w[:, 0] / (numbers[SCALE] * np.sqrt(h)), _whitened(rows[:, :-1], ok, ar)[1]
     cov, unseen = _covariance(white / np.sqrt(h)[:, None], x)
-    return Frozen(theta / unit, unit, np.ascontiguousarray(ar), cov, numbers, unseen), Rows(white, x)
+    return Frozen(fit.theta / unit, unit, np.ascontiguousarray(ar), cov, numbers, unseen), Rows(white, x)
 
 
 def noise_model(w: Array, n: int) -> tuple[Array, Array]:
@@ -145,10 +147,10 @@ def _covariance(phi: Array, x: Array) -> tuple[Array, Array]:
     inside = np.mean(np.abs(x) < OF_FIT)
     fitted = N / max(N - n, 1) * (1.0 + n / N * (1.0 - inside) / inside) ** 2
     values, vectors = np.linalg.eigh(phi.T @ phi)
-    seen = values > UNSEEN * values.max()
+    excited = values > ROUNDING * values.max()
     factor = fitted * np.mean(psi * psi) / inside**2
-    cov = factor * (vectors / np.where(seen, values, values.max())) @ vectors.T
-    return np.ascontiguousarray(cov), np.ascontiguousarray(vectors[:, ~seen].T)
+    cov = factor * (vectors / np.where(excited, values, values.max())) @ vectors.T
+    return np.ascontiguousarray(cov), np.ascontiguousarray(vectors[:, ~excited].T)
 
 
 def _whitened(rows: Array, ok: Array, ar: Array) -> tuple[Array, Array]:

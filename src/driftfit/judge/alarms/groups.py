@@ -98,12 +98,12 @@ def _limits_of(chosen: Sequence[tuple[Track, AlarmRule, Reference]], seed: int) 
     return limits(together(parts), rule.kind == "cusum", rule.every)
 
 
-def chance(run: Track, rule: AlarmRule, seen: Look) -> float:
+def chance(run: Track, rule: AlarmRule, found: Look) -> float:
     """The p-value of a series by these limits; NaN if nothing was judged."""
-    return chance_of(run, rule)(seen.extreme, seen.samples) if seen.samples else float("nan")
+    return chance_of(run, rule)(found.extreme, found.samples) if found.samples else float("nan")
 
 
-def in_doubt(p: float, q: float, level: float, seen: Look, every: float) -> bool:
+def in_doubt(p: float, q: float, level: float, found: Look, every: float) -> bool:
     """Whether an alarm or a fault is possible by the limits of the series itself."""
-    alarm = -np.expm1(-seen.samples / every)  # the p-value of a series whose largest statistic is at its limit
+    alarm = -np.expm1(-found.samples / every)  # the p-value of a series whose largest statistic is at its limit
     return bool(q <= MARGIN * level or p <= MARGIN * alarm)

@@ -27,7 +27,6 @@ from driftfit.judge.alarms.onsets import (
 )
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
 from driftfit.judge.regressors import refuse_hidden
-from driftfit.judge.statistics.robust import noisy, robust_fit
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.live.likelihood_ratio import CUSUM, SAME, memory_of, scan
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
@@ -98,13 +97,13 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
     if not ((np.ptp(phi[ok], axis=0) == 0.0) & (phi[ok][0] != 0.0)).any():
         phi, names = np.column_stack([phi, np.ones(len(phi))]), (*names, OFFSET)
     root = np.sqrt(np.where(ok, noise, 1.0))
-    scaled, output = (phi / root[:, None])[ok], (y / root)[ok]
-    if not noisy(robust_fit(scaled, output), scaled, output):
+    found = frozen_model(phi / root[:, None], y / root, ok)
+    if found is None:
         raise ValueError(
             f'detect: "{rule.kind}" measures changes in units of the noise, and the reference has none: constant '
             f"parameters explain samples {first} to {start} without error. Choose another reference."
         )
-    frozen, known = frozen_model(phi / root[:, None], y / root, ok)
+    frozen, known = found
     rule = replace(
         rule,
         parameters=names,

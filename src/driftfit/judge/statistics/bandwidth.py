@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 
 
@@ -29,7 +30,7 @@ def plugged_in(phi: Array, psi: Array) -> int:
     N = len(phi)
     scores = phi * psi[:, None]
     values, vectors = np.linalg.eigh(scores.T @ scores / N)
-    kept = values > 1e-12 * values[-1]
+    kept = values > ROUNDING * values[-1]
     if not kept.any():
         return 0
     white = scores @ (vectors[:, kept] / np.sqrt(values[kept]))

@@ -52,7 +52,7 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.bandwidth import plugged_in, rule_of_thumb
 from driftfit.judge.statistics.noise import HELD, Noise, noise, of_rare_events, whitened
 from driftfit.judge.statistics.quadratic import tail
-from driftfit.judge.statistics.robust import Fit, clipped, fit_in, noisy, orthonormal, robust_fit
+from driftfit.judge.statistics.robust import Basis, Fit, clipped, fit_in, noisy, orthonormal, robust_fit
 from driftfit.judge.statistics.supremum import TIED, suprema, together
 from driftfit.judge.statistics.wild_bootstrap import wild_supremum
 
@@ -117,19 +117,17 @@ def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
     ``lags``: order of the autoregression of the noise; None estimates it, and 0 assumes white scores.
     """
     N, n = phi.shape
-    size: Array = np.sqrt(np.mean(phi * phi, axis=0)) if N else np.zeros(n)
-    if least_rows(n) > N or not (size > 0.0).all():
+    if least_rows(n) > N:
         return _nothing(N, n)
-    X = phi / size
-    Q, R = orthonormal(X)
-    if np.linalg.matrix_rank(R, 1e-9 / np.sqrt(N)) < n:
+    basis = orthonormal(phi)
+    if not basis.distinct:
         return _nothing(N, n)
-    fit = fit_in((Q, R), y)
-    if not noisy(fit, X, y):
-        return _nothing(N, n)._replace(fit=fit._replace(theta=fit.theta / size))
+    fit = fit_in(basis, y)
+    if not noisy(fit, phi, y):
+        return _nothing(N, n)._replace(fit=fit)
     rare = _rare(fit.psi, y, shortest(n))
-    found = (of_rare_events if rare else noise)(Q, fit.residual, CELLS, rare or shortest(n), lags)
-    return _tested((Q, R), X, fit._replace(theta=fit.theta / size), found, lags, rare)
+    found = (of_rare_events if rare else noise)(basis.Q, fit.residual, CELLS, rare or shortest(n), lags)
+    return _tested(basis, phi, fit, found, lags)
 
 
 def _rare(psi: Array, y: Array, least: int) -> int | None:
@@ -145,19 +143,15 @@ def _rare(psi: Array, y: Array, least: int) -> int | None:
     return max(least, min(int(FEW * skewness**2), len(y) // 4))
 
 
-def _tested(
-    basis: tuple[Array, Array], regressors: Array, fit: Fit, found: Noise, lags: int | None, rare: int | None
-) -> Constancy:
-    """The tests in the orthonormal basis: moments of regressors with a large mean would have lost their digits;
-    ``rare``: rows in the shortest interval of rare events, None for other noise.
-    """
-    X, R = basis
+def _tested(basis: Basis, phi: Array, fit: Fit, found: Noise, lags: int | None) -> Constancy:
+    """The tests in the orthonormal basis: moments of regressors with a large mean would have lost their digits."""
+    X, R, size = basis
     N, n = X.shape
     still, added = fit, np.zeros((N, 0))
     if len(found.ar):
         c = found.level[:, None]
         rows, y = whitened(X / c, found.held / found.level, found.ar)
-        added = c * missing_lags(regressors / c, rows, found) if lags is None else added
+        added = c * missing_lags(phi / size / c, rows, found) if lags is None else added
         X, y = rows * c, y * found.level
         still = robust_fit(np.column_stack([X, added]), y)
     psi = _alternative(found, still, added)
@@ -169,7 +163,7 @@ def _tested(
     V = _profile(*(2 * (_summed(whole * psi[:, None], rest),)), ends)
     if not full_rank(A[-1]) or not full_rank(V[-1]):
         return _nothing(N, n)
-    if rare is not None:
+    if found.rare:
         V = _even(V[-1], _profile(whole, whole, ends))
     S, inverse = np.cumsum(whole * still.psi[:, None], axis=0), np.linalg.inv(A[-1])
     null = _null(A, V, inverse)
@@ -177,14 +171,14 @@ def _tested(
     own, path = _turned(null, each), S @ each.T
     var = np.diag(each @ V[-1] @ each.T)
     S, null, V = S[:, :n], np.ascontiguousarray(null[:, :n, :, :n]), V[:, :n, :n]
-    least, apart = rare or shortest(n), len(found.breaks) > 0
+    least, apart = found.least, len(found.breaks) > 0
     mean = np.arange(m)[::-2][::-1]
     L, p = _each(S[ends[mean] - 1] @ R, _turned(_thinned(null, mean), R.T), np.diag(R.T @ V[-1] @ R))
     _, p_path = _each(path[ends[mean] - 1], _thinned(own, mean), var)
     alone = ((path[ends - 1, i : i + 1], own[:, i : i + 1, :, i : i + 1]) for i in range(n))
     p_own = [together(p_path[i], *suprema(*one, ends, least, apart)) for i, one in enumerate(alone)]
     joint, p_mean = _joint(S[ends[mean] - 1], _thinned(null, mean), V[-1])
-    white = len(found.ar) + rest == 0 and rare is None
+    white = len(found.ar) + rest == 0 and not found.rare
     late = wild_supremum(X, still.residual, found.level) if white else np.nan
     p_each = (p_mean, *suprema(S[ends - 1], null, ends, least, apart), late)
     spread = np.sqrt(np.maximum(np.einsum("bibi->bi", own), 0.0))

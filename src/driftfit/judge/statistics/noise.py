@@ -75,6 +75,10 @@ class Noise(NamedTuple):
     """Standard deviation of w, in units of the level."""
     penalty: float
     """The gain required for a break, in units of w's variance."""
+    least: int
+    """Rows in the shortest segment."""
+    rare: bool = False
+    """Whether these are rare events, whose variance a few rows do not show."""
 
 
 @shared
@@ -212,7 +216,7 @@ def of_rare_events(Q: Array, y: Array, cells: int, least: int, order: int | None
     search = Search(Q, y, np.full(N, deviation(y)), _spans(N, n), overlap(Q), P, order, _grid(N, cells), least,
                     2.0 * penalty(N, n, least, QUIET))  # fmt: skip
     starts = [search.correlation(y, none), none[:0].astype(float)]
-    return min((search.settle(ar, y, y) for ar in starts), key=lambda one: one[0])[1]
+    return min((search.settle(ar, y, y) for ar in starts), key=lambda one: one[0])[1]._replace(rare=True)
 
 
 def _grid(N: int, cells: int) -> Array:
@@ -270,7 +274,7 @@ class Search(NamedTuple):
         c = self.c * max(deviation(near / self.c), SMALL)
         held = y - near + np.clip(near, -HELD * c, HELD * c)
         white = self.size(near, ar) * median(self.c / c)
-        return Noise(breaks, residual, c, ar, held, near, leverage, white, self.price(ar))
+        return Noise(breaks, residual, c, ar, held, near, leverage, white, self.price(ar), self.least)
 
     def price(self, ar: Array) -> float:
         """The penalty, raised by the standard error of the logarithm of the noise's long-run variance."""

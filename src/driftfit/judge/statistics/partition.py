@@ -49,7 +49,7 @@ class Space(NamedTuple):
     """Sums of the blocks of the segment that begins at each start, (k k, m): entry (i, j) in row k i + j."""
     M: Array
     """The sums of eight starts, (k k, 8)."""
-    seen: Array
+    rows: Array
     """Rows after each start that belong to two segments, (1, m)."""
     F: Array
     """F of each start, (1, m)."""
@@ -80,23 +80,23 @@ def _extend(G: Array, ends: Array, t: int, p: int, k: int, space: Space) -> None
             for s in range(settled):
                 space.total[k * i + j, s] += block
     for s in range(settled, t - 1):
-        space.seen[0, s] += ends[t - 1] - begin
+        space.rows[0, s] += ends[t - 1] - begin
     if settled < t:
         for i in range(k):
             for j in range(i + 1):
                 space.total[k * i + j, t - 1] += G[1, t - 1, i, j]
-        space.seen[0, t - 1] += min(p, ends[t - 1] - begin)
+        space.rows[0, t - 1] += min(p, ends[t - 1] - begin)
 
 
 @shared
 def _costs(space: Space, first: int, k: int) -> None:
     """F(s) + C(s, t) of the eight starts from ``first`` on."""
-    total, M, seen, F, value = space
+    total, M, rows, F, value = space
     for i in range(k):
         for j in range(i + 1):
             store(M, k * i + j, 0, load(total, k * i + j, first))
     cholesky_of_eight(M, k - 1)
-    cost = plus(load(M, k * k - 1, 0), load(seen, 0, first))
+    cost = plus(load(M, k * k - 1, 0), load(rows, 0, first))
     store(value, 0, first, plus(load(F, 0, first), cost))
 
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array, Driver, shared
 from driftfit.engine.simd import (
     WIDTH,
@@ -31,6 +32,7 @@ from driftfit.engine.simd import (
     sum_of,
     times,
 )
+from driftfit.smooth.parts.rank import column_sizes
 
 CLIP = 1.5
 ROUNDS = 30
@@ -69,8 +71,6 @@ where more than half of the readings of a coarse meter are the same, the median 
 
 FLAT = 1e-10
 """A pivot below this share of its diagonal entry counts as zero."""
-ROUNDING = 1e-12
-"""Residuals of this share of the terms of a fit may be rounding."""
 
 
 class Fit(NamedTuple):
@@ -284,27 +284,38 @@ def _fit(columns: Array, theta: Array, residual: Array, scale: Array) -> None:
 _run = Driver(_fit)
 
 
-def orthonormal(phi: Array) -> tuple[Array, Array]:
-    """(Q, R): phi (N, n) = Q R, Q' Q = N I, for linearly independent columns."""
-    Q, R = np.linalg.qr(phi)
-    root = np.sqrt(len(phi))
-    return np.ascontiguousarray(Q * root), R / root
+class Basis(NamedTuple):
+    """Regressors phi (N, n) = Q R diag(size), Q' Q = N I."""
+
+    Q: Array
+    R: Array
+    size: Array
+    """(n,): `column_sizes` of phi."""
+
+    @property
+    def distinct(self) -> bool:
+        """Whether the columns of phi are linearly independent, whatever their units."""
+        return bool(np.linalg.matrix_rank(self.R, 1e-9 / np.sqrt(len(self.Q))) == len(self.size))
+
+
+def orthonormal(phi: Array) -> Basis:
+    """An orthonormal basis of regressors phi (N, n), N > 0."""
+    size, root = column_sizes(phi), np.sqrt(len(phi))
+    Q, R = np.linalg.qr(phi / size)
+    return Basis(np.ascontiguousarray(Q * root), R / root, size)
 
 
 def robust_fit(phi: Array, y: Array) -> Fit:
     """Constant coefficients with bounded influence of outliers in y; phi (N, n), y (N,)."""
-    size = np.sqrt(np.mean(phi * phi, axis=0))
-    size[size == 0.0] = 1.0  # an idle column, whose parameter is 0
-    fit = fit_in(orthonormal(phi / size), y)
-    return fit._replace(theta=fit.theta / size)
+    return fit_in(orthonormal(phi), y)
 
 
-def fit_in(basis: tuple[Array, Array], y: Array) -> Fit:
+def fit_in(basis: Basis, y: Array) -> Fit:
     """The same in a basis that `orthonormal` made."""
-    Q, R = basis
+    Q, R, size = basis
     theta, residual, scale = np.zeros(Q.shape[1]), np.empty((1, len(y) + WIDTH)), np.empty(1)
     _run(columns_of(Q, y), theta, residual, scale)
-    return clipped(np.linalg.lstsq(R, theta, rcond=1e-12)[0], residual[0, : len(y)], float(scale[0]))
+    return clipped(np.linalg.lstsq(R, theta, rcond=ROUNDING)[0] / size, residual[0, : len(y)], float(scale[0]))
 
 
 def noisy(fit: Fit, phi: Array, y: Array) -> bool:
@@ -324,16 +335,14 @@ def inverted(X: Array) -> Array:
 
     It is computed from X itself: the moments have half of its digits.
     """
-    size = np.sqrt(np.sum(X * X, axis=0))
-    size[size == 0.0] = 1.0
+    size = column_sizes(X, np.sum)
     root = np.linalg.pinv(X / size, rcond=np.finfo(float).eps * max(X.shape)) / size[:, None]
     return np.asarray(root @ root.T)
 
 
 def least_squares(X: Array, y: Array) -> Array:
     """theta (n,) of least norm in units of the regressors X (N, n), which may be far apart."""
-    size = np.sqrt(np.mean(X * X, axis=0))
-    size[size == 0.0] = 1.0
+    size = column_sizes(X)
     return np.asarray(np.linalg.lstsq(X / size, y, rcond=None)[0] / size)
 
 

@@ -52,8 +52,8 @@ def averaged(
     """Average predictions; ``scored`` (T,) marks the samples that count."""
     terms = np.stack([p.loglik for p in predictions], axis=1)
     known = np.isfinite(terms).all(axis=1)
-    seen = terms[known]
-    steps = seen - seen.max(axis=1, keepdims=True)
+    counted = terms[known]
+    steps = counted - counted.max(axis=1, keepdims=True)
     total = np.concatenate([np.zeros((1, terms.shape[1])), signal.lfilter([1.0], [1.0, -forgetting], steps, axis=0)])
     before = forgetting * total[np.cumsum(known) - known]
     log_weights = special.log_softmax(before, axis=1)

@@ -126,16 +126,15 @@ class Pool:
                 shared = tracker.pads and structure.model.family is not None
                 families.setdefault((structure.model.family if shared else k, shared), {})[k] = structure.model
         found: list[dict[int, Model]] = []
-        waiting = list(families.values())
-        while waiting:
-            models = waiting.pop()
-            sizes = [model.n for model in models.values()]
-            together = len(sizes) > 1 and size_of(sizes, max(sizes), len(self.gaps)) > 0
-            N = next(iter(models.values())).as_large_as(list(models.values())).n if together else 0
-            alike = {k: model for k, model in models.items() if together and fits(tracker, model.n, N)}
-            found += [alike] if alike else [{k: model} for k, model in models.items()]
-            rest = {k: model for k, model in models.items() if alike and k not in alike}
-            waiting += [rest] if rest else []
+        for models in families.values():
+            while models:
+                some, alike = list(models.values()), dict[int, Model]()
+                sizes = [model.n for model in some]
+                if len(sizes) > 1 and size_of(sizes, max(sizes), len(self.gaps)) > 0:
+                    N = some[0].as_large_as(some).n
+                    alike = {k: model for k, model in models.items() if fits(tracker, model.n, N)}
+                found += [alike] if alike else [{k: model} for k, model in models.items()]
+                models = {k: model for k, model in models.items() if alike and k not in alike}
         return found
 
     def _lanes(self, tracker: Tracker, structures: Sequence[Candidate], size: int) -> list[Predicted]:
@@ -157,9 +156,9 @@ class Pool:
         starts = {n: padded(tracker, n, size) for n in {s.n for s in structures} if n < size}
         begun = {k * R + r: starts[s.n] for k, s in enumerate(structures) if s.n in starts for r in range(R)}
         lanes = run_lanes([program] * len(first), records, "std", begun)
-        runs = [Track(program, records.part(k), lane) for k, lane in enumerate(lanes) if lane is not None]
         if not lanes.done.all():
             raise KeyboardInterrupt
+        runs = [Track(program, records.part(k), lane) for k, lane in enumerate(lanes)]
         return [joined([predicted(run) for run in runs[k * R : (k + 1) * R]]) for k in range(count)]
 
 
@@ -202,9 +201,9 @@ def pool_of(models: Sequence[Model], names: Sequence[str], records: Sequence[Rec
         return empty, [Candidate(name, model.n, model, None) for name, model in zip(names, models, strict=True)]
     union = _union(linear)
     order = {term: i for i, term in enumerate(_terms(union) or ())}
-    seen = np.concatenate([constant_least_squares(union, record) for record in records])
-    phi = np.where(seen["valid"] > 0.0, seen["phi"][..., 0], np.nan)
-    pool = Pool(tuple(records), phi, union.names, seen["dt"][:, 0].copy())
+    rows = np.concatenate([constant_least_squares(union, record) for record in records])
+    phi = np.where(rows["valid"] > 0.0, rows["phi"][..., 0], np.nan)
+    pool = Pool(tuple(records), phi, union.names, rows["dt"][:, 0].copy())
     structures = []
     for name, model in zip(names, models, strict=True):
         terms = _terms(model)

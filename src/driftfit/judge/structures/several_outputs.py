@@ -39,10 +39,10 @@ def _pool(models: Sequence[Model], candidates: Sequence[Sequence[Track]]) -> Can
     columns: dict[str, Array] = {}
     gaps = []
     for runs in candidates:
-        seen = np.concatenate([constant_least_squares(run.model, run.record) for run in runs])
-        phi = np.where(seen["valid"] > 0.0, seen["phi"][..., 0], np.nan)
+        rows = np.concatenate([constant_least_squares(run.model, run.record) for run in runs])
+        phi = np.where(rows["valid"] > 0.0, rows["phi"][..., 0], np.nan)
         columns = dict(zip(runs[0].names, phi.T, strict=True)) | columns
-        gaps.append(seen["dt"][:, 0])
+        gaps.append(rows["dt"][:, 0])
     names, records = tuple(columns), tuple(replace(run.record, time=None) for run in candidates[0])
     pool = Pool(records, np.column_stack(list(columns.values())), names, np.min(gaps, axis=0))
     places = [tuple(names.index(name) for name in runs[0].names) for runs in candidates]

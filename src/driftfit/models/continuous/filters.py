@@ -344,11 +344,11 @@ def steps(o: Orders) -> ModelSteps:
 
     @kernel
     def push(s: State, l: int) -> None:
-        seen = s.observed[l] > 0.0
+        observed = s.observed[l] > 0.0
         predicted = informed(s, l)
-        restore(s, seen, l)
-        y = s.measured[l] if seen else (s.y_hat[l] if predicted else s.expected[l])
-        if seen & (s.begun[l] == 0.0):
+        restore(s, observed, l)
+        y = s.measured[l] if observed else (s.y_hat[l] if predicted else s.expected[l])
+        if observed & (s.begun[l] == 0.0):
             level = s.point[parameters - 1, l] if offset else 0.0
             s.chain[m, 0, l] = (y - level) / s.poly[1, 0, l] if offset else 0.0
             s.expected[l], s.begun[l] = y, 1.0

@@ -366,24 +366,25 @@ class HammersteinWiener(Model):
                 continue
             with np.errstate(invalid="ignore", over="ignore"):
                 total = float(data.sum())
-            seen = data if abs(total) < LARGEST else data[np.abs(data) < LARGEST]  # usually no value is missing
+            values = data if abs(total) < LARGEST else data[np.abs(data) < LARGEST]  # usually no value is missing
             low, high = basis.expected
-            outside = int(np.sum((seen < low) | (seen > high))) if low > -np.inf or high < np.inf else 0
+            outside = int(np.sum((values < low) | (values > high))) if low > -np.inf or high < np.inf else 0
             if outside:
                 effect = "are missing" if basis.limits == basis.expected else "are beyond what it was made for"
                 warn(
-                    f"{outside} of {seen.size} samples of {what} lie outside the range ({low:g}, {high:g}) of "
-                    f"{type(basis).__name__} and {effect}; {what} spans {seen.min():g} to {seen.max():g}.",
+                    f"{outside} of {values.size} samples of {what} lie outside the range ({low:g}, {high:g}) of "
+                    f"{type(basis).__name__} and {effect}; {what} spans {values.min():g} to {values.max():g}.",
                     UserWarning,
                 )
-            size = float(np.sqrt(seen @ seen / seen.size)) if seen.size else 0.0
+            size = float(np.sqrt(values @ values / values.size)) if values.size else 0.0
             if isinstance(basis, Polynomial) and basis.degree > 1 and size and not 1.0 / UNIT <= size <= UNIT:
-                powers = np.abs(seen[:, None] ** [1, basis.degree])
+                powers = np.abs(values[:, None] ** [1, basis.degree])
                 lost = int(np.sum(powers[:, 1] >= DIGITS * np.maximum(powers[:, 0], 1.0)))
                 unusable = f", and {lost} samples, whose powers span more than 13 digits, are missing" if lost else ""
                 warn(
                     f"{what} has a root mean square of {size:g}: raw powers of data far from unit size are badly "
-                    f"scaled{unusable}; scale it, or use Legendre({basis.degree}, ({seen.min():g}, {seen.max():g})).",
+                    f"scaled{unusable}; scale it, or use Legendre({basis.degree}, ({values.min():g}, "
+                    f"{values.max():g})).",
                     UserWarning,
                 )
 

@@ -32,8 +32,8 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     CELL,
     COARSE,
     CURVE,
+    D_CHECKED,
     D_NOW,
-    D_SEEN,
     EARLIER,
     EIGHT,
     FIRM_HIGH,
@@ -126,7 +126,7 @@ def beneath_in_lane(m: Array, p: Places, at: int, row: int, right: float) -> int
 @shared
 def look(m: Array, p: Places) -> None:
     """Check whether the levels increase, and how far d may change until the next check; if not, make the envelope."""
-    n_out, d, seen, reach, at = p[N_OUT], p[D_NOW], p[D_SEEN], p[REACH], p[CURVE]
+    n_out, d, checked, reach, at = p[N_OUT], p[D_NOW], p[D_CHECKED], p[REACH], p[CURVE]
     levels = p[LEVEL]
     for i in range(GRID):
         m[levels + i, 0] = level(m, p, at, i)
@@ -141,7 +141,7 @@ def look(m: Array, p: Places) -> None:
             for i in range(GRID - 1):
                 place = at + k * ROW + i
                 most = max(most, abs(m[place + 1, 0] - m[place, 0]) / (m[levels + i + 1, 0] - m[levels + i, 0]))
-            m[seen + k, 0], m[reach + k, 0] = m[d + k, 0], most
+            m[checked + k, 0], m[reach + k, 0] = m[d + k, 0], most
     else:
         for i in range(GRID // 2, GRID - 1):
             m[levels + i + 1, 0] = max(m[levels + i + 1, 0], m[levels + i, 0])
@@ -171,10 +171,10 @@ def on_envelope(m: Array, p: Places, right: float) -> float:
 @part
 def rises(m: Array, p: Places) -> bool:
     """Whether the output block with the present d increases along the grid."""
-    d, seen, reach = p[D_NOW], p[D_SEEN], p[REACH]
+    d, checked, reach = p[D_NOW], p[D_CHECKED], p[REACH]
     moved = m[reach, 0]
     for k in range(1, p[N_OUT]):
-        moved += abs(m[d + k, 0] - m[seen + k, 0]) * m[reach + k, 0]
+        moved += abs(m[d + k, 0] - m[checked + k, 0]) * m[reach + k, 0]
     if not moved < SAFE:
         look(m, p)
     return bool(m[RISING, 0] > 0.0)

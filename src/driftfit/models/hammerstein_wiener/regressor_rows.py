@@ -111,7 +111,7 @@ def forget(m: Array, p: Places) -> None:
 
 
 @part
-def fill(m: Array, p: Places, to: int, ago: int, seen: bool) -> None:
+def fill(m: Array, p: Places, to: int, ago: int, observed: bool) -> None:
     """Fill phi without the columns of the present output, from the lags ``ago`` samples before it."""
     na, n_out, g = p[NA], p[N_OUT], p[G_PAST] + (1 - ago) * p[N_OUT]
     first, at = to + na, to + na + p[NB] + n_out - 1
@@ -129,7 +129,7 @@ def fill(m: Array, p: Places, to: int, ago: int, seen: bool) -> None:
     for k in range(n_out):
         start = to if k == 0 else at + (k - 1) * na
         for i in range(na):
-            m[start + i, 0] = m[g + i * n_out + k, 0] if seen or i > 0 else np.nan
+            m[start + i, 0] = m[g + i * n_out + k, 0] if observed or i > 0 else np.nan
     for i in range(at + (n_out - 1) * na, to + p[N]):
         m[i, 0] = 1.0
 

@@ -32,10 +32,10 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     NB,
     NEXT,
     NOW,
+    OBSERVED,
     OK,
     OWN,
     PREDICTED,
-    SEEN,
     US,
     N,
     Y,
@@ -100,7 +100,7 @@ def _steps(into: tuple[Kind, ...], out: Kind) -> ModelSteps:
         if s.orders[IDENTITY, l] == 0:
             push_any(s.blocks.ctypes.data, s.orders.ctypes.data)
         s.y_hat[l] = s.blocks[PREDICTED, l]
-        s.blocks[SEEN, l], s.blocks[OK, l] = s.observed[l], s.ok[l]
+        s.blocks[OBSERVED, l], s.blocks[OK, l] = s.observed[l], s.ok[l]
         for i in range(s.orders[N, l]):
             s.blocks[s.orders[NOW, l] + i, l] = s.blocks[s.orders[NEXT, l] + i, l]
 

@@ -33,7 +33,7 @@ ROW = GRID + 1
 
 (
     LOW, STEP, LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED, STARTED, MINIMAL, GIVEN, RAW, VARIANCE, BEFORE, EARLIER,
-    FIRM_LOW, FIRM_HIGH, MOVED, LATE, CELL, Y, DT, SEEN, OK, FACTOR, HEAD,
+    FIRM_LOW, FIRM_HIGH, MOVED, LATE, CELL, Y, DT, OBSERVED, OK, FACTOR, HEAD,
 ) = range(26)  # fmt: skip
 """Numbers: the grid, the range of accepted outputs, where the output block is defined, results, whether all lags are
 known, whether theta is xi, the given noise factor, the output as given, sigma^2 or 0, the two previous outputs, the
@@ -43,7 +43,7 @@ prediction, its cell of the grid, and what steps and compiled routine exchange; 
 
 (
     NA, NB, N_IN, N_OUT, N, NK, IDENTITY, ADAPTIVE, NOW, NEXT, F_PAST, G_PAST, H_PAST, SPARE, D_NOW, TRIAL,
-    TRIAL_BEND, INTO, OUT, CURVE, BEND, COARSE, LEVEL, D_SEEN, REACH, US, INPUTS, OWN,
+    TRIAL_BEND, INTO, OUT, CURVE, BEND, COARSE, LEVEL, D_CHECKED, REACH, US, INPUTS, OWN,
 ) = range(28)  # fmt: skip
 """Places: orders, whether the output block is the identity and an input basis depends on its own coefficients, where
 the arrays begin, and how many inputs there are. NB is the number of all b, NK the smallest delay; N_IN, F_PAST and INTO
@@ -70,7 +70,7 @@ def _arrays(structure: Structure, nk: tuple[int, ...], into: tuple[Array, ...], 
         SPARE: np.zeros(max(n_in)), D_NOW: np.eye(1, n_out)[0], TRIAL: np.zeros(n_out), TRIAL_BEND: np.zeros(n_out),
         INTO: np.concatenate(into), OUT: out,
         CURVE: np.zeros(ROW * n_out), BEND: np.zeros(ROW * n_out), COARSE: np.zeros(EIGHT * n_out),
-        LEVEL: np.zeros(GRID), D_SEEN: np.zeros(n_out), REACH: np.full(n_out, np.inf),
+        LEVEL: np.zeros(GRID), D_CHECKED: np.zeros(n_out), REACH: np.full(n_out, np.inf),
         US: np.zeros(len(nb)),
     }  # fmt: skip
 

@@ -51,6 +51,7 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     NEXT,
     NK,
     NOW,
+    OBSERVED,
     OK,
     OWN,
     OWN_ADAPTIVE,
@@ -61,7 +62,6 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     OWN_NK,
     PREDICTED,
     RAW,
-    SEEN,
     SPARE,
     STARTED,
     US,
@@ -128,7 +128,7 @@ def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
 
     def regress_sample(m: Array, p: Places, theta: Array) -> None:
         n_out, rows, g, h = p[N_OUT], 1 + max(p[NA], 1), p[G_PAST], p[H_PAST]
-        if not m[SEEN, 0] > 0.0:  # the previous sample
+        if not m[OBSERVED, 0] > 0.0:  # the previous sample
             for k in range(n_out):
                 m[g + k, 0] = np.nan
         shift(m, g, n_out, rows)
@@ -147,30 +147,30 @@ def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
             m[STARTED, 0] = 1.0
         right = minimal_past(m, p, theta) if m[MINIMAL, 0] > 0.0 else past(m, p, theta)
         y = m[Y, 0]
-        seen = abs(y) < LARGEST
-        if seen:
+        observed = abs(y) < LARGEST
+        if observed:
             if m[VARIANCE, 0] > 0.0:
                 output_at(m, p, y, g, h)
             else:
                 bare_output_at(m, p, y, g, h)
-            seen = usable(m, g, n_out)
-        m[RAW, 0] = y if seen else np.nan
+            observed = usable(m, g, n_out)
+        m[RAW, 0] = y if observed else np.nan
         if p[IDENTITY] == 0:
-            if seen:
+            if observed:
                 right = locate(m, p, right)
             else:
                 right = invert(m, p, right)
                 m[LATE, 0] = 0.0
-        if seen:
+        if observed:
             believe(m, y)
         m[PREDICTED, 0] = right
-        if not seen:
+        if not observed:
             output_at(m, p, right, g, h)
         m[FACTOR, 0] = noise_factor(m, p, theta) if m[VARIANCE, 0] > 0.0 else 1.0
-        m[Y, 0] = -m[g, 0] if seen else np.nan
+        m[Y, 0] = -m[g, 0] if observed else np.nan
         m[DT, 0] = m[DT, 0] if m[STARTED, 0] > 0.0 else 0.0
         if p[NK] > 0:
-            fill(m, p, p[NEXT], 1, seen)
+            fill(m, p, p[NEXT], 1, observed)
 
     return part(regress_sample)
 
@@ -238,7 +238,7 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
             else:
                 push_lane(s.blocks.ctypes.data + at, L)
         s.y_hat[l] = s.blocks[PREDICTED, l]
-        s.blocks[SEEN, l], s.blocks[OK, l] = s.observed[l], s.ok[l]
+        s.blocks[OBSERVED, l], s.blocks[OK, l] = s.observed[l], s.ok[l]
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 
@@ -264,7 +264,7 @@ def applying(into: tuple[Kind, ...], p: tuple[int, ...]) -> Step:
             s.blocks[us + i, l] = s.u[i, l]
         m = floats(s.blocks.ctypes.data + 8 * l, 1, s.y.shape[0])
         place(m, orders)
-        fill(m, orders, following, 1, m[SEEN, 0] > 0.0)
+        fill(m, orders, following, 1, m[OBSERVED, 0] > 0.0)
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 

@@ -113,10 +113,10 @@ def shift_doubts(s: State, o: int, l: int, own: int, first: int, step: int, ny: 
     for i in range(na - 1, 0, -1):
         s.doubt[o, i, l], s.suspect[o, i, l] = s.doubt[o, i - 1, l], s.suspect[o, i - 1, l]
         s.aside[o, i, l], s.blur[o, i, l] = s.aside[o, i - 1, l], s.blur[o, i - 1, l]
-    outlier, seen, known = s.outlier[own], s.observed[own] > 0.0, s.s[own] < np.inf
+    outlier, observed, known = s.outlier[own], s.observed[own] > 0.0, s.s[own] < np.inf
     doubt = s.false_share[o, l] * outlier
-    some = seen & known & (doubt > SMALLEST)
+    some = observed & known & (doubt > SMALLEST)
     s.suspect[o, 0, l] = outlier if some else 0.0
-    s.doubt[o, 0, l] = doubt if some else (0.0 if seen else 1.0)
+    s.doubt[o, 0, l] = doubt if some else (0.0 if observed else 1.0)
     s.aside[o, 0, l] = s.y_hat[own] - s.y[own] if some else 0.0
-    s.blur[o, 0, l] = s.s[own] if known & (some | (not seen)) else 0.0
+    s.blur[o, 0, l] = s.s[own] if known & (some | (not observed)) else 0.0

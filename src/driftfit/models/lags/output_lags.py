@@ -1,4 +1,4 @@
-"""What the models with lags share: when a record begins, and which value an output has as a lag.
+"""What the models with lags share: how inputs age, when a record begins, and which value an output has as a lag.
 
 Cost: O(n) per sample.
 """
@@ -9,6 +9,18 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import State, kernel
+from driftfit.models.base import GAP
+
+
+@kernel
+def shift_inputs(s: State, m: int, l: int) -> None:
+    """Inputs become lags, which a long interval breaks; the present input is lag 0."""
+    broken = s.dt[l] > GAP
+    for j in range(m):
+        for i in range(s.u_lag.shape[1] - 1, 0, -1):
+            lag = s.u_lag[j, i - 1, l]
+            s.u_lag[j, i, l] = np.nan if broken else lag
+        s.u_lag[j, 0, l] = s.u[j, l]
 
 
 @kernel

@@ -428,25 +428,25 @@ def pushing(p: Places, place: Step, waiting: float = ENTRY) -> Step:
 
     @kernel
     def push(s: State, l: int) -> None:
-        seen = s.observed[l] > 0.0
+        observed = s.observed[l] > 0.0
         predicted = informed(s, l)
         # w and e of this sample are those of the theta that has learned from it
-        enlarge(s, s.measured[l] if seen else np.nan, 0, l)
+        enlarge(s, s.measured[l] if observed else np.nan, 0, l)
         linearise(s, l)
         fitted = predict(s, False, l)
-        fitted = possible(s, fitted, l) if seen else fitted
+        fitted = possible(s, fitted, l) if observed else fitted
         # a point that is held says what noise is, also before theta is determined, and before the first regressor
         known = (s.valid[l] > 0.0) | (s.started[l] == 0.0) if held else predicted
-        e = s.measured[l] - fitted if seen & known else 0.0
+        e = s.measured[l] - fitted if observed & known else 0.0
         # what is left of an interpolated sample is rounding, and no regressor
         e = e if abs(e) > ROUNDING * (abs(s.measured[l]) + abs(fitted)) else 0.0
         e = within(s, e, l)
         begun = s.usable[l] >= first_noise
         v = within(s, e + noise(s, l), l) if begun else 0.0
-        known = seen | (predicted & ((na == 0) | (s.without[l] < na)))
-        restore(s, seen, l)
-        y = s.measured[l] if seen else s.y_hat[l]
-        y = y if seen | credible(s, y, 0, l) else 0.0
+        known = observed | (predicted & ((na == 0) | (s.without[l] < na)))
+        restore(s, observed, l)
+        y = s.measured[l] if observed else s.y_hat[l]
+        y = y if observed | credible(s, y, 0, l) else 0.0
         remember(s, y, known, v, e if begun else 0.0, l)
         if (first_f > 0) & (s.usable[l] < SETTLING * n):
             s.signals[OWN + W, 0, l] = responding(s, y, s.signals[OWN + W, 0, l], l)

@@ -91,10 +91,10 @@ class AlarmRule(Settings):
 
     @property
     def reference(self) -> Frozen:
-        """The frozen model of "glr" and "cusum", as arrays."""
+        """The frozen model of "glr" and "cusum", as arrays; rules of earlier versions have no ``unseen`` directions."""
         n = len(self.parameters)
-        shapes = (-1, -1, -1, (n, n), -1, (-1, n))
-        return Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(self.frozen, shapes, strict=False)))
+        shapes, given = (-1, -1, -1, (n, n), -1, (-1, n)), (*self.frozen, ())
+        return Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(given, shapes, strict=False)))
 
     @property
     def real_rate(self) -> tuple[float, float]:

@@ -9,14 +9,16 @@ Of K series with ny outputs each, programs and states have K ny entries, those o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from driftfit.data.record import Records
 from driftfit.engine.kernel import Array, Driver
-from driftfit.run.parallel_lanes import Job, prepare, run_jobs
+from driftfit.run.parallel_lanes import Job, lanes_in, prepare, run_jobs
 from driftfit.run.program import Program
+from driftfit.run.result import Lanes
 
 
 class Advanced:
@@ -47,13 +49,10 @@ class Advanced:
             first, length = self.records.first[series], self.records.length[series]
             _natural(words, np.concatenate(begin), lanes, first, length, output, into)
 
-    def lanes(self) -> list[tuple[Job, int]]:
-        """The job and the lane of each program."""
-        found: list[tuple[Job, int]] = [(self.jobs[0], 0)] * len(self.programs)
-        for job in self.jobs:
-            for lane in np.flatnonzero(job.live).tolist():
-                found[job.lanes[lane]] = job, lane
-        return found
+    @cached_property
+    def lanes(self) -> Lanes:
+        """The lane of each program."""
+        return lanes_in(self.jobs, self.records)
 
     def states(self) -> Array:
         """The words (K ny, W) after the last samples; of a layout with fewer words the first of them."""

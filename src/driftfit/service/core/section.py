@@ -187,18 +187,16 @@ class Section:
             np.sqrt(std, out=std)
         flags = (given[:, -1] > 0.0).astype(np.uint8) * np.uint8(OK)
         np.add.at(self.streams.counted[:, USED], places, flags)
-        lanes = None
         for k, place in enumerate(places[records.first].tolist()):
             unit = self.units[place]
             if unit.calibrated and not unit.alarms:
                 continue
-            lanes = found.lanes() if lanes is None else lanes
             part = slice(int(records.first[k]), int(records.first[k] + records.length[k]))
             own = None if rows.time is None else rows.time[part]
             if unit.alarms:
-                job, lane = lanes[k]
+                rows_of, _, lane = found.lanes[k]
                 factors = np.broadcast_to(noise, len(places))[part]
-                on = unit.watch(job.out[: len(factors)], lane, factors, own, number[part], out)
+                on = unit.watch(rows_of, lane, factors, own, number[part], out)
                 flags[part] |= np.array(on, np.uint8) * np.uint8(ALARM)
             if not unit.calibrated:
                 unit.remember(own, rows.values[part], out)

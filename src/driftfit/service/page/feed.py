@@ -43,7 +43,7 @@ class Feed:
         self.names = Names(self.journal)
         self.names.read()
         self.latest: dict[int, list[Any]] = {}
-        self.seen: dict[int, float] = {}
+        self.updated: dict[int, float] = {}
         self.fleet: list[dict[str, Any]] = []
         self.events: deque[list[Any]] = deque(maxlen=200)
         self.watched: dict[int, tuple[deque[list[Any]], list[float]]] = {}
@@ -79,7 +79,7 @@ class Feed:
                 for part in parts:
                     for row in part.last().rows():
                         self.latest[row[1]] = row
-                        self.seen[row[1]] = now
+                        self.updated[row[1]] = now
                     for unit, (kept, _) in self.watched.items():
                         kept.extend(part.some(np.flatnonzero(part.unit == unit)).rows())
                 self.events.extend(events)
@@ -113,7 +113,7 @@ class Feed:
         """A unit of the overview."""
         return {
             "unit": self.names.names[unit], "drift": round(drift, 2), "alarm": row[10], "time": row[2],
-            "age": round(now - self.seen[unit], 1), "y": finite(row[3]), "y_hat": finite(row[4]), "ok": row[7],
+            "age": round(now - self.updated[unit], 1), "y": finite(row[3]), "y_hat": finite(row[4]), "ok": row[7],
             "theta": [finite(one) for one in row[8]],
         }  # fmt: skip
 

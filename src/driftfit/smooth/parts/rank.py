@@ -15,6 +15,16 @@ FAR = 1e250
 """Sums of squares between this and its inverse have lost nothing to overflow or underflow."""
 
 
+def column_sizes(phi: Array, total: Any = np.mean) -> Array:
+    """Root mean square (n,) of each column of phi (N, n), N > 0; 1 for columns of zeros, whose parameters are then 0.
+
+    In units of their size the columns are equally long, so that rank is not lost where units are far apart. With
+    ``total=np.sum`` it is their length, which they have without rows too.
+    """
+    size = np.sqrt(total(phi * phi, axis=0))
+    return np.where(size > 0.0, size, 1.0)
+
+
 @Driver
 def column_scale(phi: Array, signals: Array) -> Array:
     """Root mean square of each column of phi over the samples that are used; 1 for columns of zeros.

@@ -59,7 +59,7 @@ prior, WIDE if its level is not that of one nominal interval, PARTED if leaves a
 """
 WAITING, READY = 0, -1
 (
-    IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
+    IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_OBSERVED, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
     SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SHIFT, READING, LOWEST, HIGHEST, DOUBTS, ENTERS, SIZE,
 ) = range(28)  # fmt: skip
 """Numbers of the present sample: inputs and results. MOST is the largest mean square that a leaf's own

@@ -19,7 +19,7 @@ from typing import Any
 from numba import types
 from numba.extending import infer_getattr, lower_getattr_generic, models, register_model
 
-from driftfit.engine.numba_internals import AttributeTemplate, array_at, ir, named_intrinsic
+from driftfit.engine.numba_internals import WORD, AttributeTemplate, array_at, entry_of, named_intrinsic
 
 MATRIX, VECTOR, COUNTS, NUMBER = "matrix", "vector", "counts", "number"
 """Kinds of fields: floats (rows, columns), floats (columns,), whole numbers (columns,), one whole number."""
@@ -27,7 +27,6 @@ _KINDS = {
     MATRIX: types.Array(types.float64, 2, "C"), VECTOR: types.Array(types.float64, 1, "C"),
     COUNTS: types.Array(types.int64, 1, "C"), NUMBER: types.int64,
 }  # fmt: skip
-_I64 = ir.IntType(64)
 
 
 class TableType(types.Type):
@@ -42,7 +41,7 @@ class TableType(types.Type):
 @register_model(TableType)
 class _Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _I64.as_pointer())
+        super().__init__(manager, kind, WORD.as_pointer())
 
 
 @infer_getattr
@@ -58,9 +57,7 @@ def _read(context: Any, builder: Any, table: TableType, value: Any, name: str) -
     row, kind, base = table.rows[name]
 
     def entry(row: int, column: int) -> Any:
-        read = builder.load(builder.gep(value, [ir.Constant(_I64, 3 * row + column)]))
-        read.set_metadata("invariant.load", builder.module.add_metadata([]))
-        return read
+        return entry_of(builder, value, 3 * row + column)
 
     if kind == NUMBER:
         return entry(row, 0)
@@ -83,7 +80,7 @@ class Table:
 
         def typed(context: Any, address: Any) -> Any:
             def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-                return builder.inttoptr(given[0], _I64.as_pointer())
+                return builder.inttoptr(given[0], WORD.as_pointer())
 
             return kind(types.intp), build
 

@@ -26,15 +26,13 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array, State, kernel
 
 SHARE = 0.1
 """Share of the readings that repeat, and of the steps that are about as small as the least, for a quantum."""
 ENOUGH = 3.0
 """Number of steps of the size of the quantum, and of repeated readings, before it is accepted."""
-ROUNDING = 1e-12
-"""A step below this share of the reading is rounding, and the reading a repeated one."""
-
 LONGEST = 4.0
 """At most so many repeated readings in a row count."""
 
@@ -63,19 +61,19 @@ def same_reading(s: State, other: float, l: int) -> bool:
 @kernel
 def resolve(s: State, l: int) -> None:
     """Process a reading."""
-    y, seen, quantum = reading(s, l), s.observed[l], s.quantum[l]
+    y, observed, quantum = reading(s, l), s.observed[l], s.quantum[l]
     step = abs(y - s.reading[l])  # NaN at the first reading, which neither moves nor repeats
-    repeated = seen if same_reading(s, s.reading[l], l) else 0.0
-    moved = seen - repeated if step >= 0.0 else 0.0
+    repeated = observed if same_reading(s, s.reading[l], l) else 0.0
+    moved = observed - repeated if step >= 0.0 else 0.0
     near = moved if step < 1.5 * quantum else 0.0
     smallest = near + (s.smallest[l] if (moved == 0.0) | (step >= 0.75 * quantum) else 0.0)
     quantum = step if (moved > 0.0) & (step < quantum) else quantum
     steps, repeats = s.steps[l] + moved, s.repeats[l] + repeated
     coarse = (smallest >= max(ENOUGH, SHARE * steps)) & (repeats >= max(ENOUGH, SHARE * (steps + repeats)))
-    s.reading[l] = y if seen > 0.0 else s.reading[l]
+    s.reading[l] = y if observed > 0.0 else s.reading[l]
     s.quantum[l], s.smallest[l], s.steps[l], s.repeats[l] = quantum, smallest, steps, repeats
     s.coarse[l] = quantum * quantum / 12.0 if coarse else 0.0
-    s.alike[l] = min(s.alike[l] + 1.0, LONGEST) * repeated if seen > 0.0 else s.alike[l]
+    s.alike[l] = min(s.alike[l] + 1.0, LONGEST) * repeated if observed > 0.0 else s.alike[l]
     s.fresh[l] = 0.0 if (repeated > 0.0) & (not coarse) else 1.0
 
 

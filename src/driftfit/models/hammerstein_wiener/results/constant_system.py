@@ -129,8 +129,8 @@ def _separated(model: HammersteinWiener, theta: Array, f: Array, y: Array) -> Co
 
     w = lfilter(np.concatenate([np.zeros(model.nk), b]), np.concatenate([[1.0], a]), v)
     w = w - (0.0 if rest is None else float(rest[0]) / (1.0 + a.sum()))
-    seen = y[np.abs(y) < LARGEST]
-    grid = np.linspace(seen.min(), seen.max(), POINTS)
+    outputs = y[np.abs(y) < LARGEST]
+    grid = np.linspace(outputs.min(), outputs.max(), POINTS)
     level = np.maximum.accumulate(model.out.value(grid) @ d)
     xi = minimal(model, Groups(a, b, c, d), rest[0] if rest is not None else None)
     simulated = np.interp(w, level, grid)

@@ -80,8 +80,8 @@ def diagnose_blocks(run: Track, window: int | None = None, every: int = 1, limit
         raise ValueError(f"diagnose_blocks: the run must be of a HammersteinWiener; got {type(model).__name__}.")
     whole("diagnose_blocks", "every", every, 1)
     span = whole("diagnose_blocks", "window", 3 * model.n if window is None else window, 3 * model.n)
-    seen = replay(run)
-    phi = np.where(seen["ok"][:, :1] > 0.0, seen["phi"][..., 0], 0.0)
+    replayed = replay(run)
+    phi = np.where(replayed["ok"][:, :1] > 0.0, replayed["phi"][..., 0], 0.0)
     at = np.arange(every - 1, len(run), every)
     excitation, unexcited = excitation_of(phi, at, span, limit)
     found = blocks_of(run)
@@ -117,10 +117,10 @@ def excitation_of(phi: Array, at: Array, span: int, limit: float) -> tuple[Array
 
 def _least_slope(model: HammersteinWiener, d: Array, y: Array) -> float:
     """The smallest F' over the span of the outputs of a window."""
-    seen = y[np.isfinite(y)]
-    if not seen.size:
+    outputs = y[np.isfinite(y)]
+    if not outputs.size:
         return float("nan")
-    return float(np.min(model.out.derivative(np.linspace(seen.min(), seen.max(), 33)) @ d))
+    return float(np.min(model.out.derivative(np.linspace(outputs.min(), outputs.max(), 33)) @ d))
 
 
 def _covariance(run: Track, at: Array) -> tuple[Array, Array, Array]:

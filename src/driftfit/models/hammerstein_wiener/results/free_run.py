@@ -106,14 +106,14 @@ def believed(y: Array) -> tuple[Array, Array]:
     `driftfit.models.hammerstein_wiener.output_curve`.
     """
     known = np.abs(y) < LARGEST
-    seen = y[known]
-    low, high = seen.copy(), seen.copy()
-    if len(seen) > 2:
-        middle = np.median(np.stack([seen[:-2], seen[1:-1], seen[2:]]), axis=0)
+    outputs = y[known]
+    low, high = outputs.copy(), outputs.copy()
+    if len(outputs) > 2:
+        middle = np.median(np.stack([outputs[:-2], outputs[1:-1], outputs[2:]]), axis=0)
         bottom, top = np.minimum.accumulate(middle), np.maximum.accumulate(middle)
         margin = FAR * (top - bottom)
         bottom, top = bottom - margin, top + margin
-        low[2:], high[2:] = np.maximum(seen[2:], bottom), np.minimum(seen[2:], top)
+        low[2:], high[2:] = np.maximum(outputs[2:], bottom), np.minimum(outputs[2:], top)
         low[:2], high[:2] = np.nan, np.nan
     last = np.cumsum(known)  # the number of known outputs up to each sample
     none = [np.nan]

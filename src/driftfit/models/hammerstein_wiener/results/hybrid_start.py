@@ -101,8 +101,8 @@ def _sufficient(model: HammersteinWiener, first: Tracker, y: Array, u: Array, li
     n = model.n
     for T in (20 * n, len(y)):  # most records are excited early
         run = track_one(model, first, y[:T], u[:T])
-        seen = replay(run)
-        phi = np.where(seen["ok"][:, :1] > 0.0, seen["phi"][..., 0], 0.0)
+        replayed = replay(run)
+        phi = np.where(replayed["ok"][:, :1] > 0.0, replayed["phi"][..., 0], 0.0)
         at = np.arange(3 * n, len(run))
         found = np.flatnonzero(excitation_of(phi, at, 3 * n, limit)[0] > limit)
         if found.size:

@@ -51,8 +51,8 @@ def plot_blocks(run: Track, method: str = "svd-joint", times: Sequence[int] | No
 
 def _points(signal: Any) -> Any:
     """Points over the central 99 % of a signal."""
-    seen = signal[np.isfinite(signal)]
-    low, high = np.quantile(seen, (0.005, 0.995)) if seen.size else (-1.0, 1.0)
+    values = signal[np.isfinite(signal)]
+    low, high = np.quantile(values, (0.005, 0.995)) if values.size else (-1.0, 1.0)
     return np.linspace(low, high, POINTS)
 
 

@@ -33,11 +33,11 @@ from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.step_memory import PREDICTED
 from driftfit.models.hammerstein_wiener.trackers.minimal import Minimal, minimal_memory, structure_of
 from driftfit.models.hammerstein_wiener.trackers.output_error_steps import (
+    OBSERVED,
     OK,
     P_W,
     Q_W,
     S2,
-    SEEN,
     TIME,
     V_POWER,
     VALID,
@@ -58,7 +58,7 @@ def _steps(machine: Any) -> TrackerSteps:
             s.S.ctypes.data, s.scratch.ctypes.data, s.own.ctypes.data, s.P.ctypes.data,
         ))  # fmt: skip
         machine(fields, s.theta.shape[0], s.phi.shape[0])
-        s.valid[l], s.observed[l], s.ok[l] = s.own[VALID, l], s.own[SEEN, l], s.own[OK, l]
+        s.valid[l], s.observed[l], s.ok[l] = s.own[VALID, l], s.own[OBSERVED, l], s.own[OK, l]
         s.e[l], s.s[l], s.y_hat[l] = s.own[E, l], s.own[S2, l], s.blocks[PREDICTED, l]
 
     return TrackerSteps(nothing, correct)

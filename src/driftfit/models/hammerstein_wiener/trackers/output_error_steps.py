@@ -61,7 +61,7 @@ SHARE, LARGE = 0.01, 25.0
 that a fault code cannot become the scale.
 """
 
-TIME, R, Q_W, P_W, BEGUN, VALID, SEEN, OK, E, S2, R_NOW, SLOPE, V_POWER = range(13)
+TIME, R, Q_W, P_W, BEGUN, VALID, OBSERVED, OK, E, S2, R_NOW, SLOPE, V_POWER = range(13)
 """Numbers of the filter: nominal intervals times the drift, variances, whether w has begun, the results, the noise
 variance and the slope of F at this sample; from V_POWER on the usual power of v of each input.
 """
@@ -264,9 +264,9 @@ def _work(out: Kind) -> Any:
         slope = 0.0
         for k in range(n_out):
             slope += m[d + k, 0] * m[p[TRIAL_BEND] + k, 0]
-        valid, seen = known and able and own[BEGUN] > 0.0, abs(y) < np.inf
-        used = valid and seen and m[GIVEN, 0] < np.inf
-        own[VALID], own[SEEN], own[OK] = 1.0 if valid else 0.0, 1.0 if seen else 0.0, 1.0 if used else 0.0
+        valid, observed = known and able and own[BEGUN] > 0.0, abs(y) < np.inf
+        used = valid and observed and m[GIVEN, 0] < np.inf
+        own[VALID], own[OBSERVED], own[OK] = 1.0 if valid else 0.0, 1.0 if observed else 0.0, 1.0 if used else 0.0
         own[E] = y - y_hat if used else 0.0
         own[R_NOW], own[SLOPE] = own[R] * m[GIVEN, 0] if used else own[R], max(slope, FLATTEST)
         absorb(m, p, own, theta, w, S, scratch)

@@ -47,7 +47,7 @@ const connect = () => {
   const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
   state.socket = socket;
   socket.addEventListener("open", () => { pause = 500; look(); });
-  socket.addEventListener("message", (event) => told(JSON.parse(event.data)));
+  socket.addEventListener("message", (event) => receive(JSON.parse(event.data)));
   socket.addEventListener("close", () => {
     link("reconnecting", "bad");
     at("numbers").textContent = "the service does not answer";
@@ -62,7 +62,7 @@ const look = () => {
 };
 
 const rate = { at: 0, samples: 0, value: null };
-const told = (message) => {
+const receive = (message) => {
   const { status } = message;
   link(status.alive ? "live" : "engine away", status.alive ? "good" : "bad");
   at("problem").hidden = !status.problem;

@@ -41,7 +41,7 @@ def covariance_row(n: int, na: int) -> int:
 
 
 @shared
-def push(t: Any, L: int, seen: bool, y_hat: Array, most: float) -> None:
+def push(t: Any, L: int, observed: bool, y_hat: Array, most: float) -> None:
     """Store output lags of leaves without a measurement update: y if it was observed, otherwise each prediction, within
     limits.
     """
@@ -52,7 +52,7 @@ def push(t: Any, L: int, seen: bool, y_hat: Array, most: float) -> None:
             B[at + i, l] = B[at + i - 1, l]
     if na > 0:
         for l in range(L):
-            B[at, l] = y if seen else min(max(y_hat[l], -limit), limit)
+            B[at, l] = y if observed else min(max(y_hat[l], -limit), limit)
 
 
 @shared

@@ -31,8 +31,8 @@ from driftfit.trackers.bank.layout import (
     IMPOSSIBLE,
     IN_DT,
     IN_NOISE,
+    IN_OBSERVED,
     IN_OK,
-    IN_SEEN,
     IN_TIME,
     IN_Y,
     KEPT,
@@ -250,7 +250,7 @@ def choose(t: Any, L: int) -> None:
     counters, samples, kind = t.counters, t.samples, int(t.reduction[KIND])
     if kind == CUT:
         phi = t.phi
-        if t.reduction[WAIT] > 0.0:  # the last regressor before the open events stands for the next one
+        if t.reduction[WAIT] > 0.0:  # the last regressor before the open events represents the next one
             phi = samples[max(counters[STORED] - 1 - counters[HELD], 0) % len(samples), TIME + 1 :]
         decide(t, L, phi)
         counters[GROUPS] = number(t.group, L, t.order)
@@ -358,9 +358,10 @@ def certain(prior: Array, L: int) -> None:
 @shared
 def let_pass(t: Any, L: int) -> None:
     """Process a sample that is not used: the time update of the leaves."""
-    counters, B, n, dt, seen, apart = t.counters, t.leaves, t.n, t.sample[IN_DT], t.sample[IN_SEEN] > 0.0, t.apart > 0
-    shift_covariance(t, B, L, 0, L, not seen)
-    push(t, L, seen, t.expected[1], t.sample[MOST])
+    counters, B, n, dt, apart = t.counters, t.leaves, t.n, t.sample[IN_DT], t.apart > 0
+    observed = t.sample[IN_OBSERVED] > 0.0
+    shift_covariance(t, B, L, 0, L, not observed)
+    push(t, L, observed, t.expected[1], t.sample[MOST])
     if dt == 0.0:
         return
     if counters[EXPANDED] == 0:
@@ -396,7 +397,7 @@ def refused(sample: Array, counters: Array) -> bool:
     usual = sample[LOWEST] <= y <= sample[HIGHEST]
     patient = counters[REFUSED] < FAULTS_IN_A_ROW and (sample[DOUBTS] < DOUBTED or not usual)
     if patient and far * far > sample[LIMIT] * sample[LIMIT] * sample[S2]:
-        sample[IN_OK], sample[IN_SEEN] = 0.0, 0.0
+        sample[IN_OK], sample[IN_OBSERVED] = 0.0, 0.0
         sample[DOUBTS] += 1.0 if usual else 0.0
         counters[REFUSED] += 1
         counters[FAULTS] += 1
@@ -464,7 +465,7 @@ def note(t: Any, window: float) -> None:
 @shared
 def remember_reading(sample: Array) -> None:
     """Update what is known of the readings, after a sample."""
-    if sample[IN_SEEN] > 0.0:
+    if sample[IN_OBSERVED] > 0.0:
         y = sample[IN_Y] + sample[SHIFT]
         sample[READING], sample[DOUBTS] = y, FORGOTTEN * sample[DOUBTS]
         sample[LOWEST], sample[HIGHEST] = min(sample[LOWEST], y), max(sample[HIGHEST], y)

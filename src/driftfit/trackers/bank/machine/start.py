@@ -11,7 +11,7 @@ from driftfit.trackers.bank.layout import (
     CLOCK,
     EXPANDED,
     GROUPS,
-    IN_SEEN,
+    IN_OBSERVED,
     LEAST,
     LEAVES,
     NEVER,
@@ -55,7 +55,7 @@ def wait(t: Any) -> None:
     t.lag_prob[0, 0] = 1.0
     y_hat = t.leaves[WEIGHT, :1]
     y_hat[0] = sample[Y_HAT] if abs(sample[Y_HAT]) < np.inf else 0.0
-    push(t, 1, sample[IN_SEEN] > 0.0, y_hat, np.inf)
+    push(t, 1, sample[IN_OBSERVED] > 0.0, y_hat, np.inf)
     counters[CLOCK] += 1
     if counters[SETTLED] == READY:
         begin(t, sample[TIMES], max(sample[SQUARES], sample[LEAST] * sample[TIMES]))

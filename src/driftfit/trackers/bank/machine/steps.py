@@ -14,8 +14,8 @@ from driftfit.trackers.bank.layout import (
     FREEDOM,
     IN_DT,
     IN_NOISE,
+    IN_OBSERVED,
     IN_OK,
-    IN_SEEN,
     IN_TIME,
     IN_Y,
     LEAST,
@@ -195,7 +195,7 @@ def hand_over(s: State, l: int) -> None:
     """Write the numbers of this sample for the compiled routine."""
     s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l] * repeated(s, l), s.dt[l]
     s.sample[IN_TIME, l], s.sample[SHIFT, l] = s.dt[l] * s.drift[l], s.shift[l]
-    s.sample[IN_OK, l], s.sample[IN_SEEN, l] = s.ok[l], s.observed[l]
+    s.sample[IN_OK, l], s.sample[IN_OBSERVED, l] = s.ok[l], s.observed[l]
     s.sample[R, l], s.sample[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])
     s.sample[ENTERS, l] = 0.0
     s.sample[MOST, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
@@ -234,7 +234,8 @@ def correct(s: State, l: int) -> None:
         hand_over(s, l)
         run(s, l)
         s.y_hat[l], s.s[l], s.e[l] = s.sample[Y_HAT, l], s.sample[S2, l], s.y[l] - s.sample[Y_HAT, l]
-        s.ok[l], s.observed[l] = s.sample[IN_OK, l], s.sample[IN_SEEN, l]  # a fault code counts as missing, in lags too
+        # a fault code counts as missing, in lags too
+        s.ok[l], s.observed[l] = s.sample[IN_OK, l], s.sample[IN_OBSERVED, l]
         learn_scales(s, l)
     else:
         only_drift(s, l)
@@ -279,7 +280,7 @@ def in_span(s: State, l: int) -> None:
                 )
     else:
         s.y_hat[l], s.s[l] = s.sample[Y_HAT, l], s.sample[S2, l]
-        s.ok[l], s.observed[l] = s.sample[IN_OK, l], s.sample[IN_SEEN, l]
+        s.ok[l], s.observed[l] = s.sample[IN_OK, l], s.sample[IN_OBSERVED, l]
     s.e[l] = s.y[l] - s.y_hat[l]
     learn_scales(s, l)
     read(s, l)

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.trackers.bank.results.events import LEVEL, Event, back_to, densest
 
@@ -69,7 +70,7 @@ def posterior(around: Around) -> Array:
     gram[:, n:, n:] = after[:, moved[:, None], moved] + penalty
     right[:, n:] = tail[:, moved]
     left = d @ d - np.einsum("ti,ti->t", right, np.linalg.solve(gram, right[..., None])[..., 0])
-    left = np.maximum(left, 1e-12 * max(float(d @ d), np.finfo(float).tiny))
+    left = np.maximum(left, ROUNDING * max(float(d @ d), np.finfo(float).tiny))
     logs = np.where(used, -0.5 * np.linalg.slogdet(gram)[1] - 0.5 * free * np.log(left), -np.inf)
     logs[: int(np.argmax(used)) + 1] = -np.inf  # a change before the first sample is not possible
     if not np.isfinite(logs).any():

@@ -125,16 +125,16 @@ class Measured(NamedTuple):
 def measurements(run: Track, events: list[Event]) -> Measured:
     """The samples of a run; those of sensor faults have little or no weight."""
     bank: Any = run.tracker
-    seen = replay(run)
-    ok, phi = seen["ok"][:, 0] > 0.0, np.ascontiguousarray(seen["phi"][..., 0])
+    replayed = replay(run)
+    ok, phi = replayed["ok"][:, 0] > 0.0, np.ascontiguousarray(replayed["phi"][..., 0])
     noise = noise_variance(bank, run)
-    factor = seen["used_noise"][:, 0]
+    factor = replayed["used_noise"][:, 0]
     squares = np.mean(phi[ok] ** 2 / factor[ok, None], axis=0) if ok.any() else np.ones(phi.shape[1])
     unit = np.where(squares > 0.0, noise / np.where(squares > 0.0, squares, 1.0), noise)
     relative = noise if bank.all_sensors[0].r is None and bank.all_sensors[0].guess is None else 1.0
     r = np.where(ok, noise * factor, np.inf) * faults(bank, run, events)
     drift = run.known.over(len(phi)).drift.copy()
-    return Measured(phi, seen["y"][:, 0].copy(), r, seen["dt"][:, 0].copy(), drift, unit, relative)
+    return Measured(phi, replayed["y"][:, 0].copy(), r, replayed["dt"][:, 0].copy(), drift, unit, relative)
 
 
 def steps_of(run: Track, measured: Measured) -> list[Array]:

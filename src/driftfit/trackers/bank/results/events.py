@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 
 
@@ -170,8 +171,8 @@ def clusters(p: Array, reach: slice, threshold: float) -> list[tuple[int, int]]:
     found = [(reach.start + a, reach.start + b) for a, b in runs(part > FAINT) if part[a:b].sum() > threshold]
     if found or not len(part) or part.sum() <= threshold:
         return found
-    seen = np.flatnonzero(part > FAINT)
-    return [(reach.start + int(seen[0]), reach.start + int(seen[-1]) + 1)] if len(seen) else []
+    likely = np.flatnonzero(part > FAINT)
+    return [(reach.start + int(likely[0]), reach.start + int(likely[-1]) + 1)] if len(likely) else []
 
 
 def back_to(first: int, start: int, used: Array) -> int:
@@ -184,7 +185,7 @@ def back_to(first: int, start: int, used: Array) -> int:
 def densest(mass: Array) -> tuple[int, int]:
     """First and last of the smallest set of neighbours with `LEVEL` of the total."""
     total = np.r_[0.0, np.cumsum(mass)]
-    wanted = LEVEL * total[-1] * (1.0 - 1e-12)
+    wanted = LEVEL * total[-1] * (1.0 - ROUNDING)
     ends = np.searchsorted(total, total[:-1] + wanted)
     first = int(np.argmin(np.where(ends <= len(mass), ends - np.arange(len(mass)), len(mass) + 1)))
     return first, int(ends[first]) - 1

@@ -13,7 +13,7 @@ shrink as 1/T. Noise of standard deviation S before the rounding averages the er
 since readings that spread over more than a quantum share nothing, and each level at which the prediction stayed has an
 error of its own; quantum^2 / 12 itself is subtracted from both variances too. f is for meters so coarse that the
 readings alternate between two values: they do so with a variance of up to 3 quantum^2 / 12 without any noise, and tell
-only that there is less of it than a quantum. m is 1 then, and SEEN over the share of the steps that are wider than the
+only that there is less of it than a quantum. m is 1 then, and WIDER over the share of the steps that are wider than the
 quantum otherwise.
 
 A variance of theta from N readings is multiplied by fold = 1 + N c / r. N and levels are those of the tracker's memory:
@@ -38,7 +38,7 @@ from driftfit.trackers.parts.diffuse import spanned_variance
 from driftfit.trackers.parts.resolution import lasting, reading
 
 RATE = 4.0 * np.pi**2
-SEEN = 0.01
+WIDER = 0.01
 """Share of wider steps from which on readings count as more than two values."""
 MOVED = 0.25
 """A prediction that moves by this share of the quantum has another error of rounding."""
@@ -90,7 +90,7 @@ def count_levels(s: State, kept: float, known: bool, l: int) -> None:
 def in_common(s: State, noise: float, l: int) -> float:
     """The variance c per reading; ``noise`` is the noise variance of the tracker, rounding included."""
     coarse, quantum = s.coarse[l], s.quantum[l] if s.coarse[l] > 0.0 else 1.0
-    two = 2.0 * min(1.0, SEEN * s.steps[l] / max(s.steps[l] - s.smallest[l], SEEN))
+    two = 2.0 * min(1.0, WIDER * s.steps[l] / max(s.steps[l] - s.smallest[l], WIDER))
     spread = averaged(s.spread[l] - coarse * (1.0 + two), quantum)
     held = averaged(noise - coarse * (1.0 + two / np.sqrt(s.levels[l])), quantum) / s.levels[l]
     return coarse * max(spread, held)  # type: ignore[no-any-return]

@@ -41,6 +41,7 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.covariance import corrected, prediction, symmetric_product
 
@@ -57,9 +58,8 @@ MEMORY = 1000.0
 ENOUGH, CLIP, BLOCK_CLIP = 4.0, 100.0, 4.0
 """Samples from which on the mean of e^2 / s is used; the largest multiples of it by which a sample, and the mean of a
 block, enter it."""
-BLOCK, GROWING, SAME = 32.0, 0.25, 1e-12
-"""Samples of a block at least, and per reading before; share of their mean square below which their variance is
-rounding."""
+BLOCK, GROWING = 32.0, 0.25
+"""Samples of a block at least, and per reading before."""
 LASTING, LONGEST = 4.0, 1e12
 """The factor p from which on the lag of a strange input is accepted as well; its upper bound."""
 LAGS = 50.0
@@ -131,11 +131,12 @@ def close_block(s: State, l: int) -> None:
         away, square = s.block_sum[l] / count, s.block_squares[l] / count
         ratio = s.block_ratios[l] / (count * s.scale[l])
         variance = max(square - away * away, 0.0)
+        differ = variance > ROUNDING * square
         if count == 1.0:
             learn_reading(s, s.y_mean[l] + away, l)
-        if (count > 1.0) & (variance > SAME * square):
+        if (count > 1.0) & differ:
             learn_range(s, away, variance, count, l)
-        if (ratio >= 0.0) & (s.y_count[l] > s.judged_from[l] - JUDGED) & ((count == 1.0) | (variance > SAME * square)):
+        if (ratio >= 0.0) & (s.y_count[l] > s.judged_from[l] - JUDGED) & ((count == 1.0) | differ):
             learn_ratio(s, ratio, count, l)
     known = (s.y_count[l] >= s.judged_from[l]) & (s.ratios[l] >= ENOUGH)
     calm = (s.widening[l] <= 1.0) & (s.lagging[l] + s.distrusted[l] <= 0.0)

@@ -251,7 +251,7 @@ def outgrown(s: State, l: int) -> int:
     return -1
 
 
-@partial(kernel, seldom=True)
+@partial(kernel, short=True)
 def enter_filters(s: State, j: int, l: int) -> None:
     """Row j of M becomes the rest of phi. The other coordinates take the sample as always, unless nothing was known of
     z_j; then z_j = y - sum_{i<j} x_i z_i - v, which is correlated with them also by v.

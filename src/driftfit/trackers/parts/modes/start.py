@@ -76,7 +76,7 @@ def take_first(s: State, l: int) -> None:
         learn_scale(s, l)
 
 
-@partial(kernel, seldom=True)
+@partial(kernel, short=True)
 def take_start(s: State, l: int) -> None:
     """A sample of the start."""
     s.waited[l] += s.dt[l] * s.drift[l]
@@ -106,7 +106,7 @@ def forget(s: State, l: int) -> None:
     s.middle[l], s.spread[l], s.readings[l], s.widening[l] = 0.0, 0.0, 0.0, 1.0
 
 
-@partial(kernel, seldom=True)
+@partial(kernel, short=True)
 def repeat(s: State, every: bool, l: int) -> float:
     """Repeat least squares, with every sample or without the doubtful ones.
 
@@ -141,7 +141,7 @@ def drop(s: State, l: int) -> None:
     s.remembered[l] = left
 
 
-@partial(kernel, seldom=True)
+@partial(kernel, short=True)
 def reconsider(s: State, enough: bool, l: int) -> bool:
     """Whether the filters may start: if there are ``enough`` samples, and `SURE` residuals if some are doubtful.
 
@@ -213,7 +213,7 @@ def run_again(s: State, l: int) -> None:
         absorb(s, l)
 
 
-@partial(kernel, seldom=True)
+@partial(kernel, short=True)
 def begin_with_drift(s: State, least: float, l: int) -> None:
     """Estimates, r, which is at least ``least``, and probabilities of the filters, which have m = d and C = I."""
     n, K = s.theta.shape[0], s.modes[l]

@@ -11,7 +11,7 @@ they are
 
 where D is the mean of all changes of the interval and M that of those after its first. An interval of dt nominal
 samples has r_0 = p_0^dt, and dt (1 - p_0) changes on average. The next used sample grows one level with the
-probabilities a and the covariances A. Its event stands for the whole gap.
+probabilities a and the covariances A. Its event represents the whole gap.
 
 That is exact in the probability of any change and in the first two moments of the parameters after the gap given the
 first change, and entirely exact if at most one change falls into a gap; the drift of the normal course is not removed
