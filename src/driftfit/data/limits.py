@@ -33,6 +33,10 @@ FAR, FEWEST = 300.0, 20
 """Usual deviations beyond which a value looks like a fault code, and the number of values that this judgement needs."""
 
 
+NO_CODE = float("nan"), np.zeros(0, int)
+"""What `shared_code` finds nearly always."""
+
+
 class Limits:
     """Valid ranges of ny outputs and m inputs: ``low`` and ``high`` (ny + m,), infinite if there is no limit."""
 
@@ -117,11 +121,11 @@ def shared_code(y: Array, u: Array) -> tuple[float, Array]:
     column is away from it by more than the range of its other values; without such a number no sample is returned.
     """
     if not u.shape[1]:
-        return float("nan"), np.zeros(0, int)
+        return NO_CODE
     first = y if y.ndim == 1 else y[:, 0]
     same = first == u[:, 0]
-    if not same.any():  # nearly always, so it must cost little
-        return float("nan"), np.zeros(0, int)
+    if not np.count_nonzero(same):  # nearly always, so it must cost little
+        return NO_CODE
     same = np.flatnonzero(same & (np.abs(first) < LARGEST))  # larger numbers count as missing
     for column in (*y.reshape(len(y), -1).T[1:], *u.T[1:]):
         same = same[column[same] == first[same]]
@@ -134,7 +138,7 @@ def shared_code(y: Array, u: Array) -> tuple[float, Array]:
                 low, high = np.nanmin(rest, axis=0), np.nanmax(rest, axis=0)
                 if (np.maximum(low - value, value - high) > high - low).all():
                     return value, same[signals[same, 0] == value]
-    return float("nan"), same[:0]
+    return NO_CODE
 
 
 def code_text(verb: str, value: float, places: Array) -> str:

@@ -156,8 +156,10 @@ class Records(NamedTuple):
 
     def part(self, k: int) -> Record:
         """Series k; its arrays are views."""
-        begin = self.first.item(k)
-        rows = slice(begin, begin + self.length.item(k))
+        begin, count = self.first.item(k), self.length.item(k)
+        if count == len(self.y):
+            return Record(self.y, self.u, self.known, self.time, self.labels_of(k))
+        rows = slice(begin, begin + count)
         time = None if self.time is None else self.time[rows]
         return Record(self.y[rows], self.u[rows], self.known.part(rows), time, self.labels_of(k))
 
@@ -269,19 +271,32 @@ FIRST = np.zeros(1, dtype=int)
 def one_series(y: Any, u: Any, reading: Reading) -> Records:
     """One series; y (T,), u (T,), (T, m) or None."""
     given_y, given_u = held("y", y), held("u", u)
-    weights, drift = held("weights", reading.weights), held("drift", reading.drift)
-    together(y=given_y, u=given_u, weights=weights, drift=drift)
+    weights, drift = reading.weights, reading.drift
+    if type(weights) is type(drift) is float:  # what most calls give
+        together(y=given_y, u=given_u)
+    else:
+        given_weights, given_drift = held("weights", weights), held("drift", drift)
+        together(y=given_y, u=given_u, weights=given_weights, drift=given_drift)
+        weights, drift = given_weights.values, given_drift.values
     output = as_output(given_y.values)
     T = len(output)
     times = times_of(reading.time, (given_y, given_u) if reading.indexed else ())
     dt = LABEL if times.labels and reading.dt is None else reading.dt
     axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
-    common, drifts = (1.0, as_numbers("drift", drift.values)) if axes(drift.values) == 2 else (drift.values, None)
-    known = Known.of(gaps, noise_of(weights.values, T), factor("drift", common, T))
+    common, drifts = (1.0, as_numbers("drift", drift)) if axes(drift) == 2 else (drift, None)
+    known = Known.of(gaps, noise_of(weights, T), factor("drift", common, T))
     name = given_y.names[0] if given_y.names else "y"
     labels = labels_of_series(name, given_u.names, times.name, times.zone, Clock.of(dt).plain)
     inputs = as_inputs(given_u.values, T)
-    return Records((0,), FIRST, np.array((T,)), output, inputs, known, axis, labels, drifts=drifts)
+    return Records((0,), FIRST, _length(T), output, inputs, known, axis, labels, drifts=drifts)
+
+
+@lru_cache(maxsize=256)
+def _length(T: int) -> Array:
+    """The length of a single series; made once for all of that length."""
+    length = np.array((T,))
+    length.flags.writeable = False
+    return length
 
 
 def rows(y: Any, u: Any, reading: Reading) -> Records:

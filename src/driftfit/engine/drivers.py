@@ -46,6 +46,10 @@ NOWHERE = np.empty((0, 0, 0))
 """The array for theta alone, where all results are kept."""
 
 
+CONTIGUOUS = 0x0001 | 0x0100
+"""NumPy's flags of arrays that are contiguous by rows, and aligned: of these the compiler's type is that of numbers."""
+
+
 def no_preparation(L: int) -> None:
     """Steps that call nothing by symbol need none."""
 
@@ -253,7 +257,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         y = np.ascontiguousarray(y, dtype=np.float64)
         u = np.ascontiguousarray(u, dtype=np.float64)
         known = np.ascontiguousarray(known, dtype=np.float64)
-        _, m, L = tile["u"].shape
+        m, L = tile.dtype["u"].shape
         if theta is NOWHERE:
             _check_shapes(m, L, len(out), y, u, known)
         else:
@@ -261,7 +265,12 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
             if len(out) != 1 or theta.shape[1:] != tile["theta"].shape[1:]:
                 raise ValueError(f"run: out must have one row beside theta, which has shape {theta.shape}.")
         ready(L)
-        run(as_compiled(tile), y, u, known, out, theta)
+        given = as_compiled(tile), y, u, known, out, theta
+        flags = y.flags.num & u.flags.num & known.flags.num & tile.flags.num & out.flags.num & theta.flags.num
+        if flags & CONTIGUOUS == CONTIGUOUS:
+            run.of_kind((tile.dtype, out.dtype), given)
+        else:
+            run(*given)
 
     return Drivers(checked, *_updates(driver, sample))
 

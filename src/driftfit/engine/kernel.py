@@ -22,6 +22,7 @@ import math
 import os
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from threading import Lock
 from types import FunctionType
 from typing import Any
@@ -219,8 +220,15 @@ class Driver:
 
     def __call__(self, *given: Any) -> Any:
         """Run on arrays and numbers. Whether arrays are read-only is not part of the signature."""
-        # the properties on which the type of an argument depends; a list is made faster than what a generator yields
-        kind = tuple([(a.dtype, a.ndim, a.flags.num & LAYOUT) if isinstance(a, np.ndarray) else type(a) for a in given])
+        kind: tuple[Any, ...]
+        try:
+            kind = tuple(map(_KIND, given))
+        except AttributeError:  # numbers
+            kind = tuple([_KIND(one) if isinstance(one, np.ndarray) else type(one) for one in given])
+        return self.of_kind(kind, given)
+
+    def of_kind(self, kind: Any, given: tuple[Any, ...]) -> Any:
+        """The same where the caller knows what decides the signature, and has no need to ask every array."""
         found = self._entries.get(kind)
         if found is None:  # the compiler's own types take half a millisecond to make and compare
             found = self._entries[kind] = self.entry(*(_type(a) for a in given))
@@ -259,8 +267,9 @@ class Driver:
         self._entries = {key: one for key, one in self._entries.items() if one is not found}
 
 
-LAYOUT = 0x0001 | 0x0002 | 0x0100
-"""NumPy's flags that are part of the compiler's type of an array: rows contiguous, columns contiguous, aligned."""
+_KIND = attrgetter("dtype", "ndim", "flags.num")
+"""Properties of an array on which the compiler's type depends, and more: asked for together they take half the time.
+Numbers of NumPy have them too; no driver takes arrays without axes, with which they could be confused."""
 
 
 def _type(value: Any) -> types.Type:

@@ -56,20 +56,28 @@ def fresh(samples: Array, k: int) -> bool:
 
 @shared
 def median(samples: Array, N: int, column: int, center: float, apart: float) -> float:
-    """The upper median of a column over fresh readings, or, with apart = 1, of its distances from center."""
-    count = 0
+    """The upper median of a column over fresh readings, or, with apart = 1, of its distances from center.
+
+    Every value that is not the median is a bound for it, and values beyond a bound are not counted.
+    """
+    count, low, high = 0, -np.inf, np.inf
     for k in range(N):
         count += 1 if fresh(samples, k) else 0
     for k in range(N):
         value: float = abs(samples[k, column] - center) if apart > 0.0 else samples[k, column]
-        less, same = 0, 0
-        for other in range(N):
-            x = abs(samples[other, column] - center) if apart > 0.0 else samples[other, column]
-            counts = fresh(samples, other)
-            less += 1 if counts and x < value else 0
-            same += 1 if counts and x == value else 0
-        if less <= count // 2 and count // 2 < less + same:
-            return value
+        if low < value < high:
+            less, same = 0, 0
+            for other in range(N):
+                x = abs(samples[other, column] - center) if apart > 0.0 else samples[other, column]
+                if x <= value and fresh(samples, other):
+                    less += 1 if x < value else 0
+                    same += 1 if x == value else 0
+            if less > count // 2:
+                high = value
+            elif count // 2 < less + same:
+                return value
+            else:
+                low = value
     return 0.0
 
 

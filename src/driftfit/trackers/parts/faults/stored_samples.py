@@ -10,13 +10,11 @@ Cost: O(n) to store, repeat or compare a sample.
 
 from __future__ import annotations
 
-from functools import partial
-
 from driftfit.engine.kernel import State, cubes, kernel, machine
 from driftfit.trackers.parts.faults.first_samples import NOISE, PHI, READING, SPAN, Y, doubt
 
 
-@partial(machine, short=True)
+@machine
 def machine_doubt(samples: int, rows: int, columns: int, count: int, last: int, L: int, l: int) -> None:
     """`doubt` for lane l of L, from the address of the samples (rows, columns)."""
     doubt(cubes(samples, rows, columns, L)[:, :, l], count, last > 0)
