@@ -333,7 +333,7 @@ def test_an_input_that_was_dead_in_the_reference_raises_no_alarm_when_it_moves(k
 @pytest.mark.parametrize("kind", ["glr", "cusum"])
 @pytest.mark.parametrize("moved", [0.03, 1e-4])
 def test_an_input_that_hardly_moved_in_the_reference_gives_no_alarms_when_it_does(kind, moved):
-    """What is then left of y is the error of its gain, which the noise would have to explain: three to ten times as many
+    """What is then left of y is the error of its gain, which the noise would have to explain: many times as many
     alarms as set. Faults of other parameters are found as before."""
     false, found = 0, 0
     for seed in range(8):
