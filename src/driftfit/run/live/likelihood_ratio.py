@@ -52,7 +52,7 @@ SHIFT = 0.5
 FLAT = 1e-9
 SAME = 1e-6
 """A regressor that differs by less than this share from what it was in the whole reference has not changed."""
-UNSURE, USUAL = 0.1, 8.0
+UNSURE, USUAL = 0.2, 8.0
 """Variances of a prediction by theta, as shares of that of the noise, from which on a sample does not judge the noise.
 """
 UNKNOWN = 1.0
