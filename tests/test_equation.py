@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from driftfit import AdaptiveKalman, Equation, Kalman, Live, Regression, track
+from driftfit import ARX, AdaptiveKalman, Equation, Kalman, Live, Regression, track
 from driftfit.models.base import Model
 from driftfit.models.formulas.text import parse
 from driftfit.parsing.expressions import read
@@ -88,8 +88,22 @@ def test_forecasts_and_simulations_play_the_equation():
     expected = [g * np.tanh(u[-1, 0]) + a * y[-1]]
     expected += [g * np.tanh(u[0, 0]) + a * expected[0]]
     np.testing.assert_allclose(ahead.y_hat[:2], expected, rtol=1e-9)
-    assert np.isfinite(ahead.y_std[0])
-    assert np.isnan(ahead.y_std[1])
+    # linear in what is not known, so that futures have the bands of an ARX model; they were NaN from the second on
+    w = np.tanh(u[:, 0])
+    same = track(ARX(1, 1), Kalman(q=0.0, r=1.0), y, w).forecast(3, w[:3])
+    np.testing.assert_allclose(ahead.y_std, same.y_std, rtol=0.05)
+    assert ahead.y_std[0] == pytest.approx(same.y_std[0], rel=1e-9)
+
+
+def test_forecasts_of_equations_of_which_little_is_known():
+    y, u = data(200)
+    model = Equation("y = theta.g * tanh(u[-1]) + theta.a * y[-1]")
+    run = track(model, Kalman(q=0.0, r=1.0), y[:2], u[:2, 0])  # one sample for two parameters
+    assert np.isinf(run.forecast(4, u[:4, 0]).y_std[1:]).all()
+    later = np.array([0.1, np.nan, 0.1, 0.1])
+    ahead = track(model, Kalman(q=0.0, r=1.0), y, u[:, 0]).forecast(4, later)
+    assert np.isfinite(ahead.y_std[:2]).all()
+    assert np.isnan(ahead.y_std[2])
 
 
 @pytest.mark.parametrize(
@@ -127,3 +141,17 @@ def test_settings():
         Equation("y = theta.k * p1 / p2", inputs=["p1"])
     with pytest.raises(ValueError, match="1 inputs"):
         Live(Equation("y = theta.k * u"), Kalman(q=0.0, r=1.0)).update(1.0, [1.0, 2.0])
+
+
+@pytest.mark.parametrize("form", ["tanh(u)", "exp(u)", "max(u, 0)", "(1 if u > 0 else 0)", "min(u[-1], y[-1])"])
+def test_a_missing_input_is_missing_in_functions_that_have_a_value_without_it(form):
+    """tanh(NaN) was -1, exp(NaN), max(NaN, 0) and conditions 0, and theta learned from that."""
+    y, u = data(60)
+    u = u[:, 0].copy()
+    u[30] = np.nan
+    y[30 + ("[-1]" in form)] = 50.0
+    run = track(Equation(f"y = theta.k * {form} + theta.c"), Kalman(q=0.0, r=1.0, p0=1.0), y, u)
+    at = 30 + ("[-1]" in form)
+    assert not run.ok[at]
+    assert np.isnan(run.prediction[at])
+    np.testing.assert_array_equal(run.theta[at], run.theta[at - 1])

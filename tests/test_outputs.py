@@ -143,6 +143,8 @@ def test_summary_and_pictures():
     run = track(ARX(1, 1, ny=NAMES), Kalman(q=1e-5, r=0.01), y, u)
     assert "a1[flow<-level]" in str(run.summary())
     assert "b1[level<-u]" in str(run.summary())
+    assert "Signals" not in str(run.summary())  # regressors of the joint model are no signals
+    assert repr(run.model) in str(run.summary())
     drawn = {axis.get_ylabel(): axis.get_lines()[0].get_ydata() for axis in run.plot().axes}
     assert drawn.keys() == {name for names in run.names for name in names}
     for k, names in enumerate(run.names):

@@ -169,6 +169,24 @@ def test_the_noise_model_is_uncertain_in_forecasts_too():
     assert np.mean(inside) > 0.87
 
 
+@pytest.mark.parametrize(
+    ("model", "tracker"),
+    [(ARMAX(1), RLS(1.0)), (BoxJenkins(), RLS(1.0)), (BoxJenkins(), InstrumentalVariables(1.0))],
+    ids=["ARMAX", "Box-Jenkins", "instruments"],
+)
+def test_the_noise_variance_is_not_that_of_the_quietest_samples(model, tracker):
+    """A start that is forgotten leaves P in units of the least of many estimates, which is .7 of the variance; taken as
+    the scale it let .85 of the outputs into their bands."""
+    scale, inside = [], []
+    for seed in range(50):
+        y, u = armax_record(200, seed, c=0.5)
+        run = track(model, tracker, y, u)
+        scale.append(run.state["scale"] / 0.09)
+        inside.append(np.abs(run.innovation[120:]) < 1.96 * run.innovation_std[120:])
+    assert 0.9 < np.median(scale) < 1.15
+    assert 0.92 < np.mean(inside) < 0.98
+
+
 def test_the_forecast_of_coloured_noise_decays():
     y, u, _ = plant(THETA, 1000, 6)
     live = Live(BJ, Kalman(q=0.0, r=0.25, p0=1e-20, theta0=tuple(THETA)))

@@ -180,11 +180,14 @@ def test_actions_are_part_of_the_journal(tmp_path):
         {"do": "hold", "on": True}, {"do": "hold", "on": False}, {"do": "reset", "p": 1.0, "which": "a1"},
         {"do": "limits", "limits": {"y": [-0.5, 0.5]}}, {"do": "reset", "p": -1.0}, {"do": "nonsense"},
     ]  # fmt: skip
+    told = []
     for k, action in enumerate(actions):
-        engine.act("a", action | {"who": "Ann", "why": "maintenance"})
+        engine.act("a", action | {"who": "Ann", "why": "maintenance"}, told.append)
         engine.step(0.0)
         part = slice(100 + 20 * k, 120 + 20 * k)
         feed(engine, message("plant/a", range(100 + 20 * k, 120 + 20 * k), y[part], u[part]))
+    assert [bool(problem) for problem in told] == [False, False, False, False, True, True]
+    assert "nonsense" in told[-1]
     theta, counts = engine.units.get(1).live.theta, engine.units.get(1).counts
     assert counts["y outside its limits"] > 10
     engine.journal.close()  # nothing of the state was stored

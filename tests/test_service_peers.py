@@ -436,7 +436,24 @@ def test_http_samples_are_answered_when_they_are_in_the_journal(tmp_path):
         answer = INCOMING.offer("", body)
         assert answer["received"] == 2
         assert "plant/b" in answer["refused"][0]
+        assert "status" not in answer
         assert len(engine.journal.rows_of(1)[0]) == 2
+        for topic, sent, status, reason in (
+            ("plant/a", b"{", 400, "not an object"),
+            ("", b"[1, 2]", 400, "not an object"),
+            ("", b"{}", 400, "no topic"),
+            ("nothing", b'{"t": 3, "y": 1}', 422, "1 no unit for the topic"),
+            ("plant/a", b'{"t": 3, "pressure": 1}', 422, "1 no signal"),
+            ("plant/a", b'{"t": [1e11, 1e12], "y": 1}', 422, "2 time in the future"),
+            ("plant/a", b'{"y": [1, 2]}', 422, "2 no time"),
+        ):
+            answer = INCOMING.offer(topic, sent)
+            assert (answer["status"], reason in answer["error"]) == (status, True), answer
+        answer = INCOMING.offer("plant/a", b'{"t": [2, 3, 1e12], "y": 1}')  # two of them are left out, one is taken
+        assert "status" not in answer
+        assert answer["left_out"] == {"duplicate": 1, "time in the future": 1}
+        assert "status" not in INCOMING.offer("plant/a", b'{"t": 3, "y": 1}')  # sent again, as after a lost answer
+        assert len(engine.journal.rows_of(1)[0]) == 3
     names = Names(engine.journal)
     names.read()
     assert names.about["a"]["names"] == ["a1", "b1[u]"]

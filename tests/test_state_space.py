@@ -121,6 +121,23 @@ def test_streams_lanes_files_and_forecasts():
     assert ahead.y_hat[0] == pytest.approx(h(expected, u[-1]), abs=2e-2)
 
 
+@pytest.mark.parametrize("method", ["extended", "unscented"])
+def test_bands_of_forecasts_with_output_lags_are_those_of_an_arx_model(method):
+    """Beyond one step they were NaN."""
+    rng = np.random.default_rng(4)
+    u, y = rng.normal(size=40), np.zeros(40)
+    for t in range(1, 40):
+        y[t] = 0.8 * y[t - 1] + u[t - 1] + 0.3 * rng.normal()
+    known = {"q": 1e-4, "r": 0.09, "p0": 1.0}
+    equations = StateSpace("y = theta.a * y[-1] + theta.b * u[-1]", start=0.0)
+    run = track(equations, JointKalman(**known, method=method), y[:25], u[:25])
+    same = track(ARX(1, 1), Kalman(**known), y[:25], u[:25])
+    expected = same.forecast(15, u[25:])
+    for found in (run.forecast(15, u[25:]), Live(equations, run.tracker, warm_start=run).forecast(15, u[25:])):
+        np.testing.assert_allclose(found.y_hat, expected.y_hat, atol=0.02)
+        np.testing.assert_allclose(found.y_std, expected.y_std, rtol=0.06)
+
+
 def test_in_other_units_and_where_there_is_no_value():
     y, u = data()
     base = track(MODEL, JointKalman(q=Q, r=R, p0=P0), y, u)

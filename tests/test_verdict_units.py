@@ -57,3 +57,42 @@ def test_noise_far_below_an_offset_is_noise_unless_it_is_rounding():
     p = constancy(X, y).p_joint
     assert constancy(X, 1.7e9 + 0.01 * y).p_joint == pytest.approx(p, rel=0.01)
     assert np.isnan(constancy(X, 1.7e9 + X @ np.arange(4.0)).p_joint)
+
+
+@pytest.mark.parametrize("offset", [30.0, 1e3, 1e7])
+@pytest.mark.parametrize("moved", ["slope about the mean", "slope through zero", "level"])
+def test_inputs_far_from_zero_do_not_hide_which_parameter_moved(moved, offset):
+    """A slope through zero and the constant are then nearly collinear, and a change about the mean changes both."""
+    rng = np.random.default_rng(2)
+    u, later = rng.normal(size=(600, 2)), np.arange(600) >= 300
+    about = u + offset if moved == "slope through zero" else u
+    y = 3.0 + about @ [1.0, 0.5] + later * (0.3 if moved == "level" else about[:, 0]) + 0.3 * rng.normal(size=600)
+    found = track(Regression(2, intercept=True), Kalman(q=0.0, r=0.09), y, u + offset).verdict()
+    steps = {moved.name: moved.after - moved.before for moved in found.parameters if moved.moves}
+    if moved == "level":
+        assert list(steps) == ["intercept"]
+        assert abs(steps["intercept"] - 0.3) < 0.08
+        return
+    assert abs(steps["theta1"] - 1.0) < 0.08
+    assert ("intercept" in steps) == (moved == "slope about the mean")
+    assert "theta2" not in steps
+
+
+@pytest.mark.parametrize("kind", ["a gain drawn at every sample", "noise that grows with the input", "bursts"])
+def test_residuals_that_grow_with_a_regressor_are_reported_and_are_no_drift(kind):
+    """One distribution of y has both explanations, so the verdict names them; bursts of both in turn are neither."""
+    named, drifts = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        u, v, later = rng.normal(size=(600, 2)), rng.normal(size=600), np.arange(600)
+        gain = 1.0 + (rng.choice([-0.8, 0.8], 600) if kind[0] == "a" else 0.0)
+        if kind[0] == "n":
+            v *= 0.5 + 0.8 * np.abs(u[:, 0])
+        elif kind == "bursts":
+            u, v = u * np.where(later // 130 % 2, 3.0, 1.0)[:, None], v * np.where(later // 70 % 2, 2.0, 1.0)
+        found = track(Regression(2), Kalman(q=0.0, r=1.0), gain * u[:, 0] + 0.5 * u[:, 1] + v, u).verdict()
+        named.append(found.spread_with)
+        drifts.append(found.drifts)
+        assert ("from sample to sample" in " ".join(found.sentences)) == bool(found.spread_with)
+    assert sum(drifts) <= 2
+    assert named.count(()) == 8 if kind == "bursts" else named.count(("theta1",)) >= 8 - sum(drifts)

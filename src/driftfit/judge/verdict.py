@@ -42,7 +42,7 @@ from driftfit.judge.statistics.attribution import Attribution, alike, attribute
 from driftfit.judge.statistics.constancy import Constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
-from driftfit.judge.statistics.whiteness import whiteness
+from driftfit.judge.statistics.whiteness import grows_with, whiteness
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, digits, facts, table_of
 
@@ -50,7 +50,9 @@ LEVEL = 0.05
 """Error rate of the statement that the parameters move, where none is given."""
 RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
 CORRELATED = 1e-3
-"""If the p-value of whiteness of the residuals of segments is below this, they are reported as correlated."""
+"""If the p-value of whiteness of the residuals of segments is below this, they are reported as correlated; the same
+for residuals that grow with a regressor.
+"""
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,8 @@ class Verdict(Printed):
         Samples at the beginning that are not scored.
     hidden : bool
         Whether the model moves hidden states: it has no regression, and only its predictions are judged.
+    spread_with : tuple of str
+        If constants are not rejected: parameters with residuals that are clearly larger where their regressors are.
     """
 
     drifts: bool | None
@@ -137,6 +141,7 @@ class Verdict(Printed):
     lags: int
     burn: int
     hidden: bool = False
+    spread_with: tuple[str, ...] = ()
 
     @property
     def constants(self) -> Paired:
@@ -235,7 +240,12 @@ class Verdict(Printed):
             text += (
                 "The residuals are correlated, even within segments of constant parameters. A model with too few "
                 f"lags causes this, and so does a fast drift. The test allows for {self.lags} "
-                f"lag{'' if self.lags == 1 else 's'} of correlation; try one more lag in the model."
+                f"lag{'' if self.lags == 1 else 's'} of correlation; try one more lag in the model. "
+            )
+        if self.spread_with:
+            text += (
+                f"The residuals are larger where the regressor of {' or '.join(self.spread_with)} is: either this "
+                "coefficient varies from sample to sample, which no tracker can follow, or the noise grows with it."
             )
         return text.strip()
 
@@ -355,7 +365,17 @@ def judged(known: Evidence, level: float) -> Verdict:
         lags=test.lags,
         burn=burn_in(run.model.n) if known.burn is None else known.burn,
         hidden=run.model.hidden is not None,
+        spread_with=_spread_with(run.model.names, rows, test) if drifts is False else (),
     )
+
+
+def _spread_with(names: Sequence[str], rows: Rows, test: Constancy) -> tuple[str, ...]:
+    """The parameter with residuals that grow most clearly with its regressor, if they do."""
+    if test.noise is None:
+        return ()
+    p = grows_with(test.noise.residual, rows.phi)
+    most = int(np.argmin(p))
+    return (names[most],) if p[most] * len(p) < CORRELATED else ()
 
 
 def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, which: tuple[int, str]) -> Moved:

@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
-from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.models.base import GAP
 from driftfit.models.fault_codes import possible
 from driftfit.models.formulas.functions import equation_text
@@ -133,11 +133,31 @@ class Equation(NamedInputs):
         return out[:, p:]
 
     def noise_response(self, theta: Array, h: int) -> Array:
-        """1, then 0 without output lags; with them it depends on the operating point and is NaN: use `simulate`."""
+        """1, then 0 without output lags; with them it depends on the operating point and is NaN."""
         response: Array = np.eye(1, h)[0]
         if self.formula.lags_of(self.formula.output):
             response[1:] = np.nan
         return response
+
+
+def _complete(formula: Formula, inputs: tuple[str, ...]) -> Step:
+    """``complete(s, l)``: whether all inputs and lags are known; tanh, min or a condition has a value without them."""
+    used = sorted({(inputs.index(name), lag) for name, lag in formula.lags if name in inputs})
+    of_input, with_lag = tuple(j for j, _ in used) or (0,), tuple(lag for _, lag in used) or (0,)
+    own = tuple(sorted(formula.lags_of(formula.output))) or (0,)
+    count, owned = len(used), len(formula.lags_of(formula.output))
+
+    @kernel
+    def complete(s: State, l: int) -> bool:
+        known = True
+        for k in range(count):
+            known = known & (abs(s.u_lag[of_input[k], with_lag[k], l]) < LARGEST)
+        for k in range(owned):
+            known = known & (abs(s.y_lag[own[k], l]) < LARGEST)
+        return known
+
+    step: Step = complete
+    return step
 
 
 @lru_cache
@@ -145,6 +165,7 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
     formula = parse(equation)
     m, n, reach = len(inputs), len(formula.parameters), formula.reach
     evaluate = compiled(equation, inputs)
+    complete = _complete(formula, inputs)
 
     @kernel
     def age(s: State, l: int) -> None:
@@ -164,11 +185,12 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
     def regress(s: State, l: int) -> None:
         age(s, l)
         evaluate(s, l)
-        if not (finite(s, l) and possible(s, s.value[l], l)):
+        known = complete(s, l)
+        if known and not (finite(s, l) and possible(s, s.value[l], l)):
             for i in range(n):
                 s.point[i, l] = s.first_point[i, l]
             evaluate(s, l)
-        good = finite(s, l)
+        good = known and finite(s, l)
         shift = s.value[l] - along(s, l) if good else 0.0
         if not good:
             s.phi[0, l] = np.nan

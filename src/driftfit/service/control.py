@@ -7,6 +7,7 @@ folder that nobody else can enter. Each connection has a thread; at most MOST ar
 from __future__ import annotations
 
 import json
+import queue
 import socket
 import struct
 import threading
@@ -80,9 +81,13 @@ class Control(threading.Thread):
         if do == "unit":
             return self.engine.units.get(number).plain()
         if do == "act":
-            done = threading.Event()
-            self.engine.act(name, header["action"], done.set)
-            return {"done": True} if done.wait(WAIT) else {"error": "the journal does not answer", "status": 503}
+            problems: queue.Queue[str] = queue.Queue()
+            self.engine.act(name, header["action"], problems.put)
+            try:
+                problem = problems.get(timeout=WAIT)
+            except queue.Empty:
+                return {"error": "the journal does not answer", "status": 503}
+            return {"error": problem, "status": 400} if problem else {"done": True}
         return {"error": f"unknown request {do!r}", "status": 400}
 
 

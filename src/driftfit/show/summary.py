@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
+from driftfit.data.record import Labels
 from driftfit.judge.compare import Comparison, compare
 from driftfit.models.fault_codes import refusals
 from driftfit.run.outputs import Outputs
@@ -102,14 +103,18 @@ def summarise(run: Track) -> Summary:
     tracker = shortened(repr(run.tracker))
     return Summary(
         repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
-        _signals(run), _span(run), counts(run.labels.dropped),
+        _signals(run.labels) if run.labels.u or run.labels.y != "y" else "", _span(run), counts(run.labels.dropped),
         (*remarks, *_missing(run), *refusals(run.state), *run.tracker.remarks(run)),
     )  # fmt: skip
 
 
 def summarise_outputs(run: Outputs) -> ByOutput[Summary]:
-    """The summary of each output with a separate theta."""
-    return ByOutput({name: summarise(run[name]) for name in run.outputs})
+    """The summary of each output with a separate theta, with the model and the signals of the joint run."""
+    model, labels = repr(run.model), run.labels
+    return ByOutput({
+        name: replace(summarise(run[name]), model=model, signals=_signals(replace(labels, y=name)) if labels.u else "")
+        for name in run.outputs
+    })  # fmt: skip
 
 
 def _of_each_output(run: Track) -> tuple[tuple[str, str], ...]:
@@ -122,11 +127,8 @@ def _of_each_output(run: Track) -> tuple[tuple[str, str], ...]:
     return ("Rows", f"{len(run.outputs)} of each sample"), ("RMS error of", text)
 
 
-def _signals(run: Track) -> str:
-    """Names of the signals with their units; empty where they have none."""
-    labels = run.labels
-    if not labels.u and labels.y == "y":
-        return ""
+def _signals(labels: Labels) -> str:
+    """Names of the signals with their units."""
     named = [f"{name} ({labels.units[name]})" if name in labels.units else name for name in (labels.y, *labels.u)]
     return f"{named[0]} from {', '.join(named[1:])}" if labels.u else named[0]
 

@@ -65,7 +65,7 @@ from driftfit.trackers.parts.diffuse import SCRATCH, knowing, knowing_nothing
 from driftfit.trackers.parts.faults.contradictions import add_to_block, contradictions
 from driftfit.trackers.parts.faults.judged_start import judged, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve
-from driftfit.trackers.rls import fade, follow_variance, learn_variance, no_scale, no_settling, settling_of
+from driftfit.trackers.rls import fade, learn_settling_variance, no_scale, no_settling, settling_of
 
 FOLLOWING = 0.05
 """Share of the distance to theta that the auxiliary model moves at a sample: it lags by twenty samples."""
@@ -158,8 +158,7 @@ def learning(refined: bool) -> Step:
             s.P[i, i, l] = max(left, LEFT * s.P[i, i, l])
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
         add_to_block(s, along * e * e, l)
-        learn_variance(s, l)
-        follow_variance(s, l)
+        learn_settling_variance(s, l)
 
     step: Step = learn
     return step

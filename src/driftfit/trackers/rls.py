@@ -15,10 +15,10 @@ regressors first had full rank (before that: when they last spanned a new direct
 
 A model that is linearised poorly at first has its first samples forgotten, also for lambda = 1: up to sample k = N of
 `Model.settling` the memory is at most `Model.settling_memory` samples or k / 4, if that is more: the lambda(t) -> 1 of
-Ljung and Soderstrom (1983), section 5.6. If the model has one of the noise, P and the scale are in units of the least
-variance of e so far, of max(20, k / 8) samples: those before the noise was known have large innovations, and would
-outweigh all later ones. The least of many estimates is too small, and so are bands in the first hundred samples; a unit
-that falls to 1.6 or 2.5 times an estimate mends these, but leaves more records of Box-Jenkins models astray.
+Ljung and Soderstrom (1983), section 5.6. If the model has one of the noise, P is in units of the least variance of e so
+far, of max(20, k / 8) samples: those before the noise was known have large innovations, and would outweigh all later
+ones. The least of many estimates is too small for a noise variance, which is instead the mean of e^2 / s over the last
+max(20, k / 4) samples (exponential weights) until the start is forgotten.
 
 Directional forgetting (kind="directional") forgets only in the direction of a sample, after it has been used:
 
@@ -61,8 +61,8 @@ from driftfit.trackers.parts.faults.contradictions import contradictions, judged
 from driftfit.trackers.parts.faults.judged_start import judged, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
-RECENT, RECENT_SHARE = 20.0, 0.125
-"""Memory of the present noise variance: samples, and share of those so far."""
+RECENT, RECENT_SHARE, LATER_SHARE = 20.0, 0.125, 0.25
+"""Memory of the present noise variance: samples, and shares of those so far for the unit of P and for the scale."""
 LARGE = 25.0
 """A square above this multiple of it counts as this multiple."""
 
@@ -139,8 +139,20 @@ def learn_variance(s: State, l: int) -> None:
 
 
 @kernel
+def keep_recent(s: State, square: float, l: int) -> None:
+    """While a start is forgotten, the noise variance is a mean over the later samples, of squares e^2 / s."""
+    counted = s.ok[l] * s.fresh[l] > 0.0
+    if counted & (s.count[l] > 1.0) & (s.count[l] < s.unequal[l]):
+        before = (s.squares[l] - square) / (s.count[l] - 1.0)
+        share = 1.0 / min(s.count[l], max(RECENT, LATER_SHARE * s.count[l]))
+        mean = before + share * (min(square, LARGE * before) - before)
+        s.squares[l] = s.count[l] * mean
+        s.scale[l] = s.coarse[l] if s.coarse[l] > mean else mean
+
+
+@kernel
 def follow_variance(s: State, l: int) -> None:
-    """While a start is forgotten, P and the scale are in units of the least noise variance so far."""
+    """While a start is forgotten, P is in units of the least noise variance so far."""
     if (s.ok[l] > 0.0) & (s.count[l] > 0.0) & (s.count[l] < s.unequal[l]):
         square = s.e[l] * s.e[l]
         before = s.recent[l] if s.recent[l] > 0.0 else square
@@ -151,15 +163,23 @@ def follow_variance(s: State, l: int) -> None:
         ratio = s.least[l] / least if (s.least[l] > 0.0) & (least > 0.0) else 1.0
         s.least[l] = least
         s.quieter[l] *= ratio
-        s.squares[l] /= ratio
+
+
+@kernel
+def learn_settling_variance(s: State, l: int) -> None:
+    """The same for a tracker that may forget its start."""
+    per_noise = s.s[l]
+    learn_scale(s, l)
+    keep_recent(s, s.e[l] * s.e[l] / per_noise, l)
+    share_rounding(s, per_noise, l)
+    follow_variance(s, l)
 
 
 @kernel
 def correct(s: State, l: int) -> None:
     resolve(s, l)
     judged_measurement(s, l)
-    learn_variance(s, l)
-    follow_variance(s, l)
+    learn_settling_variance(s, l)
 
 
 @kernel
@@ -173,8 +193,7 @@ def begin(s: State, l: int) -> None:
             s.S[i, j, l] *= shrink
     enter(s, l)
     if s.s[l] < np.inf:
-        learn_variance(s, l)
-        follow_variance(s, l)
+        learn_settling_variance(s, l)
     spanned_folded(s, l)
     # the cap applies from the first direction on: regressors may lack excitation before they span everything
     for i in range(n):

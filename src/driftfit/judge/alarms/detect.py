@@ -112,7 +112,8 @@ class Alarms(Printed):
     findings : (T, k)
         For "glr" and "cusum": the numbers that `change` reads; otherwise without columns.
     unseen : int
-        For "glr" and "cusum": samples that are not judged, because a regressor moves that did not in the reference.
+        For "glr" and "cusum": samples that are not judged, because a regressor moves that did not in the reference, or
+        hardly.
     """
 
     rule: AlarmRule
@@ -211,7 +212,7 @@ class Alarms(Printed):
 
     def _not_judged(self) -> list[tuple[str, str]]:
         """The line on the samples that are unlike all of the reference, if there are some."""
-        why = f"{self.unseen} samples: a regressor moves that was constant in the reference"
+        why = f"{self.unseen} samples: a regressor moves that did not in the reference, or hardly"
         return [("Not judged", why)] if self.unseen else []
 
     def _real_rate(self) -> list[tuple[str, str]]:

@@ -28,7 +28,7 @@ from driftfit.judge.alarms.onsets import (
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
 from driftfit.judge.regressors import refuse_hidden
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.live.likelihood_ratio import CUSUM, SAME, memory_of, scan
+from driftfit.run.live.likelihood_ratio import CUSUM, SAME, UNKNOWN, memory_of, scan
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
@@ -203,12 +203,13 @@ def findings_of(run: Track, rule: AlarmRule, start: int, samples: Samples) -> Ar
 
 
 def unseen_in(rule: AlarmRule, start: int, samples: Samples) -> int:
-    """Usable samples from ``start`` on that excite what the reference of "glr" or "cusum" did not."""
+    """Usable samples from ``start`` on that excite what the reference of "glr" or "cusum" did not, or hardly."""
     model, (phi, rest) = rule.reference, (one[start:] for one in samples)
     rows = np.column_stack([phi, np.ones((len(phi), len(rule.parameters) - phi.shape[1]))]) / model.unit
     terms = rows[:, None] * model.unseen
     beyond = np.abs(terms.sum(axis=2)) > SAME * np.abs(terms).sum(axis=2)
-    return int(np.sum(beyond.any(axis=1) & (rest[:, 1] > 0.0) & (rest[:, 3] > 0.0)))
+    unknown = beyond.any(axis=1) | (np.einsum("ti,ij,tj->t", rows, model.cov, rows) > UNKNOWN)
+    return int(np.sum(unknown & (rest[:, 1] > 0.0) & (rest[:, 3] > 0.0)))
 
 
 def _carried(statistic: Array) -> Array:

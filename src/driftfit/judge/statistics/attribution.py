@@ -12,10 +12,15 @@ value furthest from it in units of its standard error, and the last value. A par
 the error of the first is not named. Where regressors are nearly collinear, as lags of an output far from zero and an
 intercept are, steps of several parameters explain the same: these are reported together. Bai and Perron (1998) estimate
 several breaks in all parameters in this sequential way; here each step belongs to one parameter.
+
+If the model has a constant, steps are those of slopes about the mean of each regressor that is far from zero, and of
+the level there: a slope through zero would need a step of the constant at the same sample. Values are those of the
+model's own parameters all the same. A constant that changes with the slope is named too.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +33,8 @@ from driftfit.judge.statistics.noise import Noise, whitened
 from driftfit.judge.statistics.robust import inverted, robust_fit
 
 MOST = 12
+FAR = 10.0
+"""A regressor whose mean is so many of its standard deviations from zero is far from zero."""
 ALIKE = 4.0
 """Twice the logarithm of the likelihood ratio up to which steps of two parameters cannot be distinguished."""
 AROUND = 0.03
@@ -66,20 +73,30 @@ class Attribution(NamedTuple):
     """(n,): value after its last step."""
     moves: Array
     """(n,): whether it has steps, and a significant difference."""
-    similar: tuple[tuple[int, ...], ...] = ()
+    similar: tuple[tuple[int, ...], ...]
     """For each step, the other parameters whose step near that date explains as much."""
+    changed: Array
+    """(n, steps): whether a step changes each parameter."""
+
+    def _first(self, i: int) -> int | None:
+        """The place of the step of parameter i that was found first, or else of one that changes it."""
+        own = [k for k, step in enumerate(self.steps) if step.parameter == i]
+        return next(iter([*own, *np.flatnonzero(self.changed[i]).tolist()]), None)
 
     def first(self, i: int) -> int | None:
-        """The date of the step of parameter i that was found first; None if it has none."""
-        return next((step.at for step in self.steps if step.parameter == i), None)
+        """The date of that step; None if there is none."""
+        k = self._first(i)
+        return None if k is None else self.steps[k].at
 
     def instead(self, i: int) -> tuple[int, ...]:
         """The other parameters to which that step may belong."""
-        return next((s for step, s in zip(self.steps, self.similar, strict=True) if step.parameter == i), ())
+        k = self._first(i)
+        return () if k is None or self.steps[k].parameter != i else self.similar[k]
 
     def span(self, i: int) -> tuple[int, int] | None:
         """The interval of that date."""
-        return next((span for step, span in zip(self.steps, self.spans, strict=True) if step.parameter == i), None)
+        k = self._first(i)
+        return None if k is None else self.spans[k]
 
 
 def holm(p: Array, level: float) -> Array:
@@ -94,6 +111,11 @@ def holm(p: Array, level: float) -> Array:
 def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | None = None) -> Attribution:
     """Explain the changes in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags)`."""
     N, n = phi.shape
+    M = centring(phi)
+    if M is not None:
+        phi = phi @ M
+        test = constancy(phi, y, lags)
+    M = np.eye(n) if M is None else M
     steps: list[Step] = []
     similar: list[tuple[int, ...]] = []
     p, now = test.p_own.copy(), test
@@ -113,12 +135,26 @@ def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | N
         now = later
     named = {step.parameter for step in steps}
     p = np.array([p[i] if i in named else now.p_own[i] for i in range(n)])
-    before, after, std, last = _sizes(_with(phi, steps), y, steps, n, now.noise)
+    changed = M[:, [step.parameter for step in steps]] != 0.0
+    before, after, std, last = _sizes(_with(phi, steps), y, steps, M, now.noise)
     far = np.abs(after - before) > scipy.special.ndtri(1.0 - 0.5 * level) * std
     spans = tuple(_span(phi, step, steps, test.noise) for step in steps)
-    return Attribution(
-        p, tuple(steps), spans, before, after, std, last, far & [i in named for i in range(n)], tuple(similar)
-    )
+    moves = far & changed.any(axis=1)
+    return Attribution(p, tuple(steps), spans, before, after, std, last, moves, tuple(similar), changed)
+
+
+def centring(phi: Array) -> Array | None:
+    """M (n, n): the columns of phi M (N, n) that were far from zero have the mean 0, and theta is M times their
+    coefficients. None without a constant column, or if no regressor is far from zero.
+    """
+    flat = np.flatnonzero((np.ptp(phi, axis=0) == 0.0) & (phi[:1] != 0.0).any(axis=0))
+    mean, spread = phi.mean(axis=0), phi.std(axis=0)
+    far = np.flatnonzero((np.abs(mean) > FAR * spread) & (spread > 0.0))
+    if len(flat) != 1 or not len(far):
+        return None
+    M = np.eye(len(mean))
+    M[flat[0], far] = -mean[far] / mean[flat[0]]
+    return M
 
 
 def _span(phi: Array, step: Step, steps: list[Step], noise: Noise | None) -> tuple[int, int]:
@@ -188,8 +224,12 @@ def _with(phi: Array, steps: list[Step]) -> Array:
     return np.column_stack([phi, *later])
 
 
-def _sizes(X: Array, y: Array, steps: list[Step], n: int, noise: Noise | None) -> tuple[Array, Array, Array, Array]:
-    """(before, after, standard error of their difference, last); errors are heteroscedasticity-consistent."""
+def _sizes(X: Array, y: Array, steps: list[Step], M: Array, noise: Noise | None) -> tuple[Array, Array, Array, Array]:
+    """(before, after, standard error of their difference, last) of M times the coefficients of X (N, n + steps).
+
+    Errors are heteroscedasticity-consistent.
+    """
+    n = len(M)
     if noise is not None and len(noise.ar):
         c = noise.level
         X, y = whitened(X / c[:, None], y / c, noise.ar)
@@ -198,14 +238,18 @@ def _sizes(X: Array, y: Array, steps: list[Step], n: int, noise: Noise | None) -
     inverse = inverted(X * fit.inside[:, None])
     scores = X * fit.psi[:, None]
     cov = inverse @ (scores.T @ scores) @ inverse
-    before, after, std, last = fit.theta[:n].copy(), fit.theta[:n].copy(), np.zeros(n), fit.theta[:n].copy()
+    before = M @ fit.theta[:n]
+    after, std, last = before.copy(), np.zeros(n), before.copy()
     for i in range(n):
-        own = sorted((k for k, step in enumerate(steps) if step.parameter == i), key=lambda k: steps[k].at)
+        own = sorted((k for k, step in enumerate(steps) if M[i, step.parameter] != 0.0), key=lambda k: steps[k].at)
         if not own:
             continue
-        levels = np.tril(np.ones((len(own), len(own))))
+        pairs = pairwise(steps[k] for k in own)
+        levels = np.tril(np.ones((len(own), len(own)))) * [M[i, steps[k].parameter] for k in own]
         moved, columns = levels @ fit.theta[n:][own], np.ix_([n + k for k in own], [n + k for k in own])
         errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", levels, cov[columns], levels), 0.0))
-        furthest = int(np.argmax(np.abs(moved) / np.maximum(errors, 1e-300)))
+        # between the steps of a slope and of the level at one date neither is the value of a constant
+        soon = [later.at - step.at <= AROUND * len(X) and later.parameter != step.parameter for step, later in pairs]
+        furthest = int(np.argmax(np.where([*soon, False], 0.0, np.abs(moved) / np.maximum(errors, 1e-300))))
         after[i], std[i], last[i] = before[i] + moved[furthest], errors[furthest], before[i] + moved[-1]
     return before, after, std, last

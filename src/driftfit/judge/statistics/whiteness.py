@@ -1,9 +1,13 @@
-"""Whiteness of a sequence: autocorrelations whose limits do not require a constant variance.
+"""Whiteness of a sequence: autocorrelations whose limits do not require a constant variance; and the size of residuals.
 
     r_k = sum z_t z_(t-k) / sum z_t^2,   se_k^2 = sum z_t^2 z_(t-k)^2 / (sum z_t^2)^2,   Q = sum_k (r_k / se_k)^2
 
 Q is chi-square with K degrees of freedom for martingale differences, whatever their variance. Values are first clipped
 at three robust standard deviations, so that a pair of outliers does not decide. Source: Lo and MacKinlay (1989).
+
+Whether residuals are larger where a regressor is: squares, clipped, against the ranks of its size, with the Bartlett
+variance of the sum (White 1980, Newey and West 1987). A gain that is drawn again at every sample does that, and so does
+noise that grows with the input: the two are the same distribution of y.
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ import numpy as np
 import scipy
 
 from driftfit.engine.kernel import Array
+from driftfit.judge.statistics.bandwidth import rule_of_thumb
 from driftfit.judge.statistics.robust import deviation
 
 
@@ -58,3 +63,19 @@ def _correlation(z: Array, u: Array, lags: range) -> Whiteness:
     std = np.sqrt((shifted * shifted) @ (z * z)) / total
     Q = float(np.sum((r[std > 0.0] / std[std > 0.0]) ** 2))
     return Whiteness(r, std, Q, float(scipy.special.chdtrc(len(lags), Q)))
+
+
+def grows_with(z: Array, phi: Array) -> Array:
+    """p-values (n,), one-sided, of no larger residuals z (N,) where a regressor of phi (N, n) is larger; 1 for those of
+    constant size."""
+    N, square = len(z), clipped(z) ** 2
+    size = np.abs(phi)
+    below, up_to = ([np.searchsorted(np.sort(one), one, side) for one in size.T] for side in ("left", "right"))
+    x = (np.array(below) + np.array(up_to)).T / (2.0 * N)
+    d = (square - square.mean())[:, None] * (x - x.mean(axis=0))
+    lags = rule_of_thumb(N)
+    total = np.sum(d * d, axis=0)
+    for k in range(1, lags + 1):
+        total += 2.0 * (1.0 - k / (lags + 1.0)) * np.sum(d[k:] * d[:-k], axis=0)
+    varied = (np.ptp(size, axis=0) > 0.0) & (total > 0.0)
+    return np.where(varied, scipy.special.ndtr(-d.sum(axis=0) / np.sqrt(np.where(varied, total, 1.0))), 1.0)

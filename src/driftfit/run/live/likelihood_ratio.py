@@ -20,6 +20,11 @@ d_j = g_j' V^-1 U / g_j' V^-1 g_j with U = sum phi x, and of the noise sqrt(mean
 The score CUSUM of parameter j, both signs, is C <- max(0, C + log likelihood ratio of a shift by SHIFT standard
 deviations of the noise). The CUSUM of the noise is the same for its variance. Reported is sqrt(2 C), again a deviate.
 
+Where the reference knows little of a direction that a sample excites, as of an input that hardly moved, most of x may
+be the error of theta. V allows for that, but Q and the CUSUM do not: a sample with phi' C phi above `UNSURE` of the
+noise variance (and above `USUAL` n / N, which rows of the reference themselves seldom exceed) says nothing there, and
+one above `UNKNOWN` is passed over.
+
 A sample that cannot be used is passed over, and so is one that excites a direction in which the reference says nothing,
 as an input does that was 0 or constant there: what it does to y is unknown, and would be taken for a change. An
 autoregression then waits until its lags are complete. Source: Lai (1998) for windowed likelihood ratios, Huber (1964)
@@ -47,6 +52,11 @@ SHIFT = 0.5
 FLAT = 1e-9
 SAME = 1e-6
 """A regressor that differs by less than this share from what it was in the whole reference has not changed."""
+UNSURE, USUAL = 0.2, 8.0
+"""Variances of a prediction by theta, as shares of that of the noise, from which on a sample does not judge the noise.
+"""
+UNKNOWN = 1.0
+"""The same, from which on a sample judges nothing: its residual is the error of theta, and clipped."""
 WIDE = 30.0
 """x is limited to this for the size of a change."""
 SCALE, CLIP, K, V, KAPPA, ALPHA, BETA, INSIDE, RAW, SPREAD, LONGEST, NORMAL = range(12)
@@ -241,6 +251,25 @@ def windows(memory: Memory, frozen: Frozen, count: int) -> None:
 
 
 @part
+def leverage(sample: Array, frozen: Frozen) -> float:
+    """phi' C phi of a sample: the variance of its prediction by theta, as a share of that of the noise."""
+    n, total = frozen.theta.shape[0], 0.0
+    at = 2 * n + 2
+    for i in range(n):
+        for j in range(i + 1):
+            total += (1.0 if i == j else 2.0) * frozen.cov[i, j] * sample[at]
+            at += 1
+    return total
+
+
+@part
+def unsure(sample: Array, frozen: Frozen) -> bool:
+    """Whether that is too large for the residual to be noise."""
+    usual = USUAL * frozen.theta.shape[0] / frozen.numbers[NORMAL]
+    return leverage(sample, frozen) > max(UNSURE, usual)  # type: ignore[no-any-return]
+
+
+@part
 def accumulate(sample: Array, frozen: Frozen, cusum: Array) -> None:
     """One step of the CUSUM of every parameter, the last row that of the noise; columns are up and down."""
     n = frozen.theta.shape[0]
@@ -278,7 +307,8 @@ def judge(memory: Memory, frozen: Frozen, findings: Array) -> None:
     count = int(memory.counts[COUNT])
     enter(sums, memory.sample, count)
     windows(memory, frozen, count)
-    accumulate(memory.sample, frozen, memory.cusum)
+    if not unsure(memory.sample, frozen):
+        accumulate(memory.sample, frozen, memory.cusum)
     for i in range(findings.shape[0]):
         findings[i] = np.nan
     for j in range(last.shape[0]):
@@ -344,8 +374,12 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> bool:
     x, clip = min(WIDE, max(-WIDE, phi[n])), numbers[CLIP]
     g = min(clip, max(-clip, x))
     enter_scores(phi[:n], g, x, memory.sample)
+    if leverage(memory.sample, frozen) > UNKNOWN:
+        return False
+    if unsure(memory.sample, frozen):
+        memory.sample[2 * n], memory.sample[2 * n + 1] = numbers[V], numbers[RAW]
     # the GARCH recursion for h at the next sample
-    fed = numbers[ALPHA] * g * g / numbers[V] + numbers[BETA]
+    fed = numbers[ALPHA] * memory.sample[2 * n] / numbers[V] + numbers[BETA]
     counts[LEVEL] = 1.0 - numbers[ALPHA] - numbers[BETA] + fed * counts[LEVEL]
     return True
 

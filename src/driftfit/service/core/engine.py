@@ -167,12 +167,15 @@ class Engine:
             return 0
         for _, batch in arrived.batches:
             batch.acknowledge()
+        refusals = self._process(first, items, now) if items else {}
+        number = self.next - sum(action.unit in self.units.names for action in arrived.actions)
         for action in arrived.actions:
-            action.done()
-        count = self._process(first, items, now) if items else 0
+            known = action.unit in self.units.names
+            action.done(refusals.get(number, "") if known else f"there is no unit {action.unit!r}")
+            number += known
         done = time.monotonic()
         self.latencies.extend(done - batch.arrived for _, batch in arrived.batches if batch.arrived)
-        return count
+        return self.next - first
 
     def _admit(self, arrived: Arrived) -> list[Item]:
         """The entries of the next group."""
@@ -180,7 +183,7 @@ class Engine:
             self.units.refused["unreadable"] += batch.refused
             if batch.position is not None:
                 self._pending.positions[f"source:{source}"] = batch.position
-        messages = (samples for _, batch in arrived.batches for samples in batch.samples)
+        messages = ((samples, batch.left_out) for _, batch in arrived.batches for samples in batch.samples)
         items: list[Item] = [*self.units.admitted(messages, self._pending, self.next)]
         for action in arrived.actions:
             unit = self.units.names.get(action.unit)
@@ -188,8 +191,11 @@ class Engine:
                 items.append(Act(unit, action.what))
         return items
 
-    def _process(self, first: int, items: list[Item], now: float) -> int:
-        """Update the units of a group; its results become part of the next transaction."""
+    def _process(self, first: int, items: list[Item], now: float) -> dict[int, str]:
+        """Update the units of a group; its results become part of the next transaction.
+
+        Returns by number why actions were refused.
+        """
         out, number = Out(), first
         for item in items:
             self._apply(number, item, out)
@@ -203,7 +209,7 @@ class Engine:
         self.samples += sum(len(one.number) for one in out.results)
         for _, unit, _, kind, detail in out.events:
             log.info(kind, extra={"unit": self.units.get(unit).name, "detail": detail})
-        return number - first
+        return {number: detail["refused"] for number, *_, detail in out.events if "refused" in detail}
 
     def _publish(self, group: Group) -> None:
         """Let sinks see results. They are not stored yet, but what they follow from is in the journal."""
@@ -235,7 +241,7 @@ class Engine:
 
         self._pool.submit(find)
 
-    def act(self, unit: str, what: dict[str, Any], done: Callable[[], None] = lambda: None) -> None:
+    def act(self, unit: str, what: dict[str, Any], done: Callable[[str], None] = lambda problem: None) -> None:
         """Put an action on a unit into the journal."""
         self.intake.act(Action(unit, what, done))
 

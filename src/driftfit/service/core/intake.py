@@ -19,8 +19,8 @@ class Action(NamedTuple):
 
     unit: str
     what: dict[str, Any]
-    done: Callable[[], None] = lambda: None
-    """Called when it is in the journal."""
+    done: Callable[[str], None] = lambda problem: None
+    """Called when it was carried out, with "" or the reason why that was not possible."""
 
 
 class Arrived(NamedTuple):

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import math
 import time as wall
+from collections import Counter
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -35,6 +37,17 @@ COLUMNS = ("y_hat", "e", "s", "theta", "var", "ok")
 """Fields of a tracker's output, in the order of the results; the last becomes a flag."""
 REFUSED = {late.LATE: "late", late.REPEATED: "duplicate", late.UNTIMED: "no time"}
 """How samples are counted that do not enter the journal."""
+
+
+Told = Callable[[int], Counter[str] | None]
+"""Who, besides the unit, counts sample k if it is left out."""
+
+
+def tally(counters: Sequence[Counter[str] | None], reason: str, count: int) -> None:
+    """Count samples that are left out, by all of these counters."""
+    for one in counters:
+        if one is not None:
+            one[reason] += count
 
 
 class Section:
@@ -65,17 +78,17 @@ class Section:
             values = np.zeros((count, len(self.streams.settings.columns)))
             trial.process(0, Rows(self.streams.index, number, time, values), Out())
 
-    def admit(self, places: Array, time: Array | None, values: Array) -> Rows | None:
+    def admit(self, places: Array, time: Array | None, values: Array, told: Told) -> Rows | None:
         """The samples (N,) that enter the journal, sorted by unit and time; the others are counted."""
         if time is None:
             order = np.argsort(places, kind="stable")
         else:
-            self._refuse("time in the future", places, far := self._too_far(places, time))
+            self._refuse("time in the future", places, np.flatnonzero(far := self._too_far(places, time)), told)
             kept = np.flatnonzero(~far)
             order, fate = self.streams.waiting.judge(places[kept], time[kept], self.streams.newest)
             order = kept[order]
             for code, name in REFUSED.items():
-                self._refuse(name, places[kept], fate == code)
+                self._refuse(name, places, kept[fate == code], told)
         if not len(order):
             return None
         time = None if time is None else time[order]
@@ -93,9 +106,9 @@ class Section:
                 newest = newest if far[k] or math.isnan(time[k]) else max(newest, time[k])
         return np.asarray(far)
 
-    def _refuse(self, name: str, places: Array, which: Array) -> None:
-        for place in places[which].tolist():
-            self.units[place].rare[name] += 1
+    def _refuse(self, name: str, places: Array, which: Array, told: Told) -> None:
+        for k in which.tolist():
+            tally((self.units[places[k]].rare, told(k)), name, 1)
 
     def process(self, first: int, rows: Rows, out: Out, done: Array | None = None) -> None:
         """Process samples of the journal, the first of which has the number ``first``.

@@ -68,7 +68,7 @@ DESCRIPTION: dict[str, Any] = {
         "/api/status": _path("get", "Numbers of the service."),
         "/api/me": _path("get", "Name and role of the user."),
         "/api/samples": _path(
-            "post", "Samples by topic; answered once they are in the journal.",
+            "post", "Samples by topic; answered once they are in the journal, with those that were left out.",
             body={"type": "object", "additionalProperties": _SAMPLES},
         ),
         "/api/samples/{topic}": _named(_path("post", "Samples of one topic.", body=_SAMPLES), "topic"),

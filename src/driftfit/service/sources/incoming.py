@@ -6,6 +6,7 @@ import json
 import queue
 import threading
 import time
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +16,8 @@ from driftfit.service.sources.samples import Batch, Samples, decode
 
 WAIT = 30.0
 """Seconds after which a request that is not yet journaled is answered with an error."""
+KNOWN = frozenset({"late", "duplicate"})
+"""Reasons for which a sender need not mend anything: it has sent the samples before, or others were faster."""
 _BODY = msgspec.json.Decoder(dict[str, msgspec.Raw])
 
 
@@ -25,16 +28,28 @@ class Incoming:
         self.queue: queue.Queue[Batch] = queue.Queue(most)
 
     def offer(self, topic: str, body: bytes) -> dict[str, Any]:
-        """Decode a request, wait until it is in the journal, and report what was received."""
+        """Decode a request, wait until it is in the journal, and report what was received and what was left out.
+
+        The status is 200 if anything was taken, or all of it was known already; 400 if nothing could be read, 429 if
+        it was too much for the rate of its unit, and 422 if no unit could use it.
+        """
         samples, refused = decoded(topic, body)
-        done = threading.Event()
+        done, left_out = threading.Event(), Counter[str]()
+        batch = Batch(samples, done.set, refused=len(refused), arrived=time.monotonic(), left_out=left_out)
         try:
-            self.queue.put(Batch(samples, done.set, refused=len(refused), arrived=time.monotonic()), timeout=WAIT)
+            self.queue.put(batch, timeout=WAIT)
         except queue.Full:
             return {"error": "busy: samples are held back; try again later", "status": 503}
         if not done.wait(WAIT):
             return {"error": "the journal does not take samples now; try again later", "status": 503}
-        return {"received": sum(one.length for one in samples), "refused": refused[:20]}
+        received = sum(one.length for one in samples)
+        answer: dict[str, Any] = {"received": received, "refused": refused[:20], "left_out": dict(left_out)}
+        if not samples:
+            return answer | {"error": "; ".join(refused[:20]) or "the body has no topic.", "status": 400}
+        if left_out.total() < received or left_out.keys() <= KNOWN:
+            return answer
+        why = ", ".join(f"{count} {reason}" for reason, count in left_out.items())
+        return answer | {"error": f"no sample was taken: {why}.", "status": 429 if "flood" in left_out else 422}
 
 
 INCOMING = Incoming()

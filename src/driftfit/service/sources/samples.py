@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -53,6 +54,8 @@ class Batch(NamedTuple):
     """Messages that could not be decoded."""
     arrived: float = 0.0
     """When the first of them arrived, in seconds of the monotonic clock."""
+    left_out: Counter[str] | None = None
+    """Counts the samples that units do not take, by reason, where the sender is told before the acknowledgement."""
 
 
 def decode(topic: str, payload: bytes | str) -> Samples:
