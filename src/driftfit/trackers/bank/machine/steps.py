@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps
+from driftfit.engine.drivers import TrackerSteps, diagonal
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
 from driftfit.trackers.bank.layout import (
     COUNT,
@@ -113,12 +113,6 @@ def point(s: State) -> None:
     s.table[COUNTERS_AT, 0, 0] = s.counters.ctypes.data
     s.table[SAMPLE_AT, 0, 0] = s.sample.ctypes.data
     s.table[OWN_AT, 0, 0] = own_address(s)
-
-
-@kernel
-def report(s: State, l: int) -> None:
-    for i in range(s.theta.shape[0]):
-        s.var[i, l] = s.P[i, i, l] * s.scale[l]
 
 
 @kernel
@@ -248,7 +242,7 @@ def read(s: State, l: int) -> None:
     if s.framed[l] > 0:
         read_framed(s, l)
     else:
-        report(s, l)
+        diagonal(s, l)
         unseen_variance(s, l)
 
 
@@ -312,4 +306,4 @@ def take_known(s: State, known: Array, t: int, l: int) -> None:
             column += 1
 
 
-STEPS = TrackerSteps(nothing, correct, report, begin, keep, take_known, machines=(*FRAME, *FRAMED), outlined=True)
+STEPS = TrackerSteps(nothing, correct, diagonal, begin, keep, take_known, machines=(*FRAME, *FRAMED), outlined=True)
