@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftfit import ARX, FLS, RLS, AdaptiveKalman, Bank, Kalman, track
+from driftfit import ARX, FLS, RLS, AdaptiveKalman, Bank, InstrumentalVariables, Kalman, Regression, track
 
 T, THETA = 500, (1.1, -0.5, 1.0, 0.5)
 PLANT = ARX(2, 2)
@@ -39,3 +39,49 @@ def test_bands_are_infinite_where_parameters_are_known_and_the_noise_is_not(trac
     run = track(PLANT, tracker, y, u)
     assert np.isinf(run.std[6:50]).all()
     assert np.isfinite(run.std[-1]).all()
+
+
+@pytest.mark.parametrize("tracker", TRACKERS, ids=repr)
+@pytest.mark.parametrize("noise", [1e-7, 1e-10])
+def test_noise_far_below_the_signal_is_learned(tracker, noise):
+    """r once was at least 1e-14 of the variance of y, and 1e-12 of its mean square in a bank."""
+    y, u = plant(noise)
+    fine, ordinary = track(PLANT, tracker, y, u), track(PLANT, tracker, *plant(1e-3))
+    if not isinstance(tracker, FLS):
+        np.testing.assert_allclose(fine.std[-1] / noise, ordinary.std[-1] / 1e-3, rtol=0.05)
+    within = np.abs(fine.innovation[50:]) <= 1.96 * fine.innovation_std[50:]
+    assert within.mean() > 0.9
+    assert 0.9 * noise < np.median(fine.innovation_std[50:]) < 2.0 * noise
+
+
+@pytest.mark.parametrize("tracker", [AdaptiveKalman(), Bank()], ids=repr)
+def test_drift_far_below_the_signal_is_followed(tracker):
+    rng = np.random.default_rng(2)
+    u = rng.normal(size=(T, 2))
+    walk = np.cumsum(rng.normal(size=(T, 2)), axis=0)
+    errors = []
+    for unit in (1e-3, 1e-9):
+        theta = [1.0, -2.0] + 0.3 * unit * walk
+        run = track(Regression(2), tracker, np.sum(theta * u, axis=1) + unit * rng.normal(size=T), u)
+        errors.append(np.sqrt(np.mean((run.theta[100:] - theta[100:]) ** 2)) / unit)
+    assert errors[1] < 1.1 * errors[0]
+
+
+@pytest.mark.parametrize("tracker", [AdaptiveKalman(), RLS(0.98), InstrumentalVariables(0.99), Bank()], ids=repr)
+def test_bands_of_coarse_meters_do_not_depend_on_the_unit_of_the_weights(tracker):
+    y, u = plant()
+    y = np.round(y)
+    plain = track(PLANT, tracker, y, u)
+    for unit in (2.0**-14, 2.0**14):
+        run = track(PLANT, tracker, y, u, weights=np.full(T, unit))
+        np.testing.assert_allclose(run.std[-1], plain.std[-1], rtol=1e-6)
+        np.testing.assert_allclose(run.innovation_std[-1], plain.innovation_std[-1], rtol=1e-6)
+
+
+def test_smoothed_bands_of_coarse_meters_do_not_depend_on_the_unit_of_the_weights():
+    y, u = plant()
+    bands = [
+        track(PLANT, AdaptiveKalman(), np.round(y), u, weights=np.full(T, unit)).smooth().std[250]
+        for unit in (1.0, 2.0**-14)
+    ]
+    np.testing.assert_allclose(*bands, rtol=1e-6)
