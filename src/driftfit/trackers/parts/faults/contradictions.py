@@ -48,6 +48,8 @@ REACH = 10.0
 """Standard deviations of the readings."""
 SURE = 5.0
 """Standard deviations of the prediction."""
+LIKELY = 3.0
+"""The same where the prediction, and not the reading, is out of range."""
 FIRST = 10.0
 """Number of first readings that are accepted, for comparison with later ones."""
 JUDGED = 6.0
@@ -150,8 +152,9 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
     """Whether the sample is used: s.ok and s.observed; and s.widening, the factor p."""
     e, off, out = y - shown, abs(y - s.y_mean[l]), abs(shown - s.y_mean[l])
     reach, widening = REACH * REACH * s.y_variance[l], s.widening[l]
+    sure = SURE if off > out else LIKELY
     judged = (s.ok[l] > 0.0) & (s.y_count[l] >= s.judged_from[l]) & (s.ratios[l] >= ENOUGH)
-    strange = judged & (e * e > reach) & (e * e > SURE * SURE * v * s.mean_ratio[l]) & (min(off, out) < 0.5 * abs(e))
+    strange = judged & (e * e > reach) & (e * e > sure * sure * v * s.mean_ratio[l]) & (min(off, out) < 0.5 * abs(e))
     trusted = (off > out) | (s.distrusted[l] < LAGS)
     beyond = strange & trusted & (e * e > reach * widening * widening)
     lasting = strange & (not beyond) & (widening > LASTING)

@@ -33,6 +33,10 @@ OUTLYING = 30.0
 """Median absolute deviations; 20 standard deviations of normal data."""
 WORSE = 36.0
 """F statistic from which samples contradict each other: six standard deviations for one sample."""
+STEPS = 3
+"""Number of values that differ where most are equal, as those of an input that is often at rest, to tell a usual one."""
+SURELY_WORSE = 16.0
+"""The same with `SURE` residuals, of which a sum of squares is less uncertain: four standard deviations."""
 RESIDUALS = 4
 """Number of residuals after which the first samples are judged."""
 SURE = 12
@@ -45,7 +49,7 @@ sample is doubtful), the output as it was measured, and the first entry of the r
 @shared
 def contradict(every: float, alone: float, residuals: float) -> bool:
     """Whether least squares on every sample, and on some alone, leave these sums of squares of the latter."""
-    return (every - alone) * residuals > WORSE * alone
+    return (every - alone) * residuals > (WORSE if residuals < SURE else SURELY_WORSE) * alone
 
 
 @shared
@@ -86,6 +90,26 @@ def answered(samples: Array, N: int, column: int, center: float, usual: float, l
 
 
 @shared
+def usual_step(samples: Array, N: int, column: int, center: float) -> float:
+    """The lower median of the distances from center of values that differ from it; inf for fewer than `STEPS` values."""
+    count = 0
+    for k in range(N):
+        count += 1 if samples[k, column] != center else 0
+    if count < STEPS:
+        return np.inf
+    for k in range(N):
+        step: float = abs(samples[k, column] - center)
+        less, same = 0, 0
+        for other in range(N):
+            x = abs(samples[other, column] - center)
+            less += 1 if 0.0 < x < step else 0
+            same += 1 if x == step else 0
+        if step > 0.0 and less <= (count - 1) // 2 < less + same:
+            return step
+    return np.inf
+
+
+@shared
 def doubt(samples: Array, N: int, last: bool) -> None:
     """Give a negative noise factor to those of N samples (.., PHI + n) that are doubtful, a positive one to the rest.
 
@@ -93,6 +117,9 @@ def doubt(samples: Array, N: int, last: bool) -> None:
     """
     usual = median(samples, N, READING, 0.0, 0.0)
     limit = OUTLYING * median(samples, N, READING, usual, 1.0)
+    if limit == 0.0:
+        step = usual_step(samples, N, READING, usual)
+        limit = OUTLYING * step if step < np.inf else 0.0
     for k in range(N):
         doubtful = limit > 0.0 and abs(samples[k, READING] - usual) > limit
         samples[k, NOISE] = -abs(samples[k, NOISE]) if doubtful else abs(samples[k, NOISE])
@@ -100,13 +127,15 @@ def doubt(samples: Array, N: int, last: bool) -> None:
         center = median(samples, N, i, 0.0, 0.0)
         most = OUTLYING * median(samples, N, i, center, 1.0)
         steps = most > 0.0 or answered(samples, N, i, center, usual, limit)
+        apart = most if most > 0.0 else OUTLYING * usual_step(samples, N, i, center)
         for k in range(N):
-            if abs(samples[k, i] - center) > most:
+            away = abs(samples[k, i] - center)
+            if away > most:
                 outlying = abs(samples[k, READING] - usual) > limit
                 code = samples[k, READING] != 0.0 and abs(samples[k, i]) == abs(samples[k, READING])
                 if outlying and steps and not code:
                     samples[k, NOISE] = abs(samples[k, NOISE])
-                elif most > 0.0 and not outlying:
+                elif away > apart and not outlying:
                     samples[k, NOISE] = -abs(samples[k, NOISE])
     count, all_fresh = 0, 0
     for k in range(N):
