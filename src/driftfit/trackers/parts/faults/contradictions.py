@@ -164,6 +164,7 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
         & (s.lagging[l] > 0.0)
         & (s.distrusted[l] < LAGS)
         & (v > 2.0 * s.r[l] * s.noise[l] * s.scale[l])
+        & (e * e > LIKELY * LIKELY * v * s.mean_ratio[l])
     )
     left = beyond | lagging
     more = 1.0 if left & (off <= out) else -SELDOM
