@@ -85,3 +85,37 @@ def test_smoothed_bands_of_coarse_meters_do_not_depend_on_the_unit_of_the_weight
         for unit in (1.0, 2.0**-14)
     ]
     np.testing.assert_allclose(*bands, rtol=1e-6)
+
+
+def resting_plant(seed):
+    """An input in whole numbers, nearly half of which are 0."""
+    rng = np.random.default_rng(seed)
+    u, y = np.round(rng.normal(size=T)), np.zeros(T)
+    for t in range(2, T):
+        y[t] = THETA[0] * y[t - 1] + THETA[1] * y[t - 2] + THETA[2] * u[t - 1] + THETA[3] * u[t - 2]
+        y[t] += 0.1 * rng.normal()
+    return y, u
+
+
+@pytest.mark.parametrize("tracker", [RLS(0.99), Kalman(q=1e-6, r=0.01), AdaptiveKalman()], ids=repr)
+def test_a_code_in_an_input_that_often_rests_does_no_harm(tracker):
+    """Without a scale of its own the input could not be outlying, and its parameters stayed near 0 for good."""
+    for seed in range(8):
+        y, u = resting_plant(seed)
+        codes = np.tile(u, (20, 1))
+        codes[np.arange(20), np.arange(20)] = -999.0
+        fleet = track(PLANT, tracker, np.tile(y, (20, 1)), codes, by="row")
+        assert max(np.abs(fleet[k].theta[200] - THETA).max() for k in range(20)) < 0.1
+
+
+@pytest.mark.parametrize("tracker", [RLS(0.99), Kalman(q=1e-6, r=0.01), InstrumentalVariables(0.99)], ids=repr)
+def test_a_plant_at_rest_has_shown_nothing_of_its_range(tracker):
+    """It stands at 98 for a hundred samples; some thirty of what it did then once contradicted that."""
+    left = 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        u, y = np.where(np.arange(T) < 100, 0.3, 0.3 + 0.02 * rng.normal(size=T)), np.full(T, 98.0)
+        for t in range(100, T):
+            y[t] = 98.0 + 0.9 * (y[t - 1] - 98.0) + 2.0 * (u[t - 1] - 0.3) + 0.02 * rng.normal()
+        left += int(track(PLANT, tracker, y, u).state["left_out"])
+    assert left == 0

@@ -7,7 +7,8 @@ readings, e = y - y_hat, and s the tracker's variance of e times the mean of e^2
 
     e^2 > (REACH p)^2 v    and    e^2 > SURE^2 s    and    min(|y - m|, |y_hat - m|) < |e| / 2
 
-and is not used. If y is farther from m than y_hat, its lag also counts as missing. The second condition does not hold
+and is not used; with `LIKELY` instead of SURE if y_hat is farther from m than y, because one input may outweigh all
+samples to come. If y is farther from m than y_hat, its lag also counts as missing. The second condition does not hold
 where parameters are hardly known, and the third not after a test signal to which the output responds. A change of gain
 or level within the usual range of the readings is never strange.
 
@@ -17,7 +18,7 @@ sample in ten in the long run.
 
 A strange input stays in the regressors, as a lag or in what a model simulates, where its effect may be smaller. In the
 `LAGS` samples after one for which an input was blamed, a sample with phi' P phi > r, which would change the estimate
-more than all samples before it, is therefore not used either.
+more than all samples before it, is therefore not used either, unless it agrees with its prediction: e^2 <= LIKELY^2 s.
 
 The factor p begins at 1 and doubles with every strange reading that follows another one: a value that persists is a
 change of level and is accepted; one of 1000 standard deviations after seven samples. Where the prediction is strange,

@@ -3,7 +3,8 @@
 Least squares fits any first samples, so one reading of 9999, or one in an input, would determine estimates, scales and
 noise for hundreds of samples. The first samples are therefore judged together, when there are enough of them for a
 start. A value is outlying if it is more than `OUTLYING` times the median absolute deviation of its column away from the
-median; readings that repeat the one before count once. A sample is doubtful if
+median; readings that repeat the one before count once. Where most values are equal, as of an input that often rests or
+a coarse meter, the usual distance of those that differ takes its place. A sample is doubtful if
 
     its reading is outlying and no regressor is unusual: probably a fault code;
     or a regressor is outlying and the reading is not: a fault code of an input, or of an earlier output, now a lag.
@@ -17,7 +18,7 @@ A large input with a slow response looks the same, and its samples are the most 
 are therefore left out only if the others contradict them: if least squares on all samples leaves these others a sum of
 squared residuals Q, and least squares on themselves only q with nu residuals, and
 
-    nu (Q - q) > WORSE q
+    nu (Q - q) > WORSE q,    or SURELY_WORSE q with `SURE` residuals or more
 
 Source: the median absolute deviation as a scale is Hampel's (1974); the rule is ours. Cost: O(n N^2) for N samples,
 once.
@@ -34,7 +35,7 @@ OUTLYING = 30.0
 WORSE = 36.0
 """F statistic from which samples contradict each other: six standard deviations for one sample."""
 STEPS = 3
-"""Number of values that differ where most are equal, as those of an input that is often at rest, to tell a usual one."""
+"""Number of values that differ where most are equal, as those of an input that often rests, to tell a usual one."""
 SURELY_WORSE = 16.0
 """The same with `SURE` residuals, of which a sum of squares is less uncertain: four standard deviations."""
 RESIDUALS = 4
@@ -91,7 +92,7 @@ def answered(samples: Array, N: int, column: int, center: float, usual: float, l
 
 @shared
 def usual_step(samples: Array, N: int, column: int, center: float) -> float:
-    """The lower median of the distances from center of values that differ from it; inf for fewer than `STEPS` values."""
+    """The lower median of the distances from center of values that differ from it; inf for fewer than `STEPS`."""
     count = 0
     for k in range(N):
         count += 1 if samples[k, column] != center else 0
