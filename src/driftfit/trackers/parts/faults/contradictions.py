@@ -18,7 +18,8 @@ sample in ten in the long run.
 
 A strange input stays in the regressors, as a lag or in what a model simulates, where its effect may be smaller. In the
 `LAGS` samples after one for which an input was blamed, a sample with phi' P phi > r, which would change the estimate
-more than all samples before it, is therefore not used either, unless it agrees with its prediction: e^2 <= LIKELY^2 s.
+more than all samples before it, is therefore not used either; after n samples, when lags are ordinary again, only if it
+does not agree with its prediction, e^2 > LIKELY^2 s.
 
 The factor p begins at 1 and doubles with every strange reading that follows another one: a value that persists is a
 change of level and is accepted; one of 1000 standard deviations after seven samples. Where the prediction is strange,
@@ -165,7 +166,7 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
         & (s.lagging[l] > 0.0)
         & (s.distrusted[l] < LAGS)
         & (v > 2.0 * s.r[l] * s.noise[l] * s.scale[l])
-        & (e * e > LIKELY * LIKELY * v * s.mean_ratio[l])
+        & ((s.lagging[l] > LAGS - s.theta.shape[0]) | (e * e > LIKELY * LIKELY * v * s.mean_ratio[l]))
     )
     left = beyond | lagging
     more = 1.0 if left & (off <= out) else -SELDOM
