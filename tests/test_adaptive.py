@@ -216,7 +216,8 @@ def test_what_never_changes_is_expected_to_change_less_often():
     rng = np.random.default_rng(3)
     u = rng.normal(size=(6000, 3))
     run = track(Regression(3), AdaptiveKalman(), u @ [1.0, -0.5, 2.0] + 0.3 * rng.normal(size=6000), u)
-    jumps = track(Regression(3), AdaptiveKalman(), u @ [1.0, -0.5, 2.0] * (1.0 + np.arange(6000) // 100 % 2), u)
+    y = u @ [1.0, -0.5, 2.0] * (1.0 + np.arange(6000) // 100 % 2) + 0.01 * rng.normal(size=6000)
+    jumps = track(Regression(3), AdaptiveKalman(), y, u)
     assert run.state["calm"] < 0.5
     assert jumps.state["calm"] == 1.0
 

@@ -87,10 +87,18 @@ def clean(s: State, l: int) -> None:
 
 
 @kernel
+def in_units_of_noise(variance: float, scale: float) -> float:
+    """A variance times the estimated noise variance ``scale``; inf while that is NaN, which no residual determines."""
+    unknown = np.inf if variance > 0.0 else 0.0
+    product = variance * scale
+    return product if scale >= 0.0 else unknown
+
+
+@kernel
 def diagonal(s: State, l: int) -> None:
     """Report the diagonal of P, times the estimated noise variance where the tracker carries one."""
     for i in range(s.theta.shape[0]):
-        s.var[i, l] = s.P[i, i, l] * s.scale[l]
+        s.var[i, l] = in_units_of_noise(s.P[i, i, l], s.scale[l])
 
 
 @kernel

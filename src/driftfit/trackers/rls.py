@@ -59,7 +59,7 @@ from driftfit.trackers.parts.diffuse import (
 )
 from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
 from driftfit.trackers.parts.faults.judged_start import judged, unjudged
-from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
+from driftfit.trackers.parts.resolution import least_noise, resolution, resolve, unresolved
 
 RECENT, RECENT_SHARE, LATER_SHARE = 20.0, 0.125, 0.25
 """Memory of the present noise variance: samples, and shares of those so far for the unit of P and for the scale."""
@@ -126,8 +126,8 @@ def learn_scale(s: State, l: int) -> None:
     s.squares[l] += counted * s.e[l] * s.e[l] / s.s[l]
     s.count[l] += counted
     s.s[l] *= s.scale[l]
-    scale = s.squares[l] / s.count[l]
-    s.scale[l] = s.coarse[l] if s.coarse[l] > scale else scale  # NaN is kept
+    scale, least = s.squares[l] / s.count[l], least_noise(s, l)
+    s.scale[l] = least if least > scale else scale  # NaN is kept
 
 
 @kernel

@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.engine.drivers import in_units_of_noise
 from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, log, machine, packed, shared, wholes
 from driftfit.trackers.parts.covariance import prediction
 from driftfit.trackers.parts.information import spread
@@ -390,4 +391,4 @@ def spanned_variance(s: State, l: int) -> None:
     """Report the variance: infinite for every parameter that the regressors do not span yet."""
     for i in range(s.theta.shape[0]):
         var = s.var[i, l]
-        s.var[i, l] = var * s.scale[l] if var < np.inf else np.inf
+        s.var[i, l] = in_units_of_noise(var, s.scale[l]) if var < np.inf else np.inf

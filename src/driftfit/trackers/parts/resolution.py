@@ -10,7 +10,8 @@ collapses, and bands and likelihood with it. Therefore
     fresh      whether a residual carries information about the noise: not that of a reading that repeats the previous
                one, as long as the quantum is unknown
 
-and no tracker takes its noise variance to be below ``coarse``. `AdaptiveKalman` also treats readings that repeat as
+and no tracker takes its noise variance to be below ``coarse``. That of a sample is r / w with its weight w; the least r
+is therefore ``coarse`` times the mean weight of the readings. `AdaptiveKalman` also treats readings that repeat as
 one rounding error observed several times (`lasting`). Readings of a fine sensor never repeat, and nothing changes for
 them. If they do repeat, at a limit, at 0 while a pump is off, or because a value is held, the other steps have all
 sizes, and no step is frequent. A model that subtracts a shift from y (`driftfit.models.linearised`) writes it into the
@@ -41,7 +42,7 @@ def unresolved() -> dict[str, Any]:
     """Fields before the first reading."""
     return {
         "reading": np.nan, "quantum": np.inf, "smallest": 0.0, "steps": 0.0, "repeats": 0.0, "coarse": 0.0,
-        "fresh": 1.0, "alike": 0.0, "shift": 0.0,
+        "fresh": 1.0, "alike": 0.0, "shift": 0.0, "mean_weight": 1.0, "used_readings": 0.0,
     }  # fmt: skip
 
 
@@ -73,8 +74,16 @@ def resolve(s: State, l: int) -> None:
     s.reading[l] = y if observed > 0.0 else s.reading[l]
     s.quantum[l], s.smallest[l], s.steps[l], s.repeats[l] = quantum, smallest, steps, repeats
     s.coarse[l] = quantum * quantum / 12.0 if coarse else 0.0
+    s.used_readings[l] += s.ok[l]
+    s.mean_weight[l] += s.ok[l] * (1.0 / s.noise[l] - s.mean_weight[l]) / max(s.used_readings[l], 1.0)
     s.alike[l] = min(s.alike[l] + 1.0, LONGEST) * repeated if observed > 0.0 else s.alike[l]
     s.fresh[l] = 0.0 if (repeated > 0.0) & (not coarse) else 1.0
+
+
+@kernel
+def least_noise(s: State, l: int) -> float:
+    """The least r, in units of the noise factor of a sample."""
+    return s.coarse[l] * s.mean_weight[l]  # type: ignore[no-any-return]
 
 
 @kernel

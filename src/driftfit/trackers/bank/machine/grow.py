@@ -31,8 +31,6 @@ from driftfit.trackers.bank.leaves.own_sensor import clean_all, judge_all, weigh
 from driftfit.trackers.parts.covariance import LEFT
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
-FLOOR = 1e-12
-"""S never falls below this share of nu times the mean square of y, which is the rounding of the data."""
 
 
 @shared

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps
+from driftfit.engine.drivers import TrackerSteps, diagonal
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
 from driftfit.trackers.bank.layout import (
     COUNT,
@@ -45,14 +45,14 @@ from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
 from driftfit.trackers.bank.leaves.own_sensor import own_address
 from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, outgrown, read_framed, write_walks
-from driftfit.trackers.bank.machine.grow import FLOOR
 from driftfit.trackers.bank.machine.late_direction import begin_within, point_along
 from driftfit.trackers.parts.coordinates import FRAME, unseen_variance, whiten_within
 from driftfit.trackers.parts.covariance import measurement, prediction
 from driftfit.trackers.parts.diffuse import enter, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
-from driftfit.trackers.parts.resolution import lasting, resolve
+from driftfit.trackers.parts.modes.noise_levels import ROUNDING
+from driftfit.trackers.parts.resolution import lasting, least_noise, resolve
 from driftfit.trackers.rls import learn_scale
 
 GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift"], ROW["own_likelihoods"]
@@ -113,12 +113,6 @@ def point(s: State) -> None:
     s.table[COUNTERS_AT, 0, 0] = s.counters.ctypes.data
     s.table[SAMPLE_AT, 0, 0] = s.sample.ctypes.data
     s.table[OWN_AT, 0, 0] = own_address(s)
-
-
-@kernel
-def report(s: State, l: int) -> None:
-    for i in range(s.theta.shape[0]):
-        s.var[i, l] = s.P[i, i, l] * s.scale[l]
 
 
 @kernel
@@ -196,7 +190,7 @@ def hand_over(s: State, l: int) -> None:
     s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l] * repeated(s, l), s.dt[l]
     s.sample[IN_TIME, l], s.sample[SHIFT, l] = s.dt[l] * s.drift[l], s.shift[l]
     s.sample[IN_OK, l], s.sample[IN_OBSERVED, l] = s.ok[l], s.observed[l]
-    s.sample[R, l], s.sample[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])
+    s.sample[R, l], s.sample[LEAST, l] = s.r[l], max(ROUNDING * s.power[l] + 1e-300, least_noise(s, l))
     s.sample[ENTERS, l] = 0.0
     s.sample[MOST, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
 
@@ -249,7 +243,7 @@ def read(s: State, l: int) -> None:
     if s.framed[l] > 0:
         read_framed(s, l)
     else:
-        report(s, l)
+        diagonal(s, l)
         unseen_variance(s, l)
 
 
@@ -313,4 +307,4 @@ def take_known(s: State, known: Array, t: int, l: int) -> None:
             column += 1
 
 
-STEPS = TrackerSteps(nothing, correct, report, begin, keep, take_known, machines=(*FRAME, *FRAMED), outlined=True)
+STEPS = TrackerSteps(nothing, correct, diagonal, begin, keep, take_known, machines=(*FRAME, *FRAMED), outlined=True)

@@ -108,7 +108,7 @@ def share_rounding(s: State, per_noise: float, l: int) -> None:
     s.spread[l] = (1.0 - weight) * (s.spread[l] + weight * off * off)
     s.readings_in[l] = N
     count_levels(s, kept, s.count[l] > 2.0 * n, l)
-    scale = s.scale[l]
+    scale = s.scale[l] / s.mean_weight[l]
     s.common[l] = in_common(s, scale, l) if (s.coarse[l] > 0.0) & (scale > 0.0) else 0.0
     s.fold[l] = 1.0 + N * s.common[l] / scale if s.common[l] > 0.0 else 1.0
 
@@ -122,9 +122,9 @@ def share_among_filters(s: State, l: int) -> None:
             h += s.white[i, l] * s.white[j, l] * s.P[i, j, l] * (1.0 if i == j else 2.0)
     h = max(h, 0.0)
     s.undecided[l] += s.ok[l] * (h - s.undecided[l]) / min(s.count[l] + 1.0, RECENT)
-    count_levels(s, 1.0 - s.ok[l] * h / (h + s.r[l] + lasting(s, l)) / n, s.count[l] > 2.0 * n, l)
+    count_levels(s, 1.0 - s.ok[l] * h / (h + s.r[l] * s.noise[l] + lasting(s, l)) / n, s.count[l] > 2.0 * n, l)
     mean = s.undecided[l]
-    s.common[l] = in_common(s, s.r[l], l) if (s.coarse[l] > 0.0) & (mean > 0.0) else 0.0
+    s.common[l] = in_common(s, s.r[l] / s.mean_weight[l], l) if (s.coarse[l] > 0.0) & (mean > 0.0) else 0.0
     s.fold[l] = 1.0 + n * s.common[l] / mean if s.common[l] > 0.0 else 1.0
     for i in range(s.theta.shape[0]):
         s.var[i, l] *= s.fold[l]

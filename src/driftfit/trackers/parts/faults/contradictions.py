@@ -7,7 +7,8 @@ readings, e = y - y_hat, and s the tracker's variance of e times the mean of e^2
 
     e^2 > (REACH p)^2 v    and    e^2 > SURE^2 s    and    min(|y - m|, |y_hat - m|) < |e| / 2
 
-and is not used. If y is farther from m than y_hat, its lag also counts as missing. The second condition does not hold
+and is not used; with `LIKELY` instead of SURE if y_hat is farther from m than y, because one input may outweigh all
+samples to come. If y is farther from m than y_hat, its lag also counts as missing. The second condition does not hold
 where parameters are hardly known, and the third not after a test signal to which the output responds. A change of gain
 or level within the usual range of the readings is never strange.
 
@@ -17,7 +18,8 @@ sample in ten in the long run.
 
 A strange input stays in the regressors, as a lag or in what a model simulates, where its effect may be smaller. In the
 `LAGS` samples after one for which an input was blamed, a sample with phi' P phi > r, which would change the estimate
-more than all samples before it, is therefore not used either.
+more than all samples before it, is therefore not used either; after n samples, when lags are ordinary again, only if it
+does not agree with its prediction, e^2 > LIKELY^2 s.
 
 The factor p begins at 1 and doubles with every strange reading that follows another one: a value that persists is a
 change of level and is accepted; one of 1000 standard deviations after seven samples. Where the prediction is strange,
@@ -49,6 +51,8 @@ REACH = 10.0
 """Standard deviations of the readings."""
 SURE = 5.0
 """Standard deviations of the prediction."""
+LIKELY = 3.0
+"""The same where the prediction, and not the reading, is out of range."""
 FIRST = 10.0
 """Number of first readings that are accepted, for comparison with later ones."""
 JUDGED = 6.0
@@ -151,8 +155,9 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
     """Whether the sample is used: s.ok and s.observed; and s.widening, the factor p."""
     e, off, out = y - shown, abs(y - s.y_mean[l]), abs(shown - s.y_mean[l])
     reach, widening = REACH * REACH * s.y_variance[l], s.widening[l]
+    sure = SURE if off > out else LIKELY
     judged = (s.ok[l] > 0.0) & (s.y_count[l] >= s.judged_from[l]) & (s.ratios[l] >= ENOUGH)
-    strange = judged & (e * e > reach) & (e * e > SURE * SURE * v * s.mean_ratio[l]) & (min(off, out) < 0.5 * abs(e))
+    strange = judged & (e * e > reach) & (e * e > sure * sure * v * s.mean_ratio[l]) & (min(off, out) < 0.5 * abs(e))
     trusted = (off > out) | (s.distrusted[l] < LAGS)
     beyond = strange & trusted & (e * e > reach * widening * widening)
     lasting = strange & (not beyond) & (widening > LASTING)
@@ -162,6 +167,7 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
         & (s.lagging[l] > 0.0)
         & (s.distrusted[l] < LAGS)
         & (v > 2.0 * s.r[l] * s.noise[l] * s.scale[l])
+        & ((s.lagging[l] > LAGS - s.theta.shape[0]) | (e * e > LIKELY * LIKELY * v * s.mean_ratio[l]))
     )
     left = beyond | lagging
     more = 1.0 if left & (off <= out) else -SELDOM

@@ -3,7 +3,8 @@
 Least squares fits any first samples, so one reading of 9999, or one in an input, would determine estimates, scales and
 noise for hundreds of samples. The first samples are therefore judged together, when there are enough of them for a
 start. A value is outlying if it is more than `OUTLYING` times the median absolute deviation of its column away from the
-median; readings that repeat the one before count once. A sample is doubtful if
+median; readings that repeat the one before count once. Where most values are equal, as of an input that often rests or
+a coarse meter, the usual distance of those that differ takes its place. A sample is doubtful if
 
     its reading is outlying and no regressor is unusual: probably a fault code;
     or a regressor is outlying and the reading is not: a fault code of an input, or of an earlier output, now a lag.
@@ -17,7 +18,7 @@ A large input with a slow response looks the same, and its samples are the most 
 are therefore left out only if the others contradict them: if least squares on all samples leaves these others a sum of
 squared residuals Q, and least squares on themselves only q with nu residuals, and
 
-    nu (Q - q) > WORSE q
+    nu (Q - q) > WORSE q,    or SURELY_WORSE q with `SURE` residuals or more
 
 Source: the median absolute deviation as a scale is Hampel's (1974); the rule is ours. Cost: O(n N^2) for N samples,
 once.
@@ -33,6 +34,10 @@ OUTLYING = 30.0
 """Median absolute deviations; 20 standard deviations of normal data."""
 WORSE = 36.0
 """F statistic from which samples contradict each other: six standard deviations for one sample."""
+STEPS = 3
+"""Number of values that differ where most are equal, as those of an input that often rests, to tell a usual one."""
+SURELY_WORSE = 16.0
+"""The same with `SURE` residuals, of which a sum of squares is less uncertain: four standard deviations."""
 RESIDUALS = 4
 """Number of residuals after which the first samples are judged."""
 SURE = 12
@@ -45,7 +50,7 @@ sample is doubtful), the output as it was measured, and the first entry of the r
 @shared
 def contradict(every: float, alone: float, residuals: float) -> bool:
     """Whether least squares on every sample, and on some alone, leave these sums of squares of the latter."""
-    return (every - alone) * residuals > WORSE * alone
+    return (every - alone) * residuals > (WORSE if residuals < SURE else SURELY_WORSE) * alone
 
 
 @shared
@@ -94,6 +99,26 @@ def answered(samples: Array, N: int, column: int, center: float, usual: float, l
 
 
 @shared
+def usual_step(samples: Array, N: int, column: int, center: float) -> float:
+    """The lower median of the distances from center of values that differ from it; inf for fewer than `STEPS`."""
+    count = 0
+    for k in range(N):
+        count += 1 if samples[k, column] != center else 0
+    if count < STEPS:
+        return np.inf
+    for k in range(N):
+        step: float = abs(samples[k, column] - center)
+        less, same = 0, 0
+        for other in range(N):
+            x = abs(samples[other, column] - center)
+            less += 1 if 0.0 < x < step else 0
+            same += 1 if x == step else 0
+        if step > 0.0 and less <= (count - 1) // 2 < less + same:
+            return step
+    return np.inf
+
+
+@shared
 def doubt(samples: Array, N: int, last: bool) -> None:
     """Give a negative noise factor to those of N samples (.., PHI + n) that are doubtful, a positive one to the rest.
 
@@ -101,6 +126,9 @@ def doubt(samples: Array, N: int, last: bool) -> None:
     """
     usual = median(samples, N, READING, 0.0, 0.0)
     limit = OUTLYING * median(samples, N, READING, usual, 1.0)
+    if limit == 0.0:
+        step = usual_step(samples, N, READING, usual)
+        limit = OUTLYING * step if step < np.inf else 0.0
     for k in range(N):
         doubtful = limit > 0.0 and abs(samples[k, READING] - usual) > limit
         samples[k, NOISE] = -abs(samples[k, NOISE]) if doubtful else abs(samples[k, NOISE])
@@ -108,13 +136,15 @@ def doubt(samples: Array, N: int, last: bool) -> None:
         center = median(samples, N, i, 0.0, 0.0)
         most = OUTLYING * median(samples, N, i, center, 1.0)
         steps = most > 0.0 or answered(samples, N, i, center, usual, limit)
+        apart = most if most > 0.0 else OUTLYING * usual_step(samples, N, i, center)
         for k in range(N):
-            if abs(samples[k, i] - center) > most:
+            away = abs(samples[k, i] - center)
+            if away > most:
                 outlying = abs(samples[k, READING] - usual) > limit
                 code = samples[k, READING] != 0.0 and abs(samples[k, i]) == abs(samples[k, READING])
                 if outlying and steps and not code:
                     samples[k, NOISE] = abs(samples[k, NOISE])
-                elif most > 0.0 and not outlying:
+                elif away > apart and not outlying:
                     samples[k, NOISE] = -abs(samples[k, NOISE])
     count, all_fresh = 0, 0
     for k in range(N):

@@ -112,14 +112,16 @@ def settle(s: State, l: int) -> None:
     """The start is over: the readings of the samples that it used are the range of later ones."""
     s.start_over[l] = 1
     s.block_left[l] = s.block_size[l]  # what was added to the block is learned from the stored samples
-    known = s.scale[l] > 0.0  # it is NaN without residuals
-    s.ratios[l] = max(spare_samples(s, l) - s.start_faults[l], 0.0) if known else 0.0
-    s.mean_ratio[l] = squares_left(s, l) / (max(s.ratios[l], 1.0) * s.r[l] * s.scale[l]) if known else 0.0
     for at in range(s.remembered[l]):
         if s.samples[at, NOISE, l] > 0.0:
             learn_reading(s, s.samples[at, READING, l], l)
-    # samples are judged alone from now on, also if some of these readings repeat others
-    s.judged_from[l] = min(s.judged_from[l], max(s.y_count[l], 0.5 * FIRST))
+    varied = s.y_count[l] >= 0.5 * FIRST
+    known = (s.scale[l] > 0.0) & varied  # it is NaN without residuals
+    s.ratios[l] = max(spare_samples(s, l) - s.start_faults[l], 0.0) if known else 0.0
+    s.mean_ratio[l] = squares_left(s, l) / (max(s.ratios[l], 1.0) * s.r[l] * s.scale[l]) if known else 0.0
+    # samples are judged alone from now on, also if some of these readings repeat others; but a plant at rest has shown
+    # nothing of its range
+    s.judged_from[l] = min(s.judged_from[l], s.y_count[l]) if varied else FIRST + s.theta.shape[0]
     close_block(s, l)
 
 

@@ -29,7 +29,7 @@ from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.covariance import LEFT
 from driftfit.trackers.parts.modes.ladder import TOP, leap
-from driftfit.trackers.parts.modes.noise_levels import OUTLIER
+from driftfit.trackers.parts.modes.noise_levels import OUTLIER, noise_at
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
 from driftfit.trackers.parts.modes.trend import bend_slopes, level_slopes, move_along
 from driftfit.trackers.parts.resolution import lasting
@@ -102,10 +102,10 @@ def innovate(s: State, l: int) -> None:
     mean = sum_of_row(s, l)
     level = 0.0
     for j in range(J - 1):
-        level += s.nu_prior[j, l] * max(s.level[j, l] * s.r[l], s.coarse[l])
+        level += s.nu_prior[j, l] * noise_at(s, s.level[j, l], l)
     for k in range(K):
         s.row[k, l] = s.prior[k, l] * (s.h[k, l] + (s.e_k[k, l] - mean) ** 2)
-    v = s.noise[l] * s.leverage[l] * level / (1.0 - OUTLIER) + sum_of_row(s, l)
+    v = level / (1.0 - OUTLIER) + sum_of_row(s, l)
     for k in range(K):
         s.e_k[k, l] = s.y[l] - s.e_k[k, l]
     s.y_hat[l] = mean
@@ -117,13 +117,12 @@ def innovate(s: State, l: int) -> None:
 def likelihoods(s: State, l: int) -> float:
     """joint[j, k] = c_k nu_j N(e_k; 0, s_kj) exp(nearest / 2) (2 pi)^(1/2); returns nearest."""
     K, J = s.modes[l], s.nu.shape[0]
-    factor = s.noise[l] * s.leverage[l]
     more = lasting(s, l)
-    leap(s, l, factor * max(s.r[l], s.coarse[l]))
+    leap(s, l, noise_at(s, 1.0, l))
     for k in range(K):
         s.row[k, l] = np.inf
     for j in range(J):
-        noise = factor * max(s.level[j, l] * s.r[l], s.coarse[l]) + more
+        noise = noise_at(s, s.level[j, l], l) + more
         widest = np.inf if j == J - 1 else 0.0
         for k in range(K):
             square = s.e_k[k, l] * s.e_k[k, l]
@@ -143,9 +142,8 @@ def likelihoods(s: State, l: int) -> float:
 def as_predicted(s: State, nearest: float, l: int) -> None:
     """Add the density without an outlier to the scratch row of each filter, where ``joint`` has another."""
     K, J = s.modes[l], s.nu.shape[0]
-    factor = s.noise[l] * s.leverage[l]
     for j in range(J - 1):
-        noise = factor * max(s.level[j, l] * s.r[l], s.coarse[l])
+        noise = noise_at(s, s.level[j, l], l)
         for k in range(K):
             v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
             far = s.e_k[k, l] * s.e_k[k, l] / v - nearest
@@ -157,8 +155,7 @@ def predictive_density(s: State, nearest: float, l: int) -> None:
     """The log density of the sample under its prediction: without a leap, with the noise of a reading that does not
     repeat, and with a tail that integrates to 1."""
     K, J = s.modes[l], s.nu.shape[0]
-    factor = s.noise[l] * s.leverage[l]
-    noise = factor * max(s.level[J - 1, l] * s.r[l], s.coarse[l])
+    noise = noise_at(s, s.level[J - 1, l], l)
     for k in range(K):
         v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
         s.row[k, l] = s.prior[k, l] * s.nu_prior[J - 1, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
@@ -242,7 +239,7 @@ def update_filters(s: State, l: int) -> None:
 @kernel
 def outgrown(s: State, l: int) -> int:
     """The first coordinate about which this sample has `OUTGROWN` times the information of all earlier ones, or -1."""
-    others = s.noise[l] * s.leverage[l] * max(s.r[l], s.coarse[l])
+    others = noise_at(s, 1.0, l)
     for j in range(s.theta.shape[0]):
         own = s.x[j, l] * s.x[j, l] * s.C[j, j, 0, l]
         if own > OUTGROWN * others:
@@ -257,7 +254,7 @@ def enter_filters(s: State, j: int, l: int) -> None:
     z_j; then z_j = y - sum_{i<j} x_i z_i - v, which is correlated with them also by v.
     """
     n, K, fresh = s.theta.shape[0], s.modes[l], s.S[j, j, l] == 0.0
-    noise = s.noise[l] * s.leverage[l] * max(s.r[l], s.coarse[l])
+    noise = noise_at(s, 1.0, l)
     for k in range(K):
         s.h[k, l] = 0.0 if fresh or s.h[k, l] == 0.0 else 1.0 / (s.h[k, l] + noise)
         s.step[k, l] = s.h[k, l] * s.e_k[k, l]

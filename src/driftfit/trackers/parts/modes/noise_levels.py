@@ -19,7 +19,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.trackers.parts.modes.rows import sum_of_row
-from driftfit.trackers.parts.resolution import lasting
+from driftfit.trackers.parts.resolution import lasting, least_noise
 
 LEVELS = (1.0, 4.0, 16.0, 100.0)
 """Noise levels in units of r; the last is the outlier's."""
@@ -36,10 +36,8 @@ IN_A_ROW, RISE = 4.0, 0.3
 MISFIT, SETTLED, EARLY = 0.5, 20.0, 140.0
 """Among the first `EARLY` samples, if the mean of e^2 / s, with a memory of `SETTLED`, is below `MISFIT`, r falls by as
 much: drift at the start was taken for noise. Later it does not, see above."""
-FINEST, ROUNDING = 1e-14, 1e-26
-"""r is never below these shares of the variance of y, and of its mean square. After a jump as large as y, a covariance
-in units of a smaller r would keep no digits; the second is for rounding in the sums of a prediction, and is far below
-the noise of readings with a large offset."""
+ROUNDING = 1e-26
+"""r is never below this share of the mean square of y, for rounding in the sums of a prediction."""
 
 
 def any_level() -> dict[str, Any]:
@@ -68,8 +66,13 @@ def level_chain() -> Array:
 @kernel
 def finest(s: State, l: int) -> float:
     """The lower bound of r."""
-    least: float = max(FINEST * min(s.spread[l], s.power[l]), ROUNDING * s.power[l])
-    return max(least, s.coarse[l])  # type: ignore[no-any-return]
+    return max(ROUNDING * s.power[l], least_noise(s, l))  # type: ignore[no-any-return]
+
+
+@kernel
+def noise_at(s: State, level: float, l: int) -> float:
+    """Variance of the noise of the sample at a level; its weight does not change errors of rounding."""
+    return s.leverage[l] * max(s.noise[l] * level * s.r[l], s.coarse[l])  # type: ignore[no-any-return]
 
 
 @kernel

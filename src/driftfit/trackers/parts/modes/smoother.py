@@ -43,7 +43,8 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
         o.c[i, l] = s.c[i, l]
         o.weight[i, l] = s.weight[i, l]
         o.white[i, l] = s.white[i, l]
-    o.r[l], o.leverage[l], o.coarse[l], o.alike[l] = s.r[l], s.leverage[l], s.coarse[l], s.alike[l]
+    o.r[l], o.leverage[l], o.alike[l] = s.r[l], s.leverage[l], s.alike[l]
+    o.coarse[l] = s.coarse[l] / s.noise[l]  # in units of the noise factor, as r is
     o.leapt[l], o.weighed[l], o.settled[l], o.explained[l] = s.leapt[l], s.weighed[l], s.settled[l], s.explained[l]
     o.calm[l], o.left_out[l], o.shift[l] = s.calm[l], s.left_out[l], s.shift[l]
 
