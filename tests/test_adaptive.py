@@ -154,7 +154,7 @@ def test_a_reading_that_repeats_by_chance_is_not_reported_as_frozen():
     assert result == 0
 
 
-@pytest.mark.parametrize("groups", [[[0], [0, 1]], [[]], [[-1]]])
+@pytest.mark.parametrize("groups", [[[0], [0, 1]], [[]], [[-1]], [[0.7]], [["b1"]]])
 def test_wrong_groups_are_refused(groups):
     with pytest.raises(ValueError, match="AdaptiveKalman"):
         AdaptiveKalman(groups=groups)

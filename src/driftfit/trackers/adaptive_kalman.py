@@ -46,7 +46,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel, log
-from driftfit.engine.settings import numbers
+from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.coarse.shared_rounding import nothing_shared_among_filters, share_among_filters
@@ -253,11 +253,12 @@ class AdaptiveKalman(Tracker):
 
     def __post_init__(self) -> None:
         if self.groups is not None:
-            groups = tuple(tuple(int(i) for i in group) for group in self.groups)
+            groups = tuple(
+                tuple(whole("AdaptiveKalman", "an index in groups", i, 0) for i in group) for group in self.groups
+            )
             members = [i for group in groups for i in group]
             if len(set(members)) != len(members) or not all(members_of for members_of in groups):
                 raise ValueError(f"AdaptiveKalman: groups must be disjoint and not empty; got {self.groups!r}.")
-            numbers("AdaptiveKalman", "groups", members, low=0.0)
             self._set("groups", groups)
 
     def state(self, n: int) -> Mapping[str, Any]:
