@@ -216,9 +216,11 @@ def test_standard_errors_have_the_units_of_their_regressors():
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("change", [1.0, 1e-3])
 def test_an_exact_record_is_divided_where_it_changes_and_not_by_its_rounding(unit, change):
-    u, t = np.random.default_rng(0).normal(size=300), np.arange(300)
-    found = segment(unit * ((2.0 + change * (t >= 150)) * u + 1.0), u)
-    assert [one.at for one in found.breaks] == [150]
+    for seed, T in ((2, 300), (5, 300), (0, 3000), (1, 3000)):
+        u, t = np.random.default_rng(seed).normal(size=T), np.arange(T)
+        found = segment(unit * ((2.0 + change * (t >= T // 2)) * u + 1.0), u)
+        assert [one.at for one in found.breaks] == [T // 2]
+    t = np.arange(300)
     assert [one.at for one in segment(unit * (7.0 + change * (t > 100))).breaks] == [101]
 
 

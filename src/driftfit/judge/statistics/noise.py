@@ -49,9 +49,8 @@ QUIET = 0.01
 """Probability that a record with constant coefficients is divided."""
 WINDOW = 50
 SMALLEST, SMALL = 1e-5, 0.01
-"""The least noise of windows, as a share of the residuals of constants, and of segments, as a share of that of windows:
-sums of squares that are accumulated over a record have no more digits, and breaks would divide rounding errors.
-"""
+"""The least noise, as a share of the residuals of constants: sums of squares that are accumulated over a record have no
+more digits, and breaks would divide rounding errors. That of segments is also at least a share of that of windows."""
 
 
 class Noise(NamedTuple):
@@ -193,9 +192,10 @@ def begun(
     _fit_windows(columns_of(Q, y), *spans, residual, level, r)
     g = overlap(Q)
     width = int(spans[1][0] - spans[0][0])
-    c = np.maximum(_level(spans, level, N), SMALLEST * deviation(y))
+    least_level = SMALLEST * deviation(y)
+    c = np.maximum(_level(spans, level, N), least_level)
     search = Search(Q, y, c, spans, g, P, order, _grid(N, cells), least,
-                    penalty(N, n, least, quiet))  # fmt: skip
+                    penalty(N, n, least, quiet), max(SMALL, least_level / median(c)))  # fmt: skip
     r = r[r[:, 0] > 0.0]
     pacf = np.median(_partial(r, g, width), axis=0) if len(r) else np.zeros(P)
     local = _chosen(pacf, min(N, 8 * width), order)
@@ -214,7 +214,7 @@ def of_rare_events(Q: Array, y: Array, cells: int, least: int, order: int | None
     (N, n), none = Q.shape, np.zeros(0, np.int64)
     P = max(order or 0, min(ORDER, N // 20))
     search = Search(Q, y, np.full(N, deviation(y)), _spans(N, n), overlap(Q), P, order, _grid(N, cells), least,
-                    2.0 * penalty(N, n, least, QUIET))  # fmt: skip
+                    2.0 * penalty(N, n, least, QUIET), SMALL)  # fmt: skip
     starts = [search.correlation(y, none), none[:0].astype(float)]
     return min((search.settle(ar, y, y) for ar in starts), key=lambda one: one[0])[1]._replace(rare=True)
 
@@ -242,6 +242,8 @@ class Search(NamedTuple):
     grid: Array
     least: int
     penalty: float
+    finest: float
+    """The least noise of segments, in units of c."""
 
     def settle(self, ar: Array, local: Array, near: Array) -> tuple[float, Noise]:
         """-2 log-likelihood, and segments and noise that agree, starting from ``ar``, the autoregression of ``near``.
@@ -271,7 +273,7 @@ class Search(NamedTuple):
         _fit_segments(Q, y, columns_of(X, z), np.concatenate([[0], breaks, [N]]), np.array([len(ar)]), fits)
         residual, near, leverage = fits
         ar = self.correlation(near, breaks)
-        c = self.c * max(deviation(near / self.c), SMALL)
+        c = self.c * max(deviation(near / self.c), self.finest)
         held = y - near + np.clip(near, -HELD * c, HELD * c)
         white = self.size(near, ar) * median(self.c / c)
         return Noise(breaks, residual, c, ar, held, near, leverage, white, self.price(ar), self.least)
@@ -314,7 +316,7 @@ class Search(NamedTuple):
         w = whitened(np.zeros((len(v), 0)), v / self.c, ar)[1]
         limit = HELD * deviation(w)
         held = np.clip(w, -limit, limit)
-        return max(float(np.sqrt(held @ held / len(held))), SMALL) if limit > 0.0 else 1.0
+        return max(float(np.sqrt(held @ held / len(held))), self.finest) if limit > 0.0 else 1.0
 
 
 def whitened(X: Array, y: Array, ar: Array) -> tuple[Array, Array]:
