@@ -20,7 +20,7 @@ def correct(s: State, l: int) -> None:
     s.y_hat[l] = prediction(s, l)
     s.e[l] = s.y[l] - s.y_hat[l]
     s.s[l] = np.nan  # no variance of the innovation
-    power = 1e-12
+    power = 1e-300  # no division by zero
     for i in range(s.theta.shape[0]):
         power += s.phi[i, l] * s.phi[i, l]
     step = s.ok[l] * s.gain[l] * np.sign(s.e[l]) / np.sqrt(power)

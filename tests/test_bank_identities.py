@@ -9,7 +9,7 @@ from numba import njit
 from scipy import integrate, special, stats
 from test_bank import P3, PROBS, N, Q, R, changes, record, reported, state
 
-from driftfit import Bank, Regression, track
+from driftfit import ARX, Bank, Regression, track
 from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S
 from driftfit.trackers.bank.reducing import lookahead, merge
@@ -63,6 +63,27 @@ def test_evidence_with_unknown_noise_knows_no_scale():
     other = track(Regression(N), bank, a * Y, U)
     np.testing.assert_allclose(other.theta, a * one.theta, atol=1e-10 * a)
     np.testing.assert_allclose(reported(other, "evidence"), reported(one, "evidence") - math.log(a), atol=1e-10)
+
+
+def test_lags_that_leaves_keep_know_no_scale_either():
+    """The spread of the lags of merged leaves, squares of the output, was added to variances in units of the noise."""
+    sensors = [Sensor.nominal(), Sensor.outlier(5.0, "additive", prob=0.03)]
+    rng = np.random.default_rng(3)
+    u, y = rng.standard_normal(200), np.zeros(200)
+    for t in range(1, 200):
+        y[t] = 0.6 * y[t - 1] + u[t - 1] * (0.5 if t < 100 else 1.0) + 0.1 * rng.standard_normal()
+    y[rng.random(200) < 0.03] += 3.0
+
+    def run(a):
+        unit = np.array([1.0, a]) / (0.1 * a)
+        bank = Bank([Change(0.0), Change(0.25 * unit**2, prob=0.01)], sensors, p0=unit**2)
+        return track(ARX(1, 1), bank, a * y, u)
+
+    one = run(1.0)
+    for a in (1e6, 1e-6):
+        other = run(a)
+        np.testing.assert_allclose(other.theta, one.theta * [1.0, a], rtol=1e-7, atol=1e-9 * a)
+        assert other.loglik + np.isfinite(other.log_density).sum() * math.log(a) == pytest.approx(one.loglik, abs=1e-7)
 
 
 def test_scale_with_known_noise():

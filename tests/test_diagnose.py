@@ -26,6 +26,15 @@ def test_a_true_model_has_no_faults():
     assert "All diagnostics are within their limits." in str(diagnosis)
 
 
+def test_exact_predictions_are_diagnosed_without_a_warning():
+    u = np.random.default_rng(0).normal(size=(200, 1))
+    run = track(Regression(1), Kalman(q=0.0, r=0.01, p0=1.0, theta0=2.0), 2.0 * u[:, 0], u)
+    assert (run.innovation[run.ok] == 0.0).all()
+    diagnosis = run.diagnose()
+    assert diagnosis["noise level"].value == 0.0
+    assert np.isnan(diagnosis["steady noise"].value)
+
+
 def test_numbers_are_what_plain_numpy_gives():
     y, u = arx_record(600, 3)
     _, diagnosis = faults(TRUE, y, u)

@@ -5,6 +5,7 @@ import os
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import polars as pl
 import pytest
 from rich.progress import Progress
@@ -150,7 +151,7 @@ def test_diagnoses_are_counted(fleet):
     assert "whiteness (p)" in health.table.columns
     printed = rows_of(health)
     for name, count in health.counts.items():
-        assert [*name.split(), str(count), "7"] in printed
+        assert [*name.split(), str(count), str(health.computed[name])] in printed
     for key in fleet:
         wrong = [check.name for check in health[key].checks if not check.ok]
         assert (f"{key} {', '.join(wrong)}".split() in printed) == bool(wrong)
@@ -166,6 +167,28 @@ def test_page_of_a_fleet(fleet, tmp_path):
     assert "<h3>&lt;6&gt;" not in text  # pictures only of those that move
     with pytest.raises(ValueError, match=r"\.html"):
         fleet.report(tmp_path / "fleet.txt")
+
+
+def test_a_page_counts_what_was_left_out_and_what_cannot_be_computed(tmp_path):
+    """Rows without a unit or at a repeated time, readings outside their limits, and a series without an output."""
+    rng = np.random.default_rng(4)
+    u = rng.normal(size=200)
+    hours = pd.date_range("2024-10-26 12:00", periods=200, freq="h", tz="Europe/Berlin")
+    parts = [pd.DataFrame({"unit": k, "at": hours, "y": 2.0 * u + 0.1 * rng.normal(size=200), "u": u}) for k in "ab"]
+    parts[0].loc[7, "y"] = 9999.0
+    parts[1]["y"] = np.nan
+    table = pd.concat([*parts, parts[0].head(3), parts[0].head(2).assign(unit=None)])
+    fleet = track(Regression(1), K, "y", "u", data=table, time="at", by="unit", dt="1h", limits={"y": (-50, 50)})
+    assert fleet.dropped == {"without a unit": 2, "at a repeated time": 3}
+    health = fleet.diagnose()
+    assert health.known == ("a",)
+    assert set(health.computed.values()) <= {0, 1}
+    fleet.report(tmp_path / "fleet.html")
+    page = (tmp_path / "fleet.html").read_text()
+    assert "<dd>2 without a unit, 3 at a repeated time</dd>" in page
+    assert "<dd>1 of y outside its limits</dd>" in page
+    out = sum(not health[key].ok for key in fleet)
+    assert (f"{out} of 1 have diagnostics out of bounds" if out else "within limits") in page
 
 
 def test_outputs_of_one_record(tmp_path):

@@ -372,3 +372,13 @@ def test_names_of_columns_with_blanks_around_them_or_quotes_are_found(tmp_path):
     options = {"model": ARX(1, 1), "tracker": Kalman(q=1e-3, r=0.1), "data": str(tmp_path / "a.csv")}
     found = [track(y="lev", u=name, **options).theta for name in ("flow", 'the "old" flow')]
     assert np.array_equal(*found)
+
+
+def test_days_are_keys_of_saved_fleets(tmp_path):
+    days = [date(2024, 1, 2)] * 20 + [date(2023, 1, 1)] * 20
+    rows = pl.DataFrame({"day": days, "flow": np.arange(40.0), "u": np.ones(40)})
+    fleet = track(ARX(1, 1), Kalman(q=1e-3, r=0.1), "flow", "u", data=rows, by="day")
+    fleet.save(tmp_path / "fleet")
+    again = Fleet.load(tmp_path / "fleet")
+    assert list(again) == list(fleet) == [date(2024, 1, 2), date(2023, 1, 1)]
+    np.testing.assert_array_equal(again[date(2023, 1, 1)].theta, fleet[date(2023, 1, 1)].theta)

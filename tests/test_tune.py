@@ -1,15 +1,36 @@
 """Tuning: the right numbers on simulated truths, units that do not matter, bounds that are reported, bad input."""
 
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
 import numpy as np
 import pytest
 from support import arx_record
 
-from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Regression, frontier, track, tune
+from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Regression, Tracker, frontier, track, tune
 from driftfit.models.regression import Regression as Base
 from driftfit.systems.drift import RandomWalk, paths
 from driftfit.systems.time_varying import EXAMPLES, example
 from driftfit.tune.parametrisation import Knobs
 from driftfit.tune.search import Counted, Search
+
+
+@dataclass(frozen=True)
+class Own(Tracker):
+    """A tracker of a user, which always has a prior."""
+
+    q: Any = None
+    r: float | None = None
+    p0: float = 1.0
+
+    required: ClassVar[tuple[str, ...]] = ("q", "r")
+
+    def state(self, n):
+        return Kalman(self.q, self.r, p0=1.0).state(n) | {"P": np.asarray(self.p0, float) * np.eye(n)}
+
+    @property
+    def steps(self):
+        return Kalman(self.q, self.r, p0=1.0).steps
 
 
 def walks(seed, std=(0.1, 0.1), noise=0.5, T=200):
@@ -38,6 +59,17 @@ def test_ml_is_consistent_and_its_intervals_cover():
     assert long.tracker.mu == pytest.approx(25.0, rel=0.1)
     low, high = long.interval["mu"]
     assert low < 25.0 < high < 1.3 * low
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_a_tracker_of_ones_own_is_tuned_in_any_unit_of_y(unit):
+    """Without a diffuse start the variance of reference was 1, whatever the unit."""
+    y, u = walks(0)
+    expected = tune(Regression(2), Kalman(p0=unit**2), y * unit, u)
+    found = tune(Regression(2), Own(p0=unit**2), y * unit, u)
+    np.testing.assert_allclose(found.tracker.q, expected.tracker.q, rtol=1e-3)
+    assert found.tracker.r == pytest.approx(0.25 * unit**2, rel=0.3)
+    assert found.loglik == pytest.approx(expected.loglik, abs=1e-6)
 
 
 def test_drift_of_each_parameter_and_zero():

@@ -69,7 +69,7 @@ class Judged(keyed_results.KeyedResults, Exported):
 
         ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a separate section.
         """
-        text = page_of_many(self._rows(), title, self.failed, alarms, labels)
+        text = page_of_many(self._rows(), title, self.failed, self.dropped, alarms, labels)
         check_path(path).write_text(text, encoding="utf-8")
 
     def crossing(

@@ -24,7 +24,7 @@ import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields as dataclass_fields
-from datetime import datetime, timedelta
+from datetime import date, datetime, timedelta
 from importlib import import_module
 from io import BytesIO
 from os import PathLike
@@ -203,9 +203,11 @@ class Kept(ABC):
 
 
 def _encode(value: Any) -> Any:
-    """Encode values that JSON does not support: times and intervals."""
+    """Encode values that JSON does not support: times, days and intervals."""
     if isinstance(value, datetime):
         return {"datetime": value.isoformat()}
+    if isinstance(value, date):
+        return {"date": value.isoformat()}
     if isinstance(value, timedelta):
         return {"seconds": value.total_seconds()}
     if isinstance(value, np.datetime64 | np.timedelta64):
@@ -218,6 +220,8 @@ def _encode(value: Any) -> Any:
 def _decode(value: dict[str, Any]) -> Any:
     if value.keys() == {"datetime"}:
         return datetime.fromisoformat(value["datetime"])
+    if value.keys() == {"date"}:
+        return date.fromisoformat(value["date"])
     if value.keys() == {"seconds"}:
         return timedelta(seconds=value["seconds"])
     if value.keys() == {"numpy"}:

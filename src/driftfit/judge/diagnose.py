@@ -220,7 +220,8 @@ def _level(z: Array, white: Whiteness, robust: bool) -> tuple[Check, Check]:
         f"The one-step error is {what}: its squares are {level:.2f} of their variance. tune() estimates the settings."
     )
     levels = np.array([core(part) for part in np.array_split(z, PARTS)])
-    ratio = float(np.nanmax(levels) / np.nanmin(levels)) if np.isfinite(levels).any() else float("nan")
+    with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 where all predictions are exact
+        ratio = float(np.nanmax(levels) / np.nanmin(levels)) if np.isfinite(levels).any() else float("nan")
     wide = 3.0 * np.exp(2.0 * slack * np.sqrt(PARTS) / 2.0) if count else 3.0
     changing = (
         f"The noise is not constant: its variance changes {ratio:.1f}-fold over the record. Bands are too narrow where "

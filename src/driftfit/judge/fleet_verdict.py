@@ -208,6 +208,19 @@ class ManyDiagnoses(Printed):
         return {name: sum(not c.ok for one in self.of.values() for c in one.checks if c.name == name) for name in names}
 
     @property
+    def computed(self) -> dict[str, int]:
+        """For how many runs each number can be computed."""
+        return {
+            name: sum(np.isfinite(c.value) for one in self.of.values() for c in one.checks if c.name == name)
+            for name in self.counts
+        }
+
+    @property
+    def known(self) -> tuple[Hashable, ...]:
+        """Keys of the runs for which some number can be computed."""
+        return tuple(key for key, one in self.of.items() if any(np.isfinite(c.value) for c in one.checks))
+
+    @property
     def worst(self) -> tuple[Hashable, ...]:
         """Keys of the runs; those with the most numbers out of bounds come first."""
         return tuple(sorted(self.of, key=lambda key: -len(self.of[key].sentences)))
@@ -223,8 +236,9 @@ class ManyDiagnoses(Printed):
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         table = table_of("Out of bounds", "", "runs", "of")
+        computed = self.computed
         for name, count in self.counts.items():
-            table.add_row(name, str(count), str(len(self.of)))
+            table.add_row(name, str(count), str(computed[name]))
         yield table
         table = table_of("The worst first", "", "what is out of bounds", names=2)
         for key in [key for key in self.worst if not self.of[key].ok][:SHOWN]:

@@ -6,18 +6,17 @@ clearly, and how often each diagnostic is out of bounds. It has the style of `dr
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Hashable, Mapping
 from html import escape
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from driftfit.engine import __version__
 from driftfit.judge.fleet_verdict import Judgement, ManyDiagnoses, ManyVerdicts, verdicts_and_diagnoses
 from driftfit.judge.verdict import LEVEL, p_text
 from driftfit.show.page_parts import document, picture, section, table
 from driftfit.show.page_style import READING
-from driftfit.show.parts.text import key_text
+from driftfit.show.parts.text import counts, key_text
 from driftfit.show.report import PARAMETERS, parameter_figure
 from driftfit.show.report_faults import many_faults
 
@@ -33,6 +32,8 @@ PICTURED = 4
 NAMED = 4
 """Fewer runs, or models, than this are listed by name instead of counted."""
 
+HEADS = ("check", "series", "of")
+
 MANY = """<p>Each row was tested separately. Among many tests some reject by chance: q is the share of false rejections
 among all series with a q this small or smaller (false discovery rate).</p>"""
 
@@ -41,10 +42,13 @@ def page_of_many(
     runs: Mapping[Hashable, Track],
     title: str | None,
     failed: Mapping[Hashable, str],
+    dropped: Mapping[str, int],
     alarms: ManyAlarms | None = None,
     labels: Mapping[Hashable, Array] | None = None,
 ) -> str:
-    """The page as HTML text; ``failed`` gives the reasons of missing results; ``labels`` by key are true for faults."""
+    """The page as HTML text; ``failed`` gives the reasons of missing results and ``dropped`` counts the rows that are
+    left out, by reason; ``labels`` by key are true for faults.
+    """
     if not runs:
         raise ValueError("report: no series has a result to report.")
     verdicts, health = verdicts_and_diagnoses(runs, LEVEL)
@@ -65,7 +69,7 @@ def page_of_many(
                 "".join(_pictured(row, runs[row.key]) for row in shown),
             ),
             section("Diagnostics", _health(health)),
-            section("Settings and omitted data", _settings(runs, failed)),
+            section("Settings and omitted data", _settings(runs, failed, dropped)),
             section("How to read this", MANY + READING),
         ],
     )
@@ -73,8 +77,9 @@ def page_of_many(
 
 def _verdict(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
     out = sum(not one.ok for one in health.of.values())
-    state = f"{out} of {len(health)} have diagnostics out of bounds." if out else "All diagnostics are within limits."
-    if not any(np.isfinite(check.value) for one in health.of.values() for check in one.checks):
+    known = len(health.known)
+    state = f"{out} of {known} have diagnostics out of bounds." if out else "All diagnostics are within limits."
+    if known == 0:
         state = "No diagnostic can be computed."
     lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*verdicts.sentences, state))
     return f'<div class="verdict">{lines}</div>'
@@ -86,7 +91,7 @@ def _rows(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
         out = len(health[row.key].sentences)
         numbers = (escape(p_text(row.verdict.p)), escape(p_text(row.q)))
         errors = (f"{row.verdict.rms:.4g}", f"{row.verdict.rivals[1].rms:.4g}", "yes" if row.pays else "")
-        marked = f'<span class="bad">{out}</span>' if out else "0"
+        marked = f'<span class="bad">{out}</span>' if out else "0" if row.key in health.known else ""
         rows.append((escape(key_text(row.key)), escape(row.change), *numbers, *errors, marked))
     heads = ("", "what moves", "p", "q", "error", "of constants", "pays", "out of bounds")
     more = f" The first {LISTED} of {len(verdicts)}." if len(verdicts) > LISTED else ""
@@ -100,17 +105,17 @@ def _pictured(row: Judgement, run: Track) -> str:
 
 
 def _health(health: ManyDiagnoses) -> str:
-    counts = table(
-        "How many are out of bounds.", ("check", "series"), [(name, str(k)) for name, k in health.counts.items()]
-    )
+    computed = health.computed
+    out = [(name, str(k), str(computed[name])) for name, k in health.counts.items()]
+    counted = table("How many are out of bounds, of those for which the check can be computed.", HEADS, out)
     worst = [key for key in health.worst[:PICTURED] if not health[key].ok]
     text = "".join(
         f"<li><b>{escape(key_text(key))}</b>: {escape(' '.join(health[key].sentences))}</li>" for key in worst
     )
-    return counts + (f"<ul>{text}</ul>" if text else "")
+    return counted + (f"<ul>{text}</ul>" if text else "")
 
 
-def _settings(runs: Mapping[Hashable, Track], failed: Mapping[Hashable, str]) -> str:
+def _settings(runs: Mapping[Hashable, Track], failed: Mapping[Hashable, str], dropped: Mapping[str, int]) -> str:
     trackers = list(dict.fromkeys(repr(run.tracker) for run in runs.values()))
     models = list(dict.fromkeys(repr(run.model) for run in runs.values()))
     pairs = [
@@ -120,6 +125,8 @@ def _settings(runs: Mapping[Hashable, Track], failed: Mapping[Hashable, str]) ->
             "Without a result",
             "; ".join(f"{key_text(key)}: {reason}" for key, reason in list(failed.items())[:20]) or "none",
         ),
+        ("Rows left out", counts(dropped) or "none"),
+        ("Taken as missing", counts(sum((Counter(run.labels.missing) for run in runs.values()), Counter())) or "none"),
         ("Made by", f"driftfit {__version__}"),
     ]
     return f"<dl>{''.join(f'<dt>{escape(name)}</dt><dd>{escape(value)}</dd>' for name, value in pairs)}</dl>"

@@ -129,9 +129,9 @@ def constant(task: Task, tracker: Any) -> Tracker:
         return replace(tracker, mu=1e300)  # type: ignore[no-any-return]
     if "mu" in tracker.required:
         return replace(tracker, mu=(np.inf,) * n, p0=None)  # type: ignore[no-any-return]
-    if len(tracker.names_for(task.model)) == n:
-        return replace(tracker, q=(0.0,) * n, r=1.0, p0=None)  # type: ignore[no-any-return]
-    return Kalman(q=(0.0,) * n, r=1.0)
+    if isinstance(tracker, Kalman) and len(tracker.names_for(task.model)) == n:
+        return replace(tracker, q=(0.0,) * n, r=1.0, p0=None)
+    return Kalman(q=(0.0,) * n, r=1.0)  # other trackers need not know the diffuse start
 
 
 def _range(task: Task, tracker: Tracker, bounds: Bounds, p: int) -> tuple[Array, Array]:

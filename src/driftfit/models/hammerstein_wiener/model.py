@@ -50,14 +50,15 @@ from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.evaluate_bases import DIGITS
 from driftfit.models.hammerstein_wiener.products import Structure
-from driftfit.models.hammerstein_wiener.regressor_rows import FLOOR
 from driftfit.models.hammerstein_wiener.run_time_orders import RunTimeOrders
 from driftfit.models.hammerstein_wiener.step_memory import memory, places_of
 from driftfit.models.hammerstein_wiener.steps import applying, build
 
 IDENTITY = Polynomial(1)
 FLATTEST = 1e-3
-"""Smallest slope of the output block that the likelihood accepts."""
+"""Smallest slope of the output block that the likelihood accepts, as a share of the slope of its functions."""
+FLOOR = 1e-4
+"""Smallest variance that measurement noise adds to the equation, as a share of the squared height of the functions."""
 UNIT = 10.0
 """Root mean square beyond which, or below whose inverse, data are far from unit size for raw powers."""
 
@@ -97,7 +98,8 @@ class HammersteinWiener(Model):
         Add one constant; those of the two blocks cannot be distinguished.
     output_noise : number, one for each output, or None
         Standard deviation of white noise on y. The noise variance of the equation then is r times
-        sigma^2 sum_{i=0..na} a_i^2 F'(y_{t-i})^2 + 1e-4, from the estimates before each sample; use r = 1.
+        sigma^2 sum_{i=0..na} a_i^2 F'(y_{t-i})^2, plus 1e-4 of the squared height of the output block's
+        functions since the slope of a curve may be 0, from the estimates before each sample; use r = 1.
     name : str, tuple of str or None
         Name of the input, or of each.
     ny : int or names
@@ -324,14 +326,14 @@ class HammersteinWiener(Model):
         return found
 
     def log_jacobian(self, theta: Array, y: Array) -> Array:
-        """log max(F'(y_t; d_t), 1e-3) with the estimate after the sample: the factor that converts the density of z
-        into that of y.
+        """log max(F'(y_t; d_t), f) with the estimate after the sample, the factor that converts the density of z into
+        that of y; f is 1e-3 of the slope of the functions.
 
         The integral of a function linear in d over the posterior is its value at the posterior mean, so the density of
         y integrates to 1 with the estimate after the sample, and to more with the one before.
         """
         with np.errstate(invalid="ignore"):
-            found: Array = np.log(np.maximum(self.slope(theta, y), FLATTEST))
+            found: Array = np.log(np.maximum(self.slope(theta, y), _flattest(self)))
         return found
 
     def noise_response(self, theta: Array, h: int) -> Array:
@@ -343,16 +345,16 @@ class HammersteinWiener(Model):
         return response
 
     def output_slope(self, theta: Array, y: Array) -> Array:
-        """F'(y), at least 1e-3: an equation error moves y by its reciprocal."""
-        found: Array = np.maximum(self.slope(theta, y), FLATTEST)
+        """F'(y), at least 1e-3 of the slope of the functions: an equation error moves y by its reciprocal."""
+        found: Array = np.maximum(self.slope(theta, y), _flattest(self))
         return found
 
     def noise_factor(self, theta: Array, y: Array) -> float:
-        """1, or sigma^2 (1 + sum_i a_i^2) F'(y)^2 + 1e-4 under ``output_noise``."""
+        """1, or sigma^2 (1 + sum_i a_i^2) F'(y)^2 + floor under ``output_noise``."""
         if self.output_noise is None:
             return 1.0
         energy = 1.0 + float(np.sum(theta[: self.na] ** 2))
-        return float((self.output_noise * self.slope(theta, y)) ** 2 * energy + FLOOR)
+        return float((self.output_noise * self.slope(theta, y)) ** 2 * energy + _least_noise(self))
 
     def follows(self, other: Model) -> bool:
         return isinstance(other, HammersteinWiener) and replace(self, name=None) == replace(other, name=None)
@@ -390,6 +392,17 @@ class HammersteinWiener(Model):
 
 
 @lru_cache
+def _flattest(model: HammersteinWiener) -> float:
+    return FLATTEST * model.out.steepness
+
+
+@lru_cache
+def _least_noise(model: HammersteinWiener) -> float:
+    """The slope of the identity is 1, so that it needs no floor."""
+    return 0.0 if model.linear else FLOOR * model.out.height**2
+
+
+@lru_cache
 def _places(model: HammersteinWiener) -> tuple[int, ...]:
     into = tuple(basis.parameters for basis in model.bases)
     adaptive = tuple(basis.adaptive for basis in model.bases)
@@ -400,7 +413,9 @@ def _places(model: HammersteinWiener) -> tuple[int, ...]:
 def _memory(model: HammersteinWiener) -> Array:
     into = tuple(basis.parameters for basis in model.bases)
     sigma = model.output_noise[0] if several(model.output_noise) else model.output_noise
-    return memory(model.structure, model.delays, into, model.out.parameters, model.out.limits, sigma)
+    return memory(
+        model.structure, model.delays, into, model.out.parameters, model.out.limits, sigma, _least_noise(model)
+    )
 
 
 @lru_cache

@@ -18,6 +18,7 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     G_PAST,
     H_PAST,
     INPUTS,
+    LEAST,
     N_OUT,
     NA,
     NB,
@@ -32,9 +33,6 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     N,
     Places,
 )
-
-FLOOR = 1e-4
-"""Smallest variance of the equation error under measurement noise."""
 
 
 @part
@@ -99,7 +97,7 @@ def noise_factor(m: Array, p: Places, theta: Array) -> float:
             slope += m[d + k, 0] * m[p[H_PAST] + i * n_out + k, 0]
         weight = 1.0 if i == 0 else theta[i - 1, 0]
         total += weight * weight * slope * slope
-    factor = m[VARIANCE, 0] * total + FLOOR
+    factor = m[VARIANCE, 0] * total + m[LEAST, 0]
     return factor if factor < LARGEST else 1.0
 
 

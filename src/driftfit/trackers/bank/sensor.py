@@ -159,7 +159,7 @@ class Sensor(Settings):
         cleans : bool
             Whether ``clean`` takes the place of y in the leaf's output lags.
 
-        Cost: one call of the function per leaf and sample; about a minute of compiling on each computer. Saved runs
+        Cost: one call of the function per leaf and sample; some three seconds of compiling, once. Saved runs
         keep the function's name, and import it again.
         """
         scale = numbers("Sensor.own", "scale", scale, ndim=0, low=0.0, strict=True)

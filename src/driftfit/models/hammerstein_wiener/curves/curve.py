@@ -103,6 +103,23 @@ class Basis(Settings, ABC):
         return np.asarray(high - low)
 
     @property
+    def height(self) -> float:
+        """The largest change of a function between the inputs of `rise_between`.
+
+        1 for raw powers, 1.5 for Legendre polynomials on a range around 0, and of the unit of x for straight pieces; 1
+        where it is not a positive number, as for `Functions` that are not defined at 0.
+        """
+        with np.errstate(invalid="ignore"):
+            height = float(np.max(np.abs(self.rise)))
+        return height if 0.0 < height < np.inf else 1.0
+
+    @property
+    def steepness(self) -> float:
+        """The height as a mean slope: thresholds for slopes are shares of it, so that no unit of x matters."""
+        low, high = self.rise_between
+        return self.height / (high - low)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the functions, in the order of the coefficients."""
         return tuple(f"f{k + 1}" for k in range(self.n))

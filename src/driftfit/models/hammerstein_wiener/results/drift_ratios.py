@@ -56,7 +56,8 @@ def track_ratios(
     model : HammersteinWiener
     y, u : (T,)
     rhos : numbers
-        Ratios q / r.
+        Ratios q / r, of the unit of the squared estimates over that of the squared equation error: the default is for
+        data of unit size, or for bases on ranges, whose values are of unit size.
     fade : number
         Weight of a sample's likelihood one sample later; below 1.
     p0, theta0

@@ -3,7 +3,7 @@
     state       [w_t .. w_{t-na+1}, xi_t],   xi = (a, b, c_2 .., d_2 ..) a random walk of covariance q
     predict     w_t = -a'[w_{t-1} .. w_{t-na}] + sum_j b_j v_{t-nk-j+1} (- l) + N(0, q_w), v and b of every input
                 row of the transition: -a | -w_{t-i} | v_{t-nk-j+1} | sum_j b_j f_k(u) | 0 | (-1), then the shifts
-    measure     y_t = F^-1(w_t; d) + n_t,  n ~ N(0, r);   F' = max(F'(y_hat), 0.05)
+    measure     y_t = F^-1(w_t; d) + n_t,  n ~ N(0, r);   F' = F'(y_hat), at least 0.05 of the slope of the functions
                 row of the measurement: 1 / F' for w_t, -g_k(y_hat) / F' for d_k
 
 Measurement noise of y biases every method that has y among its regressors; here it appears in the measurement only. A
@@ -33,6 +33,8 @@ from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.step_memory import PREDICTED
 from driftfit.models.hammerstein_wiener.trackers.minimal import Minimal, minimal_memory, structure_of
 from driftfit.models.hammerstein_wiener.trackers.output_error_steps import (
+    FLATTEST,
+    LEAST_SLOPE,
     OBSERVED,
     OK,
     P_W,
@@ -127,7 +129,9 @@ class OutputError(Minimal):
         n_w = max(structure.na, 1)
         N = n_w + structure.n_x
         own = np.zeros(V_POWER + model.m)
-        own[[R, Q_W, P_W]] = self.r, self.q_w, self.p_w
+        assert isinstance(model, HammersteinWiener)
+        least = FLATTEST * model.out.steepness
+        own[[R, Q_W, P_W, LEAST_SLOPE]] = self.r, self.q_w, self.p_w, least
         S = np.zeros((N, N))
         S[n_w:, n_w:] = matrix("OutputError", "p0", self.p0, structure.n_x)
         return {

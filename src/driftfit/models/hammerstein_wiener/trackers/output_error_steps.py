@@ -48,7 +48,7 @@ from driftfit.models.hammerstein_wiener.step_memory import (
 from driftfit.trackers.parts.covariance import LEFT
 
 FLATTEST = 0.05
-"""Least slope of F that the filter divides by."""
+"""Least slope of F that the filter divides by, as a share of the slope of its functions."""
 REACH = 3.0
 """w is limited to this many times the largest w of the observed outputs."""
 TINY = 1e-300
@@ -61,9 +61,9 @@ SHARE, LARGE = 0.01, 25.0
 that a fault code cannot become the scale.
 """
 
-TIME, R, Q_W, P_W, BEGUN, VALID, OBSERVED, OK, E, S2, R_NOW, SLOPE, V_POWER = range(13)
+TIME, R, Q_W, P_W, BEGUN, VALID, OBSERVED, OK, E, S2, R_NOW, SLOPE, LEAST_SLOPE, V_POWER = range(14)
 """Numbers of the filter: nominal intervals times the drift, variances, whether w has begun, the results, the noise
-variance and the slope of F at this sample; from V_POWER on the usual power of v of each input.
+variance and the slope of F at this sample, and its least value; from V_POWER on the usual power of v of each input.
 """
 
 AT_BLOCKS, AT_THETA, AT_PHI, AT_Q, AT_W, AT_S, AT_SCRATCH, AT_OWN, AT_P, ADDRESSES = range(10)
@@ -268,7 +268,7 @@ def _work(out: Kind) -> Any:
         used = valid and observed and m[GIVEN, 0] < np.inf
         own[VALID], own[OBSERVED], own[OK] = 1.0 if valid else 0.0, 1.0 if observed else 0.0, 1.0 if used else 0.0
         own[E] = y - y_hat if used else 0.0
-        own[R_NOW], own[SLOPE] = own[R] * m[GIVEN, 0] if used else own[R], max(slope, FLATTEST)
+        own[R_NOW], own[SLOPE] = own[R] * m[GIVEN, 0] if used else own[R], max(slope, own[LEAST_SLOPE])
         absorb(m, p, own, theta, w, S, scratch)
         m[PREDICTED, 0], m[LATE, 0] = y_hat, 0.0
         follow_power(m, p, theta, own)

@@ -9,8 +9,8 @@ coefficients of the output lags,
 
 after a prediction was stored, and a zero row for an output that was measured. This is a plug-in approximation: joint
 errors of a and the lags are neglected, and so is the information of later outputs about earlier ones. Merged leaves add
-the spread of their lags to V. A prediction that cannot be an output (`PLAUSIBLE`) is not stored; y is stored instead
-or, without y, the largest possible output.
+the spread of their lags to V. Like C, V is in units of the noise variance where that is unknown. A prediction that
+cannot be an output (`PLAUSIBLE`) is not stored; y is stored instead or, without y, the largest possible output.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.trackers.bank.layout import IN_Y, MOST, R
-from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
 
 PLAUSIBLE, VAGUE = 1e4, 1e12
 """Limits beyond which a prediction is no possible output: its square in mean squares of the outputs, and its variance
@@ -107,14 +107,15 @@ def shift_covariance(t: Any, A: Array, K: int, at: int, columns: int, own: bool)
 @shared
 def merge_covariance(t: Any, members: Array, share: Array, to: int) -> None:
     """A parent, column ``to``: the average of V plus the spread of the lags, whose mean is already stored there."""
-    B, A, n, na = t.leaves, t.parents, t.n, t.output_lags
+    B, A, n, na, unknown = t.leaves, t.parents, t.n, t.output_lags, t.unknown > 0
     first, lags = covariance_row(n, na), FIRST + n + n * (n + 1) // 2
     if first >= len(B):
         return
     for k in range(len(members)):
         l, at = members[k], first
+        pull = B[NU, l] / B[S, l] if unknown else 1.0
         for i in range(na):
-            away = B[lags + i, l] - A[lags + i, to]
+            away = pull * (B[lags + i, l] - A[lags + i, to])
             for j in range(i + 1):
                 A[at, to] += share[k] * (B[at, l] + away * (B[lags + j, l] - A[lags + j, to]))
                 at += 1
