@@ -133,7 +133,8 @@ class RLS:
         return np.mean(self.squares) if self.squares else np.nan
 
     def var(self):
-        known = np.diag(self.P) * self.scale()
+        scale, P = self.scale(), np.diag(self.P)
+        known = P * scale if np.isfinite(scale) else np.where(P > 0.0, np.inf, 0.0)  # no residual has shown the noise
         return np.where((self.free**2).sum(axis=1) > 1e-8, np.inf, known)
 
 

@@ -92,7 +92,7 @@ def run(stream, tmp_path, tracker=K, **more):
 def test_a_stream_gives_what_the_sorted_table_gives(session, tmp_path):
     """Rows out of order and twice; a batch that Spark runs again; an alarm; other settings from there on."""
     rows = rows_of(12, 3, 80)
-    reference = track(MODEL, K, *np.random.default_rng(1).normal(size=(2, 400)))
+    reference = track(MODEL, K, *np.random.default_rng(1).normal(scale=3.0, size=(2, 400)))
     rule = reference.detect("glr", every=200.0, reference=300).rule
     seen = []
     stream = stream_of(session, tmp_path / "in", arriving(rows, 3))

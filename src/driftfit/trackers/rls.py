@@ -147,7 +147,7 @@ def keep_recent(s: State, square: float, l: int) -> None:
         share = 1.0 / min(s.count[l], max(RECENT, LATER_SHARE * s.count[l]))
         mean = before + share * (min(square, LARGE * before) - before)
         s.squares[l] = s.count[l] * mean
-        s.scale[l] = s.coarse[l] if s.coarse[l] > mean else mean
+        s.scale[l] = max(mean, least_noise(s, l))
 
 
 @kernel
