@@ -41,7 +41,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps
+from driftfit.engine.drivers import ROUNDING, TrackerSteps
 from driftfit.engine.kernel import State, exp, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
@@ -139,11 +139,14 @@ def learn_variance(s: State, l: int) -> None:
 
 
 @kernel
-def keep_recent(s: State, square: float, l: int) -> None:
-    """While a start is forgotten, the noise variance is a mean over the later samples, of squares e^2 / s."""
+def keep_recent(s: State, squares: float, square: float, l: int) -> None:
+    """While a start is forgotten, the noise variance is a mean over the later samples, of e^2 / s: ``squares``, their sum before this
+    sample, and its ``square``."""
     counted = s.ok[l] * s.fresh[l] > 0.0
     if counted & (s.count[l] > 1.0) & (s.count[l] < s.unequal[l]):
-        before = (s.squares[l] - square) / (s.count[l] - 1.0)
+        before, size = squares / (s.count[l] - 1.0), abs(s.y[l]) + abs(s.y_hat[l])
+        # residuals that are rounding say nothing of the noise that follows
+        before = before if before * s.noise[l] > (ROUNDING * size) ** 2 else square
         share = 1.0 / min(s.count[l], max(RECENT, LATER_SHARE * s.count[l]))
         mean = before + share * (min(square, LARGE * before) - before)
         s.squares[l] = s.count[l] * mean
@@ -168,9 +171,9 @@ def follow_variance(s: State, l: int) -> None:
 @kernel
 def learn_settling_variance(s: State, l: int) -> None:
     """The same for a tracker that may forget its start."""
-    per_noise = s.s[l]
+    per_noise, squares = s.s[l], s.squares[l]
     learn_scale(s, l)
-    keep_recent(s, s.e[l] * s.e[l] / per_noise, l)
+    keep_recent(s, squares, s.e[l] * s.e[l] / per_noise, l)
     share_rounding(s, per_noise, l)
     follow_variance(s, l)
 
