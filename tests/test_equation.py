@@ -95,6 +95,17 @@ def test_forecasts_and_simulations_play_the_equation():
     assert ahead.y_std[0] == pytest.approx(same.y_std[0], rel=1e-9)
 
 
+def test_a_few_unstable_futures_do_not_decide_the_band_of_a_forecast():
+    rng = np.random.default_rng(1)
+    u, y = rng.normal(size=460), np.zeros(460)
+    for t in range(1, 460):
+        y[t] = 0.8 * y[t - 1] + 0.5 * u[t - 1] + 0.2 * rng.normal()
+    ahead = track(Equation("y = theta.a * y[-1] + theta.b * u[-1]"), AdaptiveKalman(), y[:400], u[:400])
+    std = ahead.forecast(60, u[400:, None]).y_std
+    assert std[0] == pytest.approx(0.2, rel=0.15)
+    assert 0.3 < std[-1] < 0.7  # 0.33 if theta were known; a mean of squares was 60
+
+
 def test_forecasts_of_equations_of_which_little_is_known():
     y, u = data(200)
     model = Equation("y = theta.g * tanh(u[-1]) + theta.a * y[-1]")

@@ -442,10 +442,10 @@ def test_http_samples_are_answered_when_they_are_in_the_journal(tmp_path):
             ("plant/a", b"{", 400, "not an object"),
             ("", b"[1, 2]", 400, "not an object"),
             ("", b"{}", 400, "no topic"),
-            ("nothing", b'{"t": 3, "y": 1}', 422, "1 no unit for the topic"),
-            ("plant/a", b'{"t": 3, "pressure": 1}', 422, "1 no signal"),
-            ("plant/a", b'{"t": [1e11, 1e12], "y": 1}', 422, "2 time in the future"),
-            ("plant/a", b'{"y": [1, 2]}', 422, "2 no time"),
+            ("nothing", b'{"t": 3, "y": 1}', 422, "no unit for the topic (1)"),
+            ("plant/a", b'{"t": 3, "pressure": 1}', 422, "no signal (1)"),
+            ("plant/a", b'{"t": [1e11, 1e12], "y": 1}', 422, "time in the future (2)"),
+            ("plant/a", b'{"y": [1, 2]}', 422, "no time (2)"),
         ):
             answer = INCOMING.offer(topic, sent)
             assert (answer["status"], reason in answer["error"]) == (status, True), answer

@@ -78,6 +78,16 @@ def test_inputs_far_from_zero_do_not_hide_which_parameter_moved(moved, offset):
     assert "theta2" not in steps
 
 
+def test_a_slope_through_zero_that_comes_back_has_its_own_values():
+    """About the mean of the input it would be steps of the level, with dates of their own."""
+    rng = np.random.default_rng(0)
+    u, t = 50.0 + rng.normal(size=1200), np.arange(1200)
+    y = 5.0 + np.where((t >= 400) & (t < 800), 3.0, 2.0) * u + 0.5 * rng.normal(size=1200)
+    slope = track(Regression(1, intercept=True), Kalman(q=0.0, r=0.25), y, u).verdict().parameters[0]
+    assert slope.moves
+    np.testing.assert_allclose([slope.before, slope.after, slope.last], [2.0, 3.0, 2.0], atol=0.05)
+
+
 @pytest.mark.parametrize("kind", ["a gain drawn at every sample", "noise that grows with the input", "bursts"])
 def test_residuals_that_grow_with_a_regressor_are_reported_and_are_no_drift(kind):
     """One distribution of y has both explanations, so the verdict names them; bursts of both in turn are neither."""

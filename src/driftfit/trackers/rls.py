@@ -140,8 +140,10 @@ def learn_variance(s: State, l: int) -> None:
 
 @kernel
 def keep_recent(s: State, squares: float, square: float, l: int) -> None:
-    """While a start is forgotten, the noise variance is a mean over the later samples, of e^2 / s: ``squares``, their sum before this
-    sample, and its ``square``."""
+    """While a start is forgotten, the noise variance is a mean of e^2 / s over the later samples.
+
+    ``squares`` is the sum before this sample, and ``square`` its own.
+    """
     counted = s.ok[l] * s.fresh[l] > 0.0
     if counted & (s.count[l] > 1.0) & (s.count[l] < s.unequal[l]):
         before, size = squares / (s.count[l] - 1.0), abs(s.y[l]) + abs(s.y_hat[l])

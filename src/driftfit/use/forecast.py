@@ -25,18 +25,21 @@ The response of equations with output lags depends on the operating point. There
 after the other, each from the distribution that the tracker predicts after it has learned from those before, p(y_1)
 p(y_2 | y_1) ..:
 
-    Var_h       = mean of s_h + (y_h - y_hat)^2 over the futures, y_h and s_h their predictions of sample h
+    y_std_h     = half-width about y_hat of the central 68 % of the mixture of N(y_h, s_h) over the futures
 
-with fixed and antithetic normal numbers. Cost: 2 DRAWS h updates.
+with y_h and s_h their predictions of sample h, and with fixed and antithetic normal numbers. A mean of squares would be
+that of the few futures with an unstable theta. Cost: 2 DRAWS h updates.
 """
 
 from __future__ import annotations
 
+import math
 from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 
 from driftfit.data.labels import inputs_for
 from driftfit.engine.drivers import one_or_all
@@ -51,6 +54,8 @@ from driftfit.run.result import Track
 from driftfit.use.delta_method import spread
 
 DRAWS = 200
+CENTRAL, BISECTIONS = math.erf(math.sqrt(0.5)), 60
+"""Share of futures within one half-width; and steps of its computation."""
 
 
 class Forecast(NamedTuple):
@@ -148,22 +153,34 @@ def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
 
 
 def _spread_of_draws(update: Any, begin: Array, inputs: Array, y_hat: Array) -> Array:
-    """Standard deviations (h,) about y_hat (h,) of futures that are drawn from the state ``begin``."""
+    """Half-widths (h,) about y_hat (h,) of the central 68 % of futures that are drawn from the state ``begin``."""
     z = np.random.default_rng(0).normal(size=(DRAWS // 2, len(inputs)))
     z, given = np.concatenate([z, -z]), [one_or_all(row) for row in inputs]
     now, look = begin.copy(), begin.copy()
     state, ahead = as_compiled(now), as_compiled(look)
-    squares = np.empty_like(z)
-    for draw, own in zip(z, squares, strict=True):
+    away, deviation = np.empty_like(z), np.empty_like(z)
+    for draw, off, std in zip(z, away, deviation, strict=True):
         now[...] = begin
         for k, u in enumerate(given):
             look[...] = now
             mean, _, s, _ = update(ahead, np.nan, u)
-            own[k] = s + (mean - y_hat[k]) ** 2
-            update(state, mean + np.sqrt(s) * draw[k], u)
-    unknown = np.maximum.accumulate(np.isinf(squares).any(axis=0))
-    spread: Array = np.where(unknown, np.inf, np.sqrt(squares.mean(axis=0)))
+            off[k], std[k] = mean - y_hat[k], np.sqrt(s)
+            update(state, mean + std[k] * draw[k], u)
+    spread: Array = np.where(np.maximum.accumulate(np.isinf(deviation).any(axis=0)), np.inf, np.nan)
+    known = np.isnan(spread) & np.isfinite(away).all(axis=0) & np.isfinite(deviation).all(axis=0)
+    spread[known] = _central(away[:, known], deviation[:, known])
     return spread
+
+
+def _central(away: Array, deviation: Array) -> Array:
+    """Half-widths (h,) about 0 that contain `CENTRAL` of the mixtures of N(away, deviation^2), (N, h)."""
+    low, high = np.zeros(away.shape[1]), np.quantile(np.abs(away) + 2.0 * deviation, 0.9, axis=0)
+    for _ in range(BISECTIONS):
+        x = 0.5 * (low + high)
+        inside = scipy.special.ndtr((x - away) / deviation) - scipy.special.ndtr((-x - away) / deviation)
+        less = inside.mean(axis=0) < CENTRAL
+        low, high = np.where(less, x, low), np.where(less, high, x)
+    return np.asarray(0.5 * (low + high))
 
 
 def _fed_back(model: Model, theta: Array, slopes: Array, covs: Array, noise: float) -> Array:

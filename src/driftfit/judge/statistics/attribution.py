@@ -13,9 +13,9 @@ the error of the first is not named. Where regressors are nearly collinear, as l
 intercept are, steps of several parameters explain the same: these are reported together. Bai and Perron (1998) estimate
 several breaks in all parameters in this sequential way; here each step belongs to one parameter.
 
-If the model has a constant, steps are those of slopes about the mean of each regressor that is far from zero, and of
-the level there: a slope through zero would need a step of the constant at the same sample. Values are those of the
-model's own parameters all the same. A constant that changes with the slope is named too.
+If the model has a constant and a regressor is far from zero, steps may also be those of slopes about its mean, and of
+the level there: a slope through zero would need a step of the constant at the same sample. The steps of smaller BIC
+count. Values are those of the model's own parameters all the same. A constant that changes with the slope is named too.
 """
 
 from __future__ import annotations
@@ -110,12 +110,22 @@ def holm(p: Array, level: float) -> Array:
 
 def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | None = None) -> Attribution:
     """Explain the changes in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags)`."""
+    own, M = _attributed(phi, y, test, np.eye(phi.shape[1]), level, lags), centring(phi)
+    if M is None:
+        return own
+    centred = _attributed(phi @ M, y, constancy(phi @ M, y, lags), M, level, lags)
+    return centred if _cost(phi @ M, y, centred) <= _cost(phi, y, own) else own
+
+
+def _cost(phi: Array, y: Array, found: Attribution) -> float:
+    """BIC of steps, each with a date and a size."""
+    scale = robust_fit(_with(phi, list(found.steps)), y).scale
+    return float(2.0 * len(y) * np.log(max(scale, 1e-300)) + 2.0 * len(found.steps) * np.log(len(y)))
+
+
+def _attributed(phi: Array, y: Array, test: Constancy, M: Array, level: float, lags: int | None) -> Attribution:
+    """The same for steps of the coefficients of phi, of which theta is M times."""
     N, n = phi.shape
-    M = centring(phi)
-    if M is not None:
-        phi = phi @ M
-        test = constancy(phi, y, lags)
-    M = np.eye(n) if M is None else M
     steps: list[Step] = []
     similar: list[tuple[int, ...]] = []
     p, now = test.p_own.copy(), test
@@ -136,6 +146,7 @@ def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | N
     named = {step.parameter for step in steps}
     p = np.array([p[i] if i in named else now.p_own[i] for i in range(n)])
     changed = M[:, [step.parameter for step in steps]] != 0.0
+    p = np.array([min([p[i], *p[[step.parameter for k, step in enumerate(steps) if changed[i, k]]]]) for i in range(n)])
     before, after, std, last = _sizes(_with(phi, steps), y, steps, M, now.noise)
     far = np.abs(after - before) > scipy.special.ndtri(1.0 - 0.5 * level) * std
     spans = tuple(_span(phi, step, steps, test.noise) for step in steps)

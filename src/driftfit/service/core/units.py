@@ -16,7 +16,7 @@ from driftfit.service.core.section import Section, Told, tally
 from driftfit.service.core.unit import Unit
 from driftfit.service.settings.config import UnitSettings
 from driftfit.service.settings.matching import valid_name
-from driftfit.service.sources.samples import Samples, numbers_of, seconds_of
+from driftfit.service.sources.samples import NO_SIGNAL, OFFERED, Samples, numbers_of, seconds_of
 
 ROUTES = 200_000
 """Topics whose units are remembered, including those that have none."""
@@ -180,9 +180,11 @@ class Units:
             units = self.of_topic(samples.topic, pending, born)
             if not units:
                 tally((self.refused, told), "no unit for the topic", samples.length)
+            if told is not None:
+                told[OFFERED] += samples.length * max(len(units), 1)
             for unit in units:
                 if not gathered[unit.streams.index].add(unit.place, samples, told):
-                    tally((unit.rare, told), "no signal", samples.length)
+                    tally((unit.rare, told), NO_SIGNAL, samples.length)
         found = []
         for section, one in zip(self.sections, gathered, strict=True):
             if one.places:

@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from driftfit.service.sources.samples import Batch, Samples, decode
+from driftfit.service.sources.samples import NO_SIGNAL, OFFERED, Batch, Samples, decode
 
 WAIT = 30.0
 """Seconds after which a request that is not yet journaled is answered with an error."""
@@ -43,12 +43,14 @@ class Incoming:
         if not done.wait(WAIT):
             return {"error": "the journal does not take samples now; try again later", "status": 503}
         received = sum(one.length for one in samples)
+        offered = left_out.pop(OFFERED, received)
         answer: dict[str, Any] = {"received": received, "refused": refused[:20], "left_out": dict(left_out)}
         if not samples:
             return answer | {"error": "; ".join(refused[:20]) or "the body has no topic.", "status": 400}
-        if left_out.total() < received or left_out.keys() <= KNOWN:
+        reasons = left_out.keys() - {NO_SIGNAL} or left_out.keys()  # a unit that does not read a signal refuses nothing
+        if left_out.total() < offered or reasons <= KNOWN:
             return answer
-        why = ", ".join(f"{count} {reason}" for reason, count in left_out.items())
+        why = ", ".join(f"{reason} ({count})" for reason, count in left_out.items())
         return answer | {"error": f"no sample was taken: {why}.", "status": 429 if "flood" in left_out else 422}
 
 

@@ -32,6 +32,9 @@ LARGEST = 4 << 20
 Cell = float | int | bool | str | None
 _DECODE = msgspec.json.Decoder(dict[str, Cell | list[Cell]] | list[dict[str, Cell]])
 
+OFFERED, NO_SIGNAL = "offered", "no signal"
+"""What a sender is told besides: samples times the units that read their topic; and why one of these took none."""
+
 
 class Samples(NamedTuple):
     """Samples of one topic."""
