@@ -426,6 +426,19 @@ def test_replay(tmp_path):
         Replay("r", str(path), time="when").check()
 
 
+def test_a_request_that_one_of_two_units_takes_is_not_refused(tmp_path):
+    from driftfit.service.sources.incoming import INCOMING
+
+    config = configured(UNIT + UNIT.replace('"y"', '"p"').replace('["u"]', '["q"]'), source=HTTP)
+    engine = opened(config, tmp_path)
+    with running(engine, SourceThread(engine, config.sources[0])):
+        answers = [
+            INCOMING.offer("plant/a", b'{"t": %d, "%s": 1}' % (t, name))
+            for t, name in ((1, b"y"), (1, b"y"), (2, b"z"))
+        ]
+    assert [answer.get("status", 200) for answer in answers] == [200, 200, 422]  # taken, sent again, of neither
+
+
 def test_http_samples_are_answered_when_they_are_in_the_journal(tmp_path):
     from driftfit.service.sources.incoming import INCOMING
 

@@ -145,8 +145,9 @@ def _attributed(phi: Array, y: Array, test: Constancy, M: Array, level: float, l
         now = later
     named = {step.parameter for step in steps}
     p = np.array([p[i] if i in named else now.p_own[i] for i in range(n)])
-    changed = M[:, [step.parameter for step in steps]] != 0.0
-    p = np.array([min([p[i], *p[[step.parameter for k, step in enumerate(steps) if changed[i, k]]]]) for i in range(n)])
+    own = np.array([step.parameter for step in steps], int)
+    changed = M[:, own] != 0.0
+    p = np.array([p[[i, *own[changed[i]]]].min() for i in range(n)])
     before, after, std, last = _sizes(_with(phi, steps), y, steps, M, now.noise)
     far = np.abs(after - before) > scipy.special.ndtri(1.0 - 0.5 * level) * std
     spans = tuple(_span(phi, step, steps, test.noise) for step in steps)

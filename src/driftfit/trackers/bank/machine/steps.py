@@ -51,7 +51,7 @@ from driftfit.trackers.parts.covariance import measurement, prediction
 from driftfit.trackers.parts.diffuse import enter, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
-from driftfit.trackers.parts.modes.noise_levels import ROUNDING
+from driftfit.trackers.parts.modes.noise_levels import LEAST_SHARE
 from driftfit.trackers.parts.resolution import lasting, least_noise, resolve
 from driftfit.trackers.rls import learn_scale
 
@@ -190,7 +190,7 @@ def hand_over(s: State, l: int) -> None:
     s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l] * repeated(s, l), s.dt[l]
     s.sample[IN_TIME, l], s.sample[SHIFT, l] = s.dt[l] * s.drift[l], s.shift[l]
     s.sample[IN_OK, l], s.sample[IN_OBSERVED, l] = s.ok[l], s.observed[l]
-    s.sample[R, l], s.sample[LEAST, l] = s.r[l], max(ROUNDING * s.power[l] + 1e-300, least_noise(s, l))
+    s.sample[R, l], s.sample[LEAST, l] = s.r[l], max(LEAST_SHARE * s.power[l] + 1e-300, least_noise(s, l))
     s.sample[ENTERS, l] = 0.0
     s.sample[MOST, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
 

@@ -36,7 +36,7 @@ IN_A_ROW, RISE = 4.0, 0.3
 MISFIT, SETTLED, EARLY = 0.5, 20.0, 140.0
 """Among the first `EARLY` samples, if the mean of e^2 / s, with a memory of `SETTLED`, is below `MISFIT`, r falls by as
 much: drift at the start was taken for noise. Later it does not, see above."""
-ROUNDING = 1e-26
+LEAST_SHARE = 1e-26
 """r is never below this share of the mean square of y, for rounding in the sums of a prediction."""
 
 
@@ -66,7 +66,7 @@ def level_chain() -> Array:
 @kernel
 def finest(s: State, l: int) -> float:
     """The lower bound of r."""
-    return max(ROUNDING * s.power[l], least_noise(s, l))  # type: ignore[no-any-return]
+    return max(LEAST_SHARE * s.power[l], least_noise(s, l))  # type: ignore[no-any-return]
 
 
 @kernel
