@@ -23,7 +23,7 @@ from numba import types
 from driftfit.engine.compile_notice import compiling
 from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
-from driftfit.engine.tiles import as_compiled, tile_type
+from driftfit.engine.tiles import as_compiled, inputs_and_lanes, tile_type
 from driftfit.engine.tracker_part import tracker_part, whole_record
 
 LARGEST = 1e38
@@ -44,6 +44,10 @@ INPUTS = types.Array(types.float64, 1, "A", readonly=True)
 
 NOWHERE = np.empty((0, 0, 0))
 """The array for theta alone, where all results are kept."""
+
+
+DOUBLE = np.dtype(np.float64)
+"""The numbers that drivers take."""
 
 
 CONTIGUOUS = 0x0001 | 0x0100
@@ -261,11 +265,15 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     run = _run(driver, sample, tracker.read_extra, _written(common, tracker.store, keep_more, part), part)
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE) -> None:
-        # nothing looks at types and bounds after this; contiguous, because every layout would be compiled separately
-        y = np.ascontiguousarray(y, dtype=np.float64)
-        u = np.ascontiguousarray(u, dtype=np.float64)
-        known = np.ascontiguousarray(known, dtype=np.float64)
-        m, L = tile.dtype["u"].shape
+        # nothing looks at types and bounds after this
+        flags = y.flags.num & u.flags.num & known.flags.num & tile.flags.num & out.flags.num & theta.flags.num
+        plain = flags & CONTIGUOUS == CONTIGUOUS
+        if not (plain and y.dtype is u.dtype is known.dtype is DOUBLE):
+            # contiguous, because every layout would be compiled separately
+            y = np.ascontiguousarray(y, dtype=np.float64)
+            u = np.ascontiguousarray(u, dtype=np.float64)
+            known = np.ascontiguousarray(known, dtype=np.float64)
+        m, L = inputs_and_lanes(tile.dtype)
         if theta is NOWHERE:
             _check_shapes(m, L, len(out), y, u, known)
         else:
@@ -274,8 +282,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
                 raise ValueError(f"run: out must have one row beside theta, which has shape {theta.shape}.")
         ready(L)
         given = as_compiled(tile), y, u, known, out, theta
-        flags = y.flags.num & u.flags.num & known.flags.num & tile.flags.num & out.flags.num & theta.flags.num
-        if flags & CONTIGUOUS == CONTIGUOUS:
+        if plain:
             run.of_kind((tile.dtype, out.dtype), given)
         else:
             run(*given)

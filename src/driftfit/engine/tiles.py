@@ -69,7 +69,7 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
     tracked = [field for field in fields if field[0] in own]
     others = [field for field in fields if field[0] not in own]
     fields = [*tracked, _padding(BOUNDARY, tracked, L), *others]
-    tile = _aligned(_followed_by(np.dtype([*fields, _padding("padding", fields, L)], align=True), opened), 1)
+    tile = _aligned(_one_of(_followed_by(np.dtype([*fields, _padding("padding", fields, L)], align=True), opened)), 1)
     for l, start in enumerate(starts):
         for name, value in start.items():
             tile[name][0, ..., l] = value
@@ -87,6 +87,12 @@ def _padding(name: str, fields: Sequence[Any], L: int) -> tuple[str, type, tuple
     return name, np.float64, (8 - words % 8, L)
 
 
+@lru_cache(maxsize=256)
+def _one_of(record: np.dtype[Any]) -> np.dtype[Any]:
+    """The same object for all equal records: caches compare it by identity, and otherwise field by field for 3 us."""
+    return record
+
+
 def _followed_by(dtype: np.dtype[Any], fields: Sequence[Any]) -> np.dtype[Any]:
     """A record type with further fields of numbers behind it, in whole cache lines."""
     names, offsets, end = list(dtype.names or ()), [at for _, at, *_ in (dtype.fields or {}).values()], dtype.itemsize
@@ -98,6 +104,13 @@ def _followed_by(dtype: np.dtype[Any], fields: Sequence[Any]) -> np.dtype[Any]:
         end += 8 * math.prod(shape)
     size = -(-end // 64) * 64
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size}, align=True)
+
+
+@lru_cache(maxsize=256)
+def inputs_and_lanes(tile: np.dtype[Any]) -> tuple[int, int]:
+    """(number of inputs, number of lanes) of a record."""
+    m, L = tile["u"].shape
+    return m, L
 
 
 def as_compiled(tile: Array) -> Array:

@@ -269,9 +269,12 @@ class Program:
 
 @lru_cache(maxsize=256)
 def _driven(tile: np.dtype[Any], outputs: tuple[str, ...], out: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:
-    """(what the driver of a tile keeps, the record that it writes), for results of which ``out`` is kept."""
+    """(what the driver of a tile keeps, the record that it writes: ``out`` itself if it is equal), for results of which
+    ``out`` is kept.
+    """
     keep = "cov" if kept(out)[0] == "cov" else "std"
-    return keep, output_record(tile, outputs, keep)
+    rows = output_record(tile, outputs, keep)
+    return keep, out if out == rows else rows
 
 
 def _copy(results: Array, out: Array) -> None:
