@@ -181,6 +181,8 @@ def test_files_are_whole_or_not_used_and_are_pruned(own_cache):
     assert Driver(second)(np.ones((2, 2))) == 1.0
     assert disk_cache.read(path.name) is not None
     (own_cache / f"second-00000000-{'0' * 40}.compiled").write_bytes(b"of another version")
+    # listed, but gone when it is looked at, as if another process had just finished it
+    (own_cache / f"{path.name}.1.tmp").symlink_to(own_cache / "absent")
     found = disk_cache.contents()
     assert (found.files, found.usable) == (2, 1)
     assert disk_cache.prune(30.0) == 1

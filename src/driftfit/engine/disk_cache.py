@@ -22,6 +22,7 @@ import platform
 import tempfile
 import time
 import warnings
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -150,15 +151,14 @@ class Contents(NamedTuple):
 
 def contents() -> Contents:
     """What is kept on disk."""
-    files = [(path, path.stat()) for path in _files()]
-    usable = sum(_mine(path) for path, _ in files)
-    return Contents(_place(), len(files), sum(stat.st_size for _, stat in files), usable)
+    files = _files()
+    return Contents(_place(), len(files), sum(stat.st_size for stat in files.values()), sum(map(_mine, files)))
 
 
 def prune(days: float) -> int:
     """Remove code that other versions made, and code that was not used for so many days; returns how many files."""
     oldest = time.time() - 86400.0 * days
-    gone = [path for path in _files() if not _mine(path) or path.stat().st_mtime <= oldest]
+    gone = [path for path, stat in _files().items() if not _mine(path) or stat.st_mtime <= oldest]
     for path in gone:
         path.unlink(missing_ok=True)
     return len(gone)
@@ -169,9 +169,14 @@ def _place() -> Path | None:
     return folder() or next((place for place in folders() if place.is_dir()), None)
 
 
-def _files() -> list[Path]:
-    place = _place()
-    return [] if place is None else sorted(path for path in place.iterdir() if path.name.endswith((ENDING, ".tmp")))
+def _files() -> dict[Path, os.stat_result]:
+    """The files, with their sizes and times."""
+    place, found = _place(), dict[Path, os.stat_result]()
+    for path in () if place is None else place.iterdir():
+        if path.name.endswith((ENDING, ".tmp")):
+            with suppress(FileNotFoundError):  # another process has finished it meanwhile, or removed it
+                found[path] = path.stat()
+    return found
 
 
 def _mine(path: Path) -> bool:
