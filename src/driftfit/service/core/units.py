@@ -16,7 +16,7 @@ from driftfit.service.core.section import Section, Told, tally
 from driftfit.service.core.unit import Unit
 from driftfit.service.settings.config import UnitSettings
 from driftfit.service.settings.matching import valid_name
-from driftfit.service.sources.samples import NO_SIGNAL, OFFERED, Samples, numbers_of, seconds_of
+from driftfit.service.sources.samples import NO_SIGNAL, Receipt, Samples, numbers_of, seconds_of
 
 ROUTES = 200_000
 """Topics whose units are remembered, including those that have none."""
@@ -171,17 +171,17 @@ class Units:
         self.since[unit] = born
         return unit
 
-    def admitted(
-        self, messages: Iterable[tuple[Samples, Counter[str] | None]], pending: Pending, born: int
-    ) -> list[Rows]:
+    def admitted(self, messages: Iterable[tuple[Samples, Receipt | None]], pending: Pending, born: int) -> list[Rows]:
         """The samples of messages that enter the journal; those that units do not accept are counted."""
         gathered = [Gathered(one) for one in self.settings]
-        for samples, told in messages:
+        for samples, receipt in messages:
             units = self.of_topic(samples.topic, pending, born)
+            told = None
+            if receipt is not None:
+                told = receipt.left_out
+                receipt.offered += samples.length * max(len(units), 1)
             if not units:
                 tally((self.refused, told), "no unit for the topic", samples.length)
-            if told is not None:
-                told[OFFERED] += samples.length * max(len(units), 1)
             for unit in units:
                 if not gathered[unit.streams.index].add(unit.place, samples, told):
                     tally((unit.rare, told), NO_SIGNAL, samples.length)
