@@ -28,7 +28,7 @@ from driftfit.judge.alarms.onsets import (
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
 from driftfit.judge.regressors import refuse_hidden
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.live.likelihood_ratio import CUSUM, memory_of, scan
+from driftfit.run.live.likelihood_ratio import CUSUM, INTERVAL, NOISE_FACTOR, OK, Y, memory_of, scan
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
@@ -53,7 +53,7 @@ def rule_of(
 
 
 def samples_of(run: Track) -> Samples:
-    """Regressors (T, n) of a run, and (T, 4): y, ok, noise, dt, as the tracker receives them."""
+    """Regressors (T, n) of a run, and (T, 4): the columns of `ROW`, as the tracker receives them."""
     steps = run.program.steps._replace(store=collect)
     tile = run.fresh()
     out = np.empty(len(run), output_type(tile, COLLECTED))
@@ -78,7 +78,7 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
         )
     refuse_hidden(f'detect "{rule.kind}"', run.model, 'kind="innovation" or "band"')
     samples = samples_of(run)
-    n, usable = samples[0].shape[1], (samples[1][:, 1] > 0.0) & (samples[1][:, 3] > 0.0)
+    n, usable = samples[0].shape[1], (samples[1][:, OK] > 0.0) & (samples[1][:, INTERVAL] > 0.0)
     if run.theta.shape[1] != n:
         raise ValueError(
             f'detect: "{rule.kind}" is for trackers of the {n} parameters of the regression; '
@@ -87,7 +87,7 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
     least = max(100, 10 * n)
     first, start = first_third(run, usable, least) if reference is None else normal_samples(run, reference)
     phi, rest, ok = samples[0][first:start], samples[1][first:start], usable[first:start]
-    y, noise, names = rest[:, 0], rest[:, 2], run.model.names
+    y, noise, names = rest[:, Y], rest[:, NOISE_FACTOR], run.model.names
     if ok.sum() < least:
         raise ValueError(
             f'detect: "{rule.kind}" compares with {least} normal samples at least; samples {first} to {start} contain '

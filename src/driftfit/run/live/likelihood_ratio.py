@@ -69,6 +69,9 @@ ONE, JOINT, NOISE, WHICH, SIZE, STD, WINDOW, RATIO, NOISE_WINDOW, CUSUM = range(
 """Entries of the findings of a sample; the CUSUM of n parameters and of the noise come last."""
 
 
+ROW = ("y", "ok", "noise", "dt")
+Y, OK, NOISE_FACTOR, INTERVAL = range(4)
+"""Columns of a row after its regressors, by the names of the fields of a tile, and by their places."""
 UNUSED, UNSEEN, USED = range(3)
 """What becomes of a sample; `UNSEEN` is one that excites what the reference did not, or hardly."""
 
@@ -344,19 +347,19 @@ def outside(phi: Array, unseen: Array) -> bool:
 
 @part
 def enter_row(row: Array, frozen: Frozen, memory: Memory) -> int:
-    """Scores of a row [phi, y, ok, noise, dt] into memory.sample; returns what becomes of it."""
+    """Scores of a row into memory.sample; returns what becomes of it."""
     n, p = frozen.theta.shape[0], frozen.ar.shape[0]
     past, counts, numbers, phi = memory.past, memory.counts, frozen.numbers, memory.work[0]
-    if not row[n + 3] > 0.0:
+    if not row[n + INTERVAL] > 0.0:
         return UNUSED
-    if not row[n + 1] > 0.0:
+    if not row[n + OK] > 0.0:
         counts[SINCE] = 0.0
         return UNUSED
-    if row[n + 3] > GAP:
+    if row[n + INTERVAL] > GAP:
         counts[SINCE] = 0.0
     # residual and regressors, scaled to the noise variance of weight 1
-    root = 1.0 / np.sqrt(row[n + 2])
-    e = row[n]
+    root = 1.0 / np.sqrt(row[n + NOISE_FACTOR])
+    e = row[n + Y]
     for i in range(n):
         e -= row[i] * frozen.theta[i]
         past[p, i] = row[i] * root / frozen.unit[i]
@@ -392,7 +395,7 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> int:
 
 @Driver
 def scan(rows: Array, frozen: Frozen, memory: Memory, findings: Array) -> int:
-    """Judge rows (T, n + 4) = [phi, y, ok, noise, dt]: findings (T, CUSUM + n + 1), repeated at other rows.
+    """Judge rows (T, n + 4), regressors and the columns of `ROW`; findings (T, CUSUM + n + 1) are those of the last.
 
     Returns how many rows excite what the reference did not, or hardly, and are therefore not judged.
     """

@@ -48,7 +48,7 @@ class Samples(NamedTuple):
 
 @dataclass
 class Receipt:
-    """What becomes of a batch, for a sender that is told before the acknowledgement."""
+    """What becomes of a batch, for a sender that waits for an answer."""
 
     offered: int = 0
     """Samples times the units that read their topic."""
