@@ -6,20 +6,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support import arx_record
 
 import driftfit
 from driftfit import (
     ARMAX,
     ARX,
     OE,
+    RLS,
     BoxJenkins,
     ContinuousTransfer,
     Equation,
     HammersteinWiener,
     JointKalman,
+    Kalman,
+    Model,
     PolynomialModel,
     Regression,
     StateSpace,
+    select,
     track,
 )
 from driftfit.checks import check_model
@@ -66,6 +71,13 @@ class Lagged(ARX):
 
 
 @dataclass(frozen=True)
+class Delayed(ARX):
+    @property
+    def terms(self):
+        return (*super().terms[:-1], ("u", 0, 4))
+
+
+@dataclass(frozen=True)
 class Steep(ARX):
     implicit = True
 
@@ -98,6 +110,7 @@ class Twice(ARX):
         (Short, "reach is 1, but signals of sample 30 are in the regressors of sample 33"),
         (Proud, r"A missing u at sample 30 makes samples \[31, 32, 33\] unusable; declared: \[30\]"),
         (Lagged, "output_lags is 2, but regressor 1 is not the output 2 samples before"),
+        (Delayed, r"terms declares regressor 3 as \('u', 0, 4\), but it has another value"),
         (Steep, "log_jacobian is not the logarithm of the slope of the innovation against y, which is 1"),
         (Drawn, "play gives"), (Fickle, "follows returns False"), (Twice, "names must be 4 different names"),
     ],
@@ -179,3 +192,41 @@ def level(x):
 def test_functions_that_cannot_be_a_model_are_named(given, says):
     (broken,) = check_model(given)
     assert says in broken
+
+
+@dataclass(frozen=True)
+class Declared(Model):
+    """A model of one's own, which says what its regressors are; those of ARX(1, 3), as its steps."""
+
+    m, reach, output_lags = 1, 3, 1
+
+    @property
+    def arx(self):
+        return ARX(1, 3, inputs=1)
+
+    def bind(self, inputs):
+        return self
+
+    def memory(self):
+        return self.arx.memory()
+
+    def noise_response(self, theta, h):
+        return self.arx.noise_response(theta, h)
+
+    names = property(lambda self: self.arx.names)
+    steps = property(lambda self: self.arx.steps)
+    terms = property(lambda self: self.arx.terms)
+
+
+def test_declared_regressors_serve_simulation_prediction_selection_and_calibration():
+    y, u = arx_record(300, 3)
+    runs = [track(model, Kalman(q=1e-4, r=0.01), y, u) for model in (Declared(), ARX(1, 3))]
+    for one, other in [
+        *zip(*(run.simulate(u[:20])[:3] for run in runs), strict=True),
+        *zip(*(run.ahead(3)[:3] for run in runs), strict=True),
+    ]:
+        np.testing.assert_array_equal(one, other)
+    own, arx = (run.detect("innovation", every=200.0, calibrate=True).rule for run in runs)
+    assert own == arx
+    own, arx = select([Declared(), ARX(1, 3)], y, u, tracker=RLS(1.0)).rows
+    assert own.loglik == arx.loglik

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -187,6 +188,10 @@ def test_a_page_counts_what_was_left_out_and_what_cannot_be_computed(tmp_path):
     page = (tmp_path / "fleet.html").read_text()
     assert "<dd>2 without a unit, 3 at a repeated time</dd>" in page
     assert "<dd>1 of y outside its limits</dd>" in page
+    assert re.search(r">not tested: 0 of 12 samples\s*<", page)
+    assert not re.search(r">\s*nan\s*<", page)
+    assert "not tested: 0 of 12 samples" in str(fleet.verdict())
+    assert not re.search(r"\bnan\b", str(fleet.verdict()))
     out = sum(not health[key].ok for key in fleet)
     assert (f"{out} of 1 have diagnostics out of bounds" if out else "within limits") in page
 

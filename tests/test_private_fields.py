@@ -1,4 +1,4 @@
-"""No test writes a field that begins with an underscore: what a test needs to set, a user needs too."""
+"""No test writes a field that begins with an underscore: users need what tests set. No module reads one of another."""
 
 import ast
 from pathlib import Path
@@ -124,3 +124,42 @@ def test_what_writes_private_fields_is_found():
 @pytest.mark.parametrize("path", TESTS, ids=lambda path: path.relative_to(HOME).as_posix())
 def test_no_test_writes_private_fields(path):
     assert written(path.read_text()) == []
+
+
+ENGINE = HOME / "src/driftfit/engine"
+INTERNALS = {ENGINE / "numba_internals.py", *(ENGINE / "compile_time").glob("*.py")}
+"""They lean on the private side of Numba; a test fails first for each place."""
+SOURCES = sorted({*(HOME / "src").rglob("*.py")} - INTERNALS)
+FOREIGN = {"_jsc", "_jvm", "_getframe", "_exit", "_sock_recv", "_sock_send", "_left_title"}
+"""Private names of Spark, Python, paho and matplotlib for which there is no public way."""
+TUPLES = {"_replace", "_asdict", "_fields", "_make"}
+
+
+def reached(text):
+    """Private names of other modules that a module reads: those that it neither defines nor reads from itself."""
+    tree = ast.parse(text)
+    own, found = set(TUPLES | FOREIGN), []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            own.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            own.add(node.id)
+        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) in ("self", "cls", "super()", "type(self)"):
+            own.add(node.attr)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and is_private(node.attr) and node.attr not in own:
+            found.append(node.attr)
+        elif isinstance(node, ast.ImportFrom):
+            found += [one.name for one in node.names if is_private(one.name)]
+    return found
+
+
+def test_what_reaches_into_other_modules_is_found():
+    assert reached("from a import _b, c\nx._tile\nx.y._z()\n") == ["_b", "_tile", "_z"]
+    own = "def _f(): ...\nclass A:\n    def g(self, other): return self._x + other._x\n"
+    assert reached(own + "a._f()\nb._replace()") == []
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.relative_to(HOME / "src").as_posix())
+def test_no_module_reaches_into_another(path):
+    assert reached(path.read_text()) == []

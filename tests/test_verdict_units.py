@@ -6,7 +6,8 @@ from scipy import signal
 from test_verdict import record
 
 from driftfit import Kalman, Regression, track
-from driftfit.judge.statistics.constancy import constancy
+from driftfit.judge.statistics.attribution import centring
+from driftfit.judge.statistics.constancy import constancy, transformed
 
 
 def test_constancy_has_no_unit():
@@ -14,6 +15,21 @@ def test_constancy_has_no_unit():
     p = constancy(phi, y).p_joint
     for unit in (1e-12, 1e-9, 1e9):
         assert constancy(phi, y * unit).p_joint == pytest.approx(p, rel=1e-6)
+
+
+@pytest.mark.parametrize("a", [0.0, 0.6])
+def test_regressors_about_their_mean_have_the_test_of_these_regressors(a):
+    """Fit and noise are computed once; statistics, dates and paths are those of the other coefficients."""
+    rng = np.random.default_rng(7)
+    phi = np.column_stack([100.0 + rng.normal(size=400), np.ones(400)])
+    v = signal.lfilter([1.0], [1.0, -a], rng.normal(size=400))
+    y = phi @ [1.0, 3.0] + 0.02 * phi[:, 0] * (np.arange(400) >= 250) + v
+    M = centring(phi)
+    found, expected = transformed(constancy(phi, y), phi, M, None), constancy(phi @ M, y)
+    for name in ("L", "p_own", "p_joint", "path"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found.fit.theta, expected.fit.theta, rtol=1e-6)
+    np.testing.assert_array_equal(found.at, expected.at)
 
 
 @pytest.mark.parametrize("seed", [12, 24, 29])

@@ -151,6 +151,15 @@ def _regressors(model: Model, still: Tracker, run: Track) -> Iterator[str]:
             yield f"output_lags is {model.output_lags}, but regressor {i} is not the output {i + 1} samples before."
     if model.intercept and not (phi[run.ok, -1] == 1.0).all():
         yield "intercept is declared, but the last regressor is not 1."
+    if model.terms is None:
+        return
+    if len(model.terms) != model.n:
+        yield f"terms must have an entry for each of the {model.n} parameters; got {len(model.terms)}."
+        return
+    for i, (what, j, lag) in enumerate(model.terms):
+        value = 1.0 if what == "1" else (run.y if what == "y" else run.u[:, j])[AT - lag]
+        if not _same(phi[AT, i], value):
+            yield f"terms declares regressor {i} as {(what, j, lag)}, but it has another value."
 
 
 def _density(model: Model, still: Tracker, run: Track) -> Iterator[str]:

@@ -49,7 +49,7 @@ def read(data: Any, wanted: Wanted) -> tuple[Columns, dict[Hashable, str]]:
     """The wanted columns of a table, a file, or the concatenation of several files."""
     if not isinstance(data, str | os.PathLike | list | tuple):
         return convert(_frame(data), wanted, "the table", 0), {}
-    paths = _paths(data)
+    paths = paths_of(data)
     if len(paths) == 1:
         return convert(_file(paths[0], wanted), wanted, paths[0], 1), {}
     parts: dict[str, Columns] = {}
@@ -80,7 +80,7 @@ def _frame(data: Any) -> nw.DataFrame[Any]:
     return frame.collect() if isinstance(frame, nw.LazyFrame) else frame
 
 
-def _paths(data: Any) -> list[str]:
+def paths_of(data: Any) -> list[str]:
     """The files given by a path, a pattern, or a list of both, sorted by name."""
     paths: list[str] = []
     for entry in data if isinstance(data, list | tuple) else [data]:

@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.engine.drivers import COMMON, DRIFT, INTERVAL, NOISE
 from driftfit.engine.kernel import Array
-
-INTERVAL, NOISE, DRIFT, COMMON = 0, 1, 2, 3
-"""Columns, in the order in which `driftfit.engine.drivers` reads them, and how many every tracker reads."""
 
 
 @dataclass(frozen=True)

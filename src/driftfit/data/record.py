@@ -288,15 +288,7 @@ def one_series(y: Any, u: Any, reading: Reading) -> Records:
     name = given_y.names[0] if given_y.names else "y"
     labels = labels_of_series(name, given_u.names, times.name, times.zone, Clock.of(dt).plain)
     inputs = as_inputs(given_u.values, T)
-    return Records((0,), FIRST, _length(T), output, inputs, known, axis, labels, drifts=drifts)
-
-
-@lru_cache(maxsize=256)
-def _length(T: int) -> Array:
-    """The length of a single series; made once for all of that length."""
-    length = np.array((T,))
-    length.flags.writeable = False
-    return length
+    return Records((0,), FIRST, np.array((T,)), output, inputs, known, axis, labels, drifts=drifts)
 
 
 def rows(y: Any, u: Any, reading: Reading) -> Records:

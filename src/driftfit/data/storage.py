@@ -29,7 +29,7 @@ from importlib import import_module
 from io import BytesIO
 from os import PathLike
 from struct import Struct
-from typing import Any, ClassVar, Self, cast
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -104,7 +104,8 @@ def read(path: str | PathLike[str], *kinds: str) -> tuple[dict[str, Any], dict[s
 def _put(file: Any, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
     # the names of the arrays, because the check sums of a zip cover what it holds, not what that is called
     text = json.dumps({"format": FORMAT, "arrays": [*arrays], **header}, default=_encode)
-    np.savez(file, header=np.array(text), **cast(Any, dict(arrays)))
+    named: dict[str, Any] = dict(arrays)
+    np.savez(file, header=np.array(text), **named)
 
 
 def compact(header: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:

@@ -33,6 +33,10 @@ SMALLEST = 1e-38
 """Signals below this are zero. Between the two the fourth power of any ratio of signals is a number: no product of a
 regressor, a covariance that earlier regressors left, and an innovation overflows."""
 
+INTERVAL, NOISE, DRIFT, COMMON = range(4)
+"""Columns of what is known of every sample: nominal intervals since the one before, factors of the noise variance and
+of the drift; and how many columns every tracker reads."""
+
 ROUNDING = 1e-12
 """A result below this share of the numbers that it was computed from may be rounding: each of a few thousand operations
 adds up to 2^-53 of its terms, and decimal readings carry as much."""
@@ -363,10 +367,10 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: A
             for l in range(L):
                 s.y[l] = y[t, l]
             for l in range(L):
-                s.dt[l] = known[t * changing, 0, l]
-                s.noise[l] = known[t * changing, 1, l]
-                s.drift[l] = known[t * changing, 2, l]
-            if known.shape[1] > 3:
+                s.dt[l] = known[t * changing, INTERVAL, l]
+                s.noise[l] = known[t * changing, NOISE, l]
+                s.drift[l] = known[t * changing, DRIFT, l]
+            if known.shape[1] > COMMON:
                 for l in range(L):
                     read_extra(part(s), known, t, l)
             if given:

@@ -41,7 +41,6 @@ from driftfit.judge.statistics.whiteness import Whiteness, crossing, whiteness
 from driftfit.judge.verdict import p_text, rounded
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, table_of
-from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -152,8 +151,8 @@ def diagnosis(known: Evidence) -> Diagnosis:
     checks = (
         _whiteness(white),
         *_inputs(run, z),
-        *_level(z, white, _robust(run)),
-        *_distribution(z, _robust(run)),
+        *_level(z, white, run.tracker.adapts),
+        *_distribution(z, run.tracker.adapts),
         _excitation(run, excitation(known.rows.phi)),
         _constancy(known),
     )
@@ -200,11 +199,6 @@ def _inputs(run: Track, z: Array) -> list[Check]:
         "Try more lags of it, another delay, or a nonlinearity."
     )
     return [Check("inputs (p)", min(1.0, float(p[worst]) * len(p)), 0.01, np.inf, advice)]
-
-
-def _robust(run: Track) -> bool:
-    """Whether the tracker discounts outliers and tracks the noise itself."""
-    return isinstance(run.tracker, AdaptiveKalman)
 
 
 def _level(z: Array, white: Whiteness, robust: bool) -> tuple[Check, Check]:

@@ -79,6 +79,16 @@ class Judgement:
             return ""
         return f"{moved[0].name} {change(moved[0], 3)} at {moved[0].when}{more}"
 
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """A row of a table: what moves or why this is not tested, p, q, error, that of constants, and whether it pays.
+
+        A number that is not known is an empty cell.
+        """
+        judged = (p_text(p) if np.isfinite(p) else "" for p in (self.verdict.p, self.q))
+        errors = (f"{one:.4g}" if np.isfinite(one) else "" for one in (self.verdict.rms, self.verdict.rivals[1].rms))
+        return (self.change or self.verdict.untested, *judged, *errors, "yes" if self.pays else "")
+
 
 @dataclass(frozen=True)
 class ManyVerdicts(Printed):
@@ -171,8 +181,7 @@ class ManyVerdicts(Printed):
         for column, width in zip(table.columns[2:], (8, 8, 7, 7, 4), strict=True):
             column.ratio, column.min_width = None, width
         for row in self.rows[:SHOWN]:
-            errors = (f"{row.verdict.rms:.4g}", f"{row.verdict.rivals[1].rms:.4g}", "yes" if row.pays else "")
-            table.add_row(Text(key_text(row.key)), Text(row.change), p_text(row.verdict.p), p_text(row.q), *errors)
+            table.add_row(Text(key_text(row.key)), *map(Text, row.cells))
         yield table
         if len(self.rows) > SHOWN:
             yield Text(f" and {len(self.rows) - SHOWN} more", "dim")

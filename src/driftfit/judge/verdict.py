@@ -154,6 +154,26 @@ class Verdict(Printed):
         return tuple(moved.name for moved in self.parameters if moved.moves)
 
     @property
+    def least(self) -> int:
+        """Number of samples that a test of these parameters needs."""
+        return least_rows(len(self.parameters))
+
+    @property
+    def untested(self) -> str:
+        """Why there is no test of whether parameters move, in a few words; empty if there is one."""
+        if self.drifts is not None:
+            return ""
+        if self.hidden:
+            return "not tested: hidden states"
+        if self.samples < self.least:
+            return f"not tested: {self.samples} of {self.least} samples"
+        return (
+            "not tested: no noise"
+            if self.rivals[1].rms == 0.0
+            else "not tested: regressors too similar, or rare counts"
+        )
+
+    @property
     def sentences(self) -> tuple[str, ...]:
         """The verdict in sentences."""
         return tuple(filter(None, (f"{self._drift()} {self._gain()}", self._which(), self._caution())))
@@ -162,7 +182,7 @@ class Verdict(Printed):
         if self.hidden:
             return "Whether parameters move cannot be tested: a model with hidden states is not a regression."
         if self.drifts is None:
-            least = least_rows(len(self.parameters))
+            least = self.least
             short = f"{self.samples} samples can be used, and at least {least} are needed."
             alike = (
                 "constant parameters explain every output without error, so there is no noise to compare a change with."

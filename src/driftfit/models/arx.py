@@ -35,7 +35,7 @@ import numpy as np
 from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import one_of, output_names, whole
-from driftfit.models.base import GAP, Model
+from driftfit.models.base import GAP, Model, Term
 from driftfit.models.inputs import CountedInputs
 from driftfit.models.lags.doubted_lags import doubted, no_doubts, shift_doubts
 from driftfit.models.lags.output_lags import shift_inputs, take_output, wait_for_lags
@@ -151,6 +151,12 @@ class ARX(CountedInputs):
     def output_lags(self) -> int:
         """The number of leading entries of phi that are past outputs: a bank of hypotheses corrects them by leaf."""
         return self.na
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        past: list[Term] = [("y", o, i + 1) for o in range(len(self.outputs)) for i in range(self.na)]
+        given: list[Term] = [("u", j, nk + i) for j, (nb, nk) in enumerate(self.lags) for i in range(nb)]
+        return (*past, *given, *([("1", 0, 0)] if self.intercept else []))
 
     @property
     def reach(self) -> int:

@@ -12,6 +12,8 @@ from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import Settings
 
+Term = tuple[str, int, int]
+"""A regressor: ("y", output, lag), ("u", input, lag), or ("1", 0, 0) for the constant 1."""
 GAP = 1.5
 """Intervals longer than this many nominal ones break the lags."""
 
@@ -154,6 +156,11 @@ class Model(Settings, ABC):
 
         None if past outputs are elsewhere, or are transformed; 0 where there are none.
         """
+        return None
+
+    @property
+    def terms(self) -> tuple[Term, ...] | None:
+        """What every regressor is, if all are signals of this or an earlier sample, or 1; None for any other model."""
         return None
 
     def touched(self, t: int, signal: str) -> range | None:

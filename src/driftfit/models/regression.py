@@ -20,6 +20,7 @@ import numpy as np
 from driftfit.engine.drivers import ModelSteps
 from driftfit.engine.kernel import Array, State, kernel, nothing
 from driftfit.engine.settings import output_names
+from driftfit.models.base import Term
 from driftfit.models.inputs import CountedInputs
 
 
@@ -83,6 +84,10 @@ class Regression(CountedInputs):
     @property
     def output_lags(self) -> int:
         return 0
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        return (*(("u", j, 0) for j in range(self.m)), *([("1", 0, 0)] if self.intercept else []))
 
     def memory(self) -> Mapping[str, Any]:
         return {}

@@ -355,6 +355,11 @@ class Track(Plain, Columns):
         tile, record = self.fresh(), replace(self.record, y=y, time=None)
         return type(self)(self.program, record, Lane(self.program.run(tile, record), tile), self.start)
 
+    def run_by(self, program: Program) -> Self:
+        """The same record, run by another program from its start."""
+        other = track_record(program, self.record)
+        return type(self)(program, self.record, other._lane, other.start)
+
     def end(self) -> End:
         """The end of the run, from which another one can continue (`warm_start`)."""
         state = {name: value.copy() for name, value in self.state.items()}

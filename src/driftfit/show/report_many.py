@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from driftfit.engine import __version__
 from driftfit.judge.fleet_verdict import Judgement, ManyDiagnoses, ManyVerdicts, verdicts_and_diagnoses
-from driftfit.judge.verdict import LEVEL, p_text
+from driftfit.judge.verdict import LEVEL
 from driftfit.show.page_parts import document, picture, section, table
 from driftfit.show.page_style import READING
 from driftfit.show.parts.text import counts, key_text
@@ -86,13 +86,11 @@ def _verdict(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
 
 
 def _rows(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
-    rows = []
+    rows, known = [], set(health.known)
     for row in verdicts.rows[:LISTED]:
         out = len(health[row.key].sentences)
-        numbers = (escape(p_text(row.verdict.p)), escape(p_text(row.q)))
-        errors = (f"{row.verdict.rms:.4g}", f"{row.verdict.rivals[1].rms:.4g}", "yes" if row.pays else "")
-        marked = f'<span class="bad">{out}</span>' if out else "0" if row.key in health.known else ""
-        rows.append((escape(key_text(row.key)), escape(row.change), *numbers, *errors, marked))
+        marked = f'<span class="bad">{out}</span>' if out else "0" if row.key in known else ""
+        rows.append((escape(key_text(row.key)), *map(escape, row.cells), marked))
     heads = ("", "what moves", "p", "q", "error", "of constants", "pays", "out of bounds")
     more = f" The first {LISTED} of {len(verdicts)}." if len(verdicts) > LISTED else ""
     return table(f"The clearest first.{more}", heads, rows, (1,))

@@ -32,13 +32,13 @@ from driftfit.smooth.parts.walk import Path, Walk
 from driftfit.trackers.parts.information import triangular_root
 
 
-def smooth(walk: Walk, keep: str = "fit", again: Callable[[], Walk] | None = None) -> Path:
+def smooth(walk: Walk, keep: str = "fit", rebuild: Callable[[], Walk] | None = None) -> Path:
     """Solve the problem.
 
     The path has theta and its variances with keep="std", rho and c too with "fit", and the covariances of every sample
-    and of neighbouring samples too with "cov"; the safe method adds rho and c anyway. With ``again``, phi and signals
-    of the problem may be overwritten by the solution, and ``again()`` gives the problem a second time if the fast
-    method fails.
+    and of neighbouring samples too with "cov"; the safe method adds rho and c anyway. ``rebuild`` is a function that
+    makes the problem a second time. If it is given, the fast method writes its solution over phi and signals, which
+    saves memory, and the safe one solves the rebuilt problem.
     """
     if len(walk.trend):
         return spread(walk, slopes.smooth(walk, keep))
@@ -46,9 +46,9 @@ def smooth(walk: Walk, keep: str = "fit", again: Callable[[], Walk] | None = Non
     scale = column_scale(walk.phi, walk.signals)
     rank, unseen = ranks(walk.phi, walk.signals, scale)
     simple = keep != "cov" and walk.p0 is None and rank[-1] == n and np.array_equal(walk.q, np.diag(np.diag(walk.q)))
-    found = elimination.smooth(walk, scale, keep, again is not None) if simple else None
+    found = elimination.smooth(walk, scale, keep, overwrite=rebuild is not None) if simple else None
     if found is None:
-        walk = again() if simple and again is not None else walk
+        walk = rebuild() if simple and rebuild is not None else walk
         G = triangular_root(walk.q * np.outer(scale, scale))
         found = two_filters.smooth(walk, scale, G, two_filters.start(walk, scale, unseen), keep)
     return spread(walk, found)._replace(rank=rank)

@@ -255,13 +255,13 @@ class Smoothed:
         return plot_smoothed(self.run, self.theta, *self.band(level), ax)
 
 
-def solve(walk: Walk, keep: str, order_by: Any = None, again: Callable[[], Walk] | None = None) -> Path:
+def solve(walk: Walk, keep: str, order_by: Any = None, rebuild: Callable[[], Walk] | None = None) -> Path:
     """The smoothed path in time order; with ``order_by`` theta is a random walk along that variable instead of time.
 
-    ``again`` as for `driftfit.smooth.exact.smooth`.
+    ``rebuild`` as for `driftfit.smooth.exact.smooth`.
     """
     if order_by is None:
-        return exact.smooth(walk, keep, again)
+        return exact.smooth(walk, keep, rebuild)
     arranged, order = ordered(walk, order_by)
     path, back = exact.smooth(arranged, keep), np.argsort(order)
     slopes, fit = ("slope", "slope_var") if len(walk.trend) else (), ("rho", "c") if len(path.c) else ()

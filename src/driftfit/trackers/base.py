@@ -83,6 +83,11 @@ class Tracker(Settings, ABC):
         """Why theta is not a random walk, or y not phi' theta and noise; empty if they are, as most verbs assume."""
         return ""
 
+    @property
+    def slopes(self) -> bool:
+        """Whether theta follows a slope, and the slope drifts, so that theta is expected to move on."""
+        return False
+
     @classmethod
     def own_model(cls, na: int, nb: int, nk: int) -> Model | None:
         """The model for a linear record with these lags, if the tracker does not work with all models; used by tests.

@@ -171,6 +171,10 @@ class FLS(Tracker):
         }
 
     @property
+    def slopes(self) -> bool:
+        return self.differences == 2
+
+    @property
     def pads(self) -> bool:
         return self.differences == 1
 
@@ -197,7 +201,7 @@ class FLS(Tracker):
         p0 = None if self.p0 is None else matrix("FLS", "p0", self.p0, n)
         q = np.diag(1.0 / vector("FLS", "mu", self.mu, n))
         theta0 = vector("FLS", "theta0", self.theta0, n)
-        return RandomWalk(q, None, theta0, p0, at_first_sample=True, slopes=self.differences == 2)
+        return RandomWalk(q, None, theta0, p0, at_first_sample=True, slopes=self.slopes)
 
 
 STEPS = judged(begin, TrackerSteps(drift, correct, folded, read_extra=read_drift), restart)

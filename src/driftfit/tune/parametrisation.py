@@ -136,7 +136,7 @@ def constant(task: Task, tracker: Any) -> Tracker:
 
 def _range(task: Task, tracker: Tracker, bounds: Bounds, p: int) -> tuple[Array, Array]:
     """Ends of log10 mu, (p,) each; a drift of slopes accumulates twice over the record."""
-    times = getattr(tracker, "differences", 1)
+    times = 2 if tracker.slopes else 1
     low, high = _ends(bounds, -4.0, max(5.0, 2.0 * times * np.log10(task.longest)))
     return np.full(p, low), np.full(p, high)
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.run.result import Track, track_record
+from driftfit.run.result import Track
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.instrumental import InstrumentalVariables
 from driftfit.trackers.rls import RLS
@@ -94,8 +94,7 @@ def _at(run: R, point: Array, tracker: Tracker | None = None) -> R:
             "ARMAX, BoxJenkins, PolynomialModel and ContinuousTransfer."
         )
     program = replace(run.program, model=model, tracker=run.tracker if tracker is None else tracker)
-    once = track_record(program, run.record)
-    return type(run)(once.program, once.record, once._lane, once.start)
+    return run.run_by(program)
 
 
 def _downhill(run: Track, point: Array, goal: Array) -> Array | None:

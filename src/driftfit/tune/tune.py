@@ -139,7 +139,8 @@ def _tuned(
     sigma2 = float(final.sigma2()[0])
     if knobs.profiled and tracker.covariance and not sigma2 > (ROUNDING * _largest(task)) ** 2:
         raise ValueError(_without_noise(task))
-    tuned = Tuned(
+    _warn(search)
+    return Tuned(
         tracker=knobs.build(search.x, sigma2),
         method=method,
         loglik=float(final.loglik(knobs.profiled)[0]) if tracker.covariance else float("nan"),
@@ -149,8 +150,6 @@ def _tuned(
         level=level,
         _search=search,
     )
-    _warn(tuned)
-    return tuned
 
 
 def _outputs(task: Task) -> Array:
@@ -225,9 +224,8 @@ def _leave_out(x: Array, name: str, places: Array) -> None:
         x[places] = np.nan
 
 
-def _warn(tuned: Tuned) -> None:
+def _warn(search: Search) -> None:
     """Warn of settings that ended at a bound of the search; zero is a valid result."""
-    search = tuned._search
     stuck = [
         name
         for name, i in zip(search.knobs.names, search.knobs.owner, strict=True)

@@ -33,6 +33,10 @@ class LiveSystem:
         """Covariance of theta, (n, n)."""
         return self._cov
 
+    def covariances(self) -> Array:
+        """The same with a time axis, (1, n, n)."""
+        return self._cov[None]
+
     def poles(self) -> Array:
         """Poles, (na,) complex, the largest first."""
         poles: Array = system.poles(self)[0]

@@ -25,11 +25,9 @@ from driftfit.data.labels import inputs_for
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.continuous.transfer import ContinuousTransfer
 from driftfit.models.polynomial import PolynomialModel
-from driftfit.models.regression import Regression
 from driftfit.run.result import Track
 from driftfit.use.delta_method import spread
 from driftfit.use.draws import ahead_by_draws, simulate_by_draws
@@ -47,11 +45,11 @@ def ahead(run: Track, k: int) -> Prediction:
     """
     whole("ahead", "k", k, 1)
     within("ahead", run)
-    if getattr(run.tracker, "differences", 1) > 1:
+    if run.tracker.slopes:
         raise ValueError(
             "ahead: predictions over a record assume a constant theta, but here it follows its slope; use run.forecast."
         )
-    if not isinstance(run.model, ARX | Regression):
+    if not regresses_on_lags(run.model):
         return ahead_by_draws(run, k)
     na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))
     T, theta, cov = len(run), run.theta, covariances(run)
@@ -105,7 +103,7 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
     given = np.zeros(0) if y is None else np.asarray(y, float)
     if isinstance(run.model, PolynomialModel | ContinuousTransfer):
         return _through_transfers(run, run.model, inputs, at, given)
-    if not isinstance(run.model, ARX | Regression):
+    if not regresses_on_lags(run.model):
         return simulate_by_draws(run, inputs, at, given)
     na, U = input_regressors(run.model, inputs, rest=0.0)
     (theta,), (cov,) = taken(run, at)
@@ -175,23 +173,31 @@ def noise_at(run: Track, at: int) -> float:
         return float("nan")
     t = int(known[-1])
     before = run.cov(t - 1) if t > 0 else np.full((len(run.names),) * 2, np.nan)
-    _, U = input_regressors(run.model, run.u[: t + 1])
-    na = run.model.na if isinstance(run.model, ARX) else 0
+    na, U = input_regressors(run.model, run.u[: t + 1])
     phi = np.concatenate([[run.y[t - i] if t >= i else np.nan for i in range(1, na + 1)], U[t]])
     q = drift(run, np.full(1, run.innovation_std[t] ** 2))[0]
     r = run.innovation_std[t] ** 2 - phi @ (before + q) @ phi
     return float(r) if np.isfinite(r) and r > 0.0 else float(run.innovation_std[t] ** 2)
 
 
+def regresses_on_lags(model: Model) -> bool:
+    """Whether the regressors are the last outputs, the latest first, and then inputs and constants."""
+    na, terms = model.output_lags or 0, model.terms
+    if terms is None:
+        return False
+    return terms[:na] == tuple(("y", 0, i + 1) for i in range(na)) and all(what != "y" for what, *_ in terms[na:])
+
+
 def input_regressors(model: Model, u: Array, rest: float = np.nan) -> tuple[int, Array]:
     """(na, the regressors (T, n - na) made of inputs); values before the record are ``rest``."""
-    one = [np.ones((len(u), 1))] if model.intercept else []
-    if isinstance(model, Regression):
-        return 0, np.hstack([u, *one])
-    if not isinstance(model, ARX) or len(model.outputs) > 1:
-        raise ValueError(f"predictions over a record need ARX or Regression with one output; got {model!r}.")
-    columns = [moved(u[:, j], nk + i, rest) for j, (nb, nk) in enumerate(model.lags) for i in range(nb)]
-    return model.na, np.column_stack([np.zeros((len(u), 0)), *columns, *one])
+    if model.terms is None or not regresses_on_lags(model):
+        raise ValueError(
+            "predictions over a record need ARX, Regression or another model that declares its regressors (`terms`), "
+            f"with one output; got {model!r}."
+        )
+    na = model.output_lags or 0
+    columns = [np.ones(len(u)) if what == "1" else moved(u[:, j], lag, rest) for what, j, lag in model.terms[na:]]
+    return na, np.column_stack([np.zeros((len(u), 0)), *columns])
 
 
 def _known(values: Array) -> Array:

@@ -19,7 +19,7 @@ method fails; Fieller's interval is then unbounded, as it should be.
 from __future__ import annotations
 
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from driftfit.use.delta_method import spread
 
 if TYPE_CHECKING:
     from driftfit.models.base import Model
-    from driftfit.run.result import Track
+    from driftfit.trackers.base import Tracker
 
 
 class Followed(Protocol):
@@ -43,9 +43,12 @@ class Followed(Protocol):
 
     @property
     def model(self) -> Model: ...
+    @property
+    def tracker(self) -> Tracker: ...
 
     def __len__(self) -> int: ...
     def cov(self, t: int) -> Array: ...
+    def covariances(self) -> Array: ...
 
 
 class Response(NamedTuple):
@@ -99,7 +102,7 @@ def companion(poles: Array) -> Array:
     return found
 
 
-def covariances(run: Track) -> Array:
+def covariances(run: Followed) -> Array:
     """Covariance of theta after every sample, (T, n, n); NaN if it is not finite. Replays the record."""
     n = len(run.names)
     if not run.tracker.covariance:
@@ -117,13 +120,13 @@ def taken(run: Followed, at: Any) -> tuple[Array, Array]:
     """(theta, covariance) of samples: all of them, one, or several."""
     theta = run.theta
     if at is None:
-        return theta, covariances(cast("Track", run))
+        return theta, covariances(run)
     picked = np.atleast_1d(np.asarray(at))
     if picked.dtype.kind not in "iu" or (picked < -len(run)).any() or (picked >= len(run)).any():
         raise IndexError(f"at= must be samples within the record of {len(run)}; got {at!r}.")
     if len(picked) == 1:
         return theta[picked], _finite(run.cov(int(picked[0]))[None])
-    return theta[picked], covariances(cast("Track", run))[picked]
+    return theta[picked], covariances(run)[picked]
 
 
 def poles(run: Followed, at: Any = None) -> Array:

@@ -18,7 +18,7 @@ import numpy as np
 from driftfit.bridges.spark.flow import PLACES, Origin, migrated
 from driftfit.bridges.spark.pieces import COUNTS, SAMPLES, USED, alarms_of, alarms_schema, collects, watched
 from driftfit.bridges.spark.task import Task
-from driftfit.data.known import INTERVAL
+from driftfit.engine.drivers import INTERVAL
 from driftfit.engine.kernel import Array
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.result import Lane

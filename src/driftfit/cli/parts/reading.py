@@ -18,7 +18,7 @@ import numpy as np
 import polars as pl
 
 from driftfit.data.columns import Columns, Wanted, convert
-from driftfit.data.files import FILE, _paths
+from driftfit.data.files import FILE, paths_of
 from driftfit.data.times.periods import EXAMPLES, span
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
@@ -144,7 +144,7 @@ def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Se
     if (part.first or part.last) and time is None:
         raise ValueError("--from and --to are times, so they need --time; rows are chosen with --rows.")
     wanted = Wanted(tuple(dict.fromkeys(names)), time, tuple(by))
-    read = [_one(path, wanted, part) for path in (["-"] if "-" in files else _paths(list(files)))]
+    read = [_one(path, wanted, part) for path in (["-"] if "-" in files else paths_of(list(files)))]
     if len({one.time.dtype.kind for one in read if one.time is not None}) > 1:
         raise ValueError("the times of some files are numbers, those of others are dates.")
     found = Rows(

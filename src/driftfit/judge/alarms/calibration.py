@@ -22,11 +22,9 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.robust import core
-from driftfit.models.arx import ARX
-from driftfit.models.regression import Regression
 from driftfit.run.result import Track, burn_in
 from driftfit.use.prediction import moved
-from driftfit.use.simulate import input_regressors
+from driftfit.use.simulate import input_regressors, regresses_on_lags
 
 TIMES = 50.0
 """Expected false alarms in all simulated records together."""
@@ -42,10 +40,10 @@ LATER = 10
 
 def null_records(run: Track, every: float, at: int, seed: int) -> Iterator[Track]:
     """Runs over simulated records with the parameters of sample ``at``; ValueError for models with other regressors."""
-    if not isinstance(run.model, ARX | Regression) or len(run.model.outputs) > 1:
+    if not regresses_on_lags(run.model) or len(run.model.outputs) > 1:
         raise ValueError(
-            "detect: a calibration simulates records, which needs ARX or Regression with one output; "
-            f"this run has {run.model!r}. Give a reference= instead."
+            "detect: a calibration simulates records, which needs ARX, Regression or another model that declares its "
+            f"regressors (`terms`), with one output; this run has {run.model!r}. Give a reference= instead."
         )
     rng = np.random.default_rng(seed)
     na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))

@@ -52,7 +52,7 @@ class Look(NamedTuple):
 def look(run: Track, asked: AlarmRule, reference: Reference) -> Look:
     """Estimate the reference model of a run and compute its statistics."""
     rule, rows, start, samples = modelled(run, asked, in_samples(run, reference))
-    statistic = findings_of(run, rule, start, samples)[:, rule.entries]
+    statistic = findings_of(run, rule, start, samples)[0][:, rule.entries]
     count = int(np.isfinite(statistic[start:]).any(axis=1).sum())
     return Look(rule, start, highest(statistic, start), count, _like(rule, rows))
 

@@ -27,9 +27,8 @@ from driftfit.judge.alarms.onsets import (
 )
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
 from driftfit.judge.regressors import refuse_hidden
-from driftfit.judge.statistics.noise import whitened
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.live.likelihood_ratio import CUSUM, SAME, UNKNOWN, memory_of, scan
+from driftfit.run.live.likelihood_ratio import CUSUM, INTERVAL, NOISE_FACTOR, OK, Y, memory_of, scan
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
@@ -54,7 +53,7 @@ def rule_of(
 
 
 def samples_of(run: Track) -> Samples:
-    """Regressors (T, n) of a run, and (T, 4): y, ok, noise, dt, as the tracker receives them."""
+    """Regressors (T, n) of a run, and (T, 4): the columns of `ROW`, as the tracker receives them."""
     steps = run.program.steps._replace(store=collect)
     tile = run.fresh()
     out = np.empty(len(run), output_type(tile, COLLECTED))
@@ -79,7 +78,7 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
         )
     refuse_hidden(f'detect "{rule.kind}"', run.model, 'kind="innovation" or "band"')
     samples = samples_of(run)
-    n, usable = samples[0].shape[1], (samples[1][:, 1] > 0.0) & (samples[1][:, 3] > 0.0)
+    n, usable = samples[0].shape[1], (samples[1][:, OK] > 0.0) & (samples[1][:, INTERVAL] > 0.0)
     if run.theta.shape[1] != n:
         raise ValueError(
             f'detect: "{rule.kind}" is for trackers of the {n} parameters of the regression; '
@@ -88,7 +87,7 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
     least = max(100, 10 * n)
     first, start = first_third(run, usable, least) if reference is None else normal_samples(run, reference)
     phi, rest, ok = samples[0][first:start], samples[1][first:start], usable[first:start]
-    y, noise, names = rest[:, 0], rest[:, 2], run.model.names
+    y, noise, names = rest[:, Y], rest[:, NOISE_FACTOR], run.model.names
     if ok.sum() < least:
         raise ValueError(
             f'detect: "{rule.kind}" compares with {least} normal samples at least; samples {first} to {start} contain '
@@ -194,28 +193,15 @@ def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
     return _carried(statistic)
 
 
-def findings_of(run: Track, rule: AlarmRule, start: int, samples: Samples) -> Array:
-    """The findings of "glr" and "cusum", (T, k), NaN before ``start``; ``samples`` are those of the run."""
+def findings_of(run: Track, rule: AlarmRule, start: int, samples: Samples) -> tuple[Array, int]:
+    """The findings of "glr" and "cusum", (T, k), NaN before ``start``, and how many samples the reference cannot judge.
+
+    ``samples`` are those of the run. It cannot judge those that excite what it did not, or hardly.
+    """
     n, (phi, rest), model = len(rule.parameters), samples, rule.reference
     findings = np.full((len(run), CUSUM + n + 1), np.nan)
     rows = np.column_stack([phi, np.ones((len(run), n - phi.shape[1])), rest])
-    scan(rows[start:], model, memory_of(n, len(model.ar)), findings[start:])
-    return findings
-
-
-def unseen_in(rule: AlarmRule, start: int, samples: Samples) -> int:
-    """Usable samples from ``start`` on that excite what the reference of "glr" or "cusum" did not, or hardly."""
-    model, (phi, rest) = rule.reference, (one[start:] for one in samples)
-    used, p = (rest[:, 1] > 0.0) & (rest[:, 3] > 0.0), len(model.ar)
-    rows = np.column_stack([phi, np.ones((len(phi), len(rule.parameters) - phi.shape[1]))]) / model.unit
-    scaled = np.where(used[:, None], rows, 0.0) / np.sqrt(np.where(used, rest[:, 2], 1.0))[:, None]
-    rows = whitened(scaled, np.zeros(len(rows)), model.ar)[0]
-    terms = rows[:, None] * model.unseen
-    beyond = np.abs(terms.sum(axis=2)) > SAME * np.abs(terms).sum(axis=2)
-    unknown = beyond.any(axis=1) | (np.einsum("ti,ij,tj->t", rows, model.cov, rows) > UNKNOWN)
-    count = np.cumsum(np.concatenate([np.zeros(p + 1), used]))
-    complete = count[p + 1 :] - count[: len(used)] == p + 1.0  # the lags of the autoregression too
-    return int(np.sum(unknown & complete))
+    return findings, int(scan(rows[start:], model, memory_of(n, len(model.ar)), findings[start:]))
 
 
 def _carried(statistic: Array) -> Array:

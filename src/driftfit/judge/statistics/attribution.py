@@ -28,7 +28,7 @@ import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.break_dates import date_loglik, smallest
-from driftfit.judge.statistics.constancy import Constancy, constancy, shortest
+from driftfit.judge.statistics.constancy import Constancy, constancy, shortest, transformed
 from driftfit.judge.statistics.noise import Noise, whitened
 from driftfit.judge.statistics.robust import inverted, robust_fit
 
@@ -110,21 +110,18 @@ def holm(p: Array, level: float) -> Array:
 
 def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | None = None) -> Attribution:
     """Explain the changes in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags)`."""
-    own, M = _attributed(phi, y, test, np.eye(phi.shape[1]), level, lags), centring(phi)
+    own, bic = _attributed(phi, y, test, np.eye(phi.shape[1]), level, lags)
+    M = centring(phi)
     if M is None:
         return own
-    centred = _attributed(phi @ M, y, constancy(phi @ M, y, lags), M, level, lags)
-    return centred if _cost(phi @ M, y, centred) <= _cost(phi, y, own) else own
+    centred, other = _attributed(phi @ M, y, transformed(test, phi, M, lags), M, level, lags)
+    return centred if other <= bic else own
 
 
-def _cost(phi: Array, y: Array, found: Attribution) -> float:
-    """BIC of steps, each with a date and a size."""
-    scale = robust_fit(_with(phi, list(found.steps)), y).scale
-    return float(2.0 * len(y) * np.log(max(scale, 1e-300)) + 2.0 * len(found.steps) * np.log(len(y)))
-
-
-def _attributed(phi: Array, y: Array, test: Constancy, M: Array, level: float, lags: int | None) -> Attribution:
-    """The same for steps of the coefficients of phi, of which theta is M times."""
+def _attributed(
+    phi: Array, y: Array, test: Constancy, M: Array, level: float, lags: int | None
+) -> tuple[Attribution, float]:
+    """The same for steps of the coefficients of phi, of which theta is M times; and BIC, a date and a size per step."""
     N, n = phi.shape
     steps: list[Step] = []
     similar: list[tuple[int, ...]] = []
@@ -152,7 +149,8 @@ def _attributed(phi: Array, y: Array, test: Constancy, M: Array, level: float, l
     far = np.abs(after - before) > scipy.special.ndtri(1.0 - 0.5 * level) * std
     spans = tuple(_span(phi, step, steps, test.noise) for step in steps)
     moves = far & changed.any(axis=1)
-    return Attribution(p, tuple(steps), spans, before, after, std, last, moves, tuple(similar), changed)
+    bic = 2.0 * N * np.log(max(now.fit.scale, 1e-300)) + 2.0 * len(steps) * np.log(N)
+    return Attribution(p, tuple(steps), spans, before, after, std, last, moves, tuple(similar), changed), float(bic)
 
 
 def centring(phi: Array) -> Array | None:

@@ -130,6 +130,15 @@ def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
     return _tested(basis, phi, fit, found, lags)
 
 
+def transformed(test: Constancy, phi: Array, M: Array, lags: int | None) -> Constancy:
+    """The test of the coefficients of phi M, M (n, n) regular, from that of phi (N, n): fit and noise are the same."""
+    basis = orthonormal(phi @ M)
+    if test.noise is None or not basis.distinct:
+        return _nothing(*phi.shape)
+    fit = test.fit._replace(theta=np.linalg.solve(M, test.fit.theta))
+    return _tested(basis, phi @ M, fit, test.noise, lags)
+
+
 def _rare(psi: Array, y: Array, least: int) -> int | None:
     """Rows in the shortest interval if y (N,) counts rare events or has a bound that it often meets; otherwise None.
 

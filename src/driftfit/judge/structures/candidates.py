@@ -1,4 +1,4 @@
-"""Structures as columns of one regression: the union of the regressors of several ARX or Regression models.
+"""Structures as columns of one regression: the union of the regressors of models that declare them (`Model.terms`).
 
     phi_t of a structure = its columns of the union's phi_t
 
@@ -22,7 +22,7 @@ from driftfit.data.record import Record, Records
 from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.models.arx import ARX
-from driftfit.models.base import Model
+from driftfit.models.base import Model, Term
 from driftfit.models.regression import Regression
 from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program
@@ -31,9 +31,6 @@ from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.common_size import SIZES, fits, padded, size_of
 
 TOGETHER = 32
-
-Term = tuple[str, int, int]
-"""("y", 0, lag), ("u", input, lag) or ("1", 0, 0)."""
 
 
 class Candidate(NamedTuple):
@@ -212,32 +209,23 @@ def pool_of(models: Sequence[Model], names: Sequence[str], records: Sequence[Rec
     return pool, structures
 
 
-def _terms(model: Model) -> list[Term] | None:
-    """The terms of the columns of a model; None for a model other than ARX or Regression with one output."""
-    one: list[Term] = [("1", 0, 0)] if model.intercept else []
-    if len(model.outputs) > 1 or model.implicit:
-        return None
-    if isinstance(model, Regression):
-        return [*(("u", j, 0) for j in range(model.m)), *one]
-    if isinstance(model, ARX):
-        lags: list[Term] = [("y", 0, i + 1) for i in range(model.na)]
-        return [*lags, *(("u", j, nk + i) for j, (nb, nk) in enumerate(model.lags) for i in range(nb)), *one]
-    return None
+def _terms(model: Model) -> tuple[Term, ...] | None:
+    """The terms of the columns of a model with one output; None for a model whose regressors are no columns."""
+    return None if len(model.outputs) > 1 or model.implicit else model.terms
 
 
 def _union(models: Sequence[Model]) -> Model:
     """The smallest model that contains the regressors of all."""
     terms = {term for model in models for term in _terms(model) or ()}
     constant = ("1", 0, 0) in terms
+    inputs = models[0].input_names or models[0].m
     if all(isinstance(model, Regression) for model in models):
-        first = models[0]
-        assert isinstance(first, Regression)
-        return Regression(first.regressors, intercept=constant)
+        return Regression(inputs, intercept=constant)
     na = max((lag for what, _, lag in terms if what == "y"), default=0)
     nb, nk = [], []
     for j in range(models[0].m):
         lags = [lag for what, i, lag in terms if what == "u" and i == j]
         nk.append(min(lags, default=0))
         nb.append(max(lags) - nk[-1] + 1 if lags else 0)
-    arx = next(model for model in models if isinstance(model, ARX))
-    return ARX(na, tuple(nb), nk=tuple(nk), inputs=arx.inputs, intercept=constant, start=arx.start)
+    start = next((model.start for model in models if isinstance(model, ARX)), "drop")
+    return ARX(na, tuple(nb), nk=tuple(nk), inputs=inputs, intercept=constant, start=start)

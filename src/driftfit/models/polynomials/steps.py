@@ -28,8 +28,8 @@ STABLE = 0.9999
 CONTRACTION, CONTRACTIONS = 0.9, 20
 """Factor of the zeros of C or F while it is unstable, and how often it is applied."""
 
-ROUNDING = 1e-10
-"""A residual below this share of its output is 0."""
+LEAST_RESIDUAL = 1e-10
+"""A residual below this share of the output and the fitted value is rounding that an interpolated sample left: 0."""
 
 BEYOND = 1e6
 """A signal that the model computes is at most so many times the largest reading of its unit. Parameters that one absurd
@@ -439,7 +439,7 @@ def pushing(p: Places, place: Step, waiting: float = ENTRY) -> Step:
         known = (s.valid[l] > 0.0) | (s.started[l] == 0.0) if held else predicted
         e = s.measured[l] - fitted if observed & known else 0.0
         # what is left of an interpolated sample is rounding, and no regressor
-        e = e if abs(e) > ROUNDING * (abs(s.measured[l]) + abs(fitted)) else 0.0
+        e = e if abs(e) > LEAST_RESIDUAL * (abs(s.measured[l]) + abs(fitted)) else 0.0
         e = within(s, e, l)
         begun = s.usable[l] >= first_noise
         v = within(s, e + noise(s, l), l) if begun else 0.0

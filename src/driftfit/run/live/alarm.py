@@ -17,12 +17,10 @@ from driftfit.data.storage import describe, rebuild
 from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array, Driver
 from driftfit.run.live.change import Change, change_of
-from driftfit.run.live.likelihood_ratio import memory_of, scan
+from driftfit.run.live.likelihood_ratio import ROW, memory_of, scan
 from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits, last_power_and_mean
 from driftfit.trackers.base import Tracker
 
-ROW = ("y", "ok", "noise", "dt")
-"""Fields of the record that follow the regressors in a row of the frozen model."""
 KEPT = 256
 """Number of onsets that are kept until `onsets` is called."""
 

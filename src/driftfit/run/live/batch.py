@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.clock import Clock
-from driftfit.data.known import NOISE, Known
+from driftfit.data.known import Known
 from driftfit.data.labels import times_of
 from driftfit.data.limits import Gate
 from driftfit.data.record import Reading, Records
 from driftfit.data.times.gaps import LOOK, Pace
 from driftfit.data.times.instants import instant
+from driftfit.engine.drivers import DRIFT, INTERVAL, NOISE
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.run.columns import SCALARS, Columns
@@ -228,4 +229,4 @@ class Batched(ABC):
         for lane, alarm in self._watching:
             alarm.take(self._state_tile(), lane, float(e[lane]), float(s[lane]), time)
         for lane, window in enumerate(self._windows):
-            window.push(self._state_tile(), (known[0, lane], known[1, lane], known[2, lane]), lane)
+            window.push(self._state_tile(), (known[INTERVAL, lane], known[NOISE, lane], known[DRIFT, lane]), lane)

@@ -69,6 +69,13 @@ ONE, JOINT, NOISE, WHICH, SIZE, STD, WINDOW, RATIO, NOISE_WINDOW, CUSUM = range(
 """Entries of the findings of a sample; the CUSUM of n parameters and of the noise come last."""
 
 
+ROW = ("y", "ok", "noise", "dt")
+Y, OK, NOISE_FACTOR, INTERVAL = range(4)
+"""Columns of a row after its regressors, by the names of the fields of a tile, and by their places."""
+UNUSED, UNSEEN, USED = range(3)
+"""What becomes of a sample; `UNSEEN` is one that excites what the reference did not, or hardly."""
+
+
 class Frozen(NamedTuple):
     """The reference model as the compiled routines take it; regressors are in units of ``unit``."""
 
@@ -339,20 +346,20 @@ def outside(phi: Array, unseen: Array) -> bool:
 
 
 @part
-def enter_row(row: Array, frozen: Frozen, memory: Memory) -> bool:
-    """Scores of a row [phi, y, ok, noise, dt] into memory.sample; whether it can be used."""
+def enter_row(row: Array, frozen: Frozen, memory: Memory) -> int:
+    """Scores of a row into memory.sample; returns what becomes of it."""
     n, p = frozen.theta.shape[0], frozen.ar.shape[0]
     past, counts, numbers, phi = memory.past, memory.counts, frozen.numbers, memory.work[0]
-    if not row[n + 3] > 0.0:
-        return False
-    if not row[n + 1] > 0.0:
+    if not row[n + INTERVAL] > 0.0:
+        return UNUSED
+    if not row[n + OK] > 0.0:
         counts[SINCE] = 0.0
-        return False
-    if row[n + 3] > GAP:
+        return UNUSED
+    if row[n + INTERVAL] > GAP:
         counts[SINCE] = 0.0
     # residual and regressors, scaled to the noise variance of weight 1
-    root = 1.0 / np.sqrt(row[n + 2])
-    e = row[n]
+    root = 1.0 / np.sqrt(row[n + NOISE_FACTOR])
+    e = row[n + Y]
     for i in range(n):
         e -= row[i] * frozen.theta[i]
         past[p, i] = row[i] * root / frozen.unit[i]
@@ -369,26 +376,36 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> bool:
         for i in range(n + 1):
             past[lag, i] = past[lag + 1, i]
     counts[SINCE] += 1.0
-    if counts[SINCE] <= p or outside(phi, frozen.unseen):
-        return False
+    if counts[SINCE] <= p:
+        return UNUSED
+    if outside(phi, frozen.unseen):
+        return UNSEEN
     x, clip = min(WIDE, max(-WIDE, phi[n])), numbers[CLIP]
     g = min(clip, max(-clip, x))
     enter_scores(phi[:n], g, x, memory.sample)
     if leverage(memory.sample, frozen) > UNKNOWN:
-        return False
+        return UNSEEN
     if unsure(memory.sample, frozen):
         memory.sample[2 * n], memory.sample[2 * n + 1] = numbers[V], numbers[RAW]
     # the GARCH recursion for h at the next sample
     fed = numbers[ALPHA] * memory.sample[2 * n] / numbers[V] + numbers[BETA]
     counts[LEVEL] = 1.0 - numbers[ALPHA] - numbers[BETA] + fed * counts[LEVEL]
-    return True
+    return USED
 
 
 @Driver
-def scan(rows: Array, frozen: Frozen, memory: Memory, findings: Array) -> None:
-    """Judge rows (T, n + 4) = [phi, y, ok, noise, dt]: findings (T, CUSUM + n + 1), repeated at unused rows."""
+def scan(rows: Array, frozen: Frozen, memory: Memory, findings: Array) -> int:
+    """Judge rows (T, n + 4), regressors and the columns of `ROW`; findings (T, CUSUM + n + 1) are those of the last.
+
+    Returns how many rows excite what the reference did not, or hardly, and are therefore not judged.
+    """
+    unseen = 0
     for t in range(rows.shape[0]):
-        if enter_row(rows[t], frozen, memory):
+        fate = enter_row(rows[t], frozen, memory)
+        if fate == USED:
             judge(memory, frozen, memory.findings)
+        elif fate == UNSEEN:
+            unseen += 1
         for i in range(findings.shape[1]):
             findings[t, i] = memory.findings[i]
+    return unseen

@@ -183,7 +183,7 @@ class Engine:
             self.units.refused["unreadable"] += batch.refused
             if batch.position is not None:
                 self._pending.positions[f"source:{source}"] = batch.position
-        messages = ((samples, batch.left_out) for _, batch in arrived.batches for samples in batch.samples)
+        messages = ((samples, batch.receipt) for _, batch in arrived.batches for samples in batch.samples)
         items: list[Item] = [*self.units.admitted(messages, self._pending, self.next)]
         for action in arrived.actions:
             unit = self.units.names.get(action.unit)

@@ -15,8 +15,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from driftfit.data.known import INTERVAL, NOISE, Known
+from driftfit.data.known import Known
 from driftfit.data.record import Records
+from driftfit.engine.drivers import INTERVAL, NOISE
 from driftfit.engine.kernel import Array
 from driftfit.run.live.interventions import HELD
 from driftfit.run.live.rule import FROZEN
@@ -39,7 +40,7 @@ REFUSED = {late.LATE: "late", late.REPEATED: "duplicate", late.UNTIMED: "no time
 """How samples are counted that do not enter the journal."""
 
 
-Told = Callable[[int], Counter[str] | None]
+CounterOf = Callable[[int], Counter[str] | None]
 """Who, besides the unit, counts sample k if it is left out."""
 
 
@@ -78,17 +79,17 @@ class Section:
             values = np.zeros((count, len(self.streams.settings.columns)))
             trial.process(0, Rows(self.streams.index, number, time, values), Out())
 
-    def admit(self, places: Array, time: Array | None, values: Array, told: Told) -> Rows | None:
+    def admit(self, places: Array, time: Array | None, values: Array, counter_of: CounterOf) -> Rows | None:
         """The samples (N,) that enter the journal, sorted by unit and time; the others are counted."""
         if time is None:
             order = np.argsort(places, kind="stable")
         else:
-            self._refuse("time in the future", places, np.flatnonzero(far := self._too_far(places, time)), told)
+            self._refuse("time in the future", places, np.flatnonzero(far := self._too_far(places, time)), counter_of)
             kept = np.flatnonzero(~far)
             order, fate = self.streams.waiting.judge(places[kept], time[kept], self.streams.newest)
             order = kept[order]
             for code, name in REFUSED.items():
-                self._refuse(name, places, kept[fate == code], told)
+                self._refuse(name, places, kept[fate == code], counter_of)
         if not len(order):
             return None
         time = None if time is None else time[order]
@@ -106,9 +107,9 @@ class Section:
                 newest = newest if far[k] or math.isnan(time[k]) else max(newest, time[k])
         return np.asarray(far)
 
-    def _refuse(self, name: str, places: Array, which: Array, told: Told) -> None:
+    def _refuse(self, name: str, places: Array, which: Array, counter_of: CounterOf) -> None:
         for k in which.tolist():
-            tally((self.units[places[k]].rare, told(k)), name, 1)
+            tally((self.units[places[k]].rare, counter_of(k)), name, 1)
 
     def process(self, first: int, rows: Rows, out: Out, done: Array | None = None) -> None:
         """Process samples of the journal, the first of which has the number ``first``.

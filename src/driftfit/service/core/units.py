@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
@@ -12,11 +12,11 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.service.core.journal import Journal, Pending, Rows
-from driftfit.service.core.section import Section, Told, tally
+from driftfit.service.core.section import CounterOf, Section, tally
 from driftfit.service.core.unit import Unit
 from driftfit.service.settings.config import UnitSettings
 from driftfit.service.settings.matching import valid_name
-from driftfit.service.sources.samples import NO_SIGNAL, OFFERED, Samples, numbers_of, seconds_of
+from driftfit.service.sources.samples import NO_SIGNAL, Receipt, Samples, numbers_of, seconds_of
 
 ROUTES = 200_000
 """Topics whose units are remembered, including those that have none."""
@@ -33,17 +33,17 @@ class Gathered:
         self.lengths: list[int] = []
         self.columns: dict[str, list[Any]] = {name: [] for name in settings.columns}
         self.times: list[Any] = []
-        self.told: list[Counter[str] | None] = []
+        self.counters: list[Counter[str] | None] = []
         """Who counts what is left out of each message besides the unit."""
 
-    def add(self, place: int, samples: Samples, told: Counter[str] | None) -> bool:
+    def add(self, place: int, samples: Samples, counter: Counter[str] | None) -> bool:
         """Add a message; False if it has no signal of the section."""
         given, count = samples.columns, samples.length
         if self.columns.keys().isdisjoint(given):
             return False
         self.places.append(place)
         self.lengths.append(count)
-        self.told.append(told)
+        self.counters.append(counter)
         for name, column in self.columns.items():
             _extend(column, given.get(name), count)
         if self.time is not None:
@@ -66,9 +66,9 @@ def _extend(column: list[Any], cells: Any, count: int) -> None:
         column += [cells] * count
 
 
-def _told(counters: Sequence[Counter[str] | None], messages: Array) -> Told:
+def _counter_of(one: Gathered, messages: Array) -> CounterOf:
     """Who counts sample k, which came in one of the messages."""
-    return lambda k: counters[messages[k]]
+    return lambda k: one.counters[messages[k]]
 
 
 class Units:
@@ -171,20 +171,20 @@ class Units:
         self.since[unit] = born
         return unit
 
-    def admitted(
-        self, messages: Iterable[tuple[Samples, Counter[str] | None]], pending: Pending, born: int
-    ) -> list[Rows]:
+    def admitted(self, messages: Iterable[tuple[Samples, Receipt | None]], pending: Pending, born: int) -> list[Rows]:
         """The samples of messages that enter the journal; those that units do not accept are counted."""
         gathered = [Gathered(one) for one in self.settings]
-        for samples, told in messages:
+        for samples, receipt in messages:
             units = self.of_topic(samples.topic, pending, born)
+            counter = None
+            if receipt is not None:
+                counter = receipt.left_out
+                receipt.offered += samples.length * max(len(units), 1)
             if not units:
-                tally((self.refused, told), "no unit for the topic", samples.length)
-            if told is not None:
-                told[OFFERED] += samples.length * max(len(units), 1)
+                tally((self.refused, counter), "no unit for the topic", samples.length)
             for unit in units:
-                if not gathered[unit.streams.index].add(unit.place, samples, told):
-                    tally((unit.rare, told), NO_SIGNAL, samples.length)
+                if not gathered[unit.streams.index].add(unit.place, samples, counter):
+                    tally((unit.rare, counter), NO_SIGNAL, samples.length)
         found = []
         for section, one in zip(self.sections, gathered, strict=True):
             if one.places:
@@ -192,7 +192,7 @@ class Units:
                 messages = np.repeat(np.arange(len(one.places)), one.lengths)
                 paid = np.flatnonzero(self._paid(section, one)[messages])
                 times = None if times is None else times[paid]
-                found.append(section.admit(places[paid], times, values[paid], _told(one.told, messages[paid])))
+                found.append(section.admit(places[paid], times, values[paid], _counter_of(one, messages[paid])))
         return [rows for rows in found if rows is not None]
 
     def _paid(self, section: Section, one: Gathered) -> Array:
@@ -210,6 +210,6 @@ class Units:
             if paid[k]:
                 most[place] -= count
             else:
-                tally((section.units[place].rare, one.told[k]), "flood", count)
+                tally((section.units[place].rare, one.counters[k]), "flood", count)
         self._saved[section.streams.index] = np.where(left < 0.0, most, left), now
         return paid

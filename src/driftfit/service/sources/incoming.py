@@ -6,13 +6,12 @@ import json
 import queue
 import threading
 import time
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
 import msgspec
 
-from driftfit.service.sources.samples import NO_SIGNAL, OFFERED, Batch, Samples, decode
+from driftfit.service.sources.samples import NO_SIGNAL, Batch, Receipt, Samples, decode
 
 WAIT = 30.0
 """Seconds after which a request that is not yet journaled is answered with an error."""
@@ -34,21 +33,20 @@ class Incoming:
         it was too much for the rate of its unit, and 422 if no unit could use it.
         """
         samples, refused = decoded(topic, body)
-        done, left_out = threading.Event(), Counter[str]()
-        batch = Batch(samples, done.set, refused=len(refused), arrived=time.monotonic(), left_out=left_out)
+        done, receipt = threading.Event(), Receipt()
+        batch = Batch(samples, done.set, refused=len(refused), arrived=time.monotonic(), receipt=receipt)
         try:
             self.queue.put(batch, timeout=WAIT)
         except queue.Full:
             return {"error": "busy: samples are held back; try again later", "status": 503}
         if not done.wait(WAIT):
             return {"error": "the journal does not take samples now; try again later", "status": 503}
-        received = sum(one.length for one in samples)
-        offered = left_out.pop(OFFERED, received)
+        received, left_out = sum(one.length for one in samples), receipt.left_out
         answer: dict[str, Any] = {"received": received, "refused": refused[:20], "left_out": dict(left_out)}
         if not samples:
             return answer | {"error": "; ".join(refused[:20]) or "the body has no topic.", "status": 400}
         reasons = left_out.keys() - {NO_SIGNAL} or left_out.keys()  # a unit that does not read a signal refuses nothing
-        if left_out.total() < offered or reasons <= KNOWN:
+        if left_out.total() < receipt.offered or reasons <= KNOWN:
             return answer
         why = ", ".join(f"{reason} ({count})" for reason, count in left_out.items())
         return answer | {"error": f"no sample was taken: {why}.", "status": 429 if "flood" in left_out else 422}

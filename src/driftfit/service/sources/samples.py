@@ -14,6 +14,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
@@ -32,8 +33,8 @@ LARGEST = 4 << 20
 Cell = float | int | bool | str | None
 _DECODE = msgspec.json.Decoder(dict[str, Cell | list[Cell]] | list[dict[str, Cell]])
 
-OFFERED, NO_SIGNAL = "offered", "no signal"
-"""What a sender is told besides: samples times the units that read their topic; and why one of these took none."""
+NO_SIGNAL = "no signal"
+"""Why a unit that reads a topic took no sample of it."""
 
 
 class Samples(NamedTuple):
@@ -43,6 +44,16 @@ class Samples(NamedTuple):
     length: int
     columns: Mapping[str, Any]
     """A list of ``length`` values, or one value for all of them, by name of the field."""
+
+
+@dataclass
+class Receipt:
+    """What becomes of a batch, for a sender that waits for an answer."""
+
+    offered: int = 0
+    """Samples times the units that read their topic."""
+    left_out: Counter[str] = field(default_factory=Counter)
+    """How many of these the units did not take, by reason."""
 
 
 class Batch(NamedTuple):
@@ -57,8 +68,8 @@ class Batch(NamedTuple):
     """Messages that could not be decoded."""
     arrived: float = 0.0
     """When the first of them arrived, in seconds of the monotonic clock."""
-    left_out: Counter[str] | None = None
-    """Counts the samples that units do not take, by reason, where the sender is told before the acknowledgement."""
+    receipt: Receipt | None = None
+    """To be filled before the acknowledgement, if the sender waits for it."""
 
 
 def decode(topic: str, payload: bytes | str) -> Samples:

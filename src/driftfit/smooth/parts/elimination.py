@@ -38,17 +38,17 @@ CANCELLED = 1e-6
 """Smallest f: below it U has lost more than six digits in one step."""
 
 
-def smooth(walk: Walk, scale: Array, keep: str = "std", spent: bool = False) -> Path | None:
+def smooth(walk: Walk, scale: Array, keep: str = "std", overwrite: bool = False) -> Path | None:
     """Solve a problem with a diagonal q and a diffuse start of full rank; None if the result is not accurate enough.
 
-    ``scale`` (n,) is the size of each regressor. With keep="fit" the path has rho and c. A ``spent`` problem is
-    overwritten by its solution.
+    ``scale`` (n,) is the size of each regressor. With keep="fit" the path has rho and c. ``overwrite``: phi and signals
+    take the solution, which saves memory.
     """
-    solved = smooth_and_weigh(walk, scale, keep, spent)
+    solved = smooth_and_weigh(walk, scale, keep, overwrite)
     return None if solved is None else solved[0]
 
 
-def smooth_and_weigh(walk: Walk, scale: Array, keep: str = "std", spent: bool = False) -> tuple[Path, float] | None:
+def smooth_and_weigh(walk: Walk, scale: Array, keep: str = "std", overwrite: bool = False) -> tuple[Path, float] | None:
     """The same, and the log of the diffuse likelihood of y given q, drift and weights, up to a constant.
 
     With U of the middle sample, -2 log L = J + log |U| - sum log f, since each f is 1 / (1 + g U_ii).
@@ -69,7 +69,7 @@ def smooth_and_weigh(walk: Walk, scale: Array, keep: str = "std", spent: bool = 
     volume = float(np.linalg.slogdet(U)[1]) - logs
     work["C"][0], work["theta"][0] = C[..., None], (C @ work["z"][0].sum(axis=-1))[:, None]
     work["known"][0] = (C @ work["known_z"][0].sum(axis=-1))[:, None]
-    theta, var = (samples.signals, samples.phi) if spent else (np.empty((T, n)), np.empty((T, n)))
+    theta, var = (samples.signals, samples.phi) if overwrite else (np.empty((T, n)), np.empty((T, n)))
     of_fit = T if keep == "fit" else 0
     found = Found(theta, var, np.empty(of_fit), np.empty(of_fit))
     sums = Sums(*outwards(work, samples, K, kept, found))

@@ -53,7 +53,7 @@ OUTGROWN = 1e12
 regressor becomes a coordinate: a covariance in the old ones would keep four of sixteen digits of the rest.
 """
 
-ROUNDING = 1e-15
+LEAST_VARIANCE = 1e-15
 """A variance below this share of the sum of its squares is rounding."""
 
 
@@ -189,7 +189,7 @@ def in_units_of_theta(s: State, l: int) -> None:
             for b in range(j, n):
                 total += s.W[i, b, l] * s.R[j, b, l]
             s.P[i, j, l] = total
-        s.P[i, i, l] = max(s.P[i, i, l], ROUNDING * squares)
+        s.P[i, i, l] = max(s.P[i, i, l], LEAST_VARIANCE * squares)
 
 
 @kernel

@@ -36,8 +36,9 @@ from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, log
 from driftfit.trackers.parts.covariance import prediction
 from driftfit.trackers.parts.information import spread
 
-ROUNDING = 1e-13
-"""Share of its terms below which a sum may be rounding: 2^-53 for each of some hundred operations, with a margin."""
+WITHIN_SPAN = 1e-13
+"""Share of its terms up to which the part of a regressor outside the span may be rounding: 2^-53 for each of some
+hundred operations, with a margin."""
 
 WORST = 1e6
 """Largest variance inflation for which a covariance is used: ten of sixteen digits remain."""
@@ -122,7 +123,7 @@ def refresh(S: Array, R: Array, work: Array) -> None:
             loose += work[SIZE, i] * abs(R[i, j])
         work[LOOSE, j] = loose
         for i in range(j):
-            if S[j, j] == 0.0 and abs(R[i, j]) <= ROUNDING * work[STD, i] * loose:
+            if S[j, j] == 0.0 and abs(R[i, j]) <= WITHIN_SPAN * work[STD, i] * loose:
                 R[i, j] = 0.0
 
 
@@ -140,7 +141,7 @@ def outside(phi: Array, S: Array, work: Array) -> tuple[int, float, float]:
             u -= S[i, j] * work[ROW, i]
         x = u / S[j, j] if S[j, j] > 0.0 else 0.0
         work[ROW, j] = x
-        if S[j, j] == 0.0 and abs(u) > ROUNDING * (abs(phi[j]) + np.sqrt(squares) * work[LOOSE, j]):
+        if S[j, j] == 0.0 and abs(u) > WITHIN_SPAN * (abs(phi[j]) + np.sqrt(squares) * work[LOOSE, j]):
             return j, u, np.inf
         squares += x * x
     return -1, 0.0, squares

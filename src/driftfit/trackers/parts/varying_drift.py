@@ -13,15 +13,16 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.engine.drivers import COMMON
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import as_numbers, factor
 
 
 @kernel
 def read_drift(s: State, known: Array, t: int, l: int) -> None:
-    """Take the roots from the columns of ``known`` after the third."""
+    """Take the roots from the columns of ``known`` that only some trackers read."""
     for i in range(s.theta.shape[0]):
-        s.drift_root[i, l] = known[t, 3 + i, l]
+        s.drift_root[i, l] = known[t, COMMON + i, l]
 
 
 def roots(owner: str, names: Sequence[str], T: int, drift: Any) -> Array:

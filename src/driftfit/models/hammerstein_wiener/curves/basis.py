@@ -25,7 +25,7 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self, cast
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -129,7 +129,8 @@ class _Orthogonal(Basis):
 
     @property
     def expected(self) -> tuple[float, float]:
-        return cast("tuple[float, float]", self.range)
+        low, high = self.range
+        return low, high
 
     @property
     def own_numbers(self) -> Array:

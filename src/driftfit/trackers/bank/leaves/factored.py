@@ -28,7 +28,7 @@ from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, fill, load, minus, over, plus, reaches, store, sum_of, times
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 
-ROUNDING = 4.0 * np.finfo(float).eps
+LEAST_PIVOT = 4.0 * np.finfo(float).eps
 """A pivot below n times this share of its variance is rounding."""
 
 
@@ -137,7 +137,7 @@ def factorise(C: Array, n: int, least: float) -> None:
         for k in range(j + 1, n):
             later = k * (k + 1) // 2
             whole += C[later + k] * C[later + j] * C[later + j]
-        rounding = ROUNDING * n * whole
+        rounding = LEAST_PIVOT * n * whole
         sound = C[at + j] > rounding
         if not sound:
             C[at + j] = max(least * rounding, 0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.drivers import COMMON, TrackerSteps, diagonal
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
 from driftfit.trackers.bank.layout import (
     COUNT,
@@ -298,7 +298,7 @@ def begin(s: State, l: int) -> None:
 @kernel
 def take_known(s: State, known: Array, t: int, l: int) -> None:
     """Read the priors of the joint events of this sample, a chain of the changes, and their drift factors."""
-    row, column = t if known.shape[0] > 1 else 0, 3
+    row, column = t if known.shape[0] > 1 else 0, COMMON
     memory = floats(memory_at(s), s.table[MEMORY_AT, 2, 0], s.theta.shape[1])
     for field in (GIVEN, GIVEN_CHAIN, DRIFT):
         start = s.table[field, 0, l] // 8
