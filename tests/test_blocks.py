@@ -332,3 +332,18 @@ def test_a_stream_renews_the_drift_of_products_as_a_record_does(intercept):
         assert same(live.theta, record.theta[t])
     with pytest.raises(ValueError, match="full matrix q"):
         renewed(Live(model, Kalman(q=1e-6, r=1e-6)), q)
+
+
+def test_every_input_has_a_panel():
+    """The first was drawn alone."""
+    rng = np.random.default_rng(3)
+    u = rng.uniform(-1.0, 1.0, (120, 2))
+    y = np.convolve(u[:, 0] + 0.5 * u[:, 0] ** 2 - u[:, 1], [0.0, 1.0, 0.5])[:120] + 0.01 * rng.normal(size=120)
+    run = track(HammersteinWiener(1, 1, input=[Polynomial(2), None]), K, y, u)
+    figure = run.plot_blocks(times=[-1])
+    assert [axis.get_ylabel() for axis in figure.axes] == ["v", "v", "y", "a", "b", "c", "d"]
+    assert [axis.get_title() for axis in figure.axes[:3]] == ["block of u1", "block of u2", "output block"]
+    found = run.blocks()
+    for i, axis in enumerate(figure.axes[:2]):
+        (line,) = axis.lines
+        assert_allclose(line.get_ydata(), found.input_curve(line.get_xdata(), -1, i))

@@ -184,3 +184,21 @@ def test_an_input_with_a_run_of_codes_and_a_simulated_output():
         run = track(model, tracker, y, u)
         whole = track(model, tracker, *plant())
         assert np.abs(run.theta[-1] - whole.theta[-1]).max() < allowed
+
+
+@pytest.mark.parametrize(
+    "tracker",
+    [RLS(0.9), RLS(1.0, p0=100.0), RLS(0.99, kind="directional"), Kalman(q=0.0, r=0.01, p0=100.0)],
+    ids=["diffuse", "prior", "directional", "Kalman"],
+)
+def test_a_sample_with_an_innovation_has_a_variance(tracker):
+    """Regressors that agree in all digits leave P without any: its next variance is below 0, and the noise scale was
+    learned from that."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        x, bad = rng.normal(size=(300, 2)), rng.random(300) < 0.1
+        code = 10.0 ** rng.uniform(0.0, 20.0, 300) * rng.choice([-1.0, 1.0], 300)
+        x[bad] = np.stack([code, code + 1.0], axis=1)[bad]
+        run = track(Regression(2), tracker, x[:, 0] - x[:, 1] + 0.1 * rng.normal(size=300), x)
+        assert not np.isnan(run.innovation_std[np.isfinite(run.innovation)])[10:].any()
+        assert np.isfinite(run.theta).all()

@@ -167,3 +167,11 @@ def test_rounding_errors_are_not_diagnosed():
     x = np.column_stack([np.ones(200), np.random.default_rng(5).normal(size=200)])
     diagnosis = track(Regression(2), AdaptiveKalman(), np.full(200, 5.0), x).diagnose()
     assert diagnosis.ok
+
+
+def test_a_constant_output_has_no_noise():
+    """What the prior leaves in the innovations shrinks: it was said to be noise that is not steady."""
+    u = np.random.default_rng(6).normal(size=300)
+    for level in (5.0, 0.1):
+        found = track(ARX(2, 2), Kalman(q=1e-6, r=1.0, p0=1.0), np.full(300, level), u).diagnose()
+        assert all(np.isnan(found[name].value) for name in ("noise level", "steady noise", "whiteness (p)", "outliers"))

@@ -166,3 +166,14 @@ def test_a_missing_input_is_missing_in_functions_that_have_a_value_without_it(fo
     assert not run.ok[at]
     assert np.isnan(run.prediction[at])
     np.testing.assert_array_equal(run.theta[at], run.theta[at - 1])
+
+
+def test_a_condition_on_what_is_missing_decides_nothing():
+    """The simulation took the other branch."""
+    rng = np.random.default_rng(5)
+    u = rng.normal(size=300)
+    y = np.where(u > 0.0, 2.0 * u, 0.0) + 0.1 * rng.normal(size=300)
+    run = track(Equation("y = theta.k * (u if u > 0 else 0)"), Kalman(q=1e-6, r=0.01), y, u)
+    later = np.array([0.5, np.nan, -0.5])
+    for ahead in (run.simulate(later), run.forecast(3, later)):
+        assert np.isnan(ahead.y_hat).tolist() == [False, True, False]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftfit import ARX, AdaptiveKalman, Equation, Regression, track
+from driftfit import ARX, AdaptiveKalman, Equation, Kalman, Regression, track
 from driftfit.smooth.problem import walk_of
 
 T, THETA = 600, (1.1, -0.5, 1.0, 0.5)
@@ -112,3 +112,18 @@ def test_a_smoother_leaves_out_the_same_samples():
         counts.append((left_out(run), np.sum(walk_of(run).weight == 0.0)))
     assert sum(count > 0 for count, _ in counts) >= 5
     assert all(count == found for count, found in counts)
+
+
+@pytest.mark.parametrize(("held", "at"), [(5, 12), (20, 40)])
+@pytest.mark.parametrize("code", [999.0, -999.0])
+def test_a_code_beside_inputs_that_are_held_and_a_coarse_meter(held, at, code):
+    """Readings that repeat are few, but the plant is not at rest: they show its range."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        u, y = np.repeat(rng.normal(size=400 // held + 1), held)[:400], np.zeros(400)
+        for t in range(1, 400):
+            y[t] = 0.7 * y[t - 1] + 2.0 * u[t - 1] + 0.1 * rng.normal()
+        y = 0.5 * np.round(2.0 * y)
+        y[at] = code
+        run = track(ARX(1, 1), Kalman(q=1e-6, r=0.01), y, u)
+        np.testing.assert_allclose(run.theta[-1], [0.7, 2.0], atol=0.1)

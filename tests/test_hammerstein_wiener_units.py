@@ -47,9 +47,11 @@ TRACKERS = {
 }
 
 
+@pytest.mark.parametrize("first", [None, 0.0], ids=["", "begins with 0"])
 @pytest.mark.parametrize("kind", TRACKERS)
-def test_results_are_the_same_in_any_unit_of_y(kind):
+def test_results_are_the_same_in_any_unit_of_y(kind, first):
     y, u = record()
+    y[0] = y[0] if first is None else first
     expected = without_unit(track(*TRACKERS[kind](1.0), y, u), 1.0)
     assert np.isfinite(expected).all()
     for unit in UNITS:
@@ -72,6 +74,21 @@ def test_measurement_noise_has_the_unit_of_the_output(output):
     expected = without_unit(run(1.0), 1.0)
     for unit in UNITS:
         np.testing.assert_allclose(without_unit(run(unit), unit, of_b=unit), expected, rtol=1e-5, atol=1e-7)
+
+
+def test_one_output_does_not_give_the_grid_its_scale():
+    """A first output near 0 did: the slope of the curve was that of a narrow grid, and estimates stayed far away."""
+    errors = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        u, w, y = rng.normal(size=800), 0.0, np.zeros(800)
+        for t in range(1, 800):
+            w = 0.6 * w + u[t - 1]
+            y[t] = 2.0 * np.arctan(0.5 * w) + 0.05 * rng.normal()
+        model = HammersteinWiener(1, 1, output=Legendre(3, (-4.0, 4.0)))
+        run = track(model, OutputError(q=1e-6, r=0.0025, theta0=0.3), y, u)
+        errors.append(np.sqrt(np.mean(run.innovation[300:] ** 2)))
+    assert max(errors) < 0.1  # .2 before
 
 
 def values(x, p, out):

@@ -169,11 +169,14 @@ def test_the_noise_model_is_uncertain_in_forecasts_too():
     assert np.mean(inside) > 0.87
 
 
-@pytest.mark.parametrize(
+IN_COLOURED_NOISE = pytest.mark.parametrize(
     ("model", "tracker"),
     [(ARMAX(1), RLS(1.0)), (BoxJenkins(), RLS(1.0)), (BoxJenkins(), InstrumentalVariables(1.0))],
     ids=["ARMAX", "Box-Jenkins", "instruments"],
 )
+
+
+@IN_COLOURED_NOISE
 def test_the_noise_variance_is_not_that_of_the_quietest_samples(model, tracker):
     """A start that is forgotten leaves P in units of the least of many estimates, which is .7 of the variance; taken as
     the scale it let .85 of the outputs into their bands."""
@@ -185,6 +188,22 @@ def test_the_noise_variance_is_not_that_of_the_quietest_samples(model, tracker):
         inside.append(np.abs(run.innovation[120:]) < 1.96 * run.innovation_std[120:])
     assert 0.9 < np.median(scale) < 1.15
     assert 0.92 < np.mean(inside) < 0.98
+
+
+@IN_COLOURED_NOISE
+@pytest.mark.parametrize(("quiet", "loudness"), [(20, 1e-6), (50, 1e-3)])
+def test_noise_that_begins_late_is_soon_within_the_bands(model, tracker, quiet, loudness):
+    """A square that counted as at most 25 times the mean let none of the outputs into their bands for 40 samples."""
+    inside = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        u, e = rng.normal(size=200), 0.3 * rng.normal(size=200)
+        e[:quiet] *= loudness
+        y = signal.lfilter([0.0, 1.0], [1.0, -0.8], u) + signal.lfilter([1.0, 0.5], [1.0, -0.8], e)
+        run = track(model, tracker, y, u)
+        later = slice(quiet + 30, quiet + 60)
+        inside.append((np.abs(run.innovation) < 1.96 * run.innovation_std)[later][run.ok[later]])
+    assert np.mean(np.concatenate(inside)) > 0.85
 
 
 def test_the_forecast_of_coloured_noise_decays():

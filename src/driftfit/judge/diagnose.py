@@ -162,7 +162,10 @@ def diagnosis(known: Evidence) -> Diagnosis:
 def standardised(run: Track) -> tuple[Array, Whiteness]:
     """Standardised innovations after the start, NaN where there are none, and their whiteness."""
     start = burn_in(run.model.n)
-    e = run.innovation if run.model.implicit else rounded(run.innovation, run.y[run.ok])
+    used = run.y[run.ok]
+    e = run.innovation if run.model.implicit else rounded(run.innovation, used)
+    if run.model.output_lags and np.ptp(used if used.size else 0.0) == 0.0:
+        e = np.full(len(run), np.nan)  # a constant output has no noise: what is left is the prior, on its way out
     with np.errstate(divide="ignore", invalid="ignore"):
         z = e / run.innovation_std
     z = np.where(run.ok & np.isfinite(z) & (np.arange(len(run)) >= min(start, len(run) // 2)), z, np.nan)

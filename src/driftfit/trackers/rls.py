@@ -41,7 +41,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.engine.drivers import ROUNDING, TrackerSteps
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import State, exp, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
@@ -64,7 +64,7 @@ from driftfit.trackers.parts.resolution import least_noise, resolution, resolve,
 RECENT, RECENT_SHARE, LATER_SHARE = 20.0, 0.125, 0.25
 """Memory of the present noise variance: samples, and shares of those so far for the unit of P and for the scale."""
 LARGE = 25.0
-"""A square above this multiple of it counts as this multiple."""
+"""For the unit of P, a square above this multiple of the variance counts as this multiple."""
 
 
 def no_settling() -> dict[str, Any]:
@@ -142,15 +142,14 @@ def learn_variance(s: State, l: int) -> None:
 def keep_recent(s: State, squares: float, square: float, l: int) -> None:
     """While a start is forgotten, the noise variance is a mean of e^2 / s over the later samples.
 
-    ``squares`` is the sum before this sample, and ``square`` its own.
+    ``squares`` is the sum before this sample, and ``square`` its own, which counts in full: the sample changes theta in
+    full, and with a bounded square the bands would stay too narrow after a quiet start, until dozens of samples later.
     """
     counted = s.ok[l] * s.fresh[l] > 0.0
     if counted & (s.count[l] > 1.0) & (s.count[l] < s.unequal[l]):
-        before, size = squares / (s.count[l] - 1.0), abs(s.y[l]) + abs(s.y_hat[l])
-        # residuals that are rounding say nothing of the noise that follows
-        before = before if before * s.noise[l] > (ROUNDING * size) ** 2 else square
+        before = squares / (s.count[l] - 1.0)
         share = 1.0 / min(s.count[l], max(RECENT, LATER_SHARE * s.count[l]))
-        mean = before + share * (min(square, LARGE * before) - before)
+        mean = before + share * (square - before)
         s.squares[l] = s.count[l] * mean
         s.scale[l] = max(mean, least_noise(s, l))
 

@@ -74,9 +74,12 @@ class Formula:
             case ast.BinOp():
                 return _BINARY[type(node.op)](at(node.left), at(node.right))
             case ast.IfExp():
-                return np.where(at(node.test), at(node.body), at(node.orelse))
+                test = at(node.test)
+                return np.where(np.isnan(test), np.nan, np.where(test, at(node.body), at(node.orelse)))
             case ast.Compare():
-                return _COMPARE[type(node.ops[0])](at(node.left), at(node.comparators[0]))
+                left, right = at(node.left), at(node.comparators[0])
+                holds = _COMPARE[type(node.ops[0])](left, right)
+                return np.where(np.isnan(left) | np.isnan(right), np.nan, holds)  # what is missing decides nothing
             case ast.Call():
                 return _CALLS[node.func.id](*(at(one) for one in node.args))  # type: ignore[attr-defined]
         raise AssertionError(node)

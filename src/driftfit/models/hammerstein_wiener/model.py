@@ -413,9 +413,8 @@ def _places(model: HammersteinWiener) -> tuple[int, ...]:
 def _memory(model: HammersteinWiener) -> Array:
     into = tuple(basis.parameters for basis in model.bases)
     sigma = model.output_noise[0] if several(model.output_noise) else model.output_noise
-    return memory(
-        model.structure, model.delays, into, model.out.parameters, model.out.limits, sigma, _least_noise(model)
-    )
+    out, least = model.out, _least_noise(model)
+    return memory(model.structure, model.delays, into, out.parameters, out.limits, sigma, least, out.scale)
 
 
 @lru_cache

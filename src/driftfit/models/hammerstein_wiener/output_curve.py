@@ -1,8 +1,9 @@
 """The inverse of an output block on a grid: the y at which sum_k d_k g_k(y) has a given level.
 
 The grid covers the range of accepted outputs so far, widened by a fifth, and is computed again when an output leaves
-it. An output far beyond all others (three times the range of medians of three) widens the range only up to that limit,
-so that one absurd number does not make the grid coarse for ever.
+it. While all outputs are equal, it is widened by the scale of range, knots or centres (`Basis.scale`). An output far
+beyond all others (three times the range of medians of three) widens the range only up to that limit, so that one
+absurd number does not make the grid coarse for ever.
 
 If the levels increase along the grid, the cell is found by bisection, and y in the cell by the monotone cubic through
 levels and slopes at its ends, refined by Newton's method. Whether the levels increase is not checked at every sample.
@@ -49,6 +50,7 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     REACH,
     RISING,
     ROW,
+    SCALE,
     STEP,
     TOP,
     TRIAL,
@@ -264,7 +266,8 @@ def laying(values: Any) -> Any:
         low, high = m[LOWEST, 0], m[HIGHEST, 0]
         start, end = m[LOW, 0], m[LOW, 0] + (GRID - 1) * m[STEP, 0]
         wide = high - low
-        margin = WIDER * (wide if wide > 0.0 else abs(high) if high != 0.0 else 1.0)
+        alone = m[SCALE, 0] if m[SCALE, 0] > 0.0 else WIDER * (abs(high) if high != 0.0 else 1.0)
+        margin = WIDER * wide if wide > 0.0 else alone
         short = (low < start and start > m[BOTTOM, 0]) or (high > end and end < m[TOP, 0])
         if low <= high and (m[STEP, 0] == 0.0 or short or end - start > WIDE * (wide + 2.0 * margin)):
             start, end = max(low - margin, m[BOTTOM, 0]), min(high + margin, m[TOP, 0])

@@ -33,13 +33,13 @@ ROW = GRID + 1
 
 (
     LOW, STEP, LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED, STARTED, MINIMAL, GIVEN, RAW, VARIANCE, BEFORE, EARLIER,
-    FIRM_LOW, FIRM_HIGH, MOVED, LATE, CELL, Y, DT, OBSERVED, OK, FACTOR, LEAST, HEAD,
-) = range(27)  # fmt: skip
+    FIRM_LOW, FIRM_HIGH, MOVED, LATE, CELL, Y, DT, OBSERVED, OK, FACTOR, LEAST, SCALE, HEAD,
+) = range(28)  # fmt: skip
 """Numbers: the grid, the range of accepted outputs, where the output block is defined, results, whether all lags are
 known, whether theta is xi, the given noise factor, the output as given, sigma^2 or 0, the two previous outputs, the
 range of medians of three, whether the range changed, whether a level is stored in place of the
-prediction, its cell of the grid, what steps and compiled routine exchange, and the least variance that sigma adds to
-an equation; HEAD is their number.
+prediction, its cell of the grid, what steps and compiled routine exchange, the least variance that sigma adds to
+an equation, and the scale of y that the basis gives; HEAD is their number.
 """
 
 (
@@ -94,11 +94,11 @@ def places_of(
 
 def memory(
     structure: Structure, nk: tuple[int, ...], into: tuple[Array, ...], out: Array, limits: tuple[float, float],
-    sigma: float | None, least: float,
+    sigma: float | None, least: float, scale: float,
 ) -> Array:  # fmt: skip
     """``blocks`` before the first sample."""
     head = np.zeros(HEAD)
     head[[LOWEST, HIGHEST, FIRM_LOW, FIRM_HIGH, BOTTOM, TOP]] = np.inf, -np.inf, np.inf, -np.inf, *limits
     head[[RISING, PREDICTED, BEFORE, EARLIER]] = 1.0, np.nan, np.nan, np.nan
-    head[[VARIANCE, LEAST]] = 0.0 if sigma is None else sigma * sigma, least
+    head[[VARIANCE, LEAST, SCALE]] = 0.0 if sigma is None else sigma * sigma, least, scale
     return np.concatenate([head, *_arrays(structure, nk, into, out).values()])

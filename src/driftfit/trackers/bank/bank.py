@@ -91,7 +91,8 @@ class Bank(Tracker):
         Changes of theta between samples; the first is the normal course. None: a small drift, and a rare
         jump of any parameter, both scale-free.
     sensors : list of Sensor
-        How the sensor may behave; the first must be nominal. None: nominal, with unknown noise variance.
+        How the sensor may behave; the first must be nominal. None: nominal, with unknown noise variance. A spike is
+        then one jump, and its end another: for readings with spikes give [Sensor.nominal(), Sensor.outlier()].
     transition : None, (H_d, H_d), (H, H), or a pair
         Markov prior P[from, to]: of the changes, of joint events (change i, sensor j at i H_m + j), or (changes,
         sensors). None: events are independent, with the probabilities of the changes and sensors.

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from driftfit.engine.kernel import State, kernel
 
 LEFT = 1e-14
@@ -116,14 +118,16 @@ def reduce_covariance(s: State, gain: float, l: int) -> None:
 def corrected(s: State, y_hat: float, v: float, l: int) -> float:
     """Correct theta and P from s.g = P h and the variance v of the innovation, and report s.y_hat, s.e, s.s.
 
-    Returns 1 / v, or 0 if the sample is not used.
+    Returns 1 / v, or 0 if the sample is not used. Where v is not positive, s.ok becomes 0, and s.s infinite.
     """
     e = s.y[l] - y_hat
     gain = s.ok[l] / v
     for i in range(s.theta.shape[0]):
         s.theta[i, l] += gain * s.g[i, l] * e
     reduce_covariance(s, gain, l)
-    s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
+    # P that has lost its digits gets some of them back, but the sample has no variance, and says nothing of the noise
+    s.ok[l] = s.ok[l] if v > 0.0 else 0.0
+    s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v if v > 0.0 else np.inf
     return gain  # type: ignore[no-any-return]
 
 

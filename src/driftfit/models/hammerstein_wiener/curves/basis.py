@@ -97,6 +97,10 @@ class Polynomial(Basis):
         return self.degree
 
     @property
+    def scale(self) -> float:
+        return 0.0
+
+    @property
     def names(self) -> tuple[str, ...]:
         return tuple("x" if k == 0 else f"x^{k + 1}" for k in range(self.degree))
 

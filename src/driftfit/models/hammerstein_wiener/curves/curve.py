@@ -120,6 +120,12 @@ class Basis(Settings, ABC):
         return self.height / (high - low)
 
     @property
+    def scale(self) -> float:
+        """The scale of x that range, knots or centres give; 0 if there are none."""
+        low, high = self.rise_between
+        return high - low
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the functions, in the order of the coefficients."""
         return tuple(f"f{k + 1}" for k in range(self.n))
@@ -185,6 +191,10 @@ class Functions(Basis):
             self._set("labels", tuple(str(label) for label in self.labels))
             if len(self.labels) != self.n:
                 raise ValueError(f"Functions: {len(self.labels)} labels were given for {self.n} functions.")
+
+    @property
+    def scale(self) -> float:
+        return 0.0
 
     @property
     def evaluate(self) -> Any:

@@ -135,10 +135,11 @@ class _Grid:
         """Build the grid for the outputs before sample t, if it does not contain them."""
         low, high = float(self.low[t - 1]), float(self.high[t - 1])
         known = bool(np.isfinite(low) and np.isfinite(high))
-        low, high = (low, high) if known else (-1.0, 1.0)
+        alone = self.basis.scale or (WIDER * abs(high) if known else 0.0) or 1.0
+        low, high = (low, high) if known else (-alone, alone)
         if not self.y.size or known > self.known or low < self.y[0] or high > self.y[-1]:
             self.known = known
-            margin = WIDER * max(high - low, 1e-9 * max(-low, high), 1e-30)
+            margin = WIDER * (high - low) or alone
             bottom, top = self.basis.limits
             self.y = np.linspace(max(low - margin, bottom), min(high + margin, top), GRID)
             self.curve = self.basis.value(self.y)

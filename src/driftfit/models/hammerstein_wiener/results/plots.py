@@ -20,22 +20,29 @@ POINTS = 200
 
 
 def plot_blocks(run: Track, method: str = "svd-joint", times: Sequence[int] | None = None, ax: Any = None) -> Figure:
-    """Input and output curve at samples ``times`` (four by default), and a, b, c, d over time."""
+    """The curves of the inputs and the output at samples ``times`` (four by default), and a, b, c, d over time."""
     from matplotlib import colormaps
 
     found = blocks_of(run, method)
-    T = len(run)
+    T, m = len(run), found.model.m
     chosen = [T // 4, T // 2, 3 * T // 4, T - 1] if times is None else [range(T)[t] for t in times]
     colours = colormaps["viridis"](np.linspace(0.0, 0.85, len(chosen)))
-    figure, (left, right, *below) = panels(ax, (9.0, 6.6), 6, 2, heights=[1.4, 1.0, 1.0])
-    u, y = (_points(signal) for signal in (run.u[:, 0], run.y))
+    heights = [1.4] * (m // 2 + 1) + [1.0] * (-(-(m + 5) // 2) - m // 2 - 1)
+    figure, axes = panels(ax, (9.0, 2.2 * len(heights)), m + 5, 2, heights=heights)
+    curves, below = axes[: m + 1], axes[m + 1 :]
+    *lefts, right = curves
+    y = _points(run.y)
     for t, colour in zip(chosen, colours, strict=True):
         label = run.time_text(t) if run.timed else f"sample {t}"
-        left.plot(u, found.input_curve(u, t), color=colour, lw=1.3, label=label)
+        for i, left in enumerate(lefts):
+            u = _points(run.u[:, i])
+            left.plot(u, found.input_curve(u, t, i), color=colour, lw=1.3, label=label)
         right.plot(found.output_curve(y, t), y, color=colour, lw=1.3)
-    left.set(xlabel=run.labels.u[0] if run.labels.u else "u", ylabel="v", title="input block")
+    for i, left in enumerate(lefts):
+        name = run.labels.u[i] if run.labels.u else "u" if m == 1 else f"u{i + 1}"
+        left.set(xlabel=name, ylabel="v", title="input block" if m == 1 else f"block of {name}")
     right.set(xlabel="w", ylabel=run.labels.y, title="output block")
-    left.legend(fontsize=8, frameon=False)
+    lefts[0].legend(fontsize=8, frameon=False)
     groups = zip(below, "abcd", (found.a, found.b, found.c, found.d), found.names, found.std, strict=True)
     for place, (axis, letter, group, names, std) in enumerate(groups):
         _paths(axis, run, group, names, std)
@@ -43,7 +50,7 @@ def plot_blocks(run: Track, method: str = "svd-joint", times: Sequence[int] | No
         if place > 1:
             axis.set_xlabel(time_label(run))
         date_axis(axis, run)
-    for axis in (left, right):
+    for axis in curves:
         axis.title.set_fontsize(10)
         axis.grid(alpha=0.25, lw=0.5)
     return figure

@@ -56,6 +56,9 @@ from driftfit.trackers.parts.faults.stored_samples import (
 
 MORE = 16
 """Samples that are stored beyond the number of parameters."""
+VARIED = 3.0
+"""Number of readings, not counting those that repeat the one before, that show a range of the plant: at rest it has one
+or two, but a coarse meter beside an input that is held for some samples has few more."""
 
 
 def unjudged(theta: Array, diffuse: bool) -> dict[str, Any]:
@@ -115,7 +118,7 @@ def settle(s: State, l: int) -> None:
     for at in range(s.remembered[l]):
         if s.samples[at, NOISE, l] > 0.0:
             learn_reading(s, s.samples[at, READING, l], l)
-    varied = s.y_count[l] >= 0.5 * FIRST
+    varied = s.y_count[l] >= VARIED
     known = (s.scale[l] > 0.0) & varied  # it is NaN without residuals
     s.ratios[l] = max(spare_samples(s, l) - s.start_faults[l], 0.0) if known else 0.0
     s.mean_ratio[l] = squares_left(s, l) / (max(s.ratios[l], 1.0) * s.r[l] * s.scale[l]) if known else 0.0
