@@ -152,8 +152,12 @@ def test_several_inputs_are_the_same_alive_in_lanes_and_saved():
     assert same(lanes[0].theta, run.theta)
     assert run.names[3] == "b1[heat]"
     assert HammersteinWiener.from_settings(json.loads(json.dumps(model.settings()))) == model
-    one = HammersteinWiener(1, [2], input=[PiecewiseLinear((-0.5, 0.5))])
-    assert one == HammersteinWiener(1, 2, input=PiecewiseLinear((-0.5, 0.5)))
+    one = HammersteinWiener(1, [2], input=[PiecewiseLinear((-0.5, 0.5))], name=["valve"])
+    assert one == HammersteinWiener(1, 2, input=PiecewiseLinear((-0.5, 0.5)), name="valve")
+    assert hash(replace(VALVES, name=["valve", "heat"])) == hash(model)  # a list is a tuple, as for other settings
+    for wrong in ("valve", ("valve",), ("valve", "heat", "pump")):
+        with pytest.raises(ValueError, match="a name for each input"):
+            replace(VALVES, name=wrong)
 
 
 def test_several_inputs_in_use():

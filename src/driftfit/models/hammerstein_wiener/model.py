@@ -45,7 +45,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, Step
-from driftfit.engine.settings import numbers, output_names, warn, whole
+from driftfit.engine.settings import input_names, numbers, output_names, warn, whole
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.evaluate_bases import DIGITS
@@ -136,6 +136,11 @@ class HammersteinWiener(Model):
             for name in counts:
                 self._set(name, getattr(self, name)[0])
         self._set("input", _blocks(self.input))
+        if self.name is not None:
+            names = input_names("HammersteinWiener", "name", [self.name] if isinstance(self.name, str) else self.name)
+            if len(names) != self.m:
+                raise ValueError(f"HammersteinWiener: there is a name for each input; got {self.name!r} for {self.m}.")
+            self._set("name", names if self.m > 1 else names[0])
         self._check_outputs()
 
     def _check_outputs(self) -> None:
