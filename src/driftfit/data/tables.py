@@ -17,7 +17,7 @@ from driftfit.data.clock import LABEL, Clock
 from driftfit.data.columns import Columns, Wanted
 from driftfit.data.files import read
 from driftfit.data.known import Known
-from driftfit.data.labels import dated
+from driftfit.data.labels import dated, warn_of_skipped_periods
 from driftfit.data.record import Labels, Reading, Records, drift_of
 from driftfit.data.signals import noise_of
 from driftfit.data.times.instants import warn_of_summer_time, warn_of_written_numbers
@@ -78,6 +78,8 @@ def _dated(data: Any, by: Any, reading: Reading) -> tuple[Any, Reading]:
     name = index.name if isinstance(index.name, str) else "time"
     if name in data.columns:
         return data, reading
+    if reading.dt is None:
+        warn_of_skipped_periods(index)
     stamps = index.to_timestamp() if hasattr(index, "to_timestamp") else index
     return data.set_axis(stamps).reset_index(names=name), reading._replace(
         time=name, dt=LABEL if reading.dt is None else reading.dt
