@@ -48,6 +48,7 @@ from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import input_names, numbers, output_names, warn, whole
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
+from driftfit.models.hammerstein_wiener.curves.settled_thresholds import settled
 from driftfit.models.hammerstein_wiener.evaluate_bases import DIGITS
 from driftfit.models.hammerstein_wiener.products import Structure
 from driftfit.models.hammerstein_wiener.run_time_orders import RunTimeOrders
@@ -360,6 +361,11 @@ class HammersteinWiener(Model):
             return 1.0
         energy = 1.0 + float(np.sum(theta[: self.na] ** 2))
         return float((self.output_noise * self.slope(theta, y)) ** 2 * energy + _least_noise(self))
+
+    def settled(self, phi: Array, y: Array, u: Array, at: Array) -> Array:
+        if not any(basis.adaptive for basis in self.bases):
+            return phi
+        return settled(phi, y, u, at, self.bases, self.delays, self.structure)
 
     def follows(self, other: Model) -> bool:
         return isinstance(other, HammersteinWiener) and replace(self, name=None) == replace(other, name=None)
