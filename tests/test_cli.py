@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 import driftfit
 from driftfit import ARX, Kalman, Regression, Track, cli, track, trackers
 from driftfit.cli.parts.arguments import parse_interval
+from driftfit.data.clock import Clock
 from driftfit.data.files import read_columns
 from driftfit.models.hammerstein_wiener.curves.basis import BSpline, DeadZone, Legendre, PiecewiseLinear, Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
@@ -243,8 +244,11 @@ def test_values():
 def test_intervals():
     assert parse_interval(None) is None
     assert parse_interval("0.25") == 0.25
-    for text, seconds in (("10ms", 0.01), ("1s", 1), ("15min", 900), ("1h", 3600), ("1d", 86400), ("2w", 1209600)):
-        assert parse_interval(text) / np.timedelta64(1, "s") == seconds
+    durations = {"10ms": 0.01, "1s": 1, "15min": 900, "15m": 900, "1h": 3600, "1d": 86400, "2w": 1209600}
+    for text, seconds in durations.items():
+        assert Clock.of(parse_interval(text)).duration / np.timedelta64(1, "s") == seconds
+    for text in ("month", "quarter", "year", "business day", "label"):
+        assert Clock.of(parse_interval(text)) == Clock.of(text)
 
 
 def test_trackers_are_all_listed_with_their_settings():

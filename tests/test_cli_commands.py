@@ -98,6 +98,11 @@ def test_the_other_ways_to_write_a_table(table):
         text.write_csv("comma.csv", separator=sign)
         more = [] if sign == ";" else ["--separator", name]
         assert np.array_equal(theta("comma.csv", *arguments, *more), expected().theta[:, 1])
+    for encoding in ("utf-16", "cp1252"):  # parts of a file are read as the whole file is
+        Path("foreign.csv").write_bytes(Path("comma.csv").read_text().encode(encoding))
+        assert np.array_equal(
+            theta("foreign.csv", *arguments, *more, "--rows", "50:250"), expected(49, 250).theta[:, 1]
+        )
     piped = io.BytesIO()
     table.write_csv(piped)
     assert np.array_equal(theta("-", *SIGNALS[1:], stdin=piped.getvalue()), expected().theta[:, 1])

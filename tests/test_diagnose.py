@@ -71,6 +71,15 @@ def test_each_fault_has_its_name_and_its_sentence(name, tracker, spoil):
 NOISE = np.random.default_rng(7).normal(size=600)
 
 
+def test_correlation_of_a_season_is_named_by_its_lag():
+    rng = np.random.default_rng(0)
+    u, season = rng.normal(size=400), np.tile([1.0, 0.0, -1.0, 0.0], 100)
+    run = track(Regression(1), Kalman(q=0.0, r=0.75), u + season + 0.5 * rng.normal(size=400), u)
+    [sentence] = [one for one in run.diagnose().sentences if "correlated (" in one]
+    assert "-0.69 at lag 6, 0.01 at the first" in sentence  # every other lag is as large
+    assert "regressors that describe a season" in sentence
+
+
 def test_constancy_needs_record_and_tracker_to_agree():
     path = np.tile([1.2, -0.5, 1.0, 0.4], (600, 1))
     path[300:, 2] += 0.5

@@ -3,9 +3,10 @@
 import re
 
 import numpy as np
+import polars as pl
 import pytest
 
-from driftfit import RLS, Regression, track
+from driftfit import RLS, DataWarning, Regression, track
 from driftfit.data.files import read_columns
 
 
@@ -78,3 +79,34 @@ def test_such_a_file_is_tracked_like_any_other(tmp_path):
 def test_a_line_that_declares_the_separator_and_files_with_a_byte_order_mark(tmp_path, encoding):
     for text in ("sep=|\r\nt|y\r\n1|2.5\r\n", "t;y\n1;2,5\n"):
         np.testing.assert_array_equal(read_columns(written(tmp_path, text, encoding), ["y"])["y"], [2.5])
+
+
+def test_whole_numbers_with_dots_between_thousands_beside_decimal_commas(tmp_path):
+    path = written(tmp_path, "a;b;c\n998;1,5;0.998\n1.002;2,5;1.002\nn/a;3,5;2\n")
+    np.testing.assert_array_equal(read_columns(path, ["a"])["a"], [998.0, 1002.0, np.nan])  # whatever else is read
+    np.testing.assert_array_equal(read_columns(path, ["c"])["c"], [0.998, 1.002, 2.0])
+
+
+def test_a_column_that_occurs_twice_is_not_chosen_silently(tmp_path):
+    path = written(tmp_path, "t,y,x,x\n1,2,3,4\n")
+    with pytest.raises(ValueError, match="has 2 columns 'x'"):
+        read_columns(path, ["y", "x"])
+    assert read_columns(path, ["y"], "t")["y"].tolist() == [2.0]
+
+
+def test_days_without_hyphens_are_dates_and_numbers_like_them_cause_a_warning(tmp_path):
+    assert dates(tmp_path, "20240131", "20240229") == ["2024-01-31", "2024-02-29"]
+    with pytest.raises(ValueError, match="row 2 of column 't' holds '20240231'"):
+        dates(tmp_path, "20240131", "20240231")
+    days = ["20231031", "20231130", "20231231", "20240131"]
+    x, y = np.array([1.0, 2.0, 1.0, 3.0]), np.ones(4)
+    run = track(Regression(1), RLS(1.0), y, x, time=days, dt="month")
+    assert run.time_text(3) == "2024-01-31"
+    for numbers in (np.array(days, float), np.array([202310, 202311, 202312, 202401])):
+        with pytest.warns(DataWarning, match=f"the numbers {numbers[0]:.0f}, {numbers[1]:.0f}, .. look like dates"):
+            track(Regression(1), RLS(1.0), y, x, time=numbers)
+        with pytest.warns(DataWarning, match="look like dates"):
+            track(Regression(1), RLS(1.0), "y", "x", data=pl.DataFrame({"x": x, "y": y, "t": numbers}), time="t")
+        track(Regression(1), RLS(1.0), y, x, time=numbers, dt="label")
+    with pytest.raises(ValueError, match="'202310' is not a date"):  # which was the year 202310
+        track(Regression(1), RLS(1.0), y, x, time=["202310", "202311", "202312", "202401"], dt="month")

@@ -7,7 +7,7 @@ import pandas as pd
 import polars as pl
 import pytest
 
-from driftfit import ARX, HammersteinWiener, Kalman, Live, Regression, select, track, tune
+from driftfit import ARX, DataWarning, HammersteinWiener, Kalman, Live, Regression, select, track, tune
 
 T = 60
 TRACKER = Kalman(q=1e-3, r=0.1)
@@ -241,3 +241,15 @@ def test_an_index_of_dates_labels_the_rows_of_a_table():
         assert track(ARX(1, 1), TRACKER, "flow", "a", data=table, dt="1d").ok.sum() < T - 5
     for plain in (table.sample(frac=1.0, random_state=0), table.reset_index(drop=True), table.assign(day=0)):
         assert np.array_equal(track(NAMED, TRACKER, "flow", data=plain).time, np.arange(T))
+
+
+def test_periods_that_an_index_leaves_out_are_not_skipped_silently():
+    y, X = record()
+    index = pd.period_range("1980Q1", periods=T + 3, freq="Q").delete([30, 31, 50])
+    y, X = y.set_axis(index), X.set_axis(index)
+    message = r"leaves out 3 periods, the first after 1987Q2, .* Give dt='quarter', or dt='label'"
+    for signals in ({"y": y, "u": X}, {"y": "flow", "u": ["a", "b"], "data": X.assign(flow=y)}):
+        with pytest.warns(DataWarning, match=message):
+            track(NAMED, TRACKER, **signals)
+        for dt in ("quarter", "label"):
+            track(NAMED, TRACKER, **signals, dt=dt)

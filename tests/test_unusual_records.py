@@ -41,6 +41,14 @@ def test_bands_are_infinite_where_parameters_are_known_and_the_noise_is_not(trac
     assert np.isfinite(run.std[-1]).all()
 
 
+def test_a_constant_output_is_not_said_to_have_regressors_that_never_varied():
+    u = plant()[1]
+    run = track(PLANT, AdaptiveKalman(), np.full(len(u), 3.0), u)  # its lag repeats it: that is another reason
+    assert "never varied" in " ".join(str(run.summary()).split())
+    run = track(Regression(1), AdaptiveKalman(), np.zeros(len(u)), u)
+    assert "every output without error" in " ".join(str(run.summary()).split())
+
+
 @pytest.mark.parametrize("tracker", TRACKERS, ids=repr)
 @pytest.mark.parametrize("noise", [1e-7, 1e-10])
 def test_noise_far_below_the_signal_is_learned(tracker, noise):

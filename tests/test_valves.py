@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from support import same
 
 from driftfit import Kalman, Live, track
+from driftfit.judge.regressors import regressors
 from driftfit.models.hammerstein_wiener.curves.basis import DeadZone, PiecewiseLinear, Polynomial, Saturation
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.results.constant_system import fit_constant
@@ -152,8 +153,12 @@ def test_several_inputs_are_the_same_alive_in_lanes_and_saved():
     assert same(lanes[0].theta, run.theta)
     assert run.names[3] == "b1[heat]"
     assert HammersteinWiener.from_settings(json.loads(json.dumps(model.settings()))) == model
-    one = HammersteinWiener(1, [2], input=[PiecewiseLinear((-0.5, 0.5))])
-    assert one == HammersteinWiener(1, 2, input=PiecewiseLinear((-0.5, 0.5)))
+    one = HammersteinWiener(1, [2], input=[PiecewiseLinear((-0.5, 0.5))], name=["valve"])
+    assert one == HammersteinWiener(1, 2, input=PiecewiseLinear((-0.5, 0.5)), name="valve")
+    assert hash(replace(VALVES, name=["valve", "heat"])) == hash(model)  # a list is a tuple, as for other settings
+    for wrong in ("valve", ("valve",), ("valve", "heat", "pump")):
+        with pytest.raises(ValueError, match="a name for each input"):
+            replace(VALVES, name=wrong)
 
 
 def test_several_inputs_in_use():
@@ -197,3 +202,17 @@ def test_forecasts_never_warn(h):
             assert forecast.y_std[-1] == pytest.approx(0.02 if h == 1 else 0.02 / 0.6, rel=0.05)
         elif h == 2000:
             assert np.nanmax(forecast.y_std) > 1e30  # up to where readings end
+
+
+def test_thresholds_that_are_learned_on_the_way_are_not_mistaken_for_drift():
+    model = replace(VALVES, input=[PiecewiseLinear((-0.5, 0.5)), Saturation(3.0, start=2.5)])
+    for seed in (0, 2):
+        y, u, _ = record(seed)
+        run = track(model, K, y, u)
+        assert not run.verdict().drifts
+    heat, rows = u[:, 1], regressors(run)
+    inside = np.where(np.abs(heat) < 1.0, heat, 0.0)[rows.at - 2]
+    assert np.mean(rows.phi[:, model.names.index("b1[u2]")] == -inside) > 0.98  # the first samples too
+    y[400:] = record(2, limits=(-1.0, 2.0))[0][400:]
+    assert "b1[u2]*c2" in track(model, K, y, u).verdict().moving
+    assert len(regressors(track(model, K, np.full(60, np.nan), u[:60])).phi) == 0

@@ -14,7 +14,7 @@ import narwhals as nw
 import numpy as np
 import polars as pl
 
-from driftfit.data.times.instants import zone_name
+from driftfit.data.times.instants import DAY, zone_name
 from driftfit.data.times.periods import EXAMPLES, periods
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, near
@@ -107,7 +107,8 @@ def times_of_column(series: nw.Series[Any], where: str, base: int) -> tuple[Arra
     """(numbers or datetime64 in UTC, zone); NaN or NaT for rows without a time."""
     if _is_text(series):
         text = _as_text(series)
-        if text.cast(pl.Float64, strict=False).is_null().eq(text.is_null()).all():
+        compact = bool(text.drop_nulls().str.contains(f"^{DAY}$").all()) and text.null_count() < len(text)
+        if not compact and text.cast(pl.Float64, strict=False).is_null().eq(text.is_null()).all():
             return _numbers_of_text(text, where, base), None
         series = nw.from_native(_dates_of_text(text, where, base), series_only=True)
     native: Any = series.to_native()
@@ -132,12 +133,14 @@ DAY_FIRST = r"^(\d{1,2})([./-])(\d{1,2})[./-](\d{4})(?:[ T]+(\d{1,2}:\d{2}(?::\d
 
 
 def _year_first(text: pl.Series, where: str) -> pl.Series:
-    """Dates that end with the year as 2024-01-31; other columns as they are.
+    """Dates that end with the year, or have no hyphens (20240131), as 2024-01-31; other columns as they are.
 
     With dots the day is first. With another separator a number above 12 shows which of the two it is; ValueError if
     there is none.
     """
     known = text.drop_nulls()
+    if len(known) and known.str.contains(f"^{DAY}$").all():
+        return text.str.replace(r"^(....)(..)(..)$", "$1-$2-$3")
     if not len(known) or not known.str.contains(DAY_FIRST).all():
         return text
     first, second = (text.str.extract(DAY_FIRST, k).cast(pl.Int64) for k in (1, 3))

@@ -2,14 +2,16 @@
 
 CSV is read as text, so that messages can name a cell that is not a number. Lines that begin with # are comments. The
 header determines whether cells are separated by comma, semicolon or tab, or a line such as ``sep=;`` before it, which
-spreadsheets write. Where semicolons separate cells, numbers may have decimal commas, and dots between thousands. Text
-that is neither UTF-8 nor UTF-16 with a byte order mark is taken as Windows-1252. If some of several files cannot be
-read, they are left out with a warning and kept with their reasons.
+spreadsheets write. Where semicolons separate cells, numbers may have decimal commas, and dots between thousands, also
+whole numbers in a file where others have decimal commas. A column that occurs twice cannot be used. Text that is
+neither UTF-8 nor UTF-16 with a byte order mark is taken as Windows-1252. If some of several files cannot be read, they
+are left out with a warning and kept with their reasons.
 """
 
 from __future__ import annotations
 
 import glob
+import io
 import os
 import re
 import warnings
@@ -21,7 +23,7 @@ import narwhals as nw
 import numpy as np
 import polars as pl
 
-from driftfit.data.columns import Columns, Wanted, convert, plain_names
+from driftfit.data.columns import MISSING, Columns, Wanted, convert, plain_names
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
@@ -41,7 +43,8 @@ def read_columns(path: str | os.PathLike[str], names: Sequence[str], time: str |
         If the file cannot be read.
     """
     wanted = Wanted(tuple(names), time)
-    columns = convert(_file(os.fspath(path), wanted), wanted, os.fspath(path), 1)
+    where = os.fspath(path)
+    columns = convert(read_file(where, wanted, where), wanted, where, 1)
     return {**columns.numbers, **({time: columns.time} if time is not None and columns.time is not None else {})}
 
 
@@ -51,12 +54,12 @@ def read(data: Any, wanted: Wanted) -> tuple[Columns, dict[Hashable, str]]:
         return convert(_frame(data), wanted, "the table", 0), {}
     paths = paths_of(data)
     if len(paths) == 1:
-        return convert(_file(paths[0], wanted), wanted, paths[0], 1), {}
+        return convert(read_file(paths[0], wanted, paths[0]), wanted, paths[0], 1), {}
     parts: dict[str, Columns] = {}
     failed: dict[Hashable, str] = {}
     for path in paths:
         try:
-            frame = _file(path, wanted)
+            frame = read_file(path, wanted, path)
         except (ValueError, OSError) as error:
             failed[path] = str(error)
             continue
@@ -92,50 +95,75 @@ def paths_of(data: Any) -> list[str]:
     return paths
 
 
-def _file(path: str, wanted: Wanted) -> nw.DataFrame[Any]:
-    """The wanted columns of one file."""
-    parquet = Path(path).suffix.lower() in (".parquet", ".pq")
+def read_file(
+    source: str | bytes, wanted: Wanted, where: str, separator: str | None = None, decimal: str = "."
+) -> nw.DataFrame[Any]:
+    """The wanted columns of one file, given by its path or its contents; `_csv` explains separator and decimal."""
+    start = _start(source)
+    parquet = start[:4] == b"PAR1" or (isinstance(source, str) and Path(source).suffix.lower() in (".parquet", ".pq"))
     try:
         if parquet:
-            names = list(pl.read_parquet_schema(path))
-            frame = pl.read_parquet(path, columns=[name for name in names if name in wanted.names])
+            opened = io.BytesIO(source) if isinstance(source, bytes) else source
+            names = list(pl.read_parquet_schema(opened))
+            frame = pl.read_parquet(opened, columns=[name for name in names if name in wanted.names])
         else:
-            names, frame = _csv(path, wanted)
+            names, frame = _csv(source, start, wanted, separator, decimal)
     except (pl.exceptions.PolarsError, UnicodeDecodeError) as error:
         text = " ".join(str(error).split())
-        raise ValueError(f"{path} cannot be read as {'Parquet' if parquet else 'CSV'}: {text}") from None
-    for name in (name for name in wanted.names if name not in names and not (name == FILE and FILE in wanted.by)):
-        raise ValueError(f"{path} has no column {name!r}: {near(name, names)}")
+        raise ValueError(f"{where} cannot be read as {'Parquet' if parquet else 'CSV'}: {text}") from None
+    for name in (name for name in wanted.names if not (name == FILE and FILE in wanted.by)):
+        if name not in names:
+            raise ValueError(f"{where} has no column {name!r}: {near(name, names)}")
+        if names.count(name) > 1:
+            raise ValueError(f"{where} has {names.count(name)} columns {name!r}: rename those that are not meant.")
     if FILE in wanted.by and FILE not in names:
-        frame = frame.with_columns(pl.lit(path).alias(FILE))
+        frame = frame.with_columns(pl.lit(where).alias(FILE))
     if frame.height == 0:
-        raise ValueError(f"{path} has a header but no rows.")
+        raise ValueError(f"{where} has a header but no rows.")
     return nw.from_native(frame, eager_only=True)
 
 
-def _csv(path: str, wanted: Wanted) -> tuple[list[str], pl.DataFrame]:
-    """(all column names, the wanted columns as text); the header determines whether the separator is , ; or tab."""
-    encoding = _encoding(path)
-    with open(path, encoding=encoding, errors="replace") as file:
-        header = next((line for line in file if not line.startswith("#")), "")
+def _csv(
+    source: str | bytes, start: bytes, wanted: Wanted, separator: str | None, decimal: str
+) -> tuple[list[str], pl.DataFrame]:
+    """(all column names, one that occurs twice as often as it occurs; the wanted columns as text).
+
+    Without ``separator`` the header determines whether it is , ; or tab. ``decimal=","`` is for files that say so;
+    with "." numbers may still have decimal commas where semicolons separate cells.
+    """
+    encoding = _encoding(start)
+    text = start.decode(encoding, errors="replace").splitlines()
+    header = next((line for line in text if not line.startswith("#")), "")
     declared = re.fullmatch(r"\ufeff?sep=(.)\s*", header, re.IGNORECASE)
-    separator = declared[1] if declared else max(",;\t", key=header.count)
-    options: dict[str, Any] = {"infer_schema": False, "comment_prefix": "#", "separator": separator}
+    sign = declared[1] if declared else max(";\t" if decimal == "," else ",;\t", key=header.count)
+    options: dict[str, Any] = {"infer_schema": False, "comment_prefix": "#", "separator": separator or sign}
     options |= {"encoding": encoding, "skip_rows": 1 if declared else 0}
-    raw = pl.read_csv(path, n_rows=0, **options).columns
+    raw = pl.read_csv(source, n_rows=0, **options).columns
+    cells = pl.read_csv(source, n_rows=1, has_header=False, **options).rows()[0]
+    again = [str(cell) for k, cell in enumerate(cells) if cell in cells[:k]]  # polars gives these another name
     names = plain_names(raw, [name for name in wanted.names if name != FILE])
     chosen = {old: new for old, new in zip(raw, names, strict=True) if new in wanted.names}
-    frame = pl.read_csv(path, columns=list(chosen), **options).rename(chosen)
-    if separator == ";":
-        frame = frame.with_columns(_with_points(frame[name]) for name in wanted.numbers if name in frame.columns)
+    frame = pl.read_csv(source, columns=list(chosen), **options).rename(chosen)
+    numbers = [frame[name] for name in wanted.numbers if name in frame.columns]
+    if decimal == ",":
+        frame = frame.with_columns(map(_points, numbers))
+    elif options["separator"] == ";":
+        commas = any(re.search(r"(^|;)[\s\"]*[+-]?[\d.]*,\d+[\s\"]*(;|$)", line) for line in text)
+        frame = frame.with_columns(_with_points(column, commas) for column in numbers)
     whole = frame.select(pl.col(name).str.strip_chars() for name in wanted.by if name in frame.columns)
-    return names, frame.with_columns(_whole(column) for column in whole)
+    return [*names, *again], frame.with_columns(_whole(column) for column in whole)
 
 
-def _encoding(path: str) -> str:
+def _start(source: str | bytes) -> bytes:
+    """The header and the first cells of a file."""
+    if isinstance(source, bytes):
+        return source[: 1 << 16]
+    with open(source, "rb") as file:
+        return file.read(1 << 16)
+
+
+def _encoding(start: bytes) -> str:
     """The encoding of a file, judged by its header and its first cells."""
-    with open(path, "rb") as file:
-        start = file.read(1 << 16)
     if start.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "utf-16"
     try:
@@ -149,14 +177,30 @@ COMMA = r"^\s*[+-]?(\d+|\d{1,3}(\.\d{3})+)?(,\d*)?([eE][+-]?\d+)?\s*$"
 """A number with a decimal comma, perhaps with dots between thousands."""
 
 
-def _with_points(text: pl.Series) -> pl.Series:
-    """A column with decimal points instead of decimal commas; a column without commas is returned unchanged."""
-    comma = text.str.contains(",", literal=True)
-    if not comma.any() or not text.filter(comma).str.contains(COMMA).all():
+GROUPED = r"^\s*[+-]?([1-9]\d{0,2}(\.\d{3})+|\d+)\s*$"
+"""A whole number, perhaps with dots between thousands."""
+
+
+def _with_points(text: pl.Series, commas: bool) -> pl.Series:
+    """A column with decimal points instead of decimal commas, and without dots between thousands.
+
+    In a file with decimal ``commas`` the dots of a column of whole numbers are between thousands too.
+    """
+    known = text.filter(~text.str.strip_chars().str.to_lowercase().is_in(MISSING))
+    comma = known.str.contains(",", literal=True)
+    if not comma.any():
+        return _points(text) if commas and known.str.contains(GROUPED).all() else text
+    if not known.filter(comma).str.contains(COMMA).all():
         return text
-    if text.filter(~comma).str.contains(r"\.\d{0,2}$|\.\d{4,}").any():
+    if known.filter(~comma).str.contains(r"\.\d{0,2}$|\.\d{4,}").any():
         return text  # a mixture of both: the error message names the cell
-    return text.str.replace_all(".", "", literal=True).str.replace(",", ".", literal=True)
+    return _points(text)
+
+
+def _points(text: pl.Series) -> pl.Series:
+    """A column with a decimal point instead of a comma; points that group thousands are removed."""
+    plain = text.str.replace_all(".", "", literal=True).str.replace(",", ".", literal=True)
+    return plain.zip_with(text.str.contains(COMMA).fill_null(False), text)
 
 
 def _whole(text: pl.Series) -> pl.Series:

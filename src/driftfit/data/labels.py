@@ -15,6 +15,7 @@ import numpy as np
 from driftfit.data.signals import as_inputs
 from driftfit.data.times.instants import instants, zone_name
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import warn
 
 PLAIN = (np.ndarray, list, tuple, float, int)
 """Types that have neither names nor an index."""
@@ -101,11 +102,13 @@ WITHOUT = Times()
 """Samples that have no times."""
 
 
-def times_of(time: Any, parts: Sequence[Held]) -> Times:
+def times_of(time: Any, parts: Sequence[Held], dt: Any = None) -> Times:
     """The times that a user passed, or the first index of dates among the signals."""
     if time is None:
         for part in parts:
             if part.index is not None and dated(part.index):
+                if dt is None:
+                    warn_of_skipped_periods(part.index)
                 return _dates(part.index)._replace(labels=True)
         return WITHOUT
     if dated(time):
@@ -126,6 +129,24 @@ def times_of(time: Any, parts: Sequence[Held]) -> Times:
 def dated(index: Any) -> bool:
     """Whether the index consists of dates or of periods."""
     return hasattr(index, "to_series") and (hasattr(index, "to_timestamp") or getattr(index.dtype, "kind", "") == "M")
+
+
+PERIODS = {"Q": "quarter", "M": "month", "Y": "year", "A": "year"}
+"""The dt of an index of periods, by the first letter of its frequency; days leave out weekends."""
+
+
+def warn_of_skipped_periods(index: Any) -> None:
+    """Warn if an index of periods, which labels samples that are one step apart, leaves some periods out."""
+    step = PERIODS.get(str(getattr(index, "freqstr", ""))[:1])
+    if not hasattr(index, "to_timestamp") or step is None or len(index) < 2:
+        return
+    steps = np.diff(index.asi8)
+    if (places := np.flatnonzero(steps > 1)).size:
+        warn(
+            f"time: the index leaves out {int((steps[places] - 1).sum())} periods, the first after {index[places[0]]}, "
+            f"but its samples are taken as one step apart, also by lags. Give dt={step!r}, or dt='label' if that is "
+            "meant."
+        )
 
 
 def _dates(index: Any) -> Times:

@@ -28,7 +28,7 @@ def of_arrays(model: Model, y: Any, u: Any, reading: Reading) -> tuple[Model, Re
     if output.ndim != 2 or output.shape[1] != ny or len(output) == 0:
         raise ValueError(f"y must be (T, {ny}) for the outputs {', '.join(model.outputs)}; got shape {output.shape}.")
     T = len(output)
-    times = times_of(reading.time, list(given.values()) if reading.indexed else ())
+    times = times_of(reading.time, list(given.values()) if reading.indexed else (), reading.dt)
     dt = LABEL if times.labels and reading.dt is None else reading.dt
     axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
     common, drifts = (1.0, as_numbers("drift", reading.drift)) if np.ndim(reading.drift) == 2 else (reading.drift, None)

@@ -280,7 +280,7 @@ def one_series(y: Any, u: Any, reading: Reading) -> Records:
         weights, drift = given_weights.values, given_drift.values
     output = as_output(given_y.values)
     T = len(output)
-    times = times_of(reading.time, (given_y, given_u) if reading.indexed else ())
+    times = times_of(reading.time, (given_y, given_u) if reading.indexed else (), reading.dt)
     dt = LABEL if times.labels and reading.dt is None else reading.dt
     axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
     common, drifts = (1.0, as_numbers("drift", drift)) if axes(drift) == 2 else (drift, None)

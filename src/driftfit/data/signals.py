@@ -6,8 +6,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from driftfit.data.clock import Clock
-from driftfit.data.times.instants import instants
+from driftfit.data.clock import LABEL, Clock
+from driftfit.data.times.instants import instants, warn_of_written_numbers
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, as_numbers, factor, missing_settings
 
@@ -74,4 +74,7 @@ def intervals(time: Any, dt: Any, T: int) -> tuple[Array, Array]:
             f"time must increase: time[{i - 1}] = {axis[i - 1]} is followed by time[{i}] = {axis[i]}; "
             "sort the record and drop repeated times first."
         )
-    return axis, Clock.of(dt).steps(axis)
+    clock = Clock.of(dt)
+    if clock.kind != LABEL:
+        warn_of_written_numbers(axis)
+    return axis, clock.steps(axis)

@@ -17,10 +17,10 @@ from driftfit.data.clock import LABEL, Clock
 from driftfit.data.columns import Columns, Wanted
 from driftfit.data.files import read
 from driftfit.data.known import Known
-from driftfit.data.labels import dated
+from driftfit.data.labels import dated, warn_of_skipped_periods
 from driftfit.data.record import Labels, Reading, Records, drift_of
 from driftfit.data.signals import noise_of
-from driftfit.data.times.instants import warn_of_summer_time
+from driftfit.data.times.instants import warn_of_summer_time, warn_of_written_numbers
 from driftfit.engine.kernel import Array
 
 
@@ -54,6 +54,8 @@ def read_records(
     first = (np.cumsum(length) - length)[there]
     values = {name: column[order] for name, column in columns.numbers.items()}
     clock = Clock.of(reading.dt, columns.zone)
+    if times is not None and clock.kind != LABEL:
+        warn_of_written_numbers(times)
     known = Known.of(
         1.0 if times is None else _gaps(times, first, clock),
         _factor(weights, values, noise_of),
@@ -76,6 +78,8 @@ def _dated(data: Any, by: Any, reading: Reading) -> tuple[Any, Reading]:
     name = index.name if isinstance(index.name, str) else "time"
     if name in data.columns:
         return data, reading
+    if reading.dt is None:
+        warn_of_skipped_periods(index)
     stamps = index.to_timestamp() if hasattr(index, "to_timestamp") else index
     return data.set_axis(stamps).reset_index(names=name), reading._replace(
         time=name, dt=LABEL if reading.dt is None else reading.dt

@@ -174,15 +174,19 @@ def standardised(run: Track) -> tuple[Array, Whiteness]:
 
 
 def _whiteness(white: Whiteness) -> Check:
-    first = white.r[0] if len(white.r) else np.nan
-    sign = "positive" if first > 0.0 else "negative"
-    hint = (
-        "more drift (a larger q, less memory), or one more lag"
-        if first > 0.0
-        else "less drift, or one more lag (noise on the output does this too)"
-    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        clear = np.nan_to_num(np.abs(white.r) / white.std, posinf=0.0)
+    first, most = (white.r[0], int(np.argmax(clear))) if len(clear) else (np.nan, 0)
+    if most and clear[0] < 2.0:
+        where = f"{white.r[most]:.2f} at lag {most + 1}, {first:.2f} at the first"
+        hint = f"lags up to {most + 1}, or regressors that describe a season"
+    elif first > 0.0:
+        where, hint = f"{first:.2f} at the first lag, positive", "more drift (a larger q, less memory), or one more lag"
+    else:
+        where = f"{first:.2f} at the first lag, negative"
+        hint = "less drift, or one more lag (noise on the output does this too)"
     advice = (
-        f"The innovations are correlated ({first:.2f} at the first lag, {sign}): the model leaves something "
+        f"The innovations are correlated ({where}): the model leaves something "
         f"predictable. Try {hint}; if they stay correlated, the noise is coloured: use ARMAX, OE or BoxJenkins."
     )
     return Check("whiteness (p)", white.p, 0.01, np.inf, advice)

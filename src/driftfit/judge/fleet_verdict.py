@@ -146,7 +146,8 @@ class ManyVerdicts(Printed):
         gain = f"Tracking pays in {pays} of {paying}." if paying else ""
         rest = len(self.rows) - tested
         short = (
-            f"{rest} cannot be tested: they have too few samples, hidden states, or regressors that do not span."
+            f"{rest} cannot be tested: they have too few samples, hidden states, no noise, or "
+            "regressors that do not span."
             if rest
             else ""
         )

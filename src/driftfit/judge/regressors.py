@@ -38,4 +38,6 @@ def regressors(run: Track, steady: Array | None = None) -> Rows:
     at = np.flatnonzero(out["ok"][:, 0] > 0.0)
     noise = run.known.part(at).noise
     root = 1.0 / np.sqrt(noise)
-    return Rows(at, out["phi"][at, :, 0] * np.reshape(root, (-1, 1)), out["y"][at, 0] * root)
+    y = out["y"][at, 0]
+    phi = run.model.settled(out["phi"][at, :, 0], y, run.u, at)
+    return Rows(at, phi * np.reshape(root, (-1, 1)), y * root)

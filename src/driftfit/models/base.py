@@ -222,6 +222,14 @@ class Model(Settings, ABC):
         """Whether first innovations are far larger, because a model of the noise is not known yet."""
         return False
 
+    def settled(self, phi: Array, y: Array, u: Array, at: Array) -> Array:
+        """Regressors phi (N, n) of the usable samples ``at`` (N,), with outputs y (N,), of a whole record u (T, m).
+
+        A model that takes settings of its functions from its estimates holds them at one value for all samples, because
+        a judgement of the record would mistake their first values for a change of the parameters.
+        """
+        return phi
+
     def held_at(self, theta: Array) -> Model | None:
         """This model with its linearisation held at theta (n,), so that a run is a linear regression; None without."""
         return None

@@ -6,7 +6,7 @@ import csv
 import re
 from collections.abc import Sequence
 
-import numpy as np
+from driftfit.data.clock import Clock
 
 
 def listed(given: Sequence[str] | None) -> list[str]:
@@ -33,19 +33,16 @@ def parse_units(given: Sequence[str] | None) -> dict[str, str]:
     return {name.strip(): unit.strip() for name, _, unit in pairs.values()}
 
 
-UNITS = {"us": "us", "ms": "ms", "s": "s", "min": "m", "m": "m", "h": "h", "d": "D", "w": "W"}
-
-
-def parse_interval(text: str | None) -> float | np.timedelta64 | None:
-    """``0.5`` as a number, ``15min`` as a duration."""
+def parse_interval(text: str | None) -> float | str | None:
+    """``0.5`` as a number; a duration or a step of the calendar as text, in which ``m`` after a number is minutes."""
     if text is None:
         return None
-    match = re.fullmatch(r"\s*(\d+)\s*([a-z]+)\s*", text)
-    if match and match[2] in UNITS:
-        return np.timedelta64(int(match[1]), UNITS[match[2]])  # type: ignore[call-overload,no-any-return]
     try:
         return float(text)
     except ValueError:
-        raise ValueError(
-            f"--dt {text}: give a number, or a whole number with one of {', '.join(UNITS)} for a time that is a date."
-        ) from None
+        given = re.sub(r"(\d\s*)m\s*$", r"\1min", text)
+    try:
+        Clock.of(given)
+    except ValueError as error:
+        raise ValueError(f"--dt {text}: {error}") from None
+    return given

@@ -72,7 +72,11 @@ class Given:
         typer.Option("--with", metavar="MODULE:CLASS", help="Your own tracker, from a module in this folder."),
     ] = None
     dt: Annotated[
-        str | None, typer.Option(help="Nominal interval: a number, or 10ms, 1s, 15min, 1h, 1d, 1w for dates.")
+        str | None,
+        typer.Option(
+            help="Nominal interval: a number; for dates 10ms, 1s, 15min, 1h, 1d, 1w, 'business day', month, quarter, "
+            "year, or label if samples are one step apart whatever their dates."
+        ),
     ] = None
     first: Annotated[str | None, typer.Option("--from", help="First time to use, with --time.")] = None
     last: Annotated[str | None, typer.Option("--to", help="Last time to use, with --time.")] = None

@@ -6,19 +6,17 @@ intervals are passed on unchanged (`driftfit.data.limits`).
 
 from __future__ import annotations
 
-import io
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, NamedTuple
 
-import narwhals as nw
 import numpy as np
 import polars as pl
 
 from driftfit.data.columns import Columns, Wanted, convert
-from driftfit.data.files import FILE, paths_of
+from driftfit.data.files import paths_of, read_file
 from driftfit.data.times.periods import EXAMPLES, span
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
@@ -159,44 +157,11 @@ def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Se
 def _one(path: str, wanted: Wanted, part: Part) -> Columns:
     """The selected rows of one file."""
     where = "stdin" if path == "-" else path
-    frame = _frame(path, where, part)
-    if FILE in wanted.by and FILE not in frame.columns:
-        frame = frame.with_columns(pl.lit(path).alias(FILE))
+    frame = read_file(sys.stdin.buffer.read() if path == "-" else path, wanted, where, part.separator, part.decimal)
     first, last = part.rows
-    count = None if last is None else last - first + 1
-    frame = frame.slice(first - 1, count)
-    if frame.height == 0:
+    if len(frame) < first:
         raise ValueError(f"{where} has no row {first}.")
-    if part.decimal == ",":
-        frame = frame.with_columns(_points(frame, wanted))
-    return convert(nw.from_native(frame, eager_only=True), wanted, where, first)
-
-
-def _frame(path: str, where: str, part: Part) -> pl.DataFrame:
-    """A file as a table; cells of CSV are text."""
-    try:
-        with open(path, "rb") if path != "-" else sys.stdin.buffer as file:
-            data = file.read()
-        if data[:4] == b"PAR1":
-            return pl.read_parquet(io.BytesIO(data))
-        lines = data.decode("utf-8", errors="replace").splitlines()
-        header = next((line for line in lines if not line.startswith("#")), "")
-        sign = part.separator or max(";\t" if part.decimal == "," else ",;\t", key=header.count)
-        return pl.read_csv(io.BytesIO(data), infer_schema=False, comment_prefix="#", separator=sign)
-    except pl.exceptions.PolarsError as error:
-        raise ValueError(f"{where} cannot be read: {' '.join(str(error).split())}") from None
-
-
-def _points(frame: pl.DataFrame, wanted: Wanted) -> list[pl.Series]:
-    """Number columns with a decimal point instead of a comma; points that group thousands are removed."""
-    text = [name for name in wanted.names if name in frame.columns and frame[name].dtype == pl.String]
-    number = r"^\s*[+-]?(\d{1,3}(\.\d{3})+|\d*)(,\d*)?([eE][+-]?\d+)?\s*$"
-    made = []
-    for name in text:
-        cells = frame[name]
-        plain = cells.str.replace_all(".", "", literal=True).str.replace(",", ".", literal=True)
-        made.append(plain.zip_with(cells.str.contains(number).fill_null(False), cells))
-    return made
+    return convert(frame[first - 1 : last], wanted, where, first)
 
 
 def _between(rows: Rows, part: Part) -> Rows:

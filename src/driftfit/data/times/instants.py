@@ -56,9 +56,16 @@ def _of_texts(texts: Sequence[str]) -> Array:
     return np.asarray(days, dtype="datetime64[us]")
 
 
+DAY = r"(?:1[89]|2[01])\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])"
+"""A day without hyphens, 20240131, which ISO 8601 permits."""
+
+
 def _date_of_text(text: str) -> np.datetime64:
+    plain = text.strip()
+    if plain.isdigit() and len(plain) != 4:  # NumPy takes all digits as the year
+        plain = f"{plain[:4]}-{plain[4:6]}-{plain[6:]}" if re.fullmatch(DAY, plain) else ""
     try:
-        return np.datetime64(text, "us")
+        return np.datetime64(plain or "NaT", "us")
     except ValueError:
         return np.datetime64("NaT", "us")
 
@@ -79,6 +86,26 @@ def _by_days(axis: Array) -> Array:
     """Dates in units of at most a day, because nothing can be divided by a month."""
     coarse = np.datetime_data(axis.dtype)[0] in ("Y", "M", "W", "generic")
     return axis.astype("datetime64[D]") if coarse else axis
+
+
+def warn_of_written_numbers(time: Array) -> None:
+    """Warn if numeric times, such as 20240131 or 202401, are all written like days or months.
+
+    Their differences are not those of the calendar: from 31 January to 1 February there are 70.
+    """
+    if time.dtype.kind != "f" or len(time) < 3 or not 180001.0 <= time[0] <= 21991231.0:
+        return
+    known = time[np.isfinite(time)]
+    day = known % 100.0 if known[0] >= 18000101.0 else np.ones(len(known))
+    month = known // (100.0 if known[0] >= 18000101.0 else 1.0)
+    year, month = month // 100.0, month % 100.0
+    written = (year >= 1800) & (year < 2200) & (month >= 1) & (month <= 12) & (day >= 1) & (day <= 31)
+    if (written & (known == np.rint(known))).all() and np.ptp(year) > 0:
+        warn(
+            f"time: the numbers {known[0]:.0f}, {known[1]:.0f}, .. look like dates, but their differences are not "
+            "those of the calendar, and drift scales with them. Give dates, such as 2024-01-31, 2024-01 or the text "
+            "'20240131', with dt= their nominal interval, or dt='label' if samples are one step apart."
+        )
 
 
 def warn_of_summer_time(repeated: Array, zone: str | None) -> None:

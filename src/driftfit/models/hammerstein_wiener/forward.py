@@ -14,14 +14,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.models.hammerstein_wiener.curves.basis import Basis, Thresholds
+from driftfit.models.hammerstein_wiener.curves.basis import INSIDE, Basis, Thresholds
 from driftfit.models.hammerstein_wiener.products import Structure
 
 GRID = 64
 WIDER = 0.2
 NEWTON = 3
-INSIDE = 0.97
-"""Limit of the thresholds of a dead zone, as a share of u_max."""
 
 
 class Blocks(Protocol):

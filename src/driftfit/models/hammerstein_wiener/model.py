@@ -45,9 +45,10 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, Step
-from driftfit.engine.settings import numbers, output_names, warn, whole
+from driftfit.engine.settings import input_names, numbers, output_names, warn, whole
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
+from driftfit.models.hammerstein_wiener.curves.settled_thresholds import settled
 from driftfit.models.hammerstein_wiener.evaluate_bases import DIGITS
 from driftfit.models.hammerstein_wiener.products import Structure
 from driftfit.models.hammerstein_wiener.run_time_orders import RunTimeOrders
@@ -136,6 +137,11 @@ class HammersteinWiener(Model):
             for name in counts:
                 self._set(name, getattr(self, name)[0])
         self._set("input", _blocks(self.input))
+        if self.name is not None:
+            names = input_names("HammersteinWiener", "name", [self.name] if isinstance(self.name, str) else self.name)
+            if len(names) != self.m:
+                raise ValueError(f"HammersteinWiener: there is a name for each input; got {self.name!r} for {self.m}.")
+            self._set("name", names if self.m > 1 else names[0])
         self._check_outputs()
 
     def _check_outputs(self) -> None:
@@ -355,6 +361,11 @@ class HammersteinWiener(Model):
             return 1.0
         energy = 1.0 + float(np.sum(theta[: self.na] ** 2))
         return float((self.output_noise * self.slope(theta, y)) ** 2 * energy + _least_noise(self))
+
+    def settled(self, phi: Array, y: Array, u: Array, at: Array) -> Array:
+        if not any(basis.adaptive for basis in self.bases):
+            return phi
+        return settled(phi, y, u, at, self.bases, self.delays, self.structure)
 
     def follows(self, other: Model) -> bool:
         return isinstance(other, HammersteinWiener) and replace(self, name=None) == replace(other, name=None)

@@ -21,6 +21,7 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, Step, floats, kernel, machine, part, shared
 from driftfit.models.base import GAP
+from driftfit.models.hammerstein_wiener.curves.basis import INSIDE
 from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, input_values, level_of, output_values, usable
 from driftfit.models.hammerstein_wiener.output_curve import believe, inverting, laying, locating, refining
 from driftfit.models.hammerstein_wiener.regressor_rows import (
@@ -70,9 +71,6 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     Places,
     Y,
 )
-
-INSIDE = 0.97
-"""Limit of the thresholds of a dead zone, as a share of u_max."""
 
 
 @shared

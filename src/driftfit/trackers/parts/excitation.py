@@ -115,4 +115,6 @@ def learned(lane: Mapping[str, Array]) -> Array:
 def not_learned(run: Any, names: Iterable[str]) -> tuple[str, str]:
     """The line of a summary on parameters that a run has not determined."""
     why = "never varied separately from the others" if run.ok.any() else "no sample could be used"
+    if run.ok.any() and np.isnan(run.state["scale"]) and run.state["rank"] == len(run.names):
+        why = "constants explain every output without error, so the noise is unknown"
     return "Not learned", f"{', '.join(names)}: {why}; std is inf"

@@ -160,6 +160,10 @@ class Chebyshev(_Orthogonal):
     code: ClassVar[int] = kernels.CHEBYSHEV
 
 
+INSIDE = 0.97
+"""Limit of the thresholds of a dead zone or saturation, as a share of u_max."""
+
+
 @dataclass(frozen=True)
 class Thresholds(Basis):
     """The common part of dead zone and saturation: two thresholds p2 <= 0 <= p1 among the coefficients (1, p1, p2).
