@@ -11,7 +11,8 @@ banded solve gives means only.
 
 Memory is the peak of what Python allocates during a call, counted from before it. The output is what is asked for, the
 means and standard deviations, 8 n bytes each; "held" is what our result keeps: these and the rank. Residuals and
-leverages are not part of it: what it costs to read them later, or to ask for them at once, is printed last.
+leverages are not part of it: what it costs to read them later, or to ask for them at once, is printed last, with the
+time of other starts and results.
 """
 
 import os
@@ -28,7 +29,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.linalg import solveh_banded
 
-from driftfit import FLS, Regression, track
+from driftfit import FLS, Kalman, Regression, track
 
 N, MU = 4, 100.0
 
@@ -108,13 +109,21 @@ def memory(T=10_000):
     )
 
 
-def leverages(T=10_000, turns=60):
-    """Time with leverages, relative to that without."""
+def others(T=10_000, turns=60):
+    """Time with a proper prior, with leverages, and with covariances, relative to that without."""
     phi, y = record(T)
     run = track(Regression(N), FLS(MU), y, phi)
-    ways = (run.smooth, lambda: run.smooth().leverage, lambda: run.smooth("fit").leverage)
-    alone, later, at_once = np.min([[seconds(way)[0] for way in ways] for _ in range(turns)], axis=0)
-    print(f'With leverages: {later / alone:.2f} times as long, {at_once / alone:.2f} times with keep="fit"')
+    prior = track(Regression(N), Kalman(q=1.0 / MU, r=1.0, p0=10.0), y, phi)
+    ways = (
+        run.smooth, prior.smooth, lambda: run.smooth().leverage, lambda: run.smooth("fit").leverage,
+        lambda: run.smooth("cov"),
+    )  # fmt: skip
+    alone, *others = np.min([[seconds(way)[0] for way in ways] for _ in range(turns)], axis=0)
+    proper, later, at_once, cov = np.array(others) / alone
+    print(
+        f"Times as long: {proper:.2f} with a proper prior (Kalman, p0=10); {later:.2f} with leverages, {at_once:.2f} "
+        f'with keep="fit"; {cov:.1f} with keep="cov"'
+    )
 
 
 def main(quick: bool) -> None:
@@ -136,7 +145,7 @@ def main(quick: bool) -> None:
         table.add_row(f"{T:,}", *cells, f"{ratio:.1f}", f"{gap:.0e}")
     Console(width=120).print(table)
     memory()
-    leverages()
+    others()
 
 
 def compare(methods, T, turns):
