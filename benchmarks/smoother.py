@@ -23,6 +23,7 @@ for _library in ("OMP", "OPENBLAS", "MKL"):
 import argparse
 import tracemalloc
 from time import process_time
+from unittest.mock import patch
 
 import numpy as np
 from rich.console import Console
@@ -30,6 +31,9 @@ from rich.table import Table
 from scipy.linalg import solveh_banded
 
 from driftfit import FLS, Kalman, Regression, track
+from driftfit.smooth.parts import elimination
+from driftfit.smooth.parts.halves import inwards, outwards
+from driftfit.smooth.problem import walk_of
 
 N, MU = 4, 100.0
 
@@ -114,15 +118,38 @@ def others(T=10_000, turns=60):
     phi, y = record(T)
     run = track(Regression(N), FLS(MU), y, phi)
     prior = track(Regression(N), Kalman(q=1.0 / MU, r=1.0, p0=10.0), y, phi)
-    ways = (
-        run.smooth, prior.smooth, lambda: run.smooth().leverage, lambda: run.smooth("fit").leverage,
-        lambda: run.smooth("cov"),
-    )  # fmt: skip
+    ways = (run.smooth, prior.smooth, lambda: run.smooth().leverage, lambda: run.smooth("fit").leverage)
     alone, *others = np.min([[seconds(way)[0] for way in ways] for _ in range(turns)], axis=0)
+    others.append(min(seconds(run.smooth, "cov")[0] for _ in range(5)))  # apart: its memory is new to the next in turn
     proper, later, at_once, cov = np.array(others) / alone
     print(
         f"Times as long: {proper:.2f} with a proper prior (Kalman, p0=10); {later:.2f} with leverages, {at_once:.2f} "
         f'with keep="fit"; {cov:.1f} with keep="cov"'
+    )
+
+
+def phases(T=100_000, turns=20):
+    """Shares of the time: the replay of the filter, and the elimination inwards and outwards."""
+    phi, y = record(T)
+    run = track(Regression(N), FLS(MU), y, phi)
+    least = dict.fromkeys(("walk_of", "inwards", "outwards"), np.inf)
+
+    def timed(name, function):
+        def call(*arguments):
+            taken, result = seconds(function, *arguments)
+            least[name] = min(least[name], taken)
+            return result
+
+        return call
+
+    with patch.multiple(elimination, inwards=timed("inwards", inwards), outwards=timed("outwards", outwards)):
+        whole = min(seconds(run.smooth)[0] for _ in range(turns))
+    for _ in range(turns):
+        timed("walk_of", walk_of)(run)
+    replay, inside, outside = np.array(list(least.values())) / whole
+    print(
+        f"Shares of the time at {T:,} samples ({whole / T * 1e9:.0f} ns a sample): replay of the filter {replay:.2f}, "
+        f"elimination {inside:.2f} inwards and {outside:.2f} outwards"
     )
 
 
@@ -146,6 +173,7 @@ def main(quick: bool) -> None:
     Console(width=120).print(table)
     memory()
     others()
+    phases()
 
 
 def compare(methods, T, turns):
