@@ -11,7 +11,8 @@ banded solve gives means only.
 
 Memory is the peak of what Python allocates during a call, counted from before it. The output is what is asked for, the
 means and standard deviations, 8 n bytes each; "held" is what our result keeps: these and the rank. Residuals and
-leverages are not part of it: what it costs to read them later, or to ask for them at once, is printed last.
+leverages are not part of it: what it costs to read them later, or to ask for them at once, is printed last, with the
+time of other starts and results.
 """
 
 import os
@@ -22,13 +23,17 @@ for _library in ("OMP", "OPENBLAS", "MKL"):
 import argparse
 import tracemalloc
 from time import process_time
+from unittest.mock import patch
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 from scipy.linalg import solveh_banded
 
-from driftfit import FLS, Regression, track
+from driftfit import FLS, Kalman, Regression, track
+from driftfit.smooth.parts import elimination
+from driftfit.smooth.parts.halves import inwards, outwards
+from driftfit.smooth.problem import walk_of
 
 N, MU = 4, 100.0
 
@@ -108,13 +113,44 @@ def memory(T=10_000):
     )
 
 
-def leverages(T=10_000, turns=60):
-    """Time with leverages, relative to that without."""
+def others(T=10_000, turns=60):
+    """Time with a proper prior, with leverages, and with covariances, relative to that without."""
     phi, y = record(T)
     run = track(Regression(N), FLS(MU), y, phi)
-    ways = (run.smooth, lambda: run.smooth().leverage, lambda: run.smooth("fit").leverage)
-    alone, later, at_once = np.min([[seconds(way)[0] for way in ways] for _ in range(turns)], axis=0)
-    print(f'With leverages: {later / alone:.2f} times as long, {at_once / alone:.2f} times with keep="fit"')
+    prior = track(Regression(N), Kalman(q=1.0 / MU, r=1.0, p0=10.0), y, phi)
+    ways = (run.smooth, prior.smooth, lambda: run.smooth().leverage, lambda: run.smooth("fit").leverage)
+    alone, *others = np.min([[seconds(way)[0] for way in ways] for _ in range(turns)], axis=0)
+    others.append(min(seconds(run.smooth, "cov")[0] for _ in range(5)))  # apart: its memory is new to the next in turn
+    proper, later, at_once, cov = np.array(others) / alone
+    print(
+        f"Times as long: {proper:.2f} with a proper prior (Kalman, p0=10); {later:.2f} with leverages, {at_once:.2f} "
+        f'with keep="fit"; {cov:.1f} with keep="cov"'
+    )
+
+
+def phases(T=100_000, turns=20):
+    """Shares of the time: the replay of the filter, and the elimination inwards and outwards."""
+    phi, y = record(T)
+    run = track(Regression(N), FLS(MU), y, phi)
+    least = dict.fromkeys(("walk_of", "inwards", "outwards"), np.inf)
+
+    def timed(name, function):
+        def call(*arguments):
+            taken, result = seconds(function, *arguments)
+            least[name] = min(least[name], taken)
+            return result
+
+        return call
+
+    with patch.multiple(elimination, inwards=timed("inwards", inwards), outwards=timed("outwards", outwards)):
+        whole = min(seconds(run.smooth)[0] for _ in range(turns))
+    for _ in range(turns):
+        timed("walk_of", walk_of)(run)
+    replay, inside, outside = np.array(list(least.values())) / whole
+    print(
+        f"Shares of the time at {T:,} samples ({whole / T * 1e9:.0f} ns a sample): replay of the filter {replay:.2f}, "
+        f"elimination {inside:.2f} inwards and {outside:.2f} outwards"
+    )
 
 
 def main(quick: bool) -> None:
@@ -136,7 +172,8 @@ def main(quick: bool) -> None:
         table.add_row(f"{T:,}", *cells, f"{ratio:.1f}", f"{gap:.0e}")
     Console(width=120).print(table)
     memory()
-    leverages()
+    others()
+    phases()
 
 
 def compare(methods, T, turns):

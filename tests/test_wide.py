@@ -1,15 +1,17 @@
-"""More parameters than a row of P is summed in order for: the same filter, and the same bits in every mode."""
+"""More parameters than loops are unrolled for: the same filter, the same bits in blocks, in rows and in every mode."""
 
 import numpy as np
 import pytest
 
 from driftfit import HammersteinWiener, Kalman, Live, Regression, track
+from driftfit.engine.kernel import Driver
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 from driftfit.run.parallel_lanes import FEWEST, width_of
 from driftfit.run.program import MOST, Program
-from driftfit.trackers.parts.covariance import NARROW
+from driftfit.trackers.parts.covariance import reduce_covariance, symmetric_product
 
-N = NARROW + 3
+N = 27
+"""Three blocks of eight, and a rest."""
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +41,31 @@ def test_a_stream_of_a_wide_model_has_the_bits_of_the_record(record):
     for t in range(len(y)):
         live.update(y[t], u[t])
         assert np.array_equal(live.theta, run.theta[t])
+
+
+@Driver
+def correct(work):
+    s = work[0]
+    for l in range(s.theta.shape[1]):
+        s.total[l] = symmetric_product(s, l)
+        reduce_covariance(s, 0.3, l)
+
+
+@pytest.mark.parametrize("n", [11, 27])
+def test_blocks_have_the_bits_of_rows(n):
+    """One lane is computed in blocks; two are computed in rows, entry after entry."""
+    rng = np.random.default_rng(n)
+    root, found = rng.normal(size=(n, n)), []
+    for L in (1, 2):
+        shapes = {"theta": (n, L), "g": (n, L), "phi": (n, L), "P": (n, n, L), "total": (L,)}
+        work = np.zeros(1, np.dtype([(name, np.float64, shape) for name, shape in shapes.items()]))
+        work["P"] = np.where(np.tri(n, dtype=bool), root @ root.T, np.nan)[..., None]
+        work["phi"] = root[0][:, None] / 3.0
+        correct(work)
+        found.append([work[name][0, ..., 0] for name in ("g", "P", "total")])
+    for one, other in zip(*found, strict=True):
+        assert np.array_equal(one, other, equal_nan=True)
+    assert found[0][0] == pytest.approx(root @ root.T @ root[0] / 3.0)
 
 
 K = Kalman(q=1e-3, r=0.01)

@@ -84,21 +84,35 @@ def watch() -> Violations:
         check(context, builder, beyond, last, size)
         return builder.bitcast(builder.gep(inside.data, [at]), simd._VECTOR8.as_pointer())
 
-    unchecked = simd._pair_place
+    pairs, eights = simd._pair_place, simd._flat_place
 
     def pair_place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
-        shape, size = context.make_array(kind)(context, builder, array).shape, ir.Constant(i64, 1)
-        for k in range(kind.ndim - 1):
-            size = builder.mul(size, builder.extract_value(shape, k))
+        size = _length(context, builder, kind, array, kind.ndim - 1)
         check(context, builder, builder.icmp_unsigned(">=", at, size), at, size)
-        return unchecked(context, builder, kind, array, at)
+        return pairs(context, builder, kind, array, at)
+
+    def flat_place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
+        size = _length(context, builder, kind, array, kind.ndim)
+        last = builder.add(at, ir.Constant(i64, simd.WIDTH - 1))
+        beyond = builder.or_(builder.icmp_signed("<", at, ir.Constant(i64, 0)), builder.icmp_signed(">=", last, size))
+        check(context, builder, beyond, last, size)
+        return eights(context, builder, kind, array, at)
 
     for name in settings():  # processes that a test starts have no checks, and must not store their code in this folder
         del os.environ[name]
     config.reload_config = lambda: None  # it would see that the variables are gone
     cgutils.do_boundscheck = checked
-    simd._place, simd._pair_place = place, pair_place
+    simd._place, simd._pair_place, simd._flat_place = place, pair_place, flat_place
     return violations
+
+
+def _length(context: Any, builder: Any, kind: Any, array: Any, axes: int) -> Any:
+    """The product of the first extents of an array."""
+    shape = context.make_array(kind)(context, builder, array).shape
+    size = builder.extract_value(shape, 0)
+    for k in range(1, axes):
+        size = builder.mul(size, builder.extract_value(shape, k))
+    return size
 
 
 def _line() -> str:

@@ -21,7 +21,9 @@ from driftfit.engine.kernel import ARTANH, EXP, LOG2, LOG2_HIGH, LOG2_LOW, ROUND
 from driftfit.engine.numba_internals import ir, named_intrinsic
 
 WIDTH = 8
-_I64 = ir.IntType(64)
+UNROLLED = 10
+"""Parameters up to which the compiler unrolls all loops."""
+_I32, _I64 = ir.IntType(32), ir.IntType(64)
 _VECTOR8, _WHOLE = ir.VectorType(ir.DoubleType(), WIDTH), ir.VectorType(_I64, WIDTH)
 _VECTOR4, _VECTOR2 = (ir.VectorType(ir.DoubleType(), count) for count in (4, 2))
 
@@ -140,12 +142,92 @@ def _put_pair(context: Any, array: Any, at: Any, value: Any) -> Any:
     return types.void(array, types.intp, vector2), build
 
 
+def _flat_place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
+    """The address of entry ``at`` of an array, counted over all its axes."""
+    inside = context.make_array(kind)(context, builder, array)
+    return builder.bitcast(builder.gep(inside.data, [at]), _VECTOR8.as_pointer())
+
+
+def _eight_at(context: Any, array: Any, at: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return builder.load(_flat_place(context, builder, signature.args[0], *given), align=8)
+
+    return vector8(array, types.intp), build
+
+
+def _put_eight(context: Any, array: Any, at: Any, value: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        builder.store(given[2], _flat_place(context, builder, signature.args[0], *given[:2]), align=8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, vector8), build
+
+
+def _eight_of(context: Any, numbers: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return _assembled(builder, [builder.extract_value(given[0], k) for k in range(WIDTH)], _VECTOR8)
+
+    return vector8(numbers), build
+
+
+def _assembled(builder: Any, entries: Any, kind: Any) -> Any:
+    made = ir.Constant(kind, ir.Undefined)
+    for k, entry in enumerate(entries):
+        made = builder.insert_element(made, entry, ir.Constant(_I32, k))
+    return made
+
+
+def _add_in_order(context: Any, total: Any, value: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        total, value = given
+        for k in range(WIDTH):
+            total = builder.fadd(total, builder.extract_element(value, ir.Constant(_I32, k)))
+        return total
+
+    return types.float64(types.float64, vector8), build
+
+
+def _add_products(context: Any, total: Any, array: Any, at: Any, columns: Any, x: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        total, array, at, columns, x = given
+        products = []
+        for k in range(WIDTH):
+            row = builder.add(at, builder.mul(columns, ir.Constant(_I64, k)))
+            place = _flat_place(context, builder, signature.args[1], array, row)
+            products.append(builder.fmul(builder.load(place, align=8), x))
+        for column in _transposed(builder, products):
+            total = builder.fadd(total, column)
+        return total
+
+    return vector8(vector8, array, types.intp, types.intp, vector8), build
+
+
+def _transposed(builder: Any, rows: Any) -> Any:
+    """The columns of eight vectors: off the diagonal entries, then squares of two, then of four are exchanged."""
+    rows = list(rows)
+    for step in (1, 2, 4):
+        for k in (k for k in range(WIDTH) if not k & step):
+            first = [m + WIDTH - step if m & step else m for m in range(WIDTH)]
+            second = [m + WIDTH if m & step else m + step for m in range(WIDTH)]
+            rows[k], rows[k + step] = (
+                builder.shuffle_vector(rows[k], rows[k + step], ir.Constant(ir.VectorType(_I32, WIDTH), order))
+                for order in (first, second)
+            )
+    return rows
+
+
+def _in_blocks(context: Any, record: Any) -> Any:
+    n, L = record.fields["theta"].type.shape if isinstance(record, types.Record) else (0, 0)
+
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return ir.Constant(ir.IntType(1), n > UNROLLED and L == 1)
+
+    return types.boolean(record), build
+
+
 def _two_of(context: Any, first: Any, second: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        made = ir.Constant(_VECTOR2, ir.Undefined)
-        for k in range(2):
-            made = builder.insert_element(made, given[k], ir.Constant(ir.IntType(32), k))
-        return made
+        return _assembled(builder, given, _VECTOR2)
 
     return vector2(types.float64, types.float64), build
 
@@ -335,6 +417,20 @@ pair, put_pair = _named("pair", _pair), _named("put_pair", _put_pair)
 """Pair ``at`` of an array whose last axis is 2, counted over its other axes; and write it there."""
 two, entry = _named("two", _two_of), _named("entry", _one_of_two)
 """A pair of two numbers; and entry k of a pair."""
+eight_at, put_eight = _named("eight_at", _eight_at), _named("put_eight", _put_eight)
+"""Entries ``at`` to at + 7 of an array, counted over all its axes; and write them there."""
+eight_of = _named("eight_of", _eight_of)
+"""A vector of the eight numbers of a tuple."""
+add_in_order = _named("add_in_order", _add_in_order)
+"""A number plus the eight entries of a vector, added one after the other."""
+add_products = _named("add_products", _add_products)
+"""Eight sums plus the products of eight rows with x, which are added one after the other. Row k begins at entry
+at + k columns of an array.
+"""
+in_blocks = _named("in_blocks", _in_blocks)
+"""Whether a record has one lane and more than `UNROLLED` parameters, as its type says: steps that are compiled once for
+all sizes, and those that are exported to C, do without vectors.
+"""
 sum_of = _named("sum_of", _sum)
 """The sum of the eight entries, added in pairs."""
 lower, higher = (_named(name, _pick(sign)) for name, sign in (("lower", "<"), ("higher", ">")))

@@ -34,9 +34,9 @@ CHUNK = 1_000_000
 BLOCK = 4096
 """Samples of a block of results that are kept in single precision."""
 
-MOST = 14
+MOST = 10
 """With more parameters than this loops over lanes are slower than single lanes (docs/design.md): the compiler does not
-unroll a loop over that many, and the rows of a covariance of 16 lie in the same lines of the cache.
+unroll a loop over that many, and then does not vectorise the loop over lanes.
 """
 
 SHORT = 32

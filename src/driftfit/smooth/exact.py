@@ -5,10 +5,10 @@ It minimises the following cost, and computes the corresponding posterior distri
     J = sum_t weight_t (y_t - phi_t' theta_t)^2 + sum_t |G^-1 E_t^-1 (theta_t - theta_{t-1})|^2 / drift_t + prior
 
 with G G' = q and E_t the square roots of the factors of each parameter's drift. There are two methods. The fast one
-(`driftfit.smooth.parts.elimination`) handles a diagonal q with a diffuse start, and tests its own result by a second
-problem with a known solution. If the test fails, and in all other cases, the safe one
-(`driftfit.smooth.parts.two_filters`) works on square roots of information. ``Path.method`` names the method that was
-used. Second differences instead of first ones are in `driftfit.smooth.parts.slopes`.
+(`driftfit.smooth.parts.elimination`) handles a diagonal q if the regressors span all directions, also with a proper
+prior, and tests its own result by a second problem with a known solution. If the test fails, and in all other cases,
+the safe one (`driftfit.smooth.parts.two_filters`) works on square roots of information. ``Path.method`` names the
+method that was used. Second differences instead of first ones are in `driftfit.smooth.parts.slopes`.
 
 If the regressors never span all directions, a constant shift in the complement costs nothing. The first point then
 takes theta0 there, the limit of a vanishing prior, and std is inf for parameters that are not determined. Rank is
@@ -45,7 +45,7 @@ def smooth(walk: Walk, keep: str = "fit", rebuild: Callable[[], Walk] | None = N
     n = walk.phi.shape[1]
     scale = column_scale(walk.phi, walk.signals)
     rank, unseen = ranks(walk.phi, walk.signals, scale)
-    simple = keep != "cov" and walk.p0 is None and rank[-1] == n and np.array_equal(walk.q, np.diag(np.diag(walk.q)))
+    simple = keep != "cov" and rank[-1] == n and np.array_equal(walk.q, np.diag(np.diag(walk.q)))
     found = elimination.smooth(walk, scale, keep, overwrite=rebuild is not None) if simple else None
     if found is None:
         walk = rebuild() if simple and rebuild is not None else walk

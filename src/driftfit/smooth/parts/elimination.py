@@ -1,7 +1,8 @@
 """The fast path of the exact smoother: elimination of one increment at a time, from both ends of the record.
 
-For a diagonal q, with U, z the information on theta_t (U theta = z), the increment of parameter i before sample t has
-variance g = q_i drift_t drift_root_ti^2, and leaves
+For a diagonal q, with U, z the information on theta_t (U theta = z), which begins as P0^-1 and P0^-1 theta0 before the
+first sample (zero if the start is diffuse) and as zero after the last one, the increment of parameter i before sample t
+has variance g = q_i drift_t drift_root_ti^2, and leaves
 
     f = 1 / (1 + g U_ii);   a_i = f,  a_j = -g f U_ji;   b = g f z_i
     U_jk <- U_jk + a_j U_ik,  U_ij <- f U_ij;   z_j <- z_j + a_j z_i,  z_i <- f z_i          towards the middle
@@ -10,7 +11,7 @@ variance g = q_i drift_t drift_root_ti^2, and leaves
 between which the sample adds w phi phi' to U and w phi y to z. This is the recursion of flexible least squares,
 theta_t = e_t + M_t theta_{t+1}, with M_t as a product of n steps, so O(n^2) for means and no matrix to invert. A random
 walk has no direction of time: the same recursion runs from the last sample backwards, and where the two meet U and z
-are the sums of both (`driftfit.smooth.parts.halves`).
+are the sums of both (`driftfit.smooth.parts.halves`). A proper prior adds its term of J when theta_0 has been found.
 
 Test: together with z, the recursion carries the information of a second record, which the constant path 1 / (rms of
 each regressor) produces without noise. The largest difference of its solution from that path estimates the relative
@@ -37,9 +38,12 @@ ERROR = 1e-10
 CANCELLED = 1e-6
 """Smallest f: below it U has lost more than six digits in one step."""
 
+CORRELATED = 1e4
+"""Largest condition number of the correlations of a prior, whose inverse the known path does not test."""
+
 
 def smooth(walk: Walk, scale: Array, keep: str = "std", overwrite: bool = False) -> Path | None:
-    """Solve a problem with a diagonal q and a diffuse start of full rank; None if the result is not accurate enough.
+    """Solve a problem with a diagonal q and regressors of full rank; None if the result is not accurate enough.
 
     ``scale`` (n,) is the size of each regressor. With keep="fit" the path has rho and c. ``overwrite``: phi and signals
     take the solution, which saves memory.
@@ -49,14 +53,19 @@ def smooth(walk: Walk, scale: Array, keep: str = "std", overwrite: bool = False)
 
 
 def smooth_and_weigh(walk: Walk, scale: Array, keep: str = "std", overwrite: bool = False) -> tuple[Path, float] | None:
-    """The same, and the log of the diffuse likelihood of y given q, drift and weights, up to a constant.
+    """The same, and the log of the likelihood of y given q, drift, weights and the start, up to a constant.
 
     With U of the middle sample, -2 log L = J + log |U| - sum log f, since each f is 1 / (1 + g U_ii).
     """
     T, n = walk.phi.shape
     K = T // 2 + 1
+    before = np.zeros((n, n)) if walk.p0 is None else inverse(walk.p0, CORRELATED)
+    if before is None:
+        return None
     work = workspace(n).copy()
     work["q"], work["truth"] = np.diag(walk.q)[:, None], 1.0 / scale[:, None]
+    work["U"][0, ..., 0], work["z"][0, :, 0] = np.tril(before), before @ walk.theta0
+    work["known_z"][0, :, 0] = before @ (1.0 / scale)
     drift_root = np.ascontiguousarray(walk.drift_root if len(walk.drift_root) else np.ones((1, n)))
     samples = Samples(np.ascontiguousarray(walk.phi), np.ascontiguousarray(walk.signals), drift_root)
     kept = np.empty((-(-K // BLOCK), n + 2, n, 2))
@@ -78,17 +87,21 @@ def smooth_and_weigh(walk: Walk, scale: Array, keep: str = "std", overwrite: boo
         return None
     empty = np.zeros((0, n, n))
     theta = np.ascontiguousarray(theta[:, :n])
-    path = Path(theta, var, found.rho, found.c, sums.cost, sums.measurement_cost, sums.spread, empty, empty, "fast")
-    return path, -0.5 * (sums.cost + volume)
+    away = work["theta"][0, :, 0] - walk.theta0
+    cost = sums.cost + float(away @ before @ away)
+    path = Path(theta, var, found.rho, found.c, cost, sums.measurement_cost, sums.spread, empty, empty, "fast")
+    return path, -0.5 * (cost + volume)
 
 
-def inverse(U: Array) -> Array | None:
-    """U^-1 after scaling its diagonal to 1; None if U is numerically singular."""
+def inverse(U: Array, limit: float = np.inf) -> Array | None:
+    """U^-1 after scaling its diagonal to 1; None if its condition number is then above the limit, or it is singular."""
     size = np.sqrt(np.diag(U))
     if not (size > 0.0).all():
         return None
     cross = np.outer(size, size)
     try:
+        if limit < np.inf and not np.linalg.cond(U / cross) <= limit:
+            return None
         C: Array = np.linalg.inv(U / cross) / cross
     except np.linalg.LinAlgError:
         return None

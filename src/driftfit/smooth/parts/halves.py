@@ -96,11 +96,14 @@ def sample_of(T: int, K: int, h: int, k: int) -> int:
 
 @kernel
 def drifts(s: State, samples: Any, K: int, k: int) -> None:
-    """Variances g of the increments before step k of both halves."""
+    """Variances g of the increments before step k of both halves.
+
+    That before the first sample changes nothing if the start is diffuse, because U is zero there.
+    """
     n, T = s.q.shape[0], samples.phi.shape[0]
     many = 1 if samples.drift_root.shape[0] > 1 else 0
     after = 2 * (K - 1) - k + 1
-    moved = two(1.0 if k > 0 else 0.0, 1.0 if (k > 0) & (after < T) else 0.0)
+    moved = two(1.0, 1.0 if (k > 0) & (after < T) else 0.0)
     after = min(after, T - 1)
     first = min(k, T - 1)
     drift = two(samples.signals[first, DRIFT], samples.signals[after, DRIFT])
