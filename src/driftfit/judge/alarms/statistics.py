@@ -15,7 +15,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import plain
 from driftfit.engine.tiles import output_type
 from driftfit.judge.alarms.bootstrap import RECORDS, limits, simulated
-from driftfit.judge.alarms.frozen import Rows, frozen_model
+from driftfit.judge.alarms.frozen import Rows, centred, frozen_model
 from driftfit.judge.alarms.onsets import (
     chance,
     mean_limit,
@@ -95,10 +95,11 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
             f"{ok.sum()} that can be used. Give a longer normal segment, reference=(from, to), or choose "
             'kind="innovation".'
         )
-    if not ((np.ptp(phi[ok], axis=0) == 0.0) & (phi[ok][0] != 0.0)).any():
-        phi, names = np.column_stack([phi, np.ones(len(phi))]), (*names, OFFSET)
+    constants = np.flatnonzero((np.ptp(phi[ok], axis=0) == 0.0) & (phi[ok][0] != 0.0))
+    if not len(constants):
+        phi, names, constants = np.column_stack([phi, np.ones(len(phi))]), (*names, OFFSET), np.array([n])
     root = np.sqrt(np.where(ok, noise, 1.0))
-    found = frozen_model(phi / root[:, None], y / root, ok)
+    found = frozen_model(phi / root[:, None], y / root, ok, int(constants[-1]))
     if found is None:
         raise ValueError(
             f'detect: "{rule.kind}" measures changes in units of the noise, and the reference has none: constant '
@@ -199,7 +200,7 @@ def findings_of(run: Track, rule: AlarmRule, start: int, samples: Samples) -> Ar
     n, (phi, rest), model = len(rule.parameters), samples, rule.reference
     findings = np.full((len(run), CUSUM + n + 1), np.nan)
     rows = np.column_stack([phi, np.ones((len(run), n - phi.shape[1])), rest])
-    scan(rows[start:], model, memory_of(n, len(model.ar)), findings[start:])
+    scan(rows[start:], model, memory_of(model), findings[start:])
     return findings
 
 
@@ -207,7 +208,8 @@ def unseen_in(rule: AlarmRule, start: int, samples: Samples) -> int:
     """Usable samples from ``start`` on that excite what the reference of "glr" or "cusum" did not, or hardly."""
     model, (phi, rest) = rule.reference, (one[start:] for one in samples)
     used, p = (rest[:, 1] > 0.0) & (rest[:, 3] > 0.0), len(model.ar)
-    rows = np.column_stack([phi, np.ones((len(phi), len(rule.parameters) - phi.shape[1]))]) / model.unit
+    rows = np.column_stack([phi, np.ones((len(phi), len(rule.parameters) - phi.shape[1]))])
+    rows = centred(rows, model.mean, int(model.numbers[-1])) / model.unit
     scaled = np.where(used[:, None], rows, 0.0) / np.sqrt(np.where(used, rest[:, 2], 1.0))[:, None]
     rows = whitened(scaled, np.zeros(len(rows)), model.ar)[0]
     terms = rows[:, None] * model.unseen

@@ -69,7 +69,7 @@ class LiveAlarm:
         self._onsets: deque[Onset] = deque(maxlen=KEPT)
         if rule.kind in FROZEN:
             self._frozen = rule.reference
-            self._memory = memory_of(len(rule.parameters), len(self._frozen.ar))
+            self._memory = memory_of(self._frozen)
             self._row = np.ones((1, len(rule.parameters) + len(ROW)))
             self._findings = self._memory.findings[None].copy()
 

@@ -58,15 +58,24 @@ UNSURE, USUAL = 0.2, 8.0
 UNKNOWN = 1.0
 """The same, from which on a sample judges nothing: its residual is the error of theta, and clipped."""
 WIDE = 30.0
-"""x is limited to this for the size of a change."""
-SCALE, CLIP, K, V, KAPPA, ALPHA, BETA, INSIDE, RAW, SPREAD, LONGEST, NORMAL = range(12)
+"""For the size of a change x is limited to this, so that one outlier does not count more, or to twice the last e."""
+SCALE, CLIP, K, V, KAPPA, ALPHA, BETA, INSIDE, RAW, SPREAD, LONGEST, NORMAL, CONSTANT = range(13)
 """Entries of `Frozen.numbers`. INSIDE is the mean of x^2 where x is not clipped and 0 elsewhere, RAW and SPREAD are the
-mean and variance of x^2, LONGEST is the longest window that judges the noise, NORMAL the size of the reference.
+mean and variance of x^2, LONGEST is the longest window that judges the noise, NORMAL the size of the reference,
+CONSTANT the index of the regressor that the others are centred on (read only if some are).
 """
+ALIKE = 1.0
+"""Twice the logarithm of the likelihood ratio up to which a step is of the level, not of a slope through zero."""
+LITTLE = 0.2
+"""Share of a slope in a step through zero below which it is that of the level, which has a CUSUM of its own."""
+MOST = 0.5
+"""Share of sum g^2, of what it is where every score is clipped, from which on scores no longer show what moved."""
 SINCE, LEVEL, COUNT = range(3)
 """Entries of `Memory.counts`: usable samples in a row, h, samples that were used."""
 ONE, JOINT, NOISE, WHICH, SIZE, STD, WINDOW, RATIO, NOISE_WINDOW, CUSUM = range(10)
 """Entries of the findings of a sample; the CUSUM of n parameters and of the noise come last."""
+FIT = NOISE_WINDOW
+"""Entry of a window in its place: where scores are clipped, how well one change explains it, or 0; otherwise NaN."""
 
 
 class Frozen(NamedTuple):
@@ -79,6 +88,8 @@ class Frozen(NamedTuple):
     numbers: Array
     unseen: Array = np.zeros((0, 0))
     """(k, n): directions of the regressors in which the reference has none, such as that of an input that was 0."""
+    mean: Array = np.zeros(0)
+    """(n,): regressors in the reference as multiples of the constant, 0 where they were near zero; none if all were."""
 
 
 class Memory(NamedTuple):
@@ -96,13 +107,14 @@ class Memory(NamedTuple):
     findings: Array
 
 
-def memory_of(n: int, p: int) -> Memory:
-    """The state before the first sample, for n parameters and an autoregression of order p."""
+def memory_of(frozen: Frozen) -> Memory:
+    """The state before the first sample."""
+    n, p, centred = len(frozen.theta), len(frozen.ar), len(frozen.mean)
     last = np.full((LEVELS, 2, CUSUM), np.nan)
     sums = np.zeros((LEVELS, BLOCKS, size_of(n)))
-    work = np.zeros((2 * n + 4, size_of(n)))
+    work = np.zeros((2 * n + 4 + (centred > 0), size_of(n)))
     counts, findings = np.array([0.0, 1.0, 0.0]), np.full(CUSUM + n + 1, np.nan)
-    past, cusum = np.zeros((p + 1, n + 1)), np.zeros((n + 1, 2))
+    past, cusum = np.zeros((p + 1, n + 1)), np.zeros((n + 1 + centred, 2))
     return Memory(past, sums, last, cusum, counts, work, np.zeros(size_of(n)), findings)
 
 
@@ -190,6 +202,49 @@ def solve(work: Array, n: int, given: Array, into: Array) -> None:
         into[i] = value / work[i, i] if work[i, i] > 0.0 else 0.0
 
 
+@kernel
+def through_zero(frozen: Frozen, j: int, constant: int) -> tuple[float, float]:
+    """(a, b): a step of the slope j through zero moves that about the mean by a, and the level by b; both in units."""
+    own, level = frozen.unit[j], frozen.mean[j] * frozen.unit[constant]
+    size = np.sqrt(own * own + level * level)
+    return own / size, level / size
+
+
+@part
+def explain(g: Array, z: Array, u: Array, j: int, share: float, clipped: bool, named: float, findings: Array) -> float:
+    """Consider a change along g (n,), of which parameter j has a share; returns the best square by which one is named.
+
+    By residuals if scores are clipped, which then show only that there is a change.
+    """
+    length, score, raw = 0.0, 0.0, 0.0
+    for i in range(g.shape[0]):
+        length += g[i] * g[i]
+        score += g[i] * z[i]
+        raw += g[i] * u[i]
+    if not length > 0.0:
+        return named
+    square = score * score / length
+    if not findings[ONE] >= square:
+        findings[ONE] = square
+    by = (raw * raw / length if clipped else square) - (ALIKE if share < 1.0 else 0.0)
+    if by > named:
+        findings[WHICH], findings[SIZE], findings[STD] = j, share * raw / length, share / np.sqrt(length)
+    return max(by, named)
+
+
+@part
+def explained(total: Array, frozen: Frozen, work: Array, j: int, constant: int) -> float:
+    """The squares that a step of parameter j explains, about its mean or through zero."""
+    n = frozen.theta.shape[0]
+    own, level = total[n + j], total[n + constant]
+    most: float = own * own / work[n + j, j]
+    if frozen.mean.shape[0] > 0 and frozen.mean[j] != 0.0:
+        a, b = through_zero(frozen, j, constant)
+        length = a * a * work[n + j, j] + 2.0 * a * b * work[n + j, constant] + b * b * work[n + constant, constant]
+        most = max(most, (a * own + b * level) ** 2 / max(length, SMALLEST))
+    return most
+
+
 @part
 def compare(total: Array, L: int, frozen: Frozen, work: Array, findings: Array) -> None:
     """The statistics of one window into findings."""
@@ -205,28 +260,35 @@ def compare(total: Array, L: int, frozen: Frozen, work: Array, findings: Array) 
     for i in range(n):
         square += z[i] * z[i]
     findings[JOINT] = cube_deviate(square / rank, 0.5 * rank) if rank > 0 else np.nan
-    best, findings[ONE] = -1.0, np.nan
+    clipped = total[2 * n] > MOST * L * numbers[CLIP] * numbers[CLIP]
+    centred, named, findings[ONE] = frozen.mean.shape[0] > 0, -ALIKE, np.nan
+    constant = int(numbers[CONSTANT]) if centred else 0
+    if centred:
+        solve(work, n, work[n + constant, :n], work[2 * n + 3])
     for j in range(n):
         # a change of parameter j alone: (g'z)^2 / g'g, its size g'u / g'g
         solve(work, n, work[n + j, :n], g)
-        length, score, raw = 0.0, 0.0, 0.0
-        for i in range(n):
-            length += g[i] * g[i]
-            score += g[i] * z[i]
-            raw += g[i] * u[i]
-        if length > 0.0 and score * score > best * length:
-            best = score * score / length
-            findings[WHICH], findings[SIZE] = j, raw / length
-            findings[STD] = np.sqrt(numbers[RAW] / (numbers[V] * length))
-    if best >= 0.0:
-        findings[ONE] = np.sqrt(best)
+        named = explain(g[:n], z, u, j, 1.0, clipped, named, findings)
+        if centred and frozen.mean[j] != 0.0:
+            a, b = through_zero(frozen, j, constant)
+            for i in range(n):
+                g[i] = a * g[i] + b * work[2 * n + 3, i]
+            named = explain(g[:n], z, u, j, a, clipped, named, findings)
+    findings[ONE] = np.sqrt(findings[ONE])
+    # squares of the residuals in units of those of the reference, and what that change leaves of them
+    fit = explained(total, frozen, work, int(findings[WHICH]), constant) if findings[ONE] >= 0.0 else 0.0
+    squares = total[2 * n + 1] / (L * numbers[RAW])
+    left = max(total[2 * n + 1] - fit, 0.0) / ((L - 1.0) * numbers[RAW])
+    moved = squares > 1.0 and left * left < squares
+    findings[STD] *= np.sqrt(numbers[RAW] * (max(left, 1.0) if moved else 1.0) / numbers[V])
+    findings[FIT] = np.nan if not clipped else fit / max(left, SMALLEST) if moved else 0.0
     # the variance of the noise: sum g^2 against L v, as a deviate
     findings[NOISE], findings[WINDOW] = np.nan, L
     if numbers[LONGEST] >= L:
         ratio = total[2 * n] / (L * numbers[V])
         z_noise = cube_deviate(ratio, L * numbers[V] * numbers[V] / numbers[KAPPA])
         findings[NOISE] = abs(z_noise) / np.sqrt(1.0 + L / numbers[NORMAL])
-        findings[RATIO] = np.sqrt(total[2 * n + 1] / (L * numbers[RAW]))
+        findings[RATIO] = np.nan if moved else np.sqrt(squares)  # a parameter explains more of them than the noise
 
 
 @part
@@ -269,21 +331,38 @@ def unsure(sample: Array, frozen: Frozen) -> bool:
     return leverage(sample, frozen) > max(UNSURE, usual)  # type: ignore[no-any-return]
 
 
+@kernel
+def entry(n: int, i: int, j: int) -> int:
+    """Where the sums of a block contain phi_i phi_j, j <= i."""
+    return 2 * n + 2 + i * (i + 1) // 2 + j
+
+
+@part
+def climb(cusum: Array, z: float, mean: float, var: float, power: float) -> None:
+    """One step of a CUSUM up and of one down."""
+    for side in range(2):
+        step = (mean * z if side == 0 else -mean * z) - 0.5 * mean * mean * power
+        cusum[side] = max(0.0, cusum[side] + step / var)
+
+
 @part
 def accumulate(sample: Array, frozen: Frozen, cusum: Array) -> None:
-    """One step of the CUSUM of every parameter, the last row that of the noise; columns are up and down."""
+    """One step of the CUSUM of every parameter, of the noise, and of slopes through zero; columns are up and down."""
     n = frozen.theta.shape[0]
     k, v, kappa = frozen.numbers[K], frozen.numbers[V], frozen.numbers[KAPPA]
     at = 2 * n + 2
-    for j in range(n + 1):
+    for j in range(n):
         at += j
-        if j < n:
-            z, mean, var, power = sample[j], SHIFT * k, v, sample[at + j]
-        else:
-            z, mean, var, power = sample[2 * n] - v, SHIFT * v, kappa, 1.0
-        for side in range(2):
-            step = (mean * z if side == 0 else -mean * z) - 0.5 * mean * mean * power
-            cusum[j, side] = max(0.0, cusum[j, side] + step / var)
+        climb(cusum[j], sample[j], SHIFT * k, v, sample[at + j])
+    climb(cusum[n], sample[2 * n] - v, SHIFT * v, kappa, 1.0)
+    constant = int(frozen.numbers[CONSTANT]) if frozen.mean.shape[0] > 0 else 0
+    for j in range(frozen.mean.shape[0]):
+        a, b = through_zero(frozen, j, constant) if frozen.mean[j] != 0.0 else (0.0, 0.0)
+        if a > LITTLE:
+            low, high = min(j, constant), max(j, constant)
+            both = sample[entry(n, high, low)]
+            power = a * a * sample[entry(n, j, j)] + 2.0 * a * b * both + b * b * sample[entry(n, constant, constant)]
+            climb(cusum[n + 1 + j], a * sample[j] + b * sample[constant], SHIFT * k, v, power)
 
 
 @part
@@ -311,18 +390,26 @@ def judge(memory: Memory, frozen: Frozen, findings: Array) -> None:
         accumulate(memory.sample, frozen, memory.cusum)
     for i in range(findings.shape[0]):
         findings[i] = np.nan
-    for j in range(last.shape[0]):
-        for kind in range(2):
-            one = last[j, kind]
-            if one[JOINT] > findings[JOINT] or np.isnan(findings[JOINT]):
-                findings[JOINT] = one[JOINT]
-            if one[ONE] > findings[ONE] or np.isnan(findings[ONE]):
-                for i in (ONE, WHICH, SIZE, STD, WINDOW):
-                    findings[i] = one[i]
-            if one[NOISE] > findings[NOISE] or np.isnan(findings[NOISE]):
-                findings[NOISE], findings[RATIO], findings[NOISE_WINDOW] = one[NOISE], one[RATIO], one[WINDOW]
+    best, fit = 0, np.nan
+    for w in range(2 * last.shape[0]):
+        one = last[w // 2, w % 2]
+        if one[JOINT] > findings[JOINT] or np.isnan(findings[JOINT]):
+            findings[JOINT] = one[JOINT]
+        if one[ONE] > findings[ONE] or np.isnan(findings[ONE]):
+            best, fit, findings[ONE] = w, one[FIT], one[ONE]
+        if one[NOISE] > findings[NOISE] or np.isnan(findings[NOISE]):
+            findings[NOISE], findings[RATIO], findings[NOISE_WINDOW] = one[NOISE], one[RATIO], one[WINDOW]
+    # where scores are clipped, the window that one change explains best shows which
+    for w in range(2 * last.shape[0]):
+        if last[w // 2, w % 2, FIT] > fit:
+            best, fit, findings[RATIO] = w, last[w // 2, w % 2, FIT], np.nan
+    for i in (WHICH, SIZE, STD, WINDOW):
+        findings[i] = last[best // 2, best % 2, i]
     for j in range(n + 1):
-        findings[CUSUM + j] = np.sqrt(2.0 * max(memory.cusum[j, 0], memory.cusum[j, 1]))
+        highest = max(memory.cusum[j, 0], memory.cusum[j, 1])
+        if j < frozen.mean.shape[0]:
+            highest = max(highest, memory.cusum[n + 1 + j, 0], memory.cusum[n + 1 + j, 1])
+        findings[CUSUM + j] = np.sqrt(2.0 * highest)
 
 
 @part
@@ -350,12 +437,13 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> bool:
         return False
     if row[n + 3] > GAP:
         counts[SINCE] = 0.0
-    # residual and regressors, scaled to the noise variance of weight 1
-    root = 1.0 / np.sqrt(row[n + 2])
-    e = row[n]
+    # residual and centred regressors, scaled to the noise variance of weight 1
+    root, before, centred = 1.0 / np.sqrt(row[n + 2]), abs(past[p, n]), frozen.mean.shape[0] > 0
+    e, level = row[n], row[int(numbers[CONSTANT])] if centred else 0.0
     for i in range(n):
-        e -= row[i] * frozen.theta[i]
-        past[p, i] = row[i] * root / frozen.unit[i]
+        own = row[i] - frozen.mean[i] * level if centred else row[i]
+        e -= own * frozen.theta[i]
+        past[p, i] = own * root / frozen.unit[i]
     past[p, n] = e * root
     # whitened by the autoregression, and divided by the present standard deviation
     scale = numbers[SCALE] * np.sqrt(counts[LEVEL])
@@ -371,7 +459,8 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> bool:
     counts[SINCE] += 1.0
     if counts[SINCE] <= p or outside(phi, frozen.unseen):
         return False
-    x, clip = min(WIDE, max(-WIDE, phi[n])), numbers[CLIP]
+    wide, clip = max(WIDE, 2.0 * before / scale), numbers[CLIP]
+    x = min(wide, max(-wide, phi[n]))
     g = min(clip, max(-clip, x))
     enter_scores(phi[:n], g, x, memory.sample)
     if leverage(memory.sample, frozen) > UNKNOWN:

@@ -62,7 +62,7 @@ class AlarmRule(Settings):
     parameters : (n,)
         Names of the parameters of the frozen model, for "glr" and "cusum"; otherwise empty. The last is OFFSET if the
         run has no constant regressor.
-    frozen : theta, unit, ar, cov, numbers, unseen
+    frozen : theta, unit, ar, cov, numbers, unseen, mean
         That model, as `driftfit.run.live.likelihood_ratio.Frozen`.
     growth : (c,)
         Growth of the squares of the limits with log(every).
@@ -91,10 +91,10 @@ class AlarmRule(Settings):
 
     @property
     def reference(self) -> Frozen:
-        """The frozen model of "glr" and "cusum", as arrays; rules of earlier versions have no ``unseen`` directions."""
+        """The frozen model of "glr" and "cusum", as arrays; rules of earlier versions have fewer of them."""
         n = len(self.parameters)
-        shapes, given = (-1, -1, -1, (n, n), -1, (-1, n)), (*self.frozen, ())
-        return Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(given, shapes, strict=False)))
+        shapes, given = (-1, -1, -1, (n, n), -1, (-1, n), -1), (*self.frozen, *((), ())[len(self.frozen) - 5 :])
+        return Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(given, shapes, strict=True)))
 
     @property
     def real_rate(self) -> tuple[float, float]:
