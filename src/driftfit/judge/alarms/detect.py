@@ -59,7 +59,6 @@ from driftfit.judge.alarms.statistics import (
     rule_of,
     samples_of,
     statistic_of,
-    unseen_in,
 )
 from driftfit.judge.plots import plot_alarms
 from driftfit.judge.verdict import p_text
@@ -325,7 +324,7 @@ def judged(run: Track, rule: AlarmRule, start: int | None = None) -> Alarms:
     findings, unseen = np.zeros((0, 0)), 0
     if rule.kind in FROZEN:
         samples = samples_of(run)
-        findings, unseen = findings_of(run, rule, start, samples), unseen_in(rule, start, samples)
+        findings, unseen = findings_of(run, rule, start, samples)
     statistic = findings[:, rule.entries] if rule.kind in FROZEN else statistic_of(run, rule, start)
     count = int(np.isfinite(statistic[start:]).any(axis=1).sum())
     p = chance_of(run, rule)(highest(statistic, start), count) if count else float("nan")

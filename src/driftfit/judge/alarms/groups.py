@@ -26,7 +26,7 @@ from driftfit.judge.alarms.frozen import Rows
 from driftfit.judge.alarms.reference import in_samples
 from driftfit.judge.alarms.statistics import Reference, chance_of, findings_of, highest, modelled
 from driftfit.judge.cores.on_all_cores import on_all_cores
-from driftfit.run.live.likelihood_ratio import ALPHA, CONSTANT, K
+from driftfit.run.live.reference_model import ALPHA, CONSTANT, K
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.result import Track
 
@@ -52,7 +52,7 @@ class Look(NamedTuple):
 def look(run: Track, asked: AlarmRule, reference: Reference) -> Look:
     """Estimate the reference model of a run and compute its statistics."""
     rule, rows, start, samples = modelled(run, asked, in_samples(run, reference))
-    statistic = findings_of(run, rule, start, samples)[:, rule.entries]
+    statistic = findings_of(run, rule, start, samples)[0][:, rule.entries]
     count = int(np.isfinite(statistic[start:]).any(axis=1).sum())
     return Look(rule, start, highest(statistic, start), count, _like(rule, rows))
 

@@ -31,7 +31,7 @@ from driftfit.engine.simd import (
     store,
     times,
 )
-from driftfit.run.live.likelihood_ratio import (
+from driftfit.run.live.reference_model import (
     BLOCKS,
     CONSTANT,
     FLAT,

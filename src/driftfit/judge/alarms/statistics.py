@@ -15,7 +15,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import plain
 from driftfit.engine.tiles import output_type
 from driftfit.judge.alarms.bootstrap import RECORDS, limits, simulated
-from driftfit.judge.alarms.frozen import Rows, centred, frozen_model
+from driftfit.judge.alarms.frozen import Rows, frozen_model
 from driftfit.judge.alarms.onsets import (
     chance,
     mean_limit,
@@ -27,9 +27,9 @@ from driftfit.judge.alarms.onsets import (
 )
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
 from driftfit.judge.regressors import refuse_hidden
-from driftfit.judge.statistics.noise import whitened
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.live.likelihood_ratio import CUSUM, SAME, UNKNOWN, memory_of, scan
+from driftfit.run.live.likelihood_ratio import scan
+from driftfit.run.live.reference_model import CUSUM, UNLIKE, memory_of
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
@@ -195,29 +195,15 @@ def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
     return _carried(statistic)
 
 
-def findings_of(run: Track, rule: AlarmRule, start: int, samples: Samples) -> Array:
-    """The findings of "glr" and "cusum", (T, k), NaN before ``start``; ``samples`` are those of the run."""
+def findings_of(run: Track, rule: AlarmRule, start: int, samples: Samples) -> tuple[Array, int]:
+    """The findings of "glr" and "cusum", (T, k), NaN before ``start``; and how many samples were not judged because
+    they excite what the reference did not, or hardly. ``samples`` are those of the run.
+    """
     n, (phi, rest), model = len(rule.parameters), samples, rule.reference
-    findings = np.full((len(run), CUSUM + n + 1), np.nan)
+    findings, use = np.full((len(run), CUSUM + n + 1), np.nan), np.zeros(len(run), np.int8)
     rows = np.column_stack([phi, np.ones((len(run), n - phi.shape[1])), rest])
-    scan(rows[start:], model, memory_of(model), findings[start:])
-    return findings
-
-
-def unseen_in(rule: AlarmRule, start: int, samples: Samples) -> int:
-    """Usable samples from ``start`` on that excite what the reference of "glr" or "cusum" did not, or hardly."""
-    model, (phi, rest) = rule.reference, (one[start:] for one in samples)
-    used, p = (rest[:, 1] > 0.0) & (rest[:, 3] > 0.0), len(model.ar)
-    rows = np.column_stack([phi, np.ones((len(phi), len(rule.parameters) - phi.shape[1]))])
-    rows = centred(rows, model.mean, int(model.numbers[-1])) / model.unit
-    scaled = np.where(used[:, None], rows, 0.0) / np.sqrt(np.where(used, rest[:, 2], 1.0))[:, None]
-    rows = whitened(scaled, np.zeros(len(rows)), model.ar)[0]
-    terms = rows[:, None] * model.unseen
-    beyond = np.abs(terms.sum(axis=2)) > SAME * np.abs(terms).sum(axis=2)
-    unknown = beyond.any(axis=1) | (np.einsum("ti,ij,tj->t", rows, model.cov, rows) > UNKNOWN)
-    count = np.cumsum(np.concatenate([np.zeros(p + 1), used]))
-    complete = count[p + 1 :] - count[: len(used)] == p + 1.0  # the lags of the autoregression too
-    return int(np.sum(unknown & complete))
+    scan(rows[start:], model, memory_of(model), findings[start:], use[start:])
+    return findings, int(np.sum(use == UNLIKE))
 
 
 def _carried(statistic: Array) -> Array:
