@@ -28,7 +28,7 @@ from driftfit.judge.alarms.frozen import GARCH, Rows, noise_models, plausible, s
 from driftfit.judge.alarms.side_by_side import SimulatedRecords, statistics_of
 from driftfit.judge.alarms.variances import residuals, variances
 from driftfit.judge.statistics.whiteness import whiteness
-from driftfit.run.live.reference_model import ALPHA, BETA, CLIP, CONSTANT, LEVELS, SCALE, SHORT, Frozen, K
+from driftfit.run.live.frozen.reference_model import ALPHA, BETA, CLIP, CONSTANT, LEVELS, SCALE, SHORT, Frozen, K
 
 RECORDS, SAMPLES = 64, 1000
 """Simulated records, and the samples of each that count."""

@@ -28,8 +28,8 @@ from driftfit.judge.alarms.onsets import (
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
 from driftfit.judge.regressors import refuse_hidden
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.live.likelihood_ratio import scan
-from driftfit.run.live.reference_model import CUSUM, UNLIKE, memory_of
+from driftfit.run.live.frozen.likelihood_ratio import scan
+from driftfit.run.live.frozen.reference_model import CUSUM, UNLIKE, memory_of
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track

@@ -17,8 +17,8 @@ from driftfit.data.storage import describe, rebuild
 from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array, Driver
 from driftfit.run.live.change import Change, change_of
-from driftfit.run.live.likelihood_ratio import scan
-from driftfit.run.live.reference_model import memory_of
+from driftfit.run.live.frozen.likelihood_ratio import scan
+from driftfit.run.live.frozen.reference_model import memory_of
 from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits, last_power_and_mean
 from driftfit.trackers.base import Tracker
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.run.live.reference_model import NOISE_WINDOW, RATIO, RAW, SCALE, SIZE, SPREAD, STD, WHICH, WINDOW
+from driftfit.run.live.frozen.reference_model import NOISE_WINDOW, RATIO, RAW, SCALE, SIZE, SPREAD, STD, WHICH, WINDOW
 from driftfit.run.live.rule import AlarmRule
 
 SURE = NormalDist().inv_cdf(0.975)

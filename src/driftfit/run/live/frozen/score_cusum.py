@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.engine.kernel import Array, part
-from driftfit.run.live.reference_model import CONSTANT, KAPPA, LITTLE, SHIFT, Frozen, K, V, through_zero
+from driftfit.run.live.frozen.reference_model import CONSTANT, KAPPA, LITTLE, SHIFT, Frozen, K, V, through_zero
 
 
 @part

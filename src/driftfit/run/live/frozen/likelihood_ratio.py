@@ -1,7 +1,7 @@
 """Windowed likelihood ratios on a frozen reference model, recursive and in constant memory.
 
 For a window of L samples S = sum phi g, G = sum phi phi', Q = sum g^2, with the scores of
-`driftfit.run.live.reference_model`. theta was estimated, with covariance C, so that without a fault S ~ N(0, V),
+`driftfit.run.live.frozen.reference_model`. theta was estimated, with covariance C, so that without a fault S ~ N(0, V),
 V = v G + k^2 G C G. The statistics are
 
     one            max_d (d'G V^-1 S)^2 / d'G V^-1 G d                      one parameter moved along d
@@ -30,7 +30,7 @@ import numpy as np
 
 from driftfit.engine.drivers import SMALLEST
 from driftfit.engine.kernel import Array, Driver, exp, kernel, log, part
-from driftfit.run.live.reference_model import (
+from driftfit.run.live.frozen.reference_model import (
     ALIKE,
     BLOCKS,
     CLIP,
@@ -64,7 +64,7 @@ from driftfit.run.live.reference_model import (
     enter_row,
     through_zero,
 )
-from driftfit.run.live.score_cusum import accumulate, report
+from driftfit.run.live.frozen.score_cusum import accumulate, report
 
 
 @part
