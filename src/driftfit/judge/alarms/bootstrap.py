@@ -24,20 +24,11 @@ import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.calibration import limits_of
-from driftfit.judge.alarms.frozen import GARCH, Rows, noise_models, plausible
+from driftfit.judge.alarms.frozen import GARCH, Rows, noise_models, plausible, slopes_of
 from driftfit.judge.alarms.side_by_side import SimulatedRecords, statistics_of
 from driftfit.judge.alarms.variances import residuals, variances
 from driftfit.judge.statistics.whiteness import whiteness
-from driftfit.run.live.likelihood_ratio import (
-    ALPHA,
-    BETA,
-    CLIP,
-    LEVELS,
-    SCALE,
-    SHORT,
-    Frozen,
-    K,
-)
+from driftfit.run.live.frozen.reference_model import ALPHA, BETA, CLIP, CONSTANT, LEVELS, SCALE, SHORT, Frozen, K
 
 RECORDS, SAMPLES = 64, 1000
 """Simulated records, and the samples of each that count."""
@@ -73,7 +64,9 @@ def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> 
     phi = rows.phi[later] / np.sqrt(h)[..., None]
     clip, k = numbers[:, CLIP, None], numbers[:, K, None]
     g = np.clip(w / np.sqrt(h), -clip, clip) - k * np.einsum("rti,ri->rt", phi, z @ root.T)
-    return SimulatedRecords(np.broadcast_to(frozen.cov, (records, n, n)), numbers, phi, g)
+    numbers[:, CONSTANT] = frozen.numbers[CONSTANT]
+    cov, slopes = (np.broadcast_to(one, (records, *one.shape)) for one in (frozen.cov, slopes_of(frozen)))
+    return SimulatedRecords(cov, numbers, phi, g, slopes)
 
 
 @lru_cache(64)

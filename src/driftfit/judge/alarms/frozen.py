@@ -23,10 +23,11 @@ from driftfit.engine.simd import WIDTH
 from driftfit.judge.alarms.variances import losses, variances
 from driftfit.judge.statistics.robust import CLIP as OF_FIT
 from driftfit.judge.statistics.robust import median, medians, noisy, robust_fit
-from driftfit.run.live.likelihood_ratio import (
+from driftfit.run.live.frozen.reference_model import (
     ALPHA,
     BETA,
     CLIP,
+    CONSTANT,
     INSIDE,
     KAPPA,
     LONGEST,
@@ -38,6 +39,7 @@ from driftfit.run.live.likelihood_ratio import (
     Frozen,
     K,
     V,
+    through_zero,
 )
 from driftfit.smooth.parts.rank import column_sizes
 
@@ -54,6 +56,8 @@ PRIOR[0] = PRIOR[1:].sum()
 """How probable each candidate is before the reference, in relation (C,): constant noise as all others together, and
 those in proportion to their time constant, since short references show long bursts least and long bursts alarm most.
 """
+NEAR = 0.2
+"""A regressor whose mean is a smaller part of its spread stays as it is: its slope about the mean is that through 0."""
 SHARE = 8
 """The noise is judged by windows of at most this part of the reference."""
 
@@ -67,8 +71,13 @@ class Rows(NamedTuple):
     """(N,): residuals over their standard deviation at the time."""
 
 
-def frozen_model(phi: Array, y: Array, ok: Array) -> tuple[Frozen, Rows] | None:
-    """Estimate the model from rows phi (N, n), y (N,), of which ok (N,) can be used; None if they have no noise."""
+def frozen_model(phi: Array, y: Array, ok: Array, constant: int = -1) -> tuple[Frozen, Rows] | None:
+    """Estimate the model from rows phi (N, n), y (N,), of which ok (N,) can be used; None if they have no noise.
+
+    Regressors that are far from zero are centred on column ``constant``, if it is not negative.
+    """
+    mean = means(phi[ok], constant) if constant >= 0 else np.zeros(0)
+    phi = centred(phi, mean, constant)
     unit = column_sizes(phi[ok])
     rows = np.where(ok[:, None], np.column_stack([phi / unit, y]), 0.0)
     ar, root = np.zeros(0), np.ones(len(y))
@@ -86,7 +95,30 @@ def frozen_model(phi: Array, y: Array, ok: Array) -> tuple[Frozen, Rows] | None:
         root[used] = np.sqrt(h)
     x, white = w[:, 0] / (numbers[SCALE] * np.sqrt(h)), _whitened(rows[:, :-1], ok, ar)[1]
     cov, unseen = _covariance(white / np.sqrt(h)[:, None], x)
-    return Frozen(fit.theta / unit, unit, np.ascontiguousarray(ar), cov, numbers, unseen), Rows(white, x)
+    numbers[CONSTANT] = constant
+    return Frozen(fit.theta / unit, unit, np.ascontiguousarray(ar), cov, numbers, unseen, mean), Rows(white, x)
+
+
+def means(phi: Array, constant: int) -> Array:
+    """Mean of each column of phi (N, n) as a multiple of the constant's, 0 where it is near zero; empty if all are."""
+    level = phi[:, constant]
+    mean = level @ phi / (level @ level)
+    spread = np.sqrt(np.mean((phi - level[:, None] * mean) ** 2, axis=0) / np.mean(level * level))
+    moves = spread > ROUNDING * np.abs(mean)
+    mean = np.where(moves & (np.abs(mean) > NEAR * spread), mean, 0.0)
+    return mean if mean.any() else np.zeros(0)
+
+
+def centred(phi: Array, mean: Array, constant: int) -> Array:
+    """phi (N, n) about these means."""
+    return phi - phi[:, constant, None] * mean if len(mean) else phi
+
+
+def slopes_of(frozen: Frozen) -> Array:
+    """(n, 2): `through_zero` of the centred regressors, 0 of the others; (0, 2) if none is centred."""
+    constant, centred = int(frozen.numbers[CONSTANT]), enumerate(frozen.mean)
+    every = [through_zero(frozen, j, constant) if mean != 0.0 else (0.0, 0.0) for j, mean in centred]
+    return np.array(every).reshape(-1, 2)
 
 
 def noise_model(w: Array, n: int) -> tuple[Array, Array]:
@@ -98,7 +130,7 @@ def noise_model(w: Array, n: int) -> tuple[Array, Array]:
 def noise_models(w: Array, n: int) -> tuple[Array, Array]:
     """The same for R references of N residuals each, w (R, N): numbers (R, k) and h (R, N)."""
     R, N = w.shape
-    numbers = np.zeros((R, NORMAL + 1))
+    numbers = np.zeros((R, CONSTANT + 1))
     numbers[:, CLIP], numbers[:, NORMAL], numbers[:, LONGEST] = CLIPPED, N, max(N // SHARE, 8)
     numbers[:, SCALE] = _scales(w, n)
     x = w / numbers[:, SCALE, None]

@@ -26,7 +26,7 @@ from driftfit.judge.alarms.frozen import Rows
 from driftfit.judge.alarms.reference import in_samples
 from driftfit.judge.alarms.statistics import Reference, chance_of, findings_of, highest, modelled
 from driftfit.judge.cores.on_all_cores import on_all_cores
-from driftfit.run.live.likelihood_ratio import ALPHA, K
+from driftfit.run.live.frozen.reference_model import ALPHA, CONSTANT, K
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.result import Track
 
@@ -60,7 +60,8 @@ def look(run: Track, asked: AlarmRule, reference: Reference) -> Look:
 def _like(rule: AlarmRule, rows: Rows) -> Hashable:
     frozen = rule.reference
     length, tails = round(2.0 * np.log2(len(rows.x))), round(TAILS * frozen.numbers[K])
-    return rule.parameters, length, tails, bool(frozen.numbers[ALPHA] > 0.0), drawn_in_blocks(frozen, rows.x)
+    noise = length, tails, bool(frozen.numbers[ALPHA] > 0.0), drawn_in_blocks(frozen, rows.x)
+    return rule.parameters, *noise, frozen.numbers[CONSTANT] if len(frozen.mean) else None
 
 
 def with_limits(

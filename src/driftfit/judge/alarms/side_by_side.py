@@ -1,10 +1,11 @@
 """The statistics of simulated records, eight records side by side in SIMD vectors.
 
-The statistics of `driftfit.run.live.likelihood_ratio`, for records in which every sample can be used: all eight then
-take the same branches, so that each operation on a number becomes one on a vector. Only what the limits need is
-computed, not which parameter moved, by how much and when. A matrix (rows, 8) has a column for each record.
+The statistics of `driftfit.run.live.frozen.likelihood_ratio` and `driftfit.run.live.frozen.score_cusum`, for records in
+which every sample can be used: all eight then take the same branches, so that each operation on a number becomes one on
+a vector. Only what the limits need is computed, not which parameter moved, by how much and when. A matrix (rows, 8) has
+a column for each record.
 
-Source and notation: `driftfit.run.live.likelihood_ratio`. Cost: less than a seventh of eight records one by one.
+Source and notation: `driftfit.run.live.frozen.likelihood_ratio`. Cost: less than a seventh of eight records one by one.
 """
 
 from __future__ import annotations
@@ -31,11 +32,13 @@ from driftfit.engine.simd import (
     store,
     times,
 )
-from driftfit.run.live.likelihood_ratio import (
+from driftfit.run.live.frozen.reference_model import (
     BLOCKS,
+    CONSTANT,
     FLAT,
     KAPPA,
     LEVELS,
+    LITTLE,
     LONGEST,
     NORMAL,
     SHIFT,
@@ -60,6 +63,16 @@ class SimulatedRecords(NamedTuple):
     """(R, T, n)"""
     g: Array
     """(R, T)"""
+    slopes: Array
+    """(R, n, 2): `through_zero` of every regressor that is centred, 0 for others; (R, 0, 2) if none is."""
+
+
+class Models(NamedTuple):
+    """What was estimated from the references of eight records: as in `SimulatedRecords`, all (rows, 8)."""
+
+    cov: Array
+    numbers: Array
+    slopes: Array
 
 
 class Work(NamedTuple):
@@ -76,6 +89,8 @@ class Work(NamedTuple):
     """Reciprocals of the diagonal of the factor, 0 where there is no direction left."""
     z: Array
     row: Array
+    level: Array
+    """`row` of the constant, of which a slope through zero has a part."""
     last: Array
     """The statistics of the last window of each length."""
 
@@ -91,11 +106,12 @@ def statistics_of(records: SimulatedRecords, cusum: bool, begin: int = 0) -> Arr
         phi = np.ascontiguousarray(records.phi[lanes].transpose(1, 2, 0)).reshape(T * n, WIDTH)
         g, cov = np.ascontiguousarray(records.g[lanes].T), records.cov[lanes].reshape(WIDTH, n * n)
         out = np.empty((T, len(made), WIDTH))
-        given = (np.ascontiguousarray(cov.T), np.ascontiguousarray(records.numbers[lanes].T))
+        numbers, slopes = records.numbers[lanes].T, records.slopes[lanes].reshape(WIDTH, -1).T
+        model = Models(*(np.ascontiguousarray(one) for one in (cov.T, numbers, slopes)))
         if cusum:
-            _cusums(phi, g, given[1], np.zeros((2 * n + 2, WIDTH)), out.reshape(-1, WIDTH))
+            _cusums(phi, g, model, np.zeros((2 * (n + 1) + len(slopes), WIDTH)), out.reshape(-1, WIDTH))
         else:
-            _ratios(phi, g, *given, work(n), begin, out.reshape(-1, WIDTH))
+            _ratios(phi, g, model, work(n), begin, out.reshape(-1, WIDTH))
         made[:, first : first + WIDTH] = out[begin:].transpose(1, 2, 0)[:, : R - first]
     return np.moveaxis(made, 0, -1)
 
@@ -103,7 +119,7 @@ def statistics_of(records: SimulatedRecords, cusum: bool, begin: int = 0) -> Arr
 def work(n: int) -> Work:
     """The scratch before the first sample."""
     size = n + 1 + n * (n + 1) // 2
-    rows = (LEVELS * BLOCKS * size, size, n * n, n * n, n, n, n, 3 * 2 * LEVELS)
+    rows = (LEVELS * BLOCKS * size, size, n * n, n * n, n, n, n, n, 3 * 2 * LEVELS)
     made = Work(*(np.zeros((count, WIDTH)) for count in rows))
     made.last[:] = LOWEST
     return made
@@ -144,9 +160,9 @@ def _enter(sums: Array, phi: Array, g: Array, t: int, n: int) -> int:
 
 
 @part
-def _variance(w: Work, n: int, cov: Array, numbers: Array) -> None:
+def _variance(w: Work, n: int, model: Models) -> None:
     """V = v G + k^2 G C G of the sums of a window, the lower triangle, and G."""
-    v, k, at = load(numbers, V, 0), load(numbers, K, 0), n + 1
+    v, k, at = load(model.numbers, V, 0), load(model.numbers, K, 0), n + 1
     square = times(k, k)
     for i in range(n):
         for j in range(i + 1):
@@ -157,7 +173,7 @@ def _variance(w: Work, n: int, cov: Array, numbers: Array) -> None:
         for j in range(n):
             value = fill(0.0)
             for m in range(n):
-                value = plus(value, times(load(w.G, i * n + m, 0), load(cov, m * n + j, 0)))
+                value = plus(value, times(load(w.G, i * n + m, 0), load(model.cov, m * n + j, 0)))
             store(w.row, j, 0, value)
         for j in range(i + 1):
             value = fill(0.0)
@@ -184,10 +200,32 @@ def _factor(w: Work, n: int) -> None:
             store(w.V, i * n + j, 0, times(value, load(w.inverse, j, 0)))
 
 
+@part
+def _solved(n: int, w: Work, j: int, row: Array) -> None:
+    """row = F^-1 G e_j, where V = F F'."""
+    for i in range(n):
+        value = load(w.G, j * n + i, 0)
+        for m in range(i):
+            value = minus(value, times(load(w.V, i * n + m, 0), load(row, m, 0)))
+        store(row, i, 0, times(value, load(w.inverse, i, 0)))
+
+
+@part
+def _explained(n: int, w: Work, row: Array) -> Any:
+    """The square of the statistic of a change along ``row``."""
+    own, score = fill(0.0), fill(0.0)
+    for i in range(n):
+        value = load(row, i, 0)
+        own = plus(own, times(value, value))
+        score = plus(score, times(value, load(w.z, i, 0)))
+    return only(over(times(score, score), own), own)
+
+
 @part(sizes=(2, 3, 4))
-def _compare(n: int, w: Work, length: int, cov: Array, numbers: Array, at: int) -> None:
+def _compare(n: int, w: Work, length: int, model: Models, at: int) -> None:
     """The statistics of a window of ``length`` samples into rows at .. at + 2 of ``last``."""
-    _variance(w, n, cov, numbers)
+    numbers = model.numbers
+    _variance(w, n, model)
     _factor(w, n)
     square, rank = fill(0.0), fill(0.0)
     for i in range(n):
@@ -201,17 +239,17 @@ def _compare(n: int, w: Work, length: int, cov: Array, numbers: Array, at: int) 
     rank = higher(rank, fill(1.0))
     store(w.last, at + JOINT, 0, _deviate(over(square, rank), times(fill(0.5), rank)))
     best = fill(0.0)
+    centred = model.slopes.shape[0] > 0
+    if centred:
+        _solved(n, w, int(numbers[CONSTANT, 0]), w.level)
     for j in range(n):
-        own, score = fill(0.0), fill(0.0)
-        for i in range(n):
-            value = load(w.G, j * n + i, 0)
-            for m in range(i):
-                value = minus(value, times(load(w.V, i * n + m, 0), load(w.row, m, 0)))
-            value = times(value, load(w.inverse, i, 0))
-            store(w.row, i, 0, value)
-            own = plus(own, times(value, value))
-            score = plus(score, times(value, load(w.z, i, 0)))
-        best = higher(only(over(times(score, score), own), own), best)
+        _solved(n, w, j, w.row)
+        best = higher(_explained(n, w, w.row), best)
+        if centred:
+            a, b = load(model.slopes, 2 * j, 0), load(model.slopes, 2 * j + 1, 0)
+            for i in range(n):
+                store(w.row, i, 0, plus(times(a, load(w.row, i, 0)), times(b, load(w.level, i, 0))))
+            best = higher(_explained(n, w, w.row), best)
     store(w.last, at + ONE, 0, root(best))
     v, samples = load(numbers, V, 0), fill(float(length))
     ratio = over(load(w.total, n, 0), times(samples, v))
@@ -222,7 +260,7 @@ def _compare(n: int, w: Work, length: int, cov: Array, numbers: Array, at: int) 
 
 
 @Driver
-def _ratios(phi: Array, g: Array, cov: Array, numbers: Array, w: Work, begin: int, out: Array) -> None:
+def _ratios(phi: Array, g: Array, model: Models, w: Work, begin: int, out: Array) -> None:
     """The windowed ratios of phi (T n, 8) and g (T, 8) into out (3 T, 8), right from sample ``begin`` on."""
     n = phi.shape[0] // g.shape[0]
     for t in range(g.shape[0]):
@@ -243,7 +281,7 @@ def _ratios(phi: Array, g: Array, cov: Array, numbers: Array, w: Work, begin: in
                     first = (level * BLOCKS + (b - back) % BLOCKS) * size
                     for i in range(size):
                         store(w.total, i, 0, plus(load(w.total, i, 0), load(w.sums, first + i, 0)))
-                _compare(n, w, blocks << level, cov, numbers, 3 * (2 * level + kind))
+                _compare(n, w, blocks << level, model, 3 * (2 * level + kind))
         for i in range(3):
             value = load(w.last, i, 0)
             for window in range(1, 2 * LEVELS):
@@ -251,23 +289,35 @@ def _ratios(phi: Array, g: Array, cov: Array, numbers: Array, w: Work, begin: in
             store(out, 3 * t + i, 0, value)
 
 
+@part
+def _climb(cusum: Array, j: int, z: Any, mean: Any, var: Any, power: Any) -> Any:
+    """One step of the CUSUM up and down in row j; returns the larger one."""
+    half, drift = times(times(fill(0.5), times(mean, mean)), power), times(mean, z)
+    up = plus(load(cusum, 2 * j, 0), over(minus(drift, half), var))
+    down = plus(load(cusum, 2 * j + 1, 0), over(minus(minus(fill(0.0), drift), half), var))
+    up, down = higher(up, fill(0.0)), higher(down, fill(0.0))
+    store(cusum, 2 * j, 0, up)
+    store(cusum, 2 * j + 1, 0, down)
+    return higher(up, down)
+
+
 @Driver
-def _cusums(phi: Array, g: Array, numbers: Array, cusum: Array, out: Array) -> None:
+def _cusums(phi: Array, g: Array, model: Models, cusum: Array, out: Array) -> None:
     """The CUSUM of n parameters and of the noise, of phi (T n, 8) and g (T, 8), into out (T (n + 1), 8)."""
     n = phi.shape[0] // g.shape[0]
-    k, v, kappa = load(numbers, K, 0), load(numbers, V, 0), load(numbers, KAPPA, 0)
+    k, v, kappa = load(model.numbers, K, 0), load(model.numbers, V, 0), load(model.numbers, KAPPA, 0)
+    constant = int(model.numbers[CONSTANT, 0]) if model.slopes.shape[0] > 0 else 0
     for t in range(g.shape[0]):
-        score = load(g, t, 0)
-        for j in range(n + 1):
-            if j < n:
-                own = load(phi, t * n + j, 0)
-                z, mean, var, power = times(own, score), times(fill(SHIFT), k), v, times(own, own)
-            else:
-                z, mean, var, power = minus(times(score, score), v), times(fill(SHIFT), v), kappa, fill(1.0)
-            half, drift = times(times(fill(0.5), times(mean, mean)), power), times(mean, z)
-            up = plus(load(cusum, 2 * j, 0), over(minus(drift, half), var))
-            down = plus(load(cusum, 2 * j + 1, 0), over(minus(minus(fill(0.0), drift), half), var))
-            up, down = higher(up, fill(0.0)), higher(down, fill(0.0))
-            store(cusum, 2 * j, 0, up)
-            store(cusum, 2 * j + 1, 0, down)
-            store(out, t * (n + 1) + j, 0, root(times(fill(2.0), higher(up, down))))
+        score, shift = load(g, t, 0), times(fill(SHIFT), k)
+        for j in range(n):
+            own = load(phi, t * n + j, 0)
+            most = _climb(cusum, j, times(own, score), shift, v, times(own, own))
+            if model.slopes.shape[0] > 0:
+                a, b = load(model.slopes, 2 * j, 0), load(model.slopes, 2 * j + 1, 0)
+                own = plus(times(a, own), times(b, load(phi, t * n + constant, 0)))
+                own = only(own, minus(a, fill(LITTLE)))
+                most = higher(_climb(cusum, n + 1 + j, times(own, score), shift, v, times(own, own)), most)
+            store(out, t * (n + 1) + j, 0, root(times(fill(2.0), most)))
+        z, shift = minus(times(score, score), v), times(fill(SHIFT), v)
+        most = _climb(cusum, n, z, shift, kappa, fill(1.0))
+        store(out, t * (n + 1) + n, 0, root(times(fill(2.0), most)))

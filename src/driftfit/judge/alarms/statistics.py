@@ -28,7 +28,8 @@ from driftfit.judge.alarms.onsets import (
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
 from driftfit.judge.regressors import refuse_hidden
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.live.likelihood_ratio import CUSUM, INTERVAL, NOISE_FACTOR, OK, Y, memory_of, scan
+from driftfit.run.live.frozen.likelihood_ratio import scan
+from driftfit.run.live.frozen.reference_model import CUSUM, INTERVAL, NOISE_FACTOR, OK, UNLIKE, Y, memory_of
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
@@ -94,10 +95,11 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
             f"{ok.sum()} that can be used. Give a longer normal segment, reference=(from, to), or choose "
             'kind="innovation".'
         )
-    if not ((np.ptp(phi[ok], axis=0) == 0.0) & (phi[ok][0] != 0.0)).any():
-        phi, names = np.column_stack([phi, np.ones(len(phi))]), (*names, OFFSET)
+    constants = np.flatnonzero((np.ptp(phi[ok], axis=0) == 0.0) & (phi[ok][0] != 0.0))
+    if not len(constants):
+        phi, names, constants = np.column_stack([phi, np.ones(len(phi))]), (*names, OFFSET), np.array([n])
     root = np.sqrt(np.where(ok, noise, 1.0))
-    found = frozen_model(phi / root[:, None], y / root, ok)
+    found = frozen_model(phi / root[:, None], y / root, ok, int(constants[-1]))
     if found is None:
         raise ValueError(
             f'detect: "{rule.kind}" measures changes in units of the noise, and the reference has none: constant '
@@ -194,14 +196,14 @@ def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
 
 
 def findings_of(run: Track, rule: AlarmRule, start: int, samples: Samples) -> tuple[Array, int]:
-    """The findings of "glr" and "cusum", (T, k), NaN before ``start``, and how many samples the reference cannot judge.
-
-    ``samples`` are those of the run. It cannot judge those that excite what it did not, or hardly.
+    """The findings of "glr" and "cusum", (T, k), NaN before ``start``; and how many samples were not judged because
+    they excite what the reference did not, or hardly. ``samples`` are those of the run.
     """
     n, (phi, rest), model = len(rule.parameters), samples, rule.reference
-    findings = np.full((len(run), CUSUM + n + 1), np.nan)
+    findings, use = np.full((len(run), CUSUM + n + 1), np.nan), np.zeros(len(run), np.int8)
     rows = np.column_stack([phi, np.ones((len(run), n - phi.shape[1])), rest])
-    return findings, int(scan(rows[start:], model, memory_of(n, len(model.ar)), findings[start:]))
+    scan(rows[start:], model, memory_of(model), findings[start:], use[start:])
+    return findings, int(np.sum(use == UNLIKE))
 
 
 def _carried(statistic: Array) -> Array:

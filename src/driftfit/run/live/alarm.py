@@ -17,7 +17,8 @@ from driftfit.data.storage import describe, rebuild
 from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array, Driver
 from driftfit.run.live.change import Change, change_of
-from driftfit.run.live.likelihood_ratio import ROW, memory_of, scan
+from driftfit.run.live.frozen.likelihood_ratio import scan
+from driftfit.run.live.frozen.reference_model import ROW, memory_of
 from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits, last_power_and_mean
 from driftfit.trackers.base import Tracker
 
@@ -67,7 +68,7 @@ class LiveAlarm:
         self._onsets: deque[Onset] = deque(maxlen=KEPT)
         if rule.kind in FROZEN:
             self._frozen = rule.reference
-            self._memory = memory_of(len(rule.parameters), len(self._frozen.ar))
+            self._memory = memory_of(self._frozen)
             self._row = np.ones((1, len(rule.parameters) + len(ROW)))
             self._findings = self._memory.findings[None].copy()
 
@@ -157,7 +158,7 @@ class LiveAlarm:
             row[: len(phi)] = phi
             for place, name in enumerate(ROW, len(rule.parameters)):
                 row[place] = tile[name][0, lane]
-            scan(self._row, self._frozen, self._memory, self._findings)
+            scan(self._row, self._frozen, self._memory, self._findings, np.zeros(1, np.int8))
             self.statistic = self._findings[0, rule.entries]
         elif rule.kind == "band":
             theta, var = (tile[name][0, self._columns, lane] for name in ("theta", "var"))
@@ -183,7 +184,7 @@ class LiveAlarm:
             for place, name in enumerate(ROW, len(rule.parameters)):
                 samples[:, place] = known[name]
             findings = np.empty((T, self._findings.shape[1]))
-            scan(samples, self._frozen, self._memory, findings)
+            scan(samples, self._frozen, self._memory, findings, np.zeros(T, np.int8))
             return findings[:, rule.entries], findings
         if rule.kind == "band":
             theta, var = (rows[name][:, self._columns, lane] for name in ("theta", "var"))
@@ -223,7 +224,8 @@ class LiveAlarm:
         alarm.statistic, alarm._left = np.array(state["statistic"], float), state["left"]
         alarm._scores.extend(state["scores"])
         alarm._onsets.extend(Onset(*onset) for onset in state["onsets"])
-        for part, stored in zip(alarm._memory if state.get("memory") else (), state.get("memory", ()), strict=True):
+        # states of earlier versions end before what was learned since the reference
+        for part, stored in zip(alarm._memory if state.get("memory") else (), state.get("memory", ()), strict=False):
             part[...] = np.frombuffer(b64decode(stored)).reshape(part.shape)
         if state.get("memory"):
             alarm._findings[0] = alarm._memory.findings

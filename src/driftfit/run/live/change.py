@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.run.live.likelihood_ratio import NOISE_WINDOW, RATIO, RAW, SCALE, SIZE, SPREAD, STD, WHICH, WINDOW
+from driftfit.run.live.frozen.reference_model import NOISE_WINDOW, RATIO, RAW, SCALE, SIZE, SPREAD, STD, WHICH, WINDOW
 from driftfit.run.live.rule import AlarmRule
 
 SURE = NormalDist().inv_cdf(0.975)
@@ -37,7 +37,9 @@ def change_of(rule: AlarmRule, findings: Array, t: int) -> Change:
         L = findings[NOISE_WINDOW]
         error = 0.5 * np.sqrt(model.numbers[SPREAD] / L) / model.numbers[RAW]
         size, half = findings[RATIO], SURE * findings[RATIO] * error
-    elif np.isfinite(findings[WHICH]) and (rule.kind == "glr" or cause == rule.parameters[int(findings[WHICH])]):
+    elif np.isfinite(findings[WHICH]) and (
+        rule.kind == "glr" or cause in ("noise", rule.parameters[int(findings[WHICH])])
+    ):
         which, L = int(findings[WHICH]), findings[WINDOW]
         unit = model.numbers[SCALE] / model.unit[which]
         cause, size, half = rule.parameters[which], findings[SIZE] * unit, SURE * findings[STD] * unit

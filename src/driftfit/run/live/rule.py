@@ -6,7 +6,7 @@ streams.
                   score among normal innovations
     probability   the probability of a change in the tracker's window
     glr, cusum    likelihood ratios or cumulated scores on a frozen reference model
-                  (`driftfit.run.live.likelihood_ratio`)
+                  (`driftfit.run.live.frozen.likelihood_ratio`)
 
 A record and a stream use the same operations in the same order, so their results agree bit for bit.
 """
@@ -24,7 +24,7 @@ import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, near
-from driftfit.run.live.likelihood_ratio import CUSUM, JOINT, NOISE, ONE, Frozen
+from driftfit.run.live.frozen.reference_model import CUSUM, JOINT, NOISE, ONE, Frozen
 from driftfit.trackers.base import Tracker
 
 FROZEN = ("glr", "cusum")
@@ -62,8 +62,8 @@ class AlarmRule(Settings):
     parameters : (n,)
         Names of the parameters of the frozen model, for "glr" and "cusum"; otherwise empty. The last is OFFSET if the
         run has no constant regressor.
-    frozen : theta, unit, ar, cov, numbers, unseen
-        That model, as `driftfit.run.live.likelihood_ratio.Frozen`.
+    frozen : theta, unit, ar, cov, numbers, unseen, mean
+        That model, as `driftfit.run.live.frozen.reference_model.Frozen`.
     growth : (c,)
         Growth of the squares of the limits with log(every).
     unsure : number
@@ -91,10 +91,10 @@ class AlarmRule(Settings):
 
     @property
     def reference(self) -> Frozen:
-        """The frozen model of "glr" and "cusum", as arrays; rules of earlier versions have no ``unseen`` directions."""
+        """The frozen model of "glr" and "cusum", as arrays; rules of earlier versions have fewer of them."""
         n = len(self.parameters)
-        shapes, given = (-1, -1, -1, (n, n), -1, (-1, n)), (*self.frozen, ())
-        return Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(given, shapes, strict=False)))
+        shapes, given = (-1, -1, -1, (n, n), -1, (-1, n), -1), (*self.frozen, *((), ())[len(self.frozen) - 5 :])
+        return Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(given, shapes, strict=True)))
 
     @property
     def real_rate(self) -> tuple[float, float]:

@@ -1,0 +1,1 @@
+"""The frozen model of a reference, and the "glr" and "cusum" statistics on it."""

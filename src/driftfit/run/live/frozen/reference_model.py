@@ -1,0 +1,252 @@
+"""The frozen model of a reference as the compiled routines take it, and the scores of a sample.
+
+    e_t = y_t - phi_t' theta,                 theta of the reference, frozen; phi about the means of the reference
+    w_t = e_t - sum_k a_k e_(t-k)             the noise of the reference was an autoregression; phi in the same way
+    x_t = w_t / (scale sqrt(h_t))             h_(t+1) = 1 - alpha - beta + alpha h_t g_t^2 / v + beta h_t
+    g_t = x_t clipped at +-clip               score; E g^2 = v, var g^2 = kappa, E dg/dx = k in the reference
+
+A regressor that is far from zero in the reference is taken about its mean, as a multiple of the constant regressor: a
+slope about the mean does not move the level, so that the two can be told apart.
+
+Where the reference knows little of a direction that a sample excites, as of an input that hardly moved, most of x may
+be the error of theta, with the variance phi' C phi in units of the noise. From `TEACHES` on, a sample corrects theta as
+a Kalman filter without drift does, until that variance is n / N, the mean of the N rows of the reference: its error is
+then divided by its standard deviation, and judges as any other. An error of more than `CREDIBLE` deviations and the
+first such sample teach nothing, and above `UNKNOWN` judge nothing, since one reading of an input may be false. What
+else is above `UNSURE` (and above `USUAL` n / N, which rows of the reference seldom exceed) is judged by windows alone,
+whose V allows for it. No sample above it judges the noise.
+
+A sample that cannot be used is passed over, and so is one that excites a direction in which the reference says nothing,
+as an input does that was 0 or constant there: what it does to y is unknown, and would be taken for a change. An
+autoregression then waits until its lags are complete. Source: Huber (1964) for the score, Bollerslev (1986) for h.
+Cost per sample: O(n^2 + p n).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, kernel, part
+
+LEVELS, BLOCKS, SHORT = 6, 12, 8
+"""Levels of blocks of 1, 2, 4, .. samples; blocks that each keeps; blocks of the shorter window."""
+GAP = 1.5
+"""An interval longer than this breaks an autoregression."""
+SHIFT = 0.5
+"""The shift for which the score CUSUM is designed, in standard deviations of the noise per root mean square regressor.
+"""
+FLAT = 1e-9
+SAME = 1e-6
+"""A regressor that differs by less than this share from what it was in the whole reference has not changed."""
+UNSURE, USUAL = 0.2, 8.0
+"""Variances of a prediction by theta, as shares of that of the noise, from which on a sample does not judge the noise.
+"""
+TEACHES, UNKNOWN, HUGE = 0.5, 1.0, 1e200
+"""The same: from which on a sample corrects theta, from which on it judges nothing if it cannot, and from which on
+squares may overflow.
+"""
+CREDIBLE = 3.0
+"""Standard deviations up to which an error corrects theta: false readings of an input have larger ones."""
+ROW = ("y", "ok", "noise", "dt")
+Y, OK, NOISE_FACTOR, INTERVAL = range(4)
+"""Columns of a row after its regressors, by the names of the fields of a tile, and by their places."""
+NOTHING, UNLIKE, WINDOWS, PARAMETERS, FULLY = range(5)
+"""What a row judges: nothing, as it cannot be used; nothing, as it is unlike the reference; the windows, without the
+noise; the CUSUM of the parameters too; everything.
+"""
+WIDE = 30.0
+"""For the size of a change x is limited to this, so that one outlier does not count more, or to twice the last e."""
+SCALE, CLIP, K, V, KAPPA, ALPHA, BETA, INSIDE, RAW, SPREAD, LONGEST, NORMAL, CONSTANT = range(13)
+"""Entries of `Frozen.numbers`. INSIDE is the mean of x^2 where x is not clipped and 0 elsewhere, RAW and SPREAD are the
+mean and variance of x^2, LONGEST is the longest window that judges the noise, NORMAL the size of the reference,
+CONSTANT the index of the regressor that the others are centred on (read only if some are).
+"""
+ALIKE = 1.0
+"""Twice the logarithm of the likelihood ratio up to which a step is of the level, not of a slope through zero."""
+LITTLE = 0.2
+"""Share of a slope in a step through zero below which it is that of the level, which has a CUSUM of its own."""
+MOST = 0.5
+"""Share of sum g^2, of what it is where every score is clipped, from which on scores no longer show what moved."""
+SINCE, LEVEL, COUNT = range(3)
+"""Entries of `Memory.counts`: usable samples in a row, h, samples that were used."""
+ONE, JOINT, NOISE, WHICH, SIZE, STD, WINDOW, RATIO, NOISE_WINDOW, CUSUM = range(10)
+"""Entries of the findings of a sample; the CUSUM of n parameters and of the noise come last."""
+FIT = NOISE_WINDOW
+"""Entry of a window in its place: where scores are clipped, how well one change explains it, or 0; otherwise NaN."""
+
+
+class Frozen(NamedTuple):
+    """The reference model as the compiled routines take it; regressors are in units of ``unit``."""
+
+    theta: Array
+    unit: Array
+    ar: Array
+    cov: Array
+    numbers: Array
+    unseen: Array = np.zeros((0, 0))
+    """(k, n): directions of the regressors in which the reference has none, such as that of an input that was 0."""
+    mean: Array = np.zeros(0)
+    """(n,): regressors in the reference as multiples of the constant, 0 where they were near zero; none if all were."""
+
+
+class Memory(NamedTuple):
+    """The state: lags, block sums, the statistics of every window, CUSUM, counts, and the sums and statistics of the
+    last sample; ``work`` is scratch.
+    """
+
+    past: Array
+    sums: Array
+    last: Array
+    cusum: Array
+    counts: Array
+    work: Array
+    sample: Array
+    findings: Array
+    known: Array
+    """(n + 2, n): what theta differs from that of the reference by, its covariance, and phi' C phi of the last row."""
+
+
+def memory_of(frozen: Frozen) -> Memory:
+    """The state before the first sample."""
+    n, p, centred = len(frozen.theta), len(frozen.ar), len(frozen.mean)
+    last = np.full((LEVELS, 2, CUSUM), np.nan)
+    sums = np.zeros((LEVELS, BLOCKS, size_of(n)))
+    work = np.zeros((2 * n + 4 + (centred > 0), size_of(n)))
+    counts, findings = np.array([0.0, 1.0, 0.0]), np.full(CUSUM + n + 1, np.nan)
+    past, cusum = np.zeros((p + 1, n + 1)), np.zeros((n + 1 + centred, 2))
+    known = np.vstack([np.zeros((1, n)), frozen.cov, np.zeros((1, n))])
+    return Memory(past, sums, last, cusum, counts, work, np.zeros(size_of(n)), findings, known)
+
+
+def size_of(n: int) -> int:
+    """Numbers in the sums of a block: S, U, Q, sum x^2 and the lower triangle of G."""
+    return 2 * n + 2 + n * (n + 1) // 2
+
+
+@kernel
+def through_zero(frozen: Frozen, j: int, constant: int) -> tuple[float, float]:
+    """(a, b): a step of the slope j through zero moves that about the mean by a, and the level by b; both in units."""
+    own, level = frozen.unit[j], frozen.mean[j] * frozen.unit[constant]
+    size = np.sqrt(own * own + level * level)
+    return own / size, level / size
+
+
+@part
+def leverage(phi: Array, cov: Array) -> float:
+    """phi' C phi: the variance of the prediction by theta, as a share of that of the noise."""
+    total = 0.0
+    for i in range(cov.shape[1]):
+        for j in range(i):
+            total += 2.0 * cov[i, j] * phi[i] * phi[j]
+        total += cov[i, i] * phi[i] * phi[i]
+    return total
+
+
+@part
+def learn(phi: Array, x: float, h: float, frozen: Frozen, known: Array, gain: Array) -> None:
+    """Correct theta by the error x of a prediction of variance h, as a Kalman filter does; gain (n,) is scratch."""
+    n, noise = frozen.theta.shape[0], frozen.numbers[V] / frozen.numbers[K] ** 2
+    cov = known[1 : n + 1]
+    for i in range(n):
+        gain[i] = 0.0
+        for j in range(n):
+            gain[i] += cov[i, j] * phi[j]
+    for i in range(n):
+        known[0, i] += gain[i] * x / (noise + h)
+        for j in range(n):
+            cov[i, j] -= gain[i] * gain[j] / (noise + h)
+
+
+@part
+def enter_scores(phi: Array, g: float, x: float, sample: Array) -> None:
+    """The sums of a single sample: phi g, phi x, g^2, x^2, phi phi'."""
+    n, at = phi.shape[0], 2 * phi.shape[0] + 2
+    for i in range(n):
+        sample[i], sample[n + i] = phi[i] * g, phi[i] * x
+        for j in range(i + 1):
+            sample[at] = phi[i] * phi[j]
+            at += 1
+    sample[2 * n], sample[2 * n + 1] = g * g, x * x
+
+
+@part
+def outside(phi: Array, unseen: Array) -> bool:
+    """Whether a row excites a direction that the reference did not, beyond the rounding of its terms."""
+    for i in range(unseen.shape[0]):
+        total, size = 0.0, 0.0
+        for j in range(unseen.shape[1]):
+            term = unseen[i, j] * phi[j]
+            total, size = total + term, size + abs(term)
+        if abs(total) > SAME * size:
+            return True
+    return False
+
+
+@part
+def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
+    """[phi, x] of a row into memory.work[0]; returns the limit of x, 0 if it cannot be used."""
+    n, p = frozen.theta.shape[0], frozen.ar.shape[0]
+    past, counts, numbers, phi = memory.past, memory.counts, frozen.numbers, memory.work[0]
+    if not row[n + INTERVAL] > 0.0:
+        return 0.0
+    if not row[n + OK] > 0.0:
+        counts[SINCE] = 0.0
+        return 0.0
+    if row[n + INTERVAL] > GAP:
+        counts[SINCE] = 0.0
+    # residual and centred regressors, scaled to the noise variance of weight 1
+    root, before, centred = 1.0 / np.sqrt(row[n + NOISE_FACTOR]), abs(past[p, n]), frozen.mean.shape[0] > 0
+    e, level = row[n + Y], row[int(numbers[CONSTANT])] if centred else 0.0
+    for i in range(n):
+        own = row[i] - frozen.mean[i] * level if centred else row[i]
+        e -= own * frozen.theta[i]
+        past[p, i] = own * root / frozen.unit[i]
+    past[p, n] = e * root
+    # whitened by the autoregression, and divided by the present standard deviation
+    scale = numbers[SCALE] * np.sqrt(counts[LEVEL])
+    for i in range(n + 1):
+        value = past[p, i]
+        for lag in range(p):
+            value -= frozen.ar[lag] * past[p - 1 - lag, i]
+        phi[i] = value / np.sqrt(counts[LEVEL]) if i < n else value / scale
+    # shift the lags; after a gap they must first be filled again
+    for lag in range(p):
+        for i in range(n + 1):
+            past[lag, i] = past[lag + 1, i]
+    counts[SINCE] += 1.0
+    return max(WIDE, 2.0 * before / scale) if counts[SINCE] > p else 0.0
+
+
+@part
+def enter_row(row: Array, frozen: Frozen, memory: Memory) -> int:
+    """Scores of a row into memory.sample, and [phi, g] for the CUSUM into memory.work[0]; what it can judge."""
+    n, numbers, phi = frozen.theta.shape[0], frozen.numbers, memory.work[0]
+    wide = whiten(row, frozen, memory)
+    if not wide > 0.0:
+        return NOTHING
+    reference, h, x = leverage(phi, frozen.cov), leverage(phi, memory.known[1 : n + 1]), phi[n]
+    if outside(phi, frozen.unseen) or not reference < HUGE:
+        return UNLIKE
+    for i in range(n):
+        x -= phi[i] * memory.known[0, i]
+    clip, least = numbers[CLIP], max(UNSURE, USUAL * n / numbers[NORMAL])
+    sure, root = h <= least, np.sqrt(1.0 + h * numbers[K] * numbers[K] / numbers[V])
+    before, memory.known[n + 1, 0] = memory.known[n + 1, 0], reference
+    learns = min(before, reference) > TEACHES and h > n / numbers[NORMAL] and abs(x) <= CREDIBLE * root
+    if h > UNKNOWN and not learns:
+        return UNLIKE
+    if learns:
+        learn(phi, x, h, frozen, memory.known, memory.work[1])
+        x /= root
+        for i in range(n):
+            phi[i] /= root
+    phi[n] = min(clip, max(-clip, x))
+    enter_scores(phi[:n], phi[n], min(wide, max(-wide, x)), memory.sample)
+    if not sure:
+        memory.sample[2 * n], memory.sample[2 * n + 1] = numbers[V], numbers[RAW]
+    # the GARCH recursion for h at the next sample
+    fed = numbers[ALPHA] * memory.sample[2 * n] / numbers[V] + numbers[BETA]
+    memory.counts[LEVEL] = 1.0 - numbers[ALPHA] - numbers[BETA] + fed * memory.counts[LEVEL]
+    return FULLY if sure else PARAMETERS if learns else WINDOWS

@@ -1,0 +1,51 @@
+"""The score CUSUM of a frozen reference model.
+
+    C <- max(0, C + log likelihood ratio of a shift by SHIFT standard deviations of the noise)
+
+for each parameter and both signs, and for the variance of the noise. Where a regressor is centred, its parameter also
+has sums for a step of the slope through zero, unless that is hardly more than one of the level. Reported is the larger
+of them as sqrt(2 C), a deviate. Source: Page (1954). Cost per sample: O(n).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, part
+from driftfit.run.live.frozen.reference_model import CONSTANT, KAPPA, LITTLE, SHIFT, Frozen, K, V, through_zero
+
+
+@part
+def climb(cusum: Array, z: float, mean: float, var: float, power: float) -> None:
+    """One step of a CUSUM up and of one down."""
+    for side in range(2):
+        step = (mean * z if side == 0 else -mean * z) - 0.5 * mean * mean * power
+        cusum[side] = max(0.0, cusum[side] + step / var)
+
+
+@part
+def accumulate(phi: Array, g: float, noise: bool, frozen: Frozen, cusum: Array) -> None:
+    """One step of the CUSUM of every parameter, of the noise, and of slopes through zero; columns are up and down."""
+    n = frozen.theta.shape[0]
+    k, v, kappa = frozen.numbers[K], frozen.numbers[V], frozen.numbers[KAPPA]
+    for j in range(n):
+        climb(cusum[j], phi[j] * g, SHIFT * k, v, phi[j] * phi[j])
+    if noise:
+        climb(cusum[n], g * g - v, SHIFT * v, kappa, 1.0)
+    constant = int(frozen.numbers[CONSTANT]) if frozen.mean.shape[0] > 0 else 0
+    for j in range(frozen.mean.shape[0]):
+        a, b = through_zero(frozen, j, constant) if frozen.mean[j] != 0.0 else (0.0, 0.0)
+        if a > LITTLE:
+            own = a * phi[j] + b * phi[constant]
+            climb(cusum[n + 1 + j], own * g, SHIFT * k, v, own * own)
+
+
+@part
+def report(cusum: Array, frozen: Frozen, deviates: Array) -> None:
+    """sqrt(2 C) of the parameters and of the noise into deviates (n + 1,)."""
+    n = frozen.theta.shape[0]
+    for j in range(n + 1):
+        highest = max(cusum[j, 0], cusum[j, 1])
+        if j < frozen.mean.shape[0]:
+            highest = max(highest, cusum[n + 1 + j, 0], cusum[n + 1 + j, 1])
+        deviates[j] = np.sqrt(2.0 * highest)

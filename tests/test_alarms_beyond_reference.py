@@ -1,0 +1,141 @@
+"""Alarms on a frozen reference model whose inputs are far from zero, or beyond those of the reference."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from driftfit import Kalman, Live, Regression, track
+from driftfit.run.live.alarm import LiveAlarm
+
+HELD = Kalman(q=0.0, r=1.0)
+GAIN = Regression(["gain"], intercept=True)
+
+
+@pytest.mark.parametrize("kind", ["glr", "cusum"])
+@pytest.mark.parametrize("offset", [10.0, 100.0, 1e5])
+def test_a_change_is_named_and_sized_where_an_input_is_far_from_zero(kind, offset):
+    """A slope about the mean of the input, one through zero, which shifts y by many deviations, and the level."""
+    named, late = [], []
+    for seed in range(3):
+        rng, after = np.random.default_rng(seed), np.arange(1300) >= 1000
+        w, v = rng.normal(size=(2, 1300))
+        y = 2.0 * w + 1.0 + v
+        rule = track(GAIN, HELD, y, offset + w).detect(kind, every=1000.0, reference=900, records=64).rule
+        for name, size, change in (("gain", 0.8, w), ("gain", 0.8, offset + w), ("intercept", 0.8, 1.0)):
+            found = track(GAIN, HELD, y + size * after * change, offset + w).detect(rule, start=900)
+            begun = int(found.onsets[found.onsets >= 1000][0])
+            settled = found.change(1200)
+            named.append((settled.name == name, settled.low < size < settled.high))
+            late.append(begun - 1000)
+    right, covered = np.sum(named, axis=0)
+    assert right >= 8
+    assert covered >= 7
+    assert np.median(late) < 30
+
+
+@pytest.mark.parametrize("kind", ["glr", "cusum"])
+@pytest.mark.parametrize("before", [0.0, 3.3])
+@pytest.mark.parametrize("size", [1.0, 1e-9])
+def test_an_input_that_was_dead_in_the_reference_raises_no_alarm_when_it_moves(kind, before, size):
+    """Its coefficient is unknown there, whatever its unit; a fault is found again when it rests."""
+    rng, T = np.random.default_rng(1), 1500
+    u = before * size + np.where((np.arange(T) >= 700) & (np.arange(T) < 1000), size * rng.normal(size=T), 0.0)
+    y = 2.0 + 5.0 * u / size + rng.normal(size=T) + 3.0 * (np.arange(T) >= 1200)
+    run = track(GAIN, HELD, y, u)
+    alarms = run.detect(kind, reference=600, records=8)
+    assert alarms.onsets[0] >= 1200
+    assert alarms.unseen == 300
+    assert "300 samples: a regressor moves that did not" in str(alarms)
+
+
+@pytest.mark.parametrize("kind", ["glr", "cusum"])
+@pytest.mark.parametrize("moved", [0.03, 1e-4])
+def test_an_input_that_hardly_moved_in_the_reference_hides_no_fault_when_it_does(kind, moved):
+    """What is then left of y is the error of its gain, many times as many alarms as set, until the first samples have
+    corrected it. Faults of other parameters are found as before."""
+    false, found = 0, 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        u, later = rng.normal(size=(1500, 2)), np.arange(1500) >= 800
+        u[~later, 1] *= moved
+        fault = np.where(np.arange(1500) >= 1200, 0.5, 0.0)
+        y = u @ [1.0, 2.0] + 1.0 + 0.5 * rng.normal(size=1500) + fault
+        run = track(Regression(2, intercept=True), Kalman(q=0.0, r=0.25), y, u)
+        alarms = run.detect(kind, every=1000, reference=400, records=64)
+        assert alarms.unseen <= 5
+        onsets = alarms.onsets[alarms.onsets >= 800]
+        false += int(np.sum(onsets < 1200))
+        found += bool(alarms.active[1200:1300].any())
+    assert false <= 9  # 3 are set, give or take the errors of the references
+    assert found == 8
+
+
+@pytest.mark.parametrize("kind", ["glr", "cusum"])
+def test_inputs_far_beyond_those_of_the_reference_are_judged(kind):
+    """All of them are 20 times as large: none of the two thousand samples resembles the reference."""
+    false, found = 0, 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        u, v, at = rng.normal(size=(2500, 2)), rng.normal(size=2500), np.arange(2500)
+        u[at >= 500] *= 20.0
+        run = track(Regression(2, intercept=True), HELD, u @ [1.0, -1.0] + v + 1.0 * (at >= 2300), u)
+        alarms = run.detect(kind, every=500.0, reference=500, records=64)
+        assert alarms.unseen <= 5
+        false += int(np.sum(alarms.onsets < 2300))
+        found += bool(alarms.active[2300:2400].any())
+    assert false <= 36  # 22 are set
+    assert found == 6
+
+
+@pytest.mark.parametrize("kind", ["glr", "cusum"])
+def test_false_readings_of_an_input_do_not_correct_its_gain(kind):
+    """One reading in a hundred is thirty deviations off, which y does not follow."""
+    false, left_out, wrong = 0, 0, 0
+    for seed in range(6):
+        rng = np.random.default_rng([seed, 300])
+        u = rng.normal(size=2300)
+        y = 0.3 * u + 1.0 + rng.normal(size=2300)
+        bad = (np.arange(2300) >= 300) & (rng.random(2300) < 0.01)
+        u[bad] += 30.0 * rng.choice([-1.0, 1.0], bad.sum())
+        alarms = track(GAIN, HELD, y, u).detect(kind, every=1000.0, reference=300, records=64)
+        false, left_out, wrong = false + len(alarms.onsets), left_out + alarms.unseen, wrong + int(bad.sum())
+    assert false <= 20  # 12 are set
+    assert left_out > 0.8 * wrong
+
+
+def test_what_is_not_judged_under_coloured_noise():
+    """A whitened row of an input that was 0 in the reference differs from 0 until its lags do not."""
+    rng, T = np.random.default_rng(3), 1500
+    moves = (np.arange(T) >= 700) & (np.arange(T) < 1000)
+    u, e = np.where(moves, rng.normal(size=T), 0.0), signal.lfilter([0.8], [1.0, -0.6], rng.normal(size=T))
+    y = 2.0 + 5.0 * u + e
+    y[[900, 1200]] = np.nan
+    alarms = track(GAIN, HELD, y, u).detect("cusum", reference=600, records=8)
+    p = len(alarms.rule.reference.ar)
+    assert p == 1
+    assert alarms.unseen == 300 + p - 2  # the row after the movement; a gap and the row of which it is a lag
+
+
+@pytest.mark.parametrize("kind", ["glr", "cusum"])
+def test_a_stream_learns_and_centres_as_the_record_does(kind):
+    """Also after it was saved while it learned, and as a state of an earlier version, which had learned nothing."""
+    rng = np.random.default_rng(6)
+    u = rng.normal(size=(900, 2))
+    u[:600, 1] *= 1e-3
+    u[:, 0] += 50.0
+    y = u @ [0.5, 2.0] + rng.normal(size=900)
+    model, tracker = Regression(2), Kalman(q=0.0, r=1.0)
+    run = track(model, tracker, y, u)
+    record = run.detect(kind, reference=500, records=8)
+    live = Live(model, tracker, warm_start=track(model, tracker, y[:500], u[:500]))
+    alarm = live.detect(record.rule)
+    for t in range(500, 900):
+        live.update(y[t], u[t])
+        np.testing.assert_array_equal(alarm.statistic, record.statistic[t])
+        if t in (550, 603):
+            live = Live.from_bytes(live.to_bytes())
+            (alarm,) = live.alarms
+    state = alarm.plain()
+    earlier = LiveAlarm.of({**state, "memory": state["memory"][:-1]}, tracker, model.names)
+    assert (earlier._memory.known[0] == 0.0).all()
+    assert not (alarm._memory.known[0] == 0.0).all()
