@@ -262,3 +262,17 @@ def test_waiting_pays_if_some_number_of_samples_does(ahead, decided):
         near.append(abs(max(gains)) < 1e-5)
     assert [a == b or c for a, b, c in zip(ruled, rule, near, strict=True)] == [True] * 41
     assert sum(ruled) == decided
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_spikes_are_told_from_jumps(seed):
+    """Without a sensor for outliers each of them is two jumps, and nothing said so."""
+    rng = np.random.default_rng(seed)
+    X, noise = rng.normal(size=(600, 2)), 0.3 * rng.normal(size=600)
+    theta = np.array([1.0, -0.5]) + np.cumsum((rng.random((600, 1)) < 0.01) * 3.0 * rng.normal(size=(600, 2)), axis=0)
+    moved = track(Regression(2), Bank(), np.sum(X * theta, axis=1) + noise, X)
+    assert "Spikes" not in str(moved.summary())
+    y = X @ [1.0, -0.5] + noise + 3.0 * (rng.random(600) < 0.02)
+    with pytest.warns(UserWarning, match=r"spikes rather than jumps; give Bank\(sensors="):
+        run = track(Regression(2), Bank(), y, X)
+    assert "Spikes" in str(run.summary())

@@ -57,6 +57,8 @@ def track(
         run = _one(programs, records, keep, warm_start, dtype)
     warn_unlearned(run)
     warn_astray(run)
+    if isinstance(run, Track) and (doubt := run.tracker.doubts(run)):
+        warn(f"{type(run.tracker).__name__}: {doubt}.", UserWarning)
     value, places = shared_code(records.y, records.u)
     if len(places):
         warn(

@@ -70,6 +70,7 @@ from driftfit.trackers.bank.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.prior import chains, events, per_sample
 from driftfit.trackers.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.trackers.bank.sensor import Sensor
+from driftfit.trackers.bank.spikes import LARGE, evident
 from driftfit.trackers.bank.variants import steps_of
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing
@@ -411,6 +412,8 @@ class Bank(Tracker):
         if len(self.all_sensors) > 1:
             text += f", {wrong} fault{'' if wrong == 1 else 's'} of the sensor"
         facts = [("Events", f"{text}; see run.hypotheses.events()")]
+        if doubt := self.doubts(run):
+            facts.append(("Spikes", doubt))
         faults = int(run.state["counters"][FAULTS])
         if faults:
             facts.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
@@ -422,6 +425,15 @@ class Bank(Tracker):
         if (never := np.isinf(lane["var"])).any():
             facts.append(not_learned(run, np.array(run.names)[never]))
         return (*facts, *(resolution(lane) if self.all_sensors[0].r is None else ()))
+
+    def doubts(self, run: Any) -> str:
+        count = evident(run) if len(self.all_sensors) == 1 else 0
+        if not count:
+            return ""
+        return (
+            f"after {count} innovations of more than {LARGE:g} standard deviations the parameters returned to where "
+            "they were, so these are spikes rather than jumps; give Bank(sensors=[Sensor.nominal(), Sensor.outlier()])"
+        )
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
         """Which entries of theta the regressors have distinguished so far, (n,) bool."""
