@@ -278,8 +278,8 @@ def judge(memory: Memory, frozen: Frozen, findings: Array) -> None:
 
 @Driver
 def scan(rows: Array, frozen: Frozen, memory: Memory, findings: Array, use: Array) -> None:
-    """Judge rows (T, n + 4), regressors and the columns of `ROW`: findings (T, CUSUM + n + 1), repeated at rows without a
-    result.
+    """Judge rows (T, n + 4), regressors and the columns of `ROW`: findings (T, CUSUM + n + 1) are repeated at
+    rows without a result.
 
     use (T,) is what every row could judge, `NOTHING` to `FULLY`.
     """
