@@ -16,6 +16,7 @@ import pytest
 from support import arx_record
 
 from driftfit import ARX, Fleet, Kalman, Live, Track, track
+from driftfit.data.record import time_text
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-3, r=0.1)
 T = 60
@@ -382,3 +383,14 @@ def test_days_are_keys_of_saved_fleets(tmp_path):
     again = Fleet.load(tmp_path / "fleet")
     assert list(again) == list(fleet) == [date(2024, 1, 2), date(2023, 1, 1)]
     np.testing.assert_array_equal(again[date(2023, 1, 1)].theta, fleet[date(2023, 1, 1)].theta)
+
+
+def test_times_as_text_tell_fast_samples_and_seconds_since_1970_apart():
+    at = np.datetime64("2024-03-01T06:00:00.000150")
+    assert time_text(at, None) == "2024-03-01 06:00:00.00015"
+    assert time_text(at, "Europe/Berlin") == "2024-03-01 07:00:00.00015 CET"
+    assert time_text(np.datetime64("2024-03-01"), None) == "2024-03-01"
+    assert time_text(np.datetime64("2024-03-01T00:00:01"), "UTC") == "2024-03-01 00:00:01 UTC"
+    assert [time_text(t, None) for t in (1.7e9 + 0.25, 1700000001.0, 7 * 5e-5, 0.1 + 0.2)] == [
+        "1700000000.25", "1700000001", "0.00035", "0.3",
+    ]  # fmt: skip
