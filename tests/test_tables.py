@@ -16,6 +16,7 @@ import pytest
 from support import arx_record
 
 from driftfit import ARX, Fleet, Kalman, Live, Track, track
+from driftfit.data.record import time_text
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-3, r=0.1)
 T = 60
@@ -78,6 +79,7 @@ def test_columns_of_every_type(kind):
         "nullable": [None if v == 3 else int(v) for v in whole],
         "nullable bool": [None if v == 3 else bool(v > 2) for v in whole],
         "text": ["n/a" if v == 3 else f" {v} " for v in whole],
+        "other text": [{3: "#N/A", 4: "."}.get(v, str(v)) for v in whole.tolist()],
     }
     numbers = {
         "decimal": whole / 4.0,
@@ -85,6 +87,7 @@ def test_columns_of_every_type(kind):
         "nullable": np.where(whole == 3, np.nan, whole),
         "nullable bool": np.where(whole == 3, np.nan, whole > 2),
         "text": np.where(whole == 3, np.nan, whole),
+        "other text": np.where(whole > 2, np.nan, whole),
     }
     table = KINDS[kind]({"y": y, **forms})
     for name in forms:
@@ -382,3 +385,14 @@ def test_days_are_keys_of_saved_fleets(tmp_path):
     again = Fleet.load(tmp_path / "fleet")
     assert list(again) == list(fleet) == [date(2024, 1, 2), date(2023, 1, 1)]
     np.testing.assert_array_equal(again[date(2023, 1, 1)].theta, fleet[date(2023, 1, 1)].theta)
+
+
+def test_times_as_text_tell_fast_samples_and_seconds_since_1970_apart():
+    at = np.datetime64("2024-03-01T06:00:00.000150")
+    assert time_text(at, None) == "2024-03-01 06:00:00.00015"
+    assert time_text(at, "Europe/Berlin") == "2024-03-01 07:00:00.00015 CET"
+    assert time_text(np.datetime64("2024-03-01"), None) == "2024-03-01"
+    assert time_text(np.datetime64("2024-03-01T00:00:01"), "UTC") == "2024-03-01 00:00:01 UTC"
+    assert [time_text(t, None) for t in (1.7e9 + 0.25, 1700000001.0, 7 * 5e-5, 0.1 + 0.2)] == [
+        "1700000000.25", "1700000001", "0.00035", "0.3",
+    ]  # fmt: skip

@@ -19,8 +19,8 @@ from driftfit.data.times.periods import EXAMPLES, periods
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, near
 
-MISSING = ("", "na", "n/a", "nan", "null", "none")
-"""Cell contents that mean "no value", in lower case."""
+MISSING = ("", "na", "n/a", "nan", "null", "none", "#n/a", ".")
+"""Cell contents that mean "no value", in lower case; spreadsheets write #N/A, SAS and central banks a dot."""
 
 
 @dataclass(frozen=True)

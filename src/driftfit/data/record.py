@@ -75,13 +75,19 @@ def labels_of_series(y: str, u: tuple[str, ...], time: str | None, zone: str | N
 
 
 def time_text(time: Any, zone: str | None) -> str:
-    """A time as text, dates in a time zone; midnight without a zone is the date alone."""
+    """A time as text, dates in a time zone; midnight without a zone is the date alone.
+
+    Numbers have twelve digits, so that seconds since 1970 are told apart; dates have a fraction of the second if it is
+    not zero.
+    """
     if not isinstance(time, np.datetime64):
-        return f"{time:g}"
-    text = time.astype("datetime64[us]").item()
-    if zone is None:
-        return f"{text:%Y-%m-%d}" if text.time() == clock(0) else f"{text:%Y-%m-%d %H:%M:%S}"
-    return f"{text.replace(tzinfo=UTC).astimezone(ZoneInfo(zone)):%Y-%m-%d %H:%M:%S %Z}"
+        return f"{time:.12g}"
+    date = time.astype("datetime64[us]").item()
+    if zone is None and date.time() == clock(0):
+        return f"{date:%Y-%m-%d}"
+    shown = date if zone is None else date.replace(tzinfo=UTC).astimezone(ZoneInfo(zone))
+    part = f".{date.microsecond:06d}".rstrip("0") if date.microsecond else ""
+    return f"{shown:%Y-%m-%d %H:%M:%S}{part}{'' if zone is None else f'{shown: %Z}'}"
 
 
 class Reading(NamedTuple):

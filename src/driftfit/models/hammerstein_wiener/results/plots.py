@@ -77,4 +77,5 @@ def _paths(axis: Axes, run: Track, group: Any, names: Any, std: Any) -> None:
         axis.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(shown))
     else:
         axis.text(0.5, 0.5, "the identity", transform=axis.transAxes, ha="center", va="center", color="grey")
+        axis.set_axis_off()
     axis.grid(alpha=0.25, lw=0.5)
