@@ -427,7 +427,7 @@ class Bank(Tracker):
         return (*facts, *(resolution(lane) if self.all_sensors[0].r is None else ()))
 
     def doubts(self, run: Any) -> str:
-        count = evident(run) if len(self.all_sensors) == 1 else 0
+        count = evident(run) if self.changes is None and self.sensors is None else 0
         if not count:
             return ""
         return (
