@@ -5,7 +5,8 @@
 The first table has faults that begin 200 samples after the reference of 1000: the median delay in samples, "-" if
 fewer than half are found within 1000, at one false alarm in 1000 samples for all. The second has records without a
 fault: the share of the set rate that "glr" and "cusum" have, one alarm in EVERY samples being set, with two standard
-errors. The third has the same under GARCH noise as estimated, and where alpha and beta are known beforehand.
+errors. The third has the same under GARCH noise as estimated, and where alpha and beta are known beforehand. The fourth
+has inputs that are far from zero, or after the reference beyond those in it.
 The rivals get what they need: the residuals of least squares on the reference, times the regressor that changes
 (squared for the noise), and limits that were fitted to records without a fault. "GLR, textbook" is the likelihood ratio
 of that regressor over the last 8, 16, .., 256 samples, which does not allow for the errors of the reference.
@@ -223,6 +224,49 @@ def dated(fault: str, records: int) -> str:
     return f"{100.0 * np.mean([(np.abs(one - START) < 50).any() for one in dates]):.0f} %"
 
 
+INPUTS = ("as in the reference", "50 from zero", "hardly moved before", "20 times as large")
+
+
+def unlike(which: str, seed: int, T: int) -> tuple[Array, Array]:
+    """y (T,) without a fault and inputs (T, 2), the second of which is as ``which`` says, in standard deviations."""
+    rng = np.random.default_rng([seed, 7])
+    u, v, later = rng.normal(size=(T, 2)), rng.normal(size=T), np.arange(T) >= NORMAL
+    u[:, 1] += 50.0 * (which == INPUTS[1])
+    u[:, 1] *= np.where(later, 1.0, 0.01 if which == INPUTS[2] else 1.0)
+    u[:, 1] *= np.where(later, 20.0 if which == INPUTS[3] else 1.0, 1.0)
+    return 2.0 * u.sum(axis=1) + 1.0 + v, u
+
+
+def unlike_cells(alarm: str, which: str, seed: int) -> tuple[float, ...]:
+    """False alarms over those set; delays of steps of 0.6 of the first gain, the level, and the second gain, which is
+    that about the mean and in units of the second input's later variation.
+    """
+    y, u = unlike(which, seed, NORMAL + LATER)
+    model = Regression(2, intercept=True)
+    rule = track(model, HELD, y, u).detect(alarm, every=1000.0, reference=NORMAL, seed=seed).rule
+    false = len(track(model, HELD, y, u).detect(rule, start=NORMAL).onsets) * 1000.0 / LATER
+    T = NORMAL + START + FAULT
+    after, second = np.arange(T) >= NORMAL + START, u[:T, 1] - u[NORMAL:T, 1].mean()
+    found = [false]
+    for step in (u[:T, 0], np.ones(T), second / second[NORMAL:].std()):
+        onsets = track(model, HELD, y[:T] + 0.6 * step * after, u[:T]).detect(rule, start=NORMAL).onsets
+        found.append(first_of(onsets[onsets >= NORMAL + START]))
+    return tuple(found)
+
+
+def beyond(records: int, inputs: tuple[str, ...]) -> Table:
+    title = f"Median delay (share found) of steps of 0.6, {records} records"
+    table = Table(box=SIMPLE_HEAD, show_edge=False, title=title)
+    for name in ("second input", "alarm", "first gain", "level", "second gain", "measured over set rate"):
+        table.add_column(name, justify="left" if name in ("second input", "alarm") else "right")
+    for which in inputs:
+        for alarm in ("glr", "cusum"):
+            false, *late = zip(*(unlike_cells(alarm, which, seed) for seed in range(records)), strict=True)
+            spread = 2.0 * np.std(false) / np.sqrt(records)
+            table.add_row(which, alarm, *(told(list(one)) for one in late), f"{np.mean(false):.2f} +- {spread:.2f}")
+    return table
+
+
 def told(delays: list[float]) -> str:
     middle, share = np.median(delays), np.mean(np.isfinite(delays))
     return (f"{middle:.0f}" if np.isfinite(middle) else "-") + (f" ({100.0 * share:.0f} %)" if share < 1.0 else "")
@@ -259,6 +303,7 @@ def main(records: int = 24, lengths: tuple[int, ...] = (300, 1000), quick: bool 
     Console(width=120).print(delays(records, FAULTS[1:2] if quick else FAULTS))
     Console(width=120).print(rates(lengths, 2 * records, NOISES[::6] if quick else NOISES))
     Console(width=120).print(identified(lengths[0], 8 * records, CHANGING[:1] if quick else CHANGING))
+    Console(width=120).print(beyond(records, INPUTS[1:2] if quick else INPUTS))
 
 
 if __name__ == "__main__":

@@ -226,12 +226,14 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> int:
     wide = whiten(row, frozen, memory)
     if not wide > 0.0:
         return NOTHING
-    reference, h, x = leverage(phi, frozen.cov), leverage(phi, memory.known[1 : n + 1]), phi[n]
+    reference, x = leverage(phi, frozen.cov), phi[n]
     if outside(phi, frozen.unseen) or not reference < HUGE:
         return UNLIKE
     for i in range(n):
         x -= phi[i] * memory.known[0, i]
     clip, least = numbers[CLIP], max(UNSURE, USUAL * n / numbers[NORMAL])
+    # the variance can only have become smaller since the reference
+    h = reference if reference <= least else leverage(phi, memory.known[1 : n + 1])
     sure, root = h <= least, np.sqrt(1.0 + h * numbers[K] * numbers[K] / numbers[V])
     before, memory.known[n + 1, 0] = memory.known[n + 1, 0], reference
     learns = min(before, reference) > TEACHES and h > n / numbers[NORMAL] and abs(x) <= CREDIBLE * root
