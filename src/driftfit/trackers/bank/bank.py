@@ -432,7 +432,8 @@ class Bank(Tracker):
             return ""
         return (
             f"after {count} innovations of more than {LARGE:g} standard deviations the parameters returned to where "
-            "they were, so these are spikes rather than jumps; give Bank(sensors=[Sensor.nominal(), Sensor.outlier()])"
+            "they were, so these look like spikes rather than jumps; give "
+            "Bank(sensors=[Sensor.nominal(), Sensor.outlier()])"
         )
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
