@@ -276,8 +276,8 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE) -> None:
         # nothing looks at types and bounds after this
-        flags = y.flags.num & u.flags.num & known.flags.num & tile.flags.num & out.flags.num & theta.flags.num
-        plain = flags & CONTIGUOUS == CONTIGUOUS
+        flags = y.flags.num & u.flags.num & known.flags.num & tile.flags.num & out.flags.num
+        plain = (flags if theta is NOWHERE else flags & theta.flags.num) & CONTIGUOUS == CONTIGUOUS
         if not (plain and y.dtype is u.dtype is known.dtype is DOUBLE):
             # contiguous, because every layout would be compiled separately
             y = np.ascontiguousarray(y, dtype=np.float64)

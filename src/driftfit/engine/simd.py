@@ -87,7 +87,9 @@ def _place(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: 
 def _load(of: Any) -> Any:
     def typed(context: Any, array: Any, row: Any, column: Any) -> Any:
         def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            return builder.load(_place(context, builder, signature.args[0], *given, _LLVM[of]), align=8)
+            return builder.load(
+                _place(context, builder, signature.args[0], given[0], given[1], given[2], _LLVM[of]), align=8
+            )
 
         return of(array, types.intp, types.intp), build
 
@@ -97,7 +99,7 @@ def _load(of: Any) -> Any:
 def _store(of: Any) -> Any:
     def typed(context: Any, array: Any, row: Any, column: Any, value: Any) -> Any:
         def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            place = _place(context, builder, signature.args[0], *given[:3], _LLVM[of])
+            place = _place(context, builder, signature.args[0], given[0], given[1], given[2], _LLVM[of])
             builder.store(given[3], place, align=8)
             return context.get_dummy_value()
 
