@@ -158,7 +158,7 @@ class Records(NamedTuple):
     @property
     def ny(self) -> int:
         """Number of outputs of every series."""
-        return max(len(self.outputs), 1)
+        return len(self.outputs) or 1
 
     def part(self, k: int) -> Record:
         """Series k; its arrays are views."""

@@ -323,6 +323,18 @@ def write_common(o: State, s: State) -> None:
 
 
 @kernel
+def store_theta(s: State, theta: Array, t: int) -> None:
+    """theta alone, as row t of theta (T, n, L)."""
+    n, L = s.theta.shape
+    whole = n - n % 4 if in_fours(s) else 0
+    for i in range(0, whole, 4):
+        store_four(theta, t, i, load_four(s.theta, i, 0))
+    for i in range(whole, n):
+        for l in range(L):
+            theta[t, i, l] = s.theta[i, l]
+
+
+@kernel
 def nothing_common(o: State, s: State) -> None:
     """Only the tracker's own results are written."""
 
@@ -373,7 +385,7 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: A
         given = u.shape[1] > 0
         changing = 1 if known.shape[0] > 1 else 0
         alone = theta.shape[0] > 0
-        kept = 0 if alone else 1
+        kept, last = 0 if alone else 1, y.shape[0] - 1
         for t in range(y.shape[0]):
             for l in range(L):
                 s.y[l] = y[t, l]
@@ -389,11 +401,10 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: A
                     for l in range(L):
                         s.u[j, l] = u[t, j, l]
             sample(s)
-            write(out[t * kept], s)
             if alone:
-                for i in range(s.theta.shape[0]):
-                    for l in range(L):
-                        theta[t, i, l] = s.theta[i, l]
+                store_theta(s, theta, t)
+            if not alone or t == last:
+                write(out[t * kept], s)
 
     return run
 
