@@ -123,10 +123,10 @@ def shared_code(y: Array, u: Array) -> tuple[float, Array]:
     if not u.shape[1]:
         return NO_CODE
     first = y if y.ndim == 1 else y[:, 0]
-    same = first == u[:, 0]
-    if not np.count_nonzero(same):  # nearly always, so it must cost little
+    (same,) = (first == u[:, 0]).nonzero()
+    if not len(same):  # nearly always, so it must cost little
         return NO_CODE
-    same = np.flatnonzero(same & (np.abs(first) < LARGEST))  # larger numbers count as missing
+    same = same[np.abs(first[same]) < LARGEST]  # larger numbers count as missing
     for column in (*y.reshape(len(y), -1).T[1:], *u.T[1:]):
         same = same[column[same] == first[same]]
     if len(same) > 1:

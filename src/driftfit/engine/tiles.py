@@ -175,7 +175,7 @@ def output_record(
     for name in names:
         own = tile[name].base
         fields.append((name, dtype if own.kind == "f" else own, tile[name].shape))
-    return np.dtype(fields, align=True)
+    return _one_of(np.dtype(fields, align=True))
 
 
 def tile_type(tile: Array) -> types.Type:
