@@ -236,3 +236,15 @@ def test_a_record_that_compares_nothing_says_so(level):
     selection = select(ARX(2, 2), np.full(300, level), np.random.default_rng(0).normal(size=300))
     assert "nothing can be compared" in str(selection)
     assert selection.simplest in {row.name for row in selection.rows}
+
+
+class Lagged(Regression):
+    """A regression of the user's own on the last input and output."""
+
+    n, names, terms = 2, ("a", "b"), (("u", 0, 1), ("y", 0, 1))
+
+
+def test_a_regression_of_the_users_own_may_have_lags():
+    y, u = arx_record(300)
+    found = select([Lagged(1), ARX(1, 1)], y, u, tracker=Kalman(q=0.0, r=0.01))
+    assert found.rows[0].loglik == pytest.approx(found.rows[1].loglik)

@@ -219,7 +219,7 @@ def _union(models: Sequence[Model]) -> Model:
     terms = {term for model in models for term in _terms(model) or ()}
     constant = ("1", 0, 0) in terms
     inputs = models[0].input_names or models[0].m
-    if all(isinstance(model, Regression) for model in models):
+    if all(isinstance(model, Regression) for model in models) and all(lag == 0 for _, _, lag in terms):
         return Regression(inputs, intercept=constant)
     na = max((lag for what, _, lag in terms if what == "y"), default=0)
     nb, nk = [], []
