@@ -397,8 +397,9 @@ def programs_of(model: Model, tracker: Any, inputs: int | Sequence[str]) -> tupl
             return found
         if not isinstance(tracker, Tracker):
             raise ValueError(f"a model with one output takes one tracker for each series; got {tracker!r}.")
-        found = _programs(model, tracker, inputs if isinstance(inputs, int) else tuple(inputs))
-        _last[0] = model, tracker, inputs, found
+        given = inputs if isinstance(inputs, int) else tuple(inputs)
+        found = _programs(model, tracker, given)
+        _last[0] = model, tracker, given, found
         return found
     if isinstance(tracker, Mapping) and not model.shared:
         if set(tracker) != set(model.outputs):
