@@ -1,6 +1,6 @@
 """What a user waits for: records, streams and batches through public calls, against loops in C and against peers.
 
-    python -m benchmarks.end_to_end                  records, live
+    python -m benchmarks.end_to_end                  records, live, the default tracker at several sizes
     python -m benchmarks.end_to_end live --quick
 
 The model is ARX(2, 2), n = 4, tracked by Kalman(q=1e-4, r=0.01); one thread. The loop in C (benchmarks/filter.c) writes
@@ -195,7 +195,22 @@ def live(quick: bool) -> Iterator[tuple[str, ...]]:
         yield name, f"{ns:.0f}", *(f"{peer / ns:.1f}" for peer in beside)
 
 
-PARTS = {"records": records, "live": live}
+def default(quick: bool) -> Iterator[tuple[str, ...]]:
+    """One update of AdaptiveKalman from Python, u a float."""
+    T, turns = (100, 3) if quick else (1000, 60)
+    y, u = (part.tolist() for part in signals(T))
+    yield "parameters", "us"
+    for n in (4,) if quick else (2, 4, 8, 12):
+        one = Live(ARX(n // 2, n // 2), AdaptiveKalman())
+
+        def job(one: Live = one) -> None:
+            for value, present in zip(y, u, strict=True):
+                one.update(value, present)
+
+        yield str(n), f"{least([job], turns)[0] / T / 1e3:.1f}"
+
+
+PARTS = {"records": records, "live": live, "default": default}
 
 
 def main(

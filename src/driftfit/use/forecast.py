@@ -246,6 +246,7 @@ class LagErrors:
             self._ll[:] = np.inf
             return np.full(len(s), np.inf) if begun else s
         a, tl, al = theta[:, :L], self._tl, self._tl[:, :L]
+        s = np.maximum(s, np.einsum("i,oij,j->o", phi, P, phi))  # less contradicts P, and a variance could be negative
         first = np.einsum("i,oij,pj->op", phi, tl, a)
         both = first + first.T + a @ self._ll @ a.T + np.einsum("oij,pji->op", al, al)
         both[np.diag_indices(len(s))] += s + np.einsum("oij,ji->o", P[:, :L, :L], self._ll)
