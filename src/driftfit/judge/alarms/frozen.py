@@ -58,6 +58,10 @@ those in proportion to their time constant, since short references show long bur
 """
 NEAR = 0.2
 """A regressor whose mean is a smaller part of its spread stays as it is: its slope about the mean is that through 0."""
+DUST = 1e-9
+"""An entry of a direction, which has length 1, below which it is the rounding of 0: where all else of a row is 0, as of
+an idle input, such an entry alone would say that the row excites the direction.
+"""
 SHARE = 8
 """The noise is judged by windows of at most this part of the reference."""
 
@@ -182,7 +186,8 @@ def _covariance(phi: Array, x: Array) -> tuple[Array, Array]:
     excited = values > ROUNDING * values.max()
     factor = fitted * np.mean(psi * psi) / inside**2
     cov = factor * (vectors / np.where(excited, values, values.max())) @ vectors.T
-    return np.ascontiguousarray(cov), np.ascontiguousarray(vectors[:, ~excited].T)
+    unseen = vectors[:, ~excited].T
+    return np.ascontiguousarray(cov), np.ascontiguousarray(np.where(np.abs(unseen) > DUST, unseen, 0.0))
 
 
 def _whitened(rows: Array, ok: Array, ar: Array) -> tuple[Array, Array]:
