@@ -202,7 +202,7 @@ def test_a_run_of_codes_does_no_harm(tracker, run):
 @pytest.mark.parametrize("level", [100.0, 1e4])
 @pytest.mark.parametrize("gap", [0, 5])
 def test_a_new_level_is_accepted_soon_also_after_a_gap(tracker, level, gap):
-    y, u = plant()
+    y, u = plant(seed=1)
     y[250:] += level
     y[250 : 250 + gap] = np.nan
     run = track(ARX(2, 2, intercept=True), tracker, y, u)
