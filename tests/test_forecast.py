@@ -104,3 +104,15 @@ def test_outputs_that_are_lags_of_each_other():
         now = np.einsum("doi,di->do", theta, now) + 0.3 * rng.normal(size=(D, 2))
         low, high = np.quantile(now, [0.16, 0.84], axis=0)
         assert np.all(np.abs(2.0 * found.y_std[k] / (high - low) / 0.9945 - 1.0) < 0.06)
+
+
+def test_forecasts_are_printed_as_tables_and_parameters_of_one_name_apart():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=80)
+    run = track(Regression(("intercept",), intercept=True), Kalman(q=1e-3, r=0.01), 1e6 + 2.0 * u, u)
+    assert run.names == ("intercept", "intercept (2)")
+    text = repr(run.forecast(12, np.ones((12, 1))))
+    assert "Forecast of 12 samples" in text
+    assert "the first 10 of 12" in text
+    assert "10000" in text
+    assert "array" not in text
