@@ -115,3 +115,15 @@ def test_variances_are_positive_where_theta_is_less_certain_than_the_one_step_ba
         y[t] = 1.2 * y[t - 1] - 0.5 * y[t - 2] + (1.0 + 0.5 * (t > 50)) * u[t - 1] + 0.4 * u[t - 2] + 0.3 * e[t]
     run = track(ARX(2, 2), AdaptiveKalman(), y[:100], u[:100])
     assert run.forecast(20, u[100:]).y_std.min() > 0.2
+
+
+def test_forecasts_are_printed_as_tables_and_parameters_of_one_name_apart():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=80)
+    run = track(Regression(("intercept",), intercept=True), Kalman(q=1e-3, r=0.01), 1e6 + 2.0 * u, u)
+    assert run.names == ("intercept", "intercept (2)")
+    text = repr(run.forecast(12, np.ones((12, 1))))
+    assert "Forecast of 12 samples" in text
+    assert "the first 10 of 12" in text
+    assert "10000" in text
+    assert "array" not in text

@@ -103,11 +103,11 @@ class Program:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
+        """Names of the parameters; of several with one name the later ones have a number: g, g (2)."""
         if self.output is None:
-            return self.tracker.names_for(self.model)
+            return _distinct(self.tracker.names_for(self.model))
         own = () if self.alone is None else self.alone.names
-        return tuple(f"{name}[{self.output}]" for name in own) or self.model.names_of(self.output)
+        return tuple(f"{name}[{self.output}]" for name in own) or _distinct(self.model.names_of(self.output))
 
     @property
     def start(self) -> State:
@@ -438,3 +438,10 @@ def _row_model(model: Model, tracker: Tracker, inputs: int | Sequence[str]) -> M
             "use FLS, Kalman or RLS with shared=True."
         )
     return replace(model, ny=1, shared=False).bind(inputs)
+
+
+def _distinct(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of which those that occur again have a number, since tables and columns are read by them."""
+    if len(set(names)) == len(names):
+        return names
+    return tuple(name if (k := names[: i + 1].count(name)) == 1 else f"{name} ({k})" for i, name in enumerate(names))
