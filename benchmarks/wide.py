@@ -5,7 +5,7 @@
 
 ARX(n/2, n/2), a random-walk Kalman filter. P phi takes n^2 products and sums, the update of one triangle of P half as
 many: 3 n^2 floating-point operations in all. NumPy uses symv and syr of SciPy's BLAS, the
-fewest calls that do it, and no missing-data rule. What is compared takes turns; figures are the least processor time.
+fewest calls that do it, and no missing-data rule. What is compared takes turns; figures are undisturbed processor time.
 """
 
 import os
