@@ -5,7 +5,8 @@
 
 The model is ARX(2, 2), n = 4, tracked by Kalman(q=1e-4, r=0.01); one thread. The loop in C (benchmarks/filter.c) writes
 the same results into memory that it allocates at every call, as `track` does. What is compared takes turns; figures are
-the least processor time of many turns, so that other programs on the machine disturb them as little as possible.
+the processor time that one turn in twenty needs at most, so that other programs on the machine disturb them as little
+as possible.
 """
 
 import os
@@ -35,7 +36,7 @@ BUDGET = 1_000_000
 """Samples over which the turns of one comparison are spread, at least five turns."""
 
 
-def least(jobs: Sequence[Callable[[], object]], turns: int) -> list[float]:
+def undisturbed(jobs: Sequence[Callable[[], object]], turns: int) -> list[float]:
     """Nanoseconds of processor time of each job, all taking turns: those that one turn in twenty needs at most.
 
     The very least may be wrong by a third, because the clock is corrected while a turn runs.
@@ -108,7 +109,7 @@ def records(quick: bool) -> Iterator[tuple[str, ...]]:
                 found, loop = track(MODEL, TRACKER, y, u, **options), loops[name].over(y, u)
                 # the loop begins with a variance of 1e6, which half of its digits do not survive
                 np.testing.assert_allclose(found.theta[-1], loop()[-1, :N], rtol=1e-2, atol=1e-3)
-                ours, c = least(
+                ours, c = undisturbed(
                     (lambda: track(MODEL, TRACKER, y, u, **options), loop),  # noqa: B023
                     10 if quick else max(5, min(2000, 3 * BUDGET // T)),
                 )
@@ -189,7 +190,7 @@ def live(quick: bool) -> Iterator[tuple[str, ...]]:
     }
     others = peers(outputs, phi)
     yield "a sample by", "ns", *(f"{name.split()[0]}, times" for name in others)
-    taken = [ns / T for ns in least((*jobs.values(), *others.values()), turns)]
+    taken = [ns / T for ns in undisturbed((*jobs.values(), *others.values()), turns)]
     beside = taken[len(jobs) :]
     for name, ns in zip((*jobs, *others), taken, strict=True):
         yield name, f"{ns:.0f}", *(f"{peer / ns:.1f}" for peer in beside)
