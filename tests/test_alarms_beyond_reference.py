@@ -35,7 +35,7 @@ def test_a_change_is_named_and_sized_where_an_input_is_far_from_zero(kind, offse
 
 
 @pytest.mark.parametrize("kind", ["glr", "cusum"])
-@pytest.mark.parametrize("before", [0.0, 3.3])
+@pytest.mark.parametrize("before", [0.0, 3.3, 1e5])
 @pytest.mark.parametrize("size", [1.0, 1e-9])
 def test_an_input_that_was_dead_in_the_reference_raises_no_alarm_when_it_moves(kind, before, size):
     """Its coefficient is unknown there, whatever its unit: the second sample shows it, and later ones are judged."""

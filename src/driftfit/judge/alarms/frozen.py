@@ -28,11 +28,13 @@ from driftfit.run.live.frozen.reference_model import (
     BETA,
     CLIP,
     CONSTANT,
+    FLAT,
     INSIDE,
     KAPPA,
     LONGEST,
     NORMAL,
     RAW,
+    SAME,
     SCALE,
     SPREAD,
     WIDE,
@@ -109,19 +111,24 @@ def means(phi: Array, constant: int) -> Array:
     mean = level @ phi / (level @ level)
     spread = np.sqrt(np.mean((phi - level[:, None] * mean) ** 2, axis=0) / np.mean(level * level))
     moves = spread > ROUNDING * np.abs(mean)
-    mean = np.where(moves & (np.abs(mean) > NEAR * spread), mean, 0.0)
+    mean = np.where(~moves | (np.abs(mean) > NEAR * spread), mean, 0.0)
+    mean[constant] = 0.0
     return mean if mean.any() else np.zeros(0)
 
 
 def centred(phi: Array, mean: Array, constant: int) -> Array:
-    """phi (N, n) about these means."""
-    return phi - phi[:, constant, None] * mean if len(mean) else phi
+    """phi (N, n) about these means, exactly 0 where it is constant."""
+    if not len(mean):
+        return phi
+    about = phi - phi[:, constant, None] * mean
+    return np.where((mean != 0.0) & (np.abs(about) <= FLAT * np.abs(phi)), 0.0, about)
 
 
 def slopes_of(frozen: Frozen) -> Array:
-    """(n, 2): `through_zero` of the centred regressors, 0 of the others; (0, 2) if none is centred."""
+    """(n, 2): `through_zero` of the centred regressors that moved, 0 of the others; (0, 2) if none is centred."""
     constant, centred = int(frozen.numbers[CONSTANT]), enumerate(frozen.mean)
-    every = [through_zero(frozen, j, constant) if mean != 0.0 else (0.0, 0.0) for j, mean in centred]
+    moved = np.sum(frozen.unseen**2, axis=0) <= 1.0 - SAME
+    every = [through_zero(frozen, j, constant) if mean != 0.0 and moved[j] else (0.0, 0.0) for j, mean in centred]
     return np.array(every).reshape(-1, 2)
 
 

@@ -5,8 +5,8 @@
     x_t = w_t / (scale sqrt(h_t))             h_(t+1) = 1 - alpha - beta + alpha h_t g_t^2 / v + beta h_t
     g_t = x_t clipped at +-clip               score; E g^2 = v, var g^2 = kappa, E dg/dx = k in the reference
 
-A regressor that is far from zero in the reference is taken about its mean, as a multiple of the constant regressor: a
-slope about the mean does not move the level, so that the two can be told apart.
+A regressor that is far from zero in the reference, or constant, is taken about its mean, as a multiple of the constant
+regressor: a slope about the mean does not move the level, so that the two can be told apart.
 
 Where the reference knows little of a direction that a sample excites, as of an input that hardly moved, much of x may
 be the error of theta, with the variance phi' C phi in units of the noise. From `UNSURE` on (and from `USUAL` n / N on,
@@ -93,7 +93,8 @@ class Frozen(NamedTuple):
     unseen: Array = np.zeros((0, 0))
     """(k, n): directions of the regressors in which the reference has none, such as that of an input that was 0."""
     mean: Array = np.zeros(0)
-    """(n,): regressors in the reference as multiples of the constant, 0 where they were near zero; none if all were."""
+    """(n,): means of regressors in the reference as multiples of the constant, 0 where they moved about zero; none if all did.
+    """
 
 
 class Memory(NamedTuple):
@@ -257,7 +258,10 @@ def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
     root, before, centred = 1.0 / np.sqrt(row[n + NOISE_FACTOR]), abs(past[p, n]), frozen.mean.shape[0] > 0
     e, level = row[n + Y], row[int(numbers[CONSTANT])] if centred else 0.0
     for i in range(n):
-        own = row[i] - frozen.mean[i] * level if centred else row[i]
+        own = row[i]
+        if centred and frozen.mean[i] != 0.0:
+            own -= frozen.mean[i] * level
+            own = 0.0 if abs(own) <= FLAT * abs(row[i]) else own
         e -= own * frozen.theta[i]
         past[p, i] = own * root / frozen.unit[i]
     past[p, n] = e * root

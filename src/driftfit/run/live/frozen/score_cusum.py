@@ -35,14 +35,12 @@ def climb(cusum: Array, z: float, mean: float, var: float, power: float) -> None
 
 
 @part
-def bounded(phi: float, j: int, frozen: Frozen) -> float:
-    """A regressor at most BOUND from 0; its sign, if it was always 0 in the reference, where it has no unit."""
-    idle = 0.0
+def idle(j: int, frozen: Frozen) -> bool:
+    """Whether regressor j was always 0 in the reference, or constant and is centred, so that it has no unit there."""
+    share = 0.0
     for m in range(frozen.unseen.shape[0]):
-        idle += frozen.unseen[m, j] * frozen.unseen[m, j]
-    if idle > 1.0 - SAME:
-        return np.sign(phi)  # type: ignore[no-any-return]
-    return min(BOUND, max(-BOUND, phi))
+        share += frozen.unseen[m, j] * frozen.unseen[m, j]
+    return share > 1.0 - SAME
 
 
 @part
@@ -51,14 +49,14 @@ def accumulate(phi: Array, g: float, noise: bool, frozen: Frozen, cusum: Array) 
     n = frozen.theta.shape[0]
     k, v, kappa = frozen.numbers[K], frozen.numbers[V], frozen.numbers[KAPPA]
     for j in range(n):
-        own = bounded(phi[j], j, frozen)
+        own = np.sign(phi[j]) if idle(j, frozen) else min(BOUND, max(-BOUND, phi[j]))
         climb(cusum[j], own * g, SHIFT * k, v, own * own)
     if noise:
         climb(cusum[n], g * g - v, SHIFT * v, kappa, 1.0)
     constant = int(frozen.numbers[CONSTANT]) if frozen.mean.shape[0] > 0 else 0
     for j in range(frozen.mean.shape[0]):
         a, b = through_zero(frozen, j, constant) if frozen.mean[j] != 0.0 else (0.0, 0.0)
-        if a > LITTLE:
+        if a > LITTLE and not idle(j, frozen):
             own = min(BOUND, max(-BOUND, a * phi[j] + b * phi[constant]))
             climb(cusum[n + 1 + j], own * g, SHIFT * k, v, own * own)
 
