@@ -47,6 +47,7 @@ def test_decimal_commas_dots_between_thousands_and_days_first(tmp_path):
         ('t,y\n1,"1,065.26"\n', "holds '1,065.26', which is not a number (1 such cell); write numbers without signs"),
         ("t;y\n1;1,234\n2.5;3,500\n", "row 1 of column 'y' holds '1,234'"),  # commas between thousands
         ("t,y\ns,bar\n1,2\n", "holds 'bar', which is not a number (1 such cell); if this line holds units"),
+        ("sep=;\nt;y\n1;2\n1;2;3\n", "row 2 has 3 cells, but the header (t, y) has 2"),
         ("t,y\n1,2,3\n", "row 1 has 3 cells, but the header (t, y) has 2"),
         ("PK\x03\x04", "is an Excel workbook or a ZIP archive; write its table to a CSV or Parquet file"),
     ],
@@ -139,6 +140,9 @@ def test_compressed_files_and_utf_16_without_a_mark(tmp_path):
     path = written(tmp_path, "t,y\n1,2.5\n")
     path.write_bytes(gzip.compress(path.read_bytes()))
     assert read_columns(path, ["y"])["y"].tolist() == [2.5]
+    path.write_bytes(gzip.compress(b"t,y\n1,2.5\n")[:-9])
+    with pytest.raises(ValueError, match="cannot be decompressed"):
+        read_columns(path, ["y"])
     for encoding in ("utf-16-le", "utf-16-be"):
         assert read_columns(written(tmp_path, "t,y\n1,2.5\n", encoding), ["y"])["y"].tolist() == [2.5]
 

@@ -11,6 +11,7 @@ import gzip
 import io
 import os
 import warnings
+import zlib
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -103,7 +104,10 @@ def read_file(
 ) -> nw.DataFrame[Any]:
     """The wanted columns of one file, given by its path or its contents; `read_csv` says how CSV is read."""
     if (start := start_of(source)).startswith(b"\x1f\x8b"):
-        source = gzip.decompress(source if isinstance(source, bytes) else Path(source).read_bytes())
+        try:
+            source = gzip.decompress(source if isinstance(source, bytes) else Path(source).read_bytes())
+        except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+            raise ValueError(f"{where} cannot be decompressed: {error}") from None
         start = start_of(source)
     if kind := next((kind for first, kind in OTHER.items() if start.startswith(first)), None):
         raise ValueError(f"{where} is {kind}; write its table to a CSV or Parquet file.")

@@ -38,6 +38,8 @@ def read_records(
     """
     data, reading = _dated(data, by, reading)
     inputs, weights, drift, time = _names("u", u), reading.weights, reading.drift, reading.time
+    if y in inputs:
+        raise ValueError(f"u contains the output {y!r}, which would explain itself; its past is in models such as ARX.")
     axis = None if time is None else _name("time", time)
     each = () if isinstance(drift, str) or np.ndim(drift) == 0 else _names("drift", drift)
     factors = [*(name for name in (weights, drift) if isinstance(name, str)), *each]

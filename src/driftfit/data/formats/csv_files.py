@@ -22,6 +22,9 @@ from driftfit.data.formats.decimal_commas import points, with_points
 PROBE = 1 << 16
 """The bytes from which the separator, the encoding and the decimal sign are judged."""
 
+DECLARED = re.compile(r"\ufeff?sep=(.)\s*$", re.IGNORECASE)
+"""A first line with which spreadsheets say what separates cells."""
+
 CHECKED = 1 << 26
 """Bytes of a file up to which all columns are read: only then polars reports lines with more cells than the header."""
 
@@ -46,7 +49,7 @@ def read_csv(
     start = start_of(source)
     encoding = _encoding(start)
     lines = _lines(start, encoding)
-    declared = re.fullmatch(r"sep=(.)\s*", lines[0], re.IGNORECASE) if lines else None
+    declared = DECLARED.match(lines[0]) if lines else None
     lines = lines[1:] if declared else lines
     sign = separator or (declared[1] if declared else _separator(lines, ";\t" if decimal == "," else ",;\t"))
     end = "\r" if b"\r" in start and b"\n" not in start else "\n"
@@ -109,7 +112,9 @@ def _separator(lines: Sequence[str], signs: str) -> str:
 def _check_widths(source: str | bytes, encoding: str, sign: str, width: int) -> None:
     """ValueError for the first row that has cells beyond the ``width`` of the header that are not empty."""
     with io.TextIOWrapper(io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb"), encoding) as file:
-        rows = csv.reader((line for line in file if not line.startswith("#")), delimiter=sign)
+        rows = csv.reader(
+            (line for line in file if not line.startswith("#") and not DECLARED.match(line)), delimiter=sign
+        )
         header = next((row for row in rows if row), [])
         for k, row in enumerate(rows, 1):
             if any(cell.strip() for cell in row[width:]):
