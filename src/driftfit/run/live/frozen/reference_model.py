@@ -93,9 +93,7 @@ class Frozen(NamedTuple):
     unseen: Array = np.zeros((0, 0))
     """(k, n): directions of the regressors in which the reference has none, such as that of an input that was 0."""
     mean: Array = np.zeros(0)
-    """(n,): means of regressors in the reference as multiples of the constant, 0 where they moved about zero; empty if
-    all did.
-    """
+    """(n,): regressors in the reference as multiples of the constant, 0 if they moved about zero; none if all did."""
 
 
 class Memory(NamedTuple):
