@@ -60,7 +60,7 @@ def test_the_partition_is_the_cheapest_of_all(price, width, p):
 
 
 def test_likelihood_of_dates_is_that_of_dense_matrices():
-    """RSS and determinant of the regression on what was before and after, whitened as a whole."""
+    """RSS and determinant of the regression on what was before and after, whitened as a whole, with a row more."""
     rng, a = np.random.default_rng(1), np.array([0.5, -0.2])
     X, y = rng.normal(size=(40, 2)), rng.normal(size=40)
     got = date_loglik(X, y, a, 10, 30)
@@ -68,7 +68,9 @@ def test_likelihood_of_dates_is_that_of_dense_matrices():
     for d in (10, 17, 30):
         split = np.column_stack([X * (np.arange(40) < d)[:, None], X * (np.arange(40) >= d)[:, None]])
         W, z = (white @ split)[2:], (white @ y)[2:]
-        expected = -0.5 * cost(W, z) - 0.5 * np.linalg.slogdet(W.T @ W)[1]
+        both = W[:, :2] + W[:, 2:]
+        one_row = np.kron(np.eye(2), both.T @ both / 38)
+        expected = -0.5 * cost(W, z) - 0.5 * np.linalg.slogdet(W.T @ W + one_row)[1]
         assert got[d - 10] == pytest.approx(expected, rel=1e-9)
     assert smallest(np.log([0.01, 0.3, 0.6, 0.05, 0.04]), 0.9) == (1, 2)
 
@@ -156,6 +158,20 @@ def test_lags_of_the_output_and_records_that_cannot_be_divided():
     for wrong in ({"level": 1.0}, {"false": 0.0}, {"shortest": 0}):
         with pytest.raises(ValueError, match="segment"):
             segment(y, **wrong)
+
+
+def test_dates_beside_which_an_input_rests_are_not_preferred_whatever_the_basis():
+    """In noise alone; with the input at rest from 30 on, the determinant after such dates would be rounding alone."""
+    rng = np.random.default_rng(3)
+    X, y, ar = np.ones((100, 3)), rng.normal(size=100), np.array([0.4])
+    X[:, 1:] = rng.normal(size=(100, 2)) * [[1.0, 3.0]]
+    X[30:, 1] = 0.0
+    expected = date_loglik(X, y, ar, 6, 94)
+    assert expected[30:].max() - expected[:24].max() < np.log(100.0)
+    for seed in range(3):
+        mixed = np.random.default_rng(seed).normal(size=(3, 3))
+        got = date_loglik(X @ mixed, y, ar, 6, 94)
+        np.testing.assert_allclose(got - got.mean(), expected - expected.mean(), atol=1e-6)
 
 
 def test_segments_shorter_than_the_correlation_of_the_noise_have_no_standard_errors():

@@ -3,7 +3,12 @@
     x_t, y_t            rows divided by the level of the noise, which is an autoregression a of order p
     left and right      x_t 1(t < d), x_t 1(t >= d): 2 n columns, whitened together with y, so that the p rows after d
                         contain both
-    log L(d)            -RSS(d) / 2 - log |X'X| / 2        coefficients integrated out under a flat prior
+    G                   mean of x_t x_t' over the whitened rows: what one row tells
+    log L(d)            -RSS(d) / 2 - log |X'X + G| / 2    coefficients integrated out under a nearly flat prior
+
+Without G, dates would be preferred on one side of which an input rests: there a coefficient that is not determined
+has no price, and the logarithm of a determinant that is rounding alone decides. With G the dates are the same in all
+units, offsets and orders of the regressors.
 
 For a given size of the change the likelihood is a random walk on either side of the date, whatever the date is, so an
 interval with 95 % of sum exp log L contains the date in at least 95 % of records (more if one sample decides). The
@@ -18,6 +23,7 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, shared
+from driftfit.judge.statistics.noise import whitened
 from driftfit.judge.statistics.robust import cholesky
 
 SWEEPS = 10
@@ -51,11 +57,11 @@ def add(M: Array, row: Array, sign: float) -> None:
 def _dates(X: Array, y: Array, ar: Array, dates: Array, loglik: Array, sums: Array, row: Array) -> None:
     """log L of the dates from ``dates`` (2, 1) on, a date and the next; rows of X (N, n) from p on.
 
-    The scratch space is two matrices that are zero and a row, (2, 2 n + 1, 2 n + 1) and (2 n + 1,): arrays that are
-    made in compiled code take seconds to compile.
+    The scratch space is two matrices that are zero, and a row, (2 n + 1,): arrays that are made in compiled code take
+    seconds to compile. The third matrix of ``sums`` (3, 2 n + 1, 2 n + 1) is G of both sides.
     """
     N, n, p = X.shape[0], X.shape[1], ar.shape[0]
-    M, L, here, following = sums[0], sums[1], dates[0], dates[1]
+    M, L, G, here, following = sums[0], sums[1], sums[2], dates[0], dates[1]
     for t in range(p, N):
         whiten(X, y, ar, t, here, row)
         add(M, row, 1.0)
@@ -63,8 +69,11 @@ def _dates(X: Array, y: Array, ar: Array, dates: Array, loglik: Array, sums: Arr
         for i in range(2 * n + 1):
             for j in range(i + 1):
                 L[i, j] = M[i, j]
-        rss = cholesky(L, 2 * n)
-        loglik[place] = -0.5 * rss
+        loglik[place] = -0.5 * cholesky(L, 2 * n)
+        for i in range(2 * n):
+            for j in range(i + 1):
+                L[i, j] = M[i, j] + G[i, j]
+        cholesky(L, 2 * n)
         for i in range(2 * n):
             if L[i, i] > 0.0:
                 loglik[place] -= np.log(L[i, i])
@@ -81,9 +90,11 @@ _run = Driver(_dates)
 
 def date_loglik(X: Array, y: Array, ar: Array, first: int, last: int) -> Array:
     """log L of the dates first .. last, X (N, n) and y (N,) in units of the white noise."""
-    loglik, k = np.empty(last - first + 1), 2 * X.shape[1] + 1
+    n, rows = X.shape[1], whitened(X, y, ar)[0][len(ar) :]
+    loglik, sums = np.empty(last - first + 1), np.zeros((3, 2 * n + 1, 2 * n + 1))
+    sums[2, :n, :n] = sums[2, n:-1, n:-1] = rows.T @ rows / max(len(rows), 1)
     X, y, ar = (np.ascontiguousarray(one) for one in (X, y, ar))
-    _run(X, y, ar, np.array([[first], [first + 1]]), loglik, np.zeros((2, k, k)), np.zeros(k))
+    _run(X, y, ar, np.array([[first], [first + 1]]), loglik, sums, np.zeros(2 * n + 1))
     return loglik
 
 
