@@ -208,7 +208,7 @@ def believable(s: State, more_out: int, l: int) -> float:
     input.
     """
     left_out = (more_out > 0) & (s.valid[l] > 0.0) & (s.noise[l] < np.inf) & (s.ok[l] == 0.0)
-    return 0.0 if left_out else s.observed[l]  # type: ignore[no-any-return]
+    return 0.0 if left_out else s.observed[l]
 
 
 @lru_cache
