@@ -413,7 +413,7 @@ def fuzz(options, folder):
         for _ in range(int(rng.integers(1, 4))):
             text[int(rng.integers(len(text)))] = int(rng.choice(ODD))
         topic = f"plant/{rng.integers(20)}" if rng.uniform() < 0.8 else rng.bytes(5).decode("latin1")
-        samples, wrong = decoded(topic, bytes(text))
+        samples, wrong, _ = decoded(topic, bytes(text))
         refused += len(wrong)
         one.intake._batches.append(("web", Batch(samples, refused=len(wrong))))
         if k % 200 == 199:

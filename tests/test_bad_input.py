@@ -39,7 +39,7 @@ def test_text_in_a_numeric_column_is_named_with_its_row(tmp_path):
     data = table().with_columns(
         pl.when(pl.col("t") == 7).then(pl.lit("broken")).otherwise(pl.col("u").cast(str)).alias("u")
     )
-    assert "the table, row 7 of column 'u' holds 'broken', which is not a number (1 such cells)" in message(
+    assert "the table, row 7 of column 'u' holds 'broken', which is not a number (1 such cell)" in message(
         ValueError, "flow", "u", data=data
     )
     data.write_csv(tmp_path / "a.csv")

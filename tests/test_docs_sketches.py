@@ -40,10 +40,10 @@ GIVEN = {
 """By page, what its sketches take for granted besides `COMMON`."""
 
 NO_CODE = {
-    "coloured_noise.md", "equations.md", "flexible_least_squares.md", "instrumental_variables.md", "spark.md",
-    "structure.md",
+    "choosing_a_tracker.md", "coloured_noise.md", "equations.md", "flexible_least_squares.md",
+    "instrumental_variables.md", "spark.md", "structure.md",
 }  # fmt: skip
-"""Pages whose indented lines are formulas, or need Java or a file of their own."""
+"""Pages whose indented lines are lists or formulas, or need Java or a file of their own."""
 
 
 def blocks(page):

@@ -37,13 +37,16 @@ def read_records(
         out and has a reason; all units may be left out.
     """
     data, reading = _dated(data, by, reading)
-    inputs, weights, drift, time = _names("u", u), reading.weights, reading.drift, reading.time
-    if y in inputs:
-        raise ValueError(f"u contains the output {y!r}, which would explain itself; its past is in models such as ARX.")
+    output, inputs = _name("y", y), _names("u", u)
+    weights, drift, time = reading.weights, reading.drift, reading.time
+    if output in inputs:
+        raise ValueError(
+            f"u contains the output {output!r}, which would explain itself; its past is in models such as ARX."
+        )
     axis = None if time is None else _name("time", time)
     each = () if isinstance(drift, str) or np.ndim(drift) == 0 else _names("drift", drift)
     factors = [*(name for name in (weights, drift) if isinstance(name, str)), *each]
-    wanted = Wanted(tuple(dict.fromkeys([_name("y", y), *inputs, *factors])), axis, _names("by", by))
+    wanted = Wanted(tuple(dict.fromkeys([output, *inputs, *factors])), axis, _names("by", by))
     columns, failed = read(data, wanted)
     keys, code = _codes(columns)
     dropped: dict[Hashable, dict[str, int]] = {}

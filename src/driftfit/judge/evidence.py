@@ -33,7 +33,7 @@ class Evidence:
     @cached_property
     def test(self) -> Constancy:
         """Whether constants explain it."""
-        return constancy(self.rows.phi, self.rows.y, self.lags)
+        return constancy(self.rows.phi, self.rows.y, self.lags, self.rows.at)
 
     @cached_property
     def errors(self) -> Errors:

@@ -133,7 +133,7 @@ def _attributed(
         p[step.parameter] = min(p[step.parameter], now.p_own[step.parameter])
         X = _with(phi, steps)
         steps.append(step)
-        later = constancy(_with(phi, steps), y, lags)
+        later = constancy(_with(phi, steps), y, lags, None if test.noise is None else test.noise.at)
         if np.isnan(later.p_joint):
             steps.pop()
             break
@@ -206,7 +206,7 @@ def _alike(X: Array, test: Constancy, n: int, first: int, last: int) -> tuple[in
         return 0, ()
     held = test.noise.held
     if len(test.noise.ar):
-        X, held = whitened(X, held, test.noise.ar)
+        X, held = whitened(X, held, test.noise.ar, test.noise.at)
     Q = np.linalg.qr(X)[0]
     e = held - Q @ (Q.T @ held)
     found = [_dated(Q, X[:, i], e, first, last) for i in range(n)]
@@ -242,7 +242,7 @@ def _sizes(X: Array, y: Array, steps: list[Step], M: Array, noise: Noise | None)
     n = len(M)
     if noise is not None and len(noise.ar):
         c = noise.level
-        X, y = whitened(X / c[:, None], y / c, noise.ar)
+        X, y = whitened(X / c[:, None], y / c, noise.ar, noise.at)
         X, y = X * c[:, None], y * c
     fit = robust_fit(X, y)
     inverse = inverted(X * fit.inside[:, None])

@@ -26,7 +26,8 @@ The noise is estimated under the alternative (`driftfit.judge.statistics.noise`)
 are those of constants if the record is not divided. Residuals of constants would count a large change as noise, and the
 test would lose power as the change grows. If the noise is an autoregression, the rows of the regression are whitened
 first. The Bartlett estimate of V allows for the remaining correlation of the scores, with up to 4 (N / 100)^(2/9) lags,
-the rule of thumb (`driftfit.judge.statistics.bandwidth`).
+the rule of thumb (`driftfit.judge.statistics.bandwidth`). Missing samples are passed over, which correlation at short
+lags survives, unless the noise has a season, which they would blur: then rows are whitened at their own times.
 
 To find out which parameter moves, the test uses A_T^-1 S_t, the path of the estimates. A change of one parameter
 appears in the scores of all parameters whose regressors are correlated with its own, but in this path only in its own
@@ -50,7 +51,7 @@ import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.bandwidth import plugged_in, rule_of_thumb
-from driftfit.judge.statistics.noise import HELD, Noise, noise, of_rare_events, whitened
+from driftfit.judge.statistics.noise import HELD, ORDER, Noise, noise, of_rare_events, whitened
 from driftfit.judge.statistics.quadratic import tail
 from driftfit.judge.statistics.robust import Basis, Fit, clipped, fit_in, noisy, orthonormal, robust_fit
 from driftfit.judge.statistics.supremum import TIED, suprema, together
@@ -111,10 +112,11 @@ def shortest(n: int) -> int:
     return max(10, 4 * n)
 
 
-def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
+def constancy(phi: Array, y: Array, lags: int | None = None, at: Array | None = None) -> Constancy:
     """Test whether y (N,) on phi (N, n) has constant coefficients.
 
-    ``lags``: order of the autoregression of the noise; None estimates it, and 0 assumes white scores.
+    ``lags``: order of the autoregression of the noise; None estimates it, and 0 assumes white scores. ``at`` (N,):
+    sample numbers of the rows, where some may be missing between them.
     """
     N, n = phi.shape
     if least_rows(n) > N:
@@ -126,7 +128,11 @@ def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
     if not noisy(fit, phi, y):
         return _nothing(N, n)._replace(fit=fit)
     rare = _rare(fit.psi, y, shortest(n))
-    found = (of_rare_events if rare else noise)(basis.Q, fit.residual, CELLS, rare or shortest(n), lags)
+    estimated, least = of_rare_events if rare else noise, rare or shortest(n)
+    found = estimated(basis.Q, fit.residual, CELLS, least, lags)
+    if lags is None and at is not None and at[-1] - at[0] >= N:
+        in_time = estimated(basis.Q, fit.residual, CELLS, least, None, at)
+        found = in_time if len(in_time.ar) > ORDER else found
     return _tested(basis, phi, fit, found, lags)
 
 
@@ -159,7 +165,7 @@ def _tested(basis: Basis, phi: Array, fit: Fit, found: Noise, lags: int | None) 
     still, added = fit, np.zeros((N, 0))
     if len(found.ar):
         c = found.level[:, None]
-        rows, y = whitened(X / c, found.held / found.level, found.ar)
+        rows, y = whitened(X / c, found.held / found.level, found.ar, found.at)
         added = c * missing_lags(phi / size / c, rows, found) if lags is None else added
         X, y = rows * c, y * found.level
         still = robust_fit(np.column_stack([X, added]), y)
@@ -206,12 +212,17 @@ def missing_lags(X: Array, rows: Array, found: Noise) -> Array:
     """
     N, n = X.shape
     least = 1e-6 * np.sqrt(N * np.mean(X * X))
-    w = whitened(X[:, :0], np.clip(found.residual / found.level, -HELD, HELD), found.ar)[1]
+    w = whitened(X[:, :0], np.clip(found.residual / found.level, -HELD, HELD), found.ar, found.at)[1]
     basis = scipy.linalg.qr(rows, mode="economic")[0]
     w = w - basis @ (basis.T @ w)
     for k in range(1, min(len(found.ar), MOST_LAGS) + 1):
         lagged = np.zeros((N, n))
-        lagged[k:] = X[:-k]
+        if found.at is None:
+            lagged[k:] = X[:-k]
+        else:
+            before = np.searchsorted(found.at, found.at - k)
+            known = found.at[before] == found.at - k
+            lagged[known] = X[before[known]]
         lagged[: len(found.ar)] = 0.0
         lagged -= basis @ (basis.T @ lagged)
         Q, R, _ = scipy.linalg.qr(lagged, mode="economic", pivoting=True)
@@ -237,7 +248,7 @@ def _alternative(found: Noise, still: Fit, added: Array) -> Array:
     v = found.residual
     if len(found.ar):
         held = np.clip(v / c, -HELD, HELD)
-        v = c * whitened(np.zeros((len(v), 0)), held, found.ar)[1]
+        v = c * whitened(np.zeros((len(v), 0)), held, found.ar, found.at)[1]
     v = v - added @ np.linalg.lstsq(added, v, rcond=None)[0]
     return clipped(still.theta, v / np.maximum(1.0 - found.leverage, 0.05), still.scale).psi
 

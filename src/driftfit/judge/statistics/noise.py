@@ -20,6 +20,10 @@ fit reduces the correlation of its residuals: the first autocorrelation r of N r
 (g_i - r)(1 + g_i r) / (1 - g_i r)) / N, where g_i are the autocorrelations of the regressors (for a mean alone (1 + 3
 r) / N); this bias is corrected.
 
+Rows are samples, of which some may be missing between them; ``at`` says which. A missing row is filled by what the
+autoregression predicts from those before it, regressors and outputs alike, and the autoregression is estimated with
+the filled residuals, a few times in turn. Without that, missing samples blur a season of the noise.
+
 Source: Chakar, Lebarbier, Levy-Leduc and Robin (2017) for whitening before the segments; Box and Jenkins (1970) for the
 seasonal factor; Marriott and Pope (1954) for the bias of a mean. Cost: O(T n^2), and that of the partition.
 """
@@ -45,6 +49,8 @@ SEASON = 200
 """Longest lag of a seasonal factor; it is also at most an eighth of the record."""
 LARGEST = 0.97
 ROUNDS = 6
+FILLS = 5
+"""Times that missing rows are filled and the autoregression is estimated again."""
 QUIET = 0.01
 """Probability that a record with constant coefficients is divided."""
 WINDOW = 50
@@ -78,6 +84,8 @@ class Noise(NamedTuple):
     """Rows in the shortest segment."""
     rare: bool = False
     """Whether these are rare events, whose variance a few rows do not show."""
+    at: Array | None = None
+    """(N,): sample numbers of the rows; None if no sample is missing between them."""
 
 
 @shared
@@ -166,25 +174,51 @@ def _pooled(v: Array, bounds: Array, r: Array) -> None:
         lagged(v[bounds[k] : bounds[k + 1]], r)
 
 
+def _filled(rows: Array, at: Array, ar: Array, past: Array) -> None:
+    """Rows (N, k) minus what the autoregression predicts, in place; ``past`` (span, k) is scratch, 0."""
+    N, k, p = rows.shape[0], rows.shape[1], ar.shape[0]
+    row = 0
+    for t in range(past.shape[0]):
+        present = t == at[row] - at[0]
+        for j in range(k):
+            predicted = 0.0
+            for i in range(min(t, p)):
+                predicted += ar[i] * past[t - 1 - i, j]
+            past[t, j] = rows[row, j] if present else predicted
+            if present:
+                rows[row, j] = rows[row, j] - predicted if t >= p else 0.0
+        row = min(row + 1, N - 1) if present else row
+
+
 NEAR = 20
 _fit_windows = Driver(_windows)
 _fit_segments = Driver(_segments)
 _lags = Driver(_pooled)
+_whiten_with_gaps = Driver(_filled)
 
 
-def noise(Q: Array, y: Array, cells: int, least: int, order: int | None = None, quiet: float = QUIET) -> Noise:
+def noise(Q: Array, y: Array, cells: int, least: int, order: int | None = None, at: Array | None = None) -> Noise:
     """The noise of y (N,) on Q (N, n), Q' Q = N I.
 
     ``cells``: largest number of positions for breaks, evenly spaced; ``least``: rows in a segment; ``order`` of the
-    autoregression, None estimates it; ``quiet``: probability that constants are divided.
+    autoregression, None estimates it; ``at`` (N,): sample numbers of the rows, if some are missing between them.
     """
-    return begun(Q, y, cells, least, order, quiet)[1]
+    return begun(Q, y, cells, least, order, at=at)[1]
 
 
 def begun(
-    Q: Array, y: Array, cells: int, least: int, order: int | None = None, quiet: float = QUIET
+    Q: Array,
+    y: Array,
+    cells: int,
+    least: int,
+    order: int | None = None,
+    quiet: float = QUIET,
+    at: Array | None = None,
 ) -> tuple[Search, Noise, tuple[Array, Array]]:
-    """The search of `noise`, its result, and the autoregressions that it began with: of windows, of the whole."""
+    """The search of `noise`, its result, and the autoregressions that it began with: of windows, of the whole.
+
+    ``quiet``: probability that constants are divided.
+    """
     N, n = Q.shape
     spans = _spans(N, n)
     P = max(order or 0, min(ORDER, N // 20, (spans[1][0] - spans[0][0]) // 6))
@@ -195,7 +229,7 @@ def begun(
     least_level = SMALLEST * deviation(y)
     c = np.maximum(_level(spans, level, N), least_level)
     search = Search(Q, y, c, spans, g, P, order, _grid(N, cells), least,
-                    penalty(N, n, least, quiet), max(SMALL, least_level / median(c)))  # fmt: skip
+                    penalty(N, n, least, quiet), max(SMALL, least_level / median(c)), at)  # fmt: skip
     r = r[r[:, 0] > 0.0]
     pacf = np.median(_partial(r, g, width), axis=0) if len(r) else np.zeros(P)
     local = _chosen(pacf, min(N, 8 * width), order)
@@ -206,7 +240,9 @@ def begun(
     return search, found[1], (local, whole)
 
 
-def of_rare_events(Q: Array, y: Array, cells: int, least: int, order: int | None = None) -> Noise:
+def of_rare_events(
+    Q: Array, y: Array, cells: int, least: int, order: int | None = None, at: Array | None = None
+) -> Noise:
     """`noise` of one level, where windows show none, because they hold too few events.
 
     Sums of rare events are skewed, so a break must gain twice as much as in Gaussian noise.
@@ -214,7 +250,7 @@ def of_rare_events(Q: Array, y: Array, cells: int, least: int, order: int | None
     (N, n), none = Q.shape, np.zeros(0, np.int64)
     P = max(order or 0, min(ORDER, N // 20))
     search = Search(Q, y, np.full(N, deviation(y)), _spans(N, n), overlap(Q), P, order, _grid(N, cells), least,
-                    2.0 * penalty(N, n, least, QUIET), SMALL)  # fmt: skip
+                    2.0 * penalty(N, n, least, QUIET), SMALL, at)  # fmt: skip
     starts = [search.correlation(y, none), none[:0].astype(float)]
     return min((search.settle(ar, y, y) for ar in starts), key=lambda one: one[0])[1]._replace(rare=True)
 
@@ -244,6 +280,8 @@ class Search(NamedTuple):
     penalty: float
     finest: float
     """The least noise of segments, in units of c."""
+    at: Array | None
+    """Sample numbers of the rows, if some are missing between them."""
 
     def settle(self, ar: Array, local: Array, near: Array) -> tuple[float, Noise]:
         """-2 log-likelihood, and segments and noise that agree, starting from ``ar``, the autoregression of ``near``.
@@ -255,7 +293,7 @@ class Search(NamedTuple):
         held = y - local + np.clip(local, -HELD * c, HELD * c)
         for _ in range(ROUNDS):
             before = breaks
-            X, z = whitened(Q / self.c[:, None], held / self.c, ar)
+            X, z = whitened(Q / self.c[:, None], held / self.c, ar, self.at)
             size = self.size(near, ar)
             breaks = partition(X / size, z / size, self.grid, self.price(ar), self.least, len(ar))
             found = self.described(breaks, X, ar)
@@ -268,7 +306,7 @@ class Search(NamedTuple):
     def described(self, breaks: Array, X: Array, ar: Array) -> Noise:
         """The noise given its breaks; segments are fitted on X, the regressors divided by c and whitened by ``ar``."""
         Q, y, N = self.Q, self.y, len(self.y)
-        z = whitened(X[:, :0], y / self.c, ar)[1]
+        z = whitened(X[:, :0], y / self.c, ar, self.at)[1]
         fits = np.empty((3, N))
         _fit_segments(Q, y, columns_of(X, z), np.concatenate([[0], breaks, [N]]), np.array([len(ar)]), fits)
         residual, near, leverage = fits
@@ -276,7 +314,7 @@ class Search(NamedTuple):
         c = self.c * max(deviation(near / self.c), self.finest)
         held = y - near + np.clip(near, -HELD * c, HELD * c)
         white = self.size(near, ar) * median(self.c / c)
-        return Noise(breaks, residual, c, ar, held, near, leverage, white, self.price(ar), self.least)
+        return Noise(breaks, residual, c, ar, held, near, leverage, white, self.price(ar), self.least, at=self.at)
 
     def price(self, ar: Array) -> float:
         """The penalty, raised by the standard error of the logarithm of the noise's long-run variance."""
@@ -285,12 +323,15 @@ class Search(NamedTuple):
 
     def correlation(self, v: Array, breaks: Array) -> Array:
         """The autoregression of v within segments."""
-        N, r, v = len(v), np.zeros(self.P + 1), v / self.c
+        N, v = len(v), v / self.c
         limit = HELD * deviation(v)
-        _lags(np.clip(v, -limit, limit), np.concatenate([[0], breaks, [N]]), r)
-        if not r[0] > 0.0:
-            return r[:0]
-        ar = _chosen(_partial(r[None], self.g, N / (len(breaks) + 1.0))[0], N, self.order)
+        held, ar = np.clip(v, -limit, limit), np.zeros(0)
+        for _ in range(1 if self.at is None else FILLS):
+            every, bounds, r = *self.without_gaps(held, breaks, ar), np.zeros(self.P + 1)
+            _lags(every, bounds, r)
+            if not r[0] > 0.0:
+                return r[:0]
+            ar = _chosen(_partial(r[None], self.g, N / (len(breaks) + 1.0))[0], N, self.order)
         return ar if self.order is not None else self.seasonal(v, ar, breaks)
 
     def seasonal(self, v: Array, ar: Array, breaks: Array) -> Array:
@@ -299,31 +340,58 @@ class Search(NamedTuple):
         longest = min(SEASON, N // 8)
         if longest <= self.P:
             return ar
-        w, r = whitened(np.zeros((N, 0)), v, ar)[1], np.zeros(longest + 1)
-        limit = HELD * deviation(w)
-        _lags(np.clip(w, -limit, limit), np.concatenate([[0], breaks, [N]]), r)
-        later = r[self.P + 1 :] / r[0] if r[0] > 0.0 else np.zeros(longest - self.P)
-        best = int(np.argmax(np.abs(later)))
+        w = whitened(np.zeros((N, 0)), v, ar, self.at)[1]
+        limit, r = HELD * deviation(w), np.zeros(longest + 1)
+        _lags(*self.without_gaps(np.clip(w, -limit, limit), breaks, ar[:0]), r)
+        share = self.share(longest)[self.P + 1 :]
+        later = r[self.P + 1 :] / r[0] / share if r[0] > 0.0 else np.zeros(longest - self.P)
+        best = int(np.argmax(later * later * share))
         b = float(np.clip(later[best], -LARGEST, LARGEST))
-        if N * np.log1p(-b * b) + np.log(N) + 2.0 * np.log(longest) > 0.0:
+        if N * share[best] * np.log1p(-b * b) + np.log(N) + 2.0 * np.log(longest) > 0.0:
             return ar
         season = np.zeros(self.P + best + 2)
         season[0], season[-1] = 1.0, -b
         return -np.convolve(np.append(1.0, -ar), season)[1:]
 
+    def without_gaps(self, v: Array, breaks: Array, ar: Array) -> tuple[Array, Array]:
+        """v with missing samples as the autoregression predicts them, and the bounds of the segments in it."""
+        if self.at is None:
+            return v, np.concatenate([[0], breaks, [len(v)]])
+        place = self.at - self.at[0]
+        every = np.zeros((int(place[-1]) + 1, 1))
+        _whiten_with_gaps(v[:, None].copy(), self.at, ar, every)
+        return every[:, 0].copy(), np.concatenate([[0], place[breaks], [len(every)]])
+
+    def share(self, longest: int) -> Array:
+        """Pairs of rows that are 0 .. longest samples apart, as shares of those of as many rows without gaps."""
+        if self.at is None:
+            return np.ones(longest + 1)
+        N, pairs = len(self.at), np.zeros(longest + 1)
+        every, bounds = self.without_gaps(np.ones(N), np.zeros(0, np.int64), np.zeros(0))
+        _lags(every, bounds, pairs)
+        return np.maximum(pairs, 1.0) / (N * (1.0 - np.arange(longest + 1) / len(every)))
+
     def size(self, v: Array, ar: Array) -> float:
         """Standard deviation of the white noise, with outliers limited."""
-        w = whitened(np.zeros((len(v), 0)), v / self.c, ar)[1]
+        w = whitened(np.zeros((len(v), 0)), v / self.c, ar, self.at)[1]
         limit = HELD * deviation(w)
         held = np.clip(w, -limit, limit)
         return max(float(np.sqrt(held @ held / len(held))), self.finest) if limit > 0.0 else 1.0
 
 
-def whitened(X: Array, y: Array, ar: Array) -> tuple[Array, Array]:
-    """Rows minus a times the rows before; the first p rows are left out."""
+def whitened(X: Array, y: Array, ar: Array, at: Array | None = None) -> tuple[Array, Array]:
+    """Rows minus a times the rows before; the first p rows are left out.
+
+    ``at`` (N,): sample numbers, if some are missing between the rows; those are filled as the autoregression predicts
+    them. After a gap a row has more noise than others.
+    """
     p = len(ar)
     if p == 0:
         return X, y
+    if at is not None:
+        both = np.column_stack([X, y])
+        _whiten_with_gaps(both, at, ar, np.zeros((int(at[-1] - at[0]) + 1, both.shape[1])))
+        return np.ascontiguousarray(both[:, :-1]), both[:, -1].copy()
     rows, values = X.copy(), y.copy()
     for k, a in enumerate(ar, 1):
         rows[k:] -= a * X[:-k]
