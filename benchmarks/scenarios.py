@@ -191,8 +191,7 @@ def main() -> None:
     heads: list[str] = []
     for name in given.only or (QUICK if given.quick else list(found())):
         runs = 2 if given.quick else given.runs if name != "very_slow" else max(2, given.runs // 5)
-        columns = [c for c in given.columns if not (name == "very_slow" and c in ("ml",))]
-        row = scored(name, runs, columns)
+        row = scored(name, runs, given.columns)
         if not heads:
             heads = [*given.columns, *(head for head in row if " " in head)]
             print(f"{'':18}" + "".join(f"{head:>14}" for head in heads))

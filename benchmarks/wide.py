@@ -5,7 +5,7 @@
 
 ARX(n/2, n/2), a random-walk Kalman filter. P phi takes n^2 products and sums, the update of one triangle of P half as
 many: 3 n^2 floating-point operations in all. NumPy uses symv and syr of SciPy's BLAS, the
-fewest calls that do it, and no missing-data rule. What is compared takes turns; figures are the least processor time.
+fewest calls that do it, and no missing-data rule. What is compared takes turns; figures are undisturbed processor time.
 """
 
 import os
@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.linalg.blas import dsymv, dsyr
 
-from benchmarks.end_to_end import least
+from benchmarks.end_to_end import undisturbed
 from benchmarks.kernel import CFilter, Tile
 
 
@@ -56,7 +56,7 @@ def main(quick: Annotated[bool, typer.Option(help="Small sizes, to see that it w
             loop = CFilter(tile, folder)
             ours, c, blas = (
                 ns / T / 1e3
-                for ns in least((tile.run, loop.run, lambda: numpy_loop(tile, n)), 3 if quick else 15)  # noqa: B023
+                for ns in undisturbed((tile.run, loop.run, lambda: numpy_loop(tile, n)), 3 if quick else 15)  # noqa: B023
             )
             table.add_row(f"{n}", f"{ours:.3f}", f"{c:.3f}", f"{blas:.2f}", f"{c / ours:.2f}", f"{blas / ours:.2f}",
                           f"{3e-3 * n * n / ours:.1f}")  # fmt: skip

@@ -205,6 +205,24 @@ def test_columns_of_any_name_can_be_given(folder, name):
     assert f"b1[{name}]" in text
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--u", "flow"], "--u flow: this is the output"),
+        (
+            ["--u", "valve", "--tracker", "kalman", "-p", "q=0"],
+            "--tracker kalman: r must be given: -p r=...; `driftfit tune`",
+        ),
+    ],
+)
+def test_what_a_newcomer_types_is_explained(folder, arguments, message):
+    result = CliRunner().invoke(app, ["track", "a.csv", "--y", "flow", *arguments])
+    assert result.exit_code == 2
+    assert message in " ".join(result.output.split())
+    with pytest.raises(ValueError, match="u contains the output 'flow'"):
+        track(ARX(1, 1), Kalman(q=0.0, r=1.0), "flow", ["valve", "flow"], data="a.csv")
+
+
 def test_a_name_in_quotes_that_do_not_end_is_explained(folder):
     result = CliRunner().invoke(app, ["track", "a.csv", "--y", "flow", "--u", '"valve, cold'])
     assert result.exit_code == 2

@@ -177,6 +177,39 @@ def test_what_is_no_fault_is_learned_from(tracker):
     assert abs(run.theta[-1, 0] - 10.0) < 0.1
 
 
+RUNS = {
+    "one code": lambda y: np.full_like(y, 9999.0),
+    "of either sign": lambda y: np.where(np.arange(y.size).reshape(y.shape) * 7 % 5 < 3, -999.0, 999.0),
+    "in turn": lambda y: np.where(np.arange(y.shape[1]) % 2 == 0, 9999.0, -999.0) + 0.0 * y,
+    "with good readings between": lambda y: np.where(np.arange(y.shape[1]) % 4 == 3, y, -999.0),
+    "after a gap": lambda y: np.where(np.arange(y.shape[1]) < 5, np.nan, -999.0) + 0.0 * y,
+}
+
+
+@pytest.mark.parametrize("run", list(RUNS))
+@pytest.mark.parametrize("tracker", DIFFUSE, ids=repr)
+def test_a_run_of_codes_does_no_harm(tracker, run):
+    """After na of them the next has no prediction; as a lag, it made those after it look like a response to a test."""
+    rows = np.array([plant(seed=seed) for seed in range(8)]).swapaxes(0, 1)
+    bad = rows[0].copy()
+    bad[:, 200:230] = RUNS[run](bad[:, 200:230])
+    whole, fleet = track(PLANT, tracker, *rows, by="row"), track(PLANT, tracker, bad, rows[1], by="row")
+    assert max(np.abs(fleet[k].theta - whole[k].theta)[[240, -1]].max() for k in range(8)) < 0.08
+    assert min(fleet[k].state["left_out"] for k in range(8)) > 20.0
+
+
+@pytest.mark.parametrize("tracker", [RLS(0.99), Kalman(q=1e-4, r=0.01)], ids=repr)
+@pytest.mark.parametrize("level", [100.0, 1e4])
+@pytest.mark.parametrize("gap", [0, 5])
+def test_a_new_level_is_accepted_soon_also_after_a_gap(tracker, level, gap):
+    y, u = plant(seed=1)
+    y[250:] += level
+    y[250 : 250 + gap] = np.nan
+    run = track(ARX(2, 2, intercept=True), tracker, y, u)
+    assert 0.0 < run.state["left_out"] <= 25.0
+    assert np.median(np.abs(run.innovation[300:])) < 1.0
+
+
 def test_an_input_with_a_run_of_codes_and_a_simulated_output():
     y, u = plant()
     u[250:260] = 9999.0

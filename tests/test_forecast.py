@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from driftfit import ARX, RLS, Kalman, Regression, track
+from driftfit import ARX, RLS, AdaptiveKalman, Kalman, Regression, track
 
 H = 15
 
@@ -104,3 +104,26 @@ def test_outputs_that_are_lags_of_each_other():
         now = np.einsum("doi,di->do", theta, now) + 0.3 * rng.normal(size=(D, 2))
         low, high = np.quantile(now, [0.16, 0.84], axis=0)
         assert np.all(np.abs(2.0 * found.y_std[k] / (high - low) / 0.9945 - 1.0) < 0.06)
+
+
+@pytest.mark.parametrize("seed", [132, 290])
+def test_variances_are_positive_where_theta_is_less_certain_than_the_one_step_band(seed):
+    """One step of the default tracker has not the variance of its covariance: y_std was NaN where lags outweigh it."""
+    rng = np.random.default_rng(seed)
+    (u, e), y = rng.normal(size=(2, 120)), np.zeros(120)
+    for t in range(2, 120):
+        y[t] = 1.2 * y[t - 1] - 0.5 * y[t - 2] + (1.0 + 0.5 * (t > 50)) * u[t - 1] + 0.4 * u[t - 2] + 0.3 * e[t]
+    run = track(ARX(2, 2), AdaptiveKalman(), y[:100], u[:100])
+    assert run.forecast(20, u[100:]).y_std.min() > 0.2
+
+
+def test_forecasts_are_printed_as_tables_and_parameters_of_one_name_apart():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=80)
+    run = track(Regression(("intercept",), intercept=True), Kalman(q=1e-3, r=0.01), 1e6 + 2.0 * u, u)
+    assert run.names == ("intercept", "intercept (2)")
+    text = repr(run.forecast(12, np.ones((12, 1))))
+    assert "Forecast of 12 samples" in text
+    assert "the first 10 of 12" in text
+    assert "10000" in text
+    assert "array" not in text

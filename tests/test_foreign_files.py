@@ -1,13 +1,19 @@
 """Files as spreadsheets of other countries write them: decimal commas, days before months, other encodings."""
 
+import gzip
 import re
+from contextlib import nullcontext
 
 import numpy as np
 import polars as pl
 import pytest
 
 from driftfit import RLS, DataWarning, Regression, track
+from driftfit.cli.parts.reading import Part, moment, rows_of
+from driftfit.data.clock import Clock
 from driftfit.data.files import read_columns
+from driftfit.data.limits import within
+from driftfit.data.times.instants import warn_of_counted_years, warn_of_written_numbers
 
 
 def written(tmp_path, text, encoding="utf-8"):
@@ -38,7 +44,12 @@ def test_decimal_commas_dots_between_thousands_and_days_first(tmp_path):
     [
         ("t;y\n1;1,5\n2;2.5\n", "row 1 of column 'y' holds '1,5'"),  # both kinds in one column
         ("t;y\n1;1,5\n2;1,2,3\n", "row 1 of column 'y' holds '1,5'"),
-        ('t,y\n1,"1,065.26"\n', "holds '1,065.26', which is not a number"),
+        ('t,y\n1,"1,065.26"\n', "holds '1,065.26', which is not a number (1 such cell); write numbers without signs"),
+        ("t;y\n1;1,234\n2.5;3,500\n", "row 1 of column 'y' holds '1,234'"),  # commas between thousands
+        ("t,y\ns,bar\n1,2\n", "holds 'bar', which is not a number (1 such cell); if this line holds units"),
+        ("sep=;\nt;y\n1;2\n1;2;3\n", "row 2 has 3 cells, but the header (t, y) has 2"),
+        ("t,y\n1,2,3\n", "row 1 has 3 cells, but the header (t, y) has 2"),
+        ("PK\x03\x04", "is an Excel workbook or a ZIP archive; write its table to a CSV or Parquet file"),
     ],
 )
 def test_numbers_that_are_neither_are_named(tmp_path, text, message):
@@ -110,3 +121,102 @@ def test_days_without_hyphens_are_dates_and_numbers_like_them_cause_a_warning(tm
         track(Regression(1), RLS(1.0), y, x, time=numbers, dt="label")
     with pytest.raises(ValueError, match="'202310' is not a date"):  # which was the year 202310
         track(Regression(1), RLS(1.0), y, x, time=["202310", "202311", "202312", "202401"], dt="month")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t,y\n1,1.5,\n2,2.5,\n",
+        "t;y\n1;1,5;;\n2;2,5\n",
+        "\r\rt,y\r1,1.5\r2,2.5\r",
+        "t;y;name (a, b, c)\n1;1.5;x\n2;2.5;y\n",
+    ],
+)
+def test_separators_at_the_ends_of_lines_and_other_lines(tmp_path, text):
+    assert read_columns(written(tmp_path, text), ["y"], "t")["y"].tolist() == [1.5, 2.5]
+
+
+def test_compressed_files_and_utf_16_without_a_mark(tmp_path):
+    path = written(tmp_path, "t,y\n1,2.5\n")
+    path.write_bytes(gzip.compress(path.read_bytes()))
+    assert read_columns(path, ["y"])["y"].tolist() == [2.5]
+    path.write_bytes(gzip.compress(b"t,y\n1,2.5\n")[:-9])
+    with pytest.raises(ValueError, match="cannot be decompressed"):
+        read_columns(path, ["y"])
+    for encoding in ("utf-16-le", "utf-16-be"):
+        assert read_columns(written(tmp_path, "t,y\n1,2.5\n", encoding), ["y"])["y"].tolist() == [2.5]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "y;u;n\n1.234;2;a\n3.500;4;0,5\n",  # a text
+        "# 1;2,5;3\ny;u\n1.234;2\n3.500;4\n",  # a comment
+        "y;u;0,5\n1.234;2;1\n3.500;4;2\n",  # a name
+        "y;u;z\n1.234;2,5;1.5\n3.500;4,5;2\n",  # another column has decimal points
+        "y;u\n" + "3.500;4\n" * 8191 + "1.234;2\n" + "3.500;4\n" * 9,  # the probe ends within a line
+    ],
+)
+def test_commas_elsewhere_do_not_make_numbers_larger(tmp_path, text):
+    found = read_columns(written(tmp_path, text), ["y"])["y"]
+    assert set(found.tolist()) == {1.234, 3.5}
+
+
+def test_decimal_commas_in_times(tmp_path):
+    for text, part in (("t,y\n", Part(decimal=",", separator=";")), ("t;y\n", Part())):
+        path = written(tmp_path, text.replace(",", ";") + "0,5;1,5\n1,5;2,5\n")
+        assert rows_of([str(path)], ["y"], "t", [], part).time.tolist() == [0.5, 1.5]
+
+
+def test_rows_have_the_order_of_day_and_month_of_the_whole_file(tmp_path):
+    path = written(tmp_path, "t,y\n31/01/2024,1\n01/02/2024,2\n02/02/2024,3\n")
+    found = rows_of([str(path)], ["y"], "t", [], Part(rows=(2, None)))
+    assert found.time.astype("datetime64[D]").astype(str).tolist() == ["2024-02-01", "2024-02-02"]
+    with pytest.raises(ValueError, match="row 2 of column 'y' holds 'x'"):
+        rows_of([str(written(tmp_path, "t,y\n1,x\n1,x\n"))], ["y"], "t", [], Part(rows=(2, None)))
+
+
+def test_times_on_the_command_line():
+    axis = np.array(["2024-01-31"], "datetime64[us]")
+    for text in ("20240201", "2024-02-01", "1.2.2024", "2024/02/01"):
+        assert str(moment(text, axis, None)) == "2024-02-01T00:00:00.000000"
+        assert str(moment(text, axis, None, end=True)) == "2024-02-01T23:59:59.999999"
+    assert str(moment("2024", axis, None)) == "2024-01-01T00:00:00.000000"
+    assert str(moment("2024", axis, None, end=True)) == "2024-12-31T23:59:59.999999"
+    for text in ("01/02/2024", "2024-02-31", "yesterday"):
+        with pytest.raises(ValueError, match=f"'{text}'"):
+            moment(text, axis, None)
+
+
+def test_intervals_that_are_excluded_are_days_without_hyphens_too():
+    days = np.datetime64("2024-01-30") + np.arange(5)
+    assert within([("20240131", "20240201")], days, np.arange(5)).tolist() == [False, True, True, False, False]
+    with pytest.raises(ValueError, match="got '20240231'"):
+        within([("20240131", "20240231")], days, np.arange(5))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "warned"),
+    [
+        ([20240130, 20240131, 20240201], True),
+        ([20240129, 20240130, 20240131], False),  # their differences are right
+        ([202401, 202402, 202403], False),
+        ([2024013022, 2024013023, 2024013100], True),
+        ([20240131235900, 20240131235959, 20240201000000], True),
+        ([20240131, 20240132, 20240233], False),
+        ([1970, 1971, 1972], False),
+        ([1904067198, 1904067199, 1904067200], False),  # seconds
+    ],
+)
+def test_numbers_that_are_written_like_dates(numbers, warned):
+    with pytest.warns(DataWarning) if warned else nullcontext():
+        warn_of_written_numbers(np.array(numbers, float))
+
+
+def test_years_that_pandas_read_as_nanoseconds():
+    years = np.arange(1970, 1980)
+    with pytest.warns(DataWarning, match="1970 to 1979 nanoseconds after the beginning of 1970"):
+        warn_of_counted_years(years.astype("datetime64[ns]"))
+    warn_of_counted_years(years.astype(str).astype("datetime64[Y]").astype("datetime64[ns]"))
+    with pytest.raises(ValueError, match="as in dt=1 for the years 1970, 1971"):
+        Clock.of("year").steps(years.astype(float))

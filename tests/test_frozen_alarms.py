@@ -18,6 +18,7 @@ from driftfit.run.live.frozen.likelihood_ratio import scan
 from driftfit.run.live.frozen.reference_model import (
     ALPHA,
     BETA,
+    BOUND,
     CLIP,
     CONSTANT,
     CUSUM,
@@ -118,7 +119,7 @@ def test_statistics_are_those_of_a_naive_twin(ar, centred):
         CONSTANT: 2,
     }.items():  # fmt: skip
         numbers[place] = value
-    root = 0.05 * rng.normal(size=(n, n))
+    root = 0.01 * rng.normal(size=(n, n))
     mean = np.array([0.0, 50.0, 0.0] if centred else [])
     model = Frozen(
         rng.normal(size=n), np.array([1.0, 10.0, 0.1]), np.array(ar), root @ root.T, numbers, np.zeros((0, n)), mean
@@ -143,7 +144,7 @@ def test_statistics_are_those_of_a_naive_twin(ar, centred):
                 L = blocks << level
                 if count % (1 << level) == 0 and count >= L:
                     best[L] = naive_window(scores[count - L : count], model)
-        own = np.array([phi @ step for _, step in slopes])
+        own, phi = np.clip([phi @ step for _, step in slopes], -BOUND, BOUND), np.clip(phi, -BOUND, BOUND)
         z, power = np.r_[phi * g, g * g - numbers[V], own * g], np.r_[phi * phi, 1.0, own * own]
         shift, var = np.full(len(z), SHIFT * numbers[K]), np.full(len(z), numbers[V])
         shift[n], var[n] = SHIFT * numbers[V], numbers[KAPPA]
@@ -372,6 +373,18 @@ def test_an_idle_input_leaves_the_alarm_as_it_is():
     idle = track(Regression(2, intercept=True), Kalman(q=0.0, r=0.25), y, np.c_[u, np.zeros(1600)])
     begun = idle.detect(every=1000.0, reference=800).onsets
     assert 1200 <= begun[begun >= 1200][0] < 1250
+
+
+def test_an_idle_input_among_others_is_no_movement():
+    """The directions that a reference did not excite are computed, and their rounding is not excited either: no sample
+    of such a record was judged."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        u = rng.normal(size=(700, 3)) * [1.0, 0.0, 1.0]
+        y = u.sum(axis=1) + 1.0 + rng.normal(size=700) + 1.0 * (np.arange(700) >= 600)
+        alarms = track(Regression(3, intercept=True), HELD, y, u).detect(every=1000.0, reference=500, records=8)
+        assert alarms.unseen == 0
+        assert alarms.active[600:650].any()
 
 
 @pytest.mark.parametrize("slope", [0.0, 2.0])

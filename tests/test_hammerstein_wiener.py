@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support import same
 
-from driftfit import ARX, RLS, Kalman, Live, Track, track
+from driftfit import ARX, RLS, ExtendedKalman, Kalman, Live, Track, track
 from driftfit.engine.drivers import TrackerSteps, unknown
 from driftfit.engine.kernel import kernel, nothing
 from driftfit.models.hammerstein_wiener.curves.basis import (
@@ -447,3 +447,27 @@ def test_a_run_is_continued_only_with_its_own_model():
     assert same(again.theta, track(SMALL, K, y, u).theta[30:])
     with pytest.raises(ValueError, match="followed"):
         track(HammersteinWiener(1, 1, input=Legendre(2, (-1, 1)), output=Polynomial(2)), K, y, u, warm_start=run)
+
+
+@pytest.mark.filterwarnings("ignore:y has a root mean square")
+@pytest.mark.parametrize("tracker", [RLS(0.99), Kalman(q=1e-5, r=1e-2, p0=1e2)], ids=repr)
+@pytest.mark.parametrize("code", [-999.0, 9999.0, 20.0])
+def test_a_run_of_fault_codes_spoils_neither_theta_nor_the_grid(tracker, code):
+    """Codes that the tracker refused were lags, and the output block was inverted on a grid as wide as they are."""
+    s = example(1, 2, T=500)
+    whole = track(s.model, tracker, s.y, s.u)
+    for count in (1, 3, 30):
+        y = s.y.copy()
+        y[200 : 200 + count] = code
+        run = track(s.model, tracker, y, s.u)
+        assert count - 1 <= run.state["left_out"] <= count + 3
+        error = np.median(np.abs(run.prediction - s.y)[300:])
+        assert error < 1.2 * np.median(np.abs(whole.prediction - s.y)[300:])
+
+
+def test_minimal_parameters_are_plotted():
+    """There are fewer of them than regressors."""
+    pytest.importorskip("matplotlib")
+    s = example(1, 2, T=100)
+    run = track(s.model, ExtendedKalman(q=1e-5, r=1e-2), s.y, s.u)
+    assert len(run.plot().axes) == len(run.names) + 2

@@ -194,6 +194,8 @@ def test_minimal_filters_want_their_model():
 def test_hand_off_continues_the_record():
     s = record(300)
     found = hand_off(SMALL, K, ExtendedKalman(q=1e-6, r=1e-6), s.y, s.u)
+    assert found.then.names[0] in repr(found)
+    assert len(repr(found).splitlines()) < 30
     assert 21 <= found.at < 100
     assert found.xi.shape == s.xi.shape
     assert len(found.then) == 300 - found.at - 1

@@ -5,7 +5,9 @@ import pytest
 from scipy import stats
 from support import arx_record, damaged
 
+from benchmarks import select_orders
 from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Kalman, Regression, grid, select, track
+from driftfit.judge.structures.candidates import Predicted, mixed
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
@@ -236,3 +238,38 @@ def test_a_record_that_compares_nothing_says_so(level):
     selection = select(ARX(2, 2), np.full(300, level), np.random.default_rng(0).normal(size=300))
     assert "nothing can be compared" in str(selection)
     assert selection.simplest in {row.name for row in selection.rows}
+
+
+class Lagged(Regression):
+    """A regression of the user's own on the last input and output."""
+
+    n, names, terms = 2, ("a", "b"), (("u", 0, 1), ("y", 0, 1))
+
+
+def test_a_regression_of_the_users_own_may_have_lags():
+    y, u = arx_record(300)
+    found = select([Lagged(1), ARX(1, 1)], y, u, tracker=Kalman(q=0.0, r=0.01))
+    assert found.rows[0].loglik == pytest.approx(found.rows[1].loglik)
+
+
+@pytest.mark.parametrize("seed", [41, 54])
+def test_constants_beside_the_default_tracker_find_orders_that_it_misses(seed):
+    """What it pays for being prepared for a drift differs between structures by more than a superfluous lag costs."""
+    y, u = select_orders.record(np.random.default_rng(seed), 300, False, False)
+    assert select(select_orders.CANDIDATES, y, u, tracker=AdaptiveKalman()).best != select_orders.TRUTH
+    assert select(select_orders.CANDIDATES, y, u).best == select_orders.TRUTH
+
+
+def test_a_mixture_loses_little_against_the_better_and_takes_what_one_has():
+    rng = np.random.default_rng(0)
+    loglik = rng.normal(size=(2, 300))
+    loglik[1, 150:] -= 3.0
+    loglik[0, 7] = loglik[1, 9] = loglik[:, 11] = np.nan
+    one, other = (Predicted(np.full(300, 1.0 * k), np.ones(300), terms) for k, terms in enumerate(loglik))
+    (found,) = mixed([one], [other], [slice(0, 300)])
+    assert found.y_hat[7] == 1.0
+    assert found.y_hat[9] == 0.0
+    np.testing.assert_array_equal(found.loglik[[7, 9]], [loglik[1, 7], loglik[0, 9]])
+    assert np.isnan(found.loglik[11])
+    assert np.nansum(found.loglik[150:]) > np.nansum(loglik[0, 150:]) - 15.0
+    assert 0.0 <= found.y_hat[-1] < 0.01

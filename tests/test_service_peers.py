@@ -459,14 +459,20 @@ def test_http_samples_are_answered_when_they_are_in_the_journal(tmp_path):
             ("plant/a", b'{"t": 3, "pressure": 1}', 422, "no signal (1)"),
             ("plant/a", b'{"t": [1e11, 1e12], "y": 1}', 422, "time in the future (2)"),
             ("plant/a", b'{"y": [1, 2]}', 422, "no time (2)"),
+            ("plant/a", b'{"t": [5, 6], "y": [1]}', 422, "different lengths (t 2, y 1)"),
+            ("", b'{"plant/a": {"t": [5, 6], "y": [1]}}', 422, "different lengths (t 2, y 1)"),
+            ("plant/a", b'{"t": [], "y": []}', 422, "0 samples in one message"),
         ):
             answer = INCOMING.offer(topic, sent)
             assert (answer["status"], reason in answer["error"]) == (status, True), answer
         answer = INCOMING.offer("plant/a", b'{"t": [2, 3, 1e12], "y": 1}')  # two of them are left out, one is taken
         assert "status" not in answer
         assert answer["left_out"] == {"duplicate": 1, "time in the future": 1}
+        answer = INCOMING.offer("plant/a", b'{"t": [4, 5, 6, 7], "y": ["1.5", "high", null, Infinity]}')
+        assert answer["missing"]["plant/a"]["y"] == {"count": 3, "first": [1, 2, 3]}  # a number as text is one
+        assert answer["missing"]["plant/a"]["u"]["count"] == 4
         assert "status" not in INCOMING.offer("plant/a", b'{"t": 3, "y": 1}')  # sent again, as after a lost answer
-        assert len(engine.journal.rows_of(1)[0]) == 3
+        assert len(engine.journal.rows_of(1)[0]) == 7
     names = Names(engine.journal)
     names.read()
     assert names.about["a"]["names"] == ["a1", "b1[u]"]

@@ -153,7 +153,7 @@ def test_payloads():
     assert decode("a", b'{"t": [1, 2], "y": [2.5, null], "site": "x"}').length == 2
     assert decode("a", b'[{"y": 1}, {"u": 2}]').columns == {"y": [1, None], "u": [None, 2]}
     assert np.isnan(decode("a", b'{"y": NaN}').columns["y"])
-    (one, other), refused = decoded("", b'{"a": {"y": [NaN, 1.5]}, "b": {"y": 2}}')
+    (one, other), refused, _ = decoded("", b'{"a": {"y": [NaN, 1.5]}, "b": {"y": 2}}')
     assert (other.columns, refused) == ({"y": 2}, [])
     assert np.isnan(one.columns["y"][0])
     assert [number(one) for one in (1, 1.5, "2.5", True)] == [1.0, 1.5, 2.5, 1.0]

@@ -216,3 +216,18 @@ def test_thresholds_that_are_learned_on_the_way_are_not_mistaken_for_drift():
     y[400:] = record(2, limits=(-1.0, 2.0))[0][400:]
     assert "b1[u2]*c2" in track(model, K, y, u).verdict().moving
     assert len(regressors(track(model, K, np.full(60, np.nan), u[:60])).phi) == 0
+
+
+@pytest.mark.parametrize(("kind", "true"), [(DeadZone, (0.25, -0.2)), (Saturation, (0.4, -0.35))])
+def test_thresholds_of_a_record_do_not_depend_on_those_of_the_stream(kind, true):
+    rng = np.random.default_rng(0)
+    model, at = HammersteinWiener(0, 1, nk=0, input=kind(1.0)), np.arange(400)
+    u = rng.uniform(-1.0, 1.0, (400, 1))
+
+    def rows(high, low):
+        return -model.bases[0].split(u[:, 0], u[:, 0] > high, u[:, 0] < low)
+
+    y = 2.0 * rows(*true) @ np.array([1.0, *true]) + 0.001 * rng.normal(size=400)
+    expected = model.settled(rows(*true), y, u, at)
+    for high, low in ((0.0, 0.0), (0.01, -0.9), (0.97, 0.0)):  # inputs of a saturation are never inside the first
+        assert_allclose(model.settled(rows(high, low), y, u, at), expected)

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.what_works import COLUMNS, PAIRS, cells_of
 
-PAGE = pathlib.Path(__file__).parents[1] / "docs" / "choosing_a_tracker.md"
+PAGE = pathlib.Path(__file__).parents[1] / "docs" / "tracking.md"
 CHEAP = ("gaps", "smooth", "forecast", "simulate", "gains", "C")
 ROWS = ("ARX, Kalman", "ARX, RLS", "ARX, FLS", "ARX, InstrumentalVariables", "Regression, DynamicGLM")
 

@@ -130,7 +130,10 @@ class Clock:
                 f"dt={self.count:g} has no unit, but time consists of dates; give one, as in dt='{self.count:g}s'."
             )
         if self.kind not in ("number", "unset", LABEL) and not dates:
-            raise ValueError(f"dt={self.plain!r} is for dates, but time is numeric: give dt in the unit of time.")
+            years = ", as in dt=1 for the years 1970, 1971, .." if self.kind == "month" and self.count % 12 == 0 else ""
+            raise ValueError(
+                f"dt={self.plain!r} is for dates, but time is numeric: give dt in the unit of time{years}."
+            )
 
     def at(self, time: Any) -> Clock:
         """This clock with days and months in the zone of a time that has one."""

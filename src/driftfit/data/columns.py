@@ -6,6 +6,7 @@ not a number raises an error that names its row and its text.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,10 @@ from driftfit.engine.settings import as_numbers, near
 
 MISSING = ("", "na", "n/a", "nan", "null", "none", "#n/a", ".")
 """Cell contents that mean "no value", in lower case; spreadsheets write #N/A, SAS and central banks a dot."""
+
+
+FILE = "file"
+"""The name with which ``by`` refers to the file that a row comes from."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +52,24 @@ class Columns:
     rows: int
 
 
-def convert(frame: nw.DataFrame[Any], wanted: Wanted, where: str, base: int) -> Columns:
-    """The wanted columns of one table as arrays; ``base`` is the number of its first row."""
+def convert(frame: nw.DataFrame[Any], wanted: Wanted, where: str, base: int, rows: slice | None = None) -> Columns:
+    """The wanted columns of one table as arrays; ``base`` is the number of its first row.
+
+    Of ``rows`` alone every cell is read; but the dates of all rows show whether their day or month comes first.
+    """
     names = plain_names(frame.columns, wanted.names)
     if names != frame.columns:
         frame = frame.rename(dict(zip(frame.columns, names, strict=True)))
     for name in wanted.names:
         if name not in frame.columns:
             raise ValueError(f"{where} has no column {name!r}: {near(name, frame.columns)}")
-    time, zone = (None, None) if wanted.time is None else times_of_column(frame[wanted.time], where, base)
+    dates = None if wanted.time is None else frame[wanted.time]
+    first = day_first(_as_text(dates)) if dates is not None and _is_text(dates) else None
+    if rows is not None:
+        frame, base = frame[rows], base + (rows.start or 0)
+    time, zone = (None, None)
+    if wanted.time is not None:
+        time, zone = times_of_column(frame[wanted.time], where, base, first)
     numbers = {name: numbers_of(frame[name], where, base) for name in wanted.numbers}
     return Columns(numbers, time, zone, [_units(frame[name]) for name in wanted.by], len(frame))
 
@@ -98,19 +112,39 @@ def _numbers_of_text(text: pl.Series, where: str, base: int) -> Array:
     if len(wrong):
         raise ValueError(
             f"{where}, row {wrong[0] + base} of column {text.name!r} holds {text[wrong[0]]!r}, which is not a number "
-            f"({len(wrong)} such cells); leave a cell empty where there is no value."
+            f"({_count(len(wrong))}); {_advice(text[wrong[0]], wrong.to_list() == [0] and base == 1)}."
         )
     return np.array(values.fill_null(np.nan).to_numpy())
 
 
-def times_of_column(series: nw.Series[Any], where: str, base: int) -> tuple[Array, str | None]:
-    """(numbers or datetime64 in UTC, zone); NaN or NaT for rows without a time."""
+def _count(wrong: int) -> str:
+    return "1 such cell" if wrong == 1 else f"{wrong} such cells"
+
+
+def _advice(cell: str, second_line: bool) -> str:
+    """What to do about a cell that is not a number."""
+    if re.search(r"\d[ ,'\u00a0\u2019\u202f]\d{3}", cell):
+        return "write numbers without signs between thousands"
+    if re.fullmatch(r"[+-]?\d*,\d+", cell):
+        return "write numbers with a decimal point, or, on the command line, give --decimal ,"
+    if second_line and not re.search(r"\d", cell):
+        return "if this line holds units, put # before it"
+    return "leave a cell empty where there is no value"
+
+
+def times_of_column(
+    series: nw.Series[Any], where: str, base: int, first: bool | None = None
+) -> tuple[Array, str | None]:
+    """(numbers or datetime64 in UTC, zone); NaN or NaT for rows without a time.
+
+    ``first``: whether dates such as 1/2/2024 begin with the day; None: the column shows it.
+    """
     if _is_text(series):
         text = _as_text(series)
         compact = bool(text.drop_nulls().str.contains(f"^{DAY}$").all()) and text.null_count() < len(text)
         if not compact and text.cast(pl.Float64, strict=False).is_null().eq(text.is_null()).all():
             return _numbers_of_text(text, where, base), None
-        series = nw.from_native(_dates_of_text(text, where, base), series_only=True)
+        series = nw.from_native(_dates_of_text(text, where, base, first), series_only=True)
     native: Any = series.to_native()
     if str(getattr(native, "dtype", "")).startswith("period["):  # pandas: periods, which narwhals does not know
         return np.asarray(native.dt.to_timestamp().to_numpy()), None
@@ -132,11 +166,22 @@ DAY_FIRST = r"^(\d{1,2})([./-])(\d{1,2})[./-](\d{4})(?:[ T]+(\d{1,2}:\d{2}(?::\d
 """31.1.2024, 31/01/2024 12:00, 1/31/2024: day, separator, month (or the reverse), year, time of day."""
 
 
-def _year_first(text: pl.Series, where: str) -> pl.Series:
+def day_first(text: pl.Series) -> bool | None:
+    """Whether dates that end with the year begin with the day; None if no cell shows it.
+
+    With dots the day is first. With another separator a number above 12 shows which of the two it is.
+    """
+    dates = text.filter(text.str.contains(DAY_FIRST).fill_null(False))
+    first, second = (dates.str.extract(DAY_FIRST, k).cast(pl.Int64) for k in (1, 3))
+    if (len(dates) and (dates.str.extract(DAY_FIRST, 2) == ".").all()) or (first > 12).any():
+        return True
+    return False if (second > 12).any() else None
+
+
+def year_first(text: pl.Series, where: str, begins: bool | None = None) -> pl.Series:
     """Dates that end with the year, or have no hyphens (20240131), as 2024-01-31; other columns as they are.
 
-    With dots the day is first. With another separator a number above 12 shows which of the two it is; ValueError if
-    there is none.
+    ``begins``: whether they begin with the day; None: the column shows it, or ValueError.
     """
     known = text.drop_nulls()
     if len(known) and known.str.contains(f"^{DAY}$").all():
@@ -144,13 +189,13 @@ def _year_first(text: pl.Series, where: str) -> pl.Series:
     if not len(known) or not known.str.contains(DAY_FIRST).all():
         return text
     first, second = (text.str.extract(DAY_FIRST, k).cast(pl.Int64) for k in (1, 3))
-    dots = bool((known.str.extract(DAY_FIRST, 2) == ".").all())
-    if not dots and not (first > 12).any() and not (second > 12).any():
+    begins = day_first(known) if begins is None else begins
+    if begins is None:
         raise ValueError(
             f"{where}: the dates of column {text.name!r}, such as {known[0]!r}, may have the day or the month first, "
             "and none of them shows which; write them as 2024-01-31."
         )
-    day, month = (first, second) if dots or (first > 12).any() else (second, first)
+    day, month = (first, second) if begins else (second, first)
     parts = pl.DataFrame({
         "year": text.str.extract(DAY_FIRST, 4), "month": month.cast(pl.String).str.zfill(2),
         "day": day.cast(pl.String).str.zfill(2), "clock": text.str.extract(DAY_FIRST, 5).fill_null("00:00:00"),
@@ -161,11 +206,11 @@ def _year_first(text: pl.Series, where: str) -> pl.Series:
     return dates.alias(text.name).zip_with(text.is_not_null(), pl.Series([None], dtype=pl.String))
 
 
-def _dates_of_text(text: pl.Series, where: str, base: int) -> pl.Series:
+def _dates_of_text(text: pl.Series, where: str, base: int, first: bool | None) -> pl.Series:
     begin = periods(text.to_list())
     try:
         if begin is None:
-            dates = _year_first(text, where).str.to_datetime(time_unit="us", strict=False)
+            dates = year_first(text, where, first).str.to_datetime(time_unit="us", strict=False)
         else:
             dates = pl.Series(text.name, begin)
     except pl.exceptions.ComputeError:  # the first cells contain no date from which to infer the format

@@ -1,20 +1,17 @@
-"""Files: CSV and Parquet, one or many, read with polars.
+"""Files: CSV (`driftfit.data.formats`) and Parquet, one or several, read with polars.
 
-CSV is read as text, so that messages can name a cell that is not a number. Lines that begin with # are comments. The
-header determines whether cells are separated by comma, semicolon or tab, or a line such as ``sep=;`` before it, which
-spreadsheets write. Where semicolons separate cells, numbers may have decimal commas, and dots between thousands, also
-whole numbers in a file where others have decimal commas. A column that occurs twice cannot be used. Text that is
-neither UTF-8 nor UTF-16 with a byte order mark is taken as Windows-1252. If some of several files cannot be read, they
-are left out with a warning and kept with their reasons.
+If some of several files cannot be read, they are left out with a warning and kept with their reasons.
 """
 
 from __future__ import annotations
 
+import csv
 import glob
+import gzip
 import io
 import os
-import re
 import warnings
+import zlib
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,12 +20,19 @@ import narwhals as nw
 import numpy as np
 import polars as pl
 
-from driftfit.data.columns import MISSING, Columns, Wanted, convert, plain_names
+from driftfit.data.columns import FILE, Columns, Wanted, convert
+from driftfit.data.formats.csv_files import read_csv, start_of
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
-FILE = "file"
-"""The name with which ``by`` refers to the file that a row comes from."""
+OTHER = {
+    b"PK\x03\x04": "an Excel workbook or a ZIP archive",
+    b"\xd0\xcf\x11\xe0": "an Excel workbook",
+    b"\x89HDF": "an HDF5 file",
+    b"SQLite format": "an SQLite database",
+    b"MATLAB 5.0": "a MATLAB file",
+}
+"""The first bytes of files that are often passed instead."""
 
 
 def read_columns(path: str | os.PathLike[str], names: Sequence[str], time: str | None = None) -> dict[str, Array]:
@@ -98,8 +102,15 @@ def paths_of(data: Any) -> list[str]:
 def read_file(
     source: str | bytes, wanted: Wanted, where: str, separator: str | None = None, decimal: str = "."
 ) -> nw.DataFrame[Any]:
-    """The wanted columns of one file, given by its path or its contents; `_csv` explains separator and decimal."""
-    start = _start(source)
+    """The wanted columns of one file, given by its path or its contents; `read_csv` says how CSV is read."""
+    if (start := start_of(source)).startswith(b"\x1f\x8b"):
+        try:
+            source = gzip.decompress(source if isinstance(source, bytes) else Path(source).read_bytes())
+        except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+            raise ValueError(f"{where} cannot be decompressed: {error}") from None
+        start = start_of(source)
+    if kind := next((kind for first, kind in OTHER.items() if start.startswith(first)), None):
+        raise ValueError(f"{where} is {kind}; write its table to a CSV or Parquet file.")
     parquet = start[:4] == b"PAR1" or (isinstance(source, str) and Path(source).suffix.lower() in (".parquet", ".pq"))
     try:
         if parquet:
@@ -107,8 +118,8 @@ def read_file(
             names = list(pl.read_parquet_schema(opened))
             frame = pl.read_parquet(opened, columns=[name for name in names if name in wanted.names])
         else:
-            names, frame = _csv(source, start, wanted, separator, decimal)
-    except (pl.exceptions.PolarsError, UnicodeDecodeError) as error:
+            names, frame = read_csv(source, wanted, separator, decimal)
+    except (pl.exceptions.PolarsError, csv.Error, ValueError) as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{where} cannot be read as {'Parquet' if parquet else 'CSV'}: {text}") from None
     for name in (name for name in wanted.names if not (name == FILE and FILE in wanted.by)):
@@ -121,92 +132,6 @@ def read_file(
     if frame.height == 0:
         raise ValueError(f"{where} has a header but no rows.")
     return nw.from_native(frame, eager_only=True)
-
-
-def _csv(
-    source: str | bytes, start: bytes, wanted: Wanted, separator: str | None, decimal: str
-) -> tuple[list[str], pl.DataFrame]:
-    """(all column names, one that occurs twice as often as it occurs; the wanted columns as text).
-
-    Without ``separator`` the header determines whether it is , ; or tab. ``decimal=","`` is for files that say so;
-    with "." numbers may still have decimal commas where semicolons separate cells.
-    """
-    encoding = _encoding(start)
-    text = start.decode(encoding, errors="replace").splitlines()
-    header = next((line for line in text if not line.startswith("#")), "")
-    declared = re.fullmatch(r"\ufeff?sep=(.)\s*", header, re.IGNORECASE)
-    sign = declared[1] if declared else max(";\t" if decimal == "," else ",;\t", key=header.count)
-    options: dict[str, Any] = {"infer_schema": False, "comment_prefix": "#", "separator": separator or sign}
-    options |= {"encoding": encoding, "skip_rows": 1 if declared else 0}
-    raw = pl.read_csv(source, n_rows=0, **options).columns
-    cells = pl.read_csv(source, n_rows=1, has_header=False, **options).rows()[0]
-    again = [str(cell) for k, cell in enumerate(cells) if cell in cells[:k]]  # polars gives these another name
-    names = plain_names(raw, [name for name in wanted.names if name != FILE])
-    chosen = {old: new for old, new in zip(raw, names, strict=True) if new in wanted.names}
-    frame = pl.read_csv(source, columns=list(chosen), **options).rename(chosen)
-    numbers = [frame[name] for name in wanted.numbers if name in frame.columns]
-    if decimal == ",":
-        frame = frame.with_columns(map(_points, numbers))
-    elif options["separator"] == ";":
-        commas = any(re.search(r"(^|;)[\s\"]*[+-]?[\d.]*,\d+[\s\"]*(;|$)", line) for line in text)
-        frame = frame.with_columns(_with_points(column, commas) for column in numbers)
-    whole = frame.select(pl.col(name).str.strip_chars() for name in wanted.by if name in frame.columns)
-    return [*names, *again], frame.with_columns(_whole(column) for column in whole)
-
-
-def _start(source: str | bytes) -> bytes:
-    """The header and the first cells of a file."""
-    if isinstance(source, bytes):
-        return source[: 1 << 16]
-    with open(source, "rb") as file:
-        return file.read(1 << 16)
-
-
-def _encoding(start: bytes) -> str:
-    """The encoding of a file, judged by its header and its first cells."""
-    if start.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return "utf-16"
-    try:
-        start[: start.rfind(b"\n") + 1 or None].decode("utf-8")
-    except UnicodeDecodeError:
-        return "windows-1252"
-    return "utf8"
-
-
-COMMA = r"^\s*[+-]?(\d+|\d{1,3}(\.\d{3})+)?(,\d*)?([eE][+-]?\d+)?\s*$"
-"""A number with a decimal comma, perhaps with dots between thousands."""
-
-
-GROUPED = r"^\s*[+-]?([1-9]\d{0,2}(\.\d{3})+|\d+)\s*$"
-"""A whole number, perhaps with dots between thousands."""
-
-
-def _with_points(text: pl.Series, commas: bool) -> pl.Series:
-    """A column with decimal points instead of decimal commas, and without dots between thousands.
-
-    In a file with decimal ``commas`` the dots of a column of whole numbers are between thousands too.
-    """
-    known = text.filter(~text.str.strip_chars().str.to_lowercase().is_in(MISSING))
-    comma = known.str.contains(",", literal=True)
-    if not comma.any():
-        return _points(text) if commas and known.str.contains(GROUPED).all() else text
-    if not known.filter(comma).str.contains(COMMA).all():
-        return text
-    if known.filter(~comma).str.contains(r"\.\d{0,2}$|\.\d{4,}").any():
-        return text  # a mixture of both: the error message names the cell
-    return _points(text)
-
-
-def _points(text: pl.Series) -> pl.Series:
-    """A column with a decimal point instead of a comma; points that group thousands are removed."""
-    plain = text.str.replace_all(".", "", literal=True).str.replace(",", ".", literal=True)
-    return plain.zip_with(text.str.contains(COMMA).fill_null(False), text)
-
-
-def _whole(text: pl.Series) -> pl.Series:
-    """A column that names units. In a file of text it has no type; it becomes integers if every cell is one."""
-    whole = text.cast(pl.Int64, strict=False)
-    return whole if whole.cast(pl.String).eq_missing(text).all() else text
 
 
 def _together(parts: Mapping[str, Columns]) -> Columns:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,11 @@ class Known:
 
     def __len__(self) -> int:
         return len(self.columns)
+
+    @cached_property
+    def lanes(self) -> Array:
+        """The columns of one output with an axis for its lane, (T, k, 1) or (1, k, 1)."""
+        return self.columns[:, :, None]
 
     @property
     def constant(self) -> bool:

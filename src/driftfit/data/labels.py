@@ -132,7 +132,10 @@ def dated(index: Any) -> bool:
 
 
 PERIODS = {"Q": "quarter", "M": "month", "Y": "year", "A": "year"}
-"""The dt of an index of periods, by the first letter of its frequency; days leave out weekends."""
+"""The step of the calendar, as `dt` names it, by the first letter of the frequency of an index of periods.
+
+Days are not among them: an index of days usually leaves out weekends on purpose.
+"""
 
 
 def warn_of_skipped_periods(index: Any) -> None:

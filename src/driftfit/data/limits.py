@@ -23,7 +23,7 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from driftfit.data.times.instants import instant
+from driftfit.data.times.instants import instant, with_hyphens
 from driftfit.data.times.periods import span
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
@@ -123,10 +123,10 @@ def shared_code(y: Array, u: Array) -> tuple[float, Array]:
     if not u.shape[1]:
         return NO_CODE
     first = y if y.ndim == 1 else y[:, 0]
-    same = first == u[:, 0]
-    if not np.count_nonzero(same):  # nearly always, so it must cost little
+    (same,) = (first == u[:, 0]).nonzero()
+    if not len(same):  # nearly always, so it must cost little
         return NO_CODE
-    same = np.flatnonzero(same & (np.abs(first) < LARGEST))  # larger numbers count as missing
+    same = same[np.abs(first[same]) < LARGEST]  # larger numbers count as missing
     for column in (*y.reshape(len(y), -1).T[1:], *u.T[1:]):
         same = same[column[same] == first[same]]
     if len(same) > 1:
@@ -223,7 +223,9 @@ def _stamp(given: Any, upper: int) -> Any:
     if (found := span(given)) is not None:
         return np.datetime64(found[1] - timedelta(1) if upper else found[0])
     zoned = re.search(r"\d\d:\d\d.*([+-]\d\d:?\d\d|Z)$", given.strip())
-    return datetime.fromisoformat(given) if zoned else np.datetime64(given)
+    if not zoned and np.isnat(np.datetime64(with_hyphens(given))):
+        raise ValueError("not a date")
+    return datetime.fromisoformat(given) if zoned else np.datetime64(with_hyphens(given))
 
 
 def _in_utc(moment: Any, given: Any, zone: str | None) -> Any:

@@ -17,7 +17,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from driftfit.data.clock import LABEL, Clock
-from driftfit.data.known import Known
+from driftfit.data.known import Known, row_of
 from driftfit.data.labels import held, ordered, times_of, together
 from driftfit.data.limits import Limits, marked, within_each
 from driftfit.data.signals import as_inputs, as_output, intervals, noise_of
@@ -158,7 +158,7 @@ class Records(NamedTuple):
     @property
     def ny(self) -> int:
         """Number of outputs of every series."""
-        return max(len(self.outputs), 1)
+        return len(self.outputs) or 1
 
     def part(self, k: int) -> Record:
         """Series k; its arrays are views."""
@@ -276,18 +276,21 @@ FIRST = np.zeros(1, dtype=int)
 
 def one_series(y: Any, u: Any, reading: Reading) -> Records:
     """One series; y (T,), u (T,), (T, m) or None."""
+    time, dt, weights, drift, *_ = reading
+    if type(y) is type(u) is np.ndarray and time is dt is None and type(weights) is type(drift) is float:
+        # what most calls give has neither names nor an index
+        output = as_output(y)
+        T = len(output)
+        known = row_of(1.0, noise_of(weights, T), factor("drift", drift))
+        return Records((0,), FIRST, np.array((T,)), output, as_inputs(u, T), known)
     given_y, given_u = held("y", y), held("u", u)
-    weights, drift = reading.weights, reading.drift
-    if type(weights) is type(drift) is float:  # what most calls give
-        together(y=given_y, u=given_u)
-    else:
-        given_weights, given_drift = held("weights", weights), held("drift", drift)
-        together(y=given_y, u=given_u, weights=given_weights, drift=given_drift)
-        weights, drift = given_weights.values, given_drift.values
+    given_weights, given_drift = held("weights", weights), held("drift", drift)
+    together(y=given_y, u=given_u, weights=given_weights, drift=given_drift)
+    weights, drift = given_weights.values, given_drift.values
     output = as_output(given_y.values)
     T = len(output)
-    times = times_of(reading.time, (given_y, given_u) if reading.indexed else (), reading.dt)
-    dt = LABEL if times.labels and reading.dt is None else reading.dt
+    times = times_of(time, (given_y, given_u) if reading.indexed else (), dt)
+    dt = LABEL if times.labels and dt is None else dt
     axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
     common, drifts = (1.0, as_numbers("drift", drift)) if axes(drift) == 2 else (drift, None)
     known = Known.of(gaps, noise_of(weights, T), factor("drift", common, T))

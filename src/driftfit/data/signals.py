@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from driftfit.data.clock import LABEL, Clock
-from driftfit.data.times.instants import instants, warn_of_written_numbers
+from driftfit.data.times.instants import instants, warn_of_counted_years, warn_of_written_numbers
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, as_numbers, factor, missing_settings
 
@@ -75,6 +75,7 @@ def intervals(time: Any, dt: Any, T: int) -> tuple[Array, Array]:
             "sort the record and drop repeated times first."
         )
     clock = Clock.of(dt)
+    warn_of_counted_years(axis)
     if clock.kind != LABEL:
         warn_of_written_numbers(axis)
     return axis, clock.steps(axis)

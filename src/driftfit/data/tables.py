@@ -20,7 +20,7 @@ from driftfit.data.known import Known
 from driftfit.data.labels import dated, warn_of_skipped_periods
 from driftfit.data.record import Labels, Reading, Records, drift_of
 from driftfit.data.signals import noise_of
-from driftfit.data.times.instants import warn_of_summer_time, warn_of_written_numbers
+from driftfit.data.times.instants import warn_of_counted_years, warn_of_summer_time, warn_of_written_numbers
 from driftfit.engine.kernel import Array
 
 
@@ -38,6 +38,8 @@ def read_records(
     """
     data, reading = _dated(data, by, reading)
     inputs, weights, drift, time = _names("u", u), reading.weights, reading.drift, reading.time
+    if y in inputs:
+        raise ValueError(f"u contains the output {y!r}, which would explain itself; its past is in models such as ARX.")
     axis = None if time is None else _name("time", time)
     each = () if isinstance(drift, str) or np.ndim(drift) == 0 else _names("drift", drift)
     factors = [*(name for name in (weights, drift) if isinstance(name, str)), *each]
@@ -54,8 +56,10 @@ def read_records(
     first = (np.cumsum(length) - length)[there]
     values = {name: column[order] for name, column in columns.numbers.items()}
     clock = Clock.of(reading.dt, columns.zone)
-    if times is not None and clock.kind != LABEL:
-        warn_of_written_numbers(times)
+    if times is not None:
+        warn_of_counted_years(times)
+        if clock.kind != LABEL:
+            warn_of_written_numbers(times)
     known = Known.of(
         1.0 if times is None else _gaps(times, first, clock),
         _factor(weights, values, noise_of),

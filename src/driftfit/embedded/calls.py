@@ -34,7 +34,7 @@ class Calls(Expressions):
             return arguments[0]  # C passes addresses one by one
         if function in (kernel.floats, kernel.wholes, kernel.cubes):
             return self._at_address(arguments)
-        if function is simd.in_blocks:
+        if function in (simd.in_blocks, simd.in_fours):
             return number(False)
         if function in FOUR or function is simd.reached:
             return self._of_four(function, arguments)

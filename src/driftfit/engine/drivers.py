@@ -23,6 +23,7 @@ from numba import types
 from driftfit.engine.compile_notice import compiling
 from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
+from driftfit.engine.simd import fill_four, four_of, in_fours, load_four, store_four, times
 from driftfit.engine.tiles import as_compiled, inputs_and_lanes, tile_type
 from driftfit.engine.tracker_part import tracker_part, whole_record
 
@@ -105,8 +106,13 @@ def in_units_of_noise(variance: float, scale: float) -> float:
 @kernel
 def diagonal(s: State, l: int) -> None:
     """Report the diagonal of P, times the estimated noise variance where the tracker carries one."""
-    for i in range(s.theta.shape[0]):
-        s.var[i, l] = in_units_of_noise(s.P[i, i, l], s.scale[l])
+    n, scale = s.theta.shape[0], s.scale[l]
+    whole = n - n % 4 if in_fours(s) and scale >= 0.0 else 0
+    for i in range(0, whole, 4):
+        P = four_of((s.P[i, i, 0], s.P[i + 1, i + 1, 0], s.P[i + 2, i + 2, 0], s.P[i + 3, i + 3, 0]))
+        store_four(s.var, i, 0, times(P, fill_four(scale)))
+    for i in range(whole, n):
+        s.var[i, l] = in_units_of_noise(s.P[i, i, l], scale)
 
 
 @kernel
@@ -270,8 +276,8 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE) -> None:
         # nothing looks at types and bounds after this
-        flags = y.flags.num & u.flags.num & known.flags.num & tile.flags.num & out.flags.num & theta.flags.num
-        plain = flags & CONTIGUOUS == CONTIGUOUS
+        flags = y.flags.num & u.flags.num & known.flags.num & tile.flags.num & out.flags.num
+        plain = (flags if theta is NOWHERE else flags & theta.flags.num) & CONTIGUOUS == CONTIGUOUS
         if not (plain and y.dtype is u.dtype is known.dtype is DOUBLE):
             # contiguous, because every layout would be compiled separately
             y = np.ascontiguousarray(y, dtype=np.float64)
@@ -298,10 +304,15 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
 def write_common(o: State, s: State) -> None:
     """The results of every tracker."""
     n, L = s.theta.shape
-    for i in range(n):
+    whole = n - n % 4 if in_fours(s) else 0
+    for i in range(0, whole, 4):
+        theta, var = load_four(s.theta, i, 0), load_four(s.var, i, 0)
+        store_four(o.theta, i, 0, theta)
+        store_four(o.var, i, 0, var)
+    for i in range(whole, n):
         for l in range(L):
             o.theta[i, l] = s.theta[i, l]
-    for i in range(n):
+    for i in range(whole, n):
         for l in range(L):
             o.var[i, l] = s.var[i, l]
     for l in range(L):
@@ -309,6 +320,18 @@ def write_common(o: State, s: State) -> None:
         o.e[l] = s.e[l]
         o.s[l] = s.s[l]
         o.ok[l] = s.ok[l]
+
+
+@kernel
+def store_theta(s: State, theta: Array, t: int) -> None:
+    """theta alone, as row t of theta (T, n, L)."""
+    n, L = s.theta.shape
+    whole = n - n % 4 if in_fours(s) else 0
+    for i in range(0, whole, 4):
+        store_four(theta, t, i, load_four(s.theta, i, 0))
+    for i in range(whole, n):
+        for l in range(L):
+            theta[t, i, l] = s.theta[i, l]
 
 
 @kernel
@@ -362,7 +385,7 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: A
         given = u.shape[1] > 0
         changing = 1 if known.shape[0] > 1 else 0
         alone = theta.shape[0] > 0
-        kept = 0 if alone else 1
+        kept, last = 0 if alone else 1, y.shape[0] - 1
         for t in range(y.shape[0]):
             for l in range(L):
                 s.y[l] = y[t, l]
@@ -378,11 +401,10 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: A
                     for l in range(L):
                         s.u[j, l] = u[t, j, l]
             sample(s)
-            write(out[t * kept], s)
             if alone:
-                for i in range(s.theta.shape[0]):
-                    for l in range(L):
-                        theta[t, i, l] = s.theta[i, l]
+                store_theta(s, theta, t)
+            if not alone or t == last:
+                write(out[t * kept], s)
 
     return run
 

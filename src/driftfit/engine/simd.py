@@ -68,6 +68,7 @@ class _Model2(models.PrimitiveModel):
 
 
 vector8, vector4, vector2 = Vector8(), Vector4(), Vector2()
+_LLVM = {vector8: _VECTOR8, vector4: _VECTOR4, vector2: _VECTOR2}
 
 
 def _named(name: str, build: Any) -> Any:
@@ -75,49 +76,56 @@ def _named(name: str, build: Any) -> Any:
     return named_intrinsic(f"simd.{name}", build)
 
 
-def _place(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any) -> Any:
+def _place(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any, vector: Any = _VECTOR8) -> Any:
     """The address of entry [row, column]."""
     inside = context.make_array(kind)(context, builder, array)
     columns = builder.extract_value(inside.shape, 1)
     first = builder.gep(inside.data, [builder.add(builder.mul(row, columns), column)])
-    return builder.bitcast(first, _VECTOR8.as_pointer())
+    return builder.bitcast(first, vector.as_pointer())
 
 
-def _load(context: Any, array: Any, row: Any, column: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return builder.load(_place(context, builder, signature.args[0], *given), align=8)
+def _load(of: Any) -> Any:
+    def typed(context: Any, array: Any, row: Any, column: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+            return builder.load(
+                _place(context, builder, signature.args[0], given[0], given[1], given[2], _LLVM[of]), align=8
+            )
 
-    return vector8(array, types.intp, types.intp), build
+        return of(array, types.intp, types.intp), build
 
-
-def _load_four(context: Any, array: Any, row: Any, column: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        first = _place(context, builder, signature.args[0], *given)
-        return builder.load(builder.bitcast(first, _VECTOR4.as_pointer()), align=8)
-
-    return vector4(array, types.intp, types.intp), build
+    return typed
 
 
-def _store(context: Any, array: Any, row: Any, column: Any, value: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        builder.store(given[3], _place(context, builder, signature.args[0], *given[:3]), align=8)
-        return context.get_dummy_value()
+def _store(of: Any) -> Any:
+    def typed(context: Any, array: Any, row: Any, column: Any, value: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+            place = _place(context, builder, signature.args[0], given[0], given[1], given[2], _LLVM[of])
+            builder.store(given[3], place, align=8)
+            return context.get_dummy_value()
 
-    return types.void(array, types.intp, types.intp, vector8), build
+        return types.void(array, types.intp, types.intp, of), build
 
-
-def _fill(context: Any, value: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return _spread(builder, given[0], _VECTOR8)
-
-    return vector8(types.float64), build
+    return typed
 
 
-def _fill_four(context: Any, value: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return _spread(builder, given[0], _VECTOR4)
+def _fill(of: Any) -> Any:
+    def typed(context: Any, value: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+            return _spread(builder, given[0], _LLVM[of])
 
-    return vector4(types.float64), build
+        return of(types.float64), build
+
+    return typed
+
+
+def _made_of(of: Any) -> Any:
+    def typed(context: Any, numbers: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+            return _assembled(builder, [builder.extract_value(given[0], k) for k in range(len(numbers))], _LLVM[of])
+
+        return of(numbers), build
+
+    return typed
 
 
 def _pair_place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
@@ -161,13 +169,6 @@ def _put_eight(context: Any, array: Any, at: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.intp, vector8), build
-
-
-def _eight_of(context: Any, numbers: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return _assembled(builder, [builder.extract_value(given[0], k) for k in range(WIDTH)], _VECTOR8)
-
-    return vector8(numbers), build
 
 
 def _assembled(builder: Any, entries: Any, kind: Any) -> Any:
@@ -216,13 +217,18 @@ def _transposed(builder: Any, rows: Any) -> Any:
     return rows
 
 
-def _in_blocks(context: Any, record: Any) -> Any:
-    n, L = record.fields["theta"].type.shape if isinstance(record, types.Record) else (0, 0)
+def _one_lane(least: int, most: int) -> Any:
+    """Whether a record has one lane and so many parameters, as its type says."""
 
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return ir.Constant(ir.IntType(1), n > UNROLLED and L == 1)
+    def typed(context: Any, record: Any) -> Any:
+        n, L = record.fields["theta"].type.shape if isinstance(record, types.Record) else (0, 0)
 
-    return types.boolean(record), build
+        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+            return ir.Constant(ir.IntType(1), least <= n <= most and L == 1)
+
+        return types.boolean(record), build
+
+    return typed
 
 
 def _two_of(context: Any, first: Any, second: Any) -> Any:
@@ -232,11 +238,11 @@ def _two_of(context: Any, first: Any, second: Any) -> Any:
     return vector2(types.float64, types.float64), build
 
 
-def _one_of_two(context: Any, pair: Any, k: Any) -> Any:
+def _one_of(context: Any, vector: Any, k: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         return builder.extract_element(given[0], builder.trunc(given[1], ir.IntType(32)))
 
-    return types.float64(vector2, types.intp), build
+    return types.float64(vector, types.intp), build
 
 
 def _gather(context: Any, array: Any, row: Any, order: Any, k: Any) -> Any:
@@ -391,11 +397,11 @@ def _sums(context: Any, array: Any, row: Any) -> Any:
     return vector8(array, types.intp), build
 
 
-load = _named("load", _load)
+load = _named("load", _load(vector8))
 """Entries [row, column] to [row, column + 7] of a matrix."""
-store = _named("store", _store)
+store = _named("store", _store(vector8))
 """Write a vector there."""
-fill = _named("fill", _fill)
+fill = _named("fill", _fill(vector8))
 """A vector of one number, eight times."""
 plus, minus, times, over = (
     _named(name, _two(operation))
@@ -411,15 +417,18 @@ gathered = _named("gathered", _gather)
 """Entries [row, order[k]] to [row, order[k + 7]] of a matrix."""
 reached = _named("reached", _reached)
 """How many entries of the first are at least those of the second."""
-load_four, fill_four = _named("load_four", _load_four), _named("fill_four", _fill_four)
-"""The same for vectors of four."""
+load_four, fill_four = _named("load_four", _load(vector4)), _named("fill_four", _fill(vector4))
+store_four, four_of = _named("store_four", _store(vector4)), _named("four_of", _made_of(vector4))
+"""The same for vectors of four; and one of the four numbers of a tuple. A vector that is loaded right after its entries
+were stored one by one waits until all of them are in the cache, so such entries are put together with `four_of`.
+"""
 pair, put_pair = _named("pair", _pair), _named("put_pair", _put_pair)
 """Pair ``at`` of an array whose last axis is 2, counted over its other axes; and write it there."""
-two, entry = _named("two", _two_of), _named("entry", _one_of_two)
-"""A pair of two numbers; and entry k of a pair."""
+two, entry = _named("two", _two_of), _named("entry", _one_of)
+"""A pair of two numbers; and entry k of a pair or of a vector of four."""
 eight_at, put_eight = _named("eight_at", _eight_at), _named("put_eight", _put_eight)
 """Entries ``at`` to at + 7 of an array, counted over all its axes; and write them there."""
-eight_of = _named("eight_of", _eight_of)
+eight_of = _named("eight_of", _made_of(vector8))
 """A vector of the eight numbers of a tuple."""
 add_in_order = _named("add_in_order", _add_in_order)
 """A number plus the eight entries of a vector, added one after the other."""
@@ -427,10 +436,12 @@ add_products = _named("add_products", _add_products)
 """Eight sums plus the products of eight rows with x, which are added one after the other. Row k begins at entry
 at + k columns of an array.
 """
-in_blocks = _named("in_blocks", _in_blocks)
-"""Whether a record has one lane and more than `UNROLLED` parameters, as its type says: steps that are compiled once for
-all sizes, and those that are exported to C, do without vectors.
+in_fours = _named("in_fours", _one_lane(4, UNROLLED))
+"""Whether a record has one lane and four to `UNROLLED` parameters, as its type says: the compiler leaves these loops as
+single numbers. Steps that are compiled once for all sizes, and those that are exported to C, do without vectors.
 """
+in_blocks = _named("in_blocks", _one_lane(UNROLLED + 1, 2**31))
+"""Whether it has one lane and more parameters."""
 sum_of = _named("sum_of", _sum)
 """The sum of the eight entries, added in pairs."""
 lower, higher = (_named(name, _pick(sign)) for name, sign in (("lower", "<"), ("higher", ">")))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
+from itertools import groupby
 from typing import Any
 
 import numba
@@ -55,12 +56,12 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
     """A tile of ``len(trackers)`` lanes: an array of one record, its fields set to the given starts.
 
     ``model`` and each entry of ``trackers`` map field names to start values without the lane axis; the shapes of the
-    values are the shapes of the fields. All trackers must have the same fields.
+    values are the shapes of the fields. All trackers must have the same fields; what both give is that of the tracker.
     """
-    L, inputs = len(trackers), {"u": np.zeros(max(m, 1))}
-    starts = [{**start, **_common(n), **model, **inputs, **start} for start in trackers]
+    L, given = len(trackers), {**_common(n), **model, "u": np.zeros(max(m, 1))}
+    rest = {name: value for name, value in given.items() if name not in trackers[0]}
     fields: list[Any] = []
-    for name, value in starts[0].items():
+    for name, value in {**trackers[0], **rest}.items():
         kind = np.int64 if np.asarray(value).dtype.kind in "iub" else np.float64
         fields.append((name, kind, (*np.shape(value), L)))
     opened = [field for name in OPEN for field in fields if field[0] == name]
@@ -70,9 +71,14 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
     others = [field for field in fields if field[0] not in own]
     fields = [*tracked, _padding(BOUNDARY, tracked, L), *others]
     tile = _aligned(_one_of(_followed_by(np.dtype([*fields, _padding("padding", fields, L)], align=True), opened)), 1)
-    for l, start in enumerate(starts):
+    for name, value in rest.items():
+        tile[name][0] = np.asarray(value)[..., None]
+    first = 0
+    for _, alike in groupby(trackers, id):  # lanes that begin alike are written together
+        start, *others = alike
+        lanes, first = slice(first, first + 1 + len(others)), first + 1 + len(others)
         for name, value in start.items():
-            tile[name][0, ..., l] = value
+            tile[name][0, ..., lanes] = np.asarray(value)[..., None]
     if opened:
         tile[BOUNDARY][0, 0] = tile[opened[0][0]].ctypes.data - tile[BOUNDARY].ctypes.data
     return tile
@@ -169,7 +175,7 @@ def output_record(
     for name in names:
         own = tile[name].base
         fields.append((name, dtype if own.kind == "f" else own, tile[name].shape))
-    return np.dtype(fields, align=True)
+    return _one_of(np.dtype(fields, align=True))
 
 
 def tile_type(tile: Array) -> types.Type:

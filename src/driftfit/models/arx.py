@@ -87,7 +87,7 @@ class ARX(CountedInputs):
         bound = super().bind(inputs)
         return bound if len(self.outputs) == 1 else JointARX.from_settings(bound.settings())
 
-    @property
+    @cached_property
     def outputs(self) -> tuple[str, ...]:
         return output_names("ARX", self.ny)
 

@@ -39,6 +39,8 @@ MOST = 10
 unroll a loop over that many, and then does not vectorise the loop over lanes.
 """
 
+_NOTHING: tuple[Array, ...] = ()
+
 SHORT = 32
 """Rows of fewer numbers are copied column by column: NumPy takes 30 ns for each row."""
 
@@ -101,11 +103,11 @@ class Program:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
+        """Names of the parameters; of several with one name the later ones have a number: g, g (2)."""
         if self.output is None:
-            return self.tracker.names_for(self.model)
+            return _distinct(self.tracker.names_for(self.model))
         own = () if self.alone is None else self.alone.names
-        return tuple(f"{name}[{self.output}]" for name in own) or self.model.names_of(self.output)
+        return tuple(f"{name}[{self.output}]" for name in own) or _distinct(self.model.names_of(self.output))
 
     @property
     def start(self) -> State:
@@ -136,14 +138,12 @@ class Program:
         return {}
 
     @cached_property
-    def _begin(self) -> Array:
-        """The tile of one lane at its start."""
-        return _started([self])
-
-    @cached_property
-    def _bytes(self) -> bytes:
-        """The bytes of that tile, which are copied faster than its fields."""
-        return self._begin.tobytes()
+    def _begin(self) -> tuple[np.dtype[Any], Array | bytes]:
+        """The record of a tile, and that of one lane at its start: where it has no open fields, its bytes, which are
+        copied faster than fields.
+        """
+        tile = _started([self])
+        return tile.dtype, tile if OPEN[0] in (tile.dtype.fields or ()) else tile.tobytes()
 
     def schema(self, arrays: bool = False) -> dict[str, str]:
         """Columns and types of the results at a sample, which `to_table` writes after the signals, before any data.
@@ -208,10 +208,9 @@ class Program:
 
     def tile(self, state: State | None = None) -> Array:
         """A tile of one lane at its start, or with the given fields."""
-        if OPEN[0] in (self._begin.dtype.fields or ()):  # a bank, which reads its memory as vectors
-            tile = repeat_tile(self._begin, 1)
-        else:  # a single lane needs no alignment
-            tile = np.ndarray((1,), self._begin.dtype, bytearray(self._bytes))
+        record, start = self._begin
+        # a bank reads its memory as vectors; another single lane needs no alignment
+        tile = repeat_tile(start, 1) if isinstance(start, np.ndarray) else np.ndarray((1,), record, bytearray(start))
         if state is not None:
             put(tile, 0, state)
         return tile
@@ -222,7 +221,8 @@ class Program:
 
     def written(self, tile: Array, T: int, keep: str = "std", dtype: Any = np.float64) -> Array:
         """An array for the results of T samples of a tile."""
-        return np.empty(T, output_record(tile.dtype, self.tracker.outputs, keep, dtype))
+        record = output_record(tile.dtype, self.tracker.outputs, keep, dtype)
+        return np.ndarray(T, record, np.empty(T * record.itemsize, np.uint8))  # np.empty goes through all fields
 
     def loop(self, tile: Array, T: int, keep: str, dtype: Any, collected: bool) -> tuple[Any, Array]:
         """(the routine that runs tiles like this one, an array for the results of T samples).
@@ -253,7 +253,7 @@ class Program:
         the cache.
         """
         keep, rows = _driven(tile.dtype, self.tracker.outputs, out.dtype)
-        run, last = self.drivers(keep).run, tuple[Array, ...]()
+        run, last = self.drivers(keep).run, _NOTHING
         if out.dtype.names == ("theta",):  # the driver writes theta, and the rest of a sample over that of the last one
             last, out, rows = (np.empty(1, rows),), out["theta"], rows["theta"]
         if out.dtype == rows.base:
@@ -360,7 +360,7 @@ def lanes_of(record: Record) -> tuple[Array, Array, Array]:
     """(y, u, known) of a record in the form that drivers take: a lane for each output, all with the same inputs."""
     if record.y.ndim > 1:
         return record.y, np.repeat(record.u[:, :, None], record.y.shape[1], axis=2), record.known.columns
-    return record.y[:, None], record.u[:, :, None], record.known.columns[:, :, None]
+    return record.y[:, None], record.u[:, :, None], record.known.lanes
 
 
 def spread(record: Record, L: int) -> tuple[Array, Array, Array]:
@@ -379,6 +379,12 @@ def shown(trackers: Sequence[Tracker]) -> str:
     return repr(trackers[0]) if len(set(trackers)) == 1 else ", ".join(map(repr, trackers))
 
 
+_last: list[tuple[Any, Any, Any, tuple[Program, ...]]] = [(None, None, None, ())]
+"""The model, the tracker and the inputs of the last programs: settings do not change, and hashing them takes longer
+than all else here.
+"""
+
+
 def programs_of(model: Model, tracker: Any, inputs: int | Sequence[str]) -> tuple[Program, ...]:
     """The program of each output of a model with these inputs; outputs that share one theta have one.
 
@@ -386,9 +392,15 @@ def programs_of(model: Model, tracker: Any, inputs: int | Sequence[str]) -> tupl
     are incomplete, or that cannot run together.
     """
     if len(model.outputs) == 1:
+        before, by, of, found = _last[0]
+        if model is before and tracker is by and inputs == of:
+            return found
         if not isinstance(tracker, Tracker):
             raise ValueError(f"a model with one output takes one tracker for each series; got {tracker!r}.")
-        return _programs(model, tracker, inputs if isinstance(inputs, int) else tuple(inputs))
+        given = inputs if isinstance(inputs, int) else tuple(inputs)
+        found = _programs(model, tracker, given)
+        _last[0] = model, tracker, given, found
+        return found
     if isinstance(tracker, Mapping) and not model.shared:
         if set(tracker) != set(model.outputs):
             raise ValueError(
@@ -426,3 +438,10 @@ def _row_model(model: Model, tracker: Tracker, inputs: int | Sequence[str]) -> M
             "use FLS, Kalman or RLS with shared=True."
         )
     return replace(model, ny=1, shared=False).bind(inputs)
+
+
+def _distinct(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of which those that occur again have a number, since tables and columns are read by them."""
+    if len(set(names)) == len(names):
+        return names
+    return tuple(name if (k := names[: i + 1].count(name)) == 1 else f"{name} ({k})" for i, name in enumerate(names))

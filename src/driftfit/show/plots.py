@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def plot_track(run: Track, level: float = 0.95, ax: Any = None) -> Figure:
     """Parameters with bands, prediction against output, innovations with their band."""
-    n = run.model.n
+    n = len(run.names)
     columns = 1 if n <= 4 else 2 if n <= 12 else 4
     rows = -(-n // columns)
     heights = [*[1.5] * rows, 2.3, 1.7]

@@ -120,7 +120,8 @@ def score(task: Task, trackers: Sequence[Tracker], h: int = 1) -> Scores:
 
 def _score_tile(model: Model, record: Record, trackers: Sequence[Tracker], h: int) -> Scores:
     L = len(trackers)
-    programs = [Program(model, tracker) for tracker in trackers]
+    made = {id(tracker): Program(model, tracker) for tracker in trackers}  # lanes beyond the last setting repeat it
+    programs = [made[id(tracker)] for tracker in trackers]
     T, tile = len(record), tile_of(programs)
     steps, own = programs[0].steps, trackers[0].outputs if trackers[0].density else ()
     out = np.empty(min(BLOCK, T), output_type(tile, ("scale", "phi", *own)))

@@ -51,9 +51,13 @@ from driftfit.run.live.live import Live
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, state_of
 from driftfit.run.result import Track
+from driftfit.show.parts.text import digits, printed, table_of
 from driftfit.use.delta_method import spread
 
 DRAWS = 200
+PRINTED = 10
+"""Samples of a forecast that are printed."""
+
 CENTRAL, BISECTIONS = math.erf(math.sqrt(0.5)), 60
 """Share of futures within one half-width; and steps of its computation."""
 
@@ -69,6 +73,25 @@ class Forecast(NamedTuple):
     """(h,): NaN if an input is not known."""
     y_std: Array
     """(h,): standard deviation of the forecast error; NaN for trackers without a covariance."""
+
+    def __repr__(self) -> str:
+        """A table of the first outputs, with their standard deviations."""
+        h, means, stds = (
+            len(self.y_hat),
+            self.y_hat.reshape(len(self.y_hat), -1),
+            self.y_std.reshape(len(self.y_std), -1),
+        )
+        outputs = ["y"] if means.shape[1] == 1 else [f"y{j + 1}" for j in range(means.shape[1])]
+        table = table_of(
+            f"Forecast of {h} samples", "ahead", *(head for name in outputs for head in (name, "+-")), group=2
+        )
+        for k in range(min(h, PRINTED)):
+            pairs = zip(means[k].tolist(), stds[k].tolist(), strict=True)
+            table.add_row(str(k + 1), *(cell for mean, std in pairs for cell in (digits(mean, std), f"{std:.3g}")))
+        more = f" the first {PRINTED} of {h};" if h > PRINTED else ""
+        return printed(table, f"{more} +- one standard deviation; theta and std are those of the parameters").strip(
+            "\n"
+        )
 
 
 def forecast(run: Track, h: int, u: Any = None) -> Forecast:
@@ -246,6 +269,7 @@ class LagErrors:
             self._ll[:] = np.inf
             return np.full(len(s), np.inf) if begun else s
         a, tl, al = theta[:, :L], self._tl, self._tl[:, :L]
+        s = np.maximum(s, np.einsum("i,oij,j->o", phi, P, phi))  # less contradicts P, and a variance could be negative
         first = np.einsum("i,oij,pj->op", phi, tl, a)
         both = first + first.T + a @ self._ll @ a.T + np.einsum("oij,pji->op", al, al)
         both[np.diag_indices(len(s))] += s + np.einsum("oij,ji->o", P[:, :L, :L], self._ll)

@@ -23,6 +23,7 @@ from driftfit.cli.parts.reading import (
     rows_of,
     separator_from,
 )
+from driftfit.engine.settings import missing_settings
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.parsing.settings import parse_model, parse_tracker
@@ -112,7 +113,12 @@ class Given:
     @property
     def inputs(self) -> list[str]:
         """Names of the inputs."""
-        return listed(self.u)
+        names = listed(self.u)
+        if both := [name for name in names if name in listed(self.y)]:
+            raise ValueError(
+                f"--u {both[0]}: this is the output, which would explain itself; its past is in arx models."
+            )
+        return names
 
     def models(self) -> list[Model]:
         """The models, each bound to the inputs."""
@@ -155,6 +161,12 @@ class Given:
         from driftfit.tracking import track
 
         model, chosen, before = self._begun()
+        if tracker is None and (missing := missing_settings(chosen)):
+            typed = " ".join(f"-p {name}=..." for name in missing)
+            names = ", ".join(missing)
+            raise ValueError(
+                f"--tracker {self.tracker}: {names} must be given: {typed}; `driftfit tune` estimates them from data."
+            )
         signals: Any = self.signals(rows)
         more: Any = {} if before is None else {"warm_start": before}
         with progress.status("tracking"):

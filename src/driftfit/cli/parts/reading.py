@@ -6,6 +6,7 @@ intervals are passed on unchanged (`driftfit.data.limits`).
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 
-from driftfit.data.columns import Columns, Wanted, convert
+from driftfit.data.columns import Columns, Wanted, convert, year_first
 from driftfit.data.files import paths_of, read_file
 from driftfit.data.times.periods import EXAMPLES, span
 from driftfit.engine.kernel import Array
@@ -161,7 +162,7 @@ def _one(path: str, wanted: Wanted, part: Part) -> Columns:
     first, last = part.rows
     if len(frame) < first:
         raise ValueError(f"{where} has no row {first}.")
-    return convert(frame[first - 1 : last], wanted, where, first)
+    return convert(frame, wanted, where, 1, slice(first - 1, last))
 
 
 def _between(rows: Rows, part: Part) -> Rows:
@@ -187,10 +188,16 @@ def moment(text: str, axis: Array, zone: str | None, end: bool = False) -> Any:
             return float(text)
         except ValueError:
             raise ValueError(f"{text!r} is not a number, but the times of the record are.") from None
-    if (days := span(text)) is not None:
+    text = text.strip()
+    if re.fullmatch(r"\d{4}", text):
+        text += "-12-31" if end else "-01-01"
+    elif (days := span(text)) is not None:
         text, end = (str(days[1] - timedelta(1)), True) if end else (str(days[0]), False)
+    else:
+        end = end and ":" not in text
+        text = year_first(pl.Series("time", [text]), "the command line")[0]
     try:
-        found = pl.Series([text.strip()]).str.to_datetime(time_unit="us")
+        found = pl.Series([text]).str.to_datetime(time_unit="us")
     except pl.exceptions.PolarsError:
         raise ValueError(
             f"{text!r} is not a date; write 2024-01-31, '2024-01-31 12:00:00', or a period as in {EXAMPLES}."
@@ -202,5 +209,4 @@ def moment(text: str, axis: Array, zone: str | None, end: bool = False) -> Any:
             .dt.replace_time_zone(None)
         )
     instant = found.to_numpy()[0]
-    whole_day = end and len(text.strip()) <= len("2024-01-31")
-    return instant + np.timedelta64(1, "D") - np.timedelta64(1, "us") if whole_day else instant
+    return instant + np.timedelta64(1, "D") - np.timedelta64(1, "us") if end else instant

@@ -60,12 +60,17 @@ DAY = r"(?:1[89]|2[01])\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])"
 """A day without hyphens, 20240131, which ISO 8601 permits."""
 
 
-def _date_of_text(text: str) -> np.datetime64:
+def with_hyphens(text: str) -> str:
+    """A day without hyphens, 20240131, with them; NaT for other digits that are not a year, as NumPy takes them."""
     plain = text.strip()
-    if plain.isdigit() and len(plain) != 4:  # NumPy takes all digits as the year
-        plain = f"{plain[:4]}-{plain[4:6]}-{plain[6:]}" if re.fullmatch(DAY, plain) else ""
+    if not plain.isdigit() or len(plain) == 4:
+        return plain or "NaT"
+    return f"{plain[:4]}-{plain[4:6]}-{plain[6:]}" if re.fullmatch(DAY, plain) else "NaT"
+
+
+def _date_of_text(text: str) -> np.datetime64:
     try:
-        return np.datetime64(plain or "NaT", "us")
+        return np.datetime64(with_hyphens(text), "us")
     except ValueError:
         return np.datetime64("NaT", "us")
 
@@ -88,23 +93,40 @@ def _by_days(axis: Array) -> Array:
     return axis.astype("datetime64[D]") if coarse else axis
 
 
-def warn_of_written_numbers(time: Array) -> None:
-    """Warn if numeric times, such as 20240131 or 202401, are all written like days or months.
+PAIRS = ((1, 12), (1, 31), (0, 23), (0, 59), (0, 59))
+"""Month, day, hour, minute and second: the least and largest numbers that two digits of a written time hold."""
 
-    Their differences are not those of the calendar: from 31 January to 1 February there are 70.
+
+def warn_of_written_numbers(time: Array) -> None:
+    """Warn if numeric times, such as 20240131 or 202401, are all written like dates, perhaps with a time of day.
+
+    Their differences are not those of the calendar: from 31 January to 1 February there are 70. Without a carry, as
+    within one month of days, they are.
     """
-    if time.dtype.kind != "f" or len(time) < 3 or not 180001.0 <= time[0] <= 21991231.0:
+    known = time[np.isfinite(time)] if time.dtype.kind == "f" else time[:0]
+    if len(known) < 3 or not 1e5 <= known[0] < 1e14 or np.ptp(known // 100.0) == 0:
         return
-    known = time[np.isfinite(time)]
-    day = known % 100.0 if known[0] >= 18000101.0 else np.ones(len(known))
-    month = known // (100.0 if known[0] >= 18000101.0 else 1.0)
-    year, month = month // 100.0, month % 100.0
-    written = (year >= 1800) & (year < 2200) & (month >= 1) & (month <= 12) & (day >= 1) & (day <= 31)
-    if (written & (known == np.rint(known))).all() and np.ptp(year) > 0:
+    rest, written = known, known == np.rint(known)
+    for low, high in reversed(PAIRS[: len(f"{known[0]:.0f}") // 2 - 2]):
+        rest, pair = rest // 100.0, rest % 100.0
+        written &= (pair >= low) & (pair <= high)
+    if (written & (rest >= 1800) & (rest < 2200)).all():
         warn(
             f"time: the numbers {known[0]:.0f}, {known[1]:.0f}, .. look like dates, but their differences are not "
             "those of the calendar, and drift scales with them. Give dates, such as 2024-01-31, 2024-01 or the text "
             "'20240131', with dt= their nominal interval, or dt='label' if samples are one step apart."
+        )
+
+
+def warn_of_counted_years(time: Array) -> None:
+    """Warn if dates are years that pandas took for nanoseconds since 1970, as pd.to_datetime([1970, 1971]) does."""
+    if time.dtype.kind != "M" or len(time) < 3:
+        return
+    since = (time - np.datetime64("1970-01-01")) / np.timedelta64(1, "ns")
+    if ((since >= 1500) & (since < 2500)).all():
+        warn(
+            f"time: all dates lie {since[0]:.0f} to {since[-1]:.0f} nanoseconds after the beginning of 1970. They look "
+            "like years that were read as nanoseconds: convert them with pd.to_datetime(years, format='%Y')."
         )
 
 

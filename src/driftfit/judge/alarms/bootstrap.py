@@ -121,6 +121,8 @@ def limits(records: SimulatedRecords, cusum: bool, every: float) -> tuple[Array,
     near, nearer = limits_of([(one, 0) for one in statistic], base, often)
     growth = np.maximum(near**2 - nearer**2, 0.1) / np.log(base / often)
     found = np.sqrt(near**2 + growth * np.log(every / base))
+    idle = ~statistic.any(axis=(0, 1))
+    found[idle], growth[idle] = found[~idle].max(), growth[~idle].max()
     active = np.logical_or.reduce([statistic[..., j] > limit for j, limit in enumerate(near)])
     begun = active[:, 0] + np.sum(active[:, 1:] & ~active[:, :-1], axis=1)
     mean = max(float(begun.mean()), 1e-9)

@@ -28,11 +28,13 @@ from driftfit.run.live.frozen.reference_model import (
     BETA,
     CLIP,
     CONSTANT,
+    FLAT,
     INSIDE,
     KAPPA,
     LONGEST,
     NORMAL,
     RAW,
+    SAME,
     SCALE,
     SPREAD,
     WIDE,
@@ -58,6 +60,10 @@ those in proportion to their time constant, since short references show long bur
 """
 NEAR = 0.2
 """A regressor whose mean is a smaller part of its spread stays as it is: its slope about the mean is that through 0."""
+DUST = 1e-9
+"""An entry of a direction, which has length 1, below which it is the rounding of 0: where all else of a row is 0, as of
+an idle input, such an entry alone would say that the row excites the direction.
+"""
 SHARE = 8
 """The noise is judged by windows of at most this part of the reference."""
 
@@ -105,19 +111,24 @@ def means(phi: Array, constant: int) -> Array:
     mean = level @ phi / (level @ level)
     spread = np.sqrt(np.mean((phi - level[:, None] * mean) ** 2, axis=0) / np.mean(level * level))
     moves = spread > ROUNDING * np.abs(mean)
-    mean = np.where(moves & (np.abs(mean) > NEAR * spread), mean, 0.0)
+    mean = np.where(~moves | (np.abs(mean) > NEAR * spread), mean, 0.0)
+    mean[constant] = 0.0
     return mean if mean.any() else np.zeros(0)
 
 
 def centred(phi: Array, mean: Array, constant: int) -> Array:
-    """phi (N, n) about these means."""
-    return phi - phi[:, constant, None] * mean if len(mean) else phi
+    """phi (N, n) about these means, exactly 0 where it is constant."""
+    if not len(mean):
+        return phi
+    about = phi - phi[:, constant, None] * mean
+    return np.where((mean != 0.0) & (np.abs(about) <= FLAT * np.abs(phi)), 0.0, about)
 
 
 def slopes_of(frozen: Frozen) -> Array:
-    """(n, 2): `through_zero` of the centred regressors, 0 of the others; (0, 2) if none is centred."""
+    """(n, 2): `through_zero` of the centred regressors that moved, 0 of the others; (0, 2) if none is centred."""
     constant, centred = int(frozen.numbers[CONSTANT]), enumerate(frozen.mean)
-    every = [through_zero(frozen, j, constant) if mean != 0.0 else (0.0, 0.0) for j, mean in centred]
+    moved = np.sum(frozen.unseen**2, axis=0) <= 1.0 - SAME
+    every = [through_zero(frozen, j, constant) if mean != 0.0 and moved[j] else (0.0, 0.0) for j, mean in centred]
     return np.array(every).reshape(-1, 2)
 
 
@@ -182,7 +193,8 @@ def _covariance(phi: Array, x: Array) -> tuple[Array, Array]:
     excited = values > ROUNDING * values.max()
     factor = fitted * np.mean(psi * psi) / inside**2
     cov = factor * (vectors / np.where(excited, values, values.max())) @ vectors.T
-    return np.ascontiguousarray(cov), np.ascontiguousarray(vectors[:, ~excited].T)
+    unseen = vectors[:, ~excited].T
+    return np.ascontiguousarray(cov), np.ascontiguousarray(np.where(np.abs(unseen) > DUST, unseen, 0.0))
 
 
 def _whitened(rows: Array, ok: Array, ar: Array) -> tuple[Array, Array]:

@@ -23,6 +23,7 @@ from driftfit.engine.simd import (
     higher,
     load,
     log_of,
+    lower,
     minus,
     only,
     over,
@@ -34,6 +35,7 @@ from driftfit.engine.simd import (
 )
 from driftfit.run.live.frozen.reference_model import (
     BLOCKS,
+    BOUND,
     CONSTANT,
     FLAT,
     KAPPA,
@@ -310,11 +312,12 @@ def _cusums(phi: Array, g: Array, model: Models, cusum: Array, out: Array) -> No
     for t in range(g.shape[0]):
         score, shift = load(g, t, 0), times(fill(SHIFT), k)
         for j in range(n):
-            own = load(phi, t * n + j, 0)
+            own = lower(higher(load(phi, t * n + j, 0), fill(-BOUND)), fill(BOUND))
             most = _climb(cusum, j, times(own, score), shift, v, times(own, own))
             if model.slopes.shape[0] > 0:
                 a, b = load(model.slopes, 2 * j, 0), load(model.slopes, 2 * j + 1, 0)
-                own = plus(times(a, own), times(b, load(phi, t * n + constant, 0)))
+                own = plus(times(a, load(phi, t * n + j, 0)), times(b, load(phi, t * n + constant, 0)))
+                own = lower(higher(own, fill(-BOUND)), fill(BOUND))
                 own = only(own, minus(a, fill(LITTLE)))
                 most = higher(_climb(cusum, n + 1 + j, times(own, score), shift, v, times(own, own)), most)
             store(out, t * (n + 1) + j, 0, root(times(fill(2.0), most)))

@@ -90,8 +90,16 @@ class Pool:
             [np.arange(len(record)) >= start for record, start in zip(self.records, starts, strict=True)]
         )
 
-    def predict(self, tracker: Tracker, structures: Sequence[Candidate]) -> list[Predicted]:
-        """Run structures and return their predictions."""
+    def predict(
+        self, tracker: Tracker, structures: Sequence[Candidate], beside: Tracker | None = None
+    ) -> list[Predicted]:
+        """Run structures and return their predictions, or with ``beside`` the mixtures of those of two trackers."""
+        found = self._run(tracker, structures)
+        if beside is None:
+            return found
+        return mixed(found, self._run(beside, structures), self.spans) if structures else found
+
+    def _run(self, tracker: Tracker, structures: Sequence[Candidate]) -> list[Predicted]:
         found: dict[int, Predicted] = {}
         columns = [k for k, s in enumerate(structures) if s.columns is not None]
         shared = tracker.pads and columns
@@ -189,6 +197,37 @@ def predicted(run: Track) -> Predicted:
     return Predicted(run.prediction, np.where(known, s, np.nan), run.log_density)
 
 
+SHARE = 0.001
+"""Probability that the other tracker is the better one from the next sample on."""
+
+
+def mixed(ones: Sequence[Predicted], others: Sequence[Predicted], spans: Sequence[slice]) -> list[Predicted]:
+    """The mixture of the predictions of two trackers for each structure, weighted by how well they predicted before.
+
+    Where one tracker has no prediction, it is the other's, and the weights rest (Herbster and Warmuth, 1998).
+    """
+    first, second = (np.stack([p.loglik for p in found], axis=1) for found in (ones, others))
+    both = np.isfinite(first) & np.isfinite(second)
+    ratio = np.exp(np.clip(np.where(both, second - first, 0.0), -700.0, 700.0))
+    weight = np.where(np.isfinite(first), 0.0, 1.0)
+    for span in spans:
+        now = np.full(first.shape[1], 0.5)
+        for t in range(span.start, span.stop):
+            known = both[t]
+            weight[t] = np.where(known, now, weight[t])
+            after = now * ratio[t]
+            now = np.where(known, SHARE + (1.0 - 2.0 * SHARE) * after / (1.0 - now + after), now)
+    with np.errstate(divide="ignore"):
+        terms = np.where(both, first + np.log1p(weight * (ratio - 1.0)), np.where(np.isfinite(first), first, second))
+    result = []
+    for one, other, w, loglik in zip(ones, others, weight.T, terms.T, strict=True):
+        y_hat = np.where(w > 0.0, np.where(w < 1.0, (1.0 - w) * one.y_hat + w * other.y_hat, other.y_hat), one.y_hat)
+        apart = w * (1.0 - w) * (one.y_hat - other.y_hat) ** 2
+        s = np.where(w > 0.0, np.where(w < 1.0, (1.0 - w) * one.s + w * other.s + apart, other.s), one.s)
+        result.append(Predicted(y_hat, s, loglik))
+    return result
+
+
 def pool_of(models: Sequence[Model], names: Sequence[str], records: Sequence[Record]) -> tuple[Pool, list[Candidate]]:
     """The records with the union of the models' regressors, and the models as structures; models are bound."""
     linear = [model for model in models if _terms(model) is not None]
@@ -219,7 +258,7 @@ def _union(models: Sequence[Model]) -> Model:
     terms = {term for model in models for term in _terms(model) or ()}
     constant = ("1", 0, 0) in terms
     inputs = models[0].input_names or models[0].m
-    if all(isinstance(model, Regression) for model in models):
+    if all(isinstance(model, Regression) for model in models) and all(lag == 0 for _, _, lag in terms):
         return Regression(inputs, intercept=constant)
     na = max((lag for what, _, lag in terms if what == "y"), default=0)
     nb, nk = [], []

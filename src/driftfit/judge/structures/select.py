@@ -8,6 +8,10 @@ is the tracker's predictive density, a mixture if it has several modes. All stru
 those after the first m that all of them could predict, m = max(50, 5 n of the largest, min(100, T / 2)). The term
 (n / 2) log m is the cost of learning n parameters in the first m samples, which are not scored (Rissanen, 1986).
 
+Without a tracker of the user's, and where all structures are columns of one regression, p is the mixture of the
+densities of `AdaptiveKalman` and of `RLS(1.0)`, constant least squares: what the first pays for being prepared for a
+drift differs at random between structures, and would hide a superfluous parameter where nothing drifts.
+
 * `select(grid(ARX, na=[1, 2, 3], nb=[1, 2], nk=[0, 1]), y, u)` compares a list of models. ARX and Regression models are
   columns of one regression, the union of their regressors. It is built once, its rows are shared, and structures run
   in parallel as lanes of one compiled driver, as wide as the largest of them. Other models, such as
@@ -53,6 +57,7 @@ from driftfit.show.parts.by_output import ByOutput
 from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.rls import RLS
 
 if TYPE_CHECKING:
     import polars
@@ -245,7 +250,8 @@ def select(
         As for `track`: several records, for which one structure is sought. Parameters are estimated for each of them
         from the start, the logliks are added, and the first m samples of each are not scored.
     tracker : Tracker
-        Estimates their parameters; AdaptiveKalman() by default. Its settings must fit every number of parameters: one
+        Estimates their parameters; by default AdaptiveKalman(), and RLS(1.0) beside it where structures are columns of
+        one regression: their predictions are mixed. Its settings must fit every number of parameters: one
         q, not a vector.
     keep : names
         Regressors that every subset contains, such as ("intercept",).
@@ -262,6 +268,7 @@ def select(
         If there is no candidate, for a tracker without a variance, more than 30 regressors or unknown names, and for
         everything that `track` does not accept.
     """
+    beside = RLS(1.0) if tracker is None else None
     tracker = AdaptiveKalman() if tracker is None else tracker
     candidates = list(models) if isinstance(models, Iterable) and not isinstance(models, str) else [models]
     for model in candidates:
@@ -275,7 +282,7 @@ def select(
     search = (keep, most) if isinstance(models, Model) else None
     if any(len(model.outputs) > 1 for model in candidates):
         pools = pools_of(candidates, y, u, reading, data, by)
-        found = {name: _selected(*pool, tracker, search) for name, pool in pools.items()}
+        found = {name: _selected(*pool, tracker, search, beside) for name, pool in pools.items()}
         return found["rows"] if candidates[0].shared else ByOutput(found)
     _, records, _ = records_of(candidates[0], y, u, reading, data, by)
     if data is None and by is None:
@@ -287,18 +294,24 @@ def select(
     bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
     names = [repr(model) for model in candidates]
     pool, structures = pool_of(bound, names, [replace(records.part(k), time=None) for k in range(len(records.keys))])
-    return _selected(pool, structures, tracker, search)
+    return _selected(pool, structures, tracker, search, beside)
 
 
 def _selected(
-    pool: Pool, structures: list[Candidate], tracker: Tracker, search: tuple[Sequence[str], int | None] | None
+    pool: Pool,
+    structures: list[Candidate],
+    tracker: Tracker,
+    search: tuple[Sequence[str], int | None] | None,
+    beside: Tracker | None,
 ) -> Selection:
     """Compare structures, or with ``search`` = (keep, most) subsets of the regressors of the first."""
+    if any(one.columns is None for one in structures):
+        beside = None  # other models run one by one, and would have to compile another driver
     if search is None:
-        return _judged(pool, tracker, structures, pool.predict(tracker, structures))
+        return _judged(pool, tracker, structures, pool.predict(tracker, structures, beside))
     if structures[0].n > MOST:
         raise ValueError(f"select: at most {MOST} regressors can be searched; there are {structures[0].n}.")
-    structures, predictions = subsets(pool, tracker, structures[0], *search)
+    structures, predictions = subsets(pool, tracker, structures[0], *search, beside)
     return _judged(pool, tracker, structures, predictions)
 
 

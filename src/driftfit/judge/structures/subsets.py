@@ -22,7 +22,12 @@ ALL = 5
 
 
 def subsets(
-    pool: Pool, tracker: Tracker, full: Candidate, keep: Sequence[str], most: int | None
+    pool: Pool,
+    tracker: Tracker,
+    full: Candidate,
+    keep: Sequence[str],
+    most: int | None,
+    beside: Tracker | None = None,
 ) -> tuple[list[Candidate], list[Predicted]]:
     """Subsets of the regressors of one model: all, or those that a search visits."""
     if full.columns is None:
@@ -34,7 +39,7 @@ def subsets(
     largest = N if most is None else whole("select", "most", most, 1)
     kept = frozenset(pool.names.index(name) for name in keep)
     free = [i for i in range(N) if i not in kept]
-    tried = Tried(pool, tracker)
+    tried = Tried(pool, tracker, beside)
     if len(free) <= ALL:
         every = [kept | set(c) for r in range(len(free) + 1) for c in combinations(free, r)]
         tried([chosen for chosen in every if 0 < len(chosen) <= largest])
@@ -46,8 +51,8 @@ def subsets(
 class Tried:
     """Subsets that were run, each once."""
 
-    def __init__(self, pool: Pool, tracker: Tracker) -> None:
-        self.pool, self.tracker = pool, tracker
+    def __init__(self, pool: Pool, tracker: Tracker, beside: Tracker | None) -> None:
+        self.pool, self.tracker, self.beside = pool, tracker, beside
         self.structures: list[Candidate] = []
         self.predictions: list[Predicted] = []
         self._place: dict[frozenset[int], int] = {}
@@ -61,7 +66,8 @@ class Tried:
         structures = [
             Candidate(" ".join(self.pool.names[i] for i in sorted(s)), len(s), None, tuple(sorted(s))) for s in new
         ]
-        for subset, structure, found in zip(new, structures, self.pool.predict(self.tracker, structures), strict=True):
+        predictions = self.pool.predict(self.tracker, structures, self.beside)
+        for subset, structure, found in zip(new, structures, predictions, strict=True):
             self._place[subset] = len(self.structures)
             self.structures.append(structure)
             self.predictions.append(found)

@@ -133,6 +133,19 @@ def fill(m: Array, p: Places, to: int, ago: int, observed: bool) -> None:
 
 
 @shared
+def lose_output(m: Array, p: Places) -> None:
+    """The newest output, which a row of regressors already contains, is missing: a tracker refused it."""
+    at = p[NOW] + p[NA] + p[NB] + p[N_OUT] - 1
+    for i in range(p[INPUTS]):
+        own = OWN + EACH * i
+        at += p[own + OWN_NB] * (p[own + OWN_N_IN] - 1)
+    if p[NA] > 0:
+        m[p[NOW], 0] = np.nan
+        for k in range(p[N_OUT] - 1):
+            m[at + k * p[NA], 0] = np.nan
+
+
+@shared
 def complete(m: Array, p: Places) -> bool:
     """Whether all lags are known."""
     at_d = p[NA] + p[NB]

@@ -40,7 +40,7 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     N,
     Y,
 )
-from driftfit.models.hammerstein_wiener.steps import regress_work
+from driftfit.models.hammerstein_wiener.steps import believable, regress_work
 from driftfit.models.wider import Wider
 
 
@@ -100,7 +100,7 @@ def _steps(into: tuple[Kind, ...], out: Kind) -> ModelSteps:
         if s.orders[IDENTITY, l] == 0:
             push_any(s.blocks.ctypes.data, s.orders.ctypes.data)
         s.y_hat[l] = s.blocks[PREDICTED, l]
-        s.blocks[OBSERVED, l], s.blocks[OK, l] = s.observed[l], s.ok[l]
+        s.blocks[OBSERVED, l], s.blocks[OK, l] = believable(s, s.orders[N_OUT, l] - 1, l), s.ok[l]
         for i in range(s.orders[N, l]):
             s.blocks[s.orders[NOW, l] + i, l] = s.blocks[s.orders[NEXT, l] + i, l]
 

@@ -28,6 +28,7 @@ from driftfit.models.hammerstein_wiener.regressor_rows import (
     complete,
     fill,
     forget,
+    lose_output,
     minimal_past,
     noise_factor,
     past,
@@ -129,6 +130,9 @@ def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
         if not m[OBSERVED, 0] > 0.0:  # the previous sample
             for k in range(n_out):
                 m[g + k, 0] = np.nan
+            lose_output(m, p)
+        elif abs(m[RAW, 0]) < LARGEST:
+            believe(m, m[RAW, 0])  # not before the tracker has judged it
         shift(m, g, n_out, rows)
         if m[VARIANCE, 0] > 0.0:
             shift(m, h, n_out, rows)
@@ -159,8 +163,6 @@ def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
             else:
                 right = invert(m, p, right)
                 m[LATE, 0] = 0.0
-        if observed:
-            believe(m, y)
         m[PREDICTED, 0] = right
         if not observed:
             output_at(m, p, right, g, h)
@@ -196,6 +198,17 @@ def _push(out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
             m[PREDICTED, 0] = refine(m, orders, m[PREDICTED, 0])
 
     return machine(machine_push)
+
+
+@kernel
+def believable(s: State, more_out: int, l: int) -> float:
+    """Whether the output becomes a lag and part of the range of outputs: it was observed, and its sample not left out.
+
+    With an output block the output is also a regressor, and trackers cannot tell a fault code in it from one in an
+    input.
+    """
+    left_out = (more_out > 0) & (s.valid[l] > 0.0) & (s.noise[l] < np.inf) & (s.ok[l] == 0.0)
+    return 0.0 if left_out else s.observed[l]
 
 
 @lru_cache
@@ -236,7 +249,7 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
             else:
                 push_lane(s.blocks.ctypes.data + at, L)
         s.y_hat[l] = s.blocks[PREDICTED, l]
-        s.blocks[OBSERVED, l], s.blocks[OK, l] = s.observed[l], s.ok[l]
+        s.blocks[OBSERVED, l], s.blocks[OK, l] = believable(s, more, l), s.ok[l]
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 

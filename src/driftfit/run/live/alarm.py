@@ -226,7 +226,13 @@ class LiveAlarm:
         alarm._onsets.extend(Onset(*onset) for onset in state["onsets"])
         # states of earlier versions end before what was learned since the reference
         for part, stored in zip(alarm._memory if state.get("memory") else (), state.get("memory", ()), strict=False):
-            part[...] = np.frombuffer(b64decode(stored)).reshape(part.shape)
+            values = np.frombuffer(b64decode(stored))
+            if values.size != part.size:
+                raise ValueError(
+                    "the state of the alarm was saved by another version of driftfit, whose sums have other sizes: "
+                    "make the rule again, run.detect(...).rule, and give it to a stream that was saved without alarms."
+                )
+            part[...] = values.reshape(part.shape)
         if state.get("memory"):
             alarm._findings[0] = alarm._memory.findings
         return alarm

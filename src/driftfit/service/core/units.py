@@ -36,14 +36,16 @@ class Gathered:
         self.counters: list[Counter[str] | None] = []
         """Who counts what is left out of each message besides the unit."""
 
-    def add(self, place: int, samples: Samples, counter: Counter[str] | None) -> bool:
+    def add(self, place: int, samples: Samples, receipt: Receipt | None) -> bool:
         """Add a message; False if it has no signal of the section."""
         given, count = samples.columns, samples.length
         if self.columns.keys().isdisjoint(given):
             return False
         self.places.append(place)
         self.lengths.append(count)
-        self.counters.append(counter)
+        self.counters.append(None if receipt is None else receipt.left_out)
+        if receipt is not None:
+            receipt.note_missing(samples, self.columns)
         for name, column in self.columns.items():
             _extend(column, given.get(name), count)
         if self.time is not None:
@@ -183,7 +185,7 @@ class Units:
             if not units:
                 tally((self.refused, counter), "no unit for the topic", samples.length)
             for unit in units:
-                if not gathered[unit.streams.index].add(unit.place, samples, counter):
+                if not gathered[unit.streams.index].add(unit.place, samples, receipt):
                     tally((unit.rare, counter), NO_SIGNAL, samples.length)
         found = []
         for section, one in zip(self.sections, gathered, strict=True):

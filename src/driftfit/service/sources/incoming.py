@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from driftfit.service.sources.samples import NO_SIGNAL, Batch, Receipt, Samples, decode
+from driftfit.service.sources.samples import NO_SIGNAL, Batch, Receipt, Samples, ShapeError, decode
 
 WAIT = 30.0
 """Seconds after which a request that is not yet journaled is answered with an error."""
@@ -29,10 +29,10 @@ class Incoming:
     def offer(self, topic: str, body: bytes) -> dict[str, Any]:
         """Decode a request, wait until it is in the journal, and report what was received and what was left out.
 
-        The status is 200 if anything was taken, or all of it was known already; 400 if nothing could be read, 429 if
-        it was too much for the rate of its unit, and 422 if no unit could use it.
+        The status is 200 if anything was taken, or all of it was known already; 400 if nothing is JSON, 429 if it was
+        too much for the rate of its unit, and 422 if there are no samples in it, or no unit could use them.
         """
-        samples, refused = decoded(topic, body)
+        samples, refused, shaped = decoded(topic, body)
         done, receipt = threading.Event(), Receipt()
         batch = Batch(samples, done.set, refused=len(refused), arrived=time.monotonic(), receipt=receipt)
         try:
@@ -44,7 +44,10 @@ class Incoming:
         received, left_out = sum(one.length for one in samples), receipt.left_out
         answer: dict[str, Any] = {"received": received, "refused": refused[:20], "left_out": dict(left_out)}
         if not samples:
-            return answer | {"error": "; ".join(refused[:20]) or "the body has no topic.", "status": 400}
+            error = "; ".join(refused[:20]) or "the body has no topic."
+            return answer | {"error": error, "status": 422 if shaped else 400}
+        if receipt.missing:
+            answer["missing"] = receipt.missing
         reasons = left_out.keys() - {NO_SIGNAL} or left_out.keys()  # a unit that does not read a signal refuses nothing
         if left_out.total() < receipt.offered or reasons <= KNOWN:
             return answer
@@ -56,23 +59,26 @@ INCOMING = Incoming()
 """The one queue of this process."""
 
 
-def decoded(topic: str, body: bytes) -> tuple[list[Samples], list[str]]:
-    """Samples of one topic, or of a mapping from topics to payloads; and what could not be read."""
+def decoded(topic: str, body: bytes) -> tuple[list[Samples], list[str], bool]:
+    """Samples of one topic, or of a mapping from topics to payloads; what could not be read; and whether all of that is
+    JSON in another shape.
+    """
     if topic:
         try:
-            return [decode(topic, body)], []
+            return [decode(topic, body)], [], False
         except ValueError as error:
-            return [], [str(error)]
+            return [], [str(error)], isinstance(error, ShapeError)
     parts = _payloads(body)
     if parts is None:
-        return [], ["the body is not an object with a payload for each topic, in JSON."]
-    samples, refused = [], []
+        return [], ["the body is not an object with a payload for each topic, in JSON."], False
+    samples, refused, shaped = [], [], bool(parts)
     for name, payload in parts.items():
         try:
             samples.append(decode(name, bytes(payload)))
         except ValueError as error:
             refused.append(f"{name[:100]}: {error}")
-    return samples, refused
+            shaped = shaped and isinstance(error, ShapeError)
+    return samples, refused, shaped
 
 
 def _payloads(body: bytes) -> Mapping[str, Any] | None:

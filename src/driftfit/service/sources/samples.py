@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -32,6 +32,9 @@ LARGEST = 4 << 20
 
 Cell = float | int | bool | str | None
 _DECODE = msgspec.json.Decoder(dict[str, Cell | list[Cell]] | list[dict[str, Cell]])
+
+FIRST = 20
+"""Samples of a message that an answer names."""
 
 NO_SIGNAL = "no signal"
 """Why a unit that reads a topic took no sample of it."""
@@ -54,6 +57,20 @@ class Receipt:
     """Samples times the units that read their topic."""
     left_out: Counter[str] = field(default_factory=Counter)
     """How many of these the units did not take, by reason."""
+    missing: dict[str, dict[str, dict[str, Any]]] = field(default_factory=dict)
+    """By topic and signal: how many samples have no finite number for it, and the first of them."""
+
+    def note_missing(self, samples: Samples, names: Iterable[str]) -> None:
+        """Note the samples of a message without a finite number for one of the signals ``names``."""
+        for name in names:
+            cells = samples.columns.get(name)
+            if isinstance(cells, list):
+                places = np.flatnonzero(~np.isfinite(numbers_of(cells))).tolist()
+            else:
+                places = [] if math.isfinite(number(cells)) else list(range(samples.length))
+            if places:
+                signals = self.missing.setdefault(samples.topic, {})
+                signals[name] = {"count": len(places), "first": places[:FIRST]}
 
 
 class Batch(NamedTuple):
@@ -72,6 +89,10 @@ class Batch(NamedTuple):
     """To be filled before the acknowledgement, if the sender waits for it."""
 
 
+class ShapeError(ValueError):
+    """A message in JSON that holds no samples: lists of different lengths, too many of them, or none."""
+
+
 def decode(topic: str, payload: bytes | str) -> Samples:
     """The samples of one message; ValueError if it is not one of the three forms."""
     if len(payload) > LARGEST:
@@ -83,10 +104,12 @@ def decode(topic: str, payload: bytes | str) -> Samples:
     if isinstance(data, list):
         return _of_rows(topic, data)
     if len(data) > MOST_FIELDS:
-        raise ValueError(f"{len(data)} fields; at most {MOST_FIELDS} are read.")
-    lengths = {len(value) for value in data.values() if isinstance(value, list)}
+        raise ShapeError(f"{len(data)} fields; at most {MOST_FIELDS} are read.")
+    sizes = {name: len(value) for name, value in data.items() if isinstance(value, list)}
+    lengths = set(sizes.values())
     if len(lengths) > 1:
-        raise ValueError("lists of different lengths; one number per sample in each.")
+        found = ", ".join(f"{name[:50]} {size}" for name, size in list(sizes.items())[:8])
+        raise ShapeError(f"lists of different lengths ({found}); give one number per sample in each, null if missing.")
     return Samples(topic, bounded(lengths.pop() if lengths else 1), data)
 
 
@@ -104,7 +127,7 @@ def _with_nan(payload: bytes | str) -> Any:
 def _of_rows(topic: str, rows: list[dict[str, Cell]]) -> Samples:
     names = {name for row in rows[:MOST_SAMPLES] for name in row}
     if len(names) > MOST_FIELDS:
-        raise ValueError(f"{len(names)} fields; at most {MOST_FIELDS} are read.")
+        raise ShapeError(f"{len(names)} fields; at most {MOST_FIELDS} are read.")
     count = bounded(len(rows))
     return Samples(topic, count, {name: [row.get(name) for row in rows] for name in names})
 
@@ -112,7 +135,7 @@ def _of_rows(topic: str, rows: list[dict[str, Cell]]) -> Samples:
 def bounded(count: int) -> int:
     """A number of samples that one message may have; ValueError for another."""
     if not 0 < count <= MOST_SAMPLES:
-        raise ValueError(f"{count} samples in one message; 1 to {MOST_SAMPLES} are read.")
+        raise ShapeError(f"{count} samples in one message; 1 to {MOST_SAMPLES} are read.")
     return count
 
 

@@ -20,10 +20,15 @@ from driftfit.engine.simd import (
     eight_at,
     eight_of,
     fill,
+    fill_four,
+    four_of,
     in_blocks,
+    in_fours,
+    load_four,
     minus,
     plus,
     put_eight,
+    store_four,
     times,
 )
 
@@ -43,7 +48,7 @@ def rows_with(entry: Any) -> Any:
     def rows(s: State, l: int) -> None:
         n = s.theta.shape[0]
         for i in range(n):
-            g = 0.0
+            g = -0.0  # to which adding changes nothing: the addition of 0.0 would remain
             for j in range(i + 1):
                 g += s.P[i, j, l] * entry(s, j, l)
             s.g[i, l] = g
@@ -83,7 +88,7 @@ def blocks_with(entry: Any) -> Any:
         n, columns = s.theta.shape[0], s.P.shape[1]
         whole = n - n % WIDTH
         for i in range(n):
-            s.g[i, 0] = 0.0
+            s.g[i, 0] = -0.0
         for j in range(0, whole, WIDTH):
             corner(s, j, j + WIDTH)
             x, g = eight(s, j), eight_at(s.g, j)
@@ -115,7 +120,7 @@ def product_with(entry: Any) -> Any:
             blocks(s)
         else:
             rows(s, l)
-        total = 0.0
+        total = -0.0
         for i in range(n):
             total += entry(s, i, l) * s.g[i, l]
         return total
@@ -136,7 +141,7 @@ symmetric_product = product_with(regressor)
 @kernel
 def prediction(s: State, l: int) -> float:
     """phi' theta."""
-    total = 0.0
+    total = -0.0
     for i in range(s.theta.shape[0]):
         total += s.phi[i, l] * s.theta[i, l]
     return total
@@ -184,6 +189,19 @@ def reduce_covariance(s: State, gain: float, l: int) -> None:
 
 
 @kernel
+def move(s: State, gain: float, e: float, l: int) -> None:
+    """theta <- theta + gain g e with s.g."""
+    n = s.theta.shape[0]
+    whole = n - n % 4 if in_fours(s) else 0
+    for i in range(0, whole, 4):
+        g = four_of((s.g[i, 0], s.g[i + 1, 0], s.g[i + 2, 0], s.g[i + 3, 0]))
+        change = times(times(fill_four(gain), g), fill_four(e))
+        store_four(s.theta, i, 0, plus(load_four(s.theta, i, 0), change))
+    for i in range(whole, n):
+        s.theta[i, l] += gain * s.g[i, l] * e
+
+
+@kernel
 def corrected(s: State, y_hat: float, v: float, l: int) -> float:
     """Correct theta and P from s.g = P h and the variance v of the innovation, and report s.y_hat, s.e, s.s.
 
@@ -191,8 +209,7 @@ def corrected(s: State, y_hat: float, v: float, l: int) -> float:
     """
     e = s.y[l] - y_hat
     gain = s.ok[l] / v
-    for i in range(s.theta.shape[0]):
-        s.theta[i, l] += gain * s.g[i, l] * e
+    move(s, gain, e, l)
     reduce_covariance(s, gain, l)
     # P that has lost its digits gets some of them back, but the sample has no variance, and says nothing of the noise
     s.ok[l] = s.ok[l] if v > 0.0 else 0.0

@@ -8,6 +8,7 @@ stream):
 
     p_k = sum_j b_j (b_j p_k) / sum_j b_j^2
 
+With thresholds at which a gain has no regressor, as those of a saturation at (0, 0), they begin again at their start.
 Cost: a least squares fit of N rows per pass.
 """
 
@@ -32,16 +33,18 @@ def settled(
 ) -> Array:
     """phi (N, n) of the usable samples ``at`` (N,) of a record u (T, m), with outputs y (N,), in settled functions."""
     phi, moved = phi.copy(), np.inf
-    last = {i: np.zeros(2) for i, basis in enumerate(bases) if isinstance(basis, Thresholds)}
+    last = {i: np.full(2, np.inf) for i, basis in enumerate(bases) if isinstance(basis, Thresholds)}
     for _ in range(PASSES if len(at) else 0):
         theta = np.linalg.lstsq(phi, y)[0]
         moved, b, products = 0.0, s.na, s.na + sum(s.nb) + s.n_out - 1
         for i, basis in enumerate(bases):
             nb = s.nb[i]
             if isinstance(basis, Thresholds):
+                unseen = not phi[:, b : b + nb].any()  # no input is where its gain can be learned
                 gain, each = theta[b : b + nb], theta[products : products + 2 * nb].reshape(2, nb)
                 room = INSIDE * basis.u_max * np.array([[0.0, 1.0], [-1.0, 0.0]])
-                found = np.clip(each @ gain / max(float(gain @ gain), 1e-300), *room.T)
+                found = basis.own_numbers[:2] if unseen else each @ gain / max(float(gain @ gain), 1e-300)
+                found = np.clip(found, *room.T)
                 moved = max(moved, float(np.max(np.abs(found - last[i]))) / basis.u_max)
                 last[i] = found
                 f = -basis.split(u[:, i], u[:, i] > found[0], u[:, i] < found[1])  # as in the rows of the model

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from rich.text import Text
 
 from driftfit.data.known import Known
 from driftfit.data.record import Record
@@ -26,17 +27,26 @@ from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.run.program import Program
 from driftfit.run.result import Track, track_record
 from driftfit.run.track import track_one
+from driftfit.show.parts.text import digits, facts, printed, table_of
 from driftfit.smooth.problem import replay
 from driftfit.trackers.base import Tracker
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class HandOff:
     """``first``, the run of stage one until sample ``at``, and ``then``, that of the second filter after it."""
 
     first: Track
     then: Track
     at: int
+
+    def __repr__(self) -> str:
+        """Both runs, and the last estimates of the second."""
+        table = table_of("Parameters after the last sample", "", "theta", "std")
+        for name, value, std in zip(self.then.names, self.then.theta[-1], self.then.std[-1], strict=True):
+            table.add_row(Text(name), digits(value, std), f"{std:.4g}")
+        runs = facts(("First", f"{self.first!r}, until sample {self.at}"), ("Then", repr(self.then)))
+        return printed(runs, table).strip("\n")
 
     @property
     def xi(self) -> Array:

@@ -36,6 +36,7 @@ from driftfit.run.live.frozen.reference_model import (
     CLIP,
     CONSTANT,
     COUNT,
+    COVARIANCE,
     CUSUM,
     FIT,
     FLAT,
@@ -231,7 +232,7 @@ def compare(total: Array, L: int, cov: Array, frozen: Frozen, work: Array, findi
 def windows(memory: Memory, frozen: Frozen, count: int) -> None:
     """Compare the windows that end with a block that the last sample completed."""
     sums, work, size = memory.sums, memory.work, memory.sums.shape[2]
-    cov = memory.known[1 : frozen.theta.shape[0] + 1]
+    cov = memory.known[COVARIANCE : COVARIANCE + frozen.theta.shape[0]]
     total = work[work.shape[0] - 1]
     for j in range(sums.shape[0]):
         b = count >> j

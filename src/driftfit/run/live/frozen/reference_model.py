@@ -5,20 +5,20 @@
     x_t = w_t / (scale sqrt(h_t))             h_(t+1) = 1 - alpha - beta + alpha h_t g_t^2 / v + beta h_t
     g_t = x_t clipped at +-clip               score; E g^2 = v, var g^2 = kappa, E dg/dx = k in the reference
 
-A regressor that is far from zero in the reference is taken about its mean, as a multiple of the constant regressor: a
-slope about the mean does not move the level, so that the two can be told apart.
+A regressor that is far from zero in the reference, or constant, is taken about its mean, as a multiple of the constant
+regressor: a slope about the mean does not move the level, so that the two can be told apart.
 
-Where the reference knows little of a direction that a sample excites, as of an input that hardly moved, most of x may
-be the error of theta, with the variance phi' C phi in units of the noise. From `TEACHES` on, a sample corrects theta as
-a Kalman filter without drift does, until that variance is n / N, the mean of the N rows of the reference: its error is
-then divided by its standard deviation, and judges as any other. An error of more than `CREDIBLE` deviations and the
-first such sample teach nothing, and above `UNKNOWN` judge nothing, since one reading of an input may be false. What
-else is above `UNSURE` (and above `USUAL` n / N, which rows of the reference seldom exceed) is judged by windows alone,
-whose V allows for it. No sample above it judges the noise.
+Where the reference knows little of a direction that a sample excites, as of an input that hardly moved, much of x may
+be the error of theta, with the variance phi' C phi in units of the noise. From `UNSURE` on (and from `USUAL` n / N on,
+which rows of the reference seldom exceed), a sample corrects theta as a Kalman filter without drift does, until that
+variance is n / N, the mean of the N rows of the reference: its error is then divided by its standard deviation, and
+judges as any other, but not the noise while the variance is that large. Where nothing is known, as of an input that was
+0 or constant, a sample corrects theta as from a diffuse start and judges nothing. Since one reading of an input may be
+false, the first of such samples teaches nothing, and neither does an error of more than `CREDIBLE` deviations: they are
+judged by windows alone, whose V allows for the variance, and not at all above `UNKNOWN`.
 
-A sample that cannot be used is passed over, and so is one that excites a direction in which the reference says nothing,
-as an input does that was 0 or constant there: what it does to y is unknown, and would be taken for a change. An
-autoregression then waits until its lags are complete. Source: Huber (1964) for the score, Bollerslev (1986) for h.
+A sample that cannot be used is passed over; an autoregression then waits until its lags are complete.
+Source: Huber (1964) for the score, Bollerslev (1986) for h, Koopman and Durbin (2003) for the diffuse start.
 Cost per sample: O(n^2 + p n).
 """
 
@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from driftfit.engine.drivers import SMALLEST
 from driftfit.engine.kernel import Array, kernel, part
 
 LEVELS, BLOCKS, SHORT = 6, 12, 8
@@ -38,14 +39,16 @@ SHIFT = 0.5
 """The shift for which the score CUSUM is designed, in standard deviations of the noise per root mean square regressor.
 """
 FLAT = 1e-9
+BOUND = 2.0
+"""Regressors further from 0, in root mean squares of the reference, count as this in the CUSUM: the shift that it waits
+for, SHIFT of the noise at 1, would otherwise be far larger than any where an input moves more than in the reference.
+"""
 SAME = 1e-6
 """A regressor that differs by less than this share from what it was in the whole reference has not changed."""
-UNSURE, USUAL = 0.2, 8.0
-"""Variances of a prediction by theta, as shares of that of the noise, from which on a sample does not judge the noise.
-"""
-TEACHES, UNKNOWN, HUGE = 0.5, 1.0, 1e200
-"""The same: from which on a sample corrects theta, from which on it judges nothing if it cannot, and from which on
-squares may overflow.
+UNSURE, USUAL, UNKNOWN, HUGE = 0.05, 8.0, 1.0, 1e200
+"""Variances of a prediction by theta, as shares of that of the noise: from UNSURE on (and from USUAL times the mean of
+the reference on, which rows of the reference seldom exceed) a sample may correct theta, and does not judge the noise;
+from UNKNOWN on it judges nothing if it cannot correct theta; from HUGE on squares may overflow.
 """
 CREDIBLE = 3.0
 """Standard deviations up to which an error corrects theta: false readings of an input have larger ones."""
@@ -73,6 +76,8 @@ SINCE, LEVEL, COUNT = range(3)
 """Entries of `Memory.counts`: usable samples in a row, h, samples that were used."""
 ONE, JOINT, NOISE, WHICH, SIZE, STD, WINDOW, RATIO, NOISE_WINDOW, CUSUM = range(10)
 """Entries of the findings of a sample; the CUSUM of n parameters and of the noise come last."""
+LEARNED, COVARIANCE = 0, 1
+"""Rows of `Memory.known`."""
 FIT = NOISE_WINDOW
 """Entry of a window in its place: where scores are clipped, how well one change explains it, or 0; otherwise NaN."""
 
@@ -88,7 +93,7 @@ class Frozen(NamedTuple):
     unseen: Array = np.zeros((0, 0))
     """(k, n): directions of the regressors in which the reference has none, such as that of an input that was 0."""
     mean: Array = np.zeros(0)
-    """(n,): regressors in the reference as multiples of the constant, 0 where they were near zero; none if all were."""
+    """(n,): regressors in the reference as multiples of the constant, 0 if they moved about zero; none if all did."""
 
 
 class Memory(NamedTuple):
@@ -105,7 +110,12 @@ class Memory(NamedTuple):
     sample: Array
     findings: Array
     known: Array
-    """(n + 2, n): what theta differs from that of the reference by, its covariance, and phi' C phi of the last row."""
+    """(n + 2, n): row LEARNED is how far theta is from that of the reference; n rows from COVARIANCE on are its
+    covariance C, which has no part in ``unknown``; and the last row begins with phi' C phi of the last sample, by the C
+    of the reference.
+    """
+    unknown: Array
+    """(k, n): what is left of `Frozen.unseen`, as no row after the reference has excited it either."""
 
 
 def memory_of(frozen: Frozen) -> Memory:
@@ -116,8 +126,9 @@ def memory_of(frozen: Frozen) -> Memory:
     work = np.zeros((2 * n + 4 + (centred > 0), size_of(n)))
     counts, findings = np.array([0.0, 1.0, 0.0]), np.full(CUSUM + n + 1, np.nan)
     past, cusum = np.zeros((p + 1, n + 1)), np.zeros((n + 1 + centred, 2))
-    known = np.vstack([np.zeros((1, n)), frozen.cov, np.zeros((1, n))])
-    return Memory(past, sums, last, cusum, counts, work, np.zeros(size_of(n)), findings, known)
+    excited = np.eye(n) - frozen.unseen.T @ frozen.unseen
+    known = np.vstack([np.zeros((1, n)), excited @ frozen.cov @ excited, np.zeros((1, n))])
+    return Memory(past, sums, last, cusum, counts, work, np.zeros(size_of(n)), findings, known, frozen.unseen.copy())
 
 
 def size_of(n: int) -> int:
@@ -145,18 +156,64 @@ def leverage(phi: Array, cov: Array) -> float:
 
 
 @part
+def correct(phi: Array, x: float, noise: float, gain: Array, known: Array) -> None:
+    """theta + K x, and (I - K phi') C (I - K phi')' + K noise K' with K = gain[0], which no size of C makes negative
+    (Joseph's form); gain[1] is scratch.
+    """
+    n = known.shape[1]
+    for j in range(n):
+        gain[1, j] = 0.0
+        for i in range(n):
+            gain[1, j] += phi[i] * known[COVARIANCE + i, j]
+    for i in range(n):
+        known[LEARNED, i] += gain[0, i] * x
+        for j in range(n):
+            known[COVARIANCE + i, j] -= gain[0, i] * gain[1, j]
+    for i in range(n):
+        gain[1, i] = 0.0
+        for j in range(n):
+            gain[1, i] += known[COVARIANCE + i, j] * phi[j]
+    for i in range(n):
+        for j in range(i + 1):
+            value = known[COVARIANCE + i, j] - gain[1, i] * gain[0, j] + noise * gain[0, i] * gain[0, j]
+            known[COVARIANCE + i, j] = known[COVARIANCE + j, i] = value
+
+
+@part
 def learn(phi: Array, x: float, h: float, frozen: Frozen, known: Array, gain: Array) -> None:
-    """Correct theta by the error x of a prediction of variance h, as a Kalman filter does; gain (n,) is scratch."""
+    """Correct theta by the error x of a prediction of variance h, as a Kalman filter does; gain (2, n) is scratch."""
     n, noise = frozen.theta.shape[0], frozen.numbers[V] / frozen.numbers[K] ** 2
-    cov = known[1 : n + 1]
     for i in range(n):
-        gain[i] = 0.0
+        gain[0, i] = 0.0
         for j in range(n):
-            gain[i] += cov[i, j] * phi[j]
-    for i in range(n):
-        known[0, i] += gain[i] * x / (noise + h)
+            gain[0, i] += known[COVARIANCE + i, j] * phi[j] / (noise + h)
+    correct(phi, x, noise, gain, known)
+
+
+@part
+def discover(phi: Array, x: float, frozen: Frozen, memory: Memory, gain: Array) -> None:
+    """Correct theta along the directions D of which nothing was known, with the gain of an exact diffuse start,
+    D'c / c'c with c = D phi; then D <- (I - c c' / c'c) D. gain (2, n) is scratch.
+    """
+    n, noise, unknown = frozen.theta.shape[0], frozen.numbers[V] / frozen.numbers[K] ** 2, memory.unknown
+    c, size = gain[1], 0.0
+    for m in range(unknown.shape[0]):
+        c[m] = 0.0
         for j in range(n):
-            cov[i, j] -= gain[i] * gain[j] / (noise + h)
+            c[m] += unknown[m, j] * phi[j]
+        size += c[m] * c[m]
+    for j in range(n):
+        gain[0, j] = 0.0
+        for m in range(unknown.shape[0]):
+            gain[0, j] += unknown[m, j] * (c[m] / size)
+    for m in range(unknown.shape[0]):
+        left = 0.0
+        for j in range(n):
+            unknown[m, j] -= c[m] * gain[0, j]
+            left += unknown[m, j] * unknown[m, j]
+        for j in range(n):
+            unknown[m, j] *= 1.0 if left > FLAT * FLAT else 0.0
+    correct(phi, x, noise, gain, memory.known)
 
 
 @part
@@ -179,7 +236,7 @@ def outside(phi: Array, unseen: Array) -> bool:
         for j in range(unseen.shape[1]):
             term = unseen[i, j] * phi[j]
             total, size = total + term, size + abs(term)
-        if abs(total) > SAME * size:
+        if abs(total) > max(SAME * size, SMALLEST):
             return True
     return False
 
@@ -200,7 +257,10 @@ def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
     root, before, centred = 1.0 / np.sqrt(row[n + NOISE_FACTOR]), abs(past[p, n]), frozen.mean.shape[0] > 0
     e, level = row[n + Y], row[int(numbers[CONSTANT])] if centred else 0.0
     for i in range(n):
-        own = row[i] - frozen.mean[i] * level if centred else row[i]
+        own = row[i]
+        if centred and frozen.mean[i] != 0.0:
+            own -= frozen.mean[i] * level
+            own = 0.0 if abs(own) <= FLAT * abs(row[i]) else own
         e -= own * frozen.theta[i]
         past[p, i] = own * root / frozen.unit[i]
     past[p, n] = e * root
@@ -222,25 +282,37 @@ def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
 @part
 def enter_row(row: Array, frozen: Frozen, memory: Memory) -> int:
     """Scores of a row into memory.sample, and [phi, g] for the CUSUM into memory.work[0]; what it can judge."""
-    n, numbers, phi = frozen.theta.shape[0], frozen.numbers, memory.work[0]
+    n, numbers, phi, known, scratch = (
+        frozen.theta.shape[0],
+        frozen.numbers,
+        memory.work[0],
+        memory.known,
+        memory.work[1:3],
+    )
     wide = whiten(row, frozen, memory)
     if not wide > 0.0:
         return NOTHING
     reference, x = leverage(phi, frozen.cov), phi[n]
-    if outside(phi, frozen.unseen) or not reference < HUGE:
+    if not reference < HUGE:
         return UNLIKE
+    if outside(phi, frozen.unseen):
+        reference = np.inf
     for i in range(n):
-        x -= phi[i] * memory.known[0, i]
+        x -= phi[i] * known[LEARNED, i]
     clip, least = numbers[CLIP], max(UNSURE, USUAL * n / numbers[NORMAL])
     # the variance can only have become smaller since the reference
-    h = reference if reference <= least else leverage(phi, memory.known[1 : n + 1])
+    h = reference if reference <= least else leverage(phi, known[COVARIANCE : COVARIANCE + n])
     sure, root = h <= least, np.sqrt(1.0 + h * numbers[K] * numbers[K] / numbers[V])
-    before, memory.known[n + 1, 0] = memory.known[n + 1, 0], reference
-    learns = min(before, reference) > TEACHES and h > n / numbers[NORMAL] and abs(x) <= CREDIBLE * root
+    teaches, known[n + 1, 0] = min(known[n + 1, 0], reference) > least, reference
+    if outside(phi, memory.unknown):
+        if teaches:
+            discover(phi, x, frozen, memory, scratch)
+        return UNLIKE
+    learns = teaches and h > n / numbers[NORMAL] and abs(x) <= CREDIBLE * root
     if h > UNKNOWN and not learns:
         return UNLIKE
     if learns:
-        learn(phi, x, h, frozen, memory.known, memory.work[1])
+        learn(phi, x, h, frozen, known, scratch)
         x /= root
         for i in range(n):
             phi[i] /= root

@@ -12,7 +12,18 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.engine.kernel import Array, part
-from driftfit.run.live.frozen.reference_model import CONSTANT, KAPPA, LITTLE, SHIFT, Frozen, K, V, through_zero
+from driftfit.run.live.frozen.reference_model import (
+    BOUND,
+    CONSTANT,
+    KAPPA,
+    LITTLE,
+    SAME,
+    SHIFT,
+    Frozen,
+    K,
+    V,
+    through_zero,
+)
 
 
 @part
@@ -24,19 +35,29 @@ def climb(cusum: Array, z: float, mean: float, var: float, power: float) -> None
 
 
 @part
+def idle(j: int, frozen: Frozen) -> bool:
+    """Whether regressor j was always 0 in the reference, or constant and is centred, so that it has no unit there."""
+    share = 0.0
+    for m in range(frozen.unseen.shape[0]):
+        share += frozen.unseen[m, j] * frozen.unseen[m, j]
+    return share > 1.0 - SAME
+
+
+@part
 def accumulate(phi: Array, g: float, noise: bool, frozen: Frozen, cusum: Array) -> None:
     """One step of the CUSUM of every parameter, of the noise, and of slopes through zero; columns are up and down."""
     n = frozen.theta.shape[0]
     k, v, kappa = frozen.numbers[K], frozen.numbers[V], frozen.numbers[KAPPA]
     for j in range(n):
-        climb(cusum[j], phi[j] * g, SHIFT * k, v, phi[j] * phi[j])
+        own = np.sign(phi[j]) if idle(j, frozen) else min(BOUND, max(-BOUND, phi[j]))
+        climb(cusum[j], own * g, SHIFT * k, v, own * own)
     if noise:
         climb(cusum[n], g * g - v, SHIFT * v, kappa, 1.0)
     constant = int(frozen.numbers[CONSTANT]) if frozen.mean.shape[0] > 0 else 0
     for j in range(frozen.mean.shape[0]):
         a, b = through_zero(frozen, j, constant) if frozen.mean[j] != 0.0 else (0.0, 0.0)
-        if a > LITTLE:
-            own = a * phi[j] + b * phi[constant]
+        if a > LITTLE and not idle(j, frozen):
+            own = min(BOUND, max(-BOUND, a * phi[j] + b * phi[constant]))
             climb(cusum[n + 1 + j], own * g, SHIFT * k, v, own * own)
 
 

@@ -21,18 +21,24 @@ A strange input stays in the regressors, as a lag or in what a model simulates, 
 more than all samples before it, is therefore not used either; after n samples, when lags are ordinary again, only if it
 does not agree with its prediction, e^2 > LIKELY^2 s.
 
-The factor p begins at 1 and doubles with every strange reading that follows another one: a value that persists is a
-change of level and is accepted; one of 1000 standard deviations after seven samples. Where the prediction is strange,
-p doubles in four samples, and in 16 where the strange value repeats itself, because fault codes come in runs. It stays
-the same while a strange prediction decays, as the output of a simulation does. The first `FIRST` readings are not
+A reading that has no prediction, because a lag or an input is missing, is judged by the first condition alone, with
+y - m in the place of e. After na codes in a row, or a gap, the next code would otherwise become a lag, and the one
+after it a response to that.
+
+The factor p begins at 1 and doubles with every strange reading that is near the last one: a value that persists is a
+change of level and is accepted, also if it is 1000 standard deviations away. It doubles in 16 samples where a reading
+repeats the last strange one in all digits, or is far from it, because codes come in runs, some of them with either
+sign. Where the prediction is strange, p doubles in four samples, and in 16 where the strange value repeats itself. It
+stays the same while a strange prediction decays, as the output of a simulation does. The first `FIRST` readings are not
 judged here; those of a diffuse start are judged together (`driftfit.trackers.parts.faults.judged_start`).
 
-Nearly every sample is ordinary: no input was blamed lately, and e^2 <= REACH^2 v. Ordinary samples are added to a
-block, a sum of y - m, of its square and of e^2 / s. Before a sample that is not ordinary is judged, the block is
-closed: its sums enter the means. It is also closed when it has a quarter as many samples as there were readings before.
+Nearly every sample is ordinary: no input was blamed lately, and e^2 <= REACH^2 v, or (y - m)^2 without a prediction.
+Ordinary samples are added to a block, a sum of y - m, of its square and of e^2 / s. Before a sample that is not
+ordinary is judged, the block is closed: its sums enter the means. It is also closed when it has a quarter as many
+samples as there were readings before.
 
 Source: ours; see `driftfit.trackers.parts.outlying_readings` for the rule of a tracker that learns its own noise. Cost
-per ordinary sample: one comparison and three sums.
+per ordinary sample: two comparisons and three sums.
 """
 
 from __future__ import annotations
@@ -71,9 +77,11 @@ LAGS = 50.0
 SELDOM = 0.1
 """Share of samples that inputs may be blamed for in the long run."""
 QUICK, SLOW, SLOWEST = 2.0, 2.0 ** (1.0 / 4.0), 2.0 ** (1.0 / 16.0)
-"""Growth of the factor p: for readings, for predictions, and if the strange value repeats itself."""
-ALIKE, SINKING = 1.01, 0.8
-"""A strange prediction repeats itself if its distance from m is that of the ones before, up to `ALIKE`. The latter is
+"""Growth of the factor p: for readings that persist, for predictions, and for values that repeat themselves or jump."""
+ALIKE = 0.25
+"""A strange reading persists if it differs from the last strange one by less than this share of its distance from m."""
+SAME, SINKING = 1.01, 0.8
+"""A strange prediction repeats itself if its distance from m is that of the ones before, up to `SAME`. The latter is
 the largest of them, of which `SINKING` is kept with every sample."""
 
 
@@ -159,8 +167,15 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
     judged = (s.ok[l] > 0.0) & (s.y_count[l] >= s.judged_from[l]) & (s.ratios[l] >= ENOUGH)
     strange = judged & (e * e > reach) & (e * e > sure * sure * v * s.mean_ratio[l]) & (min(off, out) < 0.5 * abs(e))
     trusted = (off > out) | (s.distrusted[l] < LAGS)
-    beyond = strange & trusted & (e * e > reach * widening * widening)
-    lasting = strange & (not beyond) & (widening > LASTING)
+    unpredicted = (s.observed[l] > s.valid[l]) & (s.y_count[l] >= s.judged_from[l])
+    outside = unpredicted & (off * off > reach)
+    of_reading, apart, follows = outside | (off > out), abs(y - s.y_strange[l]), widening > 1.0
+    persists = follows & (apart > 0.0) & (apart < ALIKE * off)
+    of_readings = min((QUICK if persists else SLOWEST) * widening, LONGEST)
+    p = of_readings if of_reading & follows else widening
+    beyond = strange & trusted & (e * e > reach * p * p)
+    refused = (beyond & (off > out)) | (outside & (off * off > reach * p * p))
+    lasting = strange & (not beyond) & (p > LASTING)
     lagging = (
         judged
         & (not lasting)
@@ -172,16 +187,15 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
     left = beyond | lagging
     more = 1.0 if left & (off <= out) else -SELDOM
     s.distrusted[l] = min(max(s.distrusted[l] + more, 0.0), 2.0 * LAGS) if s.ok[l] > 0.0 else s.distrusted[l]
-    of_reading = SLOWEST if y == s.y_strange[l] else QUICK
-    of_prediction = (1.0 if out * ALIKE < s.farthest[l] else SLOWEST) if out < ALIKE * s.farthest[l] else SLOW
-    grown = min((of_reading if off > out else of_prediction) * widening, LONGEST)
+    of_prediction = (1.0 if out * SAME < s.farthest[l] else SLOWEST) if out < SAME * s.farthest[l] else SLOW
+    grown = of_readings if of_reading else min(of_prediction * widening, LONGEST)
     left_over = 0.0 if lasting else max(s.lagging[l] - 1.0, 0.0)
     s.lagging[l] = LAGS if beyond & (off <= out) else left_over
-    s.widening[l] = grown if strange else (1.0 if s.ok[l] > 0.0 else widening)
-    s.y_strange[l] = y if strange else s.y_strange[l]
+    s.widening[l] = grown if strange | outside else (1.0 if unpredicted | (s.ok[l] > 0.0) else widening)
+    s.y_strange[l] = y if strange | outside else s.y_strange[l]
     s.farthest[l] = max(out, SINKING * s.farthest[l]) if strange else 0.0
-    s.left_out[l] += 1.0 if left else 0.0
-    s.observed[l] = 0.0 if beyond & (off > out) else s.observed[l]
+    s.left_out[l] += 1.0 if left | refused else 0.0
+    s.observed[l] = 0.0 if refused else s.observed[l]
     s.ok[l] = 0.0 if left else s.ok[l]
 
 
@@ -195,7 +209,9 @@ def judge_unusual(s: State, y_hat: float, v: float, l: int) -> None:
 @kernel
 def needs_judging(s: State, e: float, l: int) -> bool:
     """Whether a sample with innovation e is not ordinary, or the block is full."""
-    return ((e * e > s.ordinary[l]) & (s.ok[l] > 0.0)) | (s.block_left[l] <= 0)  # type: ignore[no-any-return]
+    off = s.y[l] + s.shift[l] - s.y_mean[l]
+    outside = (off * off > s.ordinary[l]) & (s.observed[l] > s.valid[l])
+    return ((e * e > s.ordinary[l]) & (s.ok[l] > 0.0)) | outside | (s.block_left[l] <= 0)  # type: ignore[no-any-return]
 
 
 @kernel

@@ -1,0 +1,1 @@
+"""Text files: cells of CSV files, and the signs with which their numbers are written."""
