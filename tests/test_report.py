@@ -9,7 +9,7 @@ import pytest
 from support import arx_record, damaged
 from typer.testing import CliRunner
 
-from driftfit import ARX, AugmentedFLS, Kalman, Regression, track
+from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Kalman, Regression, track
 from driftfit.cli import app
 from driftfit.show.page_parts import LONG, svg
 from driftfit.show.report import page
@@ -76,6 +76,13 @@ def test_page_says_what_the_judges_say(run):
     assert f"{result.rms:.5g}" in text
     assert f"{len(run) - int(run.ok.sum())} skipped" in text
     assert "largest pole" in text
+
+
+def test_page_says_which_readings_the_tracker_left_out():
+    y, u = arx_record(300, 1)
+    y[[120, 180, 240]] = 9999.0
+    run = track(ARX(1, 1), AdaptiveKalman(), y, u)
+    assert "<dt>Left out</dt><dd>3 readings out of all proportion to those before" in page(run)
 
 
 def test_pictures_take_the_colours_of_the_page(run):

@@ -183,7 +183,7 @@ def _settings(run: Track, facts: Summary) -> str:
         ("Model", facts.model), ("Tracker", facts.tracker), ("Signals", facts.signals), ("Time", facts.span),
         ("Samples", f"{facts.samples}, of which {facts.used} were used and {facts.samples - facts.used} skipped"),
         ("Missing", f"{missing_y} outputs, {missing_u} samples with a missing input"),
-        ("Rows left out", facts.dropped or "none"), ("Log-likelihood", f"{facts.loglik:.6g}"),
+        ("Rows left out", facts.dropped), *facts.remarks, ("Log-likelihood", f"{facts.loglik:.6g}"),
         ("Made by", f"driftfit {__version__}"),
     ]  # fmt: skip
     return f"<dl>{''.join(f'<dt>{escape(name)}</dt><dd>{escape(value)}</dd>' for name, value in pairs if value)}</dl>"
