@@ -9,7 +9,7 @@ those after the first m that all of them could predict, m = max(50, 5 n of the l
 (n / 2) log m is the cost of learning n parameters in the first m samples, which are not scored (Rissanen, 1986).
 
 Without a tracker of the user's, and where all structures are columns of one regression, p is the mixture of the
-densities of `AdaptiveKalman` and of `RLS(1.0)`, constant least squares: what the first pays for being prepared for a
+densities of `AdaptiveKalman` and of constant least squares, `FLS(inf)`: what the first pays for being prepared for a
 drift differs at random between structures, and would hide a superfluous parameter where nothing drifts.
 
 * `select(grid(ARX, na=[1, 2, 3], nb=[1, 2], nk=[0, 1]), y, u)` compares a list of models. ARX and Regression models are
@@ -57,7 +57,7 @@ from driftfit.show.parts.by_output import ByOutput
 from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.rls import RLS
+from driftfit.trackers.fls import FLS
 
 if TYPE_CHECKING:
     import polars
@@ -250,7 +250,7 @@ def select(
         As for `track`: several records, for which one structure is sought. Parameters are estimated for each of them
         from the start, the logliks are added, and the first m samples of each are not scored.
     tracker : Tracker
-        Estimates their parameters; by default AdaptiveKalman(), and RLS(1.0) beside it where structures are columns of
+        Estimates their parameters; by default AdaptiveKalman(), and FLS(inf) beside it where structures are columns of
         one regression: their predictions are mixed. Its settings must fit every number of parameters: one
         q, not a vector.
     keep : names
@@ -268,7 +268,7 @@ def select(
         If there is no candidate, for a tracker without a variance, more than 30 regressors or unknown names, and for
         everything that `track` does not accept.
     """
-    beside = RLS(1.0) if tracker is None else None
+    beside = FLS(np.inf) if tracker is None else None  # RLS(1.0) bit for bit, but all structures share a driver
     tracker = AdaptiveKalman() if tracker is None else tracker
     candidates = list(models) if isinstance(models, Iterable) and not isinstance(models, str) else [models]
     for model in candidates:
