@@ -101,7 +101,7 @@ def records(quick: bool) -> Iterator[tuple[str, ...]]:
     }
     with tempfile.TemporaryDirectory() as folder:
         loops = {name: Loop(folder, f"loop{k}", *kind[1:3], *kind[3]) for k, (name, kind) in enumerate(kinds.items())}
-        for T in (500, 1000) if quick else (500, 1000, 10_000, 100_000, 1_000_000):
+        for T in (500, 1000) if quick else (500, 1000, 10_000, 100_000, 1_000_000, 10_000_000):
             y, u = signals(T)
             for name, (options, fields, real, _) in kinds.items():
                 if T < 100_000 and name != "std":
