@@ -98,6 +98,13 @@ def test_whole_numbers_with_dots_between_thousands_beside_decimal_commas(tmp_pat
     np.testing.assert_array_equal(read_columns(path, ["c"])["c"], [0.998, 1.002, 2.0])
 
 
+def test_decimal_commas_far_below_the_header_and_below_one_of_several_lines(tmp_path):
+    path = written(tmp_path, "a;b\n" + "1234;5678\n" * 7000 + "1.234;2,5\n")
+    assert read_columns(path, ["a"])["a"][-1] == read_columns(path, ["a", "b"])["a"][-1] == 1234.0
+    path = written(tmp_path, '"a\n[V]";"b\n[A]"\n1.234;2,5\n')
+    assert read_columns(path, ["a\n[V]"])["a\n[V]"] == 1234.0
+
+
 def test_a_column_that_occurs_twice_is_not_chosen_silently(tmp_path):
     path = written(tmp_path, "t,y,x,x\n1,2,3,4\n")
     with pytest.raises(ValueError, match="has 2 columns 'x'"):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import os
 import re
 from collections.abc import Sequence
@@ -60,17 +61,19 @@ def read_csv(
     again = [copy[1] for copy in copies if copy and copy[1] in raw]
     names = plain_names(raw, [name for name in wanted.names if name != FILE])
     chosen = {old: new for old, new in zip(raw, names, strict=True) if new in wanted.names}
+    read = None if _size(source) <= CHECKED else list(chosen)
     try:
-        frame = pl.read_csv(source, columns=None if _size(source) <= CHECKED else list(chosen), **options)
+        every = pl.read_csv(source, columns=read, **options)
     except pl.exceptions.ComputeError:
         _check_widths(source, encoding, sign, len(raw))
-        frame = pl.read_csv(source, columns=list(chosen), truncate_ragged_lines=True, **options)
-    frame = frame.select(list(chosen)).rename(chosen)
+        every = pl.read_csv(source, columns=read, truncate_ragged_lines=True, **options)
+    frame = every.select(list(chosen)).rename(chosen)
     numbers = [frame[name] for name in dict.fromkeys((*wanted.numbers, wanted.time)) if name in frame.columns]
     if decimal == ",":
         frame = frame.with_columns(map(points, numbers))
     elif sign == ";":
-        frame = frame.with_columns(with_points(numbers, list(csv.reader(lines[1:], delimiter=sign))))
+        others = every if read is None else _cells(lines, sign)
+        frame = frame.with_columns(with_points(numbers, others.get_columns()))
     units = frame.select(pl.col(name).str.strip_chars() for name in wanted.by if name in frame.columns)
     return [*names, *again], frame.with_columns(_whole(column) for column in units)
 
@@ -84,6 +87,14 @@ def _lines(start: bytes, encoding: str) -> list[str]:
     lines = start.decode(encoding, errors="replace").removeprefix("\ufeff").splitlines()
     whole = lines[:-1] if len(start) == PROBE and len(lines) > 1 else lines
     return [line for line in whole if line.strip() and not line.startswith("#")]
+
+
+def _cells(lines: Sequence[str], sign: str) -> pl.DataFrame:
+    """The cells of the first lines of a file below the header."""
+    rows = list(csv.reader(lines, delimiter=sign))[1:]
+    return pl.DataFrame(
+        [pl.Series(str(k), cells) for k, cells in enumerate(itertools.zip_longest(*rows, fillvalue=""))]
+    )
 
 
 def _encoding(start: bytes) -> str:

@@ -18,18 +18,27 @@ POINT = r"^\s*[+-]?\d*\.(\d{0,2}|\d{4,})([eE][+-]?\d+)?\s*$"
 """A number with a decimal point, which cannot be between thousands."""
 
 
-def with_points(columns: Sequence[pl.Series], rows: Sequence[Sequence[str]]) -> list[pl.Series]:
+def with_points(columns: Sequence[pl.Series], others: Sequence[pl.Series]) -> list[pl.Series]:
     """Columns of a file with decimal points instead of decimal commas, and without dots between thousands.
 
-    ``rows`` are the first ones of the file, with all its columns: decimal commas in one of them say that the dots in
+    ``others`` are all columns of the file, or the beginning of each: decimal commas in one of them say that the dots in
     columns of whole numbers are between thousands, and a decimal point that commas may be between thousands.
     """
-    width = max(map(len, rows), default=0)
-    first = [pl.Series([row[k] if k < len(row) else "" for row in rows], dtype=pl.String) for k in range(width)]
-    every = [_known(column) for column in [*columns, *first]]
+    if not any(map(_doubtful, columns)):
+        return [_with_points(column, False, False) for column in columns]
+    every = [_known(column) for column in [*columns, *others]]
     pointed = any(column.str.contains(POINT).any() for column in every)
     commas = not pointed and any(map(_has_commas, every))
     return [_with_points(column, commas, pointed) for column in columns]
+
+
+def _doubtful(text: pl.Series) -> bool:
+    """Whether only other columns can show if all signs of a column are decimal ones or between thousands."""
+    known = _known(text)
+    commas = known.filter(known.str.contains(",", literal=True))
+    if len(commas):
+        return bool(commas.str.contains(r",\d{3}\s*$").all())
+    return bool(known.str.contains(".", literal=True).any() and known.str.contains(GROUPED).all())
 
 
 def points(text: pl.Series) -> pl.Series:
