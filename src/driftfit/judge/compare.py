@@ -20,8 +20,8 @@ from driftfit.data.record import Record
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_errors, constant_least_squares
-from driftfit.models.arx import ARX
 from driftfit.judge.regressors import without_left_out
+from driftfit.models.arx import ARX
 from driftfit.run.result import Track, burn_in, root_mean_square
 
 LAGS = 2
