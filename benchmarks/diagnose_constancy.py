@@ -22,10 +22,8 @@ from rich.table import Table
 from scipy import signal
 
 from driftfit import ARX, AdaptiveKalman, Kalman, Regression, Track, track
-from driftfit.judge.compare import errors
 from driftfit.judge.diagnose import MATERIAL, holds_constant
-from driftfit.judge.regressors import regressors
-from driftfit.judge.statistics.constancy import constancy
+from driftfit.judge.evidence import Evidence
 from driftfit.judge.statistics.paired import paired
 from driftfit.run.result import root_mean_square
 
@@ -48,8 +46,8 @@ def record(model: str, seed: int, T: int) -> tuple[np.ndarray, np.ndarray]:
 
 def judged(run: Track) -> tuple[float, bool, bool, bool]:
     """(loss, ratio, worse, by 3 %); for a tracker with constant coefficients the first rule is its own."""
-    rows, error = regressors(run), errors(run)
-    p = constancy(rows.phi, rows.y).p_joint
+    known = Evidence(run)
+    error, p = known.errors, known.test.p_joint
     own, steady = error.tracked[error.scored], error.constant_ls[error.scored]
     loss = root_mean_square(own) / root_mean_square(steady)
     if holds_constant(run):

@@ -6,8 +6,8 @@ from scipy import stats
 from support import arx_record
 
 from driftfit import ARX, RLS, AdaptiveKalman, AugmentedFLS, Kalman, Regression, track
-from driftfit.judge.compare import errors
 from driftfit.judge.diagnose import holds_constant, standardised
+from driftfit.judge.evidence import Evidence
 from driftfit.judge.excitation import excitation
 
 TRUE = Kalman(q=0.0, r=0.01)
@@ -150,7 +150,7 @@ def test_a_tracker_that_may_move_is_not_accused_on_short_constant_records():
         u, v = rng.normal(size=(2, 25, 200, 3))
         for k in range(25):
             run = track(Regression(3), AdaptiveKalman(), u[k] @ [1.0, -1.0, 0.5] + v[k, :, 0], u[k])
-            error = errors(run)
+            error = Evidence(run).errors
             own, steady = (np.mean(e[error.scored] ** 2) for e in (error.tracked, error.constant_ls))
             dearer += own > 1.03**2 * steady
             accused += not run.diagnose()["constancy (p)"].ok

@@ -6,7 +6,8 @@
 *constant ARX*  the same on ARX(2, 1 per input) with intercept
 
 All are one-step predictions. A model with hidden states has no regressors, and is compared with the others only. They
-are scored on the samples after max(50, 5 n) that all of them could predict.
+are scored on the samples after max(50, 5 n) that all of them could predict. None of them learns from a sample that the
+run left out, and none is scored on it.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from driftfit.data.record import Record
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_errors, constant_least_squares
+from driftfit.judge.regressors import without_left_out
 from driftfit.models.arx import ARX
 from driftfit.run.result import Track, burn_in, root_mean_square
 
@@ -64,20 +66,23 @@ class Errors(NamedTuple):
     scored: Array
 
 
-def errors(run: Track, burn: int | None = None, steady: Array | None = None) -> Errors:
+def errors(run: Track, record: Record, burn: int | None = None, steady: Array | None = None) -> Errors:
     """One-step errors of a run, of persistence, of constants without and with lags, and of constant ARX.
 
     Where lags are missing, the constants without lags predict. The first ``burn`` samples are not scored; by default
-    max(50, 5 n). ``steady`` are the constants of the run, if they are known.
+    max(50, 5 n). ``record`` is what they learn from (`driftfit.judge.regressors.without_left_out`); ``steady`` are the
+    constants of the run, if they are known.
     """
-    y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
-    steady = constant_least_squares(run.model, run.record) if steady is None else steady
-    gaps = run.known.interval
-    known = run.known.changed(interval=np.where(gaps > 0.0, gaps, 1.0), noise=1.0)  # 0 before the lags were filled
+    y, u = np.where(np.abs(record.y) < LARGEST, record.y, np.nan), record.u
+    steady = constant_least_squares(run.model, record) if steady is None else steady
+    gaps, unused = record.known.interval, np.broadcast_to(record.known.noise == np.inf, len(y)).copy()
+    unused[1:] |= unused[:-1] & np.isfinite(y[:-1])  # an input that may be to blame is the lag of the next sample
+    gaps = np.where(gaps > 0.0, gaps, 1.0)  # 0 before the lags were filled
+    known = record.known.changed(interval=gaps, noise=np.where(unused, np.inf, 1.0))
     small = ARX(2, 1 if u.shape[1] else 0, inputs=u.shape[1], intercept=True)
     arx = constant_least_squares(small, Record(y, u, known))
     tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
-    lagged = _with_lags(steady, y, run.known.noise)
+    lagged = _with_lags(steady, y, record.known.noise)
     lagged = np.where(np.isfinite(lagged), lagged, constant)
     rows = len(run.program.whole.outputs)
     own = (tracked, y - persistence(y, rows), constant, lagged, arx["e"][:, 0])
@@ -89,7 +94,8 @@ def errors(run: Track, burn: int | None = None, steady: Array | None = None) -> 
 
 def _with_lags(steady: Array, y: Array, noise: Array) -> Array:
     """Errors (T,) of constants on the regressors of a run, the last outputs, and the last regressors."""
-    T, phi = len(y), np.where(steady["valid"] > 0.0, steady["phi"][..., 0], np.nan)
+    T, used = len(y), (steady["valid"] > 0.0) & (noise < np.inf)[:, None]
+    phi = np.where(used, steady["phi"][..., 0], np.nan)
     last = np.full((LAGS, T, 1 + phi.shape[1]), np.nan)
     for k in range(1, min(LAGS, T - 1) + 1):
         last[k - 1, k:] = np.column_stack([y, phi])[:-k]
@@ -98,7 +104,7 @@ def _with_lags(steady: Array, y: Array, noise: Array) -> Array:
 
 def compare(run: Track) -> Comparison:
     """Score a run against persistence, constant least squares and constant ARX."""
-    made = errors(run)
+    made = errors(run, without_left_out(run))
     shown = (made.tracked, made.persistence, made.constant_ls, made.constant_arx)
     tracked, last, ls, constant = (root_mean_square(error[made.scored]) for error in shown)
     return Comparison(tracked, last, ls, constant, int(made.scored.sum()))

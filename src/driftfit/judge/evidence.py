@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+from driftfit.data.record import Record
 from driftfit.engine.kernel import Array
 from driftfit.judge.compare import Errors, errors
 from driftfit.judge.constant_fit import constant_least_squares
-from driftfit.judge.regressors import Rows, regressors
+from driftfit.judge.regressors import Rows, regressors, without_left_out
 from driftfit.judge.statistics.constancy import Constancy, constancy
 from driftfit.run.result import Track
 
@@ -22,8 +23,12 @@ class Evidence:
     burn: int | None = None
 
     @cached_property
+    def _record(self) -> Record:
+        return without_left_out(self.run)
+
+    @cached_property
     def _steady(self) -> Array:
-        return constant_least_squares(self.run.model, self.run.record)
+        return constant_least_squares(self.run.model, self._record)
 
     @cached_property
     def rows(self) -> Rows:
@@ -38,4 +43,4 @@ class Evidence:
     @cached_property
     def errors(self) -> Errors:
         """One-step errors of the run and of simpler predictors."""
-        return errors(self.run, self.burn, self._steady)
+        return errors(self.run, self._record, self.burn, self._steady)

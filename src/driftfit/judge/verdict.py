@@ -5,8 +5,9 @@ The verdict answers two questions whose answers may differ:
 * *Do the parameters move?* Score tests of constant coefficients (`driftfit.judge.statistics.constancy`): the mean
   square of Nyblom and Hansen, and the suprema over one break and over an interval, with one error rate for all. Their
   null distribution follows the noise and the excitation of the record itself, so outliers, a changing noise variance,
-  changing inputs and correlated noise are not mistaken for drift. The tests use the record, not the tracker: q and r do
-  not enter. If the parameters are constant, the verdict says that they move with probability ``level``, as
+  changing inputs and correlated noise are not mistaken for drift. The tests use the record, not the tracker: q and r
+  do not enter. Only what the tracker left out, such as fault codes, is missing here, and for the rivals below, too.
+  If the parameters are constant, the verdict says that they move with probability ``level``, as
   ``benchmarks/verdict_error_rate.py`` verifies.
 * *Does following them pay?* The one-step errors of the run are compared with those of persistence, constant least
   squares on the past, the same with two lags of the outputs and regressors, and a constant ARX, on the same samples,

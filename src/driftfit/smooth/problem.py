@@ -42,6 +42,7 @@ def collecting_for_smoother(steps: TrackerSteps) -> TrackerSteps:
         store(o, s, l)
         o.used_noise[l] = s.used_noise[l]
         o.ok[l] = s.ok[l]
+        o.observed[l] = s.observed[l]
         o.e[l] = s.e[l]
 
     return steps._replace(store=collect_all, note=note_noise)
@@ -54,12 +55,12 @@ ROWS = 1024
 def blocks(run: Track) -> Iterator[tuple[int, Array]]:
     """Run the tracker over its record again; (first sample, samples as the tracker received them) of each block.
 
-    The fields are phi, y, dt, valid, used_noise (the factor of the noise variance), ok, e, and the tracker's
+    The fields are phi, y, dt, valid, used_noise (the factor of the noise variance), ok, observed, e, and the tracker's
     ``smoother_fields``. A block stays in the cache, and the next one takes its place.
     """
     program, T = run.program, len(run)
-    tile = program.tile()
-    names = (*run.tracker.smoother_fields, *COLLECTED, "used_noise", "ok", "e")
+    tile = run.fresh()
+    names = (*run.tracker.smoother_fields, *COLLECTED, "used_noise", "ok", "observed", "e")
     block = np.empty(min(ROWS, T), output_type(tile, names, "own"))
     loop = program.drivers("own", collecting_for_smoother(program.steps)).run
     y, u, known = lanes_of(run.record)

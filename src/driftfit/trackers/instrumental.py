@@ -46,7 +46,7 @@ noise in a constant system. Cost per sample: O(n^2), about three times `RLS`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -63,7 +63,7 @@ from driftfit.trackers.parts.coarse.shared_rounding import folded
 from driftfit.trackers.parts.covariance import LEFT, product_with, symmetric_product
 from driftfit.trackers.parts.diffuse import SCRATCH, knowing, knowing_nothing
 from driftfit.trackers.parts.faults.contradictions import add_to_block, contradictions
-from driftfit.trackers.parts.faults.judged_start import judged, unjudged
+from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
 from driftfit.trackers.parts.resolution import resolution, resolve
 from driftfit.trackers.rls import fade, learn_settling_variance, no_scale, no_settling, settling_of
 
@@ -329,6 +329,9 @@ class InstrumentalVariables(Tracker):
         super().widen(lane, p)
         scale = float(lane["scale"])
         np.einsum("ii->i", lane["G"])[:] += p / scale if scale > 0.0 else p
+
+    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
+        return faults(field, phi, y, ok)
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
         return (*contradictions(run.state), *resolution(run.state))

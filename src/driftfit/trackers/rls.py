@@ -35,14 +35,14 @@ Kulhavy and Karny (1984). Cost per sample: O(n^2).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import State, exp, kernel, nothing
+from driftfit.engine.kernel import Array, State, exp, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
@@ -58,7 +58,7 @@ from driftfit.trackers.parts.diffuse import (
     wander,
 )
 from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
-from driftfit.trackers.parts.faults.judged_start import judged, unjudged
+from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
 from driftfit.trackers.parts.resolution import least_noise, resolution, resolve, unresolved
 
 RECENT, RECENT_SHARE, LATER_SHARE = 20.0, 0.125, 0.25
@@ -341,6 +341,9 @@ class RLS(Tracker):
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         return {**self.state(model.n), **settling_of(model)}
+
+    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
+        return faults(field, phi, y, ok)
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
         return (*contradictions(run.state), *resolution(run.state))
