@@ -471,3 +471,12 @@ def test_minimal_parameters_are_plotted():
     s = example(1, 2, T=100)
     run = track(s.model, ExtendedKalman(q=1e-5, r=1e-2), s.y, s.u)
     assert len(run.plot().axes) == len(run.names) + 2
+
+
+@pytest.mark.filterwarnings("ignore:y has a root mean square")
+def test_an_output_whose_range_has_grown_is_accepted_though_it_crosses_zero():
+    """Every reading near zero ended the widening, so that those far from it were left out for 250 samples."""
+    s = example(1, 2, T=500)
+    y = s.y * np.where(np.arange(500) < 200, 1.0, 300.0)
+    run = track(s.model, RLS(0.99), y, s.u)
+    assert run.state["left_out"] < 120.0

@@ -273,3 +273,12 @@ def test_a_mixture_loses_little_against_the_better_and_takes_what_one_has():
     assert np.isnan(found.loglik[11])
     assert np.nansum(found.loglik[150:]) > np.nansum(loglik[0, 150:]) - 15.0
     assert 0.0 <= found.y_hat[-1] < 0.01
+
+
+def test_a_mixture_loses_no_more_where_one_of_them_fails_completely():
+    """A ratio of densities that is bounded lest it overflow left most of -5000 in the mixture."""
+    usual, fails = np.full(3, -1.0), np.array([-1.0, -5000.0, -1.0])
+    each = [Predicted(np.zeros(3), np.ones(3), terms) for terms in (usual, fails)]
+    for one, other in (each, each[::-1]):
+        (found,) = mixed([one], [other], [slice(0, 3)])
+        np.testing.assert_allclose(found.loglik, [-1.0, -1.0 - np.log(2.0), -1.0], atol=2e-3)

@@ -217,8 +217,11 @@ def mixed(ones: Sequence[Predicted], others: Sequence[Predicted], spans: Sequenc
             weight[t] = np.where(known, now, weight[t])
             after = now * ratio[t]
             now = np.where(known, SHARE + (1.0 - 2.0 * SHARE) * after / (1.0 - now + after), now)
-    with np.errstate(divide="ignore"):
-        terms = np.where(both, first + np.log1p(weight * (ratio - 1.0)), np.where(np.isfinite(first), first, second))
+    with np.errstate(divide="ignore", invalid="ignore"):  # one without a prediction has the weight 0
+        terms = np.logaddexp(
+            np.where(weight < 1.0, np.log1p(-weight) + first, -np.inf),
+            np.where(weight > 0.0, np.log(weight) + second, -np.inf),
+        )
     result = []
     for one, other, w, loglik in zip(ones, others, weight.T, terms.T, strict=True):
         y_hat = np.where(w > 0.0, np.where(w < 1.0, (1.0 - w) * one.y_hat + w * other.y_hat, other.y_hat), one.y_hat)

@@ -23,7 +23,7 @@ does not agree with its prediction, e^2 > LIKELY^2 s.
 
 A reading that has no prediction, because a lag or an input is missing, is judged by the first condition alone, with
 y - m in the place of e. After na codes in a row, or a gap, the next code would otherwise become a lag, and the one
-after it a response to that.
+after it a response to that. One that is inside diminishes p only a little: it may be a large signal that crosses zero.
 
 The factor p begins at 1 and doubles with every strange reading that is near the last one: a value that persists is a
 change of level and is accepted, also if it is 1000 standard deviations away. It doubles in 16 samples where a reading
@@ -191,7 +191,11 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
     grown = of_readings if of_reading else min(of_prediction * widening, LONGEST)
     left_over = 0.0 if lasting else max(s.lagging[l] - 1.0, 0.0)
     s.lagging[l] = LAGS if beyond & (off <= out) else left_over
-    s.widening[l] = grown if strange | outside else (1.0 if unpredicted | (s.ok[l] > 0.0) else widening)
+    s.widening[l] = (
+        grown
+        if strange | outside
+        else (1.0 if s.ok[l] > 0.0 else (max(widening / SLOWEST, 1.0) if unpredicted else widening))
+    )
     s.y_strange[l] = y if strange | outside else s.y_strange[l]
     s.farthest[l] = max(out, SINKING * s.farthest[l]) if strange else 0.0
     s.left_out[l] += 1.0 if left | refused else 0.0
