@@ -480,3 +480,12 @@ def test_an_output_whose_range_has_grown_is_accepted_though_it_crosses_zero():
     y = s.y * np.where(np.arange(500) < 200, 1.0, 300.0)
     run = track(s.model, RLS(0.99), y, s.u)
     assert run.state["left_out"] < 120.0
+
+
+@pytest.mark.filterwarnings("ignore:y has a root mean square")
+def test_another_range_of_the_output_is_learned():
+    """Outputs of samples that were left out are no lags; a tracker that gets no lags would leave out all others."""
+    s = example(1, 2, T=600)
+    y = np.where(np.arange(600) < 200, s.y, 30.0 * s.y)
+    run = track(s.model, RLS(0.99), y, s.u)
+    assert np.mean(run.ok[300:]) > 0.8

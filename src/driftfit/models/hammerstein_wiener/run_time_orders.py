@@ -100,7 +100,8 @@ def _steps(into: tuple[Kind, ...], out: Kind) -> ModelSteps:
         if s.orders[IDENTITY, l] == 0:
             push_any(s.blocks.ctypes.data, s.orders.ctypes.data)
         s.y_hat[l] = s.blocks[PREDICTED, l]
-        s.blocks[OBSERVED, l], s.blocks[OK, l] = believable(s, s.orders[N_OUT, l] - 1, l), s.ok[l]
+        more = s.orders[N_OUT, l] - 1
+        s.blocks[OBSERVED, l], s.blocks[OK, l] = believable(s, s.blocks[OBSERVED, l], more, l), s.ok[l]
         for i in range(s.orders[N, l]):
             s.blocks[s.orders[NOW, l] + i, l] = s.blocks[s.orders[NEXT, l] + i, l]
 

@@ -200,15 +200,24 @@ def _push(out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
     return machine(machine_push)
 
 
+PATIENCE = 10.0
+"""Samples left out one after the other, apart from those that cannot be judged, whose outputs are not believed."""
+
+
 @kernel
-def believable(s: State, more_out: int, l: int) -> float:
-    """Whether the output becomes a lag and part of the range of outputs: it was observed, and its sample not left out.
+def believable(s: State, before: float, more_out: int, l: int) -> float:
+    """Above 0 if the output becomes a lag and part of the range of outputs: observed, and its sample not left out.
 
     With an output block the output is also a regressor, and trackers cannot tell a fault code in it from one in an
-    input.
+    input. After `PATIENCE` samples it is no code but another range, which the tracker can learn only with its lags.
+    The number of samples left out since the last one that was used is c in -c, not believed, and in 1 + c, believed;
+    ``before`` is the value of the last sample.
     """
-    left_out = (more_out > 0) & (s.valid[l] > 0.0) & (s.noise[l] < np.inf) & (s.ok[l] == 0.0)
-    return 0.0 if left_out else s.observed[l]
+    judged, used = (more_out > 0) & (s.valid[l] > 0.0) & (s.noise[l] < np.inf), s.ok[l] > 0.0
+    count = max(-before, before - 1.0, 0.0)
+    count = 0.0 if used else (count + 1.0 if judged else count)
+    refused = judged & (not used) & (count <= PATIENCE)
+    return 1.0 + count if (s.observed[l] > 0.0) & (not refused) else -count
 
 
 @lru_cache
@@ -249,7 +258,7 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
             else:
                 push_lane(s.blocks.ctypes.data + at, L)
         s.y_hat[l] = s.blocks[PREDICTED, l]
-        s.blocks[OBSERVED, l], s.blocks[OK, l] = believable(s, more, l), s.ok[l]
+        s.blocks[OBSERVED, l], s.blocks[OK, l] = believable(s, s.blocks[OBSERVED, l], more, l), s.ok[l]
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 
