@@ -138,8 +138,7 @@ def _prepared(
         if program.shared is None:
             y = records.y[:, lane] if records.outputs else records.y
             (program.model if program.alone is None else program.alone.model).inspect(y, records.u)
-    if records.drifts is not None or prob is not None:
-        records = records.for_trackers(programs[0].model, [program.tracker for program in programs], prob)
+    records = records.for_trackers(programs[0].model, (program.tracker for program in programs), prob)
     return programs, records.in_rows() if model.shared else records
 
 

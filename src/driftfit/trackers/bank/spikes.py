@@ -22,7 +22,7 @@ BLOCK = 1024
 def spikes(run: Any) -> int:
     """How many jumps of a run were taken back."""
     innovation, expected, theta, var, count = run.innovation, run.innovation_var, run.theta, run.var, 0
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for first in range(1, len(run) - LATER, BLOCK):
             block = slice(first, min(first + BLOCK, len(run) - LATER))
             for t in first + np.flatnonzero(innovation[block] ** 2 > LARGE**2 * expected[block]):
