@@ -4,8 +4,8 @@
 and which readings are faults. Ratios are medians over runs. *each* is ``AdaptiveKalman(groups=[[0], [1], ..])``,
 *faults* a `Bank` with a hypothesis for outliers, *ML each* the Kalman filter with the drift of every parameter and the
 noise variance by maximum likelihood from the whole record, and *best* that with the one ratio q c / r that is best on
-these very runs. The last columns are shares within the 95 % bands of `AdaptiveKalman`, of theta and of y (without
-faults).
+these very runs. The last columns are shares within the 95 % bands of `AdaptiveKalman`: of the parameters that move,
+of those that never do, and of y (without faults).
 
 Run: python -m benchmarks.scenarios [--runs 20] [--only NAME ..] [--columns default each bank ml best] [--quick]
 """
@@ -142,13 +142,13 @@ def error(case: Case, theta: Array, c: Array) -> float:
 
 
 def within(off: Array, std: Array) -> float:
-    """Share within the band."""
+    """Share within the band; NaN for none."""
     known = np.isfinite(off) & np.isfinite(std)
-    return float(np.mean(np.abs(off[known]) <= HALF * std[known]))
+    return float(np.mean(np.abs(off[known]) <= HALF * std[known])) if known.any() else np.nan
 
 
 def scored(name: str, runs: int, columns: list[str]) -> dict[str, float]:
-    """Median ratios to the oracle by column, and coverage of the first of our trackers."""
+    """Median ratios to the oracle by column, and coverage of our trackers."""
     ratios: dict[str, list[float]] = {column: [] for column in columns if column != "best"}
     fixed, bands = [], []
     for seed in range(runs):
@@ -161,9 +161,10 @@ def scored(name: str, runs: int, columns: list[str]) -> dict[str, float]:
             out = COLUMNS[column](case, phi)
             if isinstance(out, Track):
                 late, fine = slice(case.burn, None), ~case.blind[case.burn :]
-                theta = within((out.theta - case.theta)[late], out.std[late])
+                off, moves = (out.theta - case.theta)[late], np.ptp(case.theta, axis=0) > 0.0
+                parts = [within(off[:, which], out.std[late][:, which]) for which in (moves, ~moves)]
                 y = within((case.y - out.prediction)[late][fine], out.innovation_std[late][fine])
-                bands.append((column, theta, y))
+                bands.append((column, *parts, y))
                 out = out.theta
             ratios[column].append(error(case, out, c) / least)
         if "best" in columns:
@@ -173,7 +174,8 @@ def scored(name: str, runs: int, columns: list[str]) -> dict[str, float]:
     if fixed:
         row["best"] = float(np.median(fixed, axis=0).min())
     for column in dict.fromkeys(column for column, *_ in bands):
-        row[f"{column} theta"], row[f"{column} y"] = np.mean([b[1:] for b in bands if b[0] == column], axis=0)
+        shares = np.mean([band[1:] for band in bands if band[0] == column], axis=0)
+        row |= {f"{column} {part}": share for part, share in zip(("moving", "constant", "y"), shares, strict=True)}
     return row
 
 
@@ -194,8 +196,9 @@ def main() -> None:
         row = scored(name, runs, given.columns)
         if not heads:
             heads = [*given.columns, *(head for head in row if " " in head)]
-            print(f"{'':18}" + "".join(f"{head:>14}" for head in heads))
-        print(f"{name:18}" + "".join(f"{row.get(head, np.nan):14.2f}" for head in heads), flush=True)
+            print(f"{'':18}" + "".join(f"{head:>17}" for head in heads))
+        cells = [f"{row[head]:.2f}" if np.isfinite(row[head]) else "-" for head in heads]
+        print(f"{name:18}" + "".join(f"{cell:>17}" for cell in cells), flush=True)
 
 
 if __name__ == "__main__":

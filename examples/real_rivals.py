@@ -1,10 +1,11 @@
 """`AdaptiveKalman` without a setting on real records, two or more models of each, beside what one would otherwise do.
 
 The second half of each record is scored, one step ahead, on the samples that every method could predict. RLS has the
-forgetting factor, and NLMS (normalised least mean squares) the step, with the smallest error in the first half;
-*constant LS* is RLS without forgetting, and *constant ARX* least squares on two lags of the output, the last value of
-each input, and an intercept. The last columns are the error of `AdaptiveKalman` over that of the best of them, and over
-that of the best with the same regressors: all but the constant ARX.
+forgetting factor, and NLMS (normalised least mean squares) the step, with the smallest error in the first half.
+*In band* is the share of outputs within the 95 % band of `AdaptiveKalman`, *conformal* that of its band with
+``output_band(conformal=True)``. *Constant LS* is RLS without forgetting, and *constant ARX* least squares on two lags of
+the output, the last value of each input, and an intercept. The last columns are the error of `AdaptiveKalman` over that
+of the best of them, and over that of the best with the same regressors: all but the constant ARX.
 
 The records are not part of the project. The folder must contain, besides those of `real_records.py`,
 heat_exchanger.csv (DaISy), pump_loop_skab.csv (SKAB), air_quality_sensors.csv (UCI) and us_consumption_change.csv
@@ -27,6 +28,7 @@ from rich.table import Table
 from driftfit import ARX, RLS, AdaptiveKalman, Regression, track
 from driftfit.data import read_columns
 from driftfit.judge.compare import persistence
+from driftfit.results import Track
 from driftfit.run.result import root_mean_square
 
 MEMORIES = 1.0 - 10.0 ** np.linspace(-3.5, -0.7, 15)
@@ -125,10 +127,18 @@ def tuned(candidates: list[np.ndarray], half: int) -> np.ndarray:
     return min(candidates, key=lambda e: float(np.sqrt(np.nanmean(e[min(50, half // 2) : half] ** 2))))
 
 
+def within(run: Track, conformal: bool, scored: np.ndarray) -> float:
+    """Share of the outputs within the 95 % bands of their prediction."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        low, high = run.output_band(0.95, conformal=conformal)
+    return float(np.mean(((low < run.y) & (run.y < high))[scored]))
+
+
 def main(folder: str) -> None:
     table = Table(box=SIMPLE_HEAD, show_edge=False)
     names = ("persistence", "constant LS", "constant ARX", "NLMS", "RLS")
-    for head in ("record", "AdaptiveKalman", "in band", *names, "over the best", "same phi"):
+    for head in ("record", "AdaptiveKalman", "in band", "conformal", *names, "over the best", "same phi"):
         table.add_column(head, justify="left" if head == "record" else "right", no_wrap=True)
     for read in CASES:
         case = read(Path(folder))
@@ -142,12 +152,12 @@ def main(folder: str) -> None:
         rivals = [case.level - persistence(case.level), fixed[0], arx, tuned(stepped, half), tuned(fixed, half)]
         scored = np.isfinite([run.innovation, *rivals]).all(axis=0) & (np.arange(len(case.y)) >= half)
         own, *others = (root_mean_square(e[scored]) for e in (run.innovation, *rivals))
-        inside = np.mean(np.abs(run.innovation[scored]) < 1.96 * run.innovation_std[scored])
+        inside = [within(run, conformal, scored) for conformal in (False, True)]
         alike = [error for name, error in zip(names, others, strict=True) if name != "constant ARX"]
         ratios = (f"{own / min(others):.2f}", f"{own / min(alike):.2f}")
-        numbers = (f"{own:.3g}", f"{inside:.2f}", *(f"{other:.3g}" for other in others), *ratios)
+        numbers = (f"{own:.3g}", *(f"{share:.2f}" for share in inside), *(f"{other:.3g}" for other in others), *ratios)
         table.add_row(case.name, *numbers)
-    Console(width=160).print(table)
+    Console(width=170).print(table)
 
 
 if __name__ == "__main__":

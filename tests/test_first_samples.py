@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftfit import ARX, AdaptiveKalman, Equation, Kalman, Regression, track
+from driftfit import ARX, RLS, AdaptiveKalman, Equation, Kalman, Regression, track
 from driftfit.smooth.problem import walk_of
 
 T, THETA = 600, (1.1, -0.5, 1.0, 0.5)
@@ -127,3 +127,15 @@ def test_a_code_beside_inputs_that_are_held_and_a_coarse_meter(held, at, code):
         y[at] = code
         run = track(ARX(1, 1), Kalman(q=1e-6, r=0.01), y, u)
         np.testing.assert_allclose(run.theta[-1], [0.7, 2.0], atol=0.1)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+@pytest.mark.parametrize("tracker", [AdaptiveKalman(), RLS(0.99)])
+def test_a_start_between_two_levels_of_a_coarse_meter_has_no_fault_codes(tracker, unit):
+    """Whole litres that were interpolated to other times: 32 and 32.0015 by turns, and one reading in three is 33."""
+    rng = np.random.default_rng(1)
+    litres = np.where(np.arange(12) % 3 == 2, 33.0, 32.0) + 0.0015 * (np.arange(12) % 2)
+    run = track(Regression(1, intercept=True), tracker, unit * litres, rng.normal(size=12))
+    assert run.ok.all()
+    assert left_out(run) == 0
+    assert run.innovation_std[-1] > 0.2 * unit

@@ -12,7 +12,8 @@ a coarse meter, the usual distance of those that differ takes its place. A sampl
 A large output after a large input is neither. A regressor is unusual if it is outlying, or if it differs where most are
 equal, as after a step of an input, and two readings or more, and most of those where it differs, are outlying; a lag
 with the same fault code as the reading is not unusual. If half of the samples or more are doubtful and more cannot be
-waited for, the level has changed, and no sample is doubtful.
+waited for, the level has changed, and no sample is doubtful. Nor are values outlying if they are more than one in
+`FREQUENT` and nearer to the median than half of it: a meter of whole litres that shows 32, 32.0002 and 33 by turns.
 
 A large input with a slow response looks the same, and its samples are the most informative of all. Doubtful samples
 are therefore left out only if the others contradict them: if least squares on all samples leaves these others a sum of
@@ -38,6 +39,8 @@ STEPS = 3
 """Number of values that differ where most are equal, as those of an input that often rests, to tell a usual one."""
 SURELY_WORSE = 16.0
 """The same with `SURE` residuals, of which a sum of squares is less uncertain: four standard deviations."""
+FREQUENT = 5
+"""One value in so many may be a fault code that is near the others."""
 RESIDUALS = 4
 """Number of residuals after which the first samples are judged."""
 SURE = 12
@@ -87,6 +90,20 @@ def median(samples: Array, N: int, column: int, center: float, apart: float) -> 
 
 
 @shared
+def reach(samples: Array, N: int, column: int, center: float) -> float:
+    """Distance from center beyond which a value of a column is outlying; inf where values beyond it are a level."""
+    limit: float = OUTLYING * median(samples, N, column, center, 1.0)
+    count, beyond, farthest = 0, 0, 0.0
+    for k in range(N):
+        if fresh(samples, k):
+            away = abs(samples[k, column] - center)
+            count += 1
+            beyond += 1 if away > limit else 0
+            farthest = max(farthest, away)
+    return np.inf if limit > 0.0 and FREQUENT * beyond > count and farthest < 0.5 * abs(center) else limit
+
+
+@shared
 def answered(samples: Array, N: int, column: int, center: float, usual: float, limit: float) -> bool:
     """Whether outlying readings go with a regressor that differs from center: two do, and most where it differs."""
     outlying, ordinary = 0, 0
@@ -125,7 +142,7 @@ def doubt(samples: Array, N: int, last: bool) -> None:
     Half of them or more are kept as doubtful while further samples can be waited for, which is until ``last``.
     """
     usual = median(samples, N, READING, 0.0, 0.0)
-    limit = OUTLYING * median(samples, N, READING, usual, 1.0)
+    limit = reach(samples, N, READING, usual)
     if limit == 0.0:
         step = usual_step(samples, N, READING, usual)
         limit = OUTLYING * step if step < np.inf else 0.0
@@ -134,7 +151,7 @@ def doubt(samples: Array, N: int, last: bool) -> None:
         samples[k, NOISE] = -abs(samples[k, NOISE]) if doubtful else abs(samples[k, NOISE])
     for i in range(PHI, samples.shape[1]):
         center = median(samples, N, i, 0.0, 0.0)
-        most = OUTLYING * median(samples, N, i, center, 1.0)
+        most = reach(samples, N, i, center)
         steps = most > 0.0 or answered(samples, N, i, center, usual, limit)
         apart = most if most > 0.0 else OUTLYING * usual_step(samples, N, i, center)
         for k in range(N):
