@@ -3,8 +3,8 @@
 The second half of each record is scored, one step ahead, on the samples that every method could predict. RLS has the
 forgetting factor, and NLMS (normalised least mean squares) the step, with the smallest error in the first half.
 *In band* is the share of outputs within the 95 % band of `AdaptiveKalman`, *conformal* that of its band with
-``output_band(conformal=True)``. *Constant LS* is RLS without forgetting, and *constant ARX* least squares on two lags of
-the output, the last value of each input, and an intercept. The last columns are the error of `AdaptiveKalman` over that
+``output_band(conformal=True)``. *Constant LS* is RLS without forgetting, and *constant ARX* least squares on two lags
+of the output, the last value of each input, and an intercept. The last columns are its error over that
 of the best of them, and over that of the best with the same regressors: all but the constant ARX.
 
 The records are not part of the project. The folder must contain, besides those of `real_records.py`,
