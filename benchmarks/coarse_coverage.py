@@ -6,7 +6,7 @@ counted at samples 500 and 1000 where it is finite; it is NaN as long as there i
 noise. In brackets: the share of bands that are not finite, where there are any. The second table has one parameter at
 the last sample, and the same bands with and without what readings share.
 
-Run: python benchmarks/coarse_coverage.py [records, 40 by default] [--quick, with 4]
+Run: python benchmarks/coarse_coverage.py [records, 40 by default] [--quick, with 1]
 """
 
 import sys
@@ -77,4 +77,4 @@ def main(records: int = 40, quick: bool = False) -> None:
 if __name__ == "__main__":
     counts = [int(given) for given in sys.argv[1:] if given.isdigit()]
     quick = "--quick" in sys.argv
-    main(*(counts or ([4] if quick else [])), quick=quick)
+    main(*(counts or ([1] if quick else [])), quick=quick)

@@ -23,7 +23,7 @@ from driftfit import ARX, OE, RLS, AdaptiveKalman, BoxJenkins, InstrumentalVaria
 
 T, SETTLED, ASTRAY = 1500, 300, 30.0
 QUICK = "--quick" in sys.argv
-RECORDS = 2 if QUICK else 40
+RECORDS = 1 if QUICK else 40
 PLANT = {"f1": (1.5, 1.6), "f2": (-0.7, -0.75), "b1": (1.0, 2.0), "b2": (0.5, 1.0)}
 """Before and after."""
 COLOURS = {
@@ -113,7 +113,7 @@ def main() -> None:
             drawn = {
                 name: [record(noise, decibels, drifting, s) for s in range(RECORDS)] for name, noise in COLOURS.items()
             }
-            for way in ways[::4] if QUICK else ways:
+            for way in ways[:4:3] if QUICK else ways:
                 cells = [judged(way, one, drifting) for one in drawn.values()]
                 print(f"{way[0]:32}" + "".join(cell for cell, _ in cells) + f"{sum(n for _, n in cells):8}", flush=True)
 

@@ -17,7 +17,7 @@ import numpy as np
 from driftfit import JointKalman, ParticleFilter, StateSpace, track
 
 QUICK = "--quick" in sys.argv
-RECORDS, T, FIRST, LAST = (2 if QUICK else 12), 1200, 400, 600
+RECORDS, T, FIRST, LAST = (1 if QUICK else 12), 1200, 400, 600
 MODEL = StateSpace("x = theta.a * x[-1] + theta.b * u[-1] \n y = x", start={"a": 0.5, "b": 0.5})
 GIVEN: dict[str, Any] = {"q": {"a": 1e-5, "b": 1e-5, "x": 1e-3}, "r": 0.01, "p0": {"a": 0.1, "b": 0.5, "x": 0.25}}
 TRACKERS = {

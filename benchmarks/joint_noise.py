@@ -52,7 +52,7 @@ def of_record(T: int, jump: float, seed: int) -> list[float]:
 
 
 def main() -> None:
-    runs = 4 if "--quick" in sys.argv else 100
+    runs = 1 if "--quick" in sys.argv else 100
     print("samples   change   R unknown   R estimated   outputs alone   log odds, median distance")
     for T in (30, 60, 120):
         for jump in (0.3, 0.0):

@@ -112,12 +112,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--only", nargs="*", choices=NAMES)
-    parser.add_argument("--quick", action="store_true", help="two runs of one scenario")
+    parser.add_argument("--quick", action="store_true", help="one run of one scenario")
     given = parser.parse_args()
     rows = []
     print(f"{'':16}" + "".join(f"{column:>10}" for column in COLUMNS))
     for name in given.only or (["near_unit_root"] if given.quick else NAMES):
-        runs = 2 if given.quick else given.runs if name != "very_slow" else max(2, given.runs // 5)
+        runs = 1 if given.quick else given.runs if name != "very_slow" else max(2, given.runs // 5)
         rows.append([float(value) for value in np.median([ratios(name, seed) for seed in range(runs)], axis=0)])
         print(line(name, rows[-1]), flush=True)
     print(line("median", [float(np.median(column)) for column in zip(*rows, strict=True)]))

@@ -5,7 +5,7 @@
     python benchmarks/service.py soak --seconds 900
     python benchmarks/service.py fuzz --count 100000
     chrt -r 1 python benchmarks/service.py latency         where other programs use the processor too
-    python benchmarks/service.py --quick         the parts that need no broker, in seconds
+    python benchmarks/service.py --quick         the parts that need no broker, or those given, in seconds
 
 The model is ARX(1, 1), tracked by Kalman(q=1e-4, r=0.1), with times; each sample is journaled before the update. The
 floor of MQTT is the same broker and client with an empty handler. The peer is what one writes by hand with filterpy:
@@ -449,7 +449,8 @@ def main():
     parser.add_argument("--quick", action="store_true")
     options = parser.parse_args()
     if options.quick:
-        options.parts, options.units, options.count = ["journal", "engine", "fuzz"], 20, 500
+        options.parts = options.parts or ["journal", "engine", "fuzz"]
+        options.units, options.count, options.seconds = 20, 500, 2
     for name in options.parts or [name for name in PARTS if name != "soak"]:
         with tempfile.TemporaryDirectory(prefix="driftfit-benchmark-", dir=os.environ.get("TMPDIR")) as folder:
             PARTS[name](options, Path(folder))

@@ -94,7 +94,7 @@ def peak(function, *arguments):
     return most, held, result
 
 
-def memory(T=10_000):
+def memory(T):
     """Peak memory in bytes per sample."""
     phi, y = record(T)
     run = track(Regression(N), FLS(MU), y, phi)
@@ -113,7 +113,7 @@ def memory(T=10_000):
     )
 
 
-def others(T=10_000, turns=60):
+def others(T, turns):
     """Time with a proper prior, with leverages, and with covariances, relative to that without."""
     phi, y = record(T)
     run = track(Regression(N), FLS(MU), y, phi)
@@ -128,7 +128,7 @@ def others(T=10_000, turns=60):
     )
 
 
-def phases(T=100_000, turns=20):
+def phases(T, turns):
     """Shares of the time: the replay of the filter, and the elimination inwards and outwards."""
     phi, y = record(T)
     run = track(Regression(N), FLS(MU), y, phi)
@@ -154,7 +154,7 @@ def phases(T=100_000, turns=20):
 
 
 def main(quick: bool) -> None:
-    sizes = (10_000, 30_000, 100_000) if quick else (10_000, 100_000, 1_000_000)
+    sizes = (1_000, 3_000) if quick else (10_000, 100_000, 1_000_000)
     methods = {"driftfit": ours, "statsmodels": statsmodels, "banded solve, means only": banded}
     table = Table(
         title=f"Exact smoothing, n = {N}: seconds of processor time, and microseconds a sample", title_justify="left"
@@ -166,14 +166,14 @@ def main(quick: bool) -> None:
     table.add_column("largest difference", justify="right")
     track(Regression(N), FLS(MU), *record(100)[::-1]).smooth()
     for T in sizes:
-        times, gap = compare(methods, T, 1 if T == 1_000_000 else 600_000 // T)
+        times, gap = compare(methods, T, 1 if quick or T == 1_000_000 else 600_000 // T)
         cells = [f"{min(t):.4f} ({min(t) / T * 1e6:.2f})" for t in times.values()]
         ratio = min(times["statsmodels"]) / min(times["driftfit"])
         table.add_row(f"{T:,}", *cells, f"{ratio:.1f}", f"{gap:.0e}")
     Console(width=120).print(table)
-    memory()
-    others()
-    phases()
+    memory(sizes[0])
+    others(sizes[0], 1 if quick else 60)
+    phases(sizes[1], 1 if quick else 20)
 
 
 def compare(methods, T, turns):
@@ -193,5 +193,5 @@ def compare(methods, T, turns):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="up to 100,000 samples")
+    parser.add_argument("--quick", action="store_true", help="up to 3,000 samples, once")
     main(parser.parse_args().quick)

@@ -58,6 +58,7 @@ def test_predictions_are_those_of_live():
         live.update(y, [x["a"], x["b"]])
     assert list(model.coef.values()) == list(live.theta[:2])
     assert list(model.coef) == ["a", "b"]
+    assert list(model.coef_std.values()) == list(live.std[:2])
     assert model.intercept == live.theta[2]
 
 

@@ -34,6 +34,7 @@ ELSEWHERE = {
     "python -m lab reproduce hypotheses": (
         "lab/tests/test_reproduce_hypotheses.py", '["reproduce", "hypotheses", "--quick"',
     ),
+    "driftfit warm": ("tests/test_cli_commands.py", 'run("warm", "--model", "arx:1,1", *KALMAN)'),
     "driftfit serve": ("tests/test_service_page.py", '"driftfit", "serve", *(what or ["--demo"])'),
     "python examples/controller.py": ("tests/test_embedded.py", '["controller.py"]'),
     "python -m lab bench accuracy": ("lab/tests/test_bench.py", '["bench", "accuracy", "--quick"'),
@@ -106,7 +107,7 @@ def test_benchmarks_run_quickly(command, monkeypatch):
     if "import JulierSigmaPoints" in content:
         pytest.importorskip("filterpy", reason="there is no filterpy")
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    monkeypatch.setattr("sys.argv", [script, *given, "--quick"] if "typer" not in content else [script, "--quick"])
+    monkeypatch.setattr("sys.argv", [script, *given, "--quick"])
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         runpy.run_path(str(ROOT / script), run_name="__main__")

@@ -96,7 +96,7 @@ def test_what_cannot_be_read_is_named():
 
     for function, message in (
         (endless, "'while u.a > 0:' is not understood"), (long, "'for i in u' has no known length"),
-        (other, "other takes p; arguments are x, u"), (nothing, "nothing has a way on which it returns nothing"),
+        (other, "other takes p; arguments are x, u"), (nothing, "nothing has a branch that returns nothing"),
         (unknown, "cannot be read|not understood|source"), (whole, "theta itself is no number; use its parts"),
         (lambda u, theta: theta.k * u, "has no name of its own|lambda"),
     ):  # fmt: skip

@@ -17,7 +17,7 @@ from driftfit.models.hammerstein_wiener.trackers.extended_kalman import Extended
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.systems.arc_furnace import THRESHOLDS, A, furnace, length, resistance
 from driftfit.systems.drift import RandomWalk
-from driftfit.systems.hammerstein_wiener import simulate, unstable_in_closed_loop
+from driftfit.systems.hammerstein_wiener import simulate
 
 SMALL = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(2))
 K = Kalman(q=1e-5, r=1e-4, p0=1e2, theta0=0.01)
@@ -289,7 +289,12 @@ def test_an_estimate_that_does_not_increase_is_flagged_and_predicted_with_its_en
 
 
 def test_an_unstable_block_with_a_bounded_output_is_followed():
-    s = unstable_in_closed_loop(600)
+    """A pole at 1.05, and a proportional controller."""
+    rng, T = np.random.default_rng(0), 600
+    reference = rng.normal(0.0, 0.5, T)
+    model = HammersteinWiener(1, 1, input=Polynomial(3), output=Polynomial(3))
+    laws = [-1.05], [RandomWalk(0.7, 1e-3, (0.5, 0.9))], [0.0, 0.1], [0.0, 0.1]
+    s = simulate(model, *laws, T=T, rng=rng, u=lambda t, y: reference[t] - (0.6 * y[-1] if t else 0.0))
     assert s.unstable == 0
     assert np.abs(s.y).max() < 10.0
     run = track(s.model, Kalman(q=1e-5, r=1e-4, p0=1e4), s.y, s.u)

@@ -128,7 +128,7 @@ def test_what_does_not_fit_a_law_is_refused():
         with pytest.raises(ValueError, match=message):
             track(Regression(2), Kalman(q=0.0, r=1.0, laws=laws), *data())
     for make, message in (
-        (lambda: Law.season(4, harmonics=2), "half a circle"), (lambda: Law("returns"), "needs time, std"),
+        (lambda: Law.season(4, harmonics=2), "half a wave"), (lambda: Law("returns"), "needs time, std"),
         (lambda: Law.trend(-1.0), "at least 0"), (lambda: Kalman(q=np.eye(2), r=1.0, laws=LAWS), "must be"),
         (lambda: track(Regression(2), TRACKER, *data()).smooth(), "has laws"),
         (lambda: track(Regression(2), TRACKER, *data()).ahead(2), "laws by which theta moves"),
@@ -197,7 +197,7 @@ def test_planes_condition_and_streams_say_what_records_say():
     ("text", "message"),
     [
         ("theta1", "is no constraint"), ("theta1 >=", "is no constraint"), ("theta1 * theta2 >= 0", "not linear"),
-        ("b >= 0", "not linear"), ("1 <= theta1 <= 0", "nothing meets"), ("0 <= theta1 <= theta2", "one sum"),
+        ("b >= 0", "not linear"), ("1 <= theta1 <= 0", "no parameters satisfy"), ("0 <= theta1 <= theta2", "one sum"),
         ("theta1 != 0", "must compare"), ("theta1 >= theta1", "one sum"), ("__import__('os') >= 0", "not linear"),
     ],
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The building blocks of your own trackers, models and curves; see docs/design.md and `driftfit.check_tracker`."""
+"""The building blocks of your own trackers, models and curves; see docs/own_tracker.md and `driftfit.check_tracker`."""
 
 from driftfit.engine.drivers import ModelSteps, TrackerSteps, diagonal, unknown
 from driftfit.engine.kernel import Array, State, Step, exp, kernel, log, nothing
@@ -7,6 +7,7 @@ from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.curves.curve import Basis
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.parts.covariance import prediction
+from driftfit.trackers.parts.varying_drift import read_drift
 
 __all__ = [
     "Array",
@@ -27,6 +28,7 @@ __all__ = [
     "numbers",
     "one_of",
     "prediction",
+    "read_drift",
     "unknown",
     "vector",
     "whole",

@@ -126,7 +126,7 @@ def _lanes(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
         if difference:
             yield (
                 f"A series gives other results in a fleet than alone ({difference}): index every field with [..., l], "
-                "and take exp and log from driftfit.engine.kernel, because others differ with the number of lanes."
+                "and take exp and log from driftfit.extend, because others differ with the number of lanes."
             )
             return
 

@@ -68,7 +68,7 @@ def system_of(text: str) -> System:
     left = tuple(line.output for line in lines)
     if len(set(left)) < len(left) or {TIME, CLOCK} & set(left):
         raise ValueError(
-            f"StateSpace: the names on the left must differ, and dt and clock are none; got {', '.join(left)}."
+            f"StateSpace: the names on the left must differ, and none may be dt or clock; got {', '.join(left)}."
         )
     hidden, output = left[:-1], left[-1]
     parameters: dict[str, None] = {}

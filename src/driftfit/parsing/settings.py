@@ -115,6 +115,16 @@ def parse_tracker(name: str, given: Sequence[str], own: str | None = None) -> Tr
     return build(f"tracker {own or name}", kind, settings)
 
 
+def tracker_of(text: str) -> Tracker:
+    """A tracker from one text, ``Kalman(q=1e-4, r=0.1)`` or ``kalman:q=1e-4;r=0.1``; ValueError with the reason if it
+    is wrong.
+    """
+    if "(" in text:
+        return parse_tracker(text, [])
+    name, _, settings = text.partition(":")
+    return parse_tracker(name, [one for one in settings.split(";") if one.strip()])
+
+
 def add_setting(where: str, settings: dict[str, Any], known: Any, key: str, value: Any) -> None:
     """Store a setting under an existing name; it may be given only once."""
     if key not in known:

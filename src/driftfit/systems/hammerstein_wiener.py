@@ -224,14 +224,3 @@ def example(number: int, seed: int = 0, T: int = 5000, snr_db: float | None = No
         if found.unstable is None:
             return found
         seed += 1000
-
-
-def unstable_in_closed_loop(T: int = 2000, seed: int = 0) -> Simulated:
-    """An unstable linear block (with a pole at 1.05) whose output a proportional controller keeps bounded."""
-    rng = np.random.default_rng(seed)
-    reference = rng.normal(0.0, 0.5, T)
-    model = HammersteinWiener(1, 1, input=Polynomial(3), output=Polynomial(3))
-    return simulate(
-        model, [-1.05], [RandomWalk(0.7, 1e-3, (0.5, 0.9))], [0.0, 0.1], [0.0, 0.1],
-        T=T, rng=rng, u=lambda t, y: reference[t] - (0.6 * y[-1] if t else 0.0),
-    )  # fmt: skip

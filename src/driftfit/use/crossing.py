@@ -235,9 +235,7 @@ def _of_output(run: Track, sign: float, limit: float, h: int, u: Any) -> Array:
             f"crossing: the output depends on {model.m} inputs; give their future values, u= ({h}, {model.m})."
         )
     if run.tracker.output_error or "slope" in run.state:
-        raise ValueError(
-            "crossing: the crossing of the output needs parameters that are random walks; ask for a parameter."
-        )
+        raise ValueError("crossing: for the output the parameters must be random walks; ask for a parameter.")
     p, rng = model.reach, np.random.default_rng(0)
     r = noise_at(run, -1)
     now, q = _covariances(run)

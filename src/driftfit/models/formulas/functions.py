@@ -165,7 +165,7 @@ class _Reader:
     def result(self, given: Mapping[str, Any]) -> Any:
         found = self.run(self.body, dict(given))
         if found is None:
-            raise _refused(f"{self.function.__name__} has a way on which it returns nothing")
+            raise _refused(f"{self.function.__name__} has a branch that returns nothing")
         return found
 
     def run(self, body: Sequence[Any], names: dict[str, Any]) -> Any:

@@ -140,7 +140,9 @@ class HammersteinWiener(Model):
         if self.name is not None:
             names = input_names("HammersteinWiener", "name", [self.name] if isinstance(self.name, str) else self.name)
             if len(names) != self.m:
-                raise ValueError(f"HammersteinWiener: there is a name for each input; got {self.name!r} for {self.m}.")
+                raise ValueError(
+                    f"HammersteinWiener: name must hold a name for each input; got {self.name!r} for {self.m}."
+                )
             self._set("name", names if self.m > 1 else names[0])
         self._check_outputs()
 

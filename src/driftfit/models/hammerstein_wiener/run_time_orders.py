@@ -32,15 +32,13 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     NB,
     NEXT,
     NOW,
-    OBSERVED,
-    OK,
     OWN,
     PREDICTED,
     US,
     N,
     Y,
 )
-from driftfit.models.hammerstein_wiener.steps import believable, regress_work
+from driftfit.models.hammerstein_wiener.steps import regress_work, settle_output
 from driftfit.models.wider import Wider
 
 
@@ -100,8 +98,7 @@ def _steps(into: tuple[Kind, ...], out: Kind) -> ModelSteps:
         if s.orders[IDENTITY, l] == 0:
             push_any(s.blocks.ctypes.data, s.orders.ctypes.data)
         s.y_hat[l] = s.blocks[PREDICTED, l]
-        more = s.orders[N_OUT, l] - 1
-        s.blocks[OBSERVED, l], s.blocks[OK, l] = believable(s, s.blocks[OBSERVED, l], more, l), s.ok[l]
+        settle_output(s, s.orders[N_OUT, l] - 1, l)
         for i in range(s.orders[N, l]):
             s.blocks[s.orders[NOW, l] + i, l] = s.blocks[s.orders[NEXT, l] + i, l]
 

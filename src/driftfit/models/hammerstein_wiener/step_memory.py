@@ -33,13 +33,14 @@ ROW = GRID + 1
 
 (
     LOW, STEP, LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED, STARTED, MINIMAL, GIVEN, RAW, VARIANCE, BEFORE, EARLIER,
-    FIRM_LOW, FIRM_HIGH, MOVED, LATE, CELL, Y, DT, OBSERVED, OK, FACTOR, LEAST, SCALE, HEAD,
-) = range(28)  # fmt: skip
+    FIRM_LOW, FIRM_HIGH, MOVED, LATE, CELL, Y, DT, BELIEVED, LEFT_OUT, OK, FACTOR, LEAST, SCALE, HEAD,
+) = range(29)  # fmt: skip
 """Numbers: the grid, the range of accepted outputs, where the output block is defined, results, whether all lags are
 known, whether theta is xi, the given noise factor, the output as given, sigma^2 or 0, the two previous outputs, the
 range of medians of three, whether the range changed, whether a level is stored in place of the
-prediction, its cell of the grid, what steps and compiled routine exchange, the least variance that sigma adds to
-an equation, and the scale of y that the basis gives; HEAD is their number.
+prediction, its cell of the grid, what steps and compiled routine exchange, whether the output becomes a lag, how many
+samples in a row were left out, whether the sample was used, the noise factor of the equation, the least variance that
+sigma adds to it, and the scale of y that the basis gives; HEAD is their number.
 """
 
 (

@@ -36,6 +36,7 @@ from driftfit.models.hammerstein_wiener.regressor_rows import (
 )
 from driftfit.models.hammerstein_wiener.step_memory import (
     ADAPTIVE,
+    BELIEVED,
     DT,
     EACH,
     FACTOR,
@@ -45,6 +46,7 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     IDENTITY,
     INPUTS,
     LATE,
+    LEFT_OUT,
     MINIMAL,
     MOVED,
     N_OUT,
@@ -53,7 +55,6 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     NEXT,
     NK,
     NOW,
-    OBSERVED,
     OK,
     OWN,
     OWN_ADAPTIVE,
@@ -127,7 +128,7 @@ def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
 
     def regress_sample(m: Array, p: Places, theta: Array) -> None:
         n_out, rows, g, h = p[N_OUT], 1 + max(p[NA], 1), p[G_PAST], p[H_PAST]
-        if not m[OBSERVED, 0] > 0.0:  # the previous sample
+        if not m[BELIEVED, 0] > 0.0:  # the previous sample
             for k in range(n_out):
                 m[g + k, 0] = np.nan
             lose_output(m, p)
@@ -205,19 +206,18 @@ PATIENCE = 10.0
 
 
 @kernel
-def believable(s: State, before: float, more_out: int, l: int) -> float:
-    """Above 0 if the output becomes a lag and part of the range of outputs: observed, and its sample not left out.
+def settle_output(s: State, more_out: int, l: int) -> None:
+    """Decide whether the output becomes a lag and part of the range of outputs: observed, and its sample not left out.
 
     With an output block the output is also a regressor, and trackers cannot tell a fault code in it from one in an
     input. After `PATIENCE` samples it is no code but another range, which the tracker can learn only with its lags.
-    The number of samples left out since the last one that was used is c in -c, not believed, and in 1 + c, believed;
-    ``before`` is the value of the last sample.
     """
     judged, used = (more_out > 0) & (s.valid[l] > 0.0) & (s.noise[l] < np.inf), s.ok[l] > 0.0
-    count = max(-before, before - 1.0, 0.0)
+    count = s.blocks[LEFT_OUT, l]
     count = 0.0 if used else (count + 1.0 if judged else count)
     refused = judged & (not used) & (count <= PATIENCE)
-    return 1.0 + count if (s.observed[l] > 0.0) & (not refused) else -count
+    s.blocks[BELIEVED, l] = 1.0 if (s.observed[l] > 0.0) & (not refused) else 0.0
+    s.blocks[LEFT_OUT, l], s.blocks[OK, l] = count, s.ok[l]
 
 
 @lru_cache
@@ -258,7 +258,7 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
             else:
                 push_lane(s.blocks.ctypes.data + at, L)
         s.y_hat[l] = s.blocks[PREDICTED, l]
-        s.blocks[OBSERVED, l], s.blocks[OK, l] = believable(s, s.blocks[OBSERVED, l], more, l), s.ok[l]
+        settle_output(s, more, l)
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 
@@ -284,7 +284,7 @@ def applying(into: tuple[Kind, ...], p: tuple[int, ...]) -> Step:
             s.blocks[us + i, l] = s.u[i, l]
         m = floats(s.blocks.ctypes.data + 8 * l, 1, s.y.shape[0])
         place(m, orders)
-        fill(m, orders, following, 1, m[OBSERVED, 0] > 0.0)
+        fill(m, orders, following, 1, m[BELIEVED, 0] > 0.0)
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 

@@ -16,13 +16,12 @@ from driftfit.data.clock import Clock
 from driftfit.data.signals import check_ready
 from driftfit.engine.settings import near
 from driftfit.models.base import Model
-from driftfit.parsing.settings import parse_model
+from driftfit.parsing.settings import parse_model, tracker_of
 from driftfit.run.live.rule import KINDS
 from driftfit.run.program import Program
 from driftfit.service.settings.matching import Pattern
 from driftfit.service.settings.options import PageOptions, ServiceOptions, build, kinds
 from driftfit.service.settings.toml_lines import Lines
-from driftfit.service.settings.trackers import tracker_of
 from driftfit.service.sinks.contract import Sink
 from driftfit.service.sources.contract import Source
 from driftfit.streams import Live
@@ -196,7 +195,7 @@ class _Reader:
         for key in ("match", "y"):
             if not isinstance(given.get(key), str):
                 raise KeyProblemError(
-                    (key,), f"unit needs {key} = a text" + ("; one output: several are several units." * (key == "y"))
+                    (key,), f"unit needs {key} = a text" + ("; write a [[unit]] for each output." * (key == "y"))
                 )
         u = given.get("u", [])
         if not (isinstance(u, str) or (isinstance(u, list) and all(isinstance(one, str) for one in u))):

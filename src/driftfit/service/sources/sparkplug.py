@@ -129,11 +129,11 @@ def _metric(data: bytes) -> dict[int, Any]:
     for field, value in _fields(data):
         if field in (NAME, STRING):
             if not isinstance(value, bytes):
-                raise ValueError("a text of Sparkplug that is none.")
+                raise ValueError("a name or text of Sparkplug that is sent as a number.")
             metric[field] = value.decode("utf-8")
         elif field in (FLOAT, DOUBLE):
             if not isinstance(value, bytes) or len(value) != (4 if field == FLOAT else 8):
-                raise ValueError("a number of Sparkplug of the wrong size.")
+                raise ValueError("a number of Sparkplug with the wrong number of bytes.")
             (metric[field],) = unpack_from("<f" if field == FLOAT else "<d", value)
         elif isinstance(value, int):  # the others are data sets, templates, properties
             metric[field] = value

@@ -62,7 +62,7 @@ class Law(Settings):
             raise ValueError(f"Law: {self.kind} needs {', '.join(absent)}; see Law.{self.kind}.")
         if self.kind == "season" and not self.harmonics < 0.5 * (self.period or 0.0):
             raise ValueError(
-                f"Law: {self.harmonics} harmonics of a period of {self.period:g} samples turn by half a circle or more "
+                f"Law: {self.harmonics} harmonics of a period of {self.period:g} samples have half a wave or more "
                 "between two samples; give fewer harmonics."
             )
 

@@ -69,7 +69,7 @@ def half_space(text: str, names: Sequence[str]) -> HalfSpace:
         if not above or isinstance(sign, ast.Eq):
             high = min(high, limit)
     if g is None or not low <= high:
-        raise ValueError(f"constrain: nothing meets {text!r}.")
+        raise ValueError(f"constrain: no parameters satisfy {text!r}.")
     return HalfSpace(text, g, low, high)
 
 

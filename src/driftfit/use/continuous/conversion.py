@@ -78,7 +78,7 @@ class Transfer:
         """The system for inputs held over dt; ValueError if it is discrete already."""
         step = float(numbers("discrete", "dt", dt, ndim=0, low=0.0, strict=True))
         if self.dt is not None:
-            raise ValueError("discrete: this system is in discrete time.")
+            raise ValueError("discrete: this system is in discrete time already.")
         n = len(self.a)
         x, cov = self._mapped(lambda x: sampled(x[:n], x[n:], step))
         return Transfer(x[:n], x[n:], cov, self.delay, step)
@@ -86,7 +86,7 @@ class Transfer:
     def continuous(self) -> Transfer:
         """The system whose samples these are; ValueError if there is none, or it is continuous already."""
         if self.dt is None:
-            raise ValueError("continuous: this system is in continuous time.")
+            raise ValueError("continuous: this system is in continuous time already.")
         n, step = len(self.a), self.dt
         x, cov = self._mapped(lambda x: _between(x[:n], x[n:], step))
         return Transfer(x[:n], x[n:], cov, self.delay)
@@ -100,8 +100,8 @@ def _between(a: Array, b: Array, dt: float) -> Array:
     poles = np.linalg.eigvals(Phi)
     if np.any((np.abs(poles.imag) < 1e-12) & (poles.real <= 1e-12)):
         raise ValueError(
-            f"continuous: a pole at {poles.real.min():.3g} is the sample of no continuous system; sample faster, or "
-            "take a lower order."
+            f"continuous: no continuous system has a pole at {poles.real.min():.3g} when it is sampled; "
+            "sample faster, or take a lower order."
         )
     whole = np.eye(n + 1)
     whole[:n, :n], whole[:n, n] = Phi, gamma
