@@ -144,3 +144,31 @@ def test_a_fine_meter_shares_no_error_of_rounding():
     run = track(Regression(1), RLS(1.0), 3.0 + 0.3 * rng.normal(size=400), np.ones(400))
     assert run.std[-1, 0] == pytest.approx(np.sqrt(run.state["scale"] / 400.0), rel=1e-9)
     assert run.state["fold"] == 1.0
+
+
+def interpolated(seed, missing=0.0):
+    """Whole litres between 22 and 38, two of five moved by up to a thousandth, as interpolation in time leaves them."""
+    rng = np.random.default_rng(seed)
+    exact = 30.0 + 6.0 * np.sin(np.arange(900) / 90.0) + 0.5 * rng.normal(size=900)
+    y = np.round(exact) + np.where(rng.random(900) < 0.4, rng.choice([-0.001, -0.0002, 0.0002, 0.0005], 900), 0.0)
+    y[rng.random(900) < 0.01] += 0.5  # and a few are half-way
+    y[rng.random(900) < missing] = np.nan
+    return y, exact
+
+
+@pytest.mark.parametrize(("unit", "offset", "missing"), [(1.0, 0.0, 0.0), (1.0 / 60000.0, 0.0, 0.3), (1.0, 1e5, 0.1)])
+def test_whole_litres_that_were_interpolated_are_coarse(unit, offset, missing):
+    for seed in range(3):
+        y, exact = interpolated(seed, missing)
+        run = track(Regression(1, intercept=True), RLS(0.99), offset + unit * y, exact - 30.0)
+        assert run.state["coarse"] == pytest.approx(unit * unit / 12.0, rel=0.01)
+        assert "steps of " in str(run.summary())
+
+
+def test_large_steps_of_a_fine_sensor_are_not_a_grid():
+    """Inputs of two, three and four levels; readings often repeat, because the noise is as fine as they are."""
+    rng = np.random.default_rng(0)
+    for levels in (2, 3, 4):
+        u = rng.integers(0, levels, 900).astype(float)
+        run = track(Regression(1), RLS(0.99), np.round(50.0 * u + 0.05 * rng.normal(size=900), 1), u)
+        assert run.state["coarse"] == pytest.approx(0.1**2 / 12.0, rel=0.01)

@@ -282,3 +282,22 @@ def test_a_mixture_loses_no_more_where_one_of_them_fails_completely():
     for one, other in (each, each[::-1]):
         (found,) = mixed([one], [other], [slice(0, 3)])
         np.testing.assert_allclose(found.loglik, [-1.0, -1.0 - np.log(2.0), -1.0], atol=2e-3)
+
+
+def test_weights_of_a_mixture_begin_again_with_every_record():
+    """As a plain loop says; one of the records is empty."""
+    rng = np.random.default_rng(0)
+    loglik = np.where(rng.random((2, 60, 3)) < 0.1, np.nan, 2.0 * rng.normal(size=(2, 60, 3)))
+    each = [
+        [Predicted(np.full(60, float(k)), np.ones(60), one[:, j]) for j in range(3)] for k, one in enumerate(loglik)
+    ]
+    found = mixed(*each, [slice(0, 25), slice(25, 25), slice(25, 60)])
+    for j in range(3):
+        weight = 0.5
+        for t in range(60):
+            weight = 0.5 if t == 25 else weight
+            a, b = loglik[:, t, j]
+            if np.isfinite(a) and np.isfinite(b):
+                assert found[j].y_hat[t] == pytest.approx(weight, abs=1e-12)
+                after = weight * np.exp(b - a)
+                weight = 0.001 + 0.998 * after / (1.0 - weight + after)

@@ -399,9 +399,9 @@ def test_records_that_can_tell_nothing():
     assert "18 samples can be used, and at least 24 are needed" in result.sentences[0]
     assert "0 samples remain after the first 50" in result.sentences[0]
     assert track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u).verdict(burn=5).scored == 15
-    same = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), *arx_record(200, 1)[:1], np.zeros(200)).verdict()
-    assert np.isnan(same.p)
-    assert same.drifts is None
+    idle = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), *arx_record(200, 1)[:1], np.zeros(200)).verdict()
+    assert np.isfinite(idle.p)
+    assert "Nothing is known of b1 and b2: their regressors are always 0." in idle.sentences
     none = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), np.full(100, np.nan), np.ones(100)).verdict()
     assert none.samples == 0
 

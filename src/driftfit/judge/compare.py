@@ -22,10 +22,13 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_errors, constant_least_squares
 from driftfit.judge.regressors import without_left_out
 from driftfit.models.arx import ARX
+from driftfit.models.base import Model
 from driftfit.run.result import Track, burn_in, root_mean_square
 
 LAGS = 2
 """Number of lags of y and of all regressors that are added to the regressors of a run."""
+LEARNED = 2
+"""Samples for each parameter until the errors of constants are those of the noise."""
 
 
 class Comparison(NamedTuple):
@@ -82,7 +85,7 @@ def errors(run: Track, record: Record, burn: int | None = None, steady: Array | 
     small = ARX(2, 1 if u.shape[1] else 0, inputs=u.shape[1], intercept=True)
     arx = constant_least_squares(small, Record(y, u, known))
     tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
-    lagged = _with_lags(steady, y, record.known.noise)
+    lagged = _with_lags(run.model, steady, y, constant, record.known.noise)
     lagged = np.where(np.isfinite(lagged), lagged, constant)
     rows = len(run.program.whole.outputs)
     own = (tracked, y - persistence(y, rows), constant, lagged, arx["e"][:, 0])
@@ -92,14 +95,21 @@ def errors(run: Track, record: Record, burn: int | None = None, steady: Array | 
     return Errors(*own, scored)
 
 
-def _with_lags(steady: Array, y: Array, noise: Array) -> Array:
-    """Errors (T,) of constants on the regressors of a run, the last outputs, and the last regressors."""
+def _with_lags(model: Model, steady: Array, y: Array, constant: Array, noise: Array) -> Array:
+    """Errors (T,) of constants on the regressors of a run, the last outputs, and the last regressors.
+
+    ``constant`` are the errors without lags. Regressors that hold the present output predict nothing: where a model has
+    such, lags of the regressors and errors predict ``constant``, once the parameters are known.
+    """
     T, used = len(y), (steady["valid"] > 0.0) & (noise < np.inf)[:, None]
     phi = np.where(used, steady["phi"][..., 0], np.nan)
+    known = np.cumsum(steady["ok"][:, 0]) > LEARNED * model.n if model.implicit else np.isfinite(y)
+    y = np.where(known, constant if model.implicit else steady["y"][:, 0], np.nan)
     last = np.full((LAGS, T, 1 + phi.shape[1]), np.nan)
     for k in range(1, min(LAGS, T - 1) + 1):
         last[k - 1, k:] = np.column_stack([y, phi])[:-k]
-    return constant_errors(np.column_stack([phi, *last]), y, np.broadcast_to(1.0 / noise, T))
+    columns = [*last] if model.implicit else [phi, *last]
+    return constant_errors(np.column_stack(columns), y, np.broadcast_to(1.0 / noise, T))
 
 
 def compare(run: Track) -> Comparison:

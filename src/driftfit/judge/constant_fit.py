@@ -4,8 +4,13 @@
     R theta = z                                               solved from the last row up
 
 A direction that the regressors have not yet spanned has a zero on the diagonal, and its parameter is 0 until they span
-it. The result is the estimate of ``RLS(1.0)`` from a diffuse start, without its covariance. The work is done by one
-routine on the arrays of one lane, compiled once for all models. Cost per sample: O(n^2).
+it. The result is the estimate of ``RLS(1.0)`` from a diffuse start, without its covariance: a start with poor
+regressors is forgotten (`Model.settling`). The work is done by one routine on the arrays of one lane, compiled once for
+all models. Cost per sample: O(n^2).
+
+Of a model that is linearised at its estimates, the start is too poor for a comparison with trackers, which forget it as
+well. Its constants are fitted twice, the second time with the linearisation held where the first ended
+(`Model.held_at`): this is one step of Gauss and Newton from there, with regressors as good at the start as at the end.
 """
 
 from __future__ import annotations
@@ -74,11 +79,13 @@ def learn(s: State, l: int) -> None:
     s.y_hat[l], s.e[l] = y_hat, s.y[l] - y_hat
     s.s[l] = s.noise[l] if s.used[l] >= n else np.inf
     if s.ok[l] > 0.0:
-        weight = 1.0 / np.sqrt(s.noise[l])
+        weight = s.weight[l] / np.sqrt(s.noise[l])
         for i in range(n):
             s.row[i, l] = weight * s.phi[i, l]
         s.row[n, l] = weight * s.y[l]
         s.used[l] += 1.0
+        memory = max(s.settling_memory[l], 0.25 * s.used[l])
+        s.weight[l] *= 1.0 / np.sqrt(1.0 - 1.0 / memory) if s.used[l] < s.settling[l] else 1.0
         rotate(s.R[:, :, l], s.row[:, l], s.size[:, l], s.theta[:, l])
 
 
@@ -89,7 +96,10 @@ STEPS = TrackerSteps(stay, learn, unknown, None, collect)
 def _start(model: Model) -> Array:
     """The tile of a model before its first sample."""
     n = model.n
-    state = {"theta": np.zeros(n), "R": np.zeros((n, n + 1)), "row": np.zeros(n + 1), "size": np.zeros(n), "used": 0.0}
+    state = {
+        "theta": np.zeros(n), "R": np.zeros((n, n + 1)), "row": np.zeros(n + 1), "size": np.zeros(n), "used": 0.0,
+        "weight": 1.0, "settling": model.settling, "settling_memory": model.settling_memory,
+    }  # fmt: skip
     return make_tile(n, model.m, model.memory(), [state])
 
 
@@ -99,6 +109,12 @@ def constant_least_squares(model: Model, record: Record) -> Array:
     Missing lags are replaced by the predictions of these constants. The samples of a model with hidden states are not
     those of a regression: none of them is usable.
     """
+    first = _fitted(model, record)
+    held = model.held_at(first["theta"][-1, :, 0]) if model.settling > 0.0 and len(record) else None
+    return first if held is None else _fitted(held, record)
+
+
+def _fitted(model: Model, record: Record) -> Array:
     tile = repeat_tile(_start(model), 1)
     out = np.empty(len(record), output_type(tile, COLLECTED))
     drivers(model.steps, STEPS).run(tile, *lanes_of(replace(record, known=record.known.common)), out)

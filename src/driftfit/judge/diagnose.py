@@ -135,7 +135,7 @@ class Diagnosis(Printed):
         """
         z, white = standardised(self.run)
         known = Evidence(self.run)
-        parts = (self.run, z, white, excitation(known.rows.phi), known.test, known.rows)
+        parts = (self.run, z, white, excitation(known.rows.phi), known.test, known.rows, known.names)
         return draw_diagnosis(Health(*parts, lambda name: self[name].ok), ax)
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from driftfit.data.record import Record
 from driftfit.engine.kernel import Array
 from driftfit.judge.compare import Errors, errors
 from driftfit.judge.constant_fit import constant_least_squares
-from driftfit.judge.regressors import Rows, regressors, without_left_out
+from driftfit.judge.regressors import Distinct, Rows, distinct, regressors, without_left_out
 from driftfit.judge.statistics.constancy import Constancy, constancy
 from driftfit.run.result import Track
 
@@ -36,9 +38,34 @@ class Evidence:
         return regressors(self.run, self._steady)
 
     @cached_property
+    def _whole(self) -> Constancy:
+        """The test of all parameters."""
+        return constancy(self.rows.phi, self.rows.y, self.lags, self.rows.at)
+
+    @cached_property
+    def distinct(self) -> Distinct:
+        """The parameters that the test can tell apart; it takes the others for 0."""
+        every = Distinct(tuple(range(self.run.model.n)), ())
+        return distinct(self.rows.phi) if np.isnan(self._whole.p_joint) else every
+
+    @cached_property
+    def tested(self) -> Rows:
+        """The same samples with the regressors of these parameters."""
+        if len(self.names) == self.run.model.n:
+            return self.rows
+        return self.rows._replace(phi=np.ascontiguousarray(self.rows.phi[:, self.distinct.kept]))
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of these parameters."""
+        return tuple(self.run.model.names[i] for i in self.distinct.kept)
+
+    @cached_property
     def test(self) -> Constancy:
         """Whether constants explain it."""
-        return constancy(self.rows.phi, self.rows.y, self.lags, self.rows.at)
+        if len(self.names) == self.run.model.n:
+            return self._whole
+        return constancy(self.tested.phi, self.tested.y, self.lags, self.tested.at)
 
     @cached_property
     def errors(self) -> Errors:

@@ -25,8 +25,8 @@ COLOURS = (BLUE, RED, "#3a8f4d", "#9a6fb0", "#c08a1e", "#4aa3a8", "#7a5c46", "#d
 
 
 class Health(NamedTuple):
-    """The quantities that a diagnosis examines; ``fine`` maps the names of checks to whether they are within their
-    limits.
+    """The quantities that a diagnosis examines; ``names`` are those of the parameters that the test of constancy tells
+    apart, and ``fine`` maps the names of checks to whether they are within their limits.
     """
 
     run: Track
@@ -35,6 +35,7 @@ class Health(NamedTuple):
     excited: Excitation
     constant: Constancy
     rows: Rows
+    names: tuple[str, ...]
     fine: Callable[[str], bool]
 
 
@@ -123,7 +124,7 @@ def _paths(axis: Axes, diagnosis: Health) -> None:
     path: Array = diagnosis.constant.path
     if len(path) and np.isfinite(path).all():
         inner = slice(len(path) // 20, len(path) - len(path) // 20)
-        for i, name in enumerate(diagnosis.run.model.names):
+        for i, name in enumerate(diagnosis.names):
             colour = COLOURS[i % len(COLOURS)]
             axis.plot(diagnosis.run.time[diagnosis.rows.at][inner], path[inner, i], lw=1.1, color=colour, label=name)
         axis.axhspan(-3.0, 3.0, color=GREY, alpha=0.2, lw=0)

@@ -11,6 +11,7 @@ from driftfit.data.record import Record
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_least_squares
+from driftfit.judge.statistics.robust import orthonormal
 from driftfit.models.base import Model
 from driftfit.run.result import Track, burn_in
 from driftfit.smooth.problem import blocks
@@ -28,6 +29,42 @@ class Rows(NamedTuple):
     """(N, n)"""
     y: Array
     """(N,)"""
+
+
+class Distinct(NamedTuple):
+    """Which of n columns of regressors a test can tell apart."""
+
+    kept: tuple[int, ...]
+    """Linearly independent columns, as many as there are: the constant one, and of others the first."""
+    groups: tuple[tuple[int, ...], ...]
+    """Columns that are linearly dependent on each other; those of zeros, and those apart from all groups, are in none.
+    """
+
+
+COEFFICIENT = 1e-7
+"""A coefficient above this, of columns of unit length, is not rounding."""
+
+
+def distinct(phi: Array) -> Distinct:
+    """The columns of phi (N, n) that are linearly independent, whatever their units."""
+    N, n = phi.shape
+    basis = orthonormal(phi) if n < N else None
+    if basis is None or basis.distinct:
+        return Distinct(tuple(range(n)), ())
+    constant = [i for i in range(n) if np.ptp(phi[:, i]) == 0.0]
+    order = [*constant[::-1], *(i for i in range(n) if i not in constant)]
+    kept: list[int] = []
+    for i in order:
+        if np.linalg.matrix_rank(basis.R[:, [*kept, i]], basis.negligible) > len(kept):
+            kept.append(i)
+    kept.sort()
+    groups: list[set[int]] = []
+    for i in set(order) - set(kept):
+        of = np.linalg.lstsq(basis.R[:, kept], basis.R[:, i], rcond=None)[0]
+        new = {i, *(kept[k] for k in np.flatnonzero(np.abs(of) > COEFFICIENT))}
+        joined = [group for group in groups if group & new]
+        groups = [group for group in groups if not group & new] + [new.union(*joined)]
+    return Distinct(tuple(kept), tuple(tuple(sorted(group)) for group in groups if len(group) > 1))
 
 
 def refuse_hidden(verb: str, model: Model, instead: str) -> None:

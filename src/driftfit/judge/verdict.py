@@ -124,6 +124,11 @@ class Verdict(Printed):
         Whether the model moves hidden states: it has no regression, and only its predictions are judged.
     spread_with : tuple of str
         If constants are not rejected: parameters with residuals that are clearly larger where their regressors are.
+    dependent : tuple of tuples of str
+        Groups of parameters with linearly dependent regressors, such as those of a column that repeats another.
+    held : tuple of str
+        The parameters that the test takes for 0, so that it can judge the others: one or more of every group, and
+        those whose regressors are always 0.
     """
 
     drifts: bool | None
@@ -143,6 +148,8 @@ class Verdict(Printed):
     burn: int
     hidden: bool = False
     spread_with: tuple[str, ...] = ()
+    dependent: tuple[tuple[str, ...], ...] = ()
+    held: tuple[str, ...] = ()
 
     @property
     def constants(self) -> Paired:
@@ -157,7 +164,7 @@ class Verdict(Printed):
     @property
     def least(self) -> int:
         """Number of samples that a test of these parameters needs."""
-        return least_rows(len(self.parameters))
+        return least_rows(len(self.parameters) - len(self.held))
 
     @property
     def untested(self) -> str:
@@ -177,7 +184,9 @@ class Verdict(Printed):
     @property
     def sentences(self) -> tuple[str, ...]:
         """The verdict in sentences."""
-        return tuple(filter(None, (f"{self._drift()} {self._gain()}", self._which(), self._caution())))
+        return tuple(
+            filter(None, (f"{self._drift()} {self._gain()}", self._which(), self._indistinct(), self._caution()))
+        )
 
     def _drift(self) -> str:
         if self.hidden:
@@ -223,6 +232,18 @@ class Verdict(Printed):
         if not self.moving:
             return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."
         return f"These move: {'; '.join(sentence(moved) for moved in self.parameters if moved.moves)}."
+
+    def _indistinct(self) -> str:
+        idle = [name for name in self.held if not any(name in group for group in self.dependent)]
+        text = [
+            f"The regressors of {listed(group)} are linearly dependent: only their joint effect is judged, as that of "
+            f"{listed([name for name in group if name not in self.held])}."
+            for group in self.dependent
+        ]
+        if idle:
+            whose = "its regressor is" if len(idle) == 1 else "their regressors are"
+            text.append(f"Nothing is known of {listed(idle)}: {whose} always 0.")
+        return " ".join(text)
 
     def _gain(self) -> str:
         steady = self.constants
@@ -294,6 +315,11 @@ def _larger(one: float, other: float) -> str:
     return f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
 
 
+def listed(names: Sequence[str]) -> str:
+    """Names in a sentence."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
 def rounded(error: Array, y: Array) -> Array:
     """Errors (N,) of predictions of y (N,), 0 where they are those of the arithmetic: these are not compared."""
     return np.where(np.abs(error) <= ROUNDING * np.max(np.abs(y), initial=0.0), 0.0, error)
@@ -360,11 +386,12 @@ def verdict(run: Track, level: float = LEVEL, lags: int | None = None, burn: int
 
 def judged(known: Evidence, level: float) -> Verdict:
     """The verdict where the test of constancy may be shared with the diagnosis."""
-    run, rows, test, lags = known.run, known.rows, known.test, known.lags
+    run, rows, test, lags, names = known.run, known.tested, known.test, known.lags, known.names
     drifts = None if np.isnan(test.p_joint) else bool(test.p_joint < level)
     steps = attribute(rows.phi, rows.y, test, level, lags) if drifts else None
-    names = enumerate(run.model.names)
-    moved = tuple(_moved(run, rows, test, steps, (i, name)) for i, name in names)
+    found = {name: _moved(known, steps, i) for i, name in enumerate(names)}
+    moved = tuple(found.get(name, unjudged(name)) for name in run.model.names)
+    groups = tuple(tuple(run.model.names[i] for i in group) for group in known.distinct.groups)
     at, similar = alike(rows.phi, test) if drifts and not any(m.moves for m in moved) else (0, ())
     scored = known.errors.scored
     own, *others = (rounded(error[scored], run.y[scored]) for error in known.errors[:-1])
@@ -376,7 +403,7 @@ def judged(known: Evidence, level: float) -> Verdict:
         statistic=test.joint,
         level=level,
         parameters=moved,
-        alike=tuple(run.model.names[i] for i in similar),
+        alike=tuple(names[i] for i in similar),
         since=run.time_text(int(rows.at[at])) if similar else "",
         rms=root_mean_square(own),
         rivals=rivals,
@@ -386,7 +413,9 @@ def judged(known: Evidence, level: float) -> Verdict:
         lags=test.lags,
         burn=burn_in(run.model.n) if known.burn is None else known.burn,
         hidden=run.model.hidden is not None,
-        spread_with=_spread_with(run.model.names, rows, test) if drifts is False else (),
+        spread_with=_spread_with(names, rows, test) if drifts is False else (),
+        dependent=groups,
+        held=tuple(name for name in run.model.names if name not in names),
     )
 
 
@@ -399,8 +428,14 @@ def _spread_with(names: Sequence[str], rows: Rows, test: Constancy) -> tuple[str
     return (names[most],) if p[most] * len(p) < CORRELATED else ()
 
 
-def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, which: tuple[int, str]) -> Moved:
-    i, name = which
+def unjudged(name: str) -> Moved:
+    """What is said of a parameter that the test does not judge."""
+    nan = float("nan")
+    return Moved(name, nan, nan, nan, False, 0, "", nan, nan, nan, nan, 0, 0)
+
+
+def _moved(known: Evidence, steps: Attribution | None, i: int) -> Moved:
+    run, rows, test, names = known.run, known.tested, known.test, known.names
     at, own = int(test.at[i]), float(test.p_own[i])
     before = after = std = last = np.nan
     named = steps is not None and bool(steps.moves[i])
@@ -414,6 +449,5 @@ def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, w
     sample, earliest, latest = places
     when = run.time_text(sample)
     L, p = float(test.L[i]), float(test.p[i])
-    similar = steps.instead(i) if steps is not None and named else ()
-    instead = tuple(run.model.names[k] for k in similar)
-    return Moved(name, L, p, own, named, sample, when, before, after, std, last, earliest, latest, instead)
+    instead = tuple(names[k] for k in steps.instead(i)) if steps is not None and named else ()
+    return Moved(names[i], L, p, own, named, sample, when, before, after, std, last, earliest, latest, instead)

@@ -129,7 +129,9 @@ def _parameter_table(facts: Summary, truth: Verdict) -> str:
     rows = []
     for row in facts.rows:
         test = tests.get(row.name)
-        moved = "" if test is None else (f"{change(test)}, {escape(test.when)}" if test.moves else "no")
+        moved = "no" if test is not None and np.isfinite(test.p_own) else ""
+        if test is not None and test.moves:
+            moved = f"{change(test)}, {escape(test.when)}"
         values = (row.theta, row.low, row.high, row.path_low, row.path_high)
         theta, low, high, least, most = (digits(value, row.std) for value in values)
         cells = (theta, f"{low} to {high}", f"{least} to {most}")

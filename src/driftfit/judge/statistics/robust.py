@@ -293,9 +293,14 @@ class Basis(NamedTuple):
     """(n,): `column_sizes` of phi."""
 
     @property
+    def negligible(self) -> float:
+        """The largest singular value of R that is rounding."""
+        return float(1e-9 / np.sqrt(len(self.Q)))
+
+    @property
     def distinct(self) -> bool:
         """Whether the columns of phi are linearly independent, whatever their units."""
-        return bool(np.linalg.matrix_rank(self.R, 1e-9 / np.sqrt(len(self.Q))) == len(self.size))
+        return bool(np.linalg.matrix_rank(self.R, self.negligible) == len(self.size))
 
 
 def orthonormal(phi: Array) -> Basis:

@@ -19,7 +19,7 @@ import numpy as np
 
 from driftfit.data.known import Known
 from driftfit.data.record import Record, Records
-from driftfit.engine.kernel import Array
+from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model, Term
@@ -201,6 +201,24 @@ SHARE = 0.001
 """Probability that the other tracker is the better one from the next sample on."""
 
 
+def _weights(ratio: Array, both: Array, starts: Array, weight: Array) -> None:
+    """Weights (T, K) of the second of two trackers where both predict, from the ratio of their densities (T, K)."""
+    T, K = ratio.shape
+    now, record = np.full(K, 0.5), 0
+    for t in range(T):
+        while record < len(starts) and t == starts[record]:  # a record may be empty
+            now[:] = 0.5
+            record += 1
+        for k in range(K):
+            if both[t, k]:
+                weight[t, k] = now[k]
+                after = now[k] * ratio[t, k]
+                now[k] = SHARE + (1.0 - 2.0 * SHARE) * after / (1.0 - now[k] + after)
+
+
+_weigh = Driver(_weights)
+
+
 def mixed(ones: Sequence[Predicted], others: Sequence[Predicted], spans: Sequence[slice]) -> list[Predicted]:
     """The mixture of the predictions of two trackers for each structure, weighted by how well they predicted before.
 
@@ -210,13 +228,7 @@ def mixed(ones: Sequence[Predicted], others: Sequence[Predicted], spans: Sequenc
     both = np.isfinite(first) & np.isfinite(second)
     ratio = np.exp(np.clip(np.where(both, second - first, 0.0), -700.0, 700.0))
     weight = np.where(np.isfinite(first), 0.0, 1.0)
-    for span in spans:
-        now = np.full(first.shape[1], 0.5)
-        for t in range(span.start, span.stop):
-            known = both[t]
-            weight[t] = np.where(known, now, weight[t])
-            after = now * ratio[t]
-            now = np.where(known, SHARE + (1.0 - 2.0 * SHARE) * after / (1.0 - now + after), now)
+    _weigh(ratio, both, np.array([span.start for span in spans]), weight)
     with np.errstate(divide="ignore", invalid="ignore"):  # one without a prediction has the weight 0
         terms = np.logaddexp(
             np.where(weight < 1.0, np.log1p(-weight) + first, -np.inf),

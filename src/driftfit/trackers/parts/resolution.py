@@ -5,7 +5,9 @@ constant, residuals are zero although nothing was measured exactly. A noise vari
 collapses, and bands and likelihood with it. Therefore
 
     quantum    the smallest step between two consecutive readings, if steps of its size (up to one and a half) are a
-               tenth of all steps, and a tenth of the readings repeat the previous one
+               tenth of all steps, and a tenth of the readings repeat the previous one; or else the grid
+    grid       the size of most steps, where all others are either larger, or far smaller: readings of whole litres that
+               were interpolated or converted are 30.9995, 31 and 31.0002
     coarse     quantum^2 / 12, the variance of the rounding error; 0 if readings are not coarse
     fresh      whether a residual carries information about the noise: not that of a reading that repeats the previous
                one, as long as the quantum is unknown
@@ -14,8 +16,9 @@ and no tracker takes its noise variance to be below ``coarse``. That of a sample
 is therefore ``coarse`` times the mean weight of the readings. `AdaptiveKalman` also treats readings that repeat as
 one rounding error observed several times (`lasting`). Readings of a fine sensor never repeat, and nothing changes for
 them. If they do repeat, at a limit, at 0 while a pump is off, or because a value is held, the other steps have all
-sizes, and no step is frequent. A model that subtracts a shift from y (`driftfit.models.linearised`) writes it into the
-field ``shift``: the reading is y + shift.
+sizes, and no step is frequent. A fine sensor that follows an input of a few levels has large steps and small ones, too:
+a grid needs three levels, mostly steps from one to the next, and more of them than small ones. A model that subtracts a
+shift from y (`driftfit.models.linearised`) writes it into the field ``shift``: the reading is y + shift.
 
 Source: quantum^2 / 12 is Sheppard's (1898); the rest is ours. Cost per sample: a few comparisons.
 """
@@ -34,6 +37,12 @@ SHARE = 0.1
 """Share of the readings that repeat, and of the steps that are about as small as the least, for a quantum."""
 ENOUGH = 3.0
 """Number of steps of the size of the quantum, and of repeated readings, before it is accepted."""
+JITTER = 32.0
+"""Steps below the grid over this are no steps of it."""
+RARE = 10.0
+"""Of so many steps of the grid one may be smaller, such as that of a reading half-way between two."""
+MOSTLY, LEVELS = 2.5, 1.75
+"""Least ratio of steps of the grid to larger ones; least range of the readings in units of the grid."""
 LONGEST = 4.0
 """At most so many repeated readings in a row count."""
 
@@ -41,8 +50,10 @@ LONGEST = 4.0
 def unresolved() -> dict[str, Any]:
     """Fields before the first reading."""
     return {
-        "reading": np.nan, "quantum": np.inf, "smallest": 0.0, "steps": 0.0, "repeats": 0.0, "coarse": 0.0,
-        "fresh": 1.0, "alike": 0.0, "shift": 0.0, "mean_weight": 1.0, "used_readings": 0.0,
+        "reading": np.nan, "quantum": np.inf, "finest": np.inf, "smallest": 0.0, "steps": 0.0, "repeats": 0.0,
+        "grid": np.inf, "of_grid": 0.0, "within": 0.0, "jitter": 0.0, "beyond": 0.0,
+        "lowest": np.inf, "highest": -np.inf, "coarse": 0.0, "fresh": 1.0, "alike": 0.0, "shift": 0.0,
+        "mean_weight": 1.0, "used_readings": 0.0,
     }  # fmt: skip
 
 
@@ -60,23 +71,45 @@ def same_reading(s: State, other: float, l: int) -> bool:
 
 
 @kernel
+def learn_grid(s: State, y: float, step: float, moved: float, l: int) -> None:
+    """Count a step among those of the grid, smaller and larger ones; ``moved`` is 0 if there is none."""
+    grid = s.grid[l]
+    tiny, within, beyond = step < grid / JITTER, step < 0.75 * grid, step >= 1.5 * grid
+    jitter, between = s.jitter[l] + (moved if tiny else 0.0), s.within[l] + (moved if within & (not tiny) else 0.0)
+    larger, near = s.beyond[l] + (moved if beyond else 0.0), (step >= 0.75 * grid) & (not beyond)
+    of_grid = s.of_grid[l] + (moved if near else 0.0)
+    other = (moved > 0.0) & ((max(larger, RARE * between) > of_grid) | (grid == np.inf))
+    s.grid[l], s.of_grid[l], s.jitter[l] = step if other else grid, 1.0 if other else of_grid, 0.0 if other else jitter
+    s.within[l], s.beyond[l] = 0.0 if other else between, 0.0 if other else larger
+    s.lowest[l] = min(s.lowest[l], y) if s.observed[l] > 0.0 else s.lowest[l]
+    s.highest[l] = max(s.highest[l], y) if s.observed[l] > 0.0 else s.highest[l]
+
+
+@kernel
 def resolve(s: State, l: int) -> None:
     """Process a reading."""
-    y, observed, quantum = reading(s, l), s.observed[l], s.quantum[l]
+    y, observed, finest = reading(s, l), s.observed[l], s.finest[l]
     step = abs(y - s.reading[l])  # NaN at the first reading, which neither moves nor repeats
     repeated = observed if same_reading(s, s.reading[l], l) else 0.0
     moved = observed - repeated if step >= 0.0 else 0.0
-    near = moved if step < 1.5 * quantum else 0.0
-    smallest = near + (s.smallest[l] if (moved == 0.0) | (step >= 0.75 * quantum) else 0.0)
-    quantum = step if (moved > 0.0) & (step < quantum) else quantum
-    steps, repeats = s.steps[l] + moved, s.repeats[l] + repeated
-    coarse = (smallest >= max(ENOUGH, SHARE * steps)) & (repeats >= max(ENOUGH, SHARE * (steps + repeats)))
+    near = moved if step < 1.5 * finest else 0.0
+    s.smallest[l] = near + (s.smallest[l] if (moved == 0.0) | (step >= 0.75 * finest) else 0.0)
+    s.finest[l] = step if (moved > 0.0) & (step < finest) else finest
+    s.steps[l] += moved
+    s.repeats[l] += repeated
+    learn_grid(s, y, step, moved, l)
+    frequent, repeat = max(ENOUGH, SHARE * s.steps[l]), s.repeats[l] >= max(ENOUGH, SHARE * (s.steps[l] + s.repeats[l]))
+    most = s.of_grid[l] >= max(frequent, max(s.jitter[l], MOSTLY * s.beyond[l]))
+    apart = s.highest[l] - s.lowest[l] >= LEVELS * s.grid[l]
+    on_grid = repeat & most & apart & (s.grid[l] > 1.5 * s.finest[l])
+    coarse = on_grid | (repeat & (s.smallest[l] >= frequent))
+    s.quantum[l] = s.grid[l] if on_grid else s.finest[l]
+    s.coarse[l] = s.quantum[l] * s.quantum[l] / 12.0 if coarse else 0.0
     s.reading[l] = y if observed > 0.0 else s.reading[l]
-    s.quantum[l], s.smallest[l], s.steps[l], s.repeats[l] = quantum, smallest, steps, repeats
-    s.coarse[l] = quantum * quantum / 12.0 if coarse else 0.0
     s.used_readings[l] += s.ok[l]
     s.mean_weight[l] += s.ok[l] * (1.0 / s.noise[l] - s.mean_weight[l]) / max(s.used_readings[l], 1.0)
-    s.alike[l] = min(s.alike[l] + 1.0, LONGEST) * repeated if observed > 0.0 else s.alike[l]
+    lasts = observed if on_grid & (step < s.grid[l] / JITTER) else repeated
+    s.alike[l] = min(s.alike[l] + 1.0, LONGEST) * lasts if observed > 0.0 else s.alike[l]
     s.fresh[l] = 0.0 if (repeated > 0.0) & (not coarse) else 1.0
 
 
