@@ -52,7 +52,7 @@ class Size:
         return f"{self.runs} scored runs, {self.tuning} tuning runs, {self.T} samples each"
 
 
-QUICK = Size(2, 1, 400)
+QUICK = Size(1, 1, 400)
 
 
 class Entry(NamedTuple):

@@ -153,7 +153,9 @@ def worst_ratio(found: dict[str, Array]) -> tuple[float, str]:
 
 def main(
     seeds: Annotated[int, typer.Option(help="Noise seeds per example; the reference has 100.")] = SEEDS,
-    quick: Annotated[bool, typer.Option("--quick", help="Ten seeds and short records, no search for weights.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Three seeds and short records, no search for weights.")
+    ] = False,
     figures: Annotated[Path | None, typer.Option(help="Folder for the pictures.")] = None,
 ) -> None:
     """Reproduce the examples of augmented flexible least squares."""
@@ -161,7 +163,7 @@ def main(
     from lab.reproduce.fls import figures as pictures
 
     out = Console(width=150, highlight=False)
-    numbers = range(10 if quick else seeds)
+    numbers = range(3 if quick else seeds)
     found = {name: measure(name, MU[name], numbers) for name in progress(EXAMPLES, "examples", transient=True)}
     out.print(table_of_medians(found))
     ratio, where = worst_ratio(found)
