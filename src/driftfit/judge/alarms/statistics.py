@@ -89,9 +89,7 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
         )
     least = max(100, 10 * n)
     first, start = first_third(run, usable, least) if reference is None else normal_samples(run, reference)
-    # readings that a tracker refused are normal if the reference has some, but not those of a sensor that was stuck
-    repeated = np.append(False, samples[1][1:, Y] == samples[1][:-1, Y]) & ~run.ok
-    phi, rest, ok = samples[0][first:start], samples[1][first:start], (usable & ~repeated)[first:start]
+    phi, rest, ok = samples[0][first:start], samples[1][first:start], (usable & ~_stuck(run))[first:start]
     y, noise, names = rest[:, Y], rest[:, NOISE_FACTOR], run.model.names
     if ok.sum() < least:
         raise ValueError(
@@ -118,6 +116,15 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
         simulated=True,
     )
     return rule, known, start, samples
+
+
+def _stuck(run: Track) -> Array:
+    """Samples (T,) that the tracker refused because their readings repeat the one before, from the third in a row on.
+
+    Other readings that it refused are normal if they are in the reference.
+    """
+    repeated = np.append([False] * 3, run.y[1:] == run.y[:-1]) & np.append([False] * 2, ~run.ok)
+    return np.asarray(repeated[2:] & repeated[1:-1] & repeated[:-2])
 
 
 def _band(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
