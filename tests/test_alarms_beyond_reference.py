@@ -181,7 +181,7 @@ def test_a_stream_learns_and_centres_as_the_record_does(kind):
             live = Live.from_bytes(live.to_bytes())
             (alarm,) = live.alarms
     state = alarm.plain()
-    earlier = LiveAlarm.of({**state, "memory": state["memory"][:-2]}, tracker, model.names)
+    earlier = LiveAlarm.of({**state, "memory": state["memory"][:-3]}, tracker, model.names)
     assert (earlier._memory.known[LEARNED] == 0.0).all()
     assert not (alarm._memory.known[LEARNED] == 0.0).all()
     with pytest.raises(ValueError, match=r"another version.*run.detect\(.*\)\.rule"):

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import signal, stats
+from scipy.linalg import toeplitz
 from support import arx_record, rows_of
 
 from driftfit import ARX, AugmentedFLS, Kalman, Live, Regression, track
@@ -22,16 +23,19 @@ from driftfit.run.live.frozen.reference_model import (
     CLIP,
     CONSTANT,
     CUSUM,
+    EVEN,
     JOINT,
     KAPPA,
     LONGEST,
     NOISE,
     NORMAL,
+    NUMBERS,
     ONE,
     RAW,
     SCALE,
     SHIFT,
     SIZE,
+    TOP,
     WHICH,
     Frozen,
     K,
@@ -50,22 +54,26 @@ def naive_centred(phi, model):
 
 
 def naive_scores(rows, model):
-    """(phi, x, g, index of the row) of the usable rows, from the definition."""
-    n, p, numbers = len(model.theta), len(model.ar), model.numbers
-    run, h, found, past = 0, 1.0, [], []
+    """(phi, x, g, index of the row) of the usable rows, from the definition: every row is predicted from all usable
+    ones since the last gap in time, by the covariances of the autoregression."""
+    n, numbers = len(model.theta), model.numbers
+    response = signal.lfilter([1.0], np.r_[1.0, -model.ar], np.eye(1, 4000)[0])
+    autocovariance = np.correlate(response, response, "full")[len(response) - 1 :]
+    h, at, found, places, past = 1.0, 0, [], [], []
     for t, row in enumerate(rows):
         phi, (y, ok, noise, dt) = row[:n], row[n:]
         if dt == 0.0:
             continue
-        run = 0 if ok == 0.0 or dt > 1.5 else run
+        places, past, at = ([], [], 0) if dt > 1.5 else (places, past, at + 1)
         if ok == 0.0:
             continue
         phi = naive_centred(phi, model)
-        past.append(np.append(phi / model.unit, y - phi @ model.theta) / np.sqrt(noise))
-        run += 1
-        if run <= p:
-            continue
-        white = past[-1] - sum(model.ar[i] * past[-2 - i] for i in range(p))
+        own = np.append(phi / model.unit, y - phi @ model.theta) / np.sqrt(noise)
+        cross = autocovariance[at - np.array(places, int)]
+        weights = np.linalg.solve(toeplitz(autocovariance[:400])[np.ix_(places, places)], cross)
+        variance = autocovariance[0] - weights @ cross
+        white = (own - weights @ np.reshape(past, (-1, n + 1))) / np.sqrt(variance)
+        places, past = [*places, at], [*past, own]
         x = white[n] / (numbers[SCALE] * np.sqrt(h))
         g = np.clip(x, -numbers[CLIP], numbers[CLIP])
         found.append((white[:n] / np.sqrt(h), x, g, t))
@@ -113,10 +121,10 @@ def naive_steps(model):
 def test_statistics_are_those_of_a_naive_twin(ar, centred):
     rng = np.random.default_rng(4)
     n, T = 3, 230
-    numbers = np.zeros(CONSTANT + 1)
+    numbers = np.zeros(NUMBERS)
     for place, value in {
         SCALE: 1.3, CLIP: 2.5, K: 0.98, V: 0.95, KAPPA: 1.2, ALPHA: 0.1, BETA: 0.8, RAW: 1.1, LONGEST: 60, NORMAL: 480,
-        CONSTANT: 2,
+        CONSTANT: 2, EVEN: 0.5, TOP: 3.0,
     }.items():  # fmt: skip
         numbers[place] = value
     root = 0.01 * rng.normal(size=(n, n))
@@ -150,6 +158,7 @@ def test_statistics_are_those_of_a_naive_twin(ar, centred):
         shift[n], var[n] = SHIFT * numbers[V], numbers[KAPPA]
         up = np.maximum(0.0, up + (shift * z - 0.5 * shift**2 * power) / var)
         down = np.maximum(0.0, down + (-shift * z - 0.5 * shift**2 * power) / var)
+        up, down = (np.where(one > 4.5, 4.5 + 0.98 * (one - 4.5), one) for one in (up, down))
         most = np.sqrt(2.0 * np.maximum(up, down))
         for (j, _), one in zip(slopes, most[n + 1 :], strict=True):
             most[j] = max(most[j], one)
@@ -157,12 +166,18 @@ def test_statistics_are_those_of_a_naive_twin(ar, centred):
         if not best:
             assert np.isnan(findings[t, ONE])
             continue
+        even = {L: numbers[EVEN] * 2.0 * np.log(384 / L) for L in best}
+        deviates = np.array(
+            [
+                np.sqrt(np.maximum(np.maximum(np.take(found, [0, 3, 4]), 0.0) ** 2 - even[L], 0.0))
+                for L, found in best.items()
+            ]
+        )
         one = max(best.values())
         shown = max((found for found in best.values() if found[5] >= 0.0), key=lambda found: found[5], default=one)
         shown = shown if one[5] >= 0.0 and shown[5] > one[5] else one
-        assert findings[t, [ONE, WHICH, SIZE]] == pytest.approx([one[0], *shown[1:3]])
-        assert findings[t, JOINT] == pytest.approx(max(found[3] for found in best.values()))
-        assert findings[t, NOISE] == pytest.approx(np.nanmax([found[4] for found in best.values()]))
+        assert findings[t, [WHICH, SIZE]] == pytest.approx(shown[1:3])
+        assert findings[t, [ONE, JOINT, NOISE]] == pytest.approx(np.nanmax(deviates, axis=0))
     assert np.array_equal(findings[30], findings[29], equal_nan=True)
     assert np.array_equal(findings[120], findings[119], equal_nan=True)
 
@@ -172,8 +187,8 @@ def test_records_side_by_side_have_the_statistics_of_each(cusum):
     """Eleven records in two vectors, each with a model of its own; the third has a regressor that is always zero, and
     from the sixth on the first regressor is centred."""
     rng, R, T, n = np.random.default_rng(3), 11, 400, 2
-    numbers = np.zeros((R, CONSTANT + 1))
-    numbers[:, [CLIP, K, V, KAPPA, SCALE, NORMAL, CONSTANT]] = [2.5, 0.98, 0.95, 1.2, 1.0, 480, 1]
+    numbers = np.zeros((R, NUMBERS))
+    numbers[:, [CLIP, K, V, KAPPA, SCALE, NORMAL, CONSTANT, EVEN]] = [2.5, 0.98, 0.95, 1.2, 1.0, 480, 1, 0.5]
     mean = np.where(np.arange(R) < 5, 0.0, 0.5 * np.arange(R))
     numbers[:, V] += 0.01 * np.arange(R)
     numbers[:, LONGEST] = 30 + 30 * np.arange(R)
@@ -299,7 +314,7 @@ def test_a_short_reference_says_how_far_the_real_rate_may_be():
     rng = np.random.default_rng(3)
     u, v = rng.normal(size=(2, 2500))
     run = track(GAIN, HELD, 2.0 * u + 1.0 + v, u)
-    short, long = (run.detect(every=1000.0, reference=N) for N in (180, 2000))
+    short, long = (run.detect(every=1000.0, reference=N, records=192) for N in (180, 2000))
     assert short.rule.unsure > long.rule.unsure
     low, high = short.rule.real_rate
     assert low < 400.0 < 1000.0 < high

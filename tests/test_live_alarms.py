@@ -89,7 +89,8 @@ def in_parts(before, whole, rule):
     run(tile, *lanes_of(whole.record.part(slice(CUT, T))), out)
     alarm = LiveAlarm(rule, program.tracker, program.names)
     cuts = np.sort(np.random.default_rng(2).integers(0, T - CUT, 12))
-    return alarm, [alarm.take_many(part, 0, np.ones(len(part))) for part in np.split(out, cuts)]
+    parts = zip(np.split(out, cuts), np.split(whole.y[CUT:], cuts), strict=True)
+    return alarm, [alarm.take_many(part, 0, y, np.ones(len(y))) for part, y in parts]
 
 
 def test_the_probability_of_a_bank():

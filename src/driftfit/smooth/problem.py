@@ -42,7 +42,6 @@ def collecting_for_smoother(steps: TrackerSteps) -> TrackerSteps:
         store(o, s, l)
         o.used_noise[l] = s.used_noise[l]
         o.ok[l] = s.ok[l]
-        o.observed[l] = s.observed[l]
         o.e[l] = s.e[l]
 
     return steps._replace(store=collect_all, note=note_noise)
@@ -60,7 +59,7 @@ def blocks(run: Track) -> Iterator[tuple[int, Array]]:
     """
     program, T = run.program, len(run)
     tile = run.fresh()
-    names = (*run.tracker.smoother_fields, *COLLECTED, "used_noise", "ok", "observed", "e")
+    names = (*run.tracker.smoother_fields, *COLLECTED, "used_noise", "ok", "e")
     block = np.empty(min(ROWS, T), output_type(tile, names, "own"))
     loop = program.drivers("own", collecting_for_smoother(program.steps)).run
     y, u, known = lanes_of(run.record)

@@ -133,7 +133,8 @@ class Flow:
         for j, k in enumerate(some.keys.tolist()):
             joint, lanes = known.joints[k], found.lanes.part(range(j * ny, (j + 1) * ny))
             assert isinstance(joint, JointLayout)
-            causes, known.watch[k] = watched(self.rules, joint, known.watch[k], int(earlier[k]), lanes)
+            y = some.y[some.first[j] : some.first[j] + some.length[j]]
+            causes, known.watch[k] = watched(self.rules, joint, known.watch[k], int(earlier[k]), lanes, y)
             for name, values in alarms_of(schema, causes).items():
                 columns[name] += values
         return {

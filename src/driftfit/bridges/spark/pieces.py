@@ -196,21 +196,22 @@ def watched(
     watch: str | None,
     earlier: int,
     lanes: Iterable[Lane],
+    y: Array,
 ) -> tuple[list[list[str | None]], str]:
     """(the cause of the alarm of each watched output at every sample, what `watched` continues from).
 
-    ``lanes`` has that of each output. After ``earlier`` samples without one, an alarm
+    ``lanes`` has that of each output, and y (T, ny) the readings. After ``earlier`` samples without one, an alarm
     begins to watch.
     """
     before = json.loads(watch) if watch else [None] * len(rules)
     causes: list[list[str | None]] = []
     after: list[dict[str, Any] | None] = []
-    for rule, program, state, (out, _, lane) in zip(rules, joint.programs, before, lanes, strict=True):
+    for rule, program, state, (out, _, lane), own in zip(rules, joint.programs, before, lanes, y.T, strict=True):
         if rule is None:
             after.append(None)
             continue
         alarm = _alarm(rule, program, state, earlier)
-        causes.append(alarm.take_many(out, lane, np.ones(len(out))))
+        causes.append(alarm.take_many(out, lane, own, np.ones(len(out))))
         alarm.onsets()
         after.append({name: value for name, value in alarm.plain().items() if name != "rule"})
     return causes, json.dumps(after)

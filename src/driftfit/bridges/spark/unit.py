@@ -175,7 +175,7 @@ class Unit:
         numbers, watch = self._numbers(out), known.watch
         if any(self.rules):
             lanes = [Lane(out, tile, lane) for lane in range(ny)]
-            causes, watch = watched(self.rules, joint, watch, int(known.counts[SAMPLES]), lanes)
+            causes, watch = watched(self.rules, joint, watch, int(known.counts[SAMPLES]), lanes, rows[:, :ny])
             numbers |= alarms_of(alarms_schema(task, self.rules), causes)
         known.counts[[SAMPLES, USED]] += T, int((out["ok"] > 0.0).any(axis=1).sum())
         found = [self._row(time[t], rows[t]) | {name: column[t] for name, column in numbers.items()} for t in range(T)]

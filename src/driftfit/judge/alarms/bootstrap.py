@@ -40,6 +40,12 @@ OFTEN = 10.0
 """The smallest number of samples from one onset to the next from which a limit is extrapolated."""
 CORRELATED = 1e-3
 """p-value of whiteness of squared scores below which residuals are drawn in blocks."""
+SHARES = (4.0, 2.0, 1.0)
+"""Shares of one parameter, all parameters and the noise in the false alarms of "glr". Most changes are of one
+parameter, and the noise exceeds its share where its variance comes in bursts that a short reference hardly shows.
+"""
+STRATA = 10
+"""Residuals are drawn from the rows with the same tenth of all leverages."""
 STEP = 8.0
 """Factor between the two rates that determine the line."""
 
@@ -47,14 +53,20 @@ STEP = 8.0
 def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> SimulatedRecords:
     """Records without a change; fewer records are the first of more."""
     (N, n), T = rows.phi.shape, SAMPLES + START
-    draws = [np.random.default_rng([seed, k]) for k in range(3)]
-    block = int(np.clip(N // 20, 20, 200)) if drawn_in_blocks(frozen, rows.x) else 1
+    draws = [np.random.default_rng([seed, k]) for k in (0, 1, 2, 5)]
     root = np.linalg.cholesky(frozen.cov)
-    known, later = (_blocks(rng, (records, length), N, block) for rng, length in zip(draws[:2], (N, T), strict=True))
+    if drawn_in_blocks(frozen, rows.x):
+        block = int(np.clip(N // 20, 20, 200))
+        known, own = (_blocks(rng, (records, length), N, block) for rng, length in zip(draws[:2], (N, T), strict=True))
+        later = own
+    else:
+        known = draws[0].integers(0, N, (records, N))
+        later = (draws[3].integers(0, N, (records, 1)) + np.arange(T)) % N
+        own = _of_like_rows(np.einsum("ti,ij,tj->t", rows.phi, frozen.cov, rows.phi), later, draws[1])
     signs = draws[2].integers(0, 2, (records, N + T)) * 2.0 - 1.0
     drawn = np.tile(frozen.numbers, (records, 1))
     drawn[:, [ALPHA, BETA]] = _variances(frozen, rows.x, np.random.default_rng([seed, 4]).random(records))
-    x = rows.x[np.hstack([known, later])] * signs
+    x = rows.x[np.hstack([known, own])] * signs
     w = np.hstack([residuals(x[:, :N], drawn), residuals(x[:, N:], drawn)])
     numbers, _ = noise_models(w[:, :N], n)
     w *= np.sqrt(N / max(N - n, 1))  # what follows has not been fitted
@@ -99,6 +111,16 @@ def _blocks(rng: np.random.Generator, shape: tuple[int, int], N: int, block: int
     return np.asarray((first[..., None] + np.arange(block)).reshape(R, -1)[:, :T] % N)
 
 
+def _of_like_rows(leverage: Array, rows: Array, rng: np.random.Generator) -> Array:
+    """Indices (R, T), each drawn from the rows whose leverage (N,) is about as large as that of ``rows`` (R, T)."""
+    N = len(leverage)
+    order, place = np.argsort(leverage), np.empty(N, np.int64)
+    place[order] = np.arange(N)
+    size = -(-N // STRATA)
+    first = np.minimum(place // size * size, N - size)
+    return np.asarray(order[first[rows] + rng.integers(0, size, rows.shape)])
+
+
 def _variances(frozen: Frozen, x: Array, chance: Array) -> Array:
     """alpha and beta (R, 2) of the records, drawn from those that the reference leaves plausible; ``chance`` (R,)."""
     numbers = frozen.numbers[None]
@@ -111,20 +133,20 @@ def limits(records: SimulatedRecords, cusum: bool, every: float) -> tuple[Array,
     the standard deviation of the log of the rate that a stream has with these limits, since it keeps the errors of its
     reference.
 
-    Each record has such errors of its own, so its number of onsets varies by more than that of a Poisson variable; that
-    onsets come in groups makes the result somewhat too large. The exponent of a rate, and so its error, grows with the
-    square of the limit.
+    Each record has such errors of its own, so that the numbers of onsets in its halves are correlated; that onsets come
+    in groups makes no difference to this. The exponent of a rate, and so its error, grows with the square of the limit.
     """
     statistic = statistics_of(records, cusum, START)
     base = min(every, max(SAMPLES * len(statistic) / ENOUGH, STEP * OFTEN))
     often = max(base / STEP, OFTEN)
-    near, nearer = limits_of([(one, 0) for one in statistic], base, often)
+    near, nearer = limits_of([(one, 0) for one in statistic], base, often, shares=() if cusum else SHARES)
     growth = np.maximum(near**2 - nearer**2, 0.1) / np.log(base / often)
     found = np.sqrt(near**2 + growth * np.log(every / base))
     idle = ~statistic.any(axis=(0, 1))
     found[idle], growth[idle] = found[~idle].max(), growth[~idle].max()
     active = np.logical_or.reduce([statistic[..., j] > limit for j, limit in enumerate(near)])
-    begun = active[:, 0] + np.sum(active[:, 1:] & ~active[:, :-1], axis=1)
-    mean = max(float(begun.mean()), 1e-9)
-    beyond = np.log1p(max(float(begun.var(ddof=1)) - mean, 0.0) / mean**2)
+    begun, half = active & ~np.column_stack([np.zeros(len(active), bool), active[:, :-1]]), active.shape[1] // 2
+    halves = np.column_stack([begun[:, :half].sum(axis=1), begun[:, half:].sum(axis=1)])
+    mean = max(float(halves.mean()), 1e-9)
+    beyond = np.log1p(max(float(np.cov(halves.T)[0, 1]), 0.0) / mean**2)
     return found, growth, float(np.sqrt(beyond) * np.mean(found**2) / np.mean(near**2))

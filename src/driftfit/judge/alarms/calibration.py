@@ -102,12 +102,13 @@ def _last_known(U: Array) -> Array:
     return np.where(np.isfinite(U[place]), U[place], 0.0)
 
 
-def limits_of(made: Iterable[tuple[Array, int]], *every: float) -> list[Array]:
+def limits_of(made: Iterable[tuple[Array, int]], *every: float, shares: Sequence[float] = ()) -> list[Array]:
     """For each of the numbers ``every``: limits (c,) that the columns of the statistics together begin to exceed once
     in that many samples.
 
-    ``made`` contains (statistic (T, c), first sample judged) of records. All columns have the same rate, which is the
-    largest possible one: columns that exceed at the same time begin only one alarm.
+    ``made`` contains (statistic (T, c), first sample judged) of records. The rates of the columns are in proportion to
+    ``shares`` (c,), equal without them, and the largest possible ones: columns that exceed at the same time begin only
+    one alarm.
     """
     parts: list[Array] = []
     for statistic, start in made:
@@ -116,17 +117,18 @@ def limits_of(made: Iterable[tuple[Array, int]], *every: float) -> list[Array]:
     joined[~np.isfinite(joined)] = -np.inf
     samples = joined.shape[1] - len(parts) // 2
     rates = [begun_over(column, samples / min(every)) for column in joined]
-    return [_together(joined, rates, samples / one) for one in every]
+    part = np.array(shares) / max(shares) if len(shares) else np.ones(len(joined))
+    return [_together(joined, rates, part, samples / one) for one in every]
 
 
-def _together(joined: Array, rates: Sequence[tuple[Array, Array]], allowed: float) -> Array:
-    """Limits (c,) with ``allowed`` onsets of all columns together."""
+def _together(joined: Array, rates: Sequence[tuple[Array, Array]], part: Array, allowed: float) -> Array:
+    """Limits (c,) with ``allowed`` onsets of all columns together, of which each has the same multiple of its part."""
     columns = len(joined)
 
     def limits(share: float) -> Array:
-        return np.array([_least(*rate, share) for rate in rates])
+        return np.array([_least(*rate, share * own) for rate, own in zip(rates, part, strict=True)])
 
-    low, high = allowed / columns, allowed
+    low, high = allowed / part.sum(), allowed
     for _ in range(STEPS if columns > 1 else 0):
         middle = 0.5 * (low + high)
         active = np.logical_or.reduce([column > limit for column, limit in zip(joined, limits(middle), strict=True)])

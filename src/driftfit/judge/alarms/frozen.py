@@ -17,22 +17,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.engine.drivers import ROUNDING
+from driftfit.engine.drivers import ROUNDING, SMALLEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.judge.alarms.variances import losses, variances
 from driftfit.judge.statistics.robust import CLIP as OF_FIT
-from driftfit.judge.statistics.robust import median, medians, noisy, robust_fit
+from driftfit.judge.statistics.robust import LEAST, deviation, medians, noisy, robust_fit
 from driftfit.run.live.frozen.reference_model import (
     ALPHA,
     BETA,
     CLIP,
     CONSTANT,
+    EVEN,
     FLAT,
     INSIDE,
     KAPPA,
     LONGEST,
     NORMAL,
+    NUMBERS,
     RAW,
     SAME,
     SCALE,
@@ -47,7 +49,7 @@ from driftfit.smooth.parts.rank import column_sizes
 
 CLIPPED = 2.5
 """Scores are residuals clipped at this many scales."""
-ORDER = 6
+ORDER, COMPLETE = 6, 60
 ROUNDS = 3
 PERSISTENCE, REACTION = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98), (0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
 GARCH = np.array([(0.0, 0.0), *((a, both - a) for both in PERSISTENCE for a in REACTION if a < both)])
@@ -64,6 +66,8 @@ DUST = 1e-9
 """An entry of a direction, which has length 1, below which it is the rounding of 0: where all else of a row is 0, as of
 an idle input, such an entry alone would say that the row excites the direction.
 """
+EVENNESS = 0.5
+"""`EVEN`: at 1, long windows would have as many false alarms as short ones, and large changes would be found later."""
 SHARE = 8
 """The noise is judged by windows of at most this part of the reference."""
 
@@ -94,7 +98,7 @@ def frozen_model(phi: Array, y: Array, ok: Array, constant: int = -1) -> tuple[F
         if not noisy(fit, white[:, :-1], white[:, -1]):
             return None
         e = rows[:, -1] - rows[:, :-1] @ fit.theta
-        ar = _autoregression(e, ok)
+        ar = _autoregression(e, ok, len(unit))
         used, w = _whitened(e[:, None], ok, ar)
         numbers, h = noise_model(w[:, 0], len(unit))
         root = np.ones(len(y))
@@ -141,7 +145,8 @@ def noise_model(w: Array, n: int) -> tuple[Array, Array]:
 def noise_models(w: Array, n: int) -> tuple[Array, Array]:
     """The same for R references of N residuals each, w (R, N): numbers (R, k) and h (R, N)."""
     R, N = w.shape
-    numbers = np.zeros((R, CONSTANT + 1))
+    numbers = np.zeros((R, NUMBERS))
+    numbers[:, EVEN] = EVENNESS
     numbers[:, CLIP], numbers[:, NORMAL], numbers[:, LONGEST] = CLIPPED, N, max(N // SHARE, 8)
     numbers[:, SCALE] = _scales(w, n)
     x = w / numbers[:, SCALE, None]
@@ -207,19 +212,31 @@ def _whitened(rows: Array, ok: Array, ar: Array) -> tuple[Array, Array]:
     return p + np.flatnonzero(complete), white[complete]
 
 
-def _autoregression(e: Array, ok: Array) -> Array:
-    """Coefficients of the order up to ORDER with the smallest BIC; outliers are limited to three scales."""
-    limit = 3.0 * 1.4826 * median(np.abs(e[ok]))
-    e, most = np.clip(e, -limit, limit), min(ORDER, len(e) // 20)
-    used, _ = _whitened(e[:, None], ok, np.zeros(most))
-    N, lags = len(used), [e[used - lag] for lag in range(1, most + 1)]
-    R = np.asarray(np.linalg.qr(np.column_stack([*lags, e[used]]), mode="r"))  # order p leaves the squares below row p
-    left = np.cumsum(R[::-1, -1] ** 2)[::-1][: most + 1]
-    p = int(np.argmin(N * np.log(left / N) + np.arange(most + 1) * np.log(N)))
-    return np.linalg.lstsq(R[:p, :p], R[:p, -1], rcond=None)[0] if p else np.zeros(0)
+def _autoregression(e: Array, ok: Array, n: int) -> Array:
+    """Coefficients of the order up to ORDER with the smallest BIC; outliers are limited to three scales.
+
+    Each order is compared with the one below on all samples whose lags are complete, of which there must be `COMPLETE`,
+    and five for each of n parameters.
+    """
+    limit = 3.0 * deviation(e[ok])
+    e = np.clip(e, -limit, limit)
+    found, gain, best = np.zeros(0), 0.0, 0.0
+    for p in range(1, ORDER + 1):
+        used, _ = _whitened(e[:, None], ok, np.zeros(p))
+        N = len(used)
+        if max(COMPLETE, 5 * n) > N:
+            break
+        R = np.asarray(np.linalg.qr(np.column_stack([*(e[used - lag] for lag in range(1, p + 1)), e[used]]), mode="r"))
+        gain += N * np.log1p((R[p - 1, p] / max(abs(R[p, p]), SMALLEST)) ** 2) - np.log(
+            N
+        )  # the last two rows: what each order leaves
+        if gain > best:
+            best, found = gain, np.linalg.lstsq(R[:p, :p], R[:p, -1], rcond=None)[0]
+    return np.asarray(found)
 
 
 def _scales(w: Array, n: int) -> Array:
-    """Standard deviations (R,) of w (R, N) from medians, with the degrees of freedom of n parameters."""
-    N = w.shape[1]
-    return np.asarray(1.4826 * medians(np.abs(w)) * np.sqrt(N / max(N - n, 1)))
+    """Standard deviations (R,) of w (R, N), each as `deviation`, with the degrees of freedom of n parameters."""
+    N, sizes = w.shape[1], np.abs(w)
+    high = np.partition(sizes, 9 * N // 10, axis=1)[:, 9 * N // 10]
+    return np.asarray(np.maximum(1.4826 * medians(sizes), LEAST * high) * np.sqrt(N / max(N - n, 1)))

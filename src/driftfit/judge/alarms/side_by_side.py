@@ -37,6 +37,7 @@ from driftfit.run.live.frozen.reference_model import (
     BLOCKS,
     BOUND,
     CONSTANT,
+    EVEN,
     FLAT,
     KAPPA,
     LEVELS,
@@ -45,6 +46,7 @@ from driftfit.run.live.frozen.reference_model import (
     NORMAL,
     SHIFT,
     SHORT,
+    SHORTER,
     K,
     V,
 )
@@ -285,10 +287,12 @@ def _ratios(phi: Array, g: Array, model: Models, w: Work, begin: int, out: Array
                         store(w.total, i, 0, plus(load(w.total, i, 0), load(w.sums, first + i, 0)))
                 _compare(n, w, blocks << level, model, 3 * (2 * level + kind))
         for i in range(3):
-            value = load(w.last, i, 0)
-            for window in range(1, 2 * LEVELS):
-                value = higher(load(w.last, 3 * window + i, 0), value)
-            store(out, 3 * t + i, 0, value)
+            value = fill(0.0)
+            for window in range(2 * LEVELS):
+                z = higher(load(w.last, 3 * window + i, 0), fill(0.0))
+                less = times(load(model.numbers, EVEN, 0), fill(2.0 * SHORTER[window]))
+                value = higher(minus(times(z, z), less), value)
+            store(out, 3 * t + i, 0, root(value))
 
 
 @part

@@ -29,7 +29,7 @@ from driftfit.judge.alarms.reference import burn, first_third, normal_samples
 from driftfit.judge.regressors import refuse_hidden
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.live.frozen.likelihood_ratio import scan
-from driftfit.run.live.frozen.reference_model import CUSUM, INTERVAL, NOISE_FACTOR, OK, UNLIKE, Y, memory_of
+from driftfit.run.live.frozen.reference_model import CUSUM, INTERVAL, NOISE_FACTOR, OK, UNLIKE, Y, judgeable, memory_of
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
@@ -54,13 +54,15 @@ def rule_of(
 
 
 def samples_of(run: Track) -> Samples:
-    """Regressors (T, n) of a run, and (T, 4): the columns of `ROW`, as the tracker receives them."""
+    """Regressors (T, n) of a run, and (T, 4): the columns of `ROW`, as the tracker receives them; "ok" are the samples
+    that are `judgeable`."""
     steps = run.program.steps._replace(store=collect)
     tile = run.fresh()
     out = np.empty(len(run), output_type(tile, COLLECTED))
-    run.program.drivers(steps=steps).run(tile, *lanes_of(run.record), out)
+    y, u, known = lanes_of(run.record)
+    run.program.drivers(steps=steps).run(tile, y, u, known, out)
     noise = np.broadcast_to(run.known.noise, len(run))
-    return out["phi"][..., 0], np.column_stack([out["y"], out["ok"], noise, out["dt"]])
+    return out["phi"][..., 0], np.column_stack([out["y"], judgeable(out, 0, y[:, 0], noise), noise, out["dt"]])
 
 
 def _frozen(run: Track, rule: AlarmRule, reference: Reference, seed: int, records: int) -> tuple[AlarmRule, int]:
@@ -87,7 +89,7 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
         )
     least = max(100, 10 * n)
     first, start = first_third(run, usable, least) if reference is None else normal_samples(run, reference)
-    phi, rest, ok = samples[0][first:start], samples[1][first:start], usable[first:start]
+    phi, rest, ok = samples[0][first:start], samples[1][first:start], (usable & ~_stuck(run))[first:start]
     y, noise, names = rest[:, Y], rest[:, NOISE_FACTOR], run.model.names
     if ok.sum() < least:
         raise ValueError(
@@ -114,6 +116,15 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
         simulated=True,
     )
     return rule, known, start, samples
+
+
+def _stuck(run: Track) -> Array:
+    """Samples (T,) that the tracker refused because their readings repeat the one before, from the third in a row on.
+
+    Other readings that it refused are normal if they are in the reference.
+    """
+    repeated = np.append([False] * 3, run.y[1:] == run.y[:-1]) & np.append([False] * 2, ~run.ok)
+    return np.asarray(repeated[2:] & repeated[1:-1] & repeated[:-2])
 
 
 def _band(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:

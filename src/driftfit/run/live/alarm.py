@@ -18,7 +18,7 @@ from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array, Driver
 from driftfit.run.live.change import Change, change_of
 from driftfit.run.live.frozen.likelihood_ratio import scan
-from driftfit.run.live.frozen.reference_model import ROW, memory_of
+from driftfit.run.live.frozen.reference_model import OK, ROW, judgeable, memory_of
 from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits, last_power_and_mean
 from driftfit.trackers.base import Tracker
 
@@ -94,14 +94,14 @@ class LiveAlarm:
         self._onsets.clear()
         return found
 
-    def take(self, tile: Array, lane: int, e: float, s: float, time: Any = None) -> None:
-        """Judge the sample that a lane of the tile has just processed; e is its innovation, with variance s."""
+    def take(self, tile: Array, lane: int, y: float, e: float, s: float, time: Any = None) -> None:
+        """Judge the sample y that a lane of the tile has just processed; e is its innovation, with variance s."""
         judged = self._wait == 0
         if judged:
-            self._compare(tile, lane, e, s)
+            self._compare(tile, lane, y, e, s)
         self._note(judged, judged and bool(self.rule.exceeded(self.statistic)), time)
 
-    def take_many(self, rows: Array, lane: int, noise: Array, time: Array | None = None) -> list[str | None]:
+    def take_many(self, rows: Array, lane: int, y: Array, noise: Array, time: Array | None = None) -> list[str | None]:
         """Judge T samples that a lane has processed, as `take` does one after the other; the cause wherever it is on.
 
         Parameters
@@ -110,12 +110,14 @@ class LiveAlarm:
             For "glr" and "cusum" the rows must contain the samples as well
             (`driftfit.run.collected_samples.COLLECTED`).
         lane : int
+        y : (T,)
+            The readings as they were given.
         noise : (T,)
             Factors of the noise variance.
         time : (T,) or None
         """
         T, first = len(rows), min(self._wait, len(rows))
-        statistic, findings = self._compare_many(rows[first:], lane, noise[first:])
+        statistic, findings = self._compare_many(rows[first:], lane, y[first:], noise[first:])
         on = np.zeros(T, bool)
         on[first:] = self.rule.exceeded(statistic)
         if not self._left and not on.any():  # nothing begins or ends
@@ -150,7 +152,7 @@ class LiveAlarm:
         if self.rule.kind in FROZEN:
             self._findings[...] = findings
 
-    def _compare(self, tile: Array, lane: int, e: float, s: float) -> None:
+    def _compare(self, tile: Array, lane: int, y: float, e: float, s: float) -> None:
         """The statistic after a sample; without a new one the last is kept."""
         rule = self.rule
         if rule.kind in FROZEN:
@@ -158,6 +160,7 @@ class LiveAlarm:
             row[: len(phi)] = phi
             for place, name in enumerate(ROW, len(rule.parameters)):
                 row[place] = tile[name][0, lane]
+            row[len(rule.parameters) + OK] = judgeable(tile[0], lane, np.array(y), tile["noise"][0, lane])
             scan(self._row, self._frozen, self._memory, self._findings, np.zeros(1, np.int8))
             self.statistic = self._findings[0, rule.entries]
         elif rule.kind == "band":
@@ -173,14 +176,15 @@ class LiveAlarm:
                 if len(self._scores) == rule.window:
                     self.statistic = last_power_and_mean(np.array(self._scores))
 
-    def _compare_many(self, rows: Array, lane: int, noise: Array) -> tuple[Array, Array]:
+    def _compare_many(self, rows: Array, lane: int, y: Array, noise: Array) -> tuple[Array, Array]:
         """(statistics (T, c) after samples, findings of a frozen model)."""
         rule, T = self.rule, len(rows)
         findings = np.empty((T, 0))
         if rule.kind in FROZEN:
             samples, phi = np.ones((T, self._row.shape[1])), rows["phi"][..., lane]
             samples[:, : phi.shape[1]] = phi
-            known = {"y": rows["y"][:, lane], "ok": rows["ok"][:, lane], "noise": noise, "dt": rows["dt"][:, lane]}
+            known = {"y": rows["y"][:, lane], "ok": judgeable(rows, lane, y, noise)}
+            known |= {"noise": noise, "dt": rows["dt"][:, lane]}
             for place, name in enumerate(ROW, len(rule.parameters)):
                 samples[:, place] = known[name]
             findings = np.empty((T, self._findings.shape[1]))

@@ -217,16 +217,16 @@ class Batched(ABC):
             self._loop(self._state_tile(), y, u, known, out)
             for lane, alarm in self._watching:
                 noise = np.broadcast_to(known[:, NOISE, min(lane, known.shape[2] - 1)], len(y))
-                alarm.take_many(out, lane, noise, time)
+                alarm.take_many(out, lane, y[:, lane], noise, time)
             return
         for t in range(len(y)):
             row, own = slice(t, t + 1), known[t : t + 1] if len(known) > 1 else known
             self._loop(self._state_tile(), y[row], u[row], own, out[row])
-            self._keep(out["e"][t], out["s"][t], own[0], None if time is None else instant(time[t]))
+            self._keep(y[t], out["e"][t], out["s"][t], own[0], None if time is None else instant(time[t]))
 
-    def _keep(self, e: Sequence[float], s: Sequence[float], known: Array, time: Any) -> None:
+    def _keep(self, y: Sequence[float], e: Sequence[float], s: Sequence[float], known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""
         for lane, alarm in self._watching:
-            alarm.take(self._state_tile(), lane, float(e[lane]), float(s[lane]), time)
+            alarm.take(self._state_tile(), lane, float(y[lane]), float(e[lane]), float(s[lane]), time)
         for lane, window in enumerate(self._windows):
             window.push(self._state_tile(), (known[INTERVAL, lane], known[NOISE, lane], known[DRIFT, lane]), lane)

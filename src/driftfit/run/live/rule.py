@@ -24,7 +24,7 @@ import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, near
-from driftfit.run.live.frozen.reference_model import CUSUM, JOINT, NOISE, ONE, Frozen
+from driftfit.run.live.frozen.reference_model import CUSUM, JOINT, NOISE, NUMBERS, ONE, TOP, Frozen
 from driftfit.trackers.base import Tracker
 
 FROZEN = ("glr", "cusum")
@@ -33,6 +33,8 @@ OFFSET = "offset"
 """The parameter of a constant regressor that the frozen model has even if the model of the run has none."""
 KINDS = (*FROZEN, "band", "innovation", "probability")
 
+BEYOND = 1.3
+"""From this multiple of the largest limit on, a CUSUM forgets."""
 CHANGE, REPORT = "window", "report"
 """Where the probability of a change is stored: in a field of the tracker, or in the report of a `Bank`."""
 
@@ -94,7 +96,10 @@ class AlarmRule(Settings):
         """The frozen model of "glr" and "cusum", as arrays; rules of earlier versions have fewer of them."""
         n = len(self.parameters)
         shapes, given = (-1, -1, -1, (n, n), -1, (-1, n), -1), (*self.frozen, *((), ())[len(self.frozen) - 5 :])
-        return Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(given, shapes, strict=True)))
+        found = Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(given, shapes, strict=True)))
+        numbers = np.append(found.numbers, np.zeros(NUMBERS - len(found.numbers)))
+        numbers[TOP] = BEYOND * max(self.limits, default=0.0)
+        return found._replace(numbers=numbers)
 
     @property
     def real_rate(self) -> tuple[float, float]:

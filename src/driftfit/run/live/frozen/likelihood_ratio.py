@@ -8,7 +8,9 @@ V = v G + k^2 G C G. The statistics are
     parameters     S' V^-1 S                                                any of them did
     noise          Q against L v, both tails                                the noise variance changed
 
-as normal deviates (Wilson and Hilferty 1931), each the largest over windows of 8, 12, 16, 24, .., 384 samples. Level j
+as normal deviates z (Wilson and Hilferty 1931), each the largest sqrt(z^2 - 2 EVEN log(384 / L)), at least 0, over
+windows of L = 8, 12, 16, 24, .., 384 samples: with one limit for all z, nearly all false alarms would be those of short
+windows, of which a record has many that are independent, and long windows would find small changes late. Level j
 has sums over blocks of 2^j samples, of which it keeps twelve; a block is the sum of two of the level below, so nothing
 is ever subtracted, and windows of 8 and 12 blocks are compared whenever a block is complete. d is a step of one
 parameter; where a regressor is centred that is a slope about its mean, and a slope through zero, which moves the level
@@ -19,8 +21,8 @@ Which parameter moved is the one with the largest statistic; but the level, not 
 within `ALIKE`. Where most scores are clipped they show only that there is a change: the residuals x then show which, in
 the window that one step explains best. It is not the noise that changed if a step explains most of the squares.
 
-Source: Lai (1998). Departures: the covariance of the reference within the statistic; windows of 8 and 12 blocks, of
-which the longer ones are compared less often.
+Source: Lai (1998); Dumbgen and Spokoiny (2001) for limits that depend on the length. Departures: the covariance of the
+reference within the statistic; windows of 8 and 12 blocks, of which the longer ones are compared less often.
 Cost per sample: O(n^3 + p n) on average, some 2 microseconds with four parameters.
 """
 
@@ -38,6 +40,7 @@ from driftfit.run.live.frozen.reference_model import (
     COUNT,
     COVARIANCE,
     CUSUM,
+    EVEN,
     FIT,
     FLAT,
     FULLY,
@@ -53,6 +56,7 @@ from driftfit.run.live.frozen.reference_model import (
     RATIO,
     RAW,
     SHORT,
+    SHORTER,
     SIZE,
     STD,
     WHICH,
@@ -260,15 +264,17 @@ def judge(memory: Memory, frozen: Frozen, findings: Array) -> None:
     windows(memory, frozen, count)
     for i in range(CUSUM):
         findings[i] = np.nan
-    best, fit = 0, np.nan
+    best, fit, most, loudest = 0, np.nan, np.nan, np.nan
     for w in range(2 * last.shape[0]):
-        one = last[w // 2, w % 2]
-        if one[JOINT] > findings[JOINT] or np.isnan(findings[JOINT]):
-            findings[JOINT] = one[JOINT]
-        if one[ONE] > findings[ONE] or np.isnan(findings[ONE]):
-            best, fit, findings[ONE] = w, one[FIT], one[ONE]
-        if one[NOISE] > findings[NOISE] or np.isnan(findings[NOISE]):
-            findings[NOISE], findings[RATIO], findings[NOISE_WINDOW] = one[NOISE], one[RATIO], one[WINDOW]
+        one, less = last[w // 2, w % 2], 2.0 * frozen.numbers[EVEN] * SHORTER[w]
+        for i in (ONE, JOINT, NOISE):
+            z = np.sqrt(max(one[i] * abs(one[i]) - less, 0.0)) if not np.isnan(one[i]) else np.nan
+            if z > findings[i] or np.isnan(findings[i]):
+                findings[i] = z
+        if one[ONE] > most or np.isnan(most):
+            best, fit, most = w, one[FIT], one[ONE]
+        if one[NOISE] > loudest or np.isnan(loudest):
+            loudest, findings[RATIO], findings[NOISE_WINDOW] = one[NOISE], one[RATIO], one[WINDOW]
     # where scores are clipped, the window that one change explains best shows which
     for w in range(2 * last.shape[0]):
         if last[w // 2, w % 2, FIT] > fit:

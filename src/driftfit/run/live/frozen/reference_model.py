@@ -17,24 +17,33 @@ judges as any other, but not the noise while the variance is that large. Where n
 false, the first of such samples teaches nothing, and neither does an error of more than `CREDIBLE` deviations: they are
 judged by windows alone, whose V allows for the variance, and not at all above `UNKNOWN`.
 
-A sample that cannot be used is passed over; an autoregression then waits until its lags are complete.
-Source: Huber (1964) for the score, Bollerslev (1986) for h, Koopman and Durbin (2003) for the diffuse start.
+A sample that cannot be used is passed over. Where lags of the autoregression are missing, a Kalman filter predicts
+them, [phi, e] together so that a change of theta shows in the same way, and w_t is divided by the standard deviation of
+its prediction; at the beginning and after a gap in time, all lags have the stationary covariance.
+Source: Huber (1964) for the score, Bollerslev (1986) for h, Koopman and Durbin (2003) for the diffuse start, Jones
+(1980) for lags that are missing.
 Cost per sample: O(n^2 + p n).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.engine.drivers import SMALLEST
+from driftfit.engine.drivers import LARGEST, SMALLEST
 from driftfit.engine.kernel import Array, kernel, part
 
 LEVELS, BLOCKS, SHORT = 6, 12, 8
 """Levels of blocks of 1, 2, 4, .. samples; blocks that each keeps; blocks of the shorter window."""
+LENGTHS = tuple(blocks << level for level in range(LEVELS) for blocks in (SHORT, BLOCKS))
+"""Samples L of the windows: 8, 12, 16, 24, .., 384."""
+SHORTER = tuple(float(np.log(LENGTHS[-1] / L)) for L in LENGTHS)
+"""log(longest / L) of the windows."""
 GAP = 1.5
 """An interval longer than this breaks an autoregression."""
+ROOT = 0.999
+"""The largest root of an autoregression whose lags are predicted."""
 SHIFT = 0.5
 """The shift for which the score CUSUM is designed, in standard deviations of the noise per root mean square regressor.
 """
@@ -61,11 +70,14 @@ noise; the CUSUM of the parameters too; everything.
 """
 WIDE = 30.0
 """For the size of a change x is limited to this, so that one outlier does not count more, or to twice the last e."""
-SCALE, CLIP, K, V, KAPPA, ALPHA, BETA, INSIDE, RAW, SPREAD, LONGEST, NORMAL, CONSTANT = range(13)
+SCALE, CLIP, K, V, KAPPA, ALPHA, BETA, INSIDE, RAW, SPREAD, LONGEST, NORMAL, CONSTANT, EVEN, TOP = range(15)
 """Entries of `Frozen.numbers`. INSIDE is the mean of x^2 where x is not clipped and 0 elsewhere, RAW and SPREAD are the
 mean and variance of x^2, LONGEST is the longest window that judges the noise, NORMAL the size of the reference,
-CONSTANT the index of the regressor that the others are centred on (read only if some are).
+CONSTANT the index of the regressor that the others are centred on (read only if some are), EVEN how evenly windows of
+all lengths share the false alarms, from 0 (all have the same limit) to 1, TOP the deviate of a CUSUM from which on it
+forgets (none if it is 0).
 """
+NUMBERS = TOP + 1
 ALIKE = 1.0
 """Twice the logarithm of the likelihood ratio up to which a step is of the level, not of a slope through zero."""
 LITTLE = 0.2
@@ -116,6 +128,10 @@ class Memory(NamedTuple):
     """
     unknown: Array
     """(k, n): what is left of `Frozen.unseen`, as no row after the reference has excited it either."""
+    lags: Array
+    """(2 p + 1, p): covariance of the errors of the lags ``past``, in units of the variance of w, read while fewer than
+    p samples in a row were usable; the stationary covariance; and scratch.
+    """
 
 
 def memory_of(frozen: Frozen) -> Memory:
@@ -128,12 +144,41 @@ def memory_of(frozen: Frozen) -> Memory:
     past, cusum = np.zeros((p + 1, n + 1)), np.zeros((n + 1 + centred, 2))
     excited = np.eye(n) - frozen.unseen.T @ frozen.unseen
     known = np.vstack([np.zeros((1, n)), excited @ frozen.cov @ excited, np.zeros((1, n))])
-    return Memory(past, sums, last, cusum, counts, work, np.zeros(size_of(n)), findings, known, frozen.unseen.copy())
+    unknown, lags = frozen.unseen.copy(), np.zeros((2 * p + 1, p))
+    lags[:p] = lags[p : 2 * p] = stationary(frozen.ar)
+    return Memory(past, sums, last, cusum, counts, work, np.zeros(size_of(n)), findings, known, unknown, lags)
+
+
+def stationary(ar: Array) -> Array:
+    """Covariance (p, p) of p successive values of an autoregression whose innovations have the variance 1.
+
+    One that is not stationary is taken with roots at `ROOT`.
+    """
+    p = len(ar)
+    A = np.eye(p, k=1)
+    A[p - 1 :] = ar[::-1]
+    largest = np.max(np.abs(np.linalg.eigvals(A)), initial=ROOT)
+    A[p - 1 :] *= (ROOT / largest) ** np.arange(p, 0, -1)
+    noise = np.zeros((p, p))
+    noise[p - 1 :, p - 1 :] = 1.0
+    return np.linalg.solve(np.eye(p * p) - np.kron(A, A), noise.ravel()).reshape(p, p)
 
 
 def size_of(n: int) -> int:
     """Numbers in the sums of a block: S, U, Q, sum x^2 and the lower triangle of G."""
     return 2 * n + 2 + n * (n + 1) // 2
+
+
+def judgeable(fields: Any, lane: int, y: Array, noise: Array) -> Array:
+    """Samples (T,) that an alarm judges, 1 or 0: those that the tracker used, and complete ones whose reading y it
+    refused.
+
+    A tracker refuses readings that contradict all before, or repeat the last one, since it would lose its estimate. An
+    alarm that left them out would never report a sensor that fails again and again; its scores are bounded.
+    """
+    ok, valid, observed = (fields[name][..., lane] > 0.0 for name in ("ok", "valid", "observed"))
+    given = (np.abs(y) < LARGEST) & (noise < np.inf)
+    return np.asarray(ok | (valid & ~observed & given), float)
 
 
 @kernel
@@ -242,17 +287,90 @@ def outside(phi: Array, unseen: Array) -> bool:
 
 
 @part
+def begin_again(memory: Memory, p: int) -> None:
+    """Nothing is known of the lags: they have the mean 0 and the stationary covariance."""
+    memory.counts[SINCE] = 0.0
+    for lag in range(p):
+        for i in range(memory.past.shape[1]):
+            memory.past[lag, i] = 0.0
+        for k in range(p):
+            memory.lags[lag, k] = memory.lags[p + lag, k]
+
+
+@part
+def error_of_prediction(ar: Array, memory: Memory) -> float:
+    """Variance of the error that the lags leave in a prediction; lags[2 p] are its covariances with theirs."""
+    lags, p = memory.lags, ar.shape[0]
+    total = 0.0
+    for lag in range(p):
+        lags[2 * p, lag] = 0.0
+        for k in range(p):
+            lags[2 * p, lag] += lags[lag, k] * ar[p - 1 - k]
+        total += lags[2 * p, lag] * ar[p - 1 - lag]
+    return total
+
+
+@part
+def shift_errors(memory: Memory, p: int, newest: float) -> None:
+    """The covariance of the lags a sample later, whose error has the variance ``newest``, and with them lags[2 p]."""
+    lags = memory.lags
+    for lag in range(p - 1):
+        for k in range(p - 1):
+            lags[lag, k] = lags[lag + 1, k + 1]
+    for lag in range(p - 1):
+        lags[lag, p - 1] = lags[p - 1, lag] = lags[2 * p, lag + 1]
+    lags[p - 1, p - 1] = newest
+
+
+@part
+def predict_lag(ar: Array, memory: Memory, n: int) -> None:
+    """Enter the prediction of a missing sample as its lag."""
+    past, lags, p = memory.past, memory.lags, ar.shape[0]
+    if p == 0:
+        return
+    if memory.counts[SINCE] >= p:
+        for lag in range(p):
+            for k in range(p):
+                lags[lag, k] = 0.0
+    memory.counts[SINCE] = 0.0
+    for i in range(n + 1):
+        past[p, i] = 0.0
+        for lag in range(p):
+            past[p, i] += ar[lag] * past[p - 1 - lag, i]
+        for lag in range(p):
+            past[lag, i] = past[lag + 1, i]
+    shift_errors(memory, p, error_of_prediction(ar, memory) + 1.0)
+
+
+@part
+def observe_lags(ar: Array, memory: Memory, innovation: Array, n: int) -> float:
+    """Correct the lags by the ``innovation`` [phi, w] of a sample; returns the variance of w."""
+    past, lags, p = memory.past, memory.lags, ar.shape[0]
+    s: float = 1.0 + error_of_prediction(ar, memory)
+    for lag in range(p):
+        gain = lags[2 * p, lag] / s
+        for i in range(n + 1):
+            past[lag, i] += gain * innovation[i]
+        for k in range(p):
+            lags[lag, k] -= gain * lags[2 * p, k]
+    for lag in range(p):
+        lags[2 * p, lag] = 0.0  # the sample itself is known
+    shift_errors(memory, p, 0.0)
+    return s
+
+
+@part
 def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
     """[phi, x] of a row into memory.work[0]; returns the limit of x, 0 if it cannot be used."""
     n, p = frozen.theta.shape[0], frozen.ar.shape[0]
     past, counts, numbers, phi = memory.past, memory.counts, frozen.numbers, memory.work[0]
     if not row[n + INTERVAL] > 0.0:
         return 0.0
-    if not row[n + OK] > 0.0:
-        counts[SINCE] = 0.0
-        return 0.0
     if row[n + INTERVAL] > GAP:
-        counts[SINCE] = 0.0
+        begin_again(memory, p)
+    if not row[n + OK] > 0.0:
+        predict_lag(frozen.ar, memory, n)
+        return 0.0
     # residual and centred regressors, scaled to the noise variance of weight 1
     root, before, centred = 1.0 / np.sqrt(row[n + NOISE_FACTOR]), abs(past[p, n]), frozen.mean.shape[0] > 0
     e, level = row[n + Y], row[int(numbers[CONSTANT])] if centred else 0.0
@@ -265,18 +383,21 @@ def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
         past[p, i] = own * root / frozen.unit[i]
     past[p, n] = e * root
     # whitened by the autoregression, and divided by the present standard deviation
-    scale = numbers[SCALE] * np.sqrt(counts[LEVEL])
     for i in range(n + 1):
-        value = past[p, i]
+        phi[i] = past[p, i]
         for lag in range(p):
-            value -= frozen.ar[lag] * past[p - 1 - lag, i]
-        phi[i] = value / np.sqrt(counts[LEVEL]) if i < n else value / scale
-    # shift the lags; after a gap they must first be filled again
+            phi[i] -= frozen.ar[lag] * past[p - 1 - lag, i]
+    level = np.sqrt(counts[LEVEL])
+    if counts[SINCE] < p:
+        level *= np.sqrt(observe_lags(frozen.ar, memory, phi, n))
+    scale = numbers[SCALE] * level
+    for i in range(n + 1):
+        phi[i] /= level if i < n else scale
     for lag in range(p):
         for i in range(n + 1):
             past[lag, i] = past[lag + 1, i]
     counts[SINCE] += 1.0
-    return max(WIDE, 2.0 * before / scale) if counts[SINCE] > p else 0.0
+    return max(WIDE, 2.0 * before / scale)
 
 
 @part

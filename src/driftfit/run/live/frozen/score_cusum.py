@@ -4,7 +4,9 @@
 
 for each parameter and both signs, and for the variance of the noise. Where a regressor is centred, its parameter also
 has sums for a step of the slope through zero, unless that is hardly more than one of the level. Reported is the larger
-of them as sqrt(2 C), a deviate. Source: Page (1954). Cost per sample: O(n).
+of them as sqrt(2 C), a deviate. Above TOP the sum forgets exponentially: it would otherwise grow for as long as a fault
+lasts, and the alarm would stay on for up to nine times as long after it. The column with the largest drift still has
+the largest sum. Source: Page (1954). Cost per sample: O(n).
 """
 
 from __future__ import annotations
@@ -19,19 +21,24 @@ from driftfit.run.live.frozen.reference_model import (
     LITTLE,
     SAME,
     SHIFT,
+    TOP,
     Frozen,
     K,
     V,
     through_zero,
 )
 
+LASTING = 0.98
+"""What is kept, per sample, of the excess of a sum over the largest that counts."""
+
 
 @part
-def climb(cusum: Array, z: float, mean: float, var: float, power: float) -> None:
-    """One step of a CUSUM up and of one down."""
+def climb(cusum: Array, z: float, mean: float, var: float, power: float, most: float) -> None:
+    """One step of a CUSUM up and of one down, which forget what they are above ``most``."""
     for side in range(2):
         step = (mean * z if side == 0 else -mean * z) - 0.5 * mean * mean * power
-        cusum[side] = max(0.0, cusum[side] + step / var)
+        value = max(0.0, cusum[side] + step / var)
+        cusum[side] = most + LASTING * (value - most) if value > most else value
 
 
 @part
@@ -48,17 +55,18 @@ def accumulate(phi: Array, g: float, noise: bool, frozen: Frozen, cusum: Array) 
     """One step of the CUSUM of every parameter, of the noise, and of slopes through zero; columns are up and down."""
     n = frozen.theta.shape[0]
     k, v, kappa = frozen.numbers[K], frozen.numbers[V], frozen.numbers[KAPPA]
+    most = 0.5 * frozen.numbers[TOP] ** 2 if frozen.numbers[TOP] > 0.0 else np.inf
     for j in range(n):
         own = np.sign(phi[j]) if idle(j, frozen) else min(BOUND, max(-BOUND, phi[j]))
-        climb(cusum[j], own * g, SHIFT * k, v, own * own)
+        climb(cusum[j], own * g, SHIFT * k, v, own * own, most)
     if noise:
-        climb(cusum[n], g * g - v, SHIFT * v, kappa, 1.0)
+        climb(cusum[n], g * g - v, SHIFT * v, kappa, 1.0, most)
     constant = int(frozen.numbers[CONSTANT]) if frozen.mean.shape[0] > 0 else 0
     for j in range(frozen.mean.shape[0]):
         a, b = through_zero(frozen, j, constant) if frozen.mean[j] != 0.0 else (0.0, 0.0)
         if a > LITTLE and not idle(j, frozen):
             own = min(BOUND, max(-BOUND, a * phi[j] + b * phi[constant]))
-            climb(cusum[n + 1 + j], own * g, SHIFT * k, v, own * own)
+            climb(cusum[n + 1 + j], own * g, SHIFT * k, v, own * own, most)
 
 
 @part
