@@ -69,12 +69,14 @@ def _steps(into: tuple[Kind, ...], out: Kind) -> ModelSteps:
     work, refine, count = regress_work(into, out, False), refining(level_of(out)), OWN + EACH * len(into)
 
     def machine_regress_any(blocks: int, theta: int, orders: int) -> None:
-        work(floats(blocks, 1, 1), wholes(orders, 1, count)[0], floats(theta, 1, 1))
+        p = wholes(orders, 1, count)[0]
+        work(floats(blocks, p[US] + p[INPUTS], 1), p, floats(theta, p[N], 1))
 
     def machine_push_any(blocks: int, orders: int) -> None:
-        m = floats(blocks, 1, 1)
+        p = wholes(orders, 1, count)[0]
+        m = floats(blocks, p[US] + p[INPUTS], 1)
         if m[LATE, 0] > 0.0:
-            m[PREDICTED, 0] = refine(m, wholes(orders, 1, count)[0], m[PREDICTED, 0])
+            m[PREDICTED, 0] = refine(m, p, m[PREDICTED, 0])
 
     regress_any, push_any = machine(machine_regress_any), machine(machine_push_any)
 

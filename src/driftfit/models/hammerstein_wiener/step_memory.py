@@ -61,6 +61,11 @@ Places = Array
 """Whole numbers (28 + 7 per input,), a constant for the compiler."""
 
 
+def room(p: Places | tuple[int, ...]) -> int:
+    """Length of the memory of these places: the inputs are its last numbers."""
+    return int(p[US] + p[INPUTS])
+
+
 def _arrays(structure: Structure, nk: tuple[int, ...], into: tuple[Array, ...], out: Array) -> dict[int, Array]:
     """The arrays before the first sample, in their order."""
     na, nb, n_in, n_out, _ = structure

@@ -72,6 +72,7 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     N,
     Places,
     Y,
+    room,
 )
 
 
@@ -179,11 +180,11 @@ def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
 @lru_cache
 def _regress(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
     """The compiled routine of ``regress``."""
-    work, orders = regress_work(into, out, lanes), np.array(p)
+    work, orders, rows, n = regress_work(into, out, lanes), np.array(p), room(p), p[N]
 
     def machine_regress(blocks: int, theta: int, L: int) -> None:
         stride = L if lanes else 1  # known to the compiler
-        work(floats(blocks, 1, stride), orders, floats(theta, 1, stride))
+        work(floats(blocks, rows, stride), orders, floats(theta, n, stride))
 
     return machine(machine_regress)
 
@@ -191,10 +192,10 @@ def _regress(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...], lanes: bool)
 @lru_cache
 def _push(out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
     """The compiled routine of ``push``: it predicts if no other step needed the prediction before."""
-    refine, orders = refining(level_of(out)), np.array(p)
+    refine, orders, rows = refining(level_of(out)), np.array(p), room(p)
 
     def machine_push(blocks: int, L: int) -> None:
-        m = floats(blocks, 1, L if lanes else 1)
+        m = floats(blocks, rows, L if lanes else 1)
         if m[LATE, 0] > 0.0:
             m[PREDICTED, 0] = refine(m, orders, m[PREDICTED, 0])
 
@@ -277,12 +278,12 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
 def applying(into: tuple[Kind, ...], p: tuple[int, ...]) -> Step:
     """The step that takes inputs after their sample: it evaluates their functions and fills the next row again."""
     place, orders = _entering(into, moves=False), np.array(p)
-    now, following, n, us, inputs = p[NOW], p[NEXT], p[N], p[US], p[INPUTS]
+    now, following, n, us, inputs, rows = p[NOW], p[NEXT], p[N], p[US], p[INPUTS], room(p)
 
     def apply(s: State, l: int) -> None:
         for i in range(inputs):
             s.blocks[us + i, l] = s.u[i, l]
-        m = floats(s.blocks.ctypes.data + 8 * l, 1, s.y.shape[0])
+        m = floats(s.blocks.ctypes.data + 8 * l, rows, s.y.shape[0])
         place(m, orders)
         fill(m, orders, following, 1, m[BELIEVED, 0] > 0.0)
         for i in range(n):

@@ -30,7 +30,7 @@ from driftfit.engine.kernel import Array, State, Step, floats, kernel, nothing, 
 from driftfit.engine.settings import matrix, vector
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.step_memory import PREDICTED
+from driftfit.models.hammerstein_wiener.step_memory import PREDICTED, room
 from driftfit.models.hammerstein_wiener.trackers.minimal import Minimal, minimal_memory, structure_of
 from driftfit.models.hammerstein_wiener.trackers.output_error_steps import (
     FLATTEST,
@@ -69,11 +69,11 @@ def _steps(machine: Any) -> TrackerSteps:
 @lru_cache
 def _applying(place: Step, p: tuple[int, ...]) -> Step:
     """The input also updates the usual power of v."""
-    orders = np.array(p)
+    orders, rows = np.array(p), room(p)
 
     def apply(s: State, l: int) -> None:
         place(s, l)
-        m, n, k = floats(s.blocks.ctypes.data, 1, 1), s.theta.shape[0], s.own.shape[0]
+        m, n, k = floats(s.blocks.ctypes.data, rows, 1), s.theta.shape[0], s.own.shape[0]
         theta, own = floats(s.theta.ctypes.data, 1, n)[0], floats(s.own.ctypes.data, 1, k)[0]
         follow_power(m, orders, theta, own)
 

@@ -44,6 +44,7 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     TRIAL,
     TRIAL_BEND,
     Places,
+    room,
 )
 from driftfit.trackers.parts.covariance import LEFT
 
@@ -279,7 +280,7 @@ def _work(out: Kind) -> Any:
 @lru_cache
 def output_error(out: Kind, p: tuple[int, ...]) -> Any:
     """The compiled routine for the functions of an output basis and the places of a model."""
-    work, orders = _work(out), np.array(p)
+    work, orders, rows = _work(out), np.array(p), room(p)
 
     def machine_output_error(fields: int, n_x: int, n: int) -> None:
         at, n_w, size = wholes(fields, 1, ADDRESSES), max(orders[NA], 1), V_POWER + orders[INPUTS]
@@ -291,7 +292,7 @@ def output_error(out: Kind, p: tuple[int, ...]) -> Any:
             floats(at[0, AT_W], 1, n_w)[0],
         )
         drift_theta(S, q, n_w, own[TIME])
-        work(floats(at[0, AT_BLOCKS], 1, 1), orders, own, theta, phi, w, S, floats(at[0, AT_SCRATCH], 2, N))
+        work(floats(at[0, AT_BLOCKS], rows, 1), orders, own, theta, phi, w, S, floats(at[0, AT_SCRATCH], 2, N))
         covariance_of_theta(S, n_w, P)
 
     return machine(machine_output_error)
