@@ -155,7 +155,7 @@ def _take(file: Any, name: str, kinds: Sequence[str]) -> tuple[dict[str, Any], d
             if header.pop("arrays", [*arrays]) != [*arrays]:
                 raise ValueError("its arrays have other names than those that were written")
     except Exception as error:  # zipfile, NumPy and JSON raise a dozen kinds of errors for damaged files
-        raise ValueError(f"{name} is not a driftfit file, or it is damaged ({error}).") from None
+        raise ValueError(f"{name} is not a driftfit file, or it is damaged.") from error
     if header.get("format", 0) > reads:
         raise ValueError(f"{name} was written by a newer driftfit (format {header['format']}); this one reads {reads}.")
     if header.get("kind") not in kinds:
