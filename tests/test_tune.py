@@ -8,7 +8,7 @@ import pytest
 from support import arx_record
 
 from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Regression, Tracker, frontier, track, tune
-from driftfit.data.limits import absurd
+from driftfit.models.fault_codes import absurd
 from driftfit.models.regression import Regression as Base
 from driftfit.systems.drift import RandomWalk, paths
 from driftfit.systems.time_varying import EXAMPLES, example

@@ -29,11 +29,6 @@ from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
-FAR, GAP, FEWEST = 300.0, 10.0, 20
-"""Usual deviations beyond which a value may be a fault code, how many times further than the others it must then be,
-and the number of values that this judgement needs."""
-
-
 NO_CODE = float("nan"), np.zeros(0, int)
 """What `shared_code` finds nearly always."""
 
@@ -100,22 +95,6 @@ class Gate:
 
     def restore(self, counts: Sequence[int]) -> None:
         self._counts[:] = counts
-
-
-def absurd(x: Array) -> Array:
-    """The values of a signal (T,) that are `FAR` times its usual deviation from its median, by sample; often empty.
-
-    The usual deviation is the median one of those that are not zero, so that a signal may rest most of the time. That
-    of rain is some tenths of a millimetre, so a storm is as far as a code; but only a code is `GAP` times further than
-    whatever is nearer than it.
-    """
-    known = np.isfinite(x)
-    away = np.abs(np.where(known, x, np.nan) - (np.median(x[known]) if known.any() else 0.0))
-    moving = np.sort(away[known & (away > 0.0)])
-    if len(moving) < FEWEST:
-        return np.empty(0, int)
-    beyond = moving[1:][(moving[1:] > FAR * float(np.median(moving))) & (moving[1:] > GAP * moving[:-1])]
-    return np.flatnonzero(known & (away >= beyond.min(initial=np.inf)))
 
 
 def shared_code(y: Array, u: Array) -> tuple[float, Array]:
