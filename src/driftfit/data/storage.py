@@ -83,7 +83,10 @@ def _write(path: str | PathLike[str], put: Callable[[Any], Any]) -> None:
     """Let ``put`` write a file that is complete or absent."""
     target = os.path.abspath(os.fspath(path))
     name = os.path.join(os.path.dirname(target), f".driftfit-{secrets.token_hex(8)}")
-    file = open(name, "xb")  # noqa: SIM115  (with the rights of any new file, unlike one of tempfile)
+    try:
+        file = open(name, "xb")  # noqa: SIM115  (with the rights of any new file, unlike one of tempfile)
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, target) from None
     try:
         with file:
             put(file)
