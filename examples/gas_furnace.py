@@ -3,7 +3,7 @@
 Prints the verdict; then, for several orders, its p-value and that of an independent test, the largest
 heteroscedasticity-robust Wald statistic of one break in all coefficients (Andrews, 1993) beside the same of constant
 models driven by the record's own residuals with random signs (a wild bootstrap, which keeps their level over time).
-Run: python examples/gas_furnace.py gas_furnace.csv (columns gas_rate and co2)
+Run: python examples/gas_furnace.py gas_furnace.csv (columns gas_rate and co2; not part of this package)
 """
 
 import sys
@@ -71,4 +71,6 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__.strip())
     main(sys.argv[1])

@@ -1,5 +1,7 @@
 """The command line: what it writes is what Python gives, and every mistake ends in one helpful line."""
 
+import warnings
+
 import numpy as np
 import polars as pl
 import pytest
@@ -7,6 +9,7 @@ from typer.testing import CliRunner
 
 import driftfit
 from driftfit import ARX, Kalman, Regression, Track, cli, track, trackers
+from driftfit.cli import main
 from driftfit.cli.parts.arguments import parse_interval
 from driftfit.data.clock import Clock
 from driftfit.data.files import read_columns
@@ -209,6 +212,27 @@ def test_wrong_endings_are_refused_before_the_work(file, tmp_path):
     assert ".parquet" in fails(*arguments, "--out", tmp_path / "result.xls")
     assert "--dt soon" in fails(*arguments, "--dt", "soon")
     assert ".html" in fails(*arguments, "--report", tmp_path / "page.pdf", "--y", "no such column")
+    for option in ("--plot", "--system"):
+        assert "written to .png" in fails(*arguments, option, tmp_path / "run.foo", "--y", "no such column")
+    for option, name in (("--out", "x.csv"), ("--plot", "x.png"), ("--report", "x.html")):
+        place = tmp_path / "nowhere" / name
+        expected = f"driftfit: {option} {place}: there is no folder {place.parent}."
+        assert fails(*arguments, option, place, "--y", "no such column") == expected
+
+
+def test_messages_of_the_system_and_warnings_are_sentences(file, tmp_path, monkeypatch):
+    absent = tmp_path / "absent.csv"
+    assert fails("track", absent, "--y", "y") == f"driftfit: {absent}: No such file or directory"
+    assert "pickle" not in fails("track", file, "--y", "flow rate", "--start", file)
+    assert "no signal has the name 'flow'; did you mean flow rate?" in fails(
+        "track", file, "--y", "flow rate", "--u", "pressure", "--unit", "flow=l/min"
+    )
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+    monkeypatch.setattr("sys.argv", ["driftfit", "--version"])
+    with pytest.raises(SystemExit):
+        main()
+    shown = warnings.formatwarning(UserWarning("the record is short."), UserWarning, "tune.py", 36)
+    assert shown == "driftfit: warning: the record is short.\n"
 
 
 @pytest.mark.parametrize("name", ["AugmentedFLS", "augmentedfls", "augmented-fls", "augmented_FLS"])

@@ -183,6 +183,7 @@ def test_detect_scores_labels_and_writes_alarms(table):
     assert "b1[valve]" in printed
     assert "leave out --by" in fails("detect", *DATED, "--labels", "leak", "--by", "leak")
     assert "name=low:high" in fails("detect", *DATED, "--reference", "a1=x:y")
+    assert "--labels: labels are 0 or 1" in fails("detect", *DATED, *options[:-1], "flow")
 
 
 def test_tune_smooth_and_forecast(table):

@@ -185,3 +185,26 @@ def test_crossings_of_a_fleet_come_first_on_top():
     each = fleet.crossing("a", below={"p": 3.5, "q": 1.0, "r": -5.0}, horizon=100)
     assert each["pump"][0] == "p"
     assert each["median"][0] == 0.0
+
+
+def test_a_series_that_determines_nothing_is_the_last_of_its_fleet():
+    """One dead meter in five hundred must not hide when the others will cross."""
+    rng = np.random.default_rng(0)
+    u = 1.0 + rng.random((3, 80))
+    y = 3.0 * u + 0.1 * rng.normal(size=u.shape)
+    y[1] = np.nan
+    fleet = track(Regression(["gain"]), TRACKER, y, u, by="row")
+    table = fleet.crossing("gain", below=2.5, horizon=20)
+    assert table[fleet.by[0]].to_list()[-1] == 1
+    assert table.row(2)[1:] == pytest.approx((np.nan,) * 4, nan_ok=True)
+    assert table["probability"][0] == fleet[table[fleet.by[0]][0]].crossing("gain", below=2.5, horizon=20).probability
+
+
+def test_the_keys_of_a_mapping_are_those_of_series():
+    fleet = fleet_of()
+    with pytest.raises(ValueError, match=r"below has no 'r', but the key 'R', which no series has; give one for all"):
+        fleet.crossing("a", below={"p": 3.5, "q": 1.0, "R": -5.0}, horizon=10)
+    with pytest.raises(ValueError, match=r"u has no 'p', but the key 'P', which no series has"):
+        fleet.forecast(2, {"P": np.ones((2, 2)), "q": np.ones((2, 2))})
+    every = {key: np.ones((2, 2)) for key in "pqrs"}  # one more does no harm
+    assert fleet.forecast(2, every)["y_hat"].is_not_nan().all()

@@ -220,6 +220,11 @@ def test_score_by_hand():
     rule = AlarmRule("band", 10.0, ("b1",), (1.0,))
     raised = Alarms(rule, active, onsets(active), np.zeros((20, 1)), 2, 0.5, None)
     assert raised.score(labels) == (2, 1, 2.0, 2, 9)
+    unmarked = np.where(labels == 1, 1.0, np.nan)  # a missing label marks nothing
+    assert raised.score(unmarked) == raised.score(labels)
+    for wrong in (labels + 0.5, np.where(labels, "fault", "ok"), labels[1:]):
+        with pytest.raises(ValueError, match="labels"):
+            raised.score(wrong)
     # an alarm that was on before the label is false, and finds nothing however long it stays
     early = np.zeros(20, bool)
     early[5:10] = True

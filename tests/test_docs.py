@@ -85,3 +85,18 @@ def test_links_lead_somewhere():
             if "://" not in target and not (page.parent / target).exists():
                 broken.append(f"{page.name}: {target}")
     assert broken == []
+
+
+NEED_A_FILE = [
+    path
+    for path in sorted((ROOT / "examples").glob("*.py"))
+    if re.search(rf"Run: python examples/{path.name} \w", path.read_text())
+]
+
+
+@pytest.mark.parametrize("path", NEED_A_FILE, ids=lambda path: path.stem)
+def test_an_example_without_its_file_says_what_it_needs(path, monkeypatch):
+    monkeypatch.setattr("sys.argv", [str(path)])
+    monkeypatch.syspath_prepend(path.parent)
+    with present(path.name), pytest.raises(SystemExit, match=f"Run: python examples/{path.name} "):
+        runpy.run_path(str(path), run_name="__main__")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from time import sleep
 
 import numpy as np
+import polars as pl
 import pytest
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Track, track
@@ -167,3 +169,16 @@ def test_shapes_are_named():
         track(MODEL, KALMAN, y, u, by="row", weights=np.ones((2, 2)))
     with pytest.raises(ValueError, match="carries no covariance to keep"):
         track(MODEL, AugmentedFLS(1.0), y, u, by="row", keep="cov")
+
+
+def test_a_fleet_that_continues_none_of_its_series_says_so(tmp_path):
+    """Keys that were numbers and are text now would all start from the beginning, unnoticed."""
+    y, u = rows(2, 60)
+    signals = {"y": y.ravel(), "u": u.ravel()}
+    before, after = (pl.DataFrame(signals | {"k": np.repeat(keys, 60)}) for keys in ([7, 8], ["7", "8"]))
+    first = track(MODEL, KALMAN, "y", "u", data=before, by="k")
+    with pytest.warns(UserWarning, match="all series start from the beginning.* '7' here and 7 there"):
+        track(MODEL, KALMAN, "y", "u", data=after, by="k", warm_start=first)
+    absent = tmp_path / "absent" / "fleet.npz"
+    with pytest.raises(FileNotFoundError, match=re.escape(str(absent))):
+        first.save(absent)

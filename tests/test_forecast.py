@@ -122,6 +122,8 @@ def test_forecasts_are_printed_as_tables_and_parameters_of_one_name_apart():
     u = rng.normal(size=80)
     run = track(Regression(("intercept",), intercept=True), Kalman(q=1e-3, r=0.01), 1e6 + 2.0 * u, u)
     assert run.names == ("intercept", "intercept (2)")
+    with pytest.raises(ValueError, match=r"u has shape \(3,\), but 12 samples are asked for"):
+        run.forecast(12, np.ones(3))
     text = repr(run.forecast(12, np.ones((12, 1))))
     assert "Forecast of 12 samples" in text
     assert "the first 10 of 12" in text

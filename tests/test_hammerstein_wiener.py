@@ -356,6 +356,10 @@ def test_what_does_not_fit_warns_and_names_the_remedy():
     y, u = rng.normal(size=(2, 50))
     with pytest.warns(UserWarning, match=r"u has a root mean square of .* use Legendre\(2"):
         track(HammersteinWiener(1, 1, input=Polynomial(2)), Still(), y, 100.0 * u)
+    with_code = np.append(100.0 * u[:-1], -99999.0)  # which would give the basis a range that no other value reaches
+    with pytest.warns(UserWarning, match=rf"use Legendre\(2, \({min(100.0 * u[:-1]):g}, {max(100.0 * u[:-1]):g}\)\)"):
+        track(HammersteinWiener(1, 1, input=Polynomial(2)), Still(), y, with_code)
+    track(HammersteinWiener(1, 1, input=Polynomial(2)), Still(), y, np.append(u[:-1], -999.0))  # no warning
     with pytest.warns(UserWarning, match=r"samples of y lie outside .* Legendre and are beyond"):
         track(HammersteinWiener(1, 1, output=Legendre(2, (-1, 1))), Still(), y, u)
     with pytest.warns(UserWarning, match=r"samples of u lie outside .* BSpline and are missing"):

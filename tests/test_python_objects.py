@@ -165,6 +165,8 @@ def test_a_notebook_shows_what_a_result_is(everything):
             assert html.count("<span") == html.count("</span>"), name
     for name in ("Track", "Fleet", "Outputs", "Instants", "Tuned", "TunedOutputs", "Track.verdict", "Fleet.verdict"):
         assert hasattr(everything[name], "_repr_html_"), name
+    for name in ("Tuned", "Selection", "Segmentation", "detect", "Fleet.verdict", "Fleet.diagnose", "Track.summary"):
+        assert repr(everything[name]) == str(everything[name]).strip("\n"), name  # not every field, at a prompt
     html = everything["Fleet"]._repr_html_()
     for word in ("Fleet of 3 series", "a1", "b2", f"{everything['Fleet'][2].theta[-1, 3]:.4g}"):
         assert word in html

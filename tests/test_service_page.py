@@ -122,6 +122,31 @@ def test_what_the_interface_says(service, client):
     assert {path for path in about["paths"] if "api" in path} | {"/api/openapi.json"} == routes
 
 
+def test_units_that_fell_silent_before_the_page_started_are_shown_as_silent(tmp_path):
+    """They were left out, or seen "now": what a restart hid was the sensor that had died."""
+    y, u = record()
+    engine = opened(configured(), tmp_path)
+    for pump in "abc":
+        feed(engine, message(f"plant/{pump}", range(40), y[:40], u[:40]))
+        settled(engine)
+    db = engine.journal.db
+    db.execute("delete from result where first <= 40")  # of a, as after a minute
+    db.execute("update result set at = at - 5000 where first <= 80")
+    found = Feed(tmp_path, tmp_path / "c")
+    found.look()
+    found.rank()
+    lines = {one["unit"]: one for one in found.fleet}
+    assert [one["unit"] for one in found.fleet][-1] == "a"
+    assert [lines[pump]["silent"] for pump in "abc"] == [True, True, False]
+    assert lines["a"]["age"] is None
+    assert 5000.0 <= lines["b"]["age"] < 5100.0
+    ask = Client(Page(PageOptions(), found, Sessions(tmp_path)).app())
+    for pump in "abc":
+        (one,) = json.loads(ask("GET", f"/api/units?search={pump}")[1])["units"]
+        assert (one["unit"], one["silent"]) == (pump, pump != "c")
+    engine.close()
+
+
 def test_exports_and_history_are_the_samples(service, client):
     engine = service[0]
     ask, live = client(), engine.units.get(1).live

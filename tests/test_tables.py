@@ -166,6 +166,45 @@ def test_days_and_dates_as_text():
     assert_same(by_text, by_days)
 
 
+def test_dates_that_are_python_objects():
+    """What ``column.dt.date`` of pandas and databases give; cells of several zones are instants."""
+    y, u = signals()
+    days = [date(2024, 1, 1) + timedelta(days=k) for k in range(T)]
+    frame = pd.DataFrame({"y": y, "u": u, "t": days})
+    assert frame["t"].dtype == object
+    assert_same(track(MODEL, TRACKER, "y", "u", data=frame, time="t", dt="1d"), alone(y, u))
+    hours = [datetime(2024, 1, 1, tzinfo=UTC) + timedelta(hours=k) for k in range(T)]
+    mixed = [one.astimezone(ZoneInfo("Asia/Tokyo")) if k % 2 else one for k, one in enumerate(hours)]
+    several = track(MODEL, TRACKER, "y", "u", data=frame.assign(t=pd.Series(mixed, dtype=object)), time="t", dt="1h")
+    assert_same(several, alone(y, u))
+    assert several.time_text(1) == "2024-01-01 01:00:00 UTC"
+    without = pd.Series([pd.NaT if k == 7 else day for k, day in enumerate(days)], dtype=object)
+    assert len(track(MODEL, TRACKER, "y", "u", data=frame.assign(t=without), time="t", dt="1d")) == T - 1
+    for cell, what in (("soon", "row 7 of the time holds 'soon', which is not a date"), (hours[7], "with a zone and")):
+        wrong = pd.Series([cell if k == 7 else day for k, day in enumerate(days)], dtype=object)
+        with pytest.raises(ValueError, match=what):
+            track(MODEL, TRACKER, "y", "u", data=frame.assign(t=wrong), time="t", dt="1d")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_column_without_any_value_is_missing(kind):
+    """Its type is then that of null."""
+    table = KINDS[kind]({"y": [1.0, 2.0, 3.0], "u": [None] * 3})
+    run = track(MODEL, TRACKER, "y", "u", data=table)
+    assert np.isnan(run.u).all()
+    assert not run.ok.any()
+
+
+def test_what_is_no_table_says_so():
+    for data, what in (
+        ([{"y": 1.0}], "got a list with a dict"),
+        (pl.DataFrame({"y": [], "u": []}), "the table has no rows"),
+        (pl.DataFrame({"y": [1.0], "u": [2.0]}), "time and y are both the column 'y'"),
+    ):
+        with pytest.raises(ValueError, match=what):
+            track(MODEL, TRACKER, "y", "u", data=data, time="y" if "both" in what else None)
+
+
 def test_gaps_are_those_of_the_unit():
     y, u = signals()
     time = np.arange(T, dtype=float)

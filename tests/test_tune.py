@@ -8,6 +8,7 @@ import pytest
 from support import arx_record
 
 from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Regression, Tracker, frontier, track, tune
+from driftfit.models.fault_codes import absurd
 from driftfit.models.regression import Regression as Base
 from driftfit.systems.drift import RandomWalk, paths
 from driftfit.systems.time_varying import EXAMPLES, example
@@ -394,3 +395,15 @@ def test_signals_that_are_equal_within_their_range_hold_no_code():
     y[100:120], u[100:120] = 0.0, 0.0
     y[200:220], u[200:220] = u.max(), u.max()
     track(ARX(1, 1), Kalman(q=1e-4, r=0.1), y, u)
+
+
+def test_a_storm_is_no_code():
+    """Rain is near 0 on most days, so a storm is as many usual deviations away as a code, but not far from the next."""
+    rain = np.exp(np.random.default_rng(1).normal(-2.0, 2.0, 400))
+    assert rain.max() > 300.0 * np.median(rain)
+    assert not len(absurd(rain))
+    for codes in ([9999.0], [-9999.0, 99999.0], [1e6] * 30):
+        spoilt = rain.copy()
+        spoilt[50 : 50 + len(codes)] = codes
+        assert absurd(spoilt).tolist() == list(range(50, 50 + len(codes)))
+    assert absurd(np.append(np.tile([4.0, 5.0, 6.0], 20), [1e4, 1.1e4])).tolist() == [60, 61]

@@ -80,7 +80,7 @@ class Judged(keyed_results.KeyedResults, Exported):
 
         Limits are the same for all, or a mapping from every key. Columns: those that identify the runs, ``probability``
         within the horizon, ``median``, ``low`` and ``high`` in samples after the end, with their times if the
-        record has them. See `driftfit.use.crossing`.
+        record has them; NaN, as the last rows, for runs that do not determine it. See `driftfit.use.crossing`.
         """
         return crossings(self._rows(), self.by, what, below, above, horizon, u, level)
 

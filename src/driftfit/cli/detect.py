@@ -15,6 +15,7 @@ from driftfit.cli.parts.options import Given, reads
 from driftfit.cli.parts.program import app, say
 from driftfit.cli.parts.reading import interval_from, moment
 from driftfit.cli.track import Plot, Report
+from driftfit.engine.settings import marks
 from driftfit.judge.alarms.detect import Alarms
 from driftfit.results import Track
 from driftfit.show.report import check_path
@@ -67,7 +68,7 @@ def detect(
     say(alarms)
     faulty = None
     if rows is not None and labels is not None:
-        faulty = np.nan_to_num(rows.numbers[labels][rows.order()]) > 0.5
+        faulty = marks("--labels", rows.numbers[labels][rows.order()], len(alarms.active))
         score = alarms.score(faulty)
         late = "" if np.isnan(score.delay) else f", {score.delay:g} samples after they began (median)"
         found = f" Labels: {score.found} of {score.events} found{late};"

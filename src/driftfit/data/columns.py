@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, date
 from typing import Any
 
 import narwhals as nw
@@ -101,6 +102,8 @@ def numbers_of(series: nw.Series[Any], where: str, base: int) -> Array:
         return _numbers_of_text(_as_text(series), where, base)
     if series.dtype == nw.Object:  # decimals, None and other Python objects in one column
         return as_numbers(f"{where}, column {series.name!r}", series.to_list())
+    if series.dtype == nw.Unknown and series.null_count() == len(series):  # a column in which nothing was ever written
+        return np.full(len(series), np.nan)
     if not (series.dtype.is_numeric() or series.dtype == nw.Boolean):
         raise ValueError(f"{where}: column {series.name!r} is of type {series.dtype}, which is not a number.")
     return np.asarray(series.cast(nw.Float64).to_numpy(), dtype=float)
@@ -152,6 +155,8 @@ def times_of_column(
         hasattr(native, "dt") and getattr(native.dtype, "tz", None) is not None
     ):  # narwhals does not support all zones of pandas
         return np.asarray(native.dt.tz_convert(None).to_numpy()), zone_name(native.dtype.tz)
+    if series.dtype == nw.Object and (found := _dates_of_objects(series.to_list(), f"{where}, row", base)) is not None:
+        return found
     if series.dtype == nw.Date:
         series = series.cast(nw.Datetime("us"))
     if not isinstance(series.dtype, nw.Datetime):
@@ -160,6 +165,23 @@ def times_of_column(
     if zone is not None:
         series = series.dt.convert_time_zone("UTC").dt.replace_time_zone(None)
     return np.asarray(series.to_numpy()), None if zone is None else zone_name(zone)
+
+
+def _dates_of_objects(cells: list[Any], where: str, base: int) -> tuple[Array, str | None] | None:
+    """Dates, or datetimes of any zones, as databases and pandas give them; None if no cell holds one."""
+    dates = [None if str(cell) in ("NaT", "<NA>", "nan") else cell for cell in cells]
+    zones = {getattr(one, "tzinfo", None) for one in dates if isinstance(one, date)}
+    if not zones:
+        return None
+    for k, one in enumerate(dates):
+        if one is not None and not isinstance(one, date):
+            raise ValueError(f"{where} {k + base} of the time holds {one!r}, which is not a date, as other rows do.")
+    if None not in zones:
+        dates = [None if one is None else one.astimezone(UTC).replace(tzinfo=None) for one in dates]
+    elif len(zones) > 1:
+        raise ValueError(f"{where}s of the time have dates with a zone and dates without; give all of them one.")
+    names = {zone_name(zone) for zone in zones if zone is not None}
+    return np.array(dates, dtype="datetime64[us]"), names.pop() if len(names) == 1 else "UTC" if names else None
 
 
 DAY_FIRST = r"^(\d{1,2})([./-])(\d{1,2})[./-](\d{4})(?:[ T]+(\d{1,2}:\d{2}(?::\d{2}(?:\.\d+)?)?))?$"

@@ -91,6 +91,8 @@ def paths_of(data: Any) -> list[str]:
     """The files given by a path, a pattern, or a list of both, sorted by name."""
     paths: list[str] = []
     for entry in data if isinstance(data, list | tuple) else [data]:
+        if not isinstance(entry, str | os.PathLike):
+            raise ValueError(f"data must be a table or a list of paths; got a list with a {type(entry).__name__}.")
         text = os.fspath(entry)
         found = sorted(glob.glob(text, recursive=True)) if glob.has_magic(text) else [text]
         if not found:

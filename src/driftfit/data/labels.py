@@ -191,6 +191,8 @@ def ordered(model: Any, u: Array, names: Sequence[str]) -> tuple[Array, tuple[st
 def inputs_for(model: Any, u: Any, T: int) -> Array:
     """Inputs (T, m) in the order of a model, from an array, a data frame or a mapping."""
     given = held("u", u)
+    if len(shape := np.shape(given.values)) and shape[0] != T:
+        raise ValueError(f"u has shape {shape}, but {T} samples are asked for: the first axis must be time.")
     return ordered(model, as_inputs(given.values, T), given.names)[0]
 
 

@@ -29,10 +29,6 @@ from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
-FAR, FEWEST = 300.0, 20
-"""Usual deviations beyond which a value looks like a fault code, and the number of values that this judgement needs."""
-
-
 NO_CODE = float("nan"), np.zeros(0, int)
 """What `shared_code` finds nearly always."""
 
@@ -99,19 +95,6 @@ class Gate:
 
     def restore(self, counts: Sequence[int]) -> None:
         self._counts[:] = counts
-
-
-def absurd(x: Array) -> Array:
-    """The values of a signal (T,) that are `FAR` times its usual deviation from its median, by sample; often empty.
-
-    The usual deviation is the median one of those that are not zero, so that a signal may rest most of the time.
-    """
-    known = np.isfinite(x)
-    away = np.abs(np.where(known, x, np.nan) - (np.median(x[known]) if known.any() else 0.0))
-    moving = away[known & (away > 0.0)]
-    if len(moving) < FEWEST:
-        return np.empty(0, int)
-    return np.flatnonzero(known & (away > FAR * float(np.median(moving))))
 
 
 def shared_code(y: Array, u: Array) -> tuple[float, Array]:

@@ -83,7 +83,10 @@ def _write(path: str | PathLike[str], put: Callable[[Any], Any]) -> None:
     """Let ``put`` write a file that is complete or absent."""
     target = os.path.abspath(os.fspath(path))
     name = os.path.join(os.path.dirname(target), f".driftfit-{secrets.token_hex(8)}")
-    file = open(name, "xb")  # noqa: SIM115  (with the rights of any new file, unlike one of tempfile)
+    try:
+        file = open(name, "xb")  # noqa: SIM115  (with the rights of any new file, unlike one of tempfile)
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, target) from None
     try:
         with file:
             put(file)
@@ -155,7 +158,7 @@ def _take(file: Any, name: str, kinds: Sequence[str]) -> tuple[dict[str, Any], d
             if header.pop("arrays", [*arrays]) != [*arrays]:
                 raise ValueError("its arrays have other names than those that were written")
     except Exception as error:  # zipfile, NumPy and JSON raise a dozen kinds of errors for damaged files
-        raise ValueError(f"{name} is not a driftfit file, or it is damaged ({error}).") from None
+        raise ValueError(f"{name} is not a driftfit file, or it is damaged.") from error
     if header.get("format", 0) > reads:
         raise ValueError(f"{name} was written by a newer driftfit (format {header['format']}); this one reads {reads}.")
     if header.get("kind") not in kinds:

@@ -44,6 +44,8 @@ def read_records(
             f"u contains the output {output!r}, which would explain itself; its past is in models such as ARX."
         )
     axis = None if time is None else _name("time", time)
+    if axis == output:
+        raise ValueError(f"time and y are both the column {output!r}.")
     each = () if isinstance(drift, str) or np.ndim(drift) == 0 else _names("drift", drift)
     factors = [*(name for name in (weights, drift) if isinstance(name, str)), *each]
     wanted = Wanted(tuple(dict.fromkeys([output, *inputs, *factors])), axis, _names("by", by))
@@ -55,7 +57,8 @@ def read_records(
     failed |= {keys[k]: "no row has a time" for k in np.flatnonzero(length == 0)}
     there = np.flatnonzero(length)
     if not there.size and not wanted.by:
-        raise ValueError(f"there is nothing to track: none of the {columns.rows} rows has a time.")
+        why = f"none of the {columns.rows} rows has a time" if columns.rows else "the table has no rows"
+        raise ValueError(f"there is nothing to track: {why}.")
     first = (np.cumsum(length) - length)[there]
     values = {name: column[order] for name, column in columns.numbers.items()}
     clock = Clock.of(reading.dt, columns.zone)

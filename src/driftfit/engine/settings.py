@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import sys
 import warnings
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from difflib import get_close_matches
 from importlib import import_module
@@ -169,6 +169,18 @@ def near(wrong: str, known: Collection[str]) -> str:
     return f"did you mean {' or '.join(close)}?" if close else f"there is {', '.join(known) or 'none'}."
 
 
+def of_series(owner: str, name: str, given: Any, keys: Collection[Hashable], every: bool = False) -> None:
+    """Check a mapping from the key of a series to a value, with ``every`` for all of them; other values pass.
+
+    A series without a value, and a value without a series, are usually one mistake: 7 and '7'.
+    """
+    absent = [key for key in keys if key not in given] if isinstance(given, Mapping) else []
+    unknown = [key for key in given if key not in keys] if absent else []
+    if absent and (every or unknown):
+        instead = f", but the key {unknown[0]!r}, which no series has" if unknown else ""
+        raise ValueError(f"{owner}: {name} has no {absent[0]!r}{instead}; give one for all series, or one for each.")
+
+
 def input_names(owner: str, name: str, given: Sequence[str]) -> tuple[str, ...]:
     """Names of inputs, each once: parameters and columns of tables are called after them."""
     names = tuple(str(one) for one in given)
@@ -207,6 +219,17 @@ def as_numbers(name: str, values: Any) -> Array:
             where = f"entry {place[0] if len(place) == 1 else place}" if place else "it"
             raise ValueError(f"{name}: {where} is {value!r}, which is not a number.") from None
     return out
+
+
+def marks(owner: str, labels: Any, T: int) -> Array:
+    """Labels (T,) of samples, 0 or 1, as truth values; a missing one is false, as where nothing is marked."""
+    values = as_numbers("labels", labels)
+    if values.shape != (T,):
+        raise ValueError(f"{owner}: labels have shape {values.shape}, but the record has {T} samples.")
+    odd = np.flatnonzero((values != 0.0) & (values != 1.0) & ~np.isnan(values))
+    if len(odd):
+        raise ValueError(f"{owner}: labels are 0 or 1 (or true, false); that of sample {odd[0]} is {values[odd[0]]:g}.")
+    return np.asarray(values == 1.0)
 
 
 def axes(value: Any) -> int:

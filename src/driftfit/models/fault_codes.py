@@ -14,6 +14,8 @@ codes come in runs.
 The first readings are accepted unchecked, because there is nothing to compare them with; ``limits=`` of `track` and
 `Live` gives the range of a sensor. Inputs are not judged: a large one may be a test.
 
+`absurd` judges a whole record instead, for warnings and searches.
+
 Source: the rule of `driftfit.trackers.parts.outlying_readings`, which judges sooner, because its tracker knows the
 variance of the noise. Cost per sample: a few comparisons.
 """
@@ -26,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import State, kernel
+from driftfit.engine.kernel import Array, State, kernel
 
 REACH = 30.0
 """Standard deviations of the readings beyond which one is strange."""
@@ -37,11 +39,31 @@ MEMORY = 1000.0
 LONGEST = 1e12
 """Upper bound of p."""
 
+FAR, GAP, FEWEST = 300.0, 10.0, 20
+"""Usual deviations beyond which a value may be a fault code, how many times further than the others it must then be,
+and the number of values that this judgement needs."""
+
 UNJUDGED: Mapping[str, Any] = {
     "usual": 0.0, "usual_spread": 0.0, "judged": 0.0, "accepted": np.nan, "raw": np.nan, "forbearance": 1.0,
     "refused": 0.0,
 }  # fmt: skip
 """m; v; the number of readings in them; y'; the last reading of all; p; how many were refused."""
+
+
+def absurd(x: Array) -> Array:
+    """The values of a signal (T,) that are `FAR` times its usual deviation from its median, by sample; often empty.
+
+    The usual deviation is the median one of those that are not zero, so that a signal may rest most of the time. That
+    of rain is some tenths of a millimetre, so a storm is as far as a code; but only a code is `GAP` times further than
+    whatever is nearer than it.
+    """
+    known = np.isfinite(x)
+    away = np.abs(np.where(known, x, np.nan) - (np.median(x[known]) if known.any() else 0.0))
+    moving = np.sort(away[known & (away > 0.0)])
+    if len(moving) < FEWEST:
+        return np.empty(0, int)
+    beyond = moving[1:][(moving[1:] > FAR * float(np.median(moving))) & (moving[1:] > GAP * moving[:-1])]
+    return np.flatnonzero(known & (away >= beyond.min(initial=np.inf)))
 
 
 @kernel

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.record import Records
+from driftfit.engine.settings import warn
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.parallel_lanes import run_lanes
@@ -136,6 +137,11 @@ def _begun(
     starts: dict[int, State] = {}
     factors: dict[int, float] = {}
     ny = records.ny
+    if before and records.keys and not any(key in before for key in records.keys):
+        warn(
+            f"warm_start: all series start from the beginning, because the earlier run has none of them: the first is "
+            f"{records.keys[0]!r} here and {next(iter(before))!r} there."
+        )
     for k, key in enumerate(records.keys):
         if key in before:
             run, first, lanes = ended(before[key]), int(records.first[k]), range(k * ny, (k + 1) * ny)

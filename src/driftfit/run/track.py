@@ -14,7 +14,7 @@ from driftfit.data import outputs
 from driftfit.data.arguments import check_roles
 from driftfit.data.limits import code_text, shared_code
 from driftfit.data.record import Reading, Records, one_series, rows
-from driftfit.engine.settings import one_of, warn
+from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
 from driftfit.run.fleet import Fleet, run_fleet
 from driftfit.run.keyed_results import KeyedResults
@@ -183,7 +183,17 @@ def records_of(
         records, failed = read_records(data, y, u, by, reading)
     else:
         records = (rows if by == "row" else one_series)(y, u, reading)
+    columns = _flat(y, u, reading.time) if reading.units else []
+    for name in reading.units or ():
+        if name not in columns:
+            raise ValueError(f"track: units: no signal has the name {name!r}; {near(str(name), columns)}")
     return model, records, failed
+
+
+def _flat(*names: Any) -> list[str]:
+    """Names of columns, which a model with shared parameters takes in lists of lists."""
+    each = ([one] if isinstance(one, str) else _flat(*one) for one in names if one is not None)
+    return [name for part in each for name in part]
 
 
 def _per_series(tracker: Trackers, records: Records) -> list[Any]:

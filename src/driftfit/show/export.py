@@ -19,7 +19,7 @@ import polars as pl
 
 from driftfit.data.clock import Clock
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import one_of
+from driftfit.engine.settings import of_series, one_of
 from driftfit.run.fleet import Fleet
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
@@ -182,8 +182,9 @@ def units_of(result: Result) -> dict[str, str]:
 def forecasts_table(fleet: Fleet, h: int, u: Any) -> pl.DataFrame:
     """The forecasts of a fleet in one table, one row per sample of each output."""
     parts = []
-    labels = fleet.labels
-    for key, run in fleet.series().items():
+    labels, series = fleet.labels, fleet.series()
+    of_series("forecast", "u", u, series)
+    for key, run in series.items():
         columns: dict[str, Any] = {"step": np.arange(1, h + 1)}
         last = run.time[-1] if run.timed else None
         ahead = None if last is None else Clock.of(labels.dt, labels.zone).ahead(last, h)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import marks
 from driftfit.judge.alarms.onsets import onsets
 from driftfit.judge.verdict import p_text
 from driftfit.show.page_parts import picture, table
@@ -30,7 +31,7 @@ PICTURE = "The output, and each statistic over its limit (dashed). Red: an alarm
 
 def faults(run: Track, alarms: Alarms | None, labels: Array | None) -> str:
     """The section for one run: labels, alarms, and the picture of the alarms."""
-    wrong = None if labels is None else _checked(run, labels)
+    wrong = None if labels is None else marks("report", labels, len(run))
     parts = [] if wrong is None else [_labels(run, alarms, wrong)]
     if alarms is not None:
         parts += [_score(alarms, wrong), _alarms(alarms), picture(alarms.plot(wrong), run, PICTURE)]
@@ -45,7 +46,7 @@ def many_faults(runs: Mapping[Hashable, Track], alarms: ManyAlarms | None, label
         raise ValueError(f"report: labels name {strange[0]!r}, which has no result.")
     rows = []
     for key in dict.fromkeys([*watched, *labels]):
-        wrong = _checked(runs[key], labels[key]) if key in labels else np.zeros(len(runs[key]), bool)
+        wrong = marks("report", labels[key], len(runs[key])) if key in labels else np.zeros(len(runs[key]), bool)
         begun, row = onsets(wrong), watched.get(key)
         marked = escape(runs[key].time_text(int(begun[0]))) if len(begun) else ""
         cells: tuple[str, ...] = (escape(key_text(key)), str(len(begun)) if key in labels else "", marked)
@@ -68,14 +69,7 @@ def many_faults(runs: Mapping[Hashable, Track], alarms: ManyAlarms | None, label
 
 
 def _given(runs: Mapping[Hashable, Track], labels: Mapping[Hashable, Array], key: Hashable) -> Array | None:
-    return _checked(runs[key], labels[key]) if key in labels else None
-
-
-def _checked(run: Track, labels: Array) -> Array:
-    wrong = np.asarray(labels).astype(bool)
-    if wrong.shape != (len(run),):
-        raise ValueError(f"report: labels have shape {wrong.shape}, but the record has {len(run)} samples.")
-    return wrong
+    return marks("report", labels[key], len(runs[key])) if key in labels else None
 
 
 def _labels(run: Track, alarms: Alarms | None, wrong: Array) -> str:

@@ -24,12 +24,13 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.limits import FAR, absurd, code_text, shared_code
+from driftfit.data.limits import code_text, shared_code
 from driftfit.data.record import Reading
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, warn, whole
 from driftfit.models.base import Model
+from driftfit.models.fault_codes import FAR, absurd
 from driftfit.run.track import records_of
 from driftfit.trackers.base import Tracker
 from driftfit.tune.intervals import intervals_of

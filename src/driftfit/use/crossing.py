@@ -37,7 +37,7 @@ from driftfit.data.labels import inputs_for
 from driftfit.data.record import time_text
 from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import near, whole
+from driftfit.engine.settings import near, of_series, whole
 from driftfit.engine.tiles import as_compiled
 from driftfit.run.program import state_of
 from driftfit.run.result import Track
@@ -162,8 +162,16 @@ def crossing(
         by = _of_output(run, sign, limit, whole("crossing", "horizon", h, 1), u)
     else:
         raise ValueError(f"crossing: there is no {what!r}; {near(str(what), (*run.names, run.labels.y))}")
-    times = Clock.of(run.labels.dt, run.labels.zone).ahead(run.last, h) if run.timed else None
-    return Crossing(what, limit, side, level, h, by, times, run.labels.zone)
+    return Crossing(what, limit, side, level, h, by, _times(run, h), run.labels.zone)
+
+
+def _times(run: Track, h: int) -> Array | None:
+    """The times of the h samples after a record that has times which are not only labels."""
+    return Clock.of(run.labels.dt, run.labels.zone).ahead(run.last, h) if run.timed else None
+
+
+class UndeterminedError(ValueError):
+    """A record that does not determine what a crossing depends on."""
 
 
 def _limit(below: float | None, above: float | None) -> tuple[float, str]:
@@ -178,7 +186,7 @@ def _limit(below: float | None, above: float | None) -> tuple[float, str]:
 def _known(run: Track, cov: Array, place: int | None = None) -> Array:
     """A covariance; ValueError if a parameter that it belongs to is not determined yet."""
     if not np.isfinite(cov if place is None else cov[place, place]).all():
-        raise ValueError("crossing: a parameter that it needs is not determined yet: its std is infinite.")
+        raise UndeterminedError("crossing: a parameter that it needs is not determined yet: its std is infinite.")
     return cov
 
 
@@ -242,8 +250,10 @@ def _of_output(run: Track, sign: float, limit: float, h: int, u: Any) -> Array:
     later = np.zeros((h, 0)) if u is None else inputs_for(model, u, h)
     inputs = np.concatenate([run.u[len(run) - p :], later])
     past = np.tile(run.y[len(run) - p :], (DRAWS, 1))
+    if not np.isfinite(later).all():
+        raise ValueError("crossing: the future inputs must be known.")
     if not (np.isfinite(inputs).all() and np.isfinite(past).all()):
-        raise ValueError("crossing: the last samples and the future inputs must be known, because lags contain them.")
+        raise UndeterminedError("crossing: the last samples must be known, because lags contain them.")
     zero = np.zeros(len(now))
     theta = run.theta[-1] + rng.multivariate_normal(zero, _known(run, now), DRAWS, method="eigh")
     values, vectors = np.linalg.eigh(q)
@@ -263,22 +273,29 @@ def crossings(
     runs: Mapping[Hashable, Track], by: tuple[str, ...], what: str, below: Any, above: Any, horizon: int | None,
     u: Any, level: float,
 ) -> polars.DataFrame:  # fmt: skip
-    """A table of the crossings of many runs, earliest first; limits and u are the same for all, or given by key."""
+    """A table of the crossings of many runs, earliest first; limits and u are the same for all, or given by key.
+
+    A run that does not determine its crossing has NaN, and is the last.
+    """
     import polars
 
+    for name, given in (("below", below), ("above", above), ("u", u)):
+        of_series("crossing", name, given, runs, every=name != "u")
     rows: list[dict[str, Any]] = []
     times: dict[str, list[Any]] = {}
     for key, run in runs.items():
         low, high = (one[key] if isinstance(one, Mapping) else one for one in (below, above))
         future = u.get(key) if isinstance(u, Mapping) else u
-        found = crossing(run, what, below=low, above=high, horizon=horizon, u=future, level=level)
-        row = dict(zip(by, key if isinstance(key, tuple) else (key,), strict=True)) | {"probability": found.probability}
-        row |= {name: getattr(found, name) for name in ("median", "low", "high")}
-        rows.append(row)
-        if found.times is not None:
-            nothing = np.array("NaT", found.times.dtype) if found.times.dtype.kind == "M" else np.nan
+        row = dict(zip(by, key if isinstance(key, tuple) else (key,), strict=True))
+        try:
+            found = crossing(run, what, below=low, above=high, horizon=horizon, u=future, level=level)
+        except UndeterminedError:
+            found = None
+        rows.append(row | {name: getattr(found, name, np.nan) for name in ("probability", "median", "low", "high")})
+        if (next_one := _times(run, 1)) is not None:
+            nothing = np.array("NaT", next_one.dtype) if next_one.dtype.kind == "M" else np.nan
             for name in ("median", "low", "high"):
-                time = found.time(row[name])
+                time = None if found is None else found.time(rows[-1][name])
                 times.setdefault(f"{name}_time", []).append(nothing if time is None else time)
     table = polars.DataFrame(rows, infer_schema_length=None)
     zone = next((run.labels.zone for run in runs.values()), None)

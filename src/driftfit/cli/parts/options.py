@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from driftfit.cli.parts.arguments import listed, parse_interval, parse_units
-from driftfit.cli.parts.program import helpful, progress
+from driftfit.cli.parts.program import helpful, progress, writable
 from driftfit.cli.parts.reading import (
     Part,
     Rows,
@@ -30,6 +30,8 @@ from driftfit.parsing.settings import parse_model, parse_tracker
 from driftfit.trackers.base import Tracker
 
 Names = list[str] | None
+WRITTEN = {"write_to": "--out", "plot": "--plot", "system": "--system", "report": "--report"}
+"""Arguments of commands that are files to be written."""
 
 
 @dataclass(frozen=True)
@@ -232,6 +234,8 @@ def reads(command: Callable[..., None]) -> Callable[..., None]:
 
     def run(**typed: Any) -> None:
         with helpful():
+            for name, option in WRITTEN.items():
+                writable(typed.get(name), option)
             grouped = {name: kind(**{f.name: typed.pop(f.name) for f in fields(kind)}) for name, kind in groups.items()}
             command(**grouped, **typed)
 

@@ -5,14 +5,17 @@ A user's error prints one line on stderr and ends with exit code 2; a traceback 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
 from driftfit import __version__
+from driftfit.show.parts.axes import check_picture
 from driftfit.show.parts.text import WIDTH
 
 app = typer.Typer(
@@ -38,6 +41,7 @@ def say(what: Any, **options: Any) -> None:
 
 def main() -> None:
     """Run the installed program."""
+    warnings.formatwarning = lambda message, *place: f"driftfit: warning: {message}\n"
     app()
 
 
@@ -47,8 +51,25 @@ def helpful(program: str = "driftfit") -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, ImportError) as error:
-        typer.echo(f"{program}: {' '.join(str(error).split())}", err=True)
+        typer.echo(f"{program}: {' '.join(_text(error).split())}", err=True)
         raise typer.Exit(2) from None
+
+
+def _text(error: Exception) -> str:
+    """The message of an error; of one of the system, the file and what is wrong with it."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
+def writable(path: Path | None, option: str) -> None:
+    """Check, before anything is computed, that a file can be written where an option says."""
+    if path is None:
+        return
+    if not path.absolute().parent.is_dir():
+        raise ValueError(f"{option} {path}: there is no folder {path.parent}.")
+    if option in ("--plot", "--system"):
+        check_picture(path)
 
 
 def _version(wanted: bool) -> None:

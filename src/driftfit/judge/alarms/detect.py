@@ -46,7 +46,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import numbers, one_of, whole
+from driftfit.engine.settings import marks, numbers, one_of, whole
 from driftfit.judge.alarms.bootstrap import RECORDS
 from driftfit.judge.alarms.calibration import limits_of, null_records
 from driftfit.judge.alarms.onsets import held, onsets
@@ -155,10 +155,8 @@ class Alarms(Printed):
         return change_of(self.rule, self.findings[t], t) if self.kind in FROZEN else None
 
     def score(self, labels: Any) -> Score:
-        """Compare with labels (T,), true where something is wrong; ValueError for another length."""
-        wrong = np.asarray(labels).astype(bool)
-        if wrong.shape != self.active.shape:
-            raise ValueError(f"score: labels have shape {wrong.shape}, but the record has {len(self.active)} samples.")
+        """Compare with labels (T,), true where something is wrong; ValueError for another length, or other values."""
+        wrong = marks("score", labels, len(self.active))
         first = onsets(wrong)
         last = np.array([t + int(np.argmin(np.append(wrong[t:], False))) for t in first], int)
         delays = []
@@ -224,7 +222,8 @@ class Alarms(Printed):
 
     def plot(self, labels: Any = None, ax: Any = None) -> Figure:
         """Statistics over their limits, alarms marked; labels (T,) are shaded. ``ax`` as for `Track.plot`."""
-        return plot_alarms(self.run, self.rule, self.statistic, self.active, self.start, labels, ax)
+        wrong = None if labels is None else marks("plot", labels, len(self.active))
+        return plot_alarms(self.run, self.rule, self.statistic, self.active, self.start, wrong, ax)
 
 
 def detect(

@@ -47,6 +47,7 @@ from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import input_names, numbers, output_names, warn, whole
 from driftfit.models.base import Model
+from driftfit.models.fault_codes import absurd
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.curves.settled_thresholds import settled
 from driftfit.models.hammerstein_wiener.evaluate_bases import DIGITS
@@ -391,8 +392,11 @@ class HammersteinWiener(Model):
                     f"{type(basis).__name__} and {effect}; {what} spans {values.min():g} to {values.max():g}.",
                     UserWarning,
                 )
+            if not (isinstance(basis, Polynomial) and basis.degree > 1):
+                continue
+            values = np.delete(values, absurd(values))  # which say nothing of the unit of the others
             size = float(np.sqrt(values @ values / values.size)) if values.size else 0.0
-            if isinstance(basis, Polynomial) and basis.degree > 1 and size and not 1.0 / UNIT <= size <= UNIT:
+            if size and not 1.0 / UNIT <= size <= UNIT:
                 powers = np.abs(values[:, None] ** [1, basis.degree])
                 lost = int(np.sum(powers[:, 1] >= DIGITS * np.maximum(powers[:, 0], 1.0)))
                 unusable = f", and {lost} samples, whose powers span more than 13 digits, are missing" if lost else ""

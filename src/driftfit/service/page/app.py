@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import io
 import json
+import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from starlette.staticfiles import StaticFiles
 
 from driftfit.service.page import history, metrics, openapi
 from driftfit.service.page.access import COOKIE, Access, Rates
-from driftfit.service.page.feed import Feed, finite
+from driftfit.service.page.feed import Feed, finite, unheard
 from driftfit.service.page.passwords import SESSION, Sessions, password_fits
 from driftfit.service.page.sockets import Sockets
 from driftfit.service.settings.options import PageOptions
@@ -107,11 +108,12 @@ class Page:
         search = request.query_params.get("search", "").lower()[:200]
         if not search:
             return Answer({"units": self.feed.fleet, "count": len(self.feed.names.names)})
-        feed, found = self.feed, []
+        feed, found, now = self.feed, [], time.time()
         for number, name in feed.names.names.items():
-            if search in name.lower() and number in feed.latest:
-                row = feed.latest[number]
-                found.append(feed.line(number, row, feed.drift(number, row), 0.0) | {"age": None})
+            if search in name.lower():
+                row = feed.latest.get(number)
+                line = unheard(name) if row is None else feed.line(number, row, feed.drift(number, row), now)
+                found.append(line | {"age": None})
             if len(found) == 200:
                 break
         return Answer({"units": found, "count": len(found)})

@@ -12,6 +12,7 @@ import json
 import math
 import time
 from collections import deque
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ FORGET = 120.0
 """Seconds without a request after which a unit is no longer watched."""
 SHOWN = 200
 """Units of the overview."""
+SILENT = 60.0
+"""Seconds without a result after which a unit is shown as silent."""
 BACK = 400
 """Groups of results that are read when the page starts."""
 
@@ -70,16 +73,15 @@ class Feed:
 
     def look(self) -> None:
         """Read the results that are new."""
-        now = time.time()
         for _ in range(20):
             groups = self.journal.outcomes(self.at)
-            for group, parts, events, _ in groups:
+            for group, parts, events, at in groups:
                 self.at = group
                 self.count += sum(len(part.number) for part in parts)
                 for part in parts:
                     for row in part.last().rows():
                         self.latest[row[1]] = row
-                        self.updated[row[1]] = now
+                        self.updated[row[1]] = at
                     for unit, (kept, _) in self.watched.items():
                         kept.extend(part.some(np.flatnonzero(part.unit == unit)).rows())
                 self.events.extend(events)
@@ -103,17 +105,22 @@ class Feed:
         return max((one for one in moved if math.isfinite(one)), default=0.0)
 
     def rank(self) -> None:
-        """The units that are shown first: alarms, then drift."""
+        """The units that are shown first: alarms, then drift, and last those whose results are no longer stored."""
         found = ((row[10], self.drift(unit, row), unit, row) for unit, row in self.latest.items())
         first = heapq.nlargest(SHOWN, found, key=lambda one: (one[0], one[1]))
         now = time.time()
-        self.fleet = [self.line(unit, row, drift, now) for _, drift, unit, row in first if unit in self.names.names]
+        names = self.names.names
+        self.fleet = [self.line(unit, row, drift, now) for _, drift, unit, row in first if unit in names]
+        if len(first) < SHOWN and len(self.latest) < len(names):
+            gone = (name for unit, name in names.items() if unit not in self.latest)
+            self.fleet += map(unheard, islice(gone, SHOWN - len(first)))
 
     def line(self, unit: int, row: list[Any], drift: float, now: float) -> dict[str, Any]:
         """A unit of the overview."""
+        age = now - self.updated[unit]
         return {
             "unit": self.names.names[unit], "drift": round(drift, 2), "alarm": row[10], "time": row[2],
-            "age": round(now - self.updated[unit], 1), "y": finite(row[3]), "y_hat": finite(row[4]), "ok": row[7],
+            "age": round(age, 1), "silent": age > SILENT, "y": finite(row[3]), "y_hat": finite(row[4]), "ok": row[7],
             "theta": [finite(one) for one in row[8]],
         }  # fmt: skip
 
@@ -167,6 +174,14 @@ class Feed:
     def healthy(self) -> bool:
         """Whether the engine answers and can write."""
         return time.monotonic() - self.alive < 10.0 and not self.status.get("problem")
+
+
+def unheard(name: str) -> dict[str, Any]:
+    """A unit of the overview that was silent since before the page started, and for longer than results are stored."""
+    return {
+        "unit": name, "drift": 0.0, "alarm": False, "time": None, "age": None, "silent": True, "y": None, "y_hat": None,
+        "ok": False, "theta": [],
+    }  # fmt: skip
 
 
 def finite(value: Any) -> Any:

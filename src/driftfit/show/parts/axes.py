@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 from zoneinfo import ZoneInfo
@@ -26,6 +27,13 @@ def new_figure(width: float, height: float) -> Figure:
     except ImportError:
         raise ImportError('plots need matplotlib: pip install "driftfit[plot]"') from None
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def check_picture(path: Path) -> None:
+    """ValueError for the ending of a name in which no picture can be written."""
+    ending, canvas = path.suffix.lower(), new_figure(1.0, 1.0).canvas
+    if ending and ending[1:] not in canvas.get_supported_filetypes():
+        raise ValueError(f"{path}: pictures are written to .png, .pdf, .svg, by the ending of the name.")
 
 
 def panels(

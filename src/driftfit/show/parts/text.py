@@ -46,7 +46,16 @@ def html_of(*parts: Any) -> str:
 
 
 class Printed(JupyterMixin):
-    """A result that rich draws: ``str`` returns it as plain text, and a notebook shows it as the value of a cell."""
+    """A result that rich draws: ``str`` returns it as plain text, and a notebook shows it as the value of a cell.
+
+    So does a prompt: a dataclass would write out every field, a megabyte for the verdict of a thousand series.
+    """
+
+    def __init_subclass__(cls) -> None:
+        cls.__repr__ = Printed.__repr__  # type: ignore[method-assign]  # a dataclass keeps a method of its class
+
+    def __repr__(self) -> str:
+        return str(self).strip("\n")
 
     def __str__(self) -> str:
         return printed(self)

@@ -99,20 +99,24 @@ const row = (body) => {
   make("td", "", tr, "number"); make("td", "", tr, "number wide"); make("td", "", tr, "number");
   tr.addEventListener("click", () => open(tr.dataset.unit));
 };
+const ago = (age) => {
+  if (age === null || age < 2) return age === null ? "–" : "now";
+  const [unit, size] = age < 120 ? ["s", 1] : age < 7200 ? ["min", 60] : age < 172800 ? ["h", 3600] : ["d", 86400];
+  return `${Math.round(age / size)} ${unit} ago`;
+};
 const set = (node, text) => { if (node.textContent !== text) node.textContent = text; };
 const fill = (tr, one, most) => {
   tr.dataset.unit = one.unit;
   tr.classList.toggle("alarm", one.alarm);
   const cells = tr.cells;
   set(cells[0], one.unit);
-  const stale = one.age !== null && one.age > 60;
-  set(cells[1].firstChild, one.alarm ? "alarm" : stale ? "silent" : "normal");
-  cells[1].firstChild.className = `pill ${one.alarm ? "bad" : stale ? "" : "good"}`;
+  set(cells[1].firstChild, one.alarm ? "alarm" : one.silent ? "silent" : "normal");
+  cells[1].firstChild.className = `pill ${one.alarm ? "bad" : one.silent ? "" : "good"}`;
   const [bar, text] = cells[2].firstChild.children;
   bar.style.width = `${Math.round(85 * Math.min(1, one.drift / most))}%`;
   set(text, one.drift.toFixed(1));
   set(cells[3], short(one.y)); set(cells[4], short(one.y_hat));
-  set(cells[5], one.age === null ? "–" : one.age < 2 ? "now" : `${Math.round(one.age)} s ago`);
+  set(cells[5], ago(one.age));
 };
 at("search").addEventListener("input", async (event) => {
   const text = event.target.value.trim();
@@ -131,7 +135,7 @@ const route = async () => {
   clearInterval(state.timer);
   charts.clear();
   if (state.unit) {
-    state.range = "live";
+    state.range = "live"; state.about = null;
     at("name").textContent = state.unit;
     buttons();
     await refresh();
@@ -160,7 +164,10 @@ const refresh = async () => {
     described(about); events(happened.events);
     actions.show(about, state.user);
     if (state.range !== "live") await past(name);
-  } catch (error) { at("model").textContent = error.message; }
+  } catch (error) {
+    at("model").textContent = error.message;
+    if (!state.about) { at("badges").replaceChildren(); events([]); }
+  }
 };
 const past = async (name) => {
   const span = RANGES[state.range];
