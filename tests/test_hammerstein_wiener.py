@@ -411,8 +411,7 @@ def test_an_absurd_output_spoils_no_prediction():
     for at in (0, 150):
         y = s.y.copy()
         y[at] = 1e30
-        with pytest.warns(UserWarning, match="root mean square"):
-            run = track(s.model, still, y, s.u)
+        run = track(s.model, still, y, s.u)
         np.testing.assert_allclose(run.prediction[200:][inside], usual[inside], atol=1e-9)
         low, high = believed(y)
         assert low[-1] > -10.0
