@@ -47,6 +47,25 @@ def test_codes_are_missing_readings(model, tracker, places, code):
     assert not run.verdict().pays
 
 
+def test_a_code_in_an_input_soon_after_the_start_is_not_learned_by_rivals():
+    y, u = record(LAGS)
+    run, whole = (track(LAGS, AdaptiveKalman(), y, one) for one in (replaced(u, (15,), -1e6), u))
+    assert run.state["inputs_out"] > 0.0
+    assert errors(run)[1:] == pytest.approx(errors(whole)[1:], rel=0.02)
+
+
+@pytest.mark.parametrize("tracker", [HELD, AdaptiveKalman()], ids=["RLS", "AdaptiveKalman"])
+def test_a_start_is_not_scored_however_late_it_is(tracker):
+    """The first readings were those after the samples that are not scored, and least squares fitted a code."""
+    y, u = record(LAGS)
+    y[:120] = np.nan
+    y[123] = 9999.0
+    made = compare(track(LAGS, tracker, y, u))
+    assert made.tracked < 1.1 * made.constant_ls
+    assert made.constant_ls < 0.4
+    assert made.samples == T - 120 - 50
+
+
 def test_a_drift_is_still_found():
     y, u = record(PLAIN, 2.0)
     verdict = track(PLAIN, AdaptiveKalman(), replaced(y, LATER, 9999.0), u).verdict()

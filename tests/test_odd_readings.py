@@ -10,6 +10,7 @@ from scipy import signal
 from support import same
 
 from driftfit import (
+    ARMAX,
     OE,
     RLS,
     AdaptiveKalman,
@@ -126,6 +127,21 @@ def test_a_stream_refuses_the_same_readings(name, tracker):
     assert same(live.theta, run.theta[-1])
     assert run.state["refused"] == 20.0
     assert "20 readings out of all proportion" in str(run.summary())
+
+
+@pytest.mark.parametrize("model", [OE(1, 1), ARMAX(1, 1, 1)], ids=repr)
+def test_a_long_run_of_codes_of_either_sign_is_refused(model):
+    """Every code that differed from the one before doubled the limit, so the sixth was believed."""
+    _, u = cases("OE")["whole"]
+    e = 0.1 * np.random.default_rng(3).normal(size=T)
+    y = signal.lfilter([0.0, 1.0], [1.0, -0.7], u) + (
+        signal.lfilter([1.0, 0.5], [1.0, -0.7], e) if model != OE(1, 1) else e
+    )
+    bad = y.copy()
+    bad[AT : AT + 60] = np.where(np.arange(60) % 2 == 0, -999.0, 999.0)
+    fleet = track(model, AdaptiveKalman(), np.stack([y, bad]), np.stack([u, u]), by="row")
+    assert fleet[1].state["refused"] == 60.0
+    assert np.abs(fleet[1].theta - fleet[0].theta)[AT + 100 :].max() < 0.05
 
 
 def test_a_change_of_level_is_accepted():

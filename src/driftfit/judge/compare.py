@@ -6,8 +6,8 @@
 *constant ARX*  the same on ARX(2, 1 per input) with intercept
 
 All are one-step predictions. A model with hidden states has no regressors, and is compared with the others only. They
-are scored on the samples after max(50, 5 n) that all of them could predict. None of them learns from a sample that the
-run left out, and none is scored on it.
+are scored on the samples after max(50, 5 n) complete ones that all of them could predict. None of them learns from a
+sample that the run left out, and none is scored on it.
 """
 
 from __future__ import annotations
@@ -72,9 +72,9 @@ class Errors(NamedTuple):
 def errors(run: Track, record: Record, burn: int | None = None, steady: Array | None = None) -> Errors:
     """One-step errors of a run, of persistence, of constants without and with lags, and of constant ARX.
 
-    Where lags are missing, the constants without lags predict. The first ``burn`` samples are not scored; by default
-    max(50, 5 n). ``record`` is what they learn from (`driftfit.judge.regressors.without_left_out`); ``steady`` are the
-    constants of the run, if they are known.
+    Where lags are missing, the constants without lags predict. The first ``burn`` complete samples are not scored; by
+    default max(50, 5 n). ``record`` is what they learn from (`driftfit.judge.regressors.without_left_out`); ``steady``
+    are the constants of the run, if they are known.
     """
     y, u = np.where(np.abs(record.y) < LARGEST, record.y, np.nan), record.u
     steady = constant_least_squares(run.model, record) if steady is None else steady
@@ -89,7 +89,8 @@ def errors(run: Track, record: Record, burn: int | None = None, steady: Array | 
     lagged = np.where(np.isfinite(lagged), lagged, constant)
     rows = len(run.program.whole.outputs)
     own = (tracked, y - persistence(y, rows), constant, lagged, arx["e"][:, 0])
-    scored = np.arange(len(y)) >= (burn_in(run.model.n) if burn is None else burn)
+    given = (np.abs(run.y) < LARGEST) & (np.abs(u) < LARGEST).all(axis=1)  # a start waits for what is missing
+    scored = np.cumsum(given) - given >= (burn_in(run.model.n) if burn is None else burn)
     for error in own if run.model.hidden is None else (own[0], own[1], own[4]):
         scored &= np.isfinite(error)
     return Errors(*own, scored)

@@ -82,7 +82,7 @@ def without_left_out(run: Track) -> Record:
     Readings that it took for faults are missing, as outputs and as lags. Other samples that it left out, because their
     regressors are to blame, keep their readings and have no weight.
     """
-    if not any(run.ended_with(name) for name in ("left_out", "refused")):
+    if not any(run.ended_with(name) for name in ("left_out", "refused", "inputs_out")):
         return run.record
     refused, unused = _left_out(run)
     y, known = run.y, run.known
@@ -114,7 +114,7 @@ def _left_out(run: Track) -> tuple[Array, Array]:
 def _left_out_later(run: Track, rows: Array, refused: Array, unused: Array) -> None:
     """Add those of the start (N,) that were left out once later samples contradicted them.
 
-    A reading is to blame where it is beyond all that were used.
+    A reading is to blame where it is beyond all that were used by more than their range.
     """
     fields = {name: rows[name][..., 0] for name in rows.dtype.names or ()}
     tracker, ok, y = run.tracker, fields["ok"] > 0.0, run.y[: len(rows)]
@@ -123,7 +123,7 @@ def _left_out_later(run: Track, rows: Array, refused: Array, unused: Array) -> N
     kept = y[ok & ~left]
     if left.any():
         unused[: len(rows)] |= left
-        refused[: len(rows)] |= left & ((y < kept.min()) | (y > kept.max()))
+        refused[: len(rows)] |= left & (np.abs(y - 0.5 * (kept.min() + kept.max())) > 1.5 * np.ptp(kept))
 
 
 def regressors(run: Track, steady: Array | None = None) -> Rows:

@@ -7,9 +7,9 @@ back. Therefore such a model counts a reading as missing if
     (y - m)^2 > (REACH p)^2 v    and    (y - y')^2 > (REACH p)^2 v    and    (y - y_hat)^2 > (REACH p)^2 v
 
 with m and v the mean and variance of the readings so far, y' the last one that was accepted, and y_hat the prediction
-if there is one. p is 1, and doubles with every strange reading after another one: readings that keep coming are a
-change of level. A reading that repeats the last one to the last bit says nothing new, and does not double it: fault
-codes come in runs.
+if there is one. p is 1, and doubles with every strange reading near the one before: readings that keep coming are a
+change of level. A reading that repeats the last one to the last bit says nothing new, and does not double it, and one
+far from it doubles it in 16: fault codes come in runs, some of them with either sign.
 
 The first readings are accepted unchecked, because there is nothing to compare them with; ``limits=`` of `track` and
 `Live` gives the range of a sensor. Inputs are not judged: a large one may be a test.
@@ -36,6 +36,10 @@ FIRST = 10.0
 """Readings that are accepted unchecked."""
 MEMORY = 1000.0
 """Memory of their mean and variance, in readings."""
+QUICK, SLOW = 2.0, 2.0 ** (1.0 / 16.0)
+"""Growth of p for readings that persist, and for values that jump."""
+ALIKE = 0.25
+"""A reading persists if it differs from the last one by less than this share of its distance from m."""
 LONGEST = 1e12
 """Upper bound of p."""
 
@@ -77,7 +81,9 @@ def judge(s: State, y_hat: float, l: int) -> None:
     reach = REACH * REACH * s.usual_spread[l]
     strange = observed & (s.judged[l] >= FIRST) & (near > reach)
     out = strange & (near > reach * s.forbearance[l] * s.forbearance[l])
-    longer = min(2.0 * s.forbearance[l], LONGEST) if fresh else s.forbearance[l]
+    persists = abs(y - s.raw[l]) < ALIKE * abs(y - s.usual[l])
+    growth = (QUICK if persists else SLOW) if fresh else 1.0
+    longer = min(growth * s.forbearance[l], LONGEST)
     s.forbearance[l] = longer if strange else (1.0 if observed else s.forbearance[l])
     s.raw[l] = y if observed else s.raw[l]
     s.refused[l] += 1.0 if out else 0.0

@@ -71,6 +71,15 @@ from driftfit.trackers.parts.excitation import (
 )
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
 from driftfit.trackers.parts.faults.stored_samples import machine_doubt
+from driftfit.trackers.parts.faults.strange_inputs import (
+    SELDOM,
+    SURE,
+    blame_of_inputs,
+    inputs_left_out,
+    learn_inputs,
+    learn_stored_inputs,
+    no_strange_inputs,
+)
 from driftfit.trackers.parts.frozen import held_readings, leave_out_frozen, not_frozen
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.filters import (
@@ -124,6 +133,17 @@ def go_on(s: State, l: int) -> None:
     unseen_variance(s, l)
 
 
+@partial(kernel, inline=False)
+def leave_out_input(s: State, l: int) -> None:
+    """Leave out a sample with an input at fault; s.e and s.s must be known."""
+    blame = 0.0
+    if s.ok[l] > 0.0 and (s.e[l] * s.e[l] > SURE * SURE * s.s[l] or s.distrusted[l] > 0.0):
+        blame = blame_of_inputs(s, s.e[l], s.s[l], l)
+    s.distrusted[l] = max(s.distrusted[l] + (blame if blame > 0.0 else -SELDOM * s.ok[l]), 0.0)
+    s.inputs_out[l] += 1.0 if blame > 0.0 else 0.0
+    s.ok[l] = 0.0 if blame > 0.0 else s.ok[l]
+
+
 @partial(kernel, short=True)
 def settle(s: State, l: int) -> None:
     """Start the filters from least squares once there are residuals to estimate r: z = M theta ~ N(d, r I)."""
@@ -135,6 +155,7 @@ def settle(s: State, l: int) -> None:
             s.m[i, k, l] = s.d[i, l]
             s.C[i, i, k, l] = 1.0 if s.S[i, i, l] > 0.0 else 0.0
     frame(s, l)
+    learn_stored_inputs(s, l)
     begin_with_drift(s, finest(s, l), l)
     mixture(s, l)
     go_on(s, l)
@@ -145,6 +166,7 @@ def learn(s: State, l: int, outlier: float) -> None:
     """Update excitation and the proportion of readings."""
     learn_information(s, s.leverage[l] * s.noise[l], l)
     learn_proportion(s, l, outlier)
+    learn_inputs(s, l)
 
 
 @partial(kernel, inline=False)
@@ -157,6 +179,7 @@ def follow(s: State, entering: int, l: int) -> None:
     if entering >= 0:
         s.y_hat[l] = prediction(s, l)
         s.e[l], s.s[l] = s.y[l] - s.y_hat[l], np.inf
+    leave_out_input(s, l)
     leave_out(s, l)
     leave_out_frozen(s, l)
     s.outlier[l], s.weighed[l] = 0.0, 0
@@ -295,6 +318,8 @@ class AdaptiveKalman(Tracker):
             **not_frozen(),
             **nothing_shared_among_filters(),
             **no_weights(n),
+            **no_strange_inputs(n),
+            "distrusted": 0.0,
             **white(n),
             **modes,
             **levels,
@@ -356,7 +381,14 @@ class AdaptiveKalman(Tracker):
             facts.append(not_learned(run, names[never]))
         if lately.any():
             facts.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
-        return (*facts, *proportion(lane), *held_readings(lane), *resolution(lane), *colour(lane))
+        return (
+            *facts,
+            *proportion(lane),
+            *inputs_left_out(lane),
+            *held_readings(lane),
+            *resolution(lane),
+            *colour(lane),
+        )
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])

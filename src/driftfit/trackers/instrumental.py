@@ -180,6 +180,8 @@ def auxiliary_output(s: State, l: int) -> None:
     for i in range(na, n):
         x += s.phi[i, l] * s.auxiliary[i, l]
         s.zeta[i, l] = s.phi[i, l]
+    # an input of a sample that is not used may be a fault code
+    x = x if (s.ok[l] > 0.0) | (s.observed[l] <= 0.0) else s.y[l]
     s.x[l] = max(-s.largest[l], min(s.largest[l], x))
     s.learned[l] += s.ok[l]
 

@@ -14,7 +14,8 @@ or level within the usual range of the readings is never strange.
 
 If instead y_hat is farther from m, an input is probably at fault. An estimate that went astray also gives strange
 predictions, however, and must be corrected; so inputs are blamed for at most `LAGS` samples in a row, and for one
-sample in ten in the long run.
+sample in ten in the long run. A code whose effect would stay within the range of the readings is found by the range of
+its own regressor (`driftfit.trackers.parts.faults.strange_inputs`).
 
 A strange input stays in the regressors, as a lag or in what a model simulates, where its effect may be smaller. In the
 `LAGS` samples after one for which an input was blamed, a sample with phi' P phi > r, which would change the estimate
@@ -32,13 +33,13 @@ sign. Where the prediction is strange, p doubles in four samples, and in 16 wher
 stays the same while a strange prediction decays, as the output of a simulation does. The first `FIRST` readings are not
 judged here; those of a diffuse start are judged together (`driftfit.trackers.parts.faults.judged_start`).
 
-Nearly every sample is ordinary: no input was blamed lately, and e^2 <= REACH^2 v, or (y - m)^2 without a prediction.
-Ordinary samples are added to a block, a sum of y - m, of its square and of e^2 / s. Before a sample that is not
-ordinary is judged, the block is closed: its sums enter the means. It is also closed when it has a quarter as many
-samples as there were readings before.
+Nearly every sample is ordinary: no input was blamed lately, and e^2 is at most REACH^2 v and UNUSUAL^2 times what is
+usual, or (y - m)^2 at most REACH^2 v without a prediction. Ordinary samples are added to a block, a sum of y - m, of
+its square and of e^2 / s. Before a sample that is not ordinary is judged, the block is closed: its sums enter the
+means. It is also closed when it has a quarter as many samples as there were readings before.
 
 Source: ours; see `driftfit.trackers.parts.outlying_readings` for the rule of a tracker that learns its own noise. Cost
-per ordinary sample: two comparisons and three sums.
+per ordinary sample: two comparisons, three sums, and the range of the regressors.
 """
 
 from __future__ import annotations
@@ -52,9 +53,13 @@ import numpy as np
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.covariance import corrected, prediction, symmetric_product
+from driftfit.trackers.parts.faults.strange_inputs import SELDOM, TRUST, learn_inputs
 
 REACH = 10.0
 """Standard deviations of the readings."""
+UNUSUAL, GROWN = 8.0, 4.0
+"""Usual standard deviations of the prediction from which on a sample is not ordinary; the most that the square of these
+grows with one sample."""
 SURE = 5.0
 """Standard deviations of the prediction."""
 LIKELY = 3.0
@@ -72,10 +77,8 @@ BLOCK, GROWING = 32.0, 0.25
 """Samples of a block at least, and per reading before."""
 LASTING, LONGEST = 4.0, 1e12
 """The factor p from which on the lag of a strange input is accepted as well; its upper bound."""
-LAGS = 50.0
+LAGS = TRUST
 """Samples in which a strange input may still be in the regressors."""
-SELDOM = 0.1
-"""Share of samples that inputs may be blamed for in the long run."""
 QUICK, SLOW, SLOWEST = 2.0, 2.0 ** (1.0 / 4.0), 2.0 ** (1.0 / 16.0)
 """Growth of the factor p: for readings that persist, for predictions, and for values that repeat themselves or jump."""
 ALIKE = 0.25
@@ -91,8 +94,8 @@ def no_contradictions(n: int = 0) -> dict[str, Any]:
         "judged_from": max(FIRST, n + JUDGED),
         "y_mean": 0.0, "y_variance": 0.0, "y_count": 0.0, "y_last": np.nan, "widening": 1.0, "y_strange": np.nan,
         "farthest": 0.0, "left_out": 0.0, "distrusted": 0.0, "mean_ratio": 0.0, "ratios": 0.0, "shift": 0.0,
-        "lagging": 0.0, "ordinary": 0.0, "block_size": 0, "block_left": 0, "block_sum": 0.0, "block_squares": 0.0,
-        "block_ratios": 0.0,
+        "lagging": 0.0, "usual_variance": 0.0, "ordinary": 0.0, "block_size": 0, "block_left": 0, "block_sum": 0.0,
+        "block_squares": 0.0, "block_ratios": 0.0,
     }  # fmt: skip
 
 
@@ -153,13 +156,15 @@ def close_block(s: State, l: int) -> None:
     known = (s.y_count[l] >= s.judged_from[l]) & (s.ratios[l] >= ENOUGH)
     calm = (s.widening[l] <= 1.0) & (s.lagging[l] + s.distrusted[l] <= 0.0)
     size = int(min(max(GROWING * s.y_count[l], BLOCK), GROWING * MEMORY)) if known & calm else 0
-    s.ordinary[l] = REACH * REACH * s.y_variance[l]
+    most = UNUSUAL * UNUSUAL * s.usual_variance[l] * s.mean_ratio[l]
+    reach = REACH * REACH * s.y_variance[l]
+    s.ordinary[l] = min(most, reach) if most > 0.0 else reach
     s.block_size[l], s.block_left[l] = size, size
     s.block_sum[l], s.block_squares[l], s.block_ratios[l] = 0.0, 0.0, 0.0
 
 
 @kernel
-def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
+def judge(s: State, y: float, shown: float, v: float, blame: float, l: int) -> None:
     """Whether the sample is used: s.ok and s.observed; and s.widening, the factor p."""
     e, off, out = y - shown, abs(y - s.y_mean[l]), abs(shown - s.y_mean[l])
     reach, widening = REACH * REACH * s.y_variance[l], s.widening[l]
@@ -184,13 +189,14 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
         & (v > 2.0 * s.r[l] * s.noise[l] * s.scale[l])
         & ((s.lagging[l] > LAGS - s.theta.shape[0]) | (e * e > LIKELY * LIKELY * v * s.mean_ratio[l]))
     )
-    left = beyond | lagging
-    more = 1.0 if left & (off <= out) else -SELDOM
+    blamed = judged & (blame > 0.0)
+    left = beyond | lagging | blamed
+    more = blame if blamed else (1.0 if left & (off <= out) else -SELDOM)
     s.distrusted[l] = min(max(s.distrusted[l] + more, 0.0), 2.0 * LAGS) if s.ok[l] > 0.0 else s.distrusted[l]
     of_prediction = (1.0 if out * SAME < s.farthest[l] else SLOWEST) if out < SAME * s.farthest[l] else SLOW
     grown = of_readings if of_reading else min(of_prediction * widening, LONGEST)
     left_over = 0.0 if lasting else max(s.lagging[l] - 1.0, 0.0)
-    s.lagging[l] = LAGS if beyond & (off <= out) else left_over
+    s.lagging[l] = LAGS if blamed | (beyond & (off <= out)) else left_over
     s.widening[l] = (
         grown
         if strange | outside
@@ -200,14 +206,21 @@ def judge(s: State, y: float, shown: float, v: float, l: int) -> None:
     s.farthest[l] = max(out, SINKING * s.farthest[l]) if strange else 0.0
     s.left_out[l] += 1.0 if left | refused else 0.0
     s.observed[l] = 0.0 if refused else s.observed[l]
+    s.usual_variance[l] = (
+        (min(v, GROWN * s.usual_variance[l]) if s.usual_variance[l] > 0.0 else v)
+        if judged & (not left)
+        else s.usual_variance[l]
+    )
     s.ok[l] = 0.0 if left else s.ok[l]
 
 
 @partial(kernel, inline=False)
-def judge_unusual(s: State, y_hat: float, v: float, l: int) -> None:
-    """Judge a sample that is not ordinary, given its prediction and the variance of that in units of the scale."""
+def judge_unusual(s: State, y_hat: float, v: float, blame: float, l: int) -> None:
+    """Judge a sample that is not ordinary, given its prediction, the variance of that in units of the scale, and the
+    blame of inputs (`driftfit.trackers.parts.faults.strange_inputs`).
+    """
     close_block(s, l)
-    judge(s, s.y[l] + s.shift[l], y_hat + s.shift[l], v * s.scale[l], l)
+    judge(s, s.y[l] + s.shift[l], y_hat + s.shift[l], v * s.scale[l], blame, l)
 
 
 @kernel
@@ -236,6 +249,7 @@ def judged_measurement(s: State, l: int) -> None:
     e = s.e[l]
     gain = corrected(s, s.y_hat[l], symmetric_product(s, l) + s.r[l] * s.noise[l], l)
     add_to_block(s, gain * e * e, l)
+    learn_inputs(s, l)
 
 
 @kernel
@@ -244,7 +258,7 @@ def leave_out_contradiction(s: State, y_hat: float, v: float, l: int) -> None:
     e = s.y[l] - y_hat
     unusual = needs_judging(s, e, l)
     if unusual:
-        judge_unusual(s, y_hat, v, l)
+        judge_unusual(s, y_hat, v, 0.0, l)
     add_to_block(s, e * e / v, l)
     if unusual:
         close_block(s, l)

@@ -31,8 +31,9 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, shared
 
-OUTLYING = 30.0
-"""Median absolute deviations; 20 standard deviations of normal data."""
+OUTLYING, FAR = 30.0, 10.0
+"""Median absolute deviations: 20 standard deviations of normal data; and 7 for regressors if no sample is doubtful
+otherwise."""
 WORSE = 36.0
 """F statistic from which samples contradict each other: six standard deviations for one sample."""
 STEPS = 3
@@ -90,9 +91,9 @@ def median(samples: Array, N: int, column: int, center: float, apart: float) -> 
 
 
 @shared
-def reach(samples: Array, N: int, column: int, center: float) -> float:
-    """Distance from center beyond which a value of a column is outlying; inf where values beyond it are a level."""
-    limit: float = OUTLYING * median(samples, N, column, center, 1.0)
+def reach(samples: Array, N: int, column: int, center: float, far: float) -> float:
+    """Distance from center beyond which a value is outlying: ``far`` median deviations; inf if those beyond are a level."""
+    limit: float = far * median(samples, N, column, center, 1.0)
     count, beyond, farthest = 0, 0, 0.0
     for k in range(N):
         if fresh(samples, k):
@@ -136,13 +137,10 @@ def usual_step(samples: Array, N: int, column: int, center: float) -> float:
 
 
 @shared
-def doubt(samples: Array, N: int, last: bool) -> None:
-    """Give a negative noise factor to those of N samples (.., PHI + n) that are doubtful, a positive one to the rest.
-
-    Half of them or more are kept as doubtful while further samples can be waited for, which is until ``last``.
-    """
+def doubt_beyond(samples: Array, N: int, last: bool, far: float) -> int:
+    """`doubt`, for regressors more than ``far`` deviations away; returns the number of doubtful samples."""
     usual = median(samples, N, READING, 0.0, 0.0)
-    limit = reach(samples, N, READING, usual)
+    limit = reach(samples, N, READING, usual, OUTLYING)
     if limit == 0.0:
         step = usual_step(samples, N, READING, usual)
         limit = OUTLYING * step if step < np.inf else 0.0
@@ -151,7 +149,7 @@ def doubt(samples: Array, N: int, last: bool) -> None:
         samples[k, NOISE] = -abs(samples[k, NOISE]) if doubtful else abs(samples[k, NOISE])
     for i in range(PHI, samples.shape[1]):
         center = median(samples, N, i, 0.0, 0.0)
-        most = reach(samples, N, i, center)
+        most = reach(samples, N, i, center, far)
         steps = most > 0.0 or answered(samples, N, i, center, usual, limit)
         apart = most if most > 0.0 else OUTLYING * usual_step(samples, N, i, center)
         for k in range(N):
@@ -169,8 +167,20 @@ def doubt(samples: Array, N: int, last: bool) -> None:
         all_fresh += 1 if counts else 0
         count += 1 if counts and samples[k, NOISE] < 0.0 else 0
     if last and 2 * count >= all_fresh:
+        count = 0
         for k in range(N):
             samples[k, NOISE] = abs(samples[k, NOISE])
+    return count
+
+
+@shared
+def doubt(samples: Array, N: int, last: bool) -> None:
+    """Give a negative noise factor to those of N samples (.., PHI + n) that are doubtful, a positive one to the rest.
+
+    Half of them or more are kept as doubtful while further samples can be waited for, which is until ``last``.
+    """
+    if doubt_beyond(samples, N, last, OUTLYING) == 0:
+        doubt_beyond(samples, N, last, FAR)
 
 
 @Driver

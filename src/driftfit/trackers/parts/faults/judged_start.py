@@ -53,12 +53,21 @@ from driftfit.trackers.parts.faults.stored_samples import (
     store,
     without_fault,
 )
+from driftfit.trackers.parts.faults.strange_inputs import (
+    blame_of_inputs,
+    learn_inputs,
+    learn_stored_inputs,
+    no_strange_inputs,
+)
 
 MORE = 16
 """Samples that are stored beyond the number of parameters."""
 VARIED = 3.0
 """Number of readings, not counting those that repeat the one before, that show a range of the plant: at rest it has one
 or two, but a coarse meter beside an input that is held for some samples has few more."""
+
+FEW = 2.0
+"""Variance of a prediction after a start, in those of the noise."""
 
 
 def unjudged(theta: Array, diffuse: bool) -> dict[str, Any]:
@@ -67,7 +76,7 @@ def unjudged(theta: Array, diffuse: bool) -> dict[str, Any]:
     return {
         "samples": np.zeros((n + MORE, PHI + n)), "ages": np.zeros(n + MORE), "remembered": 0, "waited": 0.0,
         "age": 0.0, "start_over": 0 if diffuse else 1, "start_theta": theta, "start_faults": 0.0,
-        **no_contradictions(0 if diffuse else n),
+        **no_contradictions(0 if diffuse else n), **no_strange_inputs(n),
     }  # fmt: skip
 
 
@@ -125,7 +134,16 @@ def settle(s: State, l: int) -> None:
     # samples are judged alone from now on, also if some of these readings repeat others; but a plant at rest has shown
     # nothing of its range
     s.judged_from[l] = min(s.judged_from[l], s.y_count[l]) if varied else FIRST + s.theta.shape[0]
+    s.usual_variance[l] = FEW * s.r[l] * s.scale[l]
+    learn_stored_inputs(s, l)
     close_block(s, l)
+
+
+@kernel
+def judge_sample(s: State, y_hat: float, v: float, l: int) -> None:
+    """Judge a sample that is not ordinary, and its inputs."""
+    blame = blame_of_inputs(s, s.y[l] - y_hat, v * s.scale[l] * s.mean_ratio[l], l)
+    judge_unusual(s, y_hat, v, blame, l)
 
 
 @kernel
@@ -210,12 +228,13 @@ def judged(
             y_hat, e = s.y_hat[l], s.e[l]
             if unusual:
                 reform(s, l)  # gives the variance of the prediction
-                judge_unusual(s, y_hat, s.at_start[BEFORE, l] + s.r[l] * s.noise[l], l)
+                judge_sample(s, y_hat, s.at_start[BEFORE, l] + s.r[l] * s.noise[l], l)
             one(s, l)
             add_to_block(s, e * e / (s.at_start[BEFORE, l] + s.r[l] * s.noise[l]), l)
+            learn_inputs(s, l)
         else:
             predict(s, l)
-            judge_unusual(s, s.y_hat[l], variance(s, l) + s.r[l] * s.noise[l], l)
+            judge_sample(s, s.y_hat[l], variance(s, l) + s.r[l] * s.noise[l], l)
             correct(s, l)
             report(s, l)
         if unusual:

@@ -1,0 +1,86 @@
+"""Fault codes in an input that are inside the range of nothing but the meter: 0 where it shows 50, runs, codes at the
+start; and large inputs that are no faults."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from support import same
+
+from driftfit import ARX, FLS, RLS, AdaptiveKalman, InstrumentalVariables, Kalman, Live, Regression, track
+
+T, PLANT, SINGLE = 500, ARX(2, 2), Regression(1)
+TRACKERS = [AdaptiveKalman(), Kalman(q=1e-5, r=0.01), RLS(0.99), FLS(1e3), InstrumentalVariables(0.99)]
+PLACES = {
+    "one": [300], "a run": range(300, 320), "three": range(300, 303),
+    "at random": np.flatnonzero(np.random.default_rng(9).random(T) < 0.01), "at the start": [7],
+}  # fmt: skip
+
+
+def respond(u, noise):
+    return lfilter([0.0, 1.0, 0.5], [1.0, -1.1, 0.5], u) + lfilter([1.0], [1.0, -1.1, 0.5], noise)
+
+
+def record(seed=0):
+    rng = np.random.default_rng(seed)
+    u = 50.0 + 5.0 * rng.normal(size=T)
+    return respond(u, 0.1 * rng.normal(size=T)), u
+
+
+@pytest.mark.parametrize("tracker", TRACKERS, ids=repr)
+def test_a_code_in_an_input_does_as_little_harm_as_a_gap(tracker):
+    y, u = record()
+    for places in PLACES.values():
+        rows = np.stack([u] * 4)
+        rows[0, places], rows[1, places], rows[2, places], rows[3, places] = np.nan, 0.0, -1.0, 9999.0
+        fleet = track(PLANT, tracker, np.stack([y] * 4), rows, by="row")
+        for k in (1, 2, 3):
+            away = np.abs(fleet[k].theta - fleet[0].theta)[60 if min(places) < 20 else min(places) :]
+            assert away.max() < 0.03
+            assert fleet[k].state["left_out"] + fleet[k].state["inputs_out"] >= len(places)
+
+
+def honest(what):
+    """y and u of a plant that responds, with an input that was never so large before."""
+    rng = np.random.default_rng(1)
+    t, noise = np.arange(T), 0.1 * rng.normal(size=T)
+    u = {
+        "steps": 0.1 * rng.normal(size=T) + np.where(t >= 300, 3.0, 0.0),
+        "rare": (rng.random(T) < 0.03).astype(float),
+        "pulses": (rng.random(T) < 0.03) * rng.exponential(5.0, T),
+        "tails": rng.standard_t(3, T),
+        "at rest": np.where(t < 200, 0.0, rng.normal(size=T)),
+        "floods": np.exp(1.5 * lfilter([0.3], [1.0, -0.95], rng.normal(size=T))),
+    }[what]
+    return respond(u, noise), u
+
+
+@pytest.mark.parametrize("tracker", TRACKERS[:3], ids=repr)
+@pytest.mark.parametrize("what", ["steps", "rare", "pulses", "tails", "at rest", "floods"])
+def test_a_large_input_to_which_the_output_responds_is_learned_from(what, tracker):
+    run = track(PLANT, tracker, *honest(what))
+    assert run.state["inputs_out" if tracker == AdaptiveKalman() else "left_out"] == 0.0
+
+
+@pytest.mark.parametrize("tracker", TRACKERS[:3], ids=repr)
+@pytest.mark.parametrize(("noise", "most"), [(0.1, 10), (0.0, 60)])
+def test_an_input_that_stays_without_a_response_is_believed(tracker, noise, most):
+    """A gain that is lost where the input goes up: at once where it moves, after fifty samples where it is constant."""
+    rng = np.random.default_rng(2)
+    u = np.where(np.arange(T) < 250, 0.1 * rng.normal(size=T), 3.0 + noise * rng.normal(size=T))
+    y = np.where(np.arange(T) < 250, 2.0 * u, 0.0) + 0.01 * rng.normal(size=T)
+    run = track(SINGLE, tracker, y, u)
+    assert 0 < np.sum(~run.ok[250:]) <= most
+    assert abs(run.theta[-1, 0]) < 0.1
+
+
+def test_a_stream_leaves_out_the_same_and_the_summary_names_it():
+    y, u = record()
+    u[300:305] = 0.0
+    for tracker in (AdaptiveKalman(), RLS(0.99)):
+        run, live = track(PLANT, tracker, y, u), Live(PLANT, tracker)
+        for one in zip(y, u, strict=True):
+            live.update(*one)
+        assert same(live.theta, run.theta[-1])
+        assert list(np.flatnonzero(~run.ok[20:]) + 20) == list(range(301, 307))
+        assert "6 samples" in str(run.summary())
+    assert "the output did not" in str(track(PLANT, AdaptiveKalman(), y, u).summary())
