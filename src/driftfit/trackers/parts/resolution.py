@@ -99,7 +99,8 @@ def resolve(s: State, l: int) -> None:
     s.repeats[l] += repeated
     learn_grid(s, y, step, moved, l)
     frequent, repeat = max(ENOUGH, SHARE * s.steps[l]), s.repeats[l] >= max(ENOUGH, SHARE * (s.steps[l] + s.repeats[l]))
-    most = s.of_grid[l] >= max(frequent, max(s.jitter[l], MOSTLY * s.beyond[l]))
+    # steps before the present candidate are not of its size: half of all steps that are no jitter must be
+    most = s.of_grid[l] >= max(max(frequent, 0.5 * (s.steps[l] - s.jitter[l])), max(s.jitter[l], MOSTLY * s.beyond[l]))
     apart = s.highest[l] - s.lowest[l] >= LEVELS * s.grid[l]
     on_grid = repeat & most & apart & (s.grid[l] > 1.5 * s.finest[l])
     coarse = on_grid | (repeat & (s.smallest[l] >= frequent))
