@@ -37,8 +37,8 @@ SHARE = 0.1
 """Share of the readings that repeat, and of the steps that are about as small as the least, for a quantum."""
 ENOUGH = 3.0
 """Number of steps of the size of the quantum, and of repeated readings, before it is accepted."""
-JITTER = 32.0
-"""Steps below the grid over this are no steps of it."""
+JITTER = 1.0 / 32.0
+"""Steps below this share of the grid are no steps of it."""
 RARE = 10.0
 """Of so many steps of the grid one may be smaller, such as that of a reading half-way between two."""
 MOSTLY, LEVELS = 2.5, 1.75
@@ -74,7 +74,7 @@ def same_reading(s: State, other: float, l: int) -> bool:
 def learn_grid(s: State, y: float, step: float, moved: float, l: int) -> None:
     """Count a step among those of the grid, smaller and larger ones; ``moved`` is 0 if there is none."""
     grid = s.grid[l]
-    tiny, within, beyond = step < grid / JITTER, step < 0.75 * grid, step >= 1.5 * grid
+    tiny, within, beyond = step < JITTER * grid, step < 0.75 * grid, step >= 1.5 * grid
     jitter, between = s.jitter[l] + (moved if tiny else 0.0), s.within[l] + (moved if within & (not tiny) else 0.0)
     larger, near = s.beyond[l] + (moved if beyond else 0.0), (step >= 0.75 * grid) & (not beyond)
     of_grid = s.of_grid[l] + (moved if near else 0.0)
@@ -109,7 +109,7 @@ def resolve(s: State, l: int) -> None:
     s.reading[l] = y if observed > 0.0 else s.reading[l]
     s.used_readings[l] += s.ok[l]
     s.mean_weight[l] += s.ok[l] * (1.0 / s.noise[l] - s.mean_weight[l]) / max(s.used_readings[l], 1.0)
-    lasts = observed if on_grid & (step < s.grid[l] / JITTER) else repeated
+    lasts = observed if on_grid & (step < JITTER * s.grid[l]) else repeated
     s.alike[l] = min(s.alike[l] + 1.0, LONGEST) * lasts if observed > 0.0 else s.alike[l]
     s.fresh[l] = 0.0 if (repeated > 0.0) & (not coarse) else 1.0
 
