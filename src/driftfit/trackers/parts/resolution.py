@@ -97,7 +97,8 @@ def resolve(s: State, l: int) -> None:
     s.finest[l] = step if (moved > 0.0) & (step < finest) else finest
     s.steps[l] += moved
     s.repeats[l] += repeated
-    learn_grid(s, y, step, moved, l)
+    if s.repeats[l] >= ENOUGH:  # readings of a fine sensor do not repeat
+        learn_grid(s, y, step, moved, l)
     frequent, repeat = max(ENOUGH, SHARE * s.steps[l]), s.repeats[l] >= max(ENOUGH, SHARE * (s.steps[l] + s.repeats[l]))
     # steps before the present candidate are not of its size: half of all steps that are no jitter must be
     most = s.of_grid[l] >= max(max(frequent, 0.5 * (s.steps[l] - s.jitter[l])), max(s.jitter[l], MOSTLY * s.beyond[l]))

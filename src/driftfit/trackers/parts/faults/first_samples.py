@@ -92,7 +92,7 @@ def median(samples: Array, N: int, column: int, center: float, apart: float) -> 
 
 @shared
 def reach(samples: Array, N: int, column: int, center: float, far: float) -> float:
-    """Distance from center beyond which a value is outlying: ``far`` median deviations, or inf: those beyond are a level."""
+    """Distance from center beyond which a value is outlying: ``far`` median deviations, inf if these are a level."""
     limit: float = far * median(samples, N, column, center, 1.0)
     count, beyond, farthest = 0, 0, 0.0
     for k in range(N):
