@@ -246,7 +246,7 @@ def _clips(x: Array) -> Array:
     for clip in CLIPS:
         square, louder = (np.minimum(np.abs(factor * x), clip) ** 2 for factor in (1.0, LOUDER))
         moved.append((louder.mean(axis=1) - square.mean(axis=1)) / square.std(axis=1))
-    return np.asarray(CLIPS)[np.argmax(moved, axis=0)]
+    return np.asarray(np.take(CLIPS, np.argmax(moved, axis=0)))
 
 
 def _scales(w: Array, n: int) -> Array:

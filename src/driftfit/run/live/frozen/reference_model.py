@@ -397,7 +397,8 @@ def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
         for i in range(n + 1):
             past[lag, i] = past[lag + 1, i]
     counts[SINCE] += 1.0
-    return max(WIDE, 2.0 * before / scale)
+    limit: float = max(WIDE, 2.0 * before / scale)
+    return limit
 
 
 @part
