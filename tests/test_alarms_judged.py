@@ -9,7 +9,7 @@ from scipy import signal
 from driftfit import AdaptiveKalman, Kalman, Live, Regression, track
 from driftfit.judge.alarms.bootstrap import limits, simulated
 from driftfit.judge.alarms.frozen import frozen_model, noise_model
-from driftfit.run.live.frozen.reference_model import EVEN, SCALE, K
+from driftfit.run.live.frozen.reference_model import CLIP, EVEN, SCALE, K
 
 HELD = Kalman(q=0.0, r=1.0)
 GAIN = Regression(["gain"], intercept=True)
@@ -92,7 +92,7 @@ def test_the_scale_of_a_meter_that_mostly_repeats():
     rng = np.random.default_rng(5)
     readings = np.where(rng.random(400) < 0.75, 0.0, rng.choice([-1.0, 1.0], 400)) + 1e-3 * rng.normal(size=400)
     numbers, _ = noise_model(readings, 2)
-    assert 0.2 < numbers[SCALE] < 0.6
+    assert 0.2 < numbers[SCALE] < 0.7
     assert numbers[K] > 0.5
 
 
@@ -121,3 +121,19 @@ def test_what_references_leave_unsure_does_not_grow_with_groups_of_alarms():
         found, rows = frozen_model(phi, phi @ [1.0, 2.0] + rng.normal(size=4000), np.ones(4000, bool))
         unsure.append(limits(simulated(found, rows, seed), False, 1000.0)[2])
     assert np.mean(unsure) < 0.5
+
+
+def test_louder_noise_is_found_soon_and_heavy_tails_are_clipped():
+    rng, late = np.random.default_rng(8), []
+    for seed in range(9):
+        u, v = np.random.default_rng([seed, 40]).normal(size=(2, 1300))
+        y = 2.0 * u + 1.0 + v * np.where(np.arange(1300) >= 1100, 1.5, 1.0)
+        begun = track(GAIN, HELD, y, u).detect(every=1000.0, reference=1000, records=32).onsets
+        late.append(np.append(begun[begun >= 1100], 1300)[0] - 1100)
+    assert np.median(late) < 36
+    clips = [
+        [noise_model(draw(300), 2)[0][CLIP] for _ in range(20)]
+        for draw in (rng.standard_normal, lambda size: rng.standard_t(2, size))
+    ]
+    assert np.mean(clips[0]) > 3.7
+    assert np.mean(clips[1]) < 3.4

@@ -55,7 +55,7 @@ def naive_centred(phi, model):
 
 def naive_scores(rows, model):
     """(phi, x, g, index of the row) of the usable rows, from the definition: every row is predicted from all usable
-    ones since the last gap in time, by the covariances of the autoregression."""
+    ones before, by the covariances of the autoregression."""
     n, numbers = len(model.theta), model.numbers
     response = signal.lfilter([1.0], np.r_[1.0, -model.ar], np.eye(1, 4000)[0])
     autocovariance = np.correlate(response, response, "full")[len(response) - 1 :]
@@ -64,7 +64,7 @@ def naive_scores(rows, model):
         phi, (y, ok, noise, dt) = row[:n], row[n:]
         if dt == 0.0:
             continue
-        places, past, at = ([], [], 0) if dt > 1.5 else (places, past, at + 1)
+        at += round(dt) if dt > 1.5 else 1
         if ok == 0.0:
             continue
         phi = naive_centred(phi, model)

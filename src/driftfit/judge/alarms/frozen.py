@@ -47,8 +47,10 @@ from driftfit.run.live.frozen.reference_model import (
 )
 from driftfit.smooth.parts.rank import column_sizes
 
-CLIPPED = 2.5
-"""Scores are residuals clipped at this many scales."""
+CLIPS = (2.5, 3.0, 3.5, 4.0)
+"""Scores are residuals clipped at one of these numbers of scales."""
+LOUDER = 1.5
+"""The factor of the noise that scores should show as soon as possible."""
 ORDER, COMPLETE = 6, 60
 ROUNDS = 3
 PERSISTENCE, REACTION = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98), (0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
@@ -147,18 +149,20 @@ def noise_models(w: Array, n: int) -> tuple[Array, Array]:
     R, N = w.shape
     numbers = np.zeros((R, NUMBERS))
     numbers[:, EVEN] = EVENNESS
-    numbers[:, CLIP], numbers[:, NORMAL], numbers[:, LONGEST] = CLIPPED, N, max(N // SHARE, 8)
+    numbers[:, NORMAL], numbers[:, LONGEST] = N, max(N // SHARE, 8)
     numbers[:, SCALE] = _scales(w, n)
     x = w / numbers[:, SCALE, None]
-    square = np.clip(x, -CLIPPED, CLIPPED) ** 2
+    numbers[:, CLIP] = _clips(x)
+    clip = numbers[:, CLIP, None]
+    square = np.clip(x, -clip, clip) ** 2
     numbers[:, V] = square.mean(axis=1)
-    numbers[:, INSIDE] = np.mean(np.where(np.abs(x) < CLIPPED, x * x, 0.0), axis=1)
+    numbers[:, INSIDE] = np.mean(np.where(np.abs(x) < clip, x * x, 0.0), axis=1)
     numbers[:, [ALPHA, BETA]] = averaged(plausible(x, numbers))
     h = variances(x, numbers)
     numbers[:, SCALE] *= _scales(w / (numbers[:, SCALE, None] * np.sqrt(h)), n)
     x = w / (numbers[:, SCALE, None] * np.sqrt(h))
-    square = np.clip(x, -CLIPPED, CLIPPED) ** 2
-    numbers[:, K], numbers[:, V] = np.mean(np.abs(x) < CLIPPED, axis=1), square.mean(axis=1)
+    square = np.clip(x, -clip, clip) ** 2
+    numbers[:, K], numbers[:, V] = np.mean(np.abs(x) < clip, axis=1), square.mean(axis=1)
     numbers[:, KAPPA] = square.var(axis=1)
     raw = np.clip(x, -WIDE, WIDE) ** 2
     numbers[:, RAW], numbers[:, SPREAD] = raw.mean(axis=1), raw.var(axis=1)
@@ -170,7 +174,8 @@ def plausible(x: Array, numbers: Array) -> Array:
     quasi-likelihood counts by as much as the tails allow."""
     total = np.zeros((len(x), GARCH.shape[1]))
     losses(x, numbers, GARCH, np.empty((1, GARCH.shape[1])), total)
-    total *= (numbers[:, INSIDE] ** 2 / np.var(np.clip(x, -CLIPPED, CLIPPED) ** 2, axis=1))[:, None]
+    clip = numbers[:, CLIP, None]
+    total *= (numbers[:, INSIDE] ** 2 / np.var(np.clip(x, -clip, clip) ** 2, axis=1))[:, None]
     share = PRIOR * np.exp(total.min(axis=1, keepdims=True) - total)
     return np.asarray(share / share.sum(axis=1, keepdims=True))
 
@@ -233,6 +238,15 @@ def _autoregression(e: Array, ok: Array, n: int) -> Array:
         if gain > best:
             best, found = gain, np.linalg.lstsq(R[:p, :p], R[:p, -1], rcond=None)[0]
     return np.asarray(found)
+
+
+def _clips(x: Array) -> Array:
+    """Where to clip residuals x (R, N): where a noise `LOUDER` moves the mean of their squares by most deviations."""
+    moved = []
+    for clip in CLIPS:
+        square, louder = (np.minimum(np.abs(factor * x), clip) ** 2 for factor in (1.0, LOUDER))
+        moved.append((louder.mean(axis=1) - square.mean(axis=1)) / square.std(axis=1))
+    return np.asarray(np.take(CLIPS, np.argmax(moved, axis=0)))
 
 
 def _scales(w: Array, n: int) -> Array:

@@ -224,7 +224,7 @@ class Batched(ABC):
             self._loop(self._state_tile(), y[row], u[row], own, out[row])
             self._keep(y[t], out["e"][t], out["s"][t], own[0], None if time is None else instant(time[t]))
 
-    def _keep(self, y: Sequence[float], e: Sequence[float], s: Sequence[float], known: Array, time: Any) -> None:
+    def _keep(self, y: Array, e: Sequence[float], s: Sequence[float], known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""
         for lane, alarm in self._watching:
             alarm.take(self._state_tile(), lane, float(y[lane]), float(e[lane]), float(s[lane]), time)

@@ -210,7 +210,8 @@ class Section:
             if unit.alarms:
                 rows_of, _, lane = found.lanes[k]
                 factors = np.broadcast_to(noise, len(places))[part]
-                on = unit.watch(rows_of, lane, factors, own, number[part], out)
+                readings = records.y.reshape(len(places))[part]
+                on = unit.watch(rows_of, lane, readings, factors, own, number[part], out)
                 flags[part] |= np.array(on, np.uint8) * np.uint8(ALARM)
             if not unit.calibrated:
                 unit.remember(own, rows.values[part], out)

@@ -85,12 +85,14 @@ class Unit:
             if len(rows) >= missing:
                 out.to_calibrate.append(self.number)
 
-    def watch(self, rows: Array, lane: int, noise: Array, time: Array | None, number: Array, out: Out) -> list[bool]:
-        """Judge results by its alarms; whether one is on after each sample."""
+    def watch(
+        self, rows: Array, lane: int, y: Array, noise: Array, time: Array | None, number: Array, out: Out
+    ) -> list[bool]:
+        """Judge results for readings y by its alarms; whether one is on after each sample."""
         on = np.zeros(len(rows), bool)
         for alarm in self.alarms:
             before = alarm.samples
-            on |= np.array([cause is not None for cause in alarm.take_many(rows, lane, noise, time)])
+            on |= np.array([cause is not None for cause in alarm.take_many(rows, lane, y, noise, time)])
             for onset in alarm.onsets():
                 self.acknowledged = False
                 detail = {"kind": alarm.rule.kind, "cause": onset.cause, "statistic": onset.statistic}

@@ -19,7 +19,7 @@ judged by windows alone, whose V allows for the variance, and not at all above `
 
 A sample that cannot be used is passed over. Where lags of the autoregression are missing, a Kalman filter predicts
 them, [phi, e] together so that a change of theta shows in the same way, and w_t is divided by the standard deviation of
-its prediction; at the beginning and after a gap in time, all lags have the stationary covariance.
+its prediction; at the beginning all lags have the covariance of the process.
 Source: Huber (1964) for the score, Bollerslev (1986) for h, Koopman and Durbin (2003) for the diffuse start, Jones
 (1980) for lags that are missing.
 Cost per sample: O(n^2 + p n).
@@ -41,7 +41,9 @@ LENGTHS = tuple(blocks << level for level in range(LEVELS) for blocks in (SHORT,
 SHORTER = tuple(float(np.log(LENGTHS[-1] / L)) for L in LENGTHS)
 """log(longest / L) of the windows."""
 GAP = 1.5
-"""An interval longer than this breaks an autoregression."""
+"""In an interval longer than this, samples of the autoregression are missing."""
+LONG_GAP = 100.0
+"""At most so many are predicted: later ones hardly differ."""
 ROOT = 0.999
 """The largest root of an autoregression whose lags are predicted."""
 SHIFT = 0.5
@@ -129,8 +131,8 @@ class Memory(NamedTuple):
     unknown: Array
     """(k, n): what is left of `Frozen.unseen`, as no row after the reference has excited it either."""
     lags: Array
-    """(2 p + 1, p): covariance of the errors of the lags ``past``, in units of the variance of w, read while fewer than
-    p samples in a row were usable; the stationary covariance; and scratch.
+    """(p + 1, p): covariance of the errors of the lags ``past``, in units of the variance of w, read while fewer than p
+    samples in a row were usable, at first that of the process; the last row is scratch.
     """
 
 
@@ -144,8 +146,7 @@ def memory_of(frozen: Frozen) -> Memory:
     past, cusum = np.zeros((p + 1, n + 1)), np.zeros((n + 1 + centred, 2))
     excited = np.eye(n) - frozen.unseen.T @ frozen.unseen
     known = np.vstack([np.zeros((1, n)), excited @ frozen.cov @ excited, np.zeros((1, n))])
-    unknown, lags = frozen.unseen.copy(), np.zeros((2 * p + 1, p))
-    lags[:p] = lags[p : 2 * p] = stationary(frozen.ar)
+    unknown, lags = frozen.unseen.copy(), np.vstack([stationary(frozen.ar), np.zeros((1, p))])
     return Memory(past, sums, last, cusum, counts, work, np.zeros(size_of(n)), findings, known, unknown, lags)
 
 
@@ -287,38 +288,27 @@ def outside(phi: Array, unseen: Array) -> bool:
 
 
 @part
-def begin_again(memory: Memory, p: int) -> None:
-    """Nothing is known of the lags: they have the mean 0 and the stationary covariance."""
-    memory.counts[SINCE] = 0.0
-    for lag in range(p):
-        for i in range(memory.past.shape[1]):
-            memory.past[lag, i] = 0.0
-        for k in range(p):
-            memory.lags[lag, k] = memory.lags[p + lag, k]
-
-
-@part
 def error_of_prediction(ar: Array, memory: Memory) -> float:
-    """Variance of the error that the lags leave in a prediction; lags[2 p] are its covariances with theirs."""
+    """Variance of the error that the lags leave in a prediction; lags[p] are its covariances with theirs."""
     lags, p = memory.lags, ar.shape[0]
     total = 0.0
     for lag in range(p):
-        lags[2 * p, lag] = 0.0
+        lags[p, lag] = 0.0
         for k in range(p):
-            lags[2 * p, lag] += lags[lag, k] * ar[p - 1 - k]
-        total += lags[2 * p, lag] * ar[p - 1 - lag]
+            lags[p, lag] += lags[lag, k] * ar[p - 1 - k]
+        total += lags[p, lag] * ar[p - 1 - lag]
     return total
 
 
 @part
 def shift_errors(memory: Memory, p: int, newest: float) -> None:
-    """The covariance of the lags a sample later, whose error has the variance ``newest``, and with them lags[2 p]."""
+    """The covariance of the lags a sample later, whose error has the variance ``newest``, and with them lags[p]."""
     lags = memory.lags
     for lag in range(p - 1):
         for k in range(p - 1):
             lags[lag, k] = lags[lag + 1, k + 1]
     for lag in range(p - 1):
-        lags[lag, p - 1] = lags[p - 1, lag] = lags[2 * p, lag + 1]
+        lags[lag, p - 1] = lags[p - 1, lag] = lags[p, lag + 1]
     lags[p - 1, p - 1] = newest
 
 
@@ -348,13 +338,13 @@ def observe_lags(ar: Array, memory: Memory, innovation: Array, n: int) -> float:
     past, lags, p = memory.past, memory.lags, ar.shape[0]
     s: float = 1.0 + error_of_prediction(ar, memory)
     for lag in range(p):
-        gain = lags[2 * p, lag] / s
+        gain = lags[p, lag] / s
         for i in range(n + 1):
             past[lag, i] += gain * innovation[i]
         for k in range(p):
-            lags[lag, k] -= gain * lags[2 * p, k]
+            lags[lag, k] -= gain * lags[p, k]
     for lag in range(p):
-        lags[2 * p, lag] = 0.0  # the sample itself is known
+        lags[p, lag] = 0.0  # the sample itself is known
     shift_errors(memory, p, 0.0)
     return s
 
@@ -367,7 +357,8 @@ def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
     if not row[n + INTERVAL] > 0.0:
         return 0.0
     if row[n + INTERVAL] > GAP:
-        begin_again(memory, p)
+        for _ in range(int(min(row[n + INTERVAL] - 0.5, LONG_GAP))):
+            predict_lag(frozen.ar, memory, n)
     if not row[n + OK] > 0.0:
         predict_lag(frozen.ar, memory, n)
         return 0.0
@@ -397,7 +388,8 @@ def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
         for i in range(n + 1):
             past[lag, i] = past[lag + 1, i]
     counts[SINCE] += 1.0
-    return max(WIDE, 2.0 * before / scale)
+    limit: float = max(WIDE, 2.0 * before / scale)
+    return limit
 
 
 @part
