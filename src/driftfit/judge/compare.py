@@ -90,7 +90,7 @@ def errors(run: Track, record: Record, burn: int | None = None, steady: Array | 
     rows = len(run.program.whole.outputs)
     own = (tracked, y - persistence(y, rows), constant, lagged, arx["e"][:, 0])
     given = (np.abs(run.y) < LARGEST) & (np.abs(u) < LARGEST).all(axis=1)  # a start waits for what is missing
-    scored = np.cumsum(given) - given >= (burn_in(run.model.n) if burn is None else burn)
+    scored = np.asarray(np.cumsum(given) - given >= (burn_in(run.model.n) if burn is None else burn))
     for error in own if run.model.hidden is None else (own[0], own[1], own[4]):
         scored &= np.isfinite(error)
     return Errors(*own, scored)

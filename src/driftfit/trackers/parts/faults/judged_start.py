@@ -141,8 +141,10 @@ def settle(s: State, l: int) -> None:
 
 @kernel
 def judge_sample(s: State, y_hat: float, v: float, l: int) -> None:
-    """Judge a sample that is not ordinary, and its inputs."""
-    blame = blame_of_inputs(s, s.y[l] - y_hat, v * s.scale[l] * s.mean_ratio[l], l)
+    """Judge a sample that is not ordinary, and its inputs: how far it is off, when errors so far were smaller than
+    expected, still depends on what is not known of theta.
+    """
+    blame = blame_of_inputs(s, s.y[l] - y_hat, v * s.scale[l] * max(s.mean_ratio[l], 1.0), l)
     judge_unusual(s, y_hat, v, blame, l)
 
 
