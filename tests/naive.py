@@ -205,6 +205,15 @@ class ARX:
         return tracker.theta, tracker.var(), y_hat, e, s, bool(complete and y is not None and np.isfinite(noise))
 
 
+def walks(lane):
+    """Drift covariances (K, n, n) of the filters of `AdaptiveKalman` in a nominal interval."""
+    unit, first = np.sqrt(lane["c"]), int(lane["first_along"])
+    found = lane["r"] * np.array([np.diag(ratio) for ratio in lane["ratio"].T])
+    for j, ratio in enumerate(lane["along"]):
+        found[first + j] += lane["r"] * ratio * np.outer(lane["direction"], lane["direction"])
+    return found / np.outer(unit, unit)
+
+
 def moved_along(lane, walked, time=1.0):
     """Means (n, K) of the filters of `AdaptiveKalman` after an interval; ``walked`` (n, K) is what it adds to C_ii."""
     m, memory = lane["m"].copy(), time / np.sqrt(max(float(lane["apart"]), SHORTEST))

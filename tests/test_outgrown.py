@@ -8,7 +8,7 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
-from naive import moved_along
+from naive import moved_along, walks
 
 from driftfit import AdaptiveKalman, Bank, Change, Live, Regression, Sensor, track
 from driftfit.trackers.parts.modes.filters import UNSURE
@@ -65,8 +65,8 @@ def test_each_filter_of_adaptive_kalman_keeps_them_too(near, seed):
     after = live.lane()
     noise = float(after["noise"] * after["leverage"] * max(after["r"], after["coarse"]))
     weights, means, covs = lane["mu"] / lane["mu"].sum(), [], []
-    walks = lane["r"] * lane["ratio"] / lane["c"][:, None]
-    moved = moved_along(lane, lane["S"] ** 2 @ walks)
+    drift = walks(lane)
+    moved = moved_along(lane, np.einsum("ij,kjl,il->ik", lane["S"], drift, lane["S"]))
     with localcontext() as context:
         context.prec = 80
         inverse = EXACT(np.eye(N))
@@ -76,7 +76,7 @@ def test_each_filter_of_adaptive_kalman_keeps_them_too(near, seed):
             )
         for k in range(len(weights)):
             C = np.tril(lane["C"][..., k]) + np.tril(lane["C"][..., k], -1).T
-            P = inverse @ EXACT(C) @ inverse.T + EXACT(np.diag(walks[:, k]))
+            P = inverse @ EXACT(C) @ inverse.T + EXACT(drift[k])
             m, P = taken(inverse @ EXACT(moved[:, k]), P, y[PARTED], u[PARTED], noise)
             means.append(m), covs.append(P)
         mean = EXACT(weights) @ np.array(means)

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from naive import moved_along
+from naive import moved_along, walks
 from scipy import stats
 
 from driftfit import (
@@ -331,15 +331,15 @@ def test_the_density_of_a_sample_is_that_of_the_mixture(step):
 
 def naive_density(lane, phi, y):
     """The mixture before a sample in numpy: modes drift, levels move, and every pair predicts."""
-    S, c, r = lane["S"], lane["c"], float(lane["r"])
+    S, c, r, drift = lane["S"], lane["c"], float(lane["r"]), walks(lane)
     x = np.linalg.solve(S.T, phi)
     chain = (1.0 - OUTLIER) * lane["nu"][:-1] @ level_chain()
     levels = np.append(chain, OUTLIER)
     leverage = max(1.0, np.max(phi**2 / (LEVERAGE * c)))
-    m, total = moved_along(lane, S**2 @ (lane["ratio"] * r / c[:, None])), 0.0
+    m, total = moved_along(lane, np.einsum("ij,kjl,il->ik", S, drift, S)), 0.0
     for k, weight in enumerate(lane["mu"]):
         lower = np.tril(lane["C"][:, :, k])
-        C = lower + np.tril(lower, -1).T + (S * (lane["ratio"][:, k] * r / c)) @ S.T
+        C = lower + np.tril(lower, -1).T + S @ drift[k] @ S.T
         e, h = y - x @ m[:, k], x @ C @ x
         for j, p in enumerate(levels):
             scale = np.sqrt(h + leverage * max(lane["level"][j] * r, lane["coarse"]))

@@ -30,6 +30,7 @@ from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new
 from driftfit.trackers.parts.covariance import LEFT
 from driftfit.trackers.parts.modes.ladder import TOP, leap
 from driftfit.trackers.parts.modes.noise_levels import OUTLIER, noise_at
+from driftfit.trackers.parts.modes.one_direction import drift_along
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
 from driftfit.trackers.parts.modes.trend import bend_slopes, level_slopes, move_along
 from driftfit.trackers.parts.resolution import lasting
@@ -53,6 +54,7 @@ def wander(s: State, size: float, l: int) -> None:
                 moved = unit * s.S[a, i, l] * s.S[b, i, l]
                 for k in range(s.modes[l]):
                     s.C[a, b, k, l] += s.ratio[i, k, l] * moved
+    drift_along(s, size, l)
 
 
 @kernel

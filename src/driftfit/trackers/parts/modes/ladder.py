@@ -7,8 +7,9 @@
 In the common ladder all parameters drift; its top is the rung of ratio 1, and those above are for noise that is small
 compared with the drift. In a second ladder the parameters have learned weights
 (`driftfit.trackers.parts.modes.weights`), and the filters of a third follow a trend
-(`driftfit.trackers.parts.modes.trend`). Each parameter has a short ladder of its own, on which it alone drifts: the
-change of one parameter neither has to be learned first nor makes the others uncertain. Groups have theirs instead.
+(`driftfit.trackers.parts.modes.trend`). In a fourth they drift together, in a direction that is learned
+(`driftfit.trackers.parts.modes.one_direction`). Each parameter has a short ladder of its own, on which it alone drifts:
+the change of one parameter neither has to be learned first nor makes the others uncertain. Groups have theirs instead.
 
 T moves one rung up or down, and leads to each mode from all others with the same small probability a_j:
 
@@ -36,6 +37,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel, log
+from driftfit.trackers.parts.modes.one_direction import ALONG, no_direction
 from driftfit.trackers.parts.modes.rows import sum_of_row
 from driftfit.trackers.parts.modes.trend import TREND, no_trend
 
@@ -56,6 +58,8 @@ DESCEND = ((0.005, 0.001), (0.02, 0.002), (0.1, 0.004), (np.inf, 0.01))
 JUMP, REST, ACROSS = 0.0015, 0.0001, 0.00005
 """Probabilities of arriving from the mixture: at rungs of ratio 1, half of it at the top; at the foot of the common
 ladder (three tenths of it at each other rung of it below the top); and at the other rungs of each kind of ladder."""
+SELDOM = 5.0
+"""Factor by which arrivals at the filters that drift in one direction are rarer than at each other kind."""
 
 TOP = LADDER.index(1.0)
 """The mode that detects jumps, and may leap; the rungs above it are for noise that is small compared with the drift."""
@@ -74,9 +78,11 @@ def ladders(n: int, groups: Any) -> tuple[Array, Array, Array, Array]:
     the modes with learned weights, 0 for others."""
     single = groups is None and 1 < n <= MOST_ALONE
     masks = [np.isin(np.arange(n), one).astype(float) for one in (range(n) if single else groups or ())]
-    rungs = [LADDER, LEARNED, TREND, *((ALONE if single else GROUP) for _ in masks)]
+    common = [(LADDER, 1.0), (LEARNED, 1.0), (TREND, 1.0), *([(ALONG, SELDOM)] if n > 1 else [])]
+    kinds = [(ladder, np.ones(n), parts) for ladder, parts in common]
+    kinds += [(ALONE if single else GROUP, mask, len(masks)) for mask in masks]
     ratio, learned, moves, arrive = [], [], [], []
-    for which, (ladder, mask) in enumerate(zip(rungs, [*np.ones((3, n)), *masks], strict=True)):
+    for which, (ladder, mask, parts) in enumerate(kinds):
         for k, rung in enumerate(ladder):
             ratio.append(rung * mask)
             learned.append(rung if which == 1 else 0.0)
@@ -88,7 +94,7 @@ def ladders(n: int, groups: Any) -> tuple[Array, Array, Array, Array]:
             elif which == 0:
                 arrive.append(REST * (1.0 if k == 0 else 0.3 if k < TOP else 0.0))
             else:
-                arrive.append(ACROSS / len(ladder) / (1 if which <= 2 else len(masks)))
+                arrive.append(ACROSS / len(ladder) / parts)
     return np.array(ratio).T, np.array(moves).T, np.array(arrive), np.array(learned)
 
 
@@ -128,6 +134,7 @@ def filters(n: int, groups: Any) -> dict[str, Any]:
         "m_next": np.zeros((n, K)),
         "C": np.zeros((n, n, K)),
         **no_trend(n, len(LADDER) + len(LEARNED)),
+        **no_direction(n, len(LADDER) + len(LEARNED) + len(TREND)),
         "Z": np.zeros((n, n)),
         "rare": 1.0,
         "leapt": 0.0,

@@ -6,7 +6,8 @@
 with f_t the probabilities after sample t and T their transitions, for drift modes and likewise for noise levels v_tj,
 and o_t the probability that sample t was an outlier. A smoother of that random walk (`driftfit.smooth.exact`) estimates
 theta from all samples, with the averaged drift and noise, on the regressors and outputs from which coloured noise was
-taken (`driftfit.trackers.parts.modes.coloured`). Before the filters start nothing drifts.
+taken (`driftfit.trackers.parts.modes.coloured`). Of drift in one direction the variances count, not the covariances.
+Before the filters start nothing drifts.
 
 Source: the backward pass is Kim's (1994), eq. 2.20; smoothing one random walk given its result, instead of one for each
 mode, is ours.
@@ -22,10 +23,11 @@ import numpy as np
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.modes.ladder import TOP, chain
 from driftfit.trackers.parts.modes.noise_levels import level_chain
+from driftfit.trackers.parts.modes.one_direction import BESIDE
 
 SMOOTHER_FIELDS = (
     "joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight", "white",
-    "explained", "calm", "left_out", "shift",
+    "explained", "calm", "left_out", "shift", "direction",
 )  # fmt: skip
 """Fields that are stored at every sample."""
 
@@ -42,6 +44,7 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
     for i in range(s.c.shape[0]):
         o.c[i, l] = s.c[i, l]
         o.weight[i, l] = s.weight[i, l]
+        o.direction[i, l] = s.direction[i, l]
         o.white[i, l] = s.white[i, l]
     o.r[l], o.leverage[l], o.alike[l] = s.r[l], s.leverage[l], s.alike[l]
     o.coarse[l] = s.coarse[l] / s.noise[l]  # in units of the noise factor, as r is
@@ -75,10 +78,14 @@ def estimated_variances(
         r * time,
         state["learned"],
     )
-    ratio = np.where(learned > 0.0, 0.0, state["ratio"])
+    along, first = np.zeros(len(learned)), state["first_along"]
+    along[first : first + len(state["along"])] = state["along"]
+    ratio = np.where((learned > 0.0) | (along > 0.0), 0.0, state["ratio"])
+    square = fields["direction"] ** 2
+    share = np.where(np.sum(square, axis=1, keepdims=True) > 0.0, BESIDE + square, 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         leapt = np.where(weighed, fields["leapt"] / span, 0.0)
-        drift = w @ ratio.T + (w @ learned)[:, None] * fields["weight"]
+        drift = w @ ratio.T + (w @ learned)[:, None] * fields["weight"] + (w @ along)[:, None] * share
         q = (drift + (w[:, TOP] * leapt)[:, None] * ratio[:, TOP]) * span[:, None] / fields["c"]
     q = np.where(running[:, None] & (span[:, None] > 0.0) & (fields["c"] > 0.0), q, 0.0)
     levels = given_all(fields["nu"][:, :-1], level_chain(), np.zeros((J, J)), np.zeros(len(r)), weighed)

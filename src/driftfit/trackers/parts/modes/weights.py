@@ -1,7 +1,7 @@
 """Weights of the drift of the single parameters, learned from the scores of the disturbance smoother.
 
-With p_i the drift that the mixture assumes for parameter i, in units of r / c_i, and e, 1 / s and k the innovation, its
-inverse variance and the gain of the mixture, a backward pass over the last samples gives
+With p_i the independent drift that the mixture assumes for parameter i, in units of r / c_i, and e, 1 / s and k the
+innovation, its inverse variance and the gain of the mixture, a backward pass over the last samples gives
 
     r <- phi e / s + (I - phi k') r,        N <- phi phi' / s + (I - phi k') N (I - k phi')
 
@@ -12,7 +12,8 @@ as the non-negative solution of
 
 whose sums fade. The pass is made every `BLOCK` samples over the last `WINDOW`, and counts the oldest block, for which
 later samples show which parameter moved. The second ladder of drift ratios climbs in these proportions, rho_i / max_j
-rho_j (`driftfit.trackers.parts.modes.ladder`).
+rho_j (`driftfit.trackers.parts.modes.ladder`). The same pass finds the direction in which all parameters may drift
+together (`driftfit.trackers.parts.modes.one_direction`).
 
 Source: the smoother and its scores are Koopman and Shephard (1992); solving for all variances together, as data
 arrive, is ours. Cost per sample: O(n^2).
@@ -27,6 +28,16 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, kernel, machine, shared
 from driftfit.trackers.parts.faults.first_samples import PHI
+from driftfit.trackers.parts.modes.one_direction import (
+    FACTOR,
+    TIME,
+    B,
+    M,
+    add_block,
+    assume_along,
+    take_direction,
+    turn,
+)
 from driftfit.trackers.parts.modes.rows import sum_of_row
 
 BLOCK, WINDOW = 50, 100
@@ -35,7 +46,7 @@ FADE = 0.97
 """Factor of the sums at every pass."""
 SWEEPS = 20
 """Sweeps over the parameters for the solution."""
-FLOOR = 0.01
+FLOOR = 0.001
 """Smallest weight."""
 TINY = 1e-300
 
@@ -81,26 +92,33 @@ def step_back(past: Array, gains: Array, at: int, t: Array) -> None:
 
 
 @shared
-def look_back(past: Array, gains: Array, newest: int, t: Array) -> None:
+def look_back(past: Array, gains: Array, newest: int, t: Array, moments: Array) -> None:
     """Add the sums of the oldest block."""
     n = t.shape[1]
+    moments[TIME, 0] = 0.0
     for i in range(n):
         t[ADJOINT, i] = 0.0
         t[SLOPE, i] *= FADE
         for j in range(n):
             t[N + 2 * i, j] = 0.0
             t[A + 2 * i, j] *= FADE
+            moments[B + 3 * i, j] *= FADE
+            moments[M + 3 * i, j] *= FADE
+            moments[FACTOR + 3 * i, j] = 0.0
     for back in range(WINDOW):
         at = (newest + WINDOW - back) % WINDOW
         step_back(past, gains, at, t)
         if back >= WINDOW - BLOCK:
             span = past[at, SPAN]
+            moments[TIME, 0] += span
             for i in range(n):
                 t[SLOPE, i] += span * (t[ADJOINT, i] * t[ADJOINT, i] - t[N + 2 * i, i])
                 for j in range(n):
                     square = span * span * t[N + 2 * i, j] * t[N + 2 * i, j]
                     t[A + 2 * i, j] += square
                     t[SLOPE, i] += square * t[ASSUMED, j]
+                    moments[B + 3 * i, j] += span * (t[ADJOINT, i] * t[ADJOINT, j] - t[N + 2 * i, j])
+                    moments[FACTOR + 3 * i, j] += span * t[N + 2 * i, j]
 
 
 @shared
@@ -122,12 +140,15 @@ def solve(t: Array) -> None:
         t[WEIGHT, i] = max(t[WEIGHT, i] / most, FLOOR) if most > 0.0 else 1.0
 
 
-@machine
-def machine_weights(past: int, gains: int, newest: int, scores: int, n: int, L: int, l: int) -> None:
+@partial(machine, short=True)
+def machine_weights(past: int, gains: int, newest: int, scores: int, moments: int, n: int, L: int, l: int) -> None:
     """A pass for lane l of L, from the addresses of fields."""
     t, k = cubes(scores, A + 2 * n, n, L)[:, :, l], cubes(gains, WINDOW, n, L)[:, :, l]
-    look_back(cubes(past, WINDOW, PHI + n, L)[:, :, l], k, newest, t)
+    m = cubes(moments, B + 3 * n, n, L)[:, :, l]
+    look_back(cubes(past, WINDOW, PHI + n, L)[:, :, l], k, newest, t, m)
     solve(t)
+    add_block(t[ASSUMED], m)
+    turn(t[ADJOINT], m)
 
 
 @kernel
@@ -156,20 +177,30 @@ def remember(s: State, at: int, l: int) -> None:
     s.samples[at, SPAN, l] = s.dt[l] * s.drift[l]
 
 
+@partial(kernel, short=True)
+def end_block(s: State, newest: int, l: int) -> None:
+    """A pass over the last samples, and what the filters take from it."""
+    n, L = s.d.shape
+    for i in range(n):
+        for k in range(s.modes[l]):
+            s.row[k, l] = s.mean_prior[k, l] * s.ratio[i, k, l]
+        s.scores[ASSUMED, i, l] = sum_of_row(s, l)
+    assume_along(s, l)
+    machine_weights(
+        s.samples.ctypes.data, s.gains.ctypes.data, newest, s.scores.ctypes.data, s.moments.ctypes.data, n, L, l
+    )
+    take_direction(s, l)
+    for i in range(n):
+        s.weight[i, l] = s.scores[WEIGHT, i, l]
+        for k in range(s.modes[l]):
+            s.ratio[i, k, l] = s.learned[k, l] * s.weight[i, l] if s.learned[k, l] > 0.0 else s.ratio[i, k, l]
+
+
 @partial(kernel, inline=False)
 def learn_weights(s: State, l: int) -> None:
-    """Store a sample, and update the weights at the end of a block."""
-    n, L = s.d.shape
+    """Store a sample, and update the weights and the direction at the end of a block."""
     at = s.remembered[l] % WINDOW
     remember(s, at, l)
     s.remembered[l] += 1
     if s.remembered[l] >= WINDOW and s.remembered[l] % BLOCK == 0:
-        for i in range(n):
-            for k in range(s.modes[l]):
-                s.row[k, l] = s.mean_prior[k, l] * s.ratio[i, k, l]
-            s.scores[ASSUMED, i, l] = sum_of_row(s, l)
-        machine_weights(s.samples.ctypes.data, s.gains.ctypes.data, at, s.scores.ctypes.data, n, L, l)
-        for i in range(n):
-            s.weight[i, l] = s.scores[WEIGHT, i, l]
-            for k in range(s.modes[l]):
-                s.ratio[i, k, l] = s.learned[k, l] * s.weight[i, l] if s.learned[k, l] > 0.0 else s.ratio[i, k, l]
+        end_block(s, at, l)
