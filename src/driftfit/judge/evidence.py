@@ -46,7 +46,8 @@ class Evidence:
     def distinct(self) -> Distinct:
         """The parameters that the test can tell apart; it takes the others for 0."""
         every = Distinct(tuple(range(self.run.model.n)), ())
-        return distinct(self.rows.phi) if np.isnan(self._whole.p_joint) else every
+        found = distinct(self.rows.phi) if np.isnan(self._whole.p_joint) else every
+        return found if found.kept else every
 
     @cached_property
     def tested(self) -> Rows:

@@ -180,8 +180,9 @@ def auxiliary_output(s: State, l: int) -> None:
     for i in range(na, n):
         x += s.phi[i, l] * s.auxiliary[i, l]
         s.zeta[i, l] = s.phi[i, l]
-    # an input of a sample that is not used may be a fault code
-    x = x if (s.ok[l] > 0.0) | (s.observed[l] <= 0.0) else s.y[l]
+    # the input of a complete sample that was left out may be a fault code
+    left_out = (s.ok[l] <= 0.0) & (s.valid[l] > 0.0) & (s.observed[l] > 0.0) & (s.noise[l] < np.inf)
+    x = s.y[l] if left_out else x
     s.x[l] = max(-s.largest[l], min(s.largest[l], x))
     s.learned[l] += s.ok[l]
 

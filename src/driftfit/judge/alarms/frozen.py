@@ -53,6 +53,8 @@ LOUDER = 1.5
 """The factor of the noise that scores should show as soon as possible."""
 ORDER, COMPLETE = 6, 60
 ROUNDS = 3
+FAULTY = 30.0
+"""Deviations from which on a residual of the reference is a fault code."""
 PERSISTENCE, REACTION = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98), (0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
 GARCH = np.array([(0.0, 0.0), *((a, both - a) for both in PERSISTENCE for a in REACTION if a < both)])
 GARCH = np.ascontiguousarray(np.vstack([GARCH, np.repeat(GARCH[-1:], -len(GARCH) % WIDTH, axis=0)]).T)
@@ -100,6 +102,7 @@ def frozen_model(phi: Array, y: Array, ok: Array, constant: int = -1) -> tuple[F
         if not noisy(fit, white[:, :-1], white[:, -1]):
             return None
         e = rows[:, -1] - rows[:, :-1] @ fit.theta
+        ok = ok & (np.abs(e) <= FAULTY * deviation(e[ok]))
         ar = _autoregression(e, ok, len(unit))
         used, w = _whitened(e[:, None], ok, ar)
         numbers, h = noise_model(w[:, 0], len(unit))
@@ -232,9 +235,8 @@ def _autoregression(e: Array, ok: Array, n: int) -> Array:
         if max(COMPLETE, 5 * n) > N:
             break
         R = np.asarray(np.linalg.qr(np.column_stack([*(e[used - lag] for lag in range(1, p + 1)), e[used]]), mode="r"))
-        gain += N * np.log1p((R[p - 1, p] / max(abs(R[p, p]), SMALLEST)) ** 2) - np.log(
-            N
-        )  # the last two rows: what each order leaves
+        # the last two rows: what each order leaves
+        gain += N * np.log1p((R[p - 1, p] / max(abs(R[p, p]), SMALLEST)) ** 2) - np.log(N)
         if gain > best:
             best, found = gain, np.linalg.lstsq(R[:p, :p], R[:p, -1], rcond=None)[0]
     return np.asarray(found)

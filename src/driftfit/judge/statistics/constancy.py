@@ -119,7 +119,7 @@ def constancy(phi: Array, y: Array, lags: int | None = None, at: Array | None = 
     sample numbers of the rows, where some may be missing between them.
     """
     N, n = phi.shape
-    if least_rows(n) > N:
+    if n == 0 or least_rows(n) > N:
         return _nothing(N, n)
     basis = orthonormal(phi)
     if not basis.distinct:

@@ -17,8 +17,9 @@ is therefore ``coarse`` times the mean weight of the readings. `AdaptiveKalman` 
 one rounding error observed several times (`lasting`). Readings of a fine sensor never repeat, and nothing changes for
 them. If they do repeat, at a limit, at 0 while a pump is off, or because a value is held, the other steps have all
 sizes, and no step is frequent. A fine sensor that follows an input of a few levels has large steps and small ones, too:
-a grid needs three levels, mostly steps from one to the next, and more of them than small ones. A model that subtracts a
-shift from y (`driftfit.models.linearised`) writes it into the field ``shift``: the reading is y + shift.
+a grid needs three levels, mostly steps from one to the next, more of them than small ones, and innovations that show
+the rounding: machines that are switched one by one have equal steps, too, but inputs explain them. A model that
+subtracts a shift from y (`driftfit.models.linearised`) writes it into the field ``shift``: the reading is y + shift.
 
 Source: quantum^2 / 12 is Sheppard's (1898); the rest is ours. Cost per sample: a few comparisons.
 """
@@ -43,6 +44,8 @@ RARE = 10.0
 """Of so many steps of the grid one may be smaller, such as that of a reading half-way between two."""
 MOSTLY, LEVELS = 2.5, 1.75
 """Least ratio of steps of the grid to larger ones; least range of the readings in units of the grid."""
+ROUNDED = 0.01
+"""Least mean square of the innovations after steps of the grid, in units of its square; that of rounding is 1/12."""
 LONGEST = 4.0
 """At most so many repeated readings in a row count."""
 
@@ -51,7 +54,7 @@ def unresolved() -> dict[str, Any]:
     """Fields before the first reading."""
     return {
         "reading": np.nan, "quantum": np.inf, "finest": np.inf, "smallest": 0.0, "steps": 0.0, "repeats": 0.0,
-        "grid": np.inf, "of_grid": 0.0, "within": 0.0, "jitter": 0.0, "beyond": 0.0,
+        "grid": np.inf, "of_grid": 0.0, "moved_by": 0.0, "rounded": 0.0, "within": 0.0, "jitter": 0.0, "beyond": 0.0,
         "lowest": np.inf, "highest": -np.inf, "coarse": 0.0, "fresh": 1.0, "alike": 0.0, "shift": 0.0,
         "mean_weight": 1.0, "used_readings": 0.0,
     }  # fmt: skip
@@ -72,8 +75,13 @@ def same_reading(s: State, other: float, l: int) -> bool:
 
 @kernel
 def learn_grid(s: State, y: float, step: float, moved: float, l: int) -> None:
-    """Count a step among those of the grid, smaller and larger ones; ``moved`` is 0 if there is none."""
+    """Count a step among those of the grid, smaller and larger ones; ``moved`` is 0 if there is none.
+
+    ``rounded`` sums e^2 / grid^2 of the samples with such a step; e is still that of the sample before.
+    """
     grid = s.grid[l]
+    share = s.e[l] / grid
+    rounded = s.rounded[l] + (min(share * share, 1.0) if (s.moved_by[l] > 0.0) & (abs(share) >= 0.0) else 0.0)
     tiny, within, beyond = step < JITTER * grid, step < 0.75 * grid, step >= 1.5 * grid
     jitter, between = s.jitter[l] + (moved if tiny else 0.0), s.within[l] + (moved if within & (not tiny) else 0.0)
     larger, near = s.beyond[l] + (moved if beyond else 0.0), (step >= 0.75 * grid) & (not beyond)
@@ -81,6 +89,7 @@ def learn_grid(s: State, y: float, step: float, moved: float, l: int) -> None:
     other = (moved > 0.0) & ((max(larger, RARE * between) > of_grid) | (grid == np.inf))
     s.grid[l], s.of_grid[l], s.jitter[l] = step if other else grid, 1.0 if other else of_grid, 0.0 if other else jitter
     s.within[l], s.beyond[l] = 0.0 if other else between, 0.0 if other else larger
+    s.moved_by[l], s.rounded[l] = 0.0 if other else (moved if near else 0.0), 0.0 if other else rounded
     s.lowest[l] = min(s.lowest[l], y) if s.observed[l] > 0.0 else s.lowest[l]
     s.highest[l] = max(s.highest[l], y) if s.observed[l] > 0.0 else s.highest[l]
 
@@ -103,7 +112,8 @@ def resolve(s: State, l: int) -> None:
     # steps before the present candidate are not of its size: half of all steps that are no jitter must be
     most = s.of_grid[l] >= max(max(frequent, 0.5 * (s.steps[l] - s.jitter[l])), max(s.jitter[l], MOSTLY * s.beyond[l]))
     apart = s.highest[l] - s.lowest[l] >= LEVELS * s.grid[l]
-    on_grid = repeat & most & apart & (s.grid[l] > 1.5 * s.finest[l])
+    explained = s.rounded[l] < ROUNDED * (s.of_grid[l] - 1.0)
+    on_grid = repeat & most & apart & (s.grid[l] > 1.5 * s.finest[l]) & (not explained)
     coarse = on_grid | (repeat & (s.smallest[l] >= frequent))
     s.quantum[l] = s.grid[l] if on_grid else s.finest[l]
     s.coarse[l] = s.quantum[l] * s.quantum[l] / 12.0 if coarse else 0.0

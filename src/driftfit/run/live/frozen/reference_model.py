@@ -175,10 +175,11 @@ def judgeable(fields: Any, lane: int, y: Array, noise: Array) -> Array:
     refused.
 
     A tracker refuses readings that contradict all before, or repeat the last one, since it would lose its estimate. An
-    alarm that left them out would never report a sensor that fails again and again; its scores are bounded.
+    alarm that left them out would never report a sensor that fails again and again; its scores are bounded. Where a
+    model refused it (`driftfit.models.fault_codes`), no reading is left.
     """
     ok, valid, observed = (fields[name][..., lane] > 0.0 for name in ("ok", "valid", "observed"))
-    given = (np.abs(y) < LARGEST) & (noise < np.inf)
+    given = (np.abs(y) < LARGEST) & (noise < np.inf) & ((fields["y"][..., lane] != 0.0) | (y == 0.0))
     return np.asarray(ok | (valid & ~observed & given), float)
 
 
@@ -379,11 +380,14 @@ def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
         for lag in range(p):
             phi[i] -= frozen.ar[lag] * past[p - 1 - lag, i]
     level = np.sqrt(counts[LEVEL])
-    if counts[SINCE] < p:
+    if counts[SINCE] < p and abs(phi[n]) <= WIDE * numbers[SCALE] * level:
         level *= np.sqrt(observe_lags(frozen.ar, memory, phi, n))
     scale = numbers[SCALE] * level
     for i in range(n + 1):
         phi[i] /= level if i < n else scale
+    if abs(phi[n]) > WIDE:  # a fault code is no lag
+        predict_lag(frozen.ar, memory, n)
+        return WIDE
     for lag in range(p):
         for i in range(n + 1):
             past[lag, i] = past[lag + 1, i]
