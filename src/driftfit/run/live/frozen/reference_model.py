@@ -176,7 +176,9 @@ def judgeable(fields: Any, lane: int, y: Array, noise: Array) -> Array:
 
     A tracker refuses readings that contradict all before, or repeat the last one, since it would lose its estimate. An
     alarm that left them out would never report a sensor that fails again and again; its scores are bounded. Where a
-    model refused it (`driftfit.models.fault_codes`), no reading is left.
+    model refused it (`driftfit.models.fault_codes`), no reading is left. A sample whose inputs the tracker blames is
+    not judged, because a score times a regressor is not bounded: a single false input could raise an alarm. If y does
+    not follow an input any more, the tracker believes the input soon, and the alarm judges the samples from then on.
     """
     ok, valid, observed = (fields[name][..., lane] > 0.0 for name in ("ok", "valid", "observed"))
     given = (np.abs(y) < LARGEST) & (noise < np.inf) & ((fields["y"][..., lane] != 0.0) | (y == 0.0))
