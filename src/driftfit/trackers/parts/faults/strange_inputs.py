@@ -29,7 +29,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.faults.first_samples import NOISE, PHI
 
-BEYOND = 1.25
+BEYOND = 2.0
 """Half ranges from the middle beyond which a regressor is outside."""
 SURE = 5.0
 """Standard deviations of the prediction that a sample at fault is away from it."""
