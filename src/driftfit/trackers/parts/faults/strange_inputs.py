@@ -73,7 +73,7 @@ def learn_stored_inputs(s: State, l: int) -> None:
 
 @kernel
 def blame_of_inputs(s: State, e: float, v: float, beyond: float, l: int) -> float:
-    """The trust that the sample costs, given its innovation, the variance of that, and `BEYOND`; 0 if none is blamed."""
+    """The trust that the sample costs, given its innovation, the variance of that, and `BEYOND`; 0 without blame."""
     rest, most, code, far = e, 0.0, 0.0, 0.0
     for i in range(s.theta.shape[0]):
         middle, half = 0.5 * (s.input_low[i, l] + s.input_high[i, l]), 0.5 * (s.input_high[i, l] - s.input_low[i, l])
