@@ -107,7 +107,7 @@ def test_a_structure_that_changes_half_way(tracker):
     y, u = arx_record(LONG, 4, theta=path)
     run = track(model_of(tracker, ARX(2, 2)), tracker, y, u, keep="cov" if tracker.covariance else "std")
     theta = as_arx(tracker, run.theta)
-    np.testing.assert_allclose(impulse(theta[half - 2000 : half].mean(axis=0)), impulse(path[0]), atol=0.005)
+    np.testing.assert_allclose(impulse(theta[half - 20000 : half].mean(axis=0)), impulse(path[0]), atol=0.005)
     np.testing.assert_allclose(impulse(theta[half + 1000 : half + 3000].mean(axis=0)), impulse(THETA), atol=0.007)
     np.testing.assert_allclose(impulse(theta[-2000:].mean(axis=0)), impulse(THETA), atol=0.015)
     if tracker.covariance:  # the order is distinguished from 1 only where it is 2

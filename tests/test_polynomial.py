@@ -325,7 +325,7 @@ def test_readings_are_judged_and_not_what_a_shift_leaves_of_them():
     rng = np.random.default_rng(3)
     u = rng.normal(size=600)
     y = 20.0 + signal.lfilter([0.0, 0.5], [1.0, -0.8], u) + 0.05 * rng.normal(size=600)
-    model = BoxJenkins()
+    model = BoxJenkins(offset=True)
     coarse = track(model, AdaptiveKalman(), 0.5 * np.round(y / 0.5), u).state
     assert coarse["quantum"] == pytest.approx(0.5)
     assert coarse["coarse"] > 0.0

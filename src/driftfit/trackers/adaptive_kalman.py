@@ -73,6 +73,7 @@ from driftfit.trackers.parts.excitation import (
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
 from driftfit.trackers.parts.faults.stored_samples import machine_doubt
 from driftfit.trackers.parts.faults.strange_inputs import (
+    BEYOND,
     SELDOM,
     SURE,
     blame_of_inputs,
@@ -139,7 +140,7 @@ def leave_out_input(s: State, l: int) -> None:
     """Leave out a sample with an input at fault; s.e and s.s must be known."""
     blame = 0.0
     if s.ok[l] > 0.0 and (s.e[l] * s.e[l] > SURE * SURE * s.s[l] or s.distrusted[l] > 0.0):
-        blame = blame_of_inputs(s, s.e[l], s.s[l], l)
+        blame = blame_of_inputs(s, s.e[l], s.s[l], BEYOND, l)
     s.distrusted[l] = max(s.distrusted[l] + (blame if blame > 0.0 else -SELDOM * s.ok[l]), 0.0)
     s.inputs_out[l] += 1.0 if blame > 0.0 else 0.0
     s.ok[l] = 0.0 if blame > 0.0 else s.ok[l]

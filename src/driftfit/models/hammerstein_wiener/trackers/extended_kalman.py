@@ -11,8 +11,8 @@ with phi, z of the model and g, J of `driftfit.models.hammerstein_wiener.product
 are large.
 
 Use it if an initial value near the truth is known, as from `hand_off`; from a distant one it can fail where stage one
-cannot. Samples that contradict all before them are left out (`driftfit.trackers.parts.faults.contradictions`). It is
-not iterated: the iterated filter failed in 17 % of the runs of example 1 of Feng and Hong (2021).
+cannot. It is not iterated: the iterated filter failed in 17 % of the runs of example 1 of Feng and Hong (2021). A
+reading out of all proportion is refused (`driftfit.models.fault_codes`).
 
 Source: the implicit-measurement form of Jazwinski (1970), section 8.3; inflation and hand-off are ours. Only one
 triangle of P is kept. Cost per sample: O(n_x^2 + n).
@@ -31,11 +31,11 @@ from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import State, kernel
 from driftfit.engine.settings import matrix, vector
 from driftfit.models.base import Model
+from driftfit.models.fault_codes import UNJUDGED, judge
 from driftfit.models.hammerstein_wiener.products import Structure
 from driftfit.models.hammerstein_wiener.trackers.minimal import Minimal, minimal_memory, structure_of
 from driftfit.trackers.kalman import drift, drift_matrix
 from driftfit.trackers.parts.covariance import corrected, product_with
-from driftfit.trackers.parts.faults.contradictions import contradictions, leave_out_contradiction, no_contradictions
 from driftfit.trackers.parts.varying_drift import read_drift
 
 
@@ -75,6 +75,16 @@ spread_of = product_with(slope)
 """s.g = P H'; returns H P H'."""
 
 
+@kernel
+def refuse(s: State, y_hat: float, l: int) -> None:
+    """Leave out a reading out of all proportion."""
+    if s.observed[l] > 0.0:
+        z = s.y[l]
+        judge(s, y_hat, l)
+        if not abs(s.y[l]) < np.inf:
+            s.y[l], s.ok[l], s.observed[l] = z, 0.0, 0.0
+
+
 @lru_cache
 def _steps(structure: Structure, together: bool) -> TrackerSteps:
     row = linearised(structure)
@@ -82,9 +92,9 @@ def _steps(structure: Structure, together: bool) -> TrackerSteps:
     @kernel
     def correct(s: State, l: int) -> None:
         y_hat = row(s, l)
-        v = (1.0 + s.inflation[l]) * spread_of(s, l) + s.r[l] * s.noise[l]
-        leave_out_contradiction(s, y_hat, v, l)
-        corrected(s, y_hat, v, l)
+        refuse(s, y_hat, l)
+        h = spread_of(s, l)
+        corrected(s, y_hat, (1.0 + s.inflation[l]) * h + s.r[l] * s.noise[l], l)
 
     return TrackerSteps(drift_matrix if together else drift, correct, read_extra=read_drift)
 
@@ -136,7 +146,7 @@ class ExtendedKalman(Minimal):
             "drift_root": np.ones(n),
             "h_row": np.zeros(n),
             "var": np.zeros(n),
-            **no_contradictions(n),
+            **UNJUDGED,
         }
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
@@ -145,6 +155,3 @@ class ExtendedKalman(Minimal):
 
     def steps_for(self, model: Model) -> TrackerSteps:
         return _steps(structure_of("ExtendedKalman", model), np.ndim(self.q) == 2)
-
-    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return contradictions(run.state)

@@ -54,6 +54,7 @@ from driftfit.trackers.parts.faults.stored_samples import (
     without_fault,
 )
 from driftfit.trackers.parts.faults.strange_inputs import (
+    FARTHER,
     blame_of_inputs,
     learn_inputs,
     learn_stored_inputs,
@@ -144,7 +145,7 @@ def judge_sample(s: State, y_hat: float, v: float, l: int) -> None:
     """Judge a sample that is not ordinary, and its inputs: how far it is off, when errors so far were smaller than
     expected, still depends on what is not known of theta.
     """
-    blame = blame_of_inputs(s, s.y[l] - y_hat, v * s.scale[l] * max(s.mean_ratio[l], 1.0), l)
+    blame = blame_of_inputs(s, s.y[l] - y_hat, v * s.scale[l] * max(s.mean_ratio[l], 1.0), FARTHER, l)
     judge_unusual(s, y_hat, v, blame, l)
 
 

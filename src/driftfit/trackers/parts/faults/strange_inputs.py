@@ -1,7 +1,7 @@
 """Inputs far outside their range to which the output does not respond: fault codes, such as 0 where a meter shows 50.
 
-A regressor is *outside* if it is more than `BEYOND` times half the range of its earlier values away from the middle m_i
-of that range. With e the innovation and s its variance, an input is at fault if
+A regressor is *outside* if it is more than `BEYOND` or `FARTHER` times half the range of its earlier values away from
+the middle m_i of that range. With e the innovation and s its variance, an input is at fault if
 
     e^2 > SURE^2 s    and    |e + sum theta_i (phi_i - m_i)| < UNMOVED |e|,    the sum over regressors outside
 
@@ -29,8 +29,9 @@ import numpy as np
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.faults.first_samples import NOISE, PHI
 
-BEYOND = 1.25
-"""Half ranges from the middle beyond which a regressor is outside."""
+BEYOND, FARTHER = 1.25, 2.0
+"""Half ranges from the middle beyond which a regressor is outside; the second for trackers with a given drift, to which
+a jump of theta looks the same where lags are a little larger than before."""
 SURE = 5.0
 """Standard deviations of the prediction that a sample at fault is away from it."""
 UNMOVED, REPEATED = 0.4, 0.6
@@ -71,13 +72,13 @@ def learn_stored_inputs(s: State, l: int) -> None:
 
 
 @kernel
-def blame_of_inputs(s: State, e: float, v: float, l: int) -> float:
-    """The trust that the sample costs, given its innovation and the variance of that; 0 if no input is at fault."""
+def blame_of_inputs(s: State, e: float, v: float, beyond: float, l: int) -> float:
+    """The trust that the sample costs, given its innovation, the variance of that, and `BEYOND`; 0 without blame."""
     rest, most, code, far = e, 0.0, 0.0, 0.0
     for i in range(s.theta.shape[0]):
         middle, half = 0.5 * (s.input_low[i, l] + s.input_high[i, l]), 0.5 * (s.input_high[i, l] - s.input_low[i, l])
         away = s.phi[i, l] - middle
-        outside = (half > 0.0) & (abs(away) > BEYOND * half)
+        outside = (half > 0.0) & (abs(away) > beyond * half)
         moved = s.theta[i, l] * away if outside else 0.0
         rest += moved
         larger = abs(moved) > most
