@@ -387,14 +387,16 @@ def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
     scale = numbers[SCALE] * level
     for i in range(n + 1):
         phi[i] /= level if i < n else scale
-    if abs(phi[n]) > WIDE:  # a fault code is no lag
+    limit: float = max(WIDE, 2.0 * before / scale)
+    if abs(phi[n]) > WIDE:  # a fault code is no lag, but the limit of the next sample
+        last = past[p, n]
         predict_lag(frozen.ar, memory, n)
-        return WIDE
+        past[p, n] = last
+        return limit
     for lag in range(p):
         for i in range(n + 1):
             past[lag, i] = past[lag + 1, i]
     counts[SINCE] += 1.0
-    limit: float = max(WIDE, 2.0 * before / scale)
     return limit
 
 
