@@ -12,6 +12,7 @@ from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow, Known
 from driftfit.bridges.spark.follow import STATE, _schema
 from driftfit.bridges.spark.pieces import ARROW
 from driftfit.bridges.spark.task import SETTING, Task
+from driftfit.run.states import layout
 
 MODEL, K = ARX(2, 2), Kalman(q=1e-4, r=0.1)
 PAIR = ARX(1, 1, ny=("flow", "pressure"))
@@ -100,5 +101,6 @@ def packed(fleet):
     for key, run in fleet.series().items():
         lanes = [run._lane] if len(run.outputs) == 1 else run._lanes
         programs = [run.program] if len(run.outputs) == 1 else run.programs
-        found[key] = b"".join(one.pack(lane.tile, lane.lane)[24:] for one, lane in zip(programs, lanes, strict=True))
+        words = [one.layout.taken(lane.tile)[lane.lane] for one, lane in zip(programs, lanes, strict=True)]
+        found[key] = layout.packed(bytes(8), np.concatenate(words))[layout.HEAD.size :]
     return found

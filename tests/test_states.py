@@ -51,14 +51,14 @@ def test_bytes_of_an_older_version_are_read_by_the_names_of_fields():
     np.testing.assert_allclose(live.update(1.0, 1.0, time=8.0), golden().update(1.0, 1.0, time=8.0), rtol=1e-12)
 
 
-def test_a_state_is_its_numbers_and_a_few_hundred_bytes():
+def test_a_state_is_its_numbers_and_a_thousand_bytes():
     live = Live(ARX(2, 2), K)
     for t in range(60):
         live.update(Y[t], U[t])
     numbers = 8 * live.program.layout.size
     assert numbers < 0.85 * live._tile.nbytes
     assert len(live.program.pack(live._tile)) == numbers + 24
-    assert len(live.to_bytes()) < numbers + 1000
+    assert len(live.to_bytes()) < numbers + 1100  # model, tracker, names of fields
 
 
 @pytest.mark.parametrize("stop", [1, 3, 50])

@@ -50,7 +50,7 @@ class End(NamedTuple):
         return self
 
     def to_bytes(self) -> bytes:
-        """The end as bytes for `Live.from_bytes` and ``warm_start=``: a few hundred bytes more than the state
+        """The end as bytes for `Live.from_bytes` and ``warm_start=``: 1,000 to 1,500 bytes more than the state
         itself.
         """
         lanes = [one.pack(one.tile(state)) for one, state in zip(self.programs, self.states, strict=True)]

@@ -321,6 +321,7 @@ class AdaptiveKalman(Tracker):
             **nothing_shared_among_filters(),
             **no_weights(n),
             **no_strange_inputs(n),
+            "inputs_out": 0.0,
             "distrusted": 0.0,
             **white(n),
             **modes,

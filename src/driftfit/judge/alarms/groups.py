@@ -1,9 +1,9 @@
 """Limits of the "glr" and "cusum" alarms for groups of like series, from records simulated for some of the members.
 
 Series are alike if their reference models have the same parameters and a similar length, and if their noise is similar:
-its tails (the share of residuals that are not clipped), and whether its variance changes. The deviates of like series
-have nearly the same distribution, so records that are simulated from many of them serve for each, at the cost of the
-bootstrap of a single one. A group of one is simulated from itself.
+its tails (the share of small residuals, and where scores are clipped), and whether its variance changes. The deviates
+of like series have nearly the same distribution, so records that are simulated from many of them serve for each, at the
+cost of the bootstrap of a single one. A group of one is simulated from itself.
 
 The limits of a group only show which series are clearly without a fault. Those need no bootstrap of their own; the
 others, which `in_doubt` finds, have one. The rates of false alarms are therefore those of single runs, or lower.
@@ -22,18 +22,18 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import plain
 from driftfit.judge.alarms.bootstrap import RECORDS, drawn_in_blocks, limits, simulated, together
-from driftfit.judge.alarms.frozen import Rows
+from driftfit.judge.alarms.frozen import CLIPS, Rows
 from driftfit.judge.alarms.reference import in_samples
 from driftfit.judge.alarms.statistics import Reference, chance_of, findings_of, highest, modelled
 from driftfit.judge.cores.on_all_cores import on_all_cores
-from driftfit.run.live.frozen.reference_model import ALPHA, CONSTANT, K
+from driftfit.run.live.frozen.reference_model import ALPHA, CLIP, CONSTANT
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.result import Track
 
 MARGIN = 4.0
 """A series is in doubt if its p-value could be this many times smaller by the limits of the series itself."""
 TAILS = 100.0
-"""Groups differ by 1 / TAILS in the share of residuals that are not clipped."""
+"""Groups differ by 1 / TAILS in the share of residuals below the smallest of `CLIPS`."""
 
 
 class Look(NamedTuple):
@@ -59,8 +59,8 @@ def look(run: Track, asked: AlarmRule, reference: Reference) -> Look:
 
 def _like(rule: AlarmRule, rows: Rows) -> Hashable:
     frozen = rule.reference
-    length, tails = round(2.0 * np.log2(len(rows.x))), round(TAILS * frozen.numbers[K])
-    noise = length, tails, bool(frozen.numbers[ALPHA] > 0.0), drawn_in_blocks(frozen, rows.x)
+    length, tails = round(2.0 * np.log2(len(rows.x))), round(TAILS * np.mean(np.abs(rows.x) < CLIPS[0]))
+    noise = length, tails, frozen.numbers[CLIP], bool(frozen.numbers[ALPHA] > 0.0), drawn_in_blocks(frozen, rows.x)
     return rule.parameters, *noise, frozen.numbers[CONSTANT] if len(frozen.mean) else None
 
 

@@ -176,7 +176,9 @@ def judgeable(fields: Any, lane: int, y: Array, noise: Array) -> Array:
 
     A tracker refuses readings that contradict all before, or repeat the last one, since it would lose its estimate. An
     alarm that left them out would never report a sensor that fails again and again; its scores are bounded. Where a
-    model refused it (`driftfit.models.fault_codes`), no reading is left.
+    model refused it (`driftfit.models.fault_codes`), no reading is left. A sample whose inputs the tracker blames is
+    not judged, because a score times a regressor is not bounded: a single false input could raise an alarm. If y does
+    not follow an input any more, the tracker believes the input soon, and the alarm judges the samples from then on.
     """
     ok, valid, observed = (fields[name][..., lane] > 0.0 for name in ("ok", "valid", "observed"))
     given = (np.abs(y) < LARGEST) & (noise < np.inf) & ((fields["y"][..., lane] != 0.0) | (y == 0.0))
@@ -385,14 +387,16 @@ def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
     scale = numbers[SCALE] * level
     for i in range(n + 1):
         phi[i] /= level if i < n else scale
-    if abs(phi[n]) > WIDE:  # a fault code is no lag
+    limit: float = max(WIDE, 2.0 * before / scale)
+    if abs(phi[n]) > WIDE:  # a fault code is no lag, but the limit of the next sample
+        last = past[p, n]
         predict_lag(frozen.ar, memory, n)
-        return WIDE
+        past[p, n] = last
+        return limit
     for lag in range(p):
         for i in range(n + 1):
             past[lag, i] = past[lag + 1, i]
     counts[SINCE] += 1.0
-    limit: float = max(WIDE, 2.0 * before / scale)
     return limit
 
 

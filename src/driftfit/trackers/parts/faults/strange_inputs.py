@@ -47,7 +47,7 @@ AGAIN, ALIKE = 10.0, 0.25
 
 def no_strange_inputs(n: int) -> dict[str, Any]:
     """Fields before the first sample."""
-    return {"input_low": np.full(n, np.inf), "input_high": np.full(n, -np.inf), "input_code": np.nan, "inputs_out": 0.0}
+    return {"input_low": np.full(n, np.inf), "input_high": np.full(n, -np.inf), "input_code": np.nan}
 
 
 @kernel
