@@ -172,3 +172,16 @@ def test_large_steps_of_a_fine_sensor_are_not_a_grid():
         u = rng.integers(0, levels, 900).astype(float)
         run = track(Regression(1), RLS(0.99), np.round(50.0 * u + 0.05 * rng.normal(size=900), 1), u)
         assert run.state["coarse"] == pytest.approx(0.1**2 / 12.0, rel=0.01)
+
+
+@pytest.mark.parametrize("tracker", [AdaptiveKalman(), RLS(0.99)])
+def test_equal_steps_that_an_input_explains_are_no_grid(tracker):
+    """Machines of 75 kW that are switched one by one, on a meter that reads exactly 0 when none runs."""
+    rng = np.random.default_rng(0)
+    running = np.zeros(600)
+    for t in range(1, 600):
+        running[t] = np.clip(running[t - 1] + rng.choice([-1.0, 1.0]), 0.0, 3.0)
+    power = np.where(running > 0.0, 75.0 * running + 0.3 * rng.normal(size=600), 0.0)
+    run = track(Regression(1), tracker, power, running)
+    assert run.state["coarse"] == 0.0
+    assert run.std[-1, 0] < 0.5

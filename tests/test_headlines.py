@@ -88,3 +88,10 @@ def test_a_report_does_not_say_no_of_a_parameter_that_was_not_judged():
     row = text[text.index("<td>theta3") :].split("</tr>")[0]
     assert "nan" in row
     assert "<td>no</td>" not in row
+
+
+def test_a_record_without_any_regressor_can_tell_nothing():
+    y = np.random.default_rng(0).normal(size=300)
+    verdict = track(Regression(2), RLS(0.99), y, np.zeros((300, 2))).verdict()
+    assert verdict.drifts is None
+    assert "cannot show" in str(verdict)
