@@ -11,6 +11,7 @@ all models. Cost per sample: O(n^2).
 Of a model that is linearised at its estimates, the start is too poor for a comparison with trackers, which forget it as
 well. Its constants are fitted twice, the second time with the linearisation held where the first ended
 (`Model.held_at`): this is one step of Gauss and Newton from there, with regressors as good at the start as at the end.
+Their errors are one step ahead in the constants, but not in the linearisation, which knows the whole record.
 """
 
 from __future__ import annotations

@@ -13,12 +13,12 @@ where parameters are hardly known, and the third not after a test signal to whic
 or level within the usual range of the readings is never strange.
 
 If instead y_hat is farther from m, an input is probably at fault. An estimate that went astray also gives strange
-predictions, however, and must be corrected; so inputs are blamed for at most `LAGS` samples in a row, and for one
+predictions, however, and must be corrected; so inputs are blamed for at most `TRUST` samples in a row, and for one
 sample in ten in the long run. A code whose effect would stay within the range of the readings is found by the range of
 its own regressor (`driftfit.trackers.parts.faults.strange_inputs`).
 
 A strange input stays in the regressors, as a lag or in what a model simulates, where its effect may be smaller. In the
-`LAGS` samples after one for which an input was blamed, a sample with phi' P phi > r, which would change the estimate
+`TRUST` samples after one for which an input was blamed, a sample with phi' P phi > r, which would change the estimate
 more than all samples before it, is therefore not used either; after n samples, when lags are ordinary again, only if it
 does not agree with its prediction, e^2 > LIKELY^2 s.
 
@@ -77,8 +77,6 @@ BLOCK, GROWING = 32.0, 0.25
 """Samples of a block at least, and per reading before."""
 LASTING, LONGEST = 4.0, 1e12
 """The factor p from which on the lag of a strange input is accepted as well; its upper bound."""
-LAGS = TRUST
-"""Samples in which a strange input may still be in the regressors."""
 QUICK, SLOW, SLOWEST = 2.0, 2.0 ** (1.0 / 4.0), 2.0 ** (1.0 / 16.0)
 """Growth of the factor p: for readings that persist, for predictions, and for values that repeat themselves or jump."""
 ALIKE = 0.25
@@ -171,7 +169,7 @@ def judge(s: State, y: float, shown: float, v: float, blame: float, l: int) -> N
     sure = SURE if off > out else LIKELY
     judged = (s.ok[l] > 0.0) & (s.y_count[l] >= s.judged_from[l]) & (s.ratios[l] >= ENOUGH)
     strange = judged & (e * e > reach) & (e * e > sure * sure * v * s.mean_ratio[l]) & (min(off, out) < 0.5 * abs(e))
-    trusted = (off > out) | (s.distrusted[l] < LAGS)
+    trusted = (off > out) | (s.distrusted[l] < TRUST)
     unpredicted = (s.observed[l] > s.valid[l]) & (s.y_count[l] >= s.judged_from[l])
     outside = unpredicted & (off * off > reach)
     of_reading, apart, follows = outside | (off > out), abs(y - s.y_strange[l]), widening > 1.0
@@ -185,18 +183,18 @@ def judge(s: State, y: float, shown: float, v: float, blame: float, l: int) -> N
         judged
         & (not lasting)
         & (s.lagging[l] > 0.0)
-        & (s.distrusted[l] < LAGS)
+        & (s.distrusted[l] < TRUST)
         & (v > 2.0 * s.r[l] * s.noise[l] * s.scale[l])
-        & ((s.lagging[l] > LAGS - s.theta.shape[0]) | (e * e > LIKELY * LIKELY * v * s.mean_ratio[l]))
+        & ((s.lagging[l] > TRUST - s.theta.shape[0]) | (e * e > LIKELY * LIKELY * v * s.mean_ratio[l]))
     )
     blamed = judged & (blame > 0.0)
     left = beyond | lagging | blamed
     more = blame if blamed else (1.0 if left & (off <= out) else -SELDOM)
-    s.distrusted[l] = min(max(s.distrusted[l] + more, 0.0), 2.0 * LAGS) if s.ok[l] > 0.0 else s.distrusted[l]
+    s.distrusted[l] = min(max(s.distrusted[l] + more, 0.0), 2.0 * TRUST) if s.ok[l] > 0.0 else s.distrusted[l]
     of_prediction = (1.0 if out * SAME < s.farthest[l] else SLOWEST) if out < SAME * s.farthest[l] else SLOW
     grown = of_readings if of_reading else min(of_prediction * widening, LONGEST)
     left_over = 0.0 if lasting else max(s.lagging[l] - 1.0, 0.0)
-    s.lagging[l] = LAGS if blamed | (beyond & (off <= out)) else left_over
+    s.lagging[l] = TRUST if blamed | (beyond & (off <= out)) else left_over
     s.widening[l] = (
         grown
         if strange | outside

@@ -66,7 +66,6 @@ MORE = 16
 VARIED = 3.0
 """Number of readings, not counting those that repeat the one before, that show a range of the plant: at rest it has one
 or two, but a coarse meter beside an input that is held for some samples has few more."""
-
 FEW = 2.0
 """Variance of a prediction after a start, in those of the noise."""
 
