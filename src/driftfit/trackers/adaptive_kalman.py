@@ -6,8 +6,9 @@ that the drift of one parameter adds to the output per sample, whatever the unit
 ladder of ratios all weights w are 1; in a second one they are learned from the record
 (`driftfit.trackers.parts.modes.weights`); the filters of a third follow a trend
 (`driftfit.trackers.parts.modes.trend`); those of a fourth drift in one direction, which is learned too
-(`driftfit.trackers.parts.modes.one_direction`); and, with up to eight parameters, each has a ladder on which it alone
-drifts. The filters are the modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
+(`driftfit.trackers.parts.modes.one_direction`); with up to eight parameters, each has a ladder on which it alone
+drifts; and the last filter comes to rest after a change (`driftfit.trackers.parts.modes.at_rest`). The filters are the
+modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each
 filter the levels are merged at once, by a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings far
@@ -31,8 +32,8 @@ Use it if nothing is known; if q and r are known, `Kalman` is as good and far ch
 in a few hundred samples; ``groups`` specifies it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the ladder of ratios, its transitions, the noise
-levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 20 + 3 n
-for two to eight parameters, and 20 for more.
+levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 22 + 3 n
+for two to eight parameters, and 22 for more.
 """
 
 from __future__ import annotations

@@ -18,8 +18,9 @@ T moves one rung up or down, and leads to each mode from all others with the sam
 so the filters that arrive at j are the mixture itself, whose moments are known, and the interaction costs O(K) instead
 of O(K^2). Jumps arrive at rungs of ratio 1, which soon move down again: from there to no drift directly only with the
 small a_0, since mixing the wide covariance of the top filter into the one without drift costs more than anything else
-when nothing changes. All but that move down have the factor calm <= 1, learned from how often rungs of ratio 1 end:
-what never changed in thousands of samples is expected to change less often (`learn_rate`).
+when nothing changes. The last filter is not mixed, and comes to rest directly
+(`driftfit.trackers.parts.modes.at_rest`). All but what moves down has the factor calm <= 1, learned from how often
+rungs of ratio 1 end: what never changed in thousands of samples is expected to change less often (`learn_rate`).
 
 The top filter may also *leap*: if a move as large as the innovation, in directions 1 / c_i and up to LEAP standard
 deviations of the output (times p of `driftfit.trackers.parts.outlying_readings`), at this regressor and at one of
@@ -37,11 +38,12 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel, log
+from driftfit.trackers.parts.modes.at_rest import come_to_rest, no_rest
 from driftfit.trackers.parts.modes.one_direction import ALONG, no_direction
 from driftfit.trackers.parts.modes.rows import sum_of_row
 from driftfit.trackers.parts.modes.trend import TREND, no_trend
 
-LADDER = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
+LADDER = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 1.5, 30.0)
 """Drift ratios of the modes in which all parameters drift."""
 LEARNED = (1e-3, 1e-2, 0.1)
 """Ratios of the ladder whose parameters have learned weights."""
@@ -81,6 +83,7 @@ def ladders(n: int, groups: Any) -> tuple[Array, Array, Array, Array]:
     common = [(LADDER, 1.0), (LEARNED, 1.0), (TREND, 1.0), *([(ALONG, SELDOM)] if n > 1 else [])]
     kinds = [(ladder, np.ones(n), parts) for ladder, parts in common]
     kinds += [(ALONE if single else GROUP, mask, len(masks)) for mask in masks]
+    kinds += [((0.0,), np.ones(n), np.inf)]  # at rest: others replace it, and none are mixed with it
     ratio, learned, moves, arrive = [], [], [], []
     for which, (ladder, mask, parts) in enumerate(kinds):
         for k, rung in enumerate(ladder):
@@ -98,11 +101,12 @@ def ladders(n: int, groups: Any) -> tuple[Array, Array, Array, Array]:
     return np.array(ratio).T, np.array(moves).T, np.array(arrive), np.array(learned)
 
 
-def chain(moves: Array, arrive: Array) -> tuple[Array, Array]:
+def chain(moves: Array, arrive: Array, over: Array) -> tuple[Array, Array]:
     """Transitions (K, K) of the modes as A + calm B."""
     K = len(arrive)
     climb, descend, back = moves
-    A = np.diag(1.0 - back) + np.diag(back[1:], -1)
+    A = np.diag(1.0 - back - over) + np.diag(back[1:], -1)
+    A[:, -1] += over
     B = np.diag(-arrive.sum() - climb - descend) + np.diag(climb[:-1], 1) + np.diag(descend[1:], -1)
     return A, B + np.broadcast_to(arrive, (K, K))
 
@@ -133,6 +137,7 @@ def filters(n: int, groups: Any) -> dict[str, Any]:
         "m": np.zeros((n, K)),
         "m_next": np.zeros((n, K)),
         "C": np.zeros((n, n, K)),
+        **no_rest(ratio),
         **no_trend(n, len(LADDER) + len(LEARNED)),
         **no_direction(n, len(LADDER) + len(LEARNED) + len(TREND)),
         "Z": np.zeros((n, n)),
@@ -167,12 +172,12 @@ def find_shares(s: State, l: int) -> None:
 
 
 @kernel
-def learn_rate(s: State, l: int) -> None:
-    """How rare changes are: those that the modes of ratio 1 end, as a share of those expected; never above 1."""
+def learn_rate(s: State, ended: float, l: int) -> None:
+    """How rare changes are: those that end in the modes of ratio 1, as a share of those expected; never above 1."""
     for j in range(s.modes[l]):
         s.row[j, l] = s.moves[2, j, l] * s.mu[j, l]
     fade = 1.0 - 1.0 / SPAN
-    s.jumps[l] = fade * s.jumps[l] + sum_of_row(s, l)
+    s.jumps[l] = fade * s.jumps[l] + ended + sum_of_row(s, l)
     s.watched[l] = fade * s.watched[l] + 1.0
     s.calm[l] = max(CALMEST, min(1.0, (EVENTS + s.jumps[l]) / (EVENTS + JUMP * s.watched[l])))
 
@@ -184,7 +189,7 @@ def mix(s: State, l: int) -> None:
     Means are taken relative to that of the mixture, d, so that moments may be added before the mean is subtracted.
     """
     n, K = s.theta.shape[0], s.modes[l]
-    learn_rate(s, l)
+    learn_rate(s, come_to_rest(s, l), l)
     find_shares(s, l)
     s.row[0, l], s.row[K + 1, l] = 0.0, 0.0
     for a in range(n):

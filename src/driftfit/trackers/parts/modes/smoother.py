@@ -74,7 +74,7 @@ def estimated_variances(
     after = np.where(weighed[:, None], fields["joint"].sum(axis=1), fields["prior"])
     J = len(state["level"]) - 1
     w, span, learned = (
-        given_all(after, *chain(state["moves"], state["arrive"]), fields["calm"], weighed),
+        given_all(after, *chain(state["moves"], state["arrive"], state["over"]), fields["calm"], weighed),
         r * time,
         state["learned"],
     )
