@@ -16,8 +16,8 @@ The first readings are accepted unchecked, because there is nothing to compare t
 
 `absurd` judges a whole record instead, for warnings and searches.
 
-Source: the rule of `driftfit.trackers.parts.outlying_readings`, which judges sooner, because its tracker knows the
-variance of the noise. Cost per sample: a few comparisons.
+Source: the rule of `driftfit.trackers.parts.faults.outlying_readings`, which judges sooner, because its tracker knows
+the variance of the noise. Cost per sample: a few comparisons.
 """
 
 from __future__ import annotations

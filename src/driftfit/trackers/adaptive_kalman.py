@@ -11,11 +11,11 @@ drifts. The filters are the modes of a Markov chain and interact (`driftfit.trac
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each
 filter the levels are merged at once, by a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings far
-outside the usual range are left out (`driftfit.trackers.parts.outlying_readings`), and r is never below the variance
-due to coarse readings (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap
-of the parameters (`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is frozen at its
-last value are left out too (`driftfit.trackers.parts.frozen`). If innovations are correlated, the previous one is an
-additional regressor (`driftfit.trackers.parts.modes.coloured`).
+outside the usual range are left out (`driftfit.trackers.parts.faults.outlying_readings`), and r is never below the
+variance due to coarse readings (`driftfit.trackers.parts.coarse.resolution`). Outliers that keep coming are a change of
+level: a leap of the parameters (`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is
+frozen at its last value are left out too (`driftfit.trackers.parts.faults.frozen_readings`). If innovations are
+correlated, the previous one is an additional regressor (`driftfit.trackers.parts.modes.coloured`).
 
 The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
 estimates themselves (`driftfit.trackers.parts.modes.filters`). The one-step variance excludes the outlier level, so its
@@ -50,6 +50,7 @@ from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coarse.resolution import resolution, resolve, unresolved
 from driftfit.trackers.parts.coarse.shared_rounding import nothing_shared_among_filters, share_among_filters
 from driftfit.trackers.parts.coordinates import (
     FRAME,
@@ -71,6 +72,15 @@ from driftfit.trackers.parts.excitation import (
     window,
 )
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
+from driftfit.trackers.parts.faults.frozen_readings import held_readings, leave_out_frozen, not_frozen
+from driftfit.trackers.parts.faults.outlying_readings import (
+    FIRST,
+    bound_leverage,
+    learn_proportion,
+    leave_out,
+    no_proportion,
+    proportion,
+)
 from driftfit.trackers.parts.faults.stored_samples import machine_doubt
 from driftfit.trackers.parts.faults.strange_inputs import (
     BEYOND,
@@ -82,7 +92,6 @@ from driftfit.trackers.parts.faults.strange_inputs import (
     learn_stored_inputs,
     no_strange_inputs,
 )
-from driftfit.trackers.parts.frozen import held_readings, leave_out_frozen, not_frozen
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.filters import (
     enter_filters,
@@ -98,15 +107,6 @@ from driftfit.trackers.parts.modes.noise_levels import any_level, finest, learn_
 from driftfit.trackers.parts.modes.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
 from driftfit.trackers.parts.modes.start import begin_with_drift, faults, reconsider, take_start
 from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
-from driftfit.trackers.parts.outlying_readings import (
-    FIRST,
-    bound_leverage,
-    learn_proportion,
-    leave_out,
-    no_proportion,
-    proportion,
-)
-from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
 LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi * math.sqrt(3.0))))
 """log(gamma((nu + 1) / 2) / gamma(nu / 2) / sqrt(pi nu)) of Student's density, for nu = 1, 2, 3."""

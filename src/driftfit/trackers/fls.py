@@ -41,6 +41,7 @@ from driftfit.engine.settings import covariance, matrix, numbers, plain, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.parts import second_differences
+from driftfit.trackers.parts.coarse.resolution import resolution, resolve
 from driftfit.trackers.parts.coarse.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.diffuse import (
     SCRATCH,
@@ -51,7 +52,6 @@ from driftfit.trackers.parts.diffuse import (
 )
 from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
 from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
-from driftfit.trackers.parts.resolution import resolution, resolve
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.rls import forget_variance, learn_variance, no_scale
 

@@ -59,12 +59,12 @@ from driftfit.engine.settings import covariance, matrix, numbers, vector
 from driftfit.models.base import Model
 from driftfit.trackers import rls
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coarse.resolution import resolution, resolve
 from driftfit.trackers.parts.coarse.shared_rounding import folded
 from driftfit.trackers.parts.covariance import LEFT, product_with, symmetric_product
 from driftfit.trackers.parts.diffuse import SCRATCH, knowing, knowing_nothing
 from driftfit.trackers.parts.faults.contradictions import add_to_block, contradictions
 from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
-from driftfit.trackers.parts.resolution import resolution, resolve
 from driftfit.trackers.rls import fade, learn_settling_variance, no_scale, no_settling, settling_of
 
 FOLLOWING = 0.05

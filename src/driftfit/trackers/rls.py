@@ -6,8 +6,8 @@
 
 It minimises sum lambda^(t-k) (y_k - phi_k' theta)^2 with a memory of 1/(1 - lambda) nominal samples. P is in units of
 the noise variance, which is estimated on-line: sum(e^2 / s) / count over the samples after the start, and not below the
-limit of coarse readings (`driftfit.trackers.parts.resolution`). Errors of rounding that readings share widen ``std``
-(`driftfit.trackers.parts.coarse.shared_rounding`).
+limit of coarse readings (`driftfit.trackers.parts.coarse.resolution`). Errors of rounding that readings share widen
+``std`` (`driftfit.trackers.parts.coarse.shared_rounding`).
 
 Use it if all parameters drift alike and nothing is known about noise and drift. Without excitation exponential
 forgetting would let P grow without bound. It stops when a variance is ``c_max`` times its value at the time when the
@@ -46,6 +46,7 @@ from driftfit.engine.kernel import Array, State, exp, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coarse.resolution import least_noise, resolution, resolve, unresolved
 from driftfit.trackers.parts.coarse.shared_rounding import folded, nothing_shared, share_rounding, spanned_folded
 from driftfit.trackers.parts.diffuse import (
     SCRATCH,
@@ -59,7 +60,6 @@ from driftfit.trackers.parts.diffuse import (
 )
 from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
 from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
-from driftfit.trackers.parts.resolution import least_noise, resolution, resolve, unresolved
 
 RECENT, RECENT_SHARE, LATER_SHARE = 20.0, 0.125, 0.25
 """Memory of the present noise variance: samples, and shares of those so far for the unit of P and for the scale."""

@@ -38,8 +38,8 @@ usual, or (y - m)^2 at most REACH^2 v without a prediction. Ordinary samples are
 its square and of e^2 / s. Before a sample that is not ordinary is judged, the block is closed: its sums enter the
 means. It is also closed when it has a quarter as many samples as there were readings before.
 
-Source: ours; see `driftfit.trackers.parts.outlying_readings` for the rule of a tracker that learns its own noise. Cost
-per ordinary sample: two comparisons, three sums, and the range of the regressors.
+Source: ours; see `driftfit.trackers.parts.faults.outlying_readings` for the rule of a tracker that learns its own
+noise. Cost per ordinary sample: two comparisons, three sums, and the range of the regressors.
 """
 
 from __future__ import annotations

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, exp, kernel, log
+from driftfit.trackers.parts.coarse.resolution import reading, same_reading
 from driftfit.trackers.parts.diffuse import know_nothing, take_in
 from driftfit.trackers.parts.excitation import learn_information, learn_scales
 from driftfit.trackers.parts.faults.first_samples import (
@@ -37,6 +38,7 @@ from driftfit.trackers.parts.faults.first_samples import (
     contradict,
     doubtful,
 )
+from driftfit.trackers.parts.faults.outlying_readings import bound_leverage, learn_proportion
 from driftfit.trackers.parts.faults.stored_samples import (
     doubtful_samples,
     recall,
@@ -47,8 +49,6 @@ from driftfit.trackers.parts.faults.stored_samples import (
 from driftfit.trackers.parts.modes.filters import absorb, project, wander
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
 from driftfit.trackers.parts.modes.weights import WINDOW
-from driftfit.trackers.parts.outlying_readings import bound_leverage, learn_proportion
-from driftfit.trackers.parts.resolution import reading, same_reading
 from driftfit.trackers.rls import learn_scale
 
 LOOSE = 1e4
@@ -94,7 +94,7 @@ def take_start(s: State, l: int) -> None:
 
 @kernel
 def forget(s: State, l: int) -> None:
-    """As before the first sample, but for the readings that `driftfit.trackers.parts.resolution` compares."""
+    """As before the first sample, but for the readings that `driftfit.trackers.parts.coarse.resolution` compares."""
     n = s.theta.shape[0]
     for i in range(n):
         s.theta[i, l], s.c[i, l], s.active[i, l] = s.m[i, 0, l], 0.0, 0.0

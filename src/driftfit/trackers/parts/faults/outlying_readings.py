@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.resolution import reading
+from driftfit.trackers.parts.coarse.resolution import reading
 
 REACH = 10.0
 """Standard deviations of the readings beyond which one is an outlier."""

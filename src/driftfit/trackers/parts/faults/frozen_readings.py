@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, exp, kernel
-from driftfit.trackers.parts.resolution import reading, same_reading
+from driftfit.trackers.parts.coarse.resolution import reading, same_reading
 
 ENTER, STAY = 0.001, 0.98
 """Probability that a sensor freezes, and that it stays frozen, per reading."""
