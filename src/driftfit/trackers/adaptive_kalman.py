@@ -37,7 +37,6 @@ for two to eight parameters, and 20 for more.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -46,7 +45,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, State, kernel, log
+from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
@@ -73,25 +72,16 @@ from driftfit.trackers.parts.excitation import (
 )
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
 from driftfit.trackers.parts.faults.frozen_readings import held_readings, leave_out_frozen, not_frozen
+from driftfit.trackers.parts.faults.omissions import omissions
 from driftfit.trackers.parts.faults.outlying_readings import (
     FIRST,
     bound_leverage,
     learn_proportion,
     leave_out,
     no_proportion,
-    proportion,
 )
 from driftfit.trackers.parts.faults.stored_samples import machine_doubt
-from driftfit.trackers.parts.faults.strange_inputs import (
-    BEYOND,
-    SELDOM,
-    SURE,
-    blame_of_inputs,
-    inputs_left_out,
-    learn_inputs,
-    learn_stored_inputs,
-    no_strange_inputs,
-)
+from driftfit.trackers.parts.faults.strange_inputs import learn_inputs, leave_out_input, no_strange_inputs
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.filters import (
     enter_filters,
@@ -105,18 +95,8 @@ from driftfit.trackers.parts.modes.filters import (
 from driftfit.trackers.parts.modes.ladder import filters, mix
 from driftfit.trackers.parts.modes.noise_levels import any_level, finest, learn_noise, noise_prior
 from driftfit.trackers.parts.modes.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
-from driftfit.trackers.parts.modes.start import begin_with_drift, faults, reconsider, take_start
+from driftfit.trackers.parts.modes.start import begin_with_drift, faults, reconsider, start_density, take_start
 from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
-
-LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi * math.sqrt(3.0))))
-"""log(gamma((nu + 1) / 2) / gamma(nu / 2) / sqrt(pi nu)) of Student's density, for nu = 1, 2, 3."""
-
-
-@kernel
-def start_density(e: float, s: float, nu: float) -> float:
-    """Student's log density of an innovation of the start, which has fewer than `RESIDUALS` before it; NaN for none."""
-    ratio = LOG_RATIOS[0] if nu < 1.5 else LOG_RATIOS[1] if nu < 2.5 else LOG_RATIOS[2]
-    return ratio - 0.5 * (log(s) + (nu + 1.0) * log(1.0 + e * e / (nu * s)))  # type: ignore[no-any-return]
 
 
 @kernel
@@ -135,17 +115,6 @@ def go_on(s: State, l: int) -> None:
     unseen_variance(s, l)
 
 
-@partial(kernel, inline=False)
-def leave_out_input(s: State, l: int) -> None:
-    """Leave out a sample with an input at fault; s.e and s.s must be known."""
-    blame = 0.0
-    if s.ok[l] > 0.0 and (s.e[l] * s.e[l] > SURE * SURE * s.s[l] or s.distrusted[l] > 0.0):
-        blame = blame_of_inputs(s, s.e[l], s.s[l], BEYOND, l)
-    s.distrusted[l] = max(s.distrusted[l] + (blame if blame > 0.0 else -SELDOM * s.ok[l]), 0.0)
-    s.inputs_out[l] += 1.0 if blame > 0.0 else 0.0
-    s.ok[l] = 0.0 if blame > 0.0 else s.ok[l]
-
-
 @partial(kernel, short=True)
 def settle(s: State, l: int) -> None:
     """Start the filters from least squares once there are residuals to estimate r: z = M theta ~ N(d, r I)."""
@@ -157,7 +126,6 @@ def settle(s: State, l: int) -> None:
             s.m[i, k, l] = s.d[i, l]
             s.C[i, i, k, l] = 1.0 if s.S[i, i, l] > 0.0 else 0.0
     frame(s, l)
-    learn_stored_inputs(s, l)
     begin_with_drift(s, finest(s, l), l)
     mixture(s, l)
     go_on(s, l)
@@ -321,8 +289,6 @@ class AdaptiveKalman(Tracker):
             **nothing_shared_among_filters(),
             **no_weights(n),
             **no_strange_inputs(n),
-            "inputs_out": 0.0,
-            "distrusted": 0.0,
             **white(n),
             **modes,
             **levels,
@@ -386,8 +352,7 @@ class AdaptiveKalman(Tracker):
             facts.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
         return (
             *facts,
-            *proportion(lane),
-            *inputs_left_out(lane),
+            *omissions(lane),
             *held_readings(lane),
             *resolution(lane),
             *colour(lane),
