@@ -45,7 +45,7 @@ def test_a_few_fault_codes_are_no_drift_of_a_hammerstein_wiener_system(output):
         assert verdict.pays is False
         assert verdict.rms < 0.03
         assert np.isfinite(verdict.rivals[2].rms)
-        assert "4 samples out of all proportion" in str(run.summary())
+        assert "4 readings out of all proportion" in str(run.summary())
 
 
 def columns(kind, moves):
