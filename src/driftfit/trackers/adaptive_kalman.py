@@ -1,6 +1,6 @@
 """A Kalman filter that estimates its own settings: drift ratio, noise variance and jumps, from the data as they arrive.
 
-K random-walk filters run side by side. Filter k lets parameter i drift by ``q_ki = ratio_k w_ki r / c_i`` a nominal
+K random-walk filters run side by side. Filter k lets parameter i drift by ``q_ki = ratio_k w_ki r / c_i`` per nominal
 sample, where r is the present noise variance and c_i the mean square of regressor i, so ratio_k w_ki is the share of r
 that the drift of one parameter adds to the output per sample, whatever the units. The first ratio is 0. In the common
 ladder of ratios all weights w are 1; in a second one they are learned from the record
@@ -10,12 +10,15 @@ ladder of ratios all weights w are 1; in a second one they are learned from the 
 drifts. The filters are the modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each
-filter the levels are merged at once, by a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings far
-outside the usual range are left out (`driftfit.trackers.parts.faults.outlying_readings`), and r is never below the
-variance due to coarse readings (`driftfit.trackers.parts.coarse.resolution`). Outliers that keep coming are a change of
-level: a leap of the parameters (`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is
-frozen at its last value are left out too (`driftfit.trackers.parts.faults.frozen_readings`). If innovations are
-correlated, the previous one is an additional regressor (`driftfit.trackers.parts.modes.coloured`).
+filter the levels are merged at once, by a rank-one update (`driftfit.trackers.parts.modes.filters`). The variance r is
+never below that due to coarse readings (`driftfit.trackers.parts.coarse.resolution`). If innovations are correlated,
+the previous one is an additional regressor (`driftfit.trackers.parts.modes.coloured`).
+
+Three kinds of samples are left out: readings far outside the usual range
+(`driftfit.trackers.parts.faults.outlying_readings`), inputs far outside theirs to which the output does not respond
+(`driftfit.trackers.parts.faults.strange_inputs`), and readings of a sensor that is frozen at its last value
+(`driftfit.trackers.parts.faults.frozen_readings`). Outliers that keep coming are a change of level: a leap of the
+parameters (`driftfit.trackers.parts.modes.ladder`), or more noise.
 
 The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
 estimates themselves (`driftfit.trackers.parts.modes.filters`). The one-step variance excludes the outlier level, so its

@@ -40,8 +40,8 @@ sum is more than a million times 1 / w + zeta' C zeta: it has lost its digits.
 
 Source: Young, Recursive Estimation and Time-Series Analysis (2011), chapters 6 (the auxiliary model, and its filter)
 and 7; Soderstrom and Stoica, Instrumental Variable Methods for System Identification (1983), chapter 6. Departures: the
-diffuse start and the cap of `RLS`; the limit of x; the skipped samples; C in the place of the variance matrix of white
-noise in a constant system. Cost per sample: O(n^2), about three times `RLS`.
+diffuse start, the cap, and the samples left out of `RLS`; the limit of x; the skipped samples; C in the place of the
+variance matrix of white noise in a constant system. Cost per sample: O(n^2), about three times `RLS`.
 """
 
 from __future__ import annotations

@@ -19,7 +19,8 @@ numbers for ordinary data, and positive variances for collinear or badly scaled 
 at O(n^3).
 
 Source: Kalman (1960); as a parameter tracker Young, Recursive Estimation and Time-Series Analysis (2011), chapter 4.
-Departures: only one triangle of P is kept; an exact diffuse start (`driftfit.trackers.parts.diffuse`). Cost per sample:
+Departures: only one triangle of P is kept; an exact diffuse start (`driftfit.trackers.parts.diffuse`); without laws,
+samples that contradict all before are left out (`driftfit.trackers.parts.faults.contradictions`). Cost per sample:
 O(n^2).
 """
 

@@ -29,8 +29,9 @@ is unchanged. There is no wind-up: without excitation nothing is forgotten, so n
 samples only. With one parameter the two kinds are the same.
 
 Source: Ljung, System Identification (1999), eq. 11.12; Plackett (1950) for lambda = 1. Departures: forgetting depends
-on time (dt, and also if y is missing); the cap; an exact diffuse start. Directional forgetting: Hagglund (1983),
-Kulhavy and Karny (1984). Cost per sample: O(n^2).
+on time (dt, and also if y is missing); the cap; an exact diffuse start; samples that contradict all before are left out
+(`driftfit.trackers.parts.faults.contradictions`). Directional forgetting: Hagglund (1983), Kulhavy and Karny (1984).
+Cost per sample: O(n^2).
 """
 
 from __future__ import annotations

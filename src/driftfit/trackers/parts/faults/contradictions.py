@@ -159,6 +159,7 @@ def judge(s: State, y: float, shown: float, v: float, blame: float, l: int) -> N
     ``shown`` is the predicted reading, v the variance of y - ``shown`` by the tracker, and ``blame`` the trust that the
     range of the inputs says the sample costs, 0 without blame.
     """
+    # is it strange, and is its reading to blame (off > out) or its prediction?
     e, off, out = y - shown, abs(y - s.y_mean[l]), abs(shown - s.y_mean[l])
     reach, widening = REACH * REACH * s.y_variance[l], s.widening[l]
     sure = SURE if off > out else LIKELY
@@ -167,12 +168,14 @@ def judge(s: State, y: float, shown: float, v: float, blame: float, l: int) -> N
     trusted = (off > out) | (s.distrusted[l] < TRUST)
     unpredicted = (s.observed[l] > s.valid[l]) & (s.y_count[l] >= s.judged_from[l])
     outside = unpredicted & (off * off > reach)
+    # the factor p: a strange reading is compared with the last one before it is judged
     of_reading, apart, follows = outside | (off > out), abs(y - s.y_strange[l]), widening > 1.0
     persists = follows & (apart > 0.0) & (apart < ALIKE * off)
     of_readings = min((QUICK if persists else SLOWEST) * widening, LONGEST)
     p = of_readings if of_reading & follows else widening
     beyond = strange & trusted & (e * e > reach * p * p)
     refused = (beyond & (off > out)) | (outside & (off * off > reach * p * p))
+    # the lags of a strange input are left out where they would outweigh all samples before, or contradict them
     lasting = strange & (not beyond) & (p > LASTING)
     lagging = (
         judged
@@ -185,6 +188,7 @@ def judge(s: State, y: float, shown: float, v: float, blame: float, l: int) -> N
     blamed = judged & (blame > 0.0)
     left = beyond | lagging | blamed
     spend_trust(s, blame if blamed else (1.0 if left & (off <= out) else 0.0), l)
+    # what the next samples are compared with
     of_prediction = (1.0 if out * SAME < s.farthest[l] else SLOWEST) if out < SAME * s.farthest[l] else SLOW
     grown = of_readings if of_reading else min(of_prediction * widening, LONGEST)
     left_over = 0.0 if lasting else max(s.lagging[l] - 1.0, 0.0)
