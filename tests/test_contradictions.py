@@ -72,7 +72,7 @@ def test_a_fault_code_in_the_middle_does_no_harm(pair):
         away = np.abs(fleet[k].theta - whole)[:, :4].max(1)
         assert away[200] < 0.03 if k < 17 else away[400] < 0.02, k
         assert away[-1] < 0.01, k
-        assert fleet[k].state["left_out"] + fleet[k].state.get("refused", 0.0) > 0.0, k
+        assert sum(fleet[k].state.get(name, 0.0) for name in ("left_out", "inputs_out", "refused")) > 0.0, k
 
 
 @pytest.mark.parametrize("tracker", DIFFUSE, ids=repr)
@@ -156,7 +156,7 @@ def test_a_stream_leaves_out_the_same():
     for one in zip(y, u, strict=True):
         live.update(*one)
     np.testing.assert_array_equal(live.theta, run.theta[-1])
-    assert run.state["left_out"] == 5.0
+    assert (run.state["left_out"], run.state["inputs_out"]) == (3.0, 2.0)
 
 
 @pytest.mark.parametrize("tracker", [RLS(0.98), Kalman(q=1e-4, r=0.01)], ids=repr)
@@ -167,11 +167,11 @@ def test_what_is_no_fault_is_learned_from(tracker):
     u[200], u[300:] = 10.0, rng.normal(size=200)
     noise = 0.1 * rng.normal(size=T)
     run = track(Regression(1), tracker, 2.0 * u + noise, u)
-    assert run.state["left_out"] == 0.0
+    assert run.state["left_out"] == run.state["inputs_out"] == 0.0
     assert abs(run.theta[200, 0] - 2.0) < 0.05
     u = rng.normal(size=T)
     run = track(Regression(1), tracker, np.where(np.arange(T) < 250, 2.0, -4.0) * u + noise, u)
-    assert run.state["left_out"] == 0.0
+    assert run.state["left_out"] == run.state["inputs_out"] == 0.0
     run = track(Regression(0, intercept=True), tracker, np.where(np.arange(T) < 250, 0.0, 10.0) + noise)
     assert 0.0 < run.state["left_out"] <= 5.0
     assert abs(run.theta[-1, 0] - 10.0) < 0.1

@@ -26,9 +26,9 @@ from driftfit import (
 from driftfit.smooth.parts.pooled_drift import pooled
 from driftfit.systems import scenarios
 from driftfit.systems.arc_furnace import switching
+from driftfit.trackers.parts.faults.outlying_readings import LEVERAGE
 from driftfit.trackers.parts.modes.filters import UNSURE
 from driftfit.trackers.parts.modes.noise_levels import OUTLIER, level_chain
-from driftfit.trackers.parts.outlying_readings import LEVERAGE
 
 T = 1500
 MODEL, PLANT = Regression(3), ARX(2, 2)
@@ -121,7 +121,7 @@ def test_a_fault_code_is_left_out_and_does_no_harm(code, count):
         theta = run.theta / [1.0, 1.0, unit, unit]
         assert np.abs(theta - clean.theta)[100:200].max() < 0.15
         assert np.abs(theta - clean.theta)[300:].max() < 0.02
-    assert f"{count} readings out of all proportion" in str(run.summary())
+    assert f"{count} samples out of all proportion" in str(run.summary())
 
 
 def test_a_change_of_level_that_stays_is_taken_in():

@@ -36,7 +36,7 @@ def test_a_code_in_an_input_does_as_little_harm_as_a_gap(tracker):
         for k in (1, 2, 3):
             away = np.abs(fleet[k].theta - fleet[0].theta)[60 if min(places) < 20 else min(places) :]
             assert away.max() < 0.03
-            assert fleet[k].state["left_out"] + fleet[k].state.get("inputs_out", 0.0) >= len(places)
+            assert fleet[k].state["left_out"] + fleet[k].state["inputs_out"] >= len(places)
 
 
 def honest(what):
@@ -58,7 +58,8 @@ def honest(what):
 @pytest.mark.parametrize("what", ["steps", "rare", "pulses", "tails", "at rest", "floods"])
 def test_a_large_input_to_which_the_output_responds_is_learned_from(what, tracker):
     run = track(PLANT, tracker, *honest(what))
-    assert run.state["inputs_out" if tracker == AdaptiveKalman() else "left_out"] == 0.0
+    assert run.state["inputs_out"] == 0.0
+    assert tracker == AdaptiveKalman() or run.state["left_out"] == 0.0
 
 
 @pytest.mark.parametrize("tracker", TRACKERS[:3], ids=repr)
@@ -82,5 +83,5 @@ def test_a_stream_leaves_out_the_same_and_the_summary_names_it():
             live.update(*one)
         assert same(live.theta, run.theta[-1])
         assert list(np.flatnonzero(~run.ok[20:]) + 20) == list(range(301, 307))
-        assert "6 samples" in str(run.summary())
-    assert "the output did not" in str(track(PLANT, AdaptiveKalman(), y, u).summary())
+        assert (run.state["inputs_out"], run.state["left_out"]) == (6.0, 0.0)
+        assert "6 samples with an input or a lag far outside its range" in " ".join(str(run.summary()).split())

@@ -125,5 +125,6 @@ def test_a_plant_at_rest_has_shown_nothing_of_its_range(tracker):
         u, y = np.where(np.arange(T) < 100, 0.3, 0.3 + 0.02 * rng.normal(size=T)), np.full(T, 98.0)
         for t in range(100, T):
             y[t] = 98.0 + 0.9 * (y[t - 1] - 98.0) + 2.0 * (u[t - 1] - 0.3) + 0.02 * rng.normal()
-        left += int(track(PLANT, tracker, y, u).state["left_out"])
+        state = track(PLANT, tracker, y, u).state
+        left += int(state["left_out"] + state["inputs_out"])
     assert left == 0

@@ -11,7 +11,8 @@ from driftfit.data.record import Record
 from driftfit.engine.kernel import Array
 from driftfit.judge.compare import Errors, errors
 from driftfit.judge.constant_fit import constant_least_squares
-from driftfit.judge.regressors import Distinct, Rows, distinct, regressors, without_left_out
+from driftfit.judge.left_out import without_left_out
+from driftfit.judge.regressors import Distinct, Rows, distinct, regressors
 from driftfit.judge.statistics.constancy import Constancy, constancy
 from driftfit.run.result import Track
 
@@ -38,35 +39,35 @@ class Evidence:
         return regressors(self.run, self._steady)
 
     @cached_property
-    def _whole(self) -> Constancy:
-        """The test of all parameters."""
-        return constancy(self.rows.phi, self.rows.y, self.lags, self.rows.at)
+    def _found(self) -> tuple[Distinct, Rows, Constancy]:
+        """The parameters that a test can tell apart, the samples with their regressors, and the test."""
+        rows, every = self.rows, Distinct(tuple(range(self.run.model.n)), ())
+        test = constancy(rows.phi, rows.y, self.lags, rows.at)
+        found = distinct(rows.phi) if np.isnan(test.p_joint) else every
+        if len(found.kept) in (0, self.run.model.n):
+            return every, rows, test
+        rows = rows._replace(phi=np.ascontiguousarray(rows.phi[:, found.kept]))
+        return found, rows, constancy(rows.phi, rows.y, self.lags, rows.at)
 
-    @cached_property
+    @property
     def distinct(self) -> Distinct:
         """The parameters that the test can tell apart; it takes the others for 0."""
-        every = Distinct(tuple(range(self.run.model.n)), ())
-        found = distinct(self.rows.phi) if np.isnan(self._whole.p_joint) else every
-        return found if found.kept else every
+        return self._found[0]
 
-    @cached_property
+    @property
     def tested(self) -> Rows:
-        """The same samples with the regressors of these parameters."""
-        if len(self.names) == self.run.model.n:
-            return self.rows
-        return self.rows._replace(phi=np.ascontiguousarray(self.rows.phi[:, self.distinct.kept]))
+        """The samples with the regressors of these parameters."""
+        return self._found[1]
 
-    @cached_property
+    @property
+    def test(self) -> Constancy:
+        """Whether constants explain them."""
+        return self._found[2]
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of these parameters."""
         return tuple(self.run.model.names[i] for i in self.distinct.kept)
-
-    @cached_property
-    def test(self) -> Constancy:
-        """Whether constants explain it."""
-        if len(self.names) == self.run.model.n:
-            return self._whole
-        return constancy(self.tested.phi, self.tested.y, self.lags, self.tested.at)
 
     @cached_property
     def errors(self) -> Errors:

@@ -16,8 +16,8 @@ The first readings are accepted unchecked, because there is nothing to compare t
 
 `absurd` judges a whole record instead, for warnings and searches.
 
-Source: the rule of `driftfit.trackers.parts.outlying_readings`, which judges sooner, because its tracker knows the
-variance of the noise. Cost per sample: a few comparisons.
+Source: the rule of `driftfit.trackers.parts.faults.outlying_readings`, which judges sooner, because its tracker knows
+the variance of the noise. Cost per sample: a few comparisons.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ FIRST = 10.0
 """Readings that are accepted unchecked."""
 MEMORY = 1000.0
 """Memory of their mean and variance, in readings."""
-QUICK, SLOW = 2.0, 2.0 ** (1.0 / 16.0)
+QUICK, SLOWEST = 2.0, 2.0 ** (1.0 / 16.0)
 """Growth of p for readings that persist, and for values that jump."""
 ALIKE = 0.25
 """A reading persists if it differs from the last one by less than this share of its distance from m."""
 LONGEST = 1e12
 """Upper bound of p."""
 
-FAR, GAP, FEWEST = 300.0, 10.0, 20
-"""Usual deviations beyond which a value may be a fault code, how many times further than the others it must then be,
-and the number of values that this judgement needs."""
+ABSURD, GAP, FEWEST = 300.0, 10.0, 20
+"""Usual deviations from the median beyond which a value may be a fault code, how many times further than the others it
+must then be, and the number of values that this judgement needs."""
 
 UNJUDGED: Mapping[str, Any] = {
     "usual": 0.0, "usual_spread": 0.0, "judged": 0.0, "accepted": np.nan, "raw": np.nan, "forbearance": 1.0,
@@ -55,7 +55,7 @@ UNJUDGED: Mapping[str, Any] = {
 
 
 def absurd(x: Array) -> Array:
-    """The values of a signal (T,) that are `FAR` times its usual deviation from its median, by sample; often empty.
+    """The values of a signal (T,) that are `ABSURD` times its usual deviation from its median, by sample; often empty.
 
     The usual deviation is the median one of those that are not zero, so that a signal may rest most of the time. That
     of rain is some tenths of a millimetre, so a storm is as far as a code; but only a code is `GAP` times further than
@@ -66,13 +66,15 @@ def absurd(x: Array) -> Array:
     moving = np.sort(away[known & (away > 0.0)])
     if len(moving) < FEWEST:
         return np.empty(0, int)
-    beyond = moving[1:][(moving[1:] > FAR * float(np.median(moving))) & (moving[1:] > GAP * moving[:-1])]
+    beyond = moving[1:][(moving[1:] > ABSURD * float(np.median(moving))) & (moving[1:] > GAP * moving[:-1])]
     return np.flatnonzero(known & (away >= beyond.min(initial=np.inf)))
 
 
 @kernel
-def judge(s: State, y_hat: float, l: int) -> None:
-    """Refuse a strange reading; y_hat is NaN where there is no prediction."""
+def refused(s: State, y_hat: float, l: int) -> bool:
+    """Whether the reading s.y is refused, and what later readings are compared with; y_hat is NaN where there is no
+    prediction. A missing reading is not judged.
+    """
     y = s.y[l]
     observed, fresh = abs(y) < LARGEST, y != s.raw[l]
     apart, off = (y - s.accepted[l]) ** 2, (y - y_hat) ** 2
@@ -82,12 +84,11 @@ def judge(s: State, y_hat: float, l: int) -> None:
     strange = observed & (s.judged[l] >= FIRST) & (near > reach)
     out = strange & (near > reach * s.forbearance[l] * s.forbearance[l])
     persists = abs(y - s.raw[l]) < ALIKE * abs(y - s.usual[l])
-    growth = (QUICK if persists else SLOW) if fresh else 1.0
+    growth = (QUICK if persists else SLOWEST) if fresh else 1.0
     longer = min(growth * s.forbearance[l], LONGEST)
     s.forbearance[l] = longer if strange else (1.0 if observed else s.forbearance[l])
     s.raw[l] = y if observed else s.raw[l]
     s.refused[l] += 1.0 if out else 0.0
-    s.y[l] = np.nan if out else y
     if observed & (not out):
         s.accepted[l] = y
         if fresh | (s.judged[l] < 1.0):
@@ -96,6 +97,7 @@ def judge(s: State, y_hat: float, l: int) -> None:
             away = y - s.usual[l]
             s.usual[l] += share * away
             s.usual_spread[l] += share * ((1.0 - share) * away * away - s.usual_spread[l])
+    return out  # type: ignore[no-any-return]
 
 
 @kernel

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import State, kernel
-from driftfit.models.fault_codes import UNJUDGED, judge
+from driftfit.models.fault_codes import UNJUDGED, refused
 
 MEMORY: Mapping[str, Any] = {
     "shift": 0.0, "measured": np.nan, "without": 0.0, "usable": 0.0, "started": 0.0, "last_row": np.nan,
@@ -41,7 +41,7 @@ def subtract(s: State, shift: float, complete: bool, l: int) -> None:
     y_hat = shift
     for i in range(s.phi.shape[0]):
         y_hat += s.phi[i, l] * s.theta[i, l]
-    judge(s, y_hat, l)
+    s.y[l] = np.nan if refused(s, y_hat, l) else s.y[l]
     s.shift[l] = shift
     s.measured[l] = s.y[l]
     s.y[l] -= shift

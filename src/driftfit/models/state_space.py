@@ -37,7 +37,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.models.fault_codes import UNJUDGED, judge
+from driftfit.models.fault_codes import UNJUDGED, refused
 from driftfit.models.formulas.functions import CLOCK, system_text
 from driftfit.models.formulas.text import Formula, Writer, parse, start_values, written
 from driftfit.models.inputs import NamedInputs
@@ -255,7 +255,7 @@ def _steps(equations: str, inputs: tuple[str, ...]) -> ModelSteps:
 
     @kernel
     def regress(s: State, l: int) -> None:
-        judge(s, np.nan, l)
+        s.y[l] = np.nan if refused(s, np.nan, l) else s.y[l]
         s.clock[l] += s.dt[l]
         for i in range(reach, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]

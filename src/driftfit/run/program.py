@@ -379,12 +379,6 @@ def shown(trackers: Sequence[Tracker]) -> str:
     return repr(trackers[0]) if len(set(trackers)) == 1 else ", ".join(map(repr, trackers))
 
 
-_last: list[tuple[Any, Any, Any, tuple[Program, ...]]] = [(None, None, None, ())]
-"""The model, the tracker and the inputs of the last programs: settings do not change, and hashing them takes longer
-than all else here.
-"""
-
-
 def programs_of(model: Model, tracker: Any, inputs: int | Sequence[str]) -> tuple[Program, ...]:
     """The program of each output of a model with these inputs; outputs that share one theta have one.
 
@@ -392,15 +386,9 @@ def programs_of(model: Model, tracker: Any, inputs: int | Sequence[str]) -> tupl
     are incomplete, or that cannot run together.
     """
     if len(model.outputs) == 1:
-        before, by, of, found = _last[0]
-        if model is before and tracker is by and inputs == of:
-            return found
         if not isinstance(tracker, Tracker):
             raise ValueError(f"a model with one output takes one tracker for each series; got {tracker!r}.")
-        given = inputs if isinstance(inputs, int) else tuple(inputs)
-        found = _programs(model, tracker, given)
-        _last[0] = model, tracker, given, found
-        return found
+        return _programs(model, tracker, inputs if isinstance(inputs, int) else tuple(inputs))
     if isinstance(tracker, Mapping) and not model.shared:
         if set(tracker) != set(model.outputs):
             raise ValueError(

@@ -21,7 +21,7 @@ from rich.text import Text
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.compare import persistence
-from driftfit.judge.regressors import without_left_out
+from driftfit.judge.left_out import without_left_out
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, counts, facts, key_text, table_of, together

@@ -1,6 +1,6 @@
 """A Kalman filter that estimates its own settings: drift ratio, noise variance and jumps, from the data as they arrive.
 
-K random-walk filters run side by side. Filter k lets parameter i drift by ``q_ki = ratio_k w_ki r / c_i`` a nominal
+K random-walk filters run side by side. Filter k lets parameter i drift by ``q_ki = ratio_k w_ki r / c_i`` per nominal
 sample, where r is the present noise variance and c_i the mean square of regressor i, so ratio_k w_ki is the share of r
 that the drift of one parameter adds to the output per sample, whatever the units. The first ratio is 0. In the common
 ladder of ratios all weights w are 1; in a second one they are learned from the record
@@ -11,12 +11,15 @@ drifts; and the last filter comes to rest after a change (`driftfit.trackers.par
 modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each
-filter the levels are merged at once, by a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings far
-outside the usual range are left out (`driftfit.trackers.parts.outlying_readings`), and r is never below the variance
-due to coarse readings (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap
-of the parameters (`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is frozen at its
-last value are left out too (`driftfit.trackers.parts.frozen`). If innovations are correlated, the previous one is an
-additional regressor (`driftfit.trackers.parts.modes.coloured`).
+filter the levels are merged at once, by a rank-one update (`driftfit.trackers.parts.modes.filters`). The variance r is
+never below that due to coarse readings (`driftfit.trackers.parts.coarse.resolution`). If innovations are correlated,
+the previous one is an additional regressor (`driftfit.trackers.parts.modes.coloured`).
+
+Three kinds of samples are left out: readings far outside the usual range
+(`driftfit.trackers.parts.faults.outlying_readings`), inputs far outside theirs to which the output does not respond
+(`driftfit.trackers.parts.faults.strange_inputs`), and readings of a sensor that is frozen at its last value
+(`driftfit.trackers.parts.faults.frozen_readings`). Outliers that keep coming are a change of level: a leap of the
+parameters (`driftfit.trackers.parts.modes.ladder`), or more noise.
 
 The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
 estimates themselves (`driftfit.trackers.parts.modes.filters`). The one-step variance excludes the outlier level, so its
@@ -38,7 +41,6 @@ for two to eight parameters, and 22 for more.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -47,10 +49,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, State, kernel, log
+from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coarse.resolution import resolution, resolve, unresolved
 from driftfit.trackers.parts.coarse.shared_rounding import nothing_shared_among_filters, share_among_filters
 from driftfit.trackers.parts.coordinates import (
     FRAME,
@@ -72,18 +75,17 @@ from driftfit.trackers.parts.excitation import (
     window,
 )
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
-from driftfit.trackers.parts.faults.stored_samples import machine_doubt
-from driftfit.trackers.parts.faults.strange_inputs import (
-    BEYOND,
-    SELDOM,
-    SURE,
-    blame_of_inputs,
-    inputs_left_out,
-    learn_inputs,
-    learn_stored_inputs,
-    no_strange_inputs,
+from driftfit.trackers.parts.faults.frozen_readings import held_readings, leave_out_frozen, not_frozen
+from driftfit.trackers.parts.faults.omissions import omissions
+from driftfit.trackers.parts.faults.outlying_readings import (
+    FIRST,
+    bound_leverage,
+    learn_proportion,
+    leave_out,
+    no_proportion,
 )
-from driftfit.trackers.parts.frozen import held_readings, leave_out_frozen, not_frozen
+from driftfit.trackers.parts.faults.stored_samples import machine_doubt
+from driftfit.trackers.parts.faults.strange_inputs import learn_inputs, leave_out_input, no_strange_inputs
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.filters import (
     enter_filters,
@@ -97,27 +99,8 @@ from driftfit.trackers.parts.modes.filters import (
 from driftfit.trackers.parts.modes.ladder import filters, mix
 from driftfit.trackers.parts.modes.noise_levels import any_level, finest, learn_noise, noise_prior
 from driftfit.trackers.parts.modes.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
-from driftfit.trackers.parts.modes.start import begin_with_drift, faults, reconsider, take_start
+from driftfit.trackers.parts.modes.start import begin_with_drift, faults, reconsider, start_density, take_start
 from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
-from driftfit.trackers.parts.outlying_readings import (
-    FIRST,
-    bound_leverage,
-    learn_proportion,
-    leave_out,
-    no_proportion,
-    proportion,
-)
-from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
-
-LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi * math.sqrt(3.0))))
-"""log(gamma((nu + 1) / 2) / gamma(nu / 2) / sqrt(pi nu)) of Student's density, for nu = 1, 2, 3."""
-
-
-@kernel
-def start_density(e: float, s: float, nu: float) -> float:
-    """Student's log density of an innovation of the start, which has fewer than `RESIDUALS` before it; NaN for none."""
-    ratio = LOG_RATIOS[0] if nu < 1.5 else LOG_RATIOS[1] if nu < 2.5 else LOG_RATIOS[2]
-    return ratio - 0.5 * (log(s) + (nu + 1.0) * log(1.0 + e * e / (nu * s)))  # type: ignore[no-any-return]
 
 
 @kernel
@@ -136,17 +119,6 @@ def go_on(s: State, l: int) -> None:
     unseen_variance(s, l)
 
 
-@partial(kernel, inline=False)
-def leave_out_input(s: State, l: int) -> None:
-    """Leave out a sample with an input at fault; s.e and s.s must be known."""
-    blame = 0.0
-    if s.ok[l] > 0.0 and (s.e[l] * s.e[l] > SURE * SURE * s.s[l] or s.distrusted[l] > 0.0):
-        blame = blame_of_inputs(s, s.e[l], s.s[l], BEYOND, l)
-    s.distrusted[l] = max(s.distrusted[l] + (blame if blame > 0.0 else -SELDOM * s.ok[l]), 0.0)
-    s.inputs_out[l] += 1.0 if blame > 0.0 else 0.0
-    s.ok[l] = 0.0 if blame > 0.0 else s.ok[l]
-
-
 @partial(kernel, short=True)
 def settle(s: State, l: int) -> None:
     """Start the filters from least squares once there are residuals to estimate r: z = M theta ~ N(d, r I)."""
@@ -158,7 +130,6 @@ def settle(s: State, l: int) -> None:
             s.m[i, k, l] = s.d[i, l]
             s.C[i, i, k, l] = 1.0 if s.S[i, i, l] > 0.0 else 0.0
     frame(s, l)
-    learn_stored_inputs(s, l)
     begin_with_drift(s, finest(s, l), l)
     mixture(s, l)
     go_on(s, l)
@@ -322,8 +293,6 @@ class AdaptiveKalman(Tracker):
             **nothing_shared_among_filters(),
             **no_weights(n),
             **no_strange_inputs(n),
-            "inputs_out": 0.0,
-            "distrusted": 0.0,
             **white(n),
             **modes,
             **levels,
@@ -387,8 +356,7 @@ class AdaptiveKalman(Tracker):
             facts.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
         return (
             *facts,
-            *proportion(lane),
-            *inputs_left_out(lane),
+            *omissions(lane),
             *held_readings(lane),
             *resolution(lane),
             *colour(lane),

@@ -41,6 +41,7 @@ from driftfit.engine.settings import covariance, matrix, numbers, plain, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.parts import second_differences
+from driftfit.trackers.parts.coarse.resolution import resolution, resolve
 from driftfit.trackers.parts.coarse.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.diffuse import (
     SCRATCH,
@@ -49,9 +50,9 @@ from driftfit.trackers.parts.diffuse import (
     knowing,
     knowing_nothing,
 )
-from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
+from driftfit.trackers.parts.faults.contradictions import judged_measurement
 from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
-from driftfit.trackers.parts.resolution import resolution, resolve
+from driftfit.trackers.parts.faults.omissions import omissions
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.rls import forget_variance, learn_variance, no_scale
 
@@ -186,7 +187,7 @@ class FLS(Tracker):
         return faults(field, phi, y, ok) if self.differences == 1 else super().left_out(field, phi, y, ok)
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return (*contradictions(run.state), *resolution(run.state))
+        return (*omissions(run.state), *resolution(run.state))
 
     def cov(self, lane: Mapping[str, Array]) -> Array:
         n = len(lane["theta"])

@@ -40,32 +40,29 @@ sum is more than a million times 1 / w + zeta' C zeta: it has lost its digits.
 
 Source: Young, Recursive Estimation and Time-Series Analysis (2011), chapters 6 (the auxiliary model, and its filter)
 and 7; Soderstrom and Stoica, Instrumental Variable Methods for System Identification (1983), chapter 6. Departures: the
-diffuse start and the cap of `RLS`; the limit of x; the skipped samples; C in the place of the variance matrix of white
-noise in a constant system. Cost per sample: O(n^2), about three times `RLS`.
+diffuse start, the cap, and the samples left out of `RLS`; the limit of x; the skipped samples; C in the place of the
+variance matrix of white noise in a constant system. Cost per sample: O(n^2), about three times `RLS`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel, nothing
-from driftfit.engine.settings import covariance, matrix, numbers, vector
 from driftfit.models.base import Model
 from driftfit.trackers import rls
-from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coarse.resolution import resolve
 from driftfit.trackers.parts.coarse.shared_rounding import folded
 from driftfit.trackers.parts.covariance import LEFT, product_with, symmetric_product
-from driftfit.trackers.parts.diffuse import SCRATCH, knowing, knowing_nothing
-from driftfit.trackers.parts.faults.contradictions import add_to_block, contradictions
-from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
-from driftfit.trackers.parts.resolution import resolution, resolve
-from driftfit.trackers.rls import fade, learn_settling_variance, no_scale, no_settling, settling_of
+from driftfit.trackers.parts.faults.contradictions import add_to_block
+from driftfit.trackers.parts.faults.judged_start import judged
+from driftfit.trackers.rls import Forgetting, fade, learn_settling_variance
 
 FOLLOWING = 0.05
 """Share of the distance to theta that the auxiliary model moves at a sample: it lags by twenty samples."""
@@ -233,7 +230,7 @@ def steps(refined: bool) -> TrackerSteps:
 
 
 @dataclass(frozen=True)
-class InstrumentalVariables(Tracker):
+class InstrumentalVariables(Forgetting):
     """Recursive instrumental variables for models in coloured noise, with an auxiliary model and forgetting.
 
     For ARX; for OE and BoxJenkins they are refined instrumental variables (RIV, SRIV).
@@ -261,50 +258,21 @@ class InstrumentalVariables(Tracker):
     theta0: Any = 0.0
     c_max: float = 1e8
 
-    required: ClassVar[tuple[str, ...]] = ("forgetting",)
-    learns_noise: ClassVar[bool] = True
-    scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
-
-    def __post_init__(self) -> None:
-        name = "InstrumentalVariables"
-        if self.forgetting is not None:
-            self._set("forgetting", numbers(name, "forgetting", self.forgetting, ndim=0, low=0.0, strict=True))
-            if self.forgetting > 1.0:
-                raise ValueError(f"{name}: forgetting must be in (0, 1]; got {self.forgetting!r}.")
-        if self.p0 is not None:
-            self._set("p0", covariance(name, "p0", self.p0))
-        self._set("theta0", numbers(name, "theta0", self.theta0))
-        self._set("c_max", numbers(name, "c_max", self.c_max, ndim=0, low=1.0))
-
     def state(self, n: int) -> Mapping[str, Any]:
-        name = "InstrumentalVariables"
-        P = np.zeros((n, n)) if self.p0 is None else matrix(name, "p0", self.p0, n)
-        first = self.c_max * np.diag(P)
-        theta0 = vector(name, "theta0", self.theta0, n)
+        own = super().state(n)
         return {
-            "theta": theta0,
-            "P": P,
-            "G": P,
-            "g": np.zeros(n),
+            **own,
+            "G": own["P"],
             "f": np.zeros(n),
             "b": np.zeros(n),
             "zeta": np.zeros(n),
-            "auxiliary": theta0,
+            "auxiliary": own["theta"],
             "x": 0.0,
             "x_lag": np.zeros(n),
             "output_lags": 0,
             "largest": 0.0,
             "learned": 0.0,
             "settling": LEAST_SQUARES * n,
-            "forgetting": self.forgetting,
-            "log_forgetting": np.log(np.asarray(self.forgetting)),
-            "r": 1.0,
-            "c_max": self.c_max,
-            **no_settling(),
-            "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
-            **no_scale(),
-            **(knowing_nothing(n) if self.p0 is None else knowing(n)),
-            **unjudged(theta0, diffuse=self.p0 is None),
         }
 
     @property
@@ -323,18 +291,12 @@ class InstrumentalVariables(Tracker):
         return steps(False)
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
-        n, first = model.n, settling_of(model)
+        own = {**super().state_for(model), "output_lags": model.output_lags or 0}
         if self.p0 is None and model.output_lags and not model.instruments:
-            first |= {"discounted": FORGOTTEN * n, "first_memory": LEAST_SQUARES * n}
-        return {**self.state(n), **first, "output_lags": model.output_lags or 0}
+            own |= {"discounted": FORGOTTEN * model.n, "first_memory": LEAST_SQUARES * model.n}
+        return own
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         super().widen(lane, p)
         scale = float(lane["scale"])
         np.einsum("ii->i", lane["G"])[:] += p / scale if scale > 0.0 else p
-
-    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
-        return faults(field, phi, y, ok)
-
-    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return (*contradictions(run.state), *resolution(run.state))

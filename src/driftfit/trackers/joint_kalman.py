@@ -17,8 +17,9 @@ negative (the cubature rule).
 A parameter is held where it is by ``q`` and ``p0`` of 0. q of a state is how wrong its equation is at each sample. Both
 filters are only as good as these numbers: look at ``run.diagnose()``, and compare by ``run.loglik``.
 
-Where equations have no finite value at the estimate, or at a point of the unscented filter, the states stay and the
-sample is not used. A gap of several nominal samples repeats equations that do not use dt, at most `MOST` times.
+Samples that contradict all before them are left out (`driftfit.trackers.parts.faults.contradictions`). Where equations
+have no finite value at the estimate, or at a point of the unscented filter, the states stay and the sample is not used.
+A gap of several nominal samples repeats equations that do not use dt, at most `MOST` times.
 
 Source: Jazwinski, Stochastic Processes and Filtering Theory (1970), theorem 8.1; Julier and Uhlmann, Unscented
 filtering and nonlinear estimation, Proc. IEEE 92 (2004); Arasaratnam and Haykin, Cubature Kalman filters, IEEE Trans.
@@ -41,7 +42,8 @@ from driftfit.engine.settings import one_of
 from driftfit.models.state_space import StateSpace, equations_of
 from driftfit.trackers.kalman import drift_matrix
 from driftfit.trackers.parts.covariance import corrected, symmetric_product
-from driftfit.trackers.parts.faults.contradictions import contradictions, leave_out_contradiction, no_contradictions
+from driftfit.trackers.parts.faults.contradictions import leave_out_contradiction, no_contradictions
+from driftfit.trackers.parts.faults.omissions import omissions
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
@@ -70,7 +72,7 @@ def keep_states(s: State, l: int) -> None:
 
 
 @kernel
-def judged(s: State, y_hat: float, v: float, l: int) -> None:
+def correct_or_leave_out(s: State, y_hat: float, v: float, l: int) -> None:
     """One correction, unless the sample contradicts all before it.
 
     If an input is to blame, the states do not move with it.
@@ -163,7 +165,7 @@ def _extended(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool)
         for i in range(s.theta.shape[0]):
             finite = finite & (abs(s.phi[i, l]) < LARGEST)
         if finite:
-            judged(s, s.value[l], symmetric_product(s, l) + s.r[l] * s.noise[l], l)
+            correct_or_leave_out(s, s.value[l], symmetric_product(s, l) + s.r[l] * s.noise[l], l)
         else:
             unusable(s, l)
 
@@ -261,7 +263,7 @@ def _unscented(equations: str, inputs: tuple[str, ...], n: int, hidden: int, tim
                 g += other * (s.shown[j, l] - s.shown[n + j, l]) * s.L[i, j, l]
             s.g[i, l] = g
         if finite:
-            judged(s, y_hat, v + s.r[l] * s.noise[l], l)
+            correct_or_leave_out(s, y_hat, v + s.r[l] * s.noise[l], l)
         else:
             unusable(s, l)
 
@@ -319,4 +321,4 @@ class JointKalman(StateSpaceTracker):
         return _unscented(*given, model.n, len(model.hidden), model.system.timed)
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return contradictions(run.state)
+        return omissions(run.state)

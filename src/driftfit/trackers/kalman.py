@@ -19,7 +19,8 @@ numbers for ordinary data, and positive variances for collinear or badly scaled 
 at O(n^3).
 
 Source: Kalman (1960); as a parameter tracker Young, Recursive Estimation and Time-Series Analysis (2011), chapter 4.
-Departures: only one triangle of P is kept; an exact diffuse start (`driftfit.trackers.parts.diffuse`). Cost per sample:
+Departures: only one triangle of P is kept; an exact diffuse start (`driftfit.trackers.parts.diffuse`); without laws,
+samples that contradict all before are left out (`driftfit.trackers.parts.faults.contradictions`). Cost per sample:
 O(n^2).
 """
 
@@ -48,14 +49,16 @@ from driftfit.trackers.parts.diffuse import (
     knowing_nothing,
     spanned_variance,
 )
-from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
+from driftfit.trackers.parts.faults.contradictions import judged_measurement
 from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
+from driftfit.trackers.parts.faults.omissions import omissions
 from driftfit.trackers.parts.information import triangular_root
 from driftfit.trackers.parts.varying_drift import read_drift
 
 
 @kernel
 def drift(s: State, l: int) -> None:
+    """P <- P + diag(q) dt d."""
     n, time = s.theta.shape[0], s.dt[l] * s.drift[l]
     whole = n - n % 4 if in_fours(s) else 0
     for i in range(0, whole, 4):
@@ -69,6 +72,7 @@ def drift(s: State, l: int) -> None:
 
 @kernel
 def drift_matrix(s: State, l: int) -> None:
+    """P <- P + q dt d, with a matrix q."""
     time = s.dt[l] * s.drift[l]
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):
@@ -211,7 +215,7 @@ class Kalman(Tracker):
         return faults(field, phi, y, ok) if self.laws is None else super().left_out(field, phi, y, ok)
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return contradictions(run.state)
+        return omissions(run.state)
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         super().widen(lane, p)

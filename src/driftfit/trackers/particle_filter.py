@@ -16,6 +16,7 @@ may be a value that cannot be; ``std`` says so. ``loglik`` is that of the mixtur
 (``q``): what does not move is never drawn again, and copies of one particle remain.
 
 Random numbers depend on the seed and a counter in the state: a run gives the same bits again, live and in lanes.
+Samples that contradict all before them are left out (`driftfit.trackers.parts.faults.contradictions`).
 
 Source: Schon, Gustafsson and Nordlund, Marginalized particle filters, IEEE Trans. Signal Processing 53 (2005); Doucet,
 de Freitas, Murphy and Russell (2000). Departures: each particle carries the covariance of all of z, of which what is
@@ -34,7 +35,8 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.settings import near, whole
 from driftfit.models.state_space import StateSpace
-from driftfit.trackers.parts.faults.contradictions import contradictions, no_contradictions
+from driftfit.trackers.parts.faults.contradictions import no_contradictions
+from driftfit.trackers.parts.faults.omissions import omissions
 from driftfit.trackers.state_space.particle_steps import steps
 from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
@@ -121,4 +123,4 @@ class ParticleFilter(StateSpaceTracker):
         lane["cloud"][:, list(which)] = values
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return contradictions(run.state)
+        return omissions(run.state)

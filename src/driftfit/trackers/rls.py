@@ -6,8 +6,8 @@
 
 It minimises sum lambda^(t-k) (y_k - phi_k' theta)^2 with a memory of 1/(1 - lambda) nominal samples. P is in units of
 the noise variance, which is estimated on-line: sum(e^2 / s) / count over the samples after the start, and not below the
-limit of coarse readings (`driftfit.trackers.parts.resolution`). Errors of rounding that readings share widen ``std``
-(`driftfit.trackers.parts.coarse.shared_rounding`).
+limit of coarse readings (`driftfit.trackers.parts.coarse.resolution`). Errors of rounding that readings share widen
+``std`` (`driftfit.trackers.parts.coarse.shared_rounding`).
 
 Use it if all parameters drift alike and nothing is known about noise and drift. Without excitation exponential
 forgetting would let P grow without bound. It stops when a variance is ``c_max`` times its value at the time when the
@@ -29,8 +29,9 @@ is unchanged. There is no wind-up: without excitation nothing is forgotten, so n
 samples only. With one parameter the two kinds are the same.
 
 Source: Ljung, System Identification (1999), eq. 11.12; Plackett (1950) for lambda = 1. Departures: forgetting depends
-on time (dt, and also if y is missing); the cap; an exact diffuse start. Directional forgetting: Hagglund (1983),
-Kulhavy and Karny (1984). Cost per sample: O(n^2).
+on time (dt, and also if y is missing); the cap; an exact diffuse start; samples that contradict all before are left out
+(`driftfit.trackers.parts.faults.contradictions`). Directional forgetting: Hagglund (1983), Kulhavy and Karny (1984).
+Cost per sample: O(n^2).
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ from driftfit.engine.kernel import Array, State, exp, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coarse.resolution import least_noise, resolution, resolve, unresolved
 from driftfit.trackers.parts.coarse.shared_rounding import folded, nothing_shared, share_rounding, spanned_folded
 from driftfit.trackers.parts.diffuse import (
     SCRATCH,
@@ -57,9 +59,9 @@ from driftfit.trackers.parts.diffuse import (
     take_in,
     wander,
 )
-from driftfit.trackers.parts.faults.contradictions import contradictions, judged_measurement
+from driftfit.trackers.parts.faults.contradictions import judged_measurement
 from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
-from driftfit.trackers.parts.resolution import least_noise, resolution, resolve, unresolved
+from driftfit.trackers.parts.faults.omissions import omissions
 
 RECENT, RECENT_SHARE, LATER_SHARE = 20.0, 0.125, 0.25
 """Memory of the present noise variance: samples, and shares of those so far for the unit of P and for the scale."""
@@ -276,8 +278,61 @@ EXPONENTIAL = judged(begin, TrackerSteps(forget, correct, folded), restart)
 DIRECTIONAL = judged(begin_direction, TrackerSteps(nothing, correct_direction, folded), restart)
 
 
+class Forgetting(Tracker):
+    """A tracker with exponential forgetting from a judged start: what `RLS` and `InstrumentalVariables` share."""
+
+    forgetting: float | None
+    p0: Any
+    theta0: Any
+    c_max: float
+
+    required: ClassVar[tuple[str, ...]] = ("forgetting",)
+    learns_noise: ClassVar[bool] = True
+    scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
+
+    def __post_init__(self) -> None:
+        owner = type(self).__name__
+        if self.forgetting is not None:
+            self._set("forgetting", numbers(owner, "forgetting", self.forgetting, ndim=0, low=0.0, strict=True))
+            if self.forgetting > 1.0:
+                raise ValueError(f"{owner}: forgetting must be in (0, 1]; got {self.forgetting!r}.")
+        if self.p0 is not None:
+            self._set("p0", covariance(owner, "p0", self.p0))
+        self._set("theta0", numbers(owner, "theta0", self.theta0))
+        self._set("c_max", numbers(owner, "c_max", self.c_max, ndim=0, low=1.0))
+
+    def state(self, n: int) -> Mapping[str, Any]:
+        owner = type(self).__name__
+        P = np.zeros((n, n)) if self.p0 is None else matrix(owner, "p0", self.p0, n)
+        first = self.c_max * np.diag(P)
+        theta0 = vector(owner, "theta0", self.theta0, n)
+        return {
+            "theta": theta0,
+            "P": P,
+            "forgetting": self.forgetting,
+            "log_forgetting": np.log(np.asarray(self.forgetting)),
+            "r": 1.0,
+            "g": np.zeros(n),
+            "c_max": self.c_max,
+            "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
+            **no_settling(),
+            **no_scale(),
+            **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            **unjudged(theta0, diffuse=self.p0 is None),
+        }
+
+    def state_for(self, model: Model) -> Mapping[str, Any]:
+        return {**self.state(model.n), **settling_of(model)}
+
+    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
+        return faults(field, phi, y, ok)
+
+    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
+        return (*omissions(run.state), *resolution(run.state))
+
+
 @dataclass(frozen=True)
-class RLS(Tracker):
+class RLS(Forgetting):
     """Recursive least squares with exponential or directional forgetting.
 
     Parameters
@@ -305,48 +360,9 @@ class RLS(Tracker):
     c_max: float = 1e8
     kind: str = "exponential"
 
-    required: ClassVar[tuple[str, ...]] = ("forgetting",)
-    learns_noise: ClassVar[bool] = True
-    scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
-
     def __post_init__(self) -> None:
-        if self.forgetting is not None:
-            self._set("forgetting", numbers("RLS", "forgetting", self.forgetting, ndim=0, low=0.0, strict=True))
-            if self.forgetting > 1.0:
-                raise ValueError(f"RLS: forgetting must be in (0, 1]; got {self.forgetting!r}.")
-        if self.p0 is not None:
-            self._set("p0", covariance("RLS", "p0", self.p0))
-        self._set("theta0", numbers("RLS", "theta0", self.theta0))
+        super().__post_init__()
         one_of("RLS", "kind", self.kind, ("exponential", "directional"))
-        self._set("c_max", numbers("RLS", "c_max", self.c_max, ndim=0, low=1.0))
-
-    def state(self, n: int) -> Mapping[str, Any]:
-        P = np.zeros((n, n)) if self.p0 is None else matrix("RLS", "p0", self.p0, n)
-        first = self.c_max * np.diag(P)
-        theta0 = vector("RLS", "theta0", self.theta0, n)
-        return {
-            "theta": theta0,
-            "P": P,
-            "forgetting": self.forgetting,
-            "log_forgetting": np.log(np.asarray(self.forgetting)),
-            "r": 1.0,
-            "g": np.zeros(n),
-            "c_max": self.c_max,
-            "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
-            **no_settling(),
-            **no_scale(),
-            **(knowing_nothing(n) if self.p0 is None else knowing(n)),
-            **unjudged(theta0, diffuse=self.p0 is None),
-        }
-
-    def state_for(self, model: Model) -> Mapping[str, Any]:
-        return {**self.state(model.n), **settling_of(model)}
-
-    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
-        return faults(field, phi, y, ok)
-
-    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return (*contradictions(run.state), *resolution(run.state))
 
     @property
     def steps(self) -> TrackerSteps:

@@ -30,7 +30,7 @@ from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, warn, whole
 from driftfit.models.base import Model
-from driftfit.models.fault_codes import FAR, absurd
+from driftfit.models.fault_codes import ABSURD, absurd
 from driftfit.run.track import records_of
 from driftfit.trackers.base import Tracker
 from driftfit.tune.intervals import intervals_of
@@ -216,9 +216,9 @@ def _leave_out(x: Array, name: str, places: Array) -> None:
     """Make values of a signal missing, and warn of it."""
     if len(places):
         warnings.warn(
-            f"tune: {name} is {x[places[0]]:.6g} at sample {places[0]}, more than {FAR:.0f} times its usual deviation "
-            f"({len(places)} such values), and no other signal is near it: they count as missing here. If they are "
-            f'fault codes, give limits={{"{name}": (low, high)}}, to `track` too.',
+            f"tune: {name} is {x[places[0]]:.6g} at sample {places[0]}, more than {ABSURD:.0f} times its usual "
+            f"deviation ({len(places)} such values), and no other signal is near it: they count as missing here. If "
+            f'they are fault codes, give limits={{"{name}": (low, high)}}, to `track` too.',
             UserWarning,
             stacklevel=5,
         )

@@ -44,6 +44,7 @@ about 200 rows.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -128,11 +129,10 @@ def constancy(phi: Array, y: Array, lags: int | None = None, at: Array | None = 
     if not noisy(fit, phi, y):
         return _nothing(N, n)._replace(fit=fit)
     rare = _rare(fit.psi, y, shortest(n))
-    estimated, least = of_rare_events if rare else noise, rare or shortest(n)
-    found = estimated(basis.Q, fit.residual, CELLS, least, lags)
-    if lags is None and at is not None and at[-1] - at[0] >= N:
-        in_time = estimated(basis.Q, fit.residual, CELLS, least, None, at)
-        found = in_time if len(in_time.ar) > ORDER else found
+    estimated = partial(of_rare_events if rare else noise, basis.Q, fit.residual, CELLS, rare or shortest(n))
+    found = estimated(None, at) if lags is None and at is not None and at[-1] - at[0] >= N else None
+    if found is None or len(found.ar) <= ORDER:  # without a season, rows are those of successive samples
+        found = estimated(lags)
     return _tested(basis, phi, fit, found, lags)
 
 

@@ -73,10 +73,10 @@ from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.bank.spikes import LARGE, evident
 from driftfit.trackers.bank.variants import steps_of
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coarse.resolution import resolution, unresolved
 from driftfit.trackers.parts.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing
 from driftfit.trackers.parts.excitation import not_learned, window
 from driftfit.trackers.parts.information import triangular_root
-from driftfit.trackers.parts.resolution import resolution, unresolved
 
 FAR = 100.0
 """Standard deviations from its forecast beyond which a sample is a fault code, for a bank without given sensors."""

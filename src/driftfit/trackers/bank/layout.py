@@ -62,12 +62,12 @@ WAITING, READY = 0, -1
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_OBSERVED, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
     SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SHIFT, READING, LOWEST, HIGHEST, DOUBTS, ENTERS, SIZE,
 ) = range(28)  # fmt: skip
-"""Numbers of the present sample: inputs and results. MOST is the largest mean square that a leaf's own
-prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`). FREEDOM is the degrees of freedom of an
-estimated noise variance before the tree grows, the number of residuals until then; inf for a variance that is given.
-The reading is y + SHIFT (`driftfit.trackers.parts.resolution`). READING is the last accepted reading, LAST the same
-minus the present shift; LOWEST and HIGHEST are the limits of all accepted readings. DOUBTS is the recent number of
-refused samples within them. ENTERS is the length of the regressor along a direction in which it is the first
+"""Numbers of the present sample: inputs and results. MOST is the largest mean square that a leaf's own prediction may
+have in its output lags (`driftfit.trackers.bank.leaves.lags`). FREEDOM is the degrees of freedom of an estimated noise
+variance before the tree grows, the number of residuals until then; inf for a variance that is given. The reading is y +
+SHIFT (`driftfit.trackers.parts.coarse.resolution`). READING is the last accepted reading, LAST the same minus the
+present shift; LOWEST and HIGHEST are the limits of all accepted readings. DOUBTS is the recent number of refused
+samples within them. ENTERS is the length of the regressor along a direction in which it is the first
 (`machine.late_direction`), else 0.
 """
 NEVER = 1e9

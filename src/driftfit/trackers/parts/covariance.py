@@ -162,10 +162,8 @@ def reduce_blocks(s: State, gain: float) -> None:
     """P <- P - gain g g' of one lane, with the bits of `reduce_rows`."""
     columns = s.P.shape[1]
     for i in range(s.g.shape[0]):
-        k, variance = (
-            gain * s.g[i, 0],
-            s.P[i, i, 0],
-        )  # read before the row is written: afterwards it would wait for that
+        # the variance is read before the row is written: afterwards it would wait for that
+        k, variance = gain * s.g[i, 0], s.P[i, i, 0]
         whole = i - i % WIDTH
         for j in range(0, whole, WIDTH):
             at = i * columns + j

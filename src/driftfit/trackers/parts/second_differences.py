@@ -28,11 +28,11 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
+from driftfit.trackers.parts.coarse.resolution import resolve
 from driftfit.trackers.parts.coarse.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.covariance import prediction, reduce_covariance, symmetric_product
 from driftfit.trackers.parts.diffuse import MACHINES, hand_over, knowing_nothing, take_in_row, wander
 from driftfit.trackers.parts.information import shear
-from driftfit.trackers.parts.resolution import resolve
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.rls import learn_variance, no_scale
 

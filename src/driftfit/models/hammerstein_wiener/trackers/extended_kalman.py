@@ -31,7 +31,7 @@ from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import State, kernel
 from driftfit.engine.settings import matrix, vector
 from driftfit.models.base import Model
-from driftfit.models.fault_codes import UNJUDGED, judge
+from driftfit.models.fault_codes import UNJUDGED, refused
 from driftfit.models.hammerstein_wiener.products import Structure
 from driftfit.models.hammerstein_wiener.trackers.minimal import Minimal, minimal_memory, structure_of
 from driftfit.trackers.kalman import drift, drift_matrix
@@ -75,16 +75,6 @@ spread_of = product_with(slope)
 """s.g = P H'; returns H P H'."""
 
 
-@kernel
-def refuse(s: State, y_hat: float, l: int) -> None:
-    """Leave out a reading out of all proportion."""
-    if s.observed[l] > 0.0:
-        z = s.y[l]
-        judge(s, y_hat, l)
-        if not abs(s.y[l]) < np.inf:
-            s.y[l], s.ok[l], s.observed[l] = z, 0.0, 0.0
-
-
 @lru_cache
 def _steps(structure: Structure, together: bool) -> TrackerSteps:
     row = linearised(structure)
@@ -92,7 +82,8 @@ def _steps(structure: Structure, together: bool) -> TrackerSteps:
     @kernel
     def correct(s: State, l: int) -> None:
         y_hat = row(s, l)
-        refuse(s, y_hat, l)
+        if s.observed[l] > 0.0 and refused(s, y_hat, l):
+            s.ok[l], s.observed[l] = 0.0, 0.0
         h = spread_of(s, l)
         corrected(s, y_hat, (1.0 + s.inflation[l]) * h + s.r[l] * s.noise[l], l)
 

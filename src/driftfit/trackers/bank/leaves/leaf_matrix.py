@@ -100,7 +100,7 @@ def normalise(B: Array, L: int) -> float:
 
 @shared
 def variance_factor(t: Any, X: Array, row: int, L: int) -> None:
-    """The unit of C, in a row of X: 1, or the expected noise variance S / (nu - 2) (spec section 8)."""
+    """The unit of C, in a row of X: 1, or the expected noise variance S / (nu - 2)."""
     B, unknown = t.leaves, t.unknown > 0
     for l in range(0, L, WIDTH):
         ratio = over(load(B, S, l), minus(load(B, NU, l), fill(2.0))) if unknown else fill(1.0)
@@ -109,7 +109,7 @@ def variance_factor(t: Any, X: Array, row: int, L: int) -> None:
 
 @part(sizes=(2, 3, 4))
 def mixture(n: int, t: Any, L: int) -> None:
-    """Mean and covariance (lower triangle) of all leaves, spec section 4: sum w m, sum w (C + d d'), d = m - mean."""
+    """Mean and covariance (lower triangle) of all leaves: sum w m, sum w (C + d d'), d = m - mean."""
     B, X, theta, P = t.leaves, t.scratch, t.theta, t.cov
     variance_factor(t, X, n, L)
     parts, tri = n + 1, n * (n + 1) // 2

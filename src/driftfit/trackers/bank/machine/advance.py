@@ -246,7 +246,7 @@ def reject(t: Any, K: int) -> None:
 
 @shared
 def choose(t: Any, L: int) -> None:
-    """Plan the reduction (spec section 5), which `reduce` carries out before the next sample that is used."""
+    """Plan the reduction, which `reduce` carries out before the next sample that is used."""
     counters, samples, kind = t.counters, t.samples, int(t.reduction[KIND])
     if kind == CUT:
         phi = t.phi

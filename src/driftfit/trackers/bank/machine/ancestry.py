@@ -111,7 +111,7 @@ def summary(lags: Array, newest: Array) -> None:
 
 @shared
 def marginals(t: Any, L: int) -> float:
-    """lag_prob[k, e] = p(event e, k levels back), spec section 4; returns the probability of a change among the levels
+    """lag_prob[k, e] = p(event e, k levels back); returns the probability of a change among the levels
     of the histories.
 
     Leaves are ordered in blocks of the children of K parents. Two spare rows are overwritten.

@@ -80,7 +80,7 @@ def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
 
 @part(sizes=(2, 3, 4))
 def correct(n: int, t: Any, at: int, columns: int, y: float, noise: float) -> None:
-    """Measurement update of the leaves from column ``at`` on (spec section 3); the last two rows of `scores` receive
+    """Measurement update of the leaves from column ``at`` on; the last two rows of `scores` receive
     eps^2 / s and s.
 
     A variance keeps at least the share `LEFT` of its value, so that rounding cannot make it negative.
@@ -124,7 +124,7 @@ def gaussian(X: Array, columns: int) -> None:
 
 @shared
 def student(t: Any, at: int, columns: int) -> None:
-    """The same in `scores` with unknown variance, spec section 8; nu and S of the leaves from column ``at`` on are
+    """The same in `scores` with unknown variance; nu and S of the leaves from column ``at`` on are
     updated.
     """
     B, X, fade, least = t.leaves, t.scores, t.sample[FADE], t.sample[LEAST]
@@ -187,7 +187,7 @@ def remember(t: Any, K: int, at: int, columns: int, y: float, own: bool) -> None
 
 @shared
 def weigh(t: Any, K: int, at: int, columns: int, j: int, own: bool) -> None:
-    """log w+ = log w + log p(event | leaf) + log N of the children under sensor j, spec section 3; their ages, parents
+    """log w+ = log w + log p(event | leaf) + log N of the children under sensor j; their ages, parents
     and events.
     """
     A, B, X, prior, parents, events = t.parents, t.leaves, t.scores, t.prior, t.parent, t.event

@@ -46,13 +46,13 @@ from driftfit.trackers.bank.leaves.own_sensor import own_address
 from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, outgrown, read_framed, write_walks
 from driftfit.trackers.bank.machine.late_direction import begin_within, point_along
+from driftfit.trackers.parts.coarse.resolution import lasting, least_noise, resolve
 from driftfit.trackers.parts.coordinates import FRAME, unseen_variance, whiten_within
 from driftfit.trackers.parts.covariance import measurement, prediction
 from driftfit.trackers.parts.diffuse import enter, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
 from driftfit.trackers.parts.modes.noise_levels import LEAST_SHARE
-from driftfit.trackers.parts.resolution import lasting, least_noise, resolve
 from driftfit.trackers.rls import learn_scale
 
 GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift"], ROW["own_likelihoods"]

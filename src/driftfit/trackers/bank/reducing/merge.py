@@ -181,7 +181,7 @@ def take(t: Any, G: int) -> float:
 
 @shared
 def mix(t: Any, L: int) -> int:
-    """Interaction (IMM), spec section 5: parent e is mixed from all leaves that may lead to event e, with the weights
+    """Interaction (IMM): parent e is mixed from all leaves that may lead to event e, with the weights
     W_le = w_l p(e | l) / sum_l w_l p(e | l). Returns the number of events.
     """
     A, B, prior, order, X = t.parents, t.leaves, t.prior, t.order, t.scratch

@@ -203,7 +203,7 @@ def settled(t: Any, L: int, held: int, risk: float, top: float, mass: float, phi
 
 @shared
 def decide(t: Any, L: int, phi: Array) -> None:
-    """Resolve the oldest events while the rule says so, spec section 5.
+    """Resolve the oldest events while the rule says so.
 
     A leaf that loses a decision leaves its group. ``decided[k]`` is the event, how many samples ago it was first
     visible, and its probability. ``phi`` is used as the next regressor.

@@ -34,8 +34,8 @@ import numpy as np
 
 from driftfit.engine.drivers import diagonal
 from driftfit.engine.kernel import State, kernel
+from driftfit.trackers.parts.coarse.resolution import lasting, reading
 from driftfit.trackers.parts.diffuse import spanned_variance
-from driftfit.trackers.parts.resolution import lasting, reading
 
 RATE = 4.0 * np.pi**2
 WIDER = 0.01

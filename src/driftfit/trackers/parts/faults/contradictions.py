@@ -38,49 +38,40 @@ usual, or (y - m)^2 at most REACH^2 v without a prediction. Ordinary samples are
 its square and of e^2 / s. Before a sample that is not ordinary is judged, the block is closed: its sums enter the
 means. It is also closed when it has a quarter as many samples as there were readings before.
 
-Source: ours; see `driftfit.trackers.parts.outlying_readings` for the rule of a tracker that learns its own noise. Cost
-per ordinary sample: two comparisons, three sums, and the range of the regressors.
+Source: ours; see `driftfit.trackers.parts.faults.outlying_readings` for the rule of a tracker that learns its own
+noise. Cost per ordinary sample: two comparisons, three sums, and the range of the regressors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from driftfit.engine.drivers import ROUNDING
-from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.kernel import State, kernel
 from driftfit.trackers.parts.covariance import corrected, prediction, symmetric_product
-from driftfit.trackers.parts.faults.strange_inputs import SELDOM, TRUST, learn_inputs
+from driftfit.trackers.parts.faults.outlying_readings import FIRST, LONGEST, MEMORY, REACH, SURE
+from driftfit.trackers.parts.faults.strange_inputs import ALIKE, TRUST, learn_inputs, spend_trust, trusted_inputs
 
-REACH = 10.0
-"""Standard deviations of the readings."""
 UNUSUAL, GROWN = 8.0, 4.0
 """Usual standard deviations of the prediction from which on a sample is not ordinary; the most that the square of these
 grows with one sample."""
-SURE = 5.0
-"""Standard deviations of the prediction."""
 LIKELY = 3.0
-"""The same where the prediction, and not the reading, is out of range."""
-FIRST = 10.0
-"""Number of first readings that are accepted, for comparison with later ones."""
+"""`SURE` where the prediction, and not the reading, is out of range."""
 JUDGED = 6.0
-"""After a prior for n parameters this many more than n, if that is more: before that s may say nothing about e."""
-MEMORY = 1000.0
-"""Memory of the mean and variance of the readings, and of the mean of e^2 / s, in samples."""
+"""After a prior for n parameters the first n + `JUDGED` readings are accepted, if those are more than `FIRST`: before
+that s may say nothing about e."""
 ENOUGH, CLIP, BLOCK_CLIP = 4.0, 100.0, 4.0
 """Samples from which on the mean of e^2 / s is used; the largest multiples of it by which a sample, and the mean of a
 block, enter it."""
 BLOCK, GROWING = 32.0, 0.25
 """Samples of a block at least, and per reading before."""
-LASTING, LONGEST = 4.0, 1e12
-"""The factor p from which on the lag of a strange input is accepted as well; its upper bound."""
+LASTING = 4.0
+"""The factor p from which on the lag of a strange input is accepted as well."""
 QUICK, SLOW, SLOWEST = 2.0, 2.0 ** (1.0 / 4.0), 2.0 ** (1.0 / 16.0)
 """Growth of the factor p: for readings that persist, for predictions, and for values that repeat themselves or jump."""
-ALIKE = 0.25
-"""A strange reading persists if it differs from the last strange one by less than this share of its distance from m."""
 SAME, SINKING = 1.01, 0.8
 """A strange prediction repeats itself if its distance from m is that of the ones before, up to `SAME`. The latter is
 the largest of them, of which `SINKING` is kept with every sample."""
@@ -91,9 +82,9 @@ def no_contradictions(n: int = 0) -> dict[str, Any]:
     return {
         "judged_from": max(FIRST, n + JUDGED),
         "y_mean": 0.0, "y_variance": 0.0, "y_count": 0.0, "y_last": np.nan, "widening": 1.0, "y_strange": np.nan,
-        "farthest": 0.0, "left_out": 0.0, "distrusted": 0.0, "mean_ratio": 0.0, "ratios": 0.0, "shift": 0.0,
+        "farthest": 0.0, "mean_ratio": 0.0, "ratios": 0.0, "shift": 0.0,
         "lagging": 0.0, "usual_variance": 0.0, "ordinary": 0.0, "block_size": 0, "block_left": 0, "block_sum": 0.0,
-        "block_squares": 0.0, "block_ratios": 0.0,
+        "block_squares": 0.0, "block_ratios": 0.0, **trusted_inputs(),
     }  # fmt: skip
 
 
@@ -163,7 +154,12 @@ def close_block(s: State, l: int) -> None:
 
 @kernel
 def judge(s: State, y: float, shown: float, v: float, blame: float, l: int) -> None:
-    """Whether the sample is used: s.ok and s.observed; and s.widening, the factor p."""
+    """Decide whether the sample is used, s.ok and s.observed, and update s.widening, the factor p.
+
+    ``shown`` is the predicted reading, v the variance of y - ``shown`` by the tracker, and ``blame`` the trust that the
+    range of the inputs says the sample costs, 0 without blame.
+    """
+    # is it strange, and is its reading to blame (off > out) or its prediction?
     e, off, out = y - shown, abs(y - s.y_mean[l]), abs(shown - s.y_mean[l])
     reach, widening = REACH * REACH * s.y_variance[l], s.widening[l]
     sure = SURE if off > out else LIKELY
@@ -172,12 +168,14 @@ def judge(s: State, y: float, shown: float, v: float, blame: float, l: int) -> N
     trusted = (off > out) | (s.distrusted[l] < TRUST)
     unpredicted = (s.observed[l] > s.valid[l]) & (s.y_count[l] >= s.judged_from[l])
     outside = unpredicted & (off * off > reach)
+    # the factor p: a strange reading is compared with the last one before it is judged
     of_reading, apart, follows = outside | (off > out), abs(y - s.y_strange[l]), widening > 1.0
     persists = follows & (apart > 0.0) & (apart < ALIKE * off)
     of_readings = min((QUICK if persists else SLOWEST) * widening, LONGEST)
     p = of_readings if of_reading & follows else widening
     beyond = strange & trusted & (e * e > reach * p * p)
     refused = (beyond & (off > out)) | (outside & (off * off > reach * p * p))
+    # the lags of a strange input are left out where they would outweigh all samples before, or contradict them
     lasting = strange & (not beyond) & (p > LASTING)
     lagging = (
         judged
@@ -189,8 +187,8 @@ def judge(s: State, y: float, shown: float, v: float, blame: float, l: int) -> N
     )
     blamed = judged & (blame > 0.0)
     left = beyond | lagging | blamed
-    more = blame if blamed else (1.0 if left & (off <= out) else -SELDOM)
-    s.distrusted[l] = min(max(s.distrusted[l] + more, 0.0), 2.0 * TRUST) if s.ok[l] > 0.0 else s.distrusted[l]
+    spend_trust(s, blame if blamed else (1.0 if left & (off <= out) else 0.0), l)
+    # what the next samples are compared with
     of_prediction = (1.0 if out * SAME < s.farthest[l] else SLOWEST) if out < SAME * s.farthest[l] else SLOW
     grown = of_readings if of_reading else min(of_prediction * widening, LONGEST)
     left_over = 0.0 if lasting else max(s.lagging[l] - 1.0, 0.0)
@@ -202,7 +200,8 @@ def judge(s: State, y: float, shown: float, v: float, blame: float, l: int) -> N
     )
     s.y_strange[l] = y if strange | outside else s.y_strange[l]
     s.farthest[l] = max(out, SINKING * s.farthest[l]) if strange else 0.0
-    s.left_out[l] += 1.0 if left | refused else 0.0
+    s.left_out[l] += 1.0 if refused else 0.0
+    s.inputs_out[l] += 1.0 if left & (not refused) else 0.0
     s.observed[l] = 0.0 if refused else s.observed[l]
     s.usual_variance[l] = (
         (min(v, GROWN * s.usual_variance[l]) if s.usual_variance[l] > 0.0 else v)
@@ -260,9 +259,3 @@ def leave_out_contradiction(s: State, y_hat: float, v: float, l: int) -> None:
     add_to_block(s, e * e / v, l)
     if unusual:
         close_block(s, l)
-
-
-def contradictions(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
-    """The line of a summary: none if all samples were accepted."""
-    count = int(lane["left_out"]) if "left_out" in lane else 0
-    return (("Left out", f"{count} samples out of all proportion to those before"),) if count else ()

@@ -19,7 +19,7 @@ A large input with a slow response looks the same, and its samples are the most 
 are therefore left out only if the others contradict them: if least squares on all samples leaves these others a sum of
 squared residuals Q, and least squares on themselves only q with nu residuals, and
 
-    nu (Q - q) > WORSE q,    or SURELY_WORSE q with `SURE` residuals or more
+    nu (Q - q) > WORSE q,    or SURELY_WORSE q with `RESIDUALS_IN_DOUBT` or more
 
 Source: the median absolute deviation as a scale is Hampel's (1974); the rule is ours. Cost: O(n N^2) for N samples,
 once.
@@ -31,21 +31,19 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, shared
 
-OUTLYING, FAR = 30.0, 10.0
-"""Median absolute deviations: 20 standard deviations of normal data; and 7 for regressors if no sample is doubtful
-otherwise."""
+OUTLYING, OUTLYING_INPUT = 30.0, 10.0
+"""Median absolute deviations from which on a value is outlying: 20 standard deviations of normal data; and 7 for
+regressors if no sample is doubtful otherwise."""
 WORSE = 36.0
 """F statistic from which samples contradict each other: six standard deviations for one sample."""
 STEPS = 3
 """Number of values that differ where most are equal, as those of an input that often rests, to tell a usual one."""
 SURELY_WORSE = 16.0
-"""The same with `SURE` residuals, of which a sum of squares is less uncertain: four standard deviations."""
+"""The same with `RESIDUALS_IN_DOUBT`, of which a sum of squares is less uncertain: four standard deviations."""
 FREQUENT = 5
 """One value in so many may be a fault code that is near the others."""
-RESIDUALS = 4
-"""Number of residuals after which the first samples are judged."""
-SURE = 12
-"""The same while some samples are doubtful: residuals of the others."""
+RESIDUALS, RESIDUALS_IN_DOUBT = 4, 12
+"""Number of residuals after which the first samples are judged; and of the others while some samples are doubtful."""
 Y, SPAN, NOISE, READING, PHI = range(5)
 """Entries of a sample: the output, intervals of drift since the previous sample, the noise factor (negative if the
 sample is doubtful), the output as it was measured, and the first entry of the regressor."""
@@ -54,7 +52,7 @@ sample is doubtful), the output as it was measured, and the first entry of the r
 @shared
 def contradict(every: float, alone: float, residuals: float) -> bool:
     """Whether least squares on every sample, and on some alone, leave these sums of squares of the latter."""
-    return (every - alone) * residuals > (WORSE if residuals < SURE else SURELY_WORSE) * alone
+    return (every - alone) * residuals > (WORSE if residuals < RESIDUALS_IN_DOUBT else SURELY_WORSE) * alone
 
 
 @shared
@@ -180,11 +178,11 @@ def doubt(samples: Array, N: int, last: bool) -> None:
     Half of them or more are kept as doubtful while further samples can be waited for, which is until ``last``.
     """
     if doubt_beyond(samples, N, last, OUTLYING) == 0:
-        doubt_beyond(samples, N, last, FAR)
+        doubt_beyond(samples, N, last, OUTLYING_INPUT)
 
 
 @Driver
-def judge(samples: Array) -> None:
+def mark_doubtful(samples: Array) -> None:
     """`doubt`, for Python."""
     doubt(samples, len(samples), True)
 
@@ -192,6 +190,6 @@ def judge(samples: Array) -> None:
 def doubtful(phi: Array, y: Array, reading: Array) -> Array:
     """Which of all samples (T,) of a start are doubtful, given their regressors, outputs and readings."""
     samples = np.column_stack([y, np.ones((len(y), 2)), reading, phi])
-    judge(samples)
+    mark_doubtful(samples)
     found: Array = samples[:, NOISE] < 0.0
     return found

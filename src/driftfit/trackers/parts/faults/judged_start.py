@@ -2,10 +2,10 @@
 
 A diffuse start fits the first samples exactly, so a fault code among them would determine the estimate. The start
 therefore lasts until there are `RESIDUALS` more samples than directions of theta that they span, and `FIRST` samples.
-If some of them are doubtful (`driftfit.trackers.parts.faults.first_samples`), it lasts until the others have `SURE`
-residuals, or the store is full. If the estimate from all samples contradicts the others, the start is repeated without
-the doubtful ones, at every sample until that is decided: models may compute later regressors with the estimate. It is
-in square-root form until a covariance is accurate enough.
+If some of them are doubtful (`driftfit.trackers.parts.faults.first_samples`), it lasts until the others have
+`RESIDUALS_IN_DOUBT`, or the store is full. If the estimate from all samples contradicts the others, the start is
+repeated without the doubtful ones, at every sample until that is decided: models may compute later regressors with the
+estimate. It is in square-root form until a covariance is accurate enough.
 
 Samples (`driftfit.trackers.parts.faults.stored_samples`) are stored with the time since the previous stored one, so
 that drift and forgetting are repeated as well.
@@ -26,7 +26,6 @@ from driftfit.engine.kernel import Array, State, Step, kernel, nothing
 from driftfit.trackers.parts.covariance import symmetric_product
 from driftfit.trackers.parts.diffuse import BEFORE, MACHINES, know_nothing, reform
 from driftfit.trackers.parts.faults.contradictions import (
-    FIRST,
     add_to_block,
     close_block,
     judge_unusual,
@@ -40,11 +39,12 @@ from driftfit.trackers.parts.faults.first_samples import (
     PHI,
     READING,
     RESIDUALS,
+    RESIDUALS_IN_DOUBT,
     SPAN,
-    SURE,
     contradict,
     doubtful,
 )
+from driftfit.trackers.parts.faults.outlying_readings import FIRST
 from driftfit.trackers.parts.faults.stored_samples import (
     doubtful_samples,
     machine_doubt,
@@ -54,7 +54,7 @@ from driftfit.trackers.parts.faults.stored_samples import (
     without_fault,
 )
 from driftfit.trackers.parts.faults.strange_inputs import (
-    FARTHER,
+    OUTSIDE_GIVEN_DRIFT,
     blame_of_inputs,
     learn_inputs,
     learn_stored_inputs,
@@ -144,7 +144,7 @@ def judge_sample(s: State, y_hat: float, v: float, l: int) -> None:
     """Judge a sample that is not ordinary, and its inputs: how far it is off, when errors so far were smaller than
     expected, still depends on what is not known of theta.
     """
-    blame = blame_of_inputs(s, s.y[l] - y_hat, v * s.scale[l] * max(s.mean_ratio[l], 1.0), FARTHER, l)
+    blame = blame_of_inputs(s, s.y[l] - y_hat, v * s.scale[l] * max(s.mean_ratio[l], 1.0), OUTSIDE_GIVEN_DRIFT, l)
     judge_unusual(s, y_hat, v, blame, l)
 
 
@@ -253,7 +253,8 @@ def judged(
             full = s.remembered[l] >= room(s, l)
             if (s.ok[l] > 0.0) & (spare >= RESIDUALS):
                 found = doubtful_samples(s, 1 if full else 0, l)
-            enough = spare - found >= (RESIDUALS if full else SURE) if found > 0 else s.remembered[l] >= FIRST
+            least = RESIDUALS if full else RESIDUALS_IN_DOUBT
+            enough = spare - found >= least if found > 0 else s.remembered[l] >= FIRST
             ready = (spare >= RESIDUALS) & enough
             if found > 0:  # also before it is decided, because models compute later regressors with these estimates
                 reconsider(s, found, l)

@@ -11,7 +11,7 @@ no parameter is added. c is estimated by weighted least squares on the derivativ
     psi_t = v_(t-1) - c psi_(t-1),    w = r / s
     A <- f A + w psi^2 / s,    b <- f b + w psi (e + c psi) / s,    V <- f V + w^2 psi^2 / s
 
-and used as c (1 - SURE V / b^2), c = b / A, where that is positive: innovations that are white leave everything as it
+and used as c (1 - SHRUNK V / b^2), c = b / A, where that is positive: innovations that are white leave everything as it
 is. After a jump of theta, innovations are alike because the filters have not followed it yet, and are no evidence of
 colour. Two things tell: w, the share of the innovation's variance that is noise, is small then, and before the filters
 notice, innovations are large: in these sums e and psi are bounded by BOUND s^(1/2). A sample that is missing or an
@@ -33,7 +33,7 @@ from driftfit.engine.kernel import Array, State, kernel
 
 FADE = 0.995
 """Factor of the sums A, b and V at every sample."""
-SURE = 5.0
+SHRUNK = 5.0
 """Square of the estimate in standard deviations below which innovations count as white. Less shrinkage of larger
 estimates, an exponent of the bracket that grows with V, makes errors of ARMAX plants 2 to 3 per cent smaller and the
 one-step errors of a river's flow 2 to 4 per cent larger.
@@ -91,7 +91,7 @@ def learn_colour(s: State, l: int) -> None:
     s.colour_scores[0, l], s.colour_scores[1, l], s.colour_scores[2, l] = A, b, V
     s.psi[l] = ordinary * psi
     square = b * b / V if V > 0.0 else 0.0
-    known = b / A * (1.0 - SURE / square) if square > SURE else 0.0
+    known = b / A * (1.0 - SHRUNK / square) if square > SHRUNK else 0.0
     s.colour[l] = max(-MOST, min(MOST, known))
 
 

@@ -26,6 +26,7 @@ from functools import partial
 import numpy as np
 
 from driftfit.engine.kernel import State, exp, kernel, log
+from driftfit.trackers.parts.coarse.resolution import lasting
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.covariance import LEFT
 from driftfit.trackers.parts.modes.ladder import TOP, leap
@@ -33,7 +34,6 @@ from driftfit.trackers.parts.modes.noise_levels import OUTLIER, noise_at
 from driftfit.trackers.parts.modes.one_direction import drift_along
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
 from driftfit.trackers.parts.modes.trend import bend_slopes, level_slopes, move_along
-from driftfit.trackers.parts.resolution import lasting
 
 LEAST = 1e-100
 """Probability that a filter is never below."""

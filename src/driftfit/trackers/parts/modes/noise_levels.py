@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, exp, kernel, log
+from driftfit.trackers.parts.coarse.resolution import lasting, least_noise
 from driftfit.trackers.parts.modes.rows import sum_of_row
-from driftfit.trackers.parts.resolution import lasting, least_noise
 
 LEVELS = (1.0, 4.0, 16.0, 100.0)
 """Noise levels in units of r; the last is the outlier's."""
@@ -32,7 +32,8 @@ START = 0.7
 MEMORY = 70.0
 """Memory of r, in samples."""
 IN_A_ROW, RISE = 4.0, 0.3
-"""From the third outlier in a row on (`driftfit.trackers.parts.outlying_readings`), log r rises by this with each."""
+"""From the third outlier in a row on (`driftfit.trackers.parts.faults.outlying_readings`), log r rises by this with
+each."""
 MISFIT, SETTLED, EARLY = 0.5, 20.0, 140.0
 """Among the first `EARLY` samples, if the mean of e^2 / s, with a memory of `SETTLED`, is below `MISFIT`, r falls by as
 much: drift at the start was taken for noise. Later it does not, see above."""

@@ -34,6 +34,7 @@ BESIDE = 0.03
 STEPS = 4
 """Iterations for the eigenvector in a pass."""
 TINY = 1e-300
+"""Added to what is divided by."""
 DEPENDENT = 1e-10
 """Least pivot of M relative to its diagonal: below it, the regressors did not determine the direction."""
 

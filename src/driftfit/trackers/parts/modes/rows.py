@@ -1,4 +1,4 @@
-"""Sum and minimum of the scratch row over the filters, in eight chains of which none waits for the others.
+"""Sum and minimum of the scratch row over the filters, in eight or four chains, none of which waits for the others.
 
 The number of filters is a field of the state: the compiler keeps loops over it as loops, which it vectorises, while it
 would unroll those of known length into single operations.
@@ -34,7 +34,7 @@ def sum_of_row(s: State, l: int) -> float:
 
 @partial(kernel, inline=False)
 def least_of_row(s: State, l: int) -> float:
-    """The smallest entry of the scratch row."""
+    """The smallest entry of the scratch row, in four chains."""
     K = s.modes[l]
     for k in range(K, K + 8):
         s.row[k, l] = np.inf

@@ -19,6 +19,7 @@ Source: marginal likelihood under an inverse-gamma variance, West and Harrison, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -26,17 +27,19 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, exp, kernel, log
+from driftfit.trackers.parts.coarse.resolution import reading, same_reading
 from driftfit.trackers.parts.diffuse import know_nothing, take_in
 from driftfit.trackers.parts.excitation import learn_information, learn_scales
 from driftfit.trackers.parts.faults.first_samples import (
     NOISE,
     PHI,
+    RESIDUALS_IN_DOUBT,
     SPAN,
-    SURE,
     Y,
     contradict,
     doubtful,
 )
+from driftfit.trackers.parts.faults.outlying_readings import bound_leverage, learn_proportion
 from driftfit.trackers.parts.faults.stored_samples import (
     doubtful_samples,
     recall,
@@ -44,16 +47,24 @@ from driftfit.trackers.parts.faults.stored_samples import (
     store,
     without_fault,
 )
+from driftfit.trackers.parts.faults.strange_inputs import learn_stored_inputs
 from driftfit.trackers.parts.modes.filters import absorb, project, wander
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
 from driftfit.trackers.parts.modes.weights import WINDOW
-from driftfit.trackers.parts.outlying_readings import bound_leverage, learn_proportion
-from driftfit.trackers.parts.resolution import reading, same_reading
 from driftfit.trackers.rls import learn_scale
 
 LOOSE = 1e4
 """Variance of each coordinate before the first sample, in units of what least squares leave. A larger one would cost
 as many digits of the estimates."""
+LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi * math.sqrt(3.0))))
+"""log(gamma((nu + 1) / 2) / gamma(nu / 2) / sqrt(pi nu)) of Student's density, for nu = 1, 2, 3."""
+
+
+@kernel
+def start_density(e: float, s: float, nu: float) -> float:
+    """Student's log density of an innovation of the start, which has fewer than `RESIDUALS` before it; NaN for none."""
+    ratio = LOG_RATIOS[0] if nu < 1.5 else LOG_RATIOS[1] if nu < 2.5 else LOG_RATIOS[2]
+    return ratio - 0.5 * (log(s) + (nu + 1.0) * log(1.0 + e * e / (nu * s)))  # type: ignore[no-any-return]
 
 
 @kernel
@@ -94,7 +105,7 @@ def take_start(s: State, l: int) -> None:
 
 @kernel
 def forget(s: State, l: int) -> None:
-    """As before the first sample, but for the readings that `driftfit.trackers.parts.resolution` compares."""
+    """As before the first sample, but for the readings that `driftfit.trackers.parts.coarse.resolution` compares."""
     n = s.theta.shape[0]
     for i in range(n):
         s.theta[i, l], s.c[i, l], s.active[i, l] = s.m[i, 0, l], 0.0, 0.0
@@ -143,7 +154,7 @@ def drop(s: State, l: int) -> None:
 
 @partial(kernel, short=True)
 def reconsider(s: State, enough: bool, l: int) -> bool:
-    """Whether the filters may start: if there are ``enough`` samples, and `SURE` residuals if some are doubtful.
+    """Whether the filters may start: if there are ``enough`` samples, and `RESIDUALS_IN_DOUBT` if some are doubtful.
 
     Estimates are those without the doubtful samples before that too, because models compute later regressors with them.
     """
@@ -158,7 +169,7 @@ def reconsider(s: State, enough: bool, l: int) -> bool:
     ok, observed, fresh, leverage = s.ok[l], s.observed[l], s.fresh[l], s.leverage[l]
     s.ok[l], s.observed[l], s.leverage[l] = 1.0, 1.0, 1.0
     alone, residuals = repeat(s, False, l), s.count[l]
-    ready = enough and (residuals >= SURE or found == 0)
+    ready = enough and (residuals >= RESIDUALS_IN_DOUBT or found == 0)
     contradicted = found > 0 and contradict(repeat(s, True, l), alone, residuals)
     if contradicted:
         repeat(s, False, l)
@@ -215,7 +226,10 @@ def run_again(s: State, l: int) -> None:
 
 @partial(kernel, short=True)
 def begin_with_drift(s: State, least: float, l: int) -> None:
-    """Estimates, r, which is at least ``least``, and probabilities of the filters, which have m = d and C = I."""
+    """Estimates, r, which is at least ``least``, and probabilities of the filters, which have m = d and C = I; and the
+    ranges of the inputs.
+    """
+    learn_stored_inputs(s, l)
     n, K = s.theta.shape[0], s.modes[l]
     if s.remembered[l] <= WINDOW:
         run_again(s, l)

@@ -49,6 +49,7 @@ SWEEPS = 20
 FLOOR = 0.001
 """Smallest weight."""
 TINY = 1e-300
+"""Added to what is divided by."""
 
 E, PRECISION, SPAN = range(3)
 """Entries of a stored sample before its regressor: the innovation over its variance, the inverse variance (both in

@@ -22,13 +22,12 @@ Source: bounded leverage is Mallows's, see Hampel, Ronchetti, Rousseeuw and Stah
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.resolution import reading
+from driftfit.engine.kernel import State, kernel
+from driftfit.trackers.parts.coarse.resolution import reading
 
 REACH = 10.0
 """Standard deviations of the readings beyond which one is an outlier."""
@@ -36,11 +35,11 @@ LEVERAGE = 100.0
 """Largest weight of one regressor, in ordinary samples."""
 FIRST = 10.0
 """Number of first readings that are accepted without a check, for comparison with later ones; half of them where the
-regressors are ordinary and the innovation has more than `SURE` standard deviations."""
+regressors are ordinary and the prediction is contradicted."""
 SURE = 5.0
-"""See `FIRST`."""
+"""Standard deviations of the prediction from which on a sample contradicts it."""
 MEMORY = 1000.0
-"""Memory of the mean and variance of the readings, in readings."""
+"""Memory of the mean and variance of the readings, and of other means with which samples are compared, in samples."""
 LONGEST = 1e12
 """Upper bound of the factor p."""
 
@@ -48,8 +47,7 @@ LONGEST = 1e12
 def no_proportion() -> dict[str, Any]:
     """Fields before the first reading."""
     return {
-        "middle": 0.0, "spread": 0.0, "readings": 0.0, "widening": 1.0, "strange": 0.0, "left_out": 0.0,
-        "leverage": 1.0,
+        "middle": 0.0, "spread": 0.0, "readings": 0.0, "widening": 1.0, "strange": 0.0, "leverage": 1.0,
     }  # fmt: skip
 
 
@@ -95,9 +93,3 @@ def bound_leverage(s: State, l: int) -> None:
         square = s.phi[i, l] * s.phi[i, l] / s.noise[l]
         most = max(most, square / (LEVERAGE * s.c[i, l])) if s.c[i, l] > 0.0 else most
     s.leverage[l] = most * (1.0 + s.vague[l] / (s.r[l] * s.noise[l]))
-
-
-def proportion(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
-    """Its remark in a summary: nothing if all readings were accepted."""
-    count = int(lane["left_out"])
-    return (("Left out", f"{count} readings out of all proportion to those before"),) if count else ()

@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, exp, kernel
-from driftfit.trackers.parts.resolution import reading, same_reading
+from driftfit.trackers.parts.coarse.resolution import reading, same_reading
 
 ENTER, STAY = 0.001, 0.98
 """Probability that a sensor freezes, and that it stays frozen, per reading."""
-FIRST = 10.0
+MOVES = 10.0
 """Number of steps between readings before the smallest of them is a resolution."""
 
 
@@ -45,7 +45,7 @@ def leave_out_frozen(s: State, l: int) -> None:
         repeats = same_reading(s, s.before[l], l)
         s.before[l] = reading(s, l)
         frozen = 0.0
-        if repeats & (s.steps[l] >= FIRST):
+        if repeats & (s.steps[l] >= MOVES):
             prior, chance = ENTER * (1.0 - s.frozen[l]) + STAY * s.frozen[l], 1.0
             if (s.valid[l] > 0.0) & (s.s[l] < np.inf) & (s.s[l] > 0.0):
                 e = max(abs(s.y[l] - s.y_hat[l]) - 0.5 * s.quantum[l], 0.0)
