@@ -1,9 +1,12 @@
 """`AdaptiveKalman` after a jump, and where one parameter walks as fast as the noise or faster."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
 from driftfit import RLS, AdaptiveKalman, Kalman, Regression, track
+from driftfit.trackers.parts.modes.smoother import given_all
 
 T, AT, NOISE = 500, 300, 0.3
 
@@ -45,3 +48,29 @@ def test_one_parameter_that_walks_fast(std, limit):
         inside.append(np.mean(np.abs(run.theta - theta)[150:] < 1.96 * run.std[150:]))
     assert np.mean(ratios) < limit
     assert 0.93 < np.mean(inside) < 0.98
+
+
+def test_probabilities_given_all_are_those_of_all_paths():
+    """Where a state replaces the last one before a transition, its path may go on there, and that of the last in it."""
+    rng = np.random.default_rng(0)
+    K, steps = 3, 6
+    stay, by, over = rng.dirichlet(np.ones(K), size=K), np.array([-1, 0, -1, 1, 0, -1]), np.array([0.5, 0.2, 0.0])
+    moves, likelihood = [], rng.random((steps, K))
+    for at in by:
+        into = np.eye(K)
+        if at >= 0:
+            into[at, at], into[at, -1] = 1.0 - over[at], over[at]
+            into[-1, at], into[-1, -1] = 1.0, 0.0
+        moves.append(into @ stay)
+    after = np.empty((steps, K))
+    before = np.full(K, 1.0 / K)
+    for t in range(steps):
+        after[t] = before * likelihood[t] / (before @ likelihood[t])
+        before = after[t] @ moves[t]
+    expected = np.zeros((steps, K))
+    for path in product(range(K), repeat=steps):
+        p = np.prod([likelihood[t, path[t]] for t in range(steps)])
+        p *= np.prod([moves[t][path[t], path[t + 1]] for t in range(steps - 1)])
+        expected[np.arange(steps), path] += p
+    found = given_all(after, stay, np.zeros((K, K)), np.zeros(steps), np.ones(steps, bool), by, over)
+    np.testing.assert_allclose(found, expected / expected.sum(axis=1, keepdims=True), rtol=1e-12)

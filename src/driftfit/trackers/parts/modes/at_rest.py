@@ -29,7 +29,7 @@ OVER = {1.0: 0.5, 0.2: 0.1}
 
 def no_rest(ratio: Array) -> dict[str, Any]:
     """Fields before the first sample, for the ratios (n, K) of the filters; the last filter is at rest."""
-    return {"over": np.array([OVER.get(float(most), 0.0) for most in ratio.max(axis=0)])}
+    return {"over": np.array([OVER.get(float(most), 0.0) for most in ratio.max(axis=0)]), "replaced_by": -1}
 
 
 @partial(kernel, inline=False)
@@ -41,6 +41,7 @@ def come_to_rest(s: State, l: int) -> float:
         if s.over[j, l] * s.mu[j, l] > most:
             best, most = j, s.over[j, l] * s.mu[j, l]
     gained = most - s.mu[last, l]
+    s.replaced_by[l] = best if gained > 0.0 else -1
     if gained <= 0.0:
         return 0.0
     s.mu[last, l] = most

@@ -101,12 +101,11 @@ def ladders(n: int, groups: Any) -> tuple[Array, Array, Array, Array]:
     return np.array(ratio).T, np.array(moves).T, np.array(arrive), np.array(learned)
 
 
-def chain(moves: Array, arrive: Array, over: Array) -> tuple[Array, Array]:
+def chain(moves: Array, arrive: Array) -> tuple[Array, Array]:
     """Transitions (K, K) of the modes as A + calm B."""
     K = len(arrive)
     climb, descend, back = moves
-    A = np.diag(1.0 - back - over) + np.diag(back[1:], -1)
-    A[:, -1] += over
+    A = np.diag(1.0 - back) + np.diag(back[1:], -1)
     B = np.diag(-arrive.sum() - climb - descend) + np.diag(climb[:-1], 1) + np.diag(descend[1:], -1)
     return A, B + np.broadcast_to(arrive, (K, K))
 
