@@ -22,8 +22,9 @@ estimates themselves (`driftfit.trackers.parts.modes.filters`). The one-step var
 band is for samples that are not outliers.
 
 The start is exact diffuse least squares without drift, in which regressors out of proportion count less too, until
-there are enough residuals to estimate r. Fault codes among these samples are found then, and least squares repeated
-without them (`driftfit.trackers.parts.faults.first_samples`). Every filter starts from generalised least squares with
+there are enough residuals to estimate r; its bands are Student's (`driftfit.trackers.parts.few_residuals`). Fault
+codes among these samples are found then, and least squares repeated without them
+(`driftfit.trackers.parts.faults.first_samples`). Every filter starts from generalised least squares with
 its own drift over the same samples (`driftfit.trackers.parts.modes.start`), in the directions that the regressors span.
 Scaling inputs or outputs changes only the units.
 
@@ -82,6 +83,7 @@ from driftfit.trackers.parts.faults.strange_inputs import (
     learn_stored_inputs,
     no_strange_inputs,
 )
+from driftfit.trackers.parts.few_residuals import widen_estimates, wider
 from driftfit.trackers.parts.frozen import held_readings, leave_out_frozen, not_frozen
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.filters import (
@@ -238,9 +240,12 @@ def begin(s: State, l: int) -> None:
         early = rank == n and s.remembered[l] <= n + RESIDUALS
         enough = s.count[l] >= RESIDUALS and (early or s.remembered[l] >= FIRST)
         ready = s.remembered[l] - rank >= RESIDUALS and reconsider(s, enough, l)
+        s.s[l] *= wider(residuals)
         spanned_variance(s, l)
         if ready:
             settle(s, l)
+        else:
+            widen_estimates(s, l)
 
 
 @kernel
