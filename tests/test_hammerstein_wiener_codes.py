@@ -57,3 +57,20 @@ def test_minimal_parameters_and_the_likelihood_of_a_single_knot():
     assert run.state["refused"] == 2
     assert np.isfinite(run.loglik)
     assert any(name == "Refused" for name, _ in run.summary().remarks)
+
+
+@pytest.mark.parametrize("signal", ["y", "u"])
+@pytest.mark.parametrize("output", [None, PiecewiseLinear([LEVEL])], ids=["linear", "bent"])
+def test_a_code_does_not_mislead_the_filter_of_minimal_parameters(signal, output):
+    plant = HammersteinWiener(1, 2, input=PiecewiseLinear([0.0]), output=output, intercept=True)
+    tracker = ExtendedKalman(q=1e-7, r=0.02, theta0=0.3)
+    for seed in range(2):
+        y, u = record(seed)
+        codes, gaps = {"y": y.copy(), "u": u.copy()}, {"y": y.copy(), "u": u.copy()}
+        for at, code in (([100], -999.0), ([200, 201, 202], 9999.0), ([350], 0.0 if signal == "y" else 30.0)):
+            codes[signal][at], gaps[signal][at] = code, np.nan
+        run, missing = (track(plant, tracker, record["y"], record["u"]) for record in (codes, gaps))
+        wrong, least = (np.sqrt(np.nanmean((one.prediction - y)[360:] ** 2)) for one in (run, missing))
+        assert wrong < 1.2 * least
+        assert (run.state["inputs_out"] > 0) == (signal == "u")
+        assert any(name == ("Refused" if signal == "y" else "Inputs left out") for name, _ in run.summary().remarks)

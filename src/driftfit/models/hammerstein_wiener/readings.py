@@ -10,7 +10,8 @@ with N their number. The factor p is 1; with every such reading in a row it doub
 on a new level, and in 16 readings if it repeats that in all digits or is far from it, as codes that come in runs. The
 excuse x is 1 if the model predicts that the output leaves its range at this end, or the number of widths by which an
 input left its own range lately, if that is more. Among the first `FIRST` readings only what is `FAR` widths away is
-refused.
+refused. Without an output block only trackers of the minimal parameters, which do not judge readings that are near,
+need this.
 
 Source: ours; see `driftfit.models.fault_codes` for the rule of models without a memory of this range. Cost: two
 comparisons per sample.
@@ -47,8 +48,8 @@ ENOUGH = 10.0
 """Number of readings among which one that is far from all others is forgotten."""
 EXCUSED = 10.0
 """Widths that are allowed for one of an input, or if the prediction is at the end of the range."""
-LASTS = 0.8
-"""Share of the excuse of an input that is left at the next sample."""
+LASTS, SLOWLY = 0.8, 0.25
+"""Share of the excuse of an input that is left at the next sample; and widths by which its range grows with one."""
 
 
 @part
@@ -70,6 +71,7 @@ def watch_inputs(m: Array, p: Places) -> None:
     """Before a reading is judged: learn the ranges of the inputs, and by how many widths one left its own lately."""
     m[RESPONDING, 0] *= LASTS
     m[REFUSED, 0] = 0.0
+    grows = SLOWLY if m[READINGS, 0] >= ENOUGH else np.inf
     for i in range(p[INPUTS]):
         low, high = p[SPANS] + 2 * i, p[SPANS] + 2 * i + 1
         u = m[p[US] + i, 0]
@@ -77,7 +79,8 @@ def watch_inputs(m: Array, p: Places) -> None:
             away, wide = max(u - m[high, 0], m[low, 0] - u), m[high, 0] - m[low, 0]
             if m[READINGS, 0] >= FEWEST and away > m[RESPONDING, 0] * wide:
                 m[RESPONDING, 0] = away / wide if wide > 0.0 else np.inf
-            m[low, 0], m[high, 0] = min(m[low, 0], u), max(m[high, 0], u)
+            most = grows * wide if wide > 0.0 else np.inf  # a few codes do not make the next one ordinary
+            m[low, 0], m[high, 0] = min(m[low, 0], max(u, m[low, 0] - most)), max(m[high, 0], min(u, m[high, 0] + most))
 
 
 @part

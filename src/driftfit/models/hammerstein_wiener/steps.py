@@ -154,10 +154,10 @@ def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
         right = minimal_past(m, p, theta) if m[MINIMAL, 0] > 0.0 else past(m, p, theta)
         y = m[Y, 0]
         observed = abs(y) < LARGEST
-        if p[IDENTITY] == 0:
+        if p[IDENTITY] == 0 or m[MINIMAL, 0] > 0.0:
             watch_inputs(m, p)
             if observed and strange(m, y):
-                observed = not refused(m, y, invert(m, p, right))
+                observed = not refused(m, y, right if p[IDENTITY] > 0 else invert(m, p, right))
         if observed:
             if m[VARIANCE, 0] > 0.0:
                 output_at(m, p, y, g, h)
