@@ -6,7 +6,9 @@ sample, *smoothed* that of `run.smooth()` over the whole record, *y + h* the for
 `largest_pole`, *gain* `dc_gain` by its standard deviation (the delta method), *Fieller* the interval of `long_run`,
 each at the last sample. ``!`` marks shares outside .93 to .98 by more than two standard errors of independent records.
 
-The last table is the smoothed path of a `Bank`, which expects jumps, where parameters of a regression walk instead.
+The second table is the smoothed path of a `Bank`, which expects jumps, where parameters of a regression walk instead.
+The third has the first samples of ARX(1, 1): `run.band()` of theta after T = n + 1 .. n + 10 samples that can be used,
+and `run.output_band()` of the next output, for 4 ``--records`` records.
 
 Run: python benchmarks/default_bands.py [--records 200] [--quick]
 """
@@ -18,7 +20,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from driftfit import ARX, AdaptiveKalman, Bank, Regression, Track, track
+from driftfit import ARX, FLS, RLS, AdaptiveKalman, Bank, InstrumentalVariables, Regression, Track, track
 from driftfit.engine.kernel import Array
 
 NOISE, HALF, LEAST, MOST = 0.3, 1.959963984540054, 0.93, 0.98
@@ -110,6 +112,23 @@ def bank(records: int) -> None:
         )
 
 
+def first(records: int, trackers: int) -> None:
+    """Print the coverage at the first samples that have a variance, for trackers that estimate it."""
+    model, start = SYSTEMS["ARX(1, 1)"]
+    n, rng = len(start), np.random.default_rng(5)
+    made = [simulated(np.tile(start, (n + 12, 1)), rng) for _ in range(records)]
+    y, u = (np.array(part) for part in zip(*made, strict=True))
+    print(f"\n{'residuals':46}" + "".join(f"{k:>6}" for k in range(1, 11)))
+    for tracker in (AdaptiveKalman(), Bank(), RLS(1.0), RLS(0.98), FLS(1e3), InstrumentalVariables(1.0))[:trackers]:
+        fleet, found = track(model, tracker, y, u, by="row"), []
+        for key, own in zip(fleet, y, strict=True):
+            (low, high), (least, most) = fleet[key].band(), fleet[key].output_band()
+            of_theta = np.mean((low <= start) & (start <= high), axis=1)[n + 1 : -1]
+            found.append([of_theta, ((least <= own) & (own <= most))[n + 2 :]])
+        for name, shares in zip(("theta", "next y"), np.mean(found, axis=0), strict=True):
+            print(f"{repr(tracker) if name == 'theta' else '':38}{name:8}" + "".join(f"{x:6.2f}" for x in shares))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--records", type=int, default=200)
@@ -124,6 +143,7 @@ def main() -> None:
                 cells = "".join(f"{shown(shares[column], records):>10}" for column in COLUMNS)
                 print(f"{f'{name}, {kind}':24}{T:5}{cells}", flush=True)
     bank(2 if given.quick else records // 4)
+    first(4 * records, 2 if given.quick else 6)
 
 
 if __name__ == "__main__":

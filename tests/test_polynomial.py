@@ -335,3 +335,17 @@ def test_readings_are_judged_and_not_what_a_shift_leaves_of_them():
     assert run.state["frozen_readings"] >= 19.0
     left_out = np.flatnonzero(~run.ok)
     assert {400, *range(501, 520)} <= set(left_out[left_out > 20]) <= {400, 401, *range(500, 521)}
+
+
+@pytest.mark.parametrize("level", [20.0, 1000.0])
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_level_without_an_offset_is_what_an_integrating_noise_predicts(order, level):
+    """D was drawn far from an unstable one, and then predicted nine tenths of the level."""
+    errors = []
+    for seed in range(3, 6):
+        rng = np.random.default_rng(seed)
+        u = rng.normal(size=600)
+        y = level + signal.lfilter([0.0, 0.5], [1.0, -0.8], u) + 0.05 * rng.normal(size=600)
+        run = track(BoxJenkins(nc=order, nd=order), AdaptiveKalman(), y, u)
+        errors.append(np.sqrt(np.mean(run.innovation[100:] ** 2)))
+    assert max(errors) < (0.15 if order == 1 else 0.3)

@@ -82,3 +82,22 @@ def test_other_trackers_have_it_while_they_start():
     np.testing.assert_allclose(adaptive[N + 1 : N + 4], plain[N + 1 : N + 4], atol=1e-9)
     instrumental = track(Regression(N), InstrumentalVariables(1.0), y, u).log_density
     np.testing.assert_allclose(instrumental, plain, atol=1e-9)
+
+
+@pytest.mark.parametrize("tracker", [AdaptiveKalman(), Bank(), RLS(1.0), FLS(1e9)], ids=repr)
+def test_bands_contain_the_truth_from_the_first_residual_on(tracker):
+    """A normal quantile of a variance that one residual determines held .7 of them."""
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=(500, N + 5, N))
+    truth = np.array([1e3, 5e4])
+    y = u @ truth + 300.0 * rng.normal(size=u.shape[:2])
+    y[:, 1] = np.nan
+    fleet = track(Regression(N), tracker, y, u, by="row")
+    found = []
+    for key, values in zip(fleet, y, strict=True):
+        (low, high), (least, most) = fleet[key].band(), fleet[key].output_band()
+        found.append([np.mean((low <= truth) & (high >= truth), axis=1), (least <= values) & (values <= most)])
+    of_theta, of_y = np.mean(found, axis=0)
+    for shares in (of_theta[N + 1 :], of_y[N + 2 :]):
+        assert (shares > 0.92).all()
+        assert (shares[:3] < 0.98).all()

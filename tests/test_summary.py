@@ -224,3 +224,23 @@ def test_numbers_beside_each_other_have_the_digits_that_differ():
     assert together(31234.41, 31234.93) == ("31234.4", "31234.9")
     assert together(4.0227, 3.485, 3.4858, std=0.05) == ("4.023", "3.485", "3.486")
     assert together(0.1, 0.1 + 1e-15, float("nan")) == ("0.1", "0.1", "nan")
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e6])
+def test_a_level_that_nothing_explains_calls_for_a_constant(unit):
+    y, u = arx_record(200, 4)
+    high = unit * (y + 20.0 * y.std())
+    high[[3, 50, 120]] = np.nan, -999.0, 1e9
+
+    def notes(model, y, u):
+        return [text for name, text in track(model, RLS(1.0), y, u).summary().remarks if name.startswith("No ")]
+
+    (note,) = notes(ARX(1, 1), high, u)
+    assert note.endswith("the inputs about 0: intercept=True is missing")
+    for model, output, inputs in (
+        (ARX(1, 1, intercept=True), high, u),
+        (ARX(1, 1), y, u),
+        (ARX(1, 1), high, u + 5.0),
+        (Regression(2), high, np.column_stack([u, np.ones(200)])),
+    ):
+        assert not notes(model, output, inputs)

@@ -38,7 +38,7 @@ from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.evidence import Evidence
-from driftfit.judge.regressors import Rows
+from driftfit.judge.regressors import Rows, stuck
 from driftfit.judge.statistics.attribution import Attribution, alike, attribute
 from driftfit.judge.statistics.constancy import Constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
@@ -129,6 +129,8 @@ class Verdict(Printed):
     held : tuple of str
         The parameters that the test takes for 0, so that it can judge the others: one or more of every group, and
         those whose regressors are always 0.
+    stuck : int
+        Readings of a stuck sensor, which are left out.
     """
 
     drifts: bool | None
@@ -150,6 +152,7 @@ class Verdict(Printed):
     spread_with: tuple[str, ...] = ()
     dependent: tuple[tuple[str, ...], ...] = ()
     held: tuple[str, ...] = ()
+    stuck: int = 0
 
     @property
     def constants(self) -> Paired:
@@ -287,7 +290,12 @@ class Verdict(Printed):
         if self.spread_with:
             text += (
                 f"The residuals are larger where the regressor of {' or '.join(self.spread_with)} is: either this "
-                "coefficient varies from sample to sample, which no tracker can follow, or the noise grows with it."
+                "coefficient varies from sample to sample, which no tracker can follow, or the noise grows with it. "
+            )
+        if self.stuck:
+            text += (
+                f"{self.stuck} readings repeat the one before while the inputs move, as those of a stuck sensor do: "
+                "they are left out."
             )
         return text.strip()
 
@@ -416,6 +424,7 @@ def judged(known: Evidence, level: float) -> Verdict:
         spread_with=_spread_with(names, rows, test) if drifts is False else (),
         dependent=groups,
         held=tuple(name for name in run.model.names if name not in names),
+        stuck=int(stuck(run.y, run.u).sum()),
     )
 
 

@@ -72,6 +72,7 @@ class ARX(CountedInputs):
     start: str = "drop"
     ny: int | tuple[str, ...] = 1
     per_input = ("nb", "nk")
+    constant = "intercept"
 
     def __post_init__(self) -> None:
         if not isinstance(self.ny, int):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -30,6 +30,8 @@ class Model(Settings, ABC):
     """Whether the last regressor is the constant 1."""
     ny: Any = 1
     """Outputs: how many, or their names."""
+    constant: ClassVar[str] = ""
+    """The setting that adds a constant to the prediction, of a model that predicts none without it."""
 
     @abstractmethod
     def bind(self, inputs: int | Sequence[str]) -> Model:

@@ -114,6 +114,7 @@ class LinearisedTransfer(CountedInputs):
     """A transfer function whose regressors depend on theta; ``point`` holds them at one theta."""
 
     point: tuple[float, ...] | None
+    constant = "offset"
 
     def _check_point(self) -> None:
         if self.point is None:

@@ -45,6 +45,7 @@ class Regression(CountedInputs):
     ny: int | tuple[str, ...] = 1
     shared: bool = False
     inputs_setting = "regressors"
+    constant = "intercept"
 
     def __post_init__(self) -> None:
         self._check_inputs()

@@ -21,7 +21,7 @@ from driftfit.run.program import Program, State, kept, lanes_of, state_of
 from driftfit.run.public_class import Plain
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.student import log_student, residuals_before
+from driftfit.trackers.student import log_student, residuals_before, wider
 
 
 class Lane(NamedTuple):
@@ -291,12 +291,14 @@ class Track(Plain, Columns):
     def band(self, level: float = 0.95, conformal: bool = False) -> tuple[Array, Array]:
         """(low, high), each (T, n): pointwise bands of theta at this level, under the tracker's own model.
 
-        With ``conformal`` they are widened by the factor by which bands of the output had to be widened so far
-        (`output_band`).
+        They are Student's where the noise variance is estimated (`Tracker.learns_noise`). With ``conformal`` they are
+        normal, and widened by the factor by which bands of the output had to be widened so far (`output_band`).
         """
         half = quantile(level) * self.std
         if conformal:
             half = half * self.after_rows(self._widened(level, "band")[1:, None])
+        else:
+            half = half * self.after_rows(self._student(level, 1)[:, None])
         return self.theta - half, self.theta + half
 
     def output_band(self, level: float = 0.95, conformal: bool = False) -> tuple[Array, Array]:
@@ -312,9 +314,19 @@ class Track(Plain, Columns):
                 "use run.forecast() for bands of the output."
             )
         half = quantile(level, "output_band") * self.innovation_std
-        if conformal:
-            half = half * self.by_row(self._widened(level, "output_band")[:-1])
+        half = half * self.by_row(self._widened(level, "output_band")[:-1] if conformal else self._student(level, 0))
         return self.prediction - half, self.prediction + half
+
+    def _student(self, level: float, own: int) -> Array:
+        """Student's quantile over the normal one, by the residuals before each row and its ``own`` (0 or 1); 1 for
+        trackers to which the noise variance is given, or which enlarge their variances themselves.
+        """
+        ok, s = self.in_rows("ok") > 0.0, self.in_rows("s")
+        if not self.tracker.learns_noise:
+            return np.ones(len(s))
+        return wider(
+            residuals_before(ok, s, float((self.start or {}).get("count", 0.0))) + own * (ok & ~np.isinf(s)), level
+        )
 
     def _widened(self, level: float, verb: str) -> Array:
         """The conformal factor before each row and after the last."""

@@ -9,6 +9,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.data.record import Labels
+from driftfit.engine.kernel import Array
 from driftfit.judge.compare import Comparison, compare
 from driftfit.models.fault_codes import refusals
 from driftfit.run.outputs import Outputs
@@ -16,6 +17,8 @@ from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.by_output import ByOutput
 from driftfit.show.parts.text import Printed, counts, digits, facts, shortened, table_of
 
+HIGH = 3.0
+"""Deviations from 0 from which on the level of an output calls for a constant."""
 _RIVALS = ("tracked", "persistence", "constant LS", "constant ARX")
 
 
@@ -104,7 +107,7 @@ def summarise(run: Track) -> Summary:
     return Summary(
         repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
         _signals(run.labels) if run.labels.u or run.labels.y != "y" else "", _span(run), counts(run.labels.dropped),
-        (*remarks, *_missing(run), *refusals(run.state), *run.tracker.remarks(run)),
+        (*remarks, *_missing(run), *_level(run), *refusals(run.state), *run.tracker.remarks(run)),
     )  # fmt: skip
 
 
@@ -136,6 +139,29 @@ def _signals(labels: Labels) -> str:
 def _missing(run: Track) -> tuple[tuple[str, str], ...]:
     """Readings that were counted as missing although they contain a number."""
     return (("Taken as missing", counts(run.labels.missing)),) if run.labels.missing else ()
+
+
+def _level(run: Track) -> tuple[tuple[str, str], ...]:
+    """What is missing if the output varies about a level that neither the model nor an input about its own explains."""
+    setting = run.model.constant
+    if not setting or getattr(run.model, setting):
+        return ()
+    (level, *others), (spread, *others_spread) = zip(*(_middle(x) for x in (run.y, *run.u.T)), strict=True)
+    explained = any(not abs(x) <= wide for x, wide in zip(others, others_spread, strict=True))
+    if explained or not abs(level) > HIGH * spread > 0.0:
+        return ()
+    inputs = ", the inputs about 0" if others else ""
+    return ((f"No {setting}", f"y varies by {spread:.3g} about {level:.4g}{inputs}: {setting}=True is missing"),)
+
+
+def _middle(x: Array) -> tuple[float, float]:
+    """The median, and the usual distance from it; their mean and deviation if most values are equal."""
+    known = x[np.isfinite(x)]
+    if not len(known):
+        return 0.0, 0.0
+    middle = float(np.median(known))
+    spread = float(np.median(np.abs(known - middle)))
+    return (middle, spread / 0.6745) if spread > 0.0 else (float(np.mean(known)), float(np.std(known)))
 
 
 def _span(run: Track) -> str:

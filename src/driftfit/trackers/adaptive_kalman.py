@@ -26,8 +26,9 @@ estimates themselves (`driftfit.trackers.parts.modes.filters`). The one-step var
 band is for samples that are not outliers.
 
 The start is exact diffuse least squares without drift, in which regressors out of proportion count less too, until
-there are enough residuals to estimate r. Fault codes among these samples are found then, and least squares repeated
-without them (`driftfit.trackers.parts.faults.first_samples`). Every filter starts from generalised least squares with
+there are enough residuals to estimate r; its bands are Student's (`driftfit.trackers.parts.few_residuals`). Fault
+codes among these samples are found then, and least squares repeated without them
+(`driftfit.trackers.parts.faults.first_samples`). Every filter starts from generalised least squares with
 its own drift over the same samples (`driftfit.trackers.parts.modes.start`), in the directions that the regressors span.
 Scaling inputs or outputs changes only the units.
 
@@ -86,6 +87,7 @@ from driftfit.trackers.parts.faults.outlying_readings import (
 )
 from driftfit.trackers.parts.faults.stored_samples import machine_doubt
 from driftfit.trackers.parts.faults.strange_inputs import learn_inputs, leave_out_input, no_strange_inputs
+from driftfit.trackers.parts.few_residuals import widen_estimates, wider
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.filters import (
     enter_filters,
@@ -210,9 +212,12 @@ def begin(s: State, l: int) -> None:
         early = rank == n and s.remembered[l] <= n + RESIDUALS
         enough = s.count[l] >= RESIDUALS and (early or s.remembered[l] >= FIRST)
         ready = s.remembered[l] - rank >= RESIDUALS and reconsider(s, enough, l)
+        s.s[l] *= wider(residuals)
         spanned_variance(s, l)
         if ready:
             settle(s, l)
+        else:
+            widen_estimates(s, l)
 
 
 @kernel

@@ -36,3 +36,9 @@ def residuals_before(ok: Array, s: Array, first: float) -> Array:
     """
     counted = ok & ~np.isinf(s)
     return np.asarray(first + np.cumsum(counted) - counted)
+
+
+def wider(nu: Array, level: float) -> Array:
+    """Student's quantile of a two-sided band over the normal one; 1 where nu is 0, and so no variance is known."""
+    p = 0.5 + level / 2.0
+    return np.where(nu > 0.0, scipy.special.stdtrit(np.maximum(nu, 1.0), p) / scipy.special.ndtri(p), 1.0)

@@ -270,7 +270,7 @@ class HammersteinWiener(Model):
         return self.out == IDENTITY
 
     def memory(self) -> Mapping[str, Any]:
-        return {"blocks": _memory(self).copy()}
+        return {"blocks": _memory(self).copy(), "refused": 0.0}
 
     @property
     def places(self) -> tuple[int, ...]:

@@ -34,6 +34,7 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     NOW,
     OWN,
     PREDICTED,
+    REFUSED,
     US,
     N,
     Y,
@@ -55,8 +56,9 @@ class RunTimeOrders(Wider):
     room: int
 
     def memory(self) -> Mapping[str, Any]:
-        own = self.model.memory()["blocks"]
-        return {"blocks": np.append(own, np.zeros(self.room - own.size)), "orders": np.array(self.places)}
+        memory = self.model.memory()
+        blocks = np.append(memory["blocks"], np.zeros(self.room - memory["blocks"].size))
+        return {**memory, "blocks": blocks, "orders": np.array(self.places)}
 
     @property
     def steps(self) -> ModelSteps:
@@ -92,6 +94,7 @@ def _steps(into: tuple[Kind, ...], out: Kind) -> ModelSteps:
         for k in range(s.orders[N_OUT, l] - 1):
             s.phi[at + k, l] = s.blocks[s.orders[G_PAST, l] + 1 + k, l]
         s.y[l], s.dt[l] = s.blocks[Y, l], s.blocks[DT, l]
+        s.refused[l] += s.blocks[REFUSED, l]
         s.noise[l] *= s.blocks[FACTOR, l]
 
     @kernel

@@ -24,6 +24,7 @@ from driftfit.models.base import GAP
 from driftfit.models.hammerstein_wiener.curves.basis import INSIDE
 from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, input_values, level_of, output_values, usable
 from driftfit.models.hammerstein_wiener.output_curve import believe, inverting, laying, locating, refining
+from driftfit.models.hammerstein_wiener.readings import refused, strange, watch_inputs
 from driftfit.models.hammerstein_wiener.regressor_rows import (
     complete,
     fill,
@@ -65,6 +66,7 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     OWN_NK,
     PREDICTED,
     RAW,
+    REFUSED,
     SPARE,
     STARTED,
     US,
@@ -152,6 +154,10 @@ def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
         right = minimal_past(m, p, theta) if m[MINIMAL, 0] > 0.0 else past(m, p, theta)
         y = m[Y, 0]
         observed = abs(y) < LARGEST
+        if p[IDENTITY] == 0 or m[MINIMAL, 0] > 0.0:
+            watch_inputs(m, p)
+            if observed and strange(m, y):
+                observed = not refused(m, y, right if p[IDENTITY] > 0 else invert(m, p, right))
         if observed:
             if m[VARIANCE, 0] > 0.0:
                 output_at(m, p, y, g, h)
@@ -247,6 +253,7 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
         for k in range(more):
             s.phi[at_d + k, l] = s.blocks[present + k, l]
         s.y[l], s.dt[l] = s.blocks[Y, l], s.blocks[DT, l]
+        s.refused[l] += s.blocks[REFUSED, l]
         s.noise[l] *= s.blocks[FACTOR, l]
 
     @kernel

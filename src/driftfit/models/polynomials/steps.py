@@ -28,6 +28,10 @@ STABLE = 0.9999
 CONTRACTION, CONTRACTIONS = 0.9, 20
 """Factor of the zeros of C or F while it is unstable, and how often it is applied."""
 
+DOUBLINGS = 12
+"""How often the zeros of D are drawn towards 0 while it is unstable: by 1 - `STABLE`, and then twice as much each time.
+"""
+
 LEAST_RESIDUAL = 1e-10
 """A residual below this share of the output and the fitted value is rounding that an interpolated sample left: 0."""
 
@@ -145,17 +149,27 @@ def contract(s: State, first: int, order: int, sign: float, l: int) -> None:
 
 @kernel
 def bound(s: State, first: int, order: int, sign: float, l: int) -> None:
-    """An unstable polynomial in s.point becomes a stable one, which is not 1.
+    """An unstable polynomial in s.point becomes a stable one near it, which is not 1.
 
-    D bounds what the model takes for noise. It must not be C, as it would be if both were 1: e and v would then be the
-    same, and their parameters could not be learned again.
+    D is what the model takes for noise, and near 1 - z^-1 it represents the level of a record without an offset: the
+    level would not be predicted any more if D were drawn far from it. D must not be C, as it would be if both were 1: e
+    and v would then be the same, and their parameters could not be learned again.
     """
+    nearer = 1.0 - STABLE
+    if not stable(s, first, order, sign, l):
+        for _ in range(DOUBLINGS if order > 1 else 0):
+            if not stable(s, first, order, sign, l):
+                scale = 1.0 - nearer
+                for i in range(order):
+                    s.point[first + i, l] *= scale
+                    scale *= 1.0 - nearer
+                nearer *= 2.0
     if not stable(s, first, order, sign, l):
         total = 0.0
         for i in range(order):
             total += abs(s.point[first + i, l])
         for i in range(order):
-            s.point[first + i, l] *= CONTRACTION / total if total < LARGEST else 0.0
+            s.point[first + i, l] *= STABLE / total if total < LARGEST else 0.0
 
 
 @kernel

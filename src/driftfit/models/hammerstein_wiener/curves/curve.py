@@ -115,9 +115,12 @@ class Basis(Settings, ABC):
 
     @property
     def steepness(self) -> float:
-        """The height as a mean slope: thresholds for slopes are shares of it, so that no unit of x matters."""
+        """The height as a mean slope: thresholds for slopes are shares of it, so that no unit of x matters.
+
+        1 for straight pieces with a single knot, which have no range, and slopes of 1.
+        """
         low, high = self.rise_between
-        return self.height / (high - low)
+        return self.height / (high - low) if high > low else 1.0
 
     @property
     def scale(self) -> float:

@@ -12,7 +12,10 @@ are large.
 
 Use it if an initial value near the truth is known, as from `hand_off`; from a distant one it can fail where stage one
 cannot. It is not iterated: the iterated filter failed in 17 % of the runs of example 1 of Feng and Hong (2021). A
-reading out of all proportion is refused (`driftfit.models.fault_codes`).
+reading out of all proportion is refused (`driftfit.models.fault_codes`,
+`driftfit.models.hammerstein_wiener.readings`). After an input left its own range a sample is not used if its error is
+`FAR` times the usual one although the reading is within the range of earlier ones: a fault code of the input, to which
+the output did not respond.
 
 Source: the implicit-measurement form of Jazwinski (1970), section 8.3; inflation and hand-off are ours. Only one
 triangle of P is kept. Cost per sample: O(n_x^2 + n).
@@ -33,10 +36,18 @@ from driftfit.engine.settings import matrix, vector
 from driftfit.models.base import Model
 from driftfit.models.fault_codes import UNJUDGED, refused
 from driftfit.models.hammerstein_wiener.products import Structure
+from driftfit.models.hammerstein_wiener.step_memory import LEAST_Y, MOST_Y, RAW, RESPONDING
 from driftfit.models.hammerstein_wiener.trackers.minimal import Minimal, minimal_memory, structure_of
 from driftfit.trackers.kalman import drift, drift_matrix
 from driftfit.trackers.parts.covariance import corrected, product_with
+from driftfit.trackers.parts.faults.omissions import omissions
 from driftfit.trackers.parts.varying_drift import read_drift
+
+LATELY, FAR = 0.3, 10.0
+"""Widths by which an input must have left its range, of which some are forgotten with each sample; and the multiple of
+the usual error from which on a sample contradicts the response to that."""
+FIRST, MEMORY = 8.0, 100.0
+"""Samples from which on there is a usual error, and its memory."""
 
 
 @lru_cache
@@ -75,6 +86,19 @@ spread_of = product_with(slope)
 """s.g = P H'; returns H P H'."""
 
 
+@kernel
+def leave_out_unmoved(s: State, e: float, l: int) -> None:
+    """Leave out a sample after an input left its range, if the output did not respond: a fault code of the input."""
+    square, y = e * e, s.blocks[RAW, l]
+    unmoved = (y >= s.blocks[LEAST_Y, l]) & (y <= s.blocks[MOST_Y, l]) & (s.blocks[RESPONDING, l] > LATELY)
+    left = unmoved & (square > FAR * FAR * s.usual_square[l]) & (s.squares[l] >= FIRST)
+    used = s.ok[l] if not left else 0.0
+    s.squares[l] += used
+    s.usual_square[l] += used * (square - s.usual_square[l]) / min(max(s.squares[l], 1.0), MEMORY)
+    s.inputs_out[l] += s.ok[l] - used
+    s.ok[l] = used
+
+
 @lru_cache
 def _steps(structure: Structure, together: bool) -> TrackerSteps:
     row = linearised(structure)
@@ -84,6 +108,7 @@ def _steps(structure: Structure, together: bool) -> TrackerSteps:
         y_hat = row(s, l)
         if s.observed[l] > 0.0 and refused(s, y_hat, l):
             s.ok[l], s.observed[l] = 0.0, 0.0
+        leave_out_unmoved(s, s.y[l] - y_hat, l)
         h = spread_of(s, l)
         corrected(s, y_hat, (1.0 + s.inflation[l]) * h + s.r[l] * s.noise[l], l)
 
@@ -137,8 +162,14 @@ class ExtendedKalman(Minimal):
             "drift_root": np.ones(n),
             "h_row": np.zeros(n),
             "var": np.zeros(n),
+            "usual_square": 0.0,
+            "squares": 0.0,
+            "inputs_out": 0.0,
             **UNJUDGED,
         }
+
+    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
+        return omissions(run.state)
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         structure = structure_of("ExtendedKalman", model)

@@ -52,6 +52,7 @@ from driftfit.trackers.parts.covariance import measurement, prediction
 from driftfit.trackers.parts.diffuse import enter, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
+from driftfit.trackers.parts.few_residuals import wider
 from driftfit.trackers.parts.modes.noise_levels import LEAST_SHARE
 from driftfit.trackers.rls import learn_scale
 
@@ -199,12 +200,14 @@ def hand_over(s: State, l: int) -> None:
 def alone(s: State, l: int, counts: bool) -> None:
     """After a sample of the single filter: update scales, noise and lags, and begin the bank as soon as possible."""
     learn_scales(s, l)
-    s.sample[FREEDOM, l] = s.count[l] if s.unknown[l] > 0 else np.inf
+    residuals = s.count[l]
+    s.sample[FREEDOM, l] = residuals if s.unknown[l] > 0 else np.inf
     if counts:
         learn_scale(s, l)
+        s.scale[l] *= wider(s.count[l])
     s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
     hand_over(s, l)
-    s.sample[Y_HAT, l], s.sample[S2, l] = s.y_hat[l], s.s[l]
+    s.sample[Y_HAT, l], s.sample[S2, l] = s.y_hat[l], s.s[l] / wider(residuals)
     s.sample[SQUARES, l], s.sample[TIMES, l] = s.squares[l], s.count[l]
     ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
     within = s.root[l] == 0
