@@ -38,7 +38,8 @@ from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.evidence import Evidence
-from driftfit.judge.regressors import Rows, stuck
+from driftfit.judge.left_out import stuck
+from driftfit.judge.regressors import Rows
 from driftfit.judge.statistics.attribution import Attribution, alike, attribute
 from driftfit.judge.statistics.constancy import Constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED

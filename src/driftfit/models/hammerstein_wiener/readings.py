@@ -23,7 +23,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, part
-from driftfit.models.fault_codes import ALIKE, LONGEST, QUICK, SLOW
+from driftfit.models.fault_codes import ALIKE, LONGEST, QUICK, SLOWEST
 from driftfit.models.hammerstein_wiener.step_memory import (
     INPUTS,
     LEAST_Y,
@@ -109,7 +109,7 @@ def refused(m: Array, y: float, y_hat: float) -> bool:
     away, apart = max(y - high, low - y), abs(y - m[ODD, 0])
     expected = 1.0 if (y > high and y_hat >= high) or (y < low and y_hat <= low) else 0.0
     near = apart > 0.0 and (apart < ALIKE * away or m[READINGS, 0] < FIRST)
-    growth = QUICK if near else SLOW
+    growth = QUICK if near else SLOWEST
     p = m[PATIENT, 0] * growth if m[PATIENT, 0] > 1.0 else 1.0
     refuse = bool(away > p * limit(m, max(m[RESPONDING, 0], expected)))
     m[ODD, 0], m[PATIENT, 0] = y, min(max(p, growth), LONGEST)

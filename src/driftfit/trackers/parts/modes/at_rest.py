@@ -50,4 +50,4 @@ def come_to_rest(s: State, l: int) -> float:
         s.m[i, last, l] = s.m[i, best, l]
         for j in range(i + 1):
             s.C[i, j, last, l] = s.C[i, j, best, l]
-    return gained if s.moves[2, best, l] > 0.0 else 0.0  # type: ignore[no-any-return]
+    return gained if s.moves[2, best, l] > 0.0 else 0.0
