@@ -33,21 +33,18 @@ def no_rest(ratio: Array) -> dict[str, Any]:
 
 
 @partial(kernel, inline=False)
-def come_to_rest(s: State, l: int) -> float:
-    """Replace the last filter, if another has come to rest more probably; returns the probability of a jump that has
-    ended."""
+def come_to_rest(s: State, l: int) -> None:
+    """Replace the last filter, if another has come to rest more probably."""
     last, best, most = s.modes[l] - 1, 0, 0.0
     for j in range(last):
         if s.over[j, l] * s.mu[j, l] > most:
             best, most = j, s.over[j, l] * s.mu[j, l]
     gained = most - s.mu[last, l]
     s.replaced_by[l] = best if gained > 0.0 else -1
-    if gained <= 0.0:
-        return 0.0
-    s.mu[last, l] = most
-    s.mu[best, l] -= gained
-    for i in range(s.theta.shape[0]):
-        s.m[i, last, l] = s.m[i, best, l]
-        for j in range(i + 1):
-            s.C[i, j, last, l] = s.C[i, j, best, l]
-    return gained if s.moves[2, best, l] > 0.0 else 0.0
+    if gained > 0.0:
+        s.mu[last, l] = most
+        s.mu[best, l] -= gained
+        for i in range(s.theta.shape[0]):
+            s.m[i, last, l] = s.m[i, best, l]
+            for j in range(i + 1):
+                s.C[i, j, last, l] = s.C[i, j, best, l]

@@ -171,12 +171,12 @@ def find_shares(s: State, l: int) -> None:
 
 
 @kernel
-def learn_rate(s: State, ended: float, l: int) -> None:
-    """How rare changes are: those that end in the modes of ratio 1, as a share of those expected; never above 1."""
+def learn_rate(s: State, l: int) -> None:
+    """How rare changes are: those that the modes of ratio 1 end, as a share of those expected; never above 1."""
     for j in range(s.modes[l]):
         s.row[j, l] = s.moves[2, j, l] * s.mu[j, l]
     fade = 1.0 - 1.0 / SPAN
-    s.jumps[l] = fade * s.jumps[l] + ended + sum_of_row(s, l)
+    s.jumps[l] = fade * s.jumps[l] + sum_of_row(s, l)
     s.watched[l] = fade * s.watched[l] + 1.0
     s.calm[l] = max(CALMEST, min(1.0, (EVENTS + s.jumps[l]) / (EVENTS + JUMP * s.watched[l])))
 
@@ -188,7 +188,8 @@ def mix(s: State, l: int) -> None:
     Means are taken relative to that of the mixture, d, so that moments may be added before the mean is subtracted.
     """
     n, K = s.theta.shape[0], s.modes[l]
-    learn_rate(s, come_to_rest(s, l), l)
+    come_to_rest(s, l)
+    learn_rate(s, l)
     find_shares(s, l)
     s.row[0, l], s.row[K + 1, l] = 0.0, 0.0
     for a in range(n):
