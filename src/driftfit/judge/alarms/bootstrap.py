@@ -21,6 +21,7 @@ from functools import lru_cache
 
 import numpy as np
 import scipy
+from scipy import signal
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.calibration import limits_of
@@ -28,7 +29,7 @@ from driftfit.judge.alarms.frozen import GARCH, Rows, noise_models, plausible, s
 from driftfit.judge.alarms.side_by_side import SimulatedRecords, statistics_of
 from driftfit.judge.alarms.variances import residuals, variances
 from driftfit.judge.statistics.whiteness import whiteness
-from driftfit.run.live.frozen.reference_model import ALPHA, BETA, CLIP, CONSTANT, LEVELS, SCALE, SHORT, Frozen, K
+from driftfit.run.live.frozen.reference_model import ALPHA, BETA, CLIP, CONSTANT, LEVELS, SCALE, SHORT, Frozen, K, stable, stationary
 
 RECORDS, SAMPLES = 64, 1000
 """Simulated records, and the samples of each that count."""
@@ -70,6 +71,8 @@ def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> 
     w = np.hstack([residuals(x[:, :N], drawn), residuals(x[:, N:], drawn)])
     numbers, _ = noise_models(w[:, :N], n)
     w *= np.sqrt(N / max(N - n, 1))  # what follows has not been fitted
+    if len(frozen.ar):
+        w[:, N:] = _whitened_again(w[:, N:], frozen.ar, N, np.random.default_rng([seed, 6]))
     z = _normal(n, records, seed) * np.sqrt(N / max(N - n - 1, 1))  # nor are its regressors those of the reference
     w = w[:, N:] / numbers[:, SCALE, None]
     h = variances(w, numbers)
@@ -119,6 +122,19 @@ def _of_like_rows(leverage: Array, rows: Array, rng: np.random.Generator) -> Arr
     size = -(-N // STRATA)
     first = np.minimum(place // size * size, N - size)
     return np.asarray(order[first[rows] + rng.integers(0, size, rows.shape)])
+
+
+def _whitened_again(w: Array, ar: Array, N: int, rng: np.random.Generator) -> Array:
+    """White noise w (R, T) coloured by an autoregression, and whitened by ``ar`` (p,), its estimate from N samples.
+
+    Errors of the estimate have the covariance (stationary covariance of p lags)^-1 / N.
+    """
+    root = np.linalg.cholesky(np.linalg.inv(stationary(ar)) / N)
+    made = np.empty_like(w)
+    for k, z in enumerate(rng.normal(size=(len(w), len(ar)))):
+        true = stable(ar + root @ z)
+        made[k] = signal.lfilter(np.append(1.0, -ar), np.append(1.0, -true), w[k])
+    return made
 
 
 def _variances(frozen: Frozen, x: Array, chance: Array) -> Array:

@@ -150,18 +150,20 @@ def memory_of(frozen: Frozen) -> Memory:
     return Memory(past, sums, last, cusum, counts, work, np.zeros(size_of(n)), findings, known, unknown, lags)
 
 
-def stationary(ar: Array) -> Array:
-    """Covariance (p, p) of p successive values of an autoregression whose innovations have the variance 1.
-
-    One that is not stationary is taken with roots at `ROOT`.
-    """
+def stable(ar: Array) -> Array:
+    """An autoregression (p,) whose roots are at most at `ROOT`."""
     p = len(ar)
     A = np.eye(p, k=1)
     A[p - 1 :] = ar[::-1]
     largest = np.max(np.abs(np.linalg.eigvals(A)), initial=ROOT)
-    A[p - 1 :] *= (ROOT / largest) ** np.arange(p, 0, -1)
-    noise = np.zeros((p, p))
-    noise[p - 1 :, p - 1 :] = 1.0
+    return np.asarray(ar * (ROOT / largest) ** np.arange(1, p + 1))
+
+
+def stationary(ar: Array) -> Array:
+    """Covariance (p, p) of p successive values of an autoregression whose innovations have the variance 1, `stable`."""
+    p = len(ar)
+    A, noise = np.eye(p, k=1), np.zeros((p, p))
+    A[p - 1 :], noise[p - 1 :, p - 1 :] = stable(ar)[::-1], 1.0
     return np.linalg.solve(np.eye(p * p) - np.kron(A, A), noise.ravel()).reshape(p, p)
 
 
