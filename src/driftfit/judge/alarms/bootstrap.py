@@ -9,6 +9,12 @@ errors for as long as it runs. Whether the variance changes at all is seldom cer
 are drawn from those that the reference leaves plausible. So is the autoregression that colours the noise of a record,
 which is whitened by the one that was estimated. Fault codes keep their sign and their regressors.
 
+A window of L samples is beyond a limit c of "glr" if its deviate z is, with
+
+    z^2 > c^2 + 2 EVEN log(384 / L)
+
+and the false alarms of its three statistics are in the relation `SHARES`.
+
 With a deviate c as statistic the logarithm of the rate of onsets falls nearly as a straight line in c^2. A limit that
 is rarer than the simulated records can show is found along that line, which also gives the probability of an extreme.
 

@@ -60,11 +60,13 @@ PERSISTENCE, REACTION = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98), (0.03, 0.06, 0.1, 0.15
 GARCH = np.array([(0.0, 0.0), *((a, both - a) for both in PERSISTENCE for a in REACTION if a < both)])
 GARCH = np.ascontiguousarray(np.vstack([GARCH, np.repeat(GARCH[-1:], -len(GARCH) % WIDTH, axis=0)]).T)
 """alpha and beta of the candidates (2, C), constant noise first, the last repeated to fill a vector."""
-PRIOR = np.where(np.arange(GARCH.shape[1]) <= len(PERSISTENCE) * len(REACTION), 1.0 / (1.0 - GARCH.sum(axis=0)), 0.0)
+TIME = np.where(np.arange(GARCH.shape[1]) <= len(PERSISTENCE) * len(REACTION), 1.0 / (1.0 - GARCH.sum(axis=0)), 0.0)
+"""Time constants of the candidates in samples, 0 of the repeated one (C,)."""
+PRIOR = TIME**2
 PRIOR[0] = 0.5 * PRIOR[1:].sum()
 """How probable each candidate is before the reference, in relation (C,): constant noise half as probable as all others
-together, and those in proportion to their time constant, since short references show long bursts least and long bursts
-alarm most.
+together, and those in proportion to the square of their time constant, since short references show long bursts least
+and long bursts alarm most.
 """
 NEAR = 0.2
 """A regressor whose mean is a smaller part of its spread stays as it is: its slope about the mean is that through 0."""
@@ -124,7 +126,7 @@ def frozen_model(phi: Array, y: Array, ok: Array, constant: int = -1) -> tuple[F
 def _shortened(phi: Array, cov: Array, most: float) -> Array:
     """Rows phi (k, n) whose leverage phi' C phi is at most that."""
     leverage = np.einsum("ti,ij,tj->t", phi, cov, phi)
-    return phi * np.sqrt(most / np.maximum(leverage, most))[:, None]
+    return np.asarray(phi * np.sqrt(most / np.maximum(leverage, most))[:, None])
 
 
 def means(phi: Array, constant: int) -> Array:
