@@ -5,7 +5,8 @@ With the gradient at a point theta',
     phi_t = d f / d theta (theta'),     y_t - shift_t = phi_t' theta_t + v_t,     shift_t = f(theta') - phi_t' theta'
 
 ``regress`` calls `subtract` once s.phi is known, and trackers see y_t - shift_t; ``push`` calls `restore`, after which
-s.y_hat is a prediction of y_t again. A reading out of all proportion is refused (`driftfit.models.fault_codes`).
+s.y_hat is a prediction of y_t again. A reading out of all proportion is refused (`driftfit.models.fault_codes`), after
+which s.y is -0, so that it can be told from a reading of 0.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import State, kernel
 from driftfit.models.fault_codes import UNJUDGED, refused
 
@@ -63,6 +65,7 @@ def restore(s: State, observed: bool, l: int) -> None:
     must not go to an estimate that is still the prior.
     """
     s.y_hat[l] += s.shift[l]
+    s.y[l] = s.y[l] if abs(s.measured[l]) < LARGEST else -0.0
     s.without[l] = 0.0 if observed else s.without[l] + 1.0
     row = 0.0
     for i in range(s.phi.shape[0]):

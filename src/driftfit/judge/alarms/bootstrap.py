@@ -6,7 +6,14 @@ model, and scale and variances are estimated from them again; an error of theta 
 record that follows, regressors and residuals are drawn together, and its scores are those of the model that was
 estimated from its own reference. The limits therefore allow for everything that is estimated: a stream keeps these
 errors for as long as it runs. Whether the variance changes at all is seldom certain, so alpha and beta of each record
-are drawn from those that the reference leaves plausible.
+are drawn from those that the reference leaves plausible. So is the autoregression that colours the noise of a record,
+which is whitened by the one that was estimated. Fault codes keep their sign and their regressors.
+
+A window of L samples is beyond a limit c of "glr" if its deviate z is, with
+
+    z^2 > c^2 + 2 EVEN log(384 / L)
+
+and the false alarms of its three statistics are in the relation `SHARES`.
 
 With a deviate c as statistic the logarithm of the rate of onsets falls nearly as a straight line in c^2. A limit that
 is rarer than the simulated records can show is found along that line, which also gives the probability of an extreme.
@@ -21,14 +28,27 @@ from functools import lru_cache
 
 import numpy as np
 import scipy
+from scipy import signal
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.calibration import limits_of
-from driftfit.judge.alarms.frozen import GARCH, Rows, noise_models, plausible, slopes_of
+from driftfit.judge.alarms.frozen import FAULTY, GARCH, Rows, noise_models, plausible, slopes_of
 from driftfit.judge.alarms.side_by_side import SimulatedRecords, statistics_of
 from driftfit.judge.alarms.variances import residuals, variances
 from driftfit.judge.statistics.whiteness import whiteness
-from driftfit.run.live.frozen.reference_model import ALPHA, BETA, CLIP, CONSTANT, LEVELS, SCALE, SHORT, Frozen, K
+from driftfit.run.live.frozen.reference_model import (
+    ALPHA,
+    BETA,
+    CLIP,
+    CONSTANT,
+    LEVELS,
+    SCALE,
+    SHORT,
+    Frozen,
+    K,
+    stable,
+    stationary,
+)
 
 RECORDS, SAMPLES = 64, 1000
 """Simulated records, and the samples of each that count."""
@@ -55,6 +75,7 @@ def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> 
     (N, n), T = rows.phi.shape, SAMPLES + START
     draws = [np.random.default_rng([seed, k]) for k in (0, 1, 2, 5)]
     root = np.linalg.cholesky(frozen.cov)
+    code = np.abs(rows.x) > FAULTY
     if drawn_in_blocks(frozen, rows.x):
         block = int(np.clip(N // 20, 20, 200))
         known, own = (_blocks(rng, (records, length), N, block) for rng, length in zip(draws[:2], (N, T), strict=True))
@@ -63,13 +84,17 @@ def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> 
         known = draws[0].integers(0, N, (records, N))
         later = (draws[3].integers(0, N, (records, 1)) + np.arange(T)) % N
         own = _of_like_rows(np.einsum("ti,ij,tj->t", rows.phi, frozen.cov, rows.phi), later, draws[1])
+        own = np.where(code[later] | code[own], later, own)
     signs = draws[2].integers(0, 2, (records, N + T)) * 2.0 - 1.0
     drawn = np.tile(frozen.numbers, (records, 1))
-    drawn[:, [ALPHA, BETA]] = _variances(frozen, rows.x, np.random.default_rng([seed, 4]).random(records))
-    x = rows.x[np.hstack([known, own])] * signs
+    drawn[:, [ALPHA, BETA]] = _variances(frozen, rows.x, _evenly(records, seed))
+    drawn_rows = np.hstack([known, own])
+    x = rows.x[drawn_rows] * np.where(code[drawn_rows], 1.0, signs)
     w = np.hstack([residuals(x[:, :N], drawn), residuals(x[:, N:], drawn)])
     numbers, _ = noise_models(w[:, :N], n)
     w *= np.sqrt(N / max(N - n, 1))  # what follows has not been fitted
+    if len(frozen.ar):
+        w[:, N:] = _whitened_again(w[:, N:], frozen.ar, N, np.random.default_rng([seed, 6]))
     z = _normal(n, records, seed) * np.sqrt(N / max(N - n - 1, 1))  # nor are its regressors those of the reference
     w = w[:, N:] / numbers[:, SCALE, None]
     h = variances(w, numbers)
@@ -87,6 +112,13 @@ def _normal(n: int, records: int, seed: int) -> Array:
     sobol = scipy.stats.qmc.Sobol(n, rng=np.random.default_rng([seed, 3]))
     drawn = sobol.random_base2(int(np.ceil(np.log2(records))))[:records]
     return np.asarray(scipy.special.ndtri(drawn * (1.0 - 1e-9) + 5e-10))
+
+
+def _evenly(records: int, seed: int) -> Array:
+    """Numbers (records,) that fill the interval from 0 to 1 evenly: multiples of the golden ratio."""
+    return np.asarray(
+        (np.random.default_rng([seed, 4]).random() + np.arange(records) * 0.5 * (np.sqrt(5.0) - 1.0)) % 1.0
+    )
 
 
 def together(parts: Sequence[SimulatedRecords]) -> SimulatedRecords:
@@ -119,6 +151,19 @@ def _of_like_rows(leverage: Array, rows: Array, rng: np.random.Generator) -> Arr
     size = -(-N // STRATA)
     first = np.minimum(place // size * size, N - size)
     return np.asarray(order[first[rows] + rng.integers(0, size, rows.shape)])
+
+
+def _whitened_again(w: Array, ar: Array, N: int, rng: np.random.Generator) -> Array:
+    """White noise w (R, T) coloured by an autoregression, and whitened by ``ar`` (p,), its estimate from N samples.
+
+    Errors of the estimate have the covariance (stationary covariance of p lags)^-1 / N.
+    """
+    root = np.linalg.cholesky(np.linalg.inv(stationary(ar)) / N)
+    made = np.empty_like(w)
+    for k, z in enumerate(rng.normal(size=(len(w), len(ar)))):
+        true = stable(ar + root @ z)
+        made[k] = signal.lfilter(np.append(1.0, -ar), np.append(1.0, -true), w[k])
+    return made
 
 
 def _variances(frozen: Frozen, x: Array, chance: Array) -> Array:

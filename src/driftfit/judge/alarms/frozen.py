@@ -26,6 +26,7 @@ from driftfit.judge.statistics.robust import LEAST, deviation, medians, noisy, r
 from driftfit.run.live.frozen.reference_model import (
     ALPHA,
     BETA,
+    BLAMED,
     CLIP,
     CONSTANT,
     EVEN,
@@ -59,10 +60,13 @@ PERSISTENCE, REACTION = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98), (0.03, 0.06, 0.1, 0.15
 GARCH = np.array([(0.0, 0.0), *((a, both - a) for both in PERSISTENCE for a in REACTION if a < both)])
 GARCH = np.ascontiguousarray(np.vstack([GARCH, np.repeat(GARCH[-1:], -len(GARCH) % WIDTH, axis=0)]).T)
 """alpha and beta of the candidates (2, C), constant noise first, the last repeated to fill a vector."""
-PRIOR = np.where(np.arange(GARCH.shape[1]) <= len(PERSISTENCE) * len(REACTION), 1.0 / (1.0 - GARCH.sum(axis=0)), 0.0)
-PRIOR[0] = PRIOR[1:].sum()
-"""How probable each candidate is before the reference, in relation (C,): constant noise as all others together, and
-those in proportion to their time constant, since short references show long bursts least and long bursts alarm most.
+TIME = np.where(np.arange(GARCH.shape[1]) <= len(PERSISTENCE) * len(REACTION), 1.0 / (1.0 - GARCH.sum(axis=0)), 0.0)
+"""Time constants of the candidates in samples, 0 of the repeated one (C,)."""
+PRIOR = TIME**2
+PRIOR[0] = 0.5 * PRIOR[1:].sum()
+"""How probable each candidate is before the reference, in relation (C,): constant noise half as probable as all others
+together, and those in proportion to the square of their time constant, since short references show long bursts least
+and long bursts alarm most.
 """
 NEAR = 0.2
 """A regressor whose mean is a smaller part of its spread stays as it is: its slope about the mean is that through 0."""
@@ -86,14 +90,17 @@ class Rows(NamedTuple):
 
 
 def frozen_model(phi: Array, y: Array, ok: Array, constant: int = -1) -> tuple[Frozen, Rows] | None:
-    """Estimate the model from rows phi (N, n), y (N,), of which ok (N,) can be used; None if they have no noise.
+    """Estimate the model from rows phi (N, n), y (N,) with `OK` in ok (N,); None if they have no noise.
 
-    Regressors that are far from zero are centred on column ``constant``, if it is not negative.
+    Regressors that are far from zero are centred on column ``constant``, if it is not negative. Fault codes, and rows
+    whose inputs are blamed, are residuals of the noise model as any other, but say nothing of theta or the
+    autoregression.
     """
+    judged, ok = ok > 0.0, ok > BLAMED
     mean = means(phi[ok], constant) if constant >= 0 else np.zeros(0)
     phi = centred(phi, mean, constant)
     unit = column_sizes(phi[ok])
-    rows = np.where(ok[:, None], np.column_stack([phi / unit, y]), 0.0)
+    rows = np.where(judged[:, None], np.column_stack([phi / unit, y]), 0.0)
     ar, root = np.zeros(0), np.ones(len(y))
     for _ in range(ROUNDS):
         used, white = _whitened(rows, ok, ar)
@@ -104,14 +111,22 @@ def frozen_model(phi: Array, y: Array, ok: Array, constant: int = -1) -> tuple[F
         e = rows[:, -1] - rows[:, :-1] @ fit.theta
         ok = ok & (np.abs(e) <= FAULTY * deviation(e[ok]))
         ar = _autoregression(e, ok, len(unit))
-        used, w = _whitened(e[:, None], ok, ar)
+        used, w = _whitened(e[:, None], ok, ar, judged)
         numbers, h = noise_model(w[:, 0], len(unit))
         root = np.ones(len(y))
         root[used] = np.sqrt(h)
-    x, white = w[:, 0] / (numbers[SCALE] * np.sqrt(h)), _whitened(rows[:, :-1], ok, ar)[1]
-    cov, unseen = _covariance(white / np.sqrt(h)[:, None], x)
+    x, white = w[:, 0] / (numbers[SCALE] * np.sqrt(h)), _whitened(rows[:, :-1], ok, ar, judged)[1]
+    fitted = ok[used]
+    cov, unseen = _covariance((white / np.sqrt(h)[:, None])[fitted], x[fitted])
     numbers[CONSTANT] = constant
+    white[~fitted] = _shortened(white[~fitted], cov, 1.0 / len(x))
     return Frozen(fit.theta / unit, unit, np.ascontiguousarray(ar), cov, numbers, unseen, mean), Rows(white, x)
+
+
+def _shortened(phi: Array, cov: Array, most: float) -> Array:
+    """Rows phi (k, n) whose leverage phi' C phi is at most that."""
+    leverage = np.einsum("ti,ij,tj->t", phi, cov, phi)
+    return np.asarray(phi * np.sqrt(most / np.maximum(leverage, most))[:, None])
 
 
 def means(phi: Array, constant: int) -> Array:
@@ -210,10 +225,13 @@ def _covariance(phi: Array, x: Array) -> tuple[Array, Array]:
     return np.ascontiguousarray(cov), np.ascontiguousarray(np.where(np.abs(unseen) > DUST, unseen, 0.0))
 
 
-def _whitened(rows: Array, ok: Array, ar: Array) -> tuple[Array, Array]:
-    """(indices of the rows whose lags can all be used, those rows (N, k) less their prediction from the lags)."""
+def _whitened(rows: Array, ok: Array, ar: Array, judged: Array | None = None) -> tuple[Array, Array]:
+    """(indices of the rows whose lags can all be used, those rows (N, k) less their prediction from the lags).
+
+    With ``judged``, of these rows, of which only some can be lags.
+    """
     p = len(ar)
-    complete, white = ok[p:].copy(), rows[p:].copy()
+    complete, white = (ok if judged is None else judged)[p:].copy(), rows[p:].copy()
     for lag, a in enumerate(ar, 1):
         complete &= ok[p - lag : len(ok) - lag]
         white -= a * rows[p - lag : len(rows) - lag]

@@ -29,7 +29,17 @@ from driftfit.judge.alarms.reference import burn, first_third, normal_samples
 from driftfit.judge.regressors import refuse_hidden
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.live.frozen.likelihood_ratio import scan
-from driftfit.run.live.frozen.reference_model import CUSUM, INTERVAL, NOISE_FACTOR, OK, UNLIKE, Y, judgeable, memory_of
+from driftfit.run.live.frozen.reference_model import (
+    BLAMED,
+    CUSUM,
+    INTERVAL,
+    NOISE_FACTOR,
+    OK,
+    UNLIKE,
+    Y,
+    judgeable,
+    memory_of,
+)
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
@@ -89,8 +99,9 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
         )
     least = max(100, 10 * n)
     first, start = first_third(run, usable, least) if reference is None else normal_samples(run, reference)
-    phi, rest, ok = samples[0][first:start], samples[1][first:start], (usable & ~_stuck(run))[first:start]
+    phi, rest, judged = samples[0][first:start], samples[1][first:start], (usable & ~_stuck(run))[first:start]
     y, noise, names = rest[:, Y], rest[:, NOISE_FACTOR], run.model.names
+    ok = judged & (rest[:, OK] > BLAMED)
     if ok.sum() < least:
         raise ValueError(
             f'detect: "{rule.kind}" compares with {least} normal samples at least; samples {first} to {start} contain '
@@ -100,8 +111,8 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
     constants = np.flatnonzero((np.ptp(phi[ok], axis=0) == 0.0) & (phi[ok][0] != 0.0))
     if not len(constants):
         phi, names, constants = np.column_stack([phi, np.ones(len(phi))]), (*names, OFFSET), np.array([n])
-    root = np.sqrt(np.where(ok, noise, 1.0))
-    found = frozen_model(phi / root[:, None], y / root, ok, int(constants[-1]))
+    root = np.sqrt(np.where(judged, noise, 1.0))
+    found = frozen_model(phi / root[:, None], y / root, np.where(judged, rest[:, OK], 0.0), int(constants[-1]))
     if found is None:
         raise ValueError(
             f'detect: "{rule.kind}" measures changes in units of the noise, and the reference has none: constant '

@@ -13,9 +13,13 @@ be the error of theta, with the variance phi' C phi in units of the noise. From 
 which rows of the reference seldom exceed), a sample corrects theta as a Kalman filter without drift does, until that
 variance is n / N, the mean of the N rows of the reference: its error is then divided by its standard deviation, and
 judges as any other, but not the noise while the variance is that large. Where nothing is known, as of an input that was
-0 or constant, a sample corrects theta as from a diffuse start and judges nothing. Since one reading of an input may be
-false, the first of such samples teaches nothing, and neither does an error of more than `CREDIBLE` deviations: they are
-judged by windows alone, whose V allows for the variance, and not at all above `UNKNOWN`.
+0 or constant, a sample corrects theta as from a diffuse start and judges nothing. Where an error has more than
+`CREDIBLE` deviations, or the tracker blames the inputs, the sample corrects nothing: its error, over its standard
+deviation, judges with regressors shortened to leverage 1 / N, that of rows along one direction, so that no reading of
+an input, however large, counts more than a reading of y. One false reading of an input comes alone. Therefore a sample
+beyond the reference corrects theta only if there was another among the `AGAIN` before, and one with such an error, or
+blamed, judges only then, and not while the first may be one of its lags. Other samples that correct nothing are judged
+by windows alone, whose V allows for the variance, and not at all above `UNKNOWN`.
 
 A sample that cannot be used is passed over. Where lags of the autoregression are missing, a Kalman filter predicts
 them, [phi, e] together so that a change of theta shows in the same way, and w_t is divided by the standard deviation of
@@ -63,9 +67,13 @@ from UNKNOWN on it judges nothing if it cannot correct theta; from HUGE on squar
 """
 CREDIBLE = 3.0
 """Standard deviations up to which an error corrects theta: false readings of an input have larger ones."""
+AGAIN = 8.0
+"""Samples for which one that is beyond the reference, or blamed, is remembered."""
 ROW = ("y", "ok", "noise", "dt")
 Y, OK, NOISE_FACTOR, INTERVAL = range(4)
 """Columns of a row after its regressors, by the names of the fields of a tile, and by their places."""
+BLAMED = 0.5
+"""`OK` of a sample whose inputs the tracker blames: it is judged, but is no lag and corrects nothing."""
 NOTHING, UNLIKE, WINDOWS, PARAMETERS, FULLY = range(5)
 """What a row judges: nothing, as it cannot be used; nothing, as it is unlike the reference; the windows, without the
 noise; the CUSUM of the parameters too; everything.
@@ -125,8 +133,7 @@ class Memory(NamedTuple):
     findings: Array
     known: Array
     """(n + 2, n): row LEARNED is how far theta is from that of the reference; n rows from COVARIANCE on are its
-    covariance C, which has no part in ``unknown``; and the last row begins with phi' C phi of the last sample, by the C
-    of the reference.
+    covariance C, which has no part in ``unknown``; and the last row begins with the result of `noted`.
     """
     unknown: Array
     """(k, n): what is left of `Frozen.unseen`, as no row after the reference has excited it either."""
@@ -150,18 +157,20 @@ def memory_of(frozen: Frozen) -> Memory:
     return Memory(past, sums, last, cusum, counts, work, np.zeros(size_of(n)), findings, known, unknown, lags)
 
 
-def stationary(ar: Array) -> Array:
-    """Covariance (p, p) of p successive values of an autoregression whose innovations have the variance 1.
-
-    One that is not stationary is taken with roots at `ROOT`.
-    """
+def stable(ar: Array) -> Array:
+    """An autoregression (p,) whose roots are at most at `ROOT`."""
     p = len(ar)
     A = np.eye(p, k=1)
     A[p - 1 :] = ar[::-1]
     largest = np.max(np.abs(np.linalg.eigvals(A)), initial=ROOT)
-    A[p - 1 :] *= (ROOT / largest) ** np.arange(p, 0, -1)
-    noise = np.zeros((p, p))
-    noise[p - 1 :, p - 1 :] = 1.0
+    return np.asarray(ar * (ROOT / largest) ** np.arange(1, p + 1))
+
+
+def stationary(ar: Array) -> Array:
+    """Covariance (p, p) of p successive values of an autoregression whose innovations have the variance 1, `stable`."""
+    p = len(ar)
+    A, noise = np.eye(p, k=1), np.zeros((p, p))
+    A[p - 1 :], noise[p - 1 :, p - 1 :] = stable(ar)[::-1], 1.0
     return np.linalg.solve(np.eye(p * p) - np.kron(A, A), noise.ravel()).reshape(p, p)
 
 
@@ -171,18 +180,17 @@ def size_of(n: int) -> int:
 
 
 def judgeable(fields: Any, lane: int, y: Array, noise: Array) -> Array:
-    """Samples (T,) that an alarm judges, 1 or 0: those that the tracker used, and complete ones whose reading y it
-    refused.
+    """`OK` of samples (T,): 1 for those that the tracker used, and complete ones whose reading y it refused; `BLAMED`
+    for those whose inputs it blames; 0 for those that cannot be judged.
 
     A tracker refuses readings that contradict all before, or repeat the last one, since it would lose its estimate. An
     alarm that left them out would never report a sensor that fails again and again; its scores are bounded. Where a
-    model refused it (`driftfit.models.fault_codes`), no reading is left. A sample whose inputs the tracker blames is
-    not judged, because a score times a regressor is not bounded: a single false input could raise an alarm. If y does
-    not follow an input any more, the tracker believes the input soon, and the alarm judges the samples from then on.
+    model refused a reading (`driftfit.models.fault_codes`), y is -0, and none is left.
     """
     ok, valid, observed = (fields[name][..., lane] > 0.0 for name in ("ok", "valid", "observed"))
-    given = (np.abs(y) < LARGEST) & (noise < np.inf) & ((fields["y"][..., lane] != 0.0) | (y == 0.0))
-    return np.asarray(ok | (valid & ~observed & given), float)
+    refused = (fields["y"][..., lane] == 0.0) & np.signbit(fields["y"][..., lane])
+    given = valid & (np.abs(y) < LARGEST) & (noise < np.inf) & ~refused
+    return np.where(ok, 1.0, np.where(given, np.where(observed, BLAMED, 1.0), 0.0))
 
 
 @kernel
@@ -382,13 +390,14 @@ def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
         for lag in range(p):
             phi[i] -= frozen.ar[lag] * past[p - 1 - lag, i]
     level = np.sqrt(counts[LEVEL])
-    if counts[SINCE] < p and abs(phi[n]) <= WIDE * numbers[SCALE] * level:
+    trusted = row[n + OK] > BLAMED
+    if trusted and counts[SINCE] < p and abs(phi[n]) <= WIDE * numbers[SCALE] * level:
         level *= np.sqrt(observe_lags(frozen.ar, memory, phi, n))
     scale = numbers[SCALE] * level
     for i in range(n + 1):
         phi[i] /= level if i < n else scale
     limit: float = max(WIDE, 2.0 * before / scale)
-    if abs(phi[n]) > WIDE:  # a fault code is no lag, but the limit of the next sample
+    if abs(phi[n]) > WIDE or not trusted:  # a fault code is no lag, but the limit of the next sample
         last = past[p, n]
         predict_lag(frozen.ar, memory, n)
         past[p, n] = last
@@ -401,15 +410,21 @@ def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
 
 
 @part
+def noted(left: float, strange: bool, n: int) -> float:
+    """How long the last strange sample is still remembered, one sample later.
+
+    Above AGAIN it may be a lag of the next, for n samples after the first.
+    """
+    if not strange:
+        return max(left - 1.0, 0.0)
+    return AGAIN if 0.0 < left <= AGAIN else (AGAIN + n if left <= 0.0 else left - 1.0)
+
+
+@part
 def enter_row(row: Array, frozen: Frozen, memory: Memory) -> int:
     """Scores of a row into memory.sample, and [phi, g] for the CUSUM into memory.work[0]; what it can judge."""
-    n, numbers, phi, known, scratch = (
-        frozen.theta.shape[0],
-        frozen.numbers,
-        memory.work[0],
-        memory.known,
-        memory.work[1:3],
-    )
+    n, numbers, known = frozen.theta.shape[0], frozen.numbers, memory.known
+    phi, scratch = memory.work[0], memory.work[1:3]
     wide = whiten(row, frozen, memory)
     if not wide > 0.0:
         return NOTHING
@@ -420,23 +435,30 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> int:
         reference = np.inf
     for i in range(n):
         x -= phi[i] * known[LEARNED, i]
-    clip, least = numbers[CLIP], max(UNSURE, USUAL * n / numbers[NORMAL])
+    clip, least, blamed = numbers[CLIP], max(UNSURE, USUAL * n / numbers[NORMAL]), row[n + OK] <= BLAMED
     # the variance can only have become smaller since the reference
     h = reference if reference <= least else leverage(phi, known[COVARIANCE : COVARIANCE + n])
     sure, root = h <= least, np.sqrt(1.0 + h * numbers[K] * numbers[K] / numbers[V])
-    teaches, known[n + 1, 0] = min(known[n + 1, 0], reference) > least, reference
+    far = abs(x) > CREDIBLE * root
+    unlike, alone = reference > least and not blamed, blamed or (far and not sure)
+    before = known[n + 1, 0]
+    teaches, known[n + 1, 0] = unlike and before > 0.0, noted(before, unlike or alone, n)
     if outside(phi, memory.unknown):
         if teaches:
             discover(phi, x, frozen, memory, scratch)
         return UNLIKE
-    learns = teaches and h > n / numbers[NORMAL] and abs(x) <= CREDIBLE * root
-    if h > UNKNOWN and not learns:
-        return UNLIKE
+    learns = teaches and h > n / numbers[NORMAL] and not far
+    if (h > UNKNOWN and not (learns or far)) or (alone and not 0.0 < before <= AGAIN):
+        return NOTHING if blamed else UNLIKE
     if learns:
         learn(phi, x, h, frozen, known, scratch)
+    if learns or alone:
+        shorter = 1.0 / root
+        if alone and h * shorter * shorter > 1.0 / numbers[NORMAL]:
+            shorter = 1.0 / np.sqrt(numbers[NORMAL] * h)
         x /= root
         for i in range(n):
-            phi[i] /= root
+            phi[i] *= shorter
     phi[n] = min(clip, max(-clip, x))
     enter_scores(phi[:n], phi[n], min(wide, max(-wide, x)), memory.sample)
     if not sure:
@@ -444,4 +466,4 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> int:
     # the GARCH recursion for h at the next sample
     fed = numbers[ALPHA] * memory.sample[2 * n] / numbers[V] + numbers[BETA]
     memory.counts[LEVEL] = 1.0 - numbers[ALPHA] - numbers[BETA] + fed * memory.counts[LEVEL]
-    return FULLY if sure else PARAMETERS if learns else WINDOWS
+    return FULLY if sure else PARAMETERS if learns or far else WINDOWS
