@@ -87,6 +87,7 @@ from driftfit.trackers.parts.faults.outlying_readings import (
 )
 from driftfit.trackers.parts.faults.stored_samples import machine_doubt
 from driftfit.trackers.parts.faults.strange_inputs import learn_inputs, leave_out_input, no_strange_inputs
+from driftfit.trackers.parts.modes.about_means import learn_means
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.few_residuals import widen_estimates, wider
 from driftfit.trackers.parts.modes.filters import (
@@ -170,6 +171,7 @@ def follow(s: State, entering: int, l: int) -> None:
         learn_noise(s, l)
     learn_colour(s, l)
     learn_scales(s, l)
+    learn_means(s, l)
     learn(s, l, s.outlier[l])
 
 

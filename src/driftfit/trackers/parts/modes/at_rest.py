@@ -27,9 +27,9 @@ OVER = {1.0: 0.5, 0.2: 0.1}
 """Probability that a change of a drift ratio is over."""
 
 
-def no_rest(ratio: Array) -> dict[str, Any]:
-    """Fields before the first sample, for the ratios (n, K) of the filters; the last filter is at rest."""
-    return {"over": np.array([OVER.get(float(most), 0.0) for most in ratio.max(axis=0)]), "replaced_by": -1}
+def no_rest(rungs: Array) -> dict[str, Any]:
+    """Fields before the first sample, for the rungs (K,) of the filters; the last filter is at rest."""
+    return {"over": np.array([OVER.get(float(rung), 0.0) for rung in rungs]), "replaced_by": -1}
 
 
 @partial(kernel, inline=False)

@@ -29,6 +29,7 @@ from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.trackers.parts.coarse.resolution import lasting
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.covariance import LEFT
+from driftfit.trackers.parts.modes.about_means import drift_about
 from driftfit.trackers.parts.modes.ladder import TOP, leap
 from driftfit.trackers.parts.modes.noise_levels import OUTLIER, noise_at
 from driftfit.trackers.parts.modes.one_direction import drift_along
@@ -55,6 +56,7 @@ def wander(s: State, size: float, l: int) -> None:
                 for k in range(s.modes[l]):
                     s.C[a, b, k, l] += s.ratio[i, k, l] * moved
     drift_along(s, size, l)
+    drift_about(s, size, l)
 
 
 @kernel

@@ -38,6 +38,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel, log
+from driftfit.trackers.parts.modes.about_means import ABOUT, no_means
 from driftfit.trackers.parts.modes.at_rest import come_to_rest, no_rest
 from driftfit.trackers.parts.modes.one_direction import ALONG, no_direction
 from driftfit.trackers.parts.modes.rows import sum_of_row
@@ -60,6 +61,7 @@ DESCEND = ((0.005, 0.001), (0.02, 0.002), (0.1, 0.004), (np.inf, 0.01))
 JUMP, REST, ACROSS = 0.0015, 0.0001, 0.00005
 """Probabilities of arriving from the mixture: at rungs of ratio 1, half of it at the top; at the foot of the common
 ladder (three tenths of it at each other rung of it below the top); and at the other rungs of each kind of ladder."""
+ABOUT_JUMPS = 0.2
 SELDOM = 5.0
 """Factor by which arrivals at the filters that drift in one direction are rarer than at each other kind."""
 
@@ -75,30 +77,35 @@ STAY, BELOW, ABOVE, MIXED = range(4)
 """Where a filter comes from: rows of ``share``."""
 
 
-def ladders(n: int, groups: Any) -> tuple[Array, Array, Array, Array]:
+def ladders(n: int, groups: Any) -> tuple[Array, Array, Array, Array, Array]:
     """Ratios (n, K), probabilities (3, K) of climbing, descending and going back, arrivals (K,), and (K,) the ratios of
     the modes with learned weights, 0 for others."""
     single = groups is None and 1 < n <= MOST_ALONE
     masks = [np.isin(np.arange(n), one).astype(float) for one in (range(n) if single else groups or ())]
     common = [(LADDER, 1.0), (LEARNED, 1.0), (TREND, 1.0), *([(ALONG, SELDOM)] if n > 1 else [])]
     kinds = [(ladder, np.ones(n), parts) for ladder, parts in common]
+    kinds += [(ABOUT, np.zeros(n), 1.0)] if n > 1 else []
     kinds += [(ALONE if single else GROUP, mask, len(masks)) for mask in masks]
     kinds += [((0.0,), np.ones(n), np.inf)]  # at rest: others replace it, and none are mixed with it
-    ratio, learned, moves, arrive = [], [], [], []
+    ratio, learned, moves, arrive, rungs = [], [], [], [], []
     for which, (ladder, mask, parts) in enumerate(kinds):
         for k, rung in enumerate(ladder):
             ratio.append(rung * mask)
+            rungs.append(rung)
             learned.append(rung if which == 1 else 0.0)
             down = next(p for most, p in DESCEND if rung <= most) if k else 0.0
             back = BACK if rung == LADDER[TOP] else 0.0
             moves.append((CLIMB if k + 1 < len(ladder) else 0.0, 0.0 if back else down, back))
             if rung == LADDER[TOP]:
-                arrive.append(JUMP * (1.0 if not masks else 0.5 if which == 0 else 0.5 / len(masks)))
+                if which == 0:
+                    arrive.append(JUMP * ((0.5 if masks else 1.0) - (ABOUT_JUMPS if n > 1 else 0.0)))
+                else:
+                    arrive.append(JUMP * (0.5 / len(masks) if mask.any() else ABOUT_JUMPS))
             elif which == 0:
                 arrive.append(REST * (1.0 if k == 0 else 0.3 if k < TOP else 0.0))
             else:
                 arrive.append(ACROSS / len(ladder) / parts)
-    return np.array(ratio).T, np.array(moves).T, np.array(arrive), np.array(learned)
+    return np.array(ratio).T, np.array(moves).T, np.array(arrive), np.array(learned), np.array(rungs)
 
 
 def chain(moves: Array, arrive: Array) -> tuple[Array, Array]:
@@ -112,7 +119,7 @@ def chain(moves: Array, arrive: Array) -> tuple[Array, Array]:
 
 def filters(n: int, groups: Any) -> dict[str, Any]:
     """Fields of the K filters before the first sample: modes, means m, covariances C (lower triangle), scratch."""
-    ratio, moves, arrive, learned = ladders(n, groups)
+    ratio, moves, arrive, learned, rungs = ladders(n, groups)
     K = len(arrive)
     start = np.full(K, (1.0 - AT_REST - COMMON) / (K - len(LADDER)))
     start[: len(LADDER)] = COMMON / (len(LADDER) - 1)
@@ -136,9 +143,10 @@ def filters(n: int, groups: Any) -> dict[str, Any]:
         "m": np.zeros((n, K)),
         "m_next": np.zeros((n, K)),
         "C": np.zeros((n, n, K)),
-        **no_rest(ratio),
+        **no_rest(rungs),
         **no_trend(n, len(LADDER) + len(LEARNED)),
         **no_direction(n, len(LADDER) + len(LEARNED) + len(TREND)),
+        **no_means(n, len(LADDER) + len(LEARNED) + len(TREND) + len(ALONG)),
         "Z": np.zeros((n, n)),
         "rare": 1.0,
         "leapt": 0.0,

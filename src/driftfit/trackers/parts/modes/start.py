@@ -48,6 +48,7 @@ from driftfit.trackers.parts.faults.stored_samples import (
     without_fault,
 )
 from driftfit.trackers.parts.faults.strange_inputs import learn_stored_inputs
+from driftfit.trackers.parts.modes.about_means import learn_means
 from driftfit.trackers.parts.modes.filters import absorb, project, wander
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
 from driftfit.trackers.parts.modes.weights import WINDOW
@@ -95,6 +96,7 @@ def take_start(s: State, l: int) -> None:
         for i in range(s.theta.shape[0]):
             s.m[i, 0, l] = s.theta[i, l]  # no filter needs it yet
     learn_scales(s, l)
+    learn_means(s, l)
     bound_leverage(s, l)  # the drift is in units of scales that such a regressor did not move much either
     noise = s.noise[l]
     s.noise[l] = noise * s.leverage[l]
@@ -109,6 +111,7 @@ def forget(s: State, l: int) -> None:
     n = s.theta.shape[0]
     for i in range(n):
         s.theta[i, l], s.c[i, l], s.active[i, l] = s.m[i, 0, l], 0.0, 0.0
+        s.centre[i, l], s.variance[i, l], s.moves_seen[i, l] = 0.0, 0.0, 0.0
         for j in range(n):
             s.information[i, j, l] = 0.0
     know_nothing(s, l)
@@ -131,6 +134,7 @@ def repeat(s: State, every: bool, l: int) -> float:
             s.fresh[l] = 0.0 if same_reading(s, last, l) else 1.0
             last = reading(s, l)
             learn_scales(s, l)
+            learn_means(s, l)
             take_first(s, l)
     return squares_left(s, l)  # type: ignore[no-any-return]
 
