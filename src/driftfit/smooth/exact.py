@@ -26,9 +26,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from driftfit.engine.kernel import Array
 from driftfit.smooth.parts import elimination, slopes, two_filters
 from driftfit.smooth.parts.rank import column_scale, ranks
-from driftfit.smooth.parts.walk import Path, Walk
+from driftfit.smooth.parts.walk import NONE, Path, Walk
 from driftfit.trackers.parts.information import triangular_root
 
 
@@ -40,6 +41,8 @@ def smooth(walk: Walk, keep: str = "fit", rebuild: Callable[[], Walk] | None = N
     makes the problem a second time. If it is given, the fast method writes its solution over phi and signals, which
     saves memory, and the safe one solves the rebuilt problem.
     """
+    if len(walk.about):
+        return turned(smooth(walk._replace(about=NONE), "cov"), walk.about, keep)
     if len(walk.trend):
         return spread(walk, slopes.smooth(walk, keep))
     n = walk.phi.shape[1]
@@ -62,3 +65,19 @@ def spread(walk: Walk, path: Path) -> Path:
     cov = path.cov + np.einsum("kti,ktj->tij", away, away) if len(path.cov) else path.cov
     lag = path.lag_cov + np.einsum("kti,ktj->tij", away[:, :-1], away[:, 1:]) if len(path.lag_cov) else path.lag_cov
     return path._replace(var=path.var + np.sum(away**2, axis=0), cov=cov, lag_cov=lag)
+
+
+def turned(path: Path, A: Array, keep: str) -> Path:
+    """The path of A theta. Variances of its slopes neglect that those of theta are correlated."""
+    unknown = np.isinf(path.var) @ (A != 0.0).T
+    with np.errstate(invalid="ignore"):
+        cov, lag = A @ path.cov @ A.T, A @ path.lag_cov @ A.T
+        slopes = path.slope_var @ (A**2).T if len(path.slope_var) else path.slope_var
+    return path._replace(
+        theta=path.theta @ A.T,
+        var=np.where(unknown, np.inf, np.diagonal(cov, axis1=1, axis2=2)),
+        slope=path.slope @ A.T if len(path.slope) else path.slope,
+        slope_var=slopes,
+        cov=cov if keep == "cov" else cov[:0],
+        lag_cov=lag if keep == "cov" else lag[:0],
+    )

@@ -111,10 +111,22 @@ def take(
         signals[t, DRIFT] = rows[t, at_dt]
 
 
-def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
+def about_means(phi: Array, weight: Array) -> Array:
+    """A (n, n), for which phi A are the regressors less their means, beside the last column that is constant and not 0;
+    the identity without one."""
+    A, used = np.eye(phi.shape[1]), phi[weight > 0.0]
+    constant = np.flatnonzero((np.ptp(used, axis=0) == 0.0) & (used[0] != 0.0)) if len(used) else ()
+    if len(constant):
+        k = constant[-1]
+        A[k] -= np.where(np.arange(len(A)) == k, 0.0, used.mean(axis=0) / used[0, k])
+    return A
+
+
+def walk_of(run: Track, prior: RandomWalk | None = None, centred: bool = False) -> Walk:
     """The problem behind a run; ValueError if its tracker does not describe a random walk in Gaussian noise.
 
-    ``prior`` replaces the random walk that the tracker assumes.
+    ``prior`` replaces the random walk that the tracker assumes. ``centred``: in regressors less their means, if the
+    tracker estimates drifts about these; otherwise such drifts count as independent ones of the intercept too.
     """
     own, tracker = prior is None, run.tracker
     drift_root = run.known.extra if own and run.known.extra.size else NONE
@@ -126,9 +138,13 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
     dt = drift.copy() if prior.slopes or fields else NONE
     first = int(np.argmax(drift > 0.0)) + 1
     drift *= run.known.drift
+    A = NONE
     if own and fields:
-        q, r_of = tracker.estimated_variances(run.model, fields, np.sqrt(weight) * fields["e"], drift)
+        q, about, r_of = tracker.estimated_variances(run.model, fields, np.sqrt(weight) * fields["e"], drift)
         phi, signals[:, Y] = tracker.regression(fields, phi, signals[:, Y])
+        A = about_means(phi, weight)
+        q, phi = (q @ (A**2).T + about, phi @ A) if centred else (q + about @ (A**2).T, phi)
+        A = A if centred and np.any(np.eye(len(A)) != A) else NONE
         time, drift_root = drift.copy(), np.sqrt(q)
         weight /= r_of
         drift[:] = 1.0
@@ -138,5 +154,5 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
         drift[:first], trend[:first], moving[:first] = 0.0, 0.0, 0.0
     r = 1.0 if prior.r is None else prior.r
     p0 = None if prior.p0 is None else prior.p0 / r
-    walk = Walk(phi, signals, prior.q / r, prior.theta0, p0, prior.r, drift_root, trend)
+    walk = Walk(phi, signals, prior.q / r, prior.theta0, p0, prior.r, drift_root, trend, about=A)
     return average_drift(walk, time, moving) if own and fields else walk

@@ -324,7 +324,7 @@ class AdaptiveKalman(Tracker):
         )
 
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
-        running = fields["settled"] > 0
+        running = np.append(False, fields["settled"][:-1] > 0)  # at the last sample of the start none was whitened
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
 
     def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
@@ -332,7 +332,7 @@ class AdaptiveKalman(Tracker):
 
     def estimated_variances(
         self, model: Model, fields: Mapping[str, Array], e: Array, time: Array
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Array, Array, Array]:
         return estimated_variances(fields, e, time, self.state(model.n))
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:

@@ -154,8 +154,9 @@ class Tracker(Settings, ABC):
 
     def estimated_variances(
         self, model: Model, fields: Mapping[str, Array], e: Array, time: Array
-    ) -> tuple[Array, Array]:
-        """Variances of the drift before each sample (T, n), and of its noise (T,), if the tracker estimates them.
+    ) -> tuple[Array, Array, Array]:
+        """Variances of the drift before each sample (T, n), of the drift about the means of the regressors (T, n), and
+        of the noise (T,), if the tracker estimates them.
 
         ``fields`` (T, ..) are those that ``smoother_fields`` names, e (T,) the innovations of samples of weight 1, time
         (T,) the intervals of drift.

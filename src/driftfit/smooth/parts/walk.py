@@ -51,6 +51,8 @@ class Walk(NamedTuple):
     """(K, T, n): paths under other drifts that are possible too; empty if the drift is known."""
     belief: Array = NONE
     """(K,): their probabilities."""
+    about: Array = NONE
+    """(n, n): the parameters of the model are this matrix times theta; empty if they are theta."""
 
     @property
     def y(self) -> Array:

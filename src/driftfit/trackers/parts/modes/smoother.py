@@ -27,7 +27,7 @@ from driftfit.trackers.parts.modes.one_direction import BESIDE
 
 SMOOTHER_FIELDS = (
     "joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight", "white",
-    "explained", "calm", "left_out", "shift", "direction", "replaced_by",
+    "explained", "calm", "left_out", "shift", "direction", "replaced_by", "variance",
 )  # fmt: skip
 """Fields that are stored at every sample."""
 
@@ -46,6 +46,7 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
         o.weight[i, l] = s.weight[i, l]
         o.direction[i, l] = s.direction[i, l]
         o.white[i, l] = s.white[i, l]
+        o.variance[i, l] = s.variance[i, l]
     o.r[l], o.leverage[l], o.alike[l] = s.r[l], s.leverage[l], s.alike[l]
     o.coarse[l] = s.coarse[l] / s.noise[l]  # in units of the noise factor, as r is
     o.leapt[l], o.weighed[l], o.settled[l], o.explained[l] = s.leapt[l], s.weighed[l], s.settled[l], s.explained[l]
@@ -78,8 +79,9 @@ def given_all(after: Array, stay: Array, change: Array, rate: Array, moves: Arra
 
 def estimated_variances(
     fields: Mapping[str, Array], e: Array, time: Array, state: Mapping[str, Any]
-) -> tuple[Array, Array]:
-    """q (T, n) and r (T,) of every sample, from the stored fields (T, ..), the innovations and intervals of drift."""
+) -> tuple[Array, Array, Array]:
+    """q (T, n), that of the drift about the means, and r (T,) of every sample, from the stored fields (T, ..), the
+    innovations and intervals of drift."""
     running, weighed = fields["settled"] > 0, fields["weighed"] > 0
     r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
     after = np.where(weighed[:, None], fields["joint"].sum(axis=1), fields["prior"])
@@ -95,11 +97,15 @@ def estimated_variances(
         leapt = np.where(weighed, fields["leapt"] / span, 0.0)
         drift = w @ ratio.T + (w @ learned)[:, None] * fields["weight"] + (w @ along)[:, None] * share
         q = (drift + (w[:, TOP] * leapt)[:, None] * ratio[:, TOP]) * span[:, None] / fields["c"]
-    q = np.where(running[:, None] & (span[:, None] > 0.0) & (fields["c"] > 0.0), q, 0.0)
+        first = state["first_about"]
+        own = np.where(fields["variance"] > 0.0, fields["variance"], fields["c"])
+        about = ((w[:, first : first + len(state["about"])] @ state["about"]) * span)[:, None] / own
+    drifts = running[:, None] & (span[:, None] > 0.0) & (fields["c"] > 0.0)
+    q, about = np.where(drifts, q, 0.0), np.where(drifts, about, 0.0)
     never = np.zeros((J, J)), np.zeros(len(r)), weighed, np.full(len(r), -1), np.zeros(J)
     levels = given_all(fields["nu"][:, :-1], level_chain(), *never)
     v = np.sum(levels * np.maximum(state["level"][:-1] * r[:, None], fields["coarse"][:, None]), axis=1)
     v = np.where(running, v + fields["coarse"] * fields["alike"] * (fields["alike"] + 2.0), r) * fields["leverage"]
     outlier = np.where(weighed, fields["joint"][:, -1].sum(axis=1), 0.0)
     far = np.maximum(state["level"][-1] * v, np.where(weighed, e * e, 0.0))
-    return q, 1.0 / ((1.0 - outlier) / v + outlier / far)
+    return q, about, 1.0 / ((1.0 - outlier) / v + outlier / far)
