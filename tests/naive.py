@@ -7,7 +7,7 @@ and returns (y_hat, e, s). A twin of a model turns signals into those calls.
 import numpy as np
 from scipy.linalg import null_space
 
-from driftfit.trackers.parts.modes.trend import FADING, GROWN, LOST, SHORTEST
+from driftfit.trackers.parts.modes.drifts.trend import FADING, GROWN, LOST, SHORTEST
 
 LARGEST = 1e100
 SMALL = 1e-9

@@ -115,9 +115,9 @@ def about_means(phi: Array, weight: Array) -> Array:
     """A (n, n), for which phi A are the regressors less their means, beside the last column that is constant and not 0;
     the identity without one."""
     A, used = np.eye(phi.shape[1]), phi[weight > 0.0]
-    constant = np.flatnonzero((np.ptp(used, axis=0) == 0.0) & (used[0] != 0.0)) if len(used) else ()
-    if len(constant):
-        k = constant[-1]
+    constant = np.flatnonzero((np.ptp(used, axis=0) == 0.0) & (used[0] != 0.0)) if len(used) else np.empty(0, int)
+    if constant.size:
+        k = int(constant[-1])
         A[k] -= np.where(np.arange(len(A)) == k, 0.0, used.mean(axis=0) / used[0, k])
     return A
 
@@ -141,8 +141,8 @@ def walk_of(run: Track, prior: RandomWalk | None = None, centred: bool = False) 
     A = NONE
     if own and fields:
         q, about, r_of = tracker.estimated_variances(run.model, fields, np.sqrt(weight) * fields["e"], drift)
-        phi, signals[:, Y] = tracker.regression(fields, phi, signals[:, Y])
         A = about_means(phi, weight)
+        phi, signals[:, Y] = tracker.regression(fields, phi, signals[:, Y])
         q, phi = (q @ (A**2).T + about, phi @ A) if centred else (q + about @ (A**2).T, phi)
         A = A if centred and np.any(np.eye(len(A)) != A) else NONE
         time, drift_root = drift.copy(), np.sqrt(q)

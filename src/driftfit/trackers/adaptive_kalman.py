@@ -5,10 +5,11 @@ sample, where r is the present noise variance and c_i the mean square of regress
 that the drift of one parameter adds to the output per sample, whatever the units. The first ratio is 0. In the common
 ladder of ratios all weights w are 1; in a second one they are learned from the record
 (`driftfit.trackers.parts.modes.weights`); the filters of a third follow a trend
-(`driftfit.trackers.parts.modes.trend`); those of a fourth drift in one direction, which is learned too
-(`driftfit.trackers.parts.modes.one_direction`); with up to eight parameters, each has a ladder on which it alone
-drifts; and the last filter comes to rest after a change (`driftfit.trackers.parts.modes.at_rest`). The filters are the
-modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
+(`driftfit.trackers.parts.modes.drifts.trend`); those of a fourth drift in one direction, which is learned too
+(`driftfit.trackers.parts.modes.drifts.one_direction`), those of a fifth about the mean regressors, beside an intercept
+(`driftfit.trackers.parts.modes.drifts.about_means`); with up to eight parameters, each has a ladder on which it alone
+drifts; and the last filter comes to rest after a change (`driftfit.trackers.parts.modes.drifts.at_rest`). The filters
+are the modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each
 filter the levels are merged at once, by a rank-one update (`driftfit.trackers.parts.modes.filters`). The variance r is
@@ -36,8 +37,8 @@ Use it if nothing is known; if q and r are known, `Kalman` is as good and far ch
 in a few hundred samples; ``groups`` specifies it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the ladder of ratios, its transitions, the noise
-levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 22 + 3 n
-for two to eight parameters, and 22 for more.
+levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 26 + 3 n
+for two to eight parameters, and 26 for more.
 """
 
 from __future__ import annotations
@@ -87,8 +88,8 @@ from driftfit.trackers.parts.faults.outlying_readings import (
 )
 from driftfit.trackers.parts.faults.stored_samples import machine_doubt
 from driftfit.trackers.parts.faults.strange_inputs import learn_inputs, leave_out_input, no_strange_inputs
-from driftfit.trackers.parts.modes.about_means import learn_means
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
+from driftfit.trackers.parts.modes.drifts.about_means import learn_means
 from driftfit.trackers.parts.modes.few_residuals import widen_estimates, wider
 from driftfit.trackers.parts.modes.filters import (
     enter_filters,

@@ -7,9 +7,11 @@
 In the common ladder all parameters drift; its top is the rung of ratio 1, and those above are for noise that is small
 compared with the drift. In a second ladder the parameters have learned weights
 (`driftfit.trackers.parts.modes.weights`), and the filters of a third follow a trend
-(`driftfit.trackers.parts.modes.trend`). In a fourth they drift together, in a direction that is learned
-(`driftfit.trackers.parts.modes.one_direction`). Each parameter has a short ladder of its own, on which it alone drifts:
-the change of one parameter neither has to be learned first nor makes the others uncertain. Groups have theirs instead.
+(`driftfit.trackers.parts.modes.drifts.trend`). In a fourth they drift together, in a direction that is learned
+(`driftfit.trackers.parts.modes.drifts.one_direction`), and in a fifth about the mean regressors
+(`driftfit.trackers.parts.modes.drifts.about_means`). Each parameter has a short ladder of its own, on which it alone
+drifts: the change of one parameter neither has to be learned first nor makes the others uncertain. Groups have theirs
+instead.
 
 T moves one rung up or down, and leads to each mode from all others with the same small probability a_j:
 
@@ -19,8 +21,8 @@ so the filters that arrive at j are the mixture itself, whose moments are known,
 of O(K^2). Jumps arrive at rungs of ratio 1, which soon move down again: from there to no drift directly only with the
 small a_0, since mixing the wide covariance of the top filter into the one without drift costs more than anything else
 when nothing changes. The last filter is not mixed, and comes to rest directly
-(`driftfit.trackers.parts.modes.at_rest`). All but what moves down has the factor calm <= 1, learned from how often
-rungs of ratio 1 end: what never changed in thousands of samples is expected to change less often (`learn_rate`).
+(`driftfit.trackers.parts.modes.drifts.at_rest`). All but what moves down has the factor calm <= 1, learned from how
+often rungs of ratio 1 end: what never changed in thousands of samples is expected to change less often (`learn_rate`).
 
 The top filter may also *leap*: if a move as large as the innovation, in directions 1 / c_i and up to LEAP standard
 deviations of the output (times p of `driftfit.trackers.parts.faults.outlying_readings`), at this regressor and at one
@@ -38,11 +40,11 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel, log
-from driftfit.trackers.parts.modes.about_means import ABOUT, no_means
-from driftfit.trackers.parts.modes.at_rest import come_to_rest, no_rest
-from driftfit.trackers.parts.modes.one_direction import ALONG, no_direction
+from driftfit.trackers.parts.modes.drifts.about_means import ABOUT, no_means
+from driftfit.trackers.parts.modes.drifts.at_rest import come_to_rest, no_rest
+from driftfit.trackers.parts.modes.drifts.one_direction import ALONG, no_direction
+from driftfit.trackers.parts.modes.drifts.trend import TREND, no_trend
 from driftfit.trackers.parts.modes.rows import sum_of_row
-from driftfit.trackers.parts.modes.trend import TREND, no_trend
 
 LADDER = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 1.5, 30.0)
 """Drift ratios of the modes in which all parameters drift."""
@@ -59,9 +61,10 @@ CLIMB, BACK = 0.0003, 0.1
 DESCEND = ((0.005, 0.001), (0.02, 0.002), (0.1, 0.004), (np.inf, 0.01))
 """Probability to the rung below, for ratios up to a limit: what moves fast may come to rest soon."""
 JUMP, REST, ACROSS = 0.0015, 0.0001, 0.00005
-"""Probabilities of arriving from the mixture: at rungs of ratio 1, half of it at the top; at the foot of the common
+"""Probabilities of arriving from the mixture: at rungs of ratio 1; at the foot of the common
 ladder (three tenths of it at each other rung of it below the top); and at the other rungs of each kind of ladder."""
-ABOUT_JUMPS = 0.2
+ABOUT_MEANS = 0.2
+"""Share of jumps that are about the means; half of all are of one parameter."""
 SELDOM = 5.0
 """Factor by which arrivals at the filters that drift in one direction are rarer than at each other kind."""
 
@@ -78,17 +81,17 @@ STAY, BELOW, ABOVE, MIXED = range(4)
 
 
 def ladders(n: int, groups: Any) -> tuple[Array, Array, Array, Array, Array]:
-    """Ratios (n, K), probabilities (3, K) of climbing, descending and going back, arrivals (K,), and (K,) the ratios of
-    the modes with learned weights, 0 for others."""
-    single = groups is None and 1 < n <= MOST_ALONE
+    """Ratios (n, K) of independent drifts, probabilities (3, K) of climbing, descending and going back, arrivals (K,),
+    (K,) the ratios of the modes with learned weights, 0 for others, and the rungs (K,)."""
+    single, several, every = groups is None and 1 < n <= MOST_ALONE, n > 1, np.ones(n)
     masks = [np.isin(np.arange(n), one).astype(float) for one in (range(n) if single else groups or ())]
-    common = [(LADDER, 1.0), (LEARNED, 1.0), (TREND, 1.0), *([(ALONG, SELDOM)] if n > 1 else [])]
-    kinds = [(ladder, np.ones(n), parts) for ladder, parts in common]
-    kinds += [(ABOUT, np.zeros(n), 1.0)] if n > 1 else []
-    kinds += [(ALONE if single else GROUP, mask, len(masks)) for mask in masks]
-    kinds += [((0.0,), np.ones(n), np.inf)]  # at rest: others replace it, and none are mixed with it
+    alone, about = 0.5 if masks else 0.0, ABOUT_MEANS if several else 0.0  # shares of jumps
+    kinds = [(LADDER, every, 1.0 - alone - about, 1.0), (LEARNED, every, 0.0, 1.0), (TREND, every, 0.0, 1.0)]
+    kinds += [(ALONG, every, 0.0, SELDOM), (ABOUT, np.zeros(n), about, 1.0)] if several else []
+    kinds += [(ALONE if single else GROUP, mask, alone / len(masks), len(masks)) for mask in masks]
+    kinds += [((0.0,), every, 0.0, np.inf)]  # at rest: others replace it, and none are mixed with it
     ratio, learned, moves, arrive, rungs = [], [], [], [], []
-    for which, (ladder, mask, parts) in enumerate(kinds):
+    for which, (ladder, mask, jumps, parts) in enumerate(kinds):
         for k, rung in enumerate(ladder):
             ratio.append(rung * mask)
             rungs.append(rung)
@@ -97,10 +100,7 @@ def ladders(n: int, groups: Any) -> tuple[Array, Array, Array, Array, Array]:
             back = BACK if rung == LADDER[TOP] else 0.0
             moves.append((CLIMB if k + 1 < len(ladder) else 0.0, 0.0 if back else down, back))
             if rung == LADDER[TOP]:
-                if which == 0:
-                    arrive.append(JUMP * ((0.5 if masks else 1.0) - (ABOUT_JUMPS if n > 1 else 0.0)))
-                else:
-                    arrive.append(JUMP * (0.5 / len(masks) if mask.any() else ABOUT_JUMPS))
+                arrive.append(JUMP * jumps)
             elif which == 0:
                 arrive.append(REST * (1.0 if k == 0 else 0.3 if k < TOP else 0.0))
             else:

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
+from driftfit.trackers.parts.modes.drifts.one_direction import BESIDE
 from driftfit.trackers.parts.modes.ladder import TOP, chain
 from driftfit.trackers.parts.modes.noise_levels import level_chain
-from driftfit.trackers.parts.modes.one_direction import BESIDE
 
 SMOOTHER_FIELDS = (
     "joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight", "white",
@@ -56,7 +56,7 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
 
 def given_all(after: Array, stay: Array, change: Array, rate: Array, moves: Array, by: Array, over: Array) -> Array:
     """Probabilities (T, K) of states, given all samples; at samples that move, transitions are stay + rate_t change,
-    and before them state by_t >= 0 replaces the last one (`driftfit.trackers.parts.modes.at_rest`)."""
+    and before them state by_t >= 0 replaces the last one (`driftfit.trackers.parts.modes.drifts.at_rest`)."""
     found, before = after.copy(), after.copy()
     at = np.flatnonzero(by >= 0)
     which = by[at]

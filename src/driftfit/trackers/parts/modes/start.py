@@ -48,7 +48,7 @@ from driftfit.trackers.parts.faults.stored_samples import (
     without_fault,
 )
 from driftfit.trackers.parts.faults.strange_inputs import learn_stored_inputs
-from driftfit.trackers.parts.modes.about_means import learn_means
+from driftfit.trackers.parts.modes.drifts.about_means import forget_mean, learn_means
 from driftfit.trackers.parts.modes.filters import absorb, project, wander
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
 from driftfit.trackers.parts.modes.weights import WINDOW
@@ -111,7 +111,7 @@ def forget(s: State, l: int) -> None:
     n = s.theta.shape[0]
     for i in range(n):
         s.theta[i, l], s.c[i, l], s.active[i, l] = s.m[i, 0, l], 0.0, 0.0
-        s.centre[i, l], s.variance[i, l], s.moves_seen[i, l] = 0.0, 0.0, 0.0
+        forget_mean(s, i, l)
         for j in range(n):
             s.information[i, j, l] = 0.0
     know_nothing(s, l)

@@ -13,7 +13,7 @@ as the non-negative solution of
 whose sums fade. The pass is made every `BLOCK` samples over the last `WINDOW`, and counts the oldest block, for which
 later samples show which parameter moved. The second ladder of drift ratios climbs in these proportions, rho_i / max_j
 rho_j (`driftfit.trackers.parts.modes.ladder`). The same pass finds the direction in which all parameters may drift
-together (`driftfit.trackers.parts.modes.one_direction`).
+together (`driftfit.trackers.parts.modes.drifts.one_direction`).
 
 Source: the smoother and its scores are Koopman and Shephard (1992); solving for all variances together, as data
 arrive, is ours. Cost per sample: O(n^2).
@@ -28,7 +28,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, kernel, machine, shared
 from driftfit.trackers.parts.faults.first_samples import PHI
-from driftfit.trackers.parts.modes.one_direction import (
+from driftfit.trackers.parts.modes.drifts.one_direction import (
     FACTOR,
     TIME,
     B,

@@ -1,0 +1,98 @@
+"""Filters whose parameters drift about the mean regressors: changes of a gain at an operating point.
+
+Beside an intercept, a gain that changes where the input is far from 0 leaves the output at the mean input as it is: in
+y = a + g (u - m) the intercept is a - g m, and moves with g. Drifts of g and the intercept that are independent would
+move y by m for each unit by which that change moves it at u = m + 1, and in units of the mean square of u the drift of
+g is (m^2 + v) / v times too small. With m_i and v_i the mean and the variance of regressor i, k the constant column and
+p its value, the covariance of these filters therefore grows by
+
+    sum_{i != k} ratio r / v_i d_i d_i' + ratio r / c_k e_k e_k',     d_i = e_i - (m_i / p) e_k
+
+    m_i <- m_i + (phi_i - m_i) / w,     v_i <- v_i + ((phi_i - m_i) (phi_i - m_i^new) / noise - v_i) / w
+
+with w the number of samples on which regressor i has moved, at most `MEMORY`. An input without mean and the same input
+with an offset of any size thus have the same drift. Without a constant column these filters are those of the common
+ladder (`driftfit.trackers.parts.modes.ladder`).
+
+Source: ours. Cost per sample: O(n^3 / 2), and O(n^2 / 2) for each filter.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import State, kernel
+from driftfit.trackers.parts.excitation import DULL, LARGE, MEMORY
+from driftfit.trackers.parts.faults.outlying_readings import FIRST
+
+ABOUT = (1e-3, 1e-2, 0.1, 1.0)
+"""Drift ratios of the filters."""
+
+
+def no_means(n: int, first: int) -> dict[str, Any]:
+    """Fields before the first sample; ``first`` is the first of these filters, if n > 1."""
+    return {
+        "about": np.array(ABOUT if n > 1 else ()),
+        "first_about": first,
+        "mean": np.zeros(n),
+        "variance": np.zeros(n),
+        "phi_before": np.zeros(n),
+        "steps_taken": np.zeros(n),
+        "away": np.zeros(n),
+        "about_drift": np.zeros((n, n)),
+    }
+
+
+@kernel
+def learn_means(s: State, l: int) -> None:
+    """Update means and variances of the regressors that have moved since the sample before."""
+    for i in range(s.theta.shape[0]):
+        step = s.phi[i, l] - s.phi_before[i, l]
+        moved = (s.steps_taken[i, l] < 1.0) | (step * step > DULL * s.variance[i, l])
+        used = s.ok[l] if moved else 0.0
+        s.steps_taken[i, l] += used
+        share = used / min(max(s.steps_taken[i, l], 1.0), MEMORY)
+        off = s.phi[i, l] - s.mean[i, l]
+        s.mean[i, l] += share * off
+        square = off * (s.phi[i, l] - s.mean[i, l]) / s.noise[l]
+        most = LARGE * s.variance[i, l] if s.steps_taken[i, l] > FIRST else np.inf
+        s.variance[i, l] += share * (min(square, most) - s.variance[i, l])
+        s.phi_before[i, l] = s.phi[i, l] if s.ok[l] > 0.0 else s.phi_before[i, l]
+
+
+@kernel
+def forget_mean(s: State, i: int, l: int) -> None:
+    """As before the first sample."""
+    s.mean[i, l], s.variance[i, l], s.steps_taken[i, l] = 0.0, 0.0, 0.0
+
+
+@kernel
+def constant_column(s: State, l: int) -> int:
+    """The last column that is constant and not 0, or -1."""
+    found = -1
+    for i in range(s.theta.shape[0]):
+        found = i if (s.mean[i, l] != 0.0) & (s.variance[i, l] == 0.0) else found
+    return found
+
+
+@partial(kernel, inline=False)
+def drift_about(s: State, size: float, l: int) -> None:
+    """Drift about the means: ``size`` in units of the ratios over the variances of the regressors."""
+    n, k = s.parameters[l], constant_column(s, l)
+    for a in range(n):
+        for b in range(a + 1):
+            s.about_drift[a, b, l] = 0.0
+    for i in range(n if s.about.shape[0] > 0 else 0):
+        beside = (k >= 0) & (i != k)
+        own = s.variance[i, l] if beside else s.c[i, l]
+        for a in range(n if own > 0.0 else 0):
+            s.away[a, l] = s.S[a, i, l] - (s.mean[i, l] / s.mean[k, l] * s.S[a, k, l] if beside else 0.0)
+            for b in range(a + 1):
+                s.about_drift[a, b, l] += s.away[a, l] * s.away[b, l] / own
+    for a in range(n):
+        for b in range(a + 1):
+            for j in range(s.about.shape[0]):
+                s.C[a, b, s.first_about[l] + j, l] += size * s.about[j, l] * s.about_drift[a, b, l]
