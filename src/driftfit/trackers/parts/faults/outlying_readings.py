@@ -70,7 +70,8 @@ def leave_out(s: State, l: int) -> None:
     judged = (s.observed[l] > 0.0) & (s.readings[l] >= (0.5 * FIRST if few else FIRST))
     strange = judged & (away > reach) & (e > reach)
     out = strange & contradicted & (away > limit) & (e > limit)
-    s.leverage[l] = max(s.leverage[l], e / (s.r[l] * s.noise[l])) if strange & new else s.leverage[l]
+    if strange & new:
+        s.leverage[l] = max(s.leverage[l], e / (s.r[l] * s.noise[l]))
     s.strange[l] = 1.0 if strange & contradicted else 0.0
     s.left_out[l] += 1.0 if out else 0.0
     s.ok[l] = 0.0 if out else s.ok[l]
