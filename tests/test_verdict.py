@@ -401,7 +401,7 @@ def test_records_that_can_tell_nothing():
     assert track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u).verdict(burn=5).scored == 15
     idle = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), *arx_record(200, 1)[:1], np.zeros(200)).verdict()
     assert np.isfinite(idle.p)
-    assert "Nothing is known of b1 and b2: their regressors are always 0." in idle.sentences
+    assert "Nothing is known of b1 and b2: their regressors are 0 in every sample that can be used." in idle.sentences
     none = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), np.full(100, np.nan), np.ones(100)).verdict()
     assert none.samples == 0
 

@@ -5,9 +5,12 @@ as an output, as a lag in the regressors of later samples, and in every scale th
 and v the mean and variance of the readings so far and e the innovation, it is left out (not used, and its lag is that
 of a missing output) if
 
-    (y - m)^2 > (REACH p)^2 v    and    e^2 > (REACH p)^2 v
+    (y - m)^2 > (REACH p)^2 v    and    e^2 > (REACH p)^2 v    and    e^2 > SURE^2 s
 
-so never if the model predicted it. The factor p, ``widening``, is 1, and doubles with every consecutive sample that is
+with s the variance of e: never if the model predicted it, or could predict nothing, as where a regressor that was 0 so
+far moves for the first time. Such a reading is the response to a rare pulse, or a fault code by coincidence. It is
+learned from with noise variance e^2: the estimate follows at once, with a band as wide as itself, and the next pulse
+confirms or replaces it. The factor p, ``widening``, is 1, and doubles with every consecutive sample that is
 so far off or an outlier: persistent readings are a change of level, and are accepted. A change of level by a factor of
 1000 costs seven samples.
 
@@ -53,16 +56,23 @@ def no_proportion() -> dict[str, Any]:
 
 @kernel
 def leave_out(s: State, l: int) -> None:
-    """Leave out a reading far outside the usual range; s.y_hat and s.s must be known, s.s inf in a new direction."""
+    """Leave out a reading far outside the usual range; s.y_hat and s.s must be known, s.s inf in a new direction, in
+    which the reading is a response that nothing confirms yet.
+    """
     away, e = (reading(s, l) - s.middle[l]) ** 2, (s.y[l] - s.y_hat[l]) ** 2
-    e = e if s.valid[l] > 0.0 else away
+    predicted = s.valid[l] > 0.0
+    e = e if predicted else away
     reach = REACH * REACH * s.spread[l]
     limit = reach * s.widening[l] * s.widening[l]
-    few = (s.s[l] < np.inf) & (e > SURE * SURE * s.s[l]) & (s.leverage[l] <= 1.0) & (s.valid[l] > 0.0)
+    new = predicted & (s.s[l] == np.inf)
+    contradicted = (not predicted) | (e > SURE * SURE * s.s[l])
+    few = predicted & contradicted & (s.leverage[l] <= 1.0)
     judged = (s.observed[l] > 0.0) & (s.readings[l] >= (0.5 * FIRST if few else FIRST))
     strange = judged & (away > reach) & (e > reach)
-    out = judged & (away > limit) & (e > limit)
-    s.strange[l] = 1.0 if strange else 0.0
+    out = strange & contradicted & (away > limit) & (e > limit)
+    if strange & new:
+        s.leverage[l] = max(s.leverage[l], e / (s.r[l] * s.noise[l]))
+    s.strange[l] = 1.0 if strange & contradicted else 0.0
     s.left_out[l] += 1.0 if out else 0.0
     s.ok[l] = 0.0 if out else s.ok[l]
     s.observed[l] = 0.0 if out else s.observed[l]
