@@ -54,12 +54,16 @@ def test_probabilities_given_all_are_those_of_all_paths():
     """Where a state replaces the last one before a transition, its path may go on there, and that of the last in it."""
     rng = np.random.default_rng(0)
     K, steps = 3, 6
-    stay, by, over = rng.dirichlet(np.ones(K), size=K), np.array([-1, 0, -1, 1, 0, -1]), np.array([0.5, 0.2, 0.0])
+    stay, by, over = (
+        rng.dirichlet(np.ones(K), size=K),
+        np.array([-1, 0, -1, 1, 0, -1]),
+        np.array([0.0, 0.5, 0.0, 0.2, 0.3, 0.0]),
+    )
     moves, likelihood = [], rng.random((steps, K))
-    for at in by:
+    for at, share in zip(by, over, strict=True):
         into = np.eye(K)
         if at >= 0:
-            into[at, at], into[at, -1] = 1.0 - over[at], over[at]
+            into[at, at], into[at, -1] = 1.0 - share, share
             into[-1, at], into[-1, -1] = 1.0, 0.0
         moves.append(into @ stay)
     after = np.empty((steps, K))

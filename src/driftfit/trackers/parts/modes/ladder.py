@@ -132,6 +132,7 @@ def filters(n: int, groups: Any) -> dict[str, Any]:
         "arrive": arrive,
         "arrivals": arrive.sum(),
         "calm": 1.0,
+        "busy": 1.0,
         "jumps": 0.0,
         "watched": 0.0,
         "learned": learned,
@@ -180,13 +181,15 @@ def find_shares(s: State, l: int) -> None:
 
 @kernel
 def learn_rate(s: State, l: int) -> None:
-    """How rare changes are: those that the modes of ratio 1 end, as a share of those expected; never above 1."""
+    """How rare changes are: those that the modes of ratio 1 end, as a share of those expected; calm is never above 1,
+    and busy never below."""
     for j in range(s.modes[l]):
         s.row[j, l] = s.moves[2, j, l] * s.mu[j, l]
     fade = 1.0 - 1.0 / SPAN
     s.jumps[l] = fade * s.jumps[l] + sum_of_row(s, l)
     s.watched[l] = fade * s.watched[l] + 1.0
-    s.calm[l] = max(CALMEST, min(1.0, (EVENTS + s.jumps[l]) / (EVENTS + JUMP * s.watched[l])))
+    rate = (EVENTS + s.jumps[l]) / (EVENTS + JUMP * s.watched[l])
+    s.calm[l], s.busy[l] = max(CALMEST, min(1.0, rate)), max(1.0, rate)
 
 
 @partial(kernel, inline=False)

@@ -27,7 +27,7 @@ from driftfit.trackers.parts.modes.noise_levels import level_chain
 
 SMOOTHER_FIELDS = (
     "joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight", "white",
-    "explained", "calm", "left_out", "shift", "direction", "replaced_by", "variance",
+    "explained", "calm", "left_out", "shift", "direction", "replaced_by", "busy", "variance",
 )  # fmt: skip
 """Fields that are stored at every sample."""
 
@@ -51,17 +51,17 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
     o.coarse[l] = s.coarse[l] / s.noise[l]  # in units of the noise factor, as r is
     o.leapt[l], o.weighed[l], o.settled[l], o.explained[l] = s.leapt[l], s.weighed[l], s.settled[l], s.explained[l]
     o.calm[l], o.left_out[l], o.shift[l] = s.calm[l], s.left_out[l], s.shift[l]
-    o.replaced_by[l] = s.replaced_by[l]
+    o.replaced_by[l], o.busy[l] = s.replaced_by[l], s.busy[l]
 
 
 def given_all(after: Array, stay: Array, change: Array, rate: Array, moves: Array, by: Array, over: Array) -> Array:
     """Probabilities (T, K) of states, given all samples; at samples that move, transitions are stay + rate_t change,
-    and before them state by_t >= 0 replaces the last one (`driftfit.trackers.parts.modes.drifts.at_rest`)."""
+    and before them a share over_t of state by_t >= 0 replaces the last one (`driftfit.trackers.parts.modes.drifts.at_rest`)."""
     found, before = after.copy(), after.copy()
     at = np.flatnonzero(by >= 0)
     which = by[at]
-    before[at, which] = (1.0 - over[which]) * after[at, which] + after[at, -1]
-    before[at, -1] = over[which] * after[at, which]
+    before[at, which] = (1.0 - over[at]) * after[at, which] + after[at, -1]
+    before[at, -1] = over[at] * after[at, which]
     ahead = before @ stay + rate[:, None] * (before @ change)
     for t in range(len(found) - 2, -1, -1):
         if not moves[t]:
@@ -70,8 +70,7 @@ def given_all(after: Array, stay: Array, change: Array, rate: Array, moves: Arra
         later = found[t + 1] / np.maximum(ahead[t], 1e-300)
         later = stay @ later + rate[t] * (change @ later)
         if by[t] >= 0:
-            share = over[by[t]]
-            later[by[t]], later[-1] = (1.0 - share) * later[by[t]] + share * later[-1], later[by[t]]
+            later[by[t]], later[-1] = (1.0 - over[t]) * later[by[t]] + over[t] * later[-1], later[by[t]]
         found[t] = after[t] * later
         found[t] /= found[t].sum()
     return found
@@ -87,7 +86,8 @@ def estimated_variances(
     after = np.where(weighed[:, None], fields["joint"].sum(axis=1), fields["prior"])
     J = len(state["level"]) - 1
     replaced_by, span, learned = fields["replaced_by"].astype(int), r * time, state["learned"]
-    w = given_all(after, *chain(state["moves"], state["arrive"]), fields["calm"], weighed, replaced_by, state["over"])
+    over = state["over"][replaced_by] / fields["busy"]
+    w = given_all(after, *chain(state["moves"], state["arrive"]), fields["calm"], weighed, replaced_by, over)
     along, first = np.zeros(len(learned)), state["first_along"]
     along[first : first + len(state["along"])] = state["along"]
     ratio = np.where((learned > 0.0) | (along > 0.0), 0.0, state["ratio"])
@@ -102,7 +102,7 @@ def estimated_variances(
         about = ((w[:, first : first + len(state["about"])] @ state["about"]) * span)[:, None] / own
     drifts = running[:, None] & (span[:, None] > 0.0) & (fields["c"] > 0.0)
     q, about = np.where(drifts, q, 0.0), np.where(drifts, about, 0.0)
-    never = np.zeros((J, J)), np.zeros(len(r)), weighed, np.full(len(r), -1), np.zeros(J)
+    never = np.zeros((J, J)), np.zeros(len(r)), weighed, np.full(len(r), -1), r
     levels = given_all(fields["nu"][:, :-1], level_chain(), *never)
     v = np.sum(levels * np.maximum(state["level"][:-1] * r[:, None], fields["coarse"][:, None]), axis=1)
     v = np.where(running, v + fields["coarse"] * fields["alike"] * (fields["alike"] + 2.0), r) * fields["leverage"]

@@ -7,6 +7,9 @@ change that filter j follows is over, filter j of the largest e_j mu_j replaces 
 
     if e_j mu_j > mu_a:     m_a <- m_j,   C_a <- C_j,   (mu_a, mu_j) <- (e_j mu_j, mu_j - e_j mu_j + mu_a)
 
+e_j is that of `OVER`, divided by how many times more often jumps end than expected
+(`driftfit.trackers.parts.modes.ladder`): where they come every ten samples, none of them ends in rest.
+
 While nothing changes, the last filter has hardly any probability, and costs nothing. After a jump it is the one that
 learns the new level as fast as constant parameters are learned.
 
@@ -37,8 +40,9 @@ def come_to_rest(s: State, l: int) -> None:
     """Replace the last filter, if another has come to rest more probably."""
     last, best, most = s.modes[l] - 1, 0, 0.0
     for j in range(last):
-        if s.over[j, l] * s.mu[j, l] > most:
-            best, most = j, s.over[j, l] * s.mu[j, l]
+        share = s.over[j, l] / s.busy[l]
+        if share * s.mu[j, l] > most:
+            best, most = j, share * s.mu[j, l]
     gained = most - s.mu[last, l]
     s.replaced_by[l] = best if gained > 0.0 else -1
     if gained > 0.0:
