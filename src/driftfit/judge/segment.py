@@ -4,9 +4,11 @@
 
 The minimum is found exactly by pruned dynamic programming (`driftfit.judge.statistics.partition`). Rows are first
 divided by the level of the noise, whitened if it is an autoregression, and limited to three levels from the fit, so
-that an outlier does not become a segment (`driftfit.judge.statistics.noise`). The penalty is chosen so that a record of
-constant parameters is divided with probability ``false``. Each date has an interval that contains the true one with
-probability at least ``level`` (`driftfit.judge.statistics.break_dates`), given that there is a break.
+that an outlier does not become a segment (`driftfit.judge.statistics.noise`). If the noise is louder where regressors
+are large, rows are weighted and the search is repeated (`driftfit.judge.segments.noise_of_regressors`). The penalty is
+chosen so that a record of constant parameters is divided with probability ``false``. Each date has an interval that
+contains the true one with probability at least ``level`` (`driftfit.judge.statistics.break_dates`), given that there
+is a break. What a segment does not determine has an infinite error (`driftfit.judge.segments.determined`).
 
 Use it on complete records in which parameters jump and are constant in between. A `Bank` does the same on-line, and
 `Track.smooth` estimates parameters that drift: a slow drift is cut into steps here. A record of more than 2000 samples
@@ -14,8 +16,8 @@ is first divided on a grid with that many positions, and every date is then move
 samples between its neighbours; two breaks closer than ``shortest`` are not distinguished.
 
 Source: Bai and Perron (1998, 2003) for breaks in regressions; Killick, Fearnhead and Eckley (2012) for the pruning; Yao
-(1987), Bai (1997) for dates. Departures: whitening, outliers, the penalty from a rate of false breaks, and dates from
-their likelihood. Cost: O(T n^2) and at most CELLS^2 / 2 factors of order n + 1.
+(1987), Bai (1997) for dates. Departures: whitening, outliers, weights, a penalty from a rate of false breaks, and
+dates from their likelihood. Cost: O(T n^2) and at most CELLS^2 / 2 factors of order n + 1.
 """
 
 from __future__ import annotations
@@ -33,11 +35,13 @@ from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.regressors import refuse_hidden, regressors
+from driftfit.judge.segments.determined import Determined, doubtful
 from driftfit.judge.segments.joint_autoregression import jointly
+from driftfit.judge.segments.noise_of_regressors import relative_size
 from driftfit.judge.statistics.break_dates import dated
 from driftfit.judge.statistics.constancy import shortest as shortest_of
 from driftfit.judge.statistics.noise import HELD, Noise, begun, whitened
-from driftfit.judge.statistics.robust import clipped, fit_in, inverted, least_squares, noisy, orthonormal, robust_fit
+from driftfit.judge.statistics.robust import clipped, fit_in, least_squares, noisy, orthonormal, robust_fit
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
@@ -67,7 +71,12 @@ class Break(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """Samples start .. stop - 1 of the record, with constant theta (n,) and standard errors (n,)."""
+    """Samples start .. stop - 1 of the record, with constant theta (n,) and standard errors (n,).
+
+    An error is inf where the segment does not determine the parameter, because an input rests there. theta is then
+    that of the last segment that does, or of the whole record, moved only where the outputs of the segment require it.
+    An error is NaN where the segment is too short.
+    """
 
     start: int
     stop: int
@@ -127,6 +136,10 @@ class Segmentation(Printed):
             numbers = (cell for value, std in pairs for cell in (digits(value, std), error_text(std)))
             table.add_row(str(part.start), str(part.stop - part.start), *numbers)
         yield table
+        for part in self.segments:
+            unknown = [name for name, std in zip(names, part.std, strict=True) if np.isinf(std)]
+            if unknown:
+                yield Text(f" {part.start}: {', '.join(unknown)} not determined in this segment")
         correlated = f"; autoregression of the noise {', '.join(f'{a:.2f}' for a in self.ar)}" if self.ar else ""
         searched = (
             f"not searched for breaks: {self.undivided}" if self.undivided else f"penalty of a break {self.penalty:.1f}"
@@ -149,6 +162,7 @@ class Segmentation(Printed):
         for i, (panel, name) in enumerate(zip(axes[1:], names, strict=True)):
             for part in self.segments:
                 span, value, width = time[[part.start, part.stop - 1]], part.theta[i], 2.0 * part.std[i]
+                width = width if np.isfinite(width) else np.nan
                 panel.plot(span, [value, value], color=BLUE)
                 panel.fill_between(span, value - width, value + width, color=BLUE, alpha=0.25, lw=0)
             panel.set_ylabel(name)
@@ -222,8 +236,17 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
     fit = fit_in(basis, rows.y)
     if not noisy(fit, rows.phi, rows.y):
         return _undivided(run, rows.phi, rows.y, level, "constant parameters explain nine of ten outputs without error")
-    search, found, starts = begun(basis.Q, fit.residual, CELLS, least, quiet=false)
-    found = jointly(search, found, starts, false)
+    phi, y, found = rows.phi, rows.y, _searched(basis.Q, fit.residual, least, false)
+    size = relative_size(phi, y, found)
+    if size is not None:
+        basis = orthonormal(phi / size[:, None])
+        weighted = fit_in(basis, y / size)
+        again = _searched(basis.Q, weighted.residual, least, false)
+        # weights also change the correlation of the noise: there they must explain breaks, not add some
+        if not len(again.ar) or len(again.breaks) < len(found.breaks):
+            phi, y, fit, found = phi / size[:, None], y / size, weighted, again
+        else:
+            basis, size = orthonormal(phi), None
     # a value limited by the fit still supports one side; without its row it does not
     used = np.abs(found.near) <= HELD * found.level
     X, z = basis.Q * (used / found.level)[:, None], np.where(used, found.held, 0.0) / found.level
@@ -232,35 +255,60 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
     time = run.time
     edges = [0, *breaks, N]
     limits = [0, *at, len(run)]
-    parts = tuple(
-        Segment(limits[k], limits[k + 1], *_fitted(rows.phi[a:b], rows.y[a:b], found, a, b))
-        for k, (a, b) in enumerate(pairwise(edges))
-    )
+    sure = [0, *(limit for span in spans for limit in span), N]
+    parts, held = [], fit.theta
+    for k, limit in enumerate(pairwise(edges)):
+        theta, std = _fitted(phi, y, found, limit, (sure[2 * k], sure[2 * k + 1]), held)
+        held = np.where(np.isfinite(std), theta, held)
+        parts.append(Segment(limits[k], limits[k + 1], theta, std))
     described = tuple(
         Break(time[t], time[rows.at[a]], time[rows.at[b]], t) for t, (a, b) in zip(at, spans, strict=True)
     )
-    spread = float(np.median(found.level))
-    return Segmentation(described, parts, level, found.penalty, spread, tuple(map(float, found.ar)), run)
+    spread = float(np.median(found.level if size is None else found.level * size))
+    return Segmentation(described, tuple(parts), level, found.penalty, spread, tuple(map(float, found.ar)), run)
 
 
-def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, Array]:
-    """theta and its standard errors, Huber's for noise that is white after whitening.
+def _searched(Q: Array, y: Array, least: int, false: float) -> Noise:
+    search, found, starts = begun(Q, y, CELLS, least, quiet=false)
+    return jointly(search, found, starts, false)
 
-    A segment too short for that has plain least squares, and errors that are not known. Where more than nine of ten
-    readings lie on one plane, as zeros of rare counts do, Huber's scale vanishes, and least squares takes its place.
+
+def _fitted(
+    phi: Array, y: Array, found: Noise, rows: tuple[int, int], sure: tuple[int, int], held: Array
+) -> tuple[Array, Array]:
+    """theta of the rows a .. b and its standard errors, Huber's for noise that is white after whitening.
+
+    Where the rows next to a break alone tell about a direction, only the rows ``sure`` between the intervals of the
+    dates are used: one row of the neighbouring segment would decide. What they do not determine stays as in ``held``
+    (n,). A segment too short for errors has plain least squares, and errors
+    that are not known. Where more than nine of ten readings lie on one plane, as zeros of rare counts do, Huber's scale
+    vanishes, and least squares takes its place.
     """
-    c, n = found.level[a:b], phi.shape[1]
-    if b - a - len(found.ar) <= n:
-        return least_squares(phi / c[:, None], y / c), np.full(n, np.nan)
-    X, z = whitened(phi / c[:, None], y / c, found.ar)
-    X, z = X[len(found.ar) :], z[len(found.ar) :]
-    fit = robust_fit(X, z)
-    if not noisy(fit, X, z):  # most of it lies on one plane: the rest would not count
-        theta = least_squares(X, z)
-        fit = clipped(theta, z - X @ theta, np.inf)
-    N = len(X)
-    variance = float(fit.psi @ fit.psi) / max(N - n, 1) / max(float(np.mean(fit.inside)), 0.1) ** 2
-    return fit.theta, np.sqrt(np.maximum(variance * np.diag(inverted(X)), 0.0))
+    (a, b), p, n = rows, len(found.ar), len(held)
+    c = found.level[a:b]
+    X, z = phi[a:b] / c[:, None], y[a:b] / c
+    short = b - a - p <= n
+    first, last = (sure[0] - a, sure[1] - a) if sure[1] - sure[0] - p > n else (0, b - a)
+    if not short:
+        X, z = (part[p:] for part in whitened(X, z, found.ar))
+        first, last = max(first - p, 0), last - p
+    if doubtful(X, first, last):
+        X, z = X[first:last], z[first:last]
+    known = Determined.of(X)
+    start = np.where(known.unknown.any(), held, 0.0)
+    X_known, z = X @ known.M, z - X @ start
+    if short:
+        theta = start + known.M @ least_squares(X_known, z)
+        return theta, np.where(known.unknown, np.inf, np.nan)
+    if not X_known.shape[1]:
+        return start, np.full(n, np.inf)
+    fit = robust_fit(X_known, z)
+    if not noisy(fit, X_known, z):  # most of it lies on one plane: the rest would not count
+        beta = least_squares(X_known, z)
+        fit = clipped(beta, z - X_known @ beta, np.inf)
+    N, r = X_known.shape
+    variance = float(fit.psi @ fit.psi) / max(N - r, 1) / max(float(np.mean(fit.inside)), 0.1) ** 2
+    return start + known.M @ fit.theta, known.errors(X, variance)
 
 
 def _undivided(run: Track, phi: Array, y: Array, level: float, why: str) -> Segmentation:
@@ -272,12 +320,13 @@ def _undivided(run: Track, phi: Array, y: Array, level: float, why: str) -> Segm
         e = y - phi @ theta
         e = np.where(np.abs(e) <= ROUNDING * (np.abs(y) + np.abs(phi) @ np.abs(theta)), 0.0, e)
         spread = float(np.std(e))
-        if n < N and orthonormal(phi).distinct:
-            std = np.sqrt(e @ e / (N - n) * np.diag(inverted(phi)))
+        if n < N:
+            known = Determined.of(phi)
+            std = known.errors(phi, e @ e / (N - known.M.shape[1]))
     one = Segment(0, len(run), theta, std)
     return Segmentation((), (one,), level, float("nan"), spread, (), run, why)
 
 
 def error_text(std: float) -> str:
     """A standard error as text; one that is not known is not a number of the table."""
-    return f"{std:.4g}" if np.isfinite(std) else "-"
+    return "-" if np.isnan(std) else f"{std:.4g}"

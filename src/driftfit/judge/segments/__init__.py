@@ -1,1 +1,1 @@
-"""Parts of `driftfit.judge.segment`: the breaks that correlated noise leaves, and their thresholds."""
+"""Parts of `driftfit.judge.segment`: breaks in correlated noise, weights, what a segment determines."""
