@@ -56,7 +56,8 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
 
 def given_all(after: Array, stay: Array, change: Array, rate: Array, moves: Array, by: Array, over: Array) -> Array:
     """Probabilities (T, K) of states, given all samples; at samples that move, transitions are stay + rate_t change,
-    and before them a share over_t of state by_t >= 0 replaces the last one (`driftfit.trackers.parts.modes.drifts.at_rest`)."""
+    and before them a share over_t of state by_t >= 0 replaces the last one
+    (`driftfit.trackers.parts.modes.drifts.at_rest`)."""
     found, before = after.copy(), after.copy()
     at = np.flatnonzero(by >= 0)
     which = by[at]
