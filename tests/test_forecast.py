@@ -129,3 +129,12 @@ def test_forecasts_are_printed_as_tables_and_parameters_of_one_name_apart():
     assert "the first 10 of 12" in text
     assert "10000" in text
     assert "array" not in text
+
+
+def test_a_forecast_without_inputs_says_what_it_needs():
+    rng = np.random.default_rng(0)
+    u, e = rng.normal(size=(2, 80))
+    run = track(Regression(1), Kalman(q=1e-3, r=0.01), 2.0 * u + 0.1 * e, u)
+    said = "future inputs are needed to forecast outputs: forecast(5, u)"
+    assert said in repr(run.forecast(5))
+    assert said not in repr(run.forecast(5, np.ones(5)))

@@ -1,10 +1,14 @@
 """Sentences to act on: in constant systems tracking does not pay, and columns that say nothing are named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import signal
 
 from driftfit import RLS, BoxJenkins, ExtendedKalman, HammersteinWiener, Kalman, Polynomial, Regression, track
+from driftfit.judge.statistics.attribution import alike
+from driftfit.judge.statistics.constancy import constancy
 from driftfit.show.report import page
 
 T = 300
@@ -95,3 +99,79 @@ def test_a_record_without_any_regressor_can_tell_nothing():
     verdict = track(Regression(2), RLS(0.99), y, np.zeros((300, 2))).verdict()
     assert verdict.drifts is None
     assert "cannot show" in str(verdict)
+
+
+def regression_record(seed, size, growth=0.0, noise=0.3):
+    """A gain that is 1, and 1 + size in the second half; the noise grows by exp(growth) over the record."""
+    rng = np.random.default_rng(seed)
+    u, e = rng.normal(size=(2, T))
+    gain = np.where(np.arange(T) < T // 2, 1.0, 1.0 + size)
+    return gain * u + noise * np.exp(growth * np.linspace(-0.5, 0.5, T)) * e, u
+
+
+@pytest.mark.parametrize("growth", [5.0, -5.0])
+def test_the_date_of_a_headline_is_that_of_its_interval_whatever_the_noise(growth):
+    """Noise that grows over the record moved the extreme point of the path to where the record is noisiest."""
+    for seed in range(8):
+        verdict = track(Regression(1), RLS(1.0), *regression_record(seed, 0.5, growth, 0.1)).verdict()
+        (moved,) = verdict.parameters
+        assert moved.earliest <= moved.at <= moved.latest
+        assert abs(moved.at - T // 2) < 15
+        assert f"about {moved.at}" in verdict.sentences[1]
+
+
+def test_a_count_that_stops_growing_is_dated_where_it_does():
+    rng = np.random.default_rng(5)
+    y = np.full(T, 50.0)
+    for t in range(1, T):
+        y[t] = rng.poisson((1.05 if t < T // 2 else 0.97) * y[t - 1] + 1.0)
+    (moved,) = track(Regression(1), RLS(1.0), y[1:], y[:-1]).verdict().parameters
+    assert (moved.earliest, moved.at, moved.latest) == (149, 149, 149)  # without its first sample
+
+
+def test_steps_of_two_parameters_at_one_event_have_one_date():
+    """The interval of each is not cut off at the step of the other."""
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        u, e = rng.normal(size=(2, 400))
+        t = np.arange(400)
+        y = (1.0 + 0.4 * (t >= 200)) * u + 0.3 * (t >= 206) + 0.3 * e
+        slope, level = track(Regression(1, intercept=True), RLS(1.0), y, u).verdict().parameters
+        assert slope.at == level.at
+        assert 199 <= slope.at <= 207
+
+
+def test_a_parameter_that_probably_moves_is_dated_by_the_noise_of_the_time():
+    rng = np.random.default_rng(1)
+    for growth in (-5.0, 5.0):
+        u, e = rng.normal(size=(2, T))
+        phi = np.column_stack([u, np.ones(T)])
+        level = 0.15 * np.exp(growth * np.linspace(-0.5, 0.5, T))
+        y = u + 0.2 * u * (np.arange(T) >= T // 2) + level * e
+        at, names = alike(phi, constancy(phi, y))
+        assert abs(at - T // 2) < 15
+        assert 0 in names
+
+
+@pytest.mark.parametrize("kind", ["exact", "rare"])
+def test_a_step_that_leaves_no_noise_to_test_is_named(kind):
+    """Its own test had p < 0.0001, and the verdict said that this test did not confirm it."""
+    y, u = regression_record(0, 0.5, noise=0.0)
+    if kind == "rare":
+        chance = np.where(np.arange(400) < 200, 0.02, 0.5)
+        y, u = (np.random.default_rng(4).random(401)[1:] < chance).astype(float), np.ones(400)
+    verdict = track(Regression(1), RLS(1.0), y, u).verdict()
+    (moved,) = verdict.parameters
+    assert moved.moves
+    assert moved.p_own < 1e-4
+    assert 0.2 < moved.after - moved.before < 0.6
+    assert abs(moved.at - len(y) // 2) <= (0 if kind == "exact" else 12)
+
+
+def test_a_sentence_about_a_test_says_what_the_table_says():
+    verdict = track(Regression(1), RLS(1.0), *regression_record(0, 0.5)).verdict()
+    (moved,) = verdict.parameters
+    for p, said in ((1e-6, "rejects constancy (p < 0.0001)"), (0.3, "does not confirm it (p = 0.30, level 0.05)")):
+        unnamed = replace(moved, moves=False, p_own=p)
+        sentence = replace(verdict, parameters=(unnamed,), alike=(moved.name,), since="150").sentences[1]
+        assert sentence.startswith(f"It probably is theta1, from about 150; its own test {said}")

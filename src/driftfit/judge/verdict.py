@@ -226,16 +226,27 @@ class Verdict(Printed):
     def _which(self) -> str:
         if not self.drifts:
             return ""
-        if not self.moving and len(self.alike) == 1:
-            return f"It probably is {self.alike[0]}, from about {self.since}; its own test does not confirm it."
-        if not self.moving and len(self.alike) < len(self.parameters):
+        if self.moving:
+            return f"These move: {'; '.join(sentence(moved) for moved in self.parameters if moved.moves)}."
+        limit = self.level / (len(self.parameters) - len(self.held))
+        own = {moved.name: moved.p_own for moved in self.parameters}
+        rejected = [name for name in own if own[name] < limit]
+        if len(self.alike) == 1:
+            name = self.alike[0]
+            test = (
+                f"rejects constancy ({p_equals(own[name])}), but its values before and after do not differ clearly"
+                if name in rejected
+                else f"does not confirm it ({p_equals(own[name])}, level {limit:g})"
+            )
+            return f"It probably is {name}, from about {self.since}; its own test {test}."
+        if len(self.alike) < len(self.parameters):
             return (
                 f"It is one of {', '.join(self.alike)}, from about {self.since}; their regressors are too similar to "
                 "tell which one."
             )
-        if not self.moving:
-            return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."
-        return f"These move: {'; '.join(sentence(moved) for moved in self.parameters if moved.moves)}."
+        if rejected:
+            return f"The values of {listed(rejected)} vary, but those before and after do not differ clearly."
+        return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."
 
     def _indistinct(self) -> str:
         idle = [name for name in self.held if not any(name in group for group in self.dependent)]

@@ -89,6 +89,8 @@ class Forecast(NamedTuple):
             pairs = zip(means[k].tolist(), stds[k].tolist(), strict=True)
             table.add_row(str(k + 1), *(cell for mean, std in pairs for cell in (digits(mean, std), f"{std:.3g}")))
         more = f" the first {PRINTED} of {h};" if h > PRINTED else ""
+        if np.isnan(means).all() and np.isfinite(self.theta).all():
+            more = f" future inputs are needed to forecast outputs: forecast({h}, u);{more}"
         return printed(table, f"{more} +- one standard deviation; theta and std are those of the parameters").strip(
             "\n"
         )

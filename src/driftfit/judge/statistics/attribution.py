@@ -3,7 +3,9 @@
     1. among the parameters whose own path rejects constancy (Holm's correction), choose the one for which a step near
        the extreme point of its path explains most of y, with outliers limited
     2. add that step: one more regressor, phi_i from that sample on
-    3. test again, until no parameter rejects or MOST steps are found
+    3. test again, until no parameter rejects, the steps leave too little noise for a test, or MOST steps are found
+    4. move each step to its most likely date between its neighbours, by the likelihood of its interval: it weighs rows
+       by the noise at their time, and the path of 1. does not
 
 A large change of one parameter alters the regressors of an ARX model and its residuals, so the paths of other
 parameters seem to change too; once the step is in the regression they no longer do. A slow drift takes several steps of
@@ -30,7 +32,7 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.break_dates import date_loglik, smallest
 from driftfit.judge.statistics.constancy import Constancy, constancy, shortest, transformed
 from driftfit.judge.statistics.noise import Noise, whitened
-from driftfit.judge.statistics.robust import inverted, robust_fit
+from driftfit.judge.statistics.robust import clipped, inverted, least_squares, noisy, orthonormal, robust_fit
 
 MOST = 12
 FAR = 10.0
@@ -74,14 +76,16 @@ class Attribution(NamedTuple):
     moves: Array
     """(n,): whether it has steps, and a significant difference."""
     similar: tuple[tuple[int, ...], ...]
-    """For each step, the other parameters whose step near that date explains as much."""
+    """For each step, the other parameters whose step near the date where it was found explains as much."""
+    clear: Array
+    """(steps,): size of each step in standard errors."""
     changed: Array
     """(n, steps): whether a step changes each parameter."""
 
     def _first(self, i: int) -> int | None:
-        """The place of the step of parameter i that was found first, or else of one that changes it."""
+        """The place of the clearest step of parameter i, or else of one that changes it."""
         own = [k for k, step in enumerate(self.steps) if step.parameter == i]
-        return next(iter([*own, *np.flatnonzero(self.changed[i]).tolist()]), None)
+        return max(own or np.flatnonzero(self.changed[i]).tolist(), key=lambda k: float(self.clear[k]), default=None)
 
     def first(self, i: int) -> int | None:
         """The date of that step; None if there is none."""
@@ -134,23 +138,29 @@ def _attributed(
         X = _with(phi, steps)
         steps.append(step)
         later = constancy(_with(phi, steps), y, lags, None if test.noise is None else test.noise.at)
-        if np.isnan(later.p_joint):
+        testable = not np.isnan(later.p_joint)
+        if not testable and not orthonormal(_with(phi, steps)).distinct:
             steps.pop()
             break
         reach = int(AROUND * N)
         similar.append(tuple(i for i in _alike(X, now, n, step.at - reach, step.at + reach)[1] if i != step.parameter))
+        if not testable:  # the steps leave too little noise to find a further change
+            now = now._replace(p_own=np.ones(n), fit=robust_fit(_with(phi, steps), y))
+            break
         now = later
     named = {step.parameter for step in steps}
     p = np.array([p[i] if i in named else now.p_own[i] for i in range(n)])
     own = np.array([step.parameter for step in steps], int)
     changed = M[:, own] != 0.0
     p = np.array([p[[i, *own[changed[i]]]].min() for i in range(n)])
-    before, after, std, last = _sizes(_with(phi, steps), y, steps, M, now.noise)
+    spans = _redated(phi, steps, test.noise)
+    before, after, std, last, clear = _sizes(_with(phi, steps), y, steps, M, now.noise)
     far = np.abs(after - before) > scipy.special.ndtri(1.0 - 0.5 * level) * std
-    spans = tuple(_span(phi, step, steps, test.noise) for step in steps)
     moves = far & changed.any(axis=1)
     bic = 2.0 * N * np.log(max(now.fit.scale, 1e-300)) + 2.0 * len(steps) * np.log(N)
-    return Attribution(p, tuple(steps), spans, before, after, std, last, moves, tuple(similar), changed), float(bic)
+    return Attribution(p, tuple(steps), spans, before, after, std, last, moves, tuple(similar), clear, changed), float(
+        bic
+    )
 
 
 def centring(phi: Array) -> Array | None:
@@ -167,18 +177,24 @@ def centring(phi: Array) -> Array | None:
     return M
 
 
-def _span(phi: Array, step: Step, steps: list[Step], noise: Noise | None) -> tuple[int, int]:
-    """The interval of the date of a step, by the likelihood of every date between the neighbouring steps."""
+def _redated(phi: Array, steps: list[Step], noise: Noise | None) -> tuple[tuple[int, int], ...]:
+    """Move each step to its most likely date between its neighbours, and return the intervals of these dates."""
     N, n = phi.shape
-    others = [other.at for other in steps if abs(other.at - step.at) > NEAR * N]
-    a, b = max((at for at in others if at < step.at), default=0), min((at for at in others if at > step.at), default=N)
     edge = max(shortest(n) // 2, len(noise.ar) + 1 if noise is not None else 0)
-    if noise is None or b - a < 4 * edge:
-        return a, b
-    c = noise.level[a:b] * noise.white
-    loglik = date_loglik(phi[a:b] / c[:, None], noise.held[a:b] / c, noise.ar, edge, b - a - edge)
-    first, last = smallest(loglik, LEVEL)
-    return a + edge + first, a + edge + last
+    found, spans = [step.at for step in steps], []
+    for k, (parameter, at) in enumerate(steps):
+        # steps of two parameters at one event have one date
+        near = [N * (NEAR if other.parameter == parameter else AROUND) for other in steps]
+        a = max((steps[m].at for m, date in enumerate(found) if date < at - near[m]), default=0)
+        b = min((steps[m].at for m, date in enumerate(found) if date > at + near[m]), default=N)
+        first, last = a, b
+        if noise is not None and b - a >= 4 * edge:
+            c = noise.level[a:b] * noise.white
+            loglik = date_loglik(phi[a:b] / c[:, None], noise.held[a:b] / c, noise.ar, edge, b - a - edge)
+            first, last = (a + edge + place for place in smallest(loglik, LEVEL))
+            steps[k] = Step(parameter, a + edge + int(np.argmax(loglik)))
+        spans.append((first, last))
+    return tuple(spans)
 
 
 def _next(X: Array, test: Constancy, n: int, level: float) -> Step | None:
@@ -204,7 +220,7 @@ def _alike(X: Array, test: Constancy, n: int, first: int, last: int) -> tuple[in
     """The same for the first n columns of X (N, ..), and dates from ``first`` to ``last``."""
     if test.noise is None:
         return 0, ()
-    held = test.noise.held
+    X, held = X / test.noise.level[:, None], test.noise.held / test.noise.level
     if len(test.noise.ar):
         X, held = whitened(X, held, test.noise.ar, test.noise.at)
     Q = np.linalg.qr(X)[0]
@@ -234,8 +250,9 @@ def _with(phi: Array, steps: list[Step]) -> Array:
     return np.column_stack([phi, *later])
 
 
-def _sizes(X: Array, y: Array, steps: list[Step], M: Array, noise: Noise | None) -> tuple[Array, Array, Array, Array]:
-    """(before, after, standard error of their difference, last) of M times the coefficients of X (N, n + steps).
+def _sizes(X: Array, y: Array, steps: list[Step], M: Array, noise: Noise | None) -> tuple[Array, ...]:
+    """(before, after, standard error of their difference, last) of M times the coefficients of X (N, n + steps), and
+    the steps in standard errors.
 
     Errors are heteroscedasticity-consistent.
     """
@@ -245,6 +262,9 @@ def _sizes(X: Array, y: Array, steps: list[Step], M: Array, noise: Noise | None)
         X, y = whitened(X / c[:, None], y / c, noise.ar, noise.at)
         X, y = X * c[:, None], y * c
     fit = robust_fit(X, y)
+    if not noisy(fit, X, y):
+        theta = least_squares(X, y)
+        fit = clipped(theta, y - X @ theta, np.inf)
     inverse = inverted(X * fit.inside[:, None])
     scores = X * fit.psi[:, None]
     cov = inverse @ (scores.T @ scores) @ inverse
@@ -262,4 +282,5 @@ def _sizes(X: Array, y: Array, steps: list[Step], M: Array, noise: Noise | None)
         soon = [later.at - step.at <= AROUND * len(X) and later.parameter != step.parameter for step, later in pairs]
         furthest = int(np.argmax(np.where([*soon, False], 0.0, np.abs(moved) / np.maximum(errors, 1e-300))))
         after[i], std[i], last[i] = before[i] + moved[furthest], errors[furthest], before[i] + moved[-1]
-    return before, after, std, last
+    clear = np.abs(fit.theta[n:]) / np.sqrt(np.maximum(np.diag(cov)[n:], 1e-300))
+    return before, after, std, last, clear
