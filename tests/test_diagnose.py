@@ -154,7 +154,7 @@ def test_a_tracker_that_may_move_is_not_accused_on_short_constant_records():
             own, steady = (np.mean(e[error.scored] ** 2) for e in (error.tracked, error.constant_ls))
             dearer += own > 1.03**2 * steady
             accused += not run.diagnose()["constancy (p)"].ok
-    assert dearer >= 3
+    assert dearer >= 2
     assert accused <= 1
 
 
