@@ -3,7 +3,7 @@
 import gc
 import os
 
-# There is a process for every core: threads of linear algebra that wait for one take two thirds of the time of some tests.
+# A process for every core: threads of linear algebra that waited for one took two thirds of the time of some tests.
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 import matplotlib
