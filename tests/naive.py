@@ -211,7 +211,19 @@ def walks(lane):
     found = lane["r"] * np.array([np.diag(ratio) for ratio in lane["ratio"].T])
     for j, ratio in enumerate(lane["along"]):
         found[first + j] += lane["r"] * ratio * np.outer(lane["direction"], lane["direction"])
-    return found / np.outer(unit, unit)
+    found /= np.outer(unit, unit)
+    mean, variance, first = lane["mean"], lane["variance"], int(lane["first_about"])
+    constant = np.flatnonzero((mean != 0.0) & (variance <= 1e-14 * lane["c"]))
+    own, away = lane["c"].copy(), np.eye(len(mean))
+    if len(constant):
+        k = constant[-1]
+        others = np.arange(len(mean)) != k
+        own[others] = variance[others]
+        away[k, others] = -mean[others] / mean[k]
+    inverse = np.divide(1.0, own, out=np.zeros(len(own)), where=own > 1e-14 * lane["c"])
+    for j, ratio in enumerate(lane["about"]):
+        found[first + j] = lane["r"] * ratio * (away * inverse) @ away.T
+    return found
 
 
 def moved_along(lane, walked, time=1.0):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from driftfit import ARX, FLS, RLS, AdaptiveKalman, Bank, InstrumentalVariables, Kalman, Regression, track
-from driftfit.judge.regressors import stuck
+from driftfit.judge.left_out import stuck
 
 T, THETA = 500, (1.1, -0.5, 1.0, 0.5)
 PLANT = ARX(2, 2)

@@ -90,6 +90,7 @@ from driftfit.trackers.parts.faults.stored_samples import machine_doubt
 from driftfit.trackers.parts.faults.strange_inputs import learn_inputs, leave_out_input, no_strange_inputs
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.drifts.about_means import learn_means
+from driftfit.trackers.parts.modes.drifts.at_rest import come_to_rest
 from driftfit.trackers.parts.modes.few_residuals import widen_estimates, wider
 from driftfit.trackers.parts.modes.filters import (
     enter_filters,
@@ -168,6 +169,7 @@ def follow(s: State, entering: int, l: int) -> None:
         s.weighed[l] = 1
         weigh(s, l)
         update_filters(s, l)
+        come_to_rest(s, l)
         learn_weights(s, l)
         learn_noise(s, l)
     learn_colour(s, l)
@@ -253,7 +255,7 @@ class AdaptiveKalman(Tracker):
     adapts: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
         *SCRATCH, "gain", "e_k", "step", "h", "inverse", "joint", "mu_next", "share", "row", "m_next",
-        "weighted", "Z",
+        "weighted", "Z", "away", "about_drift",
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -325,7 +327,7 @@ class AdaptiveKalman(Tracker):
         )
 
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
-        running = np.append(False, fields["settled"][:-1] > 0)  # at the last sample of the start none was whitened
+        running = fields["settled"] > 0
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
 
     def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:

@@ -28,7 +28,6 @@ from functools import lru_cache
 
 import numpy as np
 import scipy
-from scipy import signal
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.calibration import limits_of
@@ -162,7 +161,7 @@ def _whitened_again(w: Array, ar: Array, N: int, rng: np.random.Generator) -> Ar
     made = np.empty_like(w)
     for k, z in enumerate(rng.normal(size=(len(w), len(ar)))):
         true = stable(ar + root @ z)
-        made[k] = signal.lfilter(np.append(1.0, -ar), np.append(1.0, -true), w[k])
+        made[k] = scipy.signal.lfilter(np.append(1.0, -ar), np.append(1.0, -true), w[k])
     return made
 
 

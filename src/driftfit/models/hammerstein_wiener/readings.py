@@ -67,10 +67,16 @@ def bound_range(m: Array, bottom: float, top: float) -> None:
 
 
 @part
-def watch_inputs(m: Array, p: Places) -> None:
-    """Before a reading is judged: learn the ranges of the inputs, and by how many widths one left its own lately."""
+def forget_inputs(m: Array) -> None:
+    """At every sample: what an input did counts for less."""
     m[RESPONDING, 0] *= LASTS
     m[REFUSED, 0] = 0.0
+
+
+@part
+def watch_inputs(m: Array, p: Places) -> None:
+    """Learn the ranges of the inputs, and by how many widths one left its own lately: before the reading is judged if
+    it can respond at once, and otherwise after it."""
     grows = SLOWLY if m[READINGS, 0] >= ENOUGH else np.inf
     for i in range(p[INPUTS]):
         low, high = p[SPANS] + 2 * i, p[SPANS] + 2 * i + 1

@@ -24,7 +24,7 @@ from driftfit.models.base import GAP
 from driftfit.models.hammerstein_wiener.curves.basis import INSIDE
 from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, input_values, level_of, output_values, usable
 from driftfit.models.hammerstein_wiener.output_curve import believe, inverting, laying, locating, refining
-from driftfit.models.hammerstein_wiener.readings import refused, strange, watch_inputs
+from driftfit.models.hammerstein_wiener.readings import forget_inputs, refused, strange, watch_inputs
 from driftfit.models.hammerstein_wiener.regressor_rows import (
     complete,
     fill,
@@ -155,9 +155,13 @@ def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
         y = m[Y, 0]
         observed = abs(y) < LARGEST
         if p[IDENTITY] == 0 or m[MINIMAL, 0] > 0.0:
-            watch_inputs(m, p)
+            forget_inputs(m)
+            if p[NK] == 0:
+                watch_inputs(m, p)
             if observed and strange(m, y):
                 observed = not refused(m, y, right if p[IDENTITY] > 0 else invert(m, p, right))
+            if p[NK] > 0:
+                watch_inputs(m, p)
         if observed:
             if m[VARIANCE, 0] > 0.0:
                 output_at(m, p, y, g, h)
@@ -292,6 +296,8 @@ def applying(into: tuple[Kind, ...], p: tuple[int, ...]) -> Step:
             s.blocks[us + i, l] = s.u[i, l]
         m = floats(s.blocks.ctypes.data + 8 * l, rows, s.y.shape[0])
         place(m, orders)
+        if orders[IDENTITY] == 0 or m[MINIMAL, 0] > 0.0:
+            watch_inputs(m, orders)
         fill(m, orders, following, 1, m[BELIEVED, 0] > 0.0)
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]

@@ -41,7 +41,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.trackers.parts.modes.drifts.about_means import ABOUT, no_means
-from driftfit.trackers.parts.modes.drifts.at_rest import come_to_rest, no_rest
+from driftfit.trackers.parts.modes.drifts.at_rest import no_rest
 from driftfit.trackers.parts.modes.drifts.one_direction import ALONG, no_direction
 from driftfit.trackers.parts.modes.drifts.trend import TREND, no_trend
 from driftfit.trackers.parts.modes.rows import sum_of_row
@@ -64,7 +64,7 @@ JUMP, REST, ACROSS = 0.0015, 0.0001, 0.00005
 """Probabilities of arriving from the mixture: at rungs of ratio 1; at the foot of the common
 ladder (three tenths of it at each other rung of it below the top); and at the other rungs of each kind of ladder."""
 ABOUT_MEANS = 0.2
-"""Share of jumps that are about the means; half of all are of one parameter."""
+"""Jumps about the means, as a share of all others; half of these are of one parameter."""
 SELDOM = 5.0
 """Factor by which arrivals at the filters that drift in one direction are rarer than at each other kind."""
 
@@ -86,7 +86,7 @@ def ladders(n: int, groups: Any) -> tuple[Array, Array, Array, Array, Array]:
     single, several, every = groups is None and 1 < n <= MOST_ALONE, n > 1, np.ones(n)
     masks = [np.isin(np.arange(n), one).astype(float) for one in (range(n) if single else groups or ())]
     alone, about = 0.5 if masks else 0.0, ABOUT_MEANS if several else 0.0  # shares of jumps
-    kinds = [(LADDER, every, 1.0 - alone - about, 1.0), (LEARNED, every, 0.0, 1.0), (TREND, every, 0.0, 1.0)]
+    kinds = [(LADDER, every, 1.0 - alone, 1.0), (LEARNED, every, 0.0, 1.0), (TREND, every, 0.0, 1.0)]
     kinds += [(ALONG, every, 0.0, SELDOM), (ABOUT, np.zeros(n), about, 1.0)] if several else []
     kinds += [(ALONE if single else GROUP, mask, alone / len(masks), len(masks)) for mask in masks]
     kinds += [((0.0,), every, 0.0, np.inf)]  # at rest: others replace it, and none are mixed with it
@@ -121,6 +121,8 @@ def filters(n: int, groups: Any) -> dict[str, Any]:
     """Fields of the K filters before the first sample: modes, means m, covariances C (lower triangle), scratch."""
     ratio, moves, arrive, learned, rungs = ladders(n, groups)
     K = len(arrive)
+    # one parameter has none of these filters; in the state of several they are not among those of the one
+    along = len(LADDER) + len(LEARNED) + len(TREND) if n > 1 else K
     start = np.full(K, (1.0 - AT_REST - COMMON) / (K - len(LADDER)))
     start[: len(LADDER)] = COMMON / (len(LADDER) - 1)
     start[0] = AT_REST
@@ -146,8 +148,8 @@ def filters(n: int, groups: Any) -> dict[str, Any]:
         "C": np.zeros((n, n, K)),
         **no_rest(rungs),
         **no_trend(n, len(LADDER) + len(LEARNED)),
-        **no_direction(n, len(LADDER) + len(LEARNED) + len(TREND)),
-        **no_means(n, len(LADDER) + len(LEARNED) + len(TREND) + len(ALONG)),
+        **no_direction(n, along),
+        **no_means(n, along + len(ALONG)),
         "Z": np.zeros((n, n)),
         "rare": 1.0,
         "leapt": 0.0,
@@ -199,7 +201,6 @@ def mix(s: State, l: int) -> None:
     Means are taken relative to that of the mixture, d, so that moments may be added before the mean is subtracted.
     """
     n, K = s.theta.shape[0], s.modes[l]
-    come_to_rest(s, l)
     learn_rate(s, l)
     find_shares(s, l)
     s.row[0, l], s.row[K + 1, l] = 0.0, 0.0

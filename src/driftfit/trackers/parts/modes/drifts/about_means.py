@@ -30,6 +30,8 @@ from driftfit.trackers.parts.faults.outlying_readings import FIRST
 
 ABOUT = (1e-3, 1e-2, 0.1, 1.0)
 """Drift ratios of the filters."""
+ROUNDING = 1e-14
+"""Variance of a column, as a share of its mean square, below which it counts as constant."""
 
 
 def no_means(n: int, first: int) -> dict[str, Any]:
@@ -51,7 +53,7 @@ def learn_means(s: State, l: int) -> None:
     """Update means and variances of the regressors that have moved since the sample before."""
     for i in range(s.theta.shape[0]):
         step = s.phi[i, l] - s.phi_before[i, l]
-        moved = (s.steps_taken[i, l] < 1.0) | (step * step > DULL * s.variance[i, l])
+        moved = (s.steps_taken[i, l] < 1.0) | (step * step > DULL * s.variance[i, l] * s.noise[l])
         used = s.ok[l] if moved else 0.0
         s.steps_taken[i, l] += used
         share = used / min(max(s.steps_taken[i, l], 1.0), MEMORY)
@@ -74,7 +76,8 @@ def constant_column(s: State, l: int) -> int:
     """The last column that is constant and not 0, or -1."""
     found = -1
     for i in range(s.theta.shape[0]):
-        found = i if (s.mean[i, l] != 0.0) & (s.variance[i, l] == 0.0) else found
+        still = s.variance[i, l] <= ROUNDING * s.c[i, l]
+        found = i if still & (s.mean[i, l] != 0.0) else found
     return found
 
 
@@ -88,6 +91,7 @@ def drift_about(s: State, size: float, l: int) -> None:
     for i in range(n if s.about.shape[0] > 0 else 0):
         beside = (k >= 0) & (i != k)
         own = s.variance[i, l] if beside else s.c[i, l]
+        own = own if own > ROUNDING * s.c[i, l] else 0.0
         for a in range(n if own > 0.0 else 0):
             s.away[a, l] = s.S[a, i, l] - (s.mean[i, l] / s.mean[k, l] * s.S[a, k, l] if beside else 0.0)
             for b in range(a + 1):
