@@ -7,6 +7,7 @@ and returns (y_hat, e, s). A twin of a model turns signals into those calls.
 import numpy as np
 from scipy.linalg import null_space
 
+from driftfit.trackers.parts.modes.drifts.about_means import STILL
 from driftfit.trackers.parts.modes.drifts.trend import FADING, GROWN, LOST, SHORTEST
 
 LARGEST = 1e100
@@ -213,14 +214,14 @@ def walks(lane):
         found[first + j] += lane["r"] * ratio * np.outer(lane["direction"], lane["direction"])
     found /= np.outer(unit, unit)
     mean, variance, first = lane["mean"], lane["variance"], int(lane["first_about"])
-    constant = np.flatnonzero((mean != 0.0) & (variance <= 1e-14 * lane["c"]))
+    constant = np.flatnonzero((mean != 0.0) & (variance <= STILL * lane["c"]))
     own, away = lane["c"].copy(), np.eye(len(mean))
     if len(constant):
         k = constant[-1]
         others = np.arange(len(mean)) != k
         own[others] = variance[others]
         away[k, others] = -mean[others] / mean[k]
-    inverse = np.divide(1.0, own, out=np.zeros(len(own)), where=own > 1e-14 * lane["c"])
+    inverse = np.divide(1.0, own, out=np.zeros(len(own)), where=own > STILL * lane["c"])
     for j, ratio in enumerate(lane["about"]):
         found[first + j] = lane["r"] * ratio * (away * inverse) @ away.T
     return found

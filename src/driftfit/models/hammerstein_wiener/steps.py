@@ -170,11 +170,8 @@ def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
             observed = usable(m, g, n_out)
         m[RAW, 0] = y if observed else np.nan
         if p[IDENTITY] == 0:
-            if observed:
-                right = locate(m, p, right)
-            else:
-                right = invert(m, p, right)
-                m[LATE, 0] = 0.0
+            right = locate(m, p, right) if observed else invert(m, p, right)
+            m[LATE, 0] = m[LATE, 0] if observed else 0.0
         m[PREDICTED, 0] = right
         if not observed:
             output_at(m, p, right, g, h)

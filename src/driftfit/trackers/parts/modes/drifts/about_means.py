@@ -30,7 +30,7 @@ from driftfit.trackers.parts.faults.outlying_readings import FIRST
 
 ABOUT = (1e-3, 1e-2, 0.1, 1.0)
 """Drift ratios of the filters."""
-ROUNDING = 1e-14
+STILL = 1e-14
 """Variance of a column, as a share of its mean square, below which it counts as constant."""
 
 
@@ -76,7 +76,7 @@ def constant_column(s: State, l: int) -> int:
     """The last column that is constant and not 0, or -1."""
     found = -1
     for i in range(s.theta.shape[0]):
-        still = s.variance[i, l] <= ROUNDING * s.c[i, l]
+        still = s.variance[i, l] <= STILL * s.c[i, l]
         found = i if still & (s.mean[i, l] != 0.0) else found
     return found
 
@@ -91,7 +91,7 @@ def drift_about(s: State, size: float, l: int) -> None:
     for i in range(n if s.about.shape[0] > 0 else 0):
         beside = (k >= 0) & (i != k)
         own = s.variance[i, l] if beside else s.c[i, l]
-        own = own if own > ROUNDING * s.c[i, l] else 0.0
+        own = own if own > STILL * s.c[i, l] else 0.0
         for a in range(n if own > 0.0 else 0):
             s.away[a, l] = s.S[a, i, l] - (s.mean[i, l] / s.mean[k, l] * s.S[a, k, l] if beside else 0.0)
             for b in range(a + 1):
