@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from driftfit import RLS, AdaptiveKalman, Kalman, Regression, track
+from driftfit import ARX, RLS, AdaptiveKalman, Kalman, Regression, track
 from driftfit.trackers.parts.modes.smoother import given_all
 
 T, AT, NOISE = 500, 300, 0.3
@@ -51,30 +51,66 @@ def test_one_parameter_that_walks_fast(std, limit):
 
 
 def test_probabilities_given_all_are_those_of_all_paths():
-    """Where a state replaces the last one before a transition, its path may go on there, and that of the last in it."""
+    """Where a state replaces the last one before a transition, its path may go on there, and that of the last in it.
+    Where the last but one begins anew, any path may lead to it."""
     rng = np.random.default_rng(0)
-    K, steps = 3, 6
+    K, steps, began, share = 4, 6, 4, 0.2
     stay, by, over = (
         rng.dirichlet(np.ones(K), size=K),
         np.array([-1, 0, -1, 1, 0, -1]),
         np.array([0.0, 0.5, 0.0, 0.2, 0.3, 0.0]),
     )
     moves, likelihood = [], rng.random((steps, K))
-    for at, share in zip(by, over, strict=True):
+    for at, part in zip(by, over, strict=True):
         into = np.eye(K)
         if at >= 0:
-            into[at, at], into[at, -1] = 1.0 - share, share
+            into[at, at], into[at, -1] = 1.0 - part, part
             into[-1, at], into[-1, -1] = 1.0, 0.0
         moves.append(into @ stay)
     after = np.empty((steps, K))
     before = np.full(K, 1.0 / K)
     for t in range(steps):
         after[t] = before * likelihood[t] / (before @ likelihood[t])
+        if t == began:
+            likelihood[t] *= (1.0 - share) / (1.0 - after[t, -2])
+            new = share * (before @ likelihood[t]) * (1.0 - after[t, -2]) / (1.0 - share)
+            after[t] *= (1.0 - share) / (1.0 - after[t, -2])
+            after[t, -2] = share
         before = after[t] @ moves[t]
     expected = np.zeros((steps, K))
     for path in product(range(K), repeat=steps):
-        p = np.prod([likelihood[t, path[t]] for t in range(steps)])
-        p *= np.prod([moves[t][path[t], path[t + 1]] for t in range(steps - 1)])
+        p = 1.0
+        for t, state in enumerate(path):
+            begins = t == began and state == K - 2
+            p *= new if begins else likelihood[t, state] * (moves[t - 1][path[t - 1], state] if t else 1.0)
         expected[np.arange(steps), path] += p
-    found = given_all(after, stay, np.zeros((K, K)), np.zeros(steps), np.ones(steps, bool), by, over)
+    always, begins = np.ones(steps, bool), np.arange(steps) == began
+    found = given_all(after, stay, np.zeros((K, K)), np.zeros(steps), always, by, over, begins)
     np.testing.assert_allclose(found, expected / expected.sum(axis=1, keepdims=True), rtol=1e-12)
+
+
+@pytest.mark.parametrize("model", [Regression(1), Regression(1, intercept=True), ARX(1, 1, intercept=True)])
+def test_a_jump_of_the_response_to_rare_pulses(model):
+    """By forty deviations, at inputs that are 0 in 98 of 100 samples: every response was left out as an outlier."""
+    for seed in (0, 4, 6):
+        rng = np.random.default_rng(seed)
+        u, gain = (rng.random(1000) < 0.02) * 1.0, np.where(np.arange(1000) < 500, 5.0, 1.0)
+        lag = 0.7 if isinstance(model, ARX) else 0.0
+        y = np.zeros(1000)
+        for t in range(1, 1000):
+            y[t] = lag * y[t - 1] + (gain * u)[t - 1 if lag else t] + 0.1 * rng.normal()
+        run = track(model, AdaptiveKalman(), y, u)
+        i = 1 if lag else 0
+        assert abs(run.theta[-1, i] - 1.0) < 3.0 * run.std[-1, i]
+        assert run.std[-1, i] < 0.25
+        path = run.smooth()
+        np.testing.assert_allclose(path.theta[[100, -1], i], [5.0, 1.0], atol=0.2)
+
+
+def test_outliers_at_rare_pulses_are_no_jumps():
+    rng = np.random.default_rng(0)
+    u = (rng.random(1000) < 0.04) * 1.0
+    y = 5.0 * u + 0.1 * rng.normal(size=1000)
+    y[np.flatnonzero(u)[::4]] += rng.normal(scale=4.0, size=len(np.flatnonzero(u)[::4]))
+    run = track(Regression(1, intercept=True), AdaptiveKalman(), y, u)
+    assert np.abs(run.theta[200:, 0] - 5.0).max() < 0.5

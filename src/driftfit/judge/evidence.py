@@ -13,6 +13,7 @@ from driftfit.judge.compare import Errors, errors
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.judge.left_out import without_left_out
 from driftfit.judge.regressors import Distinct, Rows, distinct, regressors
+from driftfit.judge.segments.noise_of_regressors import relative_size
 from driftfit.judge.statistics.constancy import Constancy, constancy
 from driftfit.run.result import Track
 
@@ -45,9 +46,22 @@ class Evidence:
         test = constancy(rows.phi, rows.y, self.lags, rows.at)
         found = distinct(rows.phi) if np.isnan(test.p_joint) else every
         if len(found.kept) in (0, self.run.model.n):
-            return every, rows, test
+            return every, *self._weighted(rows, test)
         rows = rows._replace(phi=np.ascontiguousarray(rows.phi[:, found.kept]))
-        return found, rows, constancy(rows.phi, rows.y, self.lags, rows.at)
+        return found, *self._weighted(rows, constancy(rows.phi, rows.y, self.lags, rows.at))
+
+    def _weighted(self, rows: Rows, test: Constancy) -> tuple[Rows, Constancy]:
+        """Rows and test, the rows divided by the size of their noise if that depends on the regressors."""
+        noise = test.noise
+        size = None if noise is None or noise.rare else relative_size(rows.phi, rows.y, noise)
+        if noise is None or size is None:
+            return rows, test
+        weighted = rows._replace(phi=rows.phi / size[:, None], y=rows.y / size)
+        again = constancy(weighted.phi, weighted.y, self.lags, rows.at)
+        # weights also change the correlation of the noise: there they must explain breaks, not add some
+        if again.noise is None or (len(again.noise.ar) and len(again.noise.breaks) >= len(noise.breaks)):
+            return rows, test
+        return weighted, again
 
     @property
     def distinct(self) -> Distinct:

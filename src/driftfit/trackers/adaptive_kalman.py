@@ -8,8 +8,8 @@ ladder of ratios all weights w are 1; in a second one they are learned from the 
 (`driftfit.trackers.parts.modes.drifts.trend`); those of a fourth drift in one direction, which is learned too
 (`driftfit.trackers.parts.modes.drifts.one_direction`), those of a fifth about the mean regressors, beside an intercept
 (`driftfit.trackers.parts.modes.drifts.about_means`); with up to eight parameters, each has a ladder on which it alone
-drifts; and the last filter comes to rest after a change (`driftfit.trackers.parts.modes.drifts.at_rest`). The filters
-are the modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
+drifts; one filter takes an outlier for a jump (`driftfit.trackers.parts.modes.drifts.after_outlier`), and the last comes
+to rest after a change (`driftfit.trackers.parts.modes.drifts.at_rest`). The filters are the modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each
 filter the levels are merged at once, by a rank-one update (`driftfit.trackers.parts.modes.filters`). The variance r is
@@ -37,8 +37,8 @@ Use it if nothing is known; if q and r are known, `Kalman` is as good and far ch
 in a few hundred samples; ``groups`` specifies it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the ladder of ratios, its transitions, the noise
-levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 26 + 3 n
-for two to eight parameters, and 26 for more.
+levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 27 + 3 n
+for two to eight parameters, and 27 for more.
 """
 
 from __future__ import annotations
@@ -90,6 +90,7 @@ from driftfit.trackers.parts.faults.stored_samples import machine_doubt
 from driftfit.trackers.parts.faults.strange_inputs import learn_inputs, leave_out_input, no_strange_inputs
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.drifts.about_means import learn_means
+from driftfit.trackers.parts.modes.drifts.after_outlier import no_jump, suppose_jump
 from driftfit.trackers.parts.modes.drifts.at_rest import come_to_rest
 from driftfit.trackers.parts.modes.few_residuals import widen_estimates, wider
 from driftfit.trackers.parts.modes.filters import (
@@ -168,6 +169,7 @@ def follow(s: State, entering: int, l: int) -> None:
     elif s.ok[l] > 0.0:
         s.weighed[l] = 1
         weigh(s, l)
+        suppose_jump(s, l)
         update_filters(s, l)
         come_to_rest(s, l)
         learn_weights(s, l)
@@ -304,6 +306,7 @@ class AdaptiveKalman(Tracker):
             **no_weights(n),
             **no_strange_inputs(n),
             **white(n),
+            **no_jump(n),
             **modes,
             **levels,
         }

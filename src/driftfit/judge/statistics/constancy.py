@@ -70,6 +70,8 @@ SKEWED, TIED_AT_END = 1.0, 0.25
 """Skewness of the scores, and share of readings equal to the smallest or the largest one, of rare events."""
 FEW = 16.0
 """Rows in an interval of rare events, in units of their squared skewness: that of the sum is then a quarter."""
+CLIPPED = 0.5
+"""Smallest information in any direction, as a share of that of all residuals, that clipping may leave."""
 REGULAR = 1e-15
 """The smallest eigenvalue of a correlation matrix that is regular."""
 EDGE = 0.05
@@ -174,7 +176,7 @@ def _tested(basis: Basis, phi: Array, fit: Fit, found: Noise, lags: int | None) 
     m = max(24, min(POINTS, ROWS // n, N // 2))
     ends = np.linspace(0, N, m + 1).astype(int)[1:]
     whole = np.column_stack([X, added])
-    A = _profile(whole * still.inside[:, None], whole, ends)
+    A = _information(whole, still.inside, ends)
     V = _profile(*(2 * (_summed(whole * psi[:, None], rest),)), ends)
     if not full_rank(A[-1]) or not full_rank(V[-1]):
         return _nothing(N, n)
@@ -200,6 +202,17 @@ def _tested(basis: Basis, phi: Array, fit: Fit, found: Noise, lags: int | None) 
     std = np.stack([np.interp(np.arange(1, N + 1), np.append(0, ends), np.append(0.0, spread[:, i])) for i in range(n)])
     at, z = _dates(path, std.T)
     return Constancy(L, p, np.array(p_own), joint, together(*p_each), p_each, at, z, fit, found, len(found.ar) + rest)
+
+
+def _information(X: Array, inside: Array, ends: Array) -> Array:
+    """A_t at the ends (m, k, k). If nearly all residuals of one direction of X (N, k) are clipped, as those of a rare
+    pulse whose effect changes far, what is left inside says little about when its information came: then the share
+    that is inside is the same for all rows.
+    """
+    A, B = _profile(X * inside[:, None], X, ends), X.T @ X
+    if scipy.linalg.eigh(A[-1], B, eigvals_only=True, subset_by_index=[0, 0])[0] < CLIPPED * inside.mean():
+        A = inside.mean() * _profile(X, X, ends)
+    return A
 
 
 def missing_lags(X: Array, rows: Array, found: Noise) -> Array:

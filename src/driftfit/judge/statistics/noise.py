@@ -48,6 +48,9 @@ ORDER = 8
 SEASON = 200
 """Longest lag of a seasonal factor; it is also at most an eighth of the record."""
 LARGEST = 0.97
+ALONE = 0.5
+"""Leverage from which on a row is fitted mainly by itself, as a pulse that is the only one of its window or segment: its
+residual is that of constants."""
 ROUNDS = 6
 FILLS = 5
 """Times that missing rows are filled and the autoregression is estimated again."""
@@ -100,15 +103,16 @@ def lagged(v: Array, r: Array) -> None:
 def _windows(columns: Array, starts: Array, ends: Array, residual: Array, level: Array, r: Array) -> None:
     """Robust fits of windows: residual (N,) of the nearest centre, level (W,), sums at lags 0 .. P in r (W, P + 1)."""
     n, W = columns.shape[0] - 1, starts.shape[0]
-    theta = np.zeros(n)
+    theta, h = np.zeros(n), np.empty((1, np.max(ends - starts) + WIDTH))
     for w in range(W):
         a, b = starts[w], ends[w]
         own = np.empty((1, b - a + WIDTH))
         level[w] = huber(columns, a, b, theta, own) * np.sqrt((b - a) / max(b - a - n, 1.0))
         first = a if w == 0 else (a + ends[w - 1]) // 2
         final = b if w == W - 1 else (starts[w + 1] + b) // 2
+        lever(columns, a, b, h)
         for t in range(first, final):
-            residual[t] = own[0, t - a]
+            residual[t] = own[0, t - a] if h[0, t - a] < ALONE else columns[n, t]
         limit = HELD * level[w]
         for t in range(b - a):
             own[0, t] = min(max(own[0, t], -limit), limit)
@@ -138,6 +142,8 @@ def _segments(Q: Array, y: Array, columns: Array, bounds: Array, order: Array, o
             residual[t] = y[t]
             for i in range(n):
                 residual[t] -= Q[t, i] * theta[k, i]
+            if leverage[t] > ALONE:
+                residual[t] = y[t]
             near[t] = residual[t]
             other = k - 1 if t - a < b - t else k + 1
             if 0 <= other < K and min(t - a, b - t) < NEAR:

@@ -21,7 +21,8 @@ so the filters that arrive at j are the mixture itself, whose moments are known,
 of O(K^2). Jumps arrive at rungs of ratio 1, which soon move down again: from there to no drift directly only with the
 small a_0, since mixing the wide covariance of the top filter into the one without drift costs more than anything else
 when nothing changes. The last filter is not mixed, and comes to rest directly
-(`driftfit.trackers.parts.modes.drifts.at_rest`). All but what moves down has the factor calm <= 1, learned from how
+(`driftfit.trackers.parts.modes.drifts.at_rest`); nor is the one before it, which takes an outlier for a jump
+(`driftfit.trackers.parts.modes.drifts.after_outlier`). All but what moves down has the factor calm <= 1, learned from how
 often rungs of ratio 1 end: what never changed in thousands of samples is expected to change less often (`learn_rate`).
 
 The top filter may also *leap*: if a move as large as the innovation, in directions 1 / c_i and up to LEAP standard
@@ -89,7 +90,7 @@ def ladders(n: int, groups: Any) -> tuple[Array, Array, Array, Array, Array]:
     kinds = [(LADDER, every, 1.0 - alone, 1.0), (LEARNED, every, 0.0, 1.0), (TREND, every, 0.0, 1.0)]
     kinds += [(ALONG, every, 0.0, SELDOM), (ABOUT, np.zeros(n), about, 1.0)] if several else []
     kinds += [(ALONE if single else GROUP, mask, alone / len(masks), len(masks)) for mask in masks]
-    kinds += [((0.0,), every, 0.0, np.inf)]  # at rest: others replace it, and none are mixed with it
+    kinds += 2 * [((0.0,), every, 0.0, np.inf)]  # others replace these, and none are mixed with them
     ratio, learned, moves, arrive, rungs = [], [], [], [], []
     for which, (ladder, mask, jumps, parts) in enumerate(kinds):
         for k, rung in enumerate(ladder):

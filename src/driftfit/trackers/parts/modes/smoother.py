@@ -27,7 +27,7 @@ from driftfit.trackers.parts.modes.noise_levels import level_chain
 
 SMOOTHER_FIELDS = (
     "joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight", "white",
-    "explained", "calm", "left_out", "shift", "direction", "replaced_by", "busy", "variance",
+    "explained", "calm", "left_out", "shift", "direction", "replaced_by", "jumped", "busy", "variance",
 )  # fmt: skip
 """Fields that are stored at every sample."""
 
@@ -47,6 +47,7 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
         o.direction[i, l] = s.direction[i, l]
         o.white[i, l] = s.white[i, l]
         o.variance[i, l] = s.variance[i, l]
+        o.jumped[i, l] = s.jumped[i, l]
     o.r[l], o.leverage[l], o.alike[l] = s.r[l], s.leverage[l], s.alike[l]
     o.coarse[l] = s.coarse[l] / s.noise[l]  # in units of the noise factor, as r is
     o.leapt[l], o.weighed[l], o.settled[l], o.explained[l] = s.leapt[l], s.weighed[l], s.settled[l], s.explained[l]
@@ -54,10 +55,13 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
     o.replaced_by[l], o.busy[l] = s.replaced_by[l], s.busy[l]
 
 
-def given_all(after: Array, stay: Array, change: Array, rate: Array, moves: Array, by: Array, over: Array) -> Array:
+def given_all(
+    after: Array, stay: Array, change: Array, rate: Array, moves: Array, by: Array, over: Array, begins: Array
+) -> Array:
     """Probabilities (T, K) of states, given all samples; at samples that move, transitions are stay + rate_t change,
     and before them a share over_t of state by_t >= 0 replaces the last one
-    (`driftfit.trackers.parts.modes.drifts.at_rest`)."""
+    (`driftfit.trackers.parts.modes.drifts.at_rest`). Where the last but one begins
+    (`driftfit.trackers.parts.modes.drifts.after_outlier`), it says nothing about earlier states."""
     found, before = after.copy(), after.copy()
     at = np.flatnonzero(by >= 0)
     which = by[at]
@@ -68,12 +72,15 @@ def given_all(after: Array, stay: Array, change: Array, rate: Array, moves: Arra
         if not moves[t]:
             found[t] = found[t + 1]
             continue
+        new = found[t + 1, -2] if begins[t + 1] else 0.0
         later = found[t + 1] / np.maximum(ahead[t], 1e-300)
+        later[-2] = 0.0 if begins[t + 1] else later[-2]
         later = stay @ later + rate[t] * (change @ later)
         if by[t] >= 0:
             later[by[t]], later[-1] = (1.0 - over[t]) * later[by[t]] + over[t] * later[-1], later[by[t]]
         found[t] = after[t] * later
-        found[t] /= found[t].sum()
+        found[t] *= (1.0 - new) / max(found[t].sum(), 1e-300)
+        found[t] += new * after[t]
     return found
 
 
@@ -87,8 +94,9 @@ def estimated_variances(
     after = np.where(weighed[:, None], fields["joint"].sum(axis=1), fields["prior"])
     J = len(state["level"]) - 1
     replaced_by, span, learned = fields["replaced_by"].astype(int), r * time, state["learned"]
+    jumped = weighed & fields["jumped"].any(axis=1)
     over = state["over"][replaced_by] / fields["busy"]
-    w = given_all(after, *chain(state["moves"], state["arrive"]), fields["calm"], weighed, replaced_by, over)
+    w = given_all(after, *chain(state["moves"], state["arrive"]), fields["calm"], weighed, replaced_by, over, jumped)
     along, first = np.zeros(len(learned)), state["first_along"]
     along[first : first + len(state["along"])] = state["along"]
     ratio = np.where((learned > 0.0) | (along > 0.0), 0.0, state["ratio"])
@@ -103,10 +111,12 @@ def estimated_variances(
         about = ((w[:, first : first + len(state["about"])] @ state["about"]) * span)[:, None] / own
     drifts = running[:, None] & (span[:, None] > 0.0) & (fields["c"] > 0.0)
     q, about = np.where(drifts, q, 0.0), np.where(drifts, about, 0.0)
-    never = np.zeros((J, J)), np.zeros(len(r)), weighed, np.full(len(r), -1), r
+    began = np.where(jumped, w[:, -2], 0.0)
+    q += began[:, None] * fields["jumped"]
+    never = np.zeros((J, J)), np.zeros(len(r)), weighed, np.full(len(r), -1), r, np.zeros(len(r), bool)
     levels = given_all(fields["nu"][:, :-1], level_chain(), *never)
     v = np.sum(levels * np.maximum(state["level"][:-1] * r[:, None], fields["coarse"][:, None]), axis=1)
     v = np.where(running, v + fields["coarse"] * fields["alike"] * (fields["alike"] + 2.0), r) * fields["leverage"]
-    outlier = np.where(weighed, fields["joint"][:, -1].sum(axis=1), 0.0)
+    outlier = np.where(weighed, fields["joint"][:, -1].sum(axis=1), 0.0) * (1.0 - began)
     far = np.maximum(state["level"][-1] * v, np.where(weighed, e * e, 0.0))
     return q, about, 1.0 / ((1.0 - outlier) / v + outlier / far)
