@@ -46,12 +46,14 @@ class Evidence:
         test = constancy(rows.phi, rows.y, self.lags, rows.at)
         found = distinct(rows.phi) if np.isnan(test.p_joint) else every
         if len(found.kept) in (0, self.run.model.n):
-            return every, *self._weighted(rows, test)
+            return every, rows, test
         rows = rows._replace(phi=np.ascontiguousarray(rows.phi[:, found.kept]))
-        return found, *self._weighted(rows, constancy(rows.phi, rows.y, self.lags, rows.at))
+        return found, rows, constancy(rows.phi, rows.y, self.lags, rows.at)
 
-    def _weighted(self, rows: Rows, test: Constancy) -> tuple[Rows, Constancy]:
+    @cached_property
+    def _weighted(self) -> tuple[Rows, Constancy]:
         """Rows and test, the rows divided by the size of their noise if that depends on the regressors."""
+        _, rows, test = self._found
         noise = test.noise
         size = None if noise is None or noise.rare else relative_size(rows.phi, rows.y, noise)
         if noise is None or size is None:
@@ -70,13 +72,18 @@ class Evidence:
 
     @property
     def tested(self) -> Rows:
-        """The samples with the regressors of these parameters."""
-        return self._found[1]
+        """The samples with the regressors of these parameters, divided by the size of the noise."""
+        return self._weighted[0]
 
     @property
     def test(self) -> Constancy:
         """Whether constants explain them."""
-        return self._found[2]
+        return self._weighted[1]
+
+    @property
+    def unweighted(self) -> tuple[Rows, Constancy]:
+        """Samples and test before that division."""
+        return self._found[1:]
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -433,7 +433,7 @@ def judged(known: Evidence, level: float) -> Verdict:
         lags=test.lags,
         burn=burn_in(run.model.n) if known.burn is None else known.burn,
         hidden=run.model.hidden is not None,
-        spread_with=_spread_with(names, rows, test) if drifts is False else (),
+        spread_with=_spread_with(names, *known.unweighted) if drifts is False else (),
         dependent=groups,
         held=tuple(name for name in run.model.names if name not in names),
         stuck=int(stuck(run.y, run.u).sum()),

@@ -70,7 +70,7 @@ SKEWED, TIED_AT_END = 1.0, 0.25
 """Skewness of the scores, and share of readings equal to the smallest or the largest one, of rare events."""
 FEW = 16.0
 """Rows in an interval of rare events, in units of their squared skewness: that of the sum is then a quarter."""
-CLIPPED = 0.5
+CLIPPED = 0.1
 """Smallest information in any direction, as a share of that of all residuals, that clipping may leave."""
 REGULAR = 1e-15
 """The smallest eigenvalue of a correlation matrix that is regular."""
