@@ -7,7 +7,9 @@ lags); a level that switches by a factor of 5 (a Markov chain that stays 50 samp
 lag 12 (0.6); a seasonal level; 3 % outliers, ten times as large; outputs rounded to one standard deviation of the
 noise. The inputs are white, autoregressions with 0.95, steps that stay for 40 samples on average, and a closed loop
 (the first input reacts to the previous output). Inputs are white if the noise is not, and the noise is white Gaussian
-if the inputs are not, except in the last row.
+if the inputs are not, except in the last rows: a first input that is 1 in one of twenty samples and otherwise 0, with
+white noise and with noise that is ten times as large in these samples; and one that is lognormal, with noise in
+proportion to it.
 
 Run: python benchmarks/verdict_unseen.py [records per cell, 300 by default] [--quick]
 """
@@ -24,6 +26,8 @@ from rich.table import Table
 from scipy import signal
 
 from driftfit.engine.kernel import Array
+from driftfit.judge.evidence import of_one_size
+from driftfit.judge.regressors import Rows
 from driftfit.judge.statistics.constancy import constancy
 from driftfit.run.parallel_lanes import cores
 
@@ -31,7 +35,8 @@ LEVEL = 0.05
 BEFORE = 200
 NOISES = ("white", "GARCH", "t3", "AR(2), peak", "MA(2)", "switching level", "AR at lag 12", "seasonal level",
           "3 % outliers", "rounded")  # fmt: skip
-INPUTS = ("AR(0.95)", "steps", "closed loop", "AR(0.95), noise AR(0.6)")
+INPUTS = ("AR(0.95)", "steps", "closed loop", "AR(0.95), noise AR(0.6)", "pulses", "pulses, louder",
+          "lognormal, in proportion")  # fmt: skip
 LENGTHS = (80, 300, 1000)
 
 
@@ -72,12 +77,20 @@ def inputs(kind: str, rng: np.random.Generator, T: int) -> Array:
     elif kind == "steps":
         stays = np.cumsum(rng.random((T + BEFORE, 2)) < 1.0 / 40.0, axis=0)
         u = np.take_along_axis(u, stays, axis=0)
+    elif kind.startswith("pulses"):
+        u[:, 0] = rng.random(T + BEFORE) < 0.05
+    elif kind.startswith("lognormal"):
+        u[:, 0] = np.exp(u[:, 0])
     return u[BEFORE:]
 
 
 def record(model: str, kind: str, rng: np.random.Generator, T: int) -> tuple[Array, Array]:
     """Regressors and output."""
     e, u = noise(kind, rng, T), inputs(kind, rng, T)
+    if kind == "pulses, louder":
+        e[1:] *= np.where(u[:-1, 0] > 0.0, 10.0, 1.0)
+    elif kind == "lognormal, in proportion":
+        e[1:] *= u[:-1, 0]
     y, loop = np.zeros(T), 0.5 if kind == "closed loop" else 0.0
     for t in range(2, T):
         u[t - 1, 0] -= loop * y[t - 1]
@@ -96,7 +109,11 @@ def record(model: str, kind: str, rng: np.random.Generator, T: int) -> tuple[Arr
 def cell(model: str, kind: str, T: int, records: int) -> Array:
     """p-values of records."""
     rng = np.random.default_rng([T, *model.encode(), *kind.encode()])
-    return np.array([constancy(*record(model, kind, rng, T)).p_joint for _ in range(records)])
+    found = []
+    for _ in range(records):
+        rows = Rows(np.arange(T - 2), *record(model, kind, rng, T))
+        found.append(of_one_size(rows, constancy(rows.phi, rows.y), None)[1].p_joint)
+    return np.array(found)
 
 
 def rates(records: int, lengths: tuple[int, ...]) -> Table:

@@ -18,6 +18,21 @@ from driftfit.judge.statistics.constancy import Constancy, constancy
 from driftfit.run.result import Track
 
 
+def of_one_size(rows: Rows, test: Constancy, lags: int | None) -> tuple[Rows, Constancy]:
+    """Rows and their test of constancy, the rows divided by the size of their noise if that depends on the regressors
+    (`driftfit.judge.segments.noise_of_regressors`)."""
+    noise = test.noise
+    size = None if noise is None or noise.rare else relative_size(rows.phi, rows.y, noise)
+    if noise is None or size is None:
+        return rows, test
+    weighted = rows._replace(phi=rows.phi / size[:, None], y=rows.y / size)
+    again = constancy(weighted.phi, weighted.y, lags, rows.at)
+    # weights also change the correlation of the noise: there they must explain breaks, not add some
+    if again.noise is None or (len(again.noise.ar) and len(again.noise.breaks) >= len(noise.breaks)):
+        return rows, test
+    return weighted, again
+
+
 @dataclass(frozen=True)
 class Evidence:
     """Each part is computed when it is first needed; ``lags`` and ``burn`` are those of `Track.verdict`."""
@@ -52,18 +67,7 @@ class Evidence:
 
     @cached_property
     def _weighted(self) -> tuple[Rows, Constancy]:
-        """Rows and test, the rows divided by the size of their noise if that depends on the regressors."""
-        _, rows, test = self._found
-        noise = test.noise
-        size = None if noise is None or noise.rare else relative_size(rows.phi, rows.y, noise)
-        if noise is None or size is None:
-            return rows, test
-        weighted = rows._replace(phi=rows.phi / size[:, None], y=rows.y / size)
-        again = constancy(weighted.phi, weighted.y, self.lags, rows.at)
-        # weights also change the correlation of the noise: there they must explain breaks, not add some
-        if again.noise is None or (len(again.noise.ar) and len(again.noise.breaks) >= len(noise.breaks)):
-            return rows, test
-        return weighted, again
+        return of_one_size(*self._found[1:], self.lags)
 
     @property
     def distinct(self) -> Distinct:

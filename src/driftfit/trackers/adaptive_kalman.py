@@ -8,8 +8,9 @@ ladder of ratios all weights w are 1; in a second one they are learned from the 
 (`driftfit.trackers.parts.modes.drifts.trend`); those of a fourth drift in one direction, which is learned too
 (`driftfit.trackers.parts.modes.drifts.one_direction`), those of a fifth about the mean regressors, beside an intercept
 (`driftfit.trackers.parts.modes.drifts.about_means`); with up to eight parameters, each has a ladder on which it alone
-drifts; one filter takes an outlier for a jump (`driftfit.trackers.parts.modes.drifts.after_outlier`), and the last comes
-to rest after a change (`driftfit.trackers.parts.modes.drifts.at_rest`). The filters are the modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
+drifts; one filter takes the last outlier for a jump (`driftfit.trackers.parts.modes.drifts.after_outlier`); and the
+last comes to rest after a change (`driftfit.trackers.parts.modes.drifts.at_rest`). The filters are the modes of a
+Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each
 filter the levels are merged at once, by a rank-one update (`driftfit.trackers.parts.modes.filters`). The variance r is

@@ -49,8 +49,8 @@ SEASON = 200
 """Longest lag of a seasonal factor; it is also at most an eighth of the record."""
 LARGEST = 0.97
 ALONE = 0.5
-"""Leverage from which on a row is fitted mainly by itself, as a pulse that is the only one of its window or segment: its
-residual is that of constants."""
+"""Leverage from which on a row is fitted mainly by itself, as a pulse that is the only one of its window or segment:
+its residual is that of constants."""
 ROUNDS = 6
 FILLS = 5
 """Times that missing rows are filled and the autoregression is estimated again."""

@@ -20,10 +20,11 @@ T moves one rung up or down, and leads to each mode from all others with the sam
 so the filters that arrive at j are the mixture itself, whose moments are known, and the interaction costs O(K) instead
 of O(K^2). Jumps arrive at rungs of ratio 1, which soon move down again: from there to no drift directly only with the
 small a_0, since mixing the wide covariance of the top filter into the one without drift costs more than anything else
-when nothing changes. The last filter is not mixed, and comes to rest directly
-(`driftfit.trackers.parts.modes.drifts.at_rest`); nor is the one before it, which takes an outlier for a jump
-(`driftfit.trackers.parts.modes.drifts.after_outlier`). All but what moves down has the factor calm <= 1, learned from how
-often rungs of ratio 1 end: what never changed in thousands of samples is expected to change less often (`learn_rate`).
+when nothing changes. Two filters are not mixed with others: the last, which comes to rest directly
+(`driftfit.trackers.parts.modes.drifts.at_rest`), and the one before it, which takes an outlier for a jump
+(`driftfit.trackers.parts.modes.drifts.after_outlier`). All but what moves down has the factor calm <= 1, learned from
+how often rungs of ratio 1 end: what never changed in thousands of samples is expected to change less often
+(`learn_rate`).
 
 The top filter may also *leap*: if a move as large as the innovation, in directions 1 / c_i and up to LEAP standard
 deviations of the output (times p of `driftfit.trackers.parts.faults.outlying_readings`), at this regressor and at one

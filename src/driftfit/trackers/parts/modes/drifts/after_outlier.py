@@ -40,7 +40,7 @@ def no_jump(n: int) -> dict[str, Any]:
 
 @partial(kernel, inline=False)
 def begin_filter(s: State, own: int, best: int, share: float, noise: float, l: int) -> None:
-    """The filter ``own`` becomes ``best`` with a jump of the variances ``jumped``, and has the probability ``share``."""
+    """The filter ``own`` becomes ``best`` with a jump of variances ``jumped``, and has the probability ``share``."""
     n, K = s.theta.shape[0], s.modes[l]
     kept = (1.0 - share) / (1.0 - s.mu[own, l])
     for k in range(K):
