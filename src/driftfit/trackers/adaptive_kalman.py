@@ -67,7 +67,7 @@ from driftfit.trackers.parts.coordinates import (
     whiten_within,
 )
 from driftfit.trackers.parts.covariance import prediction
-from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, spanned_variance
+from driftfit.trackers.parts.diffuse import knowing_nothing, spanned_variance
 from driftfit.trackers.parts.excitation import (
     learn_information,
     learn_scales,
@@ -254,9 +254,10 @@ class AdaptiveKalman(Tracker):
     smoother_fields: ClassVar[tuple[str, ...]] = SMOOTHER_FIELDS
     adapts: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
-        *SCRATCH, "gain", "e_k", "step", "h", "inverse", "joint", "mu_next", "share", "row", "m_next",
+        "pivot", "at_start", "gain", "e_k", "step", "h", "inverse", "joint", "mu_next", "share", "row", "m_next",
         "weighted", "Z", "away", "about_drift",
     )  # fmt: skip
+    """Not H and work, which `driftfit.trackers.parts.coordinates.frame` fills only where the coordinates change."""
 
     def __post_init__(self) -> None:
         if self.groups is not None:
