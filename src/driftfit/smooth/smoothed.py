@@ -106,11 +106,11 @@ class Smoothed:
             raise ValueError("smooth: a run with a warm start cannot be smoothed; track the whole record.")
         one_of("smooth", "keep", keep, ("std", "fit", "cov"))
         one_of("smooth", "undetermined", undetermined, ("min_norm", "nan", "raise"))
-        centred = order_by is None
-        walk = walk_of(run, centred=centred)
+        turned = order_by is None
+        walk = walk_of(run, turned=turned)
         data, slopes = Data.of(walk), len(walk.trend) > 0
         weight = walk.weight.copy() if keep != "std" else NONE
-        path = solve(walk, keep, order_by, lambda: walk_of(run, centred=centred))
+        path = solve(walk, keep, order_by, lambda: walk_of(run, turned=turned))
         del walk
         smoothed = cls(path, data, run, order_by=order_by)
         if keep != "std":
@@ -138,7 +138,7 @@ class Smoothed:
     @property
     def walk(self) -> Walk:
         """The problem that was solved; collected from the record again, as `smooth` did, if it was not given."""
-        return walk_of(self.run, centred=self.order_by is None) if self._walk is None else self._walk
+        return walk_of(self.run, turned=self.order_by is None) if self._walk is None else self._walk
 
     @cached_property
     def _fit(self) -> Fit:

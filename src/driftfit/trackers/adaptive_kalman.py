@@ -328,16 +328,16 @@ class AdaptiveKalman(Tracker):
         )
 
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
-        running = fields["settled"] > 0
+        running = np.append(False, fields["settled"][:-1] > 0)  # not yet at the sample with which the filters start
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
 
     def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
         return faults(field, phi, y, ok)
 
     def estimated_variances(
-        self, model: Model, fields: Mapping[str, Array], e: Array, time: Array
-    ) -> tuple[Array, Array, Array]:
-        return estimated_variances(fields, e, time, self.state(model.n))
+        self, model: Model, fields: Mapping[str, Array], phi: Array, e: Array, time: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        return estimated_variances(fields, phi, e, time, self.state(model.n))
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:

@@ -21,13 +21,14 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
+from driftfit.trackers.parts.modes.drifts.about_means import STILL, centring
 from driftfit.trackers.parts.modes.drifts.one_direction import BESIDE
 from driftfit.trackers.parts.modes.ladder import TOP, chain
 from driftfit.trackers.parts.modes.noise_levels import level_chain
 
 SMOOTHER_FIELDS = (
     "joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight", "white",
-    "explained", "calm", "left_out", "shift", "direction", "replaced_by", "busy", "variance",
+    "explained", "calm", "left_out", "shift", "direction", "replaced_by", "busy", "variance", "constant",
 )  # fmt: skip
 """Fields that are stored at every sample."""
 
@@ -51,7 +52,7 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
     o.coarse[l] = s.coarse[l] / s.noise[l]  # in units of the noise factor, as r is
     o.leapt[l], o.weighed[l], o.settled[l], o.explained[l] = s.leapt[l], s.weighed[l], s.settled[l], s.explained[l]
     o.calm[l], o.left_out[l], o.shift[l] = s.calm[l], s.left_out[l], s.shift[l]
-    o.replaced_by[l], o.busy[l] = s.replaced_by[l], s.busy[l]
+    o.replaced_by[l], o.busy[l], o.constant[l] = s.replaced_by[l], s.busy[l], s.constant[l]
 
 
 def given_all(after: Array, stay: Array, change: Array, rate: Array, moves: Array, by: Array, over: Array) -> Array:
@@ -78,10 +79,13 @@ def given_all(after: Array, stay: Array, change: Array, rate: Array, moves: Arra
 
 
 def estimated_variances(
-    fields: Mapping[str, Array], e: Array, time: Array, state: Mapping[str, Any]
-) -> tuple[Array, Array, Array]:
-    """q (T, n), that of the drift about the means, and r (T,) of every sample, from the stored fields (T, ..), the
-    innovations and intervals of drift."""
+    fields: Mapping[str, Array], phi: Array, e: Array, time: Array, state: Mapping[str, Any]
+) -> tuple[Array, Array, Array, Array]:
+    """q (T, n), that of the drift about the means, the matrix of `centring` for this drift, and r (T,) of every sample,
+    from the stored fields (T, ..), the regressors (N, n) of used samples, the innovations and intervals of drift.
+
+    Which column is constant is what the filters knew after the last sample.
+    """
     running, weighed = fields["settled"] > 0, fields["weighed"] > 0
     r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
     after = np.where(weighed[:, None], fields["joint"].sum(axis=1), fields["prior"])
@@ -99,14 +103,16 @@ def estimated_variances(
         drift = w @ ratio.T + (w @ learned)[:, None] * fields["weight"] + (w @ along)[:, None] * share
         q = (drift + (w[:, TOP] * leapt)[:, None] * ratio[:, TOP]) * span[:, None] / fields["c"]
         first = state["first_about"]
-        own = np.where(fields["variance"] > 0.0, fields["variance"], fields["c"])
+        constant = int(fields["constant"][-1])
+        beside = (constant >= 0) & (np.arange(len(state["theta"])) != constant)
+        own = np.where(beside, fields["variance"], fields["c"])
         about = ((w[:, first : first + len(state["about"])] @ state["about"]) * span)[:, None] / own
     drifts = running[:, None] & (span[:, None] > 0.0) & (fields["c"] > 0.0)
-    q, about = np.where(drifts, q, 0.0), np.where(drifts, about, 0.0)
+    q, about = np.where(drifts, q, 0.0), np.where(drifts & (own > STILL * fields["c"]), about, 0.0)
     never = np.zeros((J, J)), np.zeros(len(r)), weighed, np.full(len(r), -1), r
     levels = given_all(fields["nu"][:, :-1], level_chain(), *never)
     v = np.sum(levels * np.maximum(state["level"][:-1] * r[:, None], fields["coarse"][:, None]), axis=1)
     v = np.where(running, v + fields["coarse"] * fields["alike"] * (fields["alike"] + 2.0), r) * fields["leverage"]
     outlier = np.where(weighed, fields["joint"][:, -1].sum(axis=1), 0.0)
     far = np.maximum(state["level"][-1] * v, np.where(weighed, e * e, 0.0))
-    return q, about, 1.0 / ((1.0 - outlier) / v + outlier / far)
+    return q, about, centring(phi, constant), 1.0 / ((1.0 - outlier) / v + outlier / far)
