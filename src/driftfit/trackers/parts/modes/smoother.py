@@ -15,7 +15,7 @@ mode, is ours.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -55,27 +55,40 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
     o.replaced_by[l], o.busy[l], o.constant[l] = s.replaced_by[l], s.busy[l], s.constant[l]
 
 
-def given_all(after: Array, stay: Array, change: Array, rate: Array, moves: Array, by: Array, over: Array) -> Array:
-    """Probabilities (T, K) of states, given all samples; at samples that move, transitions are stay + rate_t change,
-    and before them a share over_t of state by_t >= 0 replaces the last one
-    (`driftfit.trackers.parts.modes.drifts.at_rest`)."""
-    found, before = after.copy(), after.copy()
-    at = np.flatnonzero(by >= 0)
-    which = by[at]
-    before[at, which] = (1.0 - over[at]) * after[at, which] + after[at, -1]
-    before[at, -1] = over[at] * after[at, which]
-    ahead = before @ stay + rate[:, None] * (before @ change)
+def given_all(after: Array, ahead: Array, back: Callable[[int, Array], Array], moves: Array) -> Array:
+    """Probabilities (T, K) of states, given all samples, from those after each sample and those ``ahead`` of the next.
+
+    ``back(t, x)`` is T x, with the transitions T at a sample that moves.
+    """
+    found = after.copy()
     for t in range(len(found) - 2, -1, -1):
         if not moves[t]:
             found[t] = found[t + 1]
             continue
-        later = found[t + 1] / np.maximum(ahead[t], 1e-300)
-        later = stay @ later + rate[t] * (change @ later)
-        if by[t] >= 0:
-            later[by[t]], later[-1] = (1.0 - over[t]) * later[by[t]] + over[t] * later[-1], later[by[t]]
-        found[t] = after[t] * later
+        found[t] = after[t] * back(t, found[t + 1] / np.maximum(ahead[t], 1e-300))
         found[t] /= found[t].sum()
     return found
+
+
+def modes_given_all(fields: Mapping[str, Array], state: Mapping[str, Any]) -> Array:
+    """Probabilities (T, K) of the filters, given all samples.
+
+    Before transitions stay + calm_t change, a share of another filter may replace the last one
+    (`driftfit.trackers.parts.modes.drifts.at_rest`).
+    """
+    calm, by, weighed = fields["calm"], fields["replaced_by"].astype(int), fields["weighed"] > 0
+    over = state["over"][by] / np.append(1.0, fields["busy"][:-1])
+    stay, change = chain(state["moves"], state["arrive"])
+    ahead = fields["prior"]  # after the interaction, it is that of the next sample
+    after = np.where(weighed[:, None], fields["joint"].sum(axis=1), ahead)
+
+    def back(t: int, x: Array) -> Array:
+        x = stay @ x + calm[t] * (change @ x)
+        if by[t] >= 0:
+            x[by[t]], x[-1] = (1.0 - over[t]) * x[by[t]] + over[t] * x[-1], x[by[t]]
+        return x
+
+    return given_all(after, ahead, back, weighed)
 
 
 def estimated_variances(
@@ -88,11 +101,7 @@ def estimated_variances(
     """
     running, weighed = fields["settled"] > 0, fields["weighed"] > 0
     r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
-    after = np.where(weighed[:, None], fields["joint"].sum(axis=1), fields["prior"])
-    J = len(state["level"]) - 1
-    replaced_by, span, learned = fields["replaced_by"].astype(int), r * time, state["learned"]
-    over = state["over"][replaced_by] / fields["busy"]
-    w = given_all(after, *chain(state["moves"], state["arrive"]), fields["calm"], weighed, replaced_by, over)
+    w, span, learned = modes_given_all(fields, state), r * time, state["learned"]
     along, first = np.zeros(len(learned)), state["first_along"]
     along[first : first + len(state["along"])] = state["along"]
     ratio = np.where((learned > 0.0) | (along > 0.0), 0.0, state["ratio"])
@@ -109,8 +118,8 @@ def estimated_variances(
         about = ((w[:, first : first + len(state["about"])] @ state["about"]) * span)[:, None] / own
     drifts = running[:, None] & (span[:, None] > 0.0) & (fields["c"] > 0.0)
     q, about = np.where(drifts, q, 0.0), np.where(drifts & (own > STILL * fields["c"]), about, 0.0)
-    never = np.zeros((J, J)), np.zeros(len(r)), weighed, np.full(len(r), -1), r
-    levels = given_all(fields["nu"][:, :-1], level_chain(), *never)
+    nu, steps = fields["nu"][:, :-1], level_chain()
+    levels = given_all(nu, nu @ steps, lambda t, x: steps @ x, weighed)
     v = np.sum(levels * np.maximum(state["level"][:-1] * r[:, None], fields["coarse"][:, None]), axis=1)
     v = np.where(running, v + fields["coarse"] * fields["alike"] * (fields["alike"] + 2.0), r) * fields["leverage"]
     outlier = np.where(weighed, fields["joint"][:, -1].sum(axis=1), 0.0)
