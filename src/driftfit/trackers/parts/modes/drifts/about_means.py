@@ -80,15 +80,15 @@ def forget_mean(s: State, i: int, l: int) -> None:
 @partial(kernel, inline=False)
 def drift_about(s: State, size: float, l: int) -> None:
     """Drift about the means: ``size`` in units of the ratios over the variances of the regressors."""
-    n, k = s.parameters[l], s.constant[l]
+    n, k = s.parameters[l] if s.about.shape[0] > 0 else 0, s.constant[l]
     for a in range(n):
         for b in range(a + 1):
             s.about_drift[a, b, l] = 0.0
-    for i in range(n if s.about.shape[0] > 0 else 0):
+    for i in range(n):
         beside = (k >= 0) & (i != k)
         own = s.variance[i, l] if beside else s.c[i, l]
-        own = own if own > STILL * s.c[i, l] else 0.0
-        for a in range(n if own > 0.0 else 0):
+        rows = max(i, k) + 1 if own > STILL * s.c[i, l] else 0  # S is triangular
+        for a in range(rows):
             s.away[a, l] = s.S[a, i, l] - (s.mean[i, l] / s.mean[k, l] * s.S[a, k, l] if beside else 0.0)
             for b in range(a + 1):
                 s.about_drift[a, b, l] += s.away[a, l] * s.away[b, l] / own
