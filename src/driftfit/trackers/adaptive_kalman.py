@@ -27,7 +27,7 @@ estimates themselves (`driftfit.trackers.parts.modes.filters`). The one-step var
 band is for samples that are not outliers.
 
 The start is exact diffuse least squares without drift, in which regressors out of proportion count less too, until
-there are enough residuals to estimate r; its bands are Student's (`driftfit.trackers.parts.modes.few_residuals`). Fault
+there are enough residuals to estimate r; its bands are Student's (`driftfit.trackers.parts.few_residuals`). Fault
 codes among these samples are found then, and least squares repeated without them
 (`driftfit.trackers.parts.faults.first_samples`). Every filter starts from generalised least squares with
 its own drift over the same samples (`driftfit.trackers.parts.modes.start`), in the directions that the regressors span.
@@ -88,10 +88,10 @@ from driftfit.trackers.parts.faults.outlying_readings import (
 )
 from driftfit.trackers.parts.faults.stored_samples import machine_doubt
 from driftfit.trackers.parts.faults.strange_inputs import learn_inputs, leave_out_input, no_strange_inputs
+from driftfit.trackers.parts.few_residuals import widen_estimates, wider
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.drifts.about_means import learn_means
 from driftfit.trackers.parts.modes.drifts.at_rest import come_to_rest
-from driftfit.trackers.parts.modes.few_residuals import widen_estimates, wider
 from driftfit.trackers.parts.modes.filters import (
     enter_filters,
     innovate,
