@@ -13,7 +13,8 @@ as the non-negative solution of
 whose sums fade. The pass is made every `BLOCK` samples over the last `WINDOW`, and counts the oldest block, for which
 later samples show which parameter moved. The second ladder of drift ratios climbs in these proportions, rho_i / max_j
 rho_j (`driftfit.trackers.parts.modes.ladder`). The same pass finds the direction in which all parameters may drift
-together (`driftfit.trackers.parts.modes.drifts.one_direction`).
+together (`driftfit.trackers.parts.modes.drifts.one_direction`). The drift about the means is not counted in p: it is
+none of single parameters, and what its filters explain, these need not explain again.
 
 Source: the smoother and its scores are Koopman and Shephard (1992); solving for all variances together, as data
 arrive, is ours. Cost per sample: O(n^2).
@@ -49,7 +50,7 @@ SWEEPS = 20
 """Sweeps over the parameters for the solution."""
 FLOOR = 0.001
 """Smallest weight."""
-MOST = 10.0 * WINDOW * LEVERAGE
+SOUND = 10.0 * WINDOW * LEVERAGE
 """No entry of N is larger: each sample adds at most `LEVERAGE`, and coloured noise four times as much."""
 TINY = 1e-300
 """Added to what is divided by."""
@@ -131,7 +132,7 @@ def forget_rounding(t: Array, moments: Array) -> None:
     n, sound = t.shape[1], True
     for i in range(n):
         for j in range(n):
-            sound = sound and abs(t[N + 2 * i, j]) <= MOST
+            sound = sound and abs(t[N + 2 * i, j]) <= SOUND
     for table in (t, moments):
         for i in range(0 if sound else table.shape[0]):
             for j in range(n):
