@@ -1,5 +1,7 @@
 """`AdaptiveKalman` beside an intercept: an offset of the inputs changes neither predictions nor gains."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -95,3 +97,17 @@ def test_a_second_constant_column_is_not_determined(colour):
     assert np.isinf(path.std[:, [0, 2]]).all()
     assert (path.std[:, 1] < 0.1).all()
     assert path.theta[0] @ [1.0, 0.0, -7.3] == pytest.approx(0.0, abs=1e-9)  # nearest to 0
+
+
+def test_the_smoother_averages_the_drifts_beside_an_idle_column():
+    """Its likelihood, in which that column has no part, was given up: errors of the gain were three times as large."""
+    rng = np.random.default_rng(0)
+    u, gain = rng.normal(size=T), np.linspace(1.0, 3.0, T)
+    y = 20.0 + gain * u + 0.1 * rng.normal(size=T)
+    paths = []
+    for idle in (rng.normal(size=T), np.zeros(T)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # nothing can be learned of the idle column
+            paths.append(track(Regression(3), AdaptiveKalman(), y, np.column_stack([u, idle, np.ones(T)])).smooth())
+    other, path = (np.sqrt(np.mean((path.theta[:, 0] - gain) ** 2)) for path in paths)
+    assert path < 1.5 * other

@@ -83,7 +83,7 @@ def turned(walk: Walk, keep: str) -> Path:
     hidden = two_filters.unspanned(unseen, scale)
     if len(walk.trend):
         path = slopes.smooth(z, "cov")
-        unknown = np.isinf(path.var) @ (basis != 0.0).T
+        unknown = np.isinf(variances(path.var, basis))
     else:
         path = safely(z, size, np.linalg.solve(basis, hidden.T) * size[:, None], "cov")._replace(rank=rank)
         unknown = two_filters.undetermined(hidden)
@@ -95,7 +95,13 @@ def turned(walk: Walk, keep: str) -> Path:
         theta=theta,
         var=np.where(unknown, np.inf, np.diagonal(cov, axis1=1, axis2=2)),
         slope=path.slope @ basis.T if len(path.slope) else path.slope,
-        slope_var=path.slope_var @ (basis**2).T if len(path.slope_var) else path.slope_var,
+        slope_var=variances(path.slope_var, basis) if len(path.slope_var) else path.slope_var,
         cov=cov if keep == "cov" else cov[:0],
         lag_cov=basis @ path.lag_cov @ basis.T if keep == "cov" else path.lag_cov[:0],
     )
+
+
+def variances(var: Array, basis: Array) -> Array:
+    """Variances (T, n) of basis z, from those of z without their covariances; inf with a share of one that is inf."""
+    unknown = np.isinf(var)
+    return np.where(unknown @ (basis != 0.0).T, np.inf, np.where(unknown, 0.0, var) @ (basis**2).T)
