@@ -73,6 +73,8 @@ def average_drift(walk: Walk, time: Array, trend: Array) -> Walk:
     part, and their parameters stay at 0.
     """
     moved = np.flatnonzero(np.any(walk.phi[walk.weight > 0.0] != 0.0, axis=0))
+    if len(moved) == walk.phi.shape[1]:
+        return averaged(walk, time, trend)
     some = averaged(walk.of(moved), time, trend) if len(moved) else walk
     if not len(some.paths):
         return walk

@@ -133,10 +133,11 @@ def forget_rounding(t: Array, moments: Array) -> None:
     for i in range(n):
         for j in range(n):
             sound = sound and abs(t[N + 2 * i, j]) <= SOUND
-    for table in (t, moments):
-        for i in range(0 if sound else table.shape[0]):
-            for j in range(n):
-                table[i, j] = 0.0
+    for j in range(0 if sound else n):
+        for i in range(t.shape[0]):
+            t[i, j] = 0.0
+        for i in range(moments.shape[0]):
+            moments[i, j] = 0.0
 
 
 @shared
