@@ -105,5 +105,6 @@ def centring(phi: Array, constant: int) -> Array:
     A = np.eye(phi.shape[1])
     if constant >= 0:
         mean = phi.mean(axis=0)
-        A[constant] -= np.where(np.arange(len(A)) == constant, 0.0, mean / mean[constant])
+        A[constant] = -mean / mean[constant]
+        A[constant, constant] = 1.0
     return A
