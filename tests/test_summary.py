@@ -244,3 +244,10 @@ def test_a_level_that_nothing_explains_calls_for_a_constant(unit):
         (Regression(2), high, np.column_stack([u, np.ones(200)])),
     ):
         assert not notes(model, output, inputs)
+
+
+def test_a_cell_shows_the_band_of_few_residuals():
+    """Student's, as `Track.band`: with two residuals it is twice as wide."""
+    run = track(Regression(1), RLS(1.0), [1.0, 2.5, 2.0], [1.0, 2.0, 3.0])
+    for end in run.band():
+        assert digits(float(end[-1, 0]), float(run.std[-1, 0])) in run._repr_html_()

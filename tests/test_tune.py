@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support import arx_record
 
-from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Regression, Tracker, frontier, track, tune
+from driftfit import ARX, FLS, RLS, AdaptiveKalman, AugmentedFLS, Kalman, Regression, Tracker, frontier, track, tune
 from driftfit.models.fault_codes import absurd
 from driftfit.models.regression import Regression as Base
 from driftfit.systems.drift import RandomWalk, paths
@@ -228,6 +228,13 @@ def test_missing_samples_weights_and_time():
     keep = np.isfinite(y)
     gaps = tune(Regression(2), FLS(), y[keep], u[keep], time=np.flatnonzero(keep).astype(float))
     assert gaps.tracker.mu == pytest.approx(tuned.tracker.mu, rel=1e-3)
+
+
+def test_order_by_needs_a_given_drift():
+    """An estimated one is that of time, and was replaced by 1 in the units of theta."""
+    run = track(Regression(1), AdaptiveKalman(), np.ones(20), np.arange(20.0))
+    with pytest.raises(ValueError, match="estimates one in time"):
+        run.smooth(order_by=np.arange(20))
 
 
 def test_order_by_sorts_the_samples():

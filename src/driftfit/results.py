@@ -90,7 +90,8 @@ class Track(result.Track, Exported, public=True):
         The regressors that the filter used are held fixed. keep="fit" also stores what residuals and leverages are
         made of; otherwise the problem is solved again when they are read. keep="cov" also stores the covariances,
         n * n numbers for each sample and each pair of neighbours. ``order_by`` (T,): theta changes with this variable
-        instead of with time; the samples are sorted by it, smoothed in that order, and returned in time order.
+        instead of with time; the samples are sorted by it, smoothed in that order, and returned in time order. This
+        needs a tracker whose drift is given.
         ``undetermined``: the value of parameters that the record does not determine, whose std is inf: "min_norm", the
         solution nearest to theta0; "nan"; or "raise". A `Bank` is smoothed given its events
         (`driftfit.trackers.bank.results.decided_path.EventSmoothed`). ValueError for other trackers that do not

@@ -1,13 +1,17 @@
 """Fields that a tracker declares as scratch carry nothing from one sample to the next."""
 
 import numpy as np
+import pytest
 from support import arx_record, damaged
 
 from driftfit import Live
 
 
-def test_scratch_carries_nothing(model, tracker):
+@pytest.mark.parametrize("idle", [0, 50])
+def test_scratch_carries_nothing(model, tracker, idle):
+    """Also while columns are free, because the input has not moved yet."""
     y, u = damaged(*arx_record(90, 7))
+    u[:idle] = 0.0
     live = Live(model, tracker)
     other = Live(model, tracker)
     for t in range(90):

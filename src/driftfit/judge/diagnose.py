@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PARTS = 10
-MATERIAL, SURE = 1.03, 0.01
+MATERIAL, REJECTED = 1.03, 0.01
 """A tracker that lets coefficients move is at fault if its error exceeds that of constants by this factor."""
 NOT_REJECTED = 0.05
 """Constants count as not rejected if p is at least this."""
@@ -276,7 +276,7 @@ def _constancy(known: Evidence) -> Check:
         advice = (
             "The coefficients move, but this tracker holds them constant: use Kalman with a drift, or AdaptiveKalman."
         )
-        return Check("constancy (p)", test.p_joint, SURE, np.inf, advice)
+        return Check("constancy (p)", test.p_joint, REJECTED, np.inf, advice)
     error = known.errors
     own, steady = (part[error.scored] for part in (error.tracked, error.constant_ls))
     least, most = root_mean_square(steady), root_mean_square(own)
@@ -284,7 +284,7 @@ def _constancy(known: Evidence) -> Check:
         f"Constants are not rejected, and predict better ({least:.4g} against {most:.4g}): the drift is set too high. "
         "Lower q or increase the memory; tune() estimates it."
     )
-    dear = paired("constant LS", own, MATERIAL * steady).p < SURE
+    dear = paired("constant LS", own, MATERIAL * steady).p < REJECTED
     return Check("constancy (p)", test.p_joint, -np.inf, NOT_REJECTED if dear else np.inf, advice)
 
 

@@ -29,7 +29,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.smooth.parts import elimination, slopes, two_filters
 from driftfit.smooth.parts.rank import column_scale, ranks
-from driftfit.smooth.parts.walk import NONE, Path, Walk
+from driftfit.smooth.parts.walk import Path, Walk
 from driftfit.trackers.parts.information import triangular_root
 
 
@@ -41,8 +41,8 @@ def smooth(walk: Walk, keep: str = "fit", rebuild: Callable[[], Walk] | None = N
     makes the problem a second time. If it is given, the fast method writes its solution over phi and signals, which
     saves memory, and the safe one solves the rebuilt problem.
     """
-    if len(walk.about):
-        return turned(smooth(walk._replace(about=NONE), "cov"), walk.about, keep)
+    if len(walk.basis):
+        return turned(walk, keep)
     if len(walk.trend):
         return spread(walk, slopes.smooth(walk, keep))
     n = walk.phi.shape[1]
@@ -52,9 +52,14 @@ def smooth(walk: Walk, keep: str = "fit", rebuild: Callable[[], Walk] | None = N
     found = elimination.smooth(walk, scale, keep, overwrite=rebuild is not None) if simple else None
     if found is None:
         walk = rebuild() if simple and rebuild is not None else walk
-        G = triangular_root(walk.q * np.outer(scale, scale))
-        found = two_filters.smooth(walk, scale, G, two_filters.start(walk, scale, unseen), keep)
+        found = safely(walk, scale, unseen, keep)
     return spread(walk, found)._replace(rank=rank)
+
+
+def safely(walk: Walk, scale: Array, unseen: Array, keep: str) -> Path:
+    """Solve the problem with the safe method; regressors divided by ``scale`` are orthogonal to ``unseen`` (n, k)."""
+    G = triangular_root(walk.q * np.outer(scale, scale))
+    return two_filters.smooth(walk, scale, G, two_filters.start(walk, scale, unseen), keep)
 
 
 def spread(walk: Walk, path: Path) -> Path:
@@ -67,17 +72,36 @@ def spread(walk: Walk, path: Path) -> Path:
     return path._replace(var=path.var + np.sum(away**2, axis=0), cov=cov, lag_cov=lag)
 
 
-def turned(path: Path, A: Array, keep: str) -> Path:
-    """The path of A theta. Variances of its slopes neglect that those of theta are correlated."""
-    unknown = np.isinf(path.var) @ (A != 0.0).T
-    with np.errstate(invalid="ignore"):
-        cov, lag = A @ path.cov @ A.T, A @ path.lag_cov @ A.T
-        slopes = path.slope_var @ (A**2).T if len(path.slope_var) else path.slope_var
+def turned(walk: Walk, keep: str) -> Path:
+    """The path of theta = basis z, from that of z. Variances of its slopes neglect that those of z are correlated.
+
+    Rank is decided on the regressors of theta, since those of z may be nothing but rounding.
+    """
+    basis, z = walk.basis, walk.independent
+    scale, size = (column_scale(phi, walk.signals) for phi in (walk.phi, z.phi))
+    rank, unseen = ranks(walk.phi, walk.signals, scale)
+    hidden = two_filters.unspanned(unseen, scale)
+    if len(walk.trend):
+        path = slopes.smooth(z, "cov")
+        unknown = np.isinf(variances(path.var, basis))
+    else:
+        path = safely(z, size, np.linalg.solve(basis, hidden.T) * size[:, None], "cov")._replace(rank=rank)
+        unknown = two_filters.undetermined(hidden)
+    path = spread(z, path)
+    theta = path.theta @ basis.T
+    theta -= (theta[0] - walk.theta0) @ hidden.T @ hidden
+    cov = basis @ path.cov @ basis.T
     return path._replace(
-        theta=path.theta @ A.T,
+        theta=theta,
         var=np.where(unknown, np.inf, np.diagonal(cov, axis1=1, axis2=2)),
-        slope=path.slope @ A.T if len(path.slope) else path.slope,
-        slope_var=slopes,
+        slope=path.slope @ basis.T if len(path.slope) else path.slope,
+        slope_var=variances(path.slope_var, basis) if len(path.slope_var) else path.slope_var,
         cov=cov if keep == "cov" else cov[:0],
-        lag_cov=lag if keep == "cov" else lag[:0],
+        lag_cov=basis @ path.lag_cov @ basis.T if keep == "cov" else path.lag_cov[:0],
     )
+
+
+def variances(var: Array, basis: Array) -> Array:
+    """Variances (T, n) of basis z, from those of z without their covariances; inf with a share of one that is inf."""
+    unknown = np.isinf(var)
+    return np.where(unknown @ (basis != 0.0).T, np.inf, np.where(unknown, 0.0, var) @ (basis**2).T)

@@ -111,22 +111,11 @@ def take(
         signals[t, DRIFT] = rows[t, at_dt]
 
 
-def about_means(phi: Array, weight: Array) -> Array:
-    """A (n, n), for which phi A are the regressors less their means, beside the last column that is constant and not 0;
-    the identity without one."""
-    A, used = np.eye(phi.shape[1]), phi[weight > 0.0]
-    constant = np.flatnonzero((np.ptp(used, axis=0) == 0.0) & (used[0] != 0.0)) if len(used) else np.empty(0, int)
-    if constant.size:
-        k = int(constant[-1])
-        A[k] -= np.where(np.arange(len(A)) == k, 0.0, used.mean(axis=0) / used[0, k])
-    return A
-
-
-def walk_of(run: Track, prior: RandomWalk | None = None, centred: bool = False) -> Walk:
+def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -> Walk:
     """The problem behind a run; ValueError if its tracker does not describe a random walk in Gaussian noise.
 
-    ``prior`` replaces the random walk that the tracker assumes. ``centred``: in regressors less their means, if the
-    tracker estimates drifts about these; otherwise such drifts count as independent ones of the intercept too.
+    ``prior`` replaces the random walk that the tracker assumes. ``turned``: drift is independent in coordinates in
+    which the tracker estimates one; otherwise that counts as an independent drift of each parameter.
     """
     own, tracker = prior is None, run.tracker
     drift_root = run.known.extra if own and run.known.extra.size else NONE
@@ -138,13 +127,15 @@ def walk_of(run: Track, prior: RandomWalk | None = None, centred: bool = False) 
     dt = drift.copy() if prior.slopes or fields else NONE
     first = int(np.argmax(drift > 0.0)) + 1
     drift *= run.known.drift
-    A = NONE
+    basis = NONE
     if own and fields:
-        q, about, r_of = tracker.estimated_variances(run.model, fields, np.sqrt(weight) * fields["e"], drift)
-        A = about_means(phi, weight)
+        q, q_turned, B, r_of = tracker.estimated_variances(
+            run.model, fields, phi[weight > 0.0], np.sqrt(weight) * fields["e"], drift
+        )
         phi, signals[:, Y] = tracker.regression(fields, phi, signals[:, Y])
-        q, phi = (q @ (A**2).T + about, phi @ A) if centred else (q + about @ (A**2).T, phi)
-        A = A if centred and np.any(np.eye(len(A)) != A) else NONE
+        basis = B if turned and np.any(np.eye(len(B)) != B) else NONE
+        # B and its inverse have entries of the same size
+        q = q @ (B**2).T + q_turned if len(basis) else q + q_turned @ (B**2).T
         time, drift_root = drift.copy(), np.sqrt(q)
         weight /= r_of
         drift[:] = 1.0
@@ -154,5 +145,7 @@ def walk_of(run: Track, prior: RandomWalk | None = None, centred: bool = False) 
         drift[:first], trend[:first], moving[:first] = 0.0, 0.0, 0.0
     r = 1.0 if prior.r is None else prior.r
     p0 = None if prior.p0 is None else prior.p0 / r
-    walk = Walk(phi, signals, prior.q / r, prior.theta0, p0, prior.r, drift_root, trend, about=A)
-    return average_drift(walk, time, moving) if own and fields else walk
+    walk = Walk(phi, signals, prior.q / r, prior.theta0, p0, prior.r, drift_root, trend, basis=basis)
+    if not (own and fields):
+        return walk
+    return average_drift(walk.independent, time, moving)._replace(phi=phi, basis=basis)

@@ -106,11 +106,15 @@ class Smoothed:
             raise ValueError("smooth: a run with a warm start cannot be smoothed; track the whole record.")
         one_of("smooth", "keep", keep, ("std", "fit", "cov"))
         one_of("smooth", "undetermined", undetermined, ("min_norm", "nan", "raise"))
-        centred = order_by is None
-        walk = walk_of(run, centred=centred)
+        if order_by is not None and run.tracker.smoother_fields:
+            raise ValueError(
+                f"smooth: order_by= needs a drift along that variable, and {run.tracker!r} estimates one in time. "
+                "Use the tracker of tune(model, FLS(), y, u, order_by=..)."
+            )
+        walk = walk_of(run, turned=True)
         data, slopes = Data.of(walk), len(walk.trend) > 0
         weight = walk.weight.copy() if keep != "std" else NONE
-        path = solve(walk, keep, order_by, lambda: walk_of(run, centred=centred))
+        path = solve(walk, keep, order_by, lambda: walk_of(run, turned=True))
         del walk
         smoothed = cls(path, data, run, order_by=order_by)
         if keep != "std":
@@ -138,7 +142,7 @@ class Smoothed:
     @property
     def walk(self) -> Walk:
         """The problem that was solved; collected from the record again, as `smooth` did, if it was not given."""
-        return walk_of(self.run, centred=self.order_by is None) if self._walk is None else self._walk
+        return walk_of(self.run, turned=True) if self._walk is None else self._walk
 
     @cached_property
     def _fit(self) -> Fit:

@@ -28,7 +28,7 @@ estimates themselves (`driftfit.trackers.parts.modes.filters`). The one-step var
 band is for samples that are not outliers.
 
 The start is exact diffuse least squares without drift, in which regressors out of proportion count less too, until
-there are enough residuals to estimate r; its bands are Student's (`driftfit.trackers.parts.modes.few_residuals`). Fault
+there are enough residuals to estimate r; its bands are Student's (`driftfit.trackers.parts.few_residuals`). Fault
 codes among these samples are found then, and least squares repeated without them
 (`driftfit.trackers.parts.faults.first_samples`). Every filter starts from generalised least squares with
 its own drift over the same samples (`driftfit.trackers.parts.modes.start`), in the directions that the regressors span.
@@ -68,7 +68,7 @@ from driftfit.trackers.parts.coordinates import (
     whiten_within,
 )
 from driftfit.trackers.parts.covariance import prediction
-from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, spanned_variance
+from driftfit.trackers.parts.diffuse import knowing_nothing, spanned_variance
 from driftfit.trackers.parts.excitation import (
     learn_information,
     learn_scales,
@@ -89,11 +89,11 @@ from driftfit.trackers.parts.faults.outlying_readings import (
 )
 from driftfit.trackers.parts.faults.stored_samples import machine_doubt
 from driftfit.trackers.parts.faults.strange_inputs import learn_inputs, leave_out_input, no_strange_inputs
+from driftfit.trackers.parts.few_residuals import widen_estimates, wider
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.drifts.about_means import learn_means
 from driftfit.trackers.parts.modes.drifts.after_outlier import no_jump, suppose_jump
 from driftfit.trackers.parts.modes.drifts.at_rest import come_to_rest
-from driftfit.trackers.parts.modes.few_residuals import widen_estimates, wider
 from driftfit.trackers.parts.modes.filters import (
     enter_filters,
     innovate,
@@ -257,9 +257,10 @@ class AdaptiveKalman(Tracker):
     smoother_fields: ClassVar[tuple[str, ...]] = SMOOTHER_FIELDS
     adapts: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
-        *SCRATCH, "gain", "e_k", "step", "h", "inverse", "joint", "mu_next", "share", "row", "m_next",
+        "pivot", "at_start", "gain", "e_k", "step", "h", "inverse", "joint", "mu_next", "share", "row", "m_next",
         "weighted", "Z", "away", "about_drift",
     )  # fmt: skip
+    """Not H and work, which `driftfit.trackers.parts.coordinates.frame` fills only where the coordinates change."""
 
     def __post_init__(self) -> None:
         if self.groups is not None:
@@ -331,16 +332,16 @@ class AdaptiveKalman(Tracker):
         )
 
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
-        running = fields["settled"] > 0
+        running = np.append(False, fields["settled"][:-1] > 0)  # not yet at the sample with which the filters start
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
 
     def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
         return faults(field, phi, y, ok)
 
     def estimated_variances(
-        self, model: Model, fields: Mapping[str, Array], e: Array, time: Array
-    ) -> tuple[Array, Array, Array]:
-        return estimated_variances(fields, e, time, self.state(model.n))
+        self, model: Model, fields: Mapping[str, Array], phi: Array, e: Array, time: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        return estimated_variances(fields, phi, e, time, self.state(model.n))
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:

@@ -153,13 +153,13 @@ class Tracker(Settings, ABC):
         return np.zeros(len(y), bool)
 
     def estimated_variances(
-        self, model: Model, fields: Mapping[str, Array], e: Array, time: Array
-    ) -> tuple[Array, Array, Array]:
-        """Variances of the drift before each sample (T, n), of the drift about the means of the regressors (T, n), and
-        of the noise (T,), if the tracker estimates them.
+        self, model: Model, fields: Mapping[str, Array], phi: Array, e: Array, time: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Variances of the drift before each sample (T, n), those of an independent drift of B^-1 theta (T, n), B
+        (n, n), and variances of the noise (T,), if the tracker estimates them.
 
-        ``fields`` (T, ..) are those that ``smoother_fields`` names, e (T,) the innovations of samples of weight 1, time
-        (T,) the intervals of drift.
+        ``fields`` (T, ..) are those that ``smoother_fields`` names, phi (N, n) the regressors of the used samples, e
+        (T,) the innovations of samples of weight 1, time (T,) the intervals of drift.
         """
         raise NotImplementedError
 

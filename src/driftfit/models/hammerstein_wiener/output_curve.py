@@ -61,7 +61,7 @@ from driftfit.models.hammerstein_wiener.step_memory import (
 
 WIDER = 0.2
 """Share of the range of the outputs by which the grid extends beyond it at both ends."""
-FAR = 3.0
+OUTERMOST = 3.0
 """Limit beyond the range of medians of three, in units of that range; outputs farther away count only up to it."""
 SAFE = 0.99
 """The bound on the change of d, reduced for rounding."""
@@ -83,7 +83,7 @@ def believe(m: Array, y: float) -> None:
         if middle < m[FIRM_LOW, 0] or middle > m[FIRM_HIGH, 0]:
             m[FIRM_LOW, 0], m[FIRM_HIGH, 0] = min(m[FIRM_LOW, 0], middle), max(m[FIRM_HIGH, 0], middle)
             m[MOVED, 0] = 1.0
-        margin = FAR * (m[FIRM_HIGH, 0] - m[FIRM_LOW, 0])
+        margin = OUTERMOST * (m[FIRM_HIGH, 0] - m[FIRM_LOW, 0])
         bottom, top = m[FIRM_LOW, 0] - margin, m[FIRM_HIGH, 0] + margin
         y = min(max(y, bottom), top)
         m[LOWEST, 0], m[HIGHEST, 0] = max(m[LOWEST, 0], bottom), min(m[HIGHEST, 0], top)

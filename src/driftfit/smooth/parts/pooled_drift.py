@@ -69,8 +69,22 @@ def average_drift(walk: Walk, time: Array, trend: Array) -> Walk:
     """The walk with the average of the drifts, and with the paths of the single drifts.
 
     ``time`` (T,) are the intervals of drift before each sample, and ``trend`` (T,) those of motion along a slope. The
-    walk is returned unchanged if the likelihood cannot be computed accurately.
+    walk is returned unchanged if the likelihood cannot be computed accurately. Regressors that are always 0 take no
+    part, and their parameters stay at 0.
     """
+    moved = np.flatnonzero(np.any(walk.phi[walk.weight > 0.0] != 0.0, axis=0))
+    if len(moved) == walk.phi.shape[1]:
+        return averaged(walk, time, trend)
+    some = averaged(walk.of(moved), time, trend) if len(moved) else walk
+    if not len(some.paths):
+        return walk
+    drift_root, paths = np.zeros_like(walk.drift_root), np.zeros((len(some.paths), *walk.phi.shape))
+    drift_root[:, moved], paths[:, :, moved] = some.drift_root, some.paths
+    return walk._replace(drift_root=drift_root, trend=some.trend, paths=paths, belief=some.belief)
+
+
+def averaged(walk: Walk, time: Array, trend: Array) -> Walk:
+    """The same where every regressor moves."""
     q, span = walk.drift_root**2, time[:, None]
     rate = np.divide(q, span, out=np.zeros_like(q), where=span > 0.0)
     shapes = ((q, PRICE + len(q) / SHARE), (pooled(rate) * span, 0.0))

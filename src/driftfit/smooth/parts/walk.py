@@ -14,6 +14,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers
 from driftfit.trackers.base import RandomWalk
+from driftfit.trackers.parts.diffuse import WITHIN_SPAN
 
 NONE = np.zeros((0, 0))
 """No parameter has its own drift, and none has a slope."""
@@ -51,8 +52,9 @@ class Walk(NamedTuple):
     """(K, T, n): paths under other drifts that are possible too; empty if the drift is known."""
     belief: Array = NONE
     """(K,): their probabilities."""
-    about: Array = NONE
-    """(n, n): the parameters of the model are this matrix times theta; empty if they are theta."""
+    basis: Array = NONE
+    """(n, n): drifts, ``drift_root`` and ``paths`` are those of z, theta = basis z; empty if they are those of theta.
+    """
 
     @property
     def y(self) -> Array:
@@ -74,6 +76,19 @@ class Walk(NamedTuple):
         signals = self.signals.copy()
         signals[:, column] = values
         return self._replace(signals=signals)
+
+    def of(self, which: Array) -> Walk:
+        """The problem of some parameters with a diffuse start, if the regressors of the others are 0."""
+        phi, drift_root, q = self.phi[:, which], self.drift_root[:, which], self.q[np.ix_(which, which)]
+        return self._replace(phi=phi, drift_root=drift_root, q=q, theta0=self.theta0[which])
+
+    @property
+    def independent(self) -> Walk:
+        """The problem in z, whose drifts are independent."""
+        if not len(self.basis):
+            return self
+        phi, terms = self.phi @ self.basis, np.abs(self.phi) @ np.abs(self.basis)
+        return self._replace(phi=np.where(np.abs(phi) > WITHIN_SPAN * terms, phi, 0.0), basis=NONE)
 
     @property
     def used(self) -> int:

@@ -20,7 +20,7 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.curves.basis import Thresholds
-from driftfit.models.hammerstein_wiener.output_curve import FAR, WIDER
+from driftfit.models.hammerstein_wiener.output_curve import OUTERMOST, WIDER
 from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
 from driftfit.models.hammerstein_wiener.separation.paths import Blocks
 from driftfit.models.hammerstein_wiener.step_memory import GRID
@@ -111,7 +111,7 @@ def believed(y: Array) -> tuple[Array, Array]:
     if len(outputs) > 2:
         middle = np.median(np.stack([outputs[:-2], outputs[1:-1], outputs[2:]]), axis=0)
         bottom, top = np.minimum.accumulate(middle), np.maximum.accumulate(middle)
-        margin = FAR * (top - bottom)
+        margin = OUTERMOST * (top - bottom)
         bottom, top = bottom - margin, top + margin
         low[2:], high[2:] = np.maximum(outputs[2:], bottom), np.minimum(outputs[2:], top)
         low[:2], high[:2] = np.nan, np.nan

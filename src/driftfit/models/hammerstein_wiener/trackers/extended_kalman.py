@@ -14,8 +14,8 @@ Use it if an initial value near the truth is known, as from `hand_off`; from a d
 cannot. It is not iterated: the iterated filter failed in 17 % of the runs of example 1 of Feng and Hong (2021). A
 reading out of all proportion is refused (`driftfit.models.fault_codes`,
 `driftfit.models.hammerstein_wiener.readings`). After an input left its own range a sample is not used if its error is
-`FAR` times the usual one although the reading is within the range of earlier ones: a fault code of the input, to which
-the output did not respond.
+`CONTRADICTED` times the usual one although the reading is within the range of earlier ones: a fault code of the input,
+to which the output did not respond.
 
 Source: the implicit-measurement form of Jazwinski (1970), section 8.3; inflation and hand-off are ours. Only one
 triangle of P is kept. Cost per sample: O(n_x^2 + n).
@@ -43,7 +43,7 @@ from driftfit.trackers.parts.covariance import corrected, product_with
 from driftfit.trackers.parts.faults.omissions import omissions
 from driftfit.trackers.parts.varying_drift import read_drift
 
-LATELY, FAR = 0.3, 10.0
+LATELY, CONTRADICTED = 0.3, 10.0
 """Widths by which an input must have left its range, of which some are forgotten with each sample; and the multiple of
 the usual error from which on a sample contradicts the response to that."""
 FIRST, MEMORY = 8.0, 100.0
@@ -91,7 +91,7 @@ def leave_out_unmoved(s: State, e: float, l: int) -> None:
     """Leave out a sample after an input left its range, if the output did not respond: a fault code of the input."""
     square, y = e * e, s.blocks[RAW, l]
     unmoved = (y >= s.blocks[LEAST_Y, l]) & (y <= s.blocks[MOST_Y, l]) & (s.blocks[RESPONDING, l] > LATELY)
-    left = unmoved & (square > FAR * FAR * s.usual_square[l]) & (s.squares[l] >= FIRST)
+    left = unmoved & (square > CONTRADICTED * CONTRADICTED * s.usual_square[l]) & (s.squares[l] >= FIRST)
     used = s.ok[l] if not left else 0.0
     s.squares[l] += used
     s.usual_square[l] += used * (square - s.usual_square[l]) / min(max(s.squares[l], 1.0), MEMORY)

@@ -52,7 +52,7 @@ from driftfit.trackers.parts.covariance import measurement, prediction
 from driftfit.trackers.parts.diffuse import enter, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
-from driftfit.trackers.parts.modes.few_residuals import wider
+from driftfit.trackers.parts.few_residuals import wider
 from driftfit.trackers.parts.modes.noise_levels import LEAST_SHARE
 from driftfit.trackers.rls import learn_scale
 

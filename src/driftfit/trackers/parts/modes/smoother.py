@@ -15,19 +15,20 @@ mode, is ours.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
+from driftfit.trackers.parts.modes.drifts.about_means import STILL, centring
 from driftfit.trackers.parts.modes.drifts.one_direction import BESIDE
 from driftfit.trackers.parts.modes.ladder import TOP, chain
 from driftfit.trackers.parts.modes.noise_levels import level_chain
 
 SMOOTHER_FIELDS = (
     "joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight", "white",
-    "explained", "calm", "left_out", "shift", "direction", "replaced_by", "jumped", "busy", "variance",
+    "explained", "calm", "left_out", "shift", "direction", "replaced_by", "busy", "variance", "constant", "jumped",
 )  # fmt: skip
 """Fields that are stored at every sample."""
 
@@ -52,51 +53,64 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
     o.coarse[l] = s.coarse[l] / s.noise[l]  # in units of the noise factor, as r is
     o.leapt[l], o.weighed[l], o.settled[l], o.explained[l] = s.leapt[l], s.weighed[l], s.settled[l], s.explained[l]
     o.calm[l], o.left_out[l], o.shift[l] = s.calm[l], s.left_out[l], s.shift[l]
-    o.replaced_by[l], o.busy[l] = s.replaced_by[l], s.busy[l]
+    o.replaced_by[l], o.busy[l], o.constant[l] = s.replaced_by[l], s.busy[l], s.constant[l]
 
 
-def given_all(
-    after: Array, stay: Array, change: Array, rate: Array, moves: Array, by: Array, over: Array, begins: Array
-) -> Array:
-    """Probabilities (T, K) of states, given all samples; at samples that move, transitions are stay + rate_t change,
-    and before them a share over_t of state by_t >= 0 replaces the last one
-    (`driftfit.trackers.parts.modes.drifts.at_rest`). Where the last but one begins
-    (`driftfit.trackers.parts.modes.drifts.after_outlier`), it says nothing about earlier states."""
-    found, before = after.copy(), after.copy()
-    at = np.flatnonzero(by >= 0)
-    which = by[at]
-    before[at, which] = (1.0 - over[at]) * after[at, which] + after[at, -1]
-    before[at, -1] = over[at] * after[at, which]
-    ahead = before @ stay + rate[:, None] * (before @ change)
+def given_all(after: Array, ahead: Array, back: Callable[[int, Array], Array], moves: Array, begins: Array) -> Array:
+    """Probabilities (T, K) of states, given all samples, from those after each sample and those ``ahead`` of the next.
+
+    ``back(t, x)`` is T x, with the transitions T at a sample that moves. Where the last state but one ``begins``, it
+    says nothing about earlier ones.
+    """
+    found = after.copy()
     for t in range(len(found) - 2, -1, -1):
-        if not moves[t]:
-            found[t] = found[t + 1]
-            continue
-        new = found[t + 1, -2] if begins[t + 1] else 0.0
-        later = found[t + 1] / np.maximum(ahead[t], 1e-300)
-        later[-2] = 0.0 if begins[t + 1] else later[-2]
-        later = stay @ later + rate[t] * (change @ later)
-        if by[t] >= 0:
-            later[by[t]], later[-1] = (1.0 - over[t]) * later[by[t]] + over[t] * later[-1], later[by[t]]
-        found[t] = after[t] * later
+        later, new = found[t + 1].copy(), 0.0
+        if begins[t + 1]:
+            later[-2], new = 0.0, later[-2]
+        found[t] = after[t] * back(t, later / np.maximum(ahead[t], 1e-300)) if moves[t] else later
         found[t] *= (1.0 - new) / max(found[t].sum(), 1e-300)
         found[t] += new * after[t]
     return found
 
 
+def jumps(fields: Mapping[str, Array]) -> Array:
+    """The samples (T,) at which a filter begins to take an outlier for a jump."""
+    return (fields["weighed"] > 0) & fields["jumped"].any(axis=1)
+
+
+def modes_given_all(fields: Mapping[str, Array], state: Mapping[str, Any]) -> Array:
+    """Probabilities (T, K) of the filters, given all samples.
+
+    Before transitions stay + calm_t change, a share of another filter may replace the last one
+    (`driftfit.trackers.parts.modes.drifts.at_rest`), and the last but one may begin
+    (`driftfit.trackers.parts.modes.drifts.after_outlier`).
+    """
+    calm, by, weighed = fields["calm"], fields["replaced_by"].astype(int), fields["weighed"] > 0
+    over = state["over"][by] / np.append(1.0, fields["busy"][:-1])
+    stay, change = chain(state["moves"], state["arrive"])
+    ahead = fields["prior"]  # after the interaction, it is that of the next sample
+    after = np.where(weighed[:, None], fields["joint"].sum(axis=1), ahead)
+
+    def back(t: int, x: Array) -> Array:
+        x = stay @ x + calm[t] * (change @ x)
+        if by[t] >= 0:
+            x[by[t]], x[-1] = (1.0 - over[t]) * x[by[t]] + over[t] * x[-1], x[by[t]]
+        return x
+
+    return given_all(after, ahead, back, weighed, jumps(fields))
+
+
 def estimated_variances(
-    fields: Mapping[str, Array], e: Array, time: Array, state: Mapping[str, Any]
-) -> tuple[Array, Array, Array]:
-    """q (T, n), that of the drift about the means, and r (T,) of every sample, from the stored fields (T, ..), the
-    innovations and intervals of drift."""
+    fields: Mapping[str, Array], phi: Array, e: Array, time: Array, state: Mapping[str, Any]
+) -> tuple[Array, Array, Array, Array]:
+    """q (T, n), that of the drift about the means, the matrix of `centring` for this drift, and r (T,) of every sample,
+    from the stored fields (T, ..), the regressors (N, n) of used samples, the innovations and intervals of drift.
+
+    Which column is constant is what the filters knew after the last sample.
+    """
     running, weighed = fields["settled"] > 0, fields["weighed"] > 0
     r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
-    after = np.where(weighed[:, None], fields["joint"].sum(axis=1), fields["prior"])
-    J = len(state["level"]) - 1
-    replaced_by, span, learned = fields["replaced_by"].astype(int), r * time, state["learned"]
-    jumped = weighed & fields["jumped"].any(axis=1)
-    over = state["over"][replaced_by] / fields["busy"]
-    w = given_all(after, *chain(state["moves"], state["arrive"]), fields["calm"], weighed, replaced_by, over, jumped)
+    w, span, learned = modes_given_all(fields, state), r * time, state["learned"]
     along, first = np.zeros(len(learned)), state["first_along"]
     along[first : first + len(state["along"])] = state["along"]
     ratio = np.where((learned > 0.0) | (along > 0.0), 0.0, state["ratio"])
@@ -107,16 +121,18 @@ def estimated_variances(
         drift = w @ ratio.T + (w @ learned)[:, None] * fields["weight"] + (w @ along)[:, None] * share
         q = (drift + (w[:, TOP] * leapt)[:, None] * ratio[:, TOP]) * span[:, None] / fields["c"]
         first = state["first_about"]
-        own = np.where(fields["variance"] > 0.0, fields["variance"], fields["c"])
+        constant = int(fields["constant"][-1])
+        beside = (constant >= 0) & (np.arange(len(state["theta"])) != constant)
+        own = np.where(beside, fields["variance"], fields["c"])
         about = ((w[:, first : first + len(state["about"])] @ state["about"]) * span)[:, None] / own
     drifts = running[:, None] & (span[:, None] > 0.0) & (fields["c"] > 0.0)
-    q, about = np.where(drifts, q, 0.0), np.where(drifts, about, 0.0)
-    began = np.where(jumped, w[:, -2], 0.0)
+    q, about = np.where(drifts, q, 0.0), np.where(drifts & (own > STILL * fields["c"]), about, 0.0)
+    began = np.where(jumps(fields), w[:, -2], 0.0)
     q += began[:, None] * fields["jumped"]
-    never = np.zeros((J, J)), np.zeros(len(r)), weighed, np.full(len(r), -1), r, np.zeros(len(r), bool)
-    levels = given_all(fields["nu"][:, :-1], level_chain(), *never)
+    nu, steps = fields["nu"][:, :-1], level_chain()
+    levels = given_all(nu, nu @ steps, lambda t, x: steps @ x, weighed, np.zeros(len(r), bool))
     v = np.sum(levels * np.maximum(state["level"][:-1] * r[:, None], fields["coarse"][:, None]), axis=1)
     v = np.where(running, v + fields["coarse"] * fields["alike"] * (fields["alike"] + 2.0), r) * fields["leverage"]
     outlier = np.where(weighed, fields["joint"][:, -1].sum(axis=1), 0.0) * (1.0 - began)
     far = np.maximum(state["level"][-1] * v, np.where(weighed, e * e, 0.0))
-    return q, about, 1.0 / ((1.0 - outlier) / v + outlier / far)
+    return q, about, centring(phi, constant), 1.0 / ((1.0 - outlier) / v + outlier / far)

@@ -13,7 +13,8 @@ as the non-negative solution of
 whose sums fade. The pass is made every `BLOCK` samples over the last `WINDOW`, and counts the oldest block, for which
 later samples show which parameter moved. The second ladder of drift ratios climbs in these proportions, rho_i / max_j
 rho_j (`driftfit.trackers.parts.modes.ladder`). The same pass finds the direction in which all parameters may drift
-together (`driftfit.trackers.parts.modes.drifts.one_direction`).
+together (`driftfit.trackers.parts.modes.drifts.one_direction`). The drift about the means is not counted in p: it is
+none of single parameters, and what its filters explain, these need not explain again.
 
 Source: the smoother and its scores are Koopman and Shephard (1992); solving for all variances together, as data
 arrive, is ours. Cost per sample: O(n^2).
@@ -28,6 +29,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, kernel, machine, shared
 from driftfit.trackers.parts.faults.first_samples import PHI
+from driftfit.trackers.parts.faults.outlying_readings import LEVERAGE
 from driftfit.trackers.parts.modes.drifts.one_direction import (
     FACTOR,
     TIME,
@@ -48,6 +50,8 @@ SWEEPS = 20
 """Sweeps over the parameters for the solution."""
 FLOOR = 0.001
 """Smallest weight."""
+SOUND = 10.0 * WINDOW * LEVERAGE
+"""No entry of N is larger: each sample adds at most `LEVERAGE`, and coloured noise four times as much."""
 TINY = 1e-300
 """Added to what is divided by."""
 
@@ -123,6 +127,20 @@ def look_back(past: Array, gains: Array, newest: int, t: Array, moments: Array) 
 
 
 @shared
+def forget_rounding(t: Array, moments: Array) -> None:
+    """Begin again if N exceeds the information of the samples: regressors differ in their last digits alone."""
+    n, sound = t.shape[1], True
+    for i in range(n):
+        for j in range(n):
+            sound = sound and abs(t[N + 2 * i, j]) <= SOUND
+    for j in range(0 if sound else n):
+        for i in range(t.shape[0]):
+            t[i, j] = 0.0
+        for i in range(moments.shape[0]):
+            moments[i, j] = 0.0
+
+
+@shared
 def solve(t: Array) -> None:
     """Compute the weights from the sums."""
     n = t.shape[1]
@@ -147,6 +165,7 @@ def machine_weights(past: int, gains: int, newest: int, scores: int, moments: in
     t, k = cubes(scores, A + 2 * n, n, L)[:, :, l], cubes(gains, WINDOW, n, L)[:, :, l]
     m = cubes(moments, B + 3 * n, n, L)[:, :, l]
     look_back(cubes(past, WINDOW, PHI + n, L)[:, :, l], k, newest, t, m)
+    forget_rounding(t, m)
     solve(t)
     add_block(t[ASSUMED], m)
     turn(t[ADJOINT], m)

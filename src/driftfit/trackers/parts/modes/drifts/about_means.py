@@ -24,14 +24,14 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import State, kernel
+from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.excitation import DULL, LARGE, MEMORY
 from driftfit.trackers.parts.faults.outlying_readings import FIRST
 
 ABOUT = (1e-3, 1e-2, 0.1, 1.0)
 """Drift ratios of the filters."""
-STILL = 1e-14
-"""Variance of a column, as a share of its mean square, below which it counts as constant."""
+STILL = 1e-24
+"""Variance of a column, as a share of its mean square, below which it counts as constant: it may be rounding."""
 
 
 def no_means(n: int, first: int) -> dict[str, Any]:
@@ -43,6 +43,7 @@ def no_means(n: int, first: int) -> dict[str, Any]:
         "variance": np.zeros(n),
         "phi_before": np.zeros(n),
         "steps_taken": np.zeros(n),
+        "constant": -1,
         "away": np.zeros(n),
         "about_drift": np.zeros((n, n)),
     }
@@ -50,7 +51,10 @@ def no_means(n: int, first: int) -> dict[str, Any]:
 
 @kernel
 def learn_means(s: State, l: int) -> None:
-    """Update means and variances of the regressors that have moved since the sample before."""
+    """Update means and variances of the regressors that have moved since the sample before, and ``s.constant``, the
+    last column that is constant and not 0, or -1.
+    """
+    constant = -1
     for i in range(s.theta.shape[0]):
         step = s.phi[i, l] - s.phi_before[i, l]
         moved = (s.steps_taken[i, l] < 1.0) | (step * step > DULL * s.variance[i, l] * s.noise[l])
@@ -63,6 +67,8 @@ def learn_means(s: State, l: int) -> None:
         most = LARGE * s.variance[i, l] if s.steps_taken[i, l] > FIRST else np.inf
         s.variance[i, l] += share * (min(square, most) - s.variance[i, l])
         s.phi_before[i, l] = s.phi[i, l] if s.ok[l] > 0.0 else s.phi_before[i, l]
+        constant = i if (s.variance[i, l] <= STILL * s.c[i, l]) & (s.mean[i, l] != 0.0) else constant
+    s.constant[l] = constant
 
 
 @kernel
@@ -71,28 +77,18 @@ def forget_mean(s: State, i: int, l: int) -> None:
     s.mean[i, l], s.variance[i, l], s.steps_taken[i, l] = 0.0, 0.0, 0.0
 
 
-@kernel
-def constant_column(s: State, l: int) -> int:
-    """The last column that is constant and not 0, or -1."""
-    found = -1
-    for i in range(s.theta.shape[0]):
-        still = s.variance[i, l] <= STILL * s.c[i, l]
-        found = i if still & (s.mean[i, l] != 0.0) else found
-    return found
-
-
 @partial(kernel, inline=False)
 def drift_about(s: State, size: float, l: int) -> None:
     """Drift about the means: ``size`` in units of the ratios over the variances of the regressors."""
-    n, k = s.parameters[l], constant_column(s, l)
+    n, k = s.parameters[l] if s.about.shape[0] > 0 else 0, s.constant[l]
     for a in range(n):
         for b in range(a + 1):
             s.about_drift[a, b, l] = 0.0
-    for i in range(n if s.about.shape[0] > 0 else 0):
+    for i in range(n):
         beside = (k >= 0) & (i != k)
         own = s.variance[i, l] if beside else s.c[i, l]
-        own = own if own > STILL * s.c[i, l] else 0.0
-        for a in range(n if own > 0.0 else 0):
+        rows = max(i, k) + 1 if own > STILL * s.c[i, l] else 0  # S is triangular
+        for a in range(rows):
             s.away[a, l] = s.S[a, i, l] - (s.mean[i, l] / s.mean[k, l] * s.S[a, k, l] if beside else 0.0)
             for b in range(a + 1):
                 s.about_drift[a, b, l] += s.away[a, l] * s.away[b, l] / own
@@ -100,3 +96,15 @@ def drift_about(s: State, size: float, l: int) -> None:
         for b in range(a + 1):
             for j in range(s.about.shape[0]):
                 s.C[a, b, s.first_about[l] + j, l] += size * s.about[j, l] * s.about_drift[a, b, l]
+
+
+def centring(phi: Array, constant: int) -> Array:
+    """A (n, n), for which phi A are the regressors phi (N, n) less their means, beside the constant column; the
+    identity if there is none, -1.
+    """
+    A = np.eye(phi.shape[1])
+    if constant >= 0:
+        mean = phi.mean(axis=0)
+        A[constant] = -mean / mean[constant]
+        A[constant, constant] = 1.0
+    return A
