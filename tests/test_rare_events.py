@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from driftfit import RLS, Regression, track
-from driftfit.judge.statistics.constancy import constancy
+from driftfit.judge.statistics.constancy import constancy, full_rank
 
 
 def rare(kind, seed, T=400):
@@ -58,3 +58,9 @@ def test_noise_that_is_louder_in_rare_pulses():
     runs = (track(Regression(1, intercept=True), RLS(1.0), y, phi[:, 0]) for phi, y in
             (pulses(seed, louder=10.0) for seed in range(60)))  # fmt: skip
     assert np.mean([bool(run.verdict().drifts) for run in runs]) < 0.2
+
+
+def test_scores_that_are_dependent_but_for_rounding_judge_nothing():
+    """A covariance of scores with an eigenvalue of -1e-15 passed for regular, and had no Cholesky factor."""
+    assert not full_rank(np.array([[1.0, 1.0], [1.0, 1.0 - 1e-15]]))
+    assert full_rank(np.array([[1.0, 1.0 - 1e-9], [1.0 - 1e-9, 1.0]]))

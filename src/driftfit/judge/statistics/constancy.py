@@ -72,7 +72,7 @@ FEW = 16.0
 """Rows in an interval of rare events, in units of their squared skewness: that of the sum is then a quarter."""
 CLIPPED = 0.1
 """Smallest information in any direction, as a share of that of all residuals, that clipping may leave."""
-REGULAR = 1e-15
+REGULAR = 1e-14
 """The smallest eigenvalue of a correlation matrix that is regular."""
 EDGE = 0.05
 """Share of a record at each end in which no date is searched."""
@@ -278,7 +278,7 @@ def full_rank(M: Array) -> bool:
     size = np.sqrt(np.diag(M))
     if not (size > 0.0).all():
         return False
-    return bool(np.linalg.matrix_rank(M / size / size[:, None], REGULAR, hermitian=True) == len(M))
+    return bool(np.linalg.eigvalsh(M / size / size[:, None])[0] > REGULAR)
 
 
 def _nothing(N: int, n: int) -> Constancy:
