@@ -5,7 +5,8 @@ forgetting factor, and NLMS (normalised least mean squares) the step, with the s
 *In band* is the share of outputs within the 95 % band of `AdaptiveKalman`, *conformal* that of its band with
 ``output_band(conformal=True)``. *Constant LS* is RLS without forgetting, and *constant ARX* least squares on two lags
 of the output, the last value of each input, and an intercept. The last columns are its error over that
-of the best of them, and over that of the best with the same regressors: all but the constant ARX.
+of the best of them, the t of Diebold and Mariano (1995) for the claim that this best one is worse, and its error over
+that of the best with the same regressors: all but the constant ARX.
 
 The records are not part of the project. The folder must contain, besides those of `real_records.py`,
 heat_exchanger.csv (DaISy), pump_loop_skab.csv (SKAB), air_quality_sensors.csv (UCI) and us_consumption_change.csv
@@ -28,6 +29,7 @@ from rich.table import Table
 from driftfit import ARX, RLS, AdaptiveKalman, Regression, track
 from driftfit.data import read_columns
 from driftfit.judge.compare import persistence
+from driftfit.judge.statistics.paired import paired
 from driftfit.results import Track
 from driftfit.run.result import root_mean_square
 
@@ -138,7 +140,7 @@ def within(run: Track, conformal: bool, scored: np.ndarray) -> float:
 def main(folder: str) -> None:
     table = Table(box=SIMPLE_HEAD, show_edge=False)
     names = ("persistence", "constant LS", "constant ARX", "NLMS", "RLS")
-    for head in ("record", "AdaptiveKalman", "in band", "conformal", *names, "over the best", "same phi"):
+    for head in ("record", "AdaptiveKalman", "in band", "conformal", *names, "over the best", "t", "same phi"):
         table.add_column(head, justify="left" if head == "record" else "right", no_wrap=True)
     for read in CASES:
         case = read(Path(folder))
@@ -152,9 +154,11 @@ def main(folder: str) -> None:
         rivals = [case.level - persistence(case.level), fixed[0], arx, tuned(stepped, half), tuned(fixed, half)]
         scored = np.isfinite([run.innovation, *rivals]).all(axis=0) & (np.arange(len(case.y)) >= half)
         own, *others = (root_mean_square(e[scored]) for e in (run.innovation, *rivals))
+        best = int(np.argmin(others))
+        t = paired(names[best], rivals[best][scored], run.innovation[scored]).t
         inside = [within(run, conformal, scored) for conformal in (False, True)]
         alike = [error for name, error in zip(names, others, strict=True) if name != "constant ARX"]
-        ratios = (f"{own / min(others):.2f}", f"{own / min(alike):.2f}")
+        ratios = (f"{own / others[best]:.2f}", f"{t:.1f}", f"{own / min(alike):.2f}")
         numbers = (f"{own:.3g}", *(f"{share:.2f}" for share in inside), *(f"{other:.3g}" for other in others), *ratios)
         table.add_row(case.name, *numbers)
     Console(width=170).print(table)
