@@ -112,18 +112,20 @@ def holm(p: Array, level: float) -> Array:
     return rejected
 
 
-def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | None = None) -> Attribution:
-    """Explain the changes in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags)`."""
-    own, bic = _attributed(phi, y, test, np.eye(phi.shape[1]), level, lags)
+def attribute(
+    phi: Array, y: Array, test: Constancy, level: float, lags: int | None = None, coarse: Array | None = None
+) -> Attribution:
+    """Explain the changes in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags, step=coarse)`."""
+    own, bic = _attributed(phi, y, test, np.eye(phi.shape[1]), level, lags, coarse)
     M = centring(phi)
     if M is None:
         return own
-    centred, other = _attributed(phi @ M, y, transformed(test, phi, M, lags), M, level, lags)
+    centred, other = _attributed(phi @ M, y, transformed(test, phi, M, lags), M, level, lags, coarse)
     return centred if other <= bic else own
 
 
 def _attributed(
-    phi: Array, y: Array, test: Constancy, M: Array, level: float, lags: int | None
+    phi: Array, y: Array, test: Constancy, M: Array, level: float, lags: int | None, coarse: Array | None
 ) -> tuple[Attribution, float]:
     """The same for steps of the coefficients of phi, of which theta is M times; and BIC, a date and a size per step."""
     N, n = phi.shape
@@ -137,7 +139,7 @@ def _attributed(
         p[step.parameter] = min(p[step.parameter], now.p_own[step.parameter])
         X = _with(phi, steps)
         steps.append(step)
-        later = constancy(_with(phi, steps), y, lags, None if test.noise is None else test.noise.at)
+        later = constancy(_with(phi, steps), y, lags, None if test.noise is None else test.noise.at, coarse)
         testable = not np.isnan(later.p_joint)
         if not testable and not orthonormal(_with(phi, steps)).distinct:
             steps.pop()
