@@ -1,0 +1,44 @@
+"""Changes while an input rests, or two move together: the record may not tell which parameter moved."""
+
+import numpy as np
+import pytest
+
+from driftfit import RLS, Regression, track
+
+
+def resting(seed, slope, back, level=20.0):
+    """An intercept or a slope that moves by 1.3 at the output while the input rests from 300 to 450."""
+    rng = np.random.default_rng(seed)
+    u = 5.0 * rng.normal(size=600)
+    u[300:450] = level
+    moved = np.zeros(600)
+    moved[350 : 450 if back else 600] = 1.3
+    y = 3.7 + 2.0 * u + moved * (u / level if slope else 1.0) + 0.1 * rng.normal(size=600)
+    return track(Regression(["u"], intercept=True), RLS(1.0), y, u).verdict()
+
+
+@pytest.mark.parametrize("slope", [False, True])
+def test_a_change_that_ends_with_the_rest_of_an_input_may_be_of_either(slope):
+    found = [[{m.name, *m.instead} for m in resting(seed, slope, True).parameters if m.moves] for seed in range(6)]
+    assert sum({"u", "intercept"} in names for names in found) >= 5
+    verdict = resting(1, slope, True)
+    assert "(or intercept: their steps explain the record as well)" in verdict.sentences[1]
+
+
+@pytest.mark.parametrize("slope", [False, True])
+def test_a_change_that_outlasts_the_rest_is_of_one(slope):
+    for seed in range(4):
+        (moved,) = [m for m in resting(seed, slope, False).parameters if m.moves]
+        assert (moved.name, moved.instead) == ("u" if slope else "intercept", ())
+
+
+def test_inputs_that_move_together_during_a_change():
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        u = 2.0 * rng.normal(size=(600, 2))
+        u[300:450, 1] = u[300:450, 0]
+        b = 1.0 + 0.3 * ((np.arange(600) >= 350) & (np.arange(600) < 450))
+        y = b * u[:, 0] + 2.0 * u[:, 1] + 1.0 + 0.1 * rng.normal(size=600)
+        moved = [m for m in track(Regression(2, intercept=True), RLS(1.0), y, u).verdict().parameters if m.moves]
+        assert moved
+        assert all({"theta1", "theta2"} <= {m.name, *m.instead} for m in moved)
