@@ -1,9 +1,9 @@
-"""Tests of constancy on readings of a coarse sensor, whose errors of rounding last as long as an input is held."""
+"""Verdicts and alarms on readings of a coarse sensor, whose errors of rounding last as long as an input is held."""
 
 import numpy as np
 import pytest
 
-from driftfit import RLS, Regression, track
+from driftfit import RLS, Live, Regression, track
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.regressors import regressors
 from driftfit.judge.statistics.parts.coarse_readings import drawn_within, step_of
@@ -52,3 +52,25 @@ def test_readings_of_a_fine_sensor_and_loud_ones_remain_as_they_are():
     assert (np.abs(z - quiet) <= 0.5 + 1e-9).all()
     assert np.std(z - Q @ (Q.T @ z) / 300) == pytest.approx(0.2, rel=0.25)
     np.testing.assert_array_equal(z, drawn_within(Q, quiet, np.ones(300)))
+
+
+def test_alarms_of_a_coarse_sensor_are_those_of_changes_in_a_record_and_in_a_stream(tmp_path):
+    runs = [coarse(seed, 0.2, 10) for seed in range(12)]
+    assert sum(len(run.detect(reference=250).onsets) > 0 for run in runs) <= 2
+    run = coarse(3, 0.2, 10, 0.1, 1.0)
+    record = run.detect(reference=250)
+    assert record.rule.rounding == pytest.approx((0.1, 0.02), rel=0.2)
+    assert 300 <= record.onsets[0] < 310
+    live = Live(run.model, RLS(1.0))
+    for t in range(250):
+        live.update(run.y[t], run.u[t])
+    alarm = live.detect(record.rule, wait=0)
+    found = []
+    for t in range(250, 400):
+        if t == 320:  # a stream that is saved goes on with the same numbers
+            live.save(tmp_path / "stream")
+            live = Live.load(tmp_path / "stream")
+            (alarm,) = live.alarms
+        live.update(run.y[t], run.u[t])
+        found.append(alarm.statistic.copy())
+    np.testing.assert_array_equal(np.array(found), record.statistic[250:400])

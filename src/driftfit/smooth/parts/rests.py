@@ -88,7 +88,7 @@ def undecided(walk: Walk, size: Array) -> Array:
     for first, end in found:
         x = walk.phi[first]
         others = {
-            i: smooth_and_weigh(walk._replace(drift_root=np.sqrt(alone(q, x, i, first, end))), size)
+            int(i): smooth_and_weigh(walk._replace(drift_root=np.sqrt(alone(q, x, int(i), first, end))), size)
             for i in np.flatnonzero(x)
         }
         known = {i: one for i, one in others.items() if one is not None}

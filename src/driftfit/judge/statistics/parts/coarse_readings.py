@@ -8,7 +8,7 @@ next level, so that sums of residuals wander although theta is constant. It has 
 q^2) at most, which a noise of half a step averages to nothing. With less noise, the tests judge z_t: if theta is
 constant, it has the errors S w_t, whatever the inputs do. A change that is smaller than the step moves z_t by less than
 the reading, and only as far as readings can tell; one that is larger moves it as much, less half a step. The U_t are
-those of a fixed seed: the same record has the same verdict.
+functions of t: the same record has the same verdict (`driftfit.run.live.frozen.rounding`).
 
 theta and S are those of greatest likelihood of the intervals, on readings near the fit. If they move, S is large, and
 the readings remain as they are. Readings of a fine sensor always remain as they are, and so do those that constants
@@ -21,11 +21,12 @@ theta / S and 1 / S. Cost: O(N n^2) for each of some ten iterations.
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtr
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.robust import robust_fit
+from driftfit.run.live.frozen.rounding import chances, drawn
 
 MOST = 0.6
 """Noise in units of the step from which on rounding has no mean: its share of the step is below 0.0003."""
@@ -65,25 +66,23 @@ def drawn_within(X: Array, y: Array, step: Array, breaks: Array = NONE) -> Array
     if len(breaks):
         own = np.arange(len(breaks) + 1) == np.searchsorted(breaks, np.arange(len(y)), side="right")[:, None]
         X = (own[:, :, None] * X[:, None, :]).reshape(len(y), -1)
+    found = explained(X, y, step)
+    return y if found is None else drawn(y, *found, 0.5 * step, chances(0, len(y)))
+
+
+def explained(X: Array, y: Array, step: Array) -> tuple[Array, float] | None:
+    """m (N,) and S of greatest likelihood; None if the readings are not those of constants, or the noise averages the
+    errors of rounding.
+    """
     e = robust_fit(X, y).residual
-    h, m = 0.5 * step, y - e
-    q = float(np.median(step))
+    h, m, q = 0.5 * step, y - e, float(np.median(step))
     if q <= 0.0 or np.quantile(m / step, 0.95) - np.quantile(m / step, 0.05) < 1.0:
-        return y
+        return None
     near = np.abs(e) <= h + FAR * MOST * step
     if np.mean(~near) > STRANGE:
-        return y
+        return None
     moved, S = _most_likely(X[near], e[near], h[near], MOST * q)
-    if MOST * q <= S:
-        return y
-    m, S = m + X @ moved, max(S, LEAST * q)
-    low, high = (y - h - m) / S, (y + h - m) / S
-    side = np.where(low + high > 0.0, -1.0, 1.0)  # tails have digits on the left
-    low, high = np.where(side > 0.0, low, -high), np.where(side > 0.0, high, -low)
-    below, chance = ndtr(low), np.random.default_rng(0).random(len(y))
-    with np.errstate(divide="ignore"):
-        w = np.clip(ndtri(below + chance * (ndtr(high) - below)), low, high)
-    return np.asarray(m + S * side * w)
+    return None if MOST * q <= S else (m + X @ moved, max(S, LEAST * q))
 
 
 def _most_likely(X: Array, e: Array, h: Array, S: float) -> tuple[Array, float]:
