@@ -64,6 +64,9 @@ def test_a_rest_is_far_longer_than_usual():
     x[:, 0] = np.arange(600)
     x[100:300, 0] = 5.0
     gaps = np.where(np.arange(600) % 7 == 0, 0.0, 1.0)
-    assert rests(x, np.ones(600)) == [(100, 300)]
-    assert rests(x, gaps) == [(100, 300)]
+    assert rests(x, np.ones(600)) == [(100, 300, (0, 1))]
+    assert rests(x, gaps) == [(100, 300, (0, 1))]
     assert rests(x, np.zeros(600)) == []
+    moving = np.column_stack([x, np.cos(np.arange(600.0))])
+    assert rests(moving, gaps) == [(100, 300, (0, 1))]
+    assert rests(moving[:, [0, 2]], gaps) == []

@@ -42,7 +42,7 @@ from driftfit.run.live.frozen.reference_model import (
     judgeable,
     memory_of,
 )
-from driftfit.run.live.frozen.rounding import chances, drawn
+from driftfit.run.live.frozen.rounding import chances, drawn, seed_of
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
@@ -137,15 +137,15 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
 
 def _drawn(phi: Array, y: Array, step: float, root: Array, ok: Array) -> tuple[Array, tuple[float, ...]]:
     """Readings y (N,) of a reference, drawn again within the step of a coarse sensor over ``root`` (N,), and (step,
-    noise) of it; as they are, and (), if constants do not explain those that are ``ok`` as rounded ones.
+    noise, seed) of it; as they are, and (), if constants do not explain those that are ``ok`` as rounded ones.
     """
     basis = orthonormal(phi[ok]) if step else None
     found = explained(basis.Q, y[ok], step / root[ok]) if basis is not None and basis.distinct else None
     if found is None:
         return y, ()
-    y = y.copy()
-    y[ok] = drawn(y[ok], *found, 0.5 * step / root[ok], chances(0, int(ok.sum())))
-    return y, (step, found[1])
+    seed, y = seed_of(y[ok], step / root[ok]), y.copy()
+    y[ok] = drawn(y[ok], *found, 0.5 * step / root[ok], chances(0, int(ok.sum()), seed))
+    return y, (step, found[1], float(seed + 1))  # later samples draw other numbers
 
 
 def _stuck(run: Track) -> Array:

@@ -71,7 +71,7 @@ class AlarmRule(Settings):
         That model, as `driftfit.run.live.frozen.reference_model.Frozen`.
     growth : (c,)
         Growth of the squares of the limits with log(every).
-    rounding : () or (step, noise)
+    rounding : () or (step, noise, seed)
         Of a coarse sensor: its readings are drawn again within the step (`driftfit.run.live.frozen.rounding`).
     unsure : number
         Standard deviation of the log of the real rate of false alarms, which errors of the reference leave.
@@ -116,8 +116,9 @@ class AlarmRule(Settings):
         theta, mean = (np.array(self.frozen[k], float) for k in (THETA, MEAN))
         constant = int(self.frozen[OF_NUMBERS][CONSTANT])
         away = np.sum(theta * mean) * phi[:, constant] if len(mean) else 0.0
-        step, size = self.rounding
-        return drawn(y, np.sum(phi * theta, axis=1) - away, size * np.sqrt(noise), 0.5 * step, chances(first, len(y)))
+        step, size, seed = self.rounding
+        chance = chances(first, len(y), int(seed))
+        return drawn(y, np.sum(phi * theta, axis=1) - away, size * np.sqrt(noise), 0.5 * step, chance)
 
     @property
     def real_rate(self) -> tuple[float, float]:

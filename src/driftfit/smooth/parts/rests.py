@@ -1,21 +1,23 @@
-"""Drift while the inputs rest, of which the record shows only what it does to the output.
+"""Drift while inputs rest, of which the record shows only what it does to the output.
 
-While the regressors x of successive samples are the same, theta is observed along x only, and how the drift q_t (n,)
-was divided among the parameters before decides which of them seems to move. In a rest that is far longer than usual,
-each parameter with x_i != 0 may be the one that moves alone, by as much at the output,
+While the regressors x_i of some parameters G stay the same, as that of an intercept always does, only sum_G x_i theta_i
+is observed, and how the drift q_t (n,) was divided among them before decides which of them seems to move. In a rest
+that is far longer than usual, each of G with x_i != 0 may be the one of them that moves, by as much at the output,
 
-    q_ti = sum_j x_j^2 q_tj / x_i^2,   q_tj = 0 for all others,
+    q_ti = sum_{j in G} x_j^2 q_tj / x_i^2,   q_tj = 0 for the others in G,
 
 and at both ends of the rest, where the change may begin or end as well, by all of that at once. The likelihoods L_i of
 the record under these drifts, and L_0 under q, which was fitted to it, tell where the change outlasts the rest:
 otherwise those of all i are equal. Variances grow by the spread of the paths within the rest,
 
-    sum_i w_i (theta_i - theta) (theta_i - theta)',   w_i = L_i / (L_1 + .. + L_n + L_0 exp(-PRICE))
+    sum_i w_i (theta_i - theta) (theta_i - theta)',   w_i = L_i / (sum_{j in G} L_j + L_0 exp(-PRICE))
 
-Regressors with lags of an output never rest. Source: ours. Cost: n smoothers for each of at most `MOST` rests.
+Lags of an output never rest. Source: ours. Cost: n smoothers for each of at most `MOST` rests.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,17 +41,34 @@ SAME = 1e-9
 """Change of a regressor, as a share of it, that is rounding."""
 
 
-def rests(phi: Array, weight: Array) -> list[tuple[int, int]]:
-    """(first, end) of the rests among samples (T, n); samples without weight may lie between."""
+class Rest(NamedTuple):
+    """Samples first .. end - 1, and the parameters whose regressors stay the same."""
+
+    first: int
+    end: int
+    same: tuple[int, ...]
+
+
+def rests(phi: Array, weight: Array) -> list[Rest]:
+    """The rests among samples (T, n) in which two parameters or more cannot be told apart; samples without weight may
+    lie between.
+    """
     used = np.flatnonzero(weight > 0.0)
     if not len(used):
         return []
     x = phi[used]
-    same = np.all(np.abs(np.diff(x, axis=0)) <= SAME * np.abs(x[1:]), axis=1)
-    edges = np.concatenate([[0], np.flatnonzero(~same) + 1, [len(used)]])
-    length = np.diff(edges)
-    least = max(SHORTEST, USUAL * float(np.median(length)))
-    return [(int(used[edges[k]]), int(used[edges[k + 1] - 1]) + 1) for k in np.flatnonzero(length >= least)]
+    moves = np.vstack([np.abs(np.diff(x, axis=0)) > SAME * np.abs(x[1:]), np.ones(phi.shape[1], bool)])
+    found = set()
+    for own in moves.T:
+        ends = np.flatnonzero(own) + 1
+        length = np.diff(ends, prepend=0)
+        least = max(SHORTEST, USUAL * float(np.median(length)))
+        for end, count in zip(ends[length >= least], length[length >= least], strict=True):
+            part = slice(end - count, end)
+            same = np.flatnonzero(~moves[part][:-1].any(axis=0) & (x[end - count] != 0.0))
+            if len(same) > 1:
+                found.add(Rest(int(used[end - count]), int(used[end - 1]) + 1, tuple(same.tolist())))
+    return sorted(found)
 
 
 def beside(first: int, end: int) -> slice:
@@ -57,17 +76,19 @@ def beside(first: int, end: int) -> slice:
     return slice(max(first - BESIDE, 0), end + BESIDE)
 
 
-def drift_of_output(walk: Walk, q: Array, rest: tuple[int, int]) -> float:
-    """The variance by which q (T, n) moves the output during a rest, in units of that of its noise."""
-    first, end = rest
-    return float(np.sum(q[beside(first, end)] @ walk.phi[first] ** 2) * np.median(walk.weight[first:end]))
+def drift_of_output(walk: Walk, q: Array, rest: Rest) -> float:
+    """The variance by which the drift of its parameters moves the output in a rest, in units of that of the noise."""
+    first, end, same = rest
+    share = q[beside(first, end)][:, same] @ walk.phi[first, same] ** 2
+    return float(np.sum(share) * np.median(walk.weight[first:end]))
 
 
-def alone(q: Array, x: Array, i: int, first: int, end: int) -> Array:
-    """The drift (T, n) if only parameter i moves in a rest at x (n,), and at its ends."""
+def alone(q: Array, x: Array, i: int, rest: Rest) -> Array:
+    """The drift (T, n) if only parameter i of those of a rest at x (n,) moves in it, and at its ends."""
+    first, end, same = rest
     span, found = beside(first, end), q.copy()
-    own = q[span] @ x**2 / x[i] ** 2
-    found[span] = 0.0
+    own = q[span][:, same] @ x[list(same)] ** 2 / x[i] ** 2
+    found[span, same] = 0.0
     found[first:end, i] = own[first - span.start :][: end - first]
     found[[first, min(end, len(q) - 1)], i] += own.sum()
     return found
@@ -77,24 +98,22 @@ def undecided(walk: Walk, size: Array) -> Array:
     """Paths (K, T, n) of which the squared distances from the path of the walk add up to the spread; K is 0 where no
     rest leaves anything undecided. ``size`` is that of the columns.
     """
-    q, n = walk.drift_root**2, walk.phi.shape[1]
-    moved = {one: drift_of_output(walk, q, one) for one in rests(walk.phi, walk.weight) if n > 1}
+    q = walk.drift_root**2
+    moved = {one: drift_of_output(walk, q, one) for one in rests(walk.phi, walk.weight)}
     found = sorted((one for one in moved if moved[one] > LITTLE), key=lambda one: -moved[one])[:MOST]
     base = smooth_and_weigh(walk, size) if found else None
     if base is None:
         return np.zeros((0, *walk.phi.shape))
-    theta, log_p = base[0].theta, base[1]
-    paths = np.repeat(theta[None], n, axis=0)
-    for first, end in found:
-        x = walk.phi[first]
-        others = {
-            int(i): smooth_and_weigh(walk._replace(drift_root=np.sqrt(alone(q, x, int(i), first, end))), size)
-            for i in np.flatnonzero(x)
-        }
-        known = {i: one for i, one in others.items() if one is not None}
-        logs = np.array([log_p - PRICE, *(one[1] for one in known.values())])
+    theta, paths = base[0].theta, []
+    for rest in found:
+        part = slice(rest.first, rest.end)
+        drifts = [alone(q, walk.phi[rest.first], i, rest) for i in rest.same]
+        others = [smooth_and_weigh(walk._replace(drift_root=np.sqrt(one)), size) for one in drifts]
+        known = [one for one in others if one is not None]
+        logs = np.array([base[1] - PRICE, *(one[1] for one in known)])
         w = np.exp(np.minimum(logs - logs.max() + ALIKE, 0.0))
         w /= w.sum()
-        for (i, one), share in zip(known.items(), w[1:], strict=True):
-            paths[i, first:end] += np.sqrt(share) * (one[0].theta - theta)[first:end]
-    return paths
+        for one, share in zip(known, w[1:], strict=True):
+            paths.append(theta.copy())
+            paths[-1][part] += np.sqrt(share) * (one[0].theta - theta)[part]
+    return np.array(paths)
