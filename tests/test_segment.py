@@ -338,3 +338,11 @@ def test_noise_of_one_size_is_not_weighted():
     louder = noise(np.column_stack([u, np.ones(400)]), 0.5 * size * rng.normal(size=400), 400, 12)
     estimated = relative_size(u, louder.residual, louder)
     np.testing.assert_allclose(np.log(estimated / size), np.log(estimated / size).mean(), atol=0.35)
+
+
+def test_a_season_longer_than_the_windows_of_the_noise():
+    rng = np.random.default_rng(0)
+    e, u = rng.normal(size=(2, 1000))
+    for t in range(100, 1000):
+        e[t] += 0.7 * e[t - 100]
+    assert len(segment(2.0 * u + e, u).breaks) <= 1

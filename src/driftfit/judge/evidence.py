@@ -58,12 +58,12 @@ class Evidence:
     def _found(self) -> tuple[Distinct, Rows, Constancy]:
         """The parameters that a test can tell apart, the samples with their regressors, and the test."""
         rows, every = self.rows, Distinct(tuple(range(self.run.model.n)), ())
-        test = constancy(rows.phi, rows.y, self.lags, rows.at)
+        test = constancy(rows.phi, rows.y, self.lags, rows.at, rows.step)
         found = distinct(rows.phi) if np.isnan(test.p_joint) else every
         if len(found.kept) in (0, self.run.model.n):
             return every, rows, test
         rows = rows._replace(phi=np.ascontiguousarray(rows.phi[:, found.kept]))
-        return found, rows, constancy(rows.phi, rows.y, self.lags, rows.at)
+        return found, rows, constancy(rows.phi, rows.y, self.lags, rows.at, rows.step)
 
     @cached_property
     def _weighted(self) -> tuple[Rows, Constancy]:

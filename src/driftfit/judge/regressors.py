@@ -8,6 +8,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_least_squares
+from driftfit.judge.statistics.parts.coarse_readings import step_of
 from driftfit.judge.statistics.robust import orthonormal
 from driftfit.models.base import Model
 from driftfit.run.result import Track
@@ -22,6 +23,8 @@ class Rows(NamedTuple):
     """(N, n)"""
     y: Array
     """(N,)"""
+    step: Array | None = None
+    """(N,): the steps of a coarse sensor; None if it is fine."""
 
 
 class Distinct(NamedTuple):
@@ -77,4 +80,5 @@ def regressors(run: Track, steady: Array | None = None) -> Rows:
     root = 1.0 / np.sqrt(noise)
     y = out["y"][at, 0]
     phi = run.model.settled(out["phi"][at, :, 0], y, run.u, at)
-    return Rows(at, phi * np.reshape(root, (-1, 1)), y * root)
+    step = step_of(run.y)
+    return Rows(at, phi * np.reshape(root, (-1, 1)), y * root, step * np.broadcast_to(root, at.shape) if step else None)

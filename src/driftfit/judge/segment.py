@@ -41,6 +41,7 @@ from driftfit.judge.segments.noise_of_regressors import relative_size
 from driftfit.judge.statistics.break_dates import dated
 from driftfit.judge.statistics.constancy import shortest as shortest_of
 from driftfit.judge.statistics.noise import HELD, Noise, begun, whitened
+from driftfit.judge.statistics.parts.coarse_readings import drawn_within
 from driftfit.judge.statistics.robust import clipped, fit_in, least_squares, noisy, orthonormal, robust_fit
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
@@ -233,10 +234,18 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
     basis = orthonormal(rows.phi)
     if not basis.distinct:
         return _undivided(run, rows.phi, rows.y, level, "the regressors do not distinguish the parameters")
-    fit = fit_in(basis, rows.y)
-    if not noisy(fit, rows.phi, rows.y):
-        return _undivided(run, rows.phi, rows.y, level, "constant parameters explain nine of ten outputs without error")
-    phi, y, found = rows.phi, rows.y, _searched(basis.Q, fit.residual, least, false)
+    phi, y, fit = rows.phi, rows.y, fit_in(basis, rows.y)
+    step = rows.step
+    if step is not None:
+        y = drawn_within(basis.Q, y, step)
+        fit = fit_in(basis, y)
+    if not noisy(fit, phi, y):
+        return _undivided(run, phi, y, level, "constant parameters explain nine of ten outputs without error")
+    found = _searched(basis.Q, fit.residual, least, false)
+    if step is not None and y is rows.y and len(found.breaks):  # those of segments, where constants explain none
+        y = drawn_within(basis.Q, y, step, found.breaks)
+        fit = fit_in(basis, y)
+        found = _searched(basis.Q, fit.residual, least, false)
     size = relative_size(phi, y, found)
     if size is not None:
         basis = orthonormal(phi / size[:, None])

@@ -408,7 +408,7 @@ def judged(known: Evidence, level: float) -> Verdict:
     """The verdict where the test of constancy may be shared with the diagnosis."""
     run, rows, test, lags, names = known.run, known.tested, known.test, known.lags, known.names
     drifts = None if np.isnan(test.p_joint) else bool(test.p_joint < level)
-    steps = attribute(rows.phi, rows.y, test, level, lags) if drifts else None
+    steps = attribute(rows.phi, rows.y, test, level, lags, rows.step) if drifts else None
     found = {name: _moved(known, steps, i) for i, name in enumerate(names)}
     moved = tuple(found.get(name, unjudged(name)) for name in run.model.names)
     groups = tuple(tuple(run.model.names[i] for i in group) for group in known.distinct.groups)

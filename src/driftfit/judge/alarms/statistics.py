@@ -27,6 +27,8 @@ from driftfit.judge.alarms.onsets import (
 )
 from driftfit.judge.alarms.reference import burn, first_third, normal_samples
 from driftfit.judge.regressors import refuse_hidden
+from driftfit.judge.statistics.parts.coarse_readings import explained, step_of
+from driftfit.judge.statistics.robust import orthonormal
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.live.frozen.likelihood_ratio import scan
 from driftfit.run.live.frozen.reference_model import (
@@ -40,6 +42,7 @@ from driftfit.run.live.frozen.reference_model import (
     judgeable,
     memory_of,
 )
+from driftfit.run.live.frozen.rounding import chances, drawn, seed_of
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
@@ -112,7 +115,9 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
     if not len(constants):
         phi, names, constants = np.column_stack([phi, np.ones(len(phi))]), (*names, OFFSET), np.array([n])
     root = np.sqrt(np.where(judged, noise, 1.0))
-    found = frozen_model(phi / root[:, None], y / root, np.where(judged, rest[:, OK], 0.0), int(constants[-1]))
+    phi, y = phi / root[:, None], y / root
+    y, rounding = _drawn(phi, y, step_of(run.y[first:start]), root, ok)
+    found = frozen_model(phi, y, np.where(judged, rest[:, OK], 0.0), int(constants[-1]))
     if found is None:
         raise ValueError(
             f'detect: "{rule.kind}" measures changes in units of the noise, and the reference has none: constant '
@@ -124,9 +129,23 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
         parameters=names,
         names=("one parameter", "parameters", "noise") if rule.kind == "glr" else (*names, "noise"),
         frozen=tuple(plain(one) for one in frozen),
+        rounding=rounding,
         simulated=True,
     )
     return rule, known, start, samples
+
+
+def _drawn(phi: Array, y: Array, step: float, root: Array, ok: Array) -> tuple[Array, tuple[float, ...]]:
+    """Readings y (N,) of a reference, drawn again within the step of a coarse sensor over ``root`` (N,), and (step,
+    noise, seed) of it; as they are, and (), if constants do not explain those that are ``ok`` as rounded ones.
+    """
+    basis = orthonormal(phi[ok]) if step else None
+    found = explained(basis.Q, y[ok], step / root[ok]) if basis is not None and basis.distinct else None
+    if found is None:
+        return y, ()
+    seed, y = seed_of(y[ok], step / root[ok]), y.copy()
+    y[ok] = drawn(y[ok], *found, 0.5 * step / root[ok], chances(0, int(ok.sum()), seed))
+    return y, (step, found[1], float(seed + 1))  # later samples draw other numbers
 
 
 def _stuck(run: Track) -> Array:
@@ -224,6 +243,7 @@ def findings_of(run: Track, rule: AlarmRule, start: int, samples: Samples) -> tu
     n, (phi, rest), model = len(rule.parameters), samples, rule.reference
     findings, use = np.full((len(run), CUSUM + n + 1), np.nan), np.zeros(len(run), np.int8)
     rows = np.column_stack([phi, np.ones((len(run), n - phi.shape[1])), rest])
+    rows[start:, n + Y] = rule.drawn(rows[start:, :n], rows[start:, n + Y], rows[start:, n + NOISE_FACTOR], 0)
     scan(rows[start:], model, memory_of(model), findings[start:], use[start:])
     return findings, int(np.sum(use == UNLIKE))
 

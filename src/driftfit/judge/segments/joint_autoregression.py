@@ -171,12 +171,15 @@ class _Record:
 def _level(search: Search, found: Noise) -> Array:
     """c (N,): level of the noise, from white residuals, and constant unless windows differ by more than chance.
 
-    The level of correlated noise within a window varies far more than that of as many independent values.
+    The level of correlated noise within a window varies far more than that of as many independent values. A season
+    longer than the windows leaves none of them whole.
     """
     starts, ends = search.spans
     w = whitened(search.Q[:, :0], found.near, found.ar)[1][len(found.ar) :]
-    sizes = np.array([deviation(w[a : max(b - len(found.ar), a + 1)]) for a, b in zip(starts, ends, strict=True)])
     overall = deviation(found.near)
+    if starts[-1] >= len(w):
+        return np.full(len(search.c), overall)
+    sizes = np.array([deviation(w[a : max(b - len(found.ar), a + 1)]) for a, b in zip(starts, ends, strict=True)])
     if len(sizes) < 3 or not (sizes > 0.0).all():
         return np.full(len(search.c), overall)
     level = np.log(sizes)

@@ -3,7 +3,8 @@
     1. among the parameters whose own path rejects constancy (Holm's correction), choose the one for which a step near
        the extreme point of its path explains most of y, with outliers limited
     2. add that step: one more regressor, phi_i from that sample on
-    3. test again, until no parameter rejects, the steps leave too little noise for a test, or MOST steps are found
+    3. test again, until no parameter rejects, the steps leave too little noise for a test, or MOST steps are found;
+       where all together still reject, step 4, and then the step of any parameter that explains most
     4. move each step to its most likely date between its neighbours, by the likelihood of its interval: it weighs rows
        by the noise at their time, and the path of 1. does not
 
@@ -12,7 +13,8 @@ parameters seem to change too; once the step is in the regression they no longer
 the same parameter, a temporary fault two steps that return. The result contains the value before the first step, the
 value furthest from it in units of its standard error, and the last value. A parameter whose furthest value is within
 the error of the first is not named. Where regressors are nearly collinear, as lags of an output far from zero and an
-intercept are, steps of several parameters explain the same: these are reported together. Bai and Perron (1998) estimate
+intercept are, or meanwhile, while an input rests, steps of several parameters explain the same: these are reported
+together (`driftfit.judge.statistics.parts.other_steps`). Bai and Perron (1998) estimate
 several breaks in all parameters in this sequential way; here each step belongs to one parameter.
 
 If the model has a constant and a regressor is far from zero, steps may also be those of slopes about its mean, and of
@@ -32,15 +34,16 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.break_dates import date_loglik, smallest
 from driftfit.judge.statistics.constancy import Constancy, constancy, shortest, transformed
 from driftfit.judge.statistics.noise import Noise, whitened
+from driftfit.judge.statistics.parts.other_steps import ALIKE, instead
 from driftfit.judge.statistics.robust import clipped, inverted, least_squares, noisy, orthonormal, robust_fit
 
 MOST = 12
 FAR = 10.0
 """A regressor whose mean is so many of its standard deviations from zero is far from zero."""
-ALIKE = 4.0
-"""Twice the logarithm of the likelihood ratio up to which steps of two parameters cannot be distinguished."""
 AROUND = 0.03
 """Share of the record on each side of the extreme point of a path in which the date of a step is searched."""
+CLEAR = 1e-3
+"""p-value of all parameters below which there is a further step although no parameter has one by itself."""
 NEAR = 0.01
 """Steps of one parameter within this share of the record are the same step."""
 
@@ -112,32 +115,40 @@ def holm(p: Array, level: float) -> Array:
     return rejected
 
 
-def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | None = None) -> Attribution:
-    """Explain the changes in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags)`."""
-    own, bic = _attributed(phi, y, test, np.eye(phi.shape[1]), level, lags)
+def attribute(
+    phi: Array, y: Array, test: Constancy, level: float, lags: int | None = None, coarse: Array | None = None
+) -> Attribution:
+    """Explain the changes in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags, step=coarse)`."""
+    own, bic = _attributed(phi, y, test, np.eye(phi.shape[1]), level, lags, coarse)
     M = centring(phi)
     if M is None:
         return own
-    centred, other = _attributed(phi @ M, y, transformed(test, phi, M, lags), M, level, lags)
+    centred, other = _attributed(phi @ M, y, transformed(test, phi, M, lags), M, level, lags, coarse)
     return centred if other <= bic else own
 
 
 def _attributed(
-    phi: Array, y: Array, test: Constancy, M: Array, level: float, lags: int | None
+    phi: Array, y: Array, test: Constancy, M: Array, level: float, lags: int | None, coarse: Array | None
 ) -> tuple[Attribution, float]:
     """The same for steps of the coefficients of phi, of which theta is M times; and BIC, a date and a size per step."""
     N, n = phi.shape
     steps: list[Step] = []
     similar: list[tuple[int, ...]] = []
     p, now = test.p_own.copy(), test
+    at = None if test.noise is None else test.noise.at
     while len(steps) < min(MOST, N // (4 * n + 8)):
         step = _next(_with(phi, steps), now, n, level)
+        if step is None and steps and now.p_joint < CLEAR:
+            dates = list(steps)
+            _redated(phi, steps, test.noise)
+            now = now if steps == dates else constancy(_with(phi, steps), y, lags, at, coarse)
+            step = _any(_with(phi, steps), now, n) if now.p_joint < CLEAR else None
         if step is None or any(s.parameter == step.parameter and abs(s.at - step.at) <= NEAR * N for s in steps):
             break
         p[step.parameter] = min(p[step.parameter], now.p_own[step.parameter])
         X = _with(phi, steps)
         steps.append(step)
-        later = constancy(_with(phi, steps), y, lags, None if test.noise is None else test.noise.at)
+        later = constancy(_with(phi, steps), y, lags, at, coarse)
         testable = not np.isnan(later.p_joint)
         if not testable and not orthonormal(_with(phi, steps)).distinct:
             steps.pop()
@@ -157,6 +168,7 @@ def _attributed(
     before, after, std, last, clear = _sizes(_with(phi, steps), y, steps, M, now.noise)
     far = np.abs(after - before) > scipy.special.ndtri(1.0 - 0.5 * level) * std
     moves = far & changed.any(axis=1)
+    similar = _joined(similar, instead(*_white(phi, test.noise), steps)) if test.noise is not None else similar
     bic = 2.0 * N * np.log(max(now.fit.scale, 1e-300)) + 2.0 * len(steps) * np.log(N)
     return Attribution(p, tuple(steps), spans, before, after, std, last, moves, tuple(similar), clear, changed), float(
         bic
@@ -210,6 +222,13 @@ def _next(X: Array, test: Constancy, n: int, level: float) -> Step | None:
     return Step(int(rejected[most]), found[most][0])
 
 
+def _any(X: Array, test: Constancy, n: int) -> Step | None:
+    """The step that explains most, of any parameter: all together are rejected, and none by its own path, as their
+    regressors do not tell them apart meanwhile."""
+    at, best = _alike(X, test, n, n, len(X) - n)
+    return Step(best[0], at) if best else None
+
+
 def alike(phi: Array, test: Constancy) -> tuple[int, tuple[int, ...]]:
     """The date of the single step that explains most of y, and the parameters whose steps do so about as well."""
     N, n = phi.shape
@@ -220,9 +239,7 @@ def _alike(X: Array, test: Constancy, n: int, first: int, last: int) -> tuple[in
     """The same for the first n columns of X (N, ..), and dates from ``first`` to ``last``."""
     if test.noise is None:
         return 0, ()
-    X, held = X / test.noise.level[:, None], test.noise.held / test.noise.level
-    if len(test.noise.ar):
-        X, held = whitened(X, held, test.noise.ar, test.noise.at)
+    X, held = _white(X, test.noise)
     Q = np.linalg.qr(X)[0]
     e = held - Q @ (Q.T @ held)
     found = [_dated(Q, X[:, i], e, first, last) for i in range(n)]
@@ -230,6 +247,15 @@ def _alike(X: Array, test: Constancy, n: int, first: int, last: int) -> tuple[in
     at, gain = found[best]
     noise = max(float(e @ e) - gain, 0.0) / len(X)
     return at, tuple(i for i in range(n) if gain - found[i][1] <= ALIKE * noise)
+
+
+def _white(X: Array, noise: Noise) -> tuple[Array, Array]:
+    """Rows of X and y, with outliers limited, of white noise with variance 1."""
+    return whitened(X / noise.level[:, None], noise.held / noise.level, noise.ar, noise.at)
+
+
+def _joined(one: list[tuple[int, ...]], other: tuple[tuple[int, ...], ...]) -> list[tuple[int, ...]]:
+    return [tuple(sorted({*a, *b})) for a, b in zip(one, other, strict=True)]
 
 
 def _dated(Q: Array, x: Array, e: Array, first: int, last: int) -> tuple[int, float]:

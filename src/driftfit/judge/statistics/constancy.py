@@ -53,6 +53,7 @@ import scipy
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.bandwidth import plugged_in, rule_of_thumb
 from driftfit.judge.statistics.noise import HELD, ORDER, Noise, noise, of_rare_events, whitened
+from driftfit.judge.statistics.parts.coarse_readings import drawn_within
 from driftfit.judge.statistics.quadratic import tail
 from driftfit.judge.statistics.robust import Basis, Fit, clipped, fit_in, noisy, orthonormal, robust_fit
 from driftfit.judge.statistics.supremum import TIED, suprema, together
@@ -115,11 +116,13 @@ def shortest(n: int) -> int:
     return max(10, 4 * n)
 
 
-def constancy(phi: Array, y: Array, lags: int | None = None, at: Array | None = None) -> Constancy:
+def constancy(
+    phi: Array, y: Array, lags: int | None = None, at: Array | None = None, step: Array | None = None
+) -> Constancy:
     """Test whether y (N,) on phi (N, n) has constant coefficients.
 
     ``lags``: order of the autoregression of the noise; None estimates it, and 0 assumes white scores. ``at`` (N,):
-    sample numbers of the rows, where some may be missing between them.
+    sample numbers of the rows, where some may be missing between them. ``step`` (N,): that of a coarse sensor.
     """
     N, n = phi.shape
     if n == 0 or least_rows(n) > N:
@@ -128,6 +131,10 @@ def constancy(phi: Array, y: Array, lags: int | None = None, at: Array | None = 
     if not basis.distinct:
         return _nothing(N, n)
     fit = fit_in(basis, y)
+    if step is not None:
+        drawn = drawn_within(basis.Q, y, step)
+        if drawn is not y:
+            return constancy(phi, drawn, lags, at)
     if not noisy(fit, phi, y):
         return _nothing(N, n)._replace(fit=fit)
     rare = _rare(fit.psi, y, shortest(n))
@@ -135,6 +142,10 @@ def constancy(phi: Array, y: Array, lags: int | None = None, at: Array | None = 
     found = estimated(None, at) if lags is None and at is not None and at[-1] - at[0] >= N else None
     if found is None or len(found.ar) <= ORDER:  # without a season, rows are those of successive samples
         found = estimated(lags)
+    if step is not None and len(found.breaks):
+        drawn = drawn_within(basis.Q, y, step, found.breaks)
+        if drawn is not y:
+            return constancy(phi, drawn, lags, at)
     return _tested(basis, phi, fit, found, lags)
 
 

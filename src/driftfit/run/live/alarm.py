@@ -18,7 +18,7 @@ from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array, Driver
 from driftfit.run.live.change import Change, change_of
 from driftfit.run.live.frozen.likelihood_ratio import scan
-from driftfit.run.live.frozen.reference_model import OK, ROW, judgeable, memory_of
+from driftfit.run.live.frozen.reference_model import NOISE_FACTOR, OK, ROW, Y, judgeable, memory_of
 from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits, last_power_and_mean
 from driftfit.trackers.base import Tracker
 
@@ -63,7 +63,7 @@ class LiveAlarm:
         self.statistic = np.full(len(rule.names), np.nan)
         self.samples = 0
         self._tracker, self._columns = tracker, rule.columns(names)
-        self._wait, self._left = wait, 0
+        self._wait, self._left, self._judged = wait, 0, 0
         self._scores: deque[float] = deque(maxlen=rule.window)
         self._onsets: deque[Onset] = deque(maxlen=KEPT)
         if rule.kind in FROZEN:
@@ -161,6 +161,7 @@ class LiveAlarm:
             for place, name in enumerate(ROW, len(rule.parameters)):
                 row[place] = tile[name][0, lane]
             row[len(rule.parameters) + OK] = judgeable(tile[0], lane, np.array(y), tile["noise"][0, lane])
+            self._draw(self._row)
             scan(self._row, self._frozen, self._memory, self._findings, np.zeros(1, np.int8))
             self.statistic = self._findings[0, rule.entries]
         elif rule.kind == "band":
@@ -187,6 +188,7 @@ class LiveAlarm:
             known |= {"noise": noise, "dt": rows["dt"][:, lane]}
             for place, name in enumerate(ROW, len(rule.parameters)):
                 samples[:, place] = known[name]
+            self._draw(samples)
             findings = np.empty((T, self._findings.shape[1]))
             scan(samples, self._frozen, self._memory, findings, np.zeros(T, np.int8))
             return findings[:, rule.entries], findings
@@ -197,6 +199,13 @@ class LiveAlarm:
             each = ({name: rows[name][t, ..., lane] for name in self._tracker.outputs} for t in range(T))
             return np.array([change_probability(self._tracker, one) for one in each]).reshape(T, 1), findings
         return self._moving(rule.scores(rows["e"][:, lane], np.sqrt(rows["s"][:, lane]))), findings
+
+    def _draw(self, rows: Array) -> None:
+        """Draw readings of a coarse sensor again within their step."""
+        n = len(self.rule.parameters)
+        noise = rows[:, n + NOISE_FACTOR]
+        rows[:, n + Y] = self.rule.drawn(rows[:, :n], rows[:, n + Y], noise, self._judged)
+        self._judged += len(rows)
 
     def _moving(self, g: Array) -> Array:
         """Power and mean (T, 2) over the last scores at every sample, repeated where g (T,) is not finite."""
@@ -215,7 +224,7 @@ class LiveAlarm:
         """The state as plain data."""
         return {
             "rule": describe(self.rule), "active": self.active, "begun": self.begun, "samples": self.samples,
-            "statistic": self.statistic.tolist(), "wait": self._wait, "left": self._left,
+            "statistic": self.statistic.tolist(), "wait": self._wait, "left": self._left, "judged": self._judged,
             "scores": list(self._scores), "onsets": [list(onset) for onset in self._onsets],
             "memory": [b64encode(part.tobytes()).decode() for part in self._memory] if self.rule.kind in FROZEN else [],
         }  # fmt: skip
@@ -226,6 +235,7 @@ class LiveAlarm:
         alarm = cls(rebuild(state["rule"], AlarmRule), tracker, names, state["wait"])
         alarm.active, alarm.begun, alarm.samples = state["active"], state["begun"], state["samples"]
         alarm.statistic, alarm._left = np.array(state["statistic"], float), state["left"]
+        alarm._judged = state.get("judged", 0)
         alarm._scores.extend(state["scores"])
         alarm._onsets.extend(Onset(*onset) for onset in state["onsets"])
         # states of earlier versions end before what was learned since the reference

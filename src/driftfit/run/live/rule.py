@@ -24,7 +24,8 @@ import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, near
-from driftfit.run.live.frozen.reference_model import CUSUM, JOINT, NOISE, NUMBERS, ONE, TOP, Frozen
+from driftfit.run.live.frozen.reference_model import CONSTANT, CUSUM, JOINT, NOISE, NUMBERS, ONE, TOP, Frozen
+from driftfit.run.live.frozen.rounding import chances, drawn
 from driftfit.trackers.base import Tracker
 
 FROZEN = ("glr", "cusum")
@@ -33,6 +34,8 @@ OFFSET = "offset"
 """The parameter of a constant regressor that the frozen model has even if the model of the run has none."""
 KINDS = (*FROZEN, "band", "innovation", "probability")
 
+THETA, OF_NUMBERS, MEAN = (Frozen._fields.index(name) for name in ("theta", "numbers", "mean"))
+"""Places in `AlarmRule.frozen`."""
 BEYOND = 1.3
 """From this multiple of the largest limit on, a CUSUM forgets."""
 CHANGE, REPORT = "window", "report"
@@ -68,6 +71,8 @@ class AlarmRule(Settings):
         That model, as `driftfit.run.live.frozen.reference_model.Frozen`.
     growth : (c,)
         Growth of the squares of the limits with log(every).
+    rounding : () or (step, noise, seed)
+        Of a coarse sensor: its readings are drawn again within the step (`driftfit.run.live.frozen.rounding`).
     unsure : number
         Standard deviation of the log of the real rate of false alarms, which errors of the reference leave.
     """
@@ -86,6 +91,7 @@ class AlarmRule(Settings):
     frozen: tuple[Any, ...] = ()
     growth: tuple[float, ...] = ()
     unsure: float = 0.0
+    rounding: tuple[float, ...] = ()
 
     def __repr__(self) -> str:
         limits = ", ".join(f"{name} {limit:.4g}" for name, limit in zip(self.names, self.limits, strict=True))
@@ -100,6 +106,19 @@ class AlarmRule(Settings):
         numbers = np.append(found.numbers, np.zeros(NUMBERS - len(found.numbers)))
         numbers[TOP] = BEYOND * max(self.limits, default=0.0)
         return found._replace(numbers=numbers)
+
+    def drawn(self, phi: Array, y: Array, noise: Array, first: int) -> Array:
+        """Readings y (T,) on phi (T, n) of the frozen model, the first of them sample number ``first`` that is judged:
+        drawn again within the step of a coarse sensor, and otherwise as they are.
+        """
+        if not self.rounding:
+            return y
+        theta, mean = (np.array(self.frozen[k], float) for k in (THETA, MEAN))
+        constant = int(self.frozen[OF_NUMBERS][CONSTANT])
+        away = np.sum(theta * mean) * phi[:, constant] if len(mean) else 0.0
+        step, size, seed = self.rounding
+        chance = chances(first, len(y), int(seed))
+        return drawn(y, np.sum(phi * theta, axis=1) - away, size * np.sqrt(noise), 0.5 * step, chance)
 
     @property
     def real_rate(self) -> tuple[float, float]:

@@ -34,6 +34,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.smooth.parts.elimination import smooth_and_weigh
 from driftfit.smooth.parts.rank import column_scale
+from driftfit.smooth.parts.rests import undecided
 from driftfit.smooth.parts.slope_drift import compared
 from driftfit.smooth.parts.slopes import smooth as smooth_slopes
 from driftfit.smooth.parts.walk import Walk
@@ -113,6 +114,9 @@ def averaged(walk: Walk, time: Array, trend: Array) -> Walk:
     else:
         share = walks.reshape(log_p.shape) @ np.array(SCALES) / walks.sum()
         found = walk._replace(drift_root=np.sqrt(share[0] * shapes[0][0] + share[1] * shapes[1][0]))
+    if not len(found.trend):
+        more = undecided(found, size)
+        return found._replace(paths=np.concatenate([kept, more]), belief=np.append(p[which], np.ones(len(more))))
     return found._replace(paths=kept, belief=p[which])
 
 
