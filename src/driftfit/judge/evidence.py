@@ -25,8 +25,9 @@ def of_one_size(rows: Rows, test: Constancy, lags: int | None) -> tuple[Rows, Co
     size = None if noise is None or noise.rare else relative_size(rows.phi, rows.y, noise)
     if noise is None or size is None:
         return rows, test
-    weighted = rows._replace(phi=rows.phi / size[:, None], y=rows.y / size)
-    again = constancy(weighted.phi, weighted.y, lags, rows.at)
+    step = None if rows.step is None else rows.step / size
+    weighted = rows._replace(phi=rows.phi / size[:, None], y=rows.y / size, step=step)
+    again = constancy(weighted.phi, weighted.y, lags, rows.at, step)
     # weights also change the correlation of the noise: there they must explain breaks, not add some
     if again.noise is None or (len(again.noise.ar) and len(again.noise.breaks) >= len(noise.breaks)):
         return rows, test
