@@ -5,12 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Self
+from warnings import warn
 
 import numpy as np
 
+from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import input_names, numbers, whole
 from driftfit.models.base import Model
+
+LOW, FAR = 0.02, 2.0
+"""An input is far from 0 if all but the share `LOW` of its values are, by `FAR` times their usual deviation from their
+median."""
 
 
 class CountedInputs(Model):
@@ -127,6 +133,27 @@ class LinearisedTransfer(CountedInputs):
     @property
     def recursive(self) -> bool:
         return True
+
+    @property
+    def simulated(self) -> tuple[bool, ...]:
+        """Which inputs have a response that is simulated with theta."""
+        return (True,) * self.m
+
+    def inspect(self, y: Array, u: Array) -> None:
+        """Warn of inputs far from 0 beside what they vary by: the simulated response to their mean bends with theta."""
+        named = zip(self.input_names or self.suffixes, u.T, self.simulated, strict=True)
+        for name, values in ((name, values) for name, values, far in named if far and self.point is None):
+            known = values[np.abs(values) < LARGEST]
+            low, middle, high = np.quantile(known, (LOW, 0.5, 1.0 - LOW)) if len(known) else (0.0, 0.0, 0.0)
+            spread = float(np.median(np.abs(known - middle))) / 0.6745 if len(known) else 0.0
+            if max(low, -high) > FAR * spread > 0.0:
+                warn(
+                    f"{type(self).__name__}: {name.strip('[]') or 'u'} varies by {spread:.3g} about {middle:.4g}, and "
+                    "the simulated response to a mean far from 0 spoils the estimates, also with an offset. Subtract "
+                    "an operating point from the inputs and from the output.",
+                    UserWarning,
+                    stacklevel=2,
+                )
 
     def held_at(self, theta: Array) -> Self:
         held = tuple(np.asarray(theta, dtype=float).tolist())

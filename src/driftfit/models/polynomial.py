@@ -179,6 +179,10 @@ class PolynomialModel(LinearisedTransfer):
     def instruments(self) -> bool:
         return self.na == 0 and any(nf for _, nf, _ in self.orders)
 
+    @property
+    def simulated(self) -> tuple[bool, ...]:
+        return tuple(nf > 0 for _, nf, _ in self.orders)
+
     def memory_for(self, tracker: TrackerSteps) -> Mapping[str, Any]:
         memory = self.memory()
         if not (tracker.instruments and self.instruments):

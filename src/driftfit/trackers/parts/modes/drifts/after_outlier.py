@@ -72,7 +72,7 @@ def suppose_jump(s: State, l: int) -> None:
     own, share, best = K - 2, JUMP * RARE / OUTLIER * s.calm[l], 0
     probable = s.mu[own, l]
     undecided = (s.pending[l] > 0) & (probable > REFUTED * share) & (probable < CONFIRMED)
-    begins = (s.outlier[l] > 0.5) & (not undecided) & (probable < CONFIRMED)
+    begins = (s.outlier[l] > 0.5) & (not undecided) & (probable < CONFIRMED) & (s.frozen[l] <= 0.0)
     unit = 0.0
     for i in range(n):
         s.jumped[i, l] = 0.0
