@@ -401,9 +401,26 @@ def test_records_that_can_tell_nothing():
     assert track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u).verdict(burn=5).scored == 15
     idle = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), *arx_record(200, 1)[:1], np.zeros(200)).verdict()
     assert np.isfinite(idle.p)
-    assert "Nothing is known of b1 and b2: their regressors are 0 in every sample that can be used." in idle.sentences
+    assert (
+        "Nothing shows whether b1 and b2 moved: their regressors are 0 in every sample but one at most."
+        in idle.sentences
+    )
     none = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), np.full(100, np.nan), np.ones(100)).verdict()
     assert none.samples == 0
+
+
+@pytest.mark.parametrize("change", [0.0, 1.0])
+def test_a_pulse_that_comes_once(change):
+    """Its sample determines it, whatever the output is; nothing was said of the other parameters."""
+    phi, y = record(300, 3)
+    y[150:] += change * phi[150:, 0]
+    pulse = (np.arange(300) == 120) * 1.0
+    result = track(Regression(4), Kalman(q=1e-3, r=1.0), y, np.column_stack([phi, pulse])).verdict()
+    alone = track(Regression(3), Kalman(q=1e-3, r=1.0), np.delete(y, 120), np.delete(phi, 120, axis=0)).verdict()
+    assert result.p == pytest.approx(alone.p, abs=0.02)
+    assert result.moving == alone.moving == (("theta1",) if change else ())
+    assert result.held == ("theta4",)
+    assert "Nothing shows whether theta4 moved: its regressor is 0 in every sample but one at most." in result.sentences
 
 
 def test_weights_are_the_noise_that_the_test_takes_out():

@@ -12,7 +12,7 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.compare import Errors, errors
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.judge.left_out import without_left_out
-from driftfit.judge.regressors import Distinct, Rows, distinct, regressors
+from driftfit.judge.regressors import Distinct, Rows, judged_by_others, regressors
 from driftfit.judge.segments.noise_of_regressors import relative_size
 from driftfit.judge.statistics.constancy import Constancy, constancy
 from driftfit.run.result import Track
@@ -60,9 +60,11 @@ class Evidence:
         """The parameters that a test can tell apart, the samples with their regressors, and the test."""
         rows, every = self.rows, Distinct(tuple(range(self.run.model.n)), ())
         test = constancy(rows.phi, rows.y, self.lags, rows.at, rows.step)
-        found = distinct(rows.phi) if np.isnan(test.p_joint) else every
-        if len(found.kept) in (0, self.run.model.n):
+        if not np.isnan(test.p_joint):
             return every, rows, test
+        rows, found = judged_by_others(rows)
+        if not found.kept or (len(found.kept) == self.run.model.n and len(rows.y) == len(self.rows.y)):
+            return every, self.rows, test
         rows = rows._replace(phi=np.ascontiguousarray(rows.phi[:, found.kept]))
         return found, rows, constancy(rows.phi, rows.y, self.lags, rows.at, rows.step)
 

@@ -9,7 +9,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.judge.statistics.parts.coarse_readings import step_of
-from driftfit.judge.statistics.robust import orthonormal
+from driftfit.judge.statistics.robust import orthonormal, sole
 from driftfit.models.base import Model
 from driftfit.run.result import Track
 
@@ -61,6 +61,22 @@ def distinct(phi: Array) -> Distinct:
         joined = [group for group in groups if group & new]
         groups = [group for group in groups if not group & new] + [new.union(*joined)]
     return Distinct(tuple(kept), tuple(tuple(sorted(group)) for group in groups if len(group) > 1))
+
+
+def judged_by_others(rows: Rows) -> tuple[Rows, Distinct]:
+    """Rows without those that alone determine a coefficient, as that of a pulse that comes once, and the columns that
+    the others tell apart.
+
+    The outputs of such rows say nothing about a change: any value of that coefficient is possible before and after.
+    """
+    found = distinct(rows.phi)
+    if not 0 < len(found.kept) < len(rows.y):
+        return rows, found
+    alone = sole(orthonormal(rows.phi[:, found.kept]).Q)
+    if not alone.any():
+        return rows, found
+    rows = Rows(*(None if part is None else part[~alone] for part in rows))
+    return rows, distinct(rows.phi)
 
 
 def refuse_hidden(verb: str, model: Model, instead: str) -> None:

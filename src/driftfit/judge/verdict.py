@@ -129,7 +129,7 @@ class Verdict(Printed):
         Groups of parameters with linearly dependent regressors, such as those of a column that repeats another.
     held : tuple of str
         The parameters that the test takes for 0, so that it can judge the others: one or more of every group, and
-        those whose regressors are 0 in every sample that can be used.
+        those whose regressors are 0 in every sample that can be used but one at most.
     stuck : int
         Readings of a stuck sensor, which are left out.
     """
@@ -257,7 +257,7 @@ class Verdict(Printed):
         ]
         if idle:
             whose = "its regressor is" if len(idle) == 1 else "their regressors are"
-            text.append(f"Nothing is known of {listed(idle)}: {whose} 0 in every sample that can be used.")
+            text.append(f"Nothing shows whether {listed(idle)} moved: {whose} 0 in every sample but one at most.")
         return " ".join(text)
 
     def _gain(self) -> str:

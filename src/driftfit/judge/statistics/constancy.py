@@ -55,7 +55,7 @@ from driftfit.judge.statistics.bandwidth import plugged_in, rule_of_thumb
 from driftfit.judge.statistics.noise import HELD, ORDER, Noise, noise, of_rare_events, whitened
 from driftfit.judge.statistics.parts.coarse_readings import drawn_within
 from driftfit.judge.statistics.quadratic import tail
-from driftfit.judge.statistics.robust import Basis, Fit, clipped, fit_in, noisy, orthonormal, robust_fit
+from driftfit.judge.statistics.robust import Basis, Fit, clipped, fit_in, noisy, orthonormal, robust_fit, sole
 from driftfit.judge.statistics.supremum import TIED, suprema, together
 from driftfit.judge.statistics.wild_bootstrap import wild_supremum
 
@@ -128,7 +128,7 @@ def constancy(
     if n == 0 or least_rows(n) > N:
         return _nothing(N, n)
     basis = orthonormal(phi)
-    if not basis.distinct:
+    if not basis.distinct or sole(basis.Q).any():
         return _nothing(N, n)
     fit = fit_in(basis, y)
     if step is not None:

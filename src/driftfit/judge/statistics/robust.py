@@ -69,6 +69,8 @@ where more than half of the readings of a coarse meter are the same, the median 
 """
 
 
+SOLE = 1e-12
+"""A leverage of 1 less this is 1."""
 FLAT = 1e-10
 """A pivot below this share of its diagonal entry counts as zero."""
 
@@ -313,6 +315,11 @@ def orthonormal(phi: Array) -> Basis:
 def robust_fit(phi: Array, y: Array) -> Fit:
     """Constant coefficients with bounded influence of outliers in y; phi (N, n), y (N,)."""
     return fit_in(orthonormal(phi), y)
+
+
+def sole(Q: Array) -> Array:
+    """Which rows of Q (N, n), Q' Q = N I, alone determine a direction: their residuals are 0, whatever y is."""
+    return np.asarray(np.einsum("ti,ti->t", Q, Q) > (1.0 - SOLE) * len(Q))
 
 
 def fit_in(basis: Basis, y: Array) -> Fit:

@@ -8,9 +8,9 @@ innovation, and takes the sample as one with ordinary noise:
     C <- C_k + (e_k^2 - s_k) M diag(w) M' / sum_i w_i phi_i^2,      w_i = 1 / mean phi_i^2
 
 Here the mean is over all samples, so the parameter moves that is seldom excited, which earlier samples have not shown
-at its new value. The probability is that of a jump relative to that of an outlier, JUMP RARE calm / OUTLIER. The filter
-is not mixed with others: samples that confirm the jump make it probable, others make it vanish. Until then another
-outlier does not take its place.
+at its new value. Where regressors are near 0, the jump would be larger than any, and none is supposed. The probability
+is that of a jump relative to that of an outlier, JUMP RARE calm / OUTLIER. The filter is not mixed with others: samples
+that confirm the jump make it probable, others make it vanish. Until then another outlier does not take its place.
 
 Source: deciding later is as in multiple hypothesis tracking (Reid, 1979); a single such hypothesis beside a mixture is
 ours. Cost per sample: nothing, and O(n^3 + J K) at outliers.
@@ -31,6 +31,8 @@ from driftfit.trackers.parts.modes.noise_levels import OUTLIER, noise_at
 REFUTED, CONFIRMED = 0.001, 0.5
 """The jump did not happen if the filter is less probable than this share of its first probability, and did if it is
 more probable than this."""
+USUAL = 0.5
+"""Least sum of w_i phi_i^2 at which a jump is supposed."""
 
 
 def no_jump(n: int) -> dict[str, Any]:
@@ -83,7 +85,7 @@ def suppose_jump(s: State, l: int) -> None:
         best = k if (s.mu[k, l] > s.mu[best, l]) & (k != TOP) & (k != own) else best
     noise = noise_at(s, 1.0, l) + lasting(s, l)
     gained = s.e_k[best, l] * s.e_k[best, l] - s.h[best, l] - noise
-    begins = begins & (unit > 0.0) & (gained > 0.0)
+    begins = begins & (unit > USUAL * s.noise[l]) & (gained > 0.0)
     s.pending[l] = 1 if begins | undecided else 0
     for i in range(n):
         s.jumped[i, l] *= gained / unit if begins else 0.0
