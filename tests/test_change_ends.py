@@ -110,6 +110,15 @@ def test_a_jump_of_the_response_to_rare_pulses(model):
         np.testing.assert_allclose(path.theta[[100, -1], i], [5.0, 1.0], atol=0.2)
 
 
+def test_a_response_to_rare_pulses_that_rises():
+    """It is far outside the range of all readings, but not of responses, and was left out as a fault code."""
+    rng = np.random.default_rng(0)
+    u = (rng.random(1500) < 0.02) * 1.0
+    y = np.where(np.arange(1500) < 750, 1.0, 5.0) * u + 2.0 + 0.1 * rng.normal(size=1500)
+    run = track(Regression(1, intercept=True), AdaptiveKalman(), y, u)
+    assert run.theta[-1, 0] == pytest.approx(5.0, abs=0.2)
+
+
 def test_outliers_at_rare_pulses_are_no_jumps():
     rng = np.random.default_rng(0)
     u = (rng.random(1000) < 0.04) * 1.0

@@ -8,11 +8,12 @@ of a missing output) if
     (y - m)^2 > (REACH p)^2 v    and    e^2 > (REACH p)^2 v    and    e^2 > SURE^2 s
 
 with s the variance of e: never if the model predicted it, or could predict nothing, as where a regressor that was 0 so
-far moves for the first time. Such a reading is the response to a rare pulse, or a fault code by coincidence. It is
-learned from with noise variance e^2: the estimate follows at once, with a band as wide as itself, and the next pulse
-confirms or replaces it. The factor p, ``widening``, is 1, and doubles with every consecutive sample that is
-so far off or an outlier: persistent readings are a change of level, and are accepted. A change of level by a factor of
-1000 costs seven samples.
+far moves for the first time. A reading in a new direction is the response to a rare pulse, or a fault code by
+coincidence. It is learned from with noise variance e^2: the estimate follows at once, with a band as wide as itself,
+and the next pulse confirms or replaces it. Where a prediction is beyond RARELY v^(1/2) from m, as that of a rare pulse
+is, its distance takes the place of v^(1/2): a response may be up to REACH times as large as predicted. The factor p,
+``widening``, is 1, and doubles with every consecutive sample that is so far off or an outlier: persistent readings are
+a change of level, and are accepted. A change of level by a factor of 1000 costs seven samples.
 
 A regressor out of proportion to its mean square c is not left out, because it may be a test or a flood, and so contain
 the most information. It counts as at most LEVERAGE ordinary samples: the noise variance of its sample is multiplied by
@@ -41,6 +42,8 @@ FIRST = 10.0
 regressors are ordinary and the prediction is contradicted."""
 SURE = 5.0
 """Standard deviations of the prediction from which on a sample contradicts it."""
+RARELY = 3.0
+"""Standard deviations of the readings beyond which a prediction is the response to something rare, as a pulse."""
 MEMORY = 1000.0
 """Memory of the mean and variance of the readings, and of other means with which samples are compared, in samples."""
 LONGEST = 1e12
@@ -62,7 +65,8 @@ def leave_out(s: State, l: int) -> None:
     away, e = (reading(s, l) - s.middle[l]) ** 2, (s.y[l] - s.y_hat[l]) ** 2
     predicted = s.valid[l] > 0.0
     e = e if predicted else away
-    reach = REACH * REACH * s.spread[l]
+    expected = (s.y_hat[l] - s.middle[l]) ** 2 if predicted else 0.0
+    reach = REACH * REACH * (expected if expected > RARELY * RARELY * s.spread[l] else s.spread[l])
     limit = reach * s.widening[l] * s.widening[l]
     new = predicted & (s.s[l] == np.inf)
     contradicted = (not predicted) | (e > SURE * SURE * s.s[l])

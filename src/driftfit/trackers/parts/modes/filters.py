@@ -29,6 +29,7 @@ from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.trackers.parts.coarse.resolution import lasting
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.covariance import LEFT
+from driftfit.trackers.parts.faults.outlying_readings import SURE
 from driftfit.trackers.parts.modes.drifts.about_means import drift_about
 from driftfit.trackers.parts.modes.drifts.one_direction import drift_along
 from driftfit.trackers.parts.modes.drifts.trend import bend_slopes, level_slopes, move_along
@@ -117,6 +118,14 @@ def innovate(s: State, l: int) -> None:
     s.s[l] = v
 
 
+@kernel
+def too_broad(s: State, l: int) -> bool:
+    """Whether this is an outlier that the filter which took another one for a jump predicts no better than the density
+    of outliers does (`driftfit.trackers.parts.modes.drifts.after_outlier`)."""
+    outlying = noise_at(s, s.level[s.nu.shape[0] - 1, l], l)
+    return (s.e[l] * s.e[l] > SURE * SURE * s.s[l]) & (s.h[s.modes[l] - 2, l] > outlying)  # type: ignore[no-any-return]
+
+
 @partial(kernel, inline=False)
 def likelihoods(s: State, l: int) -> float:
     """joint[j, k] = c_k nu_j N(e_k; 0, s_kj) exp(nearest / 2) (2 pi)^(1/2); returns nearest."""
@@ -133,12 +142,12 @@ def likelihoods(s: State, l: int) -> float:
             v = s.h[k, l] + max(noise, min(square, widest))
             s.inverse[j, k, l] = 1.0 / v
             s.row[k, l] = min(s.row[k, l], square / v)
-    nearest = least_of_row(s, l)
+    nearest, broad = least_of_row(s, l), K - 2 if too_broad(s, l) else -1
     for j in range(J):
         for k in range(K):
             far = s.e_k[k, l] * s.e_k[k, l] * s.inverse[j, k, l] - nearest
             p = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(s.inverse[j, k, l]) * exp(-0.5 * far)
-            s.joint[j, k, l] = p * (s.rare[l] if k == TOP else 1.0)
+            s.joint[j, k, l] = p * (s.rare[l] if k == TOP else OUTLIER if k == broad else 1.0)
     return nearest  # type: ignore[no-any-return]
 
 

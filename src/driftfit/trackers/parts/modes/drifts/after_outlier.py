@@ -9,8 +9,10 @@ innovation, and takes the sample as one with ordinary noise:
 
 Here the mean is over all samples, so the parameter moves that is seldom excited, which earlier samples have not shown
 at its new value. Where regressors are near 0, the jump would be larger than any, and none is supposed. The probability
-is that of a jump relative to that of an outlier, JUMP RARE calm / OUTLIER. The filter is not mixed with others: samples
-that confirm the jump make it probable, others make it vanish. Until then another outlier does not take its place.
+is that of a jump relative to that of an outlier, JUMP RARE calm / max(OUTLIER, share of outliers so far). The filter is
+not mixed with others: samples that confirm the jump make it probable, others make it vanish. Until then another outlier
+does not take its place, nor confirm it while it predicts no better than the density of outliers does
+(`driftfit.trackers.parts.modes.filters`).
 
 Source: deciding later is as in multiple hypothesis tracking (Reid, 1979); a single such hypothesis beside a mixture is
 ours. Cost per sample: nothing, and O(n^3 + J K) at outliers.
@@ -36,8 +38,9 @@ USUAL = 0.5
 
 
 def no_jump(n: int) -> dict[str, Any]:
-    """Fields before the first sample: whether a jump waits for a decision, and the variances of one that begins now."""
-    return {"pending": 0, "jumped": np.zeros(n)}
+    """Fields before the first sample: the number of outliers, whether a jump waits for a decision, and the variances of
+    one that begins now."""
+    return {"outliers": 0.0, "pending": 0, "jumped": np.zeros(n)}
 
 
 @partial(kernel, inline=False)
@@ -71,7 +74,9 @@ def begin_filter(s: State, own: int, best: int, share: float, noise: float, l: i
 def suppose_jump(s: State, l: int) -> None:
     """Begin the filter at an outlier; it takes the sample with the others (`update_filters`)."""
     n, K = s.theta.shape[0], s.modes[l]
-    own, share, best = K - 2, JUMP * RARE / OUTLIER * s.calm[l], 0
+    s.outliers[l] += s.outlier[l]
+    rate = (1.0 + s.outliers[l]) / (1.0 / OUTLIER + s.count[l])
+    own, share, best = K - 2, JUMP * RARE * s.calm[l] / max(OUTLIER, rate), 0
     probable = s.mu[own, l]
     undecided = (s.pending[l] > 0) & (probable > REFUTED * share) & (probable < CONFIRMED)
     begins = (s.outlier[l] > 0.5) & (not undecided) & (probable < CONFIRMED) & (s.frozen[l] <= 0.0)
