@@ -134,5 +134,7 @@ def estimated_variances(
     v = np.sum(levels * np.maximum(state["level"][:-1] * r[:, None], fields["coarse"][:, None]), axis=1)
     v = np.where(running, v + fields["coarse"] * fields["alike"] * (fields["alike"] + 2.0), r) * fields["leverage"]
     outlier = np.where(weighed, fields["joint"][:, -1].sum(axis=1), 0.0) * (1.0 - began)
+    # where a regressor is out of proportion, half of a code's weight would still be more than all other samples have
+    outlier = np.where((fields["leverage"] > 1.0) & (outlier > 0.5), 1.0, outlier)
     far = np.maximum(state["level"][-1] * v, np.where(weighed, e * e, 0.0))
     return q, about, centring(phi, constant), 1.0 / ((1.0 - outlier) / v + outlier / far)
