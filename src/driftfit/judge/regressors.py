@@ -75,7 +75,8 @@ def judged_by_others(rows: Rows) -> tuple[Rows, Distinct]:
     alone = sole(orthonormal(rows.phi[:, found.kept]).Q)
     if not alone.any():
         return rows, found
-    rows = Rows(*(None if part is None else part[~alone] for part in rows))
+    others = ~alone
+    rows = Rows(rows.at[others], rows.phi[others], rows.y[others], None if rows.step is None else rows.step[others])
     return rows, distinct(rows.phi)
 
 
