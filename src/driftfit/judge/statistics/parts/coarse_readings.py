@@ -21,7 +21,7 @@ theta / S and 1 / S. Cost: O(N n^2) for each of some ten iterations.
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import ndtr
+import scipy
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
@@ -113,7 +113,10 @@ def _likelihood(lower: Array, upper: Array, p: Array) -> tuple[float, Array, Arr
     """Log-likelihood of intervals lower @ p .. upper @ p of a normal variable, its slope, and minus its curvature."""
     a, b = lower @ p, upper @ p
     side = a + b > 0.0
-    mass = np.maximum(np.where(side, ndtr(-a) - ndtr(-b), ndtr(b) - ndtr(a)), 1e-300)
+    mass = np.maximum(
+        np.where(side, scipy.special.ndtr(-a) - scipy.special.ndtr(-b), scipy.special.ndtr(b) - scipy.special.ndtr(a)),
+        1e-300,
+    )
     at_a, at_b = (np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) / mass for z in (a, b))
     slope = upper.T @ at_b - lower.T @ at_a
     both = upper * at_b[:, None] - lower * at_a[:, None]

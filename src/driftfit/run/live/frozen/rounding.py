@@ -15,7 +15,7 @@ from __future__ import annotations
 from zlib import crc32
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+import scipy
 
 from driftfit.engine.kernel import Array
 
@@ -41,7 +41,7 @@ def drawn(y: Array, m: Array, S: Array | float, h: Array | float, chance: Array)
     low, high = (y - h - m) / S, (y + h - m) / S
     side = np.where(low + high > 0.0, -1.0, 1.0)  # tails have digits on the left
     low, high = np.where(side > 0.0, low, -high), np.where(side > 0.0, high, -low)
-    below = ndtr(low)
+    below = scipy.special.ndtr(low)
     with np.errstate(divide="ignore"):
-        w = np.clip(ndtri(below + chance * (ndtr(high) - below)), low, high)
+        w = np.clip(scipy.special.ndtri(below + chance * (scipy.special.ndtr(high) - below)), low, high)
     return np.asarray(m + S * side * w)

@@ -64,8 +64,8 @@ def leave_out(s: State, l: int) -> None:
     """
     away, e = (reading(s, l) - s.middle[l]) ** 2, (s.y[l] - s.y_hat[l]) ** 2
     predicted = s.valid[l] > 0.0
+    expected = (reading(s, l) - s.middle[l] - (s.y[l] - s.y_hat[l])) ** 2 if predicted else 0.0
     e = e if predicted else away
-    expected = (s.y_hat[l] - s.middle[l]) ** 2 if predicted else 0.0
     reach = REACH * REACH * (expected if expected > RARELY * RARELY * s.spread[l] else s.spread[l])
     limit = reach * s.widening[l] * s.widening[l]
     new = predicted & (s.s[l] == np.inf)
