@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftfit import RLS, Regression, track
+from driftfit import RLS, Kalman, Regression, track
 from driftfit.judge.statistics.constancy import constancy, full_rank
 
 
@@ -58,6 +58,22 @@ def test_noise_that_is_louder_in_rare_pulses():
     runs = (track(Regression(1, intercept=True), RLS(1.0), y, phi[:, 0]) for phi, y in
             (pulses(seed, louder=10.0) for seed in range(60)))  # fmt: skip
     assert np.mean([bool(run.verdict().drifts) for run in runs]) < 0.2
+
+
+@pytest.mark.parametrize("change", [0.0, 1.0])
+def test_a_pulse_that_comes_once(change):
+    """Its sample determines it, whatever the output is; nothing was said of the other parameters."""
+    rng = np.random.default_rng(3)
+    phi = np.column_stack([rng.normal(size=(300, 2)), np.ones(300)])
+    y = phi @ [1.0, -0.5, 0.2] + rng.normal(size=300)
+    y[150:] += change * phi[150:, 0]
+    pulse = (np.arange(300) == 120) * 1.0
+    result = track(Regression(4), Kalman(q=1e-3, r=1.0), y, np.column_stack([phi, pulse])).verdict()
+    alone = track(Regression(3), Kalman(q=1e-3, r=1.0), np.delete(y, 120), np.delete(phi, 120, axis=0)).verdict()
+    assert result.p == pytest.approx(alone.p, abs=0.02)
+    assert result.moving == alone.moving == (("theta1",) if change else ())
+    assert result.held == ("theta4",)
+    assert "Nothing shows whether theta4 moved: its regressor is 0 in every sample but one at most." in result.sentences
 
 
 def test_scores_that_are_dependent_but_for_rounding_judge_nothing():

@@ -409,20 +409,6 @@ def test_records_that_can_tell_nothing():
     assert none.samples == 0
 
 
-@pytest.mark.parametrize("change", [0.0, 1.0])
-def test_a_pulse_that_comes_once(change):
-    """Its sample determines it, whatever the output is; nothing was said of the other parameters."""
-    phi, y = record(300, 3)
-    y[150:] += change * phi[150:, 0]
-    pulse = (np.arange(300) == 120) * 1.0
-    result = track(Regression(4), Kalman(q=1e-3, r=1.0), y, np.column_stack([phi, pulse])).verdict()
-    alone = track(Regression(3), Kalman(q=1e-3, r=1.0), np.delete(y, 120), np.delete(phi, 120, axis=0)).verdict()
-    assert result.p == pytest.approx(alone.p, abs=0.02)
-    assert result.moving == alone.moving == (("theta1",) if change else ())
-    assert result.held == ("theta4",)
-    assert "Nothing shows whether theta4 moved: its regressor is 0 in every sample but one at most." in result.sentences
-
-
 def test_weights_are_the_noise_that_the_test_takes_out():
     phi, y = record(300, 12)
     weights = np.where(np.arange(300) < 200, 1.0, 0.04)

@@ -15,7 +15,7 @@ does not take its place, nor confirm it while it predicts no better than the den
 (`driftfit.trackers.parts.modes.filters`).
 
 Source: deciding later is as in multiple hypothesis tracking (Reid, 1979); a single such hypothesis beside a mixture is
-ours. Cost per sample: nothing, and O(n^3 + J K) at outliers.
+ours. Cost per sample: O(n), and O(n^3 + J K) at outliers.
 """
 
 from __future__ import annotations
@@ -71,28 +71,35 @@ def begin_filter(s: State, own: int, best: int, share: float, noise: float, l: i
 
 
 @partial(kernel, inline=False)
-def suppose_jump(s: State, l: int) -> None:
-    """Begin the filter at an outlier; it takes the sample with the others (`update_filters`)."""
-    n, K = s.theta.shape[0], s.modes[l]
-    s.outliers[l] += s.outlier[l]
-    rate = (1.0 + s.outliers[l]) / (1.0 / OUTLIER + s.count[l])
-    own, share, best = K - 2, JUMP * RARE * s.calm[l] / max(OUTLIER, rate), 0
-    probable = s.mu[own, l]
-    undecided = (s.pending[l] > 0) & (probable > REFUTED * share) & (probable < CONFIRMED)
-    begins = (s.outlier[l] > 0.5) & (not undecided) & (probable < CONFIRMED) & (s.frozen[l] <= 0.0)
-    unit = 0.0
-    for i in range(n):
-        s.jumped[i, l] = 0.0
-        if begins & (s.c[i, l] > 0.0):
+def jump(s: State, own: int, share: float, l: int) -> None:
+    """The filter ``own`` becomes the most probable one with a jump, if one of a possible size explains the sample."""
+    best, unit = 0, 0.0
+    for k in range(s.modes[l]):
+        best = k if (s.mu[k, l] > s.mu[best, l]) & (k != TOP) & (k != own) else best
+    for i in range(s.theta.shape[0]):
+        if s.c[i, l] > 0.0:
             s.jumped[i, l] = s.power_samples[l] / (s.c[i, l] * max(s.active[i, l], 1.0))
             unit += s.jumped[i, l] * s.white[i, l] * s.white[i, l]
-    for k in range(K):
-        best = k if (s.mu[k, l] > s.mu[best, l]) & (k != TOP) & (k != own) else best
     noise = noise_at(s, 1.0, l) + lasting(s, l)
     gained = s.e_k[best, l] * s.e_k[best, l] - s.h[best, l] - noise
-    begins = begins & (unit > USUAL * s.noise[l]) & (gained > 0.0)
-    s.pending[l] = 1 if begins | undecided else 0
-    for i in range(n):
+    begins = (unit > USUAL * s.noise[l]) & (gained > 0.0)
+    for i in range(s.theta.shape[0]):
         s.jumped[i, l] *= gained / unit if begins else 0.0
     if begins:
+        s.pending[l] = 1
         begin_filter(s, own, best, share, noise, l)
+
+
+@partial(kernel, inline=False)
+def suppose_jump(s: State, l: int) -> None:
+    """Begin the filter at an outlier; it takes the sample with the others (`update_filters`)."""
+    s.outliers[l] += s.outlier[l]
+    rate = (1.0 + s.outliers[l]) / (1.0 / OUTLIER + s.count[l])
+    own, share = s.modes[l] - 2, JUMP * RARE * s.calm[l] / max(OUTLIER, rate)
+    probable = s.mu[own, l]
+    undecided = (s.pending[l] > 0) & (probable > REFUTED * share) & (probable < CONFIRMED)
+    s.pending[l] = 1 if undecided else 0
+    for i in range(s.theta.shape[0]):
+        s.jumped[i, l] = 0.0
+    if (s.outlier[l] > 0.5) & (not undecided) & (probable < CONFIRMED) & (s.frozen[l] <= 0.0):
+        jump(s, own, share, l)
