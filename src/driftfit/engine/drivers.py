@@ -43,6 +43,11 @@ ROUNDING = 1e-12
 adds up to 2^-53 of its terms, and decimal readings carry as much."""
 
 
+WIDE = 1e9
+"""A sample of which the variance h is this multiple of its noise is taken in on square roots: the covariance after it
+would keep seven of sixteen digits."""
+
+
 INPUTS = types.Array(types.float64, 1, "A", readonly=True)
 """The compiler's type of the inputs of one sample."""
 
@@ -123,9 +128,16 @@ def unknown(s: State, l: int) -> None:
 
 
 @kernel
-def rooted(s: State, l: int) -> int:
-    """Whether the state is in square-root form."""
-    return s.root[l]  # type: ignore[no-any-return]
+def variance_of_error(s: State, l: int) -> None:
+    """s.s = scale (h + r noise), the variance of e before y is seen; inf in a direction of no knowledge."""
+    v = s.h[l] + s.r[l] * s.noise[l]
+    s.s[l] = s.scale[l] * v if s.h[l] < np.inf else np.inf
+
+
+@kernel
+def no_variance(s: State, l: int) -> None:
+    """s.s is NaN, for trackers that have none."""
+    s.s[l] = np.nan
 
 
 @kernel
@@ -139,30 +151,36 @@ def nothing_extra(s: State, known: Array, t: int, l: int) -> None:
 
 
 class TrackerSteps(NamedTuple):
-    """The steps of a tracker.
+    """The steps of a tracker, in the order in which a driver runs them.
 
-    ``predict`` is the time update (``s.dt`` nominal intervals have passed; if 0, nothing may change), ``correct`` the
-    measurement update. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use ``s.ok`` (0 or 1)
-    as a factor of its gain. ``begin`` takes the place of both, and of ``report``, where ``apart(s, l)`` is 1: while
-    ``s.root`` is 1, for trackers that start from no knowledge at all (`driftfit.trackers.parts.diffuse`), unless the
-    tracker has other reasons, too (`driftfit.trackers.parts.faults.contradictions`). ``apart`` comes first, and
-    ``machines`` are the routines that ``begin`` calls by symbol; ``instead`` names machines that steps call, each with
-    the one that is called in its place, so that two forms of a tracker share the code of a driver. ``report`` fills
-    ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs`` name from the record ``s`` to the stored record
-    ``o``. ``read_extra(s, known, t, l)`` reads the extra columns of ``known``, those after interval, noise and drift,
-    for trackers that take more factors. ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when
-    a run is replayed for a smoother. With ``doubts`` the model weighs lags that the tracker doubts; with
-    ``instruments`` a model that has its own writes them to s.zeta (n,), a field of the tracker. Steps see the fields
-    of the tracker and those that every record has but for ``u``, so that they are compiled once for all models
-    (`driftfit.engine.tracker_part`); with ``reads_model`` they see those of the model too. ``outlined`` steps are
-    compiled apart from the drivers, which call them (`driftfit.engine.outlined`): for trackers that take so long that
-    a call costs nothing; ``begin`` always is. ``note`` comes before all of them and may write what they change later.
+    ``predict`` is the time update (``s.dt`` nominal intervals have passed; if 0, nothing may change). ``forecast``
+    writes ``s.y_hat``, ``s.e = s.y - s.y_hat`` and ``s.h``, the variance of the prediction without the noise, and
+    changes nothing of theta. ``variance`` forms ``s.s``, the variance of e, from ``s.h``, the noise and the scale.
+    ``correct`` is the measurement update, with ``s.ok`` (0 or 1) as a factor of its gain. ``report`` fills ``s.var``.
+
+    ``start`` are the steps of a lane while ``s.root`` is 1, for trackers that start from no knowledge at all
+    (`driftfit.trackers.parts.diffuse`); those with ``take_over``, which makes their state from theta and P, also take a
+    sample whose ``h`` is above `WIDE` times its noise. ``machines`` are the routines that steps call by symbol;
+    ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms of a
+    tracker share the code of a driver. ``store(o, s, l)`` copies what the tracker's ``outputs`` name from the record
+    ``s`` to the stored record ``o``. ``read_extra(s, known, t, l)`` reads the extra columns of ``known``, those after
+    interval, noise and drift, for trackers that take more factors. ``store_for_smoother(o, s, l)`` copies the tracker's
+    ``smoother_fields`` when a run is replayed for a smoother. With ``doubts`` the model weighs lags that the tracker
+    doubts; with ``instruments`` a model that has its own writes them to s.zeta (n,), a field of the tracker. Steps see
+    the fields of the tracker and those that every record has but for ``u``, so that they are compiled once for all
+    models (`driftfit.engine.tracker_part`); with ``reads_model`` they see those of the model too. ``outlined`` steps
+    are compiled apart from the drivers, which call them (`driftfit.engine.outlined`): for trackers that take so long
+    that a call costs nothing; ``start`` always is. ``note`` comes before all of them and may write what they change
+    later.
     """
 
     predict: Step
+    forecast: Step
     correct: Step
     report: Step = diagonal
-    begin: Step | None = None
+    variance: Step = variance_of_error
+    start: TrackerSteps | None = None
+    take_over: Step | None = None
     store: Any = nothing_more
     read_extra: Any = nothing_extra
     store_for_smoother: Any = nothing_more
@@ -173,7 +191,6 @@ class TrackerSteps(NamedTuple):
     reads_model: bool = False
     outlined: bool = False
     note: Step = nothing
-    apart: Any = rooted
 
 
 @kernel
@@ -208,46 +225,106 @@ def one_or_all(u: Array) -> Any:
     return u.item() if u.size == 1 else u
 
 
+def _forecasting(tracker: TrackerSteps) -> Any:
+    """predict, forecast, and the variance of the error, of one lane."""
+    predict, forecast, variance = tracker.predict, tracker.forecast, tracker.variance
+
+    @kernel
+    def forecasts(s: State, l: int) -> None:
+        predict(s, l)
+        forecast(s, l)
+        variance(s, l)
+
+    return forecasts
+
+
 def _advance(tracker: TrackerSteps) -> Any:
-    """predict, correct, report for all lanes of a tile; lanes for which ``apart`` is 1 take ``begin`` instead."""
-    predict, correct, report, begin, apart = *tracker[:4], tracker.apart
+    """One sample of all lanes of a tile; lanes whose ``s.root`` is 1 take the steps of the ``start``."""
+    forecasts, correct, report = _forecasting(tracker), tracker.correct, tracker.report
 
     @kernel
     def advance(s: State) -> None:
         for l in range(s.theta.shape[1]):
-            predict(s, l)
+            forecasts(s, l)
             correct(s, l)
         for l in range(s.theta.shape[1]):
             report(s, l)
 
-    if begin is None:
+    if tracker.start is None:
         return advance
+    first = tracker.start
+    forecasts_first, correct_first, report_first = _forecasting(first), first.correct, first.report
+    rare = partial(kernel, inline=False)  # seldom run: the lane loop is better without it
+    called = rare if tracker.outlined else lambda step: outlined(rare(step), short=True)
 
     def start(s: State) -> None:
         alone = s.theta.shape[1] == 1  # a constant, for which there is no code of the others
         for l in range(s.theta.shape[1]):
-            if alone or apart(s, l) > 0:
-                begin(s, l)
+            if alone or s.root[l] > 0:
+                forecasts_first(s, l)
+                correct_first(s, l)
+                report_first(s, l)
             else:
-                predict(s, l)
+                forecasts(s, l)
                 correct(s, l)
                 report(s, l)
 
-    started = kernel(start, inline=False)  # seldom run: the lane loop is better without it
-    if not tracker.outlined:  # else it is called together with the rest
-        started = outlined(started, short=True)
+    started = called(start)
+    if first.take_over is None:
+
+        @kernel
+        def advance_or_start(s: State) -> None:
+            some = 0
+            for l in range(s.theta.shape[1]):
+                some = max(some, s.root[l])
+            if some > 0:
+                started(s)
+            else:
+                advance(s)
+
+        return advance_or_start
+    take_over, forecast_first, variance_first = first.take_over, first.forecast, first.variance
 
     @kernel
-    def advance_or_start(s: State) -> None:
+    def wide(s: State, l: int) -> bool:
+        return s.h[l] > WIDE * (s.r[l] * s.noise[l])  # type: ignore[no-any-return]
+
+    def correct_wide(s: State) -> None:
+        for l in range(s.theta.shape[1]):
+            if wide(s, l):
+                take_over(s, l)
+                forecast_first(s, l)
+                variance_first(s, l)
+                correct_first(s, l)
+                report_first(s, l)
+            else:
+                correct(s, l)
+                report(s, l)
+
+    corrected_wide = called(correct_wide)
+
+    @kernel
+    def advance_in_two_forms(s: State) -> None:
         some = 0
         for l in range(s.theta.shape[1]):
-            some = max(some, apart(s, l))
+            some = max(some, s.root[l])
         if some > 0:
             started(s)
+            return
+        for l in range(s.theta.shape[1]):
+            forecasts(s, l)
+        some = 0
+        for l in range(s.theta.shape[1]):
+            some = max(some, 1 if wide(s, l) else 0)
+        if some > 0:
+            corrected_wide(s)
         else:
-            advance(s)
+            for l in range(s.theta.shape[1]):
+                correct(s, l)
+            for l in range(s.theta.shape[1]):
+                report(s, l)
 
-    return advance_or_start
+    return advance_in_two_forms
 
 
 @lru_cache(maxsize=256)

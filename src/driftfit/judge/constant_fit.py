@@ -72,13 +72,17 @@ def stay(s: State, l: int) -> None:
 
 
 @kernel
-def learn(s: State, l: int) -> None:
+def forecast(s: State, l: int) -> None:
     n = s.theta.shape[0]
     y_hat = 0.0
     for i in range(n):
         y_hat += s.phi[i, l] * s.theta[i, l]
-    s.y_hat[l], s.e[l] = y_hat, s.y[l] - y_hat
-    s.s[l] = s.noise[l] if s.used[l] >= n else np.inf
+    s.y_hat[l], s.e[l], s.h[l] = y_hat, s.y[l] - y_hat, 0.0 if s.used[l] >= n else np.inf
+
+
+@kernel
+def learn(s: State, l: int) -> None:
+    n = s.theta.shape[0]
     if s.ok[l] > 0.0:
         weight = s.weight[l] / np.sqrt(s.noise[l])
         for i in range(n):
@@ -90,7 +94,7 @@ def learn(s: State, l: int) -> None:
         rotate(s.R[:, :, l], s.row[:, l], s.size[:, l], s.theta[:, l])
 
 
-STEPS = TrackerSteps(stay, learn, unknown, None, collect)
+STEPS = TrackerSteps(stay, forecast, learn, unknown, store=collect)
 
 
 @lru_cache(64)

@@ -52,7 +52,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.kernel import Array, State, kernel, nothing
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
@@ -257,7 +257,7 @@ class AdaptiveKalman(Tracker):
     smoother_fields: ClassVar[tuple[str, ...]] = SMOOTHER_FIELDS
     adapts: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
-        "pivot", "at_start", "gain", "e_k", "step", "h", "inverse", "joint", "mu_next", "share", "row", "m_next",
+        "pivot", "at_start", "gain", "e_k", "step", "h_k", "inverse", "joint", "mu_next", "share", "row", "m_next",
         "weighted", "Z", "away", "about_drift",
     )  # fmt: skip
     """Not H and work, which `driftfit.trackers.parts.coordinates.frame` fills only where the coordinates change."""
@@ -294,7 +294,7 @@ class AdaptiveKalman(Tracker):
             "gain": np.zeros((n, K)),
             "e_k": np.zeros(K),
             "step": np.zeros(K),
-            "h": np.zeros(K),
+            "h_k": np.zeros(K),
             "weighted": np.zeros(K),
             "mean_prior": np.zeros(K),
             "inverse": np.zeros((J, K)),
@@ -321,10 +321,12 @@ class AdaptiveKalman(Tracker):
     def steps(self) -> TrackerSteps:
         return TrackerSteps(
             predict,
+            nothing,
             correct,
             report,
-            begin,
-            keep_density,
+            nothing,
+            TrackerSteps(nothing, nothing, begin, nothing, nothing),
+            store=keep_density,
             store_for_smoother=store_for_smoother,
             machines=(*FRAME, machine_doubt, machine_weights),
             doubts=True,

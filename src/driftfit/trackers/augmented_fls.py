@@ -1,7 +1,7 @@
 """Augmented flexible least squares, on line: a strongly regularised, cheap tracker.
 
-    a = y - phi' theta
-    theta <- theta + alpha phi a / (mu / (w d dt) + phi' phi)
+    forecast   y_hat = phi' theta;  e = y - y_hat
+    correct    theta <- theta + alpha phi e / (mu / (w d dt) + phi' phi)
 
 with w the weight of the sample and d a known factor of the drift, both 1 unless given.
 
@@ -26,7 +26,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, unknown
+from driftfit.engine.drivers import TrackerSteps, no_variance, unknown
 from driftfit.engine.kernel import State, kernel, nothing
 from driftfit.engine.settings import numbers, vector
 from driftfit.trackers.base import Tracker
@@ -34,18 +34,19 @@ from driftfit.trackers.parts.covariance import prediction
 
 
 @kernel
-def correct(s: State, l: int) -> None:
+def forecast(s: State, l: int) -> None:
     y_hat = prediction(s, l)
-    e = s.y[l] - y_hat
+    s.y_hat[l], s.e[l], s.h[l] = y_hat, s.y[l] - y_hat, 0.0
+
+
+@kernel
+def correct(s: State, l: int) -> None:
     power = 0.0
     for i in range(s.theta.shape[0]):
         power += s.phi[i, l] * s.phi[i, l]
-    gain = s.ok[l] * s.alpha[l] * e / (s.mu[l] * s.noise[l] / (s.dt[l] * s.drift[l]) + power)
+    gain = s.ok[l] * s.alpha[l] * s.e[l] / (s.mu[l] * s.noise[l] / (s.dt[l] * s.drift[l]) + power)
     for i in range(s.theta.shape[0]):
         s.theta[i, l] += gain * s.phi[i, l]
-    s.y_hat[l] = y_hat
-    s.e[l] = e
-    s.s[l] = np.nan
 
 
 @dataclass(frozen=True)
@@ -95,4 +96,4 @@ class AugmentedFLS(Tracker):
 
     @property
     def steps(self) -> TrackerSteps:
-        return TrackerSteps(nothing, correct, unknown)
+        return TrackerSteps(nothing, forecast, correct, unknown, no_variance)

@@ -7,7 +7,8 @@
     "logistic"             mu = 1 / (1 + exp(-eta)),   variance mu (1 - mu),    y between 0 and 1
     "gaussian"             mu = eta,                   variance r: the Kalman filter
 
-    predict   P <- P + q dt d;   m = phi' theta,  v = phi' P phi,  g = P phi
+    predict   P <- P + q dt d
+    forecast  m = phi' theta,  v = phi' P phi,  g = P phi
               y_hat = E mu(eta),  s = r E variance + Var mu(eta)  for eta ~ N(m, v)
     correct   (m+, v+) = mean and variance of p(y | eta)^(1/r) N(eta; m, v)
               theta <- theta + g (m+ - m) / v;   P <- P + g g' (v+ - v) / v^2
@@ -35,7 +36,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import State, exp, kernel, log, shared
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers.base import Tracker
@@ -172,16 +173,31 @@ def forecast(family: int, m: float, v: float, alpha: float) -> tuple[float, floa
 
 
 @kernel
-def correct(s: State, l: int) -> None:
-    m, v, r, y, family = prediction(s, l), symmetric_product(s, l), s.r[l] * s.noise[l], s.y[l], s.family[l]
+def forecast_output(s: State, l: int) -> None:
+    """y_hat, h = Var mu(eta), and the expected variance of y given eta, in units of the dispersion."""
+    m, v, family = prediction(s, l), symmetric_product(s, l), s.family[l]
+    s.eta[l], s.eta_variance[l] = m, v
     if family == GAUSSIAN:
-        y_hat, variance = m, v + r
-        after, left, density = m + v * (y - m) / variance, v * r / variance, 0.0
+        y_hat, own, of_mean = m, 1.0, v
+    else:
+        y_hat, own, of_mean = forecast(family, min(max(m, -HIGHEST), HIGHEST), v, s.alpha[l])
+    s.y_hat[l], s.e[l], s.h[l], s.dispersed[l] = y_hat, s.y[l] - y_hat, of_mean, own
+
+
+@kernel
+def variance_of_output(s: State, l: int) -> None:
+    s.s[l] = s.r[l] * s.noise[l] * s.dispersed[l] + s.h[l]
+
+
+@kernel
+def correct(s: State, l: int) -> None:
+    m, v, r, y, family = s.eta[l], s.eta_variance[l], s.r[l] * s.noise[l], s.y[l], s.family[l]
+    if family == GAUSSIAN:
+        variance = v + r
+        after, left = m + v * (y - m) / variance, v * r / variance
         density = -HALF_LOG_2_PI - 0.5 * (log(variance) + (y - m) * (y - m) / variance)
     else:
         held = min(max(m, -HIGHEST), HIGHEST)
-        y_hat, own, of_mean = forecast(family, held, v, s.alpha[l])
-        variance = r * own + of_mean
         after, left, density = m, v, 0.0
         possible = (y >= 0.0) & ((family != LOGISTIC) | (y <= 1.0))
         s.ok[l] = s.ok[l] if possible else 0.0
@@ -198,7 +214,7 @@ def correct(s: State, l: int) -> None:
         for j in range(i):
             s.P[i, j, l] -= shrink * s.g[i, l] * s.g[j, l]
         s.P[i, i, l] = max(s.P[i, i, l] - shrink * s.g[i, l] * s.g[i, l], LEFT * s.P[i, i, l])
-    s.y_hat[l], s.e[l], s.s[l], s.log_density[l] = y_hat, y - y_hat, variance, density
+    s.log_density[l] = density
 
 
 @kernel
@@ -242,7 +258,7 @@ class DynamicGLM(Tracker):
     width: ClassVar[int] = 1
     outputs: ClassVar[tuple[str, ...]] = ("log_density",)
     density: ClassVar[str] = "log_density"
-    scratch: ClassVar[tuple[str, ...]] = ("g", "log_density")
+    scratch: ClassVar[tuple[str, ...]] = ("g", "log_density", "eta", "eta_variance", "dispersed")
     drift_per_parameter: ClassVar[bool] = True
 
     @property
@@ -263,8 +279,11 @@ class DynamicGLM(Tracker):
             "theta": vector("DynamicGLM", "theta0", self.theta0, n), "P": matrix("DynamicGLM", "p0", self.p0, n),
             "q": matrix("DynamicGLM", "q", self.q, n), "r": self.r, "alpha": self.alpha,
             "family": FAMILIES.index(self.family), "g": np.zeros(n), "drift_root": np.ones(n), "log_density": 0.0,
+            "eta": 0.0, "eta_variance": 0.0, "dispersed": 1.0,
         }  # fmt: skip
 
     @property
     def steps(self) -> TrackerSteps:
-        return TrackerSteps(drift_matrix, correct, diagonal, store=store, read_extra=read_drift)
+        return TrackerSteps(
+            drift_matrix, forecast_output, correct, variance=variance_of_output, store=store, read_extra=read_drift
+        )

@@ -9,10 +9,10 @@ with w the weight of a sample, dt the interval since the last one and d known fa
 for each parameter, 1 unless given: ``track(.., drift=1 / mu)`` with `FLS(1.0)` has a separate mu for every step and
 parameter (``drift[0]`` belongs to the time before the first sample and is not used).
 
-    predict   P <- P + D^-1                                          (not before the first sample)
-    correct   e = y - phi' theta;  s = phi' P phi + 1 / w;  K = P phi / s
-              theta <- theta + K e;  P <- P - K (P phi)'
-    scale     r = sum(e^2 / s) / count, which is J / (N - rank) after a diffuse start
+    predict    P <- P + D^-1                                         (not before the first sample)
+    forecast   y_hat = phi' theta;  e = y - y_hat;  g = P phi;  h = phi' g;  v = h + 1 / w;  s = r v
+    correct    theta <- theta + g e / v;  P <- P - g g' / v
+               r = sum(e^2 / v) / count, which is J / (N - rank) after a diffuse start
 
 This is the Kalman filter with q = 1 / mu, r = 1 and an estimated scale: mu = r / q is a ratio of variances, and it
 depends on the scale ((c phi, c y, c^2 mu) gives the same path). mu = inf keeps a parameter constant.
@@ -22,14 +22,13 @@ cheaper and has no covariance. `run.smooth()` computes the whole path that minim
 
 Source: Kalaba and Tesfatsion, Time-varying linear regression via flexible least squares (1989), whose matrix recursion
 is used in covariance form. Departures: an exact diffuse start (`driftfit.trackers.parts.diffuse`), which needs no
-penalty on the first point and no large matrix; the minimum-norm solution about theta0 until the regressors span;
-samples that contradict all before are left out (`driftfit.trackers.parts.faults.contradictions`), so that J is without
-them. Cost: O(n^2).
+penalty on the first point and no large matrix; the minimum-norm solution about theta0 until the regressors span. Cost:
+O(n^2).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -41,20 +40,20 @@ from driftfit.engine.settings import covariance, matrix, numbers, plain, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.parts import second_differences
-from driftfit.trackers.parts.coarse.resolution import resolution, resolve
-from driftfit.trackers.parts.coarse.shared_rounding import folded, spanned_folded
+from driftfit.trackers.parts.covariance import correct as measure
+from driftfit.trackers.parts.covariance import forecast
 from driftfit.trackers.parts.diffuse import (
     SCRATCH,
+    correct_on_roots,
     drifted,
-    enter,
+    forecast_on_roots,
     knowing,
     knowing_nothing,
+    spanned_variance,
+    started,
 )
-from driftfit.trackers.parts.faults.contradictions import judged_measurement
-from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
-from driftfit.trackers.parts.faults.omissions import omissions
 from driftfit.trackers.parts.varying_drift import read_drift
-from driftfit.trackers.rls import forget_variance, learn_variance, no_scale
+from driftfit.trackers.rls import learn_scale, no_scale
 
 
 @kernel
@@ -68,27 +67,20 @@ def drift(s: State, l: int) -> None:
 
 @kernel
 def correct(s: State, l: int) -> None:
-    resolve(s, l)
-    judged_measurement(s, l)
-    learn_variance(s, l)
+    measure(s, l)
+    learn_scale(s, l)
 
 
 @kernel
-def begin(s: State, l: int) -> None:
-    resolve(s, l)
+def drift_root_form(s: State, l: int) -> None:
     drifted(s, s.dt[l] * s.drift[l] * s.begun[l], l)
     s.begun[l] = 1.0 if s.dt[l] > 0.0 else s.begun[l]
-    enter(s, l)
-    if s.s[l] < np.inf:
-        learn_variance(s, l)
-    spanned_folded(s, l)
 
 
 @kernel
-def restart(s: State, l: int) -> None:
-    """As before the first sample."""
-    forget_variance(s, l)
-    s.begun[l] = 0.0
+def correct_root_form(s: State, l: int) -> None:
+    correct_on_roots(s, l)
+    learn_scale(s, l)
 
 
 def price(mu: Any) -> Any:
@@ -168,7 +160,6 @@ class FLS(Tracker):
             "begun": 0.0,
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
-            **unjudged(theta0, diffuse=self.p0 is None),
         }
 
     @property
@@ -182,12 +173,6 @@ class FLS(Tracker):
     @property
     def steps(self) -> TrackerSteps:
         return second_differences.STEPS if self.differences == 2 else STEPS
-
-    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
-        return faults(field, phi, y, ok) if self.differences == 1 else super().left_out(field, phi, y, ok)
-
-    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return (*omissions(run.state), *resolution(run.state))
 
     def cov(self, lane: Mapping[str, Array]) -> Array:
         n = len(lane["theta"])
@@ -205,4 +190,7 @@ class FLS(Tracker):
         return RandomWalk(q, None, theta0, p0, at_first_sample=True, slopes=self.slopes)
 
 
-STEPS = judged(begin, TrackerSteps(drift, correct, folded, read_extra=read_drift), restart)
+STEPS = started(
+    TrackerSteps(drift, forecast, correct, read_extra=read_drift),
+    TrackerSteps(drift_root_form, forecast_on_roots, correct_root_form, spanned_variance),
+)

@@ -2,10 +2,10 @@
 
     y_t = phi_t' theta_t + v_t,   E zeta_t v_t = 0 although E phi_t v_t != 0
 
-    predict   C <- C / lambda_e,  G <- G / lambda_e           (lambda_e as in `driftfit.trackers.rls`)
-    correct   e = y - phi' theta;  K = G zeta / (1 / w + phi' G zeta)
-              theta <- theta + K e;  G <- G - K phi' G
-              C <- (I - K phi') C (I - K phi')' + K K' / w
+    predict    C <- C / lambda_e,  G <- G / lambda_e          (lambda_e as in `driftfit.trackers.rls`)
+    forecast   y_hat = phi' theta;  e = y - y_hat;  h = phi' C phi
+    correct    K = G zeta / (1 / w + phi' G zeta);  theta <- theta + K e;  G <- G - K phi' G
+               C <- (I - K phi') C (I - K phi')' + K K' / w
 
 with w the weight of the sample. G is the inverse of sum lambda^(t-k) zeta_k phi_k', which is not symmetric. C is the
 covariance of theta in units of the noise variance, which is estimated as in `RLS`.
@@ -40,7 +40,7 @@ sum is more than a million times 1 / w + zeta' C zeta: it has lost its digits.
 
 Source: Young, Recursive Estimation and Time-Series Analysis (2011), chapters 6 (the auxiliary model, and its filter)
 and 7; Soderstrom and Stoica, Instrumental Variable Methods for System Identification (1983), chapter 6. Departures: the
-diffuse start, the cap, and the samples left out of `RLS`; the limit of x; the skipped samples; C in the place of the
+diffuse start and the cap of `RLS`; the limit of x; the skipped samples; C in the place of the
 variance matrix of white noise in a constant system. Cost per sample: O(n^2), about three times `RLS`.
 """
 
@@ -56,13 +56,9 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel, nothing
 from driftfit.models.base import Model
-from driftfit.trackers import rls
-from driftfit.trackers.parts.coarse.resolution import resolve
-from driftfit.trackers.parts.coarse.shared_rounding import folded
-from driftfit.trackers.parts.covariance import LEFT, product_with, symmetric_product
-from driftfit.trackers.parts.faults.contradictions import add_to_block
-from driftfit.trackers.parts.faults.judged_start import judged
-from driftfit.trackers.rls import Forgetting, fade, learn_settling_variance
+from driftfit.trackers.parts.covariance import LEFT, prediction, product_with, symmetric_product
+from driftfit.trackers.parts.diffuse import MACHINES, forecast_on_roots, spanned_variance
+from driftfit.trackers.rls import Forgetting, correct_root_form, fade, forget_root_form, learn_settling_scale
 
 FOLLOWING = 0.05
 """Share of the distance to theta that the auxiliary model moves at a sample: it lags by twenty samples."""
@@ -78,8 +74,6 @@ LEAST = 0.5
 
 MOST = 1e6
 """The most that it may be beside 1 / w + zeta' C zeta, with refined instruments."""
-
-start_of_rls, restart_of_rls = rls.begin, rls.restart
 
 
 @kernel
@@ -127,19 +121,17 @@ def symmetric(s: State, l: int) -> None:
 
 @lru_cache
 def learning(refined: bool) -> Step:
-    """The correction; with refined instruments the covariance is that of least squares on them."""
-    product = along_instruments if refined else symmetric_product
+    """The correction, with g = C phi; refined: with g = C zeta, and the covariance of least squares on zeta."""
 
     @kernel
     def learn(s: State, l: int) -> None:
-        n = s.theta.shape[0]
-        noise, y_hat = s.noise[l], s.y_hat[l]
-        v = product(s, l) + noise  # s.g = C phi, or C zeta
+        n, noise, e = s.theta.shape[0], s.noise[l], s.e[l]
+        v = s.h[l] + noise
         common = noise + weigh_instruments(s, l)
         if refined and not abs(common) < MOST * v:
             symmetric(s, l)
             common = noise + weigh_instruments(s, l)
-        e, learned = s.e[l], (s.ok[l] > 0.0) & (common >= LEAST * noise) & (common < LARGEST) & (v < LARGEST)
+        learned = (s.ok[l] > 0.0) & (common >= LEAST * noise) & (common < LARGEST) & (v < LARGEST)
         gain, v_used = (1.0 / common if learned else 0.0), (v if learned else 0.0)
         along = 1.0 / v if learned else 0.0
         for i in range(n):
@@ -153,17 +145,10 @@ def learning(refined: bool) -> Step:
                 s.P[i, j, l] -= k * s.g[j, l] + s.g[i, l] * k_j - k * k_j * v_used
             left = s.P[i, i, l] - (2.0 * k * s.g[i, l] - k * k * v_used)
             s.P[i, i, l] = max(left, LEFT * s.P[i, i, l])
-        s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
-        add_to_block(s, along * e * e, l)
-        learn_settling_variance(s, l)
+        learn_settling_scale(s, l)
 
     step: Step = learn
     return step
-
-
-@kernel
-def count(s: State, l: int) -> None:
-    s.learned[l] += s.ok[l]
 
 
 @kernel
@@ -177,11 +162,7 @@ def auxiliary_output(s: State, l: int) -> None:
     for i in range(na, n):
         x += s.phi[i, l] * s.auxiliary[i, l]
         s.zeta[i, l] = s.phi[i, l]
-    # the input of a complete sample that was left out may be a fault code
-    left_out = (s.ok[l] <= 0.0) & (s.valid[l] > 0.0) & (s.observed[l] > 0.0) & (s.noise[l] < np.inf)
-    x = s.y[l] if left_out else x
     s.x[l] = max(-s.largest[l], min(s.largest[l], x))
-    s.learned[l] += s.ok[l]
 
 
 @kernel
@@ -201,32 +182,35 @@ def follow_auxiliary(s: State, l: int) -> None:
 @lru_cache
 def steps(refined: bool) -> TrackerSteps:
     """The steps for models whose first regressors are past outputs; refined: for those that give their own."""
-    instruments, follow = (count, nothing) if refined else (auxiliary_output, follow_auxiliary)
-    learn = learning(refined)
+    instruments, follow = (nothing, nothing) if refined else (auxiliary_output, follow_auxiliary)
+    learn, product = learning(refined), along_instruments if refined else symmetric_product
+
+    @kernel
+    def forecast(s: State, l: int) -> None:
+        instruments(s, l)
+        y_hat = prediction(s, l)
+        s.y_hat[l], s.e[l], s.h[l] = y_hat, s.y[l] - y_hat, max(product(s, l), 0.0)
 
     @kernel
     def correct(s: State, l: int) -> None:
-        resolve(s, l)
-        instruments(s, l)
+        s.learned[l] += s.ok[l]
         learn(s, l)
         follow(s, l)
 
     @kernel
-    def begin(s: State, l: int) -> None:
+    def forecast_first(s: State, l: int) -> None:
         instruments(s, l)
-        start_of_rls(s, l)
+        forecast_on_roots(s, l)
+
+    @kernel
+    def correct_first(s: State, l: int) -> None:
+        s.learned[l] += s.ok[l]
+        correct_root_form(s, l)
         symmetric(s, l)
         follow(s, l)
 
-    @kernel
-    def restart(s: State, l: int) -> None:
-        restart_of_rls(s, l)
-        s.learned[l], s.largest[l], s.x[l] = 0.0, 0.0, 0.0
-        for i in range(s.theta.shape[0]):
-            s.auxiliary[i, l], s.x_lag[i, l] = s.start_theta[i, l], 0.0
-
-    later = TrackerSteps(forget, correct, folded, instruments=refined)
-    return judged(begin, later, restart, along_instruments if refined else symmetric_product)
+    start = TrackerSteps(forget_root_form, forecast_first, correct_first, spanned_variance)
+    return TrackerSteps(forget, forecast, correct, start=start, instruments=refined, machines=MACHINES)
 
 
 @dataclass(frozen=True)

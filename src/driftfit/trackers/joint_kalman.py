@@ -6,7 +6,7 @@
     extended   z <- f(z);  P <- F P F' + q dt d;  y_hat = h(z);  g = P h';  s = h' P h + r / w
     unscented  points z_j = z +- sqrt(n + k) L_j,  P = L L',  and z itself with weight k / (n + k), k = max(3 - n, 0)
                z <- sum_j w_j f(z_j);  P likewise + q dt d;    new points;  y_hat = sum_j w_j h(z_j);  g, s likewise
-    both       e = y - y_hat;  z <- z + g e / s;  P <- P - g g' / s
+    both       e = y - y_hat;  h = s - r / w;  z <- z + g e / s;  P <- P - g g' / s
 
 The extended filter takes the derivatives of f and h at the estimate, which `StateSpace` computes exactly. The
 unscented one evaluates f and h at 2 n + 1 points; it sees how the equations bend within the uncertainty, at up to twice
@@ -17,7 +17,7 @@ negative (the cubature rule).
 A parameter is held where it is by ``q`` and ``p0`` of 0. q of a state is how wrong its equation is at each sample. Both
 filters are only as good as these numbers: look at ``run.diagnose()``, and compare by ``run.loglik``.
 
-Samples that contradict all before them are left out (`driftfit.trackers.parts.faults.contradictions`). Where equations
+Where equations
 have no finite value at the estimate, or at a point of the unscented filter, the states stay and the sample is not used.
 A gap of several nominal samples repeats equations that do not use dt, at most `MOST` times.
 
@@ -41,9 +41,7 @@ from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import one_of
 from driftfit.models.state_space import StateSpace, equations_of
 from driftfit.trackers.kalman import drift_matrix
-from driftfit.trackers.parts.covariance import corrected, symmetric_product
-from driftfit.trackers.parts.faults.contradictions import leave_out_contradiction, no_contradictions
-from driftfit.trackers.parts.faults.omissions import omissions
+from driftfit.trackers.parts.covariance import correct, symmetric_product
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
@@ -62,36 +60,9 @@ def at_estimate(s: State, l: int) -> None:
 
 
 @kernel
-def keep_states(s: State, l: int) -> None:
-    """Keep what a move changes."""
-    n = s.theta.shape[0]
-    for i in range(n):
-        s.theta_before[i, l] = s.theta[i, l]
-        for j in range(i + 1):
-            s.P_before[i, j, l] = s.P[i, j, l]
-
-
-@kernel
-def correct_or_leave_out(s: State, y_hat: float, v: float, l: int) -> None:
-    """One correction, unless the sample contradicts all before it.
-
-    If an input is to blame, the states do not move with it.
-    """
-    ok, n = s.ok[l], s.theta.shape[0]
-    leave_out_contradiction(s, y_hat, v, l)
-    corrected(s, y_hat, v, l)
-    if (s.ok[l] < ok) & (s.observed[l] > 0.0):
-        for i in range(n):
-            s.theta[i, l] = s.theta_before[i, l]
-            for j in range(i + 1):
-                s.P[i, j, l] = s.P_before[i, j, l]
-        drift_matrix(s, l)
-
-
-@kernel
 def unusable(s: State, l: int) -> None:
     """There is no prediction."""
-    s.valid[l], s.ok[l], s.y_hat[l], s.e[l], s.s[l] = 0.0, 0.0, 0.0, 0.0, 1.0
+    s.valid[l], s.ok[l], s.y_hat[l], s.e[l], s.h[l] = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(s.theta.shape[0]):
         s.phi[i, l] = 0.0
 
@@ -104,7 +75,6 @@ def _repeated(move: Step, timed: bool) -> Step:
     def predict(s: State, l: int) -> None:
         left = 1.0 if timed else min(max(1.0, s.dt[l]), MOST)
         left = left if s.dt[l] > 0.0 else 0.0
-        keep_states(s, l)
         while left > 0.5:
             move(s, l)
             left -= 1.0
@@ -158,18 +128,20 @@ def _extended(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool)
                     s.P[first + i, first + j, l] = total
 
     @kernel
-    def correct(s: State, l: int) -> None:
+    def forecast(s: State, l: int) -> None:
         at_estimate(s, l)
         output(s, l)
         finite = abs(s.value[l]) < LARGEST
         for i in range(s.theta.shape[0]):
             finite = finite & (abs(s.phi[i, l]) < LARGEST)
         if finite:
-            correct_or_leave_out(s, s.value[l], symmetric_product(s, l) + s.r[l] * s.noise[l], l)
+            y_hat = s.value[l]
+            s.y_hat[l], s.e[l], s.h[l] = y_hat, s.y[l] - y_hat, max(symmetric_product(s, l), 0.0)
         else:
             unusable(s, l)
 
-    return TrackerSteps(_repeated(move if hidden else _still, timed), correct, read_extra=read_drift, reads_model=True)
+    predict = _repeated(move if hidden else _still, timed)
+    return TrackerSteps(predict, forecast, correct, read_extra=read_drift, reads_model=True)
 
 
 @kernel
@@ -245,7 +217,7 @@ def _unscented(equations: str, inputs: tuple[str, ...], n: int, hidden: int, tim
                     s.P[first + i, first + k, l] = total
 
     @kernel
-    def correct(s: State, l: int) -> None:
+    def forecast(s: State, l: int) -> None:
         factorise(s, scale, l)
         finite, y_hat, v = True, 0.0, 0.0
         for j in range(points):
@@ -263,11 +235,12 @@ def _unscented(equations: str, inputs: tuple[str, ...], n: int, hidden: int, tim
                 g += other * (s.shown[j, l] - s.shown[n + j, l]) * s.L[i, j, l]
             s.g[i, l] = g
         if finite:
-            correct_or_leave_out(s, y_hat, v + s.r[l] * s.noise[l], l)
+            s.y_hat[l], s.e[l], s.h[l] = y_hat, s.y[l] - y_hat, max(v, 0.0)
         else:
             unusable(s, l)
 
-    return TrackerSteps(_repeated(move if hidden else _still, timed), correct, read_extra=read_drift, reads_model=True)
+    predict = _repeated(move if hidden else _still, timed)
+    return TrackerSteps(predict, forecast, correct, read_extra=read_drift, reads_model=True)
 
 
 @dataclass(frozen=True)
@@ -300,7 +273,7 @@ class JointKalman(StateSpaceTracker):
     theta0: Any = None
     method: str = "unscented"
 
-    scratch: ClassVar[tuple[str, ...]] = ("g", "W", "L", "moved", "shown", "theta_before", "P_before")
+    scratch: ClassVar[tuple[str, ...]] = ("g", "W", "L", "moved", "shown")
 
     def __post_init__(self) -> None:
         self._check()
@@ -309,16 +282,12 @@ class JointKalman(StateSpaceTracker):
     def state_of(self, model: StateSpace, prior: Mapping[str, Any]) -> Mapping[str, Any]:
         n, hidden = model.n, max(len(model.hidden), 1)
         own: dict[str, Array] = {"W": np.zeros((hidden, n))}
-        before = {"theta_before": np.zeros(n), "P_before": np.zeros((n, n))}
         if self.method == "unscented":
             own = {"L": np.zeros((n, n)), "moved": np.zeros((hidden, 2 * n + 1)), "shown": np.zeros(2 * n + 1)}
-        return {**prior, "g": np.zeros(n), "drift_root": np.ones(n), **own, **before, **no_contradictions()}
+        return {**prior, "g": np.zeros(n), "drift_root": np.ones(n), **own}
 
     def steps_of(self, model: StateSpace) -> TrackerSteps:
         given = model.equations, model.input_names
         if self.method == "extended":
             return _extended(*given, len(model.hidden), model.system.timed)
         return _unscented(*given, model.n, len(model.hidden), model.system.timed)
-
-    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return omissions(run.state)

@@ -2,9 +2,9 @@
 
     theta_t = theta_{t-1} + w_t,  w ~ N(0, q);    y_t = phi_t' theta_t + v_t,  v ~ N(0, r)
 
-    predict   P <- P + q dt d,  or q_ij sqrt(d_i d_j) dt if every parameter has its own factor
-    correct   e = y - phi' theta;  s = phi' P phi + r / w;  K = P phi / s
-              theta <- theta + K e;  P <- P - K (P phi)'
+    predict    P <- P + q dt d,  or q_ij sqrt(d_i d_j) dt if every parameter has its own factor
+    forecast   y_hat = phi' theta;  e = y - y_hat;  g = P phi;  h = phi' g;  s = h + r / w
+    correct    theta <- theta + g e / s;  P <- P - g g' / s
 
 with w the weight of the sample and d known factors of the drift, 1 unless given.
 
@@ -19,20 +19,19 @@ numbers for ordinary data, and positive variances for collinear or badly scaled 
 at O(n^3).
 
 Source: Kalman (1960); as a parameter tracker Young, Recursive Estimation and Time-Series Analysis (2011), chapter 4.
-Departures: only one triangle of P is kept; an exact diffuse start (`driftfit.trackers.parts.diffuse`); without laws,
-samples that contradict all before are left out (`driftfit.trackers.parts.faults.contradictions`). Cost per sample:
-O(n^2).
+Departures: only one triangle of P is kept; an exact diffuse start (`driftfit.trackers.parts.diffuse`), whose form also
+takes samples after which P would be rounding. Cost per sample: O(n^2).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.engine.simd import entry, fill_four, in_fours, load_four, times
@@ -41,17 +40,17 @@ from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.laws import filter as laws_filter
 from driftfit.trackers.laws.law import OWNER, Law, laws_of, table_of
 from driftfit.trackers.parts import square_root
+from driftfit.trackers.parts.covariance import correct, forecast
 from driftfit.trackers.parts.diffuse import (
     SCRATCH,
+    correct_on_roots,
     drifted,
-    enter,
+    forecast_on_roots,
     knowing,
     knowing_nothing,
     spanned_variance,
+    started,
 )
-from driftfit.trackers.parts.faults.contradictions import judged_measurement
-from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
-from driftfit.trackers.parts.faults.omissions import omissions
 from driftfit.trackers.parts.information import triangular_root
 from driftfit.trackers.parts.varying_drift import read_drift
 
@@ -80,14 +79,13 @@ def drift_matrix(s: State, l: int) -> None:
 
 
 @kernel
-def begin(s: State, l: int) -> None:
+def drift_root_form(s: State, l: int) -> None:
     drifted(s, s.dt[l] * s.drift[l], l)
-    enter(s, l)
-    spanned_variance(s, l)
 
 
-INDEPENDENT = judged(begin, TrackerSteps(drift, judged_measurement, diagonal, read_extra=read_drift))
-TOGETHER = judged(begin, TrackerSteps(drift_matrix, judged_measurement, diagonal, read_extra=read_drift))
+START = TrackerSteps(drift_root_form, forecast_on_roots, correct_on_roots, spanned_variance)
+INDEPENDENT = started(TrackerSteps(drift, forecast, correct, read_extra=read_drift), START)
+TOGETHER = started(TrackerSteps(drift_matrix, forecast, correct, read_extra=read_drift), START)
 
 
 @dataclass(frozen=True)
@@ -182,7 +180,6 @@ class Kalman(Tracker):
             "drift_root": np.ones(n),
             "G": triangular_root(matrix("Kalman", "q", self.q, n)),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
-            **unjudged(theta0, diffuse=self.p0 is None),
             **(self._root(n) if self.form == "sqrt" else {}),
         }
 
@@ -210,12 +207,6 @@ class Kalman(Tracker):
     @property
     def beyond(self) -> str:
         return "" if self.laws is None else "has laws by which theta moves"
-
-    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
-        return faults(field, phi, y, ok) if self.laws is None else super().left_out(field, phi, y, ok)
-
-    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return omissions(run.state)
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         super().widen(lane, p)

@@ -16,7 +16,6 @@ may be a value that cannot be; ``std`` says so. ``loglik`` is that of the mixtur
 (``q``): what does not move is never drawn again, and copies of one particle remain.
 
 Random numbers depend on the seed and a counter in the state: a run gives the same bits again, live and in lanes.
-Samples that contradict all before them are left out (`driftfit.trackers.parts.faults.contradictions`).
 
 Source: Schon, Gustafsson and Nordlund, Marginalized particle filters, IEEE Trans. Signal Processing 53 (2005); Doucet,
 de Freitas, Murphy and Russell (2000). Departures: each particle carries the covariance of all of z, of which what is
@@ -35,8 +34,6 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.settings import near, whole
 from driftfit.models.state_space import StateSpace
-from driftfit.trackers.parts.faults.contradictions import no_contradictions
-from driftfit.trackers.parts.faults.omissions import omissions
 from driftfit.trackers.state_space.particle_steps import steps
 from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
@@ -96,7 +93,7 @@ class ParticleFilter(StateSpaceTracker):
             "weight": np.full(count, 1.0 / count), "W": np.zeros((max(len(model.hidden), 1), n)),
             "gain": np.zeros((count, n)), "shown": np.zeros(count), "spread": np.zeros(count), "fit": np.zeros(count),
             "column": np.zeros(n), "cloud_after": np.zeros((count, n)), "own_after": np.zeros((count, n, n)),
-            "log_density": 0.0, **no_contradictions(),
+            "log_density": 0.0,
         }  # fmt: skip
 
     def steps_of(self, model: StateSpace) -> TrackerSteps:
@@ -121,6 +118,3 @@ class ParticleFilter(StateSpaceTracker):
     def place(self, lane: Mapping[str, Any], which: Any, values: Any) -> None:
         super().place(lane, which, values)
         lane["cloud"][:, list(which)] = values
-
-    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return omissions(run.state)

@@ -1,13 +1,12 @@
 """Recursive least squares with exponential or directional forgetting.
 
-    predict   P <- P / lambda_e,   lambda_e = min(1, max(lambda^dt, max_i P_ii / (c_max P_ii at the start)))
-    correct   e = y - phi' theta;  s = phi' P phi + 1;  K = P phi / s
-              theta <- theta + K e;  P <- P - K (P phi)'
+    predict    P <- P / lambda_e,   lambda_e = min(1, max(lambda^dt, max_i P_ii / (c_max P_ii at the start)))
+    forecast   y_hat = phi' theta;  e = y - y_hat;  g = P phi;  h = phi' g;  v = h + 1 / w;  s = r v
+    correct    theta <- theta + g e / v;  P <- P - g g' / v;  r = sum(e^2 / v) / count
 
-It minimises sum lambda^(t-k) (y_k - phi_k' theta)^2 with a memory of 1/(1 - lambda) nominal samples. P is in units of
-the noise variance, which is estimated on-line: sum(e^2 / s) / count over the samples after the start, and not below the
-limit of coarse readings (`driftfit.trackers.parts.coarse.resolution`). Errors of rounding that readings share widen
-``std`` (`driftfit.trackers.parts.coarse.shared_rounding`).
+with w the weight of the sample. It minimises sum lambda^(t-k) w_k (y_k - phi_k' theta)^2 with a memory of
+1/(1 - lambda) nominal samples. P is in units of the noise variance r, which is estimated over the samples after the
+start.
 
 Use it if all parameters drift alike and nothing is known about noise and drift. Without excitation exponential
 forgetting would let P grow without bound. It stops when a variance is ``c_max`` times its value at the time when the
@@ -29,39 +28,39 @@ is unchanged. There is no wind-up: without excitation nothing is forgotten, so n
 samples only. With one parameter the two kinds are the same.
 
 Source: Ljung, System Identification (1999), eq. 11.12; Plackett (1950) for lambda = 1. Departures: forgetting depends
-on time (dt, and also if y is missing); the cap; an exact diffuse start; samples that contradict all before are left out
-(`driftfit.trackers.parts.faults.contradictions`). Directional forgetting: Hagglund (1983), Kulhavy and Karny (1984).
+on time (dt, and also if y is missing); the cap; an exact diffuse start. Directional forgetting: Hagglund (1983),
+Kulhavy and Karny (1984).
 Cost per sample: O(n^2).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, State, exp, kernel, nothing
+from driftfit.engine.kernel import State, exp, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.coarse.resolution import least_noise, resolution, resolve, unresolved
-from driftfit.trackers.parts.coarse.shared_rounding import folded, nothing_shared, share_rounding, spanned_folded
+from driftfit.trackers.parts.covariance import correct as measure
+from driftfit.trackers.parts.covariance import forecast
 from driftfit.trackers.parts.diffuse import (
     SCRATCH,
-    enter,
+    absorb_on_roots,
+    correct_on_roots,
+    forecast_on_roots,
     hand_over,
     knowing,
     knowing_nothing,
     reform,
-    take_in,
+    spanned_variance,
+    started,
     wander,
 )
-from driftfit.trackers.parts.faults.contradictions import judged_measurement
-from driftfit.trackers.parts.faults.judged_start import faults, judged, unjudged
-from driftfit.trackers.parts.faults.omissions import omissions
 
 RECENT, RECENT_SHARE, LATER_SHARE = 20.0, 0.125, 0.25
 """Memory of the present noise variance: samples, and shares of those so far for the unit of P and for the scale."""
@@ -118,42 +117,36 @@ def forget(s: State, l: int) -> None:
 
 def no_scale() -> dict[str, Any]:
     """Fields of an estimated noise variance before the first innovation."""
-    return {"squares": 0.0, "count": 0.0, "scale": np.nan, **unresolved(), **nothing_shared()}
+    return {"squares": 0.0, "count": 0.0, "scale": np.nan}
+
+
+@kernel
+def square_over_variance(s: State, l: int) -> float:
+    """e^2 / v of a used sample, v = h + 1 / w in units of the noise variance; 0 in a direction of no knowledge."""
+    return s.ok[l] * s.e[l] * s.e[l] / (s.h[l] + s.r[l] * s.noise[l])  # type: ignore[no-any-return]
 
 
 @kernel
 def learn_scale(s: State, l: int) -> None:
-    """Count the innovation; s.s becomes a variance with the scale known before this sample, and s.scale is updated."""
-    counted = s.ok[l] * s.fresh[l]
-    s.squares[l] += counted * s.e[l] * s.e[l] / s.s[l]
-    s.count[l] += counted
-    s.s[l] *= s.scale[l]
-    scale, least = s.squares[l] / s.count[l], least_noise(s, l)
-    s.scale[l] = least if least > scale else scale  # NaN is kept
-
-
-@kernel
-def learn_variance(s: State, l: int) -> None:
-    """Learn the scale, and what readings of a coarse meter share."""
-    per_noise = s.s[l]
-    learn_scale(s, l)
-    share_rounding(s, per_noise, l)
+    """r = sum(e^2 / v) / count over the used samples that had a prediction."""
+    s.squares[l] += square_over_variance(s, l)
+    s.count[l] += s.ok[l] if s.h[l] < np.inf else 0.0
+    s.scale[l] = s.squares[l] / s.count[l]
 
 
 @kernel
 def keep_recent(s: State, squares: float, square: float, l: int) -> None:
-    """While a start is forgotten, the noise variance is a mean of e^2 / s over the later samples.
+    """While a start is forgotten, the noise variance is a mean of e^2 / v over the later samples.
 
     ``squares`` is the sum before this sample, and ``square`` its own, which counts in full: the sample changes theta in
     full, and with a bounded square the bands would stay too narrow after a quiet start, until dozens of samples later.
     """
-    counted = s.ok[l] * s.fresh[l] > 0.0
-    if counted & (s.count[l] > 1.0) & (s.count[l] < s.unequal[l]):
+    if (s.ok[l] > 0.0) & (s.count[l] > 1.0) & (s.count[l] < s.unequal[l]):
         before = squares / (s.count[l] - 1.0)
         share = 1.0 / min(s.count[l], max(RECENT, LATER_SHARE * s.count[l]))
         mean = before + share * (square - before)
         s.squares[l] = s.count[l] * mean
-        s.scale[l] = max(mean, least_noise(s, l))
+        s.scale[l] = mean
 
 
 @kernel
@@ -172,59 +165,57 @@ def follow_variance(s: State, l: int) -> None:
 
 
 @kernel
-def learn_settling_variance(s: State, l: int) -> None:
+def learn_settling_scale(s: State, l: int) -> None:
     """The same for a tracker that may forget its start."""
-    per_noise, squares = s.s[l], s.squares[l]
+    squares, square = s.squares[l], square_over_variance(s, l)
     learn_scale(s, l)
-    keep_recent(s, squares, s.e[l] * s.e[l] / per_noise, l)
-    share_rounding(s, per_noise, l)
-    follow_variance(s, l)
+    if s.h[l] < np.inf:
+        keep_recent(s, squares, square, l)
+        follow_variance(s, l)
 
 
 @kernel
 def correct(s: State, l: int) -> None:
-    resolve(s, l)
-    judged_measurement(s, l)
-    learn_settling_variance(s, l)
+    measure(s, l)
+    learn_settling_scale(s, l)
 
 
 @kernel
-def begin(s: State, l: int) -> None:
-    resolve(s, l)
-    rank, n = s.rank[l], s.theta.shape[0]
+def forget_root_form(s: State, l: int) -> None:
     shrink = 1.0 / np.sqrt(growth(s, l))
-    for i in range(n):
+    for i in range(s.theta.shape[0]):
         s.d[i, l] *= shrink
-        for j in range(i, n):
+        for j in range(i, s.theta.shape[0]):
             s.S[i, j, l] *= shrink
-    enter(s, l)
-    if s.s[l] < np.inf:
-        learn_settling_variance(s, l)
-    spanned_folded(s, l)
+
+
+@kernel
+def correct_root_form(s: State, l: int) -> None:
+    rank = s.rank[l]
+    correct_on_roots(s, l)
+    learn_settling_scale(s, l)
     # the cap applies from the first direction on: regressors may lack excitation before they span everything
-    for i in range(n):
+    for i in range(s.theta.shape[0]):
         known = s.rank[l] > rank and s.P[i, i, l] > 0.0
         s.per_cap[i, l] = 1.0 / (s.c_max[l] * s.P[i, i, l]) if known else s.per_cap[i, l]
 
 
 @kernel
 def forgotten(s: State, l: int) -> float:
-    """The factor of g g', after a correction: s.g is still P phi before the sample, s.s its innovation variance."""
-    r = s.r[l] * s.noise[l]
-    h = s.s[l] - r
+    """The factor of g g' after a correction, with g = P phi before it."""
+    h, noise = s.h[l], s.r[l] * s.noise[l]
     news = s.ok[l] > 0.0 and h > 0.0 and h < np.inf
-    return r * (1.0 / s.forgetting[l] - 1.0) / (s.s[l] * h) if news else 0.0
+    return noise * (1.0 / s.forgetting[l] - 1.0) / ((h + noise) * h) if news else 0.0
 
 
 @kernel
 def correct_direction(s: State, l: int) -> None:
-    resolve(s, l)
-    judged_measurement(s, l)
+    measure(s, l)
     gain = forgotten(s, l)
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):
             s.P[i, j, l] += gain * s.g[i, l] * s.g[j, l]
-    learn_variance(s, l)
+    learn_scale(s, l)
 
 
 @kernel
@@ -243,43 +234,35 @@ def product_of_roots(s: State, l: int) -> None:
 
 
 @kernel
-def begin_direction(s: State, l: int) -> None:
-    resolve(s, l)
-    n = s.theta.shape[0]
+def forecast_direction(s: State, l: int) -> None:
+    forecast_on_roots(s, l)
     product_of_roots(s, l)
-    take_in(s, l)
+
+
+@kernel
+def correct_direction_root_form(s: State, l: int) -> None:
+    n = s.theta.shape[0]
+    absorb_on_roots(s, l)
     for i in range(n):
         s.H[i, n - 1, l] = s.g[i, l]
     wander(s, np.sqrt(forgotten(s, l)), l)
     reform(s, l)
-    if s.s[l] < np.inf:
-        learn_variance(s, l)
+    learn_scale(s, l)
     hand_over(s, l)
-    spanned_folded(s, l)
 
 
-@kernel
-def forget_variance(s: State, l: int) -> None:
-    """What `learn_variance` learned, as before the first sample."""
-    s.squares[l], s.count[l], s.scale[l] = 0.0, 0.0, np.nan
-    s.readings_in[l], s.levels[l], s.middle[l], s.spread[l], s.stayed[l] = 0.0, 1.0, 0.0, 0.0, np.nan
-
-
-@kernel
-def restart(s: State, l: int) -> None:
-    """As before the first sample."""
-    forget_variance(s, l)
-    s.recent[l], s.least[l], s.quieter[l], s.faded_at[l] = 0.0, 0.0, 1.0, 0.0
-    for i in range(s.theta.shape[0]):
-        s.per_cap[i, l] = 0.0
-
-
-EXPONENTIAL = judged(begin, TrackerSteps(forget, correct, folded), restart)
-DIRECTIONAL = judged(begin_direction, TrackerSteps(nothing, correct_direction, folded), restart)
+EXPONENTIAL = started(
+    TrackerSteps(forget, forecast, correct),
+    TrackerSteps(forget_root_form, forecast_on_roots, correct_root_form, spanned_variance),
+)
+DIRECTIONAL = started(
+    TrackerSteps(nothing, forecast, correct_direction),
+    TrackerSteps(nothing, forecast_direction, correct_direction_root_form, spanned_variance),
+)
 
 
 class Forgetting(Tracker):
-    """A tracker with exponential forgetting from a judged start: what `RLS` and `InstrumentalVariables` share."""
+    """A tracker with exponential forgetting from a diffuse start: what `RLS` and `InstrumentalVariables` share."""
 
     forgetting: float | None
     p0: Any
@@ -318,17 +301,10 @@ class Forgetting(Tracker):
             **no_settling(),
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
-            **unjudged(theta0, diffuse=self.p0 is None),
         }
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         return {**self.state(model.n), **settling_of(model)}
-
-    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
-        return faults(field, phi, y, ok)
-
-    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return (*omissions(run.state), *resolution(run.state))
 
 
 @dataclass(frozen=True)

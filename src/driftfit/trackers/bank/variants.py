@@ -33,5 +33,6 @@ def steps_of(factored: bool, own: tuple[Callable[..., Any], ...]) -> TrackerStep
     if not own:
         return steps
     entry, address = entry_of(own)
-    correct, begin = substituted([steps.correct, steps.begin], {own_address: address})
-    return steps._replace(correct=correct, begin=begin, machines=(*steps.machines, entry))
+    assert steps.start is not None
+    correct, begin = substituted([steps.correct, steps.start.correct], {own_address: address})
+    return steps._replace(correct=correct, start=steps.start._replace(correct=begin), machines=(*steps.machines, entry))

@@ -2,8 +2,9 @@
 
     theta_t = H x_t,    x_t = F(dt) x_(t-1) + w_t,  w_t ~ N(0, Q(dt) d);    y_t = phi_t' H x_t + v_t
 
-    predict   x <- F x;  C <- F C F' + Q
-    correct   h = H' phi;  e = y - h' x;  s = h' C h + r / w;  x <- x + C h e / s;  C <- C - C h h' C / s
+    predict    x <- F x;  C <- F C F' + Q
+    forecast   h = H' phi;  e = y - h' x;  s = h' C h + r / w
+    correct    x <- x + C h e / s;  C <- C - C h h' C / s
 
 F has a block for each component: 1, exp(-dt / time), a shear, or a rotation. theta and P = H C H' are what the result
 shows.
@@ -55,9 +56,10 @@ LOG_2_PI = 1.8378770664093453
 H, G, B, W, WORK = range(5)
 """Rows of ``work``: h, C h, a, and the solution of L w = m."""
 
-TIME, DRIFT, Y, OK, R, Y_HAT, E, S, TOTAL, NOW = range(10)
+TIME, DRIFT, Y, OK, R, Y_HAT, E, S, REACHED, TOTAL, NOW = range(11)
 """Entries of ``now``: the interval, the factor of the drift, the output, whether it is used, the noise variance; the
-results; and -2 times the logarithm of the likelihood of what delta took."""
+prediction, the innovation and its variance as if delta were known, whether y depends on delta; and -2 times the
+logarithm of the likelihood of what delta took."""
 
 (AT_LAW, AT_ROOT, AT_X, AT_C, AT_A, AT_M, AT_INFO, AT_FREE, AT_PHI, AT_THETA, AT_P, AT_VAR, AT_L, AT_WORK, AT_NOW,
  AT_F, ADDRESSES) = range(17)  # fmt: skip
@@ -133,7 +135,7 @@ def spread(law: Array, root: Array, C: Array, dt: float, drift: float) -> None:
 
 @shared
 def measure(law: Array, x: Array, C: Array, phi: Array, work: Array, now: Array) -> None:
-    """h, C h, y_hat, e, and s as if delta were known."""
+    """h, C h, y_hat, e, and the variance of the prediction as if delta were known."""
     N = len(C)
     y_hat, variance = 0.0, 0.0
     for k in range(N):
@@ -145,7 +147,21 @@ def measure(law: Array, x: Array, C: Array, phi: Array, work: Array, now: Array)
             g += C[k, j] * work[H, j]
         work[G, k] = g
         variance += work[H, k] * g
-    now[Y_HAT], now[E], now[S] = y_hat, now[Y] - y_hat, variance + now[R]
+    now[Y_HAT], now[E], now[S] = y_hat, now[Y] - y_hat, variance
+
+
+@shared
+def reach(A: Array, free: Array, work: Array) -> bool:
+    """a = A' h, and whether y depends on delta."""
+    N, reached = len(A), False
+    for d in range(N):
+        a = 0.0
+        if free[d] > 0.0:
+            for k in range(N):
+                a += A[k, d] * work[H, k]
+        work[B, d] = a
+        reached = reached or a != 0.0
+    return reached
 
 
 @shared
@@ -161,24 +177,15 @@ def correct_state(x: Array, C: Array, work: Array, now: Array) -> None:
 
 
 @shared
-def inform(A: Array, M: Array, information: Array, free: Array, work: Array, now: Array) -> bool:
-    """Take the sample as information about delta; returns whether y depends on it."""
-    N, reached = len(A), False
+def inform(A: Array, M: Array, information: Array, work: Array, now: Array) -> None:
+    """Take the sample as information about delta."""
+    N = len(A)
     for d in range(N):
-        a = 0.0
-        if free[d] > 0.0:
-            for k in range(N):
-                a += A[k, d] * work[H, k]
-        work[B, d] = a
-        reached = reached or a != 0.0
-    if reached and now[OK] > 0.0:
-        for d in range(N):
-            information[d] += work[B, d] * now[E] / now[S]
-            for c in range(N):
-                M[d, c] += work[B, d] * work[B, c] / now[S]
-                A[d, c] -= work[G, d] * work[B, c] / now[S]
-        now[TOTAL] += LOG_2_PI + log(now[S]) + now[E] * now[E] / now[S]
-    return reached
+        information[d] += work[B, d] * now[E] / now[S]
+        for c in range(N):
+            M[d, c] += work[B, d] * work[B, c] / now[S]
+            A[d, c] -= work[G, d] * work[B, c] / now[S]
+    now[TOTAL] += LOG_2_PI + log(now[S]) + now[E] * now[E] / now[S]
 
 
 @shared
@@ -256,14 +263,13 @@ def show(law: Array, x: Array, C: Array, A: Array, theta: Array, P: Array, var: 
 
 
 @machine
-def machine_sample(fields: int, n: int, N: int, L: int, l: int) -> None:
-    """Prediction and correction of lane l of L, and what is shown of it."""
+def machine_forecast(fields: int, n: int, N: int, L: int, l: int) -> None:
+    """Time update and prediction of lane l of L."""
     at = wholes(fields, 1, ADDRESSES)
     law, now = cubes(at[0, AT_LAW], ROWS, N, L)[:, :, l], floats(at[0, AT_NOW], NOW, L)[:, l]
     x, C = cubes(at[0, AT_X], N, 1, L)[:, :, l], cubes(at[0, AT_C], N, N, L)[:, :, l]
     A, work = cubes(at[0, AT_A], N, N, L)[:, :, l], cubes(at[0, AT_WORK], WORK, N, L)[:, :, l]
-    M, information = cubes(at[0, AT_M], N, N, L)[:, :, l], floats(at[0, AT_INFO], N, L)[:, l]
-    free, dt = floats(at[0, AT_FREE], N, L)[:, l], now[TIME]
+    dt = now[TIME]
     if dt > 0.0:
         forward(law, x, dt)
         forward(law, A, dt)
@@ -272,10 +278,24 @@ def machine_sample(fields: int, n: int, N: int, L: int, l: int) -> None:
         forward(law, C, dt)
         spread(law, floats(at[0, AT_ROOT], n, L)[:, l], C, dt, now[DRIFT])
     measure(law, x, C, floats(at[0, AT_PHI], n, L)[:, l], work, now)
-    reached = inform(A, M, information, free, work, now)
+    now[REACHED] = 1.0 if reach(A, floats(at[0, AT_FREE], N, L)[:, l], work) else 0.0
+
+
+@machine
+def machine_correct(fields: int, n: int, N: int, L: int, l: int) -> None:
+    """Correction of lane l of L, and what is shown of it."""
+    at = wholes(fields, 1, ADDRESSES)
+    law, now = cubes(at[0, AT_LAW], ROWS, N, L)[:, :, l], floats(at[0, AT_NOW], NOW, L)[:, l]
+    x, C = cubes(at[0, AT_X], N, 1, L)[:, :, l], cubes(at[0, AT_C], N, N, L)[:, :, l]
+    A, work = cubes(at[0, AT_A], N, N, L)[:, :, l], cubes(at[0, AT_WORK], WORK, N, L)[:, :, l]
+    M, information = cubes(at[0, AT_M], N, N, L)[:, :, l], floats(at[0, AT_INFO], N, L)[:, l]
+    now[S] += now[R]
+    informs = now[REACHED] > 0.0 and now[OK] > 0.0
+    if informs:
+        inform(A, M, information, work, now)
     correct_state(x, C, work, now)
-    if reached:
-        now[S] = np.inf
+    if informs:
+        free = floats(at[0, AT_FREE], N, L)[:, l]
         taken = settle(x, C, A, M, information, free, cubes(at[0, AT_L], N, N, L)[:, :, l], work)
         if taken != 0.0:
             now[TOTAL] += taken
@@ -285,24 +305,45 @@ def machine_sample(fields: int, n: int, N: int, L: int, l: int) -> None:
     show(law, x, C, A, theta, cubes(at[0, AT_P], n, n, L)[:, :, l], var)
 
 
+def calling(routine: Any) -> Any:
+    """A kernel that calls a routine with the addresses of the fields."""
+
+    @kernel
+    def call(s: State, l: int) -> None:
+        N, L = s.x.shape
+        fields = packed((
+            s.law.ctypes.data, s.drift_root.ctypes.data, s.x.ctypes.data, s.C.ctypes.data, s.A.ctypes.data,
+            s.M.ctypes.data, s.information.ctypes.data, s.free.ctypes.data, s.phi.ctypes.data, s.theta.ctypes.data,
+            s.P.ctypes.data, s.var.ctypes.data, s.L.ctypes.data, s.work.ctypes.data, s.now.ctypes.data,
+            s.F.ctypes.data,
+        ))  # fmt: skip
+        routine(fields, s.theta.shape[0], N, L, l)
+
+    return call
+
+
+call_forecast, call_correct = calling(machine_forecast), calling(machine_correct)
+
+
 @kernel
-def predict(s: State, l: int) -> None:
-    """The routine of the correction begins with the time update."""
-    s.now[TIME, l], s.now[DRIFT, l] = s.dt[l], s.drift[l]
+def forecast(s: State, l: int) -> None:
+    """The time update, and y_hat, e, h."""
+    s.now[TIME, l], s.now[DRIFT, l], s.now[Y, l] = s.dt[l], s.drift[l], s.y[l]
+    call_forecast(s, l)
+    s.y_hat[l], s.e[l] = s.now[Y_HAT, l], s.now[E, l]
+    s.h[l] = np.inf if s.now[REACHED, l] > 0.0 else s.now[S, l]
 
 
 @kernel
 def correct(s: State, l: int) -> None:
-    N, L = s.x.shape
-    s.now[Y, l], s.now[OK, l], s.now[R, l] = s.y[l], s.ok[l], s.r[l] * s.noise[l]
-    fields = packed((
-        s.law.ctypes.data, s.drift_root.ctypes.data, s.x.ctypes.data, s.C.ctypes.data, s.A.ctypes.data,
-        s.M.ctypes.data, s.information.ctypes.data, s.free.ctypes.data, s.phi.ctypes.data, s.theta.ctypes.data,
-        s.P.ctypes.data, s.var.ctypes.data, s.L.ctypes.data, s.work.ctypes.data, s.now.ctypes.data, s.F.ctypes.data,
-    ))  # fmt: skip
-    machine_sample(fields, s.theta.shape[0], N, L, l)
-    s.y_hat[l], s.e[l], s.s[l] = s.now[Y_HAT, l], s.now[E, l], s.now[S, l]
+    """The correction, which writes the variances too."""
+    s.now[OK, l], s.now[R, l] = s.ok[l], s.r[l] * s.noise[l]
+    call_correct(s, l)
 
 
-STEPS = TrackerSteps(predict, correct, nothing, read_extra=read_drift, machines=(machine_sample,))
-"""`nothing` is the report: the correction has written the variances."""
+STEPS = TrackerSteps(
+    nothing, forecast, correct, nothing, read_extra=read_drift, machines=(machine_forecast, machine_correct)
+)
+"""The first `nothing`: the routine of the forecast begins with the time update. The last: that of the correction
+reports.
+"""

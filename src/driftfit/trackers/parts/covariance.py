@@ -1,7 +1,7 @@
-"""The correction of theta and its covariance P by one sample, for trackers that carry both.
+"""Forecast and correction of theta and its covariance P by one sample, for trackers that carry both.
 
-    y_hat = phi' theta;  e = y - y_hat;  g = P phi;  s = phi' g + r
-    theta <- theta + g e / s;  P <- P - g g' / s
+    forecast   y_hat = phi' theta;  e = y - y_hat;  g = P phi;  h = phi' g
+    correct    theta <- theta + g e / (h + r);  P <- P - g g' / (h + r)
 
 Only the lower triangle of P is kept. Source: Kalman (1960). Cost: O(n^2).
 """
@@ -9,8 +9,6 @@ Only the lower triangle of P is kept. Source: Kalman (1960). Cost: O(n^2).
 from __future__ import annotations
 
 from typing import Any
-
-import numpy as np
 
 from driftfit.engine.kernel import State, kernel
 from driftfit.engine.simd import (
@@ -200,23 +198,16 @@ def move(s: State, gain: float, e: float, l: int) -> None:
 
 
 @kernel
-def corrected(s: State, y_hat: float, v: float, l: int) -> float:
-    """Correct theta and P from s.g = P h and the variance v of the innovation, and report s.y_hat, s.e, s.s.
-
-    Returns 1 / v, or 0 if the sample is not used. Where v is not positive, s.ok becomes 0, and s.s infinite.
-    """
-    e = s.y[l] - y_hat
-    gain = s.ok[l] / v
-    move(s, gain, e, l)
-    reduce_covariance(s, gain, l)
-    # P that has lost its digits gets some of them back, but the sample has no variance, and says nothing of the noise
-    s.ok[l] = s.ok[l] if v > 0.0 else 0.0
-    s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v if v > 0.0 else np.inf
-    return gain  # type: ignore[no-any-return]
+def forecast(s: State, l: int) -> None:
+    """y_hat = phi' theta, e = y - y_hat, g = P phi, h = phi' g; less than 0 is rounding."""
+    y_hat = prediction(s, l)
+    s.y_hat[l], s.e[l] = y_hat, s.y[l] - y_hat
+    s.h[l] = max(symmetric_product(s, l), 0.0)
 
 
 @kernel
-def measurement(s: State, l: int) -> None:
-    """One correction with noise variance s.r."""
-    y_hat = prediction(s, l)
-    corrected(s, y_hat, symmetric_product(s, l) + s.r[l] * s.noise[l], l)
+def correct(s: State, l: int) -> None:
+    """theta <- theta + g e / v,  P <- P - g g' / v,  with v = h + r noise, if the sample is used."""
+    gain = s.ok[l] / (s.h[l] + s.r[l] * s.noise[l])
+    move(s, gain, s.e[l], l)
+    reduce_covariance(s, gain, l)

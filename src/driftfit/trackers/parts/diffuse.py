@@ -31,9 +31,9 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import in_units_of_noise
+from driftfit.engine.drivers import TrackerSteps, in_units_of_noise
 from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, log, machine, packed, shared, wholes
-from driftfit.trackers.parts.covariance import prediction
+from driftfit.trackers.parts.covariance import LEFT, prediction
 from driftfit.trackers.parts.information import spread
 
 WITHIN_SPAN = 1e-13
@@ -59,6 +59,8 @@ AT_S, AT_D, AT_R, AT_P, AT_THETA, AT_PHI, AT_WORK, AT_NOW, AT_VAR, ADDRESSES = r
 """Addresses that `machine_learn` is given."""
 
 
+KNOWN = 1e150
+"""Root of the information on a parameter that is known for certain: its square is finite, and its inverse's is not."""
 PASSES = 4
 """Times that a direction is made orthogonal to others at most."""
 SCRATCH = ("H", "pivot", "work", "at_start")
@@ -256,24 +258,31 @@ def covariance(S: Array, R: Array, P: Array) -> None:
             total = 0.0
             for k in range(i, n):
                 total += R[i, k] * R[j, k] if S[k, k] > 0.0 else 0.0
-            P[i, j] = total
+            P[i, j] = total if total * total > 0.0 else 0.0
+
+
+@shared
+def foresee(S: Array, R: Array, phi: Array, work: Array, now: Array) -> None:
+    """What a sample with this regressor adds, after the time update: ``now`` is ``at_start``."""
+    refresh(S, R, work)
+    entering, u, now[BEFORE] = outside(phi, S, work)
+    now[ENTERING], now[SQUARE] = entering, u * u
 
 
 @shared
 def learn(S: Array, d: Array, R: Array, P: Array, theta: Array, phi: Array, work: Array, now: Array) -> None:
-    """Update by a sample, if there is one, after the time update; ``now`` is ``at_start``."""
+    """Update by a sample, if there is one, that `foresee` has looked at."""
     n = len(S)
-    refresh(S, R, work)
-    entering, u, now[BEFORE] = outside(phi, S, work)
-    now[SQUARE] = 0.0
     if now[OK] > 0.0:
         root = np.sqrt(1.0 / now[NOISE])
         for i in range(n):
             work[ROW, i] = root * phi[i]
-        turn_in(S, d, work[ROW], root * now[Y], entering)
+        turn_in(S, d, work[ROW], root * now[Y], int(now[ENTERING]))
         refresh(S, R, work)
-        now[SQUARE], now[VOLUME] = u * u, unseen(S, R, P, now[AGE])
+        now[VOLUME] = unseen(S, R, P, now[AGE])
         estimate(S, d, P, theta, work[ROW], now[AGE])
+    else:
+        now[SQUARE] = 0.0
     covariance(S, R, P)
     worst = 0.0
     for i in range(n):
@@ -293,6 +302,15 @@ def spanned(S: Array, R: Array, P: Array, var: Array) -> None:
 
 
 @partial(machine, short=True)
+def machine_foresee(fields: int, n: int, L: int, l: int) -> None:
+    """`foresee` for lane l of L, from the addresses of fields."""
+    at = wholes(fields, 1, ADDRESSES)
+    S, R, phi = cubes(at[0, AT_S], n, n, L), cubes(at[0, AT_R], n, n, L), floats(at[0, AT_PHI], n, L)
+    work, now = cubes(at[0, AT_WORK], WORK, n, L), floats(at[0, AT_NOW], NOW, L)
+    foresee(S[:, :, l], R[:, :, l], phi[:, l], work[:, :, l], now[:, l])
+
+
+@partial(machine, short=True)
 def machine_learn(fields: int, n: int, m: int, L: int, l: int) -> None:
     """`learn` and `spanned` for lane l of L, from the addresses of fields; var has m <= n entries."""
     at = wholes(fields, 1, ADDRESSES)
@@ -304,13 +322,49 @@ def machine_learn(fields: int, n: int, m: int, L: int, l: int) -> None:
     spanned(S_l, R_l, P_l, floats(at[0, AT_VAR], m, L)[:, l])
 
 
+@shared
+def take_root(P: Array, R: Array, S: Array) -> None:
+    """The triangle S with S' S = P^-1, from the lower triangle of P = R R', R an upper triangle; what is known for
+    certain has the standard deviation 1 / `KNOWN`.
+    """
+    n = len(P)
+    for j in range(n - 1, -1, -1):
+        pivot = P[j, j]
+        for k in range(j + 1, n):
+            pivot -= R[j, k] * R[j, k]
+        R[j, j] = np.sqrt(max(pivot, LEFT * P[j, j])) if P[j, j] > 0.0 else 1.0 / KNOWN
+        for i in range(j):
+            t = P[j, i]
+            for k in range(j + 1, n):
+                t -= R[i, k] * R[j, k]
+            R[i, j] = t / R[j, j] if P[j, j] > 0.0 else 0.0
+    for j in range(n):
+        S[j, j] = 1.0 / R[j, j]
+        for i in range(j - 1, -1, -1):
+            t = 0.0
+            for k in range(i + 1, j + 1):
+                t -= R[i, k] * S[k, j]
+            S[i, j] = t / R[i, i]
+
+
+@partial(machine, short=True)
+def machine_root(S: int, d: int, R: int, P: int, theta: int, n: int, L: int, l: int) -> None:
+    """`take_root` for lane l of L, and d = S theta."""
+    S_l, right, x = cubes(S, n, n, L)[:, :, l], floats(d, n, L), floats(theta, n, L)
+    take_root(cubes(P, n, n, L)[:, :, l], cubes(R, n, n, L)[:, :, l], S_l)
+    for i in range(n):
+        right[i, l] = 0.0
+        for j in range(i, n):
+            right[i, l] += S_l[i, j] * x[j, l]
+
+
 @partial(machine, short=True)
 def machine_wander(S: int, d: int, H: int, pivot: int, n: int, L: int, l: int, size: float) -> None:
     """`spread` for lane l of L, from the addresses of fields."""
     spread(cubes(S, n, n, L), floats(d, n, L), cubes(H, n, n, L), size, floats(pivot, n, L), l)
 
 
-MACHINES = (machine_learn, machine_wander)
+MACHINES = (machine_foresee, machine_learn, machine_root, machine_wander)
 """The routines that the steps of a tracker with a diffuse start call; see `TrackerSteps`."""
 
 
@@ -338,6 +392,17 @@ def drifted(s: State, time: float, l: int) -> None:
 
 
 @kernel
+def foresee_row(s: State, theta: int, phi: int, l: int) -> None:
+    """`foresee` from parameters and regressors at these addresses: |S^-T phi|^2, inf in a new direction."""
+    n, L = s.d.shape
+    fields = packed((
+        s.S.ctypes.data, s.d.ctypes.data, s.R.ctypes.data, s.P.ctypes.data, theta, phi, s.work.ctypes.data,
+        s.at_start.ctypes.data, s.var.ctypes.data,
+    ))  # fmt: skip
+    machine_foresee(fields, n, L, l)
+
+
+@kernel
 def call(s: State, theta: int, phi: int, ok: float, age: float, l: int) -> None:
     """`learn` from parameters and regressors at these addresses, with the sample if ok is 1."""
     n, L = s.d.shape
@@ -350,10 +415,9 @@ def call(s: State, theta: int, phi: int, ok: float, age: float, l: int) -> None:
 
 
 @kernel
-def take_in_row(s: State, theta: int, phi: int, age: float, l: int) -> None:
-    """A sample in square-root form, with parameters and regressors at these addresses: P, s.s, a new direction."""
+def absorb_row(s: State, theta: int, phi: int, age: float, l: int) -> None:
+    """Take in the sample, if it is used, after `foresee_row`: theta, P, a new direction."""
     call(s, theta, phi, s.ok[l], age, l)
-    s.s[l] = s.at_start[BEFORE, l] + s.r[l] * s.noise[l]
     if s.at_start[SQUARE, l] > 0.0:
         s.F[s.rank[l], l] = s.at_start[SQUARE, l] * exp(s.at_start[VOLUME, l] - s.volume[l])
         s.rank[l] += 1
@@ -361,23 +425,53 @@ def take_in_row(s: State, theta: int, phi: int, age: float, l: int) -> None:
 
 
 @kernel
-def take_in(s: State, l: int) -> None:
-    """A sample in square-root form: theta, P, and s.y_hat, s.e, s.s."""
+def forecast_on_roots(s: State, l: int) -> None:
+    """y_hat, e and h in square-root form."""
     y_hat = prediction(s, l)
-    take_in_row(s, s.theta.ctypes.data, s.phi.ctypes.data, 0.0, l)
-    s.y_hat[l], s.e[l] = y_hat, s.y[l] - y_hat
+    foresee_row(s, s.theta.ctypes.data, s.phi.ctypes.data, l)
+    s.y_hat[l], s.e[l], s.h[l] = y_hat, s.y[l] - y_hat, s.at_start[BEFORE, l]
 
 
 @kernel
-def reform(s: State, l: int) -> None:
-    """Recompute P from the square root, after a change that is not a sample."""
-    call(s, s.theta.ctypes.data, s.phi.ctypes.data, 0.0, 0.0, l)
+def absorb_on_roots(s: State, l: int) -> None:
+    """The sample in square-root form: theta and P."""
+    absorb_row(s, s.theta.ctypes.data, s.phi.ctypes.data, 0.0, l)
 
 
 @kernel
 def hand_over(s: State, l: int) -> None:
     """Make the covariance the state from now on, if it is accurate enough."""
     s.root[l] = 0 if s.at_start[INFLATION, l] <= s.worst[l] else 1
+
+
+@kernel
+def correct_on_roots(s: State, l: int) -> None:
+    """The correction in square-root form, and the change to a covariance once that is accurate."""
+    absorb_on_roots(s, l)
+    hand_over(s, l)
+
+
+@kernel
+def take_in(s: State, l: int) -> None:
+    """A sample in square-root form: theta, P, and s.y_hat, s.e, s.s."""
+    forecast_on_roots(s, l)
+    s.s[l] = s.h[l] + s.r[l] * s.noise[l]
+    absorb_on_roots(s, l)
+
+
+@kernel
+def reform(s: State, l: int) -> None:
+    """Recompute P from the square root, after a change that is not a sample."""
+    foresee_row(s, s.theta.ctypes.data, s.phi.ctypes.data, l)
+    call(s, s.theta.ctypes.data, s.phi.ctypes.data, 0.0, 0.0, l)
+
+
+@kernel
+def take_over(s: State, l: int) -> None:
+    """The square root, from theta and P, for a sample after which P would be rounding (`driftfit.engine.drivers`)."""
+    n, L = s.d.shape
+    machine_root(s.S.ctypes.data, s.d.ctypes.data, s.R.ctypes.data, s.P.ctypes.data, s.theta.ctypes.data, n, L, l)
+    s.root[l] = 1
 
 
 @kernel
@@ -393,3 +487,8 @@ def spanned_variance(s: State, l: int) -> None:
     for i in range(s.theta.shape[0]):
         var = s.var[i, l]
         s.var[i, l] = in_units_of_noise(var, s.scale[l]) if var < np.inf else np.inf
+
+
+def started(steps: TrackerSteps, first: TrackerSteps) -> TrackerSteps:
+    """The steps of a tracker of theta and P, with those of its square-root form, from which it starts."""
+    return steps._replace(start=first._replace(take_over=take_over), machines=MACHINES)

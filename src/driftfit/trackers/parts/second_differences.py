@@ -7,8 +7,9 @@ At every t it computes the last point of the path that minimises
 
 which for even steps penalises theta_{k+1} - 2 theta_k + theta_{k-1}. With x = (theta, slope):
 
-    predict   x <- F x,  F = [[1, dt], [0, 1]];   P <- F P F' + D^-1 (dt, 1)(dt, 1)'       (not before the first sample)
-    correct   as in `driftfit.trackers.fls`, with the regressor h = (phi, 0)
+    predict             x <- F x,  F = [[1, dt], [0, 1]];   P <- F P F' + D^-1 (dt, 1)(dt, 1)'
+                                                                                  (not before the first sample)
+    forecast, correct   as in `driftfit.trackers.fls`, with the regressor h = (phi, 0)
 
 The start is diffuse in x at the first sample (`driftfit.trackers.parts.diffuse`), and the rank goes up to 2 n. The
 information moves with x, S <- S F^-1, which is a shear of the triangle: after a gap, a level that was determined is not
@@ -28,13 +29,20 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.coarse.resolution import resolve
-from driftfit.trackers.parts.coarse.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.covariance import prediction, reduce_covariance, symmetric_product
-from driftfit.trackers.parts.diffuse import MACHINES, hand_over, knowing_nothing, take_in_row, wander
+from driftfit.trackers.parts.diffuse import (
+    BEFORE,
+    MACHINES,
+    absorb_row,
+    foresee_row,
+    hand_over,
+    knowing_nothing,
+    spanned_variance,
+    wander,
+)
 from driftfit.trackers.parts.information import shear
 from driftfit.trackers.parts.varying_drift import read_drift
-from driftfit.trackers.rls import learn_variance, no_scale
+from driftfit.trackers.rls import learn_scale, no_scale
 
 
 def state(mu: Array, theta0: Array) -> Mapping[str, Any]:
@@ -84,24 +92,20 @@ def spread(s: State, l: int) -> float:
 
 
 @kernel
-def measurement(s: State, l: int) -> None:
-    n = s.theta.shape[0]
+def forecast(s: State, l: int) -> None:
     y_hat = prediction(s, l)
-    v = spread(s, l) + s.r[l] * s.noise[l]
-    e = s.y[l] - y_hat
-    gain = s.ok[l] / v
-    for i in range(n):
-        s.theta[i, l] += gain * s.g[i, l] * e
-        s.slope[i, l] += gain * s.g[n + i, l] * e
-    reduce_covariance(s, gain, l)
-    s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
+    s.y_hat[l], s.e[l], s.h[l] = y_hat, s.y[l] - y_hat, max(spread(s, l), 0.0)
 
 
 @kernel
 def correct(s: State, l: int) -> None:
-    resolve(s, l)
-    measurement(s, l)
-    learn_variance(s, l)
+    n = s.theta.shape[0]
+    gain = s.ok[l] / (s.h[l] + s.r[l] * s.noise[l])
+    for i in range(n):
+        s.theta[i, l] += gain * s.g[i, l] * s.e[l]
+        s.slope[i, l] += gain * s.g[n + i, l] * s.e[l]
+    reduce_covariance(s, gain, l)
+    learn_scale(s, l)
 
 
 @kernel
@@ -120,28 +124,27 @@ def drifted(s: State, l: int) -> None:
 
 
 @kernel
-def enter(s: State, l: int) -> None:
-    """The correction while the state is in square-root form."""
+def forecast_root_form(s: State, l: int) -> None:
     n = s.theta.shape[0]
-    y_hat = prediction(s, l)
     for i in range(n):
         s.x[i, l], s.x[n + i, l] = s.theta[i, l], s.slope[i, l]
         s.z[i, l], s.z[n + i, l] = s.phi[i, l], 0.0
-    take_in_row(s, s.x.ctypes.data, s.z.ctypes.data, s.tau[l], l)
-    for i in range(n):
-        s.theta[i, l], s.slope[i, l] = s.x[i, l], s.x[n + i, l]
-    s.y_hat[l], s.e[l] = y_hat, s.y[l] - y_hat
+    foresee_row(s, s.x.ctypes.data, s.z.ctypes.data, l)
+    y_hat = prediction(s, l)
+    s.y_hat[l], s.e[l], s.h[l] = y_hat, s.y[l] - y_hat, s.at_start[BEFORE, l]
 
 
 @kernel
-def begin(s: State, l: int) -> None:
-    resolve(s, l)
-    drifted(s, l)
-    enter(s, l)
+def correct_root_form(s: State, l: int) -> None:
+    n = s.theta.shape[0]
+    absorb_row(s, s.x.ctypes.data, s.z.ctypes.data, s.tau[l], l)
+    for i in range(n):
+        s.theta[i, l], s.slope[i, l] = s.x[i, l], s.x[n + i, l]
     hand_over(s, l)
-    if s.s[l] < np.inf:
-        learn_variance(s, l)
-    spanned_folded(s, l)
+    learn_scale(s, l)
 
 
-STEPS = TrackerSteps(drift, correct, folded, begin, read_extra=read_drift, machines=MACHINES)
+STEPS = TrackerSteps(
+    drift, forecast, correct, read_extra=read_drift, machines=MACHINES,
+    start=TrackerSteps(drifted, forecast_root_form, correct_root_form, spanned_variance),
+)  # fmt: skip

@@ -1,8 +1,8 @@
 """The Kalman filter of a random walk on square roots of information: positive by construction.
 
-    predict   theta <- theta + diag(d)^(1/2) G w sqrt(dt), G G' = q    spread
-    correct   (phi' theta = y) / sqrt(r / w)                      absorb;  theta = S^-1 d,  P = S^-1 S^-T
-              s = |S^-T phi|^2 + r / w,  e = y - phi' theta       with S before the sample
+    predict    theta <- theta + diag(d)^(1/2) G w sqrt(dt), G G' = q    spread
+    forecast   y_hat = phi' theta,  e = y - y_hat,  h = |S^-T phi|^2,  s = h + r / w
+    correct    (phi' theta = y) / sqrt(r / w)                      absorb;  theta = S^-1 d,  P = S^-1 S^-T
 
 Use it through ``Kalman(form="sqrt")``. The diffuse start (`driftfit.trackers.parts.diffuse`) is in this form too. The
 rotations are in `driftfit.trackers.parts.information`.
@@ -17,11 +17,17 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.diffuse import drifted, scale_drift, spanned_variance, take_in
-from driftfit.trackers.parts.faults.contradictions import add_to_block
-from driftfit.trackers.parts.faults.judged_start import judged
+from driftfit.trackers.parts.covariance import prediction
+from driftfit.trackers.parts.diffuse import (
+    MACHINES,
+    absorb_on_roots,
+    drifted,
+    forecast_on_roots,
+    scale_drift,
+    spanned_variance,
+)
 from driftfit.trackers.parts.information import absorb, invert, solve, spread, triangular_root
 from driftfit.trackers.parts.varying_drift import read_drift
 
@@ -67,32 +73,36 @@ def read_out(s: State, l: int) -> None:
 
 
 @kernel
-def innovation_variance(s: State, l: int) -> float:
-    """|S^-T phi|^2."""
-    total = 0.0
+def forecast(s: State, l: int) -> None:
+    """y_hat, e and h = |S^-T phi|^2."""
+    y_hat, total = prediction(s, l), 0.0
     for i in range(s.theta.shape[0]):
         t = s.phi[i, l]
         for j in range(i):
             t -= s.S[j, i, l] * s.x[j, l]
         s.x[i, l] = t / s.S[i, i, l]
         total += s.x[i, l] * s.x[i, l]
-    return total
+    s.y_hat[l], s.e[l], s.h[l] = y_hat, s.y[l] - y_hat, total
 
 
 @kernel
 def correct(s: State, l: int) -> None:
-    s.s[l] = innovation_variance(s, l) + s.r[l] * s.noise[l]
-    add_to_block(s, s.e[l] * s.e[l] / s.s[l], l)
     rotate_in(s, l)
     read_out(s, l)
 
 
 @kernel
-def begin(s: State, l: int) -> None:
+def drift_before_span(s: State, l: int) -> None:
     drifted(s, s.dt[l] * s.drift[l], l)
-    take_in(s, l)
-    spanned_variance(s, l)
+
+
+@kernel
+def correct_before_span(s: State, l: int) -> None:
+    absorb_on_roots(s, l)
     s.root[l] = 1 if s.rank[l] < s.theta.shape[0] else 0
 
 
-STEPS = judged(begin, TrackerSteps(grow, correct, diagonal, read_extra=read_drift), variance=innovation_variance)
+STEPS = TrackerSteps(
+    grow, forecast, correct, read_extra=read_drift, machines=MACHINES,
+    start=TrackerSteps(drift_before_span, forecast_on_roots, correct_before_span, spanned_variance),
+)  # fmt: skip

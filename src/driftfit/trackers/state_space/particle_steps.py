@@ -12,7 +12,6 @@ from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.models.state_space import equations_of
 from driftfit.trackers.joint_kalman import MOST, moves_are_finite
 from driftfit.trackers.parts.covariance import LEFT
-from driftfit.trackers.parts.faults.contradictions import leave_out_contradiction
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.state_space.draws import normal, uniform
 
@@ -166,7 +165,7 @@ def _forecast(equations: str, inputs: tuple[str, ...]) -> Any:
         for i in range(n):
             v += s.phi[i, l] * s.gain[p, i, l]
         s.shown[p, l] = s.value[l] if finite else 0.0
-        s.spread[p, l] = max(v, 0.0) + s.r[l] * s.noise[l] if finite else -1.0
+        s.spread[p, l] = max(v, 0.0) if finite else -1.0
         return finite  # type: ignore[no-any-return]
 
     @kernel
@@ -178,11 +177,11 @@ def _forecast(equations: str, inputs: tuple[str, ...]) -> Any:
             y_hat += w * s.shown[p, l]
         y_hat = y_hat / total if total > 0.0 else 0.0
         for p in range(count):
-            w = s.weight[p, l] if s.spread[p, l] > 0.0 else 0.0
+            w = s.weight[p, l] if s.spread[p, l] >= 0.0 else 0.0
             away = s.shown[p, l] - y_hat
             v += w * (s.spread[p, l] + away * away)
-        s.y_hat[l], s.s[l] = y_hat, v / total if total > 0.0 else 1.0
-        return (total > 0.0) & (s.s[l] < LARGEST)  # type: ignore[no-any-return]
+        s.y_hat[l], s.h[l] = y_hat, v / total if total > 0.0 else 0.0
+        return (total > 0.0) & (s.h[l] < LARGEST)  # type: ignore[no-any-return]
 
     return forecast
 
@@ -192,8 +191,8 @@ def weigh(s: State, l: int) -> None:
     """Weights and log density of the sample; particles without a value lose theirs."""
     count, top = s.weight.shape[0], -np.inf
     for p in range(count):
-        v, e = s.spread[p, l], s.y[l] - s.shown[p, l]
-        possible = (v > 0.0) & (s.weight[p, l] > 0.0)
+        v, e = s.spread[p, l] + s.r[l] * s.noise[l], s.y[l] - s.shown[p, l]
+        possible = (s.spread[p, l] >= 0.0) & (s.weight[p, l] > 0.0)
         fit = log(s.weight[p, l]) - 0.5 * (log(v) + e * e / v) if possible else -np.inf
         s.fit[p, l] = fit
         top = max(top, fit)
@@ -212,8 +211,8 @@ def learn(s: State, l: int) -> None:
     """Every particle learns what is Gaussian in it."""
     n = s.theta.shape[0]
     for p in range(s.weight.shape[0]):
-        if s.spread[p, l] > 0.0:
-            e, per = s.y[l] - s.shown[p, l], 1.0 / s.spread[p, l]
+        if s.spread[p, l] >= 0.0:
+            e, per = s.y[l] - s.shown[p, l], 1.0 / (s.spread[p, l] + s.r[l] * s.noise[l])
             for i in range(n):
                 k = per * s.gain[p, i, l]
                 s.cloud[p, i, l] += k * e
@@ -227,15 +226,13 @@ def steps(
     equations: str, inputs: tuple[str, ...], hidden: int, timed: bool, sampled: tuple[int, ...]
 ) -> TrackerSteps:  # fmt: skip
     """The steps for a system of which the entries ``sampled`` of theta are drawn."""
-    move, forecast = _moving(equations, inputs, hidden, timed), _forecast(equations, inputs)
+    move, of_all = _moving(equations, inputs, hidden, timed), _forecast(equations, inputs)
     drawn, count = sampled or (0,), len(sampled)
 
     @kernel
     def predict(s: State, l: int) -> None:
         n, time = s.theta.shape[0], s.dt[l] * s.drift[l]
         if s.dt[l] > 0.0:
-            # `resample` needs this room later
-            copy_particles(s.cloud, s.own, s.cloud_after, s.own_after, l)
             for p in range(s.weight.shape[0]):
                 move(s, p, l)
                 for i in range(n):
@@ -246,27 +243,24 @@ def steps(
             mixture(s, l)
 
     @kernel
+    def forecast(s: State, l: int) -> None:
+        found = of_all(s, l)
+        s.e[l] = s.y[l] - s.y_hat[l] if found else 0.0
+        s.valid[l] = s.valid[l] if found else 0.0
+        s.ok[l] = s.ok[l] if found else 0.0
+
+    @kernel
     def correct(s: State, l: int) -> None:
-        s.e[l], s.log_density[l] = 0.0, 0.0
-        if forecast(s, l):
-            ok = s.ok[l]
-            leave_out_contradiction(s, s.y_hat[l], s.s[l], l)
-            s.e[l] = s.y[l] - s.y_hat[l]
-            if (s.ok[l] < ok) & (s.observed[l] > 0.0):
-                # an input is to blame: states do not move with it
-                copy_particles(s.cloud_after, s.own_after, s.cloud, s.own, l)
-                mixture(s, l)
-            if s.ok[l] > 0.0:
-                weigh(s, l)
-                learn(s, l)
-                mixture(s, l)
-                resample(s, l)
-        else:
-            s.valid[l], s.ok[l] = 0.0, 0.0
+        s.log_density[l] = 0.0
+        if s.ok[l] > 0.0:
+            weigh(s, l)
+            learn(s, l)
+            mixture(s, l)
+            resample(s, l)
         for i in range(s.theta.shape[0]):
             s.phi[i, l] = 0.0
 
-    return TrackerSteps(predict, correct, store=store, read_extra=read_drift, reads_model=True)
+    return TrackerSteps(predict, forecast, correct, store=store, read_extra=read_drift, reads_model=True)
 
 
 @kernel

@@ -30,7 +30,7 @@ from driftfit.engine.kernel import Array, State, Step, floats, kernel, nothing, 
 from driftfit.engine.settings import matrix, vector
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.step_memory import PREDICTED, room
+from driftfit.models.hammerstein_wiener.step_memory import GIVEN, PREDICTED, room
 from driftfit.models.hammerstein_wiener.trackers.minimal import Minimal, minimal_memory, structure_of
 from driftfit.models.hammerstein_wiener.trackers.output_error_steps import (
     FLATTEST,
@@ -44,7 +44,7 @@ from driftfit.models.hammerstein_wiener.trackers.output_error_steps import (
     V_POWER,
     VALID,
     E,
-    R,
+    H,
     follow_power,
     output_error,
 )
@@ -53,17 +53,28 @@ from driftfit.models.hammerstein_wiener.trackers.output_error_steps import (
 @lru_cache
 def _steps(machine: Any) -> TrackerSteps:
     @kernel
-    def correct(s: State, l: int) -> None:
-        s.own[TIME, l] = s.dt[l] * s.drift[l]
+    def call(s: State, correcting: int) -> None:
         fields = packed((
             s.blocks.ctypes.data, s.theta.ctypes.data, s.phi.ctypes.data, s.q.ctypes.data, s.w.ctypes.data,
             s.S.ctypes.data, s.scratch.ctypes.data, s.own.ctypes.data, s.P.ctypes.data,
         ))  # fmt: skip
-        machine(fields, s.theta.shape[0], s.phi.shape[0])
-        s.valid[l], s.observed[l], s.ok[l] = s.own[VALID, l], s.own[OBSERVED, l], s.own[OK, l]
-        s.e[l], s.s[l], s.y_hat[l] = s.own[E, l], s.own[S2, l], s.blocks[PREDICTED, l]
+        machine(fields, s.theta.shape[0], s.phi.shape[0], correcting)
 
-    return TrackerSteps(nothing, correct)
+    @kernel
+    def forecast(s: State, l: int) -> None:
+        s.own[TIME, l] = s.dt[l] * s.drift[l]
+        call(s, 0)
+        given = s.blocks[GIVEN, l]
+        s.valid[l], s.observed[l], s.ok[l] = s.own[VALID, l], s.own[OBSERVED, l], s.own[OK, l]
+        s.e[l], s.h[l], s.y_hat[l] = s.own[E, l], s.own[H, l], s.blocks[PREDICTED, l]
+        s.noise[l] = given if given < np.inf else 1.0
+
+    @kernel
+    def correct(s: State, l: int) -> None:
+        s.own[OK, l], s.own[S2, l] = s.ok[l], s.s[l]
+        call(s, 1)
+
+    return TrackerSteps(nothing, forecast, correct)
 
 
 @lru_cache
@@ -121,6 +132,7 @@ class OutputError(Minimal):
             "theta": vector("OutputError", "theta0", self.theta0, n),
             "P": matrix("OutputError", "p0", self.p0, n),
             "q": matrix("OutputError", "q", self.q, n),
+            "r": self.r,
             "var": np.zeros(n),
         }
 
@@ -131,7 +143,7 @@ class OutputError(Minimal):
         own = np.zeros(V_POWER + model.m)
         assert isinstance(model, HammersteinWiener)
         least = FLATTEST * model.out.steepness
-        own[[R, Q_W, P_W, LEAST_SLOPE]] = self.r, self.q_w, self.p_w, least
+        own[[Q_W, P_W, LEAST_SLOPE]] = self.q_w, self.p_w, least
         S = np.zeros((N, N))
         S[n_w:, n_w:] = matrix("OutputError", "p0", self.p0, structure.n_x)
         return {

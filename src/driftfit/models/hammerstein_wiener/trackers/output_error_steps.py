@@ -62,9 +62,10 @@ SHARE, LARGE = 0.01, 25.0
 that a fault code cannot become the scale.
 """
 
-TIME, R, Q_W, P_W, BEGUN, VALID, OBSERVED, OK, E, S2, R_NOW, SLOPE, LEAST_SLOPE, V_POWER = range(14)
-"""Numbers of the filter: nominal intervals times the drift, variances, whether w has begun, the results, the noise
-variance and the slope of F at this sample, and its least value; from V_POWER on the usual power of v of each input.
+TIME, Q_W, P_W, BEGUN, VALID, OBSERVED, OK, E, H, S2, LEAST_SLOPE, V_POWER = range(12)
+"""Numbers of the filter: nominal intervals times the drift, variances, whether w has begun, what the sample has, the
+innovation, its variance without and with the noise, and the least slope of F; from V_POWER on the usual power of v of
+each input.
 """
 
 AT_BLOCKS, AT_THETA, AT_PHI, AT_Q, AT_W, AT_S, AT_SCRATCH, AT_OWN, AT_P, ADDRESSES = range(10)
@@ -159,28 +160,19 @@ def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, scratch: Ar
 
 
 @shared
-def absorb(m: Array, p: Places, own: Array, theta: Array, w: Array, S: Array, scratch: Array) -> None:
-    """The measurement update, and the variance of the innovation."""
-    n_w, N, n_out, g, row, moved = len(w), len(S), p[N_OUT], p[TRIAL], scratch[0], scratch[1]
-    e, slope = own[E], own[SLOPE]
-    x_d = n_w + at_d(p)
-    for x in range(N):
-        row[x] = 0.0
-    row[0] = 1.0 / slope
-    for k in range(1, n_out):
-        row[x_d + k - 1] = -m[g + k, 0] / slope
-    s: float = product(S, row, moved, own[R_NOW])
+def absorb(p: Places, own: Array, theta: Array, w: Array, S: Array, moved: Array) -> None:
+    """The measurement update, with ``moved`` = S h of the forecast."""
+    n_w = len(w)
     if own[OK] > 0.0:
-        for x in range(N):
-            k = moved[x] / s
+        for x in range(len(S)):
+            k = moved[x] / own[S2]
             if x < n_w:
-                w[x] += k * e
+                w[x] += k * own[E]
             else:
-                theta[x - n_w] += k * e
+                theta[x - n_w] += k * own[E]
             for z in range(x):
                 S[x, z] -= k * moved[z]
             S[x, x] = max(S[x, x] - k * moved[x], LEFT * S[x, x])
-    own[S2] = s
 
 
 @shared
@@ -244,7 +236,7 @@ def covariance_of_theta(S: Array, n_w: int, P: Array) -> None:
 
 @lru_cache
 def _work(out: Kind) -> Any:
-    """One sample, for the functions of an output basis."""
+    """The time update and the forecast, for the functions of an output basis."""
     fill_trial, invert = output_values(out), inverse_of(level_of(out))
 
     def output_error_work(
@@ -269,8 +261,13 @@ def _work(out: Kind) -> Any:
         used = valid and observed and m[GIVEN, 0] < np.inf
         own[VALID], own[OBSERVED], own[OK] = 1.0 if valid else 0.0, 1.0 if observed else 0.0, 1.0 if used else 0.0
         own[E] = y - y_hat if used else 0.0
-        own[R_NOW], own[SLOPE] = own[R] * m[GIVEN, 0] if used else own[R], max(slope, own[LEAST_SLOPE])
-        absorb(m, p, own, theta, w, S, scratch)
+        row, slope = scratch[0], max(slope, own[LEAST_SLOPE])
+        for x in range(len(S)):
+            row[x] = 0.0
+        row[0] = 1.0 / slope
+        for k in range(1, n_out):
+            row[len(w) + free + k - 1] = -m[p[TRIAL] + k, 0] / slope
+        own[H] = product(S, row, scratch[1], 0.0)
         m[PREDICTED, 0], m[LATE, 0] = y_hat, 0.0
         follow_power(m, p, theta, own)
 
@@ -279,10 +276,12 @@ def _work(out: Kind) -> Any:
 
 @lru_cache
 def output_error(out: Kind, p: tuple[int, ...]) -> Any:
-    """The compiled routine for the functions of an output basis and the places of a model."""
+    """The compiled routine, for the functions of an output basis and the places of a model: time update and forecast,
+    or the correction.
+    """
     work, orders, rows = _work(out), np.array(p), room(p)
 
-    def machine_output_error(fields: int, n_x: int, n: int) -> None:
+    def machine_output_error(fields: int, n_x: int, n: int, correcting: int) -> None:
         at, n_w, size = wholes(fields, 1, ADDRESSES), max(orders[NA], 1), V_POWER + orders[INPUTS]
         N, own = n_w + n_x, floats(at[0, AT_OWN], 1, size)[0]
         q, S, P = floats(at[0, AT_Q], n_x, n_x), floats(at[0, AT_S], N, N), floats(at[0, AT_P], n_x, n_x)
@@ -291,8 +290,12 @@ def output_error(out: Kind, p: tuple[int, ...]) -> Any:
             floats(at[0, AT_PHI], 1, n)[0],
             floats(at[0, AT_W], 1, n_w)[0],
         )
-        drift_theta(S, q, n_w, own[TIME])
-        work(floats(at[0, AT_BLOCKS], rows, 1), orders, own, theta, phi, w, S, floats(at[0, AT_SCRATCH], 2, N))
-        covariance_of_theta(S, n_w, P)
+        scratch = floats(at[0, AT_SCRATCH], 2, N)
+        if correcting > 0:
+            absorb(orders, own, theta, w, S, scratch[1])
+            covariance_of_theta(S, n_w, P)
+        else:
+            drift_theta(S, q, n_w, own[TIME])
+            work(floats(at[0, AT_BLOCKS], rows, 1), orders, own, theta, phi, w, S, scratch)
 
     return machine(machine_output_error)

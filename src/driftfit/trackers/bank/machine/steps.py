@@ -46,15 +46,15 @@ from driftfit.trackers.bank.leaves.own_sensor import own_address
 from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, outgrown, read_framed, write_walks
 from driftfit.trackers.bank.machine.late_direction import begin_within, point_along
-from driftfit.trackers.parts.coarse.resolution import lasting, least_noise, resolve
+from driftfit.trackers.parts.coarse.resolution import lasting, learn_resolved_scale, least_noise, resolve
 from driftfit.trackers.parts.coordinates import FRAME, unseen_variance, whiten_within
-from driftfit.trackers.parts.covariance import measurement, prediction
+from driftfit.trackers.parts.covariance import correct as correct_one
+from driftfit.trackers.parts.covariance import forecast, prediction
 from driftfit.trackers.parts.diffuse import enter, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.faults.first_samples import RESIDUALS
 from driftfit.trackers.parts.few_residuals import wider
 from driftfit.trackers.parts.modes.noise_levels import LEAST_SHARE
-from driftfit.trackers.rls import learn_scale
 
 GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift"], ROW["own_likelihoods"]
 
@@ -203,7 +203,7 @@ def alone(s: State, l: int, counts: bool) -> None:
     residuals = s.count[l]
     s.sample[FREEDOM, l] = residuals if s.unknown[l] > 0 else np.inf
     if counts:
-        learn_scale(s, l)
+        learn_resolved_scale(s, l)
         s.scale[l] *= wider(s.count[l])
     s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
     hand_over(s, l)
@@ -236,7 +236,9 @@ def correct(s: State, l: int) -> None:
         learn_scales(s, l)
     else:
         only_drift(s, l)
-        measurement(s, l)
+        forecast(s, l)
+        s.s[l] = s.h[l] + s.r[l] * s.noise[l]
+        correct_one(s, l)
         alone(s, l, s.unknown[l] > 0)
 
 
@@ -310,4 +312,7 @@ def take_known(s: State, known: Array, t: int, l: int) -> None:
             column += 1
 
 
-STEPS = TrackerSteps(nothing, correct, diagonal, begin, keep, take_known, machines=(*FRAME, *FRAMED), outlined=True)
+STEPS = TrackerSteps(
+    nothing, nothing, correct, variance=nothing, start=TrackerSteps(nothing, nothing, begin, nothing, nothing),
+    store=keep, read_extra=take_known, machines=(*FRAME, *FRAMED), outlined=True,
+)  # fmt: skip

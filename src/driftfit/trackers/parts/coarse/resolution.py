@@ -140,6 +140,17 @@ def lasting(s: State, l: int) -> float:
     return s.coarse[l] * s.alike[l] * (s.alike[l] + 2.0)  # type: ignore[no-any-return]
 
 
+@kernel
+def learn_resolved_scale(s: State, l: int) -> None:
+    """Count the innovation; s.s becomes a variance with the scale known before this sample, and s.scale is updated."""
+    counted = s.ok[l] * s.fresh[l]
+    s.squares[l] += counted * s.e[l] * s.e[l] / s.s[l]
+    s.count[l] += counted
+    s.s[l] *= s.scale[l]
+    scale, least = s.squares[l] / s.count[l], least_noise(s, l)
+    s.scale[l] = least if least > scale else scale  # NaN is kept
+
+
 def resolution(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
     """Its remark in a summary: nothing if the resolution is fine."""
     if not lane["coarse"] > 0.0:

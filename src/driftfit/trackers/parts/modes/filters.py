@@ -76,7 +76,7 @@ def project(s: State, l: int) -> None:
     n, K = s.theta.shape[0], s.modes[l]
     for k in range(K):
         s.e_k[k, l] = 0.0
-        s.h[k, l] = 0.0
+        s.h_k[k, l] = 0.0
     for i in range(n):
         for k in range(K):
             s.e_k[k, l] += s.x[i, l] * s.m[i, k, l]
@@ -88,12 +88,12 @@ def project(s: State, l: int) -> None:
             for k in range(K):
                 s.gain[i, k, l] += s.C[j, i, k, l] * s.x[j, l]
         for k in range(K):
-            s.h[k, l] += s.x[i, l] * s.gain[i, k, l]
+            s.h_k[k, l] += s.x[i, l] * s.gain[i, k, l]
     for i in range(n):
         for k in range(K):  # below 0: an absurd sample left no digits of C, and no gain can be trusted
-            s.gain[i, k, l] = s.gain[i, k, l] if s.h[k, l] >= 0.0 else 0.0
+            s.gain[i, k, l] = s.gain[i, k, l] if s.h_k[k, l] >= 0.0 else 0.0
     for k in range(K):
-        s.h[k, l] = max(s.h[k, l], 0.0)
+        s.h_k[k, l] = max(s.h_k[k, l], 0.0)
 
 
 @partial(kernel, inline=False)
@@ -109,7 +109,7 @@ def innovate(s: State, l: int) -> None:
     for j in range(J - 1):
         level += s.nu_prior[j, l] * noise_at(s, s.level[j, l], l)
     for k in range(K):
-        s.row[k, l] = s.prior[k, l] * (s.h[k, l] + (s.e_k[k, l] - mean) ** 2)
+        s.row[k, l] = s.prior[k, l] * (s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2)
     v = level / (1.0 - OUTLIER) + sum_of_row(s, l)
     for k in range(K):
         s.e_k[k, l] = s.y[l] - s.e_k[k, l]
@@ -123,7 +123,7 @@ def too_broad(s: State, l: int) -> bool:
     """Whether this is an outlier that the filter which took another one for a jump predicts no better than the density
     of outliers does (`driftfit.trackers.parts.modes.drifts.after_outlier`)."""
     outlying = noise_at(s, s.level[s.nu.shape[0] - 1, l], l)
-    return (s.e[l] * s.e[l] > SURE * SURE * s.s[l]) & (s.h[s.modes[l] - 2, l] > outlying)  # type: ignore[no-any-return]
+    return (s.e[l] * s.e[l] > SURE * SURE * s.s[l]) & (s.h_k[s.modes[l] - 2, l] > outlying)  # type: ignore[no-any-return]
 
 
 @partial(kernel, inline=False)
@@ -139,7 +139,7 @@ def likelihoods(s: State, l: int) -> float:
         widest = np.inf if j == J - 1 else 0.0
         for k in range(K):
             square = s.e_k[k, l] * s.e_k[k, l]
-            v = s.h[k, l] + max(noise, min(square, widest))
+            v = s.h_k[k, l] + max(noise, min(square, widest))
             s.inverse[j, k, l] = 1.0 / v
             s.row[k, l] = min(s.row[k, l], square / v)
     nearest, broad = least_of_row(s, l), K - 2 if too_broad(s, l) else -1
@@ -158,7 +158,7 @@ def as_predicted(s: State, nearest: float, l: int) -> None:
     for j in range(J - 1):
         noise = noise_at(s, s.level[j, l], l)
         for k in range(K):
-            v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
+            v = s.h_k[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
             far = s.e_k[k, l] * s.e_k[k, l] / v - nearest
             s.row[k, l] += s.prior[k, l] * s.nu_prior[j, l] / np.sqrt(v) * exp(-0.5 * far)
 
@@ -170,7 +170,7 @@ def predictive_density(s: State, nearest: float, l: int) -> None:
     K, J = s.modes[l], s.nu.shape[0]
     noise = noise_at(s, s.level[J - 1, l], l)
     for k in range(K):
-        v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
+        v = s.h_k[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
         s.row[k, l] = s.prior[k, l] * s.nu_prior[J - 1, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
     outlier = sum_of_row(s, l)
     for k in range(K):
@@ -222,9 +222,9 @@ def absorb(s: State, l: int) -> None:
             s.m[i, k, l] += s.gain[i, k, l] * s.step[k, l]
         for j in range(i):
             for k in range(K):
-                s.C[i, j, k, l] -= s.h[k, l] * s.gain[i, k, l] * s.gain[j, k, l]
+                s.C[i, j, k, l] -= s.h_k[k, l] * s.gain[i, k, l] * s.gain[j, k, l]
         for k in range(K):
-            left = s.C[i, i, k, l] - s.h[k, l] * s.gain[i, k, l] * s.gain[i, k, l]
+            left = s.C[i, i, k, l] - s.h_k[k, l] * s.gain[i, k, l] * s.gain[i, k, l]
             s.C[i, i, k, l] = max(left, LEFT * s.C[i, i, k, l])
 
 
@@ -243,7 +243,7 @@ def update_filters(s: State, l: int) -> None:
     for k in range(K):
         a = s.weighted[k, l]
         spread = max(s.mu_next[k, l] - a * a, 0.0)
-        s.h[k, l] = a - spread * s.e_k[k, l] * s.e_k[k, l]
+        s.h_k[k, l] = a - spread * s.e_k[k, l] * s.e_k[k, l]
         s.step[k, l] = a * s.e_k[k, l]
     bend_slopes(s, l)
     absorb(s, l)
@@ -269,8 +269,8 @@ def enter_filters(s: State, j: int, l: int) -> None:
     n, K, fresh = s.theta.shape[0], s.modes[l], s.S[j, j, l] == 0.0
     noise = noise_at(s, 1.0, l)
     for k in range(K):
-        s.h[k, l] = 0.0 if fresh or s.h[k, l] == 0.0 else 1.0 / (s.h[k, l] + noise)
-        s.step[k, l] = s.h[k, l] * s.e_k[k, l]
+        s.h_k[k, l] = 0.0 if fresh or s.h_k[k, l] == 0.0 else 1.0 / (s.h_k[k, l] + noise)
+        s.step[k, l] = s.h_k[k, l] * s.e_k[k, l]
         s.mu[k, l] = s.prior[k, l]
     absorb(s, l)
     sign = new_row(s, s.white, j, l)
@@ -278,7 +278,7 @@ def enter_filters(s: State, j: int, l: int) -> None:
     for i in range(j, n):
         s.x[i, l] = 0.0
     for k in range(K):
-        left = noise * s.h[k, l]  # r / s, the share of the innovation that is noise
+        left = noise * s.h_k[k, l]  # r / s, the share of the innovation that is noise
         mean, own = s.y[l] - s.explained[l] - left * s.e_k[k, l], noise * (1.0 - left)
         for i in range(n):
             mean -= s.x[i, l] * s.m[i, k, l]

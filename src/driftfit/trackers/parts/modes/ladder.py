@@ -230,7 +230,7 @@ def mix(s: State, l: int) -> None:
 def leap(s: State, l: int, noise: float) -> None:
     """Let the top filter explain the innovation by a jump of any size, if that is more likely."""
     most = LEAP * s.widening[l]
-    square, v, unit = s.e_k[TOP, l] * s.e_k[TOP, l], s.h[TOP, l] + noise, 0.0
+    square, v, unit = s.e_k[TOP, l] * s.e_k[TOP, l], s.h_k[TOP, l] + noise, 0.0
     for i in range(s.theta.shape[0]):
         own = s.ratio[i, TOP, l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
         unit += own * s.white[i, l] * s.white[i, l]
@@ -246,4 +246,4 @@ def leap(s: State, l: int, noise: float) -> None:
                 s.gain[a, TOP, l] += own * s.S[a, i, l] * s.white[i, l]
                 for b in range(a + 1):
                     s.C[a, b, TOP, l] += own * s.S[a, i, l] * s.S[b, i, l]
-        s.h[TOP, l] += s.gained[l]
+        s.h_k[TOP, l] += s.gained[l]

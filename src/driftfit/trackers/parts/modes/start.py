@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, exp, kernel, log
-from driftfit.trackers.parts.coarse.resolution import reading, same_reading
+from driftfit.trackers.parts.coarse.resolution import learn_resolved_scale, reading, same_reading
 from driftfit.trackers.parts.diffuse import know_nothing, take_in
 from driftfit.trackers.parts.excitation import learn_information, learn_scales
 from driftfit.trackers.parts.faults.first_samples import (
@@ -52,7 +52,6 @@ from driftfit.trackers.parts.modes.drifts.about_means import forget_mean, learn_
 from driftfit.trackers.parts.modes.filters import absorb, project, wander
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
 from driftfit.trackers.parts.modes.weights import WINDOW
-from driftfit.trackers.rls import learn_scale
 
 LOOSE = 1e4
 """Variance of each coordinate before the first sample, in units of what least squares leave. A larger one would cost
@@ -85,7 +84,7 @@ def take_first(s: State, l: int) -> None:
     learn_proportion(s, l, 0.0)
     take_in(s, l)
     if s.s[l] < np.inf:
-        learn_scale(s, l)
+        learn_resolved_scale(s, l)
 
 
 @partial(kernel, short=True)
@@ -221,10 +220,10 @@ def run_again(s: State, l: int) -> None:
         whitened(s, at, l)
         project(s, l)
         for k in range(K):
-            e, v = s.samples[at, Y, l] - s.e_k[k, l], s.h[k, l] + abs(s.samples[at, NOISE, l])
+            e, v = s.samples[at, Y, l] - s.e_k[k, l], s.h_k[k, l] + abs(s.samples[at, NOISE, l])
             s.weighted[k, l] += e * e / v
             s.mu_next[k, l] += log(v)
-            s.step[k, l], s.h[k, l] = e / v, 1.0 / v
+            s.step[k, l], s.h_k[k, l] = e / v, 1.0 / v
         absorb(s, l)
 
 

@@ -55,19 +55,19 @@ def begin_filter(s: State, own: int, best: int, share: float, noise: float, l: i
             s.joint[j, k, l] *= kept
         s.joint[j, own, l] = 0.0
     s.mu[own, l], s.joint[0, own, l] = share, share
-    s.e_k[own, l], s.h[own, l] = s.e_k[best, l], s.h[best, l]
+    s.e_k[own, l], s.h_k[own, l] = s.e_k[best, l], s.h_k[best, l]
     for i in range(n):
         s.m[i, own, l], s.gain[i, own, l] = s.m[i, best, l], s.gain[i, best, l]
         for a in range(i + 1):
             s.C[i, a, own, l] = s.C[i, a, best, l]
     for i in range(n):
-        s.h[own, l] += s.jumped[i, l] * s.white[i, l] * s.white[i, l]
+        s.h_k[own, l] += s.jumped[i, l] * s.white[i, l] * s.white[i, l]
         for a in range(i + 1):
             moved = s.jumped[i, l] * s.S[a, i, l]
             s.gain[a, own, l] += moved * s.white[i, l]
             for b in range(a + 1):
                 s.C[a, b, own, l] += moved * s.S[b, i, l]
-    s.inverse[0, own, l] = 1.0 / (s.h[own, l] + noise)
+    s.inverse[0, own, l] = 1.0 / (s.h_k[own, l] + noise)
 
 
 @partial(kernel, inline=False)
@@ -81,7 +81,7 @@ def jump(s: State, own: int, share: float, l: int) -> None:
             s.jumped[i, l] = s.power_samples[l] / (s.c[i, l] * max(s.active[i, l], 1.0))
             unit += s.jumped[i, l] * s.white[i, l] * s.white[i, l]
     noise = noise_at(s, 1.0, l) + lasting(s, l)
-    gained = s.e_k[best, l] * s.e_k[best, l] - s.h[best, l] - noise
+    gained = s.e_k[best, l] * s.e_k[best, l] - s.h_k[best, l] - noise
     begins = (unit > USUAL * s.noise[l]) & (gained > 0.0)
     for i in range(s.theta.shape[0]):
         s.jumped[i, l] *= gained / unit if begins else 0.0

@@ -66,7 +66,7 @@ def bend_slopes(s: State, l: int) -> None:
         for j in range(s.slopes.shape[1]):
             k = s.trend[l] + j
             before = max(s.C[i, i, k, l], 1e-300)
-            removed = min(1.0, max(s.h[k, l] * s.gain[i, k, l] * s.gain[i, k, l] / before, 0.0))
+            removed = min(1.0, max(s.h_k[k, l] * s.gain[i, k, l] * s.gain[i, k, l] / before, 0.0))
             s.corrected[i, j, l] += min(1.0, 2.0 * removed) * (before - s.corrected[i, j, l])
             s.slopes[i, j, l] += s.bend[j, l] * share * s.gain[i, k, l] * s.step[k, l]
 
