@@ -269,7 +269,6 @@ def _work(out: Kind) -> Any:
             row[len(w) + free + k - 1] = -m[p[TRIAL] + k, 0] / slope
         own[H] = product(S, row, scratch[1], 0.0)
         m[PREDICTED, 0], m[LATE, 0] = y_hat, 0.0
-        follow_power(m, p, theta, own)
 
     return shared(output_error_work)
 
@@ -290,12 +289,13 @@ def output_error(out: Kind, p: tuple[int, ...]) -> Any:
             floats(at[0, AT_PHI], 1, n)[0],
             floats(at[0, AT_W], 1, n_w)[0],
         )
-        scratch = floats(at[0, AT_SCRATCH], 2, N)
+        scratch, m = floats(at[0, AT_SCRATCH], 2, N), floats(at[0, AT_BLOCKS], rows, 1)
         if correcting > 0:
             absorb(orders, own, theta, w, S, scratch[1])
+            follow_power(m, orders, theta, own)
             covariance_of_theta(S, n_w, P)
         else:
             drift_theta(S, q, n_w, own[TIME])
-            work(floats(at[0, AT_BLOCKS], rows, 1), orders, own, theta, phi, w, S, scratch)
+            work(m, orders, own, theta, phi, w, S, scratch)
 
     return machine(machine_output_error)
