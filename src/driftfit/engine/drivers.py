@@ -238,93 +238,96 @@ def _forecasting(tracker: TrackerSteps) -> Any:
     return forecasts
 
 
+@kernel
+def keeps_digits(s: State, l: int) -> None:
+    """Whether a covariance can take the sample in; otherwise it is ``late``, and not used before that."""
+    wide = (s.h[l] > WIDE * (s.r[l] * s.noise[l])) & (s.h[l] < np.inf)
+    s.late[l] = s.ok[l] if wide else 0.0
+    s.ok[l] = 0.0 if wide else s.ok[l]
+
+
+def _late(tracker: TrackerSteps) -> Any:
+    """The samples that `keeps_digits` found to be late, by the form of the start."""
+    assert tracker.start is not None and tracker.start.take_over is not None
+    take_over, correct, report = tracker.start.take_over, tracker.start.correct, tracker.start.report
+    forecast, variance = tracker.start.forecast, tracker.start.variance
+
+    def late(s: State) -> None:
+        for l in range(s.theta.shape[1]):
+            if s.late[l] > 0.0:
+                s.ok[l] = s.late[l]
+                take_over(s, l)
+                forecast(s, l)
+                variance(s, l)
+                correct(s, l)
+                report(s, l)
+
+    return kernel(late, inline=False)
+
+
+@kernel
+def none_late(s: State, l: int) -> None:
+    """All samples are taken in at once."""
+
+
 def _advance(tracker: TrackerSteps) -> Any:
     """One sample of all lanes of a tile; lanes whose ``s.root`` is 1 take the steps of the ``start``."""
     forecasts, correct, report = _forecasting(tracker), tracker.correct, tracker.report
+    both = tracker.start is not None and tracker.start.take_over is not None
+    check, late = (keeps_digits, _late(tracker)) if both else (none_late, nothing)
+    called = outlined(late, short=True) if both else late
 
     @kernel
     def advance(s: State) -> None:
         for l in range(s.theta.shape[1]):
             forecasts(s, l)
+            check(s, l)
             correct(s, l)
         for l in range(s.theta.shape[1]):
             report(s, l)
+        if both:
+            some = 0.0
+            for l in range(s.theta.shape[1]):
+                some = max(some, s.late[l])
+            if some > 0.0:
+                called(s)
 
     if tracker.start is None:
         return advance
     first = tracker.start
     forecasts_first, correct_first, report_first = _forecasting(first), first.correct, first.report
-    rare = partial(kernel, inline=False)  # seldom run: the lane loop is better without it
-    called = rare if tracker.outlined else lambda step: outlined(rare(step), short=True)
 
     def start(s: State) -> None:
         alone = s.theta.shape[1] == 1  # a constant, for which there is no code of the others
         for l in range(s.theta.shape[1]):
+            s.late[l] = 0.0
             if alone or s.root[l] > 0:
                 forecasts_first(s, l)
                 correct_first(s, l)
                 report_first(s, l)
             else:
                 forecasts(s, l)
+                check(s, l)
                 correct(s, l)
                 report(s, l)
+        if both and not alone:
+            late(s)
 
-    started = called(start)
-    if first.take_over is None:
-
-        @kernel
-        def advance_or_start(s: State) -> None:
-            some = 0
-            for l in range(s.theta.shape[1]):
-                some = max(some, s.root[l])
-            if some > 0:
-                started(s)
-            else:
-                advance(s)
-
-        return advance_or_start
-    take_over, forecast_first, variance_first = first.take_over, first.forecast, first.variance
+    started = kernel(start, inline=False)  # seldom run: the lane loop is better without it
+    if not tracker.outlined:  # else it is called together with the rest
+        started = outlined(started, short=True)
 
     @kernel
-    def wide(s: State, l: int) -> bool:
-        return s.h[l] > WIDE * (s.r[l] * s.noise[l])  # type: ignore[no-any-return]
-
-    def correct_wide(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            if wide(s, l):
-                take_over(s, l)
-                forecast_first(s, l)
-                variance_first(s, l)
-                correct_first(s, l)
-                report_first(s, l)
-            else:
-                correct(s, l)
-                report(s, l)
-
-    corrected_wide = called(correct_wide)
-
-    @kernel
-    def advance_in_two_forms(s: State) -> None:
+    def advance_or_start(s: State) -> None:
         some = 0
         for l in range(s.theta.shape[1]):
             some = max(some, s.root[l])
         if some > 0:
             started(s)
-            return
-        for l in range(s.theta.shape[1]):
-            forecasts(s, l)
-        some = 0
-        for l in range(s.theta.shape[1]):
-            some = max(some, 1 if wide(s, l) else 0)
-        if some > 0:
-            corrected_wide(s)
         else:
-            for l in range(s.theta.shape[1]):
-                correct(s, l)
-            for l in range(s.theta.shape[1]):
-                report(s, l)
+            advance(s)
 
-    return advance_in_two_forms
+    return advance_or_start
 
 
 @lru_cache(maxsize=256)
