@@ -12,6 +12,7 @@ The trackers are Kalman(q, r) with given numbers, RLS(0.98) with estimated noise
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -19,9 +20,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from benchmarks.gate_cases import CODES, MODELS, REAL, STARTS, Case
 from driftfit.engine.kernel import kernel
 from driftfit.readings.first_samples import replayed
-from driftfit.readings.gate import AT_START, Gate, gate_step, start
+from driftfit.readings.gate import AT_START, LEVERAGE, USED, Gate, gate_step, start
 
 KALMAN, RLS, MIXTURE = range(3)
 NAMES = ("Kalman", "RLS", "mixture")
@@ -231,3 +233,80 @@ class Bench:
             reason[where[where >= 0]] = AT_START
             loop(tile, y, u, done, theta, reason)
         return theta, reason, tile
+
+
+def measured(bench: Bench, case: Case, kind: int) -> tuple[float, float, float, float]:
+    """Good readings refused, codes let in, and errors of theta with the gate and without, as multiples of what the same
+    tracker has without the codes."""
+    settings = {"q": case.q, "r": case.r}
+    theta, reason, _ = bench.run(kind, case.y, case.u, True, **settings)
+    plain, _, _ = bench.run(kind, case.y, case.u, False, **settings)
+    whole, _, _ = bench.run(kind, *case.without_codes(), False, **settings)
+    ends = np.flatnonzero(np.diff(np.r_[case.bad | case.bad_u, False][case.at :].astype(int)) < 0)
+    later = slice(max(case.at + (ends[0] if len(ends) else 0) + 20, 60), None)
+    gated, ungated, least = (np.sqrt(np.mean((one - case.theta)[later] ** 2)) for one in (theta, plain, whole))
+    refused = (reason != USED) & (reason != LEVERAGE)
+    known = case.without_codes()
+    window = bench.nb + 1  # an input code spoils the samples that remember it
+    spoilt = np.convolve(case.bad_u, np.ones(window))[: len(case.y)] > 0 if case.bad_u.any() else case.bad
+    del known
+    good = ~case.bad & ~spoilt
+    return float(np.sum(refused & good)), float(np.sum(~refused & case.bad)), gated / least, ungated / least
+
+
+def table(benches: dict[str, Bench], cases: dict[str, Callable], runs: int, show: bool = True) -> dict[str, np.ndarray]:
+    """The medians (trackers, 4) of each case; refused and let in are the largest of all runs."""
+    found = {}
+    for name, make in cases.items():
+        rows = np.array([
+            [measured(benches[case.model], case, kind) for kind in range(3)]
+            for case in (make(np.random.default_rng(seed)) for seed in range(runs))
+        ])  # fmt: skip
+        found[name] = np.median(rows, 0)
+        found[name][:, :2] = rows.max(0)[:, :2]
+        if show:
+            cells = " | ".join(f"{a:4.0f} {b:3.0f} {c:8.2f} {d:9.3g}" for a, b, c, d in found[name])
+            print(f"{name:32} {cells}", flush=True)
+    return found
+
+
+RULES = {
+    "outputs": {"far": np.inf}, "repeats": {"hold": 3}, "repeats by nature": {"natural": np.inf},
+    "unusual forecasts": {"rare": np.inf}, "inputs": {"away": np.inf}, "leverage": {"leverage": np.inf},
+    "frozen": {"frozen": 0.0}, "coarse": {"coarse": np.inf}, "first samples": {"first": 0},
+}  # fmt: skip
+
+
+def ablation(cases: dict[str, Callable], runs: int, rules: dict[str, dict[str, Any]]) -> None:
+    """For every rule the cases that it changes: lost, let in and the error, with it and without, of the tracker for
+    which the errors differ most."""
+    whole = table({name: Bench(*sizes, Gate()) for name, sizes in MODELS.items()}, cases, runs, False)
+    for rule, off in rules.items():
+        found = table({name: Bench(*sizes, Gate(**off)) for name, sizes in MODELS.items()}, cases, runs, False)
+        print(rule, flush=True)
+        for name in cases:
+            ratio = found[name][:, 2] / whole[name][:, 2]
+            k = int(np.argmax(np.abs(np.log(ratio))))
+            if abs(ratio[k] - 1.0) > 0.01 or np.abs(found[name][:, :2] - whole[name][:, :2]).max() >= 1.0:
+                one, other = (f"{a:3.0f} {b:3.0f} {c:9.4g}" for a, b, c in (whole[name][k, :3], found[name][k, :3]))
+                print(f"  {name:32} {NAMES[k]:8} {one}   without {other}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--only", default="")
+    parser.add_argument("--rules", action="store_true")
+    given = parser.parse_args()
+    words = given.only.split(",")
+    cases = {k: v for k, v in (REAL | CODES | STARTS).items() if any(word in k for word in words)}
+    if given.rules:
+        return ablation(cases, given.runs, RULES)
+    benches = {name: Bench(*sizes, Gate()) for name, sizes in MODELS.items()}
+    print(" " * 32, " | ".join(f"{name:>8}: lost in gated   ungated" for name in NAMES))
+    table(benches, cases, given.runs)
+    return None
+
+
+if __name__ == "__main__":
+    main()

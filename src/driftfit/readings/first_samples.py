@@ -34,7 +34,7 @@ from driftfit.engine.kernel import Array, State, Step, kernel
 
 OUTLYING = 10.0
 """Usual distances from the median from which on a value is outlying."""
-WORSE = 36.0
+WORSE = 25.0
 """F statistic from which samples contradict each other: six standard deviations for one sample."""
 RESIDUALS = 4
 """Fewest residuals of the samples that are not doubtful."""
@@ -198,6 +198,8 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
         same &= (s.noise[l] == s.gate_first[k, NOISE, l]) & (s.drift[l] == s.gate_first[k, DRIFT, l])
         for j in range(m):
             same &= s.u[j, l] == s.gate_first[k, U + j, l]
+        for i in range(n):
+            same &= s.phi[i, l] == s.gate_first[k, PHI + i, l]
         return same  # type: ignore[no-any-return]
 
     @kernel

@@ -42,6 +42,8 @@ FIRST = 10.0
 """Readings after which a mean and a variance are known."""
 MEMORY = 1000.0
 """Their memory, in readings; exponential."""
+GROWTH = 1.02
+"""Growth in one sample of the error of a settled tracker, at most."""
 USED, REFUSED, FROZEN, INPUT, LEVERAGE, AT_START = range(6)
 """Reasons: what was decided of a sample."""
 
@@ -84,7 +86,7 @@ class Gate(Settings):
 def start(gate: Gate, n: int, m: int) -> Mapping[str, Any]:
     """Fields of the gate's state and their values before the first sample, for n parameters and m inputs."""
     return {
-        "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0, "gate_ratios": 0.0,
+        "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0, "gate_ratios": 0.0, "gate_settled": np.inf,
         "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan, "gate_other": np.nan,
         "gate_squares": np.zeros(n), "reason": 0, "factor": 1.0,
         **unresolved(), **not_frozen(), **no_inputs(m), **no_samples(gate.first, n, m),
@@ -105,9 +107,11 @@ def variance_of_error(s: State, l: int) -> float:
 
 
 @kernel
-def learn_usual(s: State, clip: float, l: int) -> None:
-    """Mean and variance of the accepted readings, and the mean of e^2 / s of the samples used."""
-    if s.observed[l] > 0.0:
+def learn_usual(s: State, contradicts: bool, clip: float, l: int) -> None:
+    """Mean and variance of the readings that do not contradict their forecasts, the mean of e^2 / s of the samples
+    used, and the error of a settled tracker.
+    """
+    if (s.observed[l] > 0.0) & (not contradicts):
         s.gate_count[l] += 1.0
         share = 1.0 / min(s.gate_count[l], MEMORY)
         off = reading(s, l) - s.gate_mean[l]
@@ -120,6 +124,7 @@ def learn_usual(s: State, clip: float, l: int) -> None:
         ratio = s.e[l] * s.e[l] / own
         ratio = min(ratio, most) if s.gate_ratios[l] > FIRST else ratio
         s.gate_ratio[l] += (ratio - s.gate_ratio[l]) / min(s.gate_ratios[l], MEMORY)
+        s.gate_settled[l] = min(variance_of_error(s, l), GROWTH * s.gate_settled[l])
 
 
 def bound_leverage(gate: Gate, n: int) -> Step:
@@ -158,36 +163,40 @@ def output_rule(gate: Gate) -> Step:
         return predicted * predicted if unusual else v  # type: ignore[no-any-return]
 
     @kernel
-    def count_far(s: State, y: float, near: bool, unusual: bool, l: int) -> None:
-        """Which kind of evidence a far reading is: a repeat of a code, one more that differs, or one more pulse."""
-        repeats = (abs(y) == abs(s.gate_last[l])) | (abs(y) == abs(s.gate_other[l]))
-        if repeats & (not natural(s, l)):
+    def held_back(s: State, y: float, v: float, unusual: bool, l: int) -> bool:
+        """Whether a far reading is one of a code, or not yet enough of them are a change."""
+        apart, apart_other = abs(abs(y) - abs(s.gate_last[l])), abs(abs(y) - abs(s.gate_other[l]))
+        near2 = far * max(s.gate_variance[l], v)
+        turns = (apart_other == 0.0) & ((apart * apart > near2) | (not natural(s, l)))
+        if (apart == 0.0) | turns:
             s.gate_same[l] += 1
-        else:
-            s.gate_run[l] += 1
-            s.gate_pulses[l] = s.gate_pulses[l] + 1 if near & unusual else (1 if unusual else 0)
-            s.gate_other[l] = s.gate_last[l]
-            s.gate_last[l] = y
+            return s.gate_same[l] < hold  # type: ignore[no-any-return]
+        agrees = (y - s.gate_last[l]) ** 2 < near2
+        s.gate_run[l] += 1
+        s.gate_pulses[l] = (s.gate_pulses[l] + 1 if agrees else 1) if unusual else 0
+        s.gate_other[l] = s.gate_last[l]
+        s.gate_last[l] = y
+        return (s.gate_run[l] < believed) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
 
     @kernel
-    def judge(s: State, l: int) -> None:
+    def judge(s: State, l: int) -> bool:
+        """Whether the sample contradicts its forecast."""
         y, e2, v = reading(s, l), s.e[l] * s.e[l], variance_of_error(s, l)
         off = y - s.gate_mean[l]
         predicted = s.valid[l] > 0.0
         usual = usual_square(s, off, l)
-        distance = min(e2, off * off) if predicted else off * off
-        contradicts = e2 > sure * v if predicted else distance > far * usual
+        beyond = (min(e2, off * off) if predicted else off * off) > far * usual
+        contradicts = e2 > sure * v if predicted else beyond
         if not contradicts:
-            if predicted:
-                s.gate_run[l], s.gate_same[l] = 0, 0
-            return
-        if not ((s.gate_count[l] >= FIRST) & (distance > far * usual)):
+            settled = predicted & (e2 <= sure * s.gate_settled[l])
+            s.gate_run[l] = max(min(s.gate_run[l], 2 * believed) - 1, 0) if settled else s.gate_run[l]
+            s.gate_same[l] = 0
+        elif beyond & (s.gate_count[l] >= FIRST):
+            if held_back(s, y, v, usual > s.gate_variance[l], l):
+                s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, REFUSED
+        else:
             s.gate_run[l] += 1
-            return
-        apart = y - s.gate_last[l]
-        count_far(s, y, apart * apart < far * max(s.gate_variance[l], v), usual > s.gate_variance[l], l)
-        if (s.gate_run[l] < believed) & (s.gate_same[l] < hold) & (s.gate_pulses[l] < believed):
-            s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, REFUSED
+        return contradicts  # type: ignore[no-any-return]
 
     return judge  # type: ignore[no-any-return]
 
@@ -206,9 +215,11 @@ def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, in
     @kernel
     def step(s: State, l: int) -> None:
         s.reason[l], s.factor[l] = USED, 1.0
+        raw = reading(s, l) if s.observed[l] > 0.0 else s.gate_before[l]
         remember(s, l)
         notice(s, s.gate_count[l] >= FIRST, l)
         off = reading(s, l) - s.gate_mean[l]
+        contradicts = False
         if s.ok[l] > 0.0:
             contradicts = s.e[l] * s.e[l] > sure * variance_of_error(s, l)
             if blame(s, contradicts, off * off <= rare * s.gate_variance[l], l):
@@ -217,9 +228,10 @@ def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, in
             if hold_frozen(s, variance_of_error(s, l), l):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, FROZEN
             else:
-                judge(s, l)
+                contradicts = judge(s, l)
         resolve(s, l)
-        learn_usual(s, sure, l)
+        s.gate_before[l] = raw
+        learn_usual(s, contradicts, sure, l)
         bound(s, l)
 
     return step  # type: ignore[no-any-return]

@@ -78,7 +78,6 @@ def resolution(share: float) -> Step:
                 kept = s.gate_smallest[l] if step >= 0.75 * finest else 0.0
                 s.gate_smallest[l] = kept + (1.0 if step < 1.5 * finest else 0.0)
                 s.gate_finest[l] = min(step, finest)
-            s.gate_before[l] = reading(s, l)
             coarse = natural(s, l) & (s.gate_smallest[l] >= max(ENOUGH, share * s.gate_steps[l]))
             s.floor[l] = s.gate_finest[l] * s.gate_finest[l] / 12.0 if coarse else 0.0
 
