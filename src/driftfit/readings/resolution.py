@@ -1,0 +1,84 @@
+"""The resolution of the readings: the step of a coarse meter, estimated from readings that repeat.
+
+Readings of an integer meter, a counter or a converter of few bits are accurate to half a step, and where they are
+constant, residuals are zero although nothing was measured exactly. A noise variance learned from those residuals
+collapses, and bands and likelihood with it. Therefore
+
+    quantum    the smallest step between two consecutive readings, if steps of its size (up to one and a half) are a
+               tenth of all steps, and a tenth of the readings repeat the previous one
+    floor      quantum^2 / 12, the variance of the rounding error, below which no tracker estimates the variance of the
+               noise of a reading; 0 if readings are not coarse
+
+Readings of a fine sensor never repeat, and nothing changes for them. If they do, at a limit, at 0 while a pump is off,
+or because a value is held, the other steps have all sizes, and none is frequent.
+
+Source: quantum^2 / 12 is Sheppard's (1898); the rest is ours. Cost per sample: a few comparisons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.drivers import ROUNDING
+from driftfit.engine.kernel import State, Step, kernel
+
+ENOUGH = 3.0
+"""Number of repeats, and of steps of the size of the quantum, before they count."""
+
+
+def unresolved() -> Mapping[str, Any]:
+    """Fields before the first reading."""
+    return {
+        "gate_before": np.nan, "gate_finest": np.inf, "gate_smallest": 0.0, "gate_steps": 0.0, "gate_repeats": 0.0,
+        "floor": 0.0, "shift": 0.0,
+    }  # fmt: skip
+
+
+@kernel
+def reading(s: State, l: int) -> float:
+    """The output as it was measured."""
+    return s.y[l] + s.shift[l]  # type: ignore[no-any-return]
+
+
+@kernel
+def repeats_last(s: State, l: int) -> bool:
+    """Whether the reading repeats the one before in all digits, but for the rounding of a shift."""
+    y = reading(s, l)
+    return abs(y - s.gate_before[l]) <= ROUNDING * (abs(y) + abs(s.shift[l]))  # type: ignore[no-any-return]
+
+
+def repeats_by_nature(share: float) -> Callable[[State, int], bool]:
+    """``natural(s, l)``: whether so large a share of the readings repeat that a repeat is no sign of a code."""
+    share = float(share)
+
+    @kernel
+    def natural(s: State, l: int) -> bool:
+        repeats = s.gate_repeats[l]
+        return (repeats >= ENOUGH) & (repeats >= share * (repeats + s.gate_steps[l]))  # type: ignore[no-any-return]
+
+    return natural  # type: ignore[no-any-return]
+
+
+def resolution(share: float) -> Step:
+    """Learn from a reading that was accepted, and set the floor."""
+    share = float(share)
+    natural = repeats_by_nature(share)
+
+    @kernel
+    def resolve(s: State, l: int) -> None:
+        if s.observed[l] > 0.0:
+            step, finest = abs(reading(s, l) - s.gate_before[l]), s.gate_finest[l]
+            if repeats_last(s, l):
+                s.gate_repeats[l] += 1.0
+            elif step > 0.0:  # NaN at the first reading
+                s.gate_steps[l] += 1.0
+                kept = s.gate_smallest[l] if step >= 0.75 * finest else 0.0
+                s.gate_smallest[l] = kept + (1.0 if step < 1.5 * finest else 0.0)
+                s.gate_finest[l] = min(step, finest)
+            coarse = natural(s, l) & (s.gate_smallest[l] >= max(ENOUGH, share * s.gate_steps[l]))
+            s.floor[l] = s.gate_finest[l] * s.gate_finest[l] / 12.0 if coarse else 0.0
+
+    return resolve  # type: ignore[no-any-return]
