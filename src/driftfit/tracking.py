@@ -33,6 +33,7 @@ class Given(TypedDict, total=False):
     units: Mapping[str, str] | None
     limits: Ranges
     exclude: Any
+    gate: Any
     keep: str
     dtype: Any
 
@@ -92,6 +93,7 @@ def track(
     units: Mapping[str, str] | None = None,
     limits: Ranges = None,
     exclude: Any = None,
+    gate: Any = None,
     keep: str = "std",
     dtype: Any = "float64",
     warm_start: Any = None,
@@ -141,6 +143,10 @@ def track(
     exclude : list of (from, to), or a mapping from the keys of a fleet to such lists
         Intervals to leave out, both ends included, in times or, without time, in sample numbers: nothing in them is
         used or enters a lag, and the summary counts their samples (`driftfit.data.limits`).
+    gate : bool, `Gate` or None
+        Whether readings are judged before the tracker uses them: fault codes, spikes, frozen sensors, inputs to which
+        the output does not respond (`driftfit.readings.gate`). ``run.left_out`` lists what was refused. None: as the
+        tracker asks; those that are given their numbers have no gate, and use every reading as their textbook does.
     keep : "std", "cov" or "theta"
         What is stored of every sample. "std": theta, std, prediction, innovation and its standard deviation, ok:
         2 n + 4 numbers. "cov": also the covariance, n * n numbers. "theta": that alone, n numbers, for models of one
@@ -176,7 +182,7 @@ def track(
     DataWarning
         If most samples cannot be used because of ``dt``.
     """
-    reading = Reading(time, dt, weights, drift, units, limits, exclude)
+    reading = Reading(time, dt, weights, drift, units, limits, exclude, gate)
     if to is not None:
         from driftfit.show.export import write_parts  # importing polars takes as long as all other imports
 

@@ -64,7 +64,7 @@ class Limits:
         return out_y, (u < self.low[ny:]) | (u > self.high[ny:])
 
 
-class Gate:
+class StreamLimits:
     """Valid ranges of a stream: replaces values outside their range by NaN, and counts them."""
 
     def __init__(self, limits: Mapping[Any, Any], outputs: Sequence[str], inputs: Sequence[str], m: int) -> None:

@@ -100,6 +100,7 @@ class Reading(NamedTuple):
     units: Mapping[str, str] | None = None
     limits: Mapping[Any, Any] | None = None
     exclude: Any = None
+    gate: Any = None
     indexed: bool = True
     """Whether an index of dates labels the samples if no time is given."""
 

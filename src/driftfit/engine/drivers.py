@@ -330,16 +330,80 @@ def _advance(tracker: TrackerSteps) -> Any:
     return advance_or_start
 
 
+def _looking(tracker: TrackerSteps) -> Any:
+    """Time update and forecast of all lanes, before a gate."""
+    forecasts = _forecasting(tracker)
+    first = forecasts if tracker.start is None else _forecasting(tracker.start)
+
+    @kernel
+    def look(s: State) -> None:
+        for l in range(s.theta.shape[1]):
+            if s.root[l] > 0:
+                first(s, l)
+            else:
+                forecasts(s, l)
+
+    @kernel
+    def look_at_once(s: State) -> None:
+        for l in range(s.theta.shape[1]):
+            forecasts(s, l)
+
+    return look_at_once if tracker.start is None else look
+
+
+def _learning(tracker: TrackerSteps) -> Any:
+    """Correction of all lanes, and reports, after a gate, which may have raised the noise and the floor of r."""
+    variance, correct, report = tracker.variance, tracker.correct, tracker.report
+    first = tracker if tracker.start is None else tracker.start
+    variance_first, correct_first, report_first = first.variance, first.correct, first.report
+    both = first.take_over is not None
+    check, late = (keeps_digits, _late(tracker)) if both else (none_late, nothing)
+
+    @kernel
+    def corrected(s: State, l: int) -> None:
+        variance(s, l)
+        check(s, l)
+        correct(s, l)
+        s.scale[l] = max(s.scale[l], s.floor[l]) if s.floor[l] > 0.0 else s.scale[l]
+        report(s, l)
+
+    @kernel
+    def corrected_first(s: State, l: int) -> None:
+        variance_first(s, l)
+        s.late[l] = 0.0
+        correct_first(s, l)
+        s.scale[l] = max(s.scale[l], s.floor[l]) if s.floor[l] > 0.0 else s.scale[l]
+        report_first(s, l)
+
+    @kernel
+    def learn(s: State) -> None:
+        for l in range(s.theta.shape[1]):
+            if s.root[l] > 0:
+                corrected_first(s, l)
+            else:
+                corrected(s, l)
+        if both:
+            late(s)
+
+    @kernel
+    def learn_at_once(s: State) -> None:
+        for l in range(s.theta.shape[1]):
+            corrected(s, l)
+
+    return learn_at_once if tracker.start is None else learn
+
+
 @lru_cache(maxsize=256)
-def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Drivers:
-    """Build the drivers of a (model, tracker) pair.
+def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: Step | None = None) -> Drivers:
+    """Build the drivers of a (model, tracker) pair, with a ``gate`` between forecast and correction or without.
 
     ``run(tile, y, u, known, out)`` takes y (T, L), u (T, m, L) and `known` (T, 3, L), or one row of it that holds for
     every sample (extra columns go to ``read_extra``), and fills out (T,) of `output_type`, with keep="own" only with
     what the tracker's ``store`` writes; where theta (T, n, L) is given too, it fills that, and the one row of out holds
-    the last sample. ``update(tile, y, u)`` does one sample of a tile of one lane with u (m,), ``update_one`` the same
-    for a single float u (`Drivers.updater`); both take what is known from the fields ``interval``, ``noise`` and
-    ``drift`` of the record and return (y_hat, e, s, ok).
+    the last sample. It returns the number of samples that were processed: a gate may ask for the first ones again
+    (`driftfit.readings.first_samples`). ``update(tile, y, u)`` does one sample of a tile of one lane with u (m,),
+    ``update_one`` the same for a single float u (`Drivers.updater`); both take what is known from the fields
+    ``interval``, ``noise`` and ``drift`` of the record and return (y_hat, e, s, ok).
     """
     ready = model.ready
     ready(1)
@@ -348,13 +412,20 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
             machine.load()
     driver = partial(Driver, instead=tracker.instead)
     part = whole_record if tracker.reads_model else tracker_part
-    advance = _advance(tracker)
-    sample = _sample(model, tracker.note, outlined(advance) if tracker.outlined else advance, part)
+    if gate is None:
+        advance = _advance(tracker)
+        between = _at_once(outlined(advance) if tracker.outlined else advance, part)
+    else:
+        phases = _looking(tracker), _learning(tracker)
+        look, learn = (outlined(phase) for phase in phases) if tracker.outlined else phases
+        between = _gated(look, gate, learn, part)
+    sample = _sample(model, tracker.note, between, part)
     keep_more = covariance if keep == "cov" else nothing_more
     common = nothing_common if keep == "own" else write_common
-    run = _run(driver, sample, tracker.read_extra, _written(common, tracker.store, keep_more, part), part)
+    store = tracker.store if gate is None else _stored_too(tracker.store)
+    run = _run(driver, sample, tracker.read_extra, _written(common, store, keep_more, part), part, gate is not None)
 
-    def checked(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE) -> None:
+    def checked(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE) -> int:
         # nothing looks at types and bounds after this
         flags = y.flags.num & u.flags.num & known.flags.num & tile.flags.num & out.flags.num
         plain = (flags if theta is NOWHERE else flags & theta.flags.num) & CONTIGUOUS == CONTIGUOUS
@@ -372,12 +443,56 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
                 raise ValueError(f"run: out must have one row beside theta, which has shape {theta.shape}.")
         ready(L)
         given = as_compiled(tile), y, u, known, out, theta
-        if plain:
-            run.of_kind((tile.dtype, out.dtype), given)
-        else:
-            run(*given)
+        done: int = run.of_kind((tile.dtype, out.dtype), given) if plain else run(*given)
+        return done
 
     return Drivers(checked, *_updates(driver, sample))
+
+
+GATED = ("reason", "factor", "raw_e")
+"""Fields that are stored of every sample behind a gate: its decision, the factor of the noise, and y - y_hat of refused
+samples too."""
+
+
+@kernel
+def store_decision(o: State, s: State, l: int) -> None:
+    """What a gate decided."""
+    o.reason[l], o.factor[l], o.raw_e[l] = s.reason[l], s.factor[l], s.raw_e[l]
+
+
+def _stored_too(store: Any) -> Any:
+    """What a tracker stores, and what a gate decided."""
+
+    @kernel
+    def both(o: State, s: State, l: int) -> None:
+        store(o, s, l)
+        store_decision(o, s, l)
+
+    return both
+
+
+def _at_once(advance: Any, part: Any) -> Any:
+    """The steps of a tracker without a gate."""
+
+    @kernel
+    def between(s: State) -> None:
+        advance(part(s))
+
+    return between
+
+
+def _gated(look: Any, gate: Step, learn: Any, part: Any) -> Any:
+    """The steps of a tracker with a gate, which sees the inputs and the memory of the model too."""
+
+    @kernel
+    def between(s: State) -> None:
+        look(part(s))
+        for l in range(s.theta.shape[1]):
+            s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
+            gate(s, l)
+        learn(part(s))
+
+    return between
 
 
 @kernel
@@ -432,8 +547,10 @@ def _written(common: Any, store: Any, keep_more: Any, part: Any) -> Any:
     return write
 
 
-def _sample(model: ModelSteps, note: Step, advance: Any, part: Any) -> Any:
-    """One sample of all lanes, whose signals and known factors are in the record."""
+def _sample(model: ModelSteps, note: Step, between: Any, part: Any) -> Any:
+    """One sample of all lanes, whose signals and known factors are in the record; ``between`` is what the tracker, and a
+    gate, do between the regression and the lags.
+    """
     regress, push, _ = model
 
     @kernel
@@ -443,7 +560,7 @@ def _sample(model: ModelSteps, note: Step, advance: Any, part: Any) -> Any:
             regress(s, l)
             clean(tracker_part(s), l)
             note(part(s), l)
-        advance(part(s))
+        between(s)
         for l in range(L):
             push(s, l)
         for l in range(L):
@@ -455,11 +572,13 @@ def _sample(model: ModelSteps, note: Step, advance: Any, part: Any) -> Any:
     return sample
 
 
-def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: Any, part: Any) -> Driver:
-    """The loop over the samples of a record."""
+def _run(
+    driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: Any, part: Any, gated: bool
+) -> Driver:
+    """The loop over the samples of a record, which a gate may end early."""
 
     @driver
-    def run(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array) -> None:
+    def run(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array) -> int:
         s = tile[0]
         L = s.theta.shape[1]
         given = u.shape[1] > 0
@@ -485,6 +604,10 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: A
                 store_theta(s, theta, t)
             if not alone or t == last:
                 write(out[t * kept], s)
+            if gated:
+                if s.gate_replay[0] > 0:
+                    return t + 1
+        return y.shape[0]
 
     return run
 

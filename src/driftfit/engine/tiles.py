@@ -5,7 +5,7 @@ sample; 0 means that nothing may happen), ``noise`` and ``drift`` (known factors
 at this sample, 1 unless given), ``valid`` (phi is complete), ``observed`` (y is there), ``ok`` (both), the results
 ``y_hat``, ``e``, ``h`` (the variance of the prediction without the noise), ``s``, ``var`` (n,), the noise variance
 ``r`` that the tracker assumes, and ``scale``, the estimate of the noise variance where P is relative to it (1
-elsewhere); ``late``, whether a sample is to be taken in by another form of the tracker; and ``used_noise``, which only the replay for a smoother writes. Models and trackers add their own.
+elsewhere); ``floor``, below which a gate holds that estimate; ``late``, whether a sample is to be taken in by another form of the tracker; and ``used_noise``, which only the replay for a smoother writes. Models and trackers add their own.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def _common(n: int) -> dict[str, Any]:
     return {
         "phi": np.zeros(n), "y": zero, "dt": 1.0, "noise": 1.0, "drift": 1.0, "interval": 1.0,
         "valid": zero, "observed": zero, "ok": zero, "y_hat": zero, "e": zero, "h": zero, "s": zero,
-        "var": np.zeros(n), "r": 1.0, "scale": 1.0, "late": zero, "used_noise": 1.0,
+        "var": np.zeros(n), "r": 1.0, "scale": 1.0, "floor": zero, "late": zero, "used_noise": 1.0,
     }  # fmt: skip
 
 

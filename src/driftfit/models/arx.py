@@ -35,7 +35,7 @@ import numpy as np
 from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import one_of, output_names, whole
-from driftfit.models.base import GAP, Model, Term
+from driftfit.models.base import GAP, Model, Term, refuse_lag
 from driftfit.models.inputs import CountedInputs
 from driftfit.models.lags.doubted_lags import doubted, no_doubts, shift_doubts
 from driftfit.models.lags.output_lags import shift_inputs, take_output, wait_for_lags
@@ -147,6 +147,14 @@ class ARX(CountedInputs):
     @property
     def apply(self) -> Step | None:
         return take_input if all(nk > 0 for _, nk in self.lags) else None
+
+    @property
+    def input_memory(self) -> int:
+        return max((nb + nk for nb, nk in self.lags), default=1) - 1
+
+    @property
+    def refuse(self) -> Any:
+        return refuse_lag
 
     @property
     def output_lags(self) -> int:

@@ -9,13 +9,24 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.engine.drivers import ModelSteps, TrackerSteps
-from driftfit.engine.kernel import Array, Step
+from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import Settings
 
 Term = tuple[str, int, int]
 """A regressor: ("y", output, lag), ("u", input, lag), or ("1", 0, 0) for the constant 1."""
 GAP = 1.5
 """Intervals longer than this many nominal ones break the lags."""
+
+
+@kernel
+def nothing_remembered(s: State, signal: int, age: int, l: int) -> None:
+    """Nothing of an input is kept after its sample."""
+
+
+@kernel
+def refuse_lag(s: State, signal: int, age: int, l: int) -> None:
+    """`Model.refuse` for inputs whose lags are in ``u_lag``, the newest first."""
+    s.u_lag[signal, age, l] = np.nan
 
 
 class Model(Settings, ABC):
@@ -128,6 +139,19 @@ class Model(Settings, ABC):
         sample, because then it cannot be predicted before the input is known.
         """
         return None
+
+    @property
+    def input_memory(self) -> int:
+        """For how many samples after its own an input is remembered; `refuse` takes it from there."""
+        return 0
+
+    @property
+    def refuse(self) -> Any:
+        """The compiled function ``refuse(s, signal, age, l)`` that makes an input missing: column ``signal`` of u, read
+        ``age`` samples ago (0: now). What uses it from the next sample on is unusable, as for an input that was never
+        there.
+        """
+        return nothing_remembered
 
     def inspect(self, y: Array, u: Array) -> None:
         """Warn of data that do not suit the model; `track` calls it with the whole record, y (T,), u (T, m)."""

@@ -88,7 +88,7 @@ def start(gate: Gate, n: int, m: int) -> Mapping[str, Any]:
     return {
         "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0, "gate_ratios": 0.0, "gate_settled": np.inf,
         "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan, "gate_other": np.nan,
-        "gate_squares": np.zeros(n), "reason": 0, "factor": 1.0,
+        "gate_squares": np.zeros(n), "reason": 0, "factor": 1.0, "raw_e": np.nan,
         **unresolved(), **not_frozen(), **no_inputs(m), **no_samples(gate.first, n, m),
     }  # fmt: skip
 

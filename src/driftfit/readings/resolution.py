@@ -33,7 +33,7 @@ def unresolved() -> Mapping[str, Any]:
     """Fields before the first reading."""
     return {
         "gate_before": np.nan, "gate_finest": np.inf, "gate_smallest": 0.0, "gate_steps": 0.0, "gate_repeats": 0.0,
-        "floor": 0.0, "shift": 0.0,
+        "shift": 0.0,
     }  # fmt: skip
 
 

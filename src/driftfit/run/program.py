@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -19,11 +19,14 @@ from rich.progress import Progress
 from driftfit.data import storage
 from driftfit.data.record import Record
 from driftfit.data.signals import check_ready
-from driftfit.engine.drivers import Drivers, TrackerSteps, drivers
+from driftfit.engine.drivers import GATED, NOWHERE, Drivers, TrackerSteps, drivers
 from driftfit.engine.kernel import Array, Driver
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.readings.first_samples import replayed
+from driftfit.readings.gate import AT_START, Gate, gate_step
+from driftfit.readings.gate import start as gate_start
 from driftfit.run.collected_samples import COLLECTED, collecting
 from driftfit.run.states.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
@@ -78,6 +81,8 @@ class Program:
     """The index of its output, if each of several outputs has a lane."""
     shared: Model | None = None
     """The model of outputs that share one theta: ``model`` takes them one after the other, as rows of an instant."""
+    gate: Gate | None = None
+    """What decides which readings are used; None: all."""
 
     def __post_init__(self) -> None:
         if (self.model.hidden is not None) != self.tracker.follows_states:
@@ -88,7 +93,7 @@ class Program:
 
     def __reduce__(self) -> Any:
         """Copies, and programs sent to another process, are made from the fields."""
-        return Program, (self.model, self.tracker, self.output, self.shared)
+        return Program, (self.model, self.tracker, self.output, self.shared, self.gate)
 
     @property
     def whole(self) -> Model:
@@ -99,7 +104,7 @@ class Program:
     def alone(self) -> Program | None:
         """The program of its output alone; None if the model needs the other outputs, or has none."""
         model = None if self.output is None else self.model.alone(self.output)
-        return None if model is None else Program(model, self.tracker)
+        return None if model is None else Program(model, self.tracker, gate=self.gate)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -121,7 +126,13 @@ class Program:
     def tracker_start(self) -> State:
         """The tracker's fields before the first sample."""
         alone = None if self.output is None else self.alone
-        return self.tracker.state_for(self.model if alone is None else alone.model)
+        own = self.tracker.state_for(self.model if alone is None else alone.model)
+        return own if self.gate is None else {**own, **gate_start(self.gate, self.model.n, self.model.m)}
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Fields that are stored of every sample, besides those of all trackers."""
+        return self.tracker.outputs if self.gate is None else (*self.tracker.outputs, *GATED)
 
     @cached_property
     def steps(self) -> TrackerSteps:
@@ -187,14 +198,51 @@ class Program:
         """The compiled loops; ``steps`` replace the tracker's own, to inspect the run."""
         found = self._drivers.get((keep, steps))
         if found is None:
-            found = drivers(self.model.steps_for(self.steps), self.steps if steps is None else steps, keep)
+            model, own = self.model, self.steps if steps is None else steps
+            gate = None
+            if self.gate is not None:
+                gate = gate_step(self.gate, model.n, model.m, model.input_memory, model.refuse)
+            found = drivers(model.steps_for(self.steps), own, keep, gate)
+            if gate is not None:
+                found = found._replace(run=partial(self._decided, found.run))
             self._drivers[keep, steps] = found
         return found
+
+    def _decided(
+        self, run: Any, tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE
+    ) -> int:
+        """Run to the end, with the first samples once more without the codes that were found among them."""
+        done: int = run(tile, y, u, known, out, theta)
+        if tile["gate_replay"][0, 0] > 0:
+            refused = self.replay(tile)
+            if "reason" in (out.dtype.names or ()) and theta is NOWHERE:
+                at = done - 1 - refused
+                out["reason"][at[at >= 0], 0] = AT_START
+            rest = slice(done, None)
+            known = known if len(known) == 1 else known[rest]
+            if theta is NOWHERE:
+                self._decided(run, tile, y[rest], u[rest], known, out[rest])
+            else:
+                self._decided(run, tile, y[rest], u[rest], known, out, theta[rest])
+        return len(y)
+
+    def replay(self, tile: Array) -> Array:
+        """Bring a tile, whose gate has found codes among the first samples, to where it is without them.
+
+        Returns how many samples ago these were: 0 for the last.
+        """
+        y, u, dt, noise, drift = replayed(state_of(tile), self.model.m)
+        codes = np.isnan(y) | np.isnan(u).any(axis=1)
+        fresh = self.tile({"gate_decided": np.array(1)})
+        known = np.stack([dt, noise, drift], axis=1)[:, :, None]
+        self.drivers().run(fresh, y[:, None], u[:, :, None], known, self.written(fresh, len(y)))
+        tile.view(np.uint8)[:] = fresh.view(np.uint8)
+        return len(y) - 1 - np.flatnonzero(codes)
 
     @property
     def width(self) -> int:
         """The number of lanes of a tile of many series, or of many settings."""
-        return 1 if self.model.n > MOST else min(self.model.width, self.tracker.width)
+        return 1 if self.model.n > MOST or self.gate is not None else min(self.model.width, self.tracker.width)
 
     def lanes(self, count: int) -> Array:
         """A tile with this program in every lane, at its start. It is made once and must not be changed."""
@@ -221,7 +269,7 @@ class Program:
 
     def written(self, tile: Array, T: int, keep: str = "std", dtype: Any = np.float64) -> Array:
         """An array for the results of T samples of a tile."""
-        record = output_record(tile.dtype, self.tracker.outputs, keep, dtype)
+        record = output_record(tile.dtype, self.outputs, keep, dtype)
         return np.ndarray(T, record, np.empty(T * record.itemsize, np.uint8))  # np.empty goes through all fields
 
     def loop(self, tile: Array, T: int, keep: str, dtype: Any, collected: bool) -> tuple[Any, Array]:
@@ -231,7 +279,7 @@ class Program:
         """
         if not collected:
             return self.fill, self.written(tile, T, keep, dtype)
-        fields = dict.fromkeys((*self.tracker.outputs, *COLLECTED))
+        fields = dict.fromkeys((*self.outputs, *COLLECTED))
         return self.drivers(steps=collecting(self.steps)).run, np.empty(T, output_type(tile, tuple(fields)))
 
     def run(self, tile: Array, record: Record, keep: str = "std", dtype: Any = np.float64) -> Array:
@@ -252,7 +300,7 @@ class Program:
         """Run a tile over samples. Results that are kept in single precision are first written to a block that stays in
         the cache.
         """
-        keep, rows = _driven(tile.dtype, self.tracker.outputs, out.dtype)
+        keep, rows = _driven(tile.dtype, self.outputs, out.dtype)
         run, last = self.drivers(keep).run, _NOTHING
         if out.dtype.names == ("theta",):  # the driver writes theta, and the rest of a sample over that of the last one
             last, out, rows = (np.empty(1, rows),), out["theta"], rows["theta"]
@@ -379,16 +427,18 @@ def shown(trackers: Sequence[Tracker]) -> str:
     return repr(trackers[0]) if len(set(trackers)) == 1 else ", ".join(map(repr, trackers))
 
 
-def programs_of(model: Model, tracker: Any, inputs: int | Sequence[str]) -> tuple[Program, ...]:
+def programs_of(
+    model: Model, tracker: Any, inputs: int | Sequence[str], gate: Gate | bool | None = None
+) -> tuple[Program, ...]:
     """The program of each output of a model with these inputs; outputs that share one theta have one.
 
-    ``tracker`` is one for all, or a mapping from the name of each output to its tracker. ValueError for settings that
-    are incomplete, or that cannot run together.
+    ``tracker`` is one for all, or a mapping from the name of each output to its tracker; ``gate`` as in `gate_of`.
+    ValueError for settings that are incomplete, or that cannot run together.
     """
     if len(model.outputs) == 1:
         if not isinstance(tracker, Tracker):
             raise ValueError(f"a model with one output takes one tracker for each series; got {tracker!r}.")
-        return _programs(model, tracker, inputs if isinstance(inputs, int) else tuple(inputs))
+        return _programs(model, tracker, inputs if isinstance(inputs, int) else tuple(inputs), gate_of(tracker, gate))
     if isinstance(tracker, Mapping) and not model.shared:
         if set(tracker) != set(model.outputs):
             raise ValueError(
@@ -405,16 +455,29 @@ def programs_of(model: Model, tracker: Any, inputs: int | Sequence[str]) -> tupl
     if model.shared:
         return (Program(_row_model(model, tracker, inputs), tracker, shared=model),)
     bound = model.bind(inputs)
-    programs = tuple(Program(bound, one, name) for one, name in zip(trackers, model.outputs, strict=True))
+    programs = tuple(
+        Program(bound, one, name, gate=gate_of(one, gate)) for one, name in zip(trackers, model.outputs, strict=True)
+    )
     if len({one.steps for one in programs}) > 1 or len({one.shapes for one in programs}) > 1:
         raise ValueError(f"the trackers of several outputs must be of one kind and form; got {shown(trackers)}.")
     return programs
 
 
 @lru_cache(maxsize=64)
-def _programs(model: Model, tracker: Tracker, inputs: int | tuple[str, ...]) -> tuple[Program, ...]:
+def _programs(
+    model: Model, tracker: Tracker, inputs: int | tuple[str, ...], gate: Gate | None
+) -> tuple[Program, ...]:
     """The programs are cached for the next record, since settings are compared by value."""
-    return (Program(model.bind(inputs), check_ready(tracker)),)
+    return (Program(model.bind(inputs), check_ready(tracker), gate=gate),)
+
+
+def gate_of(tracker: Tracker, gate: Gate | bool | None) -> Gate | None:
+    """The gate before a tracker: one with its settings, True for the usual one, False for none; None: as it asks."""
+    if isinstance(gate, Gate):
+        return gate
+    if gate is not None and not isinstance(gate, bool):
+        raise ValueError(f"gate must be True, False, None or a Gate; got {gate!r}.")
+    return Gate() if (tracker.gated if gate is None else gate) else None
 
 
 def _row_model(model: Model, tracker: Tracker, inputs: int | Sequence[str]) -> Model:

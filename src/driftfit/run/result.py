@@ -15,6 +15,7 @@ from driftfit.data.known import Known
 from driftfit.data.record import Labels, Record, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, left_out_of
 from driftfit.run.columns import Columns
 from driftfit.run.live.conformal import quantile, widened
 from driftfit.run.program import Program, State, kept, lanes_of, state_of
@@ -331,6 +332,13 @@ class Track(Plain, Columns):
     def _widened(self, level: float, verb: str) -> Array:
         """The conformal factor before each row and after the last."""
         return widened(self.in_rows("e"), self.in_rows("s"), level, verb)
+
+    @cached_property
+    def left_out(self) -> LeftOut:
+        """What the gate decided of samples that it did not use as they are; empty without a gate."""
+        if self.program.gate is None:
+            return NOTHING_LEFT_OUT
+        return left_out_of(self.in_rows("reason"), self.in_rows("factor"), self.record.y)
 
     def cov(self, t: int) -> Array:
         """Covariance (n, n) of theta after sample t (negative t counts from the end).

@@ -116,12 +116,12 @@ def _task(
     if grid and by is None:
         records = records.repeated(tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker))))  # type: ignore[arg-type]
     trackers = (_per_series(tracker, records) if grid else [tracker] * len(records.keys)) or _any_of(tracker)
-    programs, records = _prepared(model, trackers, records, kept.keep, kept.prob)
+    programs, records = _prepared(model, trackers, records, kept.keep, kept.prob, reading.gate)
     return programs, records, failed, many
 
 
 def _prepared(
-    model: Model, trackers: Sequence[Any], records: Records, keep: str, prob: Any
+    model: Model, trackers: Sequence[Any], records: Records, keep: str, prob: Any, gate: Any
 ) -> tuple[list[Program], Records]:
     """(the program of each output of each series, the records as these take them)."""
     inputs = records.labels.u or records.u.shape[-1]
@@ -129,7 +129,7 @@ def _prepared(
     programs: list[Program] = []
     for one in trackers:
         if id(one) not in made:
-            made[id(one)] = programs_of(model, one, inputs)
+            made[id(one)] = programs_of(model, one, inputs, gate)
         programs += made[id(one)]
     for program in programs if keep == "cov" else ():
         if not program.tracker.covariance:

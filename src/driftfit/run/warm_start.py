@@ -19,6 +19,7 @@ from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import warn
 from driftfit.models.base import Model
+from driftfit.readings.gate import Gate
 from driftfit.run.program import Program, State, programs_of, state_of, tile_of
 from driftfit.run.states.layout import fields_of, unpacked
 from driftfit.trackers.base import Tracker
@@ -64,7 +65,7 @@ class End(NamedTuple):
         """
         header, arrays = storage.expand(data, KINDS)
         model, trackers, extra = read(header)
-        programs = programs_of(model, by_output(model, trackers), model.m)
+        programs = programs_of(model, by_output(model, trackers), model.m, gate_from(header))
         tile = tile_of(programs)
         restore("what was given", programs, header, arrays, tile)
         states = tuple(state_of(tile, lane) for lane in range(len(programs)))
@@ -86,6 +87,7 @@ def written(
     model = programs[0].whole
     header: dict[str, Any] = {"kind": KINDS[len(model.outputs) > 1], "model": storage.describe(model)}
     header |= {"tracker": described[0] if len(described) == 1 else described, "fields": programs[0].layout.text}
+    header |= {"gate": None if programs[0].gate is None else programs[0].gate.settings()}
     header |= {"extra": {name: value for name, value in extra.items() if value != ABSENT[name]}}
     return header, {f"state{lane}": np.frombuffer(data, np.uint8) for lane, data in enumerate(lanes)}
 
@@ -95,6 +97,12 @@ def read(header: Mapping[str, Any]) -> tuple[Model, tuple[Tracker, ...], dict[st
     given = header["tracker"]
     trackers = tuple(storage.rebuild(one, Tracker) for one in (given if isinstance(given, list) else [given]))
     return storage.rebuild(header["model"], Model), trackers, {**ABSENT, **header["extra"]}
+
+
+def gate_from(header: Mapping[str, Any]) -> Gate | bool:
+    """The gate of a header that `written` made; False for none."""
+    given = header.get("gate")
+    return False if given is None else Gate.from_settings(given)
 
 
 def by_output(model: Model, trackers: Sequence[Tracker]) -> Any:
@@ -156,6 +164,11 @@ def _carried(before: Program, state: State, now: Program) -> State:
         raise ValueError(
             f"warm_start: the earlier run was made by {type(before.tracker).__name__}, this one is by "
             f"{type(now.tracker).__name__}; start from its estimates instead, with theta0= and p0=."
+        )
+    if now.gate != before.gate:
+        raise ValueError(
+            f"warm_start: the earlier run had gate={before.gate!r}, this one has gate={now.gate!r}, and a gate must know "
+            "all readings from the first on; give the gate of the earlier run, or run its record again."
         )
     if not now.model.follows(before.model):
         raise ValueError(f"warm_start: the earlier run followed {before.model!r}, this one follows {now.model!r}.")

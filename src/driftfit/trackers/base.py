@@ -50,6 +50,10 @@ class Tracker(Settings, ABC):
     required: ClassVar[tuple[str, ...]] = ()
     width: ClassVar[int] = 32
     outputs: ClassVar[tuple[str, ...]] = ()
+    gated: ClassVar[bool] = False
+    """Whether a gate (`driftfit.readings.gate`) stands before it unless the user says otherwise: for trackers that are
+    given no numbers.
+    """
     replaces: ClassVar[tuple[str, ...]] = ("shift",)
     """Fields of the model's memory whose start the tracker gives; all its other names must differ from the model's.
     ``shift`` is common to all: what the model subtracted from y, for trackers that judge readings

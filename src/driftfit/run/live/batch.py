@@ -15,7 +15,7 @@ import numpy as np
 from driftfit.data.clock import Clock
 from driftfit.data.known import Known
 from driftfit.data.labels import times_of
-from driftfit.data.limits import Gate
+from driftfit.data.limits import StreamLimits
 from driftfit.data.record import Reading, Records
 from driftfit.data.times.gaps import LOOK, Pace
 from driftfit.data.times.instants import instant
@@ -86,7 +86,7 @@ class Batched(ABC):
     _tile: Array
     _clock: Clock
     _pace: Pace
-    _gate: Gate | None
+    _limits: StreamLimits | None
     _last: Any
     _awaits: int
     _ignored: int
@@ -205,9 +205,9 @@ class Batched(ABC):
             records = records._replace(
                 y=records.y[taken], u=records.u[taken], known=known, time=axis, length=np.array([len(axis)])
             )
-        if self._gate is not None:
+        if self._limits is not None:
             alone = records.y.ndim == 1
-            y, u = self._gate.sample(records.y[:, None] if alone else records.y, records.u)
+            y, u = self._limits.sample(records.y[:, None] if alone else records.y, records.u)
             records = records._replace(y=y.reshape(records.y.shape), u=u)
         return records, taken
 

@@ -71,16 +71,18 @@ class Live(Operated, Stream):
         Continue where that run ended; it has the same outputs.
     limits : mapping from signals to (low, high)
         Valid ranges as for `track`: a number outside its range is missing, and counted in ``outside``.
+    gate : bool, Gate or None
+        Whether readings are judged before they are used, as for `track`; ``left_out`` counts what was refused.
 
     Memory is constant. One update costs a call of a compiled function: well below a microsecond for a few parameters.
     """
 
     def __init__(
         self, model: Model, tracker: Any = None, dt: Any = None, lag: int = 0, warm_start: Run | None = None,
-        limits: Mapping[Any, Any] | None = None,
+        limits: Mapping[Any, Any] | None = None, gate: Any = None,
     ) -> None:  # fmt: skip
         check_roles("Live", model, tracker, several=isinstance(model, Model) and len(model.outputs) > 1)
-        self._begin(model, tracker, dt, lag, warm_start, limits)
+        self._begin(model, tracker, dt, lag, warm_start, limits, gate)
         self._single = len(self.model.outputs) == 1
         if lag:
             regression = self._rows if self._single else Regression(self._rows.n)
@@ -98,8 +100,10 @@ class Live(Operated, Stream):
         self._unknown = np.full(self._shape, np.nan)
         self._interval = tile["interval"][0]
         self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
+        self._undecided = False
         if self._single:
             self._update = self._stepper()
+            self._undecided = self.programs[0].gate is not None and not bool(tile["gate_decided"][0, 0])
             self._compiled, self._compiled_scratch = as_compiled(tile), as_compiled(self._scratch)  # views
         self._expect(self._awaits)
 
@@ -111,7 +115,10 @@ class Live(Operated, Stream):
         super()._expect(what)
         # whether a sample needs more than a call of the compiled step of one output
         self._careful = (
-            not self._single or self._gate is not None or bool(self._windows or self._watching) or what != NOTHING
+            not self._single
+            or self._limits is not None
+            or bool(self._windows or self._watching or self._undecided)
+            or what != NOTHING
         )
 
     @property
@@ -240,7 +247,7 @@ class Live(Operated, Stream):
 
     def _checked(self, y: Any, u: Any) -> tuple[Array, Array]:
         outputs, inputs = self._outputs(y), self._inputs(u)
-        return (outputs, inputs) if self._gate is None else self._gate.sample(outputs, inputs)
+        return (outputs, inputs) if self._limits is None else self._limits.sample(outputs, inputs)
 
     def _outputs(self, y: Any) -> Array:
         """y as floats (ny,)."""
@@ -268,6 +275,8 @@ class Live(Operated, Stream):
         if self._single:
             self._rest(known)
             step = self._update(self._compiled, float(y[0]), one_or_all(u))
+            if self._undecided:
+                self._decide()
             if self._watching or self._windows:
                 self._keep(y, step[1:2], step[2:3], np.reshape(known, (3, 1)), time)
         else:
@@ -276,6 +285,14 @@ class Live(Operated, Stream):
             step = self._reported(out)
         self._rest(resting)
         return step
+
+    def _decide(self) -> None:
+        """See whether the gate has judged the first samples, and take the codes that it found out of the state."""
+        tile = self._state_tile()
+        if tile["gate_replay"][0, 0] > 0:
+            self.program.replay(tile)
+        self._undecided = not bool(tile["gate_decided"][0, 0])
+        self._expect(self._awaits)
 
     def _row(self, y: Array, u: Array, known: Factors) -> tuple[Array, Array, Array]:
         """(y, u, known) of a sample of several outputs, as drivers take them."""
@@ -312,7 +329,7 @@ class Live(Operated, Stream):
         receive, so that candidates can be compared.
         """
         self._scratch_bytes[:] = self._bytes  # copying a record field by field takes ten times as long
-        inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
+        inputs = self._inputs(u) if self._limits is None else self._limits.inputs(self._inputs(u))
         self._put(self._scratch, inputs)
         if self._single:
             y_hat, _, s, _ = self._update(self._compiled_scratch, np.nan, one_or_all(inputs))

@@ -10,7 +10,7 @@ import numpy as np
 
 from driftfit.data import storage
 from driftfit.data.clock import Clock
-from driftfit.data.limits import Gate
+from driftfit.data.limits import StreamLimits
 from driftfit.data.times.gaps import Pace
 from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array
@@ -25,7 +25,7 @@ from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import programs_of, state_of, tile_of
 from driftfit.run.public_class import Plain
 from driftfit.run.result import burn_in
-from driftfit.run.warm_start import ABSENT, KINDS, End, Run, by_output, carried, ended, read, restore, written
+from driftfit.run.warm_start import ABSENT, KINDS, End, Run, by_output, carried, ended, gate_from, read, restore, written
 from driftfit.trackers.base import Tracker
 
 
@@ -36,16 +36,17 @@ class Stream(Batched, Plain, storage.Kept):
     """
 
     def _begin(
-        self, model: Model, tracker: Any, dt: Any, lag: int, warm_start: Run | None, limits: Mapping[Any, Any] | None
-    ) -> None:
+        self, model: Model, tracker: Any, dt: Any, lag: int, warm_start: Run | None, limits: Mapping[Any, Any] | None,
+        gate: Any,
+    ) -> None:  # fmt: skip
         """Set everything before the step is compiled."""
-        self.programs = programs_of(model, tracker, model.m)
+        self.programs = programs_of(model, tracker, model.m, gate)
         self.model = self.programs[0].whole
         self._rows = self.programs[0].model
         self._clock = Clock.of(dt)
         self.dt = self._clock.plain
         self._pace = Pace(self._clock, self.model.reach)
-        self._gate = Gate(limits, self.model.outputs, self._rows.input_names, self._rows.m) if limits else None
+        self._limits = StreamLimits(limits, self.model.outputs, self._rows.input_names, self._rows.m) if limits else None
         self.lag = whole("Live", "lag", lag, 0)
         if lag and warm_start is not None:
             raise ValueError("Live: lag= and warm_start= cannot be combined; give one of them.")
@@ -153,9 +154,9 @@ class Stream(Batched, Plain, storage.Kept):
 
     def _within(self, inputs: Array) -> Array:
         """Inputs with NaN outside their limits, which are counted."""
-        if self._gate is None or self._awaits != INPUT:
+        if self._limits is None or self._awaits != INPUT:
             return inputs
-        return self._gate.sample(np.full(len(self.model.outputs), np.nan), inputs)[1]
+        return self._limits.sample(np.full(len(self.model.outputs), np.nan), inputs)[1]
 
     @property
     def awaits(self) -> bool:
@@ -170,7 +171,7 @@ class Stream(Batched, Plain, storage.Kept):
     @property
     def outside(self) -> dict[str, int]:
         """How many numbers of each signal were outside its limits."""
-        return {} if self._gate is None else self._gate.counts
+        return {} if self._limits is None else self._limits.counts
 
     def _watch(self, lane: int, rule: AlarmRule, wait: int | None) -> LiveAlarm:
         """An alarm that watches a lane from the next sample on."""
@@ -194,7 +195,7 @@ class Stream(Batched, Plain, storage.Kept):
 
     def _written(self) -> tuple[dict[str, Any], dict[str, Array]]:
         extra = {
-            "dt": self.dt, "zone": self._clock.zone, "limits": None if self._gate is None else self._gate.plain(),
+            "dt": self.dt, "zone": self._clock.zone, "limits": None if self._limits is None else self._limits.plain(),
             "last": self._last, "ignored": self._ignored, "lag": self.lag, "awaits": self._awaits,
             "cold": self._cold, "windows": tuple(window.plain() for window in self._windows),
             "alarms": tuple([lane, alarm.plain()] for lane, alarm in self._watching),
@@ -222,9 +223,10 @@ class Stream(Batched, Plain, storage.Kept):
         limits, outside = extra["limits"] or ([], [])
         make: Any = cls
         clock = Clock.of(extra["dt"], extra["zone"])
-        live: Self = make(model, by_output(model, trackers), clock, extra["lag"], limits=dict(limits))
-        if live._gate is not None:
-            live._gate.restore(outside)
+        gate = gate_from(header)
+        live: Self = make(model, by_output(model, trackers), clock, extra["lag"], limits=dict(limits), gate=gate)
+        if live._limits is not None:
+            live._limits.restore(outside)
         live._last, live._ignored, live._cold = extra["last"], extra["ignored"], extra["cold"]
         for window, state in zip(live._windows, extra["windows"], strict=True):
             window.restore(state)
