@@ -484,12 +484,18 @@ def _at_once(advance: Any, part: Any) -> Any:
 def _gated(look: Any, gate: Step, learn: Any, part: Any) -> Any:
     """The steps of a tracker with a gate, which sees the inputs and the memory of the model too."""
 
-    @kernel
-    def between(s: State) -> None:
-        look(part(s))
+    @partial(kernel, inline=False)
+    def judge(s: State) -> None:
         for l in range(s.theta.shape[1]):
             s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
             gate(s, l)
+
+    judged = outlined(judge)
+
+    @kernel
+    def between(s: State) -> None:
+        look(part(s))
+        judged(s)
         learn(part(s))
 
     return between
