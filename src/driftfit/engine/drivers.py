@@ -248,8 +248,9 @@ def keeps_digits(s: State, l: int) -> None:
 
 def _late(tracker: TrackerSteps) -> Any:
     """The samples that `keeps_digits` found to be late, by the form of the start."""
-    assert tracker.start is not None and tracker.start.take_over is not None
+    assert tracker.start is not None
     take_over, correct, report = tracker.start.take_over, tracker.start.correct, tracker.start.report
+    assert take_over is not None
     forecast, variance = tracker.start.forecast, tracker.start.variance
 
     def late(s: State) -> None:
@@ -554,8 +555,8 @@ def _written(common: Any, store: Any, keep_more: Any, part: Any) -> Any:
 
 
 def _sample(model: ModelSteps, note: Step, between: Any, part: Any) -> Any:
-    """One sample of all lanes, whose signals and known factors are in the record; ``between`` is what the tracker, and a
-    gate, do between the regression and the lags.
+    """One sample of all lanes, whose signals and known factors are in the record; ``between`` is what the tracker and
+    the gate do between the regression and the lags.
     """
     regress, push, _ = model
 
@@ -578,9 +579,7 @@ def _sample(model: ModelSteps, note: Step, between: Any, part: Any) -> Any:
     return sample
 
 
-def _run(
-    driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: Any, part: Any, gated: bool
-) -> Driver:
+def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: Any, part: Any, gated: bool) -> Driver:
     """The loop over the samples of a record, which a gate may end early."""
 
     @driver
@@ -610,10 +609,10 @@ def _run(
                 store_theta(s, theta, t)
             if not alone or t == last:
                 write(out[t * kept], s)
-            if gated:
+            if gated:  # a constant, without which the field would be missing  # noqa: SIM102
                 if s.gate_replay[0] > 0:
                     return t + 1
-        return y.shape[0]
+        return int(y.shape[0])
 
     return run
 

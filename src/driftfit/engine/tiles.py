@@ -5,7 +5,8 @@ sample; 0 means that nothing may happen), ``noise`` and ``drift`` (known factors
 at this sample, 1 unless given), ``valid`` (phi is complete), ``observed`` (y is there), ``ok`` (both), the results
 ``y_hat``, ``e``, ``h`` (the variance of the prediction without the noise), ``s``, ``var`` (n,), the noise variance
 ``r`` that the tracker assumes, and ``scale``, the estimate of the noise variance where P is relative to it (1
-elsewhere); ``floor``, below which a gate holds that estimate; ``late``, whether a sample is to be taken in by another form of the tracker; and ``used_noise``, which only the replay for a smoother writes. Models and trackers add their own.
+elsewhere); ``floor``, below which a gate holds that estimate; ``late``, whether a sample is to be taken in by another
+form of the tracker; and ``used_noise``, which only the replay for a smoother writes. Models and trackers add their own.
 """
 
 from __future__ import annotations

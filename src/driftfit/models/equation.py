@@ -39,8 +39,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
-from driftfit.models.base import GAP
-from driftfit.models.fault_codes import possible
+from driftfit.models.base import GAP, refuse_lag
 from driftfit.models.formulas.functions import equation_text
 from driftfit.models.formulas.text import Formula, compiled, parse, start_values
 from driftfit.models.inputs import NamedInputs
@@ -102,6 +101,14 @@ class Equation(NamedInputs):
             given = dict(self.start)
             return np.array([given.get(name, 1.0) for name in self.names])
         return np.full(self.n, float(self.start))
+
+    @property
+    def input_memory(self) -> int:
+        return self.reach
+
+    @property
+    def refuse(self) -> Any:
+        return refuse_lag
 
     @property
     def reach(self) -> int:
@@ -186,7 +193,7 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
         age(s, l)
         evaluate(s, l)
         known = complete(s, l)
-        if known and not (finite(s, l) and possible(s, s.value[l], l)):
+        if known and not finite(s, l):
             for i in range(n):
                 s.point[i, l] = s.first_point[i, l]
             evaluate(s, l)

@@ -27,8 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.kernel import Array
 
 REACH = 30.0
 """Standard deviations of the readings beyond which one is strange."""
@@ -68,46 +67,3 @@ def absurd(x: Array) -> Array:
         return np.empty(0, int)
     beyond = moving[1:][(moving[1:] > ABSURD * float(np.median(moving))) & (moving[1:] > GAP * moving[:-1])]
     return np.flatnonzero(known & (away >= beyond.min(initial=np.inf)))
-
-
-@kernel
-def refused(s: State, y_hat: float, l: int) -> bool:
-    """Whether the reading s.y is refused, and what later readings are compared with; y_hat is NaN where there is no
-    prediction. A missing reading is not judged.
-    """
-    y = s.y[l]
-    observed, fresh = abs(y) < LARGEST, y != s.raw[l]
-    apart, off = (y - s.accepted[l]) ** 2, (y - y_hat) ** 2
-    near = min(apart, off) if off >= 0.0 else apart
-    near = min((y - s.usual[l]) ** 2, near)
-    reach = REACH * REACH * s.usual_spread[l]
-    strange = observed & (s.judged[l] >= FIRST) & (near > reach)
-    out = strange & (near > reach * s.forbearance[l] * s.forbearance[l])
-    persists = abs(y - s.raw[l]) < ALIKE * abs(y - s.usual[l])
-    growth = (QUICK if persists else SLOWEST) if fresh else 1.0
-    longer = min(growth * s.forbearance[l], LONGEST)
-    s.forbearance[l] = longer if strange else (1.0 if observed else s.forbearance[l])
-    s.raw[l] = y if observed else s.raw[l]
-    s.refused[l] += 1.0 if out else 0.0
-    if observed & (not out):
-        s.accepted[l] = y
-        if fresh | (s.judged[l] < 1.0):
-            s.judged[l] += 1.0
-            share = 1.0 / min(s.judged[l], MEMORY)
-            away = y - s.usual[l]
-            s.usual[l] += share * away
-            s.usual_spread[l] += share * ((1.0 - share) * away * away - s.usual_spread[l])
-    return out  # type: ignore[no-any-return]
-
-
-@kernel
-def possible(s: State, value: float, l: int) -> bool:
-    """Whether the readings so far do not make a value of the output absurd."""
-    reach = REACH * REACH * s.usual_spread[l]
-    return (s.judged[l] < FIRST) | ((value - s.usual[l]) ** 2 <= reach)  # type: ignore[no-any-return]
-
-
-def refusals(lane: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    """Its remark in a summary: nothing if all readings were accepted."""
-    count = int(lane["refused"]) if "refused" in lane else 0
-    return (("Refused", f"{count} readings out of all proportion to those before"),) if count else ()

@@ -5,8 +5,7 @@ With the gradient at a point theta',
     phi_t = d f / d theta (theta'),     y_t - shift_t = phi_t' theta_t + v_t,     shift_t = f(theta') - phi_t' theta'
 
 ``regress`` calls `subtract` once s.phi is known, and trackers see y_t - shift_t; ``push`` calls `restore`, after which
-s.y_hat is a prediction of y_t again. A reading out of all proportion is refused (`driftfit.models.fault_codes`), after
-which s.y is -0, so that it can be told from a reading of 0.
+s.y_hat is a prediction of y_t again, and s.y of a missing output is -0, so that it can be told from a reading of 0.
 """
 
 from __future__ import annotations
@@ -18,11 +17,10 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import State, kernel
-from driftfit.models.fault_codes import UNJUDGED, refused
 
 MEMORY: Mapping[str, Any] = {
     "shift": 0.0, "measured": np.nan, "without": 0.0, "usable": 0.0, "started": 0.0, "last_row": np.nan,
-    "moved_on": 1.0, **UNJUDGED,
+    "moved_on": 1.0,
 }  # fmt: skip
 """The shift; y_t; successive samples without an output; usable samples with a regressor unlike the one before; whether
 there was a complete regressor; a sum over the last regressor, and whether it was another one."""
@@ -40,10 +38,6 @@ def along(s: State, l: int) -> float:
 @kernel
 def subtract(s: State, shift: float, complete: bool, l: int) -> None:
     """y - shift takes the place of y; before the first complete regressor no time passes."""
-    y_hat = shift
-    for i in range(s.phi.shape[0]):
-        y_hat += s.phi[i, l] * s.theta[i, l]
-    s.y[l] = np.nan if refused(s, y_hat, l) else s.y[l]
     s.shift[l] = shift
     s.measured[l] = s.y[l]
     s.y[l] -= shift

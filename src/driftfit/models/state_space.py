@@ -37,7 +37,6 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.models.fault_codes import UNJUDGED, refused
 from driftfit.models.formulas.functions import CLOCK, system_text
 from driftfit.models.formulas.text import Formula, Writer, parse, start_values, written
 from driftfit.models.inputs import NamedInputs
@@ -156,12 +155,20 @@ class StateSpace(NamedInputs):
     def recursive(self) -> bool:
         return True
 
+    @property
+    def input_memory(self) -> int:
+        return self.system.reach
+
+    @property
+    def refuse(self) -> Any:
+        return forget_input
+
     def memory(self) -> Mapping[str, Any]:
         depth, n = self.system.reach + 1, self.n
         return {
             "y_lag": np.full(depth, np.nan), "u_lag": np.full((max(self.m, 1), depth), np.nan),
             "u_known": np.zeros((max(self.m, 1), depth)), "point": np.zeros(n), "next": np.zeros(n),
-            "slopes": np.zeros((max(len(self.hidden), 1), n)), "value": 0.0, "without": 0.0, "clock": -1.0, **UNJUDGED,
+            "slopes": np.zeros((max(len(self.hidden), 1), n)), "value": 0.0, "without": 0.0, "clock": -1.0,
         }  # fmt: skip
 
     @property
@@ -240,6 +247,12 @@ def equations_of(text: str, inputs: tuple[str, ...]) -> Equations:
     )
 
 
+@kernel
+def forget_input(s: State, signal: int, age: int, l: int) -> None:
+    """`Model.refuse`."""
+    s.u_known[signal, age, l] = 0.0
+
+
 @lru_cache
 def _steps(equations: str, inputs: tuple[str, ...]) -> ModelSteps:
     """Lags, and whether a sample has all its inputs. What the equations say of it is the tracker's work."""
@@ -255,7 +268,6 @@ def _steps(equations: str, inputs: tuple[str, ...]) -> ModelSteps:
 
     @kernel
     def regress(s: State, l: int) -> None:
-        s.y[l] = np.nan if refused(s, np.nan, l) else s.y[l]
         s.clock[l] += s.dt[l]
         for i in range(reach, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]

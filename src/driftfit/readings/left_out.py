@@ -24,7 +24,7 @@ REASONS = {
 class Decision(NamedTuple):
     """One sample that was not used as it is: its number, the signal, its reading, why, and the factor of its noise."""
 
-    index: int
+    sample: int
     signal: str
     value: float
     reason: str
@@ -33,17 +33,17 @@ class Decision(NamedTuple):
 
 @dataclass(frozen=True)
 class LeftOut:
-    """The decisions of a gate in the order of the samples: ``index`` (k,), ``reason`` (k,), ``factor`` (k,), and
+    """The decisions of a gate in the order of the samples: ``sample`` (k,), ``reason`` (k,), ``factor`` (k,), and
     ``value`` (k,), the readings of y there.
     """
 
-    index: Array
+    sample: Array
     reason: Array
     factor: Array
     value: Array
 
     def __len__(self) -> int:
-        return len(self.index)
+        return len(self.sample)
 
     def __iter__(self) -> Iterator[Decision]:
         for t, reason, factor, value in zip(*(a.tolist() for a in self._columns), strict=True):
@@ -52,12 +52,12 @@ class LeftOut:
 
     @property
     def _columns(self) -> tuple[Array, ...]:
-        return self.index, self.reason, self.factor, self.value
+        return self.sample, self.reason, self.factor, self.value
 
     @property
     def refused(self) -> Array:
         """The numbers (k,) of the samples that were not used at all."""
-        found: Array = self.index[self.reason != LEVERAGE]
+        found: Array = self.sample[self.reason != LEVERAGE]
         return found
 
     @property
@@ -77,5 +77,5 @@ NOTHING_LEFT_OUT = LeftOut(np.empty(0, int), np.empty(0, int), np.empty(0), np.e
 
 def left_out_of(reason: Array, factor: Array, y: Array) -> LeftOut:
     """The decisions in a run, from what its gate stored for every sample (T,), and its readings."""
-    index = np.flatnonzero(reason)
-    return LeftOut(index, reason[index].astype(int), factor[index], y[index])
+    sample = np.flatnonzero(reason)
+    return LeftOut(sample, reason[sample].astype(int), factor[sample], y[sample])

@@ -464,9 +464,7 @@ def programs_of(
 
 
 @lru_cache(maxsize=64)
-def _programs(
-    model: Model, tracker: Tracker, inputs: int | tuple[str, ...], gate: Gate | None
-) -> tuple[Program, ...]:
+def _programs(model: Model, tracker: Tracker, inputs: int | tuple[str, ...], gate: Gate | None) -> tuple[Program, ...]:
     """The programs are cached for the next record, since settings are compared by value."""
     return (Program(model.bind(inputs), check_ready(tracker), gate=gate),)
 

@@ -167,8 +167,8 @@ def _carried(before: Program, state: State, now: Program) -> State:
         )
     if now.gate != before.gate:
         raise ValueError(
-            f"warm_start: the earlier run had gate={before.gate!r}, this one has gate={now.gate!r}, and a gate must know "
-            "all readings from the first on; give the gate of the earlier run, or run its record again."
+            f"warm_start: the earlier run had gate={before.gate!r}, this one has gate={now.gate!r}, and a gate must "
+            "know all readings from the first on; give the gate of the earlier run, or run its record again."
         )
     if not now.model.follows(before.model):
         raise ValueError(f"warm_start: the earlier run followed {before.model!r}, this one follows {now.model!r}.")

@@ -11,7 +11,6 @@ from rich.text import Text
 from driftfit.data.record import Labels
 from driftfit.engine.kernel import Array
 from driftfit.judge.compare import Comparison, compare
-from driftfit.models.fault_codes import refusals
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.by_output import ByOutput
@@ -107,7 +106,7 @@ def summarise(run: Track) -> Summary:
     return Summary(
         repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
         _signals(run.labels) if run.labels.u or run.labels.y != "y" else "", _span(run), counts(run.labels.dropped),
-        (*remarks, *_missing(run), *_level(run), *refusals(run.state), *run.tracker.remarks(run)),
+        (*remarks, *_missing(run), *_level(run), *_gate(run), *run.tracker.remarks(run)),
     )  # fmt: skip
 
 
@@ -134,6 +133,14 @@ def _signals(labels: Labels) -> str:
     """Names of the signals with their units."""
     named = [f"{name} ({labels.units[name]})" if name in labels.units else name for name in (labels.y, *labels.u)]
     return f"{named[0]} from {', '.join(named[1:])}" if labels.u else named[0]
+
+
+def _gate(run: Track) -> tuple[tuple[str, str], ...]:
+    """What the gate left out, a line for each reason; nothing without a gate."""
+    if run.program.gate is None:
+        return ()
+    lines = [f"{count} samples: {reason}" for reason, count in run.left_out.counts.items()]
+    return tuple(("Gate", line) for line in lines or ["on; nothing left out"])
 
 
 def _missing(run: Track) -> tuple[tuple[str, str], ...]:

@@ -54,7 +54,7 @@ from driftfit.models.hammerstein_wiener.evaluate_bases import DIGITS
 from driftfit.models.hammerstein_wiener.products import Structure
 from driftfit.models.hammerstein_wiener.run_time_orders import RunTimeOrders
 from driftfit.models.hammerstein_wiener.step_memory import memory, places_of
-from driftfit.models.hammerstein_wiener.steps import applying, build
+from driftfit.models.hammerstein_wiener.steps import applying, build, refusing
 
 IDENTITY = Polynomial(1)
 FLATTEST = 1e-3
@@ -270,7 +270,15 @@ class HammersteinWiener(Model):
         return self.out == IDENTITY
 
     def memory(self) -> Mapping[str, Any]:
-        return {"blocks": _memory(self).copy(), "refused": 0.0}
+        return {"blocks": _memory(self).copy()}
+
+    @property
+    def input_memory(self) -> int:
+        return max(count + delay for count, delay in zip(self.structure.nb, self.delays, strict=True)) - 1
+
+    @property
+    def refuse(self) -> Any:
+        return refusing(self.places)
 
     @property
     def places(self) -> tuple[int, ...]:

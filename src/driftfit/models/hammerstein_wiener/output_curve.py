@@ -26,7 +26,6 @@ from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, part, shared
 from driftfit.engine.simd import fill_four, load_four, plus, reached, times
 from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, level_of
-from driftfit.models.hammerstein_wiener.readings import bound_range, learn_range
 from driftfit.models.hammerstein_wiener.step_memory import (
     BEFORE,
     BEND,
@@ -75,7 +74,6 @@ WIDE = 10.0
 @part
 def believe(m: Array, y: float) -> None:
     """Include an output in the range of accepted outputs."""
-    learn_range(m, y)
     one, other = m[BEFORE, 0], m[EARLIER, 0]
     m[EARLIER, 0], m[BEFORE, 0] = one, y
     if other == other:
@@ -87,7 +85,6 @@ def believe(m: Array, y: float) -> None:
         bottom, top = m[FIRM_LOW, 0] - margin, m[FIRM_HIGH, 0] + margin
         y = min(max(y, bottom), top)
         m[LOWEST, 0], m[HIGHEST, 0] = max(m[LOWEST, 0], bottom), min(m[HIGHEST, 0], top)
-        bound_range(m, bottom, top)
     if y < m[LOWEST, 0] or y > m[HIGHEST, 0]:
         m[LOWEST, 0], m[HIGHEST, 0], m[MOVED, 0] = min(m[LOWEST, 0], y), max(m[HIGHEST, 0], y), 1.0
 

@@ -34,7 +34,6 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     NOW,
     OWN,
     PREDICTED,
-    REFUSED,
     US,
     N,
     Y,
@@ -94,7 +93,6 @@ def _steps(into: tuple[Kind, ...], out: Kind) -> ModelSteps:
         for k in range(s.orders[N_OUT, l] - 1):
             s.phi[at + k, l] = s.blocks[s.orders[G_PAST, l] + 1 + k, l]
         s.y[l], s.dt[l] = s.blocks[Y, l], s.blocks[DT, l]
-        s.refused[l] += s.blocks[REFUSED, l]
         s.noise[l] *= s.blocks[FACTOR, l]
 
     @kernel
@@ -103,7 +101,7 @@ def _steps(into: tuple[Kind, ...], out: Kind) -> ModelSteps:
         if s.orders[IDENTITY, l] == 0:
             push_any(s.blocks.ctypes.data, s.orders.ctypes.data)
         s.y_hat[l] = s.blocks[PREDICTED, l]
-        settle_output(s, s.orders[N_OUT, l] - 1, l)
+        settle_output(s, l)
         for i in range(s.orders[N, l]):
             s.blocks[s.orders[NOW, l] + i, l] = s.blocks[s.orders[NEXT, l] + i, l]
 

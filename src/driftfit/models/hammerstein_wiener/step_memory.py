@@ -34,23 +34,21 @@ ROW = GRID + 1
 
 (
     LOW, STEP, LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED, STARTED, MINIMAL, GIVEN, RAW, VARIANCE, BEFORE, EARLIER,
-    FIRM_LOW, FIRM_HIGH, MOVED, LATE, CELL, Y, DT, BELIEVED, LEFT_OUT, OK, FACTOR, LEAST, SCALE, READINGS,
-    LEAST_Y, MOST_Y, ODD, PATIENT, REFUSED, RESPONDING, HEAD,
-) = range(36)  # fmt: skip
+    FIRM_LOW, FIRM_HIGH, MOVED, LATE, CELL, Y, DT, BELIEVED, OK, FACTOR, LEAST, SCALE, HEAD,
+) = range(28)  # fmt: skip
 """Numbers: the grid, the range of accepted outputs, where the output block is defined, results, whether all lags are
 known, whether theta is xi, the given noise factor, the output as given, sigma^2 or 0, the two previous outputs, the
 range of medians of three, whether the range changed, whether a level is stored in place of the
-prediction, its cell of the grid, what steps and compiled routine exchange, whether the output becomes a lag, how many
-samples in a row were left out, whether the sample was used, the noise factor of the equation, the least variance that
-sigma adds to it, the scale of y that the basis gives, and what `driftfit.models.hammerstein_wiener.readings` counts:
-accepted readings and their range, the last strange one, the factor p, whether this one is refused, and by how many
-widths an input left its range lately; HEAD is their number.
+prediction, its cell of the grid, what steps and compiled routine exchange, whether the output becomes a lag, whether
+the sample was used, the noise factor of the equation, the least variance that
+sigma adds to it, and the scale of y that the basis gives; HEAD is their
+number.
 """
 
 (
     NA, NB, N_IN, N_OUT, N, NK, IDENTITY, ADAPTIVE, NOW, NEXT, F_PAST, G_PAST, H_PAST, SPARE, D_NOW, TRIAL,
-    TRIAL_BEND, INTO, OUT, CURVE, BEND, COARSE, LEVEL, D_CHECKED, REACH, SPANS, US, INPUTS, OWN,
-) = range(29)  # fmt: skip
+    TRIAL_BEND, INTO, OUT, CURVE, BEND, COARSE, LEVEL, D_CHECKED, REACH, US, INPUTS, OWN,
+) = range(28)  # fmt: skip
 """Places: orders, whether the output block is the identity and an input basis depends on its own coefficients, where
 the arrays begin, and how many inputs there are. NB is the number of all b, NK the smallest delay; N_IN, F_PAST and INTO
 are those of the first input.
@@ -62,7 +60,7 @@ begin, whether the basis depends on its own coefficients, and where its numbers 
 
 
 Places = Array
-"""Whole numbers (29 + 7 per input,), a constant for the compiler."""
+"""Whole numbers (28 + 7 per input,), a constant for the compiler."""
 
 
 def room(p: Places | tuple[int, ...]) -> int:
@@ -82,7 +80,7 @@ def _arrays(structure: Structure, nk: tuple[int, ...], into: tuple[Array, ...], 
         INTO: np.concatenate(into), OUT: out,
         CURVE: np.zeros(ROW * n_out), BEND: np.zeros(ROW * n_out), COARSE: np.zeros(EIGHT * n_out),
         LEVEL: np.zeros(GRID), D_CHECKED: np.zeros(n_out), REACH: np.full(n_out, np.inf),
-        SPANS: np.tile([np.inf, -np.inf], len(nb)), US: np.zeros(len(nb)),
+        US: np.zeros(len(nb)),
     }  # fmt: skip
 
 
@@ -109,7 +107,6 @@ def memory(
     """``blocks`` before the first sample."""
     head = np.zeros(HEAD)
     head[[LOWEST, HIGHEST, FIRM_LOW, FIRM_HIGH, BOTTOM, TOP]] = np.inf, -np.inf, np.inf, -np.inf, *limits
-    head[[LEAST_Y, MOST_Y]] = np.inf, -np.inf
-    head[[RISING, PATIENT, PREDICTED, BEFORE, EARLIER, ODD]] = 1.0, 1.0, np.nan, np.nan, np.nan, np.nan
+    head[[RISING, PREDICTED, BEFORE, EARLIER]] = 1.0, np.nan, np.nan, np.nan
     head[[VARIANCE, LEAST, SCALE]] = 0.0 if sigma is None else sigma * sigma, least, scale
     return np.concatenate([head, *_arrays(structure, nk, into, out).values()])

@@ -24,7 +24,6 @@ from driftfit.models.base import GAP
 from driftfit.models.hammerstein_wiener.curves.basis import INSIDE
 from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, input_values, level_of, output_values, usable
 from driftfit.models.hammerstein_wiener.output_curve import believe, inverting, laying, locating, refining
-from driftfit.models.hammerstein_wiener.readings import forget_inputs, refused, strange, watch_inputs
 from driftfit.models.hammerstein_wiener.regressor_rows import (
     complete,
     fill,
@@ -47,7 +46,6 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     IDENTITY,
     INPUTS,
     LATE,
-    LEFT_OUT,
     MINIMAL,
     MOVED,
     N_OUT,
@@ -66,7 +64,6 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     OWN_NK,
     PREDICTED,
     RAW,
-    REFUSED,
     SPARE,
     STARTED,
     US,
@@ -136,7 +133,7 @@ def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
                 m[g + k, 0] = np.nan
             lose_output(m, p)
         elif abs(m[RAW, 0]) < LARGEST:
-            believe(m, m[RAW, 0])  # not before the tracker has judged it
+            believe(m, m[RAW, 0])  # not before a gate has judged it
         shift(m, g, n_out, rows)
         if m[VARIANCE, 0] > 0.0:
             shift(m, h, n_out, rows)
@@ -154,14 +151,6 @@ def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
         right = minimal_past(m, p, theta) if m[MINIMAL, 0] > 0.0 else past(m, p, theta)
         y = m[Y, 0]
         observed = abs(y) < LARGEST
-        if p[IDENTITY] == 0 or m[MINIMAL, 0] > 0.0:
-            forget_inputs(m)
-            if p[NK] == 0:
-                watch_inputs(m, p)
-            if observed and strange(m, y):
-                observed = not refused(m, y, right if p[IDENTITY] > 0 else invert(m, p, right))
-            if p[NK] > 0:
-                watch_inputs(m, p)
         if observed:
             if m[VARIANCE, 0] > 0.0:
                 output_at(m, p, y, g, h)
@@ -209,23 +198,10 @@ def _push(out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
     return machine(machine_push)
 
 
-PATIENCE = 10.0
-"""Samples left out one after the other, apart from those that cannot be judged, whose outputs are not believed."""
-
-
 @kernel
-def settle_output(s: State, more_out: int, l: int) -> None:
-    """Decide whether the output becomes a lag and part of the range of outputs: observed, and its sample not left out.
-
-    With an output block the output is also a regressor, and trackers cannot tell a fault code in it from one in an
-    input. After `PATIENCE` samples it is no code but another range, which the tracker can learn only with its lags.
-    """
-    judged, used = (more_out > 0) & (s.valid[l] > 0.0) & (s.noise[l] < np.inf), s.ok[l] > 0.0
-    count = s.blocks[LEFT_OUT, l]
-    count = 0.0 if used else (count + 1.0 if judged else count)
-    refused = judged & (not used) & (count <= PATIENCE)
-    s.blocks[BELIEVED, l] = 1.0 if (s.observed[l] > 0.0) & (not refused) else 0.0
-    s.blocks[LEFT_OUT, l], s.blocks[OK, l] = count, s.ok[l]
+def settle_output(s: State, l: int) -> None:
+    """Whether the output becomes a lag and part of the range of outputs: unless it is missing, or a gate refused it."""
+    s.blocks[BELIEVED, l], s.blocks[OK, l] = s.observed[l], s.ok[l]
 
 
 @lru_cache
@@ -254,7 +230,6 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
         for k in range(more):
             s.phi[at_d + k, l] = s.blocks[present + k, l]
         s.y[l], s.dt[l] = s.blocks[Y, l], s.blocks[DT, l]
-        s.refused[l] += s.blocks[REFUSED, l]
         s.noise[l] *= s.blocks[FACTOR, l]
 
     @kernel
@@ -267,7 +242,7 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
             else:
                 push_lane(s.blocks.ctypes.data + at, L)
         s.y_hat[l] = s.blocks[PREDICTED, l]
-        settle_output(s, more, l)
+        settle_output(s, l)
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 
@@ -293,11 +268,32 @@ def applying(into: tuple[Kind, ...], p: tuple[int, ...]) -> Step:
             s.blocks[us + i, l] = s.u[i, l]
         m = floats(s.blocks.ctypes.data + 8 * l, rows, s.y.shape[0])
         place(m, orders)
-        if orders[IDENTITY] == 0 or m[MINIMAL, 0] > 0.0:
-            watch_inputs(m, orders)
         fill(m, orders, following, 1, m[BELIEVED, 0] > 0.0)
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 
     step: Step = kernel(apply)
     return step
+
+
+@lru_cache
+def refusing(p: tuple[int, ...]) -> Any:
+    """`Model.refuse`: the functions of an input are missing, also from the row of the next sample."""
+    inputs, column, firsts = p[INPUTS], p[NEXT] + p[NA], []
+    for i in range(inputs):
+        own = OWN + EACH * i
+        firsts.append((p[own + OWN_F], p[own + OWN_N_IN], p[own + OWN_NB], p[own + OWN_NK], column))
+        column += p[own + OWN_NB]
+    begin, width, count, delay, at = (tuple(each) for each in zip(*firsts, strict=True))
+
+    @kernel
+    def refuse(s: State, signal: int, age: int, l: int) -> None:
+        for i in range(inputs):
+            if i == signal:
+                for k in range(width[i]):
+                    s.blocks[begin[i] + age * width[i] + k, l] = np.nan
+                lag = age + 1 - delay[i]
+                if (lag >= 0) & (lag < count[i]):
+                    s.blocks[at[i] + lag, l] = np.nan
+
+    return refuse

@@ -25,7 +25,19 @@ from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import programs_of, state_of, tile_of
 from driftfit.run.public_class import Plain
 from driftfit.run.result import burn_in
-from driftfit.run.warm_start import ABSENT, KINDS, End, Run, by_output, carried, ended, gate_from, read, restore, written
+from driftfit.run.warm_start import (
+    ABSENT,
+    KINDS,
+    End,
+    Run,
+    by_output,
+    carried,
+    ended,
+    gate_from,
+    read,
+    restore,
+    written,
+)
 from driftfit.trackers.base import Tracker
 
 
@@ -46,7 +58,9 @@ class Stream(Batched, Plain, storage.Kept):
         self._clock = Clock.of(dt)
         self.dt = self._clock.plain
         self._pace = Pace(self._clock, self.model.reach)
-        self._limits = StreamLimits(limits, self.model.outputs, self._rows.input_names, self._rows.m) if limits else None
+        self._limits = (
+            StreamLimits(limits, self.model.outputs, self._rows.input_names, self._rows.m) if limits else None
+        )
         self.lag = whole("Live", "lag", lag, 0)
         if lag and warm_start is not None:
             raise ValueError("Live: lag= and warm_start= cannot be combined; give one of them.")

@@ -48,7 +48,7 @@ class Minimal(Tracker):
     theta0: Any
 
     required: ClassVar[tuple[str, ...]] = ("q", "r")
-    replaces: ClassVar[tuple[str, ...]] = ("blocks", "refused")
+    replaces: ClassVar[tuple[str, ...]] = ("blocks",)
 
     def _check(self, *variances: str) -> None:
         """Check the settings that both have, and those named, which are nonnegative numbers."""

@@ -32,10 +32,8 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import diagonal
 from driftfit.engine.kernel import State, kernel
-from driftfit.trackers.parts.coarse.resolution import lasting, reading
-from driftfit.trackers.parts.diffuse import spanned_variance
+from driftfit.trackers.parts.coarse.resolution import lasting
 
 RATE = 4.0 * np.pi**2
 WIDER = 0.01
@@ -46,21 +44,8 @@ RECENT = 100.0
 """Samples of the mean of phi' P phi."""
 
 
-def nothing_shared() -> dict[str, Any]:
-    """Fields before the first reading."""
-    return {
-        "fold": 1.0,
-        "common": 0.0,
-        "readings_in": 0.0,
-        "levels": 1.0,
-        "middle": 0.0,
-        "spread": 0.0,
-        "stayed": np.nan,
-    }
-
-
 def nothing_shared_among_filters() -> dict[str, Any]:
-    """The same for a mixture, which has the mean and variance of readings already."""
+    """Fields before the first reading of a mixture, which has the mean and variance of readings already."""
     return {"fold": 1.0, "common": 0.0, "undecided": 0.0, "levels": 1.0, "stayed": np.nan}
 
 
@@ -97,25 +82,8 @@ def in_common(s: State, noise: float, l: int) -> float:
 
 
 @kernel
-def share_rounding(s: State, per_noise: float, l: int) -> None:
-    """Take in a sample after its correction; ``per_noise`` is s.s in units of the noise variance, s.scale."""
-    n, ok = s.theta.shape[0] - s.absent[l], s.ok[l]
-    kept = 1.0 - ok * max(1.0 - s.noise[l] / per_noise, 0.0) / n
-    N = kept * s.readings_in[l] + ok
-    weight = ok / max(N, 1.0)
-    off = reading(s, l) - s.middle[l]
-    s.middle[l] = s.middle[l] + weight * off
-    s.spread[l] = (1.0 - weight) * (s.spread[l] + weight * off * off)
-    s.readings_in[l] = N
-    count_levels(s, kept, s.count[l] > 2.0 * n, l)
-    scale = s.scale[l] / s.mean_weight[l]
-    s.common[l] = in_common(s, scale, l) if (s.coarse[l] > 0.0) & (scale > 0.0) else 0.0
-    s.fold[l] = 1.0 + N * s.common[l] / scale if s.common[l] > 0.0 else 1.0
-
-
-@kernel
 def share_among_filters(s: State, l: int) -> None:
-    """The same for a mixture of filters with covariance s.P, which has the mean and variance of its readings."""
+    """Take in a sample after the correction of filters with covariance s.P, of which means are known."""
     n, h = s.theta.shape[0] - s.absent[l], 0.0
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):
@@ -126,21 +94,5 @@ def share_among_filters(s: State, l: int) -> None:
     mean = s.undecided[l]
     s.common[l] = in_common(s, s.r[l] / s.mean_weight[l], l) if (s.coarse[l] > 0.0) & (mean > 0.0) else 0.0
     s.fold[l] = 1.0 + n * s.common[l] / mean if s.common[l] > 0.0 else 1.0
-    for i in range(s.theta.shape[0]):
-        s.var[i, l] *= s.fold[l]
-
-
-@kernel
-def folded(s: State, l: int) -> None:
-    """Report the diagonal of P, times the noise variance and the fold."""
-    diagonal(s, l)
-    for i in range(s.theta.shape[0]):
-        s.var[i, l] *= s.fold[l]
-
-
-@kernel
-def spanned_folded(s: State, l: int) -> None:
-    """The same while the state is in square-root form."""
-    spanned_variance(s, l)
     for i in range(s.theta.shape[0]):
         s.var[i, l] *= s.fold[l]

@@ -1,7 +1,7 @@
 """Inputs far outside their range to which the output does not respond: fault codes, such as 0 where a meter shows 50.
 
 A regressor is *outside* if it is more than `outside` times half the range of its earlier values away from the middle
-m_i of that range: `OUTSIDE`, or `OUTSIDE_GIVEN_DRIFT`. With e the innovation and s its variance, an input is at fault
+m_i of that range, `OUTSIDE`. With e the innovation and s its variance, an input is at fault
 if
 
     e^2 > SURE^2 s    and    |e + sum theta_i (phi_i - m_i)| < UNMOVED |e|,    the sum over regressors outside
@@ -15,9 +15,7 @@ lags afterwards.
 A sample at fault is not used. It costs trust, `TRUST` of which are spent before inputs are believed: 1, or `AGAIN` if
 the value is near that of the last one without repeating it in all digits, as that of an input that stays there. Every
 other complete sample earns `EARNED` back. So an input that is far away and moves is believed at the sixth sample, and a
-value that is always the same after fifty. Values that were believed widen the range. The strange predictions of
-`driftfit.trackers.parts.faults.contradictions` cost the same trust.
-
+value that is always the same after fifty. Values that were believed widen the range.
 Source: ours. Cost per sample: 2 n comparisons.
 """
 
@@ -33,9 +31,8 @@ from driftfit.trackers.parts.faults.first_samples import NOISE, PHI
 from driftfit.trackers.parts.faults.omissions import NOTHING_LEFT_OUT
 from driftfit.trackers.parts.faults.outlying_readings import SURE
 
-OUTSIDE, OUTSIDE_GIVEN_DRIFT = 1.25, 2.0
-"""Half ranges from the middle from which on a regressor is outside; the second for trackers with a given drift, to
-which a jump of theta looks the same where lags are a little larger than before."""
+OUTSIDE = 1.25
+"""Half ranges from the middle from which on a regressor is outside."""
 UNMOVED, REPEATED = 0.4, 0.6
 """Share of the innovation that is left with the usual values of the regressors, at most; the same where the value
 repeats that of the last sample at fault."""
