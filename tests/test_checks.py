@@ -20,7 +20,7 @@ from driftfit.trackers.parts.covariance import prediction
 
 
 def steps(predict, correct) -> TrackerSteps:
-    return TrackerSteps(predict, correct, unknown)
+    return TrackerSteps(predict, nothing, correct, unknown, nothing)
 
 
 @kernel
@@ -112,7 +112,7 @@ class Hindsight(NLMS):
 
 class Boastful(NLMS):
     covariance = True
-    kind = TrackerSteps(nothing, follow)
+    kind = TrackerSteps(nothing, nothing, follow, variance=nothing)
 
 
 class Deaf(Kalman):

@@ -347,7 +347,7 @@ class Descent(Tracker):
 
     @property
     def steps(self):
-        return TrackerSteps(still, descend, unknown_variance)
+        return TrackerSteps(still, still, descend, unknown_variance, still)
 
 
 @needs_gcc
@@ -382,7 +382,7 @@ class Odd(Tracker):
 
     @property
     def steps(self):
-        return TrackerSteps(predict, correct, predict)
+        return TrackerSteps(predict, still, correct, predict, still)
 
 
 @needs_gcc

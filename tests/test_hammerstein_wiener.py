@@ -48,7 +48,7 @@ class Still(Tracker):
 
     @property
     def steps(self):
-        return TrackerSteps(nothing, nothing, unknown, store=copy)
+        return TrackerSteps(nothing, nothing, nothing, unknown, store=copy)
 
 
 def seen_by(model, y, u):

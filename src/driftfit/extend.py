@@ -1,6 +1,6 @@
 """The building blocks of your own trackers, models and curves; see docs/own_tracker.md and `driftfit.check_tracker`."""
 
-from driftfit.engine.drivers import ModelSteps, TrackerSteps, diagonal, unknown
+from driftfit.engine.drivers import ModelSteps, TrackerSteps, diagonal, no_variance, unknown
 from driftfit.engine.kernel import Array, State, Step, exp, kernel, log, nothing
 from driftfit.engine.settings import Settings, numbers, one_of, vector, whole
 from driftfit.models.base import Model
@@ -24,6 +24,7 @@ __all__ = [
     "exp",
     "kernel",
     "log",
+    "no_variance",
     "nothing",
     "numbers",
     "one_of",

@@ -124,7 +124,7 @@ class Half(Tracker):
         return {"theta": np.zeros(n)}
     @property
     def steps(self):
-        return TrackerSteps(nothing, correct, unknown)
+        return TrackerSteps(nothing, nothing, correct, unknown, nothing)
 """
 
 

@@ -38,7 +38,7 @@ def called(s, l):
     s.e[l], s.s[l], s.var[0, l] = s.y[l] - s.y_hat[l], 1.0, 0.0
 
 
-STEPS = TrackerSteps(still, called, still, machines=(one, two), outlined=True)
+STEPS = TrackerSteps(still, still, called, still, still, machines=(one, two), outlined=True)
 
 
 def predictions(model, steps=STEPS, T=5):

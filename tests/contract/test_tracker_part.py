@@ -23,7 +23,7 @@ def steps(**more):
         s.y_hat[l] = s.theta[0, l] * s.phi[0, l]
         s.e[l], s.s[l], s.var[0, l] = s.y[l] - s.y_hat[l], 1.0, 0.0
 
-    return predicts, TrackerSteps(still, predicts, still, **more)
+    return predicts, TrackerSteps(still, still, predicts, still, still, **more)
 
 
 def run(model, tracker, T=20):
@@ -49,7 +49,7 @@ def test_steps_that_name_a_field_of_the_model_must_say_so():
     def of_the_model(s, l):
         s.var[0, l] = s.y_lag[0, l]
 
-    given = TrackerSteps(still, steps()[0], of_the_model)
+    given = TrackerSteps(still, still, steps()[0], of_the_model, still)
     with pytest.raises(TypeError, match=r"names the field 'y_lag'.*reads_model=True"):
         run(ARX(1, 0), given)
     _, out = run(ARX(1, 0), given._replace(reads_model=True))

@@ -44,7 +44,7 @@ for two to eight parameters, and 27 for more.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -77,19 +77,13 @@ from driftfit.trackers.parts.excitation import (
     not_learned,
     window,
 )
-from driftfit.trackers.parts.faults.first_samples import RESIDUALS
-from driftfit.trackers.parts.faults.frozen_readings import held_readings, leave_out_frozen, not_frozen
-from driftfit.trackers.parts.faults.omissions import omissions
 from driftfit.trackers.parts.faults.outlying_readings import (
     FIRST,
     bound_leverage,
     learn_proportion,
-    leave_out,
     no_proportion,
 )
-from driftfit.trackers.parts.faults.stored_samples import machine_doubt
-from driftfit.trackers.parts.faults.strange_inputs import learn_inputs, leave_out_input, no_strange_inputs
-from driftfit.trackers.parts.few_residuals import widen_estimates, wider
+from driftfit.trackers.parts.few_residuals import RESIDUALS, widen_estimates, wider
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.drifts.about_means import learn_means
 from driftfit.trackers.parts.modes.drifts.after_outlier import no_jump, suppose_jump
@@ -106,7 +100,7 @@ from driftfit.trackers.parts.modes.filters import (
 from driftfit.trackers.parts.modes.ladder import filters, mix
 from driftfit.trackers.parts.modes.noise_levels import any_level, finest, learn_noise, noise_prior
 from driftfit.trackers.parts.modes.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
-from driftfit.trackers.parts.modes.start import begin_with_drift, faults, reconsider, start_density, take_start
+from driftfit.trackers.parts.modes.start import begin_with_drift, forecast_start, start_density, take_start
 from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
 
 
@@ -142,17 +136,10 @@ def settle(s: State, l: int) -> None:
     go_on(s, l)
 
 
-@kernel
-def learn(s: State, l: int, outlier: float) -> None:
-    """Update excitation and the proportion of readings."""
-    learn_information(s, s.leverage[l] * s.noise[l], l)
-    learn_proportion(s, l, outlier)
-    learn_inputs(s, l)
-
-
 @partial(kernel, inline=False)
-def follow(s: State, entering: int, l: int) -> None:
-    """One sample of the running filters; ``entering`` is the column in a new direction, or -1."""
+def look_ahead(s: State, entering: int, l: int) -> None:
+    """Prediction of the running filters, and its variance; ``entering`` is the column in a new direction, or -1."""
+    s.column[l] = entering
     resolve(s, l)
     noise_prior(s, l)
     bound_leverage(s, l)
@@ -160,11 +147,13 @@ def follow(s: State, entering: int, l: int) -> None:
     if entering >= 0:
         s.y_hat[l] = prediction(s, l)
         s.e[l], s.s[l] = s.y[l] - s.y_hat[l], np.inf
-    leave_out_input(s, l)
-    leave_out(s, l)
-    leave_out_frozen(s, l)
+
+
+@partial(kernel, inline=False)
+def follow(s: State, l: int) -> None:
+    """One sample of the running filters."""
     s.outlier[l], s.weighed[l] = 0.0, 0
-    column = entering if entering >= 0 else outgrown(s, l)
+    column = s.column[l] if s.column[l] >= 0 else outgrown(s, l)
     if s.ok[l] > 0.0 and column >= 0:
         enter_filters(s, column, l)
     elif s.ok[l] > 0.0:
@@ -178,14 +167,20 @@ def follow(s: State, entering: int, l: int) -> None:
     learn_colour(s, l)
     learn_scales(s, l)
     learn_means(s, l)
-    learn(s, l, s.outlier[l])
+    learn_information(s, s.leverage[l] * s.noise[l], l)
+    learn_proportion(s, l, s.outlier[l])
+
+
+@kernel
+def forecast(s: State, l: int) -> None:
+    whiten_noise(s, l)
+    whiten(s, l)
+    look_ahead(s, -1, l)
 
 
 @kernel
 def correct(s: State, l: int) -> None:
-    whiten_noise(s, l)
-    whiten(s, l)
-    follow(s, -1, l)
+    follow(s, l)
 
 
 @kernel
@@ -198,31 +193,37 @@ def report(s: State, l: int) -> None:
 
 
 @kernel
-def begin(s: State, l: int) -> None:
-    """Least squares until the filters start; afterwards the running filters, while there are directions without
-    information.
+def forecast_first(s: State, l: int) -> None:
+    """That of least squares until the filters start; afterwards of the running filters, while there are directions
+    without information.
     """
     if s.settled[l] > 0:
-        predict(s, l)
         whiten_noise(s, l)
-        follow(s, whiten_within(s, s.white.ctypes.data, l), l)
+        look_ahead(s, whiten_within(s, s.white.ctypes.data, l), l)
+    else:
+        resolve(s, l)
+        forecast_start(s, l)
+        s.s[l] *= wider(s.count[l])
+
+
+@kernel
+def correct_first(s: State, l: int) -> None:
+    if s.settled[l] > 0:
+        follow(s, l)
         mixture(s, l)
         share_among_filters(s, l)
         go_on(s, l)
     else:
-        resolve(s, l)
         residuals = s.count[l]
         take_start(s, l)
-        if s.s[l] < np.inf:
-            s.density[l] = start_density(s.e[l], s.s[l], residuals)
+        if s.h[l] < np.inf:
+            s.density[l] = start_density(s.e[l], s.s[l] / wider(residuals), residuals)
         rank, n = s.rank[l] - s.absent[l], s.parameters[l]
         # a column that enters late, as of signals that a model has to compute first, has no residuals yet
         early = rank == n and s.remembered[l] <= n + RESIDUALS
         enough = s.count[l] >= RESIDUALS and (early or s.remembered[l] >= FIRST)
-        ready = s.remembered[l] - rank >= RESIDUALS and reconsider(s, enough, l)
-        s.s[l] *= wider(residuals)
         spanned_variance(s, l)
-        if ready:
+        if enough and s.remembered[l] - rank >= RESIDUALS:
             settle(s, l)
         else:
             widen_estimates(s, l)
@@ -256,6 +257,7 @@ class AdaptiveKalman(Tracker):
     density: ClassVar[str] = "density"
     smoother_fields: ClassVar[tuple[str, ...]] = SMOOTHER_FIELDS
     adapts: ClassVar[bool] = True
+    gated: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
         "pivot", "at_start", "gain", "e_k", "step", "h_k", "inverse", "joint", "mu_next", "share", "row", "m_next",
         "weighted", "Z", "away", "about_drift",
@@ -290,6 +292,7 @@ class AdaptiveKalman(Tracker):
             "count": 0.0,
             "settled": 0,
             "weighed": 0,
+            "column": -1,
             "vague": 0.0,
             "gain": np.zeros((n, K)),
             "e_k": np.zeros(K),
@@ -303,10 +306,8 @@ class AdaptiveKalman(Tracker):
             **no_excitation(n),
             **no_proportion(),
             **unresolved(),
-            **not_frozen(),
             **nothing_shared_among_filters(),
             **no_weights(n),
-            **no_strange_inputs(n),
             **white(n),
             **no_jump(n),
             **modes,
@@ -321,14 +322,14 @@ class AdaptiveKalman(Tracker):
     def steps(self) -> TrackerSteps:
         return TrackerSteps(
             predict,
-            nothing,
+            forecast,
             correct,
             report,
             nothing,
-            TrackerSteps(nothing, nothing, begin, nothing, nothing),
+            TrackerSteps(predict, forecast_first, correct_first, nothing, nothing),
             store=keep_density,
             store_for_smoother=store_for_smoother,
-            machines=(*FRAME, machine_doubt, machine_weights),
+            machines=(*FRAME, machine_weights),
             doubts=True,
             outlined=True,
         )
@@ -336,9 +337,6 @@ class AdaptiveKalman(Tracker):
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
         running = np.append(False, fields["settled"][:-1] > 0)  # not yet at the sample with which the filters start
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
-
-    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
-        return faults(field, phi, y, ok)
 
     def estimated_variances(
         self, model: Model, fields: Mapping[str, Array], phi: Array, e: Array, time: Array
@@ -373,8 +371,6 @@ class AdaptiveKalman(Tracker):
             facts.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
         return (
             *facts,
-            *omissions(lane),
-            *held_readings(lane),
             *resolution(lane),
             *colour(lane),
         )

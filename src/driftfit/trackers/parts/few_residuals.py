@@ -17,6 +17,9 @@ WIDER = (42.0277, 4.8192, 2.6365)
 TERMS = (1.21036, 1.44008, 1.30403)
 """Coefficients of t / z - 1 in powers of 1 / nu."""
 
+RESIDUALS = 4
+"""Residuals from which on they determine the variance of the noise."""
+
 
 @kernel
 def wider(residuals: float) -> float:

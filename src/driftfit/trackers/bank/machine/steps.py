@@ -52,8 +52,7 @@ from driftfit.trackers.parts.covariance import correct as correct_one
 from driftfit.trackers.parts.covariance import forecast, prediction
 from driftfit.trackers.parts.diffuse import enter, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
-from driftfit.trackers.parts.faults.first_samples import RESIDUALS
-from driftfit.trackers.parts.few_residuals import wider
+from driftfit.trackers.parts.few_residuals import RESIDUALS, wider
 from driftfit.trackers.parts.modes.noise_levels import LEAST_SHARE
 
 GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift"], ROW["own_likelihoods"]

@@ -28,7 +28,7 @@ from driftfit.trackers.parts.modes.noise_levels import level_chain
 
 SMOOTHER_FIELDS = (
     "joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight", "white",
-    "explained", "calm", "left_out", "shift", "direction", "replaced_by", "busy", "variance", "constant", "jumped",
+    "explained", "calm", "shift", "direction", "replaced_by", "busy", "variance", "constant", "jumped",
 )  # fmt: skip
 """Fields that are stored at every sample."""
 
@@ -52,7 +52,7 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
     o.r[l], o.leverage[l], o.alike[l] = s.r[l], s.leverage[l], s.alike[l]
     o.coarse[l] = s.coarse[l] / s.noise[l]  # in units of the noise factor, as r is
     o.leapt[l], o.weighed[l], o.settled[l], o.explained[l] = s.leapt[l], s.weighed[l], s.settled[l], s.explained[l]
-    o.calm[l], o.left_out[l], o.shift[l] = s.calm[l], s.left_out[l], s.shift[l]
+    o.calm[l], o.shift[l] = s.calm[l], s.shift[l]
     o.replaced_by[l], o.busy[l], o.constant[l] = s.replaced_by[l], s.busy[l], s.constant[l]
 
 

@@ -10,9 +10,6 @@ with nu the number of residuals, and p_k Student's density of the samples given 
 filters start with probabilities proportional to p_k, and with r the mean of S_k / nu. Parameters that move from the
 first sample on are therefore neither taken for noise nor for estimates that many samples agree on.
 
-Before that the samples are judged together (`driftfit.trackers.parts.faults.first_samples`). If some are fault codes,
-least squares, scales and proportions start again without them; until that can be decided, the start continues.
-
 Source: marginal likelihood under an inverse-gamma variance, West and Harrison, Bayesian Forecasting and Dynamic Models
 (1997), section 4.5. Cost: O(K n^2) for each sample of the start, once.
 """
@@ -20,38 +17,23 @@ Source: marginal likelihood under an inverse-gamma variance, West and Harrison, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, exp, kernel, log
-from driftfit.trackers.parts.coarse.resolution import learn_resolved_scale, reading, same_reading
-from driftfit.trackers.parts.diffuse import know_nothing, take_in
+from driftfit.engine.kernel import State, exp, kernel, log
+from driftfit.trackers.parts.coarse.resolution import learn_resolved_scale
+from driftfit.trackers.parts.diffuse import absorb_on_roots, forecast_on_roots
 from driftfit.trackers.parts.excitation import learn_information, learn_scales
-from driftfit.trackers.parts.faults.first_samples import (
-    NOISE,
-    PHI,
-    RESIDUALS_IN_DOUBT,
-    SPAN,
-    Y,
-    contradict,
-    doubtful,
-)
 from driftfit.trackers.parts.faults.outlying_readings import bound_leverage, learn_proportion
-from driftfit.trackers.parts.faults.stored_samples import (
-    doubtful_samples,
-    recall,
-    squares_left,
-    store,
-    without_fault,
-)
-from driftfit.trackers.parts.faults.strange_inputs import learn_stored_inputs
-from driftfit.trackers.parts.modes.drifts.about_means import forget_mean, learn_means
+from driftfit.trackers.parts.modes.drifts.about_means import learn_means
 from driftfit.trackers.parts.modes.filters import absorb, project, wander
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
-from driftfit.trackers.parts.modes.weights import WINDOW
+from driftfit.trackers.parts.modes.weights import PHI, WINDOW
+
+Y, NOISE, SPAN = range(3)
+"""Entries of a stored sample of the start before its regressor, at `PHI`: the output, the noise factor, and intervals
+of drift since the one before."""
 
 LOOSE = 1e4
 """Variance of each coordinate before the first sample, in units of what least squares leave. A larger one would cost
@@ -72,127 +54,39 @@ def keep(s: State, l: int) -> None:
     """Store a sample of the start, where those of `driftfit.trackers.parts.modes.weights` will be."""
     if s.ok[l] > 0.0:
         if s.remembered[l] < WINDOW:
-            store(s, l)
+            at = s.remembered[l]
+            for i in range(s.theta.shape[0]):
+                s.samples[at, PHI + i, l] = s.phi[i, l]
+            s.samples[at, Y, l], s.samples[at, SPAN, l], s.samples[at, NOISE, l] = s.y[l], s.waited[l], s.noise[l]
         s.remembered[l] += 1
         s.waited[l] = 0.0
 
 
 @kernel
-def take_first(s: State, l: int) -> None:
-    """One sample of least squares, and its residual, with the noise variance s.noise."""
-    learn_information(s, s.noise[l], l)
-    learn_proportion(s, l, 0.0)
-    take_in(s, l)
-    if s.s[l] < np.inf:
-        learn_resolved_scale(s, l)
+def forecast_start(s: State, l: int) -> None:
+    """Prediction of least squares, and its variance in units of the noise so far."""
+    bound_leverage(s, l)  # the drift is in units of scales that such a regressor did not move much either
+    forecast_on_roots(s, l)
+    s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l] * s.leverage[l]) if s.h[l] < np.inf else np.inf
 
 
 @partial(kernel, short=True)
 def take_start(s: State, l: int) -> None:
-    """A sample of the start."""
+    """A sample of least squares, and its residual."""
     s.waited[l] += s.dt[l] * s.drift[l]
-    if s.remembered[l] == 0:
-        for i in range(s.theta.shape[0]):
-            s.m[i, 0, l] = s.theta[i, l]  # no filter needs it yet
     learn_scales(s, l)
     learn_means(s, l)
-    bound_leverage(s, l)  # the drift is in units of scales that such a regressor did not move much either
-    noise = s.noise[l]
+    noise, v = s.noise[l], s.s[l]
     s.noise[l] = noise * s.leverage[l]
-    take_first(s, l)
+    learn_information(s, s.noise[l], l)
+    learn_proportion(s, l, 0.0)
+    absorb_on_roots(s, l)
+    if s.h[l] < np.inf:
+        s.s[l] = s.h[l] + s.r[l] * s.noise[l]
+        learn_resolved_scale(s, l)
+    s.s[l] = v
     keep(s, l)
     s.noise[l] = noise
-
-
-@kernel
-def forget(s: State, l: int) -> None:
-    """As before the first sample, but for the readings that `driftfit.trackers.parts.coarse.resolution` compares."""
-    n = s.theta.shape[0]
-    for i in range(n):
-        s.theta[i, l], s.c[i, l], s.active[i, l] = s.m[i, 0, l], 0.0, 0.0
-        forget_mean(s, i, l)
-        for j in range(n):
-            s.information[i, j, l] = 0.0
-    know_nothing(s, l)
-    s.squares[l], s.count[l], s.scale[l] = 0.0, 0.0, np.nan
-    s.power_samples[l], s.power[l] = 0.0, 0.0
-    s.middle[l], s.spread[l], s.readings[l], s.widening[l] = 0.0, 0.0, 0.0, 1.0
-
-
-@partial(kernel, short=True)
-def repeat(s: State, every: bool, l: int) -> float:
-    """Repeat least squares, with every sample or without the doubtful ones.
-
-    Returns the sum of squares of the residuals of those that are not doubtful.
-    """
-    last = np.nan
-    forget(s, l)
-    for at in range(s.remembered[l]):
-        if every or s.samples[at, NOISE, l] > 0.0:
-            recall(s, at, l)
-            s.fresh[l] = 0.0 if same_reading(s, last, l) else 1.0
-            last = reading(s, l)
-            learn_scales(s, l)
-            learn_means(s, l)
-            take_first(s, l)
-    return squares_left(s, l)  # type: ignore[no-any-return]
-
-
-@kernel
-def drop(s: State, l: int) -> None:
-    """Remove the doubtful samples."""
-    rows, columns = s.remembered[l], PHI + s.theta.shape[0]
-    left, waited = 0, 0.0
-    for at in range(rows):
-        waited += s.samples[at, SPAN, l]
-        if s.samples[at, NOISE, l] > 0.0:
-            for i in range(columns):
-                s.samples[left, i, l] = s.samples[at, i, l]
-            s.samples[left, SPAN, l] = waited
-            left, waited = left + 1, 0.0
-    s.waited[l] += waited
-    s.left_out[l] += rows - left
-    s.remembered[l] = left
-
-
-@partial(kernel, short=True)
-def reconsider(s: State, enough: bool, l: int) -> bool:
-    """Whether the filters may start: if there are ``enough`` samples, and `RESIDUALS_IN_DOUBT` if some are doubtful.
-
-    Estimates are those without the doubtful samples before that too, because models compute later regressors with them.
-    """
-    found, before, rows = 0, 0, s.remembered[l]
-    if rows <= WINDOW:
-        for at in range(rows):
-            before += 1 if s.samples[at, NOISE, l] < 0.0 else 0
-        found = doubtful_samples(s, 1, l)
-    if found + before == 0:
-        return enough
-    y, y_hat, e, v, noise, shift = s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l]
-    ok, observed, fresh, leverage = s.ok[l], s.observed[l], s.fresh[l], s.leverage[l]
-    s.ok[l], s.observed[l], s.leverage[l] = 1.0, 1.0, 1.0
-    alone, residuals = repeat(s, False, l), s.count[l]
-    ready = enough and (residuals >= RESIDUALS_IN_DOUBT or found == 0)
-    contradicted = found > 0 and contradict(repeat(s, True, l), alone, residuals)
-    if contradicted:
-        repeat(s, False, l)
-    recall(s, rows - 1, l)
-    s.y[l], s.y_hat[l], s.e[l], s.s[l], s.noise[l], s.shift[l] = y, y_hat, e, v, noise, shift
-    s.ok[l], s.observed[l], s.fresh[l], s.leverage[l] = ok, observed, fresh, leverage
-    if contradicted and ok > 0.0:
-        without_fault(s, y_hat, l)
-    if contradicted and ready:
-        drop(s, l)
-    return ready
-
-
-def faults(field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
-    """Which samples (T,) of the start `reconsider` left out."""
-    start = int(np.argmax(field("settled") > 0)) + 1
-    rows, found = np.flatnonzero(ok[:start]), np.zeros(len(y), bool)
-    if field("left_out")[start - 1] > 0.0:
-        found[rows] = doubtful(phi[rows], y[rows], y[rows] + field("shift")[rows])
-    return found
 
 
 @kernel
@@ -220,7 +114,7 @@ def run_again(s: State, l: int) -> None:
         whitened(s, at, l)
         project(s, l)
         for k in range(K):
-            e, v = s.samples[at, Y, l] - s.e_k[k, l], s.h_k[k, l] + abs(s.samples[at, NOISE, l])
+            e, v = s.samples[at, Y, l] - s.e_k[k, l], s.h_k[k, l] + s.samples[at, NOISE, l]
             s.weighted[k, l] += e * e / v
             s.mu_next[k, l] += log(v)
             s.step[k, l], s.h_k[k, l] = e / v, 1.0 / v
@@ -229,10 +123,7 @@ def run_again(s: State, l: int) -> None:
 
 @partial(kernel, short=True)
 def begin_with_drift(s: State, least: float, l: int) -> None:
-    """Estimates, r, which is at least ``least``, and probabilities of the filters, which have m = d and C = I; and the
-    ranges of the inputs.
-    """
-    learn_stored_inputs(s, l)
+    """Estimates, r, which is at least ``least``, and probabilities of the filters, which have m = d and C = I."""
     n, K = s.theta.shape[0], s.modes[l]
     if s.remembered[l] <= WINDOW:
         run_again(s, l)

@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, kernel, machine, shared
-from driftfit.trackers.parts.faults.first_samples import PHI
 from driftfit.trackers.parts.faults.outlying_readings import LEVERAGE
 from driftfit.trackers.parts.modes.drifts.one_direction import (
     FACTOR,
@@ -55,9 +54,9 @@ SOUND = 10.0 * WINDOW * LEVERAGE
 TINY = 1e-300
 """Added to what is divided by."""
 
-E, PRECISION, SPAN = range(3)
+E, PRECISION, SPAN, PHI = range(4)
 """Entries of a stored sample before its regressor: the innovation over its variance, the inverse variance (both in
-units of r), and the intervals of drift."""
+units of r), and the intervals of drift; and where that begins."""
 ASSUMED, SLOPE, WEIGHT, ADJOINT, SHIFT, A, N = range(7)
 """Rows (n,) of the estimation: p, b, the weights, r, N k; then the rows of A and of N by turns, so that they are in the
 same place for any number of parameters (`driftfit.trackers.parts.common_size`)."""

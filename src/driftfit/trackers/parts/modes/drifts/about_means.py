@@ -71,12 +71,6 @@ def learn_means(s: State, l: int) -> None:
     s.constant[l] = constant
 
 
-@kernel
-def forget_mean(s: State, i: int, l: int) -> None:
-    """As before the first sample."""
-    s.mean[i, l], s.variance[i, l], s.steps_taken[i, l] = 0.0, 0.0, 0.0
-
-
 @partial(kernel, inline=False)
 def drift_about(s: State, size: float, l: int) -> None:
     """Drift about the means: ``size`` in units of the ratios over the variances of the regressors."""

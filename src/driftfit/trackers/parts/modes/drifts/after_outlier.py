@@ -101,5 +101,5 @@ def suppose_jump(s: State, l: int) -> None:
     s.pending[l] = 1 if undecided else 0
     for i in range(s.theta.shape[0]):
         s.jumped[i, l] = 0.0
-    if (s.outlier[l] > 0.5) & (not undecided) & (probable < CONFIRMED) & (s.frozen[l] <= 0.0):
+    if (s.outlier[l] > 0.5) & (not undecided) & (probable < CONFIRMED):
         jump(s, own, share, l)
