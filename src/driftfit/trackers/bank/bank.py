@@ -78,9 +78,6 @@ from driftfit.trackers.parts.diffuse import ALMOST_ANY, WORST, knowing, knowing_
 from driftfit.trackers.parts.excitation import not_learned, window
 from driftfit.trackers.parts.information import triangular_root
 
-FAR = 100.0
-"""Standard deviations from its forecast beyond which a sample is a fault code, for a bank without given sensors."""
-
 
 @dataclass(frozen=True)
 class Bank(Tracker):
@@ -182,9 +179,14 @@ class Bank(Tracker):
         return self.changes or changes_.usual()
 
     @property
+    def gated(self) -> bool:  # type: ignore[override]
+        """A bank that is given changes or sensors has hypotheses about its readings."""
+        return not self.changes and not self.sensors
+
+    @property
     def all_sensors(self) -> tuple[Sensor, ...]:
         """The sensors, including those that `Bank()` supplies."""
-        return self.sensors or (Sensor.nominal(limit=FAR),)
+        return self.sensors or (Sensor.nominal(),)
 
     @property
     def reduction(self) -> Reduction:
@@ -314,7 +316,7 @@ class Bank(Tracker):
             "scale": scale, "count": count, "squares": squares, "sample": sample,
             "counters": counters, **unresolved(),
             **(knowing_nothing(n, WORST if self._frames(na) else ALMOST_ANY) if self.p0 is None else knowing(n)),
-            "can_frame": int(self.p0 is None and self._frames(na)), "framed": 0, "within": 0.0, "x": np.zeros(n),
+            "column": -1, "can_frame": int(self.p0 is None and self._frames(na)), "framed": 0, "within": 0.0, "x": np.zeros(n),
             "W": np.zeros((n, n)), "Pz": np.zeros((n, n)), "no_power": np.zeros(n),
             "q0": q0, "G": triangular_root(Q0 + np.tril(Q0, -1).T), "size0": self.all_changes[0].increments(n)[1],
             "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],

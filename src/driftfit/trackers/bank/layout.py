@@ -47,17 +47,18 @@ from driftfit.trackers.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
 
 (
     LEAVES, PARENTS, GROUPS, TREE_LEVELS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED,
-    OPEN, REFUSED, FAULTS, AGAIN, TAKEN, CHAINED, ALIKE, WIDE, PARTED, COUNT,
-) = range(22)  # fmt: skip
+    OPEN, REFUSED, FAULTS, AGAIN, TAKEN, CHAINED, ALIKE, WIDE, PARTED, PHASE, LOOKED, COUNT,
+) = range(24)  # fmt: skip
 """Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY if
 it begins with the next sample. OPEN levels have passed since the last used sample
 (`driftfit.trackers.bank.machine.gaps`); REFUSED samples in a row were too far from what was expected, FAULTS in all;
 AGAIN is 1 if the present one was just refused; TAKEN steps of its interval are already in the table of a gap. Four
 counters are flags of the present sample: CHAINED if the user gave a chain of changes, ALIKE if all leaves have the same
 prior, WIDE if its level is not that of one nominal interval, PARTED if leaves are continued as two
-(`machine.gaps.chain_gap`).
+(`machine.gaps.chain_gap`). PHASE says what the routine is called for, LOOKED for which kind of sample its forecast was.
 """
 WAITING, READY = 0, -1
+LEARN, FORECAST = 0, 1
 (
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_OBSERVED, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
     SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SHIFT, READING, LOWEST, HIGHEST, DOUBTS, ENTERS, SIZE,

@@ -24,6 +24,7 @@ from driftfit.trackers.bank.layout import (
     EXPANDED,
     FAULTS,
     FLIPPED,
+    FORECAST,
     FREEDOM,
     GROUPS,
     HELD,
@@ -39,11 +40,13 @@ from driftfit.trackers.bank.layout import (
     LAST,
     LEAVES,
     LIMIT,
+    LOOKED,
     LOWEST,
     MOST,
     OPEN,
     PARENTS,
     PARTED,
+    PHASE,
     READING,
     REFUSED,
     S2,
@@ -408,14 +411,22 @@ def refused(sample: Array, counters: Array) -> bool:
 
 
 @shared
-def advance(t: Any) -> None:
-    """Process one sample with a tree that has begun."""
-    counters, sample = t.counters, t.sample
-    sample[EVIDENCE] = 0.0
+def look(t: Any) -> None:
+    """The time update of a sample, and its forecast."""
+    t.sample[EVIDENCE] = 0.0
     for k in range(len(t.decided)):
         t.decided[k, 0] = -1.0
     prepare(t)
-    forecast(t, counters[LEAVES])
+    forecast(t, t.counters[LEAVES])
+    t.counters[LOOKED] = 1 if t.sample[IN_OK] > 0.0 else 0
+
+
+@shared
+def advance(t: Any) -> None:
+    """Process one sample, whose forecast is known, with a tree that has begun."""
+    counters, sample = t.counters, t.sample
+    if (counters[LOOKED] > 0) != (sample[IN_OK] > 0.0):  # it was refused since
+        look(t)
     if sample[IN_OK] > 0.0:
         if refused(sample, counters):
             return
@@ -473,11 +484,17 @@ def remember_reading(sample: Array) -> None:
 
 @partial(machine, short=True)  # rows of a dozen leaves: copies of loops for long rows made it a tenth slower
 def bank(address: int) -> None:
-    """Process one sample, given the table of a bank. A sample refused as a fault code is processed again as missing."""
+    """The forecast of a sample, or its processing, by ``PHASE``, given the table of a bank. A sample beyond the limit of
+    its sensor is processed again as missing.
+    """
     t = table_at(address)
-    t.sample[LAST] = t.sample[READING] - t.sample[SHIFT]
     counters, head = t.counters, t.report
     begun = counters[SETTLED] == 1
+    if counters[PHASE] == FORECAST:
+        t.sample[LAST] = t.sample[READING] - t.sample[SHIFT]
+        if begun:
+            look(t)
+        return
     counters[AGAIN] = 1 if begun else 0
     while counters[AGAIN] == 1:
         counters[AGAIN] = 0

@@ -11,6 +11,7 @@ from driftfit.trackers.bank.layout import (
     COUNTERS_AT,
     COV_AT,
     ENTERS,
+    FORECAST,
     FREEDOM,
     IN_DT,
     IN_NOISE,
@@ -18,9 +19,11 @@ from driftfit.trackers.bank.layout import (
     IN_OK,
     IN_TIME,
     IN_Y,
+    LEARN,
     LEAST,
     MEMORY_AT,
     MOST,
+    PHASE,
     PHI_AT,
     POWERS_AT,
     READY,
@@ -49,8 +52,9 @@ from driftfit.trackers.bank.machine.late_direction import begin_within, point_al
 from driftfit.trackers.parts.coarse.resolution import lasting, learn_resolved_scale, least_noise, resolve
 from driftfit.trackers.parts.coordinates import FRAME, unseen_variance, whiten_within
 from driftfit.trackers.parts.covariance import correct as correct_one
-from driftfit.trackers.parts.covariance import forecast, prediction
-from driftfit.trackers.parts.diffuse import enter, spanned_variance, wander
+from driftfit.trackers.parts.covariance import forecast as forecast_one
+from driftfit.trackers.parts.covariance import prediction
+from driftfit.trackers.parts.diffuse import correct_on_roots, forecast_on_roots, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.few_residuals import RESIDUALS, wider
 from driftfit.trackers.parts.modes.noise_levels import LEAST_SHARE
@@ -224,18 +228,42 @@ def alone(s: State, l: int, counts: bool) -> None:
 
 
 @kernel
-def correct(s: State, l: int) -> None:
+def look_ahead(s: State, l: int) -> None:
+    """The forecast of the tree."""
+    s.counters[PHASE, l] = FORECAST
+    run(s, l)
+    s.counters[PHASE, l] = LEARN
+    s.y_hat[l], s.s[l] = s.sample[Y_HAT, l], s.sample[S2, l]
+
+
+@kernel
+def forecast(s: State, l: int) -> None:
     resolve(s, l)
     if s.counters[SETTLED, l] > 0:
         hand_over(s, l)
-        run(s, l)
-        s.y_hat[l], s.s[l], s.e[l] = s.sample[Y_HAT, l], s.sample[S2, l], s.y[l] - s.sample[Y_HAT, l]
-        # a fault code counts as missing, in lags too
-        s.ok[l], s.observed[l] = s.sample[IN_OK, l], s.sample[IN_OBSERVED, l]
-        learn_scales(s, l)
+        look_ahead(s, l)
+        s.e[l] = s.y[l] - s.y_hat[l]
     else:
         only_drift(s, l)
-        forecast(s, l)
+        forecast_one(s, l)
+        s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l])
+
+
+@kernel
+def learn(s: State, l: int) -> None:
+    """The tree takes the sample, unless a gate refused it."""
+    s.sample[IN_OK, l], s.sample[IN_OBSERVED, l] = s.ok[l], s.observed[l]
+    run(s, l)
+    # a sample beyond the limit of its sensor counts as missing, in lags too
+    s.ok[l], s.observed[l] = s.sample[IN_OK, l], s.sample[IN_OBSERVED, l]
+
+
+@kernel
+def correct(s: State, l: int) -> None:
+    if s.counters[SETTLED, l] > 0:
+        learn(s, l)
+        learn_scales(s, l)
+    else:
         s.s[l] = s.h[l] + s.r[l] * s.noise[l]
         correct_one(s, l)
         alone(s, l, s.unknown[l] > 0)
@@ -252,10 +280,8 @@ def read(s: State, l: int) -> None:
 
 
 @kernel
-def in_span(s: State, l: int) -> None:
-    """Process one sample of a tree that began before the regressors spanned everything, or in the coordinates of the
-    start; a sample that enters a column changes no weight.
-    """
+def forecast_in_span(s: State, l: int) -> None:
+    """The forecast of a tree that began before the regressors spanned everything, or in the coordinates of the start."""
     column, y_hat, framed = whiten_within(s, s.phi.ctypes.data, l), prediction(s, l), s.framed[l] > 0
     if framed:
         write_walks(s, l)
@@ -263,12 +289,24 @@ def in_span(s: State, l: int) -> None:
     outside = column >= 0
     if framed and not outside and s.ok[l] > 0.0:
         column = outgrown(s, l)
+    s.column[l] = column
     if column >= 0:
-        s.sample[ENTERS, l] = point_along(s, column, l) if s.ok[l] > 0.0 and not framed else 0.0
         s.sample[IN_OK, l] = 0.0
-    run(s, l)
+    look_ahead(s, l)
+    if outside:
+        s.y_hat[l], s.s[l] = y_hat, np.inf
+    s.e[l] = s.y[l] - s.y_hat[l]
+
+
+@kernel
+def correct_in_span(s: State, l: int) -> None:
+    """Such a tree takes a sample; one that enters a column changes no weight."""
+    column, outside = s.column[l], s.s[l] == np.inf
     if column >= 0:
-        s.y_hat[l], s.s[l] = y_hat if outside else s.sample[Y_HAT, l], np.inf if outside else s.sample[S2, l]
+        enters = s.ok[l] > 0.0 and s.framed[l] == 0
+        s.sample[ENTERS, l] = point_along(s, column, l) if enters else 0.0
+        s.sample[IN_OBSERVED, l] = s.observed[l]
+        run(s, l)
         if s.ok[l] > 0.0:
             enter_bank(s, column, l)
             if not outside:
@@ -277,21 +315,29 @@ def in_span(s: State, l: int) -> None:
                     log(2.0 * np.pi * v) + e * e / v
                 )
     else:
-        s.y_hat[l], s.s[l] = s.sample[Y_HAT, l], s.sample[S2, l]
-        s.ok[l], s.observed[l] = s.sample[IN_OK, l], s.sample[IN_OBSERVED, l]
-    s.e[l] = s.y[l] - s.y_hat[l]
+        learn(s, l)
     learn_scales(s, l)
     read(s, l)
 
 
 @kernel
-def begin(s: State, l: int) -> None:
+def forecast_first(s: State, l: int) -> None:
     resolve(s, l)
     if s.counters[SETTLED, l] > 0:
-        in_span(s, l)
+        forecast_in_span(s, l)
     else:
         only_drifted(s, l)
-        enter(s, l)
+        forecast_on_roots(s, l)
+        s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l]) if s.h[l] < np.inf else np.inf
+
+
+@kernel
+def correct_first(s: State, l: int) -> None:
+    if s.counters[SETTLED, l] > 0:
+        correct_in_span(s, l)
+    else:
+        s.s[l] = s.h[l] + s.r[l] * s.noise[l]
+        correct_on_roots(s, l)
         alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
         if s.counters[SETTLED, l] > 0:
             read(s, l)
@@ -312,6 +358,7 @@ def take_known(s: State, known: Array, t: int, l: int) -> None:
 
 
 STEPS = TrackerSteps(
-    nothing, nothing, correct, variance=nothing, start=TrackerSteps(nothing, nothing, begin, nothing, nothing),
+    nothing, forecast, correct, variance=nothing,
+    start=TrackerSteps(nothing, forecast_first, correct_first, nothing, nothing),
     store=keep, read_extra=take_known, machines=(*FRAME, *FRAMED), outlined=True,
 )  # fmt: skip
