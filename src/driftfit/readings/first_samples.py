@@ -34,17 +34,18 @@ from driftfit.engine.kernel import Array, State, Step, kernel
 
 OUTLYING = 10.0
 """Usual distances from the median from which on a value is outlying."""
-WORSE = 25.0
-"""F statistic from which samples contradict each other: six standard deviations for one sample."""
-RESIDUALS = 4
+WORSE = 16.0
+"""F statistic from which samples contradict each other: four standard deviations for one sample."""
+RESIDUALS = 6
 """Fewest residuals of the samples that are not doubtful."""
 FEW = 3
 """Values that differ from the median, from which on their distance is usual."""
 ROUNDED = 1e-20
 """Share of the sum of squares of y that may be an error of rounding."""
 Y, READING, OK, DT, NOISE, DRIFT, TIMES, DOUBT, U = range(9)
-"""Columns of a kept sample: output and reading (NaN if missing), whether there is a row, intervals since the last sample,
-factors of noise and drift, how often it came, the judgement, and the first input; the regressor follows the inputs."""
+"""Columns of a kept sample: output and reading (NaN if missing), whether there is a row, intervals since the last
+sample, factors of noise and drift, how often it came, the judgement, and the first input. The regressor follows the
+inputs."""
 
 
 def no_samples(first: int, n: int, m: int) -> Mapping[str, Any]:
@@ -186,10 +187,9 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
     def decide(s: State, l: int) -> None:
         s.gate_decided[l] = 1
         count = doubt(s, l)
-        if (count > 0) & (2 * count < N):
-            if contradicted(s, l):
-                mark(s, l)
-                s.gate_replay[l] = 1
+        if (count > 0) & (2 * count < N) and contradicted(s, l):
+            mark(s, l)
+            s.gate_replay[l] = 1
 
     @kernel
     def repeats(s: State, k: int, l: int) -> bool:

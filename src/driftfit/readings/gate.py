@@ -44,7 +44,7 @@ MEMORY = 1000.0
 """Their memory, in readings; exponential."""
 GROWTH = 1.02
 """Growth in one sample of the error of a settled tracker, at most."""
-USED, REFUSED, FROZEN, INPUT, LEVERAGE, AT_START = range(6)
+USED, REFUSED, FROZEN, INPUT, AT_START = range(5)
 """Reasons: what was decided of a sample."""
 
 
@@ -57,9 +57,9 @@ class Gate(Settings):
     taken for a level (``believed``: repeats are as good as others). ``natural``: share of repeats from which they are
     no sign of a code (inf). ``rare``: usual deviations beyond which a forecast is unusual (inf). ``away``: half ranges
     from the middle of its range beyond which an input is strange (inf). ``trust``: how many samples in a row are blamed
-    on inputs. ``leverage``: ordinary samples that one regressor counts for at most (inf). ``frozen``: probability of
-    repeats below which a sensor is frozen (0). ``coarse``: share of repeats and of smallest steps of a coarse meter
-    (inf). ``first``: samples judged together at the start, besides one for each parameter (0).
+    on inputs. ``frozen``: probability of repeats below which a sensor is frozen (0). ``coarse``: share of repeats and
+    of smallest steps of a coarse meter (inf). ``first``: samples judged together at the start, besides one for each
+    parameter (0).
     """
 
     far: float = 10.0
@@ -70,7 +70,6 @@ class Gate(Settings):
     rare: float = 3.0
     away: float = 2.0
     trust: int = 6
-    leverage: float = 100.0
     frozen: float = 1e-4
     coarse: float = 0.1
     first: int = 16
@@ -78,7 +77,7 @@ class Gate(Settings):
     def __post_init__(self) -> None:
         for name in ("believed", "hold", "trust", "first"):
             self._set(name, whole("Gate", name, getattr(self, name), 0))
-        for name in ("far", "sure", "natural", "rare", "away", "leverage", "frozen", "coarse"):
+        for name in ("far", "sure", "natural", "rare", "away", "frozen", "coarse"):
             if getattr(self, name) != np.inf:
                 self._set(name, numbers("Gate", name, getattr(self, name), ndim=0, low=0.0))
 
@@ -86,9 +85,9 @@ class Gate(Settings):
 def start(gate: Gate, n: int, m: int) -> Mapping[str, Any]:
     """Fields of the gate's state and their values before the first sample, for n parameters and m inputs."""
     return {
-        "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0, "gate_ratios": 0.0, "gate_settled": np.inf,
-        "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan, "gate_other": np.nan,
-        "gate_squares": np.zeros(n), "reason": 0, "factor": 1.0,
+        "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0, "gate_ratios": 0.0,
+        "gate_settled": np.inf, "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan,
+        "gate_other": np.nan, "reason": 0,
         **unresolved(), **not_frozen(), **no_inputs(m), **no_samples(gate.first, n, m),
     }  # fmt: skip
 
@@ -127,27 +126,6 @@ def learn_usual(s: State, contradicts: bool, clip: float, l: int) -> None:
         s.gate_settled[l] = min(variance_of_error(s, l), GROWTH * s.gate_settled[l])
 
 
-def bound_leverage(gate: Gate, n: int) -> Step:
-    """Raise the noise of a sample whose regressor is out of all proportion to its mean square so far."""
-    leverage = float(gate.leverage)
-
-    @kernel
-    def bound(s: State, l: int) -> None:
-        most, known = 1.0, s.gate_ratios[l] >= FIRST
-        share = 1.0 / min(s.gate_ratios[l] + 1.0, MEMORY)
-        for i in range(n):
-            square, usual = s.phi[i, l] * s.phi[i, l], s.gate_squares[i, l]
-            excess = square / (leverage * usual) if known & (usual > 0.0) else 0.0
-            most = max(most, excess)
-            s.gate_squares[i, l] += s.ok[l] * share * (square / max(excess, 1.0) - usual)
-        if (s.ok[l] > 0.0) & (most > 1.0):
-            s.noise[l] *= most
-            s.factor[l] = most
-            s.reason[l] = LEVERAGE
-
-    return bound  # type: ignore[no-any-return]
-
-
 def output_rule(gate: Gate) -> Step:
     """Refuse a far reading, unless it belongs to a change."""
     far, rare = float(gate.far) ** 2, float(gate.rare) ** 2
@@ -155,18 +133,18 @@ def output_rule(gate: Gate) -> Step:
     natural = repeats_by_nature(gate.natural)
 
     @kernel
-    def usual_square(s: State, off: float, l: int) -> float:
+    def usual_square(s: State, l: int) -> float:
         """The square with which distances are compared: v, or that of a forecast which is unusual itself."""
         v = s.gate_variance[l]
-        predicted = off - s.e[l]
+        predicted = s.y_hat[l] + s.shift[l] - s.gate_mean[l]
         unusual = (s.valid[l] > 0.0) & (predicted * predicted > rare * v)
         return predicted * predicted if unusual else v  # type: ignore[no-any-return]
 
     @kernel
-    def held_back(s: State, y: float, v: float, unusual: bool, l: int) -> bool:
+    def held_back(s: State, y: float, unusual: bool, l: int) -> bool:
         """Whether a far reading is one of a code, or not yet enough of them are a change."""
         apart, apart_other = abs(abs(y) - abs(s.gate_last[l])), abs(abs(y) - abs(s.gate_other[l]))
-        near2 = far * max(s.gate_variance[l], v)
+        near2 = far * s.gate_variance[l]
         turns = (apart_other == 0.0) & ((apart * apart > near2) | (not natural(s, l)))
         if (apart == 0.0) | turns:
             s.gate_same[l] += 1
@@ -184,15 +162,15 @@ def output_rule(gate: Gate) -> Step:
         y, e2, v = reading(s, l), s.e[l] * s.e[l], variance_of_error(s, l)
         off = y - s.gate_mean[l]
         predicted = s.valid[l] > 0.0
-        usual = usual_square(s, off, l)
-        beyond = (min(e2, off * off) if predicted else off * off) > far * usual
+        usual = usual_square(s, l)
+        beyond = off * off > far * usual
         contradicts = e2 > sure * v if predicted else beyond
         if not contradicts:
             settled = predicted & (e2 <= sure * s.gate_settled[l])
             s.gate_run[l] = max(min(s.gate_run[l], 2 * believed) - 1, 0) if settled else s.gate_run[l]
             s.gate_same[l] = 0
         elif beyond & (s.gate_count[l] >= FIRST):
-            if held_back(s, y, v, usual > s.gate_variance[l], l):
+            if held_back(s, y, usual > s.gate_variance[l], l):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, REFUSED
         else:
             s.gate_run[l] += 1
@@ -204,17 +182,18 @@ def output_rule(gate: Gate) -> Step:
 def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None]) -> Step:
     """The gate of a model with n parameters and m inputs, of which it remembers ``ages`` samples besides the present.
 
-    ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, is missing from its memory.
+    ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
+    memory.
     """
     remember = first_samples(gate.first, n, m, ages)
     notice, blame = input_rules(gate, m, ages, refuse)
     hold_frozen, judge = frozen_rule(gate.frozen), output_rule(gate)
-    resolve, bound = resolution(gate.coarse), bound_leverage(gate, n)
+    resolve = resolution(gate.coarse)
     sure, rare = float(gate.sure) ** 2, float(gate.rare) ** 2
 
     @kernel
     def step(s: State, l: int) -> None:
-        s.reason[l], s.factor[l] = USED, 1.0
+        s.reason[l] = USED
         raw = reading(s, l) if s.observed[l] > 0.0 else s.gate_before[l]
         remember(s, l)
         notice(s, s.gate_count[l] >= FIRST, l)
@@ -232,6 +211,5 @@ def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, in
         resolve(s, l)
         s.gate_before[l] = raw
         learn_usual(s, contradicts, sure, l)
-        bound(s, l)
 
     return step  # type: ignore[no-any-return]

@@ -25,7 +25,7 @@ import numpy as np
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import State, Step, kernel
 
-ENOUGH = 3.0
+ENOUGH = 5.0
 """Number of repeats, and of steps of the size of the quantum, before they count."""
 
 
