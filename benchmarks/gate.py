@@ -225,12 +225,10 @@ class Bench:
         theta, reason = np.zeros((len(y), self.n)), np.zeros(len(y), np.int64)
         done = loop(tile, y, u, 0, theta, reason)
         if done < len(y) or tile["gate_replay"][0, 0] > 0:
-            y_first, u_first, *_ = replayed({name: tile[name][0, ..., 0] for name in tile.dtype.names}, self.m)
-            codes = tile["gate_codes"][0, ..., 0]
-            tile = tile_of(own | {"gate_decided": 1})
-            loop(tile, y_first, u_first, 0, np.zeros((len(y_first), self.n)), np.zeros(len(y_first), np.int64))
-            where = done - len(y_first) + np.flatnonzero(codes[: len(y_first)].any(1))
-            reason[where[where >= 0]] = AT_START
+            first = replayed({name: tile[name][0, ..., 0] for name in tile.dtype.names}, self.m)
+            tile, k = tile_of(own | {"gate_decided": 1}), len(first.y)
+            loop(tile, first.y, first.u, 0, np.zeros((k, self.n)), np.zeros(k, np.int64))
+            reason[done - k + np.flatnonzero(first.codes.any(1))] = AT_START
             loop(tile, y, u, done, theta, reason)
         return theta, reason, tile
 

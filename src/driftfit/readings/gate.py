@@ -15,8 +15,8 @@ digits, with either sign, is not counted, and believed only with the `hold`-th. 
 repeat is no sign of a code. A sample that agrees with its forecast ends the run. s = inf (start) contradicts nothing,
 a tracker without s (NaN) gets the mean of e^2 in its place, and a reading without a forecast is judged by v alone.
 
-Inputs are judged in `driftfit.readings.inputs`, readings that stay the same in `frozen`, coarse meters in `resolution`,
-and the first samples, which have nothing to be compared with, in `first_samples`.
+Inputs are judged in `driftfit.readings.inputs`, coarse meters and readings that stay the same in `repeats`, and
+the first samples, which have nothing to be compared with, in `first_samples`.
 
 Source: three in a row is the classical rule of confirmation for step changes; bounded leverage is Mallows's, see
 Hampel, Ronchetti, Rousseeuw and Stahel, Robust Statistics (1986), section 6.3; the rest is ours. Cost per ordinary
@@ -34,9 +34,8 @@ import numpy as np
 from driftfit.engine.kernel import State, Step, kernel
 from driftfit.engine.settings import Settings, numbers, whole
 from driftfit.readings.first_samples import first_samples, no_samples
-from driftfit.readings.frozen import frozen_rule, not_frozen
 from driftfit.readings.inputs import input_rules, no_inputs
-from driftfit.readings.resolution import reading, repeats_by_nature, resolution, unresolved
+from driftfit.readings.repeats import frozen_rule, no_repeats, reading, repeats_by_nature, resolution
 
 FIRST = 10.0
 """Readings after which a mean and a variance are known."""
@@ -88,14 +87,14 @@ def start(gate: Gate, n: int, m: int) -> Mapping[str, Any]:
         "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0, "gate_ratios": 0.0,
         "gate_settled": np.inf, "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan,
         "gate_other": np.nan, "reason": 0,
-        **unresolved(), **not_frozen(), **no_inputs(m), **no_samples(gate.first, n, m),
+        **no_repeats(), **no_inputs(m), **no_samples(gate.first, n, m),
     }  # fmt: skip
 
 
 @kernel
 def own_variance(s: State, l: int) -> float:
     """The tracker's variance of e; 1 for a tracker without one, of which e^2 itself is averaged."""
-    return s.s[l] if s.s[l] == s.s[l] else 1.0  # type: ignore[no-any-return]
+    return s.s[l] if s.s[l] == s.s[l] else 1.0
 
 
 @kernel
@@ -198,11 +197,9 @@ def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, in
         remember(s, l)
         notice(s, s.gate_count[l] >= FIRST, l)
         off = reading(s, l) - s.gate_mean[l]
-        contradicts = False
-        if s.ok[l] > 0.0:
-            contradicts = s.e[l] * s.e[l] > sure * variance_of_error(s, l)
-            if blame(s, contradicts, off * off <= rare * s.gate_variance[l], l):
-                s.ok[l], s.reason[l] = 0.0, INPUT
+        contradicts = (s.ok[l] > 0.0) & (s.e[l] * s.e[l] > sure * variance_of_error(s, l))
+        if s.ok[l] > 0.0 and blame(s, contradicts, off * off <= rare * s.gate_variance[l], l):
+            s.ok[l], s.reason[l] = 0.0, INPUT
         if (s.observed[l] > 0.0) & (s.reason[l] == USED):
             if hold_frozen(s, variance_of_error(s, l), l):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, FROZEN
