@@ -41,6 +41,10 @@ FIRST = 10.0
 """Readings after which a mean and a variance are known."""
 MEMORY = 1000.0
 """Their memory, in readings; exponential."""
+CLIPPED = 10.0
+"""Variances of the readings that one which contradicts its forecast adds, at most."""
+LONGER = 4
+"""Times `Gate.hold` after which a code is taken for a level although the forecast moves."""
 GROWTH = 1.02
 """Growth in one sample of the error of a settled tracker, at most."""
 USED, REFUSED, FROZEN, INPUT, AT_START = range(5)
@@ -105,16 +109,20 @@ def variance_of_error(s: State, l: int) -> float:
 
 
 @kernel
-def learn_usual(s: State, contradicts: bool, clip: float, l: int) -> None:
-    """Mean and variance of the readings that do not contradict their forecasts, the mean of e^2 / s of the samples
-    used, and the error of a settled tracker.
+def learn_usual(s: State, seen: bool, contradicts: bool, clip: float, l: int) -> None:
+    """Mean and variance of the readings, the mean of e^2 / s of the samples used, and the error of a settled tracker.
+
+    A reading that contradicts its forecast counts as no farther than `CLIPPED` variances: one in ten may be far for
+    ever, more of them are usual in the end.
     """
-    if (s.observed[l] > 0.0) & (not contradicts):
+    if seen:
         s.gate_count[l] += 1.0
-        share = 1.0 / min(s.gate_count[l], MEMORY)
+        share, v = 1.0 / min(s.gate_count[l], MEMORY), s.gate_variance[l]
         off = reading(s, l) - s.gate_mean[l]
+        most = np.sqrt(CLIPPED * v)
+        off = min(max(off, -most), most) if contradicts & (s.gate_count[l] > FIRST) else off
         s.gate_mean[l] += share * off
-        s.gate_variance[l] += share * ((1.0 - share) * off * off - s.gate_variance[l])
+        s.gate_variance[l] += share * ((1.0 - share) * off * off - v)
     own = own_variance(s, l)
     if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
         s.gate_ratios[l] += 1.0
@@ -134,7 +142,7 @@ def output_rule(gate: Gate) -> Step:
     @kernel
     def usual_square(s: State, l: int) -> float:
         """The square with which distances are compared: v, or that of a forecast which is unusual itself."""
-        v = s.gate_variance[l]
+        v = max(s.gate_variance[l], s.gate_finest[l] * s.gate_finest[l] if s.gate_steps[l] > 0.0 else 0.0)
         predicted = s.y_hat[l] + s.shift[l] - s.gate_mean[l]
         unusual = (s.valid[l] > 0.0) & (predicted * predicted > rare * v)
         return predicted * predicted if unusual else v  # type: ignore[no-any-return]
@@ -142,15 +150,17 @@ def output_rule(gate: Gate) -> Step:
     @kernel
     def held_back(s: State, y: float, unusual: bool, l: int) -> bool:
         """Whether a far reading is one of a code, or not yet enough of them are a change."""
+        unmoved, strikes = s.gate_steps[l] == 0.0, s.gate_same[l] == 0
         apart, apart_other = abs(abs(y) - abs(s.gate_last[l])), abs(abs(y) - abs(s.gate_other[l]))
         near2 = far * s.gate_variance[l]
         turns = (apart_other == 0.0) & ((apart * apart > near2) | (not natural(s, l)))
         if (apart == 0.0) | turns:
             s.gate_same[l] += 1
-            return s.gate_same[l] < hold  # type: ignore[no-any-return]
-        agrees = (y - s.gate_last[l]) ** 2 < near2
+            s.gate_pulses[l] += 1 if unmoved & strikes else 0
+            return (s.gate_same[l] < hold) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
+        alike = unmoved | ((y - s.gate_last[l]) ** 2 < near2)
         s.gate_run[l] += 1
-        s.gate_pulses[l] = (s.gate_pulses[l] + 1 if agrees else 1) if unusual else 0
+        s.gate_pulses[l] = (s.gate_pulses[l] + 1 if alike else 1) if unusual | unmoved else 0
         s.gate_other[l] = s.gate_last[l]
         s.gate_last[l] = y
         return (s.gate_run[l] < believed) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
@@ -186,14 +196,22 @@ def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, in
     """
     remember = first_samples(gate.first, n, m, ages)
     notice, blame = input_rules(gate, m, ages, refuse)
-    hold_frozen, judge = frozen_rule(gate.frozen), output_rule(gate)
+    hold_frozen, judge = frozen_rule(gate.frozen, gate.natural), output_rule(gate)
     resolve = resolution(gate.coarse)
-    sure, rare = float(gate.sure) ** 2, float(gate.rare) ** 2
+    sure, rare, longest = float(gate.sure) ** 2, float(gate.rare) ** 2, LONGER * gate.hold
+
+    @kernel
+    def outlasts(s: State, l: int) -> bool:
+        """Whether a far reading repeats for so long that it is a level although the forecast moves."""
+        s.gate_same[l] += 1 if s.gate_same[l] > 0 else 0
+        if s.gate_same[l] >= longest:
+            s.gate_chance[l] = np.inf
+        return s.gate_same[l] >= longest  # type: ignore[no-any-return]
 
     @kernel
     def step(s: State, l: int) -> None:
         s.reason[l] = USED
-        raw = reading(s, l) if s.observed[l] > 0.0 else s.gate_before[l]
+        seen = s.observed[l] > 0.0
         remember(s, l)
         notice(s, s.gate_count[l] >= FIRST, l)
         off = reading(s, l) - s.gate_mean[l]
@@ -201,12 +219,12 @@ def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, in
         if s.ok[l] > 0.0 and blame(s, contradicts, off * off <= rare * s.gate_variance[l], l):
             s.ok[l], s.reason[l] = 0.0, INPUT
         if (s.observed[l] > 0.0) & (s.reason[l] == USED):
-            if hold_frozen(s, variance_of_error(s, l), l):
+            if hold_frozen(s, variance_of_error(s, l), l) and not outlasts(s, l):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, FROZEN
             else:
                 contradicts = judge(s, l)
         resolve(s, l)
-        s.gate_before[l] = raw
-        learn_usual(s, contradicts, sure, l)
+        s.gate_before[l] = reading(s, l) if seen else s.gate_before[l]
+        learn_usual(s, seen, contradicts, sure, l)
 
     return step  # type: ignore[no-any-return]

@@ -92,9 +92,9 @@ def resolution(share: float) -> Step:
     return resolve  # type: ignore[no-any-return]
 
 
-def frozen_rule(limit: float) -> Callable[[State, float, int], bool]:
+def frozen_rule(limit: float, share: float) -> Callable[[State, float, int], bool]:
     """``frozen(s, v, l)``: whether the reading is one of a frozen sensor, given the variance v of its forecast."""
-    limit = float(limit)
+    limit, natural = float(limit), repeats_by_nature(share)
 
     @kernel
     def frozen(s: State, v: float, l: int) -> bool:
@@ -105,6 +105,6 @@ def frozen_rule(limit: float) -> Callable[[State, float, int], bool]:
                 chance *= (s.gate_repeats[l] + 1.0) / (s.gate_repeats[l] + s.gate_steps[l] + 2.0)
         s.gate_chance[l] = chance
         s.gate_forecast[l] = y_hat if predicted else s.gate_forecast[l]
-        return chance < limit
+        return (chance < limit) & (not natural(s, l))
 
     return frozen  # type: ignore[no-any-return]
