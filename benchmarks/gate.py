@@ -23,7 +23,7 @@ from numba import njit
 from benchmarks.gate_cases import CODES, MODELS, REAL, STARTS, Case
 from driftfit.engine.kernel import kernel
 from driftfit.readings.first_samples import replayed
-from driftfit.readings.gate import AT_START, LEVERAGE, USED, Gate, gate_step, start
+from driftfit.readings.gate import AT_START, USED, Gate, gate_step, start
 
 KALMAN, RLS, MIXTURE = range(3)
 NAMES = ("Kalman", "RLS", "mixture")
@@ -225,12 +225,10 @@ class Bench:
         theta, reason = np.zeros((len(y), self.n)), np.zeros(len(y), np.int64)
         done = loop(tile, y, u, 0, theta, reason)
         if done < len(y) or tile["gate_replay"][0, 0] > 0:
-            y_first, u_first, *_ = replayed({name: tile[name][0, ..., 0] for name in tile.dtype.names}, self.m)
-            codes = tile["gate_codes"][0, ..., 0]
-            tile = tile_of(own | {"gate_decided": 1})
-            loop(tile, y_first, u_first, 0, np.zeros((len(y_first), self.n)), np.zeros(len(y_first), np.int64))
-            where = done - len(y_first) + np.flatnonzero(codes[: len(y_first)].any(1))
-            reason[where[where >= 0]] = AT_START
+            first = replayed({name: tile[name][0, ..., 0] for name in tile.dtype.names}, self.m)
+            tile, k = tile_of(own | {"gate_decided": 1}), len(first.y)
+            loop(tile, first.y, first.u, 0, np.zeros((k, self.n)), np.zeros(k, np.int64))
+            reason[done - k + np.flatnonzero(first.codes.any(1))] = AT_START
             loop(tile, y, u, done, theta, reason)
         return theta, reason, tile
 
@@ -245,7 +243,7 @@ def measured(bench: Bench, case: Case, kind: int) -> tuple[float, float, float, 
     ends = np.flatnonzero(np.diff(np.r_[case.bad | case.bad_u, False][case.at :].astype(int)) < 0)
     later = slice(max(case.at + (ends[0] if len(ends) else 0) + 20, 60), None)
     gated, ungated, least = (np.sqrt(np.mean((one - case.theta)[later] ** 2)) for one in (theta, plain, whole))
-    refused = (reason != USED) & (reason != LEVERAGE)
+    refused = reason != USED
     known = case.without_codes()
     window = bench.nb + 1  # an input code spoils the samples that remember it
     spoilt = np.convolve(case.bad_u, np.ones(window))[: len(case.y)] > 0 if case.bad_u.any() else case.bad
@@ -272,7 +270,7 @@ def table(benches: dict[str, Bench], cases: dict[str, Callable], runs: int, show
 
 RULES = {
     "outputs": {"far": np.inf}, "repeats": {"hold": 3}, "repeats by nature": {"natural": np.inf},
-    "unusual forecasts": {"rare": np.inf}, "inputs": {"away": np.inf}, "leverage": {"leverage": np.inf},
+    "unusual forecasts": {"rare": np.inf}, "inputs": {"away": np.inf}, "six samples": {"trust": 50},
     "frozen": {"frozen": 0.0}, "coarse": {"coarse": np.inf}, "first samples": {"first": 0},
 }  # fmt: skip
 

@@ -450,15 +450,14 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
     return Drivers(checked, *_updates(driver, sample))
 
 
-GATED = ("reason", "factor", "raw_e")
-"""Fields that are stored of every sample behind a gate: its decision, the factor of the noise, and y - y_hat of refused
-samples too."""
+GATED = ("reason", "raw_e")
+"""Fields that are stored of every sample behind a gate: its decision, and y - y_hat, of refused samples too."""
 
 
 @kernel
 def store_decision(o: State, s: State, l: int) -> None:
     """What a gate decided."""
-    o.reason[l], o.factor[l], o.raw_e[l] = s.reason[l], s.factor[l], s.raw_e[l]
+    o.reason[l], o.raw_e[l] = s.reason[l], s.raw_e[l]
 
 
 def _stored_too(store: Any) -> Any:

@@ -15,7 +15,7 @@ Q, and least squares on themselves only q with nu residuals, and
 
     nu (Q - q) > WORSE q
 
-Then the signals that made samples doubtful are marked (``gate_codes``), ``gate_replay`` is set, and the driver restores
+Then the signals that made samples doubtful are marked, ``gate_replay`` is set, and the driver restores
 the state before the first sample and replays whole samples without the codes, once.
 
 Source: the median deviation as a scale is Hampel's (1974), the recursive QR decomposition Gentleman's (1974); the rule
@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,17 +34,19 @@ from driftfit.engine.kernel import Array, State, Step, kernel
 
 OUTLYING = 10.0
 """Usual distances from the median from which on a value is outlying."""
-WORSE = 25.0
-"""F statistic from which samples contradict each other: six standard deviations for one sample."""
-RESIDUALS = 4
+WORSE = 16.0
+"""F statistic from which samples contradict each other: four standard deviations for one sample."""
+RESIDUALS = 6
 """Fewest residuals of the samples that are not doubtful."""
 FEW = 3
 """Values that differ from the median, from which on their distance is usual."""
 ROUNDED = 1e-20
 """Share of the sum of squares of y that may be an error of rounding."""
 Y, READING, OK, DT, NOISE, DRIFT, TIMES, DOUBT, U = range(9)
-"""Columns of a kept sample: output and reading (NaN if missing), whether there is a row, intervals since the last sample,
-factors of noise and drift, how often it came, the judgement, and the first input; the regressor follows the inputs."""
+CODES = Y
+"""Columns of a kept sample: output and reading (NaN if missing), whether there is a row, intervals since the last
+sample, factors of noise and drift, how often it came, the judgement, and the first input. The regressor follows the
+inputs. When it is decided, which signals are codes takes the place of the output."""
 
 
 def no_samples(first: int, n: int, m: int) -> Mapping[str, Any]:
@@ -52,7 +54,7 @@ def no_samples(first: int, n: int, m: int) -> Mapping[str, Any]:
     N = first + n if first > 0 else 1
     return {
         "gate_first": np.full((N, U + m + n), np.nan), "gate_kept": 0, "gate_decided": 0 if first > 0 else 1,
-        "gate_replay": 0, "gate_codes": np.zeros((N, 1 + m)), "gate_fit": np.zeros((n + 1, n + 1)),
+        "gate_replay": 0, "gate_fit": np.zeros((n + 1, n + 1)),
     }  # fmt: skip
 
 
@@ -115,8 +117,9 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
         s.gate_fit[n, n, l] = s.gate_first[k, Y, l]
         for i in range(n):
             a, b = s.gate_fit[i, i, l], s.gate_fit[n, i, l]
-            r = np.sqrt(a * a + b * b)
-            if r > 0.0:
+            larger = max(abs(a), abs(b))
+            if larger > 0.0:
+                r = larger * np.sqrt((a / larger) ** 2 + (b / larger) ** 2)
                 for j in range(i, n + 1):
                     up, down = s.gate_fit[i, j, l], s.gate_fit[n, j, l]
                     s.gate_fit[i, j, l] = (a * up + b * down) / r
@@ -169,27 +172,28 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
 
     @kernel
     def mark(s: State, l: int) -> None:
-        """The signals that made samples doubtful."""
+        """The signals that made samples doubtful, as bits in the column of y: 1 for the output, 2, 4, .. for inputs."""
         for k in range(N):
-            s.gate_codes[k, 0, l] = 1.0 if s.gate_first[k, DOUBT, l] == 1.0 else 0.0
+            s.gate_first[k, CODES, l] = 1.0 if s.gate_first[k, DOUBT, l] == 1.0 else 0.0
+        bit = 2.0
         for j in range(m):
             center = usual_value(s, U + j, 0.0, False, l)
             most = reach(s, U + j, center, l)
             for k in range(N):
                 hit = 0.0
                 for later in range(k, min(k + ages + 1, N)):
-                    hit = 1.0 if s.gate_first[later, DOUBT, l] == 2.0 else hit
+                    hit = bit if s.gate_first[later, DOUBT, l] == 2.0 else hit
                 outside = abs(s.gate_first[k, U + j, l] - center) > most
-                s.gate_codes[k, 1 + j, l] = hit if outside else 0.0
+                s.gate_first[k, CODES, l] += hit if outside else 0.0
+            bit *= 2.0
 
     @partial(kernel, inline=False)
     def decide(s: State, l: int) -> None:
         s.gate_decided[l] = 1
         count = doubt(s, l)
-        if (count > 0) & (2 * count < N):
-            if contradicted(s, l):
-                mark(s, l)
-                s.gate_replay[l] = 1
+        if (count > 0) & (2 * count < N) and contradicted(s, l):
+            mark(s, l)
+            s.gate_replay[l] = 1
 
     @kernel
     def repeats(s: State, k: int, l: int) -> bool:
@@ -200,7 +204,7 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
             same &= s.u[j, l] == s.gate_first[k, U + j, l]
         for i in range(n):
             same &= s.phi[i, l] == s.gate_first[k, PHI + i, l]
-        return same  # type: ignore[no-any-return]
+        return same
 
     @kernel
     def drop_oldest(s: State, l: int) -> None:
@@ -249,11 +253,27 @@ def reading_now(s: State, l: int) -> float:
     return s.y[l] + s.shift[l] if s.observed[l] > 0.0 else np.nan  # type: ignore[no-any-return]
 
 
-def replayed(lane: Mapping[str, Array], m: int) -> tuple[Array, Array, Array, Array, Array]:
-    """y (k,), u (k, m), dt, noise and drift (k,) of the samples to replay, codes missing, each as often as it came."""
-    kept = int(lane["gate_kept"])
-    rows, codes = np.array(lane["gate_first"][:kept]), np.array(lane["gate_codes"][:kept]) > 0.0
-    rows[codes[:, 0], READING] = np.nan
-    rows[:, U : U + m][codes[:, 1:]] = np.nan
+class First(NamedTuple):
+    """Whole samples to replay, each as often as it came, up to the present one; what is a code is missing."""
+
+    y: Array
+    """Readings (k,)."""
+    u: Array
+    """Inputs (k, m)."""
+    dt: Array
+    """Intervals (k,) since the sample before."""
+    noise: Array
+    """Factors (k,) of the noise variance."""
+    drift: Array
+    """Factors (k,) of the drift."""
+    codes: Array
+    """Which signals (k, 1 + m), the output first, are left out as codes."""
+
+
+def replayed(lane: Mapping[str, Array], m: int) -> First:
+    """The first samples of a lane with ``gate_replay`` set, given the fields of its state."""
+    rows = np.array(lane["gate_first"][: int(lane["gate_kept"])])
     rows = np.repeat(rows, rows[:, TIMES].astype(int), axis=0)
-    return rows[:, READING], rows[:, U : U + m], rows[:, DT], rows[:, NOISE], rows[:, DRIFT]
+    codes = (rows[:, [CODES]].astype(int) >> np.arange(1 + m)) % 2 == 1
+    y, u = np.where(codes[:, 0], np.nan, rows[:, READING]), np.where(codes[:, 1:], np.nan, rows[:, U : U + m])
+    return First(y, u, rows[:, DT], rows[:, NOISE], rows[:, DRIFT], codes)

@@ -15,8 +15,8 @@ digits, with either sign, is not counted, and believed only with the `hold`-th. 
 repeat is no sign of a code. A sample that agrees with its forecast ends the run. s = inf (start) contradicts nothing,
 a tracker without s (NaN) gets the mean of e^2 in its place, and a reading without a forecast is judged by v alone.
 
-Inputs are judged in `driftfit.readings.inputs`, readings that stay the same in `frozen`, coarse meters in `resolution`,
-and the first samples, which have nothing to be compared with, in `first_samples`.
+Inputs are judged in `driftfit.readings.inputs`, coarse meters and readings that stay the same in `repeats`, and
+the first samples, which have nothing to be compared with, in `first_samples`.
 
 Source: three in a row is the classical rule of confirmation for step changes; bounded leverage is Mallows's, see
 Hampel, Ronchetti, Rousseeuw and Stahel, Robust Statistics (1986), section 6.3; the rest is ours. Cost per ordinary
@@ -34,17 +34,20 @@ import numpy as np
 from driftfit.engine.kernel import State, Step, kernel
 from driftfit.engine.settings import Settings, numbers, whole
 from driftfit.readings.first_samples import first_samples, no_samples
-from driftfit.readings.frozen import frozen_rule, not_frozen
 from driftfit.readings.inputs import input_rules, no_inputs
-from driftfit.readings.resolution import reading, repeats_by_nature, resolution, unresolved
+from driftfit.readings.repeats import frozen_rule, no_repeats, reading, repeats_by_nature, resolution
 
 FIRST = 10.0
 """Readings after which a mean and a variance are known."""
 MEMORY = 1000.0
 """Their memory, in readings; exponential."""
+CLIPPED = 10.0
+"""Variances of the readings that one which contradicts its forecast adds, at most."""
+LONGER = 4
+"""Times `Gate.hold` after which a code is taken for a level although the forecast moves."""
 GROWTH = 1.02
 """Growth in one sample of the error of a settled tracker, at most."""
-USED, REFUSED, FROZEN, INPUT, LEVERAGE, AT_START = range(6)
+USED, REFUSED, FROZEN, INPUT, AT_START = range(5)
 """Reasons: what was decided of a sample."""
 
 
@@ -57,9 +60,9 @@ class Gate(Settings):
     taken for a level (``believed``: repeats are as good as others). ``natural``: share of repeats from which they are
     no sign of a code (inf). ``rare``: usual deviations beyond which a forecast is unusual (inf). ``away``: half ranges
     from the middle of its range beyond which an input is strange (inf). ``trust``: how many samples in a row are blamed
-    on inputs. ``leverage``: ordinary samples that one regressor counts for at most (inf). ``frozen``: probability of
-    repeats below which a sensor is frozen (0). ``coarse``: share of repeats and of smallest steps of a coarse meter
-    (inf). ``first``: samples judged together at the start, besides one for each parameter (0).
+    on inputs. ``frozen``: probability of repeats below which a sensor is frozen (0). ``coarse``: share of repeats and
+    of smallest steps of a coarse meter (inf). ``first``: samples judged together at the start, besides one for each
+    parameter (0).
     """
 
     far: float = 10.0
@@ -70,7 +73,6 @@ class Gate(Settings):
     rare: float = 3.0
     away: float = 2.0
     trust: int = 6
-    leverage: float = 100.0
     frozen: float = 1e-4
     coarse: float = 0.1
     first: int = 16
@@ -78,7 +80,7 @@ class Gate(Settings):
     def __post_init__(self) -> None:
         for name in ("believed", "hold", "trust", "first"):
             self._set(name, whole("Gate", name, getattr(self, name), 0))
-        for name in ("far", "sure", "natural", "rare", "away", "leverage", "frozen", "coarse"):
+        for name in ("far", "sure", "natural", "rare", "away", "frozen", "coarse"):
             if getattr(self, name) != np.inf:
                 self._set(name, numbers("Gate", name, getattr(self, name), ndim=0, low=0.0))
 
@@ -86,17 +88,17 @@ class Gate(Settings):
 def start(gate: Gate, n: int, m: int) -> Mapping[str, Any]:
     """Fields of the gate's state and their values before the first sample, for n parameters and m inputs."""
     return {
-        "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0, "gate_ratios": 0.0, "gate_settled": np.inf,
-        "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan, "gate_other": np.nan,
-        "gate_squares": np.zeros(n), "reason": 0, "factor": 1.0, "raw_e": np.nan,
-        **unresolved(), **not_frozen(), **no_inputs(m), **no_samples(gate.first, n, m),
+        "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0, "gate_ratios": 0.0,
+        "gate_settled": np.inf, "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan,
+        "gate_other": np.nan, "reason": 0,
+        **no_repeats(), **no_inputs(m), **no_samples(gate.first, n, m),
     }  # fmt: skip
 
 
 @kernel
 def own_variance(s: State, l: int) -> float:
     """The tracker's variance of e; 1 for a tracker without one, of which e^2 itself is averaged."""
-    return s.s[l] if s.s[l] == s.s[l] else 1.0  # type: ignore[no-any-return]
+    return s.s[l] if s.s[l] == s.s[l] else 1.0
 
 
 @kernel
@@ -107,16 +109,20 @@ def variance_of_error(s: State, l: int) -> float:
 
 
 @kernel
-def learn_usual(s: State, contradicts: bool, clip: float, l: int) -> None:
-    """Mean and variance of the readings that do not contradict their forecasts, the mean of e^2 / s of the samples
-    used, and the error of a settled tracker.
+def learn_usual(s: State, seen: bool, contradicts: bool, clip: float, l: int) -> None:
+    """Mean and variance of the readings, the mean of e^2 / s of the samples used, and the error of a settled tracker.
+
+    A reading that contradicts its forecast counts as no farther than `CLIPPED` variances: one in ten may be far for
+    ever, more of them are usual in the end.
     """
-    if (s.observed[l] > 0.0) & (not contradicts):
+    if seen:
         s.gate_count[l] += 1.0
-        share = 1.0 / min(s.gate_count[l], MEMORY)
+        share, v = 1.0 / min(s.gate_count[l], MEMORY), s.gate_variance[l]
         off = reading(s, l) - s.gate_mean[l]
+        most = np.sqrt(CLIPPED * v)
+        off = min(max(off, -most), most) if contradicts & (s.gate_count[l] > FIRST) else off
         s.gate_mean[l] += share * off
-        s.gate_variance[l] += share * ((1.0 - share) * off * off - s.gate_variance[l])
+        s.gate_variance[l] += share * ((1.0 - share) * off * off - v)
     own = own_variance(s, l)
     if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
         s.gate_ratios[l] += 1.0
@@ -127,27 +133,6 @@ def learn_usual(s: State, contradicts: bool, clip: float, l: int) -> None:
         s.gate_settled[l] = min(variance_of_error(s, l), GROWTH * s.gate_settled[l])
 
 
-def bound_leverage(gate: Gate, n: int) -> Step:
-    """Raise the noise of a sample whose regressor is out of all proportion to its mean square so far."""
-    leverage = float(gate.leverage)
-
-    @kernel
-    def bound(s: State, l: int) -> None:
-        most, known = 1.0, s.gate_ratios[l] >= FIRST
-        share = 1.0 / min(s.gate_ratios[l] + 1.0, MEMORY)
-        for i in range(n):
-            square, usual = s.phi[i, l] * s.phi[i, l], s.gate_squares[i, l]
-            excess = square / (leverage * usual) if known & (usual > 0.0) else 0.0
-            most = max(most, excess)
-            s.gate_squares[i, l] += s.ok[l] * share * (square / max(excess, 1.0) - usual)
-        if (s.ok[l] > 0.0) & (most > 1.0):
-            s.noise[l] *= most
-            s.factor[l] = most
-            s.reason[l] = LEVERAGE
-
-    return bound  # type: ignore[no-any-return]
-
-
 def output_rule(gate: Gate) -> Step:
     """Refuse a far reading, unless it belongs to a change."""
     far, rare = float(gate.far) ** 2, float(gate.rare) ** 2
@@ -155,25 +140,27 @@ def output_rule(gate: Gate) -> Step:
     natural = repeats_by_nature(gate.natural)
 
     @kernel
-    def usual_square(s: State, off: float, l: int) -> float:
+    def usual_square(s: State, l: int) -> float:
         """The square with which distances are compared: v, or that of a forecast which is unusual itself."""
-        v = s.gate_variance[l]
-        predicted = off - s.e[l]
+        v = max(s.gate_variance[l], s.gate_finest[l] * s.gate_finest[l] if s.gate_steps[l] > 0.0 else 0.0)
+        predicted = s.y_hat[l] + s.shift[l] - s.gate_mean[l]
         unusual = (s.valid[l] > 0.0) & (predicted * predicted > rare * v)
         return predicted * predicted if unusual else v  # type: ignore[no-any-return]
 
     @kernel
-    def held_back(s: State, y: float, v: float, unusual: bool, l: int) -> bool:
+    def held_back(s: State, y: float, unusual: bool, l: int) -> bool:
         """Whether a far reading is one of a code, or not yet enough of them are a change."""
+        unmoved, strikes = s.gate_steps[l] == 0.0, s.gate_same[l] == 0
         apart, apart_other = abs(abs(y) - abs(s.gate_last[l])), abs(abs(y) - abs(s.gate_other[l]))
-        near2 = far * max(s.gate_variance[l], v)
+        near2 = far * s.gate_variance[l]
         turns = (apart_other == 0.0) & ((apart * apart > near2) | (not natural(s, l)))
         if (apart == 0.0) | turns:
             s.gate_same[l] += 1
-            return s.gate_same[l] < hold  # type: ignore[no-any-return]
-        agrees = (y - s.gate_last[l]) ** 2 < near2
+            s.gate_pulses[l] += 1 if unmoved & strikes else 0
+            return (s.gate_same[l] < hold) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
+        alike = unmoved | ((y - s.gate_last[l]) ** 2 < near2)
         s.gate_run[l] += 1
-        s.gate_pulses[l] = (s.gate_pulses[l] + 1 if agrees else 1) if unusual else 0
+        s.gate_pulses[l] = (s.gate_pulses[l] + 1 if alike else 1) if unusual | unmoved else 0
         s.gate_other[l] = s.gate_last[l]
         s.gate_last[l] = y
         return (s.gate_run[l] < believed) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
@@ -184,15 +171,15 @@ def output_rule(gate: Gate) -> Step:
         y, e2, v = reading(s, l), s.e[l] * s.e[l], variance_of_error(s, l)
         off = y - s.gate_mean[l]
         predicted = s.valid[l] > 0.0
-        usual = usual_square(s, off, l)
-        beyond = (min(e2, off * off) if predicted else off * off) > far * usual
+        usual = usual_square(s, l)
+        beyond = off * off > far * usual
         contradicts = e2 > sure * v if predicted else beyond
         if not contradicts:
             settled = predicted & (e2 <= sure * s.gate_settled[l])
             s.gate_run[l] = max(min(s.gate_run[l], 2 * believed) - 1, 0) if settled else s.gate_run[l]
             s.gate_same[l] = 0
         elif beyond & (s.gate_count[l] >= FIRST):
-            if held_back(s, y, v, usual > s.gate_variance[l], l):
+            if held_back(s, y, usual > s.gate_variance[l], l):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, REFUSED
         else:
             s.gate_run[l] += 1
@@ -204,34 +191,40 @@ def output_rule(gate: Gate) -> Step:
 def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None]) -> Step:
     """The gate of a model with n parameters and m inputs, of which it remembers ``ages`` samples besides the present.
 
-    ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, is missing from its memory.
+    ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
+    memory.
     """
     remember = first_samples(gate.first, n, m, ages)
     notice, blame = input_rules(gate, m, ages, refuse)
-    hold_frozen, judge = frozen_rule(gate.frozen), output_rule(gate)
-    resolve, bound = resolution(gate.coarse), bound_leverage(gate, n)
-    sure, rare = float(gate.sure) ** 2, float(gate.rare) ** 2
+    hold_frozen, judge = frozen_rule(gate.frozen, gate.natural), output_rule(gate)
+    resolve = resolution(gate.coarse)
+    sure, rare, longest = float(gate.sure) ** 2, float(gate.rare) ** 2, LONGER * gate.hold
+
+    @kernel
+    def outlasts(s: State, l: int) -> bool:
+        """Whether a far reading repeats for so long that it is a level although the forecast moves."""
+        s.gate_same[l] += 1 if s.gate_same[l] > 0 else 0
+        if s.gate_same[l] >= longest:
+            s.gate_chance[l] = np.inf
+        return s.gate_same[l] >= longest  # type: ignore[no-any-return]
 
     @kernel
     def step(s: State, l: int) -> None:
-        s.reason[l], s.factor[l] = USED, 1.0
-        raw = reading(s, l) if s.observed[l] > 0.0 else s.gate_before[l]
+        s.reason[l] = USED
+        seen = s.observed[l] > 0.0
         remember(s, l)
         notice(s, s.gate_count[l] >= FIRST, l)
         off = reading(s, l) - s.gate_mean[l]
-        contradicts = False
-        if s.ok[l] > 0.0:
-            contradicts = s.e[l] * s.e[l] > sure * variance_of_error(s, l)
-            if blame(s, contradicts, off * off <= rare * s.gate_variance[l], l):
-                s.ok[l], s.reason[l] = 0.0, INPUT
+        contradicts = (s.ok[l] > 0.0) & (s.e[l] * s.e[l] > sure * variance_of_error(s, l))
+        if s.ok[l] > 0.0 and blame(s, contradicts, off * off <= rare * s.gate_variance[l], l):
+            s.ok[l], s.reason[l] = 0.0, INPUT
         if (s.observed[l] > 0.0) & (s.reason[l] == USED):
-            if hold_frozen(s, variance_of_error(s, l), l):
+            if hold_frozen(s, variance_of_error(s, l), l) and not outlasts(s, l):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, FROZEN
             else:
                 contradicts = judge(s, l)
         resolve(s, l)
-        s.gate_before[l] = raw
-        learn_usual(s, contradicts, sure, l)
-        bound(s, l)
+        s.gate_before[l] = reading(s, l) if seen else s.gate_before[l]
+        learn_usual(s, seen, contradicts, sure, l)
 
     return step  # type: ignore[no-any-return]

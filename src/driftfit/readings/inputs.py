@@ -96,6 +96,6 @@ def input_rules(
             s.gate_blamed[l] += 1
             for j in range(m):
                 take_out(s, j, l)
-        return blamed
+        return blamed  # type: ignore[no-any-return]
 
     return notice, blame

@@ -9,73 +9,50 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.readings.gate import AT_START, FROZEN, INPUT, LEVERAGE, REFUSED
-
-REASONS = {
-    REFUSED: "far from its forecast and from all readings before",
-    FROZEN: "the sensor repeats its last reading",
-    INPUT: "an input far outside its range, to which the output does not respond",
-    LEVERAGE: "a regressor out of all proportion: weight lowered",
-    AT_START: "contradicted by the other first samples",
-}
-"""What is said of each decision."""
+from driftfit.readings.gate import INPUT
+from driftfit.readings.remarks import SAID, counts
 
 
 class Decision(NamedTuple):
-    """One sample that was not used as it is: its number, the signal, its reading, why, and the factor of its noise."""
+    """One sample that was not used: its number, the signal, its reading of y, and why."""
 
     sample: int
     signal: str
     value: float
     reason: str
-    factor: float
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """The decisions of a gate in the order of the samples: ``sample`` (k,), ``reason`` (k,), ``factor`` (k,), and
-    ``value`` (k,), the readings of y there.
+    """The decisions of a gate in the order of the samples: ``sample`` (k,), ``code`` (k,) of the reason
+    (`driftfit.readings.gate`), and ``value`` (k,), the readings of y there.
     """
 
     sample: Array
-    reason: Array
-    factor: Array
+    code: Array
     value: Array
 
     def __len__(self) -> int:
         return len(self.sample)
 
     def __iter__(self) -> Iterator[Decision]:
-        for t, reason, factor, value in zip(*(a.tolist() for a in self._columns), strict=True):
-            signal = "u" if reason == INPUT else "y"
-            yield Decision(t, signal, value, REASONS[reason], factor)
-
-    @property
-    def _columns(self) -> tuple[Array, ...]:
-        return self.sample, self.reason, self.factor, self.value
-
-    @property
-    def refused(self) -> Array:
-        """The numbers (k,) of the samples that were not used at all."""
-        found: Array = self.sample[self.reason != LEVERAGE]
-        return found
+        for t, code, value in zip(self.sample.tolist(), self.code.tolist(), self.value.tolist(), strict=True):
+            yield Decision(t, "u" if code == INPUT else "y", value, SAID[code][1])
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many samples there are for each reason."""
-        values, counts = np.unique(self.reason, return_counts=True)
-        return {REASONS[value]: count for value, count in zip(values.tolist(), counts.tolist(), strict=True)}
+        """How many samples there are for each reason, by the name that summaries use."""
+        return {SAID[code][0]: count for code, count in counts(self.code).items()}
 
     def __str__(self) -> str:
-        if not len(self):
-            return "nothing left out"
-        return "\n".join(f"{count:6d}  {reason}" for reason, count in self.counts.items())
+        lines = [f"{count:6d}  {SAID[code][1]}" for code, count in counts(self.code).items()]
+        return "\n".join(lines) if lines else "nothing left out"
 
 
-NOTHING_LEFT_OUT = LeftOut(np.empty(0, int), np.empty(0, int), np.empty(0), np.empty(0))
+NOTHING_LEFT_OUT = LeftOut(np.empty(0, int), np.empty(0, int), np.empty(0))
 
 
-def left_out_of(reason: Array, factor: Array, y: Array) -> LeftOut:
+def left_out_of(reason: Array, y: Array) -> LeftOut:
     """The decisions in a run, from what its gate stored for every sample (T,), and its readings."""
     sample = np.flatnonzero(reason)
-    return LeftOut(sample, reason[sample].astype(int), factor[sample], y[sample])
+    return LeftOut(sample, reason[sample].astype(int), y[sample])

@@ -127,7 +127,9 @@ class Program:
         """The tracker's fields before the first sample."""
         alone = None if self.output is None else self.alone
         own = self.tracker.state_for(self.model if alone is None else alone.model)
-        return own if self.gate is None else {**own, **gate_start(self.gate, self.model.n, self.model.m)}
+        return (
+            own if self.gate is None else {**own, **gate_start(self.gate, self.model.n, self.model.m), "raw_e": np.nan}
+        )
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -231,13 +233,12 @@ class Program:
 
         Returns how many samples ago these were: 0 for the last.
         """
-        y, u, dt, noise, drift = replayed(state_of(tile), self.model.m)
-        codes = np.isnan(y) | np.isnan(u).any(axis=1)
+        first = replayed(state_of(tile), self.model.m)
         fresh = self.tile({"gate_decided": np.array(1)})
-        known = np.stack([dt, noise, drift], axis=1)[:, :, None]
-        self.drivers().run(fresh, y[:, None], u[:, :, None], known, self.written(fresh, len(y)))
+        known = np.stack([first.dt, first.noise, first.drift], axis=1)[:, :, None]
+        self.drivers().run(fresh, first.y[:, None], first.u[:, :, None], known, self.written(fresh, len(first.y)))
         tile.view(np.uint8)[:] = fresh.view(np.uint8)
-        return len(y) - 1 - np.flatnonzero(codes)
+        return len(first.y) - 1 - np.flatnonzero(first.codes.any(axis=1))
 
     @property
     def width(self) -> int:

@@ -338,7 +338,7 @@ class Track(Plain, Columns):
         """What the gate decided of samples that it did not use as they are; empty without a gate."""
         if self.program.gate is None:
             return NOTHING_LEFT_OUT
-        return left_out_of(self.in_rows("reason"), self.in_rows("factor"), self.record.y)
+        return left_out_of(self.in_rows("reason"), self.record.y)
 
     def cov(self, t: int) -> Array:
         """Covariance (n, n) of theta after sample t (negative t counts from the end).

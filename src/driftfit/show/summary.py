@@ -11,6 +11,8 @@ from rich.text import Text
 from driftfit.data.record import Labels
 from driftfit.engine.kernel import Array
 from driftfit.judge.compare import Comparison, compare
+from driftfit.readings.remarks import counts as counts_of
+from driftfit.readings.remarks import floor_remark, remarks
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.by_output import ByOutput
@@ -139,8 +141,8 @@ def _gate(run: Track) -> tuple[tuple[str, str], ...]:
     """What the gate left out, a line for each reason; nothing without a gate."""
     if run.program.gate is None:
         return ()
-    lines = [f"{count} samples: {reason}" for reason, count in run.left_out.counts.items()]
-    return tuple(("Gate", line) for line in lines or ["on; nothing left out"])
+    left = run.left_out.code
+    return (*remarks(counts_of(left)), *floor_remark(float(run.state["floor"]))) or (("Gate", "nothing left out"),)
 
 
 def _missing(run: Track) -> tuple[tuple[str, str], ...]:

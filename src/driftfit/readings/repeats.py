@@ -1,4 +1,4 @@
-"""The resolution of the readings: the step of a coarse meter, estimated from readings that repeat.
+"""Readings that repeat the one before in all digits: coarse meters, and sensors that are frozen.
 
 Readings of an integer meter, a counter or a converter of few bits are accurate to half a step, and where they are
 constant, residuals are zero although nothing was measured exactly. A noise variance learned from those residuals
@@ -11,6 +11,12 @@ collapses, and bands and likelihood with it. Therefore
 
 Readings of a fine sensor never repeat, and nothing changes for them. If they do, at a limit, at 0 while a pump is off,
 or because a value is held, the other steps have all sizes, and none is frequent.
+
+A frozen sensor repeats its last value although the system moves. With p the share of readings that repeat, k repeats in
+a row at which the forecast moved have the probability p^k. A reading is refused if that is below `Gate.frozen`. The
+forecast moves if it changes by more than half of its own standard deviation and more than the smallest step of the
+readings: a plant at rest, and one whose meter is too coarse to show a movement, repeat their readings too. One repeat
+may be chance; two are enough where readings have many digits. A code that stays is refused in this way, however long.
 
 Source: quantum^2 / 12 is Sheppard's (1898); the rest is ours. Cost per sample: a few comparisons.
 """
@@ -25,15 +31,17 @@ import numpy as np
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import State, Step, kernel
 
-ENOUGH = 3.0
+MOVED = 0.25
+"""Share of the variance of the forecast by which the square of its change counts as a movement."""
+ENOUGH = 5.0
 """Number of repeats, and of steps of the size of the quantum, before they count."""
 
 
-def unresolved() -> Mapping[str, Any]:
+def no_repeats() -> Mapping[str, Any]:
     """Fields before the first reading."""
     return {
         "gate_before": np.nan, "gate_finest": np.inf, "gate_smallest": 0.0, "gate_steps": 0.0, "gate_repeats": 0.0,
-        "shift": 0.0,
+        "gate_chance": 1.0, "gate_forecast": np.nan, "floor": 0.0, "shift": 0.0,
     }  # fmt: skip
 
 
@@ -82,3 +90,21 @@ def resolution(share: float) -> Step:
             s.floor[l] = s.gate_finest[l] * s.gate_finest[l] / 12.0 if coarse else 0.0
 
     return resolve  # type: ignore[no-any-return]
+
+
+def frozen_rule(limit: float, share: float) -> Callable[[State, float, int], bool]:
+    """``frozen(s, v, l)``: whether the reading is one of a frozen sensor, given the variance v of its forecast."""
+    limit, natural = float(limit), repeats_by_nature(share)
+
+    @kernel
+    def frozen(s: State, v: float, l: int) -> bool:
+        predicted, y_hat, chance = s.valid[l] > 0.0, s.y_hat[l] + s.shift[l], 1.0
+        if repeats_last(s, l):
+            chance, moved = s.gate_chance[l], y_hat - s.gate_forecast[l]
+            if predicted & (moved * moved > max(MOVED * v, s.gate_finest[l] * s.gate_finest[l])):
+                chance *= (s.gate_repeats[l] + 1.0) / (s.gate_repeats[l] + s.gate_steps[l] + 2.0)
+        s.gate_chance[l] = chance
+        s.gate_forecast[l] = y_hat if predicted else s.gate_forecast[l]
+        return (chance < limit) & (not natural(s, l))
+
+    return frozen  # type: ignore[no-any-return]

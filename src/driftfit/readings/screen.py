@@ -1,0 +1,80 @@
+"""Codes in the record of a run that had no gate: said afterwards, because such a run uses whatever it is given.
+
+`suspect` is one vectorised look at the signals. Only where it finds something, `Review` runs the gate's step over the
+finished record, with the forecasts and variances of that run, and lists what a gate would have refused. A run that was
+spoilt by one code may say little of later ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, Driver, State, kernel
+from driftfit.readings.gate import Gate, gate_step, start
+
+SUSPECT = 30.0
+"""Usual distances from the median beyond which a value may be a code."""
+FEWEST = 20
+"""Values that a usual distance needs."""
+
+
+def suspect(signal: Array) -> Array:
+    """Which values (T,) of a signal are more than `SUSPECT` usual distances from its median: the median distance of
+    those that differ from it. Missing and infinite values are not."""
+    known = np.isfinite(signal)
+    if np.count_nonzero(known) < FEWEST:
+        return np.zeros(len(signal), bool)
+    away = np.abs(np.where(known, signal, np.nan) - np.median(signal[known]))
+    moving = away[away > 0.0]
+    limit = SUSPECT * float(np.median(moving)) if len(moving) >= FEWEST else 0.0
+    return np.asarray(away > limit)
+
+
+def screen(y: Array, u: Array) -> bool:
+    """Whether any value of y (T,) or of an input in u (T, m) may be a code."""
+    return any(bool(suspect(signal).any()) for signal in (y, *u.T))
+
+
+@kernel
+def nothing_refused(s: State, signal: int, age: int, l: int) -> None:
+    """The memory of a model that ran already."""
+
+
+class Review:
+    """The gate's step over finished records with m inputs, of which the model remembered ``ages`` samples."""
+
+    def __init__(self, gate: Gate, m: int, ages: int) -> None:
+        gate = replace(gate, first=0)
+        self._start = start(gate, 0, m)
+        step = gate_step(gate, 0, m, ages, nothing_refused)
+
+        def review(tile: Any, y: Any, u: Any, y_hat: Any, s: Any, valid: Any, reason: Any) -> None:
+            of, l = tile[0], 0
+            for t in range(len(y)):
+                for j in range(u.shape[1]):
+                    of.u[j, l] = u[t, j]
+                of.observed[l] = 1.0 if abs(y[t]) < np.inf else 0.0
+                of.y[l] = y[t] if abs(y[t]) < np.inf else 0.0
+                of.valid[l] = 1.0 if valid[t] else 0.0
+                of.ok[l] = of.observed[l] * of.valid[l]
+                of.y_hat[l], of.e[l], of.s[l] = y_hat[t], of.y[l] - y_hat[t], s[t]
+                step(of, l)
+                reason[t] = of.reason[l]
+
+        self._review = Driver(review)
+
+    def __call__(self, y: Array, u: Array, y_hat: Array, s: Array, valid: Array) -> Array:
+        """Reasons (T,), given readings y (T,), inputs u (T, m), forecasts and their variances (T,), and whether there
+        was a forecast (T,)."""
+        signals = {"y": 0.0, "u": np.zeros(max(u.shape[1], 1)), "y_hat": 0.0, "e": 0.0, "s": 0.0}
+        fields = {**signals, "phi": np.zeros(0), "valid": 0.0, "observed": 0.0, "ok": 0.0, "dt": 1.0, "noise": 1.0,
+                  "drift": 1.0, **self._start}  # fmt: skip
+        kinds = [(name, np.asarray(value).dtype, (*np.shape(value), 1)) for name, value in fields.items()]
+        tile, reason = np.zeros(1, np.dtype(kinds, align=True)), np.zeros(len(y), np.int64)
+        for name, value in fields.items():
+            tile[name][0] = np.asarray(value)[..., None]
+        self._review(tile, y, u, np.where(valid, y_hat, 0.0), s, valid, reason)
+        return reason
