@@ -128,7 +128,9 @@ class Program:
         alone = None if self.output is None else self.alone
         own = self.tracker.state_for(self.model if alone is None else alone.model)
         return (
-            own if self.gate is None else {**own, **gate_start(self.gate, self.model.n, self.model.m), "raw_e": np.nan}
+            own
+            if self.gate is None
+            else {**own, **gate_start(self.gate, self.model.n, self.model.m), "raw_e": np.array(np.nan)}
         )
 
     @property

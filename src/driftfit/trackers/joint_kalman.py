@@ -64,7 +64,7 @@ def unusable(s: State, l: int) -> None:
     """There is no prediction."""
     s.valid[l], s.ok[l], s.y_hat[l], s.e[l], s.h[l] = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(s.theta.shape[0]):
-        s.phi[i, l] = 0.0
+        s.phi[i, l], s.g[i, l] = 0.0, 0.0
 
 
 @lru_cache

@@ -27,7 +27,6 @@ from driftfit.engine.kernel import Array, part, shared
 from driftfit.engine.simd import fill_four, load_four, plus, reached, times
 from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, level_of
 from driftfit.models.hammerstein_wiener.step_memory import (
-    BEFORE,
     BEND,
     BOTTOM,
     CELL,
@@ -35,10 +34,7 @@ from driftfit.models.hammerstein_wiener.step_memory import (
     CURVE,
     D_CHECKED,
     D_NOW,
-    EARLIER,
     EIGHT,
-    FIRM_HIGH,
-    FIRM_LOW,
     GRID,
     HIGHEST,
     LATE,
@@ -60,8 +56,6 @@ from driftfit.models.hammerstein_wiener.step_memory import (
 
 WIDER = 0.2
 """Share of the range of the outputs by which the grid extends beyond it at both ends."""
-OUTERMOST = 3.0
-"""Limit beyond the range of medians of three, in units of that range; outputs farther away count only up to it."""
 SAFE = 0.99
 """The bound on the change of d, reduced for rounding."""
 FINE = 1e-8
@@ -74,17 +68,6 @@ WIDE = 10.0
 @part
 def believe(m: Array, y: float) -> None:
     """Include an output in the range of accepted outputs."""
-    one, other = m[BEFORE, 0], m[EARLIER, 0]
-    m[EARLIER, 0], m[BEFORE, 0] = one, y
-    if other == other:
-        middle = max(min(one, other), min(max(one, other), y))
-        if middle < m[FIRM_LOW, 0] or middle > m[FIRM_HIGH, 0]:
-            m[FIRM_LOW, 0], m[FIRM_HIGH, 0] = min(m[FIRM_LOW, 0], middle), max(m[FIRM_HIGH, 0], middle)
-            m[MOVED, 0] = 1.0
-        margin = OUTERMOST * (m[FIRM_HIGH, 0] - m[FIRM_LOW, 0])
-        bottom, top = m[FIRM_LOW, 0] - margin, m[FIRM_HIGH, 0] + margin
-        y = min(max(y, bottom), top)
-        m[LOWEST, 0], m[HIGHEST, 0] = max(m[LOWEST, 0], bottom), min(m[HIGHEST, 0], top)
     if y < m[LOWEST, 0] or y > m[HIGHEST, 0]:
         m[LOWEST, 0], m[HIGHEST, 0], m[MOVED, 0] = min(m[LOWEST, 0], y), max(m[HIGHEST, 0], y), 1.0
 

@@ -33,16 +33,14 @@ EIGHT = 8
 ROW = GRID + 1
 
 (
-    LOW, STEP, LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED, STARTED, MINIMAL, GIVEN, RAW, VARIANCE, BEFORE, EARLIER,
-    FIRM_LOW, FIRM_HIGH, MOVED, LATE, CELL, Y, DT, BELIEVED, OK, FACTOR, LEAST, SCALE, HEAD,
-) = range(28)  # fmt: skip
+    LOW, STEP, LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED, STARTED, MINIMAL, GIVEN, RAW, VARIANCE, MOVED, LATE,
+    CELL, Y, DT, BELIEVED, OK, FACTOR, LEAST, SCALE, HEAD,
+) = range(24)  # fmt: skip
 """Numbers: the grid, the range of accepted outputs, where the output block is defined, results, whether all lags are
-known, whether theta is xi, the given noise factor, the output as given, sigma^2 or 0, the two previous outputs, the
-range of medians of three, whether the range changed, whether a level is stored in place of the
-prediction, its cell of the grid, what steps and compiled routine exchange, whether the output becomes a lag, whether
-the sample was used, the noise factor of the equation, the least variance that
-sigma adds to it, and the scale of y that the basis gives; HEAD is their
-number.
+known, whether theta is xi, the given noise factor, the output as given, sigma^2 or 0, whether the range changed, whether
+a level is stored in place of the prediction, its cell of the grid, what steps and compiled routine exchange, whether
+the output becomes a lag, whether the sample was used, the noise factor of the equation, the least variance that sigma
+adds to it, and the scale of y that the basis gives; HEAD is their number.
 """
 
 (
@@ -106,7 +104,7 @@ def memory(
 ) -> Array:  # fmt: skip
     """``blocks`` before the first sample."""
     head = np.zeros(HEAD)
-    head[[LOWEST, HIGHEST, FIRM_LOW, FIRM_HIGH, BOTTOM, TOP]] = np.inf, -np.inf, np.inf, -np.inf, *limits
-    head[[RISING, PREDICTED, BEFORE, EARLIER]] = 1.0, np.nan, np.nan, np.nan
+    head[[LOWEST, HIGHEST, BOTTOM, TOP]] = np.inf, -np.inf, *limits
+    head[[RISING, PREDICTED]] = 1.0, np.nan
     head[[VARIANCE, LEAST, SCALE]] = 0.0 if sigma is None else sigma * sigma, least, scale
     return np.concatenate([head, *_arrays(structure, nk, into, out).values()])

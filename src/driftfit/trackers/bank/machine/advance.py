@@ -484,8 +484,9 @@ def remember_reading(sample: Array) -> None:
 
 @partial(machine, short=True)  # rows of a dozen leaves: copies of loops for long rows made it a tenth slower
 def bank(address: int) -> None:
-    """The forecast of a sample, or its processing, by ``PHASE``, given the table of a bank. A sample beyond the limit of
-    its sensor is processed again as missing.
+    """The forecast of a sample, or its processing, by ``PHASE``, given the table of a bank.
+
+    A sample beyond the limit of its sensor is processed again as missing.
     """
     t = table_at(address)
     counters, head = t.counters, t.report

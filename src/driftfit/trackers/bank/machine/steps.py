@@ -281,7 +281,7 @@ def read(s: State, l: int) -> None:
 
 @kernel
 def forecast_in_span(s: State, l: int) -> None:
-    """The forecast of a tree that began before the regressors spanned everything, or in the coordinates of the start."""
+    """The forecast of a tree that began before the regressors spanned everything, or in coordinates of the start."""
     column, y_hat, framed = whiten_within(s, s.phi.ctypes.data, l), prediction(s, l), s.framed[l] > 0
     if framed:
         write_walks(s, l)
