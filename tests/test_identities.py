@@ -173,6 +173,20 @@ def test_drift_as_number_vector_and_matrix():
     np.testing.assert_allclose(run.cov(39), dense.P, rtol=1e-6, atol=1e-9)
 
 
+def test_a_matrix_of_drifts_keeps_its_digits_in_other_units():
+    """Outputs a hundred million times larger: the variances of q are then 1e16 times apart."""
+    y, u = arx_record(40, 12)
+    q, c = 0.01 * (np.eye(4) + 0.3), 1e8
+    unit = np.array([1.0, 1.0, c, c])
+    for given in ({}, {"p0": np.eye(4) + 0.3, "form": "sqrt"}):
+        base = track(ARX(2, 2), Kalman(q=q, r=R, **given), y, u)
+        if "p0" in given:
+            given = {**given, "p0": given["p0"] * np.outer(unit, unit)}
+        louder = track(ARX(2, 2), Kalman(q=q * np.outer(unit, unit), r=R * c * c, **given), c * y, u)
+        np.testing.assert_allclose(louder.theta[6:] / unit, base.theta[6:], rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(louder.std[6:] / unit, base.std[6:], rtol=1e-8)
+
+
 def test_other_units_change_nothing_but_the_numbers():
     """y scaled by c: theta, sqrt(r), sqrt(q) by c. u scaled: theta by 1 / c. loglik by -log c a used sample."""
     rng = np.random.default_rng(12)
