@@ -269,7 +269,7 @@ class InstrumentalVariables(RLS):
     def __init__(self, n, forgetting, na, p0=None, theta0=0.0, c_max=1e8):
         super().__init__(n, forgetting, p0, theta0, c_max)
         self.G, self.na, self.settles = self.P, na, p0 is None and na > 0
-        self.kappa = Decimal(10) ** 8  # x is fed back: an early estimate that is unstable magnifies rounding
+        self.kappa = Decimal(10) ** 10  # x is fed back: an early estimate that is unstable magnifies rounding
         self.used = self.faded_at = 0
         self.auxiliary, self.lags, self.largest = self.x, [Decimal(0)] * na, Decimal(0)
 
