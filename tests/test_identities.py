@@ -5,7 +5,6 @@ They use Regression(1) and ARX(2, 2), the combinations that the other tests comp
 
 import math
 
-import naive
 import numpy as np
 import pytest
 from support import arx_record, run_lanes, same
@@ -128,22 +127,6 @@ def test_diffuse_start_is_the_limit_of_a_large_prior(q):
     assert diffuse.loglik == pytest.approx(large.loglik + 2.0 * math.log(2.0 * math.pi * 1e8), abs=1e-3)
 
 
-@pytest.mark.parametrize("q", [0.0, 0.02, (0.1, 0.0, 0.02, 0.3)])
-def test_diffuse_start_is_the_dense_bayesian_solution(q):
-    """theta, P and the log-likelihood of all data at once, at every prefix."""
-    y, u = arx_record(40, 9)
-    phi, target = rows_of(y, u)
-    run = track(ARX(2, 2), Kalman(q=q, r=R), y, u)
-    dense = naive.Kalman(4, q, R)
-    for k, (row, value) in enumerate(zip(phi, target, strict=True)):
-        dense.see(row, value)
-        np.testing.assert_allclose(run.theta[k + 2], dense.theta, rtol=1e-7, atol=1e-7)
-        if k >= 3:
-            np.testing.assert_allclose(run.cov(k + 2), dense.P, rtol=1e-6, atol=1e-9)
-            part = track(ARX(2, 2), Kalman(q=q, r=R), y[: k + 3], u[: k + 3])
-            assert part.loglik == pytest.approx(dense.loglik(), abs=1e-7)
-
-
 def test_a_proper_prior_gives_the_likelihood_of_the_joint_gaussian():
     rng = np.random.default_rng(10)
     u, q, p0 = rng.standard_normal(30), 0.05, 2.0
@@ -164,13 +147,20 @@ def test_drift_as_number_vector_and_matrix():
     assert same(number.theta, vector.theta)
     assert same(number.theta, matrix.theta)
     assert same(number.cov(50), matrix.cov(50))
-    full = 0.01 * (np.eye(4) + 0.8 * np.ones((4, 4)))
-    run = track(ARX(2, 2), Kalman(q=full, r=R), y, u)
-    dense = naive.Kalman(4, full, R)
-    for row, value in zip(*rows_of(y[:40], u[:40]), strict=True):
-        dense.see(row, value)
-    np.testing.assert_allclose(run.theta[39], dense.theta, rtol=1e-6, atol=1e-8)
-    np.testing.assert_allclose(run.cov(39), dense.P, rtol=1e-6, atol=1e-9)
+
+
+def test_a_matrix_of_drifts_keeps_its_digits_in_other_units():
+    """Outputs a hundred million times larger: the variances of q are then 1e16 times apart."""
+    y, u = arx_record(40, 12)
+    q, c = 0.01 * (np.eye(4) + 0.3), 1e8
+    unit = np.array([1.0, 1.0, c, c])
+    for given in ({}, {"p0": np.eye(4) + 0.3, "form": "sqrt"}):
+        base = track(ARX(2, 2), Kalman(q=q, r=R, **given), y, u)
+        if "p0" in given:
+            given = {**given, "p0": given["p0"] * np.outer(unit, unit)}
+        louder = track(ARX(2, 2), Kalman(q=q * np.outer(unit, unit), r=R * c * c, **given), c * y, u)
+        np.testing.assert_allclose(louder.theta[6:] / unit, base.theta[6:], rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(louder.std[6:] / unit, base.std[6:], rtol=1e-8)
 
 
 def test_other_units_change_nothing_but_the_numbers():

@@ -1,4 +1,4 @@
-"""Instrumental variables: their slow twin, least squares as a special case, and no bias in coloured noise."""
+"""Instrumental variables: least squares as a special case, and no bias in coloured noise."""
 
 import numpy as np
 import pytest
@@ -6,56 +6,8 @@ from scipy import signal
 from support import arx_record
 
 from driftfit import ARX, RLS, HammersteinWiener, InstrumentalVariables, Live, Regression, track
-from driftfit.trackers.instrumental import FOLLOWING, LEAST_SQUARES
 
 LAMBDA = 0.97
-
-
-def twin(y, u, weights):
-    """Rows (theta, var, e, s) of ARX(2, 2): every sample solves sum w zeta phi' theta = sum w zeta y again."""
-    T, n, measured = len(y), 4, y
-    A, S, b = np.zeros((n, n)), np.zeros((n, n)), np.zeros(n)
-    x, auxiliary, largest, squares, used = [0.0, 0.0], np.zeros(n), 0.0, [], 0
-    rows = np.full((T, 2 * n + 2), np.nan)
-    for t in range(T):
-        if t < 2:
-            continue
-        largest = max(largest, abs(measured[t - 1])) if t > 2 and np.isfinite(measured[t - 1]) else largest
-        phi = np.array([y[t - 1], y[t - 2], u[t - 1], u[t - 2]])
-        A, S, b = LAMBDA * A, LAMBDA * S, LAMBDA * b
-        instruments = np.array([*x, *phi[2:]])
-        ok = np.isfinite(y[t]) and weights[t] > 0.0
-        out = float(np.clip(instruments @ auxiliary, -largest, largest))
-        zeta = instruments if used >= LEAST_SQUARES * n else phi
-        if used >= n:
-            theta, G = np.linalg.solve(A, b), np.linalg.inv(A)
-            e, v = y[t] - phi @ theta, phi @ G @ S @ G.T @ phi + 1.0 / weights[t]
-            rows[t, 2 * n :] = e if ok else np.nan, v * np.mean(squares) if squares else np.nan
-            if ok:
-                squares.append(e * e / v)
-        if ok:
-            A, S = A + weights[t] * np.outer(zeta, phi), S + weights[t] * np.outer(zeta, zeta)
-            b, used = b + weights[t] * zeta * y[t], used + 1
-        if used >= n:
-            theta, G = np.linalg.solve(A, b), np.linalg.inv(A)
-            auxiliary = auxiliary + (FOLLOWING if used >= LEAST_SQUARES * n else 1.0) * (theta - auxiliary)
-            rows[t, :n], rows[t, n : 2 * n] = theta, np.diag(G @ S @ G.T) * (np.mean(squares) if squares else np.nan)
-        if not np.isfinite(y[t]):
-            y = np.where(np.arange(T) == t, phi @ theta, y)  # what ARX takes for a missing lag
-        x = [out, x[0]]
-    return rows
-
-
-def test_the_filter_is_its_naive_twin():
-    """With missing outputs and samples of little weight, from the first sample that determines theta well."""
-    y, u = arx_record(200, 1, noise=0.3)
-    y[[70, 130]] = np.nan
-    weights = np.ones(200)
-    weights[90:95], weights[120] = 0.25, 1e-9
-    run = track(ARX(2, 2), InstrumentalVariables(LAMBDA), y, u, weights=weights)
-    rows = twin(y, u, weights)
-    fast = np.column_stack([run.theta, run.var, run.innovation, run.innovation_var])
-    np.testing.assert_allclose(fast[10:], rows[10:], rtol=1e-6, atol=1e-7)
 
 
 def test_regressors_that_are_their_own_instruments_are_least_squares():

@@ -1,4 +1,4 @@
-"""Hidden states: the linear filter, numerical twins of the extended and the unscented one, and what is refused."""
+"""Hidden states: the linear filter, streams and forecasts, and what is refused."""
 
 import json
 
@@ -15,7 +15,6 @@ TEXT = """
 MODEL = StateSpace(TEXT, start={"a": 0.5, "b": 0.3, "x": 0.2})
 LINEAR = "x = 0.9 * x[-1] + theta.b * u \n y = x + theta.c"
 Q, R, P0 = {"a": 1e-4, "x": 1e-3}, 0.01, {"a": 0.04, "b": 0.01, "x": 1.0}
-VARIANCE, START = np.diag([0.04, 0.01, 1.0]), np.array([0.5, 0.3, 0.2])
 
 
 def data(T=120, seed=0):
@@ -33,56 +32,6 @@ def f(z, u, dt):
 
 def h(z, before):
     return np.sqrt(1.0 + z[2] ** 2) + 0.1 * before
-
-
-def slope(function, z, step=1e-6):
-    return np.array([(function(z + e) - function(z - e)) / (2.0 * step) for e in step * np.eye(3)]).T
-
-
-def extended(z, P, predict, read, Q):
-    F = slope(predict, z)
-    z, P = predict(z), F @ P @ F.T + Q
-    g = slope(read, z)
-    return z, P, read(z), P @ g, g @ P @ g
-
-
-def unscented(z, P, predict, read, Q):
-    def points(z, P):
-        root = np.sqrt(3.0) * np.linalg.cholesky(P)
-        return np.concatenate([z + root.T, z - root.T])
-
-    moved = np.array([predict(one) for one in points(z, P)])
-    z = moved.mean(axis=0)
-    P = (moved - z).T @ (moved - z) / 6.0 + Q
-    spread = points(z, P)
-    shown = np.array([read(one) for one in spread])
-    y_hat = shown.mean()
-    return z, P, y_hat, (spread - z).T @ (shown - y_hat) / 6.0, np.mean((shown - y_hat) ** 2)
-
-
-@pytest.mark.parametrize("twin", [extended, unscented], ids=["extended", "unscented"])
-def test_the_filter_against_a_numerical_twin_with_times_and_missing_data(twin):
-    y, u = data()
-    rng = np.random.default_rng(1)
-    dt = rng.choice([1.0, 0.5, 1.4], 120)
-    dt[0] = 1.0
-    y[rng.random(120) < 0.1] = np.nan
-    u[[40, 41]] = np.nan
-    tracker = JointKalman(q=Q, r=R, p0=P0, method=twin.__name__)
-    run = track(MODEL, tracker, y, u, time=np.cumsum(dt), dt=1.0)
-    z, P, held = START.copy(), VARIANCE.copy(), 0.0
-    for t in range(120):
-        before = held
-        held = u[t] if np.isfinite(u[t]) else held
-        usable = t > 0 and np.isfinite(y[t]) and np.isfinite(u[t - 1 : t + 1]).all()
-        noise = np.diag([1e-4, 0.0, 1e-3]) * dt[t]
-        z, P, y_hat, g, s = twin(z, P, lambda one: f(one, held, dt[t]), lambda one: h(one, before), noise)  # noqa: B023
-        if usable:
-            assert run.prediction[t] == pytest.approx(y_hat, rel=1e-6)
-            z, P = z + g * (y[t] - y_hat) / (s + R), P - np.outer(g, g) / (s + R)
-        assert run.ok[t] == usable
-        np.testing.assert_allclose(run.theta[t], z, rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(run.std[t], np.sqrt(np.diag(P)), rtol=1e-5)
 
 
 def test_both_are_the_kalman_filter_where_equations_are_linear():

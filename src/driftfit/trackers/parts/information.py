@@ -114,12 +114,17 @@ def widen(S: Array, d: Array, p: Array) -> None:
 
 
 def triangular_root(q: Array) -> Array:
-    """An upper triangle G with G G' = q, for a covariance that may be singular."""
+    """An upper triangle G with G G' = q, for a covariance that may be singular.
+
+    It is the triangle of the correlations in the units of each parameter: eigenvalues of q itself would lose a variance
+    1e16 times smaller than another.
+    """
     variances = np.diag(q)
     if np.array_equal(q, np.diag(variances)):
         return np.diag(np.sqrt(variances))
     from scipy import linalg  # a fifth of a second to import
 
-    values, vectors = linalg.eigh(q)
-    G: Array = linalg.rq(vectors * np.sqrt(np.maximum(values, 0.0)), mode="r")
+    unit = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+    values, vectors = linalg.eigh(q / np.outer(unit, unit))
+    G: Array = unit[:, None] * linalg.rq(vectors * np.sqrt(np.maximum(values, 0.0)), mode="r")
     return G
