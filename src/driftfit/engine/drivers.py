@@ -423,7 +423,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
     sample = _sample(model, tracker.note, between, part)
     keep_more = covariance if keep == "cov" else nothing_more
     common = nothing_common if keep == "own" else write_common
-    store = tracker.store if gate is None else _stored_too(tracker.store)
+    store = tracker.store if gate is None or keep == "own" else _stored_too(tracker.store)
     run = _run(driver, sample, tracker.read_extra, _written(common, store, keep_more, part), part, gate is not None)
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE) -> int:
