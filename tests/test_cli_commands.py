@@ -188,7 +188,9 @@ def test_detect_scores_labels_and_writes_alarms(table):
 
 @pytest.mark.parametrize(("kind", "name"), [("glr", "a.csv"), ("cusum", "a.parquet"), ("innovation", "a.csv")])
 def test_alarms_of_other_kinds_are_written_too(table, kind, name):
-    run("detect", *DATED, "--kind", kind, "--reference", "150", "--every", "100", "--out", name, "--report", "page.html")
+    run(
+        "detect", *DATED, "--kind", kind, "--reference", "150", "--every", "100", "--out", name, "--report", "page.html"
+    )
     written = pl.read_csv(name) if name.endswith("csv") else pl.read_parquet(name)
     alarms = expected().detect(kind, reference=150, every=100).table
     assert written["cause"].to_list() == alarms["cause"].to_list() != []
