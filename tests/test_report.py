@@ -207,3 +207,13 @@ def test_alarms_of_every_kind_are_the_same_in_print_in_their_table_and_on_the_pa
     fleet.report(tmp_path / "fleet.html", alarms=many)
     for row in many.rows:
         assert row.first in " ".join(read((tmp_path / "fleet.html").read_text()).text)
+
+
+def test_series_that_are_judged_by_different_kinds_have_one_table(fleet):
+    """A tracker that adapts is judged by "glr" where innovations are asked for, and only "glr" has a size."""
+    run = fleet[0]
+    grid = track(Regression(["valve"]), [Kalman(q=1e-4, r=0.25), AdaptiveKalman()], run.y, run.u)
+    with pytest.warns(UserWarning, match="follows a fault"):
+        table = grid.detect("innovation", every=200.0, reference=400).table
+    assert set(table["series"]) == {0, 1}
+    assert table["size"].is_null().to_list() == (table["series"] == 0).to_list()

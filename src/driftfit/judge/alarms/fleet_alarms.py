@@ -121,7 +121,7 @@ class ManyAlarms(Printed):
         import polars
 
         begun = [row for row in self.rows if row.onsets]
-        alarms = polars.concat(row.alarms.table for row in begun or self.rows[:1])
+        alarms = polars.concat((row.alarms.table for row in begun or self.rows[:1]), how="diagonal")
         often = [len(row.onsets) for row in self.rows]
         series = {name: np.repeat([getattr(row, name) for row in self.rows], often) for name in ("p", "q", "faulty")}
         return table_by_key(self.by, [row.key for row in self.rows], often, alarms.to_dict() | series)
