@@ -29,7 +29,7 @@ def main(plot: bool = False) -> None:
         '"gls"': run.blocks("gls").xi,
         "output error": filtered.xi,
     }
-    print("root mean square error of a1, b1, b2, c2, d2 after the first 500 samples")
+    print("root mean square error of A1, b1, b2, c2, d2 after the first 500 samples")
     for name, xi in paths.items():
         error = np.sqrt(np.mean((xi - s.xi)[500:] ** 2, axis=0))
         print(f"{name:14s}", *(f"{e:7.3f}" for e in error))

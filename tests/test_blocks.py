@@ -243,7 +243,7 @@ def test_names_and_refusals():
     s = record(T=60)
     run = track(SMALL, K, s.y, s.u)
     found = run.blocks()
-    assert found.names == (("a1",), ("b1", "b2"), ("c1", "c2"), ("d1", "d2"))
+    assert found.names == (("A1",), ("b1", "b2"), ("c1", "c2"), ("d1", "d2"))
     assert found.radius[-1] == pytest.approx(abs(found.a[-1, 0]))
     assert len(found) == 60
     assert np.isnan(found.std.b).all()

@@ -3,8 +3,9 @@
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import signal, stats
 
-from driftfit import RLS, Kalman, Regression, track
+from driftfit import RLS, AdaptiveKalman, Kalman, Regression, track
 
 pytest.importorskip("formulaic", reason="formulaic is not installed")
 
@@ -74,6 +75,61 @@ def test_formula_keeps_missing_rows_and_reads_transforms():
         TimeVaryingRegression.from_formula("x1 + x2", data)
 
 
+@pytest.mark.parametrize("formula", ["y ~ x1 + C(g)", "y ~ x1 * C(g, contr.sum)", "y ~ x1 + C(year) - 1", "y ~ x1 + g"])
+@pytest.mark.parametrize("dtype", ["object", "category"])
+def test_a_missing_category_is_a_missing_row_as_in_least_squares(formula, dtype):
+    smf = pytest.importorskip("statsmodels.formula.api", reason="statsmodels is not installed")
+    data = table(120)
+    rng = np.random.default_rng(1)
+    data["g"], data["year"] = rng.choice(["a", "b", "c"], 120), rng.choice([2020.0, 2021.0], 120)
+    data.loc[rng.choice(data.index, 40, replace=False), ["g", "year"]] = [None, np.nan]
+    mine = TimeVaryingRegression.from_formula(formula, data.astype({"g": dtype}), RLS(1.0)).fit()
+    theirs = smf.ols(formula.replace("contr.sum", "Sum"), data).fit()
+    assert mine.nobs == theirs.nobs == 80
+    assert np.sort(mine.params) == pytest.approx(np.sort(theirs.params), rel=1e-8)
+
+
+@pytest.mark.parametrize("T", [5, 12, 40])
+def test_intervals_and_p_values_are_students_where_the_noise_variance_is_estimated(T):
+    smf = pytest.importorskip("statsmodels.formula.api", reason="statsmodels is not installed")
+    mine = TimeVaryingRegression.from_formula("y ~ x1 + x2", table(T), RLS(1.0)).fit()
+    theirs = smf.ols("y ~ x1 + x2", table(T)).fit()
+    order = list(theirs.params.index)
+    assert mine.df_resid == theirs.df_resid == T - 3
+    assert mine.pvalues[order].to_numpy() == pytest.approx(theirs.pvalues.to_numpy(), rel=1e-6)
+    for alpha in (0.05, 0.3):
+        assert mine.conf_int(alpha).loc[order].to_numpy() == pytest.approx(theirs.conf_int(alpha).to_numpy(), rel=1e-8)
+    given = TimeVaryingRegression.from_formula("y ~ x1 + x2", table(T), Kalman(q=0.0, r=0.3)).fit()
+    assert 4.0 < given.tvalues.x1 < 30.0
+    assert given.pvalues.x1 == pytest.approx(2.0 * stats.norm.sf(given.tvalues.x1), rel=1e-12)
+    assert [one.summary().table.columns[3] for one in (mine, given)] == ["P>|t|", "P>|z|"]
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.9])
+def test_fitted_values_are_of_the_coefficients_before_and_forecasts_are_those_of_the_tracker(colour):
+    data = table(200)
+    noise = signal.lfilter([1.0], [1.0, -colour], np.random.default_rng(4).normal(size=200))
+    data["y"] = 1 + 2 * data.x1 + 0.3 * noise
+    for tracker in (RLS(1.0), AdaptiveKalman()):
+        result = TimeVaryingRegression.from_formula("y ~ x1", data, tracker).fit()
+        before = result.params_path.shift(fill_value=0.0)
+        assert result.fittedvalues.to_numpy() == pytest.approx(before.x1 * data.x1 + before.Intercept, rel=1e-12)
+        assert np.array_equal(result.resid, data.y - result.fittedvalues)
+        assert np.array_equal(result.forecasts, result.run.prediction)
+        assert result.forecasts_error.to_numpy() == pytest.approx(data.y - result.forecasts, abs=1e-12)
+        apart = float(np.sqrt(np.mean((result.forecasts - result.fittedvalues) ** 2)))
+        said = result.summary().facts.get("Forecasts", "")
+        assert (f"{apart:.4g}" in said) == (tracker != RLS(1.0))
+    assert (apart > 0.1) == (colour > 0.0)
+
+
+def test_dates_of_the_index_are_those_of_the_verdict():
+    result = TimeVaryingRegression.from_formula("y ~ x1 + x2", table(), RLS(0.95)).fit()
+    (moved,) = (one for one in result.run.verdict().parameters if one.moves)
+    assert moved.name == "x2"
+    assert abs(pd.Timestamp(moved.when) - table().index[40]) < pd.Timedelta("120D")
+
+
 def test_cusum_leaves_its_limits_when_a_coefficient_jumps():
     constant, jump = table(), table()
     constant["y"] = 1 + 2 * constant.x1 + 0.1 * np.random.default_rng(3).normal(size=80)
@@ -117,5 +173,5 @@ def test_summary_as_text_html_and_latex():
     for text in (summary.as_text(), summary.as_html(), summary.as_latex()):
         assert f"{row['coef']:.4f}" in text
         assert f"{row['0.975]']:.4f}" in text
-    assert summary.as_latex().count(r"\\") == 5 + 1 + 3
+    assert summary.as_latex().count(r"\\") == 6 + 1 + 3
     assert str(summary) == summary.as_text()

@@ -56,7 +56,7 @@ def test_inputs_of_every_model_are_matched():
     assert arx.names == ("a1", "b1[b]", "b1[a]", "b2[a]")
     assert np.array_equal(arx.theta, place.theta)
     with pytest.raises(ValueError, match=r"HammersteinWiener has the inputs valve, but u has the columns a"):
-        track(HammersteinWiener(1, 1, name="valve"), TRACKER, y, X["a"])
+        track(HammersteinWiener(1, 1, inputs="valve"), TRACKER, y, X["a"])
     fleet = track(NAMED, TRACKER, "flow", ["a", "b"], data=pd.concat([X.assign(flow=y, k=k) for k in "pq"]), by="k")
     alone = track(NAMED, TRACKER, y, X)
     assert np.array_equal(fleet["q"].theta, alone.theta)

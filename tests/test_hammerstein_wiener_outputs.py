@@ -62,7 +62,7 @@ def test_minimal_parameters_of_several_outputs():
     y, u = record()
     ekf = ExtendedKalman(q=1e-7, r=1e-4, p0=0.1, theta0=0.1)
     run = track(TANK, ekf, y, u)
-    assert run.names[0] == ("a1[flow]", "b1[flow]", "b2[flow]", "c2[flow]", "d2[flow]")
+    assert run.names[0] == ("A1[flow]", "b1[flow]", "b2[flow]", "c2[flow]", "d2[flow]")
     for i, name in enumerate(TANK.outputs):
         assert same(run[name].theta, track(TANK.alone(name), ekf, y[:, i], u).theta)
     with pytest.raises(ValueError, match="one output at a time"):

@@ -82,6 +82,38 @@ def test_a_stream_says_what_the_record_says(record, tracker, kind, settings):
     assert same(many[0].statistic, alarm.statistic)
 
 
+@pytest.mark.parametrize("way", ["one by one", "many", "timed", "apply", "saved"])
+def test_samples_of_an_alarm_count_from_the_start_of_the_stream(record, way):
+    """A rule that is given to the stream at sample 500 says of onsets and changes what the record says."""
+    y, u = record
+    whole = track(ARX(2, 2), K, y, u)
+    rule = whole.detect("glr", every=50.0, reference=CUT).rule
+    record_alarms = whole.detect(rule, start=CUT)
+    live = Live(ARX(2, 2), K)
+    if way == "many":
+        live.update_many(y[:CUT], u[:CUT])
+    for t in range(live.samples, CUT):
+        if way == "apply":
+            live.update(y[t])
+            live.apply(u[t])
+        elif way == "timed":
+            live.update(y[t], u[t], time=float(t))
+            live.update(y[t], u[t], time=float(t))  # ignored
+        else:
+            live.update(y[t], u[t])
+    alarm = live.detect(rule, wait=0)
+    if way == "saved":
+        live = Live.from_bytes(live.to_bytes())
+        (alarm,) = live.alarms
+    found = []
+    for t in range(CUT, T):
+        live.update(y[t], u[t], time=float(t) if way == "timed" else None)
+        assert not alarm.active or alarm.change == record_alarms.change(t)
+        found += [onset.sample for onset in alarm.onsets()]
+    assert live.samples == T
+    assert found == record_alarms.onsets.tolist() != []
+
+
 def in_parts(before, whole, rule):
     """(an alarm that judges many samples at a time, what it says of them)."""
     program, tile = whole.program, whole.program.tile(before.end().states[0])

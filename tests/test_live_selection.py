@@ -58,7 +58,7 @@ def test_the_weights_are_those_of_the_record(tmp_path):
     known = np.isfinite(expected.y_hat)
     assert known.sum() > 580
     assert_allclose(result[known], expected.y_hat[known], atol=1e-9)
-    assert repr(CANDIDATES[STUCK]) in repr(live)
+    assert repr(CANDIDATES[STUCK].bind(1)) in repr(live)
 
 
 def test_it_finds_the_structure_and_finds_it_again_after_a_change():

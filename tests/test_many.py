@@ -4,6 +4,7 @@ import math
 import os
 import re
 from dataclasses import replace
+from datetime import date
 
 import numpy as np
 import pandas as pd
@@ -55,7 +56,7 @@ def test_those_that_move_are_found_and_named(fleet):
     assert "move in 2 of 6" in result.sentences[0]
     assert "1 cannot be tested" in result.sentences[-1]
     table = result.table
-    assert table["key"][0] in result.drifting
+    assert table["unit"][0] in result.drifting
     assert table.filter(pl.col("drifts"))["moving"].to_list() == ["b1[u]"] * 2
     printed = {row[0]: row for row in rows_of(result)}
     for key in result.drifting:
@@ -63,6 +64,34 @@ def test_those_that_move_are_found_and_named(fleet):
     assert not any("b1[u]" in printed[f"<{k}>"] for k in range(7) if k not in MOVED)
     with pytest.raises(KeyError, match="<9>"):
         result["<9>"]
+
+
+@pytest.mark.parametrize("by", ["pump", ["pump", "day"], ["q", "pump"]])
+def test_tables_of_a_fleet_join_to_the_users_table_by_its_keys(by):
+    """Integers and dates keep their type, and a column of ours makes room for one of the keys; what was not tested is
+    null and has a reason.
+    """
+    rng, T, days = np.random.default_rng(6), 300, [date(2024, 1, k) for k in (1, 2, 3)]
+    u = rng.normal(size=3 * T)
+    moves = np.where(np.arange(3 * T) < T // 2, 1.0, 2.0)
+    of = np.repeat(np.arange(3), T)
+    y = moves * u + 0.1 * rng.normal(size=3 * T)
+    data = pl.DataFrame({"pump": 7 + of, "day": [days[k] for k in of], "q": 0.5 * of, "y": y, "u": u})[: 2 * T + 5]
+    fleet = track(Regression(1), Kalman(q=1e-4, r=0.01), "y", "u", data=data, by=by)
+    keys = [by] if isinstance(by, str) else by
+    known = data.select("pump", "day", "q").unique(maintain_order=True).with_columns(site=pl.Series(["a", "b", "c"]))
+    tables = [fleet.verdict().table, fleet.diagnose().table, fleet.detect("band", every=100.0, reference=100).table]
+    for table in tables:
+        assert table.columns[: len(keys)] == keys
+        joined = table.join(known, on=keys)
+        assert joined.height == table.height > 0
+        assert joined.schema["pump"] == pl.Int64
+    verdict = known.select([*keys, "site"]).join(tables[0], on=keys).sort("site")
+    assert verdict["drifts"].to_list() == [True, False, None]
+    assert verdict["pays"].to_list() == [True, False, None]
+    assert verdict["untested"].to_list() == ["", "", "not tested: 5 of 12 samples"]
+    assert ("q_" in verdict.columns) == ("q" in keys)
+    assert "those whose q is below 0.05" in str(fleet.verdict()).splitlines()[0]
 
 
 def test_a_level_is_the_false_discovery_rate(fleet):
@@ -79,7 +108,7 @@ def test_ranked_by_change_puts_the_largest_share_first(fleet):
     path = np.tile(THETA, (T, 1))
     path[150:, 3] += 0.8
     y, u = arx_record(T, 24, theta=path)
-    result = verdicts({**dict(fleet.items()), "<4>": track(ARX(2, 2), K, y, u)}, 0.05)
+    result = verdicts({**dict(fleet.items()), "<4>": track(ARX(2, 2), K, y, u)}, fleet.by, 0.05)
     rows = result.ranked("change").rows
     assert [row.key for row in rows[:2]] == ["<4>", "<1>"]
     assert rows[0].relative == pytest.approx(2.0, abs=0.1)
@@ -234,7 +263,7 @@ def test_alarms_of_a_fleet_share_one_rate(fleet):
     assert {row.key for row in result.rows[:2]} == {f"<{k}>" for k in MOVED}
     table = result.table
     assert len(table) == sum(len(row.alarms.onsets) for row in result.rows)
-    assert set(table["key"]) == {f"<{k}>" for k in MOVED}
+    assert set(table["unit"]) == {f"<{k}>" for k in MOVED}
     assert result.rows[0].first.endswith(result.rows[0].alarms.cause(int(result.rows[0].alarms.onsets[0])))
     printed = rows_of(result)
     assert ["Alarm", "band,", "one", "false", "alarm", "of", "all", "6", "series", "in", "1000", "samples"] in printed

@@ -63,7 +63,7 @@ def test_the_extended_filter_is_its_naive_twin(inflation):
     path, P = naive_ekf(SMALL, phi, -y, 1e-5, 1e-4, 0.1, start, inflation)
     assert_allclose(run.theta, path, rtol=1e-8, atol=1e-10)
     assert_allclose(run.cov(-1), P, rtol=1e-6, atol=1e-12)
-    assert run.names == ("a1", "b1", "b2", "c2", "d2")
+    assert run.names == ("A1", "b1", "b2", "c2", "d2")
     root = run.prediction[100]
     xi = run.theta[99]
     right = -np.delete(phi[100] * SMALL.structure.products(xi), 3).sum()
@@ -102,7 +102,7 @@ def test_the_extended_filter_of_several_inputs_is_its_naive_twin():
     path, P = naive_ekf(TWO, phi, -y, 1e-5, 1e-4, 0.1, TRUTH + 0.1, 0.0)
     assert_allclose(run.theta, path, rtol=1e-8, atol=1e-10)
     assert_allclose(run.cov(-1), P, rtol=1e-6, atol=1e-12)
-    assert run.names == ("a1", "b1[u1]", "b2[u1]", "b1[u2]", "c2[u1]", "c2[u2]", "c3[u2]", "d2", "intercept")
+    assert run.names == ("A1", "b1[u1]", "b2[u1]", "b1[u2]", "c2[u1]", "c2[u2]", "c3[u2]", "d2", "intercept")
     assert_allclose(run.theta[-1], TRUTH, atol=0.02)
     root, xi = run.prediction[100], run.theta[99]
     right = -np.delete(phi[100] * TWO.structure.products(xi), 4).sum()

@@ -104,6 +104,21 @@ def test_intervals_hold_their_level(kind, rho, size):
     assert np.median(width) < 25
 
 
+@pytest.mark.parametrize(("shortest", "pulse"), [(None, 6), (None, 10), (20, 14), (20, 20), (7, 7)])
+def test_no_segment_is_shorter_than_the_shortest(shortest, pulse):
+    """Also where the parameters were moved for a shorter time; intervals then contain the true dates too."""
+    inside = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        ends = np.array([0, pulse]) + 60 + rng.integers(0, 40)
+        y = 3.0 * ((np.arange(200) >= ends[0]) & (np.arange(200) < ends[1])) + rng.normal(size=200)
+        found = segment(y, shortest=shortest)
+        assert min(part.stop - part.start for part in found.segments) >= (shortest or 10)
+        assert all(one.first <= one.date <= one.last for one in found.breaks)
+        inside += [one.first <= end <= one.last for one, end in zip(found.breaks, ends, strict=False)]
+    assert np.mean(inside) > 0.95
+
+
 @pytest.mark.parametrize(("kind", "rho", "most"), [("", 0.0, 3), ("outliers", 0.0, 3), ("", 0.7, 6)])
 def test_a_record_without_breaks_is_seldom_divided(kind, rho, most):
     """At 1 % of eighty, with three standard errors; a few per cent where an autoregression is estimated."""
@@ -178,7 +193,7 @@ def test_dates_beside_which_an_input_rests_are_not_preferred_whatever_the_basis(
 def test_segments_shorter_than_the_correlation_of_the_noise_have_no_standard_errors():
     """A level that the model has no regressor for leaves noise of a long correlation and many short segments."""
     y, u = arx_record(1200, 1)
-    found = segment(y + 9.0 * (np.arange(1200) >= 500), u, ARX(2, 2))
+    found = segment(y + 9.0 * (np.arange(1200) >= 500), u, ARX(2, 2), shortest=10)
     short = [part for part in found.segments if part.stop - part.start - len(found.ar) <= 4]
     assert short
     for part in found.segments:

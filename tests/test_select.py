@@ -197,7 +197,7 @@ def test_orders_and_basis_of_a_hammerstein_wiener_model():
     w, v = np.zeros(400), u + 0.5 * u**2
     for t in range(1, 400):
         w[t] = 0.5 * w[t - 1] + v[t - 1] + 0.02 * rng.normal()
-    candidates = grid(HammersteinWiener, na=1, nb=1, input=[None, Polynomial(2), Polynomial(3)])
+    candidates = grid(HammersteinWiener, na=1, nb=1, inputs=1, input=[None, Polynomial(2), Polynomial(3)])
     selection = select(candidates, w, u, tracker=Kalman(q=1e-8, r=4e-4))
     assert selection.model().input == Polynomial(2)
     run = track(selection.model(), Kalman(q=1e-8, r=4e-4), w, u)

@@ -132,7 +132,7 @@ def test_several_inputs_are_the_regression_they_are_written_as():
     known = run.blocks().of_input(1)[1]
     phi = phi_of(known[147, 1:], y, u, 150)  # with the thresholds known before u_(t-2) came
     assert run.prediction[150] == pytest.approx(-phi @ run.theta[149], rel=1e-12)
-    names = ("a1", "b1[u1]", "b2[u1]", "b1[u2]", "b1[u1]*c2", "b2[u1]*c2", "b1[u1]*c3", "b2[u1]*c3")
+    names = ("A1", "b1[u1]", "b2[u1]", "b1[u2]", "b1[u1]*c2", "b2[u1]*c2", "b1[u1]*c3", "b2[u1]*c3")
     assert run.names == (*names, "b1[u2]*c2", "b1[u2]*c3")
     assert run.blocks().names.c == ("c1[u1]", "c2[u1]", "c3[u1]", "c1[u2]", "c2[u2]", "c3[u2]")
     holes = y.copy(), u.copy()
@@ -143,7 +143,7 @@ def test_several_inputs_are_the_regression_they_are_written_as():
 
 def test_several_inputs_are_the_same_alive_in_lanes_and_saved():
     y, u, _ = record(T=120)
-    model = replace(VALVES, name=("valve", "heat"))
+    model = replace(VALVES, inputs=("valve", "heat"))
     run, live = track(model, K, y, u), Live(model, K)
     for t in range(120):
         live.update(float(y[t]), u[t])
@@ -153,12 +153,15 @@ def test_several_inputs_are_the_same_alive_in_lanes_and_saved():
     assert same(lanes[0].theta, run.theta)
     assert run.names[3] == "b1[heat]"
     assert HammersteinWiener.from_settings(json.loads(json.dumps(model.settings()))) == model
-    one = HammersteinWiener(1, [2], input=[PiecewiseLinear((-0.5, 0.5))], name=["valve"])
-    assert one == HammersteinWiener(1, 2, input=PiecewiseLinear((-0.5, 0.5)), name="valve")
-    assert hash(replace(VALVES, name=["valve", "heat"])) == hash(model)  # a list is a tuple, as for other settings
+    one = HammersteinWiener(1, [2], input=[PiecewiseLinear((-0.5, 0.5))], inputs=["valve"])
+    assert one == HammersteinWiener(1, 2, input=PiecewiseLinear((-0.5, 0.5)), inputs="valve")
+    for given in ({"inputs": 2}, {}):  # as many as u has columns, each with its own curve
+        shared = HammersteinWiener(1, 1, input=PiecewiseLinear((-0.5, 0.5)), **given).bind(2)
+        assert shared.names == HammersteinWiener(1, 1, input=[PiecewiseLinear((-0.5, 0.5))] * 2).names
+    assert hash(replace(VALVES, inputs=["valve", "heat"])) == hash(model)  # a list is a tuple, as for other settings
     for wrong in ("valve", ("valve",), ("valve", "heat", "pump")):
-        with pytest.raises(ValueError, match="a name for each input"):
-            replace(VALVES, name=wrong)
+        with pytest.raises(ValueError, match="imply different numbers"):
+            replace(VALVES, inputs=wrong)
 
 
 def test_several_inputs_in_use():
@@ -175,10 +178,15 @@ def test_several_inputs_in_use():
 
 def test_settings_that_several_inputs_cannot_have_are_refused():
     y, u, _ = record(T=200)
-    with pytest.raises(ValueError, match="has 2 inputs, but u has 1 columns; give input= a list"):
+    with pytest.raises(ValueError, match=r"has 2 inputs \(nb=.* but u has 1 columns"):
         track(VALVES, K, y, u[:, :1])
-    with pytest.raises(ValueError, match="one entry for each input"):
+    with pytest.raises(ValueError, match="imply different numbers of inputs"):
         HammersteinWiener(1, [2, 1], input=[None, None, None])
+    for nothing in ({"inputs": 0}, {"input": []}):
+        with pytest.raises(ValueError, match="inputs must be a whole number of at least 1"):
+            HammersteinWiener(1, 1, **nothing)
+    with pytest.raises(ValueError, match="nb must be a whole number of at least 1"):
+        HammersteinWiener(1, [1, 0])
     with pytest.raises(ValueError, match="one input"):
         fit_constant(VALVES, y, u)
     for basis in (Saturation(1.0), DeadZone(1.0)):

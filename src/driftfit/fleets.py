@@ -44,11 +44,11 @@ class Judged(keyed_results.KeyedResults, Exported):
 
     def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> ManyVerdicts:
         """Which runs have parameters that move, at a false discovery rate of ``level``, and where does tracking pay?"""
-        return verdicts(self._rows(), level, lags, burn)
+        return verdicts(self._rows(), self.by, level, lags, burn)
 
     def diagnose(self) -> ManyDiagnoses:
         """Diagnose every run, and count how often each diagnostic is out of bounds."""
-        return diagnoses(self._rows())
+        return diagnoses(self._rows(), self.by)
 
     def detect(
         self, kind: str = "glr", *, every: float = 10_000.0, level: float = 0.05, reference: Any = None,
@@ -59,7 +59,7 @@ class Judged(keyed_results.KeyedResults, Exported):
         ``level`` is a false discovery rate; ``reference`` is one for all runs or a mapping from every key to its own.
         Kinds and other settings are those of `driftfit.judge.alarms.detect`.
         """
-        return alarms(self._rows(), kind, every=every, level=level, reference=reference, **settings)
+        return alarms(self._rows(), self.by, kind, every=every, level=level, reference=reference, **settings)
 
     def report(
         self, path: str | PathLike[str], title: str | None = None, *, alarms: ManyAlarms | None = None,
@@ -69,7 +69,7 @@ class Judged(keyed_results.KeyedResults, Exported):
 
         ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a separate section.
         """
-        text = page_of_many(self._rows(), title, self.failed, self.dropped, alarms, labels)
+        text = page_of_many(self._rows(), self.by, title, self.failed, self.dropped, alarms, labels)
         check_path(path).write_text(text, encoding="utf-8")
 
     def crossing(

@@ -4,14 +4,18 @@
     result.params, result.bse, result.tvalues, result.conf_int(), result.summary(), result.plot_cusum()
 
 Formulas are those of formulaic (R's and patsy's grammar: interactions, transforms, categories). Rows are in order of
-time. ``params`` are the coefficients after the last row and ``params_path`` those after every row; ``smoothed_path``
-uses the whole sample.
+time; an index of dates labels them. ``params`` are the coefficients after the last row and ``params_path`` those after
+every row; ``smoothed_path`` uses the whole sample.
+
+    fittedvalues_t = x_t' params_(t-1)
+    forecasts_t    = fittedvalues_t + what the tracker expects besides: correlated noise, and the slopes of coefficients
 
 Needs formulaic and pandas (``pip install "driftfit[formula]"``).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
@@ -19,7 +23,9 @@ from typing import TYPE_CHECKING, Any, Self
 import formulaic
 import numpy as np
 import pandas as pd
-from scipy.special import ndtr, ndtri
+from formulaic.materializers import FormulaMaterializer
+from formulaic.utils.null_handling import find_nulls
+from scipy.special import ndtr, stdtr
 
 from driftfit.models.regression import Regression
 from driftfit.results import Track
@@ -64,14 +70,16 @@ class TimeVaryingRegression:
 
     @classmethod
     def from_formula(cls, formula: str, data: Any, tracker: Tracker | None = None) -> Self:
-        """Read a formula such as ``"y ~ x1 + log(x2) + C(region)"``; rows with missing cells are kept.
+        """Read a formula such as ``"y ~ x1 + log(x2) + C(region)"``.
 
-        ValueError for a formula without a left-hand side, or with more than one output.
+        A row in which a number or a category is missing is kept, and is not used. ValueError for a formula without a
+        left-hand side, or with more than one output.
         """
-        matrices = formulaic.model_matrix(formula, data, na_action="ignore")
+        materializer = FormulaMaterializer.for_data(data)(data)
+        matrices = materializer.get_model_matrix(formula, na_action="ignore", output="pandas")
         if not isinstance(matrices, formulaic.ModelMatrices):
             raise ValueError(f"from_formula: {formula!r} has no output; write it as in 'y ~ x1 + x2'.")
-        left, right = pd.DataFrame(matrices.lhs), pd.DataFrame(matrices.rhs)
+        left, right = (_numbers(side, materializer.factor_cache) for side in (matrices.lhs, matrices.rhs))
         if left.shape[1] != 1:
             raise ValueError(f"from_formula: {formula!r} has {left.shape[1]} outputs; a regression has one.")
         return cls(left.iloc[:, 0], right, tracker)
@@ -81,8 +89,8 @@ class TimeVaryingRegression:
         names = [str(name) for name in self.exog.columns if name != _INTERCEPT]
         model = Regression(tuple(names), intercept=_INTERCEPT in self.exog.columns)
         tracker = AdaptiveKalman() if self.tracker is None else self.tracker
-        y, X = self.endog.to_numpy(dtype=float), self.exog.drop(columns=_INTERCEPT, errors="ignore")
-        run = track(model, tracker, y, X.to_numpy(dtype=float) if names else None)
+        X = self.exog.drop(columns=_INTERCEPT, errors="ignore")
+        run = track(model, tracker, self.endog, X if names else None)
         columns = [*names, *([_INTERCEPT] if model.intercept else [])]
         return TimeVaryingResults(run, self.endog, pd.Index(columns))
 
@@ -111,14 +119,25 @@ class TimeVaryingResults:
         return (self.params / self.bse).rename("tvalues")
 
     @property
+    def df_resid(self) -> float:
+        """Number of residuals from which the tracker estimates the noise variance: ``tvalues`` have Student's
+        distribution with as many degrees of freedom. inf if the variance is given, or has a distribution that the
+        standard errors include: theirs is normal.
+        """
+        return float(self.run.state["count"]) if self.run.tracker.learns_noise else np.inf
+
+    @property
     def pvalues(self) -> pd.Series:
-        """Two-sided p-values of "this coefficient is zero now", from the normal distribution, (k,)."""
-        return (2 * (1 - pd.Series(ndtr(self.tvalues.abs()), self.names))).rename("pvalues")
+        """Two-sided p-values of "this coefficient is zero now", (k,), from the distribution of ``df_resid``."""
+        far = -self.tvalues.abs()
+        tail = stdtr(self.df_resid, far) if np.isfinite(self.df_resid) else ndtr(far)
+        return pd.Series(2.0 * tail, self.names, name="pvalues")
 
     def conf_int(self, alpha: float = 0.05) -> pd.DataFrame:
-        """Limits of the 1 - alpha confidence interval of every coefficient after the last row, columns 0 and 1."""
-        half = float(ndtri(1 - alpha / 2)) * self.bse
-        return pd.DataFrame({0: self.params - half, 1: self.params + half})
+        """Limits of the 1 - alpha confidence interval of every coefficient after the last row, columns 0 and 1, from
+        the same distribution.
+        """
+        return pd.DataFrame({side: path[-1] for side, path in enumerate(self.run.band(1.0 - alpha))}, self.names)
 
     @property
     def params_path(self) -> pd.DataFrame:
@@ -137,13 +156,25 @@ class TimeVaryingResults:
 
     @property
     def fittedvalues(self) -> pd.Series:
-        """One-step predictions, (T,): of each row from those before it."""
-        return pd.Series(self.run.prediction, self.endog.index, name="fittedvalues")
+        """x_t' params_(t-1), (T,): the regressors of each row times the coefficients after the row before."""
+        before = np.concatenate([self.run.fresh()["theta"][..., 0], self.run.theta[:-1]])
+        X = np.column_stack([self.run.u, np.ones(len(self.run))])[:, : len(self.names)]
+        return pd.Series(np.sum(X * before, axis=1), self.endog.index, name="fittedvalues")
 
     @property
     def resid(self) -> pd.Series:
-        """One-step prediction errors, (T,)."""
-        return pd.Series(self.run.innovation, self.endog.index, name="resid")
+        """Outputs minus ``fittedvalues``, (T,)."""
+        return (self.endog - self.fittedvalues).rename("resid")
+
+    @property
+    def forecasts(self) -> pd.Series:
+        """One-step predictions of the tracker, (T,): of each row from those before it."""
+        return pd.Series(self.run.prediction, self.endog.index, name="forecasts")
+
+    @property
+    def forecasts_error(self) -> pd.Series:
+        """One-step prediction errors, (T,): outputs minus ``forecasts``."""
+        return pd.Series(self.run.innovation, self.endog.index, name="forecasts_error")
 
     @property
     def llf(self) -> float:
@@ -238,14 +269,19 @@ class TimeVaryingResults:
     def summary(self, alpha: float = 0.05) -> CoefficientTable:
         """The table of coefficients after the last row, as text, HTML or LaTeX."""
         limits = self.conf_int(alpha)
+        t = "t" if np.isfinite(self.df_resid) else "z"
         table = pd.DataFrame({
-            "coef": self.params, "std err": self.bse, "z": self.tvalues, "P>|z|": self.pvalues,
+            "coef": self.params, "std err": self.bse, t: self.tvalues, f"P>|{t}|": self.pvalues,
             f"[{alpha / 2:g}": limits[0], f"{1 - alpha / 2:g}]": limits[1],
         })  # fmt: skip
         facts = {
             "Dep. Variable": str(self.endog.name), "Tracker": repr(self.run.tracker), "Model": repr(self.run.model),
-            "No. Observations": str(self.nobs), "Log-Likelihood": f"{self.llf:.3f}",
+            "No. Observations": str(self.nobs), "Df Residuals": f"{self.df_resid:g}",
+            "Log-Likelihood": f"{self.llf:.3f}",
         }  # fmt: skip
+        apart = float(np.sqrt(np.mean((self.forecasts - self.fittedvalues)[self.run.ok] ** 2)))
+        if apart > 1e-9 * float(np.sqrt(np.mean(self.run.y[self.run.ok] ** 2))):
+            facts["Forecasts"] = f"fittedvalues, and correlated noise or slopes ({apart:.4g}, root mean square)"
         return CoefficientTable(facts, table)
 
 
@@ -284,6 +320,17 @@ class CoefficientTable:
 
     def _repr_html_(self) -> str:
         return self.as_html()
+
+
+def _numbers(side: Any, factors: Mapping[str, Any]) -> pd.DataFrame:
+    """A side of a formula as numbers, NaN in all columns of a row in which one of its factors is missing.
+
+    A missing category would otherwise be in no column, and so be the reference level.
+    """
+    table = pd.DataFrame(side).astype(float)
+    missing = set().union(*(find_nulls(factors[factor.expr].values) for factor in side.model_spec.factors))
+    table.iloc[sorted(missing)] = np.nan
+    return table
 
 
 def _escaped(text: str) -> str:

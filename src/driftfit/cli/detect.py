@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import polars as pl
 import typer
 from rich.text import Text
 
@@ -16,7 +15,6 @@ from driftfit.cli.parts.program import app, say
 from driftfit.cli.parts.reading import interval_from, moment
 from driftfit.cli.track import Plot, Report
 from driftfit.engine.settings import marks
-from driftfit.judge.alarms.detect import Alarms
 from driftfit.results import Track
 from driftfit.show.report import check_path
 
@@ -74,7 +72,8 @@ def detect(
         found = f" Labels: {score.found} of {score.events} found{late};"
         say(Text(f"{found} {score.false} false alarms in {score.normal} normal samples."), soft_wrap=True)
     if write_to is not None:
-        _write(alarms, write_to)
+        found = alarms.table
+        found.write_csv(write_to) if write_to.suffix.lower() == ".csv" else found.write_parquet(write_to)
     if plot is not None:
         if not isinstance(run, Track):
             raise ValueError("--plot: alarms are drawn for one series; use --report for a fleet.")
@@ -105,22 +104,3 @@ def _band(entry: str) -> tuple[str, tuple[float, float]]:
         return name.strip(), (float(low or "-inf"), float(high or "inf"))
     except ValueError:
         raise ValueError(f"--reference {entry}: give a band as name=low:high.") from None
-
-
-def _write(alarms: Any, path: Path) -> None:
-    table = _table(alarms) if isinstance(alarms, Alarms) else alarms.table
-    table.write_csv(path) if path.suffix.lower() == ".csv" else table.write_parquet(path)
-
-
-def _table(alarms: Alarms) -> pl.DataFrame:
-    """One row per alarm."""
-    places = [int(t) for t in alarms.onsets]
-    names = [alarms.names.index(alarms.cause(t)) for t in places]
-    spans = [alarms.span(t) for t in places]
-    columns = {
-        "from": [first for first, _ in spans], "to": [last for _, last in spans],
-        "cause": [alarms.names[j] for j in names],
-        "statistic": [float(alarms.statistic[t, j]) for t, j in zip(places, names, strict=True)],
-        "limit": [float(alarms.limits[j]) for j in names],
-    }  # fmt: skip
-    return pl.DataFrame(columns, schema_overrides=dict.fromkeys(("from", "to", "cause"), pl.String))

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from driftfit.judge.cores.on_all_cores import on_all_cores
 from driftfit.judge.diagnose import Diagnosis, diagnose, diagnosis
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.verdict import Verdict, change, judged, p_text, verdict
+from driftfit.run.keyed_results import table_by_key
 from driftfit.show.parts.text import Printed, key_text, table_of
 
 if TYPE_CHECKING:
@@ -47,14 +48,17 @@ def discoveries(p: Array) -> Array:
 
 @dataclass(frozen=True)
 class Judgement:
-    """One run among many: its verdict, and the q-values of "the parameters move" and of "tracking them pays"."""
+    """One run among many: its verdict, and the q-values of "the parameters move" and of "tracking them pays".
+
+    ``drifts`` and ``pays`` are None where this was not tested.
+    """
 
     key: Hashable
     verdict: Verdict
     q: float
     q_pays: float
-    drifts: bool
-    pays: bool
+    drifts: bool | None
+    pays: bool | None
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -100,10 +104,13 @@ class ManyVerdicts(Printed):
         The clearest first; runs that cannot be tested come last.
     level : float
         False discovery rate.
+    by : tuple of str
+        Names of the parts of a key.
     """
 
     rows: tuple[Judgement, ...]
     level: float
+    by: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -121,7 +128,7 @@ class ManyVerdicts(Printed):
         clear = sorted(self.rows, key=lambda row: (np.isnan(row.q), row.verdict.p, -row.verdict.statistic))
         if by == "change":
             clear.sort(key=lambda row: -row.relative)
-        return ManyVerdicts(tuple(clear), self.level)
+        return replace(self, rows=tuple(clear))
 
     @property
     def drifting(self) -> tuple[Hashable, ...]:
@@ -132,12 +139,13 @@ class ManyVerdicts(Printed):
     def sentences(self) -> tuple[str, ...]:
         """The verdict in sentences."""
         tested, paying = (int(np.isfinite([getattr(row, q) for row in self.rows]).sum()) for q in ("q", "q_pays"))
-        drifting, pays = len(self.drifting), sum(row.pays for row in self.rows)
+        drifting, pays = len(self.drifting), sum(bool(row.pays) for row in self.rows)
         found = (
-            f"Parameters move in {drifting} of {tested}; at most {100.0 * self.level:g} % of those are constant, on "
-            "average (false discovery rate)."
+            f"Parameters move in {drifting} of {tested}, those whose q is below {self.level:g}: at most "
+            f"{100.0 * self.level:g} % of them are constant, on average (false discovery rate)."
             if drifting
-            else f"No drift is found in any of {tested}. A drift much smaller than the noise cannot be ruled out."
+            else f"No drift is found in any of {tested}: no q is below {self.level:g} (false discovery rate). A drift "
+            "much smaller than the noise cannot be ruled out."
             if tested
             else ""
         )
@@ -155,12 +163,15 @@ class ManyVerdicts(Printed):
 
     @property
     def table(self) -> Any:
-        """One row per run, as a polars table."""
-        import polars
+        """One row per run, as a polars table that joins to others by the columns of its keys.
 
-        return polars.DataFrame(
+        ``drifts`` and ``pays`` are null where this was not tested; ``untested`` is the reason.
+        """
+        return table_by_key(
+            self.by,
+            [row.key for row in self.rows],
+            [1] * len(self.rows),
             {
-                "key": [key_text(row.key) for row in self.rows],
                 "p": [row.verdict.p for row in self.rows],
                 "q": [row.q for row in self.rows],
                 "drifts": [row.drifts for row in self.rows],
@@ -171,7 +182,8 @@ class ManyVerdicts(Printed):
                 "constant_ls": [row.verdict.rivals[1].rms for row in self.rows],
                 "pays": [row.pays for row in self.rows],
                 "samples": [row.verdict.samples for row in self.rows],
-            }
+                "untested": [row.verdict.untested for row in self.rows],
+            },
         )
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -196,9 +208,12 @@ class ManyDiagnoses(Printed):
     ----------
     of : dict
         The Diagnosis of every run, by key.
+    by : tuple of str
+        Names of the parts of a key.
     """
 
     of: dict[Hashable, Diagnosis] = field(repr=False)
+    by: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.of)
@@ -238,11 +253,10 @@ class ManyDiagnoses(Printed):
     @property
     def table(self) -> Any:
         """One row per run with every number, as a polars table."""
-        import polars
-
-        rows = [{"key": key_text(key)} | {c.name: c.value for c in one.checks} for key, one in self.of.items()]
-        out = [len(one.sentences) for one in self.of.values()]
-        return polars.DataFrame(rows, infer_schema_length=None).with_columns(polars.Series("out_of_bounds", out))
+        values = [{check.name: check.value for check in one.checks} for one in self.of.values()]
+        columns: dict[str, list[Any]] = {name: [row.get(name) for row in values] for name in self.counts}
+        columns["out_of_bounds"] = [len(one.sentences) for one in self.of.values()]
+        return table_by_key(self.by, self.of, [1] * len(values), columns)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         table = table_of("Out of bounds", "", "runs", "of")
@@ -257,18 +271,19 @@ class ManyDiagnoses(Printed):
 
 
 def verdicts(
-    runs: Mapping[Hashable, Track], level: float, lags: int | None = None, burn: int | None = None
+    runs: Mapping[Hashable, Track], by: tuple[str, ...], level: float, lags: int | None = None, burn: int | None = None
 ) -> ManyVerdicts:
-    """Judge runs by key; see `driftfit.judge.verdict.verdict` for the settings and errors."""
-    return ranked(on_all_cores(runs, lambda key: (runs[key], level, lags, burn), verdict, "verdict"), level)
+    """Judge runs by key, whose parts ``by`` names; see `driftfit.judge.verdict.verdict` for the settings and errors."""
+    return ranked(on_all_cores(runs, lambda key: (runs[key], level, lags, burn), verdict, "verdict"), by, level)
 
 
-def verdicts_and_diagnoses(runs: Mapping[Hashable, Track], level: float) -> tuple[ManyVerdicts, ManyDiagnoses]:
+def verdicts_and_diagnoses(
+    runs: Mapping[Hashable, Track], by: tuple[str, ...], level: float
+) -> tuple[ManyVerdicts, ManyDiagnoses]:
     """The verdicts and the diagnoses, which share the test of constancy of each run."""
     pairs = on_all_cores(runs, lambda key: (runs[key], level), _both, "report")
-    return ranked({key: one for key, (one, _) in pairs.items()}, level), ManyDiagnoses(
-        {k: d for k, (_, d) in pairs.items()}
-    )
+    judgements = ranked({key: one for key, (one, _) in pairs.items()}, by, level)
+    return judgements, ManyDiagnoses({key: health for key, (_, health) in pairs.items()}, by)
 
 
 def _both(run: Track, level: float) -> tuple[Verdict, Diagnosis]:
@@ -276,18 +291,18 @@ def _both(run: Track, level: float) -> tuple[Verdict, Diagnosis]:
     return judged(known, level), diagnosis(known)
 
 
-def ranked(verdicts: Mapping[Hashable, Verdict], level: float) -> ManyVerdicts:
+def ranked(verdicts: Mapping[Hashable, Verdict], by: tuple[str, ...], level: float) -> ManyVerdicts:
     """Verdicts by key with their q-values, the clearest first."""
     q, q_pays = (
         discoveries(np.array(p)) for p in ([v.p for v in verdicts.values()], [v.constants.p for v in verdicts.values()])
     )
     rows = [
-        Judgement(key, one, float(a), float(b), bool(a < level), bool(b < level))
+        Judgement(key, one, float(a), float(b), *(None if np.isnan(value) else bool(value < level) for value in (a, b)))
         for (key, one), a, b in zip(verdicts.items(), q, q_pays, strict=True)
     ]
-    return ManyVerdicts(tuple(rows), level).ranked("clearest")
+    return ManyVerdicts(tuple(rows), level, by).ranked("clearest")
 
 
-def diagnoses(runs: Mapping[Hashable, Track]) -> ManyDiagnoses:
+def diagnoses(runs: Mapping[Hashable, Track], by: tuple[str, ...]) -> ManyDiagnoses:
     """Diagnose runs by key."""
-    return ManyDiagnoses(on_all_cores(runs, lambda key: (runs[key],), diagnose, "diagnosis"))
+    return ManyDiagnoses(on_all_cores(runs, lambda key: (runs[key],), diagnose, "diagnosis"), by)

@@ -3,7 +3,8 @@
     y_t = sum_{i=1..na} a_i y_{t-i} + sum_{inputs} sum_{j=1..nb} b_j u_{t-nk-j+1} (+ c) + v_t
     phi_t = [y_{t-1} .. y_{t-na}, u1_{t-nk} .. u1_{t-nk-nb+1}, u2 ..., (1)],   theta_t = [a_1 .., b_1 .., (c)]
 
-The signs of a are those of the regression; MATLAB's polynomials A(z) have the opposite sign (`polynomials` converts).
+The signs of a are those of the regression; the field's polynomial A(z) = 1 + A_1 z^-1 + .. has the opposite signs
+(`polynomials` converts).
 With nk = 0 the present input is used. The model stores its own lags, so you never build a design matrix.
 
 Missing outputs: the lag is filled with the model's own prediction, if that has a finite variance, for at most ``na``
@@ -195,7 +196,7 @@ class ARX(CountedInputs):
         return response
 
     def polynomials(self, theta: Array) -> tuple[Array, list[Array]]:
-        """A(z) = [1, -a_1, ..] and, per input, B(z) = [0 (nk times), b_1, ..], in powers of z^-1.
+        """A(z) = [1, A_1, ..], A_i = -a_i, and, per input, B(z) = [0 (nk times), b_1, ..], in powers of z^-1.
 
         ``theta`` is (n,) or (..., n); the polynomials have their coefficients on the last axis.
         """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Self
 from warnings import warn
@@ -32,6 +32,8 @@ class CountedInputs(Model):
     """Settings, such as orders and delays, that are one whole number or a sequence with one for each input."""
     fewest: ClassVar[int] = 0
     """The smallest number of inputs."""
+    lowest: ClassVar[Mapping[str, int]] = {}
+    """The smallest value of settings `per_input` for which it is not 0."""
 
     @property
     def _given(self) -> int | tuple[str, ...] | None:
@@ -53,7 +55,7 @@ class CountedInputs(Model):
         elif given is not None:
             self._set(setting, input_names(kind, setting, (given,) if isinstance(given, str) else given))
         elif len(counts) == 1:
-            self._set(setting, next(iter(counts)))
+            self._set(setting, whole(kind, setting, next(iter(counts)), self.fewest))
         elif not counts and getattr(self, "nb", None) == 0:
             self._set(setting, 0)
         if len(counts | (set() if self._given is None else {self.m})) > 1:
@@ -61,12 +63,12 @@ class CountedInputs(Model):
 
     def _check_per_input(self, name: str) -> int | None:
         """Normalise a setting that may have an entry for each input; returns how many it has."""
-        kind, value = type(self).__name__, getattr(self, name)
+        kind, value, lowest = type(self).__name__, getattr(self, name), self.lowest.get(name, 0)
         if not isinstance(value, Sequence | np.ndarray):
-            self._set(name, whole(kind, name, value, 0))
+            self._set(name, whole(kind, name, value, lowest))
             return None
         entries = (int(one) if isinstance(one, float) and one.is_integer() else one for one in value)
-        self._set(name, tuple(whole(kind, name, one, 0) for one in entries))
+        self._set(name, tuple(whole(kind, name, one, lowest) for one in entries))
         return len(value)
 
     @property
@@ -80,7 +82,7 @@ class CountedInputs(Model):
         kind, setting, given = type(self).__name__, self.inputs_setting, self._given
         count = inputs if isinstance(inputs, int) else len(inputs)
         if given is None and count < (1 if self.per_input else self.fewest):
-            without = ", or nb=0" if "nb" in self.per_input else ""
+            without = ", or nb=0" if "nb" in self.per_input and "nb" not in self.lowest else ""
             raise ValueError(
                 f"{kind}: a model with {self._numbers_of_inputs} needs at least 1 input, but there is no u; give "
                 f"u{without}."
@@ -110,7 +112,7 @@ class CountedInputs(Model):
             return tuple(f"[{name}]" for name in self.input_names)
         return tuple(f"[u{j + 1}]" for j in range(self.m)) if self.m > 1 else ("",) * self.m
 
-    def for_each_input(self, setting: str) -> tuple[int, ...]:
+    def for_each_input(self, setting: str) -> tuple[Any, ...]:
         """A setting `per_input`, with an entry for every input."""
         value = getattr(self, setting)
         return value if isinstance(value, tuple) else (value,) * self.m

@@ -7,10 +7,10 @@ copies, and their files.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Iterator, KeysView, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, KeysView, Mapping, Sequence
 from dataclasses import asdict
 from os import PathLike
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from driftfit.run.program import Program, State, kept, programs_of, state_of
 from driftfit.run.public_class import Plain
 from driftfit.run.result import Lane, Lanes, Track, names_of
 from driftfit.trackers.base import Tracker
+
+if TYPE_CHECKING:
+    import polars
 
 
 class KeyedResults(Plain):
@@ -206,6 +209,21 @@ class KeyedResults(Plain):
                 lane_number, _, field = name.removeprefix("start").partition("_")
                 starts.setdefault(int(lane_number), {})[field] = arrays[name]
         return cls(programs, records, lanes, failed, starts)
+
+
+def table_by_key(
+    by: Sequence[str], keys: Iterable[Hashable], often: Sequence[int], columns: Mapping[str, Any]
+) -> polars.DataFrame:
+    """Columns beside the keys, key k in ``often[k]`` rows: each part under its name in ``by``, and of its own type.
+
+    A column that is called like a part of the key has "_" after its name.
+    """
+    import polars
+
+    parts = [key if isinstance(key, tuple) else (key,) for key in keys]
+    rows = np.repeat(np.arange(len(parts)), often)
+    table = {name: polars.Series([part[place] for part in parts]).gather(rows) for place, name in enumerate(by)}
+    return polars.DataFrame(table | {f"{name}_" if name in table else name: one for name, one in columns.items()})
 
 
 def _key(value: Any) -> Any:

@@ -73,8 +73,8 @@ class End(NamedTuple):
 
 
 ABSENT: Mapping[str, Any] = {
-    "dt": None, "zone": None, "limits": None, "last": None, "ignored": 0, "lag": 0, "awaits": 0, "cold": False,
-    "windows": (), "alarms": (),
+    "dt": None, "zone": None, "limits": None, "last": None, "samples": 0, "ignored": 0, "lag": 0, "awaits": 0,
+    "cold": False, "windows": (), "alarms": (),
 }  # fmt: skip
 """Values that are not written for a stream, because they are the default."""
 

@@ -21,7 +21,7 @@ from driftfit.data.clock import Clock
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import of_series, one_of
 from driftfit.run.fleet import Fleet
-from driftfit.run.keyed_results import KeyedResults
+from driftfit.run.keyed_results import KeyedResults, table_by_key
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
 from driftfit.trackers.base import Tracker
@@ -41,15 +41,10 @@ def as_table(result: Result, arrays: bool = False) -> pl.DataFrame:
     if not records:
         assert isinstance(result, Fleet)
         return _of_nothing(result, arrays)
-    columns: dict[str, Any] = {}
-    lengths = [len(one) for one in records]
-    for place, name in enumerate(result.records.labels.by if isinstance(result, Fleet) else ()):
-        values = [key[place] if isinstance(key, tuple) else key for key in keys]
-        columns[name] = pl.Series(values).gather(np.repeat(np.arange(len(records)), lengths))
     signals = [_of_track(one, arrays) if _is_single(one) else _of_outputs(one, arrays) for one in records]
-    for name in signals[0]:
-        columns[name if name not in columns else f"{name}_"] = np.concatenate([part[name] for part in signals])
-    table = pl.DataFrame(columns)
+    columns = {name: np.concatenate([part[name] for part in signals]) for name in signals[0]}
+    by = result.labels.by if isinstance(result, Fleet) else ()
+    table = table_by_key(by, keys, [len(one) for one in records], columns)
     zone, time = records[0].labels.zone, _time_name(records[0])
     if zone is not None:
         table = table.with_columns(pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(zone))
@@ -98,12 +93,12 @@ def _of_nothing(fleet: Fleet, arrays: bool) -> pl.DataFrame:
 
 
 def _records(result: Result) -> tuple[list[Single], list[Any]]:
-    """(records, keys); no keys for a single one."""
+    """(records, keys); the key of a single one has no parts."""
     if isinstance(result, Fleet):
         found = result.series()
         return list(found.values()), list(found)
     assert isinstance(result, Track | Outputs)
-    return [result], []
+    return [result], [()]
 
 
 def _time_name(run: Single) -> str:

@@ -100,15 +100,8 @@ def _score(alarms: Alarms, wrong: Array | None) -> str:
 
 
 def _alarms(alarms: Alarms) -> str:
-    rows = []
-    for t in alarms.onsets:
-        cause = alarms.cause(int(t))
-        j = alarms.names.index(cause)
-        first, last = alarms.span(int(t))
-        numbers = f"{alarms.statistic[t, j]:.4g}", f"{alarms.limits[j]:.4g}"
-        rows.append((escape(first), escape(last), escape(cause), *numbers))
-    heads = ("from", "to", "cause", "statistic", "limit")
-    return table(f"Alarms.{_more(rows)}", heads, rows[:LISTED], (1, 2))
+    rows = [tuple(map(escape, alarms.cells(int(t)))) for t in alarms.onsets]
+    return table(f"Alarms.{_more(rows)}", alarms.heads, rows[:LISTED], (1, 2))
 
 
 def _more(rows: Sequence[tuple[str, ...]]) -> str:

@@ -40,18 +40,19 @@ among all series with a q this small or smaller (false discovery rate).</p>"""
 
 def page_of_many(
     runs: Mapping[Hashable, Track],
+    by: tuple[str, ...],
     title: str | None,
     failed: Mapping[Hashable, str],
     dropped: Mapping[str, int],
     alarms: ManyAlarms | None = None,
     labels: Mapping[Hashable, Array] | None = None,
 ) -> str:
-    """The page as HTML text; ``failed`` gives the reasons of missing results and ``dropped`` counts the rows that are
-    left out, by reason; ``labels`` by key are true for faults.
+    """The page as HTML text; ``by`` names the parts of a key, ``failed`` gives the reasons of missing results,
+    ``dropped`` counts the rows that are left out, by reason; ``labels`` by key are true for faults.
     """
     if not runs:
         raise ValueError("report: no series has a result to report.")
-    verdicts, health = verdicts_and_diagnoses(runs, LEVEL)
+    verdicts, health = verdicts_and_diagnoses(runs, by, LEVEL)
     heading = title or (", ".join(map(key_text, runs)) if len(runs) < NAMED else f"{len(runs)} series")
     samples, used = sum(map(len, runs.values())), sum(int(run.ok.sum()) for run in runs.values())
     counted = f"{len(runs)} series, {samples} samples, {used} used, {samples - used} skipped"

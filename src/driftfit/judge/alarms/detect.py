@@ -71,6 +71,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+ROW = {"from": str, "to": str, "cause": str, "statistic": float, "limit": float}
+OF_CHANGE = {"size": float, "low": float, "high": float, "since": str}
+"""Columns of `Alarms.table` with their types; the second are those of alarms with a frozen reference model."""
+
 FAR = 2.5
 """The real rate is printed if false alarms may be this many times as frequent as set."""
 
@@ -171,6 +175,37 @@ class Alarms(Printed):
         """First and last time of the alarm that began at t."""
         return self.run.time_text(t), self.run.time_text(self._end(t) - 1)
 
+    def row(self, t: int) -> tuple[Any, ...]:
+        """The alarm that began at t as a row of `table`."""
+        j, change = self.rule.cause(self.statistic[t]), self.change(t)
+        row = (*self.span(t), self.cause(t), float(self.statistic[t, j]), float(self.rule.limits[j]))
+        return row if change is None else (*row, *change[1:4], self.run.time_text(change.since))
+
+    @property
+    def table(self) -> Any:
+        """One row per alarm, as a polars table: ``from``, ``to``, ``cause``, and the ``statistic`` that is furthest
+        beyond its ``limit``; for "glr" and "cusum" also ``size``, ``low``, ``high`` and ``since`` of `change`.
+        """
+        import polars
+
+        columns = ROW | (OF_CHANGE if self.kind in FROZEN else {})
+        return polars.DataFrame([self.row(int(t)) for t in self.onsets], columns, orient="row")
+
+    @property
+    def heads(self) -> tuple[str, ...]:
+        """Heads of `cells`."""
+        return (*ROW, *(("size", "+-", "since") if self.kind in FROZEN else ()))
+
+    def cells(self, t: int) -> tuple[str, ...]:
+        """The alarm that began at t in text, as results print it."""
+        first, last, cause, *numbers = self.row(t)
+        statistic, limit = (value_text(self.kind, number) for number in numbers[:2])
+        sizes: tuple[str, ...] = ()
+        if self.kind in FROZEN:
+            size, low, high, since = numbers[2:]
+            sizes = (f"{size:.3g}", f"{0.5 * (high - low):.2g}", since)
+        return (first, last, cause, statistic, limit, *sizes)
+
     def _end(self, t: int) -> int:
         """The sample after the alarm that began at t."""
         return t + int(np.argmin(np.append(self.active[t:], False)))
@@ -194,15 +229,9 @@ class Alarms(Printed):
             ("Alarms", f"{len(self.onsets)}"),
             *([] if np.isnan(self.p) else [("p-value", f"{p_text(self.p)} {chance}")]),
         )
-        sizes = ("size", "+-", "since") if self.kind in FROZEN else ()
-        table = table_of("Alarms", "from", "to", "cause", "statistic", "limit", *sizes, names=3)
+        table = table_of("Alarms", *self.heads, names=3)
         for t in map(int, self.onsets[:20]):
-            j, change = self.rule.cause(self.statistic[t]), self.change(t)
-            cells = [value_text(self.kind, self.statistic[t, j]), self.rule.limit_text(j)]
-            if change is not None:
-                half = 0.5 * (change.high - change.low)
-                cells += [f"{change.size:.3g}", f"{half:.2g}", self.run.time_text(change.since)]
-            table.add_row(*self.span(t), Text(self.cause(t)), *cells)
+            table.add_row(*map(Text, self.cells(t)))
         yield table
         if len(self.onsets) > 20:
             yield Text(f" and {len(self.onsets) - 20} more", "dim")

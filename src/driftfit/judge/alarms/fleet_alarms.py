@@ -37,6 +37,7 @@ from driftfit.judge.alarms.groups import Look, chance, in_doubt, look, with_limi
 from driftfit.judge.cores.on_all_cores import on_all_cores
 from driftfit.judge.fleet_verdict import SHOWN, discoveries
 from driftfit.judge.verdict import p_text
+from driftfit.run.keyed_results import table_by_key
 from driftfit.run.live.rule import FROZEN, AlarmRule
 from driftfit.show.parts.text import Printed, facts, key_text, table_of
 
@@ -79,6 +80,8 @@ class ManyAlarms(Printed):
         False discovery rate.
     failed : dict
         Reasons why some could not be judged.
+    by : tuple of str
+        Names of the parts of a key.
     """
 
     rows: tuple[Watch, ...]
@@ -86,6 +89,7 @@ class ManyAlarms(Printed):
     every: float
     level: float
     failed: dict[Hashable, str] = field(repr=False)
+    by: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -113,19 +117,14 @@ class ManyAlarms(Printed):
 
     @property
     def table(self) -> Any:
-        """One row per alarm, as a polars table."""
+        """One row per alarm, as a polars table: the key, the columns of `Alarms.table`, and p, q, faulty."""
         import polars
 
-        columns: dict[str, list[Any]] = {name: [] for name in ("key", "from", "to", "cause", "p", "q", "faulty")}
-        for row in self.rows:
-            if not row.onsets:
-                continue
-            alarms = row.alarms
-            for t in row.onsets:
-                cells = (key_text(row.key), *alarms.span(t), alarms.cause(t), alarms.p, row.q, row.faulty)
-                for column, cell in zip(columns.values(), cells, strict=True):
-                    column.append(cell)
-        return polars.DataFrame(columns, strict=False)
+        begun = [row for row in self.rows if row.onsets]
+        alarms = polars.concat((row.alarms.table for row in begun or self.rows[:1]), how="diagonal")
+        often = [len(row.onsets) for row in self.rows]
+        series = {name: np.repeat([getattr(row, name) for row in self.rows], often) for name in ("p", "q", "faulty")}
+        return table_by_key(self.by, [row.key for row in self.rows], often, alarms.to_dict() | series)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         begun = sum(len(row.onsets) for row in self.rows)
@@ -149,9 +148,12 @@ class ManyAlarms(Printed):
 
 
 def alarms(
-    runs: Mapping[Hashable, Track], kind: str, *, every: float, level: float, reference: Any, **settings: Any
-) -> ManyAlarms:
-    """Watch runs by key; ``reference`` is the same for all, or a mapping from every key to its own."""
+    runs: Mapping[Hashable, Track], by: tuple[str, ...], kind: str, *, every: float, level: float, reference: Any,
+    **settings: Any,
+) -> ManyAlarms:  # fmt: skip
+    """Watch runs by key, whose parts ``by`` names; ``reference`` is the same for all, or a mapping from every key to
+    its own.
+    """
     if not runs:
         raise ValueError("detect: no series has a result to watch.")
     level = numbers("detect", "level", level, ndim=0)
@@ -179,7 +181,7 @@ def alarms(
         Watch(key, runs[key], *one, float(a), bool(a < level)) for (key, one), a in zip(good.items(), q, strict=True)
     ]
     rows.sort(key=lambda row: (np.isnan(row.q), row.p))
-    return ManyAlarms(tuple(rows), kind, float(every), level, {key: str(error) for key, error in errors.items()})
+    return ManyAlarms(tuple(rows), kind, float(every), level, {key: str(error) for key, error in errors.items()}, by)
 
 
 class Judged(NamedTuple):

@@ -110,7 +110,11 @@ def smallest(loglik: Array, level: float) -> tuple[int, int]:
 def dated(
     X: Array, y: Array, ar: Array, breaks: list[int], least: int, level: float
 ) -> tuple[list[int], list[tuple[int, int]]]:
-    """The most likely dates, each between its neighbours until all are stable, and intervals of ``level``."""
+    """The most likely dates, each between its neighbours until all are stable, and intervals of ``level``.
+
+    A date is at least ``least`` rows away from its neighbours. Its interval may reach nearer to them, because they are
+    uncertain too.
+    """
     breaks, spans = list(breaks), [(b, b) for b in breaks]
     for _ in range(SWEEPS):
         before = list(breaks)
@@ -118,9 +122,10 @@ def dated(
             a, b = ([0, *breaks][k], [*breaks, len(y)][k + 1])
             low, high = min(max(least // 2, len(ar) + 1), (b - a) // 3), max((b - a) - least // 2, (b - a) * 2 // 3)
             loglik = date_loglik(X[a:b], y[a:b], ar, low, high)
-            breaks[k] = a + low + int(np.argmax(loglik))
-            first, last = smallest(loglik, level)
-            spans[k] = (a + low + first, a + low + last)
+            first, last = (a + low + place for place in smallest(loglik, level))
+            nearest = max(least, low)
+            breaks[k] = a + nearest + int(np.argmax(loglik[nearest - low : b - a - least - low + 1]))
+            spans[k] = min(first, breaks[k]), max(last, breaks[k])
         if breaks == before:
             break
     return breaks, spans

@@ -4,9 +4,10 @@
 
     A(s) = s^n + a_1 s^(n-1) + .. + a_n,      B_j(s) = b_1 s^nz + .. + b_(nz+1),   nz < n
 
-for inputs that are held between samples; parameters are in the unit of time of ``dt`` (seconds), also where samples are
-uneven or jittered. With L = 1 / A', a filter at the point theta' of the linearisation, there is a regression for every
-sample without a derivative of a measured signal,
+for inputs that are held between samples. Parameters are in the unit of time of ``dt`` (seconds), also where samples are
+uneven or jittered; the a_i are named A1, A2, .., since a1, a2 are coefficients of a regression, with the opposite sign.
+With L = 1 / A', a filter at the point theta' of the linearisation, there is a regression for every sample without a
+derivative of a measured signal,
 
     y - A' y_f = -sum_i a_i s^(n-i) y_f + sum_i b_i s^(nz+1-i) u_f + A y_f,      y_f = L y,  u_f = L u
 
@@ -119,7 +120,7 @@ class ContinuousTransfer(LinearisedTransfer):
 
     @property
     def names(self) -> tuple[str, ...]:
-        names = [f"a{i + 1}" for i in range(self.poles)]
+        names = [f"A{i + 1}" for i in range(self.poles)]
         names += [f"b{i + 1}{u}" for u in self.suffixes for i in range(self.zeros + 1)]
         return (*names, "offset") if self.offset else tuple(names)
 

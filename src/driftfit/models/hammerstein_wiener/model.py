@@ -24,11 +24,11 @@ The prediction of a run is of y, through the inverted output block; innovation, 
 equation error, with the Jacobian F'(y_t) in the likelihood, since phi_t contains y_t. Nothing is filled in: a missing
 output makes the samples t .. t + na unusable, a missing input t + nk .. t + nk + nb - 1.
 
-The signs of a are those of polynomials A(z) = 1 + a_1 z^-1 + ..; `ARX` has the opposite signs. Use this model if one or
-both curves matter; for a linear system use `ARX`. Least squares is consistent only for data without measurement noise,
-because phi contains y. ``output_noise`` weights samples by the effect of noise of that standard deviation on the
-equation, which lowers the variance but not the bias; `driftfit.models.hammerstein_wiener.trackers.output_error` has
-neither problem.
+The a_i are those of the field's polynomial A(z) = 1 + a_1 z^-1 + .., and are named A1, A2, ..; `ARX` has the opposite
+signs, and the names a1, a2. Use this model if one or both curves matter; for a linear system use `ARX`. Least squares
+is consistent only for data without measurement noise, because phi contains y. ``output_noise`` weights samples by the
+effect of noise of that standard deviation on the equation, which lowers the variance but not the bias;
+`driftfit.models.hammerstein_wiener.trackers.output_error` has neither problem.
 
 Source: Feng and Hong (2021), Int. J. Systems Science 52(16); Bai (1998), Automatica 34(3). Departures: all columns of
 the input have a minus sign, without which the regression gives -b. Cost per sample: O(n + 64 n_out).
@@ -39,13 +39,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, Step
-from driftfit.engine.settings import input_names, numbers, output_names, warn, whole
+from driftfit.engine.settings import numbers, output_names, warn, whole
 from driftfit.models.base import Model
 from driftfit.models.fault_codes import absurd
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
@@ -55,6 +55,7 @@ from driftfit.models.hammerstein_wiener.products import Structure
 from driftfit.models.hammerstein_wiener.run_time_orders import RunTimeOrders
 from driftfit.models.hammerstein_wiener.step_memory import memory, places_of
 from driftfit.models.hammerstein_wiener.steps import applying, build, refusing
+from driftfit.models.inputs import CountedInputs
 
 IDENTITY = Polynomial(1)
 FLATTEST = 1e-3
@@ -83,27 +84,29 @@ def _plain(value: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class HammersteinWiener(Model):
+class HammersteinWiener(CountedInputs):
     """Hammerstein-Wiener model.
 
     Parameters
     ----------
-    na, nb : int
-        Lags of w and of v in the linear block; nb at least 1.
-    nk : int
-        Delay of the input in samples; 0 uses the present input.
-    input, output : Basis or None
-        Functions of the input block, and of the inverse of the output block. None is the identity, so that
-        ``output=None`` is a Hammerstein and ``input=None`` a Wiener model. A list of bases makes a model with that many
-        inputs, each with its own curve; ``nb`` and ``nk`` may then be lists as well.
+    na : int
+        Lags of w in the linear block.
+    nb, nk : int, or one per input
+        Lags of v in the linear block, at least 1, and the delay of the input in samples (0 uses the present input).
+    input : Basis or None, or one per input
+        Functions of the input block; None is the identity. Every input has its own curve.
+    output : Basis or None
+        Functions of the inverse of the output block; None is the identity. ``output=None`` is a Hammerstein and
+        ``input=None`` a Wiener model.
     intercept : bool
         Add one constant; those of the two blocks cannot be distinguished.
     output_noise : number, one for each output, or None
         Standard deviation of white noise on y. The noise variance of the equation then is r times
         sigma^2 sum_{i=0..na} a_i^2 F'(y_{t-i})^2, plus 1e-4 of the squared height of the output block's
         functions since the slope of a curve may be 0, from the estimates before each sample; use r = 1.
-    name : str, tuple of str or None
-        Name of the input, or of each.
+    inputs : int, names, or None
+        How many inputs, or their names, as in `ARX`. None: as many as ``nb``, ``nk`` or ``input`` have entries, else as
+        many as u has columns.
     ny : int or names
         Outputs, columns of y. With several, ``output`` and ``output_noise`` may be lists with one entry for each; the
         bases of all outputs are of one kind and size, with separate ranges and knots.
@@ -122,30 +125,25 @@ class HammersteinWiener(Model):
     output: Any = None
     intercept: bool = False
     output_noise: Any = None
-    name: Any = None
+    inputs: Any = None
     ny: Any = 1
+    per_input = ("nb", "nk", "input")
+    fewest = 1
+    lowest: ClassVar[Mapping[str, int]] = {"nb": 1}
 
     def __post_init__(self) -> None:
         self._set("na", whole("HammersteinWiener", "na", self.na, 0))
-        counts = {name: len(value) for name in ("input", "nb", "nk") if several(value := getattr(self, name))}
-        if len(set(counts.values())) > 1 or 0 in counts.values():
-            raise ValueError(f"HammersteinWiener: lists have one entry for each input; got {counts}.")
-        for name, low in (("nb", 1), ("nk", 0)):
-            given = getattr(self, name)
-            checked = [whole("HammersteinWiener", name, x, low) for x in (given if several(given) else (given,))]
-            self._set(name, tuple(checked) if several(given) else checked[0])
-        if counts and max(counts.values()) == 1:
-            for name in counts:
-                self._set(name, getattr(self, name)[0])
-        self._set("input", _blocks(self.input))
-        if self.name is not None:
-            names = input_names("HammersteinWiener", "name", [self.name] if isinstance(self.name, str) else self.name)
-            if len(names) != self.m:
-                raise ValueError(
-                    f"HammersteinWiener: name must hold a name for each input; got {self.name!r} for {self.m}."
-                )
-            self._set("name", names if self.m > 1 else names[0])
+        self._check_inputs()
+        for name in self.per_input:
+            if several(value := getattr(self, name)) and len(value) == 1:
+                self._set(name, value[0])
         self._check_outputs()
+
+    def _check_per_input(self, name: str) -> int | None:
+        if name != "input":
+            return super()._check_per_input(name)
+        self._set("input", _blocks(self.input))
+        return len(self.input) if several(self.input) else None
 
     def _check_outputs(self) -> None:
         """Outputs, their bases and their noises."""
@@ -180,42 +178,19 @@ class HammersteinWiener(Model):
         bases = {"input": _blocks(settings.get("input")), "output": _blocks(settings.get("output"))}
         return super().from_settings(settings | bases)
 
-    def bind(self, inputs: int | Sequence[str]) -> HammersteinWiener:
-        count = inputs if isinstance(inputs, int) else len(inputs)
-        if count != self.m:
-            raise ValueError(
-                f"HammersteinWiener: the model has {self.m} input{'s' if self.m > 1 else ''}, but u has {count} "
-                "columns; give input= a list with a basis, or None, for each."
-            )
-        if isinstance(inputs, int) or self.name is not None:
-            return self
-        return replace(self, name=inputs[0] if count == 1 else tuple(inputs))
-
     @property
     def width(self) -> int:
         return 1
 
     @property
-    def m(self) -> int:
-        return max(len(x) if several(x) else 1 for x in (self.input, self.nb, self.nk))
-
-    @property
     def bases(self) -> tuple[Basis, ...]:
         """Functions of the curve of each input."""
-        return tuple(IDENTITY if basis is None else basis for basis in self._each(self.input))
+        return tuple(IDENTITY if basis is None else basis for basis in self.for_each_input("input"))
 
     @property
     def delays(self) -> tuple[int, ...]:
         """nk of each input."""
-        return self._each(self.nk)
-
-    def _each(self, value: Any) -> tuple[Any, ...]:
-        """A setting, for each input."""
-        return value if several(value) else (value,) * self.m
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        return () if self.name is None else (self.name,) if isinstance(self.name, str) else tuple(self.name)
+        return self.for_each_input("nk")
 
     @property
     def into(self) -> Basis:
@@ -247,7 +222,8 @@ class HammersteinWiener(Model):
     @property
     def structure(self) -> Structure:
         """The orders, and the positions of the parameters in theta."""
-        return Structure(self.na, self._each(self.nb), tuple(b.n for b in self.bases), self.out.n, self.intercept)
+        nb = self.for_each_input("nb")
+        return Structure(self.na, nb, tuple(basis.n for basis in self.bases), self.out.n, self.intercept)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -255,7 +231,7 @@ class HammersteinWiener(Model):
 
     def called(self, names: Sequence[str]) -> tuple[str, ...]:
         """Names of coefficients, with those of the inputs for [u1], [u2] .. where they have names."""
-        for i, name in enumerate(self.name if isinstance(self.name, tuple) else ()):
+        for i, name in enumerate(self.input_names):
             names = [each.replace(f"[u{i + 1}]", f"[{name}]") for each in names]
         return tuple(names)
 
@@ -379,12 +355,11 @@ class HammersteinWiener(Model):
         return settled(phi, y, u, at, self.bases, self.delays, self.structure)
 
     def follows(self, other: Model) -> bool:
-        return isinstance(other, HammersteinWiener) and replace(self, name=None) == replace(other, name=None)
+        return isinstance(other, HammersteinWiener) and replace(self, inputs=self.m) == replace(other, inputs=other.m)
 
     def inspect(self, y: Array, u: Array) -> None:
         """Warn of data that the bases do not fit; `driftfit.track` calls it with a whole record, y (T,), u (T, 1)."""
-        given = self.name if isinstance(self.name, tuple) else None
-        names = given or (["u"] if self.m == 1 else [f"u{i + 1}" for i in range(self.m)])
+        names = self.input_names or (["u"] if self.m == 1 else [f"u{i + 1}" for i in range(self.m)])
         for what, basis, data in (*zip(names, self.bases, u.T, strict=True), ("y", self.out, y)):
             if basis.n == 1 and not np.isfinite(basis.expected).any():
                 continue

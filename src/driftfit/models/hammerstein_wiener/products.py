@@ -67,7 +67,7 @@ class Structure(NamedTuple):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the entries of theta."""
-        a = [f"a{i + 1}" for i in range(self.na)]
+        a = [f"A{i + 1}" for i in range(self.na)]
         b = [name for i in range(len(self.nb)) for name in self.lags(i)]
         d = [f"d{k}" for k in range(2, self.n_out + 1)]
         bc = [f"{name}*c{k}" for i, n_in in enumerate(self.n_in) for k in range(2, n_in + 1) for name in self.lags(i)]
@@ -78,7 +78,7 @@ class Structure(NamedTuple):
     def groups_names(self) -> tuple[tuple[str, ...], ...]:
         """Names of a, b, c and d, the leading coefficients of the curves among them."""
         return (
-            tuple(f"a{i + 1}" for i in range(self.na)),
+            tuple(f"A{i + 1}" for i in range(self.na)),
             tuple(name for i in range(len(self.nb)) for name in self.lags(i)),
             tuple(f"c{k + 1}{tag}" for tag, n_in in zip(self.tags, self.n_in, strict=True) for k in range(n_in)),
             tuple(f"d{k + 1}" for k in range(self.n_out)),

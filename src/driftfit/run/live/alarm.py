@@ -30,7 +30,7 @@ class Onset(NamedTuple):
     """Where an alarm began."""
 
     sample: int
-    """Index of the sample, 0 being the first after the rule was given to the stream."""
+    """Index of the sample in the stream."""
     time: Any
     """Its time, if the stream has times."""
     cause: str
@@ -53,15 +53,17 @@ class LiveAlarm:
     statistic : (c,)
         The statistics, in the order of ``rule.names``; NaN where there is nothing to judge.
     samples : int
-        Number of samples so far, including those that were not judged.
+        Number of samples since the rule was given to the stream, including those that were not judged.
+    first : int
+        Index of the first of them in the stream.
     """
 
-    def __init__(self, rule: AlarmRule, tracker: Tracker, names: Sequence[str], wait: int = 0) -> None:
+    def __init__(self, rule: AlarmRule, tracker: Tracker, names: Sequence[str], wait: int = 0, first: int = 0) -> None:
         check_fits(rule, tracker, names)
         self.rule = rule
         self.active = self.begun = False
         self.statistic = np.full(len(rule.names), np.nan)
-        self.samples = 0
+        self.samples, self.first = 0, first
         self._tracker, self._columns = tracker, rule.columns(names)
         self._wait, self._left, self._judged = wait, 0, 0
         self._scores: deque[float] = deque(maxlen=rule.window)
@@ -83,10 +85,10 @@ class LiveAlarm:
 
     @property
     def change(self) -> Change | None:
-        """For "glr" and "cusum": what changed, by how much and since when; otherwise None."""
+        """For "glr" and "cusum": what changed, by how much and since which sample of the stream; otherwise None."""
         if self.rule.kind not in FROZEN:
             return None
-        return change_of(self.rule, self._findings[0], self.samples - 1)
+        return change_of(self.rule, self._findings[0], self.first + self.samples - 1)
 
     def onsets(self) -> list[Onset]:
         """The alarms that began since the last call; at most the last 256."""
@@ -143,7 +145,7 @@ class LiveAlarm:
         if self.begun:
             j = self.rule.cause(self.statistic)
             onset = (self.cause, float(self.statistic[j]), self.rule.limits[j])
-            self._onsets.append(Onset(self.samples, time, *onset))
+            self._onsets.append(Onset(self.first + self.samples, time, *onset))
         self.samples += 1
 
     def _show(self, statistic: Array, findings: Array) -> None:
@@ -225,14 +227,14 @@ class LiveAlarm:
         return {
             "rule": describe(self.rule), "active": self.active, "begun": self.begun, "samples": self.samples,
             "statistic": self.statistic.tolist(), "wait": self._wait, "left": self._left, "judged": self._judged,
-            "scores": list(self._scores), "onsets": [list(onset) for onset in self._onsets],
+            "first": self.first, "scores": list(self._scores), "onsets": [list(onset) for onset in self._onsets],
             "memory": [b64encode(part.tobytes()).decode() for part in self._memory] if self.rule.kind in FROZEN else [],
         }  # fmt: skip
 
     @classmethod
     def of(cls, state: Mapping[str, Any], tracker: Tracker, names: Sequence[str]) -> LiveAlarm:
         """The inverse of `plain`."""
-        alarm = cls(rebuild(state["rule"], AlarmRule), tracker, names, state["wait"])
+        alarm = cls(rebuild(state["rule"], AlarmRule), tracker, names, state["wait"], state.get("first", 0))
         alarm.active, alarm.begun, alarm.samples = state["active"], state["begun"], state["samples"]
         alarm.statistic, alarm._left = np.array(state["statistic"], float), state["left"]
         alarm._judged = state.get("judged", 0)

@@ -90,6 +90,7 @@ class Batched(ABC):
     _last: Any
     _awaits: int
     _ignored: int
+    _samples: int
     _windows: list[Window]
     _watching: list[tuple[int, LiveAlarm]]
 
@@ -169,6 +170,7 @@ class Batched(ABC):
         out = np.empty(rows * len(records.y), self._row_type)
         if len(out):
             record = (records.in_rows() if self.model.shared else records).part(0)
+            self._samples += len(records.y)
             self._drive(*lanes_of(record), out, record.time)
             self._settle(resting, extra)
         if before is not None and not taken.all():

@@ -190,6 +190,7 @@ class Live(Operated, Stream):
             if type(u) is not float or self._m != 1:
                 u = self._floats(u)
         if time is None:
+            self._samples += 1
             return self._update(self._compiled, y, u)
         return self._update_at(y, u, time)
 
@@ -212,6 +213,7 @@ class Live(Operated, Stream):
             self._ignored += 1
             return self._nothing()
         self._last = time
+        self._samples += 1
         self._pace.see(interval)
         resting = self._interval[0]
         if resting:  # 0 while the stream is held: no time passes
@@ -318,6 +320,7 @@ class Live(Operated, Stream):
     def _update_later(self, y: float) -> Step:
         """A sample without known factors, whose input comes with `apply`."""
         self._placing()
+        self._samples += 1
         step: Step = self._update(self._compiled, y, one_or_all(self._unknown))
         self._expect(INPUT)
         return step

@@ -68,7 +68,7 @@ class Stream(Batched, Plain, storage.Kept):
         self._last: Any = None if before is None else before.last
         self._awaits = NOTHING if before is None else before.awaits
         self._cold = before is None
-        self._ignored = 0
+        self._samples = self._ignored = 0
         self._place: Any = None
         self._windows: list[Window] = []
         self._watching: list[tuple[int, LiveAlarm]] = []
@@ -126,6 +126,7 @@ class Stream(Batched, Plain, storage.Kept):
         if time is not None:
             self._last = time
             self._pace.see(interval)
+        self._samples += 1
         step = self._step(y, u, known, time)
         self._expect(INPUT if later else NOTHING)
         return step
@@ -178,6 +179,11 @@ class Stream(Batched, Plain, storage.Kept):
         return self._awaits != NOTHING
 
     @property
+    def samples(self) -> int:
+        """Number of samples so far, without those that were ignored; the first after a warm start is number 0."""
+        return self._samples
+
+    @property
     def ignored(self) -> int:
         """Number of samples whose time was not after the last."""
         return self._ignored
@@ -191,7 +197,8 @@ class Stream(Batched, Plain, storage.Kept):
         """An alarm that watches a lane from the next sample on."""
         start = burn_in(self._rows.n) if self._cold else 0
         wait = start if wait is None else whole("Live.detect", "wait", wait, 0)
-        alarm = LiveAlarm(check_rule(rule), self.trackers[lane], self.programs[lane].names, wait)
+        rows = self._samples * self._rows_per_instant
+        alarm = LiveAlarm(check_rule(rule), self.trackers[lane], self.programs[lane].names, wait, rows)
         self._watching.append((lane, alarm))
         return alarm
 
@@ -210,8 +217,8 @@ class Stream(Batched, Plain, storage.Kept):
     def _written(self) -> tuple[dict[str, Any], dict[str, Array]]:
         extra = {
             "dt": self.dt, "zone": self._clock.zone, "limits": None if self._limits is None else self._limits.plain(),
-            "last": self._last, "ignored": self._ignored, "lag": self.lag, "awaits": self._awaits,
-            "cold": self._cold, "windows": tuple(window.plain() for window in self._windows),
+            "last": self._last, "samples": self._samples, "ignored": self._ignored, "lag": self.lag,
+            "awaits": self._awaits, "cold": self._cold, "windows": tuple(window.plain() for window in self._windows),
             "alarms": tuple([lane, alarm.plain()] for lane, alarm in self._watching),
         }  # fmt: skip
         tile = self._state_tile()
@@ -241,7 +248,8 @@ class Stream(Batched, Plain, storage.Kept):
         live: Self = make(model, by_output(model, trackers), clock, extra["lag"], limits=dict(limits), gate=gate)
         if live._limits is not None:
             live._limits.restore(outside)
-        live._last, live._ignored, live._cold = extra["last"], extra["ignored"], extra["cold"]
+        live._last, live._cold = extra["last"], extra["cold"]
+        live._samples, live._ignored = extra["samples"], extra["ignored"]
         for window, state in zip(live._windows, extra["windows"], strict=True):
             window.restore(state)
         live._watching = [
