@@ -22,6 +22,10 @@ Ranges = Mapping[Any, tuple[float | None, float | None]] | None
 """From signals to their valid ranges."""
 
 
+Missing = str | float | Sequence[str | float]
+"""What means "no value"."""
+
+
 class Given(TypedDict, total=False):
     """Arguments that every form of `track` takes by name."""
 
@@ -33,6 +37,7 @@ class Given(TypedDict, total=False):
     units: Mapping[str, str] | None
     limits: Ranges
     exclude: Any
+    missing: Missing
     keep: str
     dtype: Any
 
@@ -92,6 +97,7 @@ def track(
     units: Mapping[str, str] | None = None,
     limits: Ranges = None,
     exclude: Any = None,
+    missing: Missing = (),
     keep: str = "std",
     dtype: Any = "float64",
     warm_start: Any = None,
@@ -141,6 +147,9 @@ def track(
     exclude : list of (from, to), or a mapping from the keys of a fleet to such lists
         Intervals to leave out, both ends included, in times or, without time, in sample numbers: nothing in them is
         used or enters a lag, and the summary counts their samples (`driftfit.data.limits`).
+    missing : text or number, or several
+        What signals hold where there is no value, such as ``["Offline", -999]``. Texts of tables are known already if
+        spreadsheets and historians use them (`driftfit.data.columns`). The summary counts numbers.
     keep : "std", "cov" or "theta"
         What is stored of every sample. "std": theta, std, prediction, innovation and its standard deviation, ok:
         2 n + 4 numbers. "cov": also the covariance, n * n numbers. "theta": that alone, n numbers, for models of one
@@ -176,7 +185,7 @@ def track(
     DataWarning
         If most samples cannot be used because of ``dt``.
     """
-    reading = Reading(time, dt, weights, drift, units, limits, exclude)
+    reading = Reading(time, dt, weights, drift, units, limits, exclude, missing)
     if to is not None:
         from driftfit.show.export import write_parts  # importing polars takes as long as all other imports
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from statistics import NormalDist
 from typing import Annotated, Any
@@ -13,7 +14,7 @@ from rich.text import Text
 
 from driftfit.cli.parts.options import Given, reads
 from driftfit.cli.parts.program import app, say
-from driftfit.cli.parts.reading import Part, rows_of
+from driftfit.cli.parts.reading import rows_of
 from driftfit.engine.kernel import Array
 from driftfit.results import Track
 from driftfit.show.parts.text import table_of
@@ -73,5 +74,5 @@ def forecast(
 def _inputs(given: Given, future: str) -> Array:
     if not given.inputs:
         raise ValueError(f"--future {future}: the model has no inputs; leave it out.")
-    read = rows_of([future], given.inputs, None, [], Part(separator=given.part().separator, decimal=given.decimal))
+    read = rows_of([future], given.inputs, None, [], replace(given.part(), first=None, last=None, rows=(1, None)))
     return np.stack([read.numbers[name] for name in given.inputs], axis=1)

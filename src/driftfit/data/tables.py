@@ -18,6 +18,7 @@ from driftfit.data.columns import Columns, Wanted
 from driftfit.data.files import read
 from driftfit.data.known import Known
 from driftfit.data.labels import dated, warn_of_skipped_periods
+from driftfit.data.limits import marks
 from driftfit.data.record import Labels, Reading, Records, drift_of
 from driftfit.data.signals import noise_of
 from driftfit.data.times.instants import warn_of_counted_years, warn_of_summer_time, warn_of_written_numbers
@@ -48,7 +49,9 @@ def read_records(
         raise ValueError(f"time and y are both the column {output!r}.")
     each = () if isinstance(drift, str) or np.ndim(drift) == 0 else _names("drift", drift)
     factors = [*(name for name in (weights, drift) if isinstance(name, str)), *each]
-    wanted = Wanted(tuple(dict.fromkeys([output, *inputs, *factors])), axis, _names("by", by))
+    wanted = Wanted(
+        tuple(dict.fromkeys([output, *inputs, *factors])), axis, _names("by", by), marks(reading.missing)[0]
+    )
     columns, failed = read(data, wanted)
     keys, code = _codes(columns)
     dropped: dict[Hashable, dict[str, int]] = {}
@@ -73,7 +76,9 @@ def read_records(
     )
     drifts = np.stack([_factor(name, values, drift_of) for name in each], axis=1) if each else None
     signals = np.stack([values[name] for name in inputs], axis=1) if inputs else np.zeros((len(order), 0))
-    labels = Labels(y, inputs, axis, dict(reading.units or {}), columns.zone, {}, wanted.by, dt=clock.plain)
+    labels = Labels(
+        y, inputs, axis, {**columns.units, **(reading.units or {})}, columns.zone, {}, wanted.by, dt=clock.plain
+    )
     named = tuple(keys[k] for k in there)
     return Records(named, first, length[there], values[y], signals, known, times, labels, dropped, drifts), failed
 

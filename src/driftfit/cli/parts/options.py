@@ -91,7 +91,12 @@ class Given:
         str | None,
         typer.Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
     ] = None
-    decimal: Annotated[str, typer.Option(help="Decimal sign of the numbers: . or ,")] = "."
+    decimal: Annotated[
+        str | None, typer.Option(help="Decimal sign of the numbers: . or , (by default the file shows it).")
+    ] = None
+    missing: Annotated[
+        Names, typer.Option(help="What the file holds where there is no reading: Offline or -999; repeat it.")
+    ] = None
     limits: Annotated[
         Names, typer.Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
     ] = None
@@ -140,6 +145,7 @@ class Given:
         return Part(
             first=self.first, last=self.last, rows=rows_from(self.rows),
             separator=separator_from(self.separator), decimal=decimal_from(self.decimal),
+            missing=tuple(self.missing or []),
             limits=tuple(limits_from(entry, names) for entry in self.limits or []),
             exclude=tuple(map(interval_from, self.exclude or [])),
         )  # fmt: skip
@@ -152,7 +158,8 @@ class Given:
         data: Any = self.file if rows is None else rows.table(self.time, self.by or [])
         signals = {"y": outputs if len(outputs) > 1 else outputs[0], "u": self.inputs, "data": data, "time": self.time}
         signals |= self.part().restrictions(self.time is not None)
-        return signals | {"by": self.by or None, "dt": parse_interval(self.dt), "units": parse_units(self.unit) or None}
+        units = {**({} if rows is None else rows.units), **parse_units(self.unit)}
+        return signals | {"by": self.by or None, "dt": parse_interval(self.dt), "units": units or None}
 
     def read(self, *more: str) -> Rows:
         """Read the selected part of the columns, and of ``more`` columns."""

@@ -237,6 +237,7 @@ def select(
     drift: Any = 1.0,
     limits: Any = None,
     exclude: Any = None,
+    missing: Any = (),
 ) -> Selection | ByOutput[Selection]:
     """Compare structures by predictive likelihood.
 
@@ -244,7 +245,7 @@ def select(
     ----------
     models : sequence of models, or one model
         Candidates; or one model whose regressors are to be selected, at most 30.
-    y, u, data, time, dt, weights, drift, limits, exclude
+    y, u, data, time, dt, weights, drift, limits, exclude, missing
         As for `track`: with ``data`` the others name its columns. One number or (T,) for drift.
     by : names of columns, "row" or None
         As for `track`: several records, for which one structure is sought. Parameters are estimated for each of them
@@ -278,7 +279,7 @@ def select(
         raise ValueError(f"select: {type(tracker).__name__} has no variance, so there is no likelihood to compare.")
     if not candidates:
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
-    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
+    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing)
     search = (keep, most) if isinstance(models, Model) else None
     if any(len(model.outputs) > 1 for model in candidates):
         pools = pools_of(candidates, y, u, reading, data, by)
