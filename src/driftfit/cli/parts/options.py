@@ -8,7 +8,6 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
-import numpy as np
 import typer
 
 from driftfit.cli.parts.arguments import listed, parse_interval, parse_units
@@ -196,20 +195,12 @@ class Given:
         return before.model, before.tracker, before
 
     def arrays(self) -> dict[str, Any]:
-        """One series sorted by time, in the form that `tune` and `select` take."""
+        """One series in the form that `tune` and `select` take."""
         outputs = self.outputs
         if self.by or len(outputs) > 1 or self.start is not None:
             raise ValueError("this command takes one series of one output; leave out --by, --start and further --y.")
-        read = self.read()
-        order = read.order()
-        u = np.stack([read.numbers[name][order] for name in self.inputs], axis=1) if self.inputs else None
-        time = None if read.time is None else read.time[order]
-        restrictions = self.part().restrictions(time is not None)
-        places: dict[str, Any] = {name: j for j, name in enumerate(self.inputs)} | {outputs[0]: "y"}
-        if restrictions["limits"]:
-            restrictions["limits"] = {places[name]: one for name, one in restrictions["limits"].items()}
-        known = {"y": read.numbers[outputs[0]][order], "u": u, "time": time, "dt": parse_interval(self.dt)}
-        return known | restrictions
+        signals = self.signals()
+        return {name: signals[name] for name in signals if name not in ("by", "units")}
 
 
 def saved(path: Path) -> Any:
