@@ -7,7 +7,7 @@ import pandas as pd
 import polars as pl
 import pytest
 
-from driftfit import ARX, DataWarning, HammersteinWiener, Kalman, Live, Regression, select, track, tune
+from driftfit import ARX, DataWarning, HammersteinWiener, Kalman, Live, Regression, segment, select, track, tune
 
 T = 60
 TRACKER = Kalman(q=1e-3, r=0.1)
@@ -261,8 +261,22 @@ def test_rows_in_another_order_than_their_dates_are_sorted(kind, by):
         one, two = (run, same) if by is None else (run["north"], same["north"])
         assert np.array_equal(one.theta, two.theta)
         assert np.array_equal(two.time, days)
+
+
+@pytest.mark.parametrize(
+    ("verb", "what"),
+    [
+        (lambda **data: tune(NAMED, Kalman(r=0.1), **data), lambda tuned: tuned.loglik),
+        (lambda **data: select([NAMED, ARX(1, 0)], tracker=TRACKER, **data), lambda found: found.table.rows()),
+        (lambda **data: segment(**data), lambda found: found.segments[0].theta.tolist()),
+    ],
+)
+def test_every_verb_sorts_rows_by_their_dates(verb, what):
+    y, X = record()
+    table = X.assign(flow=y).set_axis(pd.date_range("2024-01-05", periods=T, name="day"))
     with pytest.warns(DataWarning, match="not in the order of 'day'"):
-        assert tune(NAMED, Kalman(r=0.1), "flow", data=kind(shuffled)).loglik == tune(NAMED, Kalman(r=0.1), y, X).loglik
+        found = verb(y="flow", u=["a", "b"], data=table[::-1])
+    assert what(found) == what(verb(y="flow", u=["a", "b"], data=table))
 
 
 def test_dates_that_repeat():

@@ -124,8 +124,8 @@ def track(
         y, u, time, by, weights and drift are then names of its columns.
     time : (T,) numbers or datetimes, increasing, or the name of a column
         The times of the samples. Drift scales with the interval, and a gap above 1.5 ``dt`` breaks the lags. Rows of a
-        table are sorted; of several rows at the same time the first is used. If no time is given, an index of dates of
-        y or u is used, with ``dt="label"`` unless dt is given.
+        table are sorted; of several rows at the same time the first is used. If no time is given, an index of dates, or
+        the only column of dates of a table, is used, with ``dt="label"`` unless dt is given.
     by : names of columns, "row" or None
         The columns that identify the series of a table ("file": the file of a row). "row": every row of the array y is
         a separate series.
@@ -183,7 +183,8 @@ def track(
     Warns
     -----
     DataWarning
-        If most samples cannot be used because of ``dt``.
+        If most samples cannot be used because of ``dt``; if rows are left out because their time repeats, or are sorted
+        by dates that were not named as the time.
     """
     reading = Reading(time, dt, weights, drift, units, limits, exclude, missing)
     if to is not None:

@@ -4,8 +4,8 @@
     result.params, result.bse, result.tvalues, result.conf_int(), result.summary(), result.plot_cusum()
 
 Formulas are those of formulaic (R's and patsy's grammar: interactions, transforms, categories). Rows are in order of
-time. ``params`` are the coefficients after the last row and ``params_path`` those after every row; ``smoothed_path``
-uses the whole sample.
+time; if their index of dates is not in order, they are sorted by it with a warning. ``params`` are the coefficients
+after the last row and ``params_path`` those after every row; ``smoothed_path`` uses the whole sample.
 
 Needs formulaic and pandas (``pip install "driftfit[formula]"``).
 """
@@ -21,6 +21,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import ndtr, ndtri
 
+from driftfit.data.labels import chronological
 from driftfit.models.regression import Regression
 from driftfit.results import Track
 from driftfit.show.parts.axes import BLUE, RED, panels
@@ -81,10 +82,12 @@ class TimeVaryingRegression:
         names = [str(name) for name in self.exog.columns if name != _INTERCEPT]
         model = Regression(tuple(names), intercept=_INTERCEPT in self.exog.columns)
         tracker = AdaptiveKalman() if self.tracker is None else self.tracker
-        y, X = self.endog.to_numpy(dtype=float), self.exog.drop(columns=_INTERCEPT, errors="ignore")
+        rows = chronological(self.endog.index)
+        endog, exog = self.endog.iloc[rows], self.exog.iloc[rows]
+        y, X = endog.to_numpy(dtype=float), exog.drop(columns=_INTERCEPT, errors="ignore")
         run = track(model, tracker, y, X.to_numpy(dtype=float) if names else None)
         columns = [*names, *([_INTERCEPT] if model.intercept else [])]
-        return TimeVaryingResults(run, self.endog, pd.Index(columns))
+        return TimeVaryingResults(run, endog, pd.Index(columns))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from driftfit.data.clock import LABEL, Clock
 from driftfit.data.columns import Columns, Wanted
 from driftfit.data.files import read
 from driftfit.data.known import Known
-from driftfit.data.labels import dated, warn_of_skipped_periods
+from driftfit.data.labels import dated, warn_of_order, warn_of_repeats, warn_of_skipped_periods
 from driftfit.data.limits import marks
 from driftfit.data.record import Labels, Reading, Records, drift_of
 from driftfit.data.signals import noise_of
@@ -121,13 +121,13 @@ def _in_order(time: Array, code: Array, axis: str, indexed: bool) -> bool:
     sort = indexed or not lost
     if not advance[inside].all():
         if sort:
-            how = f"and are sorted by it; sort the table, or give time={axis!r}, to avoid this warning"
+            warn_of_order(axis)
         else:
-            how = (
-                f"in which {lost} of them have no date or that of another row, and are used in the order of the table; "
-                f"give time={axis!r}, by= the column that tells series apart, or sort the table"
+            warn(
+                f"data: the rows are not in the order of {axis!r}, in which {lost} of them have no date or that of "
+                f"another row, and are used in the order of the table; give time={axis!r}, by= the column that tells "
+                "series apart, or sort the table."
             )
-        warn(f"data: the rows are not in the order of {axis!r}, {how}.")
     return sort
 
 
@@ -177,10 +177,7 @@ def _order(
     repeated[1:] = (np.diff(code[order]) == 0) & (time[order][1:] == time[order][:-1])
     _count(dropped, keys, code[order[repeated]], "at a repeated time")
     if repeated.any() and not warn_of_summer_time(time[order[repeated]], zone):
-        warn(
-            f"time: {repeated.sum()} of {len(order)} rows repeat the time of another row and are left out. Give times "
-            "of a finer clock, by= the column that tells series apart, or the mean of the rows at each time."
-        )
+        warn_of_repeats(int(repeated.sum()), len(order))
     order = order[~repeated]
     return order, time[order]
 
