@@ -267,7 +267,7 @@ def test_rows_in_another_order_than_their_dates_are_sorted(kind, by):
     ("verb", "what"),
     [
         (lambda **data: tune(NAMED, Kalman(r=0.1), **data), lambda tuned: tuned.loglik),
-        (lambda **data: select([NAMED, ARX(1, 0)], tracker=TRACKER, **data), lambda found: found.table.rows()),
+        (lambda **data: select([NAMED, ARX(1, 0)], tracker=TRACKER, **data), str),
         (lambda **data: segment(**data), lambda found: found.segments[0].theta.tolist()),
     ],
 )
