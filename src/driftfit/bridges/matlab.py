@@ -5,8 +5,8 @@ A file holds, for every experiment, a struct with fields ``y`` (T, ny), ``u`` (T
 
     s = struct('y', z.y, 'u', z.u, 'Ts', z.Ts, 'OutputName', {z.OutputName}, 'InputName', {z.InputName}); save f.mat s
 
-writes for an ``iddata`` object ``z``. Plain variables are read too. A vector is one signal, also as a row 1 x N. Files up
-to version 7 are read and written by scipy; version 7.3 is HDF5 and needs h5py (``pip install "driftfit[matlab]"``).
+writes for an ``iddata`` object ``z``. Plain variables are read too. A vector is one signal, also as a row 1 x N. Files
+up to version 7 are read and written by scipy; version 7.3 is HDF5 and needs h5py (``pip install "driftfit[matlab]"``).
 Objects of classes such as ``iddata`` itself are not readable outside of MATLAB: `read_mat` says how to convert them.
 
 Sign conventions: MATLAB writes A(q) y = B(q) u + e with A = 1 + a1 q^-1 + ..; `ARX` writes y_t = a1 y_(t-1) + ..; so

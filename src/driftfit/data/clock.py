@@ -197,6 +197,8 @@ class Clock:
         """
         if type(time) is float and type(last) is float and self.kind in ("number", "unset"):
             return (time - last) / self.count if last < time < np.inf else float("nan")
+        if time != time:
+            return float("nan")
         self._fits(time)
         if not np.isfinite(time):
             return float("nan")

@@ -210,6 +210,8 @@ def as_numbers(name: str, values: Any) -> Array:
     """Values as floats; `ABSENT` and masked entries become NaN; for text the error names its position."""
     if isinstance(values, np.ma.MaskedArray):
         values = np.ma.filled(values.astype(float), np.nan)
+    if isinstance(values, np.ndarray | np.generic) and values.dtype.kind in "mM":  # no dates as nanoseconds
+        values = values.astype(str)
     try:
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):

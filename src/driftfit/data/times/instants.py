@@ -12,11 +12,13 @@ import numpy as np
 
 from driftfit.data.times.periods import EXAMPLES, periods
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import warn
+from driftfit.engine.settings import ABSENT, warn
 
 
 def instant(time: Any) -> Any:
-    """One time as a float, or as datetime64 in UTC if it is a date."""
+    """One time as a float, or as datetime64 in UTC if it is a date; NaN if it is not known."""
+    if str(time) in ABSENT:
+        return float("nan")
     if isinstance(time, int | float | np.number) and not isinstance(time, np.timedelta64):
         return float(time)
     if hasattr(time, "to_datetime64"):  # a pandas time, in UTC if it has a zone
