@@ -174,7 +174,7 @@ def test_a_fleet_of_several_outputs(tanks):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--model", "arx:1,1,ny=3", "--y", "level,flow"), "ny=3, but y names level, flow"),
+        (("--model", "arx:1,1,ny=3", "--y", "level,flow"), "y must name 3 columns, one for each output"),
         (("--y", ","), "names no column"),
         (("--y", "level", "--y", "level"), "--y level,level: name each output once"),
         (("--y", "level,flow", "--u", "valve"), "inputs must be different names"),

@@ -115,7 +115,7 @@ def track(
     tracker : Tracker, or a list or mapping of them
         Estimates theta, such as ``Kalman(q=1e-4, r=0.1)``. Without ``by`` several trackers are a grid of settings for
         one record; with it they are the settings of each series, in order or by key.
-    y : (T,), with by="row" (units, T), or the name of a column of ``data``
+    y : (T,), with by="row" (units, T), or the name of a column of ``data``; a list of names for several outputs
         Output. NaN, inf and None are missing. A Series keeps its name; its index of dates labels the samples.
     u : (T,), (T, m) or None, with by="row" (units, T) or (units, T, m), or names of columns
         Inputs. Columns of a data frame, of a mapping or of ``data`` are matched by name with a model with named inputs.

@@ -25,6 +25,7 @@ import numpy as np
 
 from driftfit.data.arguments import check_roles
 from driftfit.data.limits import code_text, shared_code
+from driftfit.data.outputs import columns_as_outputs
 from driftfit.data.record import Reading
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
@@ -113,6 +114,7 @@ def tune(
         everything that `track` does not accept.
     """
     check_roles("tune", model, tracker)
+    model, y = columns_as_outputs(model, y, data)
     one_of("tune", "method", method, tuple(METHODS))
     whole("tune", "h", h, 1)
     if not 0.0 < level < 1.0:

@@ -129,7 +129,7 @@ class Given:
     def models(self) -> list[Model]:
         """The models, each bound to the inputs."""
         default = [f"arx:2,{2 if self.inputs else 0},intercept"]
-        found = [parse_model(text, self.outputs) for text in self.model or default]
+        found = [parse_model(text) for text in self.model or default]
         several = len(found) > 1  # then one of them may have no inputs
         alone = [model.shared or (several and isinstance(model, ARX) and model.nb == 0) for model in found]
         return [model if one else model.bind(self.inputs) for model, one in zip(found, alone, strict=True)]

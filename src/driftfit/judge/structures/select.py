@@ -41,6 +41,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.data.arguments import check_roles
+from driftfit.data.outputs import columns_as_outputs
 from driftfit.data.record import Reading
 from driftfit.data.signals import check_ready
 from driftfit.engine.kernel import Array
@@ -281,6 +282,8 @@ def select(
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing)
     search = (keep, most) if isinstance(models, Model) else None
+    columns = [columns_as_outputs(model, y, data) for model in candidates]
+    candidates, y = [model for model, _ in columns], columns[0][1]
     if any(len(model.outputs) > 1 for model in candidates):
         pools = pools_of(candidates, y, u, reading, data, by)
         found = {name: _selected(*pool, tracker, search, beside) for name, pool in pools.items()}
