@@ -116,8 +116,12 @@ def _is_text(series: nw.Series[Any]) -> bool:
 
 def _as_text(series: nw.Series[Any], missing: Sequence[str]) -> pl.Series:
     """Cells without surrounding blanks; null if they mean "no value"."""
-    cells = [cell if isinstance(cell, str) else None for cell in series.cast(nw.String).to_list()]
-    return present(pl.Series(series.name, cells, dtype=pl.String), missing)
+    text = series.cast(nw.String)
+    native: Any = text.to_native()
+    if not isinstance(native, pl.Series):
+        cells = [cell if isinstance(cell, str) else None for cell in text.to_list()]
+        native = pl.Series(series.name, cells, dtype=pl.String)
+    return present(native, missing)
 
 
 def present(text: pl.Series, missing: Sequence[str]) -> pl.Series:

@@ -117,7 +117,7 @@ def _mended(source: str | bytes, start: bytes, end: bytes, sign: str, alone: boo
     are left out unless they are missing readings of a column that is ``alone``.
     """
     after = rb"(?=[ \t]*(?:" + re.escape(sign.encode()) + rb"|[\r\n]|\Z))"
-    changes = [(re.compile(rb"(?<=" + end + rb")(" + ERROR.encode() + rb")" + after, re.IGNORECASE), rb'"\1"')]
+    changes = [(re.compile(end + rb"(" + ERROR.encode() + rb")" + after, re.IGNORECASE), end + rb'"\1"')]
     if not alone or not any(line.strip() for line in start.split(end)[1::2]):
         changes.append((re.compile(end + rb"[ \t\r]*(?=" + end + rb")"), b""))
     if not _size(source):
