@@ -12,11 +12,8 @@ from __future__ import annotations
 import csv
 import io
 import itertools
-import mmap
-import os
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,30 +53,32 @@ def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFra
     separates cells. With ``wanted.decimal`` of "," every number may have a decimal comma, with "." none; without it
     those of a file whose cells are not separated by commas.
     """
-    start = start_of(source)
+    content = source if isinstance(source, bytes) else Path(source).read_bytes()
+    if encoding := _encoding(content[:PROBE]):
+        content = content.decode(encoding, errors="replace").encode()
+    start = content[:PROBE]
     end = b"\r" if b"\r" in start and b"\n" not in start else b"\n"
-    source, start = _in_utf_8(source, start)
     lines = _lines(start)
     declared = DECLARED.match(lines[0]) if lines else None
     lines = lines[1:] if declared else lines
     signs = SEPARATORS[1:] if wanted.decimal == "," else SEPARATORS
     sign = wanted.separator or (declared[1] if declared else _separator(lines, signs))
-    source = _mended(source, start, end, sign, alone=not any(sign in line for line in lines))
+    content = _mended(content, end, sign, alone=not any(sign in line for line in lines))
     options: dict[str, Any] = {"infer_schema": False, "comment_prefix": "#", "separator": sign}
     options |= {"eol_char": end.decode(), "skip_rows": 1 if declared else 0}
-    raw = pl.read_csv(source, n_rows=0, truncate_ragged_lines=True, **options).columns
+    raw = pl.read_csv(content, n_rows=0, truncate_ragged_lines=True, **options).columns
     copies = (re.fullmatch(r"(.*)_duplicated_\d+", name) for name in raw)  # as polars calls them
     again = [copy[1] for copy in copies if copy and copy[1] in raw]
     names = plain_names(raw, [name for name in wanted.names if name != FILE])
     chosen = {old: new for old, new in zip(raw, names, strict=True) if new in wanted.names}
-    read = None if _size(source) <= CHECKED else list(chosen)
+    read = None if len(content) <= CHECKED else list(chosen)
     try:
-        every = pl.read_csv(source, columns=read, **options)
+        every = pl.read_csv(content, columns=read, **options)
     except pl.exceptions.ComputeError as error:
         if "utf-8" in str(error):  # the first cells do not show the encoding
-            return read_csv(_bytes(source).decode("windows-1252", errors="replace").encode(), wanted)
-        _check_widths(source, sign, len(raw))
-        every = pl.read_csv(source, columns=read, truncate_ragged_lines=True, **options)
+            return read_csv(content.decode("windows-1252", errors="replace").encode(), wanted)
+        _check_widths(content, sign, len(raw))
+        every = pl.read_csv(content, columns=read, truncate_ragged_lines=True, **options)
     rows = list(csv.reader(lines, delimiter=sign))[1:]
     units = _units(rows, names, wanted)
     every, rows = every.slice(bool(units)), rows[bool(units) :]
@@ -95,45 +94,15 @@ def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFra
     return [*names, *again], frame.with_columns(_whole(column) for column in keys), units
 
 
-def _size(source: str | bytes) -> int:
-    return len(source) if isinstance(source, bytes) else os.path.getsize(source)
-
-
-def _in_utf_8(source: str | bytes, start: bytes) -> tuple[str | bytes, bytes]:
-    """A file and its beginning in UTF-8, decoded only if its first cells are in another encoding."""
-    encoding = _encoding(start)
-    if encoding == "utf8":
-        return source, start
-    decoded = _bytes(source).decode(encoding, errors="replace").encode()
-    return decoded, decoded[:PROBE]
-
-
-def _bytes(source: str | bytes) -> bytes:
-    return source if isinstance(source, bytes) else Path(source).read_bytes()
-
-
-def _mended(source: str | bytes, start: bytes, end: bytes, sign: str, alone: bool) -> str | bytes:
+def _mended(content: bytes, end: bytes, sign: str, alone: bool) -> bytes:
     """A file in which error values at the beginnings of lines are quoted, so that they are no comments, and blank lines
     are left out unless they are missing readings of a column that is ``alone``.
     """
     after = rb"(?=[ \t]*(?:" + re.escape(sign.encode()) + rb"|[\r\n]|\Z))"
-    changes = [(re.compile(end + rb"(" + ERROR.encode() + rb")" + after, re.IGNORECASE), end + rb'"\1"')]
-    if not alone or not any(line.strip() for line in start.split(end)[1::2]):
-        changes.append((re.compile(end + rb"[ \t\r]*(?=" + end + rb")"), b""))
-    if not _size(source):
-        return source
-    with nullcontext(source) if isinstance(source, bytes) else _mapped(source) as content:
-        for pattern, new in changes:
-            if pattern.search(content):
-                source = content = pattern.sub(new, content)
-    return source
-
-
-@contextmanager
-def _mapped(path: str) -> Iterator[mmap.mmap]:
-    """The contents of a file, of which the memory holds what is read."""
-    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        yield content
+    content = re.sub(end + rb"(" + ERROR.encode() + rb")" + after, end + rb'"\1"', content, flags=re.IGNORECASE)
+    if alone and any(line.strip() for line in content[:PROBE].split(end)[1::2]):
+        return content
+    return re.sub(end + rb"[ \t\r]*(?=" + end + rb")", b"", content)
 
 
 def _lines(start: bytes) -> list[str]:
@@ -162,8 +131,8 @@ def _units(rows: Sequence[Sequence[str]], names: Sequence[str], wanted: Wanted) 
     return {name: unit.strip("[]() ") for name in wanted.numbers if (unit := found.get(name))}
 
 
-def _encoding(start: bytes) -> str:
-    """The encoding of a file, judged by its header and its first cells."""
+def _encoding(start: bytes) -> str | None:
+    """The encoding of a file, judged by its header and its first cells; None for UTF-8."""
     if start.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "utf-16"
     if 0 in start[:2]:  # UTF-16 without a byte order mark: every other byte of plain letters is 0
@@ -172,7 +141,7 @@ def _encoding(start: bytes) -> str:
         start[: start.rfind(b"\n") + 1 or None].decode("utf-8")
     except UnicodeDecodeError:
         return "windows-1252"
-    return "utf8"
+    return None
 
 
 def _separator(lines: Sequence[str], signs: str) -> str:
@@ -185,9 +154,9 @@ def _separator(lines: Sequence[str], signs: str) -> str:
     return max(signs, key=fit)
 
 
-def _check_widths(source: str | bytes, sign: str, width: int) -> None:
+def _check_widths(content: bytes, sign: str, width: int) -> None:
     """ValueError for the first row that has cells beyond the ``width`` of the header that are not empty."""
-    with io.TextIOWrapper(io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb"), "utf8") as file:
+    with io.TextIOWrapper(io.BytesIO(content), "utf8") as file:
         rows = csv.reader(
             (line for line in file if not line.startswith("#") and not DECLARED.match(line)), delimiter=sign
         )
