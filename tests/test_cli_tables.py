@@ -72,6 +72,19 @@ def test_a_fleet_over_a_pattern(folder):
     assert (folder / "f.png").stat().st_size > 1000
 
 
+@pytest.mark.parametrize("rows", [(), ("--rows", "1:80")])
+def test_texts_that_mean_no_value_and_a_row_of_units(folder, rows):
+    lines = Path("a.csv").read_text().splitlines()
+    cells = [line.split(",") for line in lines]
+    cells[6][2], cells[8][2] = "Offline", "-999"
+    Path("a.csv").write_text("\n".join(",".join(row) for row in [cells[0], ["", "", "l/min", "V"], *cells[1:]]))
+    options = ("--y", "flow", "--u", "valve", "--time", "t", "--model", "arx:1,1", "--tracker", "kalman")
+    printed = run("a.csv", *options, "-p", "q=1e-3", "-p", "r=0.1", "--missing", "Offline", "--missing", "-999", *rows)
+    assert "flow (l/min) from valve (V)" in printed
+    assert "1 marked as missing" in printed
+    assert "80, 77 used, 3 skipped" in printed
+
+
 def test_a_tracker_of_the_users_own(folder):
     text = run(
         "a.csv",
@@ -174,7 +187,7 @@ def test_a_fleet_of_several_outputs(tanks):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--model", "arx:1,1,ny=3", "--y", "level,flow"), "ny=3, but y names level, flow"),
+        (("--model", "arx:1,1,ny=3", "--y", "level,flow"), "y must name 3 columns, one for each output"),
         (("--y", ","), "names no column"),
         (("--y", "level", "--y", "level"), "--y level,level: name each output once"),
         (("--y", "level,flow", "--u", "valve"), "inputs must be different names"),

@@ -202,10 +202,17 @@ def output_names(owner: str, ny: Any) -> tuple[str, ...]:
     return names
 
 
+ABSENT = ("", "None", "NaT", "<NA>")
+"""How what holds no value is written: an empty text, None, and the NaT and NA of pandas and NumPy."""
+
+
 def as_numbers(name: str, values: Any) -> Array:
-    """Values as floats; None and masked entries become NaN; for text the error names its position."""
-    if isinstance(values, np.ma.MaskedArray):
-        values = np.ma.filled(values.astype(float), np.nan)
+    """Values as floats; `ABSENT` and masked entries become NaN; for text the error names its position."""
+    if isinstance(values, (np.ndarray, np.generic)):  # a union of types would take four times as long
+        if isinstance(values, np.ma.MaskedArray):
+            values = np.ma.filled(values.astype(float), np.nan)
+        elif values.dtype.kind in "mM":  # no dates as nanoseconds
+            values = values.astype(str)
     try:
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -214,7 +221,7 @@ def as_numbers(name: str, values: Any) -> Array:
     out = np.empty(given.shape)
     for place, value in np.ndenumerate(given):
         try:
-            out[place] = np.nan if value is None or value == "" else float(value)
+            out[place] = np.nan if str(value) in ABSENT else float(value)
         except (TypeError, ValueError):
             where = f"entry {place[0] if len(place) == 1 else place}" if place else "it"
             raise ValueError(f"{name}: {where} is {value!r}, which is not a number.") from None

@@ -100,6 +100,7 @@ def _task(
     """(the program of each output of each series, the checked series, units without data with the reasons, whether the
     result is a fleet)."""
     alone = check_roles("track", model, tracker, several=True)
+    model, y = outputs.columns_as_outputs(model, y, data)
     one_of("track", "keep", kept.keep, ("std", "cov", "theta"))
     if kept.dtype != "float64":  # the default, whose name NumPy would look up for a microsecond
         one_of("track", "dtype", np.dtype(kept.dtype).name, ("float64", "float32"))

@@ -25,6 +25,7 @@ import numpy as np
 
 from driftfit.data.arguments import check_roles
 from driftfit.data.limits import code_text, shared_code
+from driftfit.data.outputs import columns_as_outputs
 from driftfit.data.record import Reading
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
@@ -65,12 +66,13 @@ def tune(
     drift: Any = 1.0,
     limits: Any = None,
     exclude: Any = None,
+    missing: Any = (),
 ) -> Tuned | TunedOutputs:
     """Estimate the missing settings of a tracker: ``FLS()``, ``Kalman()``, ``Kalman(r=0.1)``, ``RLS()`` ...
 
     Parameters
     ----------
-    model, y, u, data, time, dt, weights, drift, limits, exclude
+    model, y, u, data, time, dt, weights, drift, limits, exclude, missing
         As for `track`: with ``data`` the others name its columns.
     tracker : Tracker
         Settings that are None are estimated: mu, q, r, q and r, or forgetting. All others are kept. For a `Bank` these
@@ -112,17 +114,17 @@ def tune(
         everything that `track` does not accept.
     """
     check_roles("tune", model, tracker)
+    model, y = columns_as_outputs(model, y, data)
     one_of("tune", "method", method, tuple(METHODS))
     whole("tune", "h", h, 1)
     if not 0.0 < level < 1.0:
         raise ValueError(f"tune: level must be between 0 and 1, such as 0.95; got {level!r}.")
     if method != "h-step" and not tracker.covariance:
         raise ValueError(f"tune: {type(tracker).__name__} has no variance, so {method!r} is undefined; use 'h-step'.")
+    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing)
     if len(model.outputs) > 1:
         options = (method, groups, h, bounds, level, order_by)
-        known = {"time": time, "dt": dt, "weights": weights, "drift": drift, "limits": limits, "exclude": exclude}
-        return tune_outputs(model, tracker, y, u, known, data, by, lambda task: _tuned(task, tracker, *options))
-    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
+        return tune_outputs(model, tracker, y, u, reading, data, by, lambda task: _tuned(task, tracker, *options))
     return _tuned(_task(model, tracker, y, u, reading, data, by), tracker, method, groups, h, bounds, level, order_by)
 
 
