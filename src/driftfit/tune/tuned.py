@@ -41,9 +41,10 @@ class Tuned(Printed):
     method : str
         The criterion.
     loglik : float
-        Log-likelihood of the record under ``tracker`` and ``noise``; NaN for trackers without a variance. For trackers
-        that estimate their scale on-line (`RLS`, `FLS`) it is above that of a run, which had less information at the
-        start.
+        Log-likelihood of the record under ``tracker``: ``track(model, tuned.tracker, y, u).loglik``, with several
+        records their sum; NaN for trackers without a variance.
+    used : int
+        Samples in this likelihood: those with a density given earlier samples.
     noise : float
         Estimated noise variance; unreliable if ``at_bound`` is not empty.
     at_bound : tuple of str
@@ -59,6 +60,7 @@ class Tuned(Printed):
     tracker: Tracker
     method: str
     loglik: float
+    used: int
     noise: float
     at_bound: tuple[str, ...]
     interval: dict[str, tuple[float, float]]
@@ -67,7 +69,10 @@ class Tuned(Printed):
 
     @property
     def table(self) -> polars.DataFrame:
-        """Every setting that was tried and its criterion, best first: log-likelihood, or mean square."""
+        """Every setting that was tried and its criterion, best first: log-likelihood, or mean square.
+
+        For `RLS` and `FLS` the likelihood is the maximum over the noise variance.
+        """
         import polars
 
         points, values = self._search.tried()
@@ -86,7 +91,7 @@ class Tuned(Printed):
         yield facts(
             ("Tracker", shortened(repr(self.tracker))),
             ("Criterion", METHODS[self.method]),
-            *([("Log-likelihood", f"{self.loglik:.6g}")] if np.isfinite(self.loglik) else []),
+            *([("Log-likelihood", f"{self.loglik:.6g} of {self.used} samples")] if np.isfinite(self.loglik) else []),
             ("Noise variance", f"{self.noise:.4g}"),
         )
         ends = (f"[{0.5 - self.level / 2:.3g}", f"{0.5 + self.level / 2:.3g}]")
