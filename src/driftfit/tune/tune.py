@@ -85,8 +85,10 @@ def tune(
     h : int
         Samples ahead, for "h-step".
     bounds : (low, high)
-        Range of the search: for mu or r / q in units of the mean square of the regressors (default 1e-4 to max(1e5,
-        T^2)), for r in units of the residual variance of constant parameters, for the memory of RLS in samples.
+        Range of the setting: of mu, q, r or forgetting, of q / r if both are estimated, of the scales of a `Bank`. A
+        drift of zero is then excluded. Default: mu or r / q from 1e-4 to max(1e5, T^2) times the mean square of the
+        regressors, r from 1e-9 to 1e3 times the residual variance of constant parameters, a memory of 2 n to 100 T
+        samples, scales from 1e-3 to 1e3.
     level : number
         Level of the intervals.
     by : names of columns, "row" or None

@@ -50,9 +50,8 @@ class Tuned(Printed):
     at_bound : tuple of str
         Settings that ended at a bound of the search, or at zero; empty if the optimum is inside.
     interval : dict of (low, high)
-        By name of setting, the interval of the likelihood at ``level``: from profiles (for "q[..]/r", "mu",
-        "forgetting" and a single "q" or "r"), or from the curvature (for "q[..]" and "r" estimated together). NaN for
-        other methods.
+        By name of setting, the interval of the likelihood at ``level``: where its profile has fallen by half the
+        chi-square quantile. NaN for other methods.
     level : float
         The level of the intervals.
     """
