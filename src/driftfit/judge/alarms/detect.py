@@ -199,9 +199,11 @@ class Alarms(Printed):
         for t in map(int, self.onsets[:20]):
             j, change = self.rule.cause(self.statistic[t]), self.change(t)
             cells = [value_text(self.kind, self.statistic[t, j]), self.rule.limit_text(j)]
-            if change is not None:
+            if change is not None and np.isfinite(change.size):
                 half = 0.5 * (change.high - change.low)
                 cells += [f"{change.size:.3g}", f"{half:.2g}", self.run.time_text(change.since)]
+            elif change is not None:  # the likelihood ratio does not name the cause that the sum has
+                cells += ["", "", ""]
             table.add_row(*self.span(t), Text(self.cause(t)), *cells)
         yield table
         if len(self.onsets) > 20:
