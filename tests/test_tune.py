@@ -339,6 +339,7 @@ def test_frontier():
     for mu in (1e-3, 1.0, 300.0):
         pair = frontier(d.model, d.y, d.u, mu=[mu * 1.001**0.5, mu / 1.001**0.5])
         assert np.diff(pair.measurement) / np.diff(pair.dynamic) == pytest.approx(-mu, rel=1e-3)
+    assert str(grid).split()[-3:] == [f"{column[-1]:.4g}" for column in grid]
     left, right = grid.plot().axes
     np.testing.assert_array_equal(left.lines[0].get_data(), (grid.dynamic, grid.measurement))
     for line, cost in zip(right.lines, (grid.measurement, grid.dynamic), strict=True):

@@ -7,7 +7,7 @@ from collections.abc import Hashable, Mapping
 from copy import copy
 from io import StringIO
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -16,6 +16,8 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.jupyter import JupyterMixin
 from rich.table import Column, Table
 from rich.text import Text
+
+from driftfit.engine.kernel import Array
 
 WIDTH = 96
 
@@ -63,6 +65,16 @@ class Printed(JupyterMixin):
     def _repr_html_(self) -> str:
         """What notebooks ask for that do not ask rich."""
         return html_of(self)
+
+
+Kind = TypeVar("Kind", bound=type)
+
+
+def printing(kind: Kind) -> Kind:
+    """Let a named tuple, which cannot inherit, show itself as `Printed` does."""
+    for name in ("__repr__", "__str__", "_repr_html_"):
+        setattr(kind, name, vars(Printed)[name])
+    return kind
 
 
 def key_text(key: Hashable) -> str:
@@ -116,6 +128,8 @@ SHORT = 10
 """A cell of at most this many characters stays on one line: numbers, and p-values such as < 0.0001."""
 
 
+ROWS = 20
+"""Rows of a table of numbers over time or over settings."""
 BETWEEN = 3
 """Blanks between two columns of a table."""
 
@@ -162,6 +176,11 @@ class Numbers(Table):
 def _widen(column: Column, text: str) -> None:
     words = [text] if len(text) <= SHORT else text.split()
     column.min_width = max(column.min_width or 0, *map(cell_len, words), 0)
+
+
+def some_rows(count: int) -> Array:
+    """The rows of a table of ``count``: at most `ROWS`, evenly spaced, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(ROWS, count)).round().astype(int))
 
 
 def table_of(title: str, *heads: str, names: int = 1, group: int = 1) -> Table:
