@@ -10,7 +10,7 @@ from rich.text import Text
 
 from driftfit.data.record import Labels
 from driftfit.engine.kernel import Array
-from driftfit.judge.compare import Comparison, compare
+from driftfit.judge.compare import Comparison, compare, left_at_start
 from driftfit.models.base import GAP
 from driftfit.models.equation import Equation
 from driftfit.models.fault_codes import refusals
@@ -96,7 +96,7 @@ class Summary(Printed):
 def summarise(run: Track) -> Summary:
     """Build the summary of a run; of outputs that share one theta that of all rows."""
     remarks, run = _of_each_output(run), run.rows
-    burn = burn_in(run.model.n)
+    burn = left_at_start(run)
     low, high = run.band(0.95)
     path = run.theta[burn:] if len(run) > burn else run.theta[-1:]
     rows = tuple(
