@@ -128,8 +128,6 @@ SHORT = 10
 """A cell of at most this many characters stays on one line: numbers, and p-values such as < 0.0001."""
 
 
-ROWS = 20
-"""Rows of a table of numbers over time or over settings."""
 BETWEEN = 3
 """Blanks between two columns of a table."""
 
@@ -178,9 +176,9 @@ def _widen(column: Column, text: str) -> None:
     column.min_width = max(column.min_width or 0, *map(cell_len, words), 0)
 
 
-def some_rows(count: int) -> Array:
-    """The rows of a table of ``count``: at most `ROWS`, evenly spaced, the first and the last among them."""
-    return np.unique(np.linspace(0, count - 1, min(ROWS, count)).round().astype(int))
+def some_rows(count: int, most: int = 20) -> Array:
+    """The rows of a table of ``count``: at most ``most``, evenly spaced, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 
 def table_of(title: str, *heads: str, names: int = 1, group: int = 1) -> Table:
