@@ -63,8 +63,8 @@ def _with_noise(search: Search, task: Task, level: float) -> dict[str, tuple[flo
             axis = np.linspace(0.0, 1.0, 32) ** 2
             found.append(at(search.line(towards, axis)))
             end = int(np.argmax(np.append(found[-1][2] < 0.0, True)))
-            if 0 < end < len(axis):
-                found.append(at(search.line(towards, np.linspace(axis[end - 1], axis[end], 32))))
+            if end < len(axis):
+                found.append(at(search.line(towards, np.linspace(0.0, axis[end], 32))))
     points, r, left = (np.concatenate(part) for part in zip(*found, strict=True))
     points, r, left = points[left >= 0.0], r[left >= 0.0], left[left >= 0.0]
     rho = [1.0 / -scipy.special.lambertw(-np.exp(-1.0 - 2.0 * left / used), k).real for k in (-1, 0)]
