@@ -36,7 +36,7 @@ from driftfit.run.track import records_of
 from driftfit.trackers.base import Tracker
 from driftfit.tune.intervals import intervals_of
 from driftfit.tune.lanes import Task, score
-from driftfit.tune.objective import Criterion, along
+from driftfit.tune.objective import Criterion, along, run_task
 from driftfit.tune.outputs import TunedOutputs, tune_outputs
 from driftfit.tune.parametrisation import find_knobs
 from driftfit.tune.search import Counted, Search, minimise
@@ -87,8 +87,10 @@ def tune(
     h : int
         Samples ahead, for "h-step".
     bounds : (low, high)
-        Range of the search: for mu or r / q in units of the mean square of the regressors (default 1e-4 to max(1e5,
-        T^2)), for r in units of the residual variance of constant parameters, for the memory of RLS in samples.
+        Range of the setting: of mu, q, r or forgetting, of q / r if both are estimated, of the scales of a `Bank`. A
+        drift of zero is then excluded. Default: mu or r / q from 1e-4 to max(1e5, T^2) times the mean square of the
+        regressors, r from 1e-9 to 1e3 times the residual variance of constant parameters, a memory of 2 n to 100 T
+        samples, scales from 1e-3 to 1e3.
     level : number
         Level of the intervals.
     by : names of columns, "row" or None
@@ -143,10 +145,13 @@ def _tuned(
     if knobs.profiled and tracker.covariance and not sigma2 > (ROUNDING * _largest(task)) ** 2:
         raise ValueError(_without_noise(task))
     _warn(search)
+    built = knobs.build(search.x, sigma2)
+    runs = run_task(task, built)
     return Tuned(
-        tracker=knobs.build(search.x, sigma2),
+        tracker=built,
         method=method,
-        loglik=float(final.loglik(knobs.profiled)[0]) if tracker.covariance else float("nan"),
+        loglik=sum(run.loglik for run in runs),
+        used=sum(int(np.isfinite(run.log_density).sum()) for run in runs) if tracker.covariance else 0,
         noise=sigma2 if knobs.profiled else float(getattr(knobs.run(search.x), "r", np.nan)),
         at_bound=tuple(name for name, i in zip(knobs.names, knobs.owner, strict=True) if search.at_bound(i)),
         interval=intervals_of(search, task, method, tracker, level),
