@@ -76,11 +76,11 @@ def rebuild(description: Mapping[str, Any], kind: type) -> Any:
 
 def write(path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
     """Write a header and arrays as .npz, completely or not at all."""
-    _write(path, lambda file: _put(file, header, arrays))
+    replace_file(path, lambda file: _put(file, header, arrays))
 
 
-def _write(path: str | PathLike[str], put: Callable[[Any], Any]) -> None:
-    """Let ``put`` write a file that is complete or absent."""
+def replace_file(path: str | PathLike[str], put: Callable[[Any], Any]) -> None:
+    """Let ``put`` write a file, which takes the place of an older one once it is complete and on the disk."""
     target = os.path.abspath(os.fspath(path))
     name = os.path.join(os.path.dirname(target), f".driftfit-{secrets.token_hex(8)}")
     try:
@@ -182,7 +182,7 @@ class Kept(ABC):
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write model, settings and state to one file without pickle, completely or not at all."""
-        _write(path, lambda file: file.write(self.to_bytes()))
+        replace_file(path, lambda file: file.write(self.to_bytes()))
 
     @classmethod
     def _kinds(cls) -> Mapping[str, type[Kept]]:

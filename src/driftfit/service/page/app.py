@@ -197,8 +197,10 @@ class Page:
 
     async def samples(self, request: Request) -> Response:
         """Take samples; the answer comes when they are in the journal."""
-        self.operator(request)
-        header = {"do": "samples", "topic": request.path_params.get("topic", "")}
+        user = request.scope["user"]
+        if user.role == "viewer":
+            raise HTTPException(403, f"{user.name} is a viewer; this needs a sender or an operator")
+        header = {"do": "samples", "topic": request.path_params.get("topic", ""), "units": user.units}
         return await self.asked(header, await request.body())
 
     async def actions(self, request: Request) -> Response:
@@ -251,12 +253,13 @@ class Page:
         response = Answer({"name": name, "role": found.role})
         secure = bool(self.options.certificate) or self.options.behind_proxy
         response.set_cookie(
-            COOKIE, self.sessions.new(name), max_age=int(SESSION), httponly=True, samesite="strict", secure=secure
+            COOKIE, self.sessions.new(found), max_age=int(SESSION), httponly=True, samesite="strict", secure=secure
         )
         return response
 
     async def logout(self, request: Request) -> Response:
-        """End the session in this browser."""
+        """End the session."""
+        self.sessions.end(request.cookies.get(COOKIE, ""))
         response = Answer({})
         response.delete_cookie(COOKIE)
         return response
