@@ -87,8 +87,13 @@ def test_a_tracker_of_the_users_own(folder):
         "q=0",
         "-p",
         "r=1",
+        "--out",
+        "own.npz",
     )
     assert "Mine(q=0.0, r=1.0" in text
+    again = ["a.csv", "--y", "flow", "--u", "valve", "--start", "own.npz"]
+    assert "Mine(q=0.0, r=1.0" in run(*again, "--with", "mine_for_cli:Mine")
+    assert "needs mine_for_cli:Mine" in CliRunner().invoke(app, ["track", *again]).output
     for place, message in (
         ("mine_for_cli:Other", "has no Tracker of the name Other"),
         ("mine_for_cli", "name the module and the class"),

@@ -66,6 +66,12 @@ def _tuples(value: Any) -> Any:
     return tuple(_tuples(v) for v in value) if isinstance(value, list | tuple) else value
 
 
+def place_of(made: Any) -> str:
+    """The module and name of a class or function, as files name it."""
+    source = getattr(made, "py_func", made)
+    return f"{source.__module__}:{source.__qualname__}"
+
+
 def plain(value: Any) -> Any:
     """A number, sequence or array as float, tuple of floats, or tuple of tuples, so that it hashes and prints."""
     array = np.asarray(value, dtype=float)
