@@ -18,6 +18,7 @@ from driftfit.cli.track import Plot, Report
 from driftfit.engine.settings import marks
 from driftfit.judge.alarms.detect import Alarms
 from driftfit.results import Track
+from driftfit.show.export import write_table
 from driftfit.show.report import check_path
 
 
@@ -109,7 +110,7 @@ def _band(entry: str) -> tuple[str, tuple[float, float]]:
 
 def _write(alarms: Any, path: Path) -> None:
     table = _table(alarms) if isinstance(alarms, Alarms) else alarms.table
-    table.write_csv(path) if path.suffix.lower() == ".csv" else table.write_parquet(path)
+    write_table(table, path)
 
 
 def _table(alarms: Alarms) -> pl.DataFrame:

@@ -16,6 +16,7 @@ from driftfit.cli.parts.program import app, say
 from driftfit.cli.parts.reading import Part, rows_of
 from driftfit.engine.kernel import Array
 from driftfit.results import Track
+from driftfit.show.export import write_table
 from driftfit.show.parts.text import table_of
 
 SHOWN = 40
@@ -66,8 +67,7 @@ def forecast(
     if write_to is not None:
         more: dict[str, Any] = {f"theta_{name}": made.theta[:, i] for i, name in enumerate(run.names)}
         more |= {f"std_{name}": made.std[:, i] for i, name in enumerate(run.names)}
-        frame = pl.DataFrame({**columns, **more})
-        frame.write_csv(write_to) if write_to.suffix.lower() == ".csv" else frame.write_parquet(write_to)
+        write_table(pl.DataFrame({**columns, **more}), write_to)
 
 
 def _inputs(given: Given, future: str) -> Array:

@@ -22,6 +22,7 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 
+from driftfit.data.formats.csv_files import without_formulas
 from driftfit.service.page import history, metrics, openapi
 from driftfit.service.page.access import COOKIE, Access, Rates
 from driftfit.service.page.feed import Feed, finite, unheard
@@ -163,7 +164,7 @@ class Page:
             values = history.samples(self.feed.journal, number, recent, start, stop)
             table = pl.DataFrame(values, schema=dict.fromkeys(names[: values.shape[1]], pl.Float64))
             if kind == "csv":
-                return table.write_csv().encode()
+                return without_formulas(table).write_csv().encode()
             file = io.BytesIO()
             table.write_ipc(file)
             return file.getvalue()
