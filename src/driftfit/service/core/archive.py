@@ -6,6 +6,7 @@ moment leaves every sample in at least one of the two, and a piece that is writt
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import time
@@ -15,6 +16,7 @@ from typing import Any
 
 import polars as pl
 
+from driftfit.data.storage import replace_file
 from driftfit.service.core.journal import Act, Journal, Pending
 from driftfit.service.settings.options import ServiceOptions
 
@@ -24,6 +26,10 @@ EVERY = 60.0
 PIECE = 2_000
 """Groups of one piece."""
 DAY = 86_400.0
+OLD = "stop < ? and stop > 1e8"
+"""Which blocks of the history are older than a time; those of units without times are kept."""
+SUMS = "SHA256SUMS"
+"""The file of the digests of all pieces, which `sha256sum -c` reads."""
 
 
 class Archive:
@@ -43,6 +49,7 @@ class Archive:
                 log.error("archive", extra={"detail": str(self._writing.exception())})
             elif upto := self._writing.result():
                 pending.forget.append(("delete from log where first < ?", (upto,)))
+                pending.forget.append(("delete from chain where number < ?", (upto,)))
             self._writing = None
         if time.monotonic() - self._looked < EVERY or self._writing is not None:
             return
@@ -52,10 +59,12 @@ class Archive:
     def begin(self, pending: Pending, needed: int, sinks_at: int) -> None:
         """Look for old rows."""
         now = time.time()
+        old = now - DAY * self.options.history
         pending.forget += [
             ("delete from result where at < ? and first < ?", (now - 60.0, min(needed, sinks_at))),
             ("delete from result where at < ?", (now - DAY * self.options.results,)),
-            ("delete from block where stop < ? and stop > 1e8", (now - DAY * self.options.history,)),
+            (f"delete from history where (unit, first) in (select unit, first from block where {OLD})", (old,)),
+            (f"delete from block where {OLD}", (old,)),
         ]
         self._writing = self._pool.submit(export, self.folder, needed, now - DAY * self.options.keep)
 
@@ -108,4 +117,7 @@ def export(folder: Path, needed: int, before: float) -> int:
     with open(partial, "rb") as handle:
         os.fsync(handle.fileno())
     partial.replace(target)
+    sums, digest = target.with_name(SUMS), hashlib.sha256(target.read_bytes()).hexdigest()
+    others = [one for one in (sums.read_text().splitlines() if sums.exists() else []) if not one.endswith(target.name)]
+    replace_file(sums, lambda file: file.write("\n".join([*others, f"{digest}  {target.name}", ""]).encode()))
     return int(upto)

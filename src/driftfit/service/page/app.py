@@ -179,12 +179,12 @@ class Page:
         limit = min(max(int(_number(request, "limit", 100.0)), 1), 1000)
         name = request.query_params.get("unit")
         where, values = ("where unit = ?", [self.number(name)]) if name else ("", [])
-        query = f"select number, unit, at, kind, detail from event {where} order by id desc limit ?"
-        rows = await run_in_threadpool(lambda: self.feed.journal.db.execute(query, (*values, limit)).fetchall())
+        where += " order by rowid desc limit ?"
+        rows = await run_in_threadpool(lambda: [*self.feed.journal.rows("event", where, *values, limit)])
         self.feed.names.read()
         names = self.feed.names.names
-        found = [{"number": n, "unit": names[u], "at": at, "kind": kind, "detail": json.loads(detail)}
-                 for n, u, at, kind, detail in rows]  # fmt: skip
+        found = [{"number": n, "unit": names.get(u, ""), "at": at, "kind": kind, "detail": json.loads(detail)}
+                 for n, u, at, kind, detail, _ in rows]  # fmt: skip
         return Answer({"events": found})
 
     async def status(self, request: Request) -> Response:

@@ -65,6 +65,8 @@ class ServiceOptions:
     """Days for which results wait for sinks that are away."""
     history: float = 365.0
     """Days for which the page's history is kept."""
+    audit: bool = False
+    """Whether the groups of the journal are a chain of digests, which `driftfit journal verify` checks."""
     units: int = 100_000
     """Most units; topics beyond that are refused and counted."""
     log: str = "info"
