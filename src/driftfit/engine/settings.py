@@ -209,18 +209,25 @@ def output_names(owner: str, ny: Any) -> tuple[str, ...]:
 
 
 def as_numbers(name: str, values: Any) -> Array:
-    """Values as floats; None and masked entries become NaN; for text the error names its position."""
+    """Values as floats; None and masked entries become NaN, whole numbers beyond all floats infinite.
+
+    For text the error names its position.
+    """
     if isinstance(values, np.ma.MaskedArray):
         values = np.ma.filled(values.astype(float), np.nan)
+    if getattr(getattr(values, "dtype", None), "kind", "") == "c":
+        raise ValueError(f"{name} is complex; give its real and imaginary parts as two signals.")
     try:
         return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pass
     given = np.asarray(values, dtype=object)
     out = np.empty(given.shape)
     for place, value in np.ndenumerate(given):
         try:
             out[place] = np.nan if value is None or value == "" else float(value)
+        except OverflowError:  # a whole number beyond all floats
+            out[place] = math.inf if value > 0 else -math.inf
         except (TypeError, ValueError):
             where = f"entry {place[0] if len(place) == 1 else place}" if place else "it"
             raise ValueError(f"{name}: {where} is {value!r}, which is not a number.") from None
