@@ -23,7 +23,7 @@ def verify(
     folder: Annotated[Path, typer.Argument(help="The folder of the service, which may run meanwhile.")],
     digest: Annotated[str, typer.Option(help="A digest that was printed earlier; the chain must have it.")] = "",
 ) -> None:
-    """Check the sum of every row, the chain of digests, and the exported files; exit code 1 if something is wrong."""
+    """Check the sum of every row, and the chain of digests; exit code 1 if something is wrong."""
     with helpful():
         try:
             from driftfit.service.verify import verify as faults_of

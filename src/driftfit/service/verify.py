@@ -1,14 +1,12 @@
-"""Check a journal: the sum of every row, the chain of digests, and the files to which old groups were exported."""
+"""Check a journal: the sum of every row, and the chain of digests."""
 
 from __future__ import annotations
 
-import hashlib
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
-from driftfit.service.core.archive import SUMS
 from driftfit.service.core.journal import NAME, Journal, linked, sum_of
 
 TABLES = ("meta", "unit", "log", "result", "program", "snapshot", "block", "history", "event", "position", "chain")
@@ -20,7 +18,7 @@ def verify(folder: Path, digest: str = "") -> tuple[str, list[str]]:
         with closing(Journal(folder, read_only=True)) as journal:
             groups = journal.db.execute("select count(*) from log").fetchone()[0]
             chain = [bytes(one) for (one,) in journal.db.execute("select digest from chain order by number")]
-            faults = [*_sums(journal), *_links(journal), *_pieces(folder / "journal")]
+            faults = [*_sums(journal), *_links(journal)]
     except sqlite3.Error as error:
         raise ValueError(f"{folder / NAME} cannot be read: {error}.") from None
     if digest and bytes.fromhex(digest) not in chain:
@@ -53,11 +51,3 @@ def _links(journal: Journal) -> Iterator[str]:
         f"select first from log where first > {since} and first not in (select number from chain)"
     ):
         yield f"log: the group {first} is not in the chain"
-
-
-def _pieces(folder: Path) -> Iterator[str]:
-    sums = folder / SUMS
-    for line in sums.read_text(encoding="utf-8").splitlines() if sums.exists() else ():
-        digest, _, name = line.partition("  ")
-        if not (folder / name).exists() or hashlib.sha256((folder / name).read_bytes()).hexdigest() != digest:
-            yield f"{name}: the file is missing or another one"

@@ -6,7 +6,6 @@ moment leaves every sample in at least one of the two, and a piece that is writt
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import time
@@ -16,7 +15,6 @@ from typing import Any
 
 import polars as pl
 
-from driftfit.data.storage import replace_file
 from driftfit.service.core.journal import Act, Journal, Pending
 from driftfit.service.settings.options import ServiceOptions
 
@@ -28,8 +26,6 @@ PIECE = 2_000
 DAY = 86_400.0
 OLD = "stop < ? and stop > 1e8"
 """Which blocks of the history are older than a time; those of units without times are kept."""
-SUMS = "SHA256SUMS"
-"""The file of the digests of all pieces, which `sha256sum -c` reads."""
 
 
 class Archive:
@@ -117,7 +113,4 @@ def export(folder: Path, needed: int, before: float) -> int:
     with open(partial, "rb") as handle:
         os.fsync(handle.fileno())
     partial.replace(target)
-    sums, digest = target.with_name(SUMS), hashlib.sha256(target.read_bytes()).hexdigest()
-    others = [one for one in (sums.read_text().splitlines() if sums.exists() else []) if not one.endswith(target.name)]
-    replace_file(sums, lambda file: file.write("\n".join([*others, f"{digest}  {target.name}", ""]).encode()))
     return int(upto)
