@@ -62,9 +62,9 @@ def warn_of_sizes(names: Sequence[str], values: Array) -> None:
     as 0, by a thousand numbers of each.
     """
     for name, column in zip(names, values[:: len(values) // ENOUGH + 1].T, strict=True):
-        if SMALLEST < column @ column < LARGEST:  # nearly always, so it must cost little
-            continue
         size = np.abs(column)
+        if SMALLEST < size.max(initial=0.0) < LARGEST:  # nearly always, so it must cost little
+            continue
         size = size[(size > 0.0) & (size < np.inf)]
         odd = size[(size <= SMALLEST) | (size >= LARGEST)]
         if 2 * len(odd) > len(size):
