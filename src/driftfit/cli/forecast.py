@@ -15,6 +15,7 @@ from driftfit.cli.parts.program import app, say
 from driftfit.cli.parts.reading import rows_of
 from driftfit.engine.kernel import Array
 from driftfit.results import Track
+from driftfit.show.export import write_table
 from driftfit.show.parts.text import table_of
 
 SHOWN = 40
@@ -60,7 +61,7 @@ def forecast(
     if ahead > SHOWN:
         say(Text(f" the first {SHOWN} of {ahead}; --out writes all", "dim"))
     if write_to is not None:
-        frame.write_csv(write_to) if write_to.suffix.lower() == ".csv" else frame.write_parquet(write_to)
+        write_table(frame, write_to)
 
 
 def _inputs(given: Given, future: str) -> Array:

@@ -20,7 +20,7 @@ from driftfit.data.clock import LABEL, Clock
 from driftfit.data.known import Known, row_of
 from driftfit.data.labels import held, ordered, times_of, together
 from driftfit.data.limits import Limits, marked, marks, within_each
-from driftfit.data.signals import as_inputs, as_output, intervals, noise_of
+from driftfit.data.signals import as_inputs, as_output, intervals, noise_of, warn_of_sizes
 from driftfit.data.times.gaps import warn_of_gaps
 from driftfit.data.times.instants import instants
 from driftfit.engine.kernel import Array
@@ -242,9 +242,13 @@ class Records(NamedTuple):
     def for_model(self, model: Model, reading: Reading, reach: int | None = None) -> Records:
         """Sort the inputs for a model with named inputs, and apply valid ranges, marks and excluded intervals.
 
-        Warns if most samples cannot be used because of dt, with lags of ``reach`` samples, or those of the model.
+        Warns if most numbers of a signal are out of range, and if most samples cannot be used because of dt, with lags
+        of ``reach`` samples, or those of the model.
         """
         u, names = ordered(model, self.u, self.labels.u)
+        warn_of_sizes(self.outputs or (self.labels.y,), self.y.reshape(len(self.y), -1))
+        if m := u.shape[-1]:
+            warn_of_sizes(names or [f"u{j + 1}" for j in range(m)], u.reshape(-1, m))
         found = self if u is self.u else self._replace(u=u, labels=replace(self.labels, u=names))
         if reading.limits or reading.exclude or reading.missing:
             found = found._restricted(names or model.input_names, reading)

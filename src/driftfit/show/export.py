@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 import polars as pl
 
+from driftfit.data.formats.csv_files import without_formulas
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import of_series, one_of
 from driftfit.run.fleet import Fleet
@@ -247,4 +248,12 @@ def write(result: Result, path: str | PathLike[str]) -> None:
     elif ending == ".parquet":
         to_parquet(result, path)
     else:
-        as_table(result).write_csv(Path(path))
+        write_table(as_table(result), Path(path))
+
+
+def write_table(table: pl.DataFrame, path: Path) -> None:
+    """Write a table as .csv or .parquet, depending on the ending of the name."""
+    if path.suffix.lower() == ".csv":
+        without_formulas(table).write_csv(path)
+    else:
+        table.write_parquet(path)

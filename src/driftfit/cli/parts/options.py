@@ -25,7 +25,7 @@ from driftfit.cli.parts.reading import (
 from driftfit.engine.settings import missing_settings
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
-from driftfit.parsing.settings import parse_model, parse_tracker
+from driftfit.parsing.settings import own_tracker, parse_model, parse_tracker
 from driftfit.trackers.base import Tracker
 
 Names = list[str] | None
@@ -187,11 +187,11 @@ class Given:
             raise ValueError("--model: give one model; `driftfit select` compares several.")
         if self.start is None:
             return models[0], self.chosen_tracker(), None
-        if self.model or self.p or self.own or self.tracker != "adaptive-kalman":
+        if self.model or self.p or self.tracker != "adaptive-kalman":
             raise ValueError(f"--start {self.start}: model and tracker come from the file; leave out --model, -p ...")
         if self.by or len(self.outputs) > 1:
             raise ValueError(f"--start {self.start}: the file holds one run of one output; leave out --by.")
-        before = saved(self.start)
+        before = saved(self.start, [own_tracker(self.own)] if self.own else [])
         return before.model, before.tracker, before
 
     def arrays(self) -> dict[str, Any]:
@@ -203,17 +203,17 @@ class Given:
         return {name: signals[name] for name in signals if name not in ("by", "units")}
 
 
-def saved(path: Path) -> Any:
-    """Load a run, or the state of a stream, from a file."""
+def saved(path: Path, classes: list[Any]) -> Any:
+    """Load a run, or the state of a stream, from a file; ``classes`` are those of the user's own that it may need."""
     from driftfit.results import Track
     from driftfit.streams import Live
 
     try:
-        return Track.load(path)
+        return Track.load(path, classes)
     except ValueError as error:
         if "state" not in str(error):
             raise
-    return Live.load(path)
+    return Live.load(path, classes)
 
 
 def reads(command: Callable[..., None]) -> Callable[..., None]:

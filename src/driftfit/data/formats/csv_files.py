@@ -26,6 +26,9 @@ from driftfit.data.times.dates import is_date
 PROBE = 1 << 16
 """The bytes from which the separator, the decimal sign and units are judged."""
 
+RUN = r"^[=+\-@\t\r]"
+"""How a text begins that spreadsheets run as a formula."""
+
 DECLARED = re.compile(r"\ufeff?sep=(.)\s*$", re.IGNORECASE)
 """A first line with which spreadsheets say what separates cells."""
 
@@ -36,6 +39,22 @@ SEPARATORS = ",;\t|"
 COMMENT = re.compile(rf"#(?!{ERROR[1:]}\s*([{SEPARATORS}]|$))", re.IGNORECASE)
 VALUE = re.compile(r"[+-]?[.,]?\d(?!/[A-Za-z])")
 """How a number or a date begins, other than the unit 1/s."""
+
+
+def without_formulas(table: pl.DataFrame) -> pl.DataFrame:
+    """A table for spreadsheets: a text or name that they would run begins with an apostrophe.
+
+    A text that is a number, as in "-5", is none of them.
+    """
+
+    def quoted(column: pl.Series) -> pl.Series:
+        texts = column.cast(pl.String)
+        runs = texts.str.contains(RUN) & texts.cast(pl.Float64, strict=False).is_null()
+        return ("'" + texts).zip_with(runs.fill_null(False), texts).alias(column.name)
+
+    texts = [quoted(column) for column in table if column.dtype in (pl.String, pl.Categorical, pl.Enum)]
+    names = quoted(pl.Series(values=table.columns, dtype=pl.String))
+    return table.with_columns(texts).rename(dict(zip(table.columns, names, strict=True)))
 
 
 def start_of(source: str | bytes) -> bytes:
