@@ -64,7 +64,7 @@ def results_of(engine):
 
 def events(engine, kind=None):
     settled(engine)
-    found = engine.journal.db.execute("select kind, detail from event order by id").fetchall()
+    found = engine.journal.db.execute("select kind, detail from event order by rowid").fetchall()
     return [json.loads(detail) for one, detail in found if kind in (None, one)]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from driftfit import ARX, RLS, AugmentedFLS, Kalman, Live, Regression, Track, track
+from driftfit import ARX, RLS, AugmentedFLS, DataWarning, Kalman, Live, Regression, Track, track
 from driftfit.data import storage
 from driftfit.trackers import found
 
@@ -78,6 +78,42 @@ def test_no_value_anywhere_poisons(tracker, bad):
         assert np.isfinite(run.theta).all()
         assert not run.ok[20 if name == "flow" else 21]
         assert run.ok[25:59].all()
+
+
+@pytest.mark.parametrize("which", ["y", "u"])
+def test_complex_signals_are_refused(which):
+    """Their imaginary parts were left out."""
+    given = {"y": np.ones(9), "u": np.ones(9)}
+    given[which] = given[which] + 1j
+    with pytest.raises(ValueError, match=f"{which} is complex; give its real and imaginary parts as two signals"):
+        track(MODEL, TRACKER, **given)
+    one = {name: values[0] for name, values in given.items()}
+    with pytest.raises(ValueError, match="is complex"):
+        Live(MODEL, TRACKER).update(one["y"], one["u"])
+
+
+@pytest.mark.parametrize("huge", [10**400, -(10**400)], ids=["above", "below"])
+def test_whole_numbers_beyond_all_floats_are_missing(huge):
+    live = Live(MODEL, TRACKER)
+    for y, u in ((1.0, 1.0), (huge, 1.0), (1.0, huge)):
+        step = live.update(y, u)
+    assert not step[3]
+    assert np.isfinite(live.theta).all()
+    run = track(MODEL, TRACKER, [1.0, 10**400, 2.0], [1.0, 1.0, -(10**400)])
+    assert np.isinf(run.y[1])
+    assert np.isinf(run.u[2, 0])
+
+
+@pytest.mark.parametrize(("size", "counted"), [(1e75, "count as missing"), (1e-75, "as 0")])
+@pytest.mark.parametrize("which", ["y", "u"])
+def test_signals_of_impossible_size_are_named(size, counted, which):
+    """theta was 0, and its deviation inf, without a word."""
+    data, rng = table(5000), np.random.default_rng(0)
+    given = {"y": data["flow"].to_numpy(), "u": np.column_stack([rng.normal(size=5000), data["u"].to_numpy()])}
+    given[which] = given[which] * size if which == "y" else given[which] * np.array([1.0, size])
+    name = {"y": "y", "u": "u2"}[which]
+    with pytest.warns(DataWarning, match=f"most numbers of {name} are like .*{counted}.*another unit"):
+        track(ARX(1, [1, 1]), TRACKER, **given)
 
 
 @pytest.mark.parametrize("tracker", KINDS, ids=repr)
@@ -237,7 +273,7 @@ def test_state_files(tmp_path):
         Live.load(path)
     absent = header["model"] | {"class": "driftfit.models.arx:Absent"}
     path.write_bytes(storage.compact(header | {"model": absent}, arrays))
-    with pytest.raises(ValueError, match="cannot be imported here"):
+    with pytest.raises(ValueError, match=r"needs driftfit\.models\.arx:Absent, which is not a part"):
         Live.load(path)
 
 

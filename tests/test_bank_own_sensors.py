@@ -121,7 +121,7 @@ def test_stream_fleet_and_file_say_the_same(tmp_path):
         assert same(live.theta, run.theta[t])
         if t == 30:
             live.save(tmp_path / "state")
-            live = Live.load(tmp_path / "state")
+            live = Live.load(tmp_path / "state", classes=[laplace, clipped])
     assert live.tracker == bank
     fleet = track(ARX(1, 1), bank, np.stack([y, y]), np.stack([u, u]), by="row")
     assert same(fleet[1].theta, run.theta)

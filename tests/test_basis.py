@@ -91,6 +91,4 @@ def test_functions_of_the_user(tmp_path):
     run = track(model, Kalman(q=0.0, r=1e-6, p0=1e6), s.y, s.u)
     np.testing.assert_allclose(run.theta[-1], s.theta[-1], atol=1e-3)
     run.save(tmp_path / "run")
-    assert Track.load(tmp_path / "run").model == run.model == model.bind(1)
-    with pytest.raises(ValueError, match="cannot be imported"):
-        Functions("nowhere:f", "nowhere:g")
+    assert Track.load(tmp_path / "run", classes=[swing, swing_slopes]).model == run.model == model.bind(1)

@@ -147,6 +147,22 @@ def test_generalised_least_squares():
         track(SMALL, AugmentedFLS(1.0), s.y, s.u).blocks("gls")
 
 
+@pytest.mark.parametrize("method", ["svd-joint", "gls"])
+def test_blocks_of_the_smoothed_path(method):
+    """After the last sample smoothed and filtered estimates are one; without drift it is that of all samples."""
+    s = record(200)
+    run = track(SMALL, K, s.y, s.u)
+    path, filtered = run.smooth().blocks(method), run.blocks(method)
+    assert_allclose(path.xi[-1], filtered.xi[-1], rtol=1e-6)
+    if method == "gls":
+        assert_allclose(path.xi_cov[-1], filtered.xi_cov[-1], rtol=1e-4, atol=1e-12)
+        assert (path.std.b[:150] < filtered.std.b[:150]).all()
+    constant = track(SMALL, replace(K, q=0.0), s.y, s.u)
+    assert_allclose(constant.smooth().blocks(method).xi, np.tile(constant.blocks(method).xi[-1], (200, 1)), rtol=1e-5)
+    with pytest.raises(ValueError, match="has no blocks"):
+        track(Regression(1), Kalman(q=0.0, r=1.0), s.y, s.u).smooth().blocks()
+
+
 def test_gauges_describe_one_system():
     s = record()
     found = track(SMALL, K, s.y, s.u).blocks("gls")

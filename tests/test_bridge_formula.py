@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from scipy import signal, stats
 
-from driftfit import RLS, AdaptiveKalman, Kalman, Regression, track
+from driftfit import RLS, AdaptiveKalman, DataWarning, Kalman, Regression, track
 
 pytest.importorskip("formulaic", reason="formulaic is not installed")
 
@@ -37,6 +37,9 @@ def test_same_numbers_as_track():
     low, high = run.band(0.9)
     np.testing.assert_allclose(result.conf_int(0.1), np.c_[low[-1], high[-1]], rtol=1e-9)
     np.testing.assert_array_equal(result.smoothed_path, run.smooth().theta)
+    with pytest.warns(DataWarning, match="not in the order of 'index', and are sorted by it"):
+        same = TimeVaryingRegression.from_formula("y ~ x1 + x2", data[::-1], Kalman(q=1e-3, r=0.01)).fit()
+    pd.testing.assert_frame_equal(same.params_path, result.params_path)
 
 
 def test_same_numbers_as_statsmodels():

@@ -34,6 +34,7 @@ def test_plain_variables_and_wrong_names(tmp_path):
     savemat(str(tmp_path / "plain.mat"), {"y": np.arange(5.0)[:, None], "u": np.ones((5, 1)), "Ts": 0.1})
     one = read_mat(tmp_path / "plain.mat")[0]
     assert (one.y.shape, one.u.shape, one.Ts) == ((5,), (5, 1), 0.1)
+    assert len(read_mat(tmp_path / "plain.mat", y="u", u=["y"])[0]) == 5
     with pytest.raises(ValueError, match="no variable 'z'"):
         read_mat(tmp_path / "plain.mat", "z")
     with pytest.raises(ValueError, match="not a struct"):
@@ -43,6 +44,26 @@ def test_plain_variables_and_wrong_names(tmp_path):
         read_mat(tmp_path / "two.mat")
     with pytest.raises(ValueError, match="one length"):
         Experiment(np.ones(4), np.ones((5, 1)))
+
+
+@pytest.mark.parametrize("turned", [(), ("flow", "pressure"), ("flow",), ("pressure", "current")])
+def test_vectors_are_series_whatever_their_orientation(tmp_path, turned):
+    given = experiment()
+    signals = {"flow": given.y[:, None], "pressure": given.u[:, :1], "current": given.u[:, 1:]}
+    signals = {name: one.T if name in turned else one for name, one in signals.items()}
+    savemat(str(tmp_path / "log.mat"), {**signals, "Ts": 0.5})
+    one = read_mat(tmp_path / "log.mat", y="flow", u=["pressure", "current"])[0]
+    np.testing.assert_array_equal(one.y, given.y)
+    np.testing.assert_array_equal(one.u, given.u)
+    assert (one.Ts, one.y_names, one.u_names) == (0.5, ("flow",), ("pressure", "current"))
+    savemat(str(tmp_path / "s.mat"), {"s": {"y": signals["flow"], "u": signals["pressure"]}})
+    np.testing.assert_array_equal(read_mat(tmp_path / "s.mat")[0].y, given.y)
+    savemat(str(tmp_path / "plain.mat"), {"y": signals["flow"], "u": signals["current"]})
+    np.testing.assert_array_equal(read_mat(tmp_path / "plain.mat")[0].u, given.u[:, 1:])
+    with pytest.raises(ValueError, match="no numbers of the name 'speed'; it has"):
+        read_mat(tmp_path / "log.mat", y="speed")
+    with pytest.raises(ValueError, match="one length; their numbers of samples are: flow 60, Ts 1"):
+        read_mat(tmp_path / "log.mat", y=["flow", "Ts"])
 
 
 def test_version_7_3(tmp_path):

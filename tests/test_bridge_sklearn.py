@@ -14,7 +14,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import check_estimator
 
-from driftfit import RLS, Kalman, Regression, track
+from driftfit import RLS, DataWarning, Kalman, Regression, track
 from driftfit.bridges.sklearn import TrackedRegressor
 
 
@@ -99,3 +99,20 @@ def test_lags_use_own_predictions(rows):
     fitted = TrackedRegressor(RLS(1.0), lags=1).fit(X[:300, :1], y[:300])
     assert fitted.lag_coef_[0] == pytest.approx(0.7)
     np.testing.assert_allclose(fitted.predict(X[300:, :1]), y[300:], atol=1e-6)
+
+
+@pytest.mark.parametrize("lags", [0, 1])
+def test_rows_in_another_order_than_their_dates_are_sorted(rows, lags):
+    values, y = rows
+    days = pd.date_range("2024-01-01", periods=len(y), name="day")
+    X, y = pd.DataFrame(values, days, [f"x{j}" for j in range(values.shape[1])]), pd.Series(y, days)
+    ahead = X.tail(5).set_axis(days[-5:] + pd.Timedelta(days=5))
+    one = TrackedRegressor(RLS(0.98), lags=lags).fit(X, y)
+    with pytest.warns(DataWarning, match="not in the order of 'day', and are sorted by it"):
+        two = TrackedRegressor(RLS(0.98), lags=lags).fit(X[::-1], y[::-1])
+    np.testing.assert_array_equal(one.coef_path_, two.coef_path_)
+    for mine, same in zip(one.predict(ahead, return_std=True), two.predict(ahead[::-1], return_std=True), strict=True):
+        np.testing.assert_array_equal(mine, same[::-1])
+    with pytest.warns(DataWarning, match=f"1 of {len(y) + 1} rows repeat the time"):
+        twice = TrackedRegressor(RLS(0.98), lags=lags).fit(pd.concat([X, X.tail(1)]), pd.concat([y, y.tail(1)]))
+    np.testing.assert_array_equal(one.coef_path_, twice.coef_path_)

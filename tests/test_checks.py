@@ -183,4 +183,4 @@ def test_a_tracker_from_any_module_passes_everywhere(tmp_path):
     live = Live(ARX(1, 1), NLMS())
     live.update(1.0, 1.0)
     live.save(tmp_path / "state.npz")
-    assert Live.load(tmp_path / "state.npz").tracker == NLMS()
+    assert Live.load(tmp_path / "state.npz", classes=[NLMS]).tracker == NLMS()

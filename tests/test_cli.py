@@ -246,7 +246,6 @@ def test_values():
     assert settings.parse_model("ARX:2,1/2,nk=0/1,intercept") == ARX(2, (1, 2), (0, 1), intercept=True)
     assert settings.parse_model("arx: na=2, nb=0") == ARX(2, 0)
     assert settings.parse_model("ARX(2, [1, 2], nk=[0, 1])") == ARX(2, (1, 2), (0, 1))
-    assert settings.parse_model("ARX(1, 1)", ["a", "b"]).outputs == ("a", "b")
     assert settings.parse_tracker("Kalman(q=1e-4, r=0.1)", []) == Kalman(q=1e-4, r=0.1)
     for wrong in ("Kalman(q=1)", "__import__('os')", "ARX(open('f'))", "ARX(*[1])", "ARX(na=oops)"):
         with pytest.raises(ValueError, match=r"not a model|there is no|not allowed|not a number"):

@@ -208,7 +208,7 @@ def test_tune_smooth_and_forecast(table):
     table.tail(4).select("valve").write_csv("plan.csv")
     printed = run("forecast", *SIGNALS, "--future", "plan.csv", "--out", "ahead.csv")
     made = expected().forecast(4, table["valve"].to_numpy()[-4:])
-    assert np.allclose(pl.read_csv("ahead.csv")["flow"], made.y_hat)
+    assert np.allclose(pl.read_csv("ahead.csv")["y_hat"], made.y_hat)
     assert f"{made.y_hat[0]:.6g}" in printed
     assert "--future FILE" in fails("forecast", *SIGNALS)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import runpy
 from pathlib import Path
 
@@ -12,7 +13,9 @@ from typer.testing import CliRunner
 
 from driftfit import ARX, Kalman, track
 from driftfit.cli import app
+from driftfit.data.formats.csv_files import without_formulas
 from driftfit.fleets import Fleet, Outputs
+from driftfit.show import export
 
 OWN = '''
 from dataclasses import dataclass
@@ -72,6 +75,19 @@ def test_a_fleet_over_a_pattern(folder):
     assert (folder / "f.png").stat().st_size > 1000
 
 
+@pytest.mark.parametrize("rows", [(), ("--rows", "1:80")])
+def test_texts_that_mean_no_value_and_a_row_of_units(folder, rows):
+    lines = Path("a.csv").read_text().splitlines()
+    cells = [line.split(",") for line in lines]
+    cells[6][2], cells[8][2] = "Offline", "-999"
+    Path("a.csv").write_text("\n".join(",".join(row) for row in [cells[0], ["", "", "l/min", "V"], *cells[1:]]))
+    options = ("--y", "flow", "--u", "valve", "--time", "t", "--model", "arx:1,1", "--tracker", "kalman")
+    printed = run("a.csv", *options, "-p", "q=1e-3", "-p", "r=0.1", "--missing", "Offline", "--missing", "-999", *rows)
+    assert "flow (l/min) from valve (V)" in printed
+    assert "1 marked as missing" in printed
+    assert "80, 77 used, 3 skipped" in printed
+
+
 def test_a_tracker_of_the_users_own(folder):
     text = run(
         "a.csv",
@@ -87,8 +103,13 @@ def test_a_tracker_of_the_users_own(folder):
         "q=0",
         "-p",
         "r=1",
+        "--out",
+        "own.npz",
     )
     assert "Mine(q=0.0, r=1.0" in text
+    again = ["a.csv", "--y", "flow", "--u", "valve", "--start", "own.npz"]
+    assert "Mine(q=0.0, r=1.0" in run(*again, "--with", "mine_for_cli:Mine")
+    assert "needs mine_for_cli:Mine" in CliRunner().invoke(app, ["track", *again]).output
     for place, message in (
         ("mine_for_cli:Other", "has no Tracker of the name Other"),
         ("mine_for_cli", "name the module and the class"),
@@ -174,7 +195,7 @@ def test_a_fleet_of_several_outputs(tanks):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--model", "arx:1,1,ny=3", "--y", "level,flow"), "ny=3, but y names level, flow"),
+        (("--model", "arx:1,1,ny=3", "--y", "level,flow"), "y must name 3 columns, one for each output"),
         (("--y", ","), "names no column"),
         (("--y", "level", "--y", "level"), "--y level,level: name each output once"),
         (("--y", "level,flow", "--u", "valve"), "inputs must be different names"),
@@ -227,3 +248,20 @@ def test_a_name_in_quotes_that_do_not_end_is_explained(folder):
     result = CliRunner().invoke(app, ["track", "a.csv", "--y", "flow", "--u", '"valve, cold'])
     assert result.exit_code == 2
     assert "a name with a comma is quoted as in a CSV file" in result.stderr
+
+
+def test_no_cell_of_an_export_is_a_formula(tmp_path):
+    """A unit that was called =cmd|'/c calc'!A0 ran a program in a spreadsheet."""
+    wicked = ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(1)", "\tx", "plain", "-5", "+1e3", "a=b"]
+    table = pl.DataFrame({"=key": wicked, "at": range(9), "kind": pl.Series(wicked, dtype=pl.Categorical)})
+    again = pl.read_csv(io.StringIO(without_formulas(table).write_csv()))
+    assert again.columns == ["'=key", "at", "kind"]
+    assert again["'=key"].to_list() == again["kind"].to_list() == [f"'{one}" for one in wicked[:5]] + wicked[5:]
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=80)
+    data = pl.DataFrame({"unit": np.repeat(wicked[:2], 40), "=u": u, "y": np.roll(u, 1)})
+    export.write(track(ARX(1, 1), Kalman(q=1e-3, r=0.1), "y", "=u", data=data, by="unit"), tmp_path / "fleet.csv")
+    cells = {cell for line in (tmp_path / "fleet.csv").read_text().splitlines() for cell in line.split(",")}
+    assert "'=1+1" in cells
+    assert "'=u" in cells
+    assert not {one for one in cells if one[:1] in "=+@" and one}

@@ -160,7 +160,19 @@ def test_forecasts_of_a_fleet_are_one_table():
     fleet = fleet_of()
     inputs = {"p": np.ones((4, 2)), "q": np.zeros((4, 2))}
     table = fleet.forecast(4, inputs)
-    assert table.columns == ["pump", "step", "t", "y_hat", "y_std", "theta_a", "std_a", "theta_b", "std_b"]
+    assert table.columns == [
+        "pump",
+        "step",
+        "t",
+        "y_hat",
+        "y_std",
+        "low",
+        "high",
+        "theta_a",
+        "std_a",
+        "theta_b",
+        "std_b",
+    ]
     assert table.height == 12
     alone = fleet["q"].forecast(4, inputs["q"])
     part = table.filter(pl.col("pump") == "q")

@@ -398,3 +398,14 @@ def test_a_band_has_a_limit_where_the_estimate_hardly_moves(reference, r):
     alarms = run.detect("band", reference=reference if reference == 200 else {run.names[0]: reference})
     assert alarms.limits == pytest.approx([1.645], abs=0.01)
     assert len(alarms.onsets) == 0
+
+
+def test_a_cause_without_a_size_has_no_numbers_in_the_table():
+    """Regressors that move together: the sum is that of one, and the largest likelihood ratio that of the other."""
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(600, 2)) @ [[1.0, 1.0], [0.0, 0.3]]
+    drift = np.linspace(0.0, 0.12, 300)
+    y = 2.0 * u[:, 0] + u[:, 1] + np.r_[np.zeros(300), drift] * u[:, 0] + 0.1 * rng.normal(size=600)
+    alarms = track(Regression(2), Kalman(q=1e-4, r=0.01), y, u).detect("cusum", every=300, reference=250)
+    assert [bool(np.isnan(alarms.change(int(t)).size)) for t in alarms.onsets] == [True]
+    assert "nan" not in repr(alarms)

@@ -350,6 +350,52 @@ class Descent(Tracker):
         return TrackerSteps(still, still, descend, unknown_variance, still)
 
 
+WICKED = "*/ int evil; /*", "a\n*/ int evil(void); //", "**//int evil;", "\u202e`](x) <b>", "x??/\\", '"; evil'
+
+
+@needs_gcc
+def test_names_of_signals_are_no_code(tmp_path):
+    """A name ended the comment of the header, and what came after it was compiled."""
+    live, _ = agree(tmp_path, Regression(WICKED), Kalman(q=1e-4, r=0.1, p0=1.0), 200)
+    for name in ("tracker.h", "tracker.c", "tracker_sfun.c"):
+        code = re.sub(r"/\*.*?\*/", "", (tmp_path / name).read_text(), flags=re.S)
+        assert "evil" not in code
+        assert code.isascii()
+    title, _, text = (tmp_path / "README.md").read_text().partition("\n")
+    parameters = next(line for line in text.splitlines() if "Parameters" in line)
+    assert parameters.count("`") == 2 * len(live.names)
+    assert title.count("`") == 2
+
+
+@kernel
+def follow(s, l):
+    μ = s.θ[l] * s.float[l]
+    for i in range(s.phi.shape[0]):
+        s.theta[i, l] += s.ok[l] * μ * s.phi[i, l] * s.y[l]
+    s.y_hat[l], s.e[l], s.s[l] = μ, s.y[l] - μ, 1.0
+    s.float[l] *= 0.5
+
+
+@dataclass(frozen=True)
+class Letters(Tracker):
+    """Names that Python knows and C does not; */ int evil; /*"""
+
+    covariance = False
+
+    def state(self, n):
+        return {"theta": np.zeros(n), "θ": 0.5, "float": 0.25}
+
+    @property
+    def steps(self):
+        return TrackerSteps(still, follow, unknown_variance)
+
+
+@needs_gcc
+def test_names_that_c_does_not_know_are_written_in_its_letters(tmp_path):
+    agree(tmp_path, Regression(1), Letters(), 200)
+    assert (tmp_path / "tracker.c").read_text().isascii()
+
+
 @needs_gcc
 def test_a_tracker_of_ones_own_is_exported_like_any_other(tmp_path):
     live, ours = agree(tmp_path, ARX(2, 2), Descent(rate=0.1), 1_000)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import polars as pl
 import pytest
 
-from driftfit import ARX, RLS, AdaptiveKalman, Kalman, Regression, track
+from driftfit import ARX, RLS, AdaptiveKalman, Kalman, Live, Regression, track
 
 H = 15
 
@@ -138,3 +139,47 @@ def test_a_forecast_without_inputs_says_what_it_needs():
     said = "future inputs are needed to forecast outputs: forecast(5, u)"
     assert said in repr(run.forecast(5))
     assert said not in repr(run.forecast(5, np.ones(5)))
+
+
+@pytest.mark.parametrize("zone", [None, "Europe/Berlin"])
+@pytest.mark.parametrize("way", ["record", "stream", "outputs", "fleet"])
+def test_forecasts_have_dates_bands_and_names(zone, way):
+    rng = np.random.default_rng(0)
+    u, e = rng.normal(size=(2, 80))
+    days = pl.Series(np.datetime64("2024-10-01") + np.arange(80)).cast(pl.Datetime("us")).dt.replace_time_zone(zone)
+    table = pl.DataFrame({"day": days, "price": 2.0 * u + 0.1 * e, "load": u, "two": u, "unit": 1})
+    model, K = Regression(["load"]), Kalman(q=1e-3, r=0.01)
+    options = {"data": table, "time": "day", "dt": "1d"}
+    if way == "outputs":
+        found = track(ARX(1, 1), K, ["price", "two"], "load", **options).forecast(3, np.ones(3))
+    else:
+        run = track(model, K, "price", "load", **options)
+        found = (Live(model, K, dt="1d", warm_start=run) if way == "stream" else run).forecast(3, np.ones(3))
+    rows = found.table.filter(pl.col("output") == "price") if way == "outputs" else found.table
+    if way == "fleet":
+        rows = track(model, K, "price", "load", **options, by="unit").forecast(3, np.ones(3))
+    day = next(name for name in rows.columns if rows[name].dtype.is_temporal())
+    assert day == ("time" if way == "stream" else "day")
+    ahead = pl.Series(np.datetime64("2024-12-20") + np.arange(3)).cast(pl.Datetime("us")).dt.replace_time_zone(zone)
+    if way == "stream" and zone is not None:  # a stream of durations has no zone
+        ahead = ahead.dt.convert_time_zone("UTC").dt.replace_time_zone(None)
+    assert rows[day].to_list() == ahead.to_list()
+    assert rows[day].dtype.time_zone == ahead.dtype.time_zone
+    band = [end[:, 0] if way == "outputs" else end for end in found.band(0.95)]
+    assert np.array_equal(rows.select("low", "high").to_numpy().T, band)
+    assert np.allclose(rows["high"] - rows["y_hat"], 1.959964 * rows["y_std"])
+    name = "b1[price<-load]" if way == "outputs" else "load"
+    assert {"step", "y_hat", "y_std", f"theta_{name}", f"std_{name}"} <= set(rows.columns)
+    assert f"{ahead[1]:%Y-%m-%d}" in repr(found)
+    assert "price" in repr(found) or way == "stream"
+
+
+def test_a_record_whose_dates_are_labels_has_steps_ahead():
+    u = np.random.default_rng(0).normal(size=80)
+    table = pl.DataFrame({"day": np.datetime64("2024-10-01") + np.arange(80), "y": 2.0 * u, "u": u})
+    found = track(Regression(1), Kalman(q=1e-3, r=0.01), "y", "u", data=table, time="day", dt="label").forecast(
+        2, u[:2]
+    )
+    assert found.time is None
+    assert found.table.columns[:5] == ["step", "y_hat", "y_std", "low", "high"]
+    assert not hasattr(found, "index")

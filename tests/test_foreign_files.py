@@ -46,7 +46,12 @@ def test_decimal_commas_dots_between_thousands_and_days_first(tmp_path):
         ("t;y\n1;1,5\n2;1,2,3\n", "row 1 of column 'y' holds '1,5'"),
         ('t,y\n1,"1,065.26"\n', "holds '1,065.26', which is not a number (1 such cell); write numbers without signs"),
         ("t;y\n1;1,234\n2.5;3,500\n", "row 1 of column 'y' holds '1,234'"),  # commas between thousands
-        ("t,y\ns,bar\n1,2\n", "holds 'bar', which is not a number (1 such cell); if this line holds units"),
+        ("t,y\n1,bar\n1,2\n", "holds 'bar', which is not a number (1 such cell); if this line holds units"),
+        (
+            "y;u;z\n1.234;2,5;1.5\n3.500;4,5;2\n",
+            "the dot in 1.234 of column 'y' may be a decimal point or stand",
+        ),
+        ("y;u\n1.234;Ruhe\n3.500;0,5\n", "the file has decimal commas and text among them. Give --decimal ,"),
         ("sep=;\nt;y\n1;2\n1;2;3\n", "row 2 has 3 cells, but the header (t, y) has 2"),
         ("t,y\n1,2,3\n", "row 1 has 3 cells, but the header (t, y) has 2"),
         ("PK\x03\x04", "is an Excel workbook or a ZIP archive; write its table to a CSV or Parquet file"),
@@ -66,10 +71,28 @@ def test_day_or_month_first_is_read_from_the_column_and_never_guessed(tmp_path):
     assert dates(tmp_path, "1/31/2024", "2/1/2024") == ["2024-01-31", "2024-02-01"]
     assert dates(tmp_path, "31/1/2024", "1/2/2024") == ["2024-01-31", "2024-02-01"]
     assert dates(tmp_path, "1.2.2024", "2.2.2024") == ["2024-02-01", "2024-02-02"]
-    with pytest.raises(ValueError, match="such as '1/1/2024', may have the day or the month first"):
-        dates(tmp_path, "1/1/2024", "2/1/2024")
+    for cells in (("1/1/2024", "2/1/2024"), ("13/1/24", "14/1/24"), ("1/1/24 3:15 PM", "2/1/24 3:15 PM")):
+        with pytest.raises(ValueError, match=f"such as '{cells[0]}', may have the day or the month first"):
+            dates(tmp_path, *cells)
     with pytest.raises(ValueError, match=re.escape("row 1 of column 't' holds '31.02.2024'")):
         dates(tmp_path, "31.02.2024", "1.3.2024")
+
+
+@pytest.mark.parametrize(
+    ("cells", "last"),
+    [
+        (("1/31/2024 11:15 AM", "2/1/2024 3:15:30 PM"), "2024-02-01T15:15:30"),
+        (("1/31/24 12:00 am", "2/1/24 12:00 am"), "2024-02-01T00:00:00"),
+        (("2024-01-31 11:15 a.m.", "2024-02-01 03:15 p.m."), "2024-02-01T15:15:00"),
+        (("01-Jan-24", "01-Feb-24"), "2024-02-01T00:00:00"),
+        (("31 January 2024 9:30", "1 February 2024 9:30"), "2024-02-01T09:30:00"),
+        (("Jan 01, 2024", "Feb 01, 2024"), "2024-02-01T00:00:00"),
+    ],
+)
+def test_dates_of_other_forms(tmp_path, cells, last):
+    text = "t;y\n" + "\n".join(f"{cell};1" for cell in cells)
+    found = read_columns(written(tmp_path, text), ["y"], "t")["t"]
+    assert found.tolist()[1] == np.datetime64(last, "us").tolist()
 
 
 def test_such_a_file_is_tracked_like_any_other(tmp_path):
@@ -86,9 +109,76 @@ def test_such_a_file_is_tracked_like_any_other(tmp_path):
     np.testing.assert_array_equal(run.theta, track(Regression(1), RLS(1.0), y, x).theta)
 
 
+SPREADSHEET = ["#N/A", "#DIV/0!", "#VALUE!", "#REF!", "#NUM!", "#NAME?", "#NULL!", "#SPILL!", "#NV", "#WERT!", "#####"]
+
+
+@pytest.mark.parametrize("cell", [*SPREADSHEET, "Bad", "Bad Input", "No Data", "I/O Timeout", "-", "offline"])
+@pytest.mark.parametrize("text", ["y,u\n{},1\n2,{}\n", "u;y\r1;{}\r{};2\r", "y\tu\r\n {} \t1\r\n2\t{}\r\n"])
+def test_what_spreadsheets_historians_and_users_write_for_no_value(tmp_path, cell, text):
+    table = written(tmp_path, text.format(cell, cell))
+    run = track(Regression(1), RLS(1.0), "y", "u", data=table, missing="Offline")
+    np.testing.assert_array_equal(np.column_stack([run.y, run.u]), [[np.nan, 1.0], [2.0, np.nan]])
+    comments = written(tmp_path, f"# {cell}, 1\ny,u\n#no {cell},1\n#\n1,2\n")
+    assert read_columns(comments, ["y"])["y"].tolist() == [1.0]
+
+
+@pytest.mark.parametrize("marks", [-999, "-999", [-999.0, "Off"]])
+def test_numbers_that_mean_no_value_are_counted(tmp_path, marks):
+    y, x = np.array([1.0, -999.0, 3.0]), np.array([-999.0, 2.0, 3.0])
+    table = pl.DataFrame({"y": y, "u": x})
+    table.write_csv(tmp_path / "log.csv")
+    for run in (
+        track(Regression(1), RLS(1.0), y, x, missing=marks),
+        track(Regression(1), RLS(1.0), "y", "u", data=table, missing=marks),
+        track(Regression(1), RLS(1.0), "y", "u", data=tmp_path / "log.csv", missing=marks),
+    ):
+        assert run.labels.missing == {"marked as missing": 2}
+        assert run.ok.tolist() == [0, 0, 1]
+    with pytest.raises(ValueError, match=r"missing: give texts or numbers .* got None"):
+        track(Regression(1), RLS(1.0), y, x, missing=[None])
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("y,u\n\n1,2\n\n3,4\n\n", [1.0, 3.0]),
+        ("y,u\r\n\r\n1,2\r\n\r\n3,4\r\n", [1.0, 3.0]),
+        ("y,u\r\r1,2\r\r3,4\r", [1.0, 3.0]),
+        ("y,u\n1,2\n , \n3,4\n", [1.0, np.nan, 3.0]),  # a row of empty cells is a sample
+        ("y\n\n1\n\n3\n\n", [1.0, 3.0]),
+        ("y\n1\n\n3\n", [1.0, np.nan, 3.0]),  # in one column a blank line is an empty cell
+    ],
+)
+def test_blank_lines(tmp_path, text, expected):
+    np.testing.assert_array_equal(read_columns(written(tmp_path, text), ["y"])["y"], expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "units"),
+    [
+        ("t,y,u\ns,bar,[1/s]\n0,1,2\n1,3,4\n", {"y": "bar", "u": "1/s"}),
+        ("t;y;u\n;°C;\n0;1,5;2\n1;3;4\n", {"y": "°C"}),
+        ("t,y,u\nBad,Bad,\n0,1,2\n1,3,4\n", {}),  # a row of missing readings
+        ("t,y,u\n0,1,2\n1,3,4\n", {}),
+    ],
+)
+def test_a_row_of_units_is_not_a_sample(tmp_path, text, units):
+    path = written(tmp_path, text, "cp1252")
+    run = track(Regression(1), RLS(1.0), "y", "u", data=path)
+    assert dict(run.labels.units) == units
+    assert len(run) == (3 if "Bad" in text else 2)
+    assert rows_of([str(path)], ["y", "u"], None, [], Part(rows=(2, None))).units == units
+
+
+def test_bytes_of_windows_1252_anywhere(tmp_path):
+    text = "unit,y,u\n" + "a,1,2\n" * 20_000 + "Zürich,3,4\n"
+    fleet = track(Regression(1), RLS(1.0), "y", "u", data=written(tmp_path, text, "cp1252"), by="unit")
+    assert list(fleet) == ["a", "Zürich"]
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 def test_a_line_that_declares_the_separator_and_files_with_a_byte_order_mark(tmp_path, encoding):
-    for text in ("sep=|\r\nt|y\r\n1|2.5\r\n", "t;y\n1;2,5\n"):
+    for text in ("sep=!\r\nt!y\r\n1!2.5\r\n", "t;y\n1;2,5\n", "t|y\n1|2.5\n", "t\ty\n1\t2,5\n", "t|y\n1|2,5\n"):
         np.testing.assert_array_equal(read_columns(written(tmp_path, text, encoding), ["y"])["y"], [2.5])
 
 
@@ -157,10 +247,8 @@ def test_compressed_files_and_utf_16_without_a_mark(tmp_path):
 @pytest.mark.parametrize(
     "text",
     [
-        "y;u;n\n1.234;2;a\n3.500;4;0,5\n",  # a text
         "# 1;2,5;3\ny;u\n1.234;2\n3.500;4\n",  # a comment
         "y;u;0,5\n1.234;2;1\n3.500;4;2\n",  # a name
-        "y;u;z\n1.234;2,5;1.5\n3.500;4,5;2\n",  # another column has decimal points
         "y;u\n" + "3.500;4\n" * 8191 + "1.234;2\n" + "3.500;4\n" * 9,  # the probe ends within a line
     ],
 )

@@ -7,7 +7,7 @@ import pandas as pd
 import polars as pl
 import pytest
 
-from driftfit import ARX, DataWarning, HammersteinWiener, Kalman, Live, Regression, select, track, tune
+from driftfit import ARX, DataWarning, HammersteinWiener, Kalman, Live, Regression, segment, select, track, tune
 
 T = 60
 TRACKER = Kalman(q=1e-3, r=0.1)
@@ -239,8 +239,56 @@ def test_an_index_of_dates_labels_the_rows_of_a_table():
     assert track(ARX(1, 1), TRACKER, "flow", "a", data=table).ok.sum() == T - 1
     with pytest.warns(UserWarning, match="business day"):
         assert track(ARX(1, 1), TRACKER, "flow", "a", data=table, dt="1d").ok.sum() < T - 5
-    for plain in (table.sample(frac=1.0, random_state=0), table.reset_index(drop=True), table.assign(day=0)):
-        assert np.array_equal(track(NAMED, TRACKER, "flow", data=plain).time, np.arange(T))
+    assert np.array_equal(track(NAMED, TRACKER, "flow", data=table.reset_index(drop=True)).time, np.arange(T))
+    assert track(NAMED, TRACKER, "flow", data=table.assign(day=0)).labels.time == "time"
+
+
+def as_index(table):
+    return table.set_index("day")
+
+
+@pytest.mark.parametrize("kind", [as_index, pd.DataFrame, pl.from_pandas, lambda table: pl.from_pandas(table).lazy()])
+@pytest.mark.parametrize("by", [None, "plant"])
+def test_rows_in_another_order_than_their_dates_are_sorted(kind, by):
+    y, X = record()
+    days = pd.date_range("2024-01-05", periods=T, freq="B", name="day")
+    table = X.assign(flow=y, plant="north").set_axis(days).reset_index()
+    shuffled = table.sample(frac=1.0, random_state=0)
+    run = track(NAMED, TRACKER, "flow", data=kind(table), by=by)
+    for other in (table[::-1], shuffled):
+        with pytest.warns(DataWarning, match=r"not in the order of 'day', and are sorted by it; .* give time='day'"):
+            same = track(NAMED, TRACKER, "flow", data=kind(other), by=by)
+        one, two = (run, same) if by is None else (run["north"], same["north"])
+        assert np.array_equal(one.theta, two.theta)
+        assert np.array_equal(two.time, days)
+
+
+@pytest.mark.parametrize(
+    ("verb", "what"),
+    [
+        (lambda **data: tune(NAMED, Kalman(r=0.1), **data), lambda tuned: tuned.loglik),
+        (lambda **data: select([NAMED, ARX(1, 0)], tracker=TRACKER, **data), str),
+        (lambda **data: segment(**data), lambda found: found.segments[0].theta.tolist()),
+    ],
+)
+def test_every_verb_sorts_rows_by_their_dates(verb, what):
+    y, X = record()
+    table = X.assign(flow=y).set_axis(pd.date_range("2024-01-05", periods=T, name="day"))
+    with pytest.warns(DataWarning, match="not in the order of 'day'"):
+        found = verb(y="flow", u=["a", "b"], data=table[::-1])
+    assert what(found) == what(verb(y="flow", u=["a", "b"], data=table))
+
+
+def test_dates_that_repeat():
+    y, X = record()
+    days = pd.date_range("2024-01-05", periods=T // 2, freq="D", name="day").repeat(2)
+    table = X.assign(flow=y).set_axis(days)
+    with pytest.warns(DataWarning, match=rf"{T // 2} of {T} rows repeat .* by= the column .* or the mean"):
+        assert track(NAMED, TRACKER, "flow", data=table).labels.dropped == {"at a repeated time": T // 2}
+    table = table.reset_index()  # a column that nobody named as the time does not cost rows
+    assert np.array_equal(track(NAMED, TRACKER, "flow", data=table).time, np.arange(T))
+    with pytest.warns(DataWarning, match=rf"{T // 2} of them .* in the order of the table; give time='day', by="):
+        assert len(track(NAMED, TRACKER, "flow", data=table[::-1])) == T
 
 
 def test_periods_that_an_index_leaves_out_are_not_skipped_silently():

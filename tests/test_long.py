@@ -1,11 +1,14 @@
 """Runs of 100,000 steps and more: drift, an unstable system, a term that appears, coverage, no excitation."""
 
+import sys
+
 import numpy as np
 import pytest
 from contract_table import SLOW, as_arx, model_of, ready
 from support import THETA, arx_record
 
 from driftfit import ARX, RLS, AugmentedFLS, InstrumentalVariables, Kalman, OutputError, Regression, track
+from driftfit.run.program import Program
 from driftfit.run.result import root_mean_square
 from driftfit.trackers import found
 
@@ -197,3 +200,24 @@ def test_augmented_fls_has_a_floor_that_does_not_drift():
     early, late = (root_mean_square(run.theta[part] - THETA) for part in (slice(1000, 50_000), slice(50_000, LONG)))
     assert 0.02 < late < 0.03
     assert late == pytest.approx(early, rel=0.05)
+
+
+@pytest.mark.parametrize(("cost", "longest", "fewest"), [(5e-4, 0.6, 10), (1e-7, 0.6, 1)])
+def test_records_run_in_parts_between_which_ctrl_c_is_heard(monkeypatch, cost, longest, fewest):
+    """A million samples were one call, which takes minutes with a slow tracker."""
+    clock, spent, fill = [0.0], [], Program.fill
+
+    def slow(self, tile, y, *rest):
+        fill(self, tile, y, *rest)
+        spent.append(cost * len(y))
+        clock[0] += spent[-1]
+
+    rng = np.random.default_rng(0)
+    y, u = rng.normal(size=(2, 20_000))
+    whole = track(ARX(1, 1), Kalman(q=1e-4, r=0.1), y, u)
+    monkeypatch.setattr(Program, "fill", slow)
+    monkeypatch.setattr(sys.modules[Program.__module__], "perf_counter", lambda: clock[0])
+    run = track(ARX(1, 1), Kalman(q=1e-4, r=0.1), y, u)
+    assert np.array_equal(run.theta, whole.theta)
+    assert max(spent) < longest
+    assert fewest <= len(spent) < 0.2 / cost + 10  # and the parts of a quick tracker are long

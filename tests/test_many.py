@@ -14,7 +14,7 @@ from rich.progress import Progress
 from scipy import stats
 from support import THETA, arx_record, rows_of
 
-from driftfit import ARX, Kalman, Regression, track
+from driftfit import ARX, DataWarning, Kalman, Regression, track
 from driftfit.judge.cores import on_all_cores
 from driftfit.judge.cores.processes import Processes, available
 from driftfit.judge.fleet_verdict import discoveries, verdicts
@@ -208,7 +208,8 @@ def test_a_page_counts_what_was_left_out_and_what_cannot_be_computed(tmp_path):
     parts[0].loc[7, "y"] = 9999.0
     parts[1]["y"] = np.nan
     table = pd.concat([*parts, parts[0].head(3), parts[0].head(2).assign(unit=None)])
-    fleet = track(Regression(1), K, "y", "u", data=table, time="at", by="unit", dt="1h", limits={"y": (-50, 50)})
+    with pytest.warns(DataWarning, match="3 of 403 rows repeat"):
+        fleet = track(Regression(1), K, "y", "u", data=table, time="at", by="unit", dt="1h", limits={"y": (-50, 50)})
     assert fleet.dropped == {"without a unit": 2, "at a repeated time": 3}
     health = fleet.diagnose()
     assert health.known == ("a",)

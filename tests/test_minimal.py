@@ -20,6 +20,7 @@ from driftfit.systems.drift import RandomWalk
 from driftfit.systems.hammerstein_wiener import simulate
 
 SMALL = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(2))
+P2 = Polynomial(2)
 K = Kalman(q=1e-5, r=1e-4, p0=1e2, theta0=0.01)
 SIGMA = 0.03
 
@@ -187,8 +188,36 @@ def test_minimal_filters_want_their_model():
     for tracker in (ExtendedKalman(q=1e-5, r=1e-4), OutputError(q=1e-5, r=1e-4)):
         with pytest.raises(ValueError, match="HammersteinWiener"):
             track(Regression(1), tracker, [1.0, 2.0], [1.0, 1.0])
-        with pytest.raises(ValueError, match="two cannot be distinguished"):
-            track(HammersteinWiener(0, 1, input=Polynomial(2)), tracker, [1.0, 2.0], [1.0, 1.0])
+        with pytest.raises(ValueError, match="where those of the output block are"):
+            track(HammersteinWiener(0, 1, input=P2, output=P2), tracker, [1.0, 2.0], [1.0, 1.0])
+
+
+@pytest.mark.parametrize("kind", [ExtendedKalman, OutputError])
+def test_as_many_products_as_minimal_parameters(kind):
+    """One b for a curve of two functions: theta holds b1*c2 and xi c2, which have the same number of entries."""
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=400)
+    y = np.zeros(400)
+    for t in range(1, 400):
+        y[t] = 0.5 * y[t - 1] + 0.8 * (u[t - 1] + 0.5 * u[t - 1] ** 2)
+    y += 0.05 * rng.normal(size=400)
+    model, tracker = HammersteinWiener(1, 1, input=P2), kind(q=0.0, r=0.0025, p0=0.5, theta0=[-0.4, 0.6, 0.3])
+    run = track(model, tracker, y, u)
+    assert run.names == ("a1", "b1", "c2")
+    assert_allclose(run.theta[-1], [-0.5, 0.8, 0.5], atol=0.03)
+    assert_allclose(run.blocks().c[-1], [1.0, run.theta[-1, 2]])
+    assert np.sqrt(np.nanmean((y - run.ahead(3).y_hat)[300:] ** 2)) < 0.065
+    live = Live(model, tracker)
+    for sample in zip(y, u, strict=True):
+        live.update(*sample)
+    assert_allclose(live.blocks().c, run.blocks().c[-1])
+
+
+def test_predictions_by_an_unstable_system_end_in_inf_without_a_warning():
+    """The systems of the first samples, under a wide prior; without an output block nothing limits what they do."""
+    y, u = record(60).y, record(60).u
+    run = track(HammersteinWiener(1, 1, input=P2), replace(K, p0=1e14), y, u)
+    assert not np.isfinite(run.ahead(55).y_std[55:]).all()
 
 
 def test_hand_off_continues_the_record():

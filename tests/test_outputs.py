@@ -1,10 +1,11 @@
 """Several outputs: lanes that share regressors, and rows that share one theta."""
 
 import numpy as np
+import polars as pl
 import pytest
 from support import rows_of, same
 
-from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Live, Regression, track
+from driftfit import ARX, FLS, OE, RLS, AugmentedFLS, Kalman, Live, Regression, segment, select, track, tune
 
 NAMES = ["level", "flow"]
 
@@ -22,6 +23,26 @@ def measured(T=60, seed=0):
     rng = np.random.default_rng(seed)
     phi = rng.standard_normal((T, 2, 2))
     return phi @ [1.0, -2.0] + 0.1 * rng.standard_normal((T, 2)), phi
+
+
+def test_several_columns_are_several_outputs(tmp_path):
+    y, u = coupled()
+    table = pl.DataFrame({"level": y[:, 0], "flow": y[:, 1], "u": u, "k": 1})
+    table.write_csv(tmp_path / "tank.csv")
+    tracker = Kalman(q=1e-5, r=0.01)
+    run = track(ARX(1, 1, ny=NAMES), tracker, y, u)
+    for data in (table, tmp_path / "tank.csv"):
+        assert np.array_equal(track(ARX(1, 1), tracker, y=list(NAMES), u="u", data=data).theta, run.theta)
+    fleet = track(ARX(1, 1), tracker, y=NAMES, u="u", data=table, by="k")
+    assert np.array_equal(fleet[1, "flow"].theta, run["flow"].theta)
+    one = track(ARX(1, 1), tracker, y=["flow"], u="u", data=table)
+    assert np.array_equal(one.theta, track(ARX(1, 1), tracker, y="flow", u="u", data=table).theta)
+    assert list(tune(ARX(1, 1), Kalman(r=0.01), y=NAMES, u="u", data=table)) == list(NAMES)
+    assert list(select([ARX(1, 1), ARX(2, 1)], y=NAMES, u="u", data=table, tracker=tracker)) == list(NAMES)
+    with pytest.raises(ValueError, match=r"OE has one output, but y names level, flow; give one of them at a time"):
+        track(OE(1, 1), tracker, y=NAMES, u="u", data=table)
+    with pytest.raises(ValueError, match=r"segment: give one series of one output at a time"):
+        segment(list(NAMES), "u", ARX(1, 1), data=table)
 
 
 def test_each_output_is_an_arx_model_with_the_other_output_among_its_inputs():

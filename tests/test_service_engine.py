@@ -32,6 +32,7 @@ from driftfit.service.core.engine import KEPT
 from driftfit.service.core.intake import Intake
 from driftfit.service.core.section import Section
 from driftfit.service.sources.samples import Batch
+from driftfit.service.supervisor import Service
 
 
 def run_of(y, u, time=None, **more):
@@ -201,6 +202,40 @@ def test_actions_are_part_of_the_journal(tmp_path):
         ("reset", "Ann", True), ("nonsense", "Ann", True),
     ]  # fmt: skip
     engine.close()
+
+
+@pytest.mark.parametrize(
+    "action",
+    [{"do": "hold", "on": "false"}, {"do": "hold", "on": 0}, {"do": "hold"}, {"do": "limits", "limits": [1, 2]},
+     {"do": "limits", "limits": {"y": [0, 1], "u": [2, 1]}}, {"do": "limits"}],
+    ids=str,
+)  # fmt: skip
+def test_actions_of_another_form_change_nothing(engine, action):
+    """A hold with on = "false" was on; of two limits the first was set before the second was refused."""
+    y, u = record(50)
+    feed(engine, message("plant/a", range(50), y, u))
+    state, told = engine.units.get(1).state(), []
+    engine.act("a", action | {"who": "Ann", "why": "an attack"}, told.append)
+    engine.step(0.0)
+    assert told[0]
+    assert engine.units.get(1).state() == state
+
+
+def test_a_folder_that_a_kill_left_is_removed_at_the_next_start(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    first = Service(configured(), tmp_path / "folder")
+    left = first.control.path.parent
+    assert left.is_dir()
+    first.engine.close()
+    first.control.listener.close()
+    first._lock.close()  # as when the process is killed
+    (tmp_path / "driftfit-other").mkdir()
+    second = Service(configured(), tmp_path / "folder")
+    assert not left.exists()
+    assert second.control.path.parent.is_dir()
+    assert (tmp_path / "driftfit-other").is_dir()  # of another service
+    second._close([])
+    assert not second.control.path.parent.exists()
 
 
 ALARM = UNIT + 'alarm = { every = 2000, on = ["band", "innovation", "glr"], reference = 300 }\n'

@@ -28,6 +28,7 @@ import browser
 from service_support import configured, feed, message, opened, record, settled
 
 from driftfit.service.control import Control
+from driftfit.service.core.journal import sum_of
 from driftfit.service.page import history
 from driftfit.service.page.app import Page
 from driftfit.service.page.feed import Feed
@@ -131,7 +132,9 @@ def test_units_that_fell_silent_before_the_page_started_are_shown_as_silent(tmp_
         settled(engine)
     db = engine.journal.db
     db.execute("delete from result where first <= 40")  # of a, as after a minute
-    db.execute("update result set at = at - 5000 where first <= 80")
+    for first, count, at, rows, _ in db.execute("select * from result where first <= 80").fetchall():
+        changed = (first, count, at - 5000, rows)
+        db.execute("replace into result values (?, ?, ?, ?, ?)", (*changed, sum_of(*changed)))
     found = Feed(tmp_path, tmp_path / "c")
     found.look()
     found.rank()
@@ -176,8 +179,9 @@ def test_a_million_samples_are_reduced_by_blocks(tmp_path):
     db.execute("begin")
     for k in range(2000):
         values = np.column_stack([np.arange(64.0) + 64 * k, rng.normal(size=(64, 8))])
-        row = (1, 100 + 64 * k, 163 + 64 * k, values[0, 0], values[-1, 0], 64, values.tobytes())
-        db.execute("insert into block values (?, ?, ?, ?, ?, ?, ?, ?)", (*row, history.extremes_of(values).tobytes()))
+        row = (1, 100 + 64 * k, 163 + 64 * k, values[0, 0].item(), values[-1, 0].item(), 64)
+        row = (*row, history.extremes_of(values).tobytes())
+        db.execute("insert into block values (?, ?, ?, ?, ?, ?, ?, ?)", (*row, sum_of(*row)))
     db.execute("commit")
     begun = time.process_time()
     answer = history.reduced(engine.journal, 1, [], -np.inf, np.inf, 500)

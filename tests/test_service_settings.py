@@ -135,6 +135,19 @@ def test_nothing_is_evaluated(text):
         parse_model(text)
 
 
+@pytest.mark.parametrize(
+    "text",
+    ['Bank(sensors=[Sensor(kind="own", likelihood="trap:density")])',
+     'Bank(sensors=[Sensor("own", None, .1, 1.0, 0.0, None, None, 4.0, None, None, "trap:density")])',
+     'HammersteinWiener(1, 1, input=Functions("trap:f", "trap:f"))'],
+)  # fmt: skip
+def test_no_configuration_imports_a_module(text, tmp_path, monkeypatch):
+    (tmp_path / "trap.py").write_text("raise SystemExit('code of a configuration was run')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match=r"must be (a function|functions)"):
+        (tracker_of if text.startswith("Bank") else parse_model)(text)
+
+
 def test_patterns():
     assert Pattern("plant/{a}/x/{b}").unit("plant/1/x/2") == "1/2"
     assert Pattern("plant/{a}/x", "pump {a}").unit("plant/1/x") == "pump 1"

@@ -22,6 +22,7 @@ Y, U = arx_record(40, 1)
         ({"y": 3.0}, ["y", "one axis", "()"]),
         ({"y": []}, ["y is empty"]),
         ({"y": ["1.0", "two"]}, ["y", "entry 1", "'two'"]),
+        ({"y": np.array(["NaT", "2024-01-31"], "datetime64[ns]")}, ["y", "entry 1", "'2024-01-31"]),
         ({"u": U[:-1]}, ["y has 40 samples", "(39, 1)", "first axis must be time"]),
         ({"u": np.ones((1, 40))}, ["(1, 40)", "u.T has shape (40, 1)"]),
         ({"u": np.ones((40, 1, 1))}, ["u", "(T,) or (T, m)", "(40, 1, 1)"]),
@@ -145,6 +146,36 @@ def test_live_takes_numbers_of_every_kind(value):
     assert same(one.theta, two.theta)
     for u in ([1.0], (1,), np.ones(1, np.float32), np.ones((1, 1)), [None], None):
         assert len(two.update(1.0, u)) == 4
+
+
+@pytest.mark.parametrize("nothing", [pd.NA, pd.NaT, float("nan")])
+def test_whatever_stands_for_no_value_is_missing_as_none_is(nothing):
+    """In outputs, in inputs one by one and by name, in fleets and records; without a time a sample is ignored."""
+    two = ARX(2, 2, inputs=["a", "b"])
+    one, other, more, same_more = Live(ARX(2, 2), K), Live(ARX(2, 2), K), Live(two, K), Live(two, K)
+    for t in range(20):
+        for live, given in ((one, nothing), (other, None)):
+            live.update(given if t == 10 else Y[t], given if t == 15 else U[t])
+        for live, given in ((more, nothing), (same_more, None)):
+            live.update(Y[t], {"a": 1.0 * t, "b": given if t == 15 else U[t]})
+    assert same(one.theta, other.theta)
+    assert same(more.theta, same_more.theta)
+    assert same(track(ARX(2, 2), K, [nothing, *Y[1:]], U).theta, track(ARX(2, 2), K, [None, *Y[1:]], U).theta)
+    timed = Live(ARX(2, 2), K)
+    for t in (0.0, 1.0, nothing):
+        assert timed.update(1.0, 1.0, time=t)[3] == 0
+    assert timed.ignored == 1
+    keys = ["a", nothing, "a"] if nothing is pd.NA else ["a", None, "a"]
+    for kind in ("string", "object"):
+        table = pd.DataFrame({"y": [1.0, 2.0, 3.0], "u": 1.0, "unit": pd.Series(keys, dtype=kind)})
+        assert track(Regression(1), K, "y", "u", data=table, by="unit").dropped == {"without a unit": 1}
+
+
+@pytest.mark.parametrize("kind", ["Int64", "boolean", "Float64", "int64[pyarrow]"])
+def test_a_key_of_a_nullable_type_may_be_missing(kind):
+    table = pd.DataFrame({"y": [1.0, 2.0, 3.0], "u": 1.0, "unit": pd.Series([1, None, 1]).astype(kind)})
+    fleet = track(Regression(1), K, "y", "u", data=table, by="unit")
+    assert (list(fleet), fleet.dropped) == ([1], {"without a unit": 1})
 
 
 def test_live_needs_no_input_where_the_model_has_none():

@@ -173,3 +173,23 @@ def test_a_forecast_has_the_variance_of_the_kalman_filter_and_samples_are_no_reg
         with pytest.raises(ValueError, match="moves hidden states"):
             verb()
     assert run.detect("band", reference=75).rule.names == ("b", "c")
+
+
+@pytest.mark.parametrize("method", ["extended", "unscented"])
+def test_a_state_that_grows_beyond_all_numbers_stays(method):
+    """x grows by exp(50) at every sample, and its variance by exp(100): the state was NaN from the tenth on."""
+    y, u = np.random.default_rng(0).normal(size=(2, 200))
+    model = StateSpace("x = x[-1] * exp(theta.k) + u \n y = x", start=50.0)
+    run = track(model, JointKalman(q=1e-6, r=0.01, p0=1.0, method=method), y, u)
+    assert np.isfinite(run.theta).all()
+    assert np.isfinite(run.cov(-1)).all()
+
+
+def test_samples_without_a_value_are_counted_in_the_summary():
+    y, u = np.random.default_rng(0).normal(size=(2, 200))
+    y[50] = np.nan
+    model = StateSpace("x = x[-1] + u \n y = exp(theta.k * x)", start=50.0)
+    run = track(model, JointKalman(q=1e-6, r=0.01, p0=1.0), y, u)
+    assert not run.ok.any()
+    (remark,) = [text for name, text in run.summary().remarks if name == "No value"]
+    assert remark.startswith("199 samples at which the equation is not finite")

@@ -4,6 +4,7 @@ import io
 import json
 import math
 import os
+import sys
 import zipfile
 
 import numpy as np
@@ -141,11 +142,65 @@ def test_a_future_format_is_named(saved):
 @pytest.mark.parametrize("which", ["model", "tracker"])
 def test_a_class_that_is_not_here_is_named(saved, which):
     path, load = saved
-    rewrite(path, lambda header: header[which].update({"class": "driftfit.trackers.absent:Absent"}))
-    with pytest.raises(ValueError, match=r"needs the class Absent of the module driftfit\.trackers\.absent"):
+    rewrite(path, lambda header: header[which].update({"class": "plant.pumps:Absent"}))
+    with pytest.raises(ValueError, match=r"needs plant\.pumps:Absent, .* hand it in: classes=\[plant\.pumps\.Absent\]"):
         load(path)
-    rewrite(path, lambda header: header[which].update({"class": "os:system"}))
-    with pytest.raises(ValueError, match=f"os:system as its {which}, which it is not"):
+    rewrite(path, lambda header: header[which].update({"class": f"{__name__}:rewrite"}))
+    with pytest.raises(ValueError, match=f"{__name__}:rewrite as its {which}, which it is not"):
+        load(path, classes=[rewrite])
+
+
+@pytest.mark.parametrize("place", ["trap:Model", "driftfit.__main__:Model", "os:system", "driftfit.data.storage:os"])
+@pytest.mark.parametrize("which", ["model", "tracker"])
+def test_nothing_is_imported_by_what_a_file_says(saved, which, place, tmp_path, monkeypatch):
+    """A forged file ran code in the current folder."""
+    path, load = saved
+    (tmp_path / "trap.py").write_text("raise SystemExit('code of a file was run')")
+    monkeypatch.syspath_prepend(tmp_path)
+    rewrite(path, lambda header: header[which].update({"class": place}))
+    with pytest.raises(ValueError, match=f"needs {place}"):
+        load(path)
+    assert "trap" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        {"tracker": {"class": "driftfit.trackers.bank.bank:Bank", "settings": {"sensors": [
+            {"kind": "own", "likelihood": {"function": "trap:density"}}]}}},
+        {"model": {"class": "driftfit.models.hammerstein_wiener.model:HammersteinWiener", "settings": {
+            "na": 1, "nb": 1, "input": {"class": "Functions", "settings": {
+                "values": {"function": "trap:f"}, "slopes": {"function": "trap:f"}}}}}},
+        {"model": {"class": "driftfit.models.hammerstein_wiener.model:HammersteinWiener", "settings": {
+            "na": 1, "nb": 1, "input": {"class": "Functions", "settings": {"values": "trap:f", "slopes": "trap:f"}}}}},
+    ],
+    ids=["likelihood", "functions", "text"],
+)  # fmt: skip
+def test_no_function_is_imported_by_what_a_file_says(saved, forged, tmp_path, monkeypatch):
+    path, load = saved
+    (tmp_path / "trap.py").write_text("raise SystemExit('code of a file was run')")
+    monkeypatch.syspath_prepend(tmp_path)
+    rewrite(path, lambda header: header.update(forged))
+    with pytest.raises(ValueError, match=r"needs trap:|must be functions"):
+        load(path)
+
+
+FORGED = {
+    "no model": lambda header: header.pop("model"),
+    "no settings": lambda header: header["model"].pop("settings"),
+    "a number for a class": lambda header: header.update(tracker=7),
+    "a model beyond memory": lambda header: header["model"]["settings"].update(na=10**6, nb=10**6),
+    "a text for a number": lambda header: header["tracker"]["settings"].update(q={"a": 1}),
+    "facts of another kind": lambda header: header.update(extra=3, labels=3),
+    "unknown facts": lambda header: header.update(extra={"alarms": [[0, {}]]}, labels={"x": 1}),
+}
+
+
+@pytest.mark.parametrize("forged", FORGED)
+def test_a_forged_header_is_one_clear_error(saved, forged):
+    path, load = saved
+    rewrite(path, FORGED[forged])
+    with pytest.raises(ValueError, match=r"does not write|does not fit|another version|must be|needs"):
         load(path)
 
 

@@ -77,8 +77,20 @@ def test_persistence_is_the_last_observed_output():
     assert same(persistence(y), [np.nan, np.nan, 1.0, 1.0, 1.0, 4.0])
 
 
-def test_a_short_record_has_nothing_to_compare():
-    y, u = arx_record(40, 3)
+def test_a_short_record_is_compared_after_a_tenth_of_it():
+    """After the first 50 of 55 samples no four errors would be compared; one of 100 has 50 left as ever."""
+    y, u = arx_record(100, 3)
+    for T, burn in ((30, 4), (55, 5), (99, 9), (100, 50)):
+        run = track(ARX(2, 2), K, y[:T], u[:T])
+        summary = run.summary()
+        assert summary.burn == run.verdict().burn == burn
+        assert summary.comparison.samples == T - burn
+        scored = np.where(np.arange(T) >= burn, y[:T] - run.prediction, np.nan)
+        assert summary.comparison.tracked == pytest.approx(np.sqrt(np.nanmean(scored**2)))
+
+
+def test_a_record_of_as_many_samples_as_parameters_has_nothing_to_compare():
+    y, u = arx_record(4, 3)
     summary = track(ARX(2, 2), K, y, u).summary()
     assert summary.comparison.samples == 0
     assert math.isnan(summary.comparison.tracked)

@@ -84,6 +84,21 @@ def test_bands_are_those_of_drawn_parameters(still):
     assert response.phase_std[0] == pytest.approx(np.angle(H / H.mean(axis=0)).std(axis=0), rel=0.06)
 
 
+def test_gains_and_responses_print_tables(run):
+    """A row for each sample, twenty at most, or for each step of the response of one sample."""
+    gain, step = run.dc_gain(), run.step_response(8)
+    for found, value, std, count in (
+        (gain, gain.value[-1, 0], gain.std[-1, 0], 20),
+        (step, step.value[0, -1], step.std[0, -1], 8),
+    ):
+        lines = str(found).rstrip().splitlines()
+        assert lines[-1].split()[1:] == [f"{value:.4g}", f"{std:.2g}"]
+        assert len(lines) == 4 + count
+        assert repr(found) == str(found).strip("\n")
+    value, _ = gain
+    assert value is gain.value
+
+
 def test_several_inputs_by_name():
     y, u = arx_record(300, 2)
     both = np.column_stack([u, np.random.default_rng(4).normal(size=300)])

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pytest
 from support import arx_record
 
-from driftfit import ARX, Fleet, Kalman, Live, Track, track
+from driftfit import ARX, DataWarning, Fleet, Kalman, Live, Track, track
 from driftfit.data.record import time_text
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-3, r=0.1)
@@ -115,7 +115,8 @@ def test_rows_are_sorted_and_of_several_at_one_time_the_first_is_used(kind):
     flow = y[rows]
     flow[T:] = 99.0  # what comes again at a time that was there
     table = KINDS[kind]({"y": flow, "u": u[rows], "t": time[rows]})
-    run = track(MODEL, TRACKER, "y", "u", data=table, time="t", dt=2)
+    with pytest.warns(DataWarning, match=r"time: 3 of 63 rows repeat the time of another row .* by= the column"):
+        run = track(MODEL, TRACKER, "y", "u", data=table, time="t", dt=2)
     assert_same(run, alone(y, u, time=time, dt=2))
     assert np.array_equal(run.time, time)
     assert run.labels.dropped == {"at a repeated time": 3}
@@ -388,7 +389,7 @@ def test_a_fleet_continues_from_its_states_as_bytes():
     ("first", "hour", "every"), [("2024-10-27", 2, 10), ("2024-04-07", 2, 30), ("2024-11-03", 1, 60)]
 )
 def test_the_hour_that_is_repeated_at_the_end_of_summer_time_is_not_left_out_silently(first, hour, every):
-    """In Europe, Australia and America; other repeated times have no such warning."""
+    """In Europe, Australia and America; of other repeated times the warning is a general one."""
     count = 60 // every
     wall = np.datetime64(first) + np.arange(6 * count) * np.timedelta64(every, "m")
     again = np.concatenate([wall[: (hour + 1) * count], wall[hour * count :]])
@@ -398,7 +399,8 @@ def test_the_hour_that_is_repeated_at_the_end_of_summer_time_is_not_left_out_sil
         run = track(y="y", u="u", data=frame, **options)
     assert run.labels.dropped == {"at a repeated time": count}
     in_june = frame.with_columns(pl.col("at").str.replace(first, "2024-06-11"))
-    assert track(y="y", u="u", data=in_june, **options).labels.dropped == {"at a repeated time": count}
+    with pytest.warns(DataWarning, match="rows repeat the time of another row"):
+        assert track(y="y", u="u", data=in_june, **options).labels.dropped == {"at a repeated time": count}
 
 
 def rng_values(count):

@@ -91,9 +91,10 @@ class Fleet(fleet.Fleet, Judged, public=True):
     def forecast(self, h: int, u: Any = None) -> polars.DataFrame:
         """The h nominal samples after the end of every series as one polars table, one row per sample.
 
-        Columns: those that identify the results, ``step`` (1 .. h), the time if the record has one, ``y_hat`` and
-        ``y_std``, and ``theta_<name>``, ``std_<name>`` of every parameter. ``u`` is a mapping from series to future
-        inputs (h,) or (h, m), or one array for all; a missing key has no inputs. See `driftfit.use.forecast`.
+        Columns: those that identify the results, and those of `Forecast.table`: ``step`` (1 .. h), the time if the
+        record has one, ``y_hat``, ``y_std``, the 95 % band ``low`` and ``high``, and for every parameter
+        ``theta_<name>`` and ``std_<name>``. ``u`` is a mapping from series to future inputs (h,) or (h, m), or one
+        array for all; a missing key has no inputs. See `driftfit.use.forecast`.
         """
         from driftfit.show.export import forecasts_table
 

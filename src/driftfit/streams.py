@@ -24,7 +24,7 @@ class Live(live.Live, public=True):
 
     @cached_property
     def _separator(self) -> Separator:
-        return Separator(self.model)
+        return Separator(self.model, self.names)
 
     def blocks(self, method: str = "svd-joint") -> Groups:
         """a, b, c, d of a `HammersteinWiener` model now; ``method`` as in `Track.blocks`, except "gls"."""

@@ -22,6 +22,10 @@ Ranges = Mapping[Any, tuple[float | None, float | None]] | None
 """From signals to their valid ranges."""
 
 
+Missing = str | float | Sequence[str | float]
+"""What means "no value"."""
+
+
 class Given(TypedDict, total=False):
     """Arguments that every form of `track` takes by name."""
 
@@ -34,6 +38,7 @@ class Given(TypedDict, total=False):
     limits: Ranges
     exclude: Any
     gate: Any
+    missing: Missing
     keep: str
     dtype: Any
 
@@ -94,6 +99,7 @@ def track(
     limits: Ranges = None,
     exclude: Any = None,
     gate: Any = None,
+    missing: Missing = (),
     keep: str = "std",
     dtype: Any = "float64",
     warm_start: Any = None,
@@ -111,7 +117,7 @@ def track(
     tracker : Tracker, or a list or mapping of them
         Estimates theta, such as ``Kalman(q=1e-4, r=0.1)``. Without ``by`` several trackers are a grid of settings for
         one record; with it they are the settings of each series, in order or by key.
-    y : (T,), with by="row" (units, T), or the name of a column of ``data``
+    y : (T,), with by="row" (units, T), or the name of a column of ``data``; a list of names for several outputs
         Output. NaN, inf and None are missing. A Series keeps its name; its index of dates labels the samples.
     u : (T,), (T, m) or None, with by="row" (units, T) or (units, T, m), or names of columns
         Inputs. Columns of a data frame, of a mapping or of ``data`` are matched by name with a model with named inputs.
@@ -120,8 +126,8 @@ def track(
         y, u, time, by, weights and drift are then names of its columns.
     time : (T,) numbers or datetimes, increasing, or the name of a column
         The times of the samples. Drift scales with the interval, and a gap above 1.5 ``dt`` breaks the lags. Rows of a
-        table are sorted; of several rows at the same time the first is used. If no time is given, an index of dates of
-        y or u is used, with ``dt="label"`` unless dt is given.
+        table are sorted; of several rows at the same time the first is used. If no time is given, an index of dates, or
+        the only column of dates of a table, is used, with ``dt="label"`` unless dt is given.
     by : names of columns, "row" or None
         The columns that identify the series of a table ("file": the file of a row). "row": every row of the array y is
         a separate series.
@@ -147,6 +153,9 @@ def track(
         Whether readings are judged before the tracker uses them: fault codes, spikes, frozen sensors, inputs to which
         the output does not respond (`driftfit.readings.gate`). ``run.left_out`` lists what was refused. None: as the
         tracker asks; those that are given their numbers have no gate, and use every reading as their textbook does.
+    missing : text or number, or several
+        What signals hold where there is no value, such as ``["Offline", -999]``. Texts of tables are known already if
+        spreadsheets and historians use them (`driftfit.data.columns`). The summary counts numbers.
     keep : "std", "cov" or "theta"
         What is stored of every sample. "std": theta, std, prediction, innovation and its standard deviation, ok:
         2 n + 4 numbers. "cov": also the covariance, n * n numbers. "theta": that alone, n numbers, for models of one
@@ -180,9 +189,10 @@ def track(
     Warns
     -----
     DataWarning
-        If most samples cannot be used because of ``dt``.
+        If most samples cannot be used because of ``dt``; if rows are left out because their time repeats, or are sorted
+        by dates that were not named as the time.
     """
-    reading = Reading(time, dt, weights, drift, units, limits, exclude, gate)
+    reading = Reading(time, dt, weights, drift, units, limits, exclude, missing, gate)
     if to is not None:
         from driftfit.show.export import write_parts  # importing polars takes as long as all other imports
 

@@ -4,8 +4,8 @@
     result.params, result.bse, result.tvalues, result.conf_int(), result.summary(), result.plot_cusum()
 
 Formulas are those of formulaic (R's and patsy's grammar: interactions, transforms, categories). Rows are in order of
-time; an index of dates labels them. ``params`` are the coefficients after the last row and ``params_path`` those after
-every row; ``smoothed_path`` uses the whole sample.
+time; an index of dates labels them, and sorts them with a warning if it is not in order. ``params`` are the
+coefficients after the last row and ``params_path`` those after every row; ``smoothed_path`` uses the whole sample.
 
     fittedvalues_t = x_t' params_(t-1)
     forecasts_t    = fittedvalues_t + what the tracker expects besides: correlated noise, and the slopes of coefficients
@@ -27,6 +27,7 @@ from formulaic.materializers import FormulaMaterializer
 from formulaic.utils.null_handling import find_nulls
 from scipy.special import ndtr, stdtr
 
+from driftfit.data.labels import chronological
 from driftfit.models.regression import Regression
 from driftfit.results import Track
 from driftfit.show.parts.axes import BLUE, RED, panels
@@ -89,10 +90,11 @@ class TimeVaryingRegression:
         names = [str(name) for name in self.exog.columns if name != _INTERCEPT]
         model = Regression(tuple(names), intercept=_INTERCEPT in self.exog.columns)
         tracker = AdaptiveKalman() if self.tracker is None else self.tracker
-        X = self.exog.drop(columns=_INTERCEPT, errors="ignore")
-        run = track(model, tracker, self.endog, X if names else None)
+        rows = chronological(self.endog.index)
+        endog, exog = self.endog.iloc[rows], self.exog.iloc[rows]
+        run = track(model, tracker, endog, exog.drop(columns=_INTERCEPT, errors="ignore") if names else None)
         columns = [*names, *([_INTERCEPT] if model.intercept else [])]
-        return TimeVaryingResults(run, self.endog, pd.Index(columns))
+        return TimeVaryingResults(run, endog, pd.Index(columns))
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ A file holds, for every experiment, a struct with fields ``y`` (T, ny), ``u`` (T
 
     s = struct('y', z.y, 'u', z.u, 'Ts', z.Ts, 'OutputName', {z.OutputName}, 'InputName', {z.InputName}); save f.mat s
 
-writes for an ``iddata`` object ``z``. Plain variables ``y`` and ``u`` are read too. Files up to version 7 are read and
-written by scipy; version 7.3 is HDF5 and needs h5py (``pip install "driftfit[matlab]"``). Objects of classes such as
-``iddata`` itself are not readable outside of MATLAB: `read_mat` says how to convert them.
+writes for an ``iddata`` object ``z``. Plain variables are read too. A vector is one signal, also as a row 1 x N. Files
+up to version 7 are read and written by scipy; version 7.3 is HDF5 and needs h5py (``pip install "driftfit[matlab]"``).
+Objects of classes such as ``iddata`` itself are not readable outside of MATLAB: `read_mat` says how to convert them.
 
 Sign conventions: MATLAB writes A(q) y = B(q) u + e with A = 1 + a1 q^-1 + ..; `ARX` writes y_t = a1 y_(t-1) + ..; so
 MATLAB's a_i is minus ours. ``run.polynomials()`` returns A and B with MATLAB's signs.
@@ -130,7 +130,10 @@ def merge(*experiments: Experiment | Experiments) -> Experiments:
     )
 
 
-def read_mat(path: str | PathLike[str], name: str | None = None) -> Experiments:
+def read_mat(
+    path: str | PathLike[str], name: str | None = None, *, y: str | Sequence[str] | None = None,
+    u: str | Sequence[str] | None = None,
+) -> Experiments:  # fmt: skip
     """Read the experiments of a `.mat` file, version 5 to 7.3.
 
     Parameters
@@ -138,6 +141,8 @@ def read_mat(path: str | PathLike[str], name: str | None = None) -> Experiments:
     path : path
     name : str or None
         The variable: a struct, or a vector of structs. None: the only struct, or plain variables ``y`` and ``u``.
+    y, u : names of plain variables
+        The outputs and the inputs, if the file has no struct: ``y="level", u=["valve", "pump"]``.
 
     Raises
     ------
@@ -145,6 +150,13 @@ def read_mat(path: str | PathLike[str], name: str | None = None) -> Experiments:
         If the file has no such variable, if it is an object of a class, or if it has no field ``y``.
     """
     variables = _variables(Path(path))
+    if y is not None:
+        outputs, y_names = _signals(path, variables, y)
+        inputs, u_names = (None, ()) if u is None else _signals(path, variables, u)
+        plain = {"y": outputs, "u": inputs, "OutputName": y_names, "InputName": u_names}
+        return Experiments(
+            (_experiment({key: variables[key] for key in ("Ts", "Tstart") if key in variables} | plain),)
+        )
     structs = {key: value for key, value in variables.items() if _is_struct(value)}
     if name is None:
         if len(structs) == 1:
@@ -161,6 +173,21 @@ def read_mat(path: str | PathLike[str], name: str | None = None) -> Experiments:
             f"'Ts', z.Ts); save('data.mat', 's')"
         )
     return Experiments(tuple(_experiment(one) for one in structs[name]))
+
+
+def _signals(path: Any, variables: Mapping[str, Any], names: str | Sequence[str]) -> tuple[Array, tuple[str, ...]]:
+    """(plain variables side by side (T, k), the names of their columns)."""
+    given = [names] if isinstance(names, str) else list(names)
+    for name in given:
+        if not isinstance(variables.get(name), np.ndarray):
+            raise ValueError(f"{path} has no numbers of the name {name!r}; it has {sorted(variables)}.")
+    parts = {name: _columns(name, variables[name]) for name in given}
+    if len({len(part) for part in parts.values()}) > 1:
+        lengths = ", ".join(f"{name} {len(part)}" for name, part in parts.items())
+        raise ValueError(f"{path}: signals must be of one length; their numbers of samples are: {lengths}.")
+    columns = [[name] if part.shape[1] == 1 else [f"{name}{j + 1}" for j in range(part.shape[1])]
+               for name, part in parts.items()]  # fmt: skip
+    return np.hstack(list(parts.values())), tuple(name for each in columns for name in each)
 
 
 def write_mat(path: str | PathLike[str], experiments: Experiment | Experiments, name: str = "s") -> None:
@@ -289,8 +316,10 @@ def _stacked(parts: Sequence[Array], gap: int) -> Array:
 
 
 def _columns(name: str, values: Any) -> Array:
-    """Samples in rows, (T, k)."""
+    """Samples in rows, (T, k); a vector is one signal, whatever its orientation."""
     columns = np.asarray(values, dtype=float)
+    if columns.ndim == 2 and len(columns) == 1:
+        columns = columns.T
     if columns.ndim not in (1, 2):
         raise ValueError(f"Experiment: {name} has shape {columns.shape}; samples are rows, signals are columns.")
     return columns[:, None] if columns.ndim == 1 else columns

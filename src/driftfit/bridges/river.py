@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from river import base
 
+from driftfit.data.storage import parts_of
 from driftfit.engine.kernel import Array
 from driftfit.models.regression import Regression
 from driftfit.streams import Live
@@ -92,7 +93,7 @@ class TrackedRegressor(base.Regressor):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._hold(None if state["_stream"] is None else Live.from_bytes(state["_stream"]))
+        self._hold(None if state["_stream"] is None else Live.from_bytes(state["_stream"], parts_of(self.tracker)))
 
     def learn_one(self, x: dict[Any, Any], y: Any) -> None:
         """Learn one sample: features by name, and the output; None and NaN are missing."""

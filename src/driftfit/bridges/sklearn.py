@@ -2,9 +2,9 @@
 
     y_t = x_t' coef_t + intercept_t (+ a_1 y_(t-1) + .. + a_lags y_(t-lags)) + noise
 
-Rows are samples in order of time, and coefficients drift from row to row. `fit` tracks the rows from first to last.
-`predict` uses the coefficients after the last row (`coef_`) for later rows; `coef_path_` has the coefficients after
-every row. `partial_fit` continues after the last row.
+Rows are samples in order of time, and coefficients drift from row to row. `fit` tracks the rows from first to last; if
+their index of dates is not in order, it sorts them and warns. `predict` uses the coefficients after the last row
+(`coef_`) for later rows; `coef_path_` has the coefficients after every row. `partial_fit` continues after the last row.
 
 The order of rows matters: a shuffled split (``KFold(shuffle=True)``, ``train_test_split`` with its default) lets the
 estimator look ahead and scores predictions that could not have been made. Use ``TimeSeriesSplit``.
@@ -25,6 +25,7 @@ import numpy as np
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils.validation import check_array, check_is_fitted, validate_data
 
+from driftfit.data.labels import chronological, dated
 from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
@@ -82,14 +83,19 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
         drift up to that row. It is NaN for a tracker without a covariance.
         """
         check_is_fitted(self)
+        index: Any = getattr(X, "index", None)
         X = validate_data(self, X, reset=False, dtype=float, ensure_all_finite="allow-nan")
         if self.lags == 0 and not return_std:
             return X @ self.coef_ + self.intercept_
-        ahead = self.run_.forecast(len(X), X)
-        mean = X @ self.coef_ + self.intercept_ if self.lags == 0 else ahead.y_hat
-        return (mean, ahead.y_std) if return_std else mean
+        order = np.argsort(index.asi8, kind="stable") if dated(index) else np.arange(len(X))
+        ahead, place = self.run_.forecast(len(X), X[order]), np.argsort(order)
+        mean = X @ self.coef_ + self.intercept_ if self.lags == 0 else ahead.y_hat[place]
+        return (mean, ahead.y_std[place]) if return_std else mean
 
     def _follow(self, X: Any, y: Any, first: bool) -> Self:
+        rows = chronological(getattr(X, "index", None))
+        if not isinstance(rows, slice):
+            X, y = X.iloc[rows], y.iloc[rows] if hasattr(y, "iloc") else np.asarray(y)[rows]
         X = validate_data(self, X, reset=first, dtype=float, ensure_all_finite="allow-nan")
         if y is None:
             raise ValueError("this TrackedRegressor estimator requires y to be passed, but the target y is None.")

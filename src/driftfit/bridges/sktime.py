@@ -5,7 +5,8 @@
 `fit` tracks the rows in their order; `predict` and the interval forecasts are those of `Track.forecast`: parameters
 keep drifting over the horizon, and bands include the noise, the uncertainty of the parameters and their drift. `update`
 continues after the last row; with ``update_params=False`` the new rows enter the lags only. Missing values may be in y
-and in X. Rows are one step apart, whatever their index.
+and in X. Rows are one step apart, whatever their index; sktime refuses an index that is not in order, and of rows with
+one date the first is used, with a warning.
 
 Needs sktime 1.0 or later (``pip install "driftfit[sktime]"``).
 """
@@ -19,6 +20,7 @@ import pandas as pd
 from scipy.special import ndtri
 from sktime.forecasting.base import BaseForecaster
 
+from driftfit.data.labels import chronological
 from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
@@ -111,8 +113,9 @@ class TrackedForecaster(BaseForecaster):
 
     def _signals(self, y: pd.Series | None, X: pd.DataFrame | None) -> tuple[Any, Any]:
         """Outputs (T,) and inputs (T, m) as numbers; None where there are none."""
-        outputs = None if y is None else y.to_numpy(dtype=float)
-        inputs = None if X is None or not self._columns else X[self._columns].to_numpy(dtype=float)
+        rows = slice(None) if y is None else chronological(y.index)
+        outputs = None if y is None else y.to_numpy(dtype=float)[rows]
+        inputs = None if X is None or not self._columns else X[self._columns].to_numpy(dtype=float)[rows]
         return outputs, inputs
 
     def _model(self) -> Model:

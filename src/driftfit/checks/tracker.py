@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from driftfit.data.storage import parts_of
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
@@ -239,7 +240,7 @@ def _saving(tracker: Tracker, model: Model, run: Track) -> Iterator[str]:
             for t in range(T):
                 if t == T // 2:
                     live.save(path)
-                    live = Live.load(path)
+                    live = Live.load(path, parts_of((model, tracker)))
                 live.update(y[t], u[t])
         except (ValueError, TypeError) as error:
             yield f"It cannot be saved and loaded: {error}"

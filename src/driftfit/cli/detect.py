@@ -16,6 +16,7 @@ from driftfit.cli.parts.reading import interval_from, moment
 from driftfit.cli.track import Plot, Report
 from driftfit.engine.settings import marks
 from driftfit.results import Track
+from driftfit.show.export import write_table
 from driftfit.show.report import check_path
 
 
@@ -73,7 +74,7 @@ def detect(
         say(Text(f"{found} {score.false} false alarms in {score.normal} normal samples."), soft_wrap=True)
     if write_to is not None:
         found = alarms.table
-        found.write_csv(write_to) if write_to.suffix.lower() == ".csv" else found.write_parquet(write_to)
+        write_table(found, write_to)
     if plot is not None:
         if not isinstance(run, Track):
             raise ValueError("--plot: alarms are drawn for one series; use --report for a fleet.")

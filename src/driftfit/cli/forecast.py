@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from statistics import NormalDist
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
-import polars as pl
 import typer
 from rich.text import Text
 
 from driftfit.cli.parts.options import Given, reads
 from driftfit.cli.parts.program import app, say
-from driftfit.cli.parts.reading import Part, rows_of
+from driftfit.cli.parts.reading import rows_of
 from driftfit.engine.kernel import Array
 from driftfit.results import Track
+from driftfit.show.export import write_table
 from driftfit.show.parts.text import table_of
 
 SHOWN = 40
@@ -49,29 +49,23 @@ def forecast(
         )
     run: Track = given.run()
     made = run.forecast(ahead, None if u is None else u[:ahead])
-    half = NormalDist().inv_cdf(0.5 + level / 2.0) * made.y_std
-    columns = {
-        "ahead": np.arange(1, ahead + 1), run.labels.y: made.y_hat, "std": made.y_std, "low": made.y_hat - half,
-        "high": made.y_hat + half,
-    }  # fmt: skip
+    low, high = made.band(level)
+    frame = made.table.with_columns(low=low, high=high)
     table = table_of(
-        f"{run.labels.y} after {run.time_text(-1)}", "ahead", run.labels.y, "std", f"{level:.0%} from", "to"
-    )
-    for row in zip(*columns.values(), strict=True):
-        if row[0] <= SHOWN:
-            table.add_row(*(f"{value:.6g}" for value in row))
+        f"{run.labels.y} after {run.time_text(-1)}", "ahead" if made.time is None else made.axis, run.labels.y, "std",
+        f"{level:.0%} from", "to",
+    )  # fmt: skip
+    for k, row in enumerate(frame.head(SHOWN).select("y_hat", "y_std", "low", "high").iter_rows()):
+        table.add_row(made.time_text(k), *(f"{value:.6g}" for value in row))
     say(table)
     if ahead > SHOWN:
         say(Text(f" the first {SHOWN} of {ahead}; --out writes all", "dim"))
     if write_to is not None:
-        more: dict[str, Any] = {f"theta_{name}": made.theta[:, i] for i, name in enumerate(run.names)}
-        more |= {f"std_{name}": made.std[:, i] for i, name in enumerate(run.names)}
-        frame = pl.DataFrame({**columns, **more})
-        frame.write_csv(write_to) if write_to.suffix.lower() == ".csv" else frame.write_parquet(write_to)
+        write_table(frame, write_to)
 
 
 def _inputs(given: Given, future: str) -> Array:
     if not given.inputs:
         raise ValueError(f"--future {future}: the model has no inputs; leave it out.")
-    read = rows_of([future], given.inputs, None, [], Part(separator=given.part().separator, decimal=given.decimal))
+    read = rows_of([future], given.inputs, None, [], replace(given.part(), first=None, last=None, rows=(1, None)))
     return np.stack([read.numbers[name] for name in given.inputs], axis=1)

@@ -14,6 +14,28 @@ from driftfit.cli.parts.program import app, helpful, progress, say
 NEEDED = "driftfit serve needs more packages: pip install 'driftfit[serve]' ({})."
 
 
+journal = typer.Typer(no_args_is_help=True, help="The journal of a service.")
+app.add_typer(journal, name="journal")
+
+
+@journal.command()
+def verify(
+    folder: Annotated[Path, typer.Argument(help="The folder of the service, which may run meanwhile.")],
+    digest: Annotated[str, typer.Option(help="A digest that was printed earlier; the chain must have it.")] = "",
+) -> None:
+    """Check the sum of every row, and the chain of digests; exit code 1 if something is wrong."""
+    with helpful():
+        try:
+            from driftfit.service.verify import verify as faults_of
+        except ImportError as error:
+            raise ValueError(NEEDED.format(error)) from None
+        found, faults = faults_of(folder, digest)
+        for line in [*faults, f"{found}: {len(faults)} faults"]:
+            say(line, soft_wrap=True)
+    if faults:
+        raise typer.Exit(1)
+
+
 @app.command()
 def serve(
     file: Annotated[

@@ -14,6 +14,7 @@ from driftfit.cli.parts.options import Given, reads
 from driftfit.cli.parts.program import app, progress, say
 from driftfit.cli.track import Plot
 from driftfit.engine.settings import missing_settings
+from driftfit.show.export import write_table
 from driftfit.show.parts.text import digits, facts, table_of
 from driftfit.tune.tune import tune
 from driftfit.tune.tuned import Tuned
@@ -53,7 +54,6 @@ def smooth(
         columns: dict[str, Any] = {run.labels.time or "sample": run.time}
         columns |= {f"theta_{name}": smoothed.theta[:, i] for i, name in enumerate(run.names)}
         columns |= {f"std_{name}": smoothed.std[:, i] for i, name in enumerate(run.names)}
-        frame = pl.DataFrame(columns)
-        frame.write_csv(write_to) if write_to.suffix.lower() == ".csv" else frame.write_parquet(write_to)
+        write_table(pl.DataFrame(columns), write_to)
     if plot is not None:
         smoothed.plot().savefig(plot, dpi=150)

@@ -40,7 +40,7 @@ def tune(
     rows = [
         ("Model", repr(models[0])),
         ("Tracker", shortened(repr(tuned.tracker))),
-        ("Log-likelihood", f"{tuned.loglik:.6g}"),
+        ("Log-likelihood", f"{tuned.loglik:.6g} of {tuned.used} samples"),
     ]
     say(facts(*rows))
     table = table_of(f"Settings by {method}", "", "chosen", f"{level:.0%} from", "to")

@@ -197,6 +197,8 @@ class Clock:
         """
         if type(time) is float and type(last) is float and self.kind in ("number", "unset"):
             return (time - last) / self.count if last < time < np.inf else float("nan")
+        if time != time:
+            return float("nan")
         self._fits(time)
         if not np.isfinite(time):
             return float("nan")
@@ -220,8 +222,10 @@ class Clock:
         return self.moved(last, np.arange(1, h + 1))
 
     def moved(self, last: Any, k: Array) -> Array | None:
-        """The times k nominal intervals after ``last``, or before it for negative k; None if times are only labels."""
-        if self.kind == LABEL or last is None:
+        """The times k nominal intervals after ``last``, or before it for negative k; None if times are only labels, or
+        dates whose interval is not given.
+        """
+        if self.kind == LABEL or last is None or (self.kind == "unset" and isinstance(last, np.datetime64)):
             return None
         if self.kind in ("number", "unset"):
             return np.asarray(last + k * self.count)

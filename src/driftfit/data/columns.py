@@ -1,14 +1,15 @@
 """Columns of tables as arrays: numbers, times and missing values, for every kind of table.
 
-Null, NaN, infinite and empty cells are missing, and so are the texts NA, N/A, NaN, null and None. Anything else that is
-not a number raises an error that names its row and its text.
+Null, NaN, infinite and empty cells are missing, and so are the texts in `MISSING`, the error values of spreadsheets
+(`ERROR`), among numbers and times the states of plant historians (`HISTORIANS`), and the texts that the user names.
+Anything else that is not a number raises an error that names its row and its text.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, date
 from typing import Any
 
@@ -16,14 +17,24 @@ import narwhals as nw
 import numpy as np
 import polars as pl
 
+from driftfit.data.times.dates import dates, day_first
 from driftfit.data.times.instants import DAY, zone_name
 from driftfit.data.times.periods import EXAMPLES, periods
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import as_numbers, near
+from driftfit.engine.settings import ABSENT, as_numbers, near
 
-MISSING = ("", "na", "n/a", "nan", "null", "none", "#n/a", ".")
-"""Cell contents that mean "no value", in lower case; spreadsheets write #N/A, SAS and central banks a dot."""
+MISSING = ("", "na", "n/a", "nan", "null", "none", ".", "-")
+"""Cell contents that mean "no value", in lower case; SAS and central banks write a dot."""
 
+HISTORIANS = (
+    "bad", "bad data", "bad input", "bad output", "calc failed", "comm fail", "i/o timeout", "intf shut", "no data",
+    "no result", "no sample", "not connect", "out of serv", "over range", "pt created", "scan off", "scan timeout",
+    "shutdown", "under range",
+)  # fmt: skip
+"""States that plant historians write instead of a reading, in lower case (the system digital states of PI)."""
+
+ERROR = r"#(?:[^\s,;|]*[!?]|N/A(?: N/A)?|N/D|NV|GETTING_DATA|##+)"
+"""Error values of spreadsheets in several languages: #DIV/0! #N/A #NV #NAME? #WERT! #####."""
 
 FILE = "file"
 """The name with which ``by`` refers to the file that a row comes from."""
@@ -31,15 +42,27 @@ FILE = "file"
 
 @dataclass(frozen=True)
 class Wanted:
-    """The columns to read: numbers, perhaps a time, and the columns that identify the series."""
+    """The columns to read: numbers, perhaps a time, and the columns that identify the series; and how they are read.
+
+    ``missing`` are further texts that mean "no value". In CSV files ``separator`` divides lines into cells, and
+    ``decimal`` is the decimal sign, "." or ","; None: the file shows it.
+    """
 
     numbers: tuple[str, ...]
     time: str | None = None
     by: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+    separator: str | None = None
+    decimal: str | None = None
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The columns of numbers, and that of the time."""
+        return tuple(dict.fromkeys([*self.numbers, *([self.time] if self.time else [])]))
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys([*self.numbers, *([self.time] if self.time else []), *self.by]))
+        return tuple(dict.fromkeys([*self.signals, *self.by]))
 
 
 @dataclass(frozen=True)
@@ -51,6 +74,8 @@ class Columns:
     zone: str | None
     by: Sequence[Sequence[Any]]
     rows: int
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Units of numbers, of a file that has a row of them."""
 
 
 def convert(frame: nw.DataFrame[Any], wanted: Wanted, where: str, base: int, rows: slice | None = None) -> Columns:
@@ -64,15 +89,15 @@ def convert(frame: nw.DataFrame[Any], wanted: Wanted, where: str, base: int, row
     for name in wanted.names:
         if name not in frame.columns:
             raise ValueError(f"{where} has no column {name!r}: {near(name, frame.columns)}")
-    dates = None if wanted.time is None else frame[wanted.time]
-    first = day_first(_as_text(dates)) if dates is not None and _is_text(dates) else None
+    axis = None if wanted.time is None else frame[wanted.time]
+    first = day_first(_as_text(axis, wanted.missing)) if axis is not None and _is_text(axis) else None
     if rows is not None:
         frame, base = frame[rows], base + (rows.start or 0)
     time, zone = (None, None)
     if wanted.time is not None:
-        time, zone = times_of_column(frame[wanted.time], where, base, first)
-    numbers = {name: numbers_of(frame[name], where, base) for name in wanted.numbers}
-    return Columns(numbers, time, zone, [_units(frame[name]) for name in wanted.by], len(frame))
+        time, zone = times_of_column(frame[wanted.time], where, base, first, wanted.missing)
+    numbers = {name: numbers_of(frame[name], where, base, wanted.missing) for name in wanted.numbers}
+    return Columns(numbers, time, zone, [_keys(frame[name], wanted.missing) for name in wanted.by], len(frame))
 
 
 def plain_names(names: Sequence[str], wanted: Sequence[str]) -> list[str]:
@@ -89,17 +114,28 @@ def _is_text(series: nw.Series[Any]) -> bool:
     return series.dtype in (nw.String, nw.Categorical) or isinstance(series.dtype, nw.Enum)
 
 
-def _as_text(series: nw.Series[Any]) -> pl.Series:
+def _as_text(series: nw.Series[Any], missing: Sequence[str]) -> pl.Series:
     """Cells without surrounding blanks; null if they mean "no value"."""
-    cells = [cell if isinstance(cell, str) else None for cell in series.cast(nw.String).to_list()]
-    text = pl.Series(series.name, cells, dtype=pl.String).str.strip_chars()
-    return text.zip_with(~text.str.to_lowercase().is_in(MISSING), pl.Series([None], dtype=pl.String))
+    text = series.cast(nw.String)
+    native: Any = text.to_native()
+    if not isinstance(native, pl.Series):
+        cells = [cell if isinstance(cell, str) else None for cell in text.to_list()]
+        native = pl.Series(series.name, cells, dtype=pl.String)
+    return present(native, missing)
 
 
-def numbers_of(series: nw.Series[Any], where: str, base: int) -> Array:
+def present(text: pl.Series, missing: Sequence[str]) -> pl.Series:
+    """Cells without surrounding blanks; null if they mean "no value", also if they are one of the texts ``missing``."""
+    text = text.str.strip_chars()
+    none = text.str.to_lowercase().is_in([*MISSING, *(word.strip().lower() for word in missing)])
+    none |= text.str.contains(f"(?i)^{ERROR}$").fill_null(False)
+    return text.zip_with(~none, pl.Series([None], dtype=pl.String))
+
+
+def numbers_of(series: nw.Series[Any], where: str, base: int, missing: Sequence[str] = ()) -> Array:
     """A column as floats, with NaN for missing values."""
     if _is_text(series):
-        return _numbers_of_text(_as_text(series), where, base)
+        return _numbers_of_text(_as_text(series, (*HISTORIANS, *missing)), where, base)
     if series.dtype == nw.Object:  # decimals, None and other Python objects in one column
         return as_numbers(f"{where}, column {series.name!r}", series.to_list())
     if series.dtype == nw.Unknown and series.null_count() == len(series):  # a column in which nothing was ever written
@@ -136,14 +172,14 @@ def _advice(cell: str, second_line: bool) -> str:
 
 
 def times_of_column(
-    series: nw.Series[Any], where: str, base: int, first: bool | None = None
+    series: nw.Series[Any], where: str, base: int, first: bool | None = None, missing: Sequence[str] = ()
 ) -> tuple[Array, str | None]:
     """(numbers or datetime64 in UTC, zone); NaN or NaT for rows without a time.
 
     ``first``: whether dates such as 1/2/2024 begin with the day; None: the column shows it.
     """
     if _is_text(series):
-        text = _as_text(series)
+        text = _as_text(series, (*HISTORIANS, *missing))
         compact = bool(text.drop_nulls().str.contains(f"^{DAY}$").all()) and text.null_count() < len(text)
         if not compact and text.cast(pl.Float64, strict=False).is_null().eq(text.is_null()).all():
             return _numbers_of_text(text, where, base), None
@@ -169,86 +205,39 @@ def times_of_column(
 
 def _dates_of_objects(cells: list[Any], where: str, base: int) -> tuple[Array, str | None] | None:
     """Dates, or datetimes of any zones, as databases and pandas give them; None if no cell holds one."""
-    dates = [None if str(cell) in ("NaT", "<NA>", "nan") else cell for cell in cells]
-    zones = {getattr(one, "tzinfo", None) for one in dates if isinstance(one, date)}
+    days = _values(cells)
+    zones = {getattr(one, "tzinfo", None) for one in days if isinstance(one, date)}
     if not zones:
         return None
-    for k, one in enumerate(dates):
+    for k, one in enumerate(days):
         if one is not None and not isinstance(one, date):
             raise ValueError(f"{where} {k + base} of the time holds {one!r}, which is not a date, as other rows do.")
     if None not in zones:
-        dates = [None if one is None else one.astimezone(UTC).replace(tzinfo=None) for one in dates]
+        days = [None if one is None else one.astimezone(UTC).replace(tzinfo=None) for one in days]
     elif len(zones) > 1:
         raise ValueError(f"{where}s of the time have dates with a zone and dates without; give all of them one.")
     names = {zone_name(zone) for zone in zones if zone is not None}
-    return np.array(dates, dtype="datetime64[us]"), names.pop() if len(names) == 1 else "UTC" if names else None
-
-
-DAY_FIRST = r"^(\d{1,2})([./-])(\d{1,2})[./-](\d{4})(?:[ T]+(\d{1,2}:\d{2}(?::\d{2}(?:\.\d+)?)?))?$"
-"""31.1.2024, 31/01/2024 12:00, 1/31/2024: day, separator, month (or the reverse), year, time of day."""
-
-
-def day_first(text: pl.Series) -> bool | None:
-    """Whether dates that end with the year begin with the day; None if no cell shows it.
-
-    With dots the day is first. With another separator a number above 12 shows which of the two it is.
-    """
-    dates = text.filter(text.str.contains(DAY_FIRST).fill_null(False))
-    first, second = (dates.str.extract(DAY_FIRST, k).cast(pl.Int64) for k in (1, 3))
-    if (len(dates) and (dates.str.extract(DAY_FIRST, 2) == ".").all()) or (first > 12).any():
-        return True
-    return False if (second > 12).any() else None
-
-
-def year_first(text: pl.Series, where: str, begins: bool | None = None) -> pl.Series:
-    """Dates that end with the year, or have no hyphens (20240131), as 2024-01-31; other columns as they are.
-
-    ``begins``: whether they begin with the day; None: the column shows it, or ValueError.
-    """
-    known = text.drop_nulls()
-    if len(known) and known.str.contains(f"^{DAY}$").all():
-        return text.str.replace(r"^(....)(..)(..)$", "$1-$2-$3")
-    if not len(known) or not known.str.contains(DAY_FIRST).all():
-        return text
-    first, second = (text.str.extract(DAY_FIRST, k).cast(pl.Int64) for k in (1, 3))
-    begins = day_first(known) if begins is None else begins
-    if begins is None:
-        raise ValueError(
-            f"{where}: the dates of column {text.name!r}, such as {known[0]!r}, may have the day or the month first, "
-            "and none of them shows which; write them as 2024-01-31."
-        )
-    day, month = (first, second) if begins else (second, first)
-    parts = pl.DataFrame({
-        "year": text.str.extract(DAY_FIRST, 4), "month": month.cast(pl.String).str.zfill(2),
-        "day": day.cast(pl.String).str.zfill(2), "clock": text.str.extract(DAY_FIRST, 5).fill_null("00:00:00"),
-    })  # fmt: skip
-    parts = parts.with_columns(clock=pl.when(pl.col("clock").str.count_matches(":") == 1).then(pl.col("clock") + ":00")
-                               .otherwise(pl.col("clock")).str.replace(r"^(\d):", "0$1:"))  # fmt: skip
-    dates = parts.select(pl.format("{}-{}-{} {}", "year", "month", "day", "clock")).to_series()
-    return dates.alias(text.name).zip_with(text.is_not_null(), pl.Series([None], dtype=pl.String))
+    return np.array(days, dtype="datetime64[us]"), names.pop() if len(names) == 1 else "UTC" if names else None
 
 
 def _dates_of_text(text: pl.Series, where: str, base: int, first: bool | None) -> pl.Series:
     begin = periods(text.to_list())
-    try:
-        if begin is None:
-            dates = year_first(text, where, first).str.to_datetime(time_unit="us", strict=False)
-        else:
-            dates = pl.Series(text.name, begin)
-    except pl.exceptions.ComputeError:  # the first cells contain no date from which to infer the format
-        dates = pl.Series(text.name, [None] * len(text), dtype=pl.Datetime("us"))
-    wrong = (dates.is_null() & text.is_not_null()).arg_true()
+    found = dates(text, where, first) if begin is None else pl.Series(text.name, begin)
+    wrong = (found.is_null() & text.is_not_null()).arg_true()
     if len(wrong):
         raise ValueError(
             f"{where}, row {wrong[0] + base} of column {text.name!r} holds {text[wrong[0]]!r}, which is neither a "
             "number nor a date in the form of the column's first cells (2024-01-31, 2024-01-31 12:00:00, or a period "
             f"as in {EXAMPLES})."
         )
-    return dates
+    return found
 
 
-def _units(series: nw.Series[Any]) -> list[Any]:
-    """The unit of every row, or None, in the type of the column: the parts of a table agree on it."""
-    if not _is_text(series):
-        return [None if value is None or value != value else value for value in series.to_list()]
-    return _as_text(series).to_list()
+def _keys(series: nw.Series[Any], missing: Sequence[str]) -> list[Any]:
+    """The key of every row's series, or None, in the type of the column: the parts of a table agree on it."""
+    return _as_text(series, missing).to_list() if _is_text(series) else _values(series.to_list())
+
+
+def _values(cells: Iterable[Any]) -> list[Any]:
+    """Cells, with None for those without a value."""
+    return [None if str(cell) in (*ABSENT, "nan") else cell for cell in cells]

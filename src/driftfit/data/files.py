@@ -13,6 +13,7 @@ import os
 import warnings
 import zlib
 from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ def read_columns(path: str | os.PathLike[str], names: Sequence[str], time: str |
     """
     wanted = Wanted(tuple(names), time)
     where = os.fspath(path)
-    columns = convert(read_file(where, wanted, where), wanted, where, 1)
+    columns = of_file(where, wanted)
     return {**columns.numbers, **({time: columns.time} if time is not None and columns.time is not None else {})}
 
 
@@ -58,16 +59,16 @@ def read(data: Any, wanted: Wanted) -> tuple[Columns, dict[Hashable, str]]:
         return convert(_frame(data), wanted, "the table", 0), {}
     paths = paths_of(data)
     if len(paths) == 1:
-        return convert(read_file(paths[0], wanted, paths[0]), wanted, paths[0], 1), {}
+        return of_file(paths[0], wanted), {}
     parts: dict[str, Columns] = {}
     failed: dict[Hashable, str] = {}
     for path in paths:
         try:
-            frame = read_file(path, wanted, path)
+            frame, units = read_file(path, wanted, path)
         except (ValueError, OSError) as error:
             failed[path] = str(error)
             continue
-        parts[path] = convert(frame, wanted, path, 1)
+        parts[path] = replace(convert(frame, wanted, path, 1), units=units)
     if not parts:
         raise ValueError(f"none of the {len(paths)} files can be read; the first: {failed[paths[0]]}")
     if failed:
@@ -75,6 +76,11 @@ def read(data: Any, wanted: Wanted) -> tuple[Columns, dict[Hashable, str]]:
             f"{len(failed)} of {len(paths)} files cannot be read: {next(iter(failed.values()))}", stacklevel=4
         )
     return _together(parts), failed
+
+
+def of_file(path: str, wanted: Wanted) -> Columns:
+    frame, units = read_file(path, wanted, path)
+    return replace(convert(frame, wanted, path, 1), units=units)
 
 
 def _frame(data: Any) -> nw.DataFrame[Any]:
@@ -101,10 +107,11 @@ def paths_of(data: Any) -> list[str]:
     return paths
 
 
-def read_file(
-    source: str | bytes, wanted: Wanted, where: str, separator: str | None = None, decimal: str = "."
-) -> nw.DataFrame[Any]:
-    """The wanted columns of one file, given by its path or its contents; `read_csv` says how CSV is read."""
+def read_file(source: str | bytes, wanted: Wanted, where: str) -> tuple[nw.DataFrame[Any], dict[str, str]]:
+    """The wanted columns of one file, given by its path or its contents, and their units if they have a row.
+
+    `read_csv` says how CSV is read.
+    """
     if (start := start_of(source)).startswith(b"\x1f\x8b"):
         try:
             source = gzip.decompress(source if isinstance(source, bytes) else Path(source).read_bytes())
@@ -113,6 +120,7 @@ def read_file(
         start = start_of(source)
     if kind := next((kind for first, kind in OTHER.items() if start.startswith(first)), None):
         raise ValueError(f"{where} is {kind}; write its table to a CSV or Parquet file.")
+    units: dict[str, str] = {}
     parquet = start[:4] == b"PAR1" or (isinstance(source, str) and Path(source).suffix.lower() in (".parquet", ".pq"))
     try:
         if parquet:
@@ -120,7 +128,7 @@ def read_file(
             names = list(pl.read_parquet_schema(opened))
             frame = pl.read_parquet(opened, columns=[name for name in names if name in wanted.names])
         else:
-            names, frame = read_csv(source, wanted, separator, decimal)
+            names, frame, units = read_csv(source, wanted)
     except (pl.exceptions.PolarsError, csv.Error, ValueError) as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{where} cannot be read as {'Parquet' if parquet else 'CSV'}: {text}") from None
@@ -133,7 +141,7 @@ def read_file(
         frame = frame.with_columns(pl.lit(where).alias(FILE))
     if frame.height == 0:
         raise ValueError(f"{where} has a header but no rows.")
-    return nw.from_native(frame, eager_only=True)
+    return nw.from_native(frame, eager_only=True), units
 
 
 def _together(parts: Mapping[str, Columns]) -> Columns:
@@ -150,6 +158,7 @@ def _together(parts: Mapping[str, Columns]) -> Columns:
         first.zone,
         [_of_one_type(column) for column in units],
         sum(part.rows for part in parts.values()),
+        first.units,
     )
 
 

@@ -131,6 +131,38 @@ def dated(index: Any) -> bool:
     return hasattr(index, "to_series") and (hasattr(index, "to_timestamp") or getattr(index.dtype, "kind", "") == "M")
 
 
+def warn_of_order(name: str) -> None:
+    """Warn that rows were sorted by dates that nobody named as the time."""
+    warn(
+        f"data: the rows are not in the order of {name!r}, and are sorted by it; sort the table, or give "
+        f"time={name!r}, to avoid this warning."
+    )
+
+
+def warn_of_repeats(count: int, rows: int) -> None:
+    """Warn that ``count`` rows were left out."""
+    warn(
+        f"time: {count} of {rows} rows repeat the time of another row and are left out. Give times of a finer clock, "
+        "by= the column that tells series apart, or the mean of the rows at each time."
+    )
+
+
+def chronological(index: Any) -> Array | slice:
+    """The rows sorted by an index of dates, of several with one date the first; all of them if it holds no dates.
+
+    Warns if they are not in order, or left out.
+    """
+    if not dated(index) or (index.is_monotonic_increasing and index.is_unique):
+        return slice(None)
+    if not index.is_monotonic_increasing:
+        warn_of_order(index.name if isinstance(index.name, str) else "index")
+    order = np.argsort(index.asi8, kind="stable")
+    again = np.append(False, np.diff(index.asi8[order]) == 0)
+    if again.any():
+        warn_of_repeats(int(again.sum()), len(index))
+    return np.asarray(order[~(again | index.isna()[order])])
+
+
 PERIODS = {"Q": "quarter", "M": "month", "Y": "year", "A": "year"}
 """The step of the calendar, as `dt` names it, by the first letter of the frequency of an index of periods.
 

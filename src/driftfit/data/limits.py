@@ -1,6 +1,7 @@
-"""Valid ranges of signals, and intervals to leave out: excluded values become missing and are counted.
+"""Valid ranges of signals, numbers that mean "no value", and intervals to leave out: they are missing and counted.
 
     limits = {"flow": (0, 80), "pressure": (None, 16)}     a number outside its range counts as missing
+    missing = ["Offline", -999]                            texts of files and tables, and numbers of any signal
     exclude = [("2024-03-01", "2024-03-04"), (500, 620)]   from, to: both are included, None leaves an end open
 
 Names are those of columns; for arrays they are "y", the names of the outputs or inputs of the model, "u" for every
@@ -219,15 +220,24 @@ def _in_utc(moment: Any, given: Any, zone: str | None) -> Any:
     return instant(local)
 
 
-def marked(
-    keys: Sequence[Any], owner: Array, outside: Mapping[str, Array], excluded: Array
-) -> dict[Any, dict[str, int]]:
+def marked(keys: Sequence[Any], owner: Array, reasons: Mapping[str, Array]) -> dict[Any, dict[str, int]]:
     """Counts by key and by reason, from counts (N,) of each sample; ``owner`` (N,) is the number of its series."""
-    reasons = {f"of {name} outside its limits": numbers for name, numbers in outside.items()}
-    reasons |= {"excluded": excluded}
     counts: dict[Any, dict[str, int]] = {}
     for reason, numbers in reasons.items():
         found = np.bincount(owner, weights=numbers, minlength=len(keys))
         for k in np.flatnonzero(found).tolist():
             counts.setdefault(keys[k], {})[reason] = int(found[k])
     return counts
+
+
+def marks(missing: Any) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """What a user says means "no value", one text or number or several of them, as (texts, numbers)."""
+    texts, numbers = [], []
+    for one in (missing,) if isinstance(missing, str | int | float) else missing or ():
+        if isinstance(one, bool) or not isinstance(one, str | int | float | np.number):
+            raise ValueError(f"missing: give texts or numbers that mean no value, as in ['Off', -999]; got {one!r}.")
+        try:
+            numbers.append(float(one))
+        except ValueError:
+            texts.append(str(one))
+    return tuple(texts), tuple(numbers)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,21 @@ from driftfit.data.signals import as_inputs, intervals, noise_of
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, factor
 from driftfit.models.base import Model
+
+
+def columns_as_outputs(model: Model, y: Any, data: Any) -> tuple[Model, Any]:
+    """(the model with an output for each column, y) where y lists columns of a table and the model has one output.
+
+    ValueError for a model that cannot have several.
+    """
+    if data is None or isinstance(y, str) or not isinstance(y, Sequence) or len(model.outputs) > 1:
+        return model, y
+    if len(y) == 1:
+        return model, y[0]
+    if "ny" not in {field.name for field in fields(model) if field.init}:  # type: ignore[arg-type]
+        named = ", ".join(map(str, y))
+        raise ValueError(f"{type(model).__name__} has one output, but y names {named}; give one of them at a time.")
+    return replace(model, ny=tuple(y)), y  # type: ignore[type-var]  # every model is a dataclass
 
 
 def of_arrays(model: Model, y: Any, u: Any, reading: Reading) -> tuple[Model, Records]:

@@ -19,8 +19,8 @@ import numpy as np
 from driftfit.data.clock import LABEL, Clock
 from driftfit.data.known import Known, row_of
 from driftfit.data.labels import held, ordered, times_of, together
-from driftfit.data.limits import Limits, marked, within_each
-from driftfit.data.signals import as_inputs, as_output, intervals, noise_of
+from driftfit.data.limits import Limits, marked, marks, within_each
+from driftfit.data.signals import as_inputs, as_output, intervals, noise_of, warn_of_sizes
 from driftfit.data.times.gaps import warn_of_gaps
 from driftfit.data.times.instants import instants
 from driftfit.engine.kernel import Array
@@ -100,6 +100,7 @@ class Reading(NamedTuple):
     units: Mapping[str, str] | None = None
     limits: Mapping[Any, Any] | None = None
     exclude: Any = None
+    missing: Any = ()
     gate: Any = None
     indexed: bool = True
     """Whether an index of dates labels the samples if no time is given."""
@@ -240,13 +241,17 @@ class Records(NamedTuple):
         return replace(self.labels, **found) if found else self.labels
 
     def for_model(self, model: Model, reading: Reading, reach: int | None = None) -> Records:
-        """Sort the inputs for a model with named inputs, and apply valid ranges and excluded intervals.
+        """Sort the inputs for a model with named inputs, and apply valid ranges, marks and excluded intervals.
 
-        Warns if most samples cannot be used because of dt, with lags of ``reach`` samples, or those of the model.
+        Warns if most numbers of a signal are out of range, and if most samples cannot be used because of dt, with lags
+        of ``reach`` samples, or those of the model.
         """
         u, names = ordered(model, self.u, self.labels.u)
+        warn_of_sizes(self.outputs or (self.labels.y,), self.y.reshape(len(self.y), -1))
+        if m := u.shape[-1]:
+            warn_of_sizes(names or [f"u{j + 1}" for j in range(m)], u.reshape(-1, m))
         found = self if u is self.u else self._replace(u=u, labels=replace(self.labels, u=names))
-        if reading.limits or reading.exclude:
+        if reading.limits or reading.exclude or reading.missing:
             found = found._restricted(names or model.input_names, reading)
         if self.time is not None and len(self.known) > 1:
             clock, zone = Clock.of(self.labels.dt), self.labels.zone
@@ -255,16 +260,20 @@ class Records(NamedTuple):
         return found
 
     def _restricted(self, inputs: Sequence[str], reading: Reading) -> Records:
-        """Replace values outside valid ranges or in excluded intervals by NaN, and count them."""
+        """Replace values outside valid ranges, marked as missing or in excluded intervals by NaN, and count them."""
         y, u, keys = self.y.copy(), self.u.copy(), self.keys
         N, m = len(y), u.shape[-1]
         owner = np.repeat(np.arange(len(keys)), self.length)
         limits = Limits(reading.limits or {}, self.outputs or (self.labels.y,), inputs, m)
+        none_y, none_u = (np.isin(signal, marks(reading.missing)[1]) for signal in (y, u))
+        y[none_y], u[none_u] = np.nan, np.nan
         out_y, out_u = limits.outside(y.reshape(N, -1), u)
         number = np.arange(N) - self.first[owner]
         excluded = within_each(reading.exclude, keys, owner, self.time, number, self.labels.zone)
         counts = np.hstack([out_y, out_u.reshape(N, -1, m).sum(axis=1)]) * ~excluded[:, None]
-        missing = marked(keys, owner, dict(zip(limits.names, counts.T, strict=True)), excluded)
+        reasons = {f"of {name} outside its limits": of for name, of in zip(limits.names, counts.T, strict=True)}
+        none = np.hstack([none_y.reshape(N, -1), none_u.reshape(N, -1)]).sum(axis=1)
+        missing = marked(keys, owner, {**reasons, "marked as missing": none * ~excluded, "excluded": excluded})
         y[out_y.reshape(y.shape)] = np.nan
         u[out_u] = np.nan
         y[excluded], u[excluded] = np.nan, np.nan

@@ -10,8 +10,9 @@ the names and sizes of the arrays are in the header: with all numbers little-end
          16 .. 19     length of the header
          20 ..        the header, and the arrays one after the other
 
-A file is written under a temporary name and then moved into place, so it is complete or absent. Classes are stored by
-module and class name; loading imports that module, so load only files from people whose code you would run.
+A file is written under a temporary name and then moved into place, so it is complete or absent. Classes and functions
+are stored by module and name, and nothing is imported by what a file says: only classes of the library are found by
+their names, and those of your own, and your functions, that you hand in (``classes=``).
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ import os
 import secrets
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields as dataclass_fields
 from datetime import date, datetime, timedelta
-from importlib import import_module
 from io import BytesIO
 from os import PathLike
 from struct import Struct
@@ -34,7 +35,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import Settings
+from driftfit.engine.settings import Settings, place_of
 from driftfit.engine.tiles import held_in
 
 FORMAT = 1
@@ -53,34 +54,91 @@ def describe(settings: Settings) -> dict[str, Any]:
     """
     absent = {field.name for field in dataclass_fields(settings) if field.default is None}  # type: ignore[arg-type]
     given = {name: one for name, one in settings.settings().items() if one is not None or name not in absent}
-    return {"class": f"{type(settings).__module__}:{type(settings).__qualname__}", "settings": given}
+    return {"class": place_of(type(settings)), "settings": given}
 
 
-def rebuild(description: Mapping[str, Any], kind: type) -> Any:
-    """The inverse of `describe`; the class must be of the given kind."""
-    module, _, name = str(description["class"]).partition(":")
-    try:
-        found = getattr(import_module(module), name)
-    except (ImportError, AttributeError):
-        raise ValueError(
-            f"the file needs the class {name} of the module {module}, which cannot be imported here."
-        ) from None
+def rebuild(description: Mapping[str, Any], kind: type, classes: Iterable[Any] = ()) -> Any:
+    """The inverse of `describe`: the library's class of the given kind, or one of ``classes``, with its settings.
+
+    Functions among the settings are those of ``classes``. ValueError says what the file needs.
+    """
+    given = {place_of(one): one for one in classes}
+    library: dict[str, Any] = {place_of(one): one for one in _within(kind)}
+    found = _found(str(description["class"]), library | given)
     if not (isinstance(found, type) and issubclass(found, kind)):
-        raise ValueError(f"the file names {module}:{name} as its {kind.__name__.lower()}, which it is not.")
+        raise ValueError(f"the file names {place_of(found)} as its {kind.__name__.lower()}, which it is not.")
     assert issubclass(found, Settings)
     try:
-        return found.from_settings(dict(description["settings"]))
+        return found.from_settings(_filled(dict(description["settings"]), given))
     except TypeError as error:  # a setting that this version does not have
         raise ValueError(f"the file was written by another version: {error}.") from None
 
 
+def _within(kind: type[Any]) -> Iterator[type[Any]]:
+    """The classes of the library that are of a kind."""
+    if kind.__module__.partition(".")[0] == __name__.partition(".")[0]:
+        yield kind
+    for one in kind.__subclasses__():
+        yield from _within(one)
+
+
+def _found(place: str, known: Mapping[str, Any]) -> Any:
+    if place not in known:
+        raise ValueError(
+            f"the file needs {place}, which is not a part of this version of driftfit. If it is your own, hand it in: "
+            f"classes=[{place.replace(':', '.')}]; nothing is imported by what a file says."
+        )
+    return known[place]
+
+
+def _filled(value: Any, given: Mapping[str, Any]) -> Any:
+    """Settings as plain data, with functions in place of their names."""
+    if isinstance(value, Mapping):
+        if value.keys() == {"function"}:
+            return _found(str(value["function"]), given)
+        return {name: _filled(one, given) for name, one in value.items()}
+    return [_filled(one, given) for one in value] if isinstance(value, list | tuple) else value
+
+
+def parts_of(value: Any) -> Iterator[Any]:
+    """The classes and functions that a model or tracker is made of: ``classes`` for files that hold the same."""
+    if isinstance(value, Settings):
+        yield type(value)
+        for field in dataclass_fields(value):  # type: ignore[arg-type]
+            yield from parts_of(getattr(value, field.name))
+    elif isinstance(value, tuple):
+        for part in value:
+            yield from parts_of(part)
+    elif callable(value):
+        yield value
+
+
+def check_size(source: str | PathLike[str], model: Any, tracker: Any, size: int) -> None:
+    """ValueError unless model and tracker have as many parameters as a file; what they need is made after that."""
+    n = len(tracker.names_for(model))
+    if n != size:
+        raise ValueError(
+            f"{os.fspath(source)} does not fit {type(tracker).__name__} in this version: field 'theta' has {size} "
+            f"numbers, the model {n} parameters."
+        )
+
+
+@contextmanager
+def reading(name: str) -> Iterator[None]:
+    """Errors of a file that holds what no driftfit writes, as ValueError."""
+    try:
+        yield
+    except (ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, TypeError) as error:
+        raise ValueError(f"{name} holds what driftfit does not write: {type(error).__name__}: {error}.") from error
+
+
 def write(path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
     """Write a header and arrays as .npz, completely or not at all."""
-    _write(path, lambda file: _put(file, header, arrays))
+    replace_file(path, lambda file: _put(file, header, arrays))
 
 
-def _write(path: str | PathLike[str], put: Callable[[Any], Any]) -> None:
-    """Let ``put`` write a file that is complete or absent."""
+def replace_file(path: str | PathLike[str], put: Callable[[Any], Any]) -> None:
+    """Let ``put`` write a file, which takes the place of an older one once it is complete and on the disk."""
     target = os.path.abspath(os.fspath(path))
     name = os.path.join(os.path.dirname(target), f".driftfit-{secrets.token_hex(8)}")
     try:
@@ -101,7 +159,7 @@ def _write(path: str | PathLike[str], put: Callable[[Any], Any]) -> None:
 def read(path: str | PathLike[str], *kinds: str) -> tuple[dict[str, Any], dict[str, Array]]:
     """Header and arrays of a file that holds one of the ``kinds`` ("state", "track"); ValueError where it does not."""
     with open(path, "rb") as handle:
-        return _take(handle, os.fspath(path), kinds)
+        return expand(handle.read(), kinds, os.fspath(path))
 
 
 def _put(file: Any, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
@@ -140,14 +198,10 @@ def _expand(data: bytes) -> tuple[dict[str, Any], dict[str, Array]]:
     return header, arrays
 
 
-def expand(data: bytes, kinds: Sequence[str]) -> tuple[dict[str, Any], dict[str, Array]]:
+def expand(data: bytes, kinds: Sequence[str], name: str = "what was given") -> tuple[dict[str, Any], dict[str, Array]]:
     """Header and arrays of bytes that hold one of the ``kinds``; ValueError where they do not."""
-    return _take(BytesIO(data), "what was given", kinds)
-
-
-def _take(file: Any, name: str, kinds: Sequence[str]) -> tuple[dict[str, Any], dict[str, Array]]:
     try:
-        data, reads = file.read(), COMPACT
+        reads = COMPACT
         if data.startswith(MAGIC):
             header, arrays = _expand(data)
         else:
@@ -177,12 +231,12 @@ class Kept(ABC):
 
     @classmethod
     @abstractmethod
-    def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
+    def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array], classes: Iterable[Any]) -> Self:
         """The inverse of `_written`; ``source`` is named in error messages."""
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write model, settings and state to one file without pickle, completely or not at all."""
-        _write(path, lambda file: file.write(self.to_bytes()))
+        replace_file(path, lambda file: file.write(self.to_bytes()))
 
     @classmethod
     def _kinds(cls) -> Mapping[str, type[Kept]]:
@@ -190,20 +244,29 @@ class Kept(ABC):
         return {cls._kind: cls}
 
     @classmethod
-    def load(cls, path: str | PathLike[str]) -> Any:
-        """Continue from a file as if never stopped."""
-        header, arrays = read(path, *cls._kinds())
-        return cls._kinds()[header["kind"]]._read(os.fspath(path), header, arrays)
+    def load(cls, path: str | PathLike[str], classes: Iterable[Any] = ()) -> Any:
+        """Continue from a file as if never stopped.
+
+        Nothing is imported or run by what the file says: a model or tracker of your own, and functions among its
+        settings, are those that you hand in as ``classes``. The ValueError names what a file needs.
+        """
+        with open(path, "rb") as file:
+            return cls._taken(os.fspath(path), file.read(), classes)
 
     def to_bytes(self) -> bytes:
         """The content of a saved file as bytes, for a queue or a database."""
         return compact(*self._written())
 
     @classmethod
-    def from_bytes(cls, data: bytes) -> Any:
-        """The inverse of `to_bytes`."""
-        header, arrays = expand(data, list(cls._kinds()))
-        return cls._kinds()[header["kind"]]._read("what was given", header, arrays)
+    def from_bytes(cls, data: bytes, classes: Iterable[Any] = ()) -> Any:
+        """The inverse of `to_bytes`; ``classes`` as for `load`."""
+        return cls._taken("what was given", data, classes)
+
+    @classmethod
+    def _taken(cls, source: str, data: bytes, classes: Iterable[Any]) -> Any:
+        header, arrays = expand(data, list(cls._kinds()), source)
+        with reading(source):
+            return cls._kinds()[header["kind"]]._read(source, header, arrays, classes)
 
 
 def _encode(value: Any) -> Any:

@@ -2,26 +2,32 @@
 
 Anything that narwhals reads is a table (pandas, polars, pyarrow, lazy frames); so is a file (`driftfit.data.files`).
 
-Rows belong to units (``by``) and are sorted by time within each unit; of several rows at the same time the first is
-used. Rows without a unit or without a time never become samples; they are counted.
+Rows belong to units (``by``) and are sorted by time within each unit, also by an index of dates if no time is given; of
+several rows at the same time the first is used. Rows without a unit or without a time never become samples; they are
+counted.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Hashable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+import narwhals as nw
 import numpy as np
 
 from driftfit.data.clock import LABEL, Clock
 from driftfit.data.columns import Columns, Wanted
 from driftfit.data.files import read
 from driftfit.data.known import Known
-from driftfit.data.labels import dated, warn_of_skipped_periods
+from driftfit.data.labels import dated, warn_of_order, warn_of_repeats, warn_of_skipped_periods
+from driftfit.data.limits import marks
 from driftfit.data.record import Labels, Reading, Records, drift_of
 from driftfit.data.signals import noise_of
 from driftfit.data.times.instants import warn_of_counted_years, warn_of_summer_time, warn_of_written_numbers
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import warn
 
 
 def read_records(
@@ -36,32 +42,36 @@ def read_records(
         that cannot be read, or a single series without a usable row. With ``by``, a unit without a usable row is left
         out and has a reason; all units may be left out.
     """
-    data, reading = _dated(data, by, reading)
-    output, inputs = _name("y", y), _names("u", u)
-    weights, drift, time = reading.weights, reading.drift, reading.time
+    output, inputs, keyed = _name("y", y), _names("u", u), _names("by", by)
+    weights, drift = reading.weights, reading.drift
     if output in inputs:
         raise ValueError(
             f"u contains the output {output!r}, which would explain itself; its past is in models such as ARX."
         )
-    axis = None if time is None else _name("time", time)
-    if axis == output:
-        raise ValueError(f"time and y are both the column {output!r}.")
     each = () if isinstance(drift, str) or np.ndim(drift) == 0 else _names("drift", drift)
     factors = [*(name for name in (weights, drift) if isinstance(name, str)), *each]
-    wanted = Wanted(tuple(dict.fromkeys([output, *inputs, *factors])), axis, _names("by", by))
-    columns, failed = read(data, wanted)
+    numbers = tuple(dict.fromkeys([output, *inputs, *factors]))
+    data, axis, indexed = _dated(data, (*numbers, *keyed), reading)
+    if axis == output:
+        raise ValueError(f"time and y are both the column {output!r}.")
+    columns, failed = read(data, Wanted(numbers, axis, keyed, marks(reading.missing)[0]))
     keys, code = _codes(columns)
+    dt = reading.dt
+    if axis is not None and columns.time is not None and reading.time is None:
+        dt = LABEL if dt is None else dt
+        if not _in_order(columns.time, code, axis, indexed):
+            axis, columns = None, replace(columns, time=None)
     dropped: dict[Hashable, dict[str, int]] = {}
     order, times = _order(columns.time, columns.zone, code, keys, dropped)
     length = np.bincount(code[order], minlength=len(keys))
     failed |= {keys[k]: "no row has a time" for k in np.flatnonzero(length == 0)}
     there = np.flatnonzero(length)
-    if not there.size and not wanted.by:
+    if not there.size and not keyed:
         why = f"none of the {columns.rows} rows has a time" if columns.rows else "the table has no rows"
         raise ValueError(f"there is nothing to track: {why}.")
     first = (np.cumsum(length) - length)[there]
     values = {name: column[order] for name, column in columns.numbers.items()}
-    clock = Clock.of(reading.dt, columns.zone)
+    clock = Clock.of(dt, columns.zone)
     if times is not None:
         warn_of_counted_years(times)
         if clock.kind != LABEL:
@@ -73,27 +83,52 @@ def read_records(
     )
     drifts = np.stack([_factor(name, values, drift_of) for name in each], axis=1) if each else None
     signals = np.stack([values[name] for name in inputs], axis=1) if inputs else np.zeros((len(order), 0))
-    labels = Labels(y, inputs, axis, dict(reading.units or {}), columns.zone, {}, wanted.by, dt=clock.plain)
-    named = tuple(keys[k] for k in there)
-    return Records(named, first, length[there], values[y], signals, known, times, labels, dropped, drifts), failed
+    units = {**columns.units, **(reading.units or {})}
+    labels = Labels(y, inputs, axis, units, columns.zone, {}, keyed, dt=clock.plain)
+    found = tuple(keys[k] for k in there)
+    return Records(found, first, length[there], values[y], signals, known, times, labels, dropped, drifts), failed
 
 
-def _dated(data: Any, by: Any, reading: Reading) -> tuple[Any, Reading]:
-    """A data frame with an index of dates in order, if no time is given: the index as a column that labels samples."""
+def _dated(data: Any, used: Sequence[str], reading: Reading) -> tuple[Any, str | None, bool]:
+    """(the table, the column of its times, whether that was its index).
+
+    If no time is given, dates label the rows: an index of dates, or the only column of dates that is not ``used``.
+    """
+    if reading.time is not None or not reading.indexed or isinstance(data, str | os.PathLike | list | tuple):
+        return data, None if reading.time is None else _name("time", reading.time), False
     index: Any = getattr(data, "index", None)
-    if reading.time is not None or by is not None or not reading.indexed or not dated(index):
-        return data, reading
-    if not (index.is_monotonic_increasing and index.is_unique):
-        return data, reading
-    name = index.name if isinstance(index.name, str) else "time"
-    if name in data.columns:
-        return data, reading
-    if reading.dt is None:
-        warn_of_skipped_periods(index)
-    stamps = index.to_timestamp() if hasattr(index, "to_timestamp") else index
-    return data.set_axis(stamps).reset_index(names=name), reading._replace(
-        time=name, dt=LABEL if reading.dt is None else reading.dt
-    )
+    if dated(index):
+        names = (index.name if isinstance(index.name, str) else "time", "time", "index of dates")
+        axis = next(name for name in names if name not in data.columns)
+        if reading.dt is None:
+            warn_of_skipped_periods(index.unique().sort_values())
+        stamps = index.to_timestamp() if hasattr(index, "to_timestamp") else index
+        return data.set_axis(stamps).reset_index(names=axis), axis, True
+    frame = nw.from_native(data, pass_through=True)
+    schema = frame.collect_schema() if isinstance(frame, nw.DataFrame | nw.LazyFrame) else {}
+    dates = [name for name, kind in schema.items() if kind in (nw.Date, nw.Datetime) and name not in used]
+    return data, dates[0] if len(dates) == 1 else None, False
+
+
+def _in_order(time: Array, code: Array, axis: str, indexed: bool) -> bool:
+    """Whether dates that nobody named as the time are the times: those of an index, or of a column if no two rows of a
+    series share one. Warns if the table is in another order.
+    """
+    listed, sorts = np.argsort(code, kind="stable"), np.lexsort((time, code))
+    inside, advance = (code[listed][1:] == code[listed][:-1]), (time[listed][1:] >= time[listed][:-1])
+    again = (time[sorts][1:] == time[sorts][:-1]) & inside
+    lost = int(again.sum() + np.isnat(time).sum())
+    sort = indexed or not lost
+    if not advance[inside].all():
+        if sort:
+            warn_of_order(axis)
+        else:
+            warn(
+                f"data: the rows are not in the order of {axis!r}, in which {lost} of them have no date or that of "
+                f"another row, and are used in the order of the table; give time={axis!r}, by= the column that tells "
+                "series apart, or sort the table."
+            )
+    return sort
 
 
 def _name(argument: str, value: Any) -> str:
@@ -141,7 +176,8 @@ def _order(
     repeated = np.zeros(len(order), dtype=bool)
     repeated[1:] = (np.diff(code[order]) == 0) & (time[order][1:] == time[order][:-1])
     _count(dropped, keys, code[order[repeated]], "at a repeated time")
-    warn_of_summer_time(time[order[repeated]], zone)
+    if repeated.any() and not warn_of_summer_time(time[order[repeated]], zone):
+        warn_of_repeats(int(repeated.sum()), len(order))
     order = order[~repeated]
     return order, time[order]
 

@@ -20,7 +20,8 @@ import textwrap
 from collections import Counter
 from typing import Any
 
-from driftfit.embedded.statements import RESERVED, Statements
+from driftfit.embedded.names import comment, identifier
+from driftfit.embedded.statements import Statements
 from driftfit.embedded.unit import TYPES, Function, TranslationError, Unit
 from driftfit.embedded.values import RANK, Value, begin_of, renamed
 
@@ -32,10 +33,8 @@ def translate(unit: Unit, source: Any, arguments: list[Value]) -> Function:
     if key not in unit.functions:
         unit.names[source.__name__] += 1
         count = unit.names[source.__name__]
-        name = f"{source.__name__.lstrip('_')}{'' if count == 1 else f'_{count}'}"
-        unit.functions[key] = Body(unit, source, arguments).function(
-            f"{name}_" if name in RESERVED or hasattr(math, name) else name
-        )
+        name = identifier(f"{source.__name__.lstrip('_')}{'' if count == 1 else f'_{count}'}")
+        unit.functions[key] = Body(unit, source, arguments).function(f"{name}_" if hasattr(math, name) else name)
     return unit.functions[key]
 
 
@@ -59,7 +58,7 @@ class Body(Statements):
         """The arguments by name; those with known values do not appear in the signature."""
         named = {}
         for argument, one in zip(self.tree.args.args, arguments, strict=True):
-            name = self.safe(argument.arg)
+            name = identifier(argument.arg)
             if one.kind in ("record", "tile"):
                 self.parameters.append("tracker_state *s")
                 named[argument.arg] = Value("record", "s") if one.kind == "record" else one
@@ -100,7 +99,7 @@ class Body(Statements):
         result = TYPES[self.returns[0]] if len(self.returns) == 1 else "void"
         signature = f"static {result} {name}({', '.join([*self.parameters, *outs]) or 'void'})"
         taken = {parameter.split("*")[-1].split()[-1] for parameter in self.parameters}
-        own = {self.safe(one): kind for one, kind in self.kinds.items() if self.safe(one) not in taken}
+        own = {identifier(one): kind for one, kind in self.kinds.items() if identifier(one) not in taken}
         for one in [one for one in own if not self._reads(one)]:  # constants went to the places that would read it
             self.lines = [line for line in self.lines if not re.fullmatch(rf"\s*{one} = -?\d+;", line)]
             if not any(re.search(rf"\b{one}\b", line) for line in self.lines):
@@ -108,8 +107,8 @@ class Body(Statements):
         declared = [f"    {TYPES[kind]} {one};" for one, kind in own.items()]
         unread = [f"    (void){one};" for one in [*sorted(taken), *own] if not self._reads(one)]
         summary = (ast.get_docstring(self.tree) or "").split("\n")[0]
-        comment = [f"/* {summary} */"] if summary else []
-        text = "\n".join([*comment, f"{signature} {{", *declared, *unread, *self.lines, "}"])
+        about = [f"/* {comment(summary)} */"] if summary else []
+        text = "\n".join([*about, f"{signature} {{", *declared, *unread, *self.lines, "}"])
         if ".view(" in ast.unparse(self.tree):
             text = self._of_doubles(name, text)
         return Function(name, self.returns, text, self.ops[0])

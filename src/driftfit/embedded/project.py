@@ -7,6 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from driftfit.embedded.names import comment, identifier, literal
 from driftfit.embedded.selftest import selftest
 from driftfit.embedded.simulink import SFUNCTION
 from driftfit.embedded.translation import Translation, translation
@@ -164,15 +165,15 @@ def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
     from driftfit import __version__
 
     made, m = translation(program, fixed_rate), program.model.m
-    names = ", ".join(program.names)
     header = HEADER.format(
-        what=what, version=__version__, n=made.start["theta"].shape[1], m=m, names=names, fields=_fields(made),
+        what=comment(what), version=__version__, n=made.start["theta"].shape[1], m=m,
+        names=comment(", ".join(program.names)), fields=_fields(made),
         known=FIXED_RATE if fixed_rate else KNOWN,
     )  # fmt: skip
-    source = SOURCE.format(what=what) + _source(made, set(program.model.memory_for(program.steps)))
+    source = SOURCE.format(what=comment(what)) + _source(made, set(program.model.memory_for(program.steps)))
     readme = README.format(
-        what=what, names=names, doubles=made.layout(8).itemsize, singles=made.layout(4).itemsize,
-        ops=_counted(made.entry.operations), ordinary=_after_the_start(made),
+        what=literal(what), names=", ".join(map(literal, program.names)), doubles=made.layout(8).itemsize,
+        singles=made.layout(4).itemsize, ops=_counted(made.entry.operations), ordinary=_after_the_start(made),
     )  # fmt: skip
     test = selftest(program.model, program.tracker)
     return {
@@ -184,7 +185,7 @@ def _fields(made: Translation) -> str:
     lines = []
     for name in made.names:
         size = made.start[name][0].size
-        lines.append(f"    {made.type_of(name)} {name}{'' if size == 1 else f'[{size}]'};")
+        lines.append(f"    {made.type_of(name)} {identifier(name)}{'' if size == 1 else f'[{size}]'};")
     return "\n".join(lines)
 
 
@@ -219,9 +220,9 @@ def _face(made: Translation, memory: set[str]) -> str:
     for name in made.names:
         if name in memory:
             continue
-        size = made.start[name][0].size
-        line = f"s->{name} = START.{name};" if size == 1 else (
-            f"for (int i = 0; i < {size}; i++) {{ s->{name}[i] = START.{name}[i]; }}"
+        size, field = made.start[name][0].size, identifier(name)
+        line = f"s->{field} = START.{field};" if size == 1 else (
+            f"for (int i = 0; i < {size}; i++) {{ s->{field}[i] = START.{field}[i]; }}"
         )  # fmt: skip
         copies.append(f"    {line}")
     return "\n".join([

@@ -6,15 +6,9 @@ import ast
 from collections import Counter
 
 from driftfit.embedded.calls import Calls
+from driftfit.embedded.names import identifier
 from driftfit.embedded.unit import TranslationError
 from driftfit.embedded.values import RANK, Value, assigned, bare, joined, lifted, narrow, plain
-
-RESERVED = frozenset(
-    """auto break case char const continue default do double else enum extern float for goto if int long register return
-    short signed sizeof static struct switch typedef union unsigned void volatile while real inline restrict
-    """.split()  # noqa: SIM905
-)
-"""Words that cannot be names of variables or functions in C."""
 
 
 class Statements(Calls):
@@ -25,10 +19,6 @@ class Statements(Calls):
     returns: tuple[str, ...]
     lines: list[str]
     temporaries: int
-
-    def safe(self, name: str) -> str:
-        """A name that is valid for a variable in C."""
-        return f"{name}_" if name in RESERVED else name
 
     def line(self, text: str) -> None:
         self.lines.append(f"{'    ' * len(self.ops)}{text}")
@@ -112,15 +102,15 @@ class Statements(Calls):
         self.kinds[name] = joined(narrow(value), self.kinds.get(name, "bool"))
         most = value.most if fixed else None
         whole = value.known and self.kinds[name] != "real"
-        self.locals[name] = value if whole else Value(self.kinds[name], self.safe(name), most=most)
-        if value.text != self.safe(name):
-            self.line(f"{self.safe(name)} = {assigned(value, self.kinds[name])};")
+        self.locals[name] = value if whole else Value(self.kinds[name], identifier(name), most=most)
+        if value.text != identifier(name):
+            self.line(f"{identifier(name)} = {assigned(value, self.kinds[name])};")
 
     def forget(self, node: ast.stmt) -> None:
         """The values of variables that a statement with branches or turns may have changed are not known after it."""
         for name in {one.id for one in ast.walk(node) if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store)}:
             if name in self.kinds and name in self.locals and self.locals[name].known:
-                self.locals[name] = Value(self.kinds[name], self.safe(name))
+                self.locals[name] = Value(self.kinds[name], identifier(name))
 
     def on_augassign(self, node: ast.AugAssign) -> None:
         target = self.value(node.target)
@@ -155,7 +145,7 @@ class Statements(Calls):
                 self.locals[node.target.id] = lifted(turn)
                 self.block(node.body)
             return
-        name = self.safe(node.target.id)
+        name = identifier(node.target.id)
         high, low = (stop, start) if step > 0 else (start, stop)
         top = self.largest(high)
         turns = max(0, top - (low.constant if low.known else 0))

@@ -20,6 +20,7 @@ import numpy as np
 
 from driftfit.data.storage import fields
 from driftfit.embedded.functions import translate
+from driftfit.embedded.names import identifier
 from driftfit.embedded.unit import Function, Unit
 from driftfit.embedded.values import Value
 from driftfit.engine.drivers import drivers
@@ -101,7 +102,7 @@ def translation(program: Program, fixed_rate: bool = False) -> Translation:
         constant, flags = constant - unit.written, flags - unit.beyond
     text = "\n".join(function.text for function in unit.functions.values())
     read = {*re.findall(r"\bs->(\w+)", text), *factors, *RESULTS}
-    names = [name for name in fields(tile) if name in read]
+    names = [name for name in fields(tile) if identifier(name) in read]
     return Translation(unit, entry, tuple(sorted(names, key=lambda name: name in flags)))  # no gaps: integers last
 
 

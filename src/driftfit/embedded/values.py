@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.embedded.names import identifier
 from driftfit.engine.kernel import Array
 
 RANK = {"bool": 0, "flag": 1, "int": 2, "long": 3, "real": 4, "four": 5}
@@ -114,7 +115,7 @@ def lifted(value: Any) -> Value:
 def field(name: str, array: Array, flag: bool = False) -> Value:
     """A field of the record, whose last axis is the only lane."""
     element = "long" if array.dtype.kind == "i" else "flag" if flag else "real"
-    return Value("array", f"s->{name}", shape=array.shape, strides=_strides(array.shape), element=element,
+    return Value("array", f"s->{identifier(name)}", shape=array.shape, strides=_strides(array.shape), element=element,
                  scalar=array.size == 1)  # fmt: skip
 
 

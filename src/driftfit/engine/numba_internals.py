@@ -59,8 +59,8 @@ from driftfit.engine.compile_time.open_record import WORD, OpenRecord, array_fro
 __all__ = ["WORD", "AttributeTemplate", "OpenRecord", "dumps", "entry_of", "ir", "opened"]
 
 TRIED = {
-    "numba": ("0.62.1", "0.63.1", "0.64.0", "0.65.1", "0.66.0", "0.68.1"),
-    "llvmlite": ("0.45.1", "0.46.0", "0.47.0", "0.48.0", "0.50.0"),
+    "numba": ("0.66.0", "0.67.0", "0.68.0", "0.68.1"),
+    "llvmlite": ("0.48.0", "0.49.0", "0.50.0"),
 }
 """Versions with which the canary tests passed."""
 

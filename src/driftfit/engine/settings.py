@@ -66,6 +66,12 @@ def _tuples(value: Any) -> Any:
     return tuple(_tuples(v) for v in value) if isinstance(value, list | tuple) else value
 
 
+def place_of(made: Any) -> str:
+    """The module and name of a class or function, as files name it."""
+    source = getattr(made, "py_func", made)
+    return f"{source.__module__}:{source.__qualname__}"
+
+
 def plain(value: Any) -> Any:
     """A number, sequence or array as float, tuple of floats, or tuple of tuples, so that it hashes and prints."""
     array = np.asarray(value, dtype=float)
@@ -202,19 +208,33 @@ def output_names(owner: str, ny: Any) -> tuple[str, ...]:
     return names
 
 
+ABSENT = ("", "None", "NaT", "<NA>")
+"""How what holds no value is written: an empty text, None, and the NaT and NA of pandas and NumPy."""
+
+
 def as_numbers(name: str, values: Any) -> Array:
-    """Values as floats; None and masked entries become NaN; for text the error names its position."""
-    if isinstance(values, np.ma.MaskedArray):
-        values = np.ma.filled(values.astype(float), np.nan)
+    """Values as floats; `ABSENT` and masked entries become NaN, whole numbers beyond all floats infinite.
+
+    For text the error names its position.
+    """
+    if isinstance(values, (np.ndarray, np.generic)):  # a union of types would take four times as long
+        if isinstance(values, np.ma.MaskedArray):
+            values = np.ma.filled(values.astype(float), np.nan)
+        elif values.dtype.kind in "mM":  # no dates as nanoseconds
+            values = values.astype(str)
+        elif values.dtype.kind == "c":
+            raise ValueError(f"{name} is complex; give its real and imaginary parts as two signals.")
     try:
         return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pass
     given = np.asarray(values, dtype=object)
     out = np.empty(given.shape)
     for place, value in np.ndenumerate(given):
         try:
-            out[place] = np.nan if value is None or value == "" else float(value)
+            out[place] = np.nan if str(value) in ABSENT else float(value)
+        except OverflowError:  # a whole number beyond all floats
+            out[place] = math.inf if value > 0 else -math.inf
         except (TypeError, ValueError):
             where = f"entry {place[0] if len(place) == 1 else place}" if place else "it"
             raise ValueError(f"{name}: {where} is {value!r}, which is not a number.") from None

@@ -6,7 +6,8 @@
 *constant ARX*  the same on ARX(2, 1 per input) with intercept
 
 All are one-step predictions. A model with hidden states has no regressors, and is compared with the others only. They
-are scored on the samples after max(50, 5 n) complete ones that all of them could predict. None of them learns from a
+are scored on the samples after max(50, 5 n) complete ones that all of them could predict; in a record of which that
+would be most, after a tenth of its samples, or n if these are more. None of them learns from a
 sample that the run left out, and none is scored on it.
 """
 
@@ -58,6 +59,12 @@ def _error(y: Array, prediction: Array, innovation: Array) -> Array:
     return np.where(np.isfinite(innovation), y - prediction, np.nan)
 
 
+def left_at_start(run: Track) -> int:
+    """Samples at the start of a run that are not scored: max(50, 5 n), or where that is most of it max(n, T / 10)."""
+    n, T = run.model.n, len(run)
+    return burn_in(n) if 2 * burn_in(n) <= T else max(n, T // 10)
+
+
 class Errors(NamedTuple):
     """One-step errors of all predictors, (T,) each, and which samples are scored."""
 
@@ -73,8 +80,8 @@ def errors(run: Track, record: Record, burn: int | None = None, steady: Array | 
     """One-step errors of a run, of persistence, of constants without and with lags, and of constant ARX.
 
     Where lags are missing, the constants without lags predict. The first ``burn`` complete samples are not scored; by
-    default max(50, 5 n). ``record`` is what they learn from (`driftfit.judge.left_out.without_left_out`); ``steady``
-    are the constants of the run, if they are known.
+    default those of `left_at_start`. ``record`` is what they learn from
+    (`driftfit.judge.left_out.without_left_out`); ``steady`` are the constants of the run, if they are known.
     """
     y, u = np.where(np.abs(record.y) < LARGEST, record.y, np.nan), record.u
     steady = constant_least_squares(run.model, record) if steady is None else steady
@@ -90,7 +97,7 @@ def errors(run: Track, record: Record, burn: int | None = None, steady: Array | 
     rows = len(run.program.whole.outputs)
     own = (tracked, y - persistence(y, rows), constant, lagged, arx["e"][:, 0])
     given = (np.abs(run.y) < LARGEST) & (np.abs(u) < LARGEST).all(axis=1)  # a start waits for what is missing
-    scored = np.asarray(np.cumsum(given) - given >= (burn_in(run.model.n) if burn is None else burn))
+    scored = np.asarray(np.cumsum(given) - given >= (left_at_start(run) if burn is None else burn))
     for error in own if run.model.hidden is None else (own[0], own[1], own[4]):
         scored &= np.isfinite(error)
     return Errors(*own, scored)

@@ -214,7 +214,8 @@ def segment(
         model = Regression(0 if u is None else None, intercept=True)
     data = record.pop("data", None)
     run = track(model, RLS(1.0), y, u, Reading(**record), data=data)
-    assert isinstance(run, Track)
+    if not isinstance(run, Track):
+        raise ValueError(f"segment: give one series of one output at a time; got y={y!r}.")
     return segmented(run, level=level, false=false, shortest=shortest)
 
 

@@ -37,6 +37,7 @@ from rich.text import Text
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
+from driftfit.judge.compare import left_at_start
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.left_out import stuck
 from driftfit.judge.regressors import Rows
@@ -45,7 +46,7 @@ from driftfit.judge.statistics.constancy import Constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
 from driftfit.judge.statistics.whiteness import grows_with, whiteness
-from driftfit.run.result import Track, burn_in, root_mean_square
+from driftfit.run.result import Track, root_mean_square
 from driftfit.show.parts.text import Printed, digits, facts, table_of
 
 LEVEL = 0.05
@@ -389,7 +390,7 @@ def verdict(run: Track, level: float = LEVEL, lags: int | None = None, burn: int
         Lags of correlation of the noise to allow for; None estimates them from the record, and 0 is for a model whose
         one-step errors are known to be white.
     burn : int or None
-        Number of samples at the beginning that are not scored; max(50, 5 n) by default.
+        Number of samples at the beginning that are not scored; by default as in `driftfit.judge.compare`.
 
     Raises
     ------
@@ -431,7 +432,7 @@ def judged(known: Evidence, level: float) -> Verdict:
         scored=int(scored.sum()),
         correlated=test.noise is not None and bool(whiteness(test.noise.residual).p < CORRELATED),
         lags=test.lags,
-        burn=burn_in(run.model.n) if known.burn is None else known.burn,
+        burn=left_at_start(run) if known.burn is None else known.burn,
         hidden=run.model.hidden is not None,
         spread_with=_spread_with(names, *known.unweighted) if drifts is False else (),
         dependent=groups,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import MISSING, Field, fields, replace
+from dataclasses import MISSING, Field, fields
 from importlib import import_module
 from typing import Any, TypeVar
 
@@ -41,13 +41,13 @@ def lookup(what: str, name: str, known: dict[str, type[Kind]]) -> type[Kind]:
     return plain[wanted]
 
 
-def parse_model(text: str, outputs: Sequence[str] = ()) -> Model:
-    """``arx:2,2,nk=1,intercept`` as ARX(2, 2, nk=1, intercept=True), with these names if there are several outputs.
+def parse_model(text: str) -> Model:
+    """``arx:2,2,nk=1,intercept`` as ARX(2, 2, nk=1, intercept=True).
 
     An expression such as ``ARX(2, 2)`` is read as well. ValueError with the reason if the text is wrong.
     """
     if "(" in text:
-        return _with_outputs(expressions.read(text, Model, models.found()), outputs)  # type: ignore[type-abstract]
+        return expressions.read(text, Model, models.found())  # type: ignore[type-abstract]
     name, _, rest = text.partition(":")
     kind = lookup("model", name, models.found())
     known = {field.name: field for field in given_fields(kind)}
@@ -63,22 +63,7 @@ def parse_model(text: str, outputs: Sequence[str] = ()) -> Model:
                 raise ValueError(f"model {text}: too many numbers; {kind.__name__} takes {', '.join(known)}.")
             key, value = places[position], key
         add_setting(f"model {text}", settings, known, key, parse_value(value, "/") if value else True)
-    if len(outputs) > 1:
-        if "ny" not in known:
-            raise ValueError(f"model {text}: {kind.__name__} has one output, but y names {', '.join(outputs)}.")
-        if settings.get("ny", len(outputs)) != len(outputs):
-            raise ValueError(f"model {text}: ny={settings['ny']}, but y names {', '.join(outputs)}.")
-        settings["ny"] = tuple(outputs)
     return build(f"model {text}", kind, settings)
-
-
-def _with_outputs(model: Model, outputs: Sequence[str]) -> Model:
-    """A model whose outputs have these names, if there are several."""
-    if len(outputs) < 2 or model.outputs == tuple(outputs):
-        return model
-    if len(model.outputs) not in (1, len(outputs)) or "ny" not in {field.name for field in given_fields(type(model))}:
-        raise ValueError(f"model {model!r} has outputs {', '.join(model.outputs)}, but y names {', '.join(outputs)}.")
-    return replace(model, ny=tuple(outputs))  # type: ignore[type-var]  # every model is a dataclass
 
 
 def own_tracker(place: str) -> type[Tracker]:

@@ -144,8 +144,10 @@ def _begun(
         )
     for k, key in enumerate(records.keys):
         if key in before:
-            run, first, lanes = ended(before[key]), int(records.first[k]), range(k * ny, (k + 1) * ny)
-            starts |= zip(lanes, carried(run, [programs[j] for j in lanes]), strict=True)
+            first, lanes = int(records.first[k]), range(k * ny, (k + 1) * ny)
+            own = [programs[j] for j in lanes]
+            run = ended(before[key], own)
+            starts |= zip(lanes, carried(run, own), strict=True)
             if records.time is not None:
                 factors[first] = first_interval(run, records.time[first], records.labels)
     return starts, records._replace(known=records.known.begun(factors)) if factors else records

@@ -6,6 +6,7 @@ copies, and their files.
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, KeysView, Mapping, Sequence
 from dataclasses import asdict
@@ -185,11 +186,20 @@ class KeyedResults(Plain):
         return list(groups.values())
 
     @classmethod
-    def load(cls, path: str | PathLike[str]) -> Self:
-        """Read a file that `save` wrote."""
+    def load(cls, path: str | PathLike[str], classes: Iterable[Any] = ()) -> Self:
+        """Read a file that `save` wrote; ``classes`` are classes and functions of your own that it needs."""
         header, arrays = storage.read(path, cls._kind)
-        model = storage.rebuild(header["model"], Model)
-        trackers = [storage.rebuild(one, Tracker) for one in header["trackers"]]
+        with storage.reading(os.fspath(path)):
+            return cls._read(path, header, arrays, tuple(classes))
+
+    @classmethod
+    def _read(
+        cls, path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array], classes: tuple[Any, ...]
+    ) -> Self:
+        model = storage.rebuild(header["model"], Model, classes)
+        trackers = [storage.rebuild(one, Tracker, classes) for one in header["trackers"]]
+        for g in range(header["groups"]):
+            storage.check_size(path, model, trackers[0], arrays[f"out{g}_theta"].shape[-1])
         made = [programs_of(model, tracker, header["inputs"]) for tracker in trackers]
         outputs = tuple(header["outputs"])
         programs = [made[k][j % max(len(outputs), 1)] for j, k in enumerate(header["tracker"])]

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from importlib.util import find_spec
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,10 @@ from driftfit.run.states.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
 CHUNK = 1_000_000
-"""Samples between two updates of the progress bar."""
+"""Samples beyond which a progress bar is shown."""
+
+FEW, PART = 1024, 0.1
+"""Samples of the first part of a record, and about the seconds that a part takes: Ctrl-C is heard between two parts."""
 
 BLOCK = 4096
 """Samples of a block of results that are kept in single precision."""
@@ -289,14 +293,16 @@ class Program:
         """Run a tile over a record, a lane for each output; returns what is kept, (T,) of `output_type`."""
         T = len(record)
         out = self.written(tile, T, keep, dtype)
-        if T <= CHUNK:
+        if FEW >= T:
             self.fill(tile, *lanes_of(record), out)
             return out
-        with progress("tracking", T, True) as advance:
-            for a in range(0, T, CHUNK):
-                part = slice(a, min(a + CHUNK, T))
+        a, count = 0, FEW
+        with progress("tracking", T, T > CHUNK) as advance:
+            while a < T:
+                begun, part = perf_counter(), slice(a, min(a + count, T))
                 self.fill(tile, *lanes_of(record.part(part)), out[part])
                 advance(part.stop - a)
+                a, count = part.stop, 2 * count if perf_counter() - begun < PART else max(1, count // 2)
         return out
 
     def fill(self, tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
 from os import PathLike
@@ -409,11 +410,20 @@ class Track(Plain, Columns):
         storage.write(path, header, arrays)
 
     @classmethod
-    def load(cls, path: str | PathLike[str]) -> Self:
-        """Read a file that `save` wrote."""
+    def load(cls, path: str | PathLike[str], classes: Iterable[Any] = ()) -> Self:
+        """Read a file that `save` wrote; ``classes`` are classes and functions of your own that it needs."""
         header, arrays = storage.read(path, *KINDS)
-        shared = storage.rebuild(header["shared"], Model) if header["kind"] == KINDS[1] else None
-        model, tracker = storage.rebuild(header["model"], Model), storage.rebuild(header["tracker"], Tracker)
+        with storage.reading(os.fspath(path)):
+            return cls._read(path, header, arrays, tuple(classes))
+
+    @classmethod
+    def _read(
+        cls, path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array], classes: tuple[Any, ...]
+    ) -> Self:
+        shared = storage.rebuild(header["shared"], Model, classes) if header["kind"] == KINDS[1] else None
+        model = storage.rebuild(header["model"], Model, classes)
+        tracker = storage.rebuild(header["tracker"], Tracker, classes)
+        storage.check_size(path, model, tracker, arrays["out_theta"].shape[-1])
         program = Program(model, tracker, shared=shared)
         record = Record(
             arrays["y"], arrays["u"], Known(arrays["known"]), arrays.get("time"), Labels(**header["labels"])

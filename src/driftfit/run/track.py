@@ -21,7 +21,7 @@ from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, programs_of, tile_of
 from driftfit.run.result import Lane, Lanes, Track
-from driftfit.run.warm_start import Run, carried, first_interval
+from driftfit.run.warm_start import Run, carried, ended, first_interval
 from driftfit.trackers.base import Tracker
 
 Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
@@ -100,6 +100,7 @@ def _task(
     """(the program of each output of each series, the checked series, units without data with the reasons, whether the
     result is a fleet)."""
     alone = check_roles("track", model, tracker, several=True)
+    model, y = outputs.columns_as_outputs(model, y, data)
     one_of("track", "keep", kept.keep, ("std", "cov", "theta"))
     if kept.dtype != "float64":  # the default, whose name NumPy would look up for a microsecond
         one_of("track", "dtype", np.dtype(kept.dtype).name, ("float64", "float32"))
@@ -215,6 +216,7 @@ def _per_series(tracker: Trackers, records: Records) -> list[Any]:
 def _one(programs: Sequence[Program], records: Records, keep: str, before: Run | None, dtype: Any) -> Track | Outputs:
     """Run one series."""
     program, record = programs[0], records.part(0)
+    before = None if before is None else ended(before, programs)
     starts = carried(before, programs)
     if before is not None:
         begins = None if record.time is None else record.time[0]

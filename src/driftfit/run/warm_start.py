@@ -7,7 +7,7 @@ value, for example a larger q.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -59,17 +59,18 @@ class End(NamedTuple):
         return storage.compact(*written(self.programs, lanes, extra))
 
     @classmethod
-    def from_bytes(cls, data: bytes) -> End:
+    def from_bytes(cls, data: bytes, classes: Iterable[Any] = ()) -> End:
         """The end from bytes, or from those of a stream (``live.to_bytes()``); ValueError if they are damaged or of
-        another kind.
+        another kind. ``classes`` as for `Live.load`.
         """
         header, arrays = storage.expand(data, KINDS)
-        model, trackers, extra = read(header)
-        programs = programs_of(model, by_output(model, trackers), model.m, gate_from(header))
-        tile = tile_of(programs)
-        restore("what was given", programs, header, arrays, tile)
-        states = tuple(state_of(tile, lane) for lane in range(len(programs)))
-        return cls(programs, states, *(extra[name] for name in ("last", "awaits", "dt", "zone")))
+        with storage.reading("what was given"):
+            model, trackers, extra = read("what was given", header, arrays, classes)
+            programs = programs_of(model, by_output(model, trackers), model.m, gate_from(header))
+            tile = tile_of(programs)
+            restore("what was given", programs, header, arrays, tile)
+            states = tuple(state_of(tile, lane) for lane in range(len(programs)))
+            return cls(programs, states, *(extra[name] for name in ("last", "awaits", "dt", "zone")))
 
 
 ABSENT: Mapping[str, Any] = {
@@ -92,11 +93,18 @@ def written(
     return header, {f"state{lane}": np.frombuffer(data, np.uint8) for lane, data in enumerate(lanes)}
 
 
-def read(header: Mapping[str, Any]) -> tuple[Model, tuple[Tracker, ...], dict[str, Any]]:
-    """(the model, the tracker of each output, everything else) from a header that `written` made."""
+def read(
+    source: str, header: Mapping[str, Any], arrays: Mapping[str, Array], classes: Iterable[Any]
+) -> tuple[Model, tuple[Tracker, ...], dict[str, Any]]:
+    """(the model, the tracker of each output, everything else) from a file that `written` made."""
     given = header["tracker"]
-    trackers = tuple(storage.rebuild(one, Tracker) for one in (given if isinstance(given, list) else [given]))
-    return storage.rebuild(header["model"], Model), trackers, {**ABSENT, **header["extra"]}
+    described, classes = given if isinstance(given, list) else [given], tuple(classes)
+    trackers = tuple(storage.rebuild(one, Tracker, classes) for one in described)
+    model = storage.rebuild(header["model"], Model, classes)
+    if "fields" in header:
+        theta = fields_of(header["fields"], unpacked(arrays["state0"].tobytes())[1]).get("theta", np.zeros(0))
+        storage.check_size(source, model, trackers[0], len(theta))
+    return model, trackers, {**ABSENT, **header["extra"]}
 
 
 def gate_from(header: Mapping[str, Any]) -> Gate | bool:
@@ -144,16 +152,18 @@ class Run(Protocol):
         """The end of the run."""
 
 
-def ended(run: Run | bytes) -> End:
-    """The end of a run, or the end that the given bytes hold."""
-    return End.from_bytes(run) if isinstance(run, bytes) else run.end()
+def ended(run: Run | bytes, programs: Sequence[Program]) -> End:
+    """The end of a run, or the end that the given bytes hold, which may need what the programs are made of."""
+    if not isinstance(run, bytes):
+        return run.end()
+    return End.from_bytes(run, [part for one in programs for part in storage.parts_of((one.whole, one.tracker))])
 
 
 def carried(run: Run | bytes | None, programs: Sequence[Program]) -> tuple[State, ...]:
     """The fields that each lane takes over from a run before; ValueError if the two do not fit."""
     if run is None:
         return ()
-    end = ended(run)
+    end = ended(run, programs)
     if len(end.programs) != len(programs):
         raise ValueError(f"warm_start: {run!r} is not a run of these outputs.")
     return tuple(_carried(*lane) for lane in zip(end.programs, end.states, programs, strict=True))
@@ -181,9 +191,9 @@ def _same(one: Any, other: Any) -> bool:
     return np.shape(one) == np.shape(other) and bool(np.all(np.equal(one, other) | (np.not_equal(one, one))))
 
 
-def first_interval(run: Run | bytes, time: Any, labels: Labels) -> float:
+def first_interval(run: Run, time: Any, labels: Labels) -> float:
     """Nominal intervals from the end of a run to the first sample of the next; 1 if either has no time."""
-    last = ended(run).last
+    last = run.end().last
     if last is None or time is None:
         return 1.0
     interval = Clock.of(labels.dt, labels.zone).since(instant(last), instant(time))

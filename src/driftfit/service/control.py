@@ -11,6 +11,7 @@ import queue
 import socket
 import struct
 import threading
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,7 @@ class Control(threading.Thread):
                     "error": 'no source takes samples over HTTP; add [source.web] with kind = "http".',
                     "status": 404,
                 }
-            return INCOMING.offer(str(header.get("topic", "")), body)
+            return INCOMING.offer(str(header.get("topic", "")), body, self._foreign(header.get("units", ())))
         name = str(header.get("unit"))
         number = self.engine.units.names.get(name)
         if number is None:
@@ -89,6 +90,11 @@ class Control(threading.Thread):
                 return {"error": "the journal does not answer", "status": 503}
             return {"error": problem, "status": 400} if problem else {"done": True}
         return {"error": f"unknown request {do!r}", "status": 400}
+
+    def _foreign(self, allowed: Collection[str]) -> Callable[[str], list[str]]:
+        """The function that names those units of a topic which a sender may not touch."""
+        named = self.engine.units.named
+        return lambda topic: [name for _, name in named(topic) if name not in allowed] if allowed else []
 
 
 def receive(file: Any) -> tuple[dict[str, Any], bytes] | None:

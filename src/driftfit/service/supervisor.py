@@ -26,6 +26,8 @@ from driftfit.service.settings.config import Config
 from driftfit.service.threads import SinkThread, SourceThread, WorkerThread
 
 log = logging.getLogger("driftfit.service")
+PRIVATE = "driftfit-"
+"""How the names of folders in the temporary directory begin."""
 LOOK = 1.0
 """Seconds between two looks at the page's process."""
 SWITCH = 0.0005
@@ -73,7 +75,7 @@ class Service:
     def __init__(self, config: Config, folder: Path) -> None:
         self.config, self.folder = config, folder
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        self._lock = open(folder / "lock", "w")  # noqa: SIM115  (held as long as the service runs)
+        self._lock = open(folder / "lock", "a+", encoding="utf-8")  # noqa: SIM115  (held as long as the service runs)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -82,13 +84,24 @@ class Service:
         self.engine = Engine(config, folder)
         if self.engine.recovered:
             log.info("recovered", extra={"detail": {"samples": self.engine.recovered}})
-        self._private = Path(tempfile.mkdtemp(prefix="driftfit-"))
+        self._private = self._made_private()
         self.control = Control(self.engine, self._private / "control", self.status)
         self.sources = [SourceThread(self.engine, one) for one in config.sources]
         self.sinks = [SinkThread(self.engine, one) for one in config.sinks]
         self.page: subprocess.Popen[bytes] | None = None
         self.page_starts = 0
         self._stopping = threading.Event()
+
+    def _made_private(self) -> Path:
+        """A folder for the control socket; the lock names it, so that the next start removes what a kill has left."""
+        self._lock.seek(0)
+        left, made = Path(self._lock.read().strip()), tempfile.mkdtemp(prefix=PRIVATE)
+        if left.name.startswith(PRIVATE) and left.parent == Path(made).parent:
+            shutil.rmtree(left, ignore_errors=True)
+        self._lock.truncate(0)
+        self._lock.write(made)
+        self._lock.flush()
+        return Path(made)
 
     def status(self) -> dict[str, Any]:
         """Numbers for the page, `/metrics` and `/healthz`."""

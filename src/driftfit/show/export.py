@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 import polars as pl
 
-from driftfit.data.clock import Clock
+from driftfit.data.formats.csv_files import without_formulas
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import of_series, one_of
 from driftfit.run.fleet import Fleet
@@ -180,39 +180,11 @@ def forecasts_table(fleet: Fleet, h: int, u: Any) -> pl.DataFrame:
     labels, series = fleet.labels, fleet.series()
     of_series("forecast", "u", u, series)
     for key, run in series.items():
-        columns: dict[str, Any] = {"step": np.arange(1, h + 1)}
-        last = run.time[-1] if run.timed else None
-        ahead = None if last is None else Clock.of(labels.dt, labels.zone).ahead(last, h)
-        if ahead is not None:
-            columns[_time_name(run)] = ahead
-        identity = key if isinstance(key, tuple) else (key,)
-        for more, results in _forecasts(run, h, u.get(key) if isinstance(u, Mapping) else u):
-            named = [pl.lit(k).alias(name) for name, k in zip((*labels.by, "output"), (*identity, *more), strict=False)]
-            part = pl.DataFrame(columns | results).select([*named, pl.all()])
-            if labels.zone is not None and ahead is not None:
-                shown = pl.col(_time_name(run)).dt.replace_time_zone("UTC").dt.convert_time_zone(labels.zone)
-                part = part.with_columns(shown)
-            parts.append(part)
+        own = u.get(key) if isinstance(u, Mapping) else u
+        found = forecast_outputs(run, h, own) if isinstance(run, Outputs) else forecast(run, h, own)
+        identity = zip(labels.by, key if isinstance(key, tuple) else (key,), strict=False)
+        parts.append(found.table.select(*(pl.lit(k).alias(name) for name, k in identity), pl.all()))
     return pl.concat(parts, how="diagonal")
-
-
-def _forecasts(run: Single, h: int, u: Any) -> Iterator[tuple[tuple[str, ...], dict[str, Array]]]:
-    """The forecast of each output, and its name if there are several."""
-    found = forecast_outputs(run, h, u) if isinstance(run, Outputs) else forecast(run, h, u)
-    if _is_single(run):
-        yield (), _columns(run.names, found.y_hat, found.y_std, found.theta, found.std)
-        return
-    for j, output in enumerate(run.outputs):
-        own = [part[:, j] for part in (found.y_hat, found.y_std)]
-        paths = [part[:, j] if isinstance(run, Outputs) else part for part in (found.theta, found.std)]
-        yield (output,), _columns(run.names[j] if isinstance(run, Outputs) else run.names, *own, *paths)
-
-
-def _columns(names: Sequence[str], y_hat: Array, y_std: Array, theta: Array, std: Array) -> dict[str, Array]:
-    columns = {"y_hat": y_hat, "y_std": y_std}
-    for i, name in enumerate(names):
-        columns |= {f"theta_{name}": theta[:, i], f"std_{name}": std[:, i]}
-    return columns
 
 
 def to_table(result: Result, kind: str = "polars", arrays: bool = False) -> Any:
@@ -276,4 +248,12 @@ def write(result: Result, path: str | PathLike[str]) -> None:
     elif ending == ".parquet":
         to_parquet(result, path)
     else:
-        as_table(result).write_csv(Path(path))
+        write_table(as_table(result), Path(path))
+
+
+def write_table(table: pl.DataFrame, path: Path) -> None:
+    """Write a table as .csv or .parquet, depending on the ending of the name."""
+    if path.suffix.lower() == ".csv":
+        without_formulas(table).write_csv(path)
+    else:
+        table.write_parquet(path)

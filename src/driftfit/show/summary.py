@@ -10,9 +10,13 @@ from rich.text import Text
 
 from driftfit.data.record import Labels
 from driftfit.engine.kernel import Array
-from driftfit.judge.compare import Comparison, compare
+from driftfit.judge.compare import Comparison, compare, left_at_start
+from driftfit.models.base import GAP
+from driftfit.models.equation import Equation
+from driftfit.models.state_space import StateSpace
 from driftfit.readings.remarks import counts as counts_of
-from driftfit.readings.remarks import floor_remark, remarks
+from driftfit.readings.remarks import floor_remark
+from driftfit.readings.remarks import remarks as remarks_of
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.by_output import ByOutput
@@ -94,7 +98,7 @@ class Summary(Printed):
 def summarise(run: Track) -> Summary:
     """Build the summary of a run; of outputs that share one theta that of all rows."""
     remarks, run = _of_each_output(run), run.rows
-    burn = burn_in(run.model.n)
+    burn = left_at_start(run)
     low, high = run.band(0.95)
     path = run.theta[burn:] if len(run) > burn else run.theta[-1:]
     rows = tuple(
@@ -108,7 +112,7 @@ def summarise(run: Track) -> Summary:
     return Summary(
         repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
         _signals(run.labels) if run.labels.u or run.labels.y != "y" else "", _span(run), counts(run.labels.dropped),
-        (*remarks, *_missing(run), *_level(run), *_gate(run), *run.tracker.remarks(run)),
+        (*remarks, *_missing(run), *_undefined(run), *_level(run), *_gate(run), *run.tracker.remarks(run)),
     )  # fmt: skip
 
 
@@ -142,12 +146,26 @@ def _gate(run: Track) -> tuple[tuple[str, str], ...]:
     if run.program.gate is None:
         return ()
     left = run.left_out.code
-    return (*remarks(counts_of(left)), *floor_remark(float(run.state["floor"]))) or (("Gate", "nothing left out"),)
+    return (*remarks_of(counts_of(left)), *floor_remark(float(run.state["floor"]))) or (("Gate", "nothing left out"),)
 
 
 def _missing(run: Track) -> tuple[tuple[str, str], ...]:
     """Readings that were counted as missing although they contain a number."""
     return (("Taken as missing", counts(run.labels.missing)),) if run.labels.missing else ()
+
+
+def _undefined(run: Track) -> tuple[tuple[str, str], ...]:
+    """Samples with all they need, at which equations have no finite value at the estimate."""
+    model = run.model
+    if not isinstance(model, (Equation, StateSpace)):
+        return ()
+    known = np.isfinite(run.y) & np.isfinite(run.u).all(axis=1) & (run.record.known.interval <= GAP)
+    whole = np.convolve(~known, np.ones(model.reach + 1))[: len(run)] == 0.0
+    count = int(np.sum((whole & np.isnan(run.prediction))[model.reach :]))
+    why = (
+        f"{count} samples at which the equation is not finite at the estimate (exp, or / by 0): begin elsewhere, start="
+    )
+    return (("No value", why),) if count else ()
 
 
 def _level(run: Track) -> tuple[tuple[str, str], ...]:

@@ -12,6 +12,8 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
+from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
+from driftfit.models.hammerstein_wiener.separation.paths import Blocks
 from driftfit.run.result import Track
 from driftfit.smooth import exact
 from driftfit.smooth.parts.walk import NONE, Path, Walk, ordered
@@ -249,6 +251,18 @@ class Smoothed:
         """Covariance (n, n) of theta at samples t and t + 1, rows for t; t counts along ``order_by`` if given."""
         lag: Array = self.r * self._covariances.lag_cov[t]
         return lag
+
+    def blocks(
+        self, method: str = "svd-joint", input: str | None = None, output: str = "d1", at: float = 0.0
+    ) -> Blocks:
+        """Coefficients of the blocks of a `HammersteinWiener` model on the smoothed path, as `Track.blocks`."""
+
+        def covariances() -> Array:
+            cov: Array = self.r * self._covariances.cov
+            np.einsum("tii->ti", cov)[:] = self.std**2
+            return cov
+
+        return blocks_of(self.run, method, input, output, at, (self.theta, covariances))
 
     @cached_property
     def _covariances(self) -> Path:

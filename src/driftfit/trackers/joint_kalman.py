@@ -86,8 +86,10 @@ def _repeated(move: Step, timed: bool) -> Step:
 
 @kernel
 def moves_are_finite(s: State, hidden: int, l: int) -> bool:
-    """Whether the next hidden states and their derivatives are numbers of a usable size."""
+    """Whether the next hidden states, their derivatives and the variances are numbers of a usable size."""
     finite = True
+    for j in range(s.theta.shape[0]):
+        finite = finite & (s.P[j, j, l] < LARGEST)
     for i in range(hidden):
         finite = finite & (abs(s.next[i, l]) < LARGEST)
         for j in range(s.theta.shape[0]):

@@ -15,6 +15,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
 
 from driftfit.data.arguments import check_role
 from driftfit.data.record import Reading, Record
@@ -26,6 +27,7 @@ from driftfit.run.result import Track, track_record
 from driftfit.run.track import track
 from driftfit.show.parts.axes import BLUE, GREY, RED, panels
 from driftfit.show.parts.by_output import ByOutput
+from driftfit.show.parts.text import printing, some_rows, table_of
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.fls import FLS
 
@@ -33,12 +35,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@printing
 class Frontier(NamedTuple):
-    """mu, measurement cost r_M^2 and dynamic cost r_D^2, (S,) each, sorted by mu."""
+    """mu, measurement cost r_M^2 and dynamic cost r_D^2, (S,) each, sorted by mu; printing it shows a table."""
 
     mu: Array
     measurement: Array
     dynamic: Array
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        rows = some_rows(len(self.mu))
+        table = table_of(f"Frontier, {len(rows)} of {len(self.mu)} weights", "mu", "measurement cost", "dynamic cost")
+        for i in rows:
+            table.add_row(*(f"{column[i]:.4g}" for column in self))
+        yield table
 
     def plot(self, ax: Any = None) -> Figure:
         """r_M^2 against r_D^2, and both against mu; a matplotlib figure. ``ax`` as for `Track.plot`."""

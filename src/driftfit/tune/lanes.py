@@ -75,13 +75,10 @@ class Scores(NamedTuple):
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(self.squares / self.used)
 
-    def loglik(self, profiled: bool) -> Array:
-        """The log-likelihood, with the noise variance at its maximum if ``profiled``; -inf if there is none."""
+    def loglik(self, noise: Array | float) -> Array:
+        """The log-likelihood if the noise variance is ``noise`` times that of the trackers; -inf if there is none."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            if profiled:
-                body = self.used * (np.log(2.0 * np.pi * self.sigma2()) + 1.0)
-            else:
-                body = self.used * np.log(2.0 * np.pi) + self.squares
+            body = self.used * np.log(2.0 * np.pi * noise) + self.squares / noise
             value = -0.5 * (body + self.log_s) + self.more
         return np.where(np.isfinite(value), value, -np.inf)
 
@@ -152,7 +149,7 @@ class _Sums:
         y = self.record.y[a : a + len(out), None]
         counted = self._likelihood(out, ok)
         self._forecast(a, out, ok, y)
-        if self.model.implicit:
+        if self.model.implicit and not self.tracker.output_error:
             terms = self.model.log_jacobian(np.moveaxis(out["theta"], 1, -1), np.broadcast_to(y, ok.shape))
             self.more += np.sum(np.where(counted, terms, 0.0), axis=0)
         root = np.reshape(np.sqrt(self.record.known.part(slice(a, a + len(out))).noise), (-1, 1, 1))

@@ -47,7 +47,8 @@ class Criterion:
     def __call__(self, points: Array) -> Array:
         trackers = [self.knobs.run(x) for x in points]
         if self.method == "ml":
-            return -score(self.task, trackers).loglik(self.knobs.profiled)
+            scores = score(self.task, trackers)
+            return -scores.loglik(scores.sigma2() if self.knobs.profiled else 1.0)
         if self.method == "h-step":
             squares = score(self.task, trackers, self.h).h_step
         else:

@@ -7,7 +7,7 @@ whose predictions also fill missing lags.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from driftfit.data.record import Reading
@@ -42,12 +42,12 @@ class TunedOutputs(ByOutput[Tuned]):
 
 
 def tune_outputs(
-    model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], data: Any, by: Any,
+    model: Model, tracker: Any, y: Any, u: Any, reading: Reading, data: Any, by: Any,
     one: Callable[[Task], Tuned],
 ) -> Tuned | TunedOutputs:  # fmt: skip
     """Tune every output with ``one(task)``, or the rows of a shared theta at once."""
     if not isinstance(tracker, Tracker):
         raise ValueError(f"tune: several outputs are tuned for one kind of tracker; got {tracker!r}.")
-    runs = constant_outputs(model, y, u, Reading(**known), data, by)
+    runs = constant_outputs(model, y, u, reading, data, by)
     tuned = {name: one(Task(some[0].model, tuple(run.record for run in some))) for name, some in runs.items()}
     return tuned["rows"] if model.shared else TunedOutputs(tuned)

@@ -134,19 +134,29 @@ def constant(task: Task, tracker: Any) -> Tracker:
     return Kalman(q=(0.0,) * n, r=1.0)  # other trackers need not know the diffuse start
 
 
-def _range(task: Task, tracker: Tracker, bounds: Bounds, p: int) -> tuple[Array, Array]:
-    """Ends of log10 mu, (p,) each; a drift of slopes accumulates twice over the record."""
-    times = 2 if tracker.slopes else 1
-    low, high = _ends(bounds, -4.0, max(5.0, 2.0 * times * np.log10(task.longest)))
-    return np.full(p, low), np.full(p, high)
+def _drift_ends(task: Task, tracker: Tracker) -> tuple[float, float]:
+    """Ends of log10 mu over the mean square of the regressors; a drift of slopes accumulates twice over the record."""
+    return -4.0, max(5.0, (4.0 if tracker.slopes else 2.0) * np.log10(task.longest))
 
 
-def _ends(bounds: Bounds, low: float, high: float) -> tuple[float, float]:
+def _range(bounds: Bounds, ends: tuple[float, float], units: Array, group: Array) -> tuple[Array, Array]:
+    """Ends of the knobs, (p,) each: those given, or where every setting 10^x unit of a group is within the bounds."""
+    p = group.max(initial=-1) + 1
     if bounds is None:
-        return low, high
+        return np.full(p, ends[0]), np.full(p, ends[1])
     if len(bounds) != 2 or not 0.0 < bounds[0] < bounds[1] < np.inf:
         raise ValueError(f"tune: bounds must be (low, high), both positive, low below high; got {bounds!r}.")
-    return float(np.log10(bounds[0])), float(np.log10(bounds[1]))
+    places = [np.flatnonzero((group == k) & (units > 0.0)) for k in range(p)]
+    low, high = (
+        np.array([np.log10(end / pick(units[at])) if at.size else x for at in places])
+        for end, x, pick in zip(bounds, ends, (np.min, np.max), strict=True)
+    )
+    if (low >= high).any():
+        raise ValueError(
+            f"tune: no shared drift keeps the settings of all its parameters within bounds={bounds!r}, because the "
+            "sizes of their regressors differ too much; widen the bounds, or use groups='each'."
+        )
+    return low, high
 
 
 def _weight(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
@@ -157,7 +167,8 @@ def _weight(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
     power, _ = still(task, constant(task, tracker))
     group = members(names, groups)
     share = np.full(len(names), power.sum()) if groups is None else np.where(power > 0.0, power, power.max())
-    low, high = _range(task, tracker, bounds, int(group.max()) + 1)
+    units = share[:1] if groups is None else share
+    low, high = _range(bounds, _drift_ends(task, tracker), units, group[: len(units)])
 
     def each(x: Array) -> Array:
         return np.asarray(10.0 ** x[group] * share)
@@ -180,13 +191,13 @@ def _drift(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
         power = np.full(len(names), power.sum())
     group = members(names, groups)
     share = np.where(power > 0.0, 1.0 / np.where(power > 0.0, power, 1.0), 0.0)
-    low, high = _range(task, tracker, bounds, int(group.max()) + 1)
-    low, high = -high, -low
+    least, most = _drift_ends(task, tracker)
+    low, high = _range(bounds, (-most, -least), share if tracker.r is None else share * tracker.r, group)
     own_r = tracker.r is None and tracker.p0 is not None
     profiled = tracker.r is None and not own_r
     if own_r:
         low, high = np.append(low, -9.0), np.append(high, 3.0)
-    zero = np.arange(len(low)) <= group.max()
+    zero = (np.arange(len(low)) <= group.max()) & (bounds is None)
 
     def ratios(x: Array) -> Array:
         return np.asarray(10.0 ** x[group] * share)
@@ -214,7 +225,8 @@ def _drift(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
 def _noise(task: Task, tracker: Any, bounds: Bounds) -> Knobs:
     """r of Kalman for a given q."""
     _, variance = still(task, constant(task, tracker))
-    low, high = _ends(bounds, -9.0, 3.0)
+    one = np.zeros(1, int)
+    low, high = _range(bounds, (-9.0, 3.0), np.array([variance]), one)
 
     def values(x: Array) -> Array:
         return np.asarray(variance * 10.0**x)
@@ -222,8 +234,7 @@ def _noise(task: Task, tracker: Any, bounds: Bounds) -> Knobs:
     def build(x: Array, sigma2: float = 1.0) -> Tracker:
         return replace(tracker, r=float(values(x)[0]))  # type: ignore[no-any-return]
 
-    one, no = np.zeros(1, int), np.zeros(1, bool)
-    return Knobs(np.array([low]), np.array([high]), no, False, build, build, ("r",), one, values)
+    return Knobs(low, high, np.zeros(1, bool), False, build, build, ("r",), one, values)
 
 
 MOST_PROBABLE = 0.5
@@ -231,7 +242,7 @@ MOST_PROBABLE = 0.5
 
 
 def _changes(tracker: Bank, bounds: Bounds) -> Knobs:
-    """Scales and prior probabilities of the changes of a bank; bounds apply to the factors of the scales."""
+    """Scales and prior probabilities of the changes of a bank; bounds are those of the factors of the scales."""
     changes = tracker.all_changes
     if all(one.prob is not None for one in changes):  # the first has the remaining probability
         changes = (replace(changes[0], prob=None), *changes[1:])
@@ -239,11 +250,11 @@ def _changes(tracker: Bank, bounds: Bounds) -> Knobs:
     given = [] if tracker.transition is not None else [i for i, one in enumerate(changes) if i and one.prob]
     if not moving and not given:
         raise ValueError("tune: no change of this Bank moves anything, and none has a probability to be found.")
-    low, high = _ends(bounds, -3.0, 3.0)
+    low, high = _range(bounds, (-3.0, 3.0), np.ones(len(moving)), np.arange(len(moving)))
     priors = np.array([changes[i].prob or 0.0 for i in given])
     most = np.log10(MOST_PROBABLE / max(len(given), 1) / priors)
-    lows = np.r_[np.full(len(moving), low), np.minimum(-2.0, most - 2.0)]
-    highs = np.r_[np.full(len(moving), high), most]
+    lows = np.r_[low, np.minimum(-2.0, most - 2.0)]
+    highs = np.r_[high, most]
 
     def build(x: Array, sigma2: float = 1.0) -> Tracker:
         made = list(changes)
@@ -258,13 +269,19 @@ def _changes(tracker: Bank, bounds: Bounds) -> Knobs:
 
     names = tuple(f"scale[{tracker.change_names[i]}]" for i in moving)
     names += tuple(f"prob[{tracker.change_names[i]}]" for i in given)
-    zero = np.array([i == 0 for i in moving] + [False] * len(given))
+    zero = np.array([i == 0 and bounds is None for i in moving] + [False] * len(given))
     return Knobs(lows, highs, zero, False, build, build, names, np.arange(len(names)), values)
 
 
 def _memory(task: Task, tracker: Any, bounds: Bounds) -> Knobs:
-    """forgetting of RLS, as samples of memory 1 / (1 - forgetting); bounds apply to the memory."""
-    low, high = _ends(bounds, float(np.log10(2.0 * task.model.n)), float(np.log10(100.0 * task.longest)))
+    """forgetting of RLS, by the logarithm of the samples of memory 1 / (1 - forgetting)."""
+    if bounds is not None and not 0.0 < bounds[0] < bounds[1] < 1.0:
+        raise ValueError(
+            f"tune: bounds of forgetting must be (low, high) between 0 and 1, such as (0.9, 0.999); got {bounds!r}."
+        )
+    memory = None if bounds is None else (1.0 / (1.0 - bounds[0]), 1.0 / (1.0 - bounds[1]))
+    ends, one = (float(np.log10(2.0 * task.model.n)), float(np.log10(100.0 * task.longest))), np.zeros(1, int)
+    low, high = _range(memory, ends, np.ones(1), one)
 
     def values(x: Array) -> Array:
         return np.asarray(np.maximum(1.0 - 10.0**-x, 0.0))
@@ -272,5 +289,4 @@ def _memory(task: Task, tracker: Any, bounds: Bounds) -> Knobs:
     def build(x: Array, sigma2: float = 1.0) -> Tracker:
         return replace(tracker, forgetting=float(values(x)[0]))  # type: ignore[no-any-return]
 
-    one, no = np.zeros(1, int), np.zeros(1, bool)
-    return Knobs(np.array([low]), np.array([high]), no, True, build, build, ("forgetting",), one, values)
+    return Knobs(low, high, np.zeros(1, bool), True, build, build, ("forgetting",), one, values)

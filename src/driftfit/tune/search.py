@@ -33,6 +33,11 @@ EDGE = 0.01
 """Distance in decades from an end of the range that counts as being at the end."""
 
 
+def half_chi2(level: float) -> float:
+    """Half the chi-square quantile with one degree of freedom: by how much a log-likelihood falls in an interval."""
+    return 0.5 * NormalDist().inv_cdf(0.5 + level / 2.0) ** 2
+
+
 class Counted:
     """An objective that stores every point at which it was evaluated."""
 
@@ -153,10 +158,9 @@ class Search:
 
     def __init__(self, f: Counted, knobs: Knobs, x: Array) -> None:
         self.f, self.knobs, self.x = f, knobs, x
-        self._tried = np.concatenate(f.points), np.concatenate(f.values)
         self.best = float(f(x[None])[0])
-        inside = np.isfinite(x) & (x > knobs.low + EDGE) & (x < knobs.high - EDGE)
-        self.free = np.flatnonzero(inside)
+        self._tried = np.concatenate(f.points), np.concatenate(f.values)
+        self.free = np.flatnonzero(np.isfinite(x))
 
     def tried(self) -> tuple[Array, Array]:
         """Points and values of the search, best first."""
@@ -166,12 +170,15 @@ class Search:
 
     def at_bound(self, i: int) -> bool:
         """Whether a knob is at an end of its range, or zero."""
-        return i not in self.free
+        return not self.knobs.low[i] + EDGE < self.x[i] < self.knobs.high[i] - EDGE
 
     @cached_property
     def inverse(self) -> Array:
-        """C, the inverse of the Hessian of the free knobs; diagonal if the objective is not convex."""
-        H = curvature(self.f, self.x, self.free)
+        """C, the inverse of the Hessian of the free knobs; NaN if the objective is not convex.
+
+        1 / range^2 is added on the diagonal, because no knob is less certain than its range.
+        """
+        H = curvature(self.f, self.x, self.free) + np.diag((self.knobs.high - self.knobs.low)[self.free] ** -2.0)
         convex = np.isfinite(H).all() and np.linalg.eigvalsh(H).min(initial=np.inf) > 0.0
         C: Array = np.linalg.inv(H) if convex else np.full(H.shape, np.nan)
         return C
@@ -197,18 +204,28 @@ class Search:
     def _along(self, i: int, axis: Array) -> Array:
         points = np.repeat(self.x[None], len(axis), axis=0)
         if np.isfinite(self.x[i]):
-            points += (axis - self.x[i])[:, None] * self.ridge(i)
-            # far from the best point the others stay within their range, where the ridge of the best would leave it
-            points = np.where(np.isfinite(points), np.clip(points, self.knobs.low, self.knobs.high), points)
+            points = self._within(points + (axis - self.x[i])[:, None] * self.ridge(i))
         points[:, i] = axis
         return points
+
+    def _within(self, points: Array) -> Array:
+        """Points whose finite knobs are within their range, which the ridge of the best point may leave far from it."""
+        return np.where(np.isfinite(points), np.clip(points, self.knobs.low, self.knobs.high), points)
+
+    def line(self, towards: Array, shares: Array) -> Array:
+        """Points from the best in a direction until a knob has passed through its range; below the range is zero."""
+        knobs, moves = self.knobs, towards != 0.0
+        start = np.where(moves & ~np.isfinite(self.x), knobs.low, self.x)
+        reach = np.min((knobs.high - knobs.low)[moves] / np.abs(towards[moves]))
+        points = start + (shares * reach)[:, None] * np.where(moves, towards, 0.0)
+        return np.where(knobs.zero & (points < knobs.low), -np.inf, self._within(points))
 
     def profile(self, i: int, level: float) -> tuple[float, float]:
         """Ends of the interval of knob i, at which the objective has risen by half the chi-square quantile.
 
         -inf or inf if it does not rise that far within the range.
         """
-        rise = 0.5 * NormalDist().inv_cdf(0.5 + level / 2.0) ** 2
+        rise = half_chi2(level)
         start = self.x[i] if np.isfinite(self.x[i]) else self.knobs.low[i]
         ends = [self._crossing(i, start, end, rise) for end in (self.knobs.low[i], self.knobs.high[i])]
         return (-np.inf if not np.isfinite(self.x[i]) else ends[0]), ends[1]

@@ -25,6 +25,7 @@ import numpy as np
 
 from driftfit.data.arguments import check_roles
 from driftfit.data.limits import code_text, shared_code
+from driftfit.data.outputs import columns_as_outputs
 from driftfit.data.record import Reading
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
@@ -35,7 +36,7 @@ from driftfit.run.track import records_of
 from driftfit.trackers.base import Tracker
 from driftfit.tune.intervals import intervals_of
 from driftfit.tune.lanes import Task, score
-from driftfit.tune.objective import Criterion, along
+from driftfit.tune.objective import Criterion, along, run_task
 from driftfit.tune.outputs import TunedOutputs, tune_outputs
 from driftfit.tune.parametrisation import find_knobs
 from driftfit.tune.search import Counted, Search, minimise
@@ -65,12 +66,13 @@ def tune(
     drift: Any = 1.0,
     limits: Any = None,
     exclude: Any = None,
+    missing: Any = (),
 ) -> Tuned | TunedOutputs:
     """Estimate the missing settings of a tracker: ``FLS()``, ``Kalman()``, ``Kalman(r=0.1)``, ``RLS()`` ...
 
     Parameters
     ----------
-    model, y, u, data, time, dt, weights, drift, limits, exclude
+    model, y, u, data, time, dt, weights, drift, limits, exclude, missing
         As for `track`: with ``data`` the others name its columns.
     tracker : Tracker
         Settings that are None are estimated: mu, q, r, q and r, or forgetting. All others are kept. For a `Bank` these
@@ -85,8 +87,10 @@ def tune(
     h : int
         Samples ahead, for "h-step".
     bounds : (low, high)
-        Range of the search: for mu or r / q in units of the mean square of the regressors (default 1e-4 to max(1e5,
-        T^2)), for r in units of the residual variance of constant parameters, for the memory of RLS in samples.
+        Range of the setting: of mu, q, r or forgetting, of q / r if both are estimated, of the scales of a `Bank`. A
+        drift of zero is then excluded. Default: mu or r / q from 1e-4 to max(1e5, T^2) times the mean square of the
+        regressors, r from 1e-9 to 1e3 times the residual variance of constant parameters, a memory of 2 n to 100 T
+        samples, scales from 1e-3 to 1e3.
     level : number
         Level of the intervals.
     by : names of columns, "row" or None
@@ -112,17 +116,17 @@ def tune(
         everything that `track` does not accept.
     """
     check_roles("tune", model, tracker)
+    model, y = columns_as_outputs(model, y, data)
     one_of("tune", "method", method, tuple(METHODS))
     whole("tune", "h", h, 1)
     if not 0.0 < level < 1.0:
         raise ValueError(f"tune: level must be between 0 and 1, such as 0.95; got {level!r}.")
     if method != "h-step" and not tracker.covariance:
         raise ValueError(f"tune: {type(tracker).__name__} has no variance, so {method!r} is undefined; use 'h-step'.")
+    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing)
     if len(model.outputs) > 1:
         options = (method, groups, h, bounds, level, order_by)
-        known = {"time": time, "dt": dt, "weights": weights, "drift": drift, "limits": limits, "exclude": exclude}
-        return tune_outputs(model, tracker, y, u, known, data, by, lambda task: _tuned(task, tracker, *options))
-    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
+        return tune_outputs(model, tracker, y, u, reading, data, by, lambda task: _tuned(task, tracker, *options))
     return _tuned(_task(model, tracker, y, u, reading, data, by), tracker, method, groups, h, bounds, level, order_by)
 
 
@@ -141,10 +145,13 @@ def _tuned(
     if knobs.profiled and tracker.covariance and not sigma2 > (ROUNDING * _largest(task)) ** 2:
         raise ValueError(_without_noise(task))
     _warn(search)
+    built = knobs.build(search.x, sigma2)
+    runs = run_task(task, built)
     return Tuned(
-        tracker=knobs.build(search.x, sigma2),
+        tracker=built,
         method=method,
-        loglik=float(final.loglik(knobs.profiled)[0]) if tracker.covariance else float("nan"),
+        loglik=sum(run.loglik for run in runs),
+        used=sum(int(np.isfinite(run.log_density).sum()) for run in runs) if tracker.covariance else 0,
         noise=sigma2 if knobs.profiled else float(getattr(knobs.run(search.x), "r", np.nan)),
         at_bound=tuple(name for name, i in zip(knobs.names, knobs.owner, strict=True) if search.at_bound(i)),
         interval=intervals_of(search, task, method, tracker, level),

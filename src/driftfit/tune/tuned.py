@@ -41,17 +41,17 @@ class Tuned(Printed):
     method : str
         The criterion.
     loglik : float
-        Log-likelihood of the record under ``tracker`` and ``noise``; NaN for trackers without a variance. For trackers
-        that estimate their scale on-line (`RLS`, `FLS`) it is above that of a run, which had less information at the
-        start.
+        Log-likelihood of the record under ``tracker``: ``track(model, tuned.tracker, y, u).loglik``, with several
+        records their sum; NaN for trackers without a variance.
+    used : int
+        Samples in this likelihood: those with a density given earlier samples.
     noise : float
         Estimated noise variance; unreliable if ``at_bound`` is not empty.
     at_bound : tuple of str
         Settings that ended at a bound of the search, or at zero; empty if the optimum is inside.
     interval : dict of (low, high)
-        By name of setting, the interval of the likelihood at ``level``: from profiles (for "q[..]/r", "mu",
-        "forgetting" and a single "q" or "r"), or from the curvature (for "q[..]" and "r" estimated together). NaN for
-        other methods.
+        By name of setting, the interval of the likelihood at ``level``: where its profile has fallen by half the
+        chi-square quantile. NaN for other methods.
     level : float
         The level of the intervals.
     """
@@ -59,6 +59,7 @@ class Tuned(Printed):
     tracker: Tracker
     method: str
     loglik: float
+    used: int
     noise: float
     at_bound: tuple[str, ...]
     interval: dict[str, tuple[float, float]]
@@ -67,7 +68,10 @@ class Tuned(Printed):
 
     @property
     def table(self) -> polars.DataFrame:
-        """Every setting that was tried and its criterion, best first: log-likelihood, or mean square."""
+        """Every setting that was tried and its criterion, best first: log-likelihood, or mean square.
+
+        For `RLS` and `FLS` the likelihood is the maximum over the noise variance.
+        """
         import polars
 
         points, values = self._search.tried()
@@ -86,7 +90,7 @@ class Tuned(Printed):
         yield facts(
             ("Tracker", shortened(repr(self.tracker))),
             ("Criterion", METHODS[self.method]),
-            *([("Log-likelihood", f"{self.loglik:.6g}")] if np.isfinite(self.loglik) else []),
+            *([("Log-likelihood", f"{self.loglik:.6g} of {self.used} samples")] if np.isfinite(self.loglik) else []),
             ("Noise variance", f"{self.noise:.4g}"),
         )
         ends = (f"[{0.5 - self.level / 2:.3g}", f"{0.5 + self.level / 2:.3g}]")

@@ -91,9 +91,10 @@ def _ahead(run: Track, at: Array, past: Array, inputs: Array, cov: Array, r: Arr
 
 def _played(run: Track, theta: Array, y: Array, u: Array, noise: Array, span: Span) -> Array:
     """The model's outputs; measurement noise is added afterwards, equation noise is fed back."""
-    if not run.tracker.output_error:
-        return run.model.play(theta, y, u, noise, span)
-    return run.model.play(theta, y, u, np.zeros_like(noise), span) + noise
+    fed = np.zeros_like(noise) if run.tracker.output_error else noise
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable system that was drawn ends in inf
+        later = run.model.play(theta, y, u, fed, span)
+    return later + noise if run.tracker.output_error else later
 
 
 def systems(run: Track, theta: Array) -> Array:

@@ -34,14 +34,18 @@ that of the few futures with an unstable theta. Cost: 2 DRAWS h updates.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from copy import copy
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
 
+from driftfit.data.clock import Clock
 from driftfit.data.labels import inputs_for
+from driftfit.data.record import time_text
 from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, whole
@@ -54,6 +58,9 @@ from driftfit.run.result import Track
 from driftfit.show.parts.text import digits, printed, table_of
 from driftfit.use.delta_method import spread
 
+if TYPE_CHECKING:
+    import polars
+
 DRAWS = 200
 PRINTED = 10
 """Samples of a forecast that are printed."""
@@ -62,38 +69,99 @@ CENTRAL, BISECTIONS = math.erf(math.sqrt(0.5)), 60
 """Share of futures within one half-width; and steps of its computation."""
 
 
-class Forecast(NamedTuple):
-    """The h samples after a record."""
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """The h samples after a record: parameters, and outputs with the distribution of their errors."""
 
     theta: Array
-    """(h, n)"""
+    """(h, n), or (h, ny, n) for outputs with a theta each."""
     std: Array
-    """(h, n): its standard deviation."""
+    """The standard deviation of theta."""
     y_hat: Array
-    """(h,): NaN if an input is not known."""
+    """(h,), or (h, ny) for several outputs: NaN if an input is not known."""
     y_std: Array
-    """(h,): standard deviation of the forecast error; NaN for trackers without a covariance."""
+    """Standard deviation of the forecast error, as y_hat; NaN for trackers without a covariance."""
+    time: Array | None = None
+    """(h,): when the samples are due, in UTC if there is a zone; None without times, or if they are only labels."""
+    names: tuple[Any, ...] = ()
+    """Names of the parameters, for each output if each has its own."""
+    outputs: tuple[str, ...] = ("y",)
+    axis: str = "time"
+    """The name of the time."""
+    zone: str | None = None
+    """The time zone in which times are shown."""
+
+    def __len__(self) -> int:
+        return len(self.y_hat)
+
+    def band(self, level: float = 0.95) -> tuple[Array, Array]:
+        """(low, high) of the outputs, shaped as y_hat, from the normal distribution."""
+        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.y_std
+        return self.y_hat - half, self.y_hat + half
+
+    def time_text(self, k: int) -> str:
+        """When sample k is due, in the time zone of the record, or how many samples it is ahead."""
+        return str(k + 1) if self.time is None else time_text(self.time[k], self.zone)
+
+    @property
+    def table(self) -> polars.DataFrame:
+        """One row per sample of each output.
+
+        Columns: ``output`` if there are several, ``step`` (1 .. h), the time if it is known, ``y_hat``, ``y_std``, the
+        95 % band ``low`` and ``high``, and for every parameter ``theta_<name>`` and ``std_<name>``.
+        """
+        import polars as pl  # this import takes as long as all others together
+
+        low, high = self.band()
+        signals = {"y_hat": self.y_hat, "y_std": self.y_std, "low": low, "high": high}
+        axis = {} if self.time is None else {self.axis: self.time}
+        parts = []
+        for j, output in enumerate(self.outputs):
+            several, own = len(self.outputs) > 1, self.theta.ndim == 3
+            columns: dict[str, Any] = {"step": np.arange(1, len(self) + 1), **axis}
+            columns |= {name: path[:, j] if several else path for name, path in signals.items()}
+            paths = [path[:, j] if own else path for path in (self.theta, self.std)]
+            for i, name in enumerate(self.names[j] if own else self.names):
+                columns |= {f"theta_{name}": paths[0][:, i], f"std_{name}": paths[1][:, i]}
+            named = [pl.lit(output).alias("output")] if several else []
+            parts.append(pl.DataFrame(columns).select(*named, pl.all()))
+        table = pl.concat(parts, how="diagonal")
+        if self.zone is None or self.time is None:
+            return table
+        return table.with_columns(pl.col(self.axis).dt.replace_time_zone("UTC").dt.convert_time_zone(self.zone))
 
     def __repr__(self) -> str:
         """A table of the first outputs, with their standard deviations."""
-        h, means, stds = (
-            len(self.y_hat),
-            self.y_hat.reshape(len(self.y_hat), -1),
-            self.y_std.reshape(len(self.y_std), -1),
-        )
-        outputs = ["y"] if means.shape[1] == 1 else [f"y{j + 1}" for j in range(means.shape[1])]
+        h = len(self)
+        means, stds = self.y_hat.reshape(h, -1), self.y_std.reshape(h, -1)
         table = table_of(
-            f"Forecast of {h} samples", "ahead", *(head for name in outputs for head in (name, "+-")), group=2
-        )
+            f"Forecast of {h} samples", "ahead" if self.time is None else self.axis,
+            *(head for name in self.outputs for head in (name, "+-")), group=2,
+        )  # fmt: skip
         for k in range(min(h, PRINTED)):
             pairs = zip(means[k].tolist(), stds[k].tolist(), strict=True)
-            table.add_row(str(k + 1), *(cell for mean, std in pairs for cell in (digits(mean, std), f"{std:.3g}")))
+            table.add_row(
+                self.time_text(k), *(cell for mean, std in pairs for cell in (digits(mean, std), f"{std:.3g}"))
+            )
         more = f" the first {PRINTED} of {h};" if h > PRINTED else ""
         if np.isnan(means).all() and np.isfinite(self.theta).all():
             more = f" future inputs are needed to forecast outputs: forecast({h}, u);{more}"
         return printed(table, f"{more} +- one standard deviation; theta and std are those of the parameters").strip(
             "\n"
         )
+
+    def of_record(self, run: Track | Outputs) -> Forecast:
+        """The same with the times and names of a record that goes on."""
+        labels, several = run.labels, len(run.outputs) > 1
+        time = Clock.of(labels.dt, labels.zone).ahead(run.time[-1], len(self)) if run.timed else None
+        outputs = run.outputs if several else (labels.y,)
+        return replace(self, time=time, names=run.names, outputs=outputs, axis=labels.time or "time", zone=labels.zone)
+
+    def of_stream(self, live: Live) -> Forecast:
+        """The same with the times and names of a stream."""
+        end = live.end()
+        time = Clock.of(end.dt, end.zone).ahead(end.last, len(self))
+        return replace(self, time=time, names=live.names, outputs=live.model.outputs, zone=end.zone)
 
 
 def forecast(run: Track, h: int, u: Any = None) -> Forecast:
@@ -115,22 +183,23 @@ def forecast(run: Track, h: int, u: Any = None) -> Forecast:
     """
     if run.rows_per_instant > 1:
         model: Any = run.model
-        return _of_outputs(Live(replace(model, regressors=run.rows.model.m), run.tracker, warm_start=run), h, u)
-    return forecast_from(run.program, run.program.resting(run.state), future(run.model, h, u))
+        live = Live(replace(model, regressors=run.rows.model.m), run.tracker, warm_start=run)
+        return _of_outputs(live, h, u).of_record(run)
+    return forecast_from(run.program, run.program.resting(run.state), future(run.model, h, u)).of_record(run)
 
 
 def forecast_stream(live: Live, h: int, u: Any = None) -> Forecast:
     """`forecast` from the present state of a stream; while `apply` is outstanding, the first row of u is its input."""
     if len(live.model.outputs) > 1:
-        return _of_outputs(copy(live), h, u)
+        return _of_outputs(copy(live), h, u).of_stream(live)
     ((one, tile),), inputs = live.driven_on(future(live.model, h, u))
-    return forecast_from(one, tile, inputs)
+    return forecast_from(one, tile, inputs).of_stream(live)
 
 
 def forecast_outputs(run: Outputs, h: int, u: Any = None) -> Forecast:
     """Forecast h nominal samples of several outputs: theta and std (h, ny, n), y_hat and y_std (h, ny)."""
     tracker = dict(zip(run.outputs, run.trackers, strict=True))
-    return _of_outputs(Live(run.model, tracker, warm_start=run), h, u)
+    return _of_outputs(Live(run.model, tracker, warm_start=run), h, u).of_record(run)
 
 
 def future(model: Model, h: int, u: Any) -> Array:
@@ -169,12 +238,12 @@ def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
         elif tracker.covariance and len(lane["phi"]) == len(now):
             slopes[k], covs[k] = lane["phi"], tracker.cov(lane)
     if lagged is not None or tracker.output_error:  # an output error is never fed back
-        return result._replace(y_std=np.sqrt(result.y_std))
+        return replace(result, y_std=np.sqrt(result.y_std))
     if begin is not None:
-        return result._replace(y_std=_spread_of_draws(update, begin, inputs, result.y_hat))
+        return replace(result, y_std=_spread_of_draws(update, begin, inputs, result.y_hat))
     noise *= model.noise_factor(now, result.y_hat[0])
     later = _fed_back(model, now, slopes, covs, float(noise))
-    return result._replace(y_std=np.sqrt(result.y_std + later) / model.output_slope(now, result.y_hat))
+    return replace(result, y_std=np.sqrt(result.y_std + later) / model.output_slope(now, result.y_hat))
 
 
 def _spread_of_draws(update: Any, begin: Array, inputs: Array, y_hat: Array) -> Array:
@@ -231,7 +300,8 @@ def _of_outputs(live: Live, h: int, u: Any) -> Forecast:
     apart, rows = live.driven_on(np.array([live.inputs_of(row) for row in inputs]))
     if apart:
         found = [forecast_from(program, tile, rows) for program, tile in apart]
-        return Forecast(*(np.stack(part, axis=1) for part in zip(*found, strict=True)))
+        each = ((one.theta, one.std, one.y_hat, one.y_std) for one in found)
+        return _stacked(each, 1)
     if live.awaits:
         live.apply(inputs[0])
         inputs = [*inputs[1:], None]
@@ -241,9 +311,14 @@ def _of_outputs(live: Live, h: int, u: Any) -> Forecast:
         y_hat, s = live.predict(row)
         live.pass_by(y_hat, row)  # the forecast takes the place of the outputs among the lags
         s = s if lagged is None else lagged.step(live.regressors, live.theta, live.cov, s)
-        parts.append((live.theta, live.std, y_hat, s))
-    theta, std, means, variances = (np.array(part) for part in zip(*parts, strict=True))
-    return Forecast(theta, std, means, np.sqrt(variances))
+        parts.append((live.theta, live.std, y_hat, np.sqrt(s)))
+    return _stacked(parts, 0)
+
+
+def _stacked(parts: Iterable[tuple[Array, ...]], axis: int) -> Forecast:
+    """A forecast from theta, std, y_hat and y_std of every output (axis 1) or every sample (axis 0)."""
+    theta, std, y_hat, y_std = (np.stack(part, axis=axis) for part in zip(*parts, strict=True))
+    return Forecast(theta, std, y_hat, y_std)
 
 
 class LagErrors:

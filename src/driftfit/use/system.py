@@ -22,10 +22,12 @@ from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.arx import ARX
+from driftfit.show.parts.text import printing, some_rows, table_of
 from driftfit.use.delta_method import spread
 
 if TYPE_CHECKING:
@@ -51,11 +53,27 @@ class Followed(Protocol):
     def covariances(self) -> Array: ...
 
 
+@printing
 class Response(NamedTuple):
-    """A value with its standard deviation; NaN if the tracker carries no covariance."""
+    """Values with their standard deviations, NaN if the tracker carries no covariance; printing it shows a table.
+
+    Its rows are those of ``value``, numbered from 0: the samples. The response of a single sample has a row for each
+    step, and its gain one for each input.
+    """
 
     value: Array
     std: Array
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        value, std = (np.reshape(part, (len(np.atleast_1d(part)), -1)) for part in self)
+        value, std = (value.T, std.T) if len(value) == 1 else (value, std)
+        rows, each = some_rows(len(value)), range(value.shape[1])
+        heads = (name for k in each for name in (f"value {k + 1}" if len(each) > 1 else "value", "std"))
+        table = table_of(f"Response, {len(rows)} of {len(value)} rows", "", *heads, group=2)
+        for t in rows:
+            cells = ((f"{value[t, k]:.4g}", "" if np.isnan(std[t, k]) else f"{std[t, k]:.2g}") for k in each)
+            table.add_row(f"{t}", *(text for pair in cells for text in pair))
+        yield table
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
         """(low, high) of a normal approximation."""

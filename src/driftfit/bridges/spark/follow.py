@@ -20,7 +20,7 @@ from driftfit.bridges.spark.pieces import COUNTS, alarms_schema, rules_of
 from driftfit.bridges.spark.store import NEXT, Store
 from driftfit.bridges.spark.task import SETTING, Task, results_schema, trackers_of
 from driftfit.data.clock import Clock
-from driftfit.data.storage import describe, rebuild
+from driftfit.data.storage import describe, parts_of, rebuild
 from driftfit.models.base import Model
 from driftfit.run.live.rule import AlarmRule
 from driftfit.trackers.base import Tracker
@@ -129,9 +129,10 @@ def _origins(store: Store, task: Task, schema: Mapping[str, str], migrate: bool)
         return ()
     last = found[-1]
     if last["model"] != about["model"]:
+        followed = rebuild(last["model"], Model, parts_of(task.model))
         raise ValueError(
-            f"spark.follow: the states in {store.path} were made with {rebuild(last['model'], Model)!r}, not with "
-            f"{task.model!r}; begin in another folder."
+            f"spark.follow: the states in {store.path} were made with {followed!r}, not with {task.model!r}; begin in "
+            "another folder."
         )
     origins = tuple(_origin(task, one) for one in reversed(found))
     if not migrate and (origins[0].tracker != task.tracker or last["fields"] != text):
@@ -147,7 +148,8 @@ def _origins(store: Store, task: Task, schema: Mapping[str, str], migrate: bool)
 
 def _origin(task: Task, about: Mapping[str, Any]) -> Origin:
     """What made states, from what was noted of it."""
-    trackers: list[Tracker] = [rebuild(one, Tracker) for one in about["tracker"]]
+    own = tuple(parts_of(trackers_of(task.tracker)))
+    trackers: list[Tracker] = [rebuild(one, Tracker, own) for one in about["tracker"]]
     several = len(trackers) > 1
     return Origin(dict(zip(task.y, trackers, strict=True)) if several else trackers[0], about["fields"])
 

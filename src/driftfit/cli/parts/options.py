@@ -8,7 +8,6 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
-import numpy as np
 import typer
 
 from driftfit.cli.parts.arguments import listed, parse_interval, parse_units
@@ -26,7 +25,7 @@ from driftfit.cli.parts.reading import (
 from driftfit.engine.settings import missing_settings
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
-from driftfit.parsing.settings import parse_model, parse_tracker
+from driftfit.parsing.settings import own_tracker, parse_model, parse_tracker
 from driftfit.trackers.base import Tracker
 
 Names = list[str] | None
@@ -91,7 +90,12 @@ class Given:
         str | None,
         typer.Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
     ] = None
-    decimal: Annotated[str, typer.Option(help="Decimal sign of the numbers: . or ,")] = "."
+    decimal: Annotated[
+        str | None, typer.Option(help="Decimal sign of the numbers: . or , (by default the file shows it).")
+    ] = None
+    missing: Annotated[
+        Names, typer.Option(help="What the file holds where there is no reading: Offline or -999; repeat it.")
+    ] = None
     limits: Annotated[
         Names, typer.Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
     ] = None
@@ -125,7 +129,7 @@ class Given:
     def models(self) -> list[Model]:
         """The models, each bound to the inputs."""
         default = [f"arx:2,{2 if self.inputs else 0},intercept"]
-        found = [parse_model(text, self.outputs) for text in self.model or default]
+        found = [parse_model(text) for text in self.model or default]
         several = len(found) > 1  # then one of them may have no inputs
         alone = [model.shared or (several and isinstance(model, ARX) and model.nb == 0) for model in found]
         return [model if one else model.bind(self.inputs) for model, one in zip(found, alone, strict=True)]
@@ -140,6 +144,7 @@ class Given:
         return Part(
             first=self.first, last=self.last, rows=rows_from(self.rows),
             separator=separator_from(self.separator), decimal=decimal_from(self.decimal),
+            missing=tuple(self.missing or []),
             limits=tuple(limits_from(entry, names) for entry in self.limits or []),
             exclude=tuple(map(interval_from, self.exclude or [])),
         )  # fmt: skip
@@ -152,7 +157,8 @@ class Given:
         data: Any = self.file if rows is None else rows.table(self.time, self.by or [])
         signals = {"y": outputs if len(outputs) > 1 else outputs[0], "u": self.inputs, "data": data, "time": self.time}
         signals |= self.part().restrictions(self.time is not None)
-        return signals | {"by": self.by or None, "dt": parse_interval(self.dt), "units": parse_units(self.unit) or None}
+        units = {**({} if rows is None else rows.units), **parse_units(self.unit)}
+        return signals | {"by": self.by or None, "dt": parse_interval(self.dt), "units": units or None}
 
     def read(self, *more: str) -> Rows:
         """Read the selected part of the columns, and of ``more`` columns."""
@@ -181,41 +187,33 @@ class Given:
             raise ValueError("--model: give one model; `driftfit select` compares several.")
         if self.start is None:
             return models[0], self.chosen_tracker(), None
-        if self.model or self.p or self.own or self.tracker != "adaptive-kalman":
+        if self.model or self.p or self.tracker != "adaptive-kalman":
             raise ValueError(f"--start {self.start}: model and tracker come from the file; leave out --model, -p ...")
         if self.by or len(self.outputs) > 1:
             raise ValueError(f"--start {self.start}: the file holds one run of one output; leave out --by.")
-        before = saved(self.start)
+        before = saved(self.start, [own_tracker(self.own)] if self.own else [])
         return before.model, before.tracker, before
 
     def arrays(self) -> dict[str, Any]:
-        """One series sorted by time, in the form that `tune` and `select` take."""
+        """One series in the form that `tune` and `select` take."""
         outputs = self.outputs
         if self.by or len(outputs) > 1 or self.start is not None:
             raise ValueError("this command takes one series of one output; leave out --by, --start and further --y.")
-        read = self.read()
-        order = read.order()
-        u = np.stack([read.numbers[name][order] for name in self.inputs], axis=1) if self.inputs else None
-        time = None if read.time is None else read.time[order]
-        restrictions = self.part().restrictions(time is not None)
-        places: dict[str, Any] = {name: j for j, name in enumerate(self.inputs)} | {outputs[0]: "y"}
-        if restrictions["limits"]:
-            restrictions["limits"] = {places[name]: one for name, one in restrictions["limits"].items()}
-        known = {"y": read.numbers[outputs[0]][order], "u": u, "time": time, "dt": parse_interval(self.dt)}
-        return known | restrictions
+        signals = self.signals()
+        return {name: signals[name] for name in signals if name not in ("by", "units")}
 
 
-def saved(path: Path) -> Any:
-    """Load a run, or the state of a stream, from a file."""
+def saved(path: Path, classes: list[Any]) -> Any:
+    """Load a run, or the state of a stream, from a file; ``classes`` are those of the user's own that it may need."""
     from driftfit.results import Track
     from driftfit.streams import Live
 
     try:
-        return Track.load(path)
+        return Track.load(path, classes)
     except ValueError as error:
         if "state" not in str(error):
             raise
-    return Live.load(path)
+    return Live.load(path, classes)
 
 
 def reads(command: Callable[..., None]) -> Callable[..., None]:

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
 
-from driftfit.data.columns import Columns, Wanted, convert, year_first
+from driftfit.data.columns import Columns, Wanted, convert
 from driftfit.data.files import paths_of, read_file
+from driftfit.data.limits import marks
+from driftfit.data.times.dates import dates
 from driftfit.data.times.periods import EXAMPLES, span
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
@@ -33,21 +35,22 @@ class Part:
     last: str | None = None
     rows: tuple[int, int | None] = (1, None)
     separator: str | None = None
-    decimal: str = "."
+    decimal: str | None = None
+    missing: tuple[str, ...] = ()
     limits: tuple[tuple[str, Range], ...] = ()
     exclude: tuple[tuple[str, str], ...] = ()
 
     @property
     def whole(self) -> bool:
         """Whether the files are read without any restriction."""
-        return self == Part(limits=self.limits, exclude=self.exclude)
+        return self == Part(limits=self.limits, exclude=self.exclude, missing=self.missing)
 
     def restrictions(self, timed: bool) -> dict[str, Any]:
-        """limits= and exclude= of `track`; without time, intervals are rows, which `track` numbers from 0."""
+        """limits=, exclude= and missing= of `track`; without time, intervals are rows, which `track` numbers from 0."""
         exclude: list[tuple[Any, Any]] = list(self.exclude)
         if not timed:
             exclude = [(self._sample(first), self._sample(last)) for first, last in self.exclude]
-        return {"limits": dict(self.limits) or None, "exclude": exclude or None}
+        return {"limits": dict(self.limits) or None, "exclude": exclude or None, "missing": self.missing}
 
     def _sample(self, row: str) -> int:
         """The sample of a row."""
@@ -63,6 +66,7 @@ class Rows(NamedTuple):
     time: Array | None
     zone: str | None
     by: list[list[Any]]
+    units: Mapping[str, str]
 
     def table(self, time: str | None, by: Sequence[str]) -> pl.DataFrame:
         """The rows as a table that `track` reads."""
@@ -108,9 +112,9 @@ def interval_from(entry: str, option: str = "--exclude") -> tuple[str, str]:
     return first.strip(), last.strip()
 
 
-def decimal_from(text: str) -> str:
-    """The decimal sign."""
-    if text not in (".", ","):
+def decimal_from(text: str | None) -> str | None:
+    """The decimal sign; None: the file shows it."""
+    if text not in (None, ".", ","):
         raise ValueError(f"--decimal {text}: the decimal sign must be a point or a comma.")
     return text
 
@@ -142,7 +146,7 @@ def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Se
     """Read columns of several files in the order of the files."""
     if (part.first or part.last) and time is None:
         raise ValueError("--from and --to are times, so they need --time; rows are chosen with --rows.")
-    wanted = Wanted(tuple(dict.fromkeys(names)), time, tuple(by))
+    wanted = Wanted(tuple(dict.fromkeys(names)), time, tuple(by), marks(part.missing)[0], part.separator, part.decimal)
     read = [_one(path, wanted, part) for path in (["-"] if "-" in files else paths_of(list(files)))]
     if len({one.time.dtype.kind for one in read if one.time is not None}) > 1:
         raise ValueError("the times of some files are numbers, those of others are dates.")
@@ -151,6 +155,7 @@ def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Se
         None if time is None else np.concatenate([one.time for one in read if one.time is not None]),
         read[0].zone,
         [[value for one in read for value in one.by[k]] for k in range(len(by))],
+        read[0].units,
     )
     return _between(found, part)
 
@@ -158,11 +163,11 @@ def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Se
 def _one(path: str, wanted: Wanted, part: Part) -> Columns:
     """The selected rows of one file."""
     where = "stdin" if path == "-" else path
-    frame = read_file(sys.stdin.buffer.read() if path == "-" else path, wanted, where, part.separator, part.decimal)
+    frame, units = read_file(sys.stdin.buffer.read() if path == "-" else path, wanted, where)
     first, last = part.rows
     if len(frame) < first:
         raise ValueError(f"{where} has no row {first}.")
-    return convert(frame, wanted, where, 1, slice(first - 1, last))
+    return replace(convert(frame, wanted, where, 1, slice(first - 1, last)), units=units)
 
 
 def _between(rows: Rows, part: Part) -> Rows:
@@ -178,7 +183,8 @@ def _between(rows: Rows, part: Part) -> Rows:
     if not keep.any():
         raise ValueError(f"no row is between --from {part.first or '...'} and --to {part.last or '...'}.")
     by = [[value for value, kept in zip(column, keep.tolist(), strict=True) if kept] for column in rows.by]
-    return Rows({name: column[keep] for name, column in rows.numbers.items()}, axis[keep], rows.zone, by)
+    numbers = {name: column[keep] for name, column in rows.numbers.items()}
+    return Rows(numbers, axis[keep], rows.zone, by, rows.units)
 
 
 def moment(text: str, axis: Array, zone: str | None, end: bool = False) -> Any:
@@ -195,13 +201,11 @@ def moment(text: str, axis: Array, zone: str | None, end: bool = False) -> Any:
         text, end = (str(days[1] - timedelta(1)), True) if end else (str(days[0]), False)
     else:
         end = end and ":" not in text
-        text = year_first(pl.Series("time", [text]), "the command line")[0]
-    try:
-        found = pl.Series([text]).str.to_datetime(time_unit="us")
-    except pl.exceptions.PolarsError:
+    found = dates(pl.Series("time", [text]), "the command line")
+    if found.has_nulls():
         raise ValueError(
             f"{text!r} is not a date; write 2024-01-31, '2024-01-31 12:00:00', or a period as in {EXAMPLES}."
-        ) from None
+        )
     if zone is not None:
         found = (
             found.dt.replace_time_zone(zone, ambiguous="earliest")

@@ -1,8 +1,10 @@
 """CSV files, read as text so that messages can name a cell that is not a number.
 
-Lines that begin with # are comments. The header determines whether cells are separated by comma, semicolon or tab, or a
-line such as ``sep=;`` before it, which spreadsheets write. Separators at the end of a line are left out; a line with
-more cells than the header is an error. Text that is neither UTF-8 nor UTF-16 is taken as Windows-1252.
+Lines that begin with # are comments, unless their first cell is the error value of a spreadsheet, such as #N/A. The
+header determines whether cells are separated by comma, semicolon, tab or bar, or a line such as ``sep=;`` before it,
+which spreadsheets write. A row of units may follow it. Blank lines are left out; in a file of one column they are
+missing readings, unless every line is followed by one. Separators at the end of a line are left out; a line with more
+cells than the header is an error. Text that is neither UTF-8 nor UTF-16 is taken as Windows-1252.
 """
 
 from __future__ import annotations
@@ -10,24 +12,49 @@ from __future__ import annotations
 import csv
 import io
 import itertools
-import os
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import polars as pl
 
-from driftfit.data.columns import FILE, Wanted, plain_names
+from driftfit.data.columns import ERROR, FILE, HISTORIANS, Wanted, plain_names, present
 from driftfit.data.formats.decimal_commas import points, with_points
+from driftfit.data.times.dates import is_date
 
 PROBE = 1 << 16
-"""The bytes from which the separator, the encoding and the decimal sign are judged."""
+"""The bytes from which the separator, the decimal sign and units are judged."""
+
+RUN = r"^[=+\-@\t\r]"
+"""How a text begins that spreadsheets run as a formula."""
 
 DECLARED = re.compile(r"\ufeff?sep=(.)\s*$", re.IGNORECASE)
 """A first line with which spreadsheets say what separates cells."""
 
 CHECKED = 1 << 26
 """Bytes of a file up to which all columns are read: only then polars reports lines with more cells than the header."""
+
+SEPARATORS = ",;\t|"
+COMMENT = re.compile(rf"#(?!{ERROR[1:]}\s*([{SEPARATORS}]|$))", re.IGNORECASE)
+VALUE = re.compile(r"[+-]?[.,]?\d(?!/[A-Za-z])")
+"""How a number or a date begins, other than the unit 1/s."""
+
+
+def without_formulas(table: pl.DataFrame) -> pl.DataFrame:
+    """A table for spreadsheets: a text or name that they would run begins with an apostrophe.
+
+    A text that is a number, as in "-5", is none of them.
+    """
+
+    def quoted(column: pl.Series) -> pl.Series:
+        texts = column.cast(pl.String)
+        runs = texts.str.contains(RUN) & texts.cast(pl.Float64, strict=False).is_null()
+        return ("'" + texts).zip_with(runs.fill_null(False), texts).alias(column.name)
+
+    texts = [quoted(column) for column in table if column.dtype in (pl.String, pl.Categorical, pl.Enum)]
+    names = quoted(pl.Series(values=table.columns, dtype=pl.String))
+    return table.with_columns(texts).rename(dict(zip(table.columns, names, strict=True)))
 
 
 def start_of(source: str | bytes) -> bytes:
@@ -38,67 +65,93 @@ def start_of(source: str | bytes) -> bytes:
         return file.read(PROBE)
 
 
-def read_csv(
-    source: str | bytes, wanted: Wanted, separator: str | None, decimal: str
-) -> tuple[list[str], pl.DataFrame]:
-    """Return the names of all columns of a CSV file, and the wanted columns as text.
+def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFrame, dict[str, str]]:
+    """The names of all columns of a CSV file, the wanted columns as text, and the units of a row of units.
 
-    A name that several columns have is listed as often as it occurs. Without ``separator`` the header shows whether
-    cells are separated by a comma, a semicolon or a tab. With ``decimal=","`` every number may have a decimal comma;
-    with "." only those of a file whose cells are separated by semicolons.
+    A name that several columns have is listed as often as it occurs. Without ``wanted.separator`` the header shows what
+    separates cells. With ``wanted.decimal`` of "," every number may have a decimal comma, with "." none; without it
+    those of a file whose cells are not separated by commas.
     """
-    start = start_of(source)
-    encoding = _encoding(start)
-    lines = _lines(start, encoding)
+    content = source if isinstance(source, bytes) else Path(source).read_bytes()
+    if encoding := _encoding(content[:PROBE]):
+        content = content.decode(encoding, errors="replace").encode()
+    start = content[:PROBE]
+    end = b"\r" if b"\r" in start and b"\n" not in start else b"\n"
+    lines = _lines(start)
     declared = DECLARED.match(lines[0]) if lines else None
     lines = lines[1:] if declared else lines
-    sign = separator or (declared[1] if declared else _separator(lines, ";\t" if decimal == "," else ",;\t"))
-    end = "\r" if b"\r" in start and b"\n" not in start else "\n"
-    options: dict[str, Any] = {"infer_schema": False, "comment_prefix": "#", "separator": sign, "eol_char": end}
-    options |= {"encoding": encoding, "skip_rows": 1 if declared else 0}
-    raw = pl.read_csv(source, n_rows=0, truncate_ragged_lines=True, **options).columns
+    signs = SEPARATORS[1:] if wanted.decimal == "," else SEPARATORS
+    sign = wanted.separator or (declared[1] if declared else _separator(lines, signs))
+    content = _mended(content, end, sign, alone=not any(sign in line for line in lines))
+    options: dict[str, Any] = {"infer_schema": False, "comment_prefix": "#", "separator": sign}
+    options |= {"eol_char": end.decode(), "skip_rows": 1 if declared else 0}
+    raw = pl.read_csv(content, n_rows=0, truncate_ragged_lines=True, **options).columns
     copies = (re.fullmatch(r"(.*)_duplicated_\d+", name) for name in raw)  # as polars calls them
     again = [copy[1] for copy in copies if copy and copy[1] in raw]
     names = plain_names(raw, [name for name in wanted.names if name != FILE])
     chosen = {old: new for old, new in zip(raw, names, strict=True) if new in wanted.names}
-    read = None if _size(source) <= CHECKED else list(chosen)
+    read = None if len(content) <= CHECKED else list(chosen)
     try:
-        every = pl.read_csv(source, columns=read, **options)
-    except pl.exceptions.ComputeError:
-        _check_widths(source, encoding, sign, len(raw))
-        every = pl.read_csv(source, columns=read, truncate_ragged_lines=True, **options)
-    frame = every.select(list(chosen)).rename(chosen)
-    numbers = [frame[name] for name in dict.fromkeys((*wanted.numbers, wanted.time)) if name in frame.columns]
-    if decimal == ",":
-        frame = frame.with_columns(map(points, numbers))
-    elif sign == ";":
-        others = every if read is None else _cells(lines, sign)
-        frame = frame.with_columns(with_points(numbers, others.get_columns()))
-    units = frame.select(pl.col(name).str.strip_chars() for name in wanted.by if name in frame.columns)
-    return [*names, *again], frame.with_columns(_whole(column) for column in units)
-
-
-def _size(source: str | bytes) -> int:
-    return len(source) if isinstance(source, bytes) else os.path.getsize(source)
-
-
-def _lines(start: bytes, encoding: str) -> list[str]:
-    """The first lines of a file, without blank ones, comments, and one that the end of the probe cuts off."""
-    lines = start.decode(encoding, errors="replace").removeprefix("\ufeff").splitlines()
-    whole = lines[:-1] if len(start) == PROBE and len(lines) > 1 else lines
-    return [line for line in whole if line.strip() and not line.startswith("#")]
-
-
-def _cells(lines: Sequence[str], sign: str) -> pl.DataFrame:
-    """The cells of the first lines of a file below the header."""
+        every = pl.read_csv(content, columns=read, **options)
+    except pl.exceptions.ComputeError as error:
+        if "utf-8" in str(error):  # the first cells do not show the encoding
+            return read_csv(content.decode("windows-1252", errors="replace").encode(), wanted)
+        _check_widths(content, sign, len(raw))
+        every = pl.read_csv(content, columns=read, truncate_ragged_lines=True, **options)
     rows = list(csv.reader(lines, delimiter=sign))[1:]
-    return pl.DataFrame(
-        [pl.Series(str(k), cells) for k, cells in enumerate(itertools.zip_longest(*rows, fillvalue=""))]
-    )
+    units = _units(rows, names, wanted)
+    every, rows = every.slice(bool(units)), rows[bool(units) :]
+    frame = every.select(list(chosen)).rename(chosen)
+    words = (*HISTORIANS, *wanted.missing)
+    numbers = [present(frame[name], words) for name in wanted.signals if name in frame.columns]
+    if wanted.decimal == ",":
+        frame = frame.with_columns(map(points, numbers))
+    elif wanted.decimal is None and sign != ",":
+        others = every.get_columns() if read is None else _columns(rows)
+        frame = frame.with_columns(with_points(numbers, (present(other, words) for other in others)))
+    keys = frame.select(pl.col(name).str.strip_chars() for name in wanted.by if name in frame.columns)
+    return [*names, *again], frame.with_columns(_whole(column) for column in keys), units
 
 
-def _encoding(start: bytes) -> str:
-    """The encoding of a file, judged by its header and its first cells."""
+def _mended(content: bytes, end: bytes, sign: str, alone: bool) -> bytes:
+    """A file in which error values at the beginnings of lines are quoted, so that they are no comments, and blank lines
+    are left out unless they are missing readings of a column that is ``alone``.
+    """
+    after = rb"(?=[ \t]*(?:" + re.escape(sign.encode()) + rb"|[\r\n]|\Z))"
+    content = re.sub(end + rb"(" + ERROR.encode() + rb")" + after, end + rb'"\1"', content, flags=re.IGNORECASE)
+    if alone and any(line.strip() for line in content[:PROBE].split(end)[1::2]):
+        return content
+    return re.sub(end + rb"[ \t\r]*(?=" + end + rb")", b"", content)
+
+
+def _lines(start: bytes) -> list[str]:
+    """The first lines of a file, without blank ones, comments, and one that the end of the probe cuts off."""
+    lines = start.decode(errors="replace").removeprefix("\ufeff").splitlines()
+    whole = lines[:-1] if len(start) == PROBE and len(lines) > 1 else lines
+    return [line for line in whole if line.strip() and not COMMENT.match(line)]
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> list[pl.Series]:
+    """Columns of cells, of lines that may differ in length."""
+    return [pl.Series(str(k), cells) for k, cells in enumerate(itertools.zip_longest(*rows, fillvalue=""))]
+
+
+def _units(rows: Sequence[Sequence[str]], names: Sequence[str], wanted: Wanted) -> dict[str, str]:
+    """The units of the wanted numbers, if the first line below the header holds them.
+
+    It is such a line if it has no number, no date, and no cell that its column holds again.
+    """
+    first = [cell.strip() for cell in rows[0]] if len(rows) > 1 else []
+    for k, cell in enumerate(first):
+        again = (row[k].strip() == cell for row in rows[1:] if k < len(row))
+        if cell and (VALUE.match(cell) or is_date(cell) or any(again)):
+            return {}
+    found = dict(zip(names, present(pl.Series(first, dtype=pl.String), (*HISTORIANS, *wanted.missing)), strict=False))
+    return {name: unit.strip("[]() ") for name in wanted.numbers if (unit := found.get(name))}
+
+
+def _encoding(start: bytes) -> str | None:
+    """The encoding of a file, judged by its header and its first cells; None for UTF-8."""
     if start.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "utf-16"
     if 0 in start[:2]:  # UTF-16 without a byte order mark: every other byte of plain letters is 0
@@ -107,7 +160,7 @@ def _encoding(start: bytes) -> str:
         start[: start.rfind(b"\n") + 1 or None].decode("utf-8")
     except UnicodeDecodeError:
         return "windows-1252"
-    return "utf8"
+    return None
 
 
 def _separator(lines: Sequence[str], signs: str) -> str:
@@ -120,9 +173,9 @@ def _separator(lines: Sequence[str], signs: str) -> str:
     return max(signs, key=fit)
 
 
-def _check_widths(source: str | bytes, encoding: str, sign: str, width: int) -> None:
+def _check_widths(content: bytes, sign: str, width: int) -> None:
     """ValueError for the first row that has cells beyond the ``width`` of the header that are not empty."""
-    with io.TextIOWrapper(io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb"), encoding) as file:
+    with io.TextIOWrapper(io.BytesIO(content), "utf8") as file:
         rows = csv.reader(
             (line for line in file if not line.startswith("#") and not DECLARED.match(line)), delimiter=sign
         )

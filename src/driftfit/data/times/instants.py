@@ -12,11 +12,13 @@ import numpy as np
 
 from driftfit.data.times.periods import EXAMPLES, periods
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import warn
+from driftfit.engine.settings import ABSENT, warn
 
 
 def instant(time: Any) -> Any:
-    """One time as a float, or as datetime64 in UTC if it is a date."""
+    """One time as a float, or as datetime64 in UTC if it is a date; NaN if it is not known."""
+    if str(time) in ABSENT:
+        return float("nan")
     if isinstance(time, int | float | np.number) and not isinstance(time, np.timedelta64):
         return float(time)
     if hasattr(time, "to_datetime64"):  # a pandas time, in UTC if it has a zone
@@ -130,13 +132,13 @@ def warn_of_counted_years(time: Array) -> None:
         )
 
 
-def warn_of_summer_time(repeated: Array, zone: str | None) -> None:
-    """Warn if times that occur twice, and are left out, look like the hour that the end of summer time repeats.
+def warn_of_summer_time(repeated: Array, zone: str | None) -> bool:
+    """Whether times that are left out because they occur twice look like the hour at the end of summer time; then warn.
 
     That is a night from Saturday to Sunday in spring or autumn, as clocks are changed in every country with a rule.
     """
-    if zone is not None or repeated.dtype.kind != "M" or not len(repeated):
-        return
+    if zone is not None or repeated.dtype.kind != "M":
+        return False
     hours = np.unique(repeated.astype("datetime64[h]"))
     days, months = hours.astype("datetime64[D]"), hours.astype("datetime64[M]").astype(int) % 12 + 1
     sunday = (days.astype(int) + 4) % 7 == 0
@@ -151,3 +153,4 @@ def warn_of_summer_time(repeated: Array, zone: str | None) -> None:
             "the times in UTC, or with their zone or offset, such as 2024-10-27 02:30+01:00.",
             UserWarning,
         )
+    return bool(len(night))

@@ -203,7 +203,9 @@ class Alarms(Printed):
         sizes: tuple[str, ...] = ()
         if self.kind in FROZEN:
             size, low, high, since = numbers[2:]
-            sizes = (f"{size:.3g}", f"{0.5 * (high - low):.2g}", since)
+            # the likelihood ratio does not always name the cause that a sum has
+            known = size == size
+            sizes = (f"{size:.3g}", f"{0.5 * (high - low):.2g}", since) if known else ("", "", "")
         return (first, last, cause, statistic, limit, *sizes)
 
     def _end(self, t: int) -> int:

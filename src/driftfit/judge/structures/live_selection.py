@@ -16,7 +16,7 @@ of parameters is that of the largest (`driftfit.judge.structures.shared_streams`
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -127,10 +127,10 @@ class LiveSelection(Kept):
         return header, streams | {"logs": self._logs, "residuals": self._residuals}
 
     @classmethod
-    def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
+    def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array], classes: Iterable[Any]) -> Self:
         found = cls.__new__(cls)
         count = len(arrays["logs"])
-        streams = [SharedStream.from_bytes(arrays[f"stream{k}"].tobytes()) for k in range(count)]
+        streams = [SharedStream.from_bytes(arrays[f"stream{k}"].tobytes(), classes) for k in range(count)]
         found._follow(streams, header["forgetting"])
         found._logs, found._residuals = np.array(arrays["logs"]), np.array(arrays["residuals"])
         return found

@@ -41,6 +41,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.data.arguments import check_roles
+from driftfit.data.outputs import columns_as_outputs
 from driftfit.data.record import Reading
 from driftfit.data.signals import check_ready
 from driftfit.engine.kernel import Array
@@ -237,6 +238,7 @@ def select(
     drift: Any = 1.0,
     limits: Any = None,
     exclude: Any = None,
+    missing: Any = (),
 ) -> Selection | ByOutput[Selection]:
     """Compare structures by predictive likelihood.
 
@@ -244,7 +246,7 @@ def select(
     ----------
     models : sequence of models, or one model
         Candidates; or one model whose regressors are to be selected, at most 30.
-    y, u, data, time, dt, weights, drift, limits, exclude
+    y, u, data, time, dt, weights, drift, limits, exclude, missing
         As for `track`: with ``data`` the others name its columns. One number or (T,) for drift.
     by : names of columns, "row" or None
         As for `track`: several records, for which one structure is sought. Parameters are estimated for each of them
@@ -278,8 +280,10 @@ def select(
         raise ValueError(f"select: {type(tracker).__name__} has no variance, so there is no likelihood to compare.")
     if not candidates:
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
-    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
+    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing)
     search = (keep, most) if isinstance(models, Model) else None
+    columns = [columns_as_outputs(model, y, data) for model in candidates]
+    candidates, y = [model for model, _ in columns], columns[0][1]
     if any(len(model.outputs) > 1 for model in candidates):
         pools = pools_of(candidates, y, u, reading, data, by)
         found = {name: _selected(*pool, tracker, search, beside) for name, pool in pools.items()}

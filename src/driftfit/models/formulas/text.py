@@ -17,11 +17,14 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, exp, kernel, log
 from driftfit.engine.settings import numbers
 
 LONGEST = 20000
 """Characters of a formula."""
+LONGEST_LAG = 10_000
+"""Samples: so many of each signal are a part of the state."""
 FUNCTIONS = {
     "abs": 1, "cos": 1, "exp": 1, "log": 1, "max": 2, "min": 2, "sin": 1, "sqrt": 1, "tanh": 1,
 }  # fmt: skip
@@ -138,7 +141,7 @@ def parse(text: str, known: bool = False) -> Formula:
 def _check(node: ast.expr, parameters: dict[str, None], lags: dict[tuple[str, int], None]) -> None:
     """Collect parameters and lags; ValueError for anything that is not allowed."""
     match node:
-        case ast.Constant(value=int() | float()) if not isinstance(node.value, bool):
+        case ast.Constant(value=int() | float() as size) if type(size) is not bool and size < LARGEST:
             return
         case ast.Attribute(value=ast.Name(id="theta")):
             parameters[node.attr] = None
@@ -149,7 +152,7 @@ def _check(node: ast.expr, parameters: dict[str, None], lags: dict[tuple[str, in
             return
         case ast.Subscript(
             value=ast.Name(id=name), slice=ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int(lag)))
-        ):
+        ) if type(lag) is not bool and lag <= LONGEST_LAG:
             lags[name, lag] = None
             return
         case ast.UnaryOp(op=ast.USub() | ast.UAdd()):
@@ -165,7 +168,8 @@ def _check(node: ast.expr, parameters: dict[str, None], lags: dict[tuple[str, in
         case _:
             raise ValueError(
                 f"Equation: {ast.unparse(node)!r} is not understood. Use theta.NAME for parameters, NAME and NAME[-1] "
-                f"for signals, + - * / **, comparisons, 'A if B else C', pi and {', '.join(FUNCTIONS)}."
+                f"for signals, back to [-{LONGEST_LAG}], numbers below {LARGEST:g}, + - * / **, comparisons, "
+                f"'A if B else C', pi and {', '.join(FUNCTIONS)}."
             )
     for one in within:
         _check(one, parameters, lags)

@@ -18,8 +18,9 @@ class Change(NamedTuple):
     """A change in the window with the largest likelihood ratio, with a band of 95 %.
 
     Of a parameter, ``size`` is the difference from its value in the reference; of the noise, the factor of its standard
-    deviation. ``since`` is the first of the used samples in that window. At the onset of an alarm the size is somewhat
-    too large, because the noise of a window that is beyond its limit tends to be on its side.
+    deviation; it is NaN where the window with the largest likelihood ratio names another cause. ``since`` is the first
+    of the used samples in that window. At the onset of an alarm the size is somewhat too large, because the noise of a
+    window that is beyond its limit tends to be on its side.
     """
 
     name: str

@@ -452,7 +452,7 @@ class Live(Operated, Stream):
         """u as floats (m,), or (ny, m) where outputs share one theta."""
         if u is None or u is LATER:
             return self._unknown
-        given: Array = np.asarray(u if self.model.shared else by_name(self.model, u), dtype=np.float64)
+        given = as_numbers("u", u if self.model.shared else by_name(self.model, u))
         if given.shape != self._shape:
             if given.size != self._unknown.size:
                 wanted = f"shape {self._shape}" if self.model.shared else f"{self._m} inputs"

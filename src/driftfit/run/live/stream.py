@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Self
 
 import numpy as np
@@ -64,7 +64,7 @@ class Stream(Batched, Plain, storage.Kept):
         self.lag = whole("Live", "lag", lag, 0)
         if lag and warm_start is not None:
             raise ValueError("Live: lag= and warm_start= cannot be combined; give one of them.")
-        before = None if warm_start is None else ended(warm_start)
+        before = None if warm_start is None else ended(warm_start, self.programs)
         self._last: Any = None if before is None else before.last
         self._awaits = NOTHING if before is None else before.awaits
         self._cold = before is None
@@ -72,7 +72,7 @@ class Stream(Batched, Plain, storage.Kept):
         self._place: Any = None
         self._windows: list[Window] = []
         self._watching: list[tuple[int, LiveAlarm]] = []
-        self._tile = tile_of(self.programs, carried(warm_start, self.programs))
+        self._tile = tile_of(self.programs, carried(before, self.programs))
 
     def __repr__(self) -> str:
         settings = ", ".join(dict.fromkeys(map(repr, self.trackers)))
@@ -225,8 +225,8 @@ class Stream(Batched, Plain, storage.Kept):
         return written(self.programs, [one.pack(tile, lane) for lane, one in enumerate(self.programs)], extra)
 
     @classmethod
-    def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
-        model, trackers, extra = read(header)
+    def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array], classes: Iterable[Any]) -> Self:
+        model, trackers, extra = read(source, header, arrays, classes)
         return cls._again(source, (model, trackers), {**header, "extra": extra}, arrays)
 
     def __reduce__(self) -> Any:

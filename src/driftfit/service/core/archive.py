@@ -24,6 +24,8 @@ EVERY = 60.0
 PIECE = 2_000
 """Groups of one piece."""
 DAY = 86_400.0
+OLD = "stop < ? and stop > 1e8"
+"""Which blocks of the history are older than a time; those of units without times are kept."""
 
 
 class Archive:
@@ -43,6 +45,7 @@ class Archive:
                 log.error("archive", extra={"detail": str(self._writing.exception())})
             elif upto := self._writing.result():
                 pending.forget.append(("delete from log where first < ?", (upto,)))
+                pending.forget.append(("delete from chain where number < ?", (upto,)))
             self._writing = None
         if time.monotonic() - self._looked < EVERY or self._writing is not None:
             return
@@ -52,10 +55,12 @@ class Archive:
     def begin(self, pending: Pending, needed: int, sinks_at: int) -> None:
         """Look for old rows."""
         now = time.time()
+        old = now - DAY * self.options.history
         pending.forget += [
             ("delete from result where at < ? and first < ?", (now - 60.0, min(needed, sinks_at))),
             ("delete from result where at < ?", (now - DAY * self.options.results,)),
-            ("delete from block where stop < ? and stop > 1e8", (now - DAY * self.options.history,)),
+            (f"delete from history where (unit, first) in (select unit, first from block where {OLD})", (old,)),
+            (f"delete from block where {OLD}", (old,)),
         ]
         self._writing = self._pool.submit(export, self.folder, needed, now - DAY * self.options.keep)
 

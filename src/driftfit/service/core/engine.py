@@ -23,7 +23,7 @@ import numpy as np
 from driftfit.service.core.archive import Archive
 from driftfit.service.core.calibration import rules_of
 from driftfit.service.core.intake import Action, Arrived, Intake
-from driftfit.service.core.journal import NEEDED_FROM, Act, Group, Item, Journal, Pending
+from driftfit.service.core.journal import DAMAGED, NEEDED_FROM, Act, Group, Item, Journal, Pending
 from driftfit.service.core.unit import Out, Unit
 from driftfit.service.core.units import Units
 from driftfit.service.settings.config import Config
@@ -65,7 +65,7 @@ class Engine:
         self.samples = 0
         self.last_stored = 0
         """The last group whose results were stored by this process."""
-        self.next = self.journal.next_number()
+        self.next, self._head = self.journal.next_number(), self.journal.head()
         self._fresh: deque[Group] = deque()
         """The newest results, so that sinks need not wait until these are stored."""
         self._elsewhere = self.next - 1
@@ -160,6 +160,8 @@ class Engine:
         now = time.time() - (time.monotonic() - oldest)
         if items:
             self._pending.add_group(first, items, now)
+            if self.config.service.audit:
+                self._head = self._pending.add_link(self._head)
             self.next += sum(item.length for item in items)
         self._store_states()
         self._archive.forget(self._pending, self.journal, self._sinks_at())
@@ -197,6 +199,9 @@ class Engine:
         Returns by number why actions were refused.
         """
         out, number = Out(), first
+        while DAMAGED:
+            table, row = DAMAGED.popleft()
+            out.event(first, 0, "damaged", {"table": table, "row": row})
         for item in items:
             self._apply(number, item, out)
             number += item.length
@@ -208,7 +213,7 @@ class Engine:
             self._ask_for_limits(self.units.get(unit))
         self.samples += sum(len(one.number) for one in out.results)
         for _, unit, _, kind, detail in out.events:
-            log.info(kind, extra={"unit": self.units.get(unit).name, "detail": detail})
+            log.info(kind, extra={"unit": self.units.get(unit).name if unit else "", "detail": detail})
         return {number: detail["refused"] for number, *_, detail in out.events if "refused" in detail}
 
     def _publish(self, group: Group) -> None:

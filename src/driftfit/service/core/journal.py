@@ -5,19 +5,28 @@
     program    models and trackers that states were made with, by the fingerprint of the states
     snapshot   the last stored state of a unit, and the number up to which it knows the samples
     result     the results of the trackers, in the order in which they arose; sinks and the page read from here
-    block      the results of one unit in pieces, with least, largest and mean of every column, for the page
+    block      pieces of the results of one unit: least, largest and mean of every column, for the page
+    history    the results in a block
     event      alarms, failures, operator's actions
     position   where sources continue, and how far sinks have come
+    chain      with ``audit``: for each group of the log a digest of the group and of the digest before it
 
 Journal before update: a group is committed (WAL, ``synchronous=FULL``) before any tracker processes it, and
 acknowledged after that. The next transaction contains the results of the group. After a crash the results that are
 missing are computed again from snapshots and log, bit for bit.
+
+Every row ends with a check sum of the others (`sum_of`), which is compared when the row is read. A damaged group, state
+or block is left out and reported (`DAMAGED`); of the other tables, on which all depends, a damaged row is an error.
 """
 
 from __future__ import annotations
 
+import hashlib
+import logging
 import sqlite3
-from collections.abc import Iterable, Iterator
+import zlib
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,24 +38,27 @@ from driftfit.service.core.results import Results
 from driftfit.service.sinks.contract import Event, Outcome
 
 SCHEMA = """
-create table if not exists meta (key text primary key, value text);
+create table if not exists meta (key text primary key, value text, sum integer);
 create table if not exists unit (id integer primary key, name text unique, section integer, topic text, born integer,
-    about text);
-create table if not exists log (first integer primary key, count integer, at real, items blob);
-create table if not exists result (first integer primary key, count integer, at real, rows blob);
-create table if not exists program (tag blob primary key, about text);
-create table if not exists snapshot (unit integer primary key, number integer, state blob);
+    about text, sum integer);
+create table if not exists log (first integer primary key, count integer, at real, items blob, sum integer);
+create table if not exists result (first integer primary key, count integer, at real, rows blob, sum integer);
+create table if not exists program (tag blob primary key, about text, sum integer);
+create table if not exists snapshot (unit integer primary key, number integer, state blob, sum integer);
 create table if not exists block (unit integer, first integer, last integer, start real, stop real, count integer,
-    rows blob, extremes blob, primary key (unit, first));
-create table if not exists event (id integer primary key, number integer, unit integer, at real, kind text,
-    detail text);
-create index if not exists event_of_unit on event (unit, id);
-create table if not exists position (name text primary key, value text);
+    extremes blob, sum integer, primary key (unit, first));
+create table if not exists history (unit integer, first integer, last integer, count integer, rows blob, sum integer,
+    primary key (unit, first));
+create table if not exists event (number integer, unit integer, at real, kind text, detail text, sum integer);
+create index if not exists event_of_unit on event (unit);
+create table if not exists position (name text primary key, value text, sum integer);
+create table if not exists chain (number integer primary key, before blob, digest blob, sum integer);
 """
+log = logging.getLogger("driftfit.service")
 PRAGMAS = ("page_size=8192", "journal_mode=wal", "synchronous=full", "wal_autocheckpoint=2000", "temp_store=memory")
-FORMAT = "2"
-RESULTS_FROM, NEEDED_FROM = "results from", "needed from"
-"""Keys of ``meta``: of `Journal.first_without_results` and `Journal.first_needed`."""
+FORMAT = "3"
+RESULTS_FROM, NEEDED_FROM, HEAD = "results from", "needed from", "head"
+"""Keys of ``meta``: of `Journal.first_without_results`, `Journal.first_needed` and `Journal.head`."""
 NAME = "driftfit.db"
 
 
@@ -111,7 +123,28 @@ class Group(NamedTuple):
 Item = Rows | Act
 _decode = msgspec.msgpack.Decoder(list[list[Any]]).decode
 _encode = msgspec.msgpack.Encoder().encode
+DAMAGED: deque[tuple[str, Sequence[Any]]] = deque(maxlen=1000)
+"""(table, first columns) of the damaged rows that this process has read and not yet reported as events."""
 _RESULTS = msgspec.msgpack.Decoder(tuple[list[tuple[bytes, bytes, bytes, bytes]], list[list[Any]]])
+
+
+def sum_of(*values: Any) -> int:
+    """CRC-32 of the values of a row."""
+    return zlib.crc32(_encode(values))
+
+
+def sound(table: str, row: Sequence[Any]) -> bool:
+    """Whether the sum at the end of a row is that of the others; if not, this is reported."""
+    fits = sum_of(*row[:-1]) == int(row[-1])
+    if not fits:
+        log.error("damaged", extra={"detail": {"table": table, "row": row[:2]}})
+        DAMAGED.append((table, row[:2]))
+    return fits
+
+
+def linked(before: bytes, group: Sequence[Any]) -> bytes:
+    """The digest of a group of the log (first, count, at, items) in the chain."""
+    return hashlib.sha256(before + _encode(group)).digest()
 
 
 class Journal:
@@ -129,22 +162,40 @@ class Journal:
         for line in PRAGMAS:
             self.db.execute(f"pragma {line}")
         self.db.executescript(SCHEMA)
-        self.db.execute("insert or ignore into meta values ('format', ?)", (FORMAT,))
-        found = self.meta("format")
-        if found != FORMAT:
-            raise ValueError(f"{self.path} has the format {found}; this version reads {FORMAT}. Use another folder.")
+        row = self.db.execute("select value from meta where key = 'format'").fetchone()
+        if row is None:
+            self.db.execute("insert into meta values (?, ?, ?)", ("format", FORMAT, sum_of("format", FORMAT)))
+        elif row[0] != FORMAT:
+            raise ValueError(f"{self.path} has the format {row[0]}; this version reads {FORMAT}. Use another folder.")
 
     def close(self) -> None:
         self.db.close()
 
+    def rows(self, table: str, where: str = "", *values: Any) -> Iterator[tuple[Any, ...]]:
+        """Rows of a table; those that are damaged are left out and reported."""
+        return (row for row in self.db.execute(f"select * from {table} {where}", values) if sound(table, row))
+
+    def certain(self, table: str, where: str = "", *values: Any) -> list[Any]:
+        """Rows of a table on which all depends, without their sums; ValueError if one is damaged."""
+        found = self.db.execute(f"select * from {table} {where}", values).fetchall()
+        if not all([sound(table, row) for row in found]):
+            raise ValueError(
+                f"{self.path}: the table {table} is damaged; `driftfit journal verify` names its rows. Put a copy of "
+                "the folder in its place, or use another folder."
+            )
+        return [row[:-1] for row in found]
+
     def meta(self, key: str) -> str | None:
-        row = self.db.execute("select value from meta where key = ?", (key,)).fetchone()
-        return None if row is None else str(row[0])
+        rows = self.certain("meta", "where key = ?", key)
+        return str(rows[0][1]) if rows else None
 
     def next_number(self) -> int:
         """The number of the next sample."""
-        row = self.db.execute("select first + count from log order by first desc limit 1").fetchone()
-        return max(int(row[0]) if row else 1, int(self.meta("next") or 1))
+        return int(self.meta("next") or 1)
+
+    def head(self) -> bytes:
+        """The last digest of the chain; empty without one."""
+        return bytes.fromhex(self.meta(HEAD) or "")
 
     def first_without_results(self) -> int:
         """The first group whose results are not yet stored."""
@@ -156,32 +207,30 @@ class Journal:
 
     def positions(self) -> dict[str, Any]:
         """The positions of sources and sinks."""
-        return {name: msgspec.json.decode(value) for name, value in self.db.execute("select * from position")}
+        return {name: msgspec.json.decode(value) for name, value in self.certain("position")}
 
     def groups(self, first: int) -> Iterator[tuple[int, list[Item]]]:
-        """(number of the first sample, entries) of the groups from a number on, a few at a time."""
+        """(number of the first sample, entries) of the groups from a number on, one at a time."""
         first = self.db.execute("select coalesce(max(first), 0) from log where first <= ?", (first,)).fetchone()[0]
-        while rows := self.db.execute(
-            "select first, items from log where first >= ? order by first limit 64", (first,)
-        ).fetchall():
-            for start, items in rows:
-                yield start, [Rows.of(*one) if len(one) == 4 else Act(*one) for one in _decode(items)]
-            first = rows[-1][0] + 1
+        for row in self.rows("log", "where first >= ? order by first", first):
+            yield row[0], [Rows.of(*one) if len(one) == 4 else Act(*one) for one in _decode(row[3])]
 
     def outcomes(self, after: int, most: int = 64) -> list[Group]:
         """The stored results of groups after one."""
-        query = "select first, at, rows from result where first > ? order by first limit ?"
-        found = [(*one, *_RESULTS.decode(rows)) for *one, rows in self.db.execute(query, (after, most)).fetchall()]
-        return [Group(first, [Results.of(*one) for one in parts], events, at) for first, at, parts, events in found]
+        found, query = [], "select * from result where first > ? order by first limit ?"
+        for row in self.db.execute(query, (after, most)):
+            parts, events = _RESULTS.decode(row[3]) if sound("result", row) else ([], [])
+            found.append(Group(row[0], [Results.of(*one) for one in parts], events, row[2]))
+        return found
 
     def units(self, after: int = 0) -> list[tuple[int, str, int, str, int, str]]:
         """(number, name, section, topic, born, about) of the units with larger numbers."""
-        return self.db.execute("select * from unit where id > ? order by id", (after,)).fetchall()
+        return self.certain("unit", "where id > ? order by id", after)
 
     def state(self, unit: int) -> tuple[int, bytes] | None:
         """(number up to which samples are in it, the stored state)."""
-        row = self.db.execute("select number, state from snapshot where unit = ?", (unit,)).fetchone()
-        return None if row is None else (int(row[0]), bytes(row[1]))
+        row = self.db.execute("select * from snapshot where unit = ?", (unit,)).fetchone()
+        return None if row is None else (int(row[1]), bytes(row[2]) if sound("snapshot", row) else b"")
 
     def rows_of(self, unit: int) -> tuple[list[float], list[list[float]]]:
         """All samples of a unit that the log has, in the order of their arrival."""
@@ -197,7 +246,7 @@ class Journal:
 
     def programs(self) -> dict[bytes, str]:
         """Models and trackers that states were made with, by the fingerprint of the states."""
-        return dict(self.db.execute("select tag, about from program").fetchall())
+        return dict(self.certain("program"))
 
 
 class Pending:
@@ -213,6 +262,7 @@ class Pending:
         self.snapshots: list[tuple[int, int, bytes]] = []
         self.positions: dict[str, Any] = {}
         self.meta: dict[str, str] = {}
+        self.chain: list[tuple[int, bytes, bytes]] = []
         self.forget: list[tuple[str, tuple[Any, ...]]] = []
 
     def __bool__(self) -> bool:
@@ -223,6 +273,14 @@ class Pending:
         count = sum(item.length for item in items)
         self.log = (first, count, at, _encode([item.plain() for item in items]))
         self.meta["next"] = str(first + count)
+
+    def add_link(self, before: bytes) -> bytes:
+        """Add the group to the chain, whose last digest is given; the digest of the group."""
+        assert self.log is not None
+        digest = linked(before, self.log)
+        self.chain.append((self.log[0], before, digest))
+        self.meta[HEAD] = digest.hex()
+        return digest
 
     def add_results(self, group: Group) -> None:
         """The results of a group."""
@@ -235,19 +293,20 @@ class Pending:
 
     def commit(self, db: sqlite3.Connection) -> None:
         """Write everything in one transaction; on an error nothing is written, and it can be tried again."""
+        tables: dict[str, Sequence[tuple[Any, ...]]] = {
+            "or ignore into program": self.programs, "into unit": self.units,
+            "into log": [self.log] if self.log else [], "into chain": self.chain,
+            "or ignore into result": self.results, "into event": self.events,
+            "or ignore into block": [(*one[:6], one[7]) for one in self.blocks],
+            "or ignore into history": [(*one[:3], *one[5:7]) for one in self.blocks],
+            "or replace into snapshot": self.snapshots, "or replace into meta": list(self.meta.items()),
+            "or replace into position": [(name, _json(value)) for name, value in self.positions.items()],
+        }  # fmt: skip
         db.execute("begin immediate")
         try:
-            put = db.executemany
-            put("insert or ignore into program values (?, ?)", self.programs)
-            put("insert into unit values (?, ?, ?, ?, ?, ?)", self.units)
-            if self.log is not None:
-                db.execute("insert into log values (?, ?, ?, ?)", self.log)
-            put("insert or ignore into result values (?, ?, ?, ?)", self.results)
-            put("insert into event (number, unit, at, kind, detail) values (?, ?, ?, ?, ?)", self.events)
-            put("insert or ignore into block values (?, ?, ?, ?, ?, ?, ?, ?)", self.blocks)
-            put("insert or replace into snapshot values (?, ?, ?)", self.snapshots)
-            put("insert or replace into position values (?, ?)", [(k, _json(v)) for k, v in self.positions.items()])
-            put("insert or replace into meta values (?, ?)", self.meta.items())
+            for into, rows in tables.items():
+                for row in rows:
+                    db.execute(f"insert {into} values ({'?, ' * len(row)}?)", (*row, sum_of(*row)))
             for statement, values in self.forget:
                 db.execute(statement, values)
             db.execute("commit")
@@ -279,8 +338,8 @@ class Names:
     def outcome(self, group: int, parts: list[Results], events: Iterable[list[Any]]) -> Outcome:
         """Stored results as a batch for a sink."""
         events = list(events)
-        units = {unit for one in parts for unit in np.unique(one.unit).tolist()} | {row[1] for row in events}
+        units = {unit for one in parts for unit in np.unique(one.unit).tolist()} | {row[1] for row in events if row[1]}
         if not units <= self.names.keys():
             self.read()
-        named = [Event(row[0], self.names[row[1]], *row[2:]) for row in events]
+        named = [Event(row[0], self.names.get(row[1], ""), *row[2:]) for row in events]
         return Outcome(group, parts, named, self.names, self.about)

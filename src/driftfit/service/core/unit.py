@@ -21,7 +21,7 @@ from driftfit.engine.kernel import Array
 from driftfit.run.live.alarm import LiveAlarm
 from driftfit.run.live.rule import AlarmRule
 from driftfit.service.core.streams import Streams
-from driftfit.service.settings.config import UnitSettings, valid_range
+from driftfit.service.settings.config import UnitSettings, valid_ranges
 from driftfit.streams import Live
 
 
@@ -124,12 +124,14 @@ class Unit:
             self.acknowledged = True
         elif what == "limits":
             names = self.settings.columns
-            for name, bounds in action["limits"].items():
-                streams.limits[place, names.index(name)] = valid_range(name, bounds, names)
+            for name, bounds in valid_ranges(action["limits"], names).items():
+                streams.limits[place, names.index(name)] = bounds
         elif self.failure:
             raise ValueError("the unit has failed; restart it.")
         elif what == "hold":
-            streams.held[place] = bool(action["on"])
+            if not isinstance(on := action.get("on"), bool):
+                raise ValueError(f"hold: on must be true or false; got {on!r}.")
+            streams.held[place] = on
         elif what == "reset":
             live = self.live
             live.reset(action.get("which"), p=action.get("p"), theta=action.get("theta"))

@@ -139,16 +139,19 @@ class Units:
                 self._routes.popitem(last=False)
         return route
 
-    def _route(self, topic: str, pending: Pending, born: int) -> tuple[Unit, ...]:
-        if not valid_name(topic):
-            return ()
+    def named(self, topic: str) -> list[tuple[int, str]]:
+        """(section, name) of the units to which a topic belongs."""
         found = []
-        for section, settings in enumerate(self.settings):
+        for section, settings in enumerate(self.settings if valid_name(topic) else ()):
             name = settings.match.unit(topic)
-            if name is None:
-                continue
-            if not settings.match.name and len(self.settings) > 1:
-                name = f"{name}:{settings.y}"
+            if name is not None:
+                alone = settings.match.name or len(self.settings) == 1
+                found.append((section, name if alone else f"{name}:{settings.y}"))
+        return found
+
+    def _route(self, topic: str, pending: Pending, born: int) -> tuple[Unit, ...]:
+        found = []
+        for section, name in self.named(topic):
             unit = self.names.get(name)
             if unit is None:
                 if len(self._known) >= self.most or len(name) > 500:

@@ -3,14 +3,15 @@
 1. the host must be one under which the page is known (a name that someone points at 127.0.0.1 is not);
 2. a request that changes something, and a WebSocket, must come from the page itself (Origin) or from a program;
 3. each client has a rate; a body has a largest size;
-4. where users are configured: a session cookie (SameSite=Strict), or a token in ``Authorization: Bearer``.
+4. where users are configured: a session cookie (SameSite=Strict), or a token in ``Authorization: Bearer``;
+5. a sender may only post samples.
 """
 
 from __future__ import annotations
 
 import time
 from collections import OrderedDict
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -19,11 +20,14 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from driftfit.service.page.passwords import Sessions, token_fits
-from driftfit.service.settings.options import PageOptions
+from driftfit.service.settings.options import PageOptions, UserOptions
 
 COOKIE = "driftfit"
+LOCAL = UserOptions("local", "operator", token="sha256$")
+"""The user where none are configured."""
 OPEN = ("/healthz", "/api/login", "/login", "/static/", "/favicon.ico")
 """Paths that need no user."""
+SAMPLES = "/api/samples"
 BURST = 4.0
 """Seconds of a client's rate that it may use at once."""
 CLIENTS = 10_000
@@ -34,14 +38,6 @@ HEADERS = [
     (b"referrer-policy", b"no-referrer"),
     (b"cache-control", b"no-store"),
 ]  # fmt: skip
-
-
-@dataclass(frozen=True)
-class User:
-    """The user of a request."""
-
-    name: str
-    role: str
 
 
 class Rates:
@@ -120,27 +116,29 @@ class Access:
         length = headers.get("content-length", "0")
         if not length.isdigit() or int(length) > self.page.body:
             return 413, f"at most {self.page.body} bytes"
-        user = self.user(connection)
-        scope["user"] = user
-        by_cookie = bool(self.page.user) and "authorization" not in headers
-        if user is not None and by_cookie and changes and origin is None:
+        user, path = self.user(connection), connection.url.path
+        scope["user"], scope["still"] = user, partial(self.user, connection)
+        if user is not None and COOKIE in connection.cookies and changes and origin is None:
             return 403, "a request with a cookie needs an Origin"
-        if user is None and not connection.url.path.startswith(OPEN):
+        if path.startswith(OPEN):
+            return None
+        if user is None:
             return 401, "log in, or send a token"
+        if user.role == "sender" and path != SAMPLES and not path.startswith(f"{SAMPLES}/"):
+            return 403, f"{user.name} is a sender, which may only post samples"
         return None
 
-    def user(self, connection: HTTPConnection) -> User | None:
+    def user(self, connection: HTTPConnection) -> UserOptions | None:
         """The user, by token or session."""
         if not self.page.user:
-            return User("local", "operator")
+            return LOCAL
         scheme, _, token = connection.headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer" and token:
             for one in self.page.user:
                 if one.token and token_fits(token, one.token):
-                    return User(one.name, one.role)
+                    return one
             return None
-        name = self.sessions.user(connection.cookies.get(COOKIE, ""))
-        return next((User(one.name, one.role) for one in self.page.user if one.name == name), None)
+        return self.sessions.user(connection.cookies.get(COOKIE, ""), self.page.user)
 
     def _bounded(self, receive: Receive) -> Receive:
         total = 0

@@ -22,6 +22,7 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 
+from driftfit.data.formats.csv_files import without_formulas
 from driftfit.service.page import history, metrics, openapi
 from driftfit.service.page.access import COOKIE, Access, Rates
 from driftfit.service.page.feed import Feed, finite, unheard
@@ -163,7 +164,7 @@ class Page:
             values = history.samples(self.feed.journal, number, recent, start, stop)
             table = pl.DataFrame(values, schema=dict.fromkeys(names[: values.shape[1]], pl.Float64))
             if kind == "csv":
-                return table.write_csv().encode()
+                return without_formulas(table).write_csv().encode()
             file = io.BytesIO()
             table.write_ipc(file)
             return file.getvalue()
@@ -178,12 +179,12 @@ class Page:
         limit = min(max(int(_number(request, "limit", 100.0)), 1), 1000)
         name = request.query_params.get("unit")
         where, values = ("where unit = ?", [self.number(name)]) if name else ("", [])
-        query = f"select number, unit, at, kind, detail from event {where} order by id desc limit ?"
-        rows = await run_in_threadpool(lambda: self.feed.journal.db.execute(query, (*values, limit)).fetchall())
+        where += " order by rowid desc limit ?"
+        rows = await run_in_threadpool(lambda: [*self.feed.journal.rows("event", where, *values, limit)])
         self.feed.names.read()
         names = self.feed.names.names
-        found = [{"number": n, "unit": names[u], "at": at, "kind": kind, "detail": json.loads(detail)}
-                 for n, u, at, kind, detail in rows]  # fmt: skip
+        found = [{"number": n, "unit": names.get(u, ""), "at": at, "kind": kind, "detail": json.loads(detail)}
+                 for n, u, at, kind, detail, _ in rows]  # fmt: skip
         return Answer({"events": found})
 
     async def status(self, request: Request) -> Response:
@@ -197,8 +198,10 @@ class Page:
 
     async def samples(self, request: Request) -> Response:
         """Take samples; the answer comes when they are in the journal."""
-        self.operator(request)
-        header = {"do": "samples", "topic": request.path_params.get("topic", "")}
+        user = request.scope["user"]
+        if user.role == "viewer":
+            raise HTTPException(403, f"{user.name} is a viewer; this needs a sender or an operator")
+        header = {"do": "samples", "topic": request.path_params.get("topic", ""), "units": user.units}
         return await self.asked(header, await request.body())
 
     async def actions(self, request: Request) -> Response:
@@ -251,12 +254,13 @@ class Page:
         response = Answer({"name": name, "role": found.role})
         secure = bool(self.options.certificate) or self.options.behind_proxy
         response.set_cookie(
-            COOKIE, self.sessions.new(name), max_age=int(SESSION), httponly=True, samesite="strict", secure=secure
+            COOKIE, self.sessions.new(found), max_age=int(SESSION), httponly=True, samesite="strict", secure=secure
         )
         return response
 
     async def logout(self, request: Request) -> Response:
-        """End the session in this browser."""
+        """End the session."""
+        self.sessions.end(request.cookies.get(COOKIE, ""))
         response = Answer({})
         response.delete_cookie(COOKIE)
         return response

@@ -33,8 +33,8 @@ def reduced(
         parts = _parts(values, points)
         return _as_lists([extremes_of(part) for part in parts], [len(part) for part in parts])
     low_high_mean, counts, end = [], [], -1
-    query = "select last, count, extremes from block where unit = ? and stop >= ? and start <= ? order by first"
-    for last, count, extremes in journal.db.execute(query, (unit, start, stop)):
+    where = "where unit = ? and stop >= ? and start <= ? order by first"
+    for _, _, last, _, _, count, extremes, _ in journal.rows("block", where, unit, start, stop):
         low_high_mean.append(np.frombuffer(extremes).reshape(3, -1))
         counts.append(count)
         end = max(end, last)
@@ -48,8 +48,8 @@ def reduced(
 def samples(journal: Journal, unit: int, recent: list[list[Any]], start: float, stop: float) -> Array:
     """All columns (T, c) between two times."""
     parts, end = [], -1
-    query = "select last, count, rows from block where unit = ? and stop >= ? and start <= ? order by first"
-    for last, count, rows in journal.db.execute(query, (unit, start, stop)):
+    where = "where unit = ? and first in (select first from block where unit = ? and stop >= ? and start <= ?)"
+    for _, _, last, count, rows, _ in journal.rows("history", f"{where} order by first", unit, unit, start, stop):
         parts.append(np.frombuffer(rows).reshape(count, -1))
         end = max(end, last)
         if sum(map(len, parts)) > MOST_ROWS:
@@ -65,10 +65,9 @@ def samples(journal: Journal, unit: int, recent: list[list[Any]], start: float, 
 
 def latest(journal: Journal, unit: int, recent: list[list[Any]], blocks: int = 10) -> Array:
     """All columns (T, c) of the last blocks, and of the samples after them."""
-    query = "select last, count, rows from block where unit = ? order by first desc limit ?"
-    found = journal.db.execute(query, (unit, blocks)).fetchall()[::-1]
-    end = max((last for last, _, _ in found), default=-1)
-    parts = [np.frombuffer(rows).reshape(count, -1) for _, count, rows in found]
+    found = [*journal.rows("history", "where unit = ? order by first desc limit ?", unit, blocks)][::-1]
+    end = max((row[2] for row in found), default=-1)
+    parts = [np.frombuffer(row[4]).reshape(row[3], -1) for row in found]
     tail = [row for row in recent if row[0] > end]
     parts += [columns_of(tail)] if tail else []
     return np.vstack(parts) if parts else np.zeros((0, 0))

@@ -1,14 +1,20 @@
-"""Passwords and tokens: stored only as hashes, compared in constant time; sessions are signed and expire."""
+"""Passwords, tokens and sessions: stored only as hashes, and compared in constant time."""
 
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import hmac
-import os
 import secrets
 import time
+from collections.abc import Iterable
 from pathlib import Path
+
+import msgspec
+
+from driftfit.data.storage import replace_file
+from driftfit.service.settings.options import UserOptions
 
 N, R, P = 1 << 14, 8, 1
 """Cost of scrypt: 16 MB and some fifty milliseconds."""
@@ -54,31 +60,41 @@ def token_fits(token: str, stored: str) -> bool:
 
 
 class Sessions:
-    """Signed sessions; the key is in the service's folder, so they outlive a restart of the page."""
+    """Open sessions: random tokens, of which only hashes are stored.
+
+    They are in the service's folder, so they outlive a restart of the page. An absent, empty or damaged file holds no
+    session: everybody logs in again. A session ends at its logout, after `SESSION` seconds, and when the password of
+    its user is another one.
+    """
 
     def __init__(self, folder: Path) -> None:
-        path = folder / "session.key"
-        if not path.exists():
-            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(secrets.token_bytes(32))
-        self._key = path.read_bytes()
+        self._path = folder / "sessions.json"
+        self._open: dict[str, tuple[str, float]] = {}
+        """By hash of the token: the hash of the user's name and password, and the end in seconds since 1970."""
+        with contextlib.suppress(OSError, msgspec.DecodeError):
+            self._open = msgspec.json.decode(self._path.read_bytes(), type=dict[str, tuple[str, float]])
 
-    def new(self, user: str) -> str:
-        """A session of a user."""
-        text = base64.urlsafe_b64encode(f"{user}\n{time.time() + SESSION:.0f}".encode()).decode()
-        return f"{text}.{self._sign(text)}"
+    def new(self, user: UserOptions) -> str:
+        """The token of a new session."""
+        token, now = secrets.token_urlsafe(32), time.time()
+        self._open = {one: about for one, about in self._open.items() if about[1] > now}
+        self._open[token_hash(token)] = (_login_of(user), now + SESSION)
+        self._store()
+        return token
 
-    def user(self, session: str) -> str | None:
-        """The user of a valid session."""
-        text, _, signature = session.rpartition(".")
-        if not hmac.compare_digest(self._sign(text).encode(), signature.encode()):
-            return None
-        try:
-            user, _, until = base64.urlsafe_b64decode(text).decode().partition("\n")
-            return user if float(until) > time.time() else None
-        except ValueError:
-            return None
+    def user(self, token: str, users: Iterable[UserOptions]) -> UserOptions | None:
+        """The one of the users whose session this is."""
+        login, until = self._open.get(token_hash(token), ("", 0.0))
+        return next((one for one in users if _login_of(one) == login and until > time.time()), None)
 
-    def _sign(self, text: str) -> str:
-        return hmac.new(self._key, text.encode(), hashlib.sha256).hexdigest()
+    def end(self, token: str) -> None:
+        """Log out."""
+        if self._open.pop(token_hash(token), None) is not None:
+            self._store()
+
+    def _store(self) -> None:
+        replace_file(self._path, lambda file: file.write(msgspec.json.encode(self._open)))
+
+
+def _login_of(user: UserOptions) -> str:
+    return token_hash(f"{user.name}\n{user.password}")

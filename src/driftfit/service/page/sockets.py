@@ -56,10 +56,11 @@ class Sockets:
     async def _send(self, socket: WebSocket, view: dict[str, Any]) -> None:
         """Messages until the page is gone."""
         try:
-            while True:
+            while socket.scope["still"]() is not None:
                 message = await self._message(view)
                 await socket.send_text(msgspec.json.encode(message).decode())
                 await asyncio.sleep(EVERY)
+            await socket.close(4401, "the session has ended")
         except (WebSocketDisconnect, RuntimeError):
             pass
 

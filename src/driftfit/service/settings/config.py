@@ -211,7 +211,7 @@ class _Reader:
             at("match", lambda: Pattern(given["match"], given.get("name", ""))), given["y"], u, model, tracker,
             given.get("time"), at("time_unit", lambda: _time_unit(given.get("time_unit", "s"))), dt,
             at("hold_back", lambda: _seconds("hold_back", given.get("hold_back", 0.0))),
-            at("limits", lambda: _limits(given.get("limits", {}), (given["y"], *u))),
+            at("limits", lambda: valid_ranges(given.get("limits", {}), (given["y"], *u))),
             at("alarm", lambda: _alarm(given.get("alarm"), dt)),
             at("rate", lambda: _positive("rate", given.get("rate", 10_000.0))),
         )  # fmt: skip
@@ -271,7 +271,7 @@ def _time_unit(given: Any) -> float:
     return TIME_UNITS[given]
 
 
-def _limits(given: Any, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+def valid_ranges(given: Any, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:
     """Valid ranges by name."""
     if not isinstance(given, dict):
         raise ValueError("give a range for each signal, such as { flow = [0, 80] }.")

@@ -65,6 +65,8 @@ class ServiceOptions:
     """Days for which results wait for sinks that are away."""
     history: float = 365.0
     """Days for which the page's history is kept."""
+    audit: bool = False
+    """Whether the groups of the journal are a chain of digests, which `driftfit journal verify` checks."""
     units: int = 100_000
     """Most units; topics beyond that are refused and counted."""
     log: str = "info"
@@ -76,15 +78,19 @@ class UserOptions:
 
     name: str
     role: str = "viewer"
-    """viewer or operator"""
+    """viewer, operator, or sender, which may only post samples"""
     password: str = ""
     """scrypt hash, as `driftfit serve --hash` prints it."""
     token: str = ""
     """SHA-256 hash of a token, as `driftfit serve --token` prints it."""
+    units: list[str] = field(default_factory=list)
+    """Names of the units of which a sender may post samples; empty: of all."""
 
     def __post_init__(self) -> None:
-        if self.role not in ("viewer", "operator"):
-            raise ValueError(f"user {self.name}: role must be viewer or operator; got {self.role!r}.")
+        if self.role not in ("viewer", "operator", "sender"):
+            raise ValueError(f"user {self.name}: role must be viewer, operator or sender; got {self.role!r}.")
+        if self.units and self.role != "sender":
+            raise ValueError(f"user {self.name}: units are those of a sender; a {self.role} has all of them.")
         if not self.password.startswith("scrypt$") and not self.token.startswith("sha256$"):
             raise ValueError(f"user {self.name}: give password or token as printed by `driftfit serve --hash`.")
 

@@ -46,10 +46,11 @@ class Event(NamedTuple):
     number: int
     """Number of the sample or action that caused it."""
     unit: str
+    """Its name; empty for what is wrong with the journal."""
     at: float
     """Wall clock, seconds since 1970."""
     kind: str
-    """new, alarm, over, failed, calibrated, action"""
+    """new, alarm, over, failed, calibrated, action, damaged"""
     detail: Mapping[str, Any]
 
 

@@ -90,7 +90,7 @@ def messages(options: Any, batch: Outcome) -> Iterator[tuple[str, bytes]]:
 
 def topic_of(template: str, batch: Outcome, unit: str) -> str:
     """The topic of a unit; wildcards in names are replaced."""
-    about = batch.about[unit]
+    about = batch.about.get(unit, {})
     parts = {name: "?" for name in Pattern(template).fields} | dict(about.get("parts") or {}) | {"unit": unit}
     return template.format_map(parts).replace("+", "_").replace("#", "_")
 

@@ -6,7 +6,7 @@ import json
 import queue
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
@@ -26,13 +26,17 @@ class Incoming:
     def __init__(self, most: int = 256) -> None:
         self.queue: queue.Queue[Batch] = queue.Queue(most)
 
-    def offer(self, topic: str, body: bytes) -> dict[str, Any]:
+    def offer(self, topic: str, body: bytes, foreign: Callable[[str], list[str]] = lambda topic: []) -> dict[str, Any]:
         """Decode a request, wait until it is in the journal, and report what was received and what was left out.
 
+        Nothing is taken if ``foreign`` names units of a topic, which the sender may not touch: the status is then 403.
         The status is 200 if anything was taken, or all of it was known already; 400 if nothing is JSON, 429 if it was
         too much for the rate of its unit, and 422 if there are no samples in it, or no unit could use them.
         """
         samples, refused, shaped = decoded(topic, body)
+        for name, units in ((one.topic, foreign(one.topic)) for one in samples):
+            if units:
+                return {"error": f"this sender may not send samples of {', '.join(units)} ({name}).", "status": 403}
         done, receipt = threading.Event(), Receipt()
         batch = Batch(samples, done.set, refused=len(refused), arrived=time.monotonic(), receipt=receipt)
         try:

@@ -120,7 +120,7 @@ def _with_nan(payload: bytes | str) -> Any:
         raise ValueError("not an object of numbers, an object of lists, or a list of objects in JSON.")
     try:
         return msgspec.convert(json.loads(raw), dict[str, Cell | list[Cell]] | list[dict[str, Cell]])
-    except (ValueError, RecursionError):
+    except (ValueError, msgspec.ValidationError, RecursionError):
         raise ValueError("not JSON.") from None
 
 

@@ -7,7 +7,7 @@ from collections.abc import Hashable, Mapping
 from copy import copy
 from io import StringIO
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -16,6 +16,8 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.jupyter import JupyterMixin
 from rich.table import Column, Table
 from rich.text import Text
+
+from driftfit.engine.kernel import Array
 
 WIDTH = 96
 
@@ -63,6 +65,16 @@ class Printed(JupyterMixin):
     def _repr_html_(self) -> str:
         """What notebooks ask for that do not ask rich."""
         return html_of(self)
+
+
+Kind = TypeVar("Kind", bound=type)
+
+
+def printing(kind: Kind) -> Kind:
+    """Let a named tuple, which cannot inherit, show itself as `Printed` does."""
+    for name in ("__repr__", "__str__", "_repr_html_"):
+        setattr(kind, name, vars(Printed)[name])
+    return kind
 
 
 def key_text(key: Hashable) -> str:
@@ -162,6 +174,11 @@ class Numbers(Table):
 def _widen(column: Column, text: str) -> None:
     words = [text] if len(text) <= SHORT else text.split()
     column.min_width = max(column.min_width or 0, *map(cell_len, words), 0)
+
+
+def some_rows(count: int, most: int = 20) -> Array:
+    """The rows of a table of ``count``: at most ``most``, evenly spaced, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 
 def table_of(title: str, *heads: str, names: int = 1, group: int = 1) -> Table:

@@ -16,14 +16,13 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from types import FunctionType
 from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import Settings, numbers, one_of
+from driftfit.engine.settings import Settings, numbers, one_of, place_of
 from driftfit.trackers.bank.change import probability
 
 KINDS = ("nominal", "outlier", "additive", "offset", "frozen", "own")
@@ -160,7 +159,7 @@ class Sensor(Settings):
             Whether ``clean`` takes the place of y in the leaf's output lags.
 
         Cost: one call of the function per leaf and sample; some three seconds of compiling, once. Saved runs
-        keep the function's name, and import it again.
+        keep the function's name; hand the function in to load them, ``Track.load(path, classes=[likelihood])``.
         """
         scale = numbers("Sensor.own", "scale", scale, ndim=0, low=0.0, strict=True)
         return cls("own", prob=prob, factor=scale * scale, likelihood=likelihood, own_lags=bool(cleans))
@@ -168,7 +167,7 @@ class Sensor(Settings):
     def settings(self) -> dict[str, Any]:
         plain = super().settings()
         if self.likelihood is not None:
-            plain["likelihood"] = f"{self.likelihood.__module__}:{self.likelihood.__qualname__}"
+            plain["likelihood"] = {"function": place_of(self.likelihood)}
         return plain
 
     def row(self) -> list[float]:
@@ -193,15 +192,12 @@ def table_of(sensors: Sequence[Sensor]) -> Array:
 
 
 def _function(given: Any) -> Any:
-    """A function, or the place from which it can be imported."""
-    if isinstance(given, str):
-        module, _, name = given.partition(":")
-        given = getattr(import_module(module), name)
+    """A function of the user's, which has a name by which files can tell it from others."""
     inner = getattr(given, "py_func", given)
     if not isinstance(inner, FunctionType) or "<" in inner.__qualname__:
         raise ValueError(
-            f"Sensor.own: likelihood must be a function that a module defines by name, so that it can be found again; "
-            f"got {given!r}."
+            f"Sensor.own: likelihood must be a function that a module defines by name, by which files tell it from "
+            f"others; got {given!r}."
         )
     if inner.__code__.co_argcount != 5:
         raise ValueError(

@@ -10,13 +10,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import import_module
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, kernel
-from driftfit.engine.settings import Settings, numbers, whole
+from driftfit.engine.settings import Settings, numbers, place_of, whole
 from driftfit.models.hammerstein_wiener.curves import kernels
 
 
@@ -168,8 +167,8 @@ class Functions(Basis):
     ----------
     values, slopes : functions (x, p, out) that Numba can compile
         Fill ``out`` (n,) with the functions, or with their derivatives, at the number x. They may use numpy, math,
-        numbers and ``driftfit.engine.kernel`` functions. To be saved they must be defined in a module that can be
-        imported.
+        numbers and ``driftfit.engine.kernel`` functions. A file keeps their names; hand them in to load it,
+        ``Live.load(path, classes=[values, slopes])``.
     n : int
         Number of functions.
     numbers : sequence
@@ -189,7 +188,7 @@ class Functions(Basis):
         given = numbers("Functions", "numbers", self.numbers)
         self._set("numbers", given if isinstance(given, tuple) else (given,))
         for name in ("values", "slopes"):
-            self._set(name, _imported(getattr(self, name)))
+            self._set(name, _function(getattr(self, name)))
         if self.labels is not None:
             self._set("labels", tuple(str(label) for label in self.labels))
             if len(self.labels) != self.n:
@@ -212,15 +211,15 @@ class Functions(Basis):
         return self.labels or super().names
 
     def __repr__(self) -> str:
-        """The expression with the modules and names of the functions, from which they are imported again."""
-        given: dict[str, Any] = {name: _place(getattr(self, name)) for name in ("values", "slopes")}
-        given |= {} if self.n == 1 else {"n": self.n}
-        given |= {} if self.numbers == (0.0,) else {"numbers": self.numbers}
-        given |= {} if self.labels is None else {"labels": self.labels}
-        return f"Functions({', '.join(f'{name}={value!r}' for name, value in given.items())})"
+        """The expression, with the names of the functions."""
+        given = {name: place_of(getattr(self, name)).partition(":")[2] for name in ("values", "slopes")}
+        given |= {} if self.n == 1 else {"n": repr(self.n)}
+        given |= {} if self.numbers == (0.0,) else {"numbers": repr(self.numbers)}
+        given |= {} if self.labels is None else {"labels": repr(self.labels)}
+        return f"Functions({', '.join(f'{name}={value}' for name, value in given.items())})"
 
     def settings(self) -> dict[str, Any]:
-        return super().settings() | {name: _place(getattr(self, name)) for name in ("values", "slopes")}
+        return super().settings() | {name: {"function": place_of(getattr(self, name))} for name in ("values", "slopes")}
 
 
 @lru_cache
@@ -242,20 +241,7 @@ def _together(values: Any, slopes: Any) -> Any:
     return kernels.machine_of(both)
 
 
-def _place(function: Any) -> str:
-    """The module and name from which a function can be imported."""
-    source = getattr(function, "py_func", function)
-    return f"{source.__module__}:{source.__qualname__}"
-
-
-def _imported(function: Any) -> Any:
-    """A function, or the one at ``module:name``."""
-    if isinstance(function, str):
-        module, _, name = function.partition(":")
-        try:
-            return getattr(import_module(module), name)
-        except (ImportError, AttributeError):
-            raise ValueError(f"Functions: {function!r} cannot be imported; define it in a module.") from None
-    if not callable(function):
-        raise ValueError(f"Functions: values and slopes must be functions (x, p, out); got {function!r}.")
-    return function
+def _function(given: Any) -> Any:
+    if not callable(given):
+        raise ValueError(f"Functions: values and slopes must be functions (x, p, out); got {given!r}.")
+    return given

@@ -127,6 +127,6 @@ def renewed(live: Live, q: Any) -> Live:
 
 def _separated(model: HammersteinWiener, theta: Array, before: Any) -> Any:
     """xi of one theta (n,) by "svd-joint", or the previous value if that is not finite."""
-    groups = Separator(model)(theta, "svd-joint")
+    groups = Separator(model, model.names)(theta, "svd-joint")
     xi = minimal(model, groups, np.asarray(theta[-1]) if model.intercept else None)
     return xi if np.isfinite(xi).all() else before

@@ -1,9 +1,10 @@
-"""The blocks of a run: its theta separated by a method, or the minimal parameters of its tracker."""
+"""The blocks of a run or of its smoothed path: theta separated by a method, or the tracker's minimal parameters."""
 
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,30 +26,38 @@ WEAK = 1e-3
 
 
 def blocks_of(
-    run: Track, method: str = "svd-joint", input: str | None = None, output: str = "d1", at: float = 0.0
+    run: Track,
+    method: str = "svd-joint",
+    input: str | None = None,
+    output: str = "d1",
+    at: float = 0.0,
+    smoothed: tuple[Array, Callable[[], Array]] | None = None,
 ) -> Blocks:
-    """The blocks of a run; see `Track.blocks`."""
+    """The blocks of a run, see `Track.blocks`; or of its ``smoothed`` theta (T, n), whose covariances (T, n, n) are
+    computed if the method needs them.
+    """
     model = run.model
     if not isinstance(model, HammersteinWiener):
         raise ValueError(f"blocks: {type(model).__name__} has no blocks; use a HammersteinWiener model.")
     one_of("blocks", "method", method, METHODS)
+    theta = run.theta if smoothed is None else smoothed[0]
     if run.names == model.structure.minimal_names:
         found = _of_minimal(run, model)
     elif method == "gls":
-        found = _by_least_squares(run, model)
+        found = _by_least_squares(run, model, theta, covariances(run) if smoothed is None else [(0, smoothed[1]())])
     else:
-        a, b, c, d, quality = split(model, run.theta, method)
+        a, b, c, d, quality = split(model, theta, method)
         none = Groups(*(np.full(part.shape, np.nan) for part in (a, b, c, d)))
-        found = Blocks(model, method, a, b, c, d, quality, none, _intercept(run))
-    _warn(found, run, input)
+        found = Blocks(model, method, a, b, c, d, quality, none, _intercept(model, theta))
+    _warn(found, run, theta, input)
     return found.gauge(found.gauged[0] if input is None else input, output, at)
 
 
-def _intercept(run: Track) -> Array | None:
-    return run.theta[:, -1].copy() if run.model.intercept else None
+def _intercept(model: HammersteinWiener, theta: Array) -> Array | None:
+    return theta[:, -1].copy() if model.intercept else None
 
 
-def _warn(found: Blocks, run: Track, input: str | None) -> None:
+def _warn(found: Blocks, run: Track, theta: Array, input: str | None) -> None:
     """Warn of separations that are not reliable."""
     used, n = int(run.ok.sum()), run.model.n
     if used < n:
@@ -73,7 +82,7 @@ def _warn(found: Blocks, run: Track, input: str | None) -> None:
                 stacklevel=4,
             )
     if found.method == "average" and found.c.shape[1] > 1:
-        near = np.abs(run.theta[late, found.a.shape[1] : found.a.shape[1] + found.b.shape[1]])
+        near = np.abs(theta[late, found.a.shape[1] : found.a.shape[1] + found.b.shape[1]])
         small = near < 0.05 * near.max(axis=1, initial=0.0, keepdims=True)
         if small.any():
             warnings.warn(
@@ -96,22 +105,22 @@ def _of_minimal(run: Track, model: HammersteinWiener) -> Blocks:
         cov = np.insert(np.insert(run.written("P"), fixed, 0.0, axis=1), fixed, 0.0, axis=2)
     a, b, c, d = structure.groups(run.theta)
     exact, std = np.zeros((len(run), 2)), deviations(model, var)
-    return Blocks(model, "minimal", a, b, c, d, exact, std, _intercept(run), cov, gauged=("c1", "d1"))
+    return Blocks(model, "minimal", a, b, c, d, exact, std, _intercept(model, run.theta), cov, gauged=("c1", "d1"))
 
 
-def _by_least_squares(run: Track, model: HammersteinWiener) -> Blocks:
-    """Replay the run in pieces, with covariances, and refine the separation of each."""
+def _by_least_squares(run: Track, model: HammersteinWiener, path: Array, pieces: Iterable[tuple[int, Array]]) -> Blocks:
+    """Refine the separation of a path (T, n), whose covariances come in pieces: (first sample, P (k, n, n))."""
     if not run.tracker.covariance:
         raise ValueError(f'blocks: "gls" needs a covariance, but {type(run.tracker).__name__} carries none.')
-    a, b, c, d, quality = split(model, run.theta, "svd-joint")
-    rest, at = _intercept(run), a.shape[1] + b.shape[1] + c.shape[1]
+    a, b, c, d, quality = split(model, path, "svd-joint")
+    rest, at = _intercept(model, path), a.shape[1] + b.shape[1] + c.shape[1]
     zeta = np.concatenate([a, b, c, d[:, 1:], *([] if rest is None else [rest[:, None]])], axis=1)
     T, n_z = zeta.shape
     cov, cost = np.empty((T, n_z, n_z)), np.empty(T)
     orders, sizes = (model.na, model.out.n), model.structure.sizes
-    for first, P in covariances(run):
+    for first, P in pieces:
         part = slice(first, first + len(P))
-        theta = np.ascontiguousarray(run.theta[part])
+        theta = np.ascontiguousarray(path[part])
         refine(theta, P, orders, sizes, zeta[part], cov[part], cost[part])
     cov = np.insert(np.insert(cov, at, 0.0, axis=1), at, 0.0, axis=2)  # the row and column of d_1
     x = np.insert(zeta, at, 1.0, axis=1)
@@ -121,7 +130,7 @@ def _by_least_squares(run: Track, model: HammersteinWiener) -> Blocks:
     return found.gauge()
 
 
-def covariances(run: Track) -> Any:
+def covariances(run: Track) -> Iterator[tuple[int, Array]]:
     """(first sample, P (k, n, n)) for the pieces of a run, replayed unless the run kept them."""
     T = len(run)
     if run.keeps_cov:

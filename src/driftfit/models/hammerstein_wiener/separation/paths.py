@@ -282,16 +282,17 @@ def apart(model: HammersteinWiener, groups: Array) -> list[Array]:
 class Separator:
     """Separates one theta after another, for streams; its arrays are allocated once."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, names: tuple[str, ...]) -> None:
+        """``names`` of the parameters: those of the model, or of the minimal ones."""
         if not isinstance(model, HammersteinWiener):
             raise ValueError(f"blocks: {type(model).__name__} has no blocks; use a HammersteinWiener model.")
-        self.model = model
+        self.model, self._minimal = model, names != model.names
         self._theta, (self._groups, self._quality) = np.empty((1, model.n)), empty(model, 1)
         self._sizes, self._rise = model.structure.sizes, model.rise
 
     def __call__(self, theta: Array, method: str) -> Groups:
         """a, b, c, d from one theta (n,), or from minimal parameters."""
-        if len(theta) != self.model.n:
+        if self._minimal:
             return Groups(*self.model.structure.groups(theta))
         if method not in METHODS[:3]:
             one_of("blocks", "method", method, METHODS[:3])

@@ -24,10 +24,11 @@ def structure_of(owner: str, model: Model) -> Structure:
             f"{owner}: works on the minimal parameters of a HammersteinWiener model; got {type(model).__name__}."
         )
     structure = model.structure
-    if structure.n == structure.n_x and structure.names != structure.minimal_names:
+    if structure.n == structure.n_x and structure.names != structure.minimal_names and structure.n_out > 1:
         raise ValueError(
-            f"{owner}: with na = {structure.na} and nb = {structure.nb} there are as many products as minimal "
-            "parameters, so the two cannot be distinguished; track the products with Kalman and separate them."
+            f"{owner}: without lags of y, and with nb = {structure.nb}, there are as many products as minimal "
+            "parameters, so where those of the output block are is not known; track the products with Kalman and "
+            "separate them."
         )
     return structure
 

@@ -48,7 +48,8 @@ const connect = () => {
   state.socket = socket;
   socket.addEventListener("open", () => { pause = 500; look(); });
   socket.addEventListener("message", (event) => receive(JSON.parse(event.data)));
-  socket.addEventListener("close", () => {
+  socket.addEventListener("close", (event) => {
+    if (event.code === 4401) { location.href = "/login"; return; }
     link("reconnecting", "bad");
     at("numbers").textContent = "the service does not answer";
     setTimeout(connect, pause);
