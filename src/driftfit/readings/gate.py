@@ -60,7 +60,7 @@ class Gate(Settings):
     taken for a level (``believed``: repeats are as good as others). ``natural``: share of repeats from which they are
     no sign of a code (inf). ``rare``: usual deviations beyond which a forecast is unusual (inf). ``away``: half ranges
     from the middle of its range beyond which an input is strange (inf). ``trust``: how many samples in a row are blamed
-    on inputs. ``frozen``: probability of repeats below which a sensor is frozen (0). ``coarse``: share of repeats and
+    on inputs. ``frozen``: probability per reading that a sensor freezes (0). ``coarse``: share of repeats and
     of smallest steps of a coarse meter (inf). ``first``: samples judged together at the start, besides one for each
     parameter (0).
     """
@@ -73,7 +73,7 @@ class Gate(Settings):
     rare: float = 3.0
     away: float = 2.0
     trust: int = 6
-    frozen: float = 1e-4
+    frozen: float = 0.001
     coarse: float = 0.1
     first: int = 16
 
@@ -196,7 +196,7 @@ def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, in
     """
     remember = first_samples(gate.first, n, m, ages)
     notice, blame = input_rules(gate, m, ages, refuse)
-    hold_frozen, judge = frozen_rule(gate.frozen, gate.natural), output_rule(gate)
+    hold_frozen, judge = frozen_rule(gate.frozen), output_rule(gate)
     resolve = resolution(gate.coarse)
     sure, rare, longest = float(gate.sure) ** 2, float(gate.rare) ** 2, LONGER * gate.hold
 
@@ -205,7 +205,7 @@ def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, in
         """Whether a far reading repeats for so long that it is a level although the forecast moves."""
         s.gate_same[l] += 1 if s.gate_same[l] > 0 else 0
         if s.gate_same[l] >= longest:
-            s.gate_chance[l] = np.inf
+            s.gate_stuck[l] = 0.0
         return s.gate_same[l] >= longest  # type: ignore[no-any-return]
 
     @kernel

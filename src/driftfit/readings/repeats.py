@@ -12,13 +12,21 @@ collapses, and bands and likelihood with it. Therefore
 Readings of a fine sensor never repeat, and nothing changes for them. If they do, at a limit, at 0 while a pump is off,
 or because a value is held, the other steps have all sizes, and none is frequent.
 
-A frozen sensor repeats its last value although the system moves. With p the share of readings that repeat, k repeats in
-a row at which the forecast moved have the probability p^k. A reading is refused if that is below `Gate.frozen`. The
-forecast moves if it changes by more than half of its own standard deviation and more than the smallest step of the
-readings: a plant at rest, and one whose meter is too coarse to show a movement, repeat their readings too. One repeat
-may be chance; two are enough where readings have many digits. A code that stays is refused in this way, however long.
+A frozen sensor repeats its last value although the system moves. Whether it is frozen is a two-state chain, which
+enters with the probability `Gate.frozen` at every reading and stays with `STAY`. A frozen sensor repeats its last
+reading for certain; one that works, where the forecast is elsewhere, with at most the probability max(delta p, a) <= 1,
+with delta the smallest step of the readings, p the density that the forecast gives to the values that are rounded to
+the reading, and a the share of readings that repeated. So the probability pi that it is frozen is
 
-Source: quantum^2 / 12 is Sheppard's (1898); the rest is ours. Cost per sample: a few comparisons.
+    pi <- prior / (prior + (1 - prior) max(delta p, a)),    prior = frozen (1 - pi) + STAY pi
+
+if the reading repeats, 0 if it does not, and the prior where the forecast is not elsewhere: a plant at rest, and one
+whose meter is too coarse to show a movement, repeat their readings too. It is elsewhere if it differs from the reading
+by more than half of its own standard deviation and more than delta. A reading with pi above one half is refused. A code that stays is
+refused in this way, however long.
+
+Source: quantum^2 / 12 is Sheppard's (1898); the chain is a hidden Markov model; the rest is ours. Cost per sample: a
+few comparisons.
 """
 
 from __future__ import annotations
@@ -29,10 +37,12 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import ROUNDING
-from driftfit.engine.kernel import State, Step, kernel
+from driftfit.engine.kernel import State, Step, exp, kernel
 
-MOVED = 0.25
-"""Share of the variance of the forecast by which the square of its change counts as a movement."""
+ELSEWHERE = 0.25
+"""Share of its variance by which the square of its distance from the reading puts a forecast elsewhere."""
+STAY = 0.98
+"""Probability per reading that a frozen sensor stays frozen."""
 ENOUGH = 5.0
 """Number of repeats, and of steps of the size of the quantum, before they count."""
 
@@ -41,7 +51,7 @@ def no_repeats() -> Mapping[str, Any]:
     """Fields before the first reading."""
     return {
         "gate_before": np.nan, "gate_finest": np.inf, "gate_smallest": 0.0, "gate_steps": 0.0, "gate_repeats": 0.0,
-        "gate_chance": 1.0, "gate_forecast": np.nan, "floor": 0.0, "shift": 0.0,
+        "gate_stuck": 0.0, "floor": 0.0, "shift": 0.0,
     }  # fmt: skip
 
 
@@ -92,19 +102,28 @@ def resolution(share: float) -> Step:
     return resolve  # type: ignore[no-any-return]
 
 
-def frozen_rule(limit: float, share: float) -> Callable[[State, float, int], bool]:
+def frozen_rule(enter: float) -> Callable[[State, float, int], bool]:
     """``frozen(s, v, l)``: whether the reading is one of a frozen sensor, given the variance v of its forecast."""
-    limit, natural = float(limit), repeats_by_nature(share)
+    enter = float(enter)
+
+    @kernel
+    def chance_of_repeat(s: State, v: float, l: int) -> float:
+        """The probability at most that a sensor that works repeats its reading."""
+        quantum, repeats = s.gate_finest[l], s.gate_repeats[l]
+        off = max(abs(s.e[l]) - 0.5 * quantum, 0.0)
+        density = exp(-0.5 * off * off / v) / np.sqrt(2.0 * np.pi * v)
+        return min(max(repeats / (repeats + s.gate_steps[l]), quantum * density), 1.0)  # type: ignore[no-any-return]
 
     @kernel
     def frozen(s: State, v: float, l: int) -> bool:
-        predicted, y_hat, chance = s.valid[l] > 0.0, s.y_hat[l] + s.shift[l], 1.0
-        if repeats_last(s, l):
-            chance, moved = s.gate_chance[l], y_hat - s.gate_forecast[l]
-            if predicted & (moved * moved > max(MOVED * v, s.gate_finest[l] * s.gate_finest[l])):
-                chance *= (s.gate_repeats[l] + 1.0) / (s.gate_repeats[l] + s.gate_steps[l] + 2.0)
-        s.gate_chance[l] = chance
-        s.gate_forecast[l] = y_hat if predicted else s.gate_forecast[l]
-        return (chance < limit) & (not natural(s, l))
+        found = 0.0
+        if repeats_last(s, l) & (s.gate_steps[l] >= 2.0 * ENOUGH):
+            prior = enter * (1.0 - s.gate_stuck[l]) + STAY * s.gate_stuck[l]
+            quantum, tells = s.gate_finest[l], (s.valid[l] > 0.0) & (v > 0.0) & (v < np.inf)
+            tells &= s.e[l] * s.e[l] > max(ELSEWHERE * v, quantum * quantum)
+            chance = chance_of_repeat(s, v, l) if tells else 1.0
+            found = prior / (prior + (1.0 - prior) * chance)
+        s.gate_stuck[l] = found
+        return found > 0.5  # type: ignore[no-any-return]
 
     return frozen  # type: ignore[no-any-return]
