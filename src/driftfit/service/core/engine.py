@@ -72,6 +72,7 @@ class Engine:
         """The number up to which results are in the database only."""
         self.latencies: deque[float] = deque(maxlen=2000)
         """Seconds from the arrival of a batch to the results of its samples."""
+        self._told: deque[tuple[str, str, dict[str, Any]]] = deque()
         self._dirty: OrderedDict[int, tuple[int, float]] = OrderedDict()
         """By unit: the number from which on the log has what its stored state does not, and when that came."""
         self._pending = Pending()
@@ -245,6 +246,11 @@ class Engine:
         """Put an action on a unit into the journal."""
         self.intake.act(Action(unit, what, done))
 
+    def tell(self, unit: str, kind: str, detail: dict[str, Any]) -> None:
+        """Note an event that no sample caused, for the page and the log; from any thread. A unit "" is none."""
+        log.error(kind, extra={"unit": unit, "detail": detail})
+        self._told.append((unit, kind, detail))
+
     def _store_states(self, everything: bool = False) -> None:
         """Add the states that have been waiting longest to the next transaction."""
         begin, now = time.perf_counter(), time.monotonic()
@@ -270,6 +276,9 @@ class Engine:
         for name, upto in self.progress.copy().items():
             if self.positions.get(f"sink:{name}") != upto:
                 self._pending.positions[f"sink:{name}"] = upto
+        while self._told:
+            unit, kind, detail = self._told.popleft()
+            self._pending.add_event(self.next - 1, self.units.names.get(unit, 0), kind, detail)
         if not self._pending:
             return True
         while True:

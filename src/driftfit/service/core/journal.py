@@ -6,7 +6,8 @@
     snapshot   the last stored state of a unit, and the number up to which it knows the samples
     result     the results of the trackers, in the order in which they arose; sinks and the page read from here
     block      the results of one unit in pieces, with least, largest and mean of every column, for the page
-    event      alarms, failures, operator's actions
+    event      alarms, failures, operator's actions; unit 0 where none is concerned
+    undelivered  events that the receiver of a sink has refused again and again
     position   where sources continue, and how far sinks have come
 
 Journal before update: a group is committed (WAL, ``synchronous=FULL``) before any tracker processes it, and
@@ -17,6 +18,7 @@ missing are computed again from snapshots and log, bit for bit.
 from __future__ import annotations
 
 import sqlite3
+import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,6 +43,8 @@ create table if not exists block (unit integer, first integer, last integer, sta
 create table if not exists event (id integer primary key, number integer, unit integer, at real, kind text,
     detail text);
 create index if not exists event_of_unit on event (unit, id);
+create table if not exists undelivered (sink text, number integer, unit text, at real, kind text, detail text,
+    tries integer, why text);
 create table if not exists position (name text primary key, value text);
 """
 PRAGMAS = ("page_size=8192", "journal_mode=wal", "synchronous=full", "wal_autocheckpoint=2000", "temp_store=memory")
@@ -209,6 +213,7 @@ class Pending:
         self.log: tuple[int, int, float, bytes] | None = None
         self.results: list[tuple[int, int, float, bytes]] = []
         self.events: list[tuple[int, int, float, str, str]] = []
+        self.undelivered: list[tuple[Any, ...]] = []
         self.blocks: list[tuple[Any, ...]] = []
         self.snapshots: list[tuple[int, int, bytes]] = []
         self.positions: dict[str, Any] = {}
@@ -233,6 +238,14 @@ class Pending:
             self.events += [(n, unit, when, kind, _json(detail)) for n, unit, when, kind, detail in events]
         self.meta[RESULTS_FROM] = str(first + 1)
 
+    def add_event(self, number: int, unit: int, kind: str, detail: dict[str, Any]) -> None:
+        """An event that no sample caused."""
+        self.events.append((number, unit, time.time(), kind, _json(detail)))
+        if kind == "undelivered":
+            columns = ("sink", "number", "unit", "at", "kind", "detail", "tries", "why")
+            row = detail | {"detail": _json(detail["detail"])}
+            self.undelivered.append(tuple(row[name] for name in columns))
+
     def commit(self, db: sqlite3.Connection) -> None:
         """Write everything in one transaction; on an error nothing is written, and it can be tried again."""
         db.execute("begin immediate")
@@ -244,6 +257,7 @@ class Pending:
                 db.execute("insert into log values (?, ?, ?, ?)", self.log)
             put("insert or ignore into result values (?, ?, ?, ?)", self.results)
             put("insert into event (number, unit, at, kind, detail) values (?, ?, ?, ?, ?)", self.events)
+            put("insert into undelivered values (?, ?, ?, ?, ?, ?, ?, ?)", self.undelivered)
             put("insert or ignore into block values (?, ?, ?, ?, ?, ?, ?, ?)", self.blocks)
             put("insert or replace into snapshot values (?, ?, ?)", self.snapshots)
             put("insert or replace into position values (?, ?)", [(k, _json(v)) for k, v in self.positions.items()])

@@ -182,7 +182,7 @@ class Page:
         rows = await run_in_threadpool(lambda: self.feed.journal.db.execute(query, (*values, limit)).fetchall())
         self.feed.names.read()
         names = self.feed.names.names
-        found = [{"number": n, "unit": names[u], "at": at, "kind": kind, "detail": json.loads(detail)}
+        found = [{"number": n, "unit": names.get(u, ""), "at": at, "kind": kind, "detail": json.loads(detail)}
                  for n, u, at, kind, detail in rows]  # fmt: skip
         return Answer({"events": found})
 
