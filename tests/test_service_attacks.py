@@ -10,12 +10,12 @@ import pytest
 
 pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
 
-from service_support import Receiver, configured, feed, message, opened, record, running, until
+from service_support import UNIT, Receiver, configured, events, feed, message, opened, record, running, until
 
 from driftfit.service.sinks.contract import Event, Outcome
 from driftfit.service.sinks.sqlite import Sqlite
 from driftfit.service.sinks.webhook import Webhook
-from driftfit.service.threads import TRIES, SinkThread
+from driftfit.service.threads import TRIES, SinkThread, SourceThread
 
 
 @contextmanager
@@ -68,3 +68,36 @@ def test_two_alarms_that_begin_at_one_sample_are_two(tmp_path):
     writer.close()
     assert [json.loads(one)["kind"] for (one,) in found] == ["band", "glr"]
     assert len({one.key for one in made}) == 2
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_file_that_is_cut_and_written_again_is_read_from_its_start(tmp_path, stopped):
+    """Copytruncate of logrotate: what was written up to the old position was skipped."""
+    path = tmp_path / "plant.csv"
+    path.write_text("t,y\n" + "".join(f"{t},1\n" for t in range(1000)))
+    config = configured(UNIT, source=f'[source.file]\nkind = "tail"\npath = "{path}"\ntopic = "plant/a"\n')
+    engine, source = opened(config, tmp_path / "folder"), config.sources[0]
+    runner = SourceThread(engine, source)
+    with running(engine, runner):
+        until(lambda: runner.count == 1000)
+        if not stopped:
+            cut(path)
+            until(lambda: runner.count == 2500)
+    assert runner.count == 1000 if stopped else 2500
+    engine.close()
+    engine = opened(config, tmp_path / "folder")
+    if stopped:
+        cut(path)
+        runner = SourceThread(engine, source)
+        with running(engine, runner):
+            until(lambda: runner.count == 1500)
+    assert engine.journal.rows_of(1)[0] == list(range(2500))
+    (found,) = events(engine, "source")
+    assert "does not continue at byte" in found["noticed"]
+    engine.close()
+
+
+def cut(path):
+    """The same file with more lines than before, in place."""
+    with path.open("r+") as file:
+        file.write("t,y\n" + "".join(f"{t},1\n" for t in range(1000, 2500)))

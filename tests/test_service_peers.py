@@ -329,17 +329,23 @@ def test_tail(tmp_path, kind):
     rest = reader.read(1.0)
     assert sum(one.length for one in rest.samples) == 10
     assert rest.refused == 1
+    with path.open("a") as file:
+        file.write(lines[0][:-1])
     path.rename(tmp_path / "old")
     path.write_text(head + "".join(lines[:4]))
-    assert sum(one.length for one in reader.read(2.0).samples) == 4  # the new file, from its beginning
+    found = [reader.read(2.0) for _ in range(2)]  # the end of the old file, and the new one from its beginning
+    assert [sum(one.length for one in batch.samples) for batch in found] == [1, 4]
     reader.close()
 
 
 def test_replay(tmp_path):
     path = tmp_path / "plant.csv"
     path.write_text("t,y\n" + "".join(f"2026-01-01T00:00:{t:02d},{t}\n" for t in range(30)))
-    fast = Replay("r", str(path)).open(5).read(1.0)
-    assert (fast.samples[0].length, fast.position) == (25, 30)
+    digest = Replay("r", str(path)).open(None).read(1.0).position[1]
+    fast = Replay("r", str(path)).open([5, digest]).read(1.0)
+    assert (fast.samples[0].length, fast.position, fast.noticed) == (25, [30, digest], "")
+    other = Replay("r", str(path)).open([5, "of another file"]).read(1.0)
+    assert (other.samples[0].length, "is another file" in other.noticed) == (30, True)
     slow = Replay("r", str(path), time="t", speed=100.0).open(None)
     begun, count = time.monotonic(), 0
     while count < 30:

@@ -182,6 +182,8 @@ class Engine:
         """The entries of the next group."""
         for source, batch in arrived.batches:
             self.units.refused["unreadable"] += batch.refused
+            if batch.noticed:
+                self.tell("", "source", {"source": source, "noticed": batch.noticed})
             if batch.position is not None:
                 self._pending.positions[f"source:{source}"] = batch.position
         messages = ((samples, batch.receipt) for _, batch in arrived.batches for samples in batch.samples)

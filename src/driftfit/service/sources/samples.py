@@ -81,6 +81,8 @@ class Batch(NamedTuple):
     """To be called once the samples are in the journal."""
     position: Any = None
     """Where the source continues after these samples, as plain data; None if the sender keeps that."""
+    noticed: str = ""
+    """What the source noticed, which becomes an event."""
     refused: int = 0
     """Messages that could not be decoded."""
     arrived: float = 0.0
