@@ -10,8 +10,12 @@ import pytest
 
 pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
 
-from service_support import UNIT, Receiver, configured, events, feed, message, opened, record, running, until
+from service_support import UNIT, Receiver, configured, events, feed, message, opened, record, running, settled, until
 
+from driftfit.service.health import health
+from driftfit.service.page import metrics
+from driftfit.service.page.feed import Feed
+from driftfit.service.settings.config import ProblemsError
 from driftfit.service.sinks.contract import Event, Outcome
 from driftfit.service.sinks.sqlite import Sqlite
 from driftfit.service.sinks.webhook import Webhook
@@ -101,3 +105,57 @@ def cut(path):
     """The same file with more lines than before, in place."""
     with path.open("r+") as file:
         file.write("t,y\n" + "".join(f"{t},1\n" for t in range(1000, 2500)))
+
+
+SHORT = 'alarm = { every = 2000, on = ["glr", "band"], reference = %d, window = %d }\n'
+
+
+@pytest.mark.parametrize(
+    ("reference", "window", "why"),
+    [(149, 50, '"glr" needs a reference of 150 samples'), (500, 3, "window must be"), (69, 50, "150 samples")],
+)
+def test_an_alarm_that_cannot_be_set_is_refused_by_check(reference, window, why):
+    """It was reported as calibrated, and never watched."""
+    with pytest.raises(ProblemsError, match=why):
+        configured(UNIT + SHORT % (reference, window))
+    assert configured(UNIT + SHORT % (150, 4)).units
+
+
+def test_alarms_that_are_not_armed_and_units_that_have_failed_are_shown(tmp_path, monkeypatch, caplog):
+    """Both looked healthy: on the page, in the metrics, in /healthz, and after a restart."""
+    y, u = record(160)
+    config = configured(UNIT + SHORT % (150, 50))
+    engine = opened(config, tmp_path)
+    feed(engine, message("plant/a", range(160), [0.0] * 160, u))  # constant parameters explain it without error
+    until(lambda: engine.step(0.0) or engine.units.get(1).calibrated, 180)  # the first time it compiles
+    settled(engine)
+    assert "alarm glr is not armed" in engine.status()["trouble"]["a"]
+    monkeypatch.setattr("driftfit.service.core.section.advance", lambda *_: 1 / 0)
+    feed(engine, message("plant/b", range(160), y, u))
+    settled(engine)
+    levels = {one.getMessage(): one.levelname for one in caplog.records}
+    assert (levels["failed"], levels["calibrated"]) == ("ERROR", "ERROR")
+    engine._store_states(everything=True)
+    engine._commit()
+    engine.close()
+    engine = opened(config, tmp_path)
+    assert [one.name for one in engine.units.resident] == ["b"]  # a is not in memory
+    status = engine.status()
+    assert (status["failed"], status["troubled"]) == (1, 2)
+    answer, code = health(status, True, True)
+    assert (code, answer["state"]) == (200, "degraded")
+    assert any(one.startswith("b: failed (ZeroDivisionError") for one in answer["reasons"])
+    page = Feed(tmp_path, tmp_path / "c")
+    page.look()
+    page.status = status
+    page.rank()
+    shown = {one["unit"]: one["trouble"] for one in page.fleet}
+    assert shown == {"a": ["alarm glr is not armed"], "b": ["failed"]}
+    text = metrics.text(page, 0)
+    assert "driftfit_units_failed 1\n" in text
+    assert 'driftfit_trouble{unit="a",what="alarm glr is not armed",why="detect: ' in text
+    engine.act("b", {"do": "restart"})
+    engine.step(0.0)
+    settled(engine)
+    assert list(engine.status()["trouble"]) == ["a"]
+    engine.close()

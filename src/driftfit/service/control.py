@@ -79,7 +79,7 @@ class Control(threading.Thread):
         if number is None:
             return {"error": f"there is no unit {name!r}", "status": 404}
         if do == "unit":
-            return self.engine.units.get(number).plain()
+            return self.engine.units.seen(number).plain()
         if do == "act":
             problems: queue.Queue[str] = queue.Queue()
             self.engine.act(name, header["action"], problems.put)

@@ -15,6 +15,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,8 @@ PACE, SLOWEST_PACE, SHARE = 0.01, 0.025, 5.0
 processor: the fixed cost of a group, about a millisecond, would otherwise be most of the work."""
 KEPT = 16
 """Groups of which the results are kept in memory."""
+TROUBLED = 100
+"""Units with trouble that are named."""
 RETRY = 1.0
 """Seconds between two attempts to write the journal."""
 
@@ -92,6 +95,7 @@ class Engine:
             if first >= unstored:
                 self._pending.add_results(Group(first, out.results, out.events, time.time()))
             self._pending.blocks += out.blocks
+            self.units.note_trouble({unit for _, unit, *_ in out.events}, self._pending)
         for unit in self.units.resident:
             self._ask_for_limits(unit)
         return again
@@ -200,6 +204,9 @@ class Engine:
         Returns by number why actions were refused.
         """
         out, number = Out(), first
+        while self.units.unreadable:
+            unit = self.units.unreadable.pop()
+            out.event(first, unit, "failed", {"error": self.units.get(unit).failure})
         for item in items:
             self._apply(number, item, out)
             number += item.length
@@ -210,8 +217,11 @@ class Engine:
         for unit in out.to_calibrate:
             self._ask_for_limits(self.units.get(unit))
         self.samples += sum(len(one.number) for one in out.results)
+        self.units.note_trouble({unit for _, unit, *_ in out.events}, self._pending)
         for _, unit, _, kind, detail in out.events:
-            log.info(kind, extra={"unit": self.units.get(unit).name, "detail": detail})
+            bad = kind == "failed" or (kind == "calibrated" and detail.get("refused"))
+            name = self.units.get(unit).name
+            log.log(logging.ERROR if bad else logging.INFO, kind, extra={"unit": name, "detail": detail})
         return {number: detail["refused"] for number, *_, detail in out.events if "refused" in detail}
 
     def _publish(self, group: Group) -> None:
@@ -235,8 +245,9 @@ class Engine:
         """Find the limits of a unit's alarms in another thread; they come back as an action in the journal."""
         alarm = unit.settings.alarm
         width = 2 + len(unit.settings.u)
-        if alarm is None or unit.calibrated or len(unit.reference) < alarm.reference * width:
+        if alarm is None or unit.calibrated or unit.asked or len(unit.reference) < alarm.reference * width:
             return
+        unit.asked = True
         rows = np.array(unit.reference).reshape(-1, width)
 
         def find() -> None:
@@ -307,8 +318,12 @@ class Engine:
 
     def status(self) -> dict[str, Any]:
         """Numbers for the page and for Prometheus."""
+        trouble = self.units.troubled()
+        shown = dict(islice(trouble.items(), TROUBLED))
         return quantiles(self.latencies) | {
             "samples": self.samples, "next": self.next, "units": len(self.units), "waiting": self.intake.waiting,
             "held_back": self.intake.held_back, "refused": dict(self.units.refused), "problem": self.problem,
+            "failed": sum("failed" in what for what in trouble.values()), "trouble": shown, "troubled": len(trouble),
+            "reasons": [f"{unit}: {what} ({why})" for unit, found in shown.items() for what, why in found.items()],
             "dirty": len(self._dirty), "recovered": self.recovered, "positions": dict(self.positions),
         }  # fmt: skip

@@ -1,6 +1,7 @@
 """The journal: one SQLite database in which samples, states, results and positions of sources change together.
 
     log        what came in, in groups: numbered samples in columns, and operator's actions
+    trouble    what does not work in a unit, and why
     unit       number, name, section and topic of every unit
     program    models and trackers that states were made with, by the fingerprint of the states
     snapshot   the last stored state of a unit, and the number up to which it knows the samples
@@ -45,10 +46,11 @@ create table if not exists event (id integer primary key, number integer, unit i
 create index if not exists event_of_unit on event (unit, id);
 create table if not exists undelivered (sink text, number integer, unit text, at real, kind text, detail text,
     tries integer, why text);
+create table if not exists trouble (unit integer primary key, what text);
 create table if not exists position (name text primary key, value text);
 """
 PRAGMAS = ("page_size=8192", "journal_mode=wal", "synchronous=full", "wal_autocheckpoint=2000", "temp_store=memory")
-FORMAT = "2"
+FORMAT = "3"
 RESULTS_FROM, NEEDED_FROM = "results from", "needed from"
 """Keys of ``meta``: of `Journal.first_without_results` and `Journal.first_needed`."""
 NAME = "driftfit.db"
@@ -199,6 +201,10 @@ class Journal:
                     rows += own.values.tolist()
         return times, rows
 
+    def trouble(self) -> dict[int, dict[str, str]]:
+        """By unit: what does not work, and why."""
+        return {unit: msgspec.json.decode(what) for unit, what in self.db.execute("select * from trouble")}
+
     def programs(self) -> dict[bytes, str]:
         """Models and trackers that states were made with, by the fingerprint of the states."""
         return dict(self.db.execute("select tag, about from program").fetchall())
@@ -214,6 +220,7 @@ class Pending:
         self.results: list[tuple[int, int, float, bytes]] = []
         self.events: list[tuple[int, int, float, str, str]] = []
         self.undelivered: list[tuple[Any, ...]] = []
+        self.trouble: list[tuple[int, str]] = []
         self.blocks: list[tuple[Any, ...]] = []
         self.snapshots: list[tuple[int, int, bytes]] = []
         self.positions: dict[str, Any] = {}
@@ -238,6 +245,10 @@ class Pending:
             self.events += [(n, unit, when, kind, _json(detail)) for n, unit, when, kind, detail in events]
         self.meta[RESULTS_FROM] = str(first + 1)
 
+    def add_trouble(self, unit: int, trouble: dict[str, str]) -> None:
+        """What does not work in a unit now."""
+        self.trouble.append((unit, _json(trouble)))
+
     def add_event(self, number: int, unit: int, kind: str, detail: dict[str, Any]) -> None:
         """An event that no sample caused."""
         self.events.append((number, unit, time.time(), kind, _json(detail)))
@@ -257,6 +268,7 @@ class Pending:
                 db.execute("insert into log values (?, ?, ?, ?)", self.log)
             put("insert or ignore into result values (?, ?, ?, ?)", self.results)
             put("insert into event (number, unit, at, kind, detail) values (?, ?, ?, ?, ?)", self.events)
+            put("insert or replace into trouble values (?, ?)", self.trouble)
             put("insert into undelivered values (?, ?, ?, ?, ?, ?, ?, ?)", self.undelivered)
             put("insert or ignore into block values (?, ?, ?, ?, ?, ?, ?, ?)", self.blocks)
             put("insert or replace into snapshot values (?, ?, ?)", self.snapshots)

@@ -20,6 +20,7 @@ from driftfit.service.sources.samples import NO_SIGNAL, Receipt, Samples, number
 
 ROUTES = 200_000
 """Topics whose units are remembered, including those that have none."""
+UNREADABLE = "its state cannot be read"
 SAVED = 10.0
 """Seconds over which the rate of a unit is averaged."""
 
@@ -87,6 +88,10 @@ class Units:
         self._saved: list[tuple[Array, float]] = [(np.zeros(0), 0.0) for _ in settings]
         """By section: samples that each unit may still send at once, and the time of that."""
         self._programs = journal.programs()
+        self.trouble = journal.trouble()
+        """By unit: what does not work, and why; also of those that are not in memory."""
+        self.unreadable: list[int] = []
+        """Units that have failed because their states cannot be read, which is yet to be an event."""
         self.since: dict[int, int] = {}
         """Number up to which samples are in the state of a unit that was loaded."""
         for unit, name, section, _, born, _ in journal.units():
@@ -112,15 +117,43 @@ class Units:
         found = self._units.get(unit)
         if found is None:
             name, section = self._known[unit]
-            stored = self.journal.state(unit)
             found = self._units[unit] = self.sections[section].add(unit, name)
-            if stored is not None:
-                self.since[unit] = stored[0]
-                try:
-                    found.restore(stored[1], self._programs)
-                except Exception as error:  # a state that cannot be read stops its unit, not the others
-                    found.failure = f"its state cannot be read: {error}"[:500]
+            self._restore(found)
+            if found.failure.startswith(UNREADABLE):
+                self.unreadable.append(unit)
         return found
+
+    def seen(self, unit: int) -> Unit:
+        """A unit for another thread to look at: one that is not in memory is read from the database by itself."""
+        found = self._units.get(unit)
+        if found is None:
+            name, section = self._known[unit]
+            found = Section(section, self.settings[section]).add(unit, name)
+            self._restore(found)
+        return found
+
+    def _restore(self, unit: Unit) -> None:
+        """Bring a unit to the state that the database has of it."""
+        stored = self.journal.state(unit.number)
+        if stored is not None:
+            self.since[unit.number] = stored[0]
+            try:
+                unit.restore(stored[1], self._programs)
+            except Exception as error:  # a state that cannot be read stops its unit, not the others
+                unit.failure = f"{UNREADABLE}: {error}"[:500]
+
+    def note_trouble(self, units: Iterable[int], pending: Pending) -> None:
+        """Add to the next transaction what does not work in units, where that has changed."""
+        for number in units:
+            now = self.get(number).trouble
+            if now != self.trouble.get(number, {}):
+                self.trouble[number] = now
+                pending.add_trouble(number, now)
+
+    def troubled(self) -> dict[str, dict[str, str]]:
+        """By name: what does not work, and why."""
+        found = self.trouble.copy()  # another thread asks
+        return {self._known[unit][0]: what for unit, what in found.items() if what}
 
     def note_programs(self, pending: Pending) -> None:
         """Add to the next transaction what the states of this process are made with."""

@@ -22,9 +22,10 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 
+from driftfit.service.health import health
 from driftfit.service.page import history, metrics, openapi
 from driftfit.service.page.access import COOKIE, Access, Rates
-from driftfit.service.page.feed import Feed, finite, unheard
+from driftfit.service.page.feed import Feed, finite
 from driftfit.service.page.passwords import SESSION, Sessions, password_fits
 from driftfit.service.page.sockets import Sockets
 from driftfit.service.settings.options import PageOptions
@@ -109,11 +110,9 @@ class Page:
         if not search:
             return Answer({"units": self.feed.fleet, "count": len(self.feed.names.names)})
         feed, found, now = self.feed, [], time.time()
-        for number, name in feed.names.names.items():
+        for name in feed.names.about:
             if search in name.lower():
-                row = feed.latest.get(number)
-                line = unheard(name) if row is None else feed.line(number, row, feed.drift(number, row), now)
-                found.append(line | {"age": None})
+                found.append(feed.shown(name, now) | {"age": None})
             if len(found) == 200:
                 break
         return Answer({"units": found, "count": len(found)})
@@ -266,10 +265,8 @@ class Page:
         return PlainTextResponse(metrics.text(self.feed, self.sockets.count), media_type=metrics.TYPE)
 
     async def healthz(self, request: Request) -> Response:
-        """200 if the engine answers and the journal can be written."""
-        healthy = self.feed.healthy
-        problem = "" if healthy else self.feed.status.get("problem") or "the engine does not answer"
-        return JSONResponse({"healthy": healthy, "problem": problem}, 200 if healthy else 503)
+        """200 if the engine answers and the journal can be written; with what does not work besides."""
+        return JSONResponse(*health(self.feed.status, self.feed.alive, request.scope["user"] is not None))
 
 
 class Answer(JSONResponse):

@@ -65,7 +65,7 @@ class Sockets:
 
     async def _message(self, view: dict[str, Any]) -> dict[str, Any]:
         feed = self.feed
-        status = {name: feed.status.get(name) for name in ("samples", "units", "problem", "p99")}
+        status = {name: feed.status.get(name) for name in ("samples", "units", "problem", "reasons", "p99")}
         status["alive"] = feed.healthy
         if view["view"] != "unit":
             return {"view": "fleet", "status": status, "units": feed.fleet}

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from driftfit.data.clock import Clock
 from driftfit.data.signals import check_ready
 from driftfit.engine.settings import near
+from driftfit.judge.alarms.detect import asked_for, check_alarm
 from driftfit.models.base import Model
 from driftfit.parsing.settings import parse_model, tracker_of
 from driftfit.run.live.rule import KINDS
@@ -50,6 +51,11 @@ class AlarmSettings:
     """Number of first samples that are normal."""
     window: int = 50
     hold: int = 0
+
+    @property
+    def each(self) -> float:
+        """Samples in which one false alarm of a kind may begin, so that all kinds together begin one in ``every``."""
+        return self.every * len(self.on)
 
 
 @dataclass(frozen=True)
@@ -220,7 +226,10 @@ class _Reader:
                 ("dt" if dt is not None else "hold_back",),
                 "dt and hold_back need the name of the field of times: time = ...",
             )
-        at("tracker", lambda: Program(model, check_ready(tracker)).tile())  # whether they fit; nothing is compiled
+        program = at("tracker", lambda: Program(model, check_ready(tracker)))
+        at("tracker", program.tile)  # whether they fit; nothing is compiled
+        if settings.alarm is not None:
+            at("alarm", partial(_check_alarms, program, settings.alarm))
         return settings
 
 
@@ -312,3 +321,9 @@ def _alarm(given: Any, dt: float | None) -> AlarmSettings | None:
         if isinstance(value, bool) or not isinstance(value, int) or value < (key != "hold"):
             raise ValueError(f"{key} must be a whole number of samples; got {value!r}.")
     return AlarmSettings(_positive("every", every), on, **whole)
+
+
+def _check_alarms(program: Program, alarm: AlarmSettings) -> None:
+    """Raise ValueError if an alarm cannot be set from its reference."""
+    for kind in alarm.on:
+        check_alarm(program, asked_for(kind, alarm.each, alarm.window, alarm.hold), alarm.reference)
