@@ -4,6 +4,7 @@ import http.server
 import json
 import sqlite3
 import threading
+import time
 from contextlib import contextmanager
 
 import pytest
@@ -158,4 +159,26 @@ def test_alarms_that_are_not_armed_and_units_that_have_failed_are_shown(tmp_path
     engine.step(0.0)
     settled(engine)
     assert list(engine.status()["trouble"]) == ["a"]
+    engine.close()
+
+
+def test_a_time_far_ahead_mutes_no_unit(tmp_path):
+    """One sample stamped 23 hours ahead made all others late, also after a restart."""
+    now, times = time.time(), range(10)
+    engine = opened(
+        configured(UNIT.replace("time =", 'ahead = "1h"\ntime =') + UNIT.replace("plant", "other")), tmp_path
+    )
+    for topic, far in (("plant/a", 7200.0), ("other/a", 301.0)):
+        feed(engine, message(topic, [now - 20.0 + t for t in times], *record(10)))
+        feed(engine, message(topic, [now + far], [0.0], [0.0]))
+        feed(engine, message(topic, [now - 5.0], [0.0], [0.0]))
+    for unit in engine.units.resident:
+        assert unit.counts["samples"] == 11
+        assert unit.counts["time in the future"] == 1
+    feed(engine, message("plant/a", [now + 3000.0], [0.0], [0.0]))  # allowed there
+    feed(engine, message("plant/a", [now], [0.0], [0.0]))
+    engine.act("a:y", {"do": "restart"})
+    engine.step(0.0)
+    feed(engine, message("plant/a", [now], [0.0], [0.0]))
+    assert (engine.units.get(1).counts["late"], engine.units.get(1).counts["samples"]) == (1, 13)
     engine.close()

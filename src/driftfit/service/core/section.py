@@ -31,9 +31,6 @@ from driftfit.service.core.streams import SAMPLES, USED, Streams
 from driftfit.service.core.unit import Out, Unit
 from driftfit.service.settings.config import UnitSettings
 
-AHEAD = 86_400.0
-"""A time so many seconds ahead of both the last sample and this machine's clock is refused: it would make every later
-sample late."""
 COLUMNS = ("y_hat", "e", "s", "theta", "var", "ok")
 """Fields of a tracker's output, in the order of the results; the last becomes a flag."""
 REFUSED = {late.LATE: "late", late.REPEATED: "duplicate", late.UNTIMED: "no time"}
@@ -96,14 +93,14 @@ class Section:
         return Rows(self.streams.index, self.streams.numbers[places[order]], time, values[order])
 
     def _too_far(self, places: Array, time: Array) -> Array:
-        """Which times are too far in the future: after a gap of more than a day, beyond the newest and this clock."""
-        now = wall.time()
-        far = time > np.fmax(self.streams.newest[places], now) + AHEAD
+        """Which times are further ahead of both the newest and this clock than the settings allow."""
+        now, ahead = wall.time(), self.streams.settings.ahead
+        far = time > np.fmax(self.streams.newest[places], now) + ahead
         for place in np.unique(places[far]).tolist():
             newest = max(now, float(np.nan_to_num(self.streams.newest[place], nan=-math.inf)))
             own = np.flatnonzero(places == place)
             for k in own[np.argsort(time[own])].tolist():
-                far[k] = time[k] > newest + AHEAD
+                far[k] = time[k] > newest + ahead
                 newest = newest if far[k] or math.isnan(time[k]) else max(newest, time[k])
         return np.asarray(far)
 

@@ -115,7 +115,8 @@ class Streams:
 
     def clear(self, place: int) -> None:
         """A unit at its start."""
-        self.begun[place], self.last[place], self.held[place] = False, math.nan, False
+        self.begun[place], self.held[place] = False, False
+        self.last[place] = self.newest[place] = math.nan
         self.waiting.put(place, np.zeros(0), np.zeros((0, self.waiting.rows.shape[1])))
 
     @cached_property

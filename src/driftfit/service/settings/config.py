@@ -75,6 +75,8 @@ class UnitSettings:
     """Seconds for which samples wait for late ones."""
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     alarm: AlarmSettings | None = None
+    ahead: float = 300.0
+    """Seconds that a time may be ahead of both the newest of its unit and the clock of this machine."""
     rate: float = 10_000.0
     """Samples a second that one unit may send, on average over ten seconds."""
 
@@ -194,7 +196,7 @@ class _Reader:
     def unit(self, k: int) -> UnitSettings:
         given = dict(self.tables("unit")[k])
         known = ["match", "name", "y", "u", "time", "time_unit", "dt", "model", "tracker", "limits", "alarm",
-                 "hold_back", "rate"]  # fmt: skip
+                 "hold_back", "ahead", "rate"]  # fmt: skip
         for key in given:
             if key not in known:
                 raise KeyProblemError((key,), f"unit has no setting {key!r}; {near(key, known)}")
@@ -219,6 +221,7 @@ class _Reader:
             at("hold_back", lambda: _seconds("hold_back", given.get("hold_back", 0.0))),
             at("limits", lambda: _limits(given.get("limits", {}), (given["y"], *u))),
             at("alarm", lambda: _alarm(given.get("alarm"), dt)),
+            at("ahead", lambda: _seconds("ahead", given.get("ahead", 300.0))),
             at("rate", lambda: _positive("rate", given.get("rate", 10_000.0))),
         )  # fmt: skip
         if settings.time is None and (settings.hold_back or dt is not None):
