@@ -6,13 +6,31 @@ import sqlite3
 import threading
 import time
 from contextlib import contextmanager
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
 
-from service_support import UNIT, Receiver, configured, events, feed, message, opened, record, running, settled, until
+from service_support import (
+    MODEL,
+    TRACKER,
+    UNIT,
+    Receiver,
+    configured,
+    events,
+    feed,
+    message,
+    opened,
+    record,
+    running,
+    settled,
+    until,
+)
 
+from driftfit import track
+from driftfit.service.core.section import Section
 from driftfit.service.health import health
 from driftfit.service.page import metrics
 from driftfit.service.page.feed import Feed
@@ -20,6 +38,7 @@ from driftfit.service.settings.config import ProblemsError
 from driftfit.service.sinks.contract import Event, Outcome
 from driftfit.service.sinks.sqlite import Sqlite
 from driftfit.service.sinks.webhook import Webhook
+from driftfit.service.sources.samples import Batch, Samples
 from driftfit.service.threads import TRIES, SinkThread, SourceThread
 
 
@@ -182,3 +201,60 @@ def test_a_time_far_ahead_mutes_no_unit(tmp_path):
     feed(engine, message("plant/a", [now], [0.0], [0.0]))
     assert (engine.units.get(1).counts["late"], engine.units.get(1).counts["samples"]) == (1, 13)
     engine.close()
+
+
+@pytest.mark.parametrize(
+    "action",
+    [{"do": "hold", "on": True, "x": 10**21}, {"do": "hold", "on": True, "x": "\ud800"}, {"do": "reset", "x": {3j}}],
+)
+def test_an_action_that_cannot_be_stored_is_refused(tmp_path, action):
+    """The first of these ended the service."""
+    engine, told = opened(configured(), tmp_path), []
+    y, u = record(40)
+    feed(engine, message("plant/a", range(20), y[:20], u[:20]))
+    engine.act("a", action, told.append)
+    assert "cannot be stored" in told[0]
+    assert feed(engine, message("plant/a", range(20, 40), y[20:], u[20:]))
+    assert events(engine, "action") == []
+    engine.close()
+
+
+def test_a_message_that_is_not_understood_harms_no_other(tmp_path):
+    """Sources hand on what devices send: lists as values, and lists of another length than they say."""
+    engine = opened(configured(), tmp_path)
+    y, u = record(20)
+    for k, columns in enumerate(
+        ({"t": 1.0, "y": [[1.0, 2.0]]}, {"t": [1.0, 2.0], "y": [1.0]}, {"t": object(), "y": [3j]})
+    ):
+        engine.intake.put("x", Batch([Samples(f"plant/odd{k}", 1, columns)], acknowledge=lambda: 1 / 0))
+    assert feed(engine, message("plant/a", range(20), y, u))
+    assert engine.units.refused["not understood"] == 1
+    assert np.array_equal(engine.units.get(engine.units.names["a"]).live.theta, theta_of(y, u))
+    engine.close()
+
+
+def theta_of(y, u):
+    return track(MODEL, TRACKER, y, u, time=np.arange(len(y)) * 1.0, dt=1.0).theta[-1]
+
+
+@pytest.mark.parametrize("where", ["section.Section._within", "unit.Unit.watch"])
+def test_an_exception_in_a_unit_never_ends_the_service(tmp_path, monkeypatch, where):
+    config = configured(UNIT + UNIT.replace("plant", "other"))
+    engine = opened(config, tmp_path)
+    y, u = record(20)
+    for topic in ("plant/a", "other/b"):
+        feed(engine, message(topic, range(10), y[:10], u[:10]))
+    engine.units.get(1).alarms = [SimpleNamespace(rule=SimpleNamespace(kind="band"))]
+    before = Section._within
+    monkeypatch.setattr(f"driftfit.service.core.{where}", lambda self, *a: before(self, *a) if odd(self) else 1 / 0)
+    for topic in ("plant/a", "other/b"):
+        engine.intake.put("web", message(topic, range(10, 20), y[10:], u[10:]))
+    engine.step(0.0)
+    assert "ZeroDivisionError" in engine.units.get(1).failure
+    assert np.array_equal(engine.units.get(2).live.theta, theta_of(y, u))
+    assert [one["error"][:4] for one in events(engine, "failed")] == ["Zero"]
+    engine.close()
+
+
+def odd(one):
+    return isinstance(one, Section) and one.streams.index == 1

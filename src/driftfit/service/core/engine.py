@@ -24,7 +24,7 @@ import numpy as np
 from driftfit.service.core.archive import Archive
 from driftfit.service.core.calibration import rules_of
 from driftfit.service.core.intake import Action, Arrived, Intake
-from driftfit.service.core.journal import NEEDED_FROM, Act, Group, Item, Journal, Pending
+from driftfit.service.core.journal import NEEDED_FROM, Act, Group, Item, Journal, Pending, check_storable
 from driftfit.service.core.unit import Out, Unit
 from driftfit.service.core.units import Units
 from driftfit.service.settings.config import Config
@@ -117,7 +117,13 @@ class Engine:
             done = number + np.arange(item.length) < since[np.searchsorted(own, item.unit)]
             own = np.unique(item.unit[~done])
         self._touched(own.tolist(), number)
-        self.units.sections[item.section].process(number, item, out, done)
+        section = self.units.sections[item.section]
+        try:
+            section.process(number, item, out, done)
+        except Exception as error:  # what is not foreseen for one unit: the others of the service go on
+            log.exception("engine")
+            for one in own.tolist():
+                self.units.get(one).fail(number, error, out)
         return item.length - (0 if done is None else int(done.sum()))
 
     def _touched(self, units: list[int], number: int) -> None:
@@ -171,7 +177,10 @@ class Engine:
         if not self._commit():
             return 0
         for _, batch in arrived.batches:
-            batch.acknowledge()
+            try:
+                batch.acknowledge()
+            except Exception:  # the sender asks again
+                log.exception("acknowledgement")
         refusals = self._process(first, items, now) if items else {}
         number = self.next - sum(action.unit in self.units.names for action in arrived.actions)
         for action in arrived.actions:
@@ -257,6 +266,12 @@ class Engine:
 
     def act(self, unit: str, what: dict[str, Any], done: Callable[[str], None] = lambda problem: None) -> None:
         """Put an action on a unit into the journal."""
+        try:
+            check_storable(what)
+        except ValueError as error:
+            log.error("refused", extra={"unit": unit, "detail": str(error)})
+            done(str(error))
+            return
         self.intake.act(Action(unit, what, done))
 
     def tell(self, unit: str, kind: str, detail: dict[str, Any]) -> None:

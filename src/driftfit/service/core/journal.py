@@ -283,6 +283,14 @@ class Pending:
             raise
 
 
+def check_storable(action: dict[str, Any]) -> None:
+    """Raise ValueError for an action that the journal cannot store: a number beyond 64 bits, half a character."""
+    try:
+        _encode(action)
+    except (OverflowError, TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"the action cannot be stored: {error}.") from None
+
+
 def _json(value: Any) -> str:
     text: str = msgspec.json.encode(value).decode()
     return text

@@ -208,7 +208,11 @@ class Section:
                 rows_of, _, lane = found.lanes[k]
                 factors = np.broadcast_to(noise, len(places))[part]
                 readings = records.y.reshape(len(places))[part]
-                on = unit.watch(rows_of, lane, readings, factors, own, number[part], out)
+                try:
+                    on = unit.watch(rows_of, lane, readings, factors, own, number[part], out)
+                except Exception as error:  # whatever it is, the other units continue
+                    unit.fail(int(number[part][0]), error, out)
+                    continue
                 flags[part] |= np.array(on, np.uint8) * np.uint8(ALARM)
             if not unit.calibrated:
                 unit.remember(own, rows.values[part], out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Iterable
@@ -18,6 +19,7 @@ from driftfit.service.settings.config import UnitSettings
 from driftfit.service.settings.matching import valid_name
 from driftfit.service.sources.samples import NO_SIGNAL, Receipt, Samples, numbers_of, seconds_of
 
+log = logging.getLogger("driftfit.service")
 ROUTES = 200_000
 """Topics whose units are remembered, including those that have none."""
 UNREADABLE = "its state cannot be read"
@@ -62,6 +64,8 @@ class Gathered:
 
 def _extend(column: list[Any], cells: Any, count: int) -> None:
     if isinstance(cells, list):
+        if len(cells) != count:  # it would move the samples of the messages behind it
+            raise ValueError(f"a list of {len(cells)} values in a message of {count} samples.")
         column += cells
     elif count == 1:
         column.append(cells)
@@ -208,6 +212,18 @@ class Units:
 
     def admitted(self, messages: Iterable[tuple[Samples, Receipt | None]], pending: Pending, born: int) -> list[Rows]:
         """The samples of messages that enter the journal; those that units do not accept are counted."""
+        messages = list(messages)
+        try:
+            return self._admitted(messages, pending, born)
+        except Exception:  # what one of them has is not foreseen: the others go on
+            if len(messages) > 1:
+                return [rows for one in messages for rows in self.admitted([one], pending, born)]
+            log.exception("message")
+            ((samples, receipt),) = messages
+            tally((self.refused, None if receipt is None else receipt.left_out), "not understood", samples.length)
+            return []
+
+    def _admitted(self, messages: list[tuple[Samples, Receipt | None]], pending: Pending, born: int) -> list[Rows]:
         gathered = [Gathered(one) for one in self.settings]
         for samples, receipt in messages:
             units = self.of_topic(samples.topic, pending, born)
@@ -224,10 +240,10 @@ class Units:
         for section, one in zip(self.sections, gathered, strict=True):
             if one.places:
                 places, times, values = one.arrays()
-                messages = np.repeat(np.arange(len(one.places)), one.lengths)
-                paid = np.flatnonzero(self._paid(section, one)[messages])
+                which = np.repeat(np.arange(len(one.places)), one.lengths)
+                paid = np.flatnonzero(self._paid(section, one)[which])
                 times = None if times is None else times[paid]
-                found.append(section.admit(places[paid], times, values[paid], _counter_of(one, messages[paid])))
+                found.append(section.admit(places[paid], times, values[paid], _counter_of(one, which[paid])))
         return [rows for rows in found if rows is not None]
 
     def _paid(self, section: Section, one: Gathered) -> Array:

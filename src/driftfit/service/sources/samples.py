@@ -167,7 +167,8 @@ def seconds(cell: Any, scale: float) -> float:
 def numbers_of(cells: list[Any]) -> Array:
     """Cells as numbers, as `number` gives them."""
     try:
-        return np.array(cells, float)
+        found = np.array(cells, float)
+        return found if found.ndim == 1 else np.array([number(cell) for cell in cells])
     except (TypeError, ValueError, OverflowError):
         return np.array([number(cell) for cell in cells])
 
