@@ -3,10 +3,15 @@
 import contextlib
 import http.server
 import json
+import signal
 import socket
 import struct
+import subprocess
+import sys
 import threading
 import time
+import urllib.error
+import urllib.request
 
 import numpy as np
 
@@ -108,6 +113,27 @@ def free_port():
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         return one.getsockname()[1]
+
+
+def started(port, *what):
+    command = [sys.executable, "-m", "driftfit", "serve", *(what or ["--demo"]), "--port", str(port)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + 90
+    while time.monotonic() < until:
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=2):
+                return process
+        except (urllib.error.URLError, OSError):
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.2)
+    raise TimeoutError
+
+
+def stopped(process):
+    process.send_signal(signal.SIGTERM)
+    result = process.communicate(timeout=60)[1]
+    assert process.returncode == 0, result
+    return [json.loads(line) for line in result.splitlines() if line.startswith("{")]
 
 
 def until(what, seconds=30.0):

@@ -2,10 +2,12 @@
 
 import http.server
 import json
+import socket
 import sqlite3
 import threading
 import time
-from contextlib import contextmanager
+import urllib.request
+from contextlib import ExitStack, contextmanager
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,13 +23,16 @@ from service_support import (
     configured,
     events,
     feed,
+    free_port,
     message,
     opened,
     record,
     running,
     settled,
+    started,
+    stopped,
     until,
-)
+)  # fmt: skip
 
 from driftfit import track
 from driftfit.service.core.section import Section
@@ -258,3 +263,23 @@ def test_an_exception_in_a_unit_never_ends_the_service(tmp_path, monkeypatch, wh
 
 def odd(one):
     return isinstance(one, Section) and one.streams.index == 1
+
+
+def test_clients_that_do_not_send_their_requests_hold_up_no_others():
+    """500 connections without a request, or with slow headers or bodies, took page, ingest and health down."""
+    pytest.importorskip("uvicorn", reason="the page needs driftfit[serve]")
+    port = free_port()
+    process = started(port)
+    head = b"POST /api/samples HTTP/1.1\r\nhost: localhost\r\ncontent-length: 100\r\n"
+    try:
+        with ExitStack() as held:
+            for k in range(500):
+                one = held.enter_context(socket.create_connection(("127.0.0.1", port + 1000 * (k % 10 == 0))))
+                one.sendall((b"", head, head + b"\r\n{")[k % 3])
+            for path, where in (("/healthz", port), ("/api/units", port), ("/healthz", port + 1000)):
+                with urllib.request.urlopen(f"http://127.0.0.1:{where}{path}", timeout=5) as answer:
+                    found = json.loads(answer.read())
+            assert found["state"] == "healthy"
+    finally:
+        stopped(process)
+        process.stderr.close()

@@ -41,6 +41,8 @@ KEPT = 16
 """Groups of which the results are kept in memory."""
 TROUBLED = 100
 """Units with trouble that are named."""
+STEP = 60.0
+"""Seconds that one group may take."""
 RETRY = 1.0
 """Seconds between two attempts to write the journal."""
 
@@ -66,6 +68,7 @@ class Engine:
         """Notified when there are results."""
         self.problem = ""
         self.samples = 0
+        self._stepped = time.monotonic()
         self.last_stored = 0
         """The last group whose results were stored by this process."""
         self.next = self.journal.next_number()
@@ -165,6 +168,7 @@ class Engine:
 
     def step(self, wait: float) -> int:
         """Take, journal and process the batches that have arrived; the number of samples."""
+        self._stepped = time.monotonic()
         arrived = self.intake.take(self.config.service.group, 0.0 if self._pending else wait)
         first, items = self.next, self._admit(arrived)
         oldest = min((batch.arrived for _, batch in arrived.batches if batch.arrived), default=time.monotonic())
@@ -330,6 +334,11 @@ class Engine:
         """The last group that all sinks have written."""
         found = [self.positions.get(f"sink:{sink.name}", 0) for sink in self.config.sinks]
         return min(found, default=self.next)
+
+    @property
+    def alive(self) -> bool:
+        """Whether it works on samples, or says what the problem is."""
+        return bool(self.problem) or time.monotonic() - self._stepped < STEP
 
     def status(self) -> dict[str, Any]:
         """Numbers for the page and for Prometheus."""

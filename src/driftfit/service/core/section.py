@@ -94,15 +94,8 @@ class Section:
 
     def _too_far(self, places: Array, time: Array) -> Array:
         """Which times are further ahead of both the newest and this clock than the settings allow."""
-        now, ahead = wall.time(), self.streams.settings.ahead
-        far = time > np.fmax(self.streams.newest[places], now) + ahead
-        for place in np.unique(places[far]).tolist():
-            newest = max(now, float(np.nan_to_num(self.streams.newest[place], nan=-math.inf)))
-            own = np.flatnonzero(places == place)
-            for k in own[np.argsort(time[own])].tolist():
-                far[k] = time[k] > newest + ahead
-                newest = newest if far[k] or math.isnan(time[k]) else max(newest, time[k])
-        return np.asarray(far)
+        newest = np.fmax(self.streams.newest[places], wall.time())
+        return np.asarray(time > newest + self.streams.settings.ahead)
 
     def _refuse(self, name: str, places: Array, which: Array, counter_of: CounterOf) -> None:
         for k in which.tolist():

@@ -96,6 +96,8 @@ class PageOptions:
     host: str = "127.0.0.1"
     port: int = 8765
     enabled: bool = True
+    health: int = 0
+    """Port of the health check, on 127.0.0.1; 0: a thousand above that of the page."""
     names: list[str] = field(default_factory=list)
     """Host names under which browsers may reach the page, besides the host itself."""
     certificate: str = ""
