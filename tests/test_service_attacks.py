@@ -273,7 +273,7 @@ def test_clients_that_do_not_send_their_requests_hold_up_no_others():
     head = b"POST /api/samples HTTP/1.1\r\nhost: localhost\r\ncontent-length: 100\r\n"
     try:
         with ExitStack() as held:
-            for k in range(500):
+            for k in range(600):
                 one = held.enter_context(socket.create_connection(("127.0.0.1", port + 1000 * (k % 10 == 0))))
                 one.sendall((b"", head, head + b"\r\n{")[k % 3])
             for path, where in (("/healthz", port), ("/api/units", port), ("/healthz", port + 1000)):
