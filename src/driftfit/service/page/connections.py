@@ -26,7 +26,8 @@ class Connection(H11Protocol):
     @property
     def waits(self) -> bool:
         """Whether the client has to send something."""
-        return self.cycle is None or self.cycle.response_complete or self.cycle.more_body
+        sent = self.cycle is not None and not self.cycle.response_complete and not self.cycle.more_body
+        return not sent and not self.transport.is_closing()
 
     @property
     def uploads(self) -> bool:
