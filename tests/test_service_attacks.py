@@ -2,12 +2,15 @@
 
 import http.server
 import json
+import re
 import socket
 import sqlite3
 import threading
 import time
 import urllib.request
+from collections import Counter
 from contextlib import ExitStack, contextmanager
+from string import Formatter
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,6 +30,7 @@ from service_support import (
     message,
     opened,
     record,
+    results_of,
     running,
     settled,
     started,
@@ -40,10 +44,11 @@ from driftfit.service.health import health
 from driftfit.service.page import metrics
 from driftfit.service.page.feed import Feed
 from driftfit.service.settings.config import ProblemsError
+from driftfit.service.settings.matching import Pattern
 from driftfit.service.sinks.contract import Event, Outcome
 from driftfit.service.sinks.sqlite import Sqlite
 from driftfit.service.sinks.webhook import Webhook
-from driftfit.service.sources.samples import Batch, Samples
+from driftfit.service.sources.samples import Batch, Receipt, Samples
 from driftfit.service.threads import TRIES, SinkThread, SourceThread
 
 
@@ -283,3 +288,55 @@ def test_clients_that_do_not_send_their_requests_hold_up_no_others():
     finally:
         stopped(process)
         process.stderr.close()
+
+
+def test_new_units_are_limited_by_client_and_those_that_had_few_samples_are_forgotten(tmp_path, monkeypatch):
+    """A body of 3.5 MB made 100,000 units, which stayed in memory for good."""
+    config = configured(UNIT, "[service]\nnew_units = 20\n")
+    engine, left = opened(config, tmp_path), Counter()
+    y, u = record(40)
+    feed(engine, message("plant/good", range(12), y[:12], u[:12]))
+    feed(engine, message("plant/slow", [0.0], y[:1], u[:1]))
+    for client in ("Ann", "Bob"):
+        samples = [Samples(f"plant/{client}{k}", 1, {"t": 0.0, "y": 1.0}) for k in range(50)]
+        engine.intake.put("web", Batch(samples, client=client, receipt=Receipt(left_out=left)))
+        engine.step(0.0)
+    assert len(engine.units) == 42
+    assert left["too many new units"] == engine.units.refused["too many new units"] == 60
+    engine._store_states(everything=True)
+    settled(engine)
+    monkeypatch.setattr("driftfit.service.core.units.QUIET", -1.0)
+    for _ in range(2):
+        engine.step(0.0)
+    assert [one.name for one in engine.units.resident] == ["good"]
+    capacity = engine.units.sections[0].streams.capacity
+    monkeypatch.setattr("driftfit.service.core.units.QUIET", 1e9)
+    engine.units._minute = -1e9  # a minute later
+    for k in range(15):
+        feed(engine, message(f"plant/other{k}", [0.0], y[:1], u[:1]))
+    for again in range(2):  # a unit that was forgotten is there again, as it was; also for another process
+        part = slice(1 + again, 2 + again)
+        feed(engine, message("plant/slow", [1.0 + again], y[part], u[part]))
+        engine.close()
+        engine = opened(config, tmp_path)
+    assert engine.units.sections[0].streams.capacity <= capacity
+    feed(engine, message("plant/slow", range(3, 40), y[3:], u[3:]))
+    feed(engine, message("plant/Ann0", [1.0], y[:1], u[:1]))
+    assert np.array_equal(engine.units.get(engine.units.names["slow"]).live.theta, theta_of(y, u))
+    rows = engine.journal.rows_of(engine.units.names["slow"])[0]
+    assert rows == list(range(40))
+    assert len(engine.units) == 18
+    assert len({row[0] for row in results_of(engine)}) == engine.next - 1
+    engine.close()
+
+
+@pytest.mark.parametrize("text", ["{a}-{b}", "{a}{b}x", "x{a}-{b}/{c}", "{{{a}", "{a}--{b}--{c}"])
+def test_topics_match_as_regular_expressions_do_and_in_linear_time(text):
+    pattern, rng = Pattern(text), np.random.default_rng(1)
+    parts = [(re.escape(fixed), name) for fixed, name, *_ in Formatter().parse(text)]
+    slow = re.compile("".join(fixed + f"(?P<{name}>[^/]+)" * bool(name) for fixed, name in parts))
+    for _ in range(2000):
+        topic = "".join(rng.choice(list("ab-x/{"), int(rng.integers(0, 9))))
+        found = slow.fullmatch(topic)
+        assert pattern.match(topic) == (found and found.groupdict()), topic
+    assert Pattern("plant/{a}-{b}-{c}-{d}-{e}-{f}x").match("plant/" + "-" * 190) is None  # it took hours

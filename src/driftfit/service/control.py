@@ -73,7 +73,7 @@ class Control(threading.Thread):
                     "error": 'no source takes samples over HTTP; add [source.web] with kind = "http".',
                     "status": 404,
                 }
-            return INCOMING.offer(str(header.get("topic", "")), body)
+            return INCOMING.offer(str(header.get("topic", "")), body, str(header.get("client", "")))
         name = str(header.get("unit"))
         number = self.engine.units.names.get(name)
         if number is None:

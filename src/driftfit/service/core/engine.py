@@ -9,6 +9,7 @@ with the load. It takes 1 to 10 ms; a sample costs a few microseconds more (`ben
 from __future__ import annotations
 
 import logging
+import math
 import sqlite3
 import threading
 import time
@@ -60,7 +61,7 @@ class Engine:
         self.config = config
         self.journal = Journal(folder)
         self.intake = Intake(config.service.queue)
-        self.units = Units(config.units, self.journal, config.service.units)
+        self.units = Units(config.units, self.journal, config.service)
         self.positions = self.journal.positions()
         self.progress: dict[str, int] = {}
         """The last group that each sink has written."""
@@ -106,17 +107,15 @@ class Engine:
     def _apply(self, number: int, item: Item, out: Out, replay: bool = False) -> int:
         """Pass an entry of the log to its units, without what their stored states contain already; how much it was."""
         if isinstance(item, Act):
-            unit = self.units.get(item.unit)
-            if replay and number < self.units.since[item.unit]:
+            if replay and number < self._since(item.unit):
                 return 0
+            unit = self.units.get(item.unit)
             self._touched([item.unit], number)
             unit.act(number, item.action, out)
             return 1
         own, done = np.unique(item.unit), None
         if replay:
-            for one in own.tolist():
-                self.units.get(one)
-            since = np.array([self.units.since[one] for one in own.tolist()])
+            since = np.array([self._since(one) for one in own.tolist()])
             done = number + np.arange(item.length) < since[np.searchsorted(own, item.unit)]
             own = np.unique(item.unit[~done])
         self._touched(own.tolist(), number)
@@ -128,6 +127,13 @@ class Engine:
             for one in own.tolist():
                 self.units.get(one).fail(number, error, out)
         return item.length - (0 if done is None else int(done.sum()))
+
+    def _since(self, unit: int) -> float:
+        """The number up to which samples are in the stored state of a unit; all are in that of one that was evicted."""
+        if unit not in self.units.since:
+            return math.inf
+        self.units.get(unit)
+        return self.units.since[unit]
 
     def _touched(self, units: list[int], number: int) -> None:
         """Note that the states of units changed from a number on."""
@@ -170,6 +176,7 @@ class Engine:
         """Take, journal and process the batches that have arrived; the number of samples."""
         self._stepped = time.monotonic()
         arrived = self.intake.take(self.config.service.group, 0.0 if self._pending else wait)
+        self.units.evict(self._dirty, self._pending)
         first, items = self.next, self._admit(arrived)
         oldest = min((batch.arrived for _, batch in arrived.batches if batch.arrived), default=time.monotonic())
         now = time.time() - (time.monotonic() - oldest)
@@ -203,7 +210,11 @@ class Engine:
                 self.tell("", "source", {"source": source, "noticed": batch.noticed})
             if batch.position is not None:
                 self._pending.positions[f"source:{source}"] = batch.position
-        messages = ((samples, batch.receipt) for _, batch in arrived.batches for samples in batch.samples)
+        messages = (
+            (batch.client or source, samples, batch.receipt)
+            for source, batch in arrived.batches
+            for samples in batch.samples
+        )
         items: list[Item] = [*self.units.admitted(messages, self._pending, self.next)]
         for action in arrived.actions:
             unit = self.units.names.get(action.unit)

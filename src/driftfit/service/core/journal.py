@@ -1,6 +1,7 @@
 """The journal: one SQLite database in which samples, states, results and positions of sources change together.
 
     log        what came in, in groups: numbered samples in columns, and operator's actions
+    evicted    units that are known by their rows only, because they had few samples
     trouble    what does not work in a unit, and why
     unit       number, name, section and topic of every unit
     program    models and trackers that states were made with, by the fingerprint of the states
@@ -47,6 +48,7 @@ create index if not exists event_of_unit on event (unit, id);
 create table if not exists undelivered (sink text, number integer, unit text, at real, kind text, detail text,
     tries integer, why text);
 create table if not exists trouble (unit integer primary key, what text);
+create table if not exists evicted (unit integer primary key);
 create table if not exists position (name text primary key, value text);
 """
 PRAGMAS = ("page_size=8192", "journal_mode=wal", "synchronous=full", "wal_autocheckpoint=2000", "temp_store=memory")
@@ -200,6 +202,17 @@ class Journal:
                     times += [] if own.time is None else own.time.tolist()
                     rows += own.values.tolist()
         return times, rows
+
+    def evicted(self) -> set[int]:
+        """Numbers of the units that are known by their rows only."""
+        return {unit for (unit,) in self.db.execute("select unit from evicted")}
+
+    def unit_named(self, name: str) -> tuple[int, int, int] | None:
+        """(number, section, born) of the unit of a name."""
+        found: tuple[int, int, int] | None = self.db.execute(
+            "select id, section, born from unit where name = ?", (name,)
+        ).fetchone()
+        return found
 
     def trouble(self) -> dict[int, dict[str, str]]:
         """By unit: what does not work, and why."""

@@ -12,6 +12,7 @@ import math
 import time as wall
 from collections import Counter
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -53,17 +54,23 @@ class Section:
 
     def __init__(self, index: int, settings: UnitSettings) -> None:
         self.streams = Streams(index, settings)
-        self.units: list[Unit] = []
+        self.units: dict[int, Unit] = {}
         """By their places."""
         self.blocks = Blocks(THETA + 2 * self.streams.program.model.n)
 
     def add(self, number: int, name: str) -> Unit:
         """A new unit."""
         unit = Unit(number, name, self.streams, self.streams.add(number))
-        if len(self.units) == self.blocks.capacity:
+        if unit.place == self.blocks.capacity:
             self.blocks.grow(self.streams.capacity)
-        self.units.append(unit)
+        self.units[unit.place] = unit
         return unit
+
+    def remove(self, unit: Unit) -> list[tuple[Any, ...]]:
+        """Forget a unit; the rows of the table ``block`` for the rest of its history."""
+        del self.units[unit.place]
+        self.streams.remove(unit.place)
+        return self.blocks.flush(unit.place, unit.number)
 
     def prepare(self) -> None:
         """Compile what the first samples need, so that they do not wait; lanes only if there are units for them."""

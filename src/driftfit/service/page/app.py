@@ -196,8 +196,9 @@ class Page:
 
     async def samples(self, request: Request) -> Response:
         """Take samples; the answer comes when they are in the journal."""
-        self.operator(request)
-        header = {"do": "samples", "topic": request.path_params.get("topic", "")}
+        user = self.operator(request)
+        client = user if self.options.user else request.client.host if request.client else "local"
+        header = {"do": "samples", "topic": request.path_params.get("topic", ""), "client": client}
         return await self.asked(header, await request.body())
 
     async def actions(self, request: Request) -> Response:

@@ -53,6 +53,7 @@ class Feed:
         self.status: dict[str, Any] = {"problem": "the engine has not answered yet"}
         self.answered = 0.0
         self.count = 0
+        self._swept = time.monotonic()
         self._base: dict[int, tuple[float, list[float], list[float]]] = {}
         query = "select coalesce(min(first), 1) - 1 from (select first from result order by first desc limit ?)"
         self.at = int(self.journal.db.execute(query, (BACK,)).fetchone()[0])
@@ -89,6 +90,11 @@ class Feed:
                 break
         if any(unit not in self.names.names for unit in self.latest):
             self.names.read()
+        if time.monotonic() - self._swept > CHECK:
+            self._swept = time.monotonic()
+            for unit in self.journal.evicted() & self.latest.keys():
+                del self.latest[unit], self.updated[unit]
+                self._base.pop(unit, None)
         for unit in [unit for unit, (_, asked) in self.watched.items() if time.monotonic() - asked[0] > FORGET]:
             del self.watched[unit]
 

@@ -67,6 +67,8 @@ class ServiceOptions:
     """Days for which the page's history is kept."""
     units: int = 100_000
     """Most units; topics beyond that are refused and counted."""
+    new_units: int = 1_000
+    """Most units that one client, or one source where clients are not told apart, may make in a minute."""
     log: str = "info"
 
 

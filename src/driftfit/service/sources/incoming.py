@@ -11,12 +11,14 @@ from typing import Any
 
 import msgspec
 
-from driftfit.service.sources.samples import NO_SIGNAL, Batch, Receipt, Samples, ShapeError, decode
+from driftfit.service.sources.samples import NO_SIGNAL, TOO_MANY_NEW, Batch, Receipt, Samples, ShapeError, decode
 
 WAIT = 30.0
 """Seconds after which a request that is not yet journaled is answered with an error."""
 KNOWN = frozenset({"late", "duplicate"})
 """Reasons for which a sender need not mend anything: it has sent the samples before, or others were faster."""
+SLOWER = frozenset({"flood", TOO_MANY_NEW})
+"""Reasons for which a sender has to wait."""
 _BODY = msgspec.json.Decoder(dict[str, msgspec.Raw])
 
 
@@ -26,7 +28,7 @@ class Incoming:
     def __init__(self, most: int = 256) -> None:
         self.queue: queue.Queue[Batch] = queue.Queue(most)
 
-    def offer(self, topic: str, body: bytes) -> dict[str, Any]:
+    def offer(self, topic: str, body: bytes, client: str = "") -> dict[str, Any]:
         """Decode a request, wait until it is in the journal, and report what was received and what was left out.
 
         The status is 200 if anything was taken, or all of it was known already; 400 if nothing is JSON, 429 if it was
@@ -34,7 +36,7 @@ class Incoming:
         """
         samples, refused, shaped = decoded(topic, body)
         done, receipt = threading.Event(), Receipt()
-        batch = Batch(samples, done.set, refused=len(refused), arrived=time.monotonic(), receipt=receipt)
+        batch = Batch(samples, done.set, client=client, refused=len(refused), arrived=time.monotonic(), receipt=receipt)
         try:
             self.queue.put(batch, timeout=WAIT)
         except queue.Full:
@@ -52,7 +54,7 @@ class Incoming:
         if left_out.total() < receipt.offered or reasons <= KNOWN:
             return answer
         why = ", ".join(f"{reason} ({count})" for reason, count in left_out.items())
-        return answer | {"error": f"no sample was taken: {why}.", "status": 429 if "flood" in left_out else 422}
+        return answer | {"error": f"no sample was taken: {why}.", "status": 429 if SLOWER & left_out.keys() else 422}
 
 
 INCOMING = Incoming()
