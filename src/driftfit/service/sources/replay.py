@@ -16,6 +16,7 @@ from typing import Any
 
 import polars as pl
 
+from driftfit.data.formats.packed import read_parquet
 from driftfit.service.sources.contract import END, FileSource, Reader
 from driftfit.service.sources.samples import Batch, Samples, seconds
 
@@ -44,7 +45,7 @@ class Replay(FileSource):
 
     def open(self, position: Any) -> Reader:
         """Continue after the rows that were read."""
-        table = pl.read_parquet(self.path) if self.path.endswith(".parquet") else pl.read_csv(self.path)
+        table = read_parquet(self.path, self.path)[1] if self.path.endswith(".parquet") else pl.read_csv(self.path)
         with open(self.path, "rb") as file:
             digest = hashlib.file_digest(file, "blake2b").hexdigest()
         return _Replay(self, table, digest, position or [0, digest])
