@@ -64,23 +64,16 @@ def _matrix(data: bytes, order: str) -> tuple[str, bool]:
     if (a, b, c, len(flags)) != (UINT32, INT32, 1, 8) or len(dimensions) % 4 or len(dimensions) < 8:
         raise ValueError("a variable without class, dimensions or name")
     about, shape = int(np.frombuffer(flags, f"{order}u4")[0]), np.frombuffer(dimensions, f"{order}i4").tolist()
-    kind, count, text, held = about & 0xFF, math.prod(shape), name.decode("latin1"), []
+    kind, count, text = about & 0xFF, math.prod(shape), name.decode("latin1")
     if kind in NUMBERS:
         fine = len(parts) == 1 + bool(about >> 8 & COMPLEX)
         fine &= all(one in WIDTHS and WIDTHS[one] * count == len(body) for one, body in parts)
     elif kind == CHAR:
         fine = len(parts) == 1 and parts[0][0] in TEXTS and count <= len(parts[0][1])
     elif kind in (CELL, STRUCT):
-        each, held = 1, parts
-        if kind == STRUCT:
-            (one, length), (other, names), *held = parts
-            (width,) = np.frombuffer(length, f"{order}i4").tolist()
-            if one != INT32 or other != 1 or width < 1 or len(names) % width:
-                raise ValueError(f"the struct {text!r} has no names")
-            each = len(names) // width
-        fine = len(held) == each * count and all(one == MATRIX for one, _ in held)
+        fine = count <= len(data)
     else:
         return text, False
     if not fine or min(shape) < 0:
         raise ValueError(f"the variable {text!r} has other contents than its class and dimensions say")
-    return text, all([_matrix(body, order)[1] for _, body in held])
+    return text, all([_matrix(body, order)[1] for one, body in parts if one == MATRIX])

@@ -31,8 +31,6 @@ LOOK = 1.0
 """Seconds between two looks at the page's process."""
 SWITCH = 0.0005
 """Seconds for which a thread may keep the interpreter while others wait."""
-WELL = ("starting", "running", "ended")
-"""States of sources and sinks that are no trouble."""
 STOP = 10.0
 """Seconds that sinks have to write stored results when the service stops."""
 
@@ -98,16 +96,11 @@ class Service:
     def status(self) -> dict[str, Any]:
         """Numbers for the page, `/metrics` and `/healthz`."""
         found = self.engine.status()
-        sources = {one.label: one.status() for one in self.sources}
-        sinks = {one.label: one.status() for one in self.sinks}
-        for what, runners in (("source", sources), ("sink", sinks)):
-            found["reasons"] += [f"{what} {name} is {one['state']}" for name, one in runners.items()
-                                 if one["state"] not in WELL]  # fmt: skip
-        found["reasons"] += [f"sink {name}: {one['set_aside']} events were refused and are set aside"
-                             for name, one in sinks.items() if one["set_aside"]]  # fmt: skip
+        found["reasons"] += [why for one in (*self.sources, *self.sinks) for why in one.reasons()]
         return found | {
-            "sources": sources, "sinks": sinks, "since": self.begun, "version": __version__,
-            "page_starts": self.page_starts,
+            "sources": {one.label: one.status() for one in self.sources},
+            "sinks": {one.label: one.status() for one in self.sinks},
+            "since": self.begun, "version": __version__, "page_starts": self.page_starts,
         }  # fmt: skip
 
     def run(self, signals: bool = True) -> None:

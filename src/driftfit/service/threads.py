@@ -57,6 +57,10 @@ class WorkerThread(threading.Thread):
         """Numbers for the page."""
         return {"state": self.state, "count": self.count, "failures": self.failures}
 
+    def reasons(self) -> list[str]:
+        """Why the service is degraded."""
+        return [f"{self.what} {self.label} is {self.state}"] if self.state.startswith("away") else []
+
     def stop(self) -> None:
         """Let the thread end."""
         self.stopping.set()
@@ -172,6 +176,11 @@ class SinkThread(WorkerThread):
             if not groups:
                 with self.engine.news:
                     self.engine.news.wait(0.2)
+
+    def reasons(self) -> list[str]:
+        """Also what was set aside."""
+        aside = f"sink {self.label}: {self.set_aside} events were refused and are set aside"
+        return super().reasons() + [aside] * bool(self.set_aside)
 
     def status(self) -> dict[str, Any]:
         """Numbers for the page."""

@@ -42,7 +42,7 @@ class Archive:
             if self._writing.exception() is not None:
                 log.error("archive", extra={"detail": str(self._writing.exception())})
             elif upto := self._writing.result():
-                pending.forget.append(("delete from log where first < ?", (upto,)))
+                pending.others.append(("delete from log where first < ?", (upto,)))
             self._writing = None
         if time.monotonic() - self._looked < EVERY or self._writing is not None:
             return
@@ -52,7 +52,7 @@ class Archive:
     def begin(self, pending: Pending, needed: int, sinks_at: int) -> None:
         """Look for old rows."""
         now = time.time()
-        pending.forget += [
+        pending.others += [
             ("delete from result where at < ? and first < ?", (now - 60.0, min(needed, sinks_at))),
             ("delete from result where at < ?", (now - DAY * self.options.results,)),
             ("delete from block where stop < ? and stop > 1e8", (now - DAY * self.options.history,)),

@@ -291,7 +291,7 @@ class Engine:
 
     def tell(self, unit: str, kind: str, detail: dict[str, Any]) -> None:
         """Note an event that no sample caused, for the page and the log; from any thread. A unit "" is none."""
-        log.error(kind, extra={"unit": unit, "detail": detail})
+        log.log(logging.ERROR if unit else logging.WARNING, kind, extra={"unit": unit, "detail": detail})
         self._told.append((unit, kind, detail))
 
     def _store_states(self, everything: bool = False) -> None:
@@ -359,6 +359,7 @@ class Engine:
             "samples": self.samples, "next": self.next, "units": len(self.units), "waiting": self.intake.waiting,
             "held_back": self.intake.held_back, "refused": dict(self.units.refused), "problem": self.problem,
             "failed": sum("failed" in what for what in trouble.values()), "trouble": shown, "troubled": len(trouble),
-            "reasons": [f"{unit}: {what} ({why})" for unit, found in shown.items() for what, why in found.items()],
+            "reasons": [f"{unit}: {what} ({why})" for unit, found in shown.items() for what, why in found.items()]
+            + [f"{len(trouble) - TROUBLED} more units"] * (len(trouble) > TROUBLED),
             "dirty": len(self._dirty), "recovered": self.recovered, "positions": dict(self.positions),
         }  # fmt: skip

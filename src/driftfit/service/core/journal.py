@@ -207,17 +207,6 @@ class Journal:
         """Numbers of the units that are known by their rows only."""
         return {unit for (unit,) in self.db.execute("select unit from evicted")}
 
-    def unit_named(self, name: str) -> tuple[int, int, int] | None:
-        """(number, section, born) of the unit of a name."""
-        found: tuple[int, int, int] | None = self.db.execute(
-            "select id, section, born from unit where name = ?", (name,)
-        ).fetchone()
-        return found
-
-    def trouble(self) -> dict[int, dict[str, str]]:
-        """By unit: what does not work, and why."""
-        return {unit: msgspec.json.decode(what) for unit, what in self.db.execute("select * from trouble")}
-
     def programs(self) -> dict[bytes, str]:
         """Models and trackers that states were made with, by the fingerprint of the states."""
         return dict(self.db.execute("select tag, about from program").fetchall())
@@ -232,13 +221,12 @@ class Pending:
         self.log: tuple[int, int, float, bytes] | None = None
         self.results: list[tuple[int, int, float, bytes]] = []
         self.events: list[tuple[int, int, float, str, str]] = []
-        self.undelivered: list[tuple[Any, ...]] = []
-        self.trouble: list[tuple[int, str]] = []
         self.blocks: list[tuple[Any, ...]] = []
         self.snapshots: list[tuple[int, int, bytes]] = []
         self.positions: dict[str, Any] = {}
         self.meta: dict[str, str] = {}
-        self.forget: list[tuple[str, tuple[Any, ...]]] = []
+        self.others: list[tuple[str, Any]] = []
+        """(statement, values)"""
 
     def __bool__(self) -> bool:
         return any(map(bool, self.__dict__.values()))
@@ -258,17 +246,13 @@ class Pending:
             self.events += [(n, unit, when, kind, _json(detail)) for n, unit, when, kind, detail in events]
         self.meta[RESULTS_FROM] = str(first + 1)
 
-    def add_trouble(self, unit: int, trouble: dict[str, str]) -> None:
-        """What does not work in a unit now."""
-        self.trouble.append((unit, _json(trouble)))
-
     def add_event(self, number: int, unit: int, kind: str, detail: dict[str, Any]) -> None:
         """An event that no sample caused."""
         self.events.append((number, unit, time.time(), kind, _json(detail)))
         if kind == "undelivered":
-            columns = ("sink", "number", "unit", "at", "kind", "detail", "tries", "why")
             row = detail | {"detail": _json(detail["detail"])}
-            self.undelivered.append(tuple(row[name] for name in columns))
+            values = ":sink, :number, :unit, :at, :kind, :detail, :tries, :why"
+            self.others.append((f"insert into undelivered values ({values})", row))
 
     def commit(self, db: sqlite3.Connection) -> None:
         """Write everything in one transaction; on an error nothing is written, and it can be tried again."""
@@ -281,13 +265,11 @@ class Pending:
                 db.execute("insert into log values (?, ?, ?, ?)", self.log)
             put("insert or ignore into result values (?, ?, ?, ?)", self.results)
             put("insert into event (number, unit, at, kind, detail) values (?, ?, ?, ?, ?)", self.events)
-            put("insert or replace into trouble values (?, ?)", self.trouble)
-            put("insert into undelivered values (?, ?, ?, ?, ?, ?, ?, ?)", self.undelivered)
             put("insert or ignore into block values (?, ?, ?, ?, ?, ?, ?, ?)", self.blocks)
             put("insert or replace into snapshot values (?, ?, ?)", self.snapshots)
             put("insert or replace into position values (?, ?)", [(k, _json(v)) for k, v in self.positions.items()])
             put("insert or replace into meta values (?, ?)", self.meta.items())
-            for statement, values in self.forget:
+            for statement, values in self.others:
                 db.execute(statement, values)
             db.execute("commit")
         except BaseException:

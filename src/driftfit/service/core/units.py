@@ -98,7 +98,7 @@ class Units:
         self._saved: list[tuple[Array, float]] = [(np.zeros(0), 0.0) for _ in settings]
         """By section: samples that each unit may still send at once, and the time of that."""
         self._programs = journal.programs()
-        self.trouble = journal.trouble()
+        self.trouble = {unit: msgspec.json.decode(what) for unit, what in journal.db.execute("select * from trouble")}
         """By unit: what does not work, and why; also of those that are not in memory."""
         self.unreadable: list[int] = []
         """Units that have failed because their states cannot be read, which is yet to be an event."""
@@ -168,7 +168,8 @@ class Units:
             now = self.get(number).trouble
             if now != self.trouble.get(number, {}):
                 self.trouble[number] = now
-                pending.add_trouble(number, now)
+                what = msgspec.json.encode(now).decode()
+                pending.others.append(("insert or replace into trouble values (?, ?)", (number, what)))
 
     def troubled(self) -> dict[str, dict[str, str]]:
         """By name: what does not work, and why."""
@@ -227,10 +228,11 @@ class Units:
 
     def _again(self, name: str, pending: Pending) -> int:
         """The number of a unit that was evicted and is there again; 0 if there was none of this name."""
-        unit, section, born = self.journal.unit_named(name) or (0, 0, 0)
+        query = "select id, section, born from unit where name = ?"
+        unit, section, born = self.journal.db.execute(query, (name,)).fetchone() or (0, 0, 0)
         if unit:
             self._known[unit], self.names[name], self.since[unit] = (name, section), unit, born
-            pending.forget.append(("delete from evicted where unit = ?", (unit,)))
+            pending.others.append(("delete from evicted where unit = ?", (unit,)))
         return unit
 
     def evict(self, unstored: Collection[int], pending: Pending) -> None:
@@ -252,7 +254,7 @@ class Units:
             name, section = self._known.pop(number)
             del self.names[name], self.since[number]
             pending.blocks += self.sections[section].remove(unit)
-            pending.forget.append(("insert or ignore into evicted values (?)", (number,)))
+            pending.others.append(("insert or ignore into evicted values (?)", (number,)))
         for topic in [topic for topic, found in self._routes.items() if any(one.number in gone for one in found)]:
             del self._routes[topic]
 
