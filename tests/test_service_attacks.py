@@ -68,6 +68,7 @@ def receiver(*answers):
 def test_an_event_that_is_refused_is_tried_again_and_then_set_aside(tmp_path, monkeypatch, status):
     """A redirect was followed, to another address too, and its answer counted; a 5xx held up all alarms behind it."""
     monkeypatch.setattr("driftfit.service.threads.FIRST_PAUSE", 1e-3)
+    monkeypatch.setattr("driftfit.service.threads.LONGEST_PAUSE", 1e-2)
     with receiver(*[status] * (TRIES + 2)) as url:
         sink = f'[[sink]]\nkind = "webhook"\nurl = "{url}"\nevents = ["action"]\n'
         config = configured(more=sink)
@@ -170,11 +171,14 @@ def test_alarms_that_are_not_armed_and_units_that_have_failed_are_shown(tmp_path
     engine.close()
     engine = opened(config, tmp_path)
     assert [one.name for one in engine.units.resident] == ["b"]  # a is not in memory
+    assert list(engine.units.seen(1).trouble) == ["alarm glr is not armed"]  # another thread looks at it by itself
+    assert len(engine.units.resident) == 1
     status = engine.status()
     assert (status["failed"], status["troubled"]) == (1, 2)
     answer, code = health(status, True, True)
     assert (code, answer["state"]) == (200, "degraded")
     assert any(one.startswith("b: failed (ZeroDivisionError") for one in answer["reasons"])
+    assert health(status, True, False)[0]["reasons"] == ["2 units, sources or sinks; log in for their names"]
     page = Feed(tmp_path, tmp_path / "c")
     page.look()
     page.status = status

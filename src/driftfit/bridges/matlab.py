@@ -226,7 +226,7 @@ def _variables_hdf5(path: Path) -> dict[str, Any]:
             sizes: list[int] = []
             file.visititems(lambda name, one: sizes.append(one.nbytes) if isinstance(one, h5py.Dataset) else None)
             check_unpacked(str(path), path.stat().st_size, sum(sizes))
-            return {key: _from_hdf5(file, value) for key, value in file.items() if not key.startswith("#")}
+            return {str(key): _from_hdf5(file, value) for key, value in file.items() if not key.startswith("#")}
     except Exception as error:  # h5py raises many kinds too
         raise ValueError(f"{path} is damaged: {error}.") from None
 
@@ -236,7 +236,7 @@ def _from_hdf5(file: Any, value: Any) -> Any:
     import h5py
 
     if isinstance(value, h5py.Group):
-        columns = {key: _cells(file, one) for key, one in value.items()}
+        columns = {str(key): _cells(file, one) for key, one in value.items()}
         count = max((len(one) for one in columns.values()), default=1)
         return [{key: one[place] for key, one in columns.items()} for place in range(count)]
     if value.dtype == h5py.ref_dtype:
