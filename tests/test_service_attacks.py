@@ -344,3 +344,14 @@ def test_topics_match_as_regular_expressions_do_and_in_linear_time(text):
         found = slow.fullmatch(topic)
         assert pattern.match(topic) == (found and found.groupdict()), topic
     assert Pattern("plant/{a}-{b}-{c}-{d}-{e}-{f}x").match("plant/" + "-" * 190) is None  # it took hours
+
+
+def test_results_that_no_sink_has_written_are_not_deleted_without_a_word(tmp_path):
+    sink = f'[[sink]]\nkind = "sqlite"\npath = "{tmp_path}/out.db"\n[service]\nresults = -1.0\n'
+    engine = opened(configured(more=sink), tmp_path)
+    feed(engine, message("plant/a", range(20), *record(20)))
+    settled(engine)
+    engine._archive.begin(engine._pending, engine.journal, engine._sinks_at())
+    (found,) = events(engine, "lost")
+    assert found["why"].startswith("1 groups of results are older")
+    engine.close()
