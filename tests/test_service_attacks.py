@@ -315,7 +315,6 @@ def test_new_units_are_limited_by_client_and_those_that_had_few_samples_are_forg
     assert [one.name for one in engine.units.resident] == ["good"]
     capacity = engine.units.sections[0].streams.capacity
     monkeypatch.setattr("driftfit.service.core.units.QUIET", 1e9)
-    engine.units._minute = -1e9  # a minute later
     for k in range(15):
         feed(engine, message(f"plant/other{k}", [0.0], y[:1], u[:1]))
     for again in range(2):  # a unit that was forgotten is there again, as it was; also for another process
