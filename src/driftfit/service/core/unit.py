@@ -38,7 +38,7 @@ class Unit:
         """The first samples, from which the limits of alarms are found: time and row, one after the other."""
         self.asked = False
         """Whether this process looks for the limits."""
-        self.unarmed: dict[str, str] | None = self._unarmed
+        self.unarmed: dict[str, str] | None = None if self.settings.alarm else {}
         """By kind: why an alarm could not be set; None while the limits are not known."""
         self.alarms: list[LiveAlarm] = []
         self.alarmed = False
@@ -48,11 +48,6 @@ class Unit:
     def settings(self) -> UnitSettings:
         """Those of its streams."""
         return self.streams.settings
-
-    @property
-    def _unarmed(self) -> dict[str, str] | None:
-        """Before the first sample."""
-        return None if self.settings.alarm else {}
 
     @property
     def calibrated(self) -> bool:
@@ -137,7 +132,7 @@ class Unit:
         if what == "restart":
             streams.clear(place)
             self.failure, self.reference, self.alarms, self.alarmed = "", array("d"), [], False
-            self.asked, self.unarmed = False, self._unarmed
+            self.asked, self.unarmed = False, None if self.settings.alarm else {}
         elif what == "acknowledge":
             self.acknowledged = True
         elif what == "limits":
