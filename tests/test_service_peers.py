@@ -9,6 +9,7 @@ import shutil
 import socket
 import subprocess
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -273,6 +274,11 @@ def test_kafka(tmp_path):
     reader.close()
     assert first == [k for k in range(20) if k != 5]
     assert batch.samples[0].topic == "plant/7"
+    for beyond in (50, -7):  # the topic was made again, or its first messages are gone
+        reader = source.open({"plant/0": beyond})
+        assert "read from its first" in reader.read(0.5).noticed
+        assert until(partial(reader.read, 0.5)).samples[0].columns["t"] == 0
+        reader.close()
     writer = Sink("out", brokers, "received").open()
     writer.write(outcome())
     consumer = Consumer({"bootstrap.servers": brokers, "group.id": "t", "auto.offset.reset": "earliest"})
