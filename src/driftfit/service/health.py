@@ -51,14 +51,14 @@ class Health(threading.Thread):
             await server.serve_forever()
 
     async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if not self._slots.locked():
-            async with self._slots:
-                with contextlib.suppress(OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-                    async with asyncio.timeout(PATIENCE):
-                        await reader.readuntil(b"\r\n\r\n")
-                        said, code = self.ask()
-                        body = json.dumps(said).encode()
-                        head = f"HTTP/1.1 {code} -\r\ncontent-type: application/json\r\ncontent-length: {len(body)}\r\n"
-                        writer.write(f"{head}connection: close\r\n\r\n".encode() + body)
-                        await writer.drain()
-        writer.close()
+        broken = (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError)
+        with contextlib.closing(writer), contextlib.suppress(*broken):
+            if self._slots.locked():
+                return
+            async with self._slots, asyncio.timeout(PATIENCE):
+                await reader.readuntil(b"\r\n\r\n")
+                said, code = self.ask()
+                body = json.dumps(said).encode()
+                head = f"HTTP/1.1 {code} -\r\ncontent-type: application/json\r\ncontent-length: {len(body)}\r\n"
+                writer.write(f"{head}connection: close\r\n\r\n".encode() + body)
+                await writer.drain()
