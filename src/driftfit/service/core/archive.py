@@ -42,7 +42,7 @@ class Archive:
             if self._writing.exception() is not None:
                 log.error("archive", extra={"detail": str(self._writing.exception())})
             elif upto := self._writing.result():
-                pending.others.append(("delete from log where first < ?", (upto,)))
+                pending.forget.append(("delete from log where first < ?", (upto,)))
             self._writing = None
         if time.monotonic() - self._looked < EVERY or self._writing is not None:
             return
@@ -57,8 +57,8 @@ class Archive:
         if lost:
             why = f"{lost} groups of results are older than {self.options.results} days, and a sink was away"
             log.error("lost", extra={"detail": why})
-            pending.add_event(sinks_at, 0, "lost", {"why": why})
-        pending.others += [
+            pending.add_event(sinks_at, 0, now, "lost", {"why": why})
+        pending.forget += [
             ("delete from result where at < ? and first < ?", (now - 60.0, min(needed, sinks_at))),
             ("delete from result where at < ?", (now - DAY * self.options.results,)),
             ("delete from block where stop < ? and stop > 1e8", (now - DAY * self.options.history,)),

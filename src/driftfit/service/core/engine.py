@@ -99,7 +99,7 @@ class Engine:
             if first >= unstored:
                 self._pending.add_results(Group(first, out.results, out.events, time.time()))
             self._pending.blocks += out.blocks
-            self.units.note_trouble({unit for _, unit, *_ in out.events}, self._pending)
+            self.units.note_trouble({unit for _, unit, *_ in out.events if unit}, self._pending)
         for unit in self.units.resident:
             self._ask_for_limits(unit)
         return again
@@ -241,10 +241,10 @@ class Engine:
         for unit in out.to_calibrate:
             self._ask_for_limits(self.units.get(unit))
         self.samples += sum(len(one.number) for one in out.results)
-        self.units.note_trouble({unit for _, unit, *_ in out.events}, self._pending)
+        self.units.note_trouble({unit for _, unit, *_ in out.events if unit}, self._pending)
         for _, unit, _, kind, detail in out.events:
             bad = kind == "failed" or (kind == "calibrated" and detail.get("refused"))
-            name = self.units.get(unit).name
+            name = self.units.get(unit).name if unit else ""
             log.log(logging.ERROR if bad else logging.INFO, kind, extra={"unit": name, "detail": detail})
         return {number: detail["refused"] for number, *_, detail in out.events if "refused" in detail}
 
@@ -321,7 +321,7 @@ class Engine:
                 self._pending.positions[f"sink:{name}"] = upto
         while self._told:
             unit, kind, detail = self._told.popleft()
-            self._pending.add_event(self.next - 1, self.units.names.get(unit, 0), kind, detail)
+            self._pending.add_event(self.next - 1, self.units.names.get(unit, 0), time.time(), kind, detail)
         if not self._pending:
             return True
         while True:

@@ -1,6 +1,7 @@
 """The journal: one SQLite database in which samples, states, results and positions of sources change together.
 
     log        what came in, in groups: numbered samples in columns, and operator's actions
+    undelivered  events that the receiver of a sink has refused again and again
     evicted    units that are known by their rows only, because they had few samples
     trouble    what does not work in a unit, and why
     unit       number, name, section and topic of every unit
@@ -8,8 +9,7 @@
     snapshot   the last stored state of a unit, and the number up to which it knows the samples
     result     the results of the trackers, in the order in which they arose; sinks and the page read from here
     block      the results of one unit in pieces, with least, largest and mean of every column, for the page
-    event      alarms, failures, operator's actions; unit 0 where none is concerned
-    undelivered  events that the receiver of a sink has refused again and again
+    event      alarms, failures, operator's actions
     position   where sources continue, and how far sinks have come
 
 Journal before update: a group is committed (WAL, ``synchronous=FULL``) before any tracker processes it, and
@@ -20,7 +20,6 @@ missing are computed again from snapshots and log, bit for bit.
 from __future__ import annotations
 
 import sqlite3
-import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -225,8 +224,7 @@ class Pending:
         self.snapshots: list[tuple[int, int, bytes]] = []
         self.positions: dict[str, Any] = {}
         self.meta: dict[str, str] = {}
-        self.others: list[tuple[str, Any]] = []
-        """(statement, values)"""
+        self.forget: list[tuple[str, Any]] = []
 
     def __bool__(self) -> bool:
         return any(map(bool, self.__dict__.values()))
@@ -246,13 +244,13 @@ class Pending:
             self.events += [(n, unit, when, kind, _json(detail)) for n, unit, when, kind, detail in events]
         self.meta[RESULTS_FROM] = str(first + 1)
 
-    def add_event(self, number: int, unit: int, kind: str, detail: dict[str, Any]) -> None:
-        """An event that no sample caused."""
-        self.events.append((number, unit, time.time(), kind, _json(detail)))
+    def add_event(self, number: int, unit: int, at: float, kind: str, detail: dict[str, Any]) -> None:
+        """An event that no sample caused, of a unit or, with 0, of none."""
+        self.events.append((number, unit, at, kind, _json(detail)))
         if kind == "undelivered":
             row = detail | {"detail": _json(detail["detail"])}
             values = ":sink, :number, :unit, :at, :kind, :detail, :tries, :why"
-            self.others.append((f"insert into undelivered values ({values})", row))
+            self.forget.append((f"insert into undelivered values ({values})", row))
 
     def commit(self, db: sqlite3.Connection) -> None:
         """Write everything in one transaction; on an error nothing is written, and it can be tried again."""
@@ -269,7 +267,7 @@ class Pending:
             put("insert or replace into snapshot values (?, ?, ?)", self.snapshots)
             put("insert or replace into position values (?, ?)", [(k, _json(v)) for k, v in self.positions.items()])
             put("insert or replace into meta values (?, ?)", self.meta.items())
-            for statement, values in self.others:
+            for statement, values in self.forget:
                 db.execute(statement, values)
             db.execute("commit")
         except BaseException:

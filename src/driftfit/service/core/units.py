@@ -169,7 +169,7 @@ class Units:
             if now != self.trouble.get(number, {}):
                 self.trouble[number] = now
                 what = msgspec.json.encode(now).decode()
-                pending.others.append(("insert or replace into trouble values (?, ?)", (number, what)))
+                pending.forget.append(("insert or replace into trouble values (?, ?)", (number, what)))
 
     def troubled(self) -> dict[str, dict[str, str]]:
         """By name: what does not work, and why."""
@@ -194,16 +194,19 @@ class Units:
                 self._routes.popitem(last=False)
         return route, why
 
-    def _route(self, topic: str, client: str, pending: Pending, born: int) -> tuple[tuple[Unit, ...], str]:
-        if not valid_name(topic):
-            return (), ""
-        found, why = [], ""
-        for section, settings in enumerate(self.settings):
+    def named(self, topic: str) -> list[tuple[int, str]]:
+        """(section, name) of the units to which a topic belongs."""
+        found = []
+        for section, settings in enumerate(self.settings if valid_name(topic) else ()):
             name = settings.match.unit(topic)
-            if name is None:
-                continue
-            if not settings.match.name and len(self.settings) > 1:
-                name = f"{name}:{settings.y}"
+            if name is not None:
+                alone = settings.match.name or len(self.settings) == 1
+                found.append((section, name if alone else f"{name}:{settings.y}"))
+        return found
+
+    def _route(self, topic: str, client: str, pending: Pending, born: int) -> tuple[tuple[Unit, ...], str]:
+        found, why = [], ""
+        for section, name in self.named(topic):
             unit = self.names.get(name)
             if unit is None:
                 if refusal := self._refusal(name, client):
@@ -232,7 +235,7 @@ class Units:
         unit, section, born = self.journal.db.execute(query, (name,)).fetchone() or (0, 0, 0)
         if unit:
             self._known[unit], self.names[name], self.since[unit] = (name, section), unit, born
-            pending.others.append(("delete from evicted where unit = ?", (unit,)))
+            pending.forget.append(("delete from evicted where unit = ?", (unit,)))
         return unit
 
     def evict(self, unstored: Collection[int], pending: Pending) -> None:
@@ -254,7 +257,7 @@ class Units:
             name, section = self._known.pop(number)
             del self.names[name], self.since[number]
             pending.blocks += self.sections[section].remove(unit)
-            pending.others.append(("insert or ignore into evicted values (?)", (number,)))
+            pending.forget.append(("insert or ignore into evicted values (?)", (number,)))
         for topic in [topic for topic, found in self._routes.items() if any(one.number in gone for one in found)]:
             del self._routes[topic]
 

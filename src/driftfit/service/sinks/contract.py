@@ -51,7 +51,7 @@ class Event(NamedTuple):
     at: float
     """Wall clock, seconds since 1970."""
     kind: str
-    """alarm, over, failed, calibrated, action"""
+    """new, alarm, over, failed, calibrated, action"""
     detail: Mapping[str, Any]
 
     @property
