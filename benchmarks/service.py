@@ -360,7 +360,7 @@ def http(options, folder):
 
 def units(options, folder):
     """Memory of many units."""
-    one = Engine(parse(HTTP + UNIT), folder)
+    one = Engine(parse(HTTP + UNIT + f"[service]\nnew_units = {options.many}\n"), folder)
     before, count = memory(), options.many
     begun = time.perf_counter()
     for unit in range(count):

@@ -1,8 +1,17 @@
 """Small services for tests: one model and tracker, which other tests compile too."""
 
+import contextlib
+import http.server
 import json
+import signal
+import socket
 import struct
+import subprocess
+import sys
+import threading
 import time
+import urllib.error
+import urllib.request
 
 import numpy as np
 
@@ -98,3 +107,78 @@ def metric(value, name=None, alias=None, when=None, kind=10, **more):
     which = 13 if isinstance(value, float) else 14 if isinstance(value, bool) else 10 if isinstance(value, int) else 15
     data = b"".join(field(number, one) for number, one in (*parts, (which, value)) if one is not None)
     return field(2, data)
+
+
+def free_port():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+def started(port, *what):
+    command = [sys.executable, "-m", "driftfit", "serve", *(what or ["--demo"]), "--port", str(port)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + 90
+    while time.monotonic() < until:
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=2):
+                return process
+        except (urllib.error.URLError, OSError):
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.2)
+    raise TimeoutError
+
+
+def stopped(process):
+    process.send_signal(signal.SIGTERM)
+    result = process.communicate(timeout=60)[1]
+    assert process.returncode == 0, result
+    return [json.loads(line) for line in result.splitlines() if line.startswith("{")]
+
+
+def until(what, seconds=30.0):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        with contextlib.suppress(OSError):
+            if found := what():
+                return found
+        time.sleep(0.02)
+    raise TimeoutError
+
+
+@contextlib.contextmanager
+def running(engine, *runners):
+    """Runners of sources and sinks, and the engine, until the end of the block."""
+    worker = threading.Thread(target=engine.run, daemon=True)
+    for one in (*runners, worker):
+        one.start()
+    yield
+    for one in runners:
+        one.stop()
+    engine.stop()
+    for one in (*runners, worker):
+        one.join(20)
+
+
+class Receiver(http.server.BaseHTTPRequestHandler):
+    """Answers with the statuses in ``answers``, and keeps what came."""
+
+    got, answers = [], []
+
+    def do_POST(self):
+        body = self.rfile.read(int(self.headers["content-length"])).decode()
+        read = json.loads(body) if self.headers["content-type"] == "application/json" else body
+        self.got.append((self.headers["idempotency-key"], read, self.headers["title"]))
+        self.answer()
+
+    def do_GET(self):
+        self.got.append(("GET", self.path, self.headers["authorization"]))
+        self.answer()
+
+    def answer(self):
+        self.send_response(self.answers.pop(0) if self.answers else 200)
+        self.send_header("location", "/elsewhere")
+        self.end_headers()
+
+    def log_message(self, *args):
+        pass

@@ -36,7 +36,7 @@ ELSEWHERE = {
     ),
     "driftfit warm": ("tests/test_cli_commands.py", 'run("warm", "--model", "arx:1,1", *KALMAN)'),
     "driftfit journal verify": ("tests/test_service_journal.py", '["journal", "verify", str(folder)'),
-    "driftfit serve": ("tests/test_service_page.py", '"driftfit", "serve", *(what or ["--demo"])'),
+    "driftfit serve": ("tests/service_support.py", '"driftfit", "serve", *(what or ["--demo"])'),
     "python examples/controller.py": ("tests/test_embedded.py", '["controller.py"]'),
     "python -m lab bench accuracy": ("lab/tests/test_bench.py", '["bench", "accuracy", "--quick"'),
     "python -m lab structure": ("lab/tests/test_structure.py", '["structure", "--picture"'),

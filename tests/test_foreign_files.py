@@ -2,17 +2,20 @@
 
 import gzip
 import re
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 
 import numpy as np
 import polars as pl
 import pytest
+from scipy.io import savemat
 
 from driftfit import RLS, DataWarning, Regression, track
+from driftfit.bridges.matlab import read_mat
 from driftfit.cli.parts.reading import Part, moment, rows_of
 from driftfit.data.clock import Clock
 from driftfit.data.files import read_columns
 from driftfit.data.limits import within
+from driftfit.data.storage import read
 from driftfit.data.times.instants import warn_of_counted_years, warn_of_written_numbers
 
 
@@ -315,3 +318,50 @@ def test_years_that_pandas_read_as_nanoseconds():
     warn_of_counted_years(years.astype(str).astype("datetime64[Y]").astype("datetime64[ns]"))
     with pytest.raises(ValueError, match="as in dt=1 for the years 1970, 1971"):
         Clock.of("year").steps(years.astype(float))
+
+
+def test_packed_files_are_looked_at_before_they_are_unpacked(tmp_path, monkeypatch):
+    """An .npz of 2.3 MB took 3.2 GB."""
+    zeros = np.zeros(200_000)
+    np.savez_compressed(tmp_path / "a.npz", header=np.array('{"kind": "track"}'), y=zeros)
+    with pytest.raises(ValueError, match="is not a driftfit file, or it is damaged") as caught:
+        read(tmp_path / "a.npz", "track")
+    assert "would unpack to more" in str(caught.value.__cause__)
+    monkeypatch.setattr("driftfit.data.formats.packed.LARGE", 1000)
+    (tmp_path / "a.csv.gz").write_bytes(gzip.compress(b"t,y\n" + b"1,2\n" * 100_000))
+    (tmp_path / "b.csv.gz").write_bytes(gzip.compress(b"t,y\n" + b"1,2\n" * 100_000)[:-4] + bytes(4))  # says nothing
+    pl.DataFrame({"y": zeros}).write_parquet(tmp_path / "a.parquet")
+    for name in ("a.csv.gz", "b.csv.gz", "a.parquet"):
+        with pytest.raises(ValueError, match="says that it unpacks to"):
+            read_columns(tmp_path / name, ["y"])
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed")
+    savemat(tmp_path / "a.mat", {"y": zeros[:, None]}, do_compression=True)
+    with h5py.File(tmp_path / "b.mat", "w", userblock_size=512) as file:
+        file.create_dataset("y", (1, 10**9), "f8", chunks=(1, 1000))
+    with (tmp_path / "b.mat").open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM")
+    for name in ("a.mat", "b.mat"):
+        with pytest.raises(ValueError, match="says that it unpacks to"):
+            read_mat(tmp_path / name)
+
+
+def test_damaged_files_give_one_error(tmp_path):
+    """Some bytes of a .mat file ended the process, and panics of the Parquet reader are no exceptions."""
+    rng, path = np.random.default_rng(0), tmp_path / "a.mat"
+    signals = {"y": rng.normal(size=(30, 1)), "u": np.zeros((30, 1)), "names": np.array(["flow"], object)}
+    for compressed in (False, True):
+        savemat(path, {"s": signals}, do_compression=compressed)
+        good, refused = path.read_bytes(), 0
+        places = [144, 224, 225, 256, 257, *rng.integers(0, len(good), 300).tolist()]  # first flags and types
+        for at in places:
+            path.write_bytes(good[:at] + bytes([good[at] ^ int(rng.choice([7, 9, 14, 128]))]) + good[at + 1 :])
+            with suppress(ValueError):
+                refused -= len(read_mat(path)[0]) > 0
+            refused += 1
+        assert refused > 50
+    pl.DataFrame({"t": np.arange(50.0), "y": rng.normal(size=50)}).write_parquet(tmp_path / "a.parquet")
+    good = (tmp_path / "a.parquet").read_bytes()
+    for at in rng.integers(0, len(good), 150).tolist():
+        (tmp_path / "b.parquet").write_bytes(good[:at] + bytes([good[at] ^ 85]) + good[at + 1 :])
+        with suppress(ValueError):
+            read_columns(tmp_path / "b.parquet", ["y"])

@@ -358,11 +358,11 @@ def test_topics_that_no_unit_has(engine):
         assert feed(engine, message(topic, range(10), y, u))
     assert engine.units.refused["no unit for the topic"] == 60
     assert len(engine.units) == 0
-    engine.units.most = 2
+    engine.units.options = replace(engine.units.options, units=2)
     for k in range(5):
         feed(engine, message(f"plant/{k}", range(10), y, u))
     assert len(engine.units) == 2
-    assert engine.units.refused["too many units"] == 3
+    assert engine.units.refused["too many units"] == 30
 
 
 def test_old_journals_become_parquet(tmp_path, monkeypatch):

@@ -8,9 +8,6 @@ import os
 import random
 import re
 import signal
-import socket
-import subprocess
-import sys
 import threading
 import time
 import urllib.error
@@ -25,7 +22,7 @@ pytest.importorskip("starlette", reason="the page needs driftfit[serve]")
 pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
 
 import browser
-from service_support import configured, feed, message, opened, record, settled
+from service_support import configured, feed, free_port, message, opened, record, settled, started, stopped
 
 from driftfit.service.control import Control
 from driftfit.service.core.journal import sum_of
@@ -279,33 +276,6 @@ def test_fuzzed_requests(service, client, monkeypatch):
         seen.add(status)
     assert max(seen) < 504
     assert 500 not in seen
-
-
-def free_port():
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
-
-
-def started(port, *what):
-    command = [sys.executable, "-m", "driftfit", "serve", *(what or ["--demo"]), "--port", str(port)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    until = time.monotonic() + 90
-    while time.monotonic() < until:
-        try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=2):
-                return process
-        except (urllib.error.URLError, OSError):
-            assert process.poll() is None, process.stderr.read()
-            time.sleep(0.2)
-    raise TimeoutError
-
-
-def stopped(process):
-    process.send_signal(signal.SIGTERM)
-    result = process.communicate(timeout=60)[1]
-    assert process.returncode == 0, result
-    return [json.loads(line) for line in result.splitlines() if line.startswith("{")]
 
 
 @pytest.mark.skipif(browser.PROGRAM is None, reason="needs Chromium")

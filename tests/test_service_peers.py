@@ -1,7 +1,6 @@
 """Sources and sinks against the real things: mosquitto, PostgreSQL, asyncua's server, librdkafka's mock cluster."""
 
 import contextlib
-import http.server
 import importlib.util
 import json
 import os
@@ -9,8 +8,8 @@ import pwd
 import shutil
 import socket
 import subprocess
-import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,20 +23,19 @@ from service_support import (
     TRACKER,
     UNIT,
     configured,
-    feed,
     field,
-    message,
+    free_port,
     metric,
     opened,
     record,
-    settled,
+    running,
+    until,
 )  # fmt: skip
 
 from driftfit import track
 from driftfit.service.core.journal import Names
 from driftfit.service.core.results import OK, Results
 from driftfit.service.sinks.contract import Event, Outcome
-from driftfit.service.sinks.webhook import Webhook
 from driftfit.service.sources.mqtt import Mqtt
 from driftfit.service.sources.replay import Replay
 from driftfit.service.sources.sparkplug import REBIRTH
@@ -49,22 +47,6 @@ def needs(package):
     return pytest.mark.skipif(importlib.util.find_spec(package) is None, reason=f"needs {package}")
 
 
-def free_port():
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
-
-
-def until(what, seconds=30.0):
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        with contextlib.suppress(OSError):
-            if found := what():
-                return found
-        time.sleep(0.02)
-    raise TimeoutError
-
-
 def outcome(count=3, first=1, theta=0.5):
     """A small batch of one unit."""
     values = np.tile([0.0, 1.0, np.nan, 0.1, 0.2, theta, 0.1, 0.1, np.inf], (count, 1))
@@ -73,20 +55,6 @@ def outcome(count=3, first=1, theta=0.5):
     parts = [Results(number, unit, np.full(count, OK, np.uint8), values)]
     events = [Event(first, "pump 1", 1.7e9, "alarm", {"kind": "band", "cause": "a1", "statistic": 4.0, "limit": 3.0})]
     return Outcome(first, parts, events, {1: "pump 1"}, {"pump 1": {"names": ["a1", "b1"], "parts": {"pump": "1"}}})
-
-
-@contextlib.contextmanager
-def running(engine, *runners):
-    """Runners of sources and sinks, and the engine, until the end of the block."""
-    worker = threading.Thread(target=engine.run, daemon=True)
-    for one in (*runners, worker):
-        one.start()
-    yield
-    for one in runners:
-        one.stop()
-    engine.stop()
-    for one in (*runners, worker):
-        one.join(20)
 
 
 class Broker:
@@ -306,6 +274,11 @@ def test_kafka(tmp_path):
     reader.close()
     assert first == [k for k in range(20) if k != 5]
     assert batch.samples[0].topic == "plant/7"
+    for beyond in (50, -7):  # the topic was made again, or its first messages are gone
+        reader = source.open({"plant/0": beyond})
+        assert "read from its first" in reader.read(0.5).noticed
+        assert until(partial(reader.read, 0.5)).samples[0].columns["t"] == 0
+        reader.close()
     writer = Sink("out", brokers, "received").open()
     writer.write(outcome())
     consumer = Consumer({"bootstrap.servers": brokers, "group.id": "t", "auto.offset.reset": "earliest"})
@@ -342,50 +315,6 @@ def test_opcua_from_our_own_server():
     writer.close()
 
 
-class Receiver(http.server.BaseHTTPRequestHandler):
-    """Answers with the statuses in ``answers``, and keeps what came."""
-
-    got, answers = [], []
-
-    def do_POST(self):
-        body = self.rfile.read(int(self.headers["content-length"])).decode()
-        read = json.loads(body) if self.headers["content-type"] == "application/json" else body
-        self.got.append((self.headers["idempotency-key"], read, self.headers["title"]))
-        self.send_response(self.answers.pop(0) if self.answers else 200)
-        self.end_headers()
-
-    def log_message(self, *args):
-        pass
-
-
-def test_webhook_tries_again(tmp_path, monkeypatch):
-    monkeypatch.setattr("driftfit.service.threads.FIRST_PAUSE", 0.05)
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Receiver)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    Receiver.answers[:] = [503, 503]
-    sink = f'[[sink]]\nkind = "webhook"\nurl = "http://127.0.0.1:{server.server_port}/x"\nevents = ["action"]\n'
-    config = configured(more=sink)
-    engine = opened(config, tmp_path)
-    y, u = record(20)
-    feed(engine, message("plant/a", range(20), y, u))
-    runner = SinkThread(engine, config.sinks[0])
-    runner.start()
-    engine.act("a", {"do": "hold", "on": True, "who": "Ann", "why": "a test"})
-    engine.step(0.0)
-    settled(engine)
-    until(lambda: len(Receiver.got) >= 3 and runner.at >= engine.last_stored)
-    runner.stop()
-    runner.join(10)
-    server.shutdown()
-    server.server_close()
-    engine.close()
-    assert len({key for key, *_ in Receiver.got}) == 1
-    assert Receiver.got[-1][1]["unit"] == "a"
-    assert runner.failures == 2
-    with pytest.raises(ValueError, match="without a password"):
-        Webhook("w", "https://me:secret@host/").check()
-
-
 @pytest.mark.parametrize("kind", ["csv", "jsonl"])
 def test_tail(tmp_path, kind):
     path = tmp_path / f"plant.{kind}"
@@ -406,17 +335,23 @@ def test_tail(tmp_path, kind):
     rest = reader.read(1.0)
     assert sum(one.length for one in rest.samples) == 10
     assert rest.refused == 1
+    with path.open("a") as file:
+        file.write(lines[0][:-1])
     path.rename(tmp_path / "old")
     path.write_text(head + "".join(lines[:4]))
-    assert sum(one.length for one in reader.read(2.0).samples) == 4  # the new file, from its beginning
+    found = [reader.read(2.0) for _ in range(2)]  # the end of the old file, and the new one from its beginning
+    assert [sum(one.length for one in batch.samples) for batch in found] == [1, 4]
     reader.close()
 
 
 def test_replay(tmp_path):
     path = tmp_path / "plant.csv"
     path.write_text("t,y\n" + "".join(f"2026-01-01T00:00:{t:02d},{t}\n" for t in range(30)))
-    fast = Replay("r", str(path)).open(5).read(1.0)
-    assert (fast.samples[0].length, fast.position) == (25, 30)
+    digest = Replay("r", str(path)).open(None).read(1.0).position[1]
+    fast = Replay("r", str(path)).open([5, digest]).read(1.0)
+    assert (fast.samples[0].length, fast.position, fast.noticed) == (25, [30, digest], "")
+    other = Replay("r", str(path)).open([5, "of another file"]).read(1.0)
+    assert (other.samples[0].length, "is another file" in other.noticed) == (30, True)
     slow = Replay("r", str(path), time="t", speed=100.0).open(None)
     begun, count = time.monotonic(), 0
     while count < 30:

@@ -17,13 +17,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from io import BytesIO
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat, matlab, savemat
+from scipy.io import loadmat, savemat
+from scipy.io.matlab import matfile_version
 
+from driftfit.bridges.mat_files import readable
+from driftfit.data.formats.packed import check_unpacked
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 
@@ -206,17 +210,21 @@ def write_mat(path: str | PathLike[str], experiments: Experiment | Experiments, 
 
 def _variables(path: Path) -> dict[str, Any]:
     """The variables of a file; structs as lists of mappings from fields to values."""
+    data = path.read_bytes()
     try:
-        found = loadmat(str(path), squeeze_me=False, struct_as_record=True, chars_as_strings=True)
+        known = readable(data, str(path)) if matfile_version(BytesIO(data))[0] == 1 else None
+        names = None if known is None else [name for name, fine in known.items() if fine]
+        found = loadmat(BytesIO(data), variable_names=names, squeeze_me=False, chars_as_strings=True)
     except NotImplementedError:
         return _variables_hdf5(path)
-    return {key: _plain(value) for key, value in found.items() if not key.startswith("__")}
+    except Exception as error:  # scipy, zlib and NumPy raise a dozen kinds of errors for damaged files
+        raise ValueError(f"{path} is not a .mat file, or it is damaged: {error}.") from None
+    others = dict.fromkeys(name for name in known or () if name)
+    return others | {key: _plain(value) for key, value in found.items() if not key.startswith("__")}
 
 
 def _plain(value: Any) -> Any:
-    """A value of scipy: structs as lists of mappings, text as str or tuple of str, objects of classes as None."""
-    if isinstance(value, matlab.MatlabOpaque | matlab.MatlabFunction | matlab.MatlabObject):
-        return None
+    """A value of scipy: structs as lists of mappings, text as str or tuple of str."""
     if isinstance(value, np.ndarray) and value.dtype.names:
         return [{key: _plain(one[key]) for key in value.dtype.names} for one in value.ravel()]
     if isinstance(value, np.ndarray) and value.dtype == object:
@@ -240,8 +248,14 @@ def _variables_hdf5(path: Path) -> dict[str, Any]:
         import h5py
     except ImportError:
         raise ImportError(f'{path} is of version 7.3, which needs h5py: pip install "driftfit[matlab]"') from None
-    with h5py.File(path) as file:
-        return {key: _from_hdf5(file, value) for key, value in file.items() if not key.startswith("#")}
+    try:
+        with h5py.File(path) as file:
+            sizes: list[int] = []
+            file.visititems(lambda name, one: sizes.append(one.nbytes) if isinstance(one, h5py.Dataset) else None)
+            check_unpacked(str(path), path.stat().st_size, sum(sizes))
+            return {str(key): _from_hdf5(file, value) for key, value in file.items() if not key.startswith("#")}
+    except Exception as error:  # h5py raises many kinds too
+        raise ValueError(f"{path} is damaged: {error}.") from None
 
 
 def _from_hdf5(file: Any, value: Any) -> Any:
@@ -249,7 +263,7 @@ def _from_hdf5(file: Any, value: Any) -> Any:
     import h5py
 
     if isinstance(value, h5py.Group):
-        columns = {key: _cells(file, one) for key, one in value.items()}
+        columns = {str(key): _cells(file, one) for key, one in value.items()}
         count = max((len(one) for one in columns.values()), default=1)
         return [{key: one[place] for key, one in columns.items()} for place in range(count)]
     if value.dtype == h5py.ref_dtype:

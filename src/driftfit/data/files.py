@@ -7,11 +7,8 @@ from __future__ import annotations
 
 import csv
 import glob
-import gzip
-import io
 import os
 import warnings
-import zlib
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +20,7 @@ import polars as pl
 
 from driftfit.data.columns import FILE, Columns, Wanted, convert
 from driftfit.data.formats.csv_files import read_csv, start_of
+from driftfit.data.formats.packed import gunzipped, read_parquet
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
@@ -113,25 +111,19 @@ def read_file(source: str | bytes, wanted: Wanted, where: str) -> tuple[nw.DataF
     `read_csv` says how CSV is read.
     """
     if (start := start_of(source)).startswith(b"\x1f\x8b"):
-        try:
-            source = gzip.decompress(source if isinstance(source, bytes) else Path(source).read_bytes())
-        except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-            raise ValueError(f"{where} cannot be decompressed: {error}") from None
+        source = gunzipped(source if isinstance(source, bytes) else Path(source).read_bytes(), where)
         start = start_of(source)
     if kind := next((kind for first, kind in OTHER.items() if start.startswith(first)), None):
         raise ValueError(f"{where} is {kind}; write its table to a CSV or Parquet file.")
     units: dict[str, str] = {}
     parquet = start[:4] == b"PAR1" or (isinstance(source, str) and Path(source).suffix.lower() in (".parquet", ".pq"))
-    try:
-        if parquet:
-            opened = io.BytesIO(source) if isinstance(source, bytes) else source
-            names = list(pl.read_parquet_schema(opened))
-            frame = pl.read_parquet(opened, columns=[name for name in names if name in wanted.names])
-        else:
+    if parquet:
+        names, frame = read_parquet(source, where, wanted.names)
+    else:
+        try:
             names, frame, units = read_csv(source, wanted)
-    except (pl.exceptions.PolarsError, csv.Error, ValueError) as error:
-        text = " ".join(str(error).split())
-        raise ValueError(f"{where} cannot be read as {'Parquet' if parquet else 'CSV'}: {text}") from None
+        except (pl.exceptions.PolarsError, csv.Error, ValueError) as error:
+            raise ValueError(f"{where} cannot be read as CSV: {' '.join(str(error).split())}") from None
     for name in (name for name in wanted.names if not (name == FILE and FILE in wanted.by)):
         if name not in names:
             raise ValueError(f"{where} has no column {name!r}: {near(name, names)}")

@@ -207,6 +207,8 @@ def expand(data: bytes, kinds: Sequence[str], name: str = "what was given") -> t
         else:
             reads = FORMAT
             with np.load(BytesIO(data), allow_pickle=False) as archive:
+                if sum(one.file_size for one in archive.zip.infolist()) > len(data):  # none is compressed
+                    raise ValueError("it would unpack to more than it has")
                 arrays = {name: archive[name] for name in archive.files}
             header = dict(json.loads(str(arrays.pop("header")), object_hook=_decode))
             if header.pop("arrays", [*arrays]) != [*arrays]:

@@ -74,13 +74,14 @@ class Control(threading.Thread):
                     "error": 'no source takes samples over HTTP; add [source.web] with kind = "http".',
                     "status": 404,
                 }
-            return INCOMING.offer(str(header.get("topic", "")), body, self._foreign(header.get("units", ())))
+            client, foreign = str(header.get("client", "")), self._foreign(header.get("units", ()))
+            return INCOMING.offer(str(header.get("topic", "")), body, client, foreign)
         name = str(header.get("unit"))
         number = self.engine.units.names.get(name)
         if number is None:
             return {"error": f"there is no unit {name!r}", "status": 404}
         if do == "unit":
-            return self.engine.units.get(number).plain()
+            return self.engine.units.seen(number).plain()
         if do == "act":
             problems: queue.Queue[str] = queue.Queue()
             self.engine.act(name, header["action"], problems.put)

@@ -22,6 +22,7 @@ from typing import Any
 from driftfit.engine import __version__
 from driftfit.service.control import Control
 from driftfit.service.core.engine import Engine
+from driftfit.service.health import Health, health
 from driftfit.service.settings.config import Config
 from driftfit.service.threads import SinkThread, SourceThread, WorkerThread
 
@@ -86,6 +87,8 @@ class Service:
             log.info("recovered", extra={"detail": {"samples": self.engine.recovered}})
         self._private = self._made_private()
         self.control = Control(self.engine, self._private / "control", self.status)
+        port = config.page.health or (config.page.port + 1000) % 65_536
+        self.health = Health(port, lambda: health(self.status(), self.engine.alive, named=True))
         self.sources = [SourceThread(self.engine, one) for one in config.sources]
         self.sinks = [SinkThread(self.engine, one) for one in config.sinks]
         self.page: subprocess.Popen[bytes] | None = None
@@ -105,7 +108,9 @@ class Service:
 
     def status(self) -> dict[str, Any]:
         """Numbers for the page, `/metrics` and `/healthz`."""
-        return self.engine.status() | {
+        found = self.engine.status()
+        found["reasons"] += [why for one in (*self.sources, *self.sinks) for why in one.reasons()]
+        return found | {
             "sources": {one.label: one.status() for one in self.sources},
             "sinks": {one.label: one.status() for one in self.sinks},
             "since": self.begun, "version": __version__, "page_starts": self.page_starts,
@@ -118,6 +123,7 @@ class Service:
                 signal.signal(one, lambda *_: self.stop())
         runners: list[WorkerThread] = [*self.sources, *self.sinks]
         self.control.start()
+        self.health.start()
         keeper = threading.Thread(target=self._keep, daemon=True)
         keeper.start()
         self.engine.prepare()

@@ -6,16 +6,19 @@ import logging
 import threading
 import time
 from collections import deque
+from dataclasses import replace
 from typing import Any
 
 from driftfit.service.core.engine import Engine, quantiles
 from driftfit.service.core.journal import Journal, Names
 from driftfit.service.core.results import Results
-from driftfit.service.sinks.contract import Outcome, Sink, Writer
+from driftfit.service.sinks.contract import Outcome, RefusedError, Sink, Writer
 from driftfit.service.sources.contract import END, Reader, Source
 
 log = logging.getLogger("driftfit.service")
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
+TRIES = 10
+"""How often an event is written that the receiver refuses, which takes five minutes."""
 READ = 0.5
 """Seconds for which a source may block."""
 
@@ -39,7 +42,7 @@ class WorkerThread(threading.Thread):
                 self.work()
                 self.state = "ended"
                 return
-            except Exception as error:  # whatever a broker or a driver raises
+            except BaseException as error:  # whatever a broker or a driver raises, panics of Rust among them
                 self.failures += 1
                 self.state = f"away: {type(error).__name__}: {error}"[:300]
                 log.warning(f"{self.what} away", extra={"name_of": self.label, "detail": self.state})
@@ -53,6 +56,10 @@ class WorkerThread(threading.Thread):
     def status(self) -> dict[str, Any]:
         """Numbers for the page."""
         return {"state": self.state, "count": self.count, "failures": self.failures}
+
+    def reasons(self) -> list[str]:
+        """Why the service is degraded."""
+        return [f"{self.what} {self.label} is {self.state}"] if self.state.startswith("away") else []
 
     def stop(self) -> None:
         """Let the thread end."""
@@ -100,6 +107,9 @@ class SinkThread(WorkerThread):
         self.latencies: deque[float] = deque(maxlen=2000)
         """Seconds from the arrival of the oldest sample of a group until it is written."""
         self._arrived: list[float] = []
+        self._written: set[str] = set()
+        """Events of the present batch that are written or set aside."""
+        self._tries = self.set_aside = 0
 
     def work(self) -> None:
         """Write until the thread is stopped."""
@@ -112,8 +122,7 @@ class SinkThread(WorkerThread):
             self.state = "running"
             while (batch := self._next(journal, names)) is not None:
                 outcome, upto = batch
-                if outcome.parts or outcome.events:
-                    writer.write(outcome)
+                self._write(writer, outcome)
                 self.at = self.engine.progress[self.sink.name] = upto
                 self.count += len(outcome)
                 now = time.time()
@@ -123,6 +132,26 @@ class SinkThread(WorkerThread):
             if writer is not None:
                 writer.close()
             journal.close()
+
+    def _write(self, writer: Writer, batch: Outcome) -> None:
+        """Write a batch; what is refused again and again is set aside, and those behind it go on."""
+        if not self.sink.one_by_one:
+            if batch.parts or batch.events:
+                writer.write(batch)
+            return
+        for event in (one for one in batch.events if one.key not in self._written):
+            try:
+                writer.write(replace(batch, parts=[], events=[event]))
+            except RefusedError as error:
+                self._tries += 1
+                if self._tries < TRIES:
+                    raise
+                self.set_aside += 1
+                detail = {"sink": self.label, "why": str(error), "tries": self._tries, **event._asdict()}
+                self.engine.tell(event.unit, "undelivered", detail)
+            self._tries = 0
+            self._written.add(event.key)
+        self._written.clear()
 
     def _next(self, journal: Journal, names: Names) -> tuple[Outcome, int] | None:
         """The next batch for the sink, and the last group in it; None when the thread is to end."""
@@ -148,6 +177,11 @@ class SinkThread(WorkerThread):
                 with self.engine.news:
                     self.engine.news.wait(0.2)
 
+    def reasons(self) -> list[str]:
+        """Also what was set aside."""
+        aside = f"sink {self.label}: {self.set_aside} events were refused and are set aside"
+        return super().reasons() + [aside] * bool(self.set_aside)
+
     def status(self) -> dict[str, Any]:
         """Numbers for the page."""
-        return super().status() | {"at": self.at, **quantiles(self.latencies)}
+        return super().status() | {"at": self.at, "set_aside": self.set_aside, **quantiles(self.latencies)}

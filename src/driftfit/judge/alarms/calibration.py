@@ -22,6 +22,7 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.robust import core
+from driftfit.models.base import Model
 from driftfit.run.result import Track, burn_in
 from driftfit.use.prediction import moved
 from driftfit.use.simulate import input_regressors, regresses_on_lags
@@ -40,11 +41,7 @@ LATER = 10
 
 def null_records(run: Track, every: float, at: int, seed: int) -> Iterator[Track]:
     """Runs over simulated records with the parameters of sample ``at``; ValueError for models with other regressors."""
-    if not regresses_on_lags(run.model) or len(run.model.outputs) > 1:
-        raise ValueError(
-            "detect: a calibration simulates records, which needs ARX, Regression or another model that declares its "
-            f"regressors (`terms`), with one output; this run has {run.model!r}. Give a reference= instead."
-        )
+    check_played(run.model)
     rng = np.random.default_rng(seed)
     na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))
     pool, U, theta = residuals(run, na, U), _last_known(U), run.theta[at]
@@ -60,6 +57,15 @@ def null_records(run: Track, every: float, at: int, seed: int) -> Iterator[Track
     pool = pool * float(np.clip(np.sqrt(core(innovations(run)) / (core(pool) * larger)), 0.2, 5.0))
     for _ in range(min(MOST, int(np.ceil(TIMES * every / len(run))))):
         yield played()[1]
+
+
+def check_played(model: Model) -> None:
+    """Raise ValueError for a model whose records are not simulated here."""
+    if not regresses_on_lags(model) or len(model.outputs) > 1:
+        raise ValueError(
+            "detect: a calibration simulates records, which needs ARX, Regression or another model that declares its "
+            f"regressors (`terms`), with one output; this run has {model!r}. Give a reference= instead."
+        )
 
 
 def innovations(run: Track) -> Array:

@@ -48,9 +48,9 @@ from rich.text import Text
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks, numbers, one_of, whole
 from driftfit.judge.alarms.bootstrap import RECORDS
-from driftfit.judge.alarms.calibration import limits_of, null_records
+from driftfit.judge.alarms.calibration import check_played, limits_of, null_records
 from driftfit.judge.alarms.onsets import held, onsets
-from driftfit.judge.alarms.reference import burn, in_samples
+from driftfit.judge.alarms.reference import burn, in_samples, least
 from driftfit.judge.alarms.statistics import (
     Reference,
     chance_of,
@@ -61,11 +61,14 @@ from driftfit.judge.alarms.statistics import (
     statistic_of,
 )
 from driftfit.judge.plots import plot_alarms
+from driftfit.judge.regressors import refuse_hidden
 from driftfit.judge.verdict import p_text
 from driftfit.run.live.change import Change, change_of
 from driftfit.run.live.rule import FROZEN, KINDS, AlarmRule, check_fits, value_text
-from driftfit.run.result import Track
+from driftfit.run.program import Program
+from driftfit.run.result import Track, burn_in
 from driftfit.show.parts.text import Printed, facts, table_of
+from driftfit.trackers.base import Tracker
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -320,7 +323,7 @@ def detect(
     if isinstance(kind, AlarmRule):
         return judged(run, kind, start)
     asked = asked_for(kind, every, window, hold)
-    if kind == "innovation" and run.tracker.adapts:
+    if judged_by(kind, run.tracker) != kind:
         _warn_of_following(run)
         asked = replace(asked, kind="glr")
     reference = in_samples(run, reference)
@@ -344,6 +347,27 @@ def asked_for(kind: str, every: float, window: int = 50, hold: int = 0) -> Alarm
     one_of("detect", "kind", kind, KINDS)
     every = numbers("detect", "every", every, ndim=0, low=1.0, strict=True)
     return AlarmRule(kind, every, (), (), whole("detect", "hold", hold, 0), whole("detect", "window", window, 4))
+
+
+def judged_by(kind: str, tracker: Tracker) -> str:
+    """The kind by which runs of a tracker are judged where a kind is asked for."""
+    return "glr" if kind == "innovation" and tracker.adapts else kind
+
+
+def check_alarm(program: Program, asked: AlarmRule, reference: int) -> None:
+    """Raise ValueError if no ``reference`` first samples can set the alarm, whatever these are."""
+    model, kind = program.model, judged_by(asked.kind, program.tracker)
+    check_fits(replace(asked, kind=kind, parameters=model.names), program.tracker, program.names)
+    if kind in FROZEN:
+        refuse_hidden(f'detect "{kind}"', model, 'kind="innovation" or "band"')
+    if kind == "probability":
+        check_played(model)
+    begun, normal = burn_in(model.n), least(kind, model.n)
+    if reference < begun + normal:
+        raise ValueError(
+            f'detect: "{kind}" needs a reference of {begun + normal} samples: {begun} are the start of the run, and '
+            f"{normal} normal ones come after them; got {reference}."
+        )
 
 
 def judged(run: Track, rule: AlarmRule, start: int | None = None) -> Alarms:

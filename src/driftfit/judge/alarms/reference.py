@@ -10,6 +10,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
+from driftfit.run.live.rule import FROZEN
 from driftfit.run.result import burn_in
 
 if TYPE_CHECKING:
@@ -22,6 +23,11 @@ LEAST = 20
 def burn(run: Track) -> int:
     """Number of samples at the beginning of a run that are not judged, because its estimate has just started."""
     return burn_in(run.model.n)
+
+
+def least(kind: str, n: int) -> int:
+    """Normal samples after the start of a run of n parameters that an alarm of a kind needs."""
+    return max(100, 10 * n) if kind in FROZEN else LEAST
 
 
 def in_samples(run: Track, reference: Any) -> Any:

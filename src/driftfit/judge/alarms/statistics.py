@@ -25,7 +25,7 @@ from driftfit.judge.alarms.onsets import (
     power_limit,
     power_rate,
 )
-from driftfit.judge.alarms.reference import burn, first_third, normal_samples
+from driftfit.judge.alarms.reference import burn, first_third, least, normal_samples
 from driftfit.judge.regressors import refuse_hidden
 from driftfit.judge.statistics.parts.coarse_readings import explained, step_of
 from driftfit.judge.statistics.robust import orthonormal
@@ -100,14 +100,14 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRu
             f'detect: "{rule.kind}" is for trackers of the {n} parameters of the regression; '
             f"{type(run.tracker).__name__} estimates {run.theta.shape[1]}."
         )
-    least = max(100, 10 * n)
-    first, start = first_third(run, usable, least) if reference is None else normal_samples(run, reference)
+    enough = least(rule.kind, n)
+    first, start = first_third(run, usable, enough) if reference is None else normal_samples(run, reference)
     phi, rest, judged = samples[0][first:start], samples[1][first:start], (usable & ~_stuck(run))[first:start]
     y, noise, names = rest[:, Y], rest[:, NOISE_FACTOR], run.model.names
     ok = judged & (rest[:, OK] > BLAMED)
-    if ok.sum() < least:
+    if ok.sum() < enough:
         raise ValueError(
-            f'detect: "{rule.kind}" compares with {least} normal samples at least; samples {first} to {start} contain '
+            f'detect: "{rule.kind}" compares with {enough} normal samples at least; samples {first} to {start} contain '
             f"{ok.sum()} that can be used. Give a longer normal segment, reference=(from, to), or choose "
             'kind="innovation".'
         )

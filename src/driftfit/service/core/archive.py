@@ -50,11 +50,17 @@ class Archive:
         if time.monotonic() - self._looked < EVERY or self._writing is not None:
             return
         self._looked = time.monotonic()
-        self.begin(pending, journal.first_needed(), sinks_at)
+        self.begin(pending, journal, sinks_at)
 
-    def begin(self, pending: Pending, needed: int, sinks_at: int) -> None:
-        """Look for old rows."""
-        now = time.time()
+    def begin(self, pending: Pending, journal: Journal, sinks_at: int) -> None:
+        """Look for old rows; results that no sink has written yet are not deleted without an event."""
+        now, needed = time.time(), journal.first_needed()
+        query = "select count(*) from result where at < ? and first > ?"
+        ((lost,),) = journal.db.execute(query, (now - DAY * self.options.results, sinks_at))
+        if lost:
+            why = f"{lost} groups of results are older than {self.options.results} days, and a sink was away"
+            log.error("lost", extra={"detail": why})
+            pending.add_event(sinks_at, 0, now, "lost", {"why": why})
         old = now - DAY * self.options.history
         pending.forget += [
             ("delete from result where at < ? and first < ?", (now - 60.0, min(needed, sinks_at))),

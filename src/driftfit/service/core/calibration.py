@@ -14,18 +14,17 @@ def rules_of(settings: UnitSettings, rows: Array) -> dict[str, Any]:
     """The action that gives a unit its rules; ``rows`` (N, 2 + m) are time, y, u of the reference."""
     alarm = settings.alarm
     assert alarm is not None
-    rules, refused = [], []
+    rules, refused = [], {}
     try:
         time = None if settings.time is None else rows[:, 0]
         run = track(settings.model, settings.tracker, rows[:, 1], rows[:, 2:], time=time, dt=settings.dt)
     except Exception as error:
-        return {"do": "calibrated", "rules": [], "refused": [str(error)]}
+        return {"do": "calibrated", "rules": [], "refused": dict.fromkeys(alarm.on, str(error))}
     for kind in alarm.on:
-        every = alarm.every * len(alarm.on)  # together they begin one false alarm in ``every`` samples
         reference = None if kind == "probability" else len(rows)
         try:
-            alarms = run.detect(kind, every=every, reference=reference, window=alarm.window, hold=alarm.hold)
+            alarms = run.detect(kind, every=alarm.each, reference=reference, window=alarm.window, hold=alarm.hold)
             rules.append(describe(alarms.rule))
         except Exception as error:
-            refused.append(f"{kind}: {error}")
+            refused[kind] = str(error)
     return {"do": "calibrated", "rules": rules, "on": list(alarm.on), "refused": refused, "samples": len(rows)}

@@ -9,12 +9,14 @@ with the load. It takes 1 to 10 ms; a sample costs a few microseconds more (`ben
 from __future__ import annotations
 
 import logging
+import math
 import sqlite3
 import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,16 @@ import numpy as np
 from driftfit.service.core.archive import Archive
 from driftfit.service.core.calibration import rules_of
 from driftfit.service.core.intake import Action, Arrived, Intake
-from driftfit.service.core.journal import DAMAGED, NEEDED_FROM, Act, Group, Item, Journal, Pending
+from driftfit.service.core.journal import (
+    DAMAGED,
+    NEEDED_FROM,
+    Act,
+    Group,
+    Item,
+    Journal,
+    Pending,
+    check_storable,
+)
 from driftfit.service.core.unit import Out, Unit
 from driftfit.service.core.units import Units
 from driftfit.service.settings.config import Config
@@ -38,6 +49,10 @@ PACE, SLOWEST_PACE, SHARE = 0.01, 0.025, 5.0
 processor: the fixed cost of a group, about a millisecond, would otherwise be most of the work."""
 KEPT = 16
 """Groups of which the results are kept in memory."""
+TROUBLED = 100
+"""Units with trouble that are named."""
+STEP = 60.0
+"""Seconds that one group may take."""
 RETRY = 1.0
 """Seconds between two attempts to write the journal."""
 
@@ -55,7 +70,7 @@ class Engine:
         self.config = config
         self.journal = Journal(folder)
         self.intake = Intake(config.service.queue)
-        self.units = Units(config.units, self.journal, config.service.units)
+        self.units = Units(config.units, self.journal, config.service)
         self.positions = self.journal.positions()
         self.progress: dict[str, int] = {}
         """The last group that each sink has written."""
@@ -63,6 +78,7 @@ class Engine:
         """Notified when there are results."""
         self.problem = ""
         self.samples = 0
+        self._stepped = time.monotonic()
         self.last_stored = 0
         """The last group whose results were stored by this process."""
         self.next, self._head = self.journal.next_number(), self.journal.head()
@@ -72,6 +88,7 @@ class Engine:
         """The number up to which results are in the database only."""
         self.latencies: deque[float] = deque(maxlen=2000)
         """Seconds from the arrival of a batch to the results of its samples."""
+        self._told: deque[tuple[str, str, dict[str, Any]]] = deque()
         self._dirty: OrderedDict[int, tuple[int, float]] = OrderedDict()
         """By unit: the number from which on the log has what its stored state does not, and when that came."""
         self._pending = Pending()
@@ -91,6 +108,7 @@ class Engine:
             if first >= unstored:
                 self._pending.add_results(Group(first, out.results, out.events, time.time()))
             self._pending.blocks += out.blocks
+            self.units.note_trouble({unit for _, unit, *_ in out.events if unit}, self._pending)
         for unit in self.units.resident:
             self._ask_for_limits(unit)
         return again
@@ -98,22 +116,33 @@ class Engine:
     def _apply(self, number: int, item: Item, out: Out, replay: bool = False) -> int:
         """Pass an entry of the log to its units, without what their stored states contain already; how much it was."""
         if isinstance(item, Act):
-            unit = self.units.get(item.unit)
-            if replay and number < self.units.since[item.unit]:
+            if replay and number < self._since(item.unit):
                 return 0
+            unit = self.units.get(item.unit)
             self._touched([item.unit], number)
             unit.act(number, item.action, out)
             return 1
         own, done = np.unique(item.unit), None
         if replay:
-            for one in own.tolist():
-                self.units.get(one)
-            since = np.array([self.units.since[one] for one in own.tolist()])
+            since = np.array([self._since(one) for one in own.tolist()])
             done = number + np.arange(item.length) < since[np.searchsorted(own, item.unit)]
             own = np.unique(item.unit[~done])
         self._touched(own.tolist(), number)
-        self.units.sections[item.section].process(number, item, out, done)
+        section = self.units.sections[item.section]
+        try:
+            section.process(number, item, out, done)
+        except Exception as error:  # what is not foreseen for one unit: the others of the service go on
+            log.exception("engine")
+            for one in own.tolist():
+                self.units.get(one).fail(number, error, out)
         return item.length - (0 if done is None else int(done.sum()))
+
+    def _since(self, unit: int) -> float:
+        """The number up to which samples are in the stored state of a unit; all are in that of one that was evicted."""
+        if unit not in self.units.since:
+            return math.inf
+        self.units.get(unit)
+        return self.units.since[unit]
 
     def _touched(self, units: list[int], number: int) -> None:
         """Note that the states of units changed from a number on."""
@@ -154,7 +183,9 @@ class Engine:
 
     def step(self, wait: float) -> int:
         """Take, journal and process the batches that have arrived; the number of samples."""
+        self._stepped = time.monotonic()
         arrived = self.intake.take(self.config.service.group, 0.0 if self._pending else wait)
+        self.units.evict(self._dirty, self._pending)
         first, items = self.next, self._admit(arrived)
         oldest = min((batch.arrived for _, batch in arrived.batches if batch.arrived), default=time.monotonic())
         now = time.time() - (time.monotonic() - oldest)
@@ -168,7 +199,10 @@ class Engine:
         if not self._commit():
             return 0
         for _, batch in arrived.batches:
-            batch.acknowledge()
+            try:
+                batch.acknowledge()
+            except Exception:  # the sender asks again
+                log.exception("acknowledgement")
         refusals = self._process(first, items, now) if items else {}
         number = self.next - sum(action.unit in self.units.names for action in arrived.actions)
         for action in arrived.actions:
@@ -183,9 +217,15 @@ class Engine:
         """The entries of the next group."""
         for source, batch in arrived.batches:
             self.units.refused["unreadable"] += batch.refused
+            if batch.noticed:
+                self.tell("", "source", {"source": source, "noticed": batch.noticed})
             if batch.position is not None:
                 self._pending.positions[f"source:{source}"] = batch.position
-        messages = ((samples, batch.receipt) for _, batch in arrived.batches for samples in batch.samples)
+        messages = (
+            (batch.client or source, samples, batch.receipt)
+            for source, batch in arrived.batches
+            for samples in batch.samples
+        )
         items: list[Item] = [*self.units.admitted(messages, self._pending, self.next)]
         for action in arrived.actions:
             unit = self.units.names.get(action.unit)
@@ -199,6 +239,9 @@ class Engine:
         Returns by number why actions were refused.
         """
         out, number = Out(), first
+        while self.units.unreadable:
+            unit = self.units.unreadable.pop()
+            out.event(first, unit, "failed", {"error": self.units.get(unit).failure})
         while DAMAGED:
             table, row = DAMAGED.popleft()
             out.event(first, 0, "damaged", {"table": table, "row": row})
@@ -212,8 +255,11 @@ class Engine:
         for unit in out.to_calibrate:
             self._ask_for_limits(self.units.get(unit))
         self.samples += sum(len(one.number) for one in out.results)
+        self.units.note_trouble({unit for _, unit, *_ in out.events if unit}, self._pending)
         for _, unit, _, kind, detail in out.events:
-            log.info(kind, extra={"unit": self.units.get(unit).name if unit else "", "detail": detail})
+            bad = kind == "failed" or (kind == "calibrated" and detail.get("refused"))
+            name = self.units.get(unit).name if unit else ""
+            log.log(logging.ERROR if bad else logging.INFO, kind, extra={"unit": name, "detail": detail})
         return {number: detail["refused"] for number, *_, detail in out.events if "refused" in detail}
 
     def _publish(self, group: Group) -> None:
@@ -237,8 +283,9 @@ class Engine:
         """Find the limits of a unit's alarms in another thread; they come back as an action in the journal."""
         alarm = unit.settings.alarm
         width = 2 + len(unit.settings.u)
-        if alarm is None or unit.calibrated or len(unit.reference) < alarm.reference * width:
+        if alarm is None or unit.calibrated or unit.asked or len(unit.reference) < alarm.reference * width:
             return
+        unit.asked = True
         rows = np.array(unit.reference).reshape(-1, width)
 
         def find() -> None:
@@ -248,7 +295,18 @@ class Engine:
 
     def act(self, unit: str, what: dict[str, Any], done: Callable[[str], None] = lambda problem: None) -> None:
         """Put an action on a unit into the journal."""
+        try:
+            check_storable(what)
+        except ValueError as error:
+            log.error("refused", extra={"unit": unit, "detail": str(error)})
+            done(str(error))
+            return
         self.intake.act(Action(unit, what, done))
+
+    def tell(self, unit: str, kind: str, detail: dict[str, Any]) -> None:
+        """Note an event that no sample caused, for the page and the log; from any thread. A unit "" is none."""
+        log.log(logging.ERROR if unit else logging.WARNING, kind, extra={"unit": unit, "detail": detail})
+        self._told.append((unit, kind, detail))
 
     def _store_states(self, everything: bool = False) -> None:
         """Add the states that have been waiting longest to the next transaction."""
@@ -275,6 +333,9 @@ class Engine:
         for name, upto in self.progress.copy().items():
             if self.positions.get(f"sink:{name}") != upto:
                 self._pending.positions[f"sink:{name}"] = upto
+        while self._told:
+            unit, kind, detail = self._told.popleft()
+            self._pending.add_event(self.next - 1, self.units.names.get(unit, 0), time.time(), kind, detail)
         if not self._pending:
             return True
         while True:
@@ -299,10 +360,20 @@ class Engine:
         found = [self.positions.get(f"sink:{sink.name}", 0) for sink in self.config.sinks]
         return min(found, default=self.next)
 
+    @property
+    def alive(self) -> bool:
+        """Whether it works on samples, or says what the problem is."""
+        return bool(self.problem) or time.monotonic() - self._stepped < STEP
+
     def status(self) -> dict[str, Any]:
         """Numbers for the page and for Prometheus."""
+        trouble = self.units.troubled()
+        shown = dict(islice(trouble.items(), TROUBLED))
         return quantiles(self.latencies) | {
             "samples": self.samples, "next": self.next, "units": len(self.units), "waiting": self.intake.waiting,
             "held_back": self.intake.held_back, "refused": dict(self.units.refused), "problem": self.problem,
+            "failed": sum("failed" in what for what in trouble.values()), "trouble": shown, "troubled": len(trouble),
+            "reasons": [f"{unit}: {what} ({why})" for unit, found in shown.items() for what, why in found.items()]
+            + [f"{len(trouble) - TROUBLED} more units"] * (len(trouble) > TROUBLED),
             "dirty": len(self._dirty), "recovered": self.recovered, "positions": dict(self.positions),
         }  # fmt: skip

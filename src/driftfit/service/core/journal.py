@@ -1,6 +1,9 @@
 """The journal: one SQLite database in which samples, states, results and positions of sources change together.
 
     log        what came in, in groups: numbered samples in columns, and operator's actions
+    undelivered  events that the receiver of a sink has refused again and again
+    evicted    units that are known by their rows only, because they had few samples
+    trouble    what does not work in a unit, and why
     unit       number, name, section and topic of every unit
     program    models and trackers that states were made with, by the fingerprint of the states
     snapshot   the last stored state of a unit, and the number up to which it knows the samples
@@ -53,6 +56,10 @@ create table if not exists event (number integer, unit integer, at real, kind te
 create index if not exists event_of_unit on event (unit);
 create table if not exists position (name text primary key, value text, sum integer);
 create table if not exists chain (number integer primary key, before blob, digest blob, sum integer);
+create table if not exists undelivered (sink text, number integer, unit text, at real, kind text, detail text,
+    tries integer, why text);
+create table if not exists trouble (unit integer primary key, what text);
+create table if not exists evicted (unit integer primary key);
 """
 log = logging.getLogger("driftfit.service")
 PRAGMAS = ("page_size=8192", "journal_mode=wal", "synchronous=full", "wal_autocheckpoint=2000", "temp_store=memory")
@@ -244,6 +251,10 @@ class Journal:
                     rows += own.values.tolist()
         return times, rows
 
+    def evicted(self) -> set[int]:
+        """Numbers of the units that are known by their rows only."""
+        return {unit for (unit,) in self.db.execute("select unit from evicted")}
+
     def programs(self) -> dict[bytes, str]:
         """Models and trackers that states were made with, by the fingerprint of the states."""
         return dict(self.certain("program"))
@@ -263,7 +274,7 @@ class Pending:
         self.positions: dict[str, Any] = {}
         self.meta: dict[str, str] = {}
         self.chain: list[tuple[int, bytes, bytes]] = []
-        self.forget: list[tuple[str, tuple[Any, ...]]] = []
+        self.forget: list[tuple[str, Any]] = []
 
     def __bool__(self) -> bool:
         return any(map(bool, self.__dict__.values()))
@@ -291,6 +302,14 @@ class Pending:
             self.events += [(n, unit, when, kind, _json(detail)) for n, unit, when, kind, detail in events]
         self.meta[RESULTS_FROM] = str(first + 1)
 
+    def add_event(self, number: int, unit: int, at: float, kind: str, detail: dict[str, Any]) -> None:
+        """An event that no sample caused, of a unit or, with 0, of none."""
+        self.events.append((number, unit, at, kind, _json(detail)))
+        if kind == "undelivered":
+            row = detail | {"detail": _json(detail["detail"])}
+            values = ":sink, :number, :unit, :at, :kind, :detail, :tries, :why"
+            self.forget.append((f"insert into undelivered values ({values})", row))
+
     def commit(self, db: sqlite3.Connection) -> None:
         """Write everything in one transaction; on an error nothing is written, and it can be tried again."""
         tables: dict[str, Sequence[tuple[Any, ...]]] = {
@@ -314,6 +333,14 @@ class Pending:
             if db.in_transaction:
                 db.execute("rollback")
             raise
+
+
+def check_storable(action: dict[str, Any]) -> None:
+    """Raise ValueError for an action that the journal cannot store: a number beyond 64 bits, half a character."""
+    try:
+        _encode(action)
+    except (OverflowError, TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"the action cannot be stored: {error}.") from None
 
 
 def _json(value: Any) -> str:

@@ -12,6 +12,7 @@ import math
 import time as wall
 from collections import Counter
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -31,9 +32,6 @@ from driftfit.service.core.streams import SAMPLES, USED, Streams
 from driftfit.service.core.unit import Out, Unit
 from driftfit.service.settings.config import UnitSettings
 
-AHEAD = 86_400.0
-"""A time so many seconds ahead of both the last sample and this machine's clock is refused: it would make every later
-sample late."""
 COLUMNS = ("y_hat", "e", "s", "theta", "var", "ok")
 """Fields of a tracker's output, in the order of the results; the last becomes a flag."""
 REFUSED = {late.LATE: "late", late.REPEATED: "duplicate", late.UNTIMED: "no time"}
@@ -56,17 +54,23 @@ class Section:
 
     def __init__(self, index: int, settings: UnitSettings) -> None:
         self.streams = Streams(index, settings)
-        self.units: list[Unit] = []
+        self.units: dict[int, Unit] = {}
         """By their places."""
         self.blocks = Blocks(THETA + 2 * self.streams.program.model.n)
 
     def add(self, number: int, name: str) -> Unit:
         """A new unit."""
         unit = Unit(number, name, self.streams, self.streams.add(number))
-        if len(self.units) == self.blocks.capacity:
+        if unit.place == self.blocks.capacity:
             self.blocks.grow(self.streams.capacity)
-        self.units.append(unit)
+        self.units[unit.place] = unit
         return unit
+
+    def remove(self, unit: Unit) -> list[tuple[Any, ...]]:
+        """Forget a unit; the rows of the table ``block`` for the rest of its history."""
+        del self.units[unit.place]
+        self.streams.remove(unit.place)
+        return self.blocks.flush(unit.place, unit.number)
 
     def prepare(self) -> None:
         """Compile what the first samples need, so that they do not wait; lanes only if there are units for them."""
@@ -96,16 +100,9 @@ class Section:
         return Rows(self.streams.index, self.streams.numbers[places[order]], time, values[order])
 
     def _too_far(self, places: Array, time: Array) -> Array:
-        """Which times are too far in the future: after a gap of more than a day, beyond the newest and this clock."""
-        now = wall.time()
-        far = time > np.fmax(self.streams.newest[places], now) + AHEAD
-        for place in np.unique(places[far]).tolist():
-            newest = max(now, float(np.nan_to_num(self.streams.newest[place], nan=-math.inf)))
-            own = np.flatnonzero(places == place)
-            for k in own[np.argsort(time[own])].tolist():
-                far[k] = time[k] > newest + AHEAD
-                newest = newest if far[k] or math.isnan(time[k]) else max(newest, time[k])
-        return np.asarray(far)
+        """Which times are further ahead of both the newest and this clock than the settings allow."""
+        newest = np.fmax(self.streams.newest[places], wall.time())
+        return np.asarray(time > newest + self.streams.settings.ahead)
 
     def _refuse(self, name: str, places: Array, which: Array, counter_of: CounterOf) -> None:
         for k in which.tolist():
@@ -211,7 +208,11 @@ class Section:
                 rows_of, _, lane = found.lanes[k]
                 factors = np.broadcast_to(noise, len(places))[part]
                 readings = records.y.reshape(len(places))[part]
-                on = unit.watch(rows_of, lane, readings, factors, own, number[part], out)
+                try:
+                    on = unit.watch(rows_of, lane, readings, factors, own, number[part], out)
+                except Exception as error:  # whatever it is, the other units continue
+                    unit.fail(int(number[part][0]), error, out)
+                    continue
                 flags[part] |= np.array(on, np.uint8) * np.uint8(ALARM)
             if not unit.calibrated:
                 unit.remember(own, rows.values[part], out)

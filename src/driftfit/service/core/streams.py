@@ -51,6 +51,8 @@ class Streams:
         self.clock = Clock.of(settings.dt)
         width = len(settings.columns)
         self.count = 0
+        self.free: list[int] = []
+        """Places of units that were removed."""
         self.words: Array = np.zeros((0, self.program.layout.size), np.int64)
         self.begun: Array = np.zeros(0, bool)
         self.last: Array = np.zeros(0)
@@ -70,7 +72,8 @@ class Streams:
 
     def add(self, number: int) -> int:
         """The place of a new unit."""
-        place, self.count = self.count, self.count + 1
+        place = self.free.pop() if self.free else self.count
+        self.count = max(self.count, place + 1)
         if place == self.capacity:
             self._grow(max(8, 2 * place))
         if number >= len(self._places):
@@ -79,6 +82,12 @@ class Streams:
         self.limits[place] = self._own_limits
         self.numbers[place], self._places[number] = number, place
         return place
+
+    def remove(self, place: int) -> None:
+        """Make room for another unit."""
+        self.clear(place)
+        self.counted[place], self._places[self.numbers[place]] = 0, -1
+        self.free.append(place)
 
     def _grow(self, capacity: int) -> None:
         for name in ("words", "begun", "last", "newest", "held", "limits", "counted", "numbers"):
@@ -115,7 +124,8 @@ class Streams:
 
     def clear(self, place: int) -> None:
         """A unit at its start."""
-        self.begun[place], self.last[place], self.held[place] = False, math.nan, False
+        self.begun[place], self.held[place] = False, False
+        self.last[place] = self.newest[place] = math.nan
         self.waiting.put(place, np.zeros(0), np.zeros((0, self.waiting.rows.shape[1])))
 
     @cached_property

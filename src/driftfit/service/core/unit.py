@@ -36,7 +36,10 @@ class Unit:
         self.acknowledged = True
         self.reference = array("d")
         """The first samples, from which the limits of alarms are found: time and row, one after the other."""
-        self.calibrated = self.settings.alarm is None
+        self.asked = False
+        """Whether this process looks for the limits."""
+        self.unarmed: dict[str, str] | None = None if self.settings.alarm else {}
+        """By kind: why an alarm could not be set; None while the limits are not known."""
         self.alarms: list[LiveAlarm] = []
         self.alarmed = False
         """Whether an alarm was on after the last sample."""
@@ -45,6 +48,17 @@ class Unit:
     def settings(self) -> UnitSettings:
         """Those of its streams."""
         return self.streams.settings
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the limits of the alarms are known, or there are no alarms."""
+        return self.unarmed is not None
+
+    @property
+    def trouble(self) -> dict[str, str]:
+        """What does not work here, and why."""
+        failed = {"failed": self.failure} if self.failure else {}
+        return failed | {f"alarm {kind} is not armed": why for kind, why in (self.unarmed or {}).items()}
 
     @property
     def counts(self) -> Counter[str]:
@@ -79,11 +93,10 @@ class Unit:
         assert alarm is not None
         width = rows.shape[1] + 1
         missing = alarm.reference - len(self.reference) // width
-        if missing > 0:
-            first = np.full(len(rows), math.nan) if time is None else time
-            self.reference.frombytes(np.column_stack([first, rows])[:missing].tobytes())
-            if len(rows) >= missing:
-                out.to_calibrate.append(self.number)
+        first = np.full(len(rows), math.nan) if time is None else time
+        self.reference.frombytes(np.column_stack([first, rows])[:missing].tobytes())
+        if len(rows) >= missing and not self.asked:
+            out.to_calibrate.append(self.number)
 
     def watch(
         self, rows: Array, lane: int, y: Array, noise: Array, time: Array | None, number: Array, out: Out
@@ -119,7 +132,7 @@ class Unit:
         if what == "restart":
             streams.clear(place)
             self.failure, self.reference, self.alarms, self.alarmed = "", array("d"), [], False
-            self.calibrated = self.settings.alarm is None
+            self.asked, self.unarmed = False, None if self.settings.alarm else {}
         elif what == "acknowledge":
             self.acknowledged = True
         elif what == "limits":
@@ -139,8 +152,8 @@ class Unit:
         elif what == "calibrated":
             rules = [rebuild(rule, AlarmRule) for rule in action["rules"]]
             program = streams.program
-            self.alarms += [LiveAlarm(rule, program.tracker, program.names) for rule in rules]
-            self.calibrated, self.reference = True, array("d")
+            self.alarms = [LiveAlarm(rule, program.tracker, program.names) for rule in rules]
+            self.unarmed, self.reference = dict(action.get("refused", {})), array("d")
         else:
             raise ValueError(f"there is no action {what!r}.")
 
@@ -148,7 +161,7 @@ class Unit:
         """The facts that the page shows besides the results."""
         return {
             "counts": dict(self.counts), "failure": self.failure, "acknowledged": self.acknowledged,
-            "calibrated": self.calibrated, "held": bool(self.streams.held[self.place]), "waiting": self.waiting,
+            "unarmed": self.unarmed, "held": bool(self.streams.held[self.place]), "waiting": self.waiting,
             "limits": {name: [None if math.isinf(v) else v for v in pair] for name, pair in self.limits.items()},
             "hypotheses": self._hypotheses(),
         }  # fmt: skip
@@ -163,7 +176,7 @@ class Unit:
     def state(self) -> bytes:
         """The state as bytes."""
         alarms = [alarm.plain() for alarm in self.alarms]
-        kept = [self.streams.packed(self.place), dict(self.rare), self.failure, self.acknowledged, self.calibrated,
+        kept = [self.streams.packed(self.place), dict(self.rare), self.failure, self.acknowledged, self.unarmed,
                 self.reference.tobytes(), alarms, self.alarmed]  # fmt: skip
         packed: bytes = msgspec.msgpack.encode(kept)
         return packed
@@ -171,7 +184,7 @@ class Unit:
     def restore(self, state: bytes, programs: Mapping[bytes, str]) -> None:
         """The inverse of `state`; ``programs`` describe what made states, by their fingerprint."""
         packed, rare, *rest, reference, alarms, self.alarmed = msgspec.msgpack.decode(state)
-        self.failure, self.acknowledged, self.calibrated = rest
+        self.failure, self.acknowledged, self.unarmed = rest
         self.rare, self.reference = Counter(rare), array("d")
         self.reference.frombytes(reference)
         program = self.streams.program

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import msgspec
@@ -13,13 +14,21 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.service.core.journal import Journal, Pending, Rows
 from driftfit.service.core.section import CounterOf, Section, tally
+from driftfit.service.core.streams import SAMPLES
 from driftfit.service.core.unit import Unit
 from driftfit.service.settings.config import UnitSettings
 from driftfit.service.settings.matching import valid_name
-from driftfit.service.sources.samples import NO_SIGNAL, Receipt, Samples, numbers_of, seconds_of
+from driftfit.service.settings.options import ServiceOptions
+from driftfit.service.sources.samples import NO_SIGNAL, TOO_MANY_NEW, Receipt, Samples, numbers_of, seconds_of
 
+log = logging.getLogger("driftfit.service")
+Message = tuple[str, Samples, Receipt | None]
+"""(client, samples, receipt)"""
+FEW, QUIET = 10, 600.0
+"""A unit that has had fewer samples, and none in so many seconds, is evicted."""
 ROUTES = 200_000
 """Topics whose units are remembered, including those that have none."""
+UNREADABLE = "its state cannot be read"
 SAVED = 10.0
 """Seconds over which the rate of a unit is averaged."""
 
@@ -61,6 +70,8 @@ class Gathered:
 
 def _extend(column: list[Any], cells: Any, count: int) -> None:
     if isinstance(cells, list):
+        if len(cells) != count:  # it would move the samples of the messages behind it
+            raise ValueError(f"a list of {len(cells)} values in a message of {count} samples.")
         column += cells
     elif count == 1:
         column.append(cells)
@@ -76,9 +87,9 @@ def _counter_of(one: Gathered, messages: Array) -> CounterOf:
 class Units:
     """All units, by number and by topic."""
 
-    def __init__(self, settings: tuple[UnitSettings, ...], journal: Journal, most: int) -> None:
+    def __init__(self, settings: tuple[UnitSettings, ...], journal: Journal, options: ServiceOptions) -> None:
         self.sections = [Section(k, one) for k, one in enumerate(settings)]
-        self.settings, self.journal, self.most = settings, journal, most
+        self.settings, self.journal, self.options = settings, journal, options
         self.names: dict[str, int] = {}
         self.refused: Counter[str] = Counter()
         self._known: dict[int, tuple[str, int]] = {}
@@ -87,9 +98,23 @@ class Units:
         self._saved: list[tuple[Array, float]] = [(np.zeros(0), 0.0) for _ in settings]
         """By section: samples that each unit may still send at once, and the time of that."""
         self._programs = journal.programs()
+        self.trouble = {unit: msgspec.json.decode(what) for unit, what in journal.db.execute("select * from trouble")}
+        """By unit: what does not work, and why; also of those that are not in memory."""
+        self.unreadable: list[int] = []
+        """Units that have failed because their states cannot be read, which is yet to be an event."""
+        self._made: Counter[str] = Counter()
+        """New units by client, since the minute began."""
+        self._minute = self._swept = time.monotonic()
+        self._few: dict[int, int] = {}
+        """By unit: samples at the last sweep, of those that had few."""
+        self._last = 0
         self.since: dict[int, int] = {}
         """Number up to which samples are in the state of a unit that was loaded."""
+        evicted = journal.evicted()
         for unit, name, section, _, born, _ in journal.units():
+            self._last = unit
+            if unit in evicted:
+                continue
             if section >= len(settings):
                 raise ValueError(
                     f"the folder has the unit {name!r} of section [[unit]] number {section + 1}, which is not in the "
@@ -112,15 +137,44 @@ class Units:
         found = self._units.get(unit)
         if found is None:
             name, section = self._known[unit]
-            stored = self.journal.state(unit)
             found = self._units[unit] = self.sections[section].add(unit, name)
-            if stored is not None:
-                self.since[unit] = stored[0]
-                try:
-                    found.restore(stored[1], self._programs)
-                except Exception as error:  # a state that cannot be read stops its unit, not the others
-                    found.failure = f"its state cannot be read: {error}"[:500]
+            self._restore(found)
+            if found.failure.startswith(UNREADABLE):
+                self.unreadable.append(unit)
         return found
+
+    def seen(self, unit: int) -> Unit:
+        """A unit for another thread to look at: one that is not in memory is read from the database by itself."""
+        found = self._units.get(unit)
+        if found is None:
+            name, section = self._known[unit]
+            found = Section(section, self.settings[section]).add(unit, name)
+            self._restore(found)
+        return found
+
+    def _restore(self, unit: Unit) -> None:
+        """Bring a unit to the state that the database has of it."""
+        stored = self.journal.state(unit.number)
+        if stored is not None:
+            self.since[unit.number] = stored[0]
+            try:
+                unit.restore(stored[1], self._programs)
+            except Exception as error:  # a state that cannot be read stops its unit, not the others
+                unit.failure = f"{UNREADABLE}: {error}"[:500]
+
+    def note_trouble(self, units: Iterable[int], pending: Pending) -> None:
+        """Add to the next transaction what does not work in units, where that has changed."""
+        for number in units:
+            now = self.get(number).trouble
+            if now != self.trouble.get(number, {}):
+                self.trouble[number] = now
+                what = msgspec.json.encode(now).decode()
+                pending.forget.append(("insert or replace into trouble values (?, ?)", (number, what)))
+
+    def troubled(self) -> dict[str, dict[str, str]]:
+        """By name: what does not work, and why."""
+        found = self.trouble.copy()  # another thread asks
+        return {self._known[unit][0]: what for unit, what in found.items() if what}
 
     def note_programs(self, pending: Pending) -> None:
         """Add to the next transaction what the states of this process are made with."""
@@ -129,15 +183,16 @@ class Units:
                 self._programs[tag] = about
                 pending.programs.append((tag, about))
 
-    def of_topic(self, topic: str, pending: Pending, born: int) -> tuple[Unit, ...]:
-        """The units of a topic; new ones are made."""
-        route = self._routes.get(topic)
+    def of_topic(self, topic: str, client: str, pending: Pending, born: int) -> tuple[tuple[Unit, ...], str]:
+        """(the units of a topic, why there may be more later); new ones are made."""
+        route, why = self._routes.get(topic), ""
         if route is None:
-            route = self._route(topic, pending, born)
-            self._routes[topic] = route
+            route, why = self._route(topic, client, pending, born)
+            if not why:
+                self._routes[topic] = route
             if len(self._routes) > ROUTES:
                 self._routes.popitem(last=False)
-        return route
+        return route, why
 
     def named(self, topic: str) -> list[tuple[int, str]]:
         """(section, name) of the units to which a topic belongs."""
@@ -149,23 +204,65 @@ class Units:
                 found.append((section, name if alone else f"{name}:{settings.y}"))
         return found
 
-    def _route(self, topic: str, pending: Pending, born: int) -> tuple[Unit, ...]:
-        found = []
+    def _route(self, topic: str, client: str, pending: Pending, born: int) -> tuple[tuple[Unit, ...], str]:
+        found, why = [], ""
         for section, name in self.named(topic):
             unit = self.names.get(name)
             if unit is None:
-                if len(self._known) >= self.most or len(name) > 500:
-                    self.refused["too many units"] += 1
+                if refusal := self._refusal(name, client):
+                    why = refusal
                     continue
-                unit = self._new(name, section, topic, pending, born)
+                unit = self._again(name, pending) or self._new(name, section, topic, pending, born)
             if self._known[unit][1] != section:
                 self.refused["two sections give one name"] += 1
                 continue
             found.append(self.get(unit))
-        return tuple(found)
+        return tuple(found), why
+
+    def _refusal(self, name: str, client: str) -> str:
+        """Why a client may not make a unit now."""
+        if (now := time.monotonic()) - self._minute > 60.0:
+            self._made.clear()
+            self._minute = now
+        if len(self._known) >= self.options.units or len(name) > 500:
+            return "too many units"
+        self._made[client] += 1
+        return TOO_MANY_NEW if self._made[client] > self.options.new_units else ""
+
+    def _again(self, name: str, pending: Pending) -> int:
+        """The number of a unit that was evicted and is there again; 0 if there was none of this name."""
+        query = "select id, section, born from unit where name = ?"
+        unit, section, born = self.journal.db.execute(query, (name,)).fetchone() or (0, 0, 0)
+        if unit:
+            self._known[unit], self.names[name], self.since[unit] = (name, section), unit, born
+            pending.forget.append(("delete from evicted where unit = ?", (unit,)))
+        return unit
+
+    def evict(self, unstored: Collection[int], pending: Pending) -> None:
+        """Forget units that have had few samples, and none since the last sweep; ``unstored`` have a state that the
+        database does not. With their next sample they are there again, as they were.
+        """
+        if time.monotonic() - self._swept < QUIET:
+            return
+        self._swept, few, gone = time.monotonic(), {}, set()
+        for unit in self.resident:
+            count = int(unit.streams.counted[unit.place, SAMPLES])
+            if count < FEW and unit.number not in unstored and not unit.trouble:
+                few[unit.number] = count
+                if self._few.get(unit.number) == count:
+                    gone.add(unit.number)
+        self._few = few
+        for number in gone:
+            unit = self._units.pop(number)
+            name, section = self._known.pop(number)
+            del self.names[name], self.since[number]
+            pending.blocks += self.sections[section].remove(unit)
+            pending.forget.append(("insert or ignore into evicted values (?)", (number,)))
+        for topic in [topic for topic, found in self._routes.items() if any(one.number in gone for one in found)]:
+            del self._routes[topic]
 
     def _new(self, name: str, section: int, topic: str, pending: Pending, born: int) -> int:
-        unit = next(reversed(self._known), 0) + 1
+        unit = self._last = self._last + 1
         made = self.sections[section].add(unit, name)
         settings = made.settings
         about = {"names": made.streams.program.names, "y": settings.y, "u": settings.u,
@@ -176,17 +273,29 @@ class Units:
         self.since[unit] = born
         return unit
 
-    def admitted(self, messages: Iterable[tuple[Samples, Receipt | None]], pending: Pending, born: int) -> list[Rows]:
+    def admitted(self, messages: Iterable[Message], pending: Pending, born: int) -> list[Rows]:
         """The samples of messages that enter the journal; those that units do not accept are counted."""
+        messages = list(messages)
+        try:
+            return self._admitted(messages, pending, born)
+        except Exception:  # what one of them has is not foreseen: the others go on
+            if len(messages) > 1:
+                return [rows for one in messages for rows in self.admitted([one], pending, born)]
+            log.exception("message")
+            ((_, samples, receipt),) = messages
+            tally((self.refused, None if receipt is None else receipt.left_out), "not understood", samples.length)
+            return []
+
+    def _admitted(self, messages: list[Message], pending: Pending, born: int) -> list[Rows]:
         gathered = [Gathered(one) for one in self.settings]
-        for samples, receipt in messages:
-            units = self.of_topic(samples.topic, pending, born)
+        for client, samples, receipt in messages:
+            units, why = self.of_topic(samples.topic, client, pending, born)
             counter = None
             if receipt is not None:
                 counter = receipt.left_out
                 receipt.offered += samples.length * max(len(units), 1)
-            if not units:
-                tally((self.refused, counter), "no unit for the topic", samples.length)
+            if not units or why:
+                tally((self.refused, counter), why or "no unit for the topic", samples.length)
             for unit in units:
                 if not gathered[unit.streams.index].add(unit.place, samples, receipt):
                     tally((unit.rare, counter), NO_SIGNAL, samples.length)
@@ -194,10 +303,10 @@ class Units:
         for section, one in zip(self.sections, gathered, strict=True):
             if one.places:
                 places, times, values = one.arrays()
-                messages = np.repeat(np.arange(len(one.places)), one.lengths)
-                paid = np.flatnonzero(self._paid(section, one)[messages])
+                which = np.repeat(np.arange(len(one.places)), one.lengths)
+                paid = np.flatnonzero(self._paid(section, one)[which])
                 times = None if times is None else times[paid]
-                found.append(section.admit(places[paid], times, values[paid], _counter_of(one, messages[paid])))
+                found.append(section.admit(places[paid], times, values[paid], _counter_of(one, which[paid])))
         return [rows for rows in found if rows is not None]
 
     def _paid(self, section: Section, one: Gathered) -> Array:

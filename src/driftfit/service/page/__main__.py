@@ -11,6 +11,7 @@ from pathlib import Path
 import uvicorn
 
 from driftfit.service.page.app import Page
+from driftfit.service.page.connections import Connection
 from driftfit.service.page.feed import Feed
 from driftfit.service.page.passwords import Sessions
 from driftfit.service.settings.options import PageOptions, build
@@ -26,8 +27,8 @@ def main() -> None:
     uvicorn.run(
         page.app(), host=options.host, port=options.port, log_level="warning", access_log=False, server_header=False,
         proxy_headers=options.behind_proxy, ssl_certfile=options.certificate or None, ssl_keyfile=options.key or None,
-        limit_concurrency=500, timeout_keep_alive=10, ws_max_size=4096, h11_max_incomplete_event_size=65536,
-        timeout_graceful_shutdown=3,
+        http=Connection, limit_concurrency=500, timeout_keep_alive=10, timeout_graceful_shutdown=3, ws_max_size=4096,
+        h11_max_incomplete_event_size=65536,
     )  # fmt: skip
 
 

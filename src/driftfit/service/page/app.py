@@ -23,9 +23,10 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 
 from driftfit.data.formats.csv_files import without_formulas
+from driftfit.service.health import health
 from driftfit.service.page import history, metrics, openapi
 from driftfit.service.page.access import COOKIE, Access, Rates
-from driftfit.service.page.feed import Feed, finite, unheard
+from driftfit.service.page.feed import Feed, finite
 from driftfit.service.page.passwords import SESSION, Sessions, password_fits
 from driftfit.service.page.sockets import Sockets
 from driftfit.service.settings.options import PageOptions
@@ -110,11 +111,9 @@ class Page:
         if not search:
             return Answer({"units": self.feed.fleet, "count": len(self.feed.names.names)})
         feed, found, now = self.feed, [], time.time()
-        for number, name in feed.names.names.items():
+        for name in feed.names.about:
             if search in name.lower():
-                row = feed.latest.get(number)
-                line = unheard(name) if row is None else feed.line(number, row, feed.drift(number, row), now)
-                found.append(line | {"age": None})
+                found.append(feed.shown(name, now) | {"age": None})
             if len(found) == 200:
                 break
         return Answer({"units": found, "count": len(found)})
@@ -201,7 +200,8 @@ class Page:
         user = request.scope["user"]
         if user.role == "viewer":
             raise HTTPException(403, f"{user.name} is a viewer; this needs a sender or an operator")
-        header = {"do": "samples", "topic": request.path_params.get("topic", ""), "units": user.units}
+        client = user.name if self.options.user else request.client.host if request.client else "local"
+        header = {"do": "samples", "topic": request.path_params.get("topic", ""), "units": user.units, "client": client}
         return await self.asked(header, await request.body())
 
     async def actions(self, request: Request) -> Response:
@@ -270,10 +270,8 @@ class Page:
         return PlainTextResponse(metrics.text(self.feed, self.sockets.count), media_type=metrics.TYPE)
 
     async def healthz(self, request: Request) -> Response:
-        """200 if the engine answers and the journal can be written."""
-        healthy = self.feed.healthy
-        problem = "" if healthy else self.feed.status.get("problem") or "the engine does not answer"
-        return JSONResponse({"healthy": healthy, "problem": problem}, 200 if healthy else 503)
+        """200 if the engine answers and the journal can be written; with what does not work besides."""
+        return JSONResponse(*health(self.feed.status, self.feed.alive, request.scope["user"] is not None))
 
 
 class Answer(JSONResponse):

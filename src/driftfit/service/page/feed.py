@@ -51,8 +51,9 @@ class Feed:
         self.events: deque[list[Any]] = deque(maxlen=200)
         self.watched: dict[int, tuple[deque[list[Any]], list[float]]] = {}
         self.status: dict[str, Any] = {"problem": "the engine has not answered yet"}
-        self.alive = 0.0
+        self.answered = 0.0
         self.count = 0
+        self._swept = time.monotonic()
         self._base: dict[int, tuple[float, list[float], list[float]]] = {}
         query = "select coalesce(min(first), 1) - 1 from (select first from result order by first desc limit ?)"
         self.at = int(self.journal.db.execute(query, (BACK,)).fetchone()[0])
@@ -66,7 +67,7 @@ class Feed:
             self.rank()
             try:
                 self.status = await self.ask({"do": "status"})
-                self.alive = time.monotonic()
+                self.answered = time.monotonic()
             except (OSError, asyncio.IncompleteReadError, ValueError):
                 pass
             await asyncio.sleep(max(0.05, TICK - (time.monotonic() - begun)))
@@ -89,6 +90,11 @@ class Feed:
                 break
         if any(unit not in self.names.names for unit in self.latest):
             self.names.read()
+        if time.monotonic() - self._swept > CHECK:
+            self._swept = time.monotonic()
+            for unit in self.journal.evicted() & self.latest.keys():
+                del self.latest[unit], self.updated[unit]
+                self._base.pop(unit, None)
         for unit in [unit for unit, (_, asked) in self.watched.items() if time.monotonic() - asked[0] > FORGET]:
             del self.watched[unit]
 
@@ -105,23 +111,39 @@ class Feed:
         return max((one for one in moved if math.isfinite(one)), default=0.0)
 
     def rank(self) -> None:
-        """The units that are shown first: alarms, then drift, and last those whose results are no longer stored."""
+        """The units that are shown first: trouble, alarms, drift, and last those whose results are no longer stored."""
         found = ((row[10], self.drift(unit, row), unit, row) for unit, row in self.latest.items())
         first = heapq.nlargest(SHOWN, found, key=lambda one: (one[0], one[1]))
         now = time.time()
         names = self.names.names
-        self.fleet = [self.line(unit, row, drift, now) for _, drift, unit, row in first if unit in names]
-        if len(first) < SHOWN and len(self.latest) < len(names):
-            gone = (name for unit, name in names.items() if unit not in self.latest)
-            self.fleet += map(unheard, islice(gone, SHOWN - len(first)))
+        ranked = [self.line(unit, row, drift, now) for _, drift, unit, row in first if unit in names]
+        bad = [self.shown(name, now) for name in self.trouble if name in self.names.about]
+        known = {one["unit"] for one in bad}
+        self.fleet = (bad + [one for one in ranked if one["unit"] not in known])[:SHOWN]
+        if len(self.fleet) < SHOWN and len(self.latest) < len(names):
+            gone = (name for unit, name in names.items() if unit not in self.latest and name not in known)
+            self.fleet += [self.shown(name, now) for name in islice(gone, SHOWN - len(self.fleet))]
+
+    @property
+    def trouble(self) -> dict[str, dict[str, str]]:
+        """By unit: what does not work, and why."""
+        return dict(self.status.get("trouble", {}))
+
+    def shown(self, name: str, now: float) -> dict[str, Any]:
+        """A unit of the overview, also one that was not heard of since results are stored."""
+        unit = int(self.names.about[name]["number"])
+        row = self.latest.get(unit)
+        if row is None:
+            return unheard(name) | {"trouble": list(self.trouble.get(name, {}))}
+        return self.line(unit, row, self.drift(unit, row), now)
 
     def line(self, unit: int, row: list[Any], drift: float, now: float) -> dict[str, Any]:
         """A unit of the overview."""
-        age = now - self.updated[unit]
+        age, name = now - self.updated[unit], self.names.names[unit]
         return {
-            "unit": self.names.names[unit], "drift": round(drift, 2), "alarm": row[10], "time": row[2],
-            "age": round(age, 1), "silent": age > SILENT, "y": finite(row[3]), "y_hat": finite(row[4]), "ok": row[7],
-            "theta": [finite(one) for one in row[8]],
+            "unit": name, "trouble": list(self.trouble.get(name, {})), "drift": round(drift, 2), "alarm": row[10],
+            "time": row[2], "age": round(age, 1), "silent": age > SILENT, "y": finite(row[3]), "y_hat": finite(row[4]),
+            "ok": row[7], "theta": [finite(one) for one in row[8]],
         }  # fmt: skip
 
     def find(self, name: str) -> int | None:
@@ -171,16 +193,21 @@ class Feed:
             writer.close()
 
     @property
+    def alive(self) -> bool:
+        """Whether the engine answers."""
+        return time.monotonic() - self.answered < 10.0
+
+    @property
     def healthy(self) -> bool:
         """Whether the engine answers and can write."""
-        return time.monotonic() - self.alive < 10.0 and not self.status.get("problem")
+        return self.alive and not self.status.get("problem")
 
 
 def unheard(name: str) -> dict[str, Any]:
     """A unit of the overview that was silent since before the page started, and for longer than results are stored."""
     return {
-        "unit": name, "drift": 0.0, "alarm": False, "time": None, "age": None, "silent": True, "y": None, "y_hat": None,
-        "ok": False, "theta": [],
+        "unit": name, "trouble": [], "drift": 0.0, "alarm": False, "time": None, "age": None, "silent": True, "y": None,
+        "y_hat": None, "ok": False, "theta": [],
     }  # fmt: skip
 
 

@@ -20,6 +20,10 @@ def _lines(feed: Feed, viewers: int) -> Iterator[str]:
     yield from _one("driftfit_up", "gauge", "Whether the engine answers and can write its journal.", int(feed.healthy))
     yield from _one("driftfit_samples_total", "counter", "Samples that were processed.", status.get("samples", 0))
     yield from _one("driftfit_units", "gauge", "Units.", status.get("units", 0))
+    yield from _one("driftfit_units_failed", "gauge", "Units that have failed.", status.get("failed", 0))
+    unarmed = {f'unit="{_label(unit)}",what="{_label(what)}",why="{_label(why)}"': 1
+               for unit, found in feed.trouble.items() for what, why in found.items()}  # fmt: skip
+    yield from _many("driftfit_trouble", "gauge", "What does not work in units, at most 100 of them.", unarmed)
     alarms = sum(bool(row[10]) for row in feed.latest.values())
     yield from _one("driftfit_units_in_alarm", "gauge", "Units whose alarm is on.", alarms)
     yield from _one("driftfit_waiting_samples", "gauge", "Samples that wait for the journal.", status.get("waiting", 0))
@@ -38,6 +42,8 @@ def _lines(feed: Feed, viewers: int) -> Iterator[str]:
         yield from _many(f"driftfit_{what}_samples_total", "counter", f"Samples of the {what}.", count)
         failures = {f'{what}="{_label(name)}"': one["failures"] for name, one in runners.items()}
         yield from _many(f"driftfit_{what}_failures_total", "counter", f"Failures of the {what}.", failures)
+    aside = {f'sink="{_label(name)}"': one["set_aside"] for name, one in status.get("sinks", {}).items()}
+    yield from _many("driftfit_sink_set_aside_total", "counter", "Events that were refused and set aside.", aside)
 
 
 def _one(name: str, kind: str, about: str, value: Any) -> Iterator[str]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections import Counter
 from typing import Any
 
 import msgspec
@@ -28,14 +29,18 @@ class Sockets:
     def __init__(self, feed: Feed, most: int) -> None:
         self.feed, self.most = feed, most
         self.count = 0
+        self._of: Counter[str] = Counter()
+        """Open pages by client."""
 
     async def endpoint(self, socket: WebSocket) -> None:
         """Serve one page until it closes."""
         await socket.accept()
-        if self.count >= self.most:
+        client = socket.client.host if socket.client else "local"
+        if self.count >= self.most or self._of[client] >= max(1, self.most // 2):
             await socket.close(4429, "too many open pages")
             return
         self.count += 1
+        self._of[client] += 1
         view: dict[str, Any] = {"view": "fleet", "unit": "", "at": 0}
         sender = asyncio.create_task(self._send(socket, view))
         try:
@@ -49,6 +54,7 @@ class Sockets:
             pass
         finally:
             self.count -= 1
+            self._of -= Counter([client])
             sender.cancel()
             with contextlib.suppress(RuntimeError):  # it may be closed
                 await socket.close(4400)
@@ -66,7 +72,7 @@ class Sockets:
 
     async def _message(self, view: dict[str, Any]) -> dict[str, Any]:
         feed = self.feed
-        status = {name: feed.status.get(name) for name in ("samples", "units", "problem", "p99")}
+        status = {name: feed.status.get(name) for name in ("samples", "units", "problem", "reasons", "p99")}
         status["alive"] = feed.healthy
         if view["view"] != "unit":
             return {"view": "fleet", "status": status, "units": feed.fleet}

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from driftfit.data.clock import Clock
 from driftfit.data.signals import check_ready
 from driftfit.engine.settings import near
+from driftfit.judge.alarms.detect import asked_for, check_alarm
 from driftfit.models.base import Model
 from driftfit.parsing.settings import parse_model, tracker_of
 from driftfit.run.live.rule import KINDS
@@ -51,6 +52,11 @@ class AlarmSettings:
     window: int = 50
     hold: int = 0
 
+    @property
+    def each(self) -> float:
+        """Samples in which one false alarm of a kind may begin, so that all kinds together begin one in ``every``."""
+        return self.every * len(self.on)
+
 
 @dataclass(frozen=True)
 class UnitSettings:
@@ -69,6 +75,8 @@ class UnitSettings:
     """Seconds for which samples wait for late ones."""
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     alarm: AlarmSettings | None = None
+    ahead: float = 300.0
+    """Seconds that a time may be ahead of both the newest of its unit and the clock of this machine."""
     rate: float = 10_000.0
     """Samples a second that one unit may send, on average over ten seconds."""
 
@@ -188,7 +196,7 @@ class _Reader:
     def unit(self, k: int) -> UnitSettings:
         given = dict(self.tables("unit")[k])
         known = ["match", "name", "y", "u", "time", "time_unit", "dt", "model", "tracker", "limits", "alarm",
-                 "hold_back", "rate"]  # fmt: skip
+                 "hold_back", "ahead", "rate"]  # fmt: skip
         for key in given:
             if key not in known:
                 raise KeyProblemError((key,), f"unit has no setting {key!r}; {near(key, known)}")
@@ -213,6 +221,7 @@ class _Reader:
             at("hold_back", lambda: _seconds("hold_back", given.get("hold_back", 0.0))),
             at("limits", lambda: valid_ranges(given.get("limits", {}), (given["y"], *u))),
             at("alarm", lambda: _alarm(given.get("alarm"), dt)),
+            at("ahead", lambda: _seconds("ahead", given.get("ahead", 300.0))),
             at("rate", lambda: _positive("rate", given.get("rate", 10_000.0))),
         )  # fmt: skip
         if settings.time is None and (settings.hold_back or dt is not None):
@@ -220,7 +229,10 @@ class _Reader:
                 ("dt" if dt is not None else "hold_back",),
                 "dt and hold_back need the name of the field of times: time = ...",
             )
-        at("tracker", lambda: Program(model, check_ready(tracker)).tile())  # whether they fit; nothing is compiled
+        program = at("tracker", lambda: Program(model, check_ready(tracker)))
+        at("tracker", program.tile)  # whether they fit; nothing is compiled
+        if settings.alarm is not None:
+            at("alarm", partial(_check_alarms, program, settings.alarm))
         return settings
 
 
@@ -312,3 +324,9 @@ def _alarm(given: Any, dt: float | None) -> AlarmSettings | None:
         if isinstance(value, bool) or not isinstance(value, int) or value < (key != "hold"):
             raise ValueError(f"{key} must be a whole number of samples; got {value!r}.")
     return AlarmSettings(_positive("every", every), on, **whole)
+
+
+def _check_alarms(program: Program, alarm: AlarmSettings) -> None:
+    """Raise ValueError if an alarm cannot be set from its reference."""
+    for kind in alarm.on:
+        check_alarm(program, asked_for(kind, alarm.each, alarm.window, alarm.hold), alarm.reference)

@@ -69,6 +69,8 @@ class ServiceOptions:
     """Whether the groups of the journal are a chain of digests, which `driftfit journal verify` checks."""
     units: int = 100_000
     """Most units; topics beyond that are refused and counted."""
+    new_units: int = 1_000
+    """Most units that one client, or one source where clients are not told apart, may make in a minute."""
     log: str = "info"
 
 
@@ -102,6 +104,8 @@ class PageOptions:
     host: str = "127.0.0.1"
     port: int = 8765
     enabled: bool = True
+    health: int = 0
+    """Port of the health check, on 127.0.0.1; 0: a thousand above that of the page."""
     names: list[str] = field(default_factory=list)
     """Host names under which browsers may reach the page, besides the host itself."""
     certificate: str = ""

@@ -7,7 +7,9 @@
 
 A sink reads the stored results from where it stopped, so one that is away or slow never delays the tracking and loses
 nothing. After a crash the last batches come again: every result has a ``number``, by which an idempotent sink skips
-results that it already has. An exception means that the sink is away; the batch is written again after a pause.
+results that it already has. An exception means that the sink is away; the batch is written again after a pause. A sink
+with ``one_by_one`` takes events in batches of one, and raises `RefusedError` for one that its receiver does not want:
+after some tries that event is set aside, so that it does not hold up those behind it.
 """
 
 from __future__ import annotations
@@ -53,6 +55,15 @@ class Event(NamedTuple):
     """new, alarm, over, failed, calibrated, action, damaged"""
     detail: Mapping[str, Any]
 
+    @property
+    def key(self) -> str:
+        """The same when the event comes again, and that of no other: several alarms may begin at one sample."""
+        return f"{self.number}-{self.kind}" + f"-{self.detail.get('kind')}" * (self.kind == "alarm")
+
+
+class RefusedError(ConnectionError):
+    """The receiver answered, and did not take the event."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -94,6 +105,8 @@ class Sink(ABC):
     name: str
     most: ClassVar[int] = 5_000
     """Results of one batch at which it is not collected further."""
+    one_by_one: ClassVar[bool] = False
+    """Whether it takes events alone, one in a batch."""
 
     @property
     def gather(self) -> float:

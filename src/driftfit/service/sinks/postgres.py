@@ -21,7 +21,8 @@ create table if not exists {schema}.driftfit_result (
     theta double precision[], std double precision[], names text[], primary key (unit, number, time));
 create index if not exists driftfit_result_time on {schema}.driftfit_result (unit, time desc);
 create table if not exists {schema}.driftfit_event (
-    at timestamptz not null, number bigint, unit text, kind text, detail jsonb, primary key (unit, number, kind));
+    at timestamptz not null, number bigint, unit text, kind text, detail jsonb,
+    primary key (unit, number, kind, detail));
 create temporary table if not exists driftfit_staging (like {schema}.driftfit_result);
 """
 COLUMNS = "time, number, unit, seconds, y, y_hat, e, s, ok, alarm, theta, std, names"

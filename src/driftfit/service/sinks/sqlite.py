@@ -18,7 +18,7 @@ SCHEMA = """
 create table if not exists result (number integer, unit text, time real, y real, y_hat real, e real, s real,
     ok integer, alarm integer, theta text, std text, primary key (number, unit)) without rowid;
 create table if not exists event (number integer, unit text, at real, kind text, detail text,
-    primary key (number, unit, kind)) without rowid;
+    primary key (number, unit, kind, detail)) without rowid;
 """
 
 RESULT = "insert or ignore into result values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"

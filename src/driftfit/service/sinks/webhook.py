@@ -3,25 +3,24 @@
     {"unit": "pump 7", "kind": "alarm", "at": "2026-01-31T12:00:00+00:00", "text": "...", "detail": {...}}
 
 ``title`` and ``text`` are what services such as Mattermost show. With ``body = "text"`` the text alone is sent, and the
-unit as the header ``Title``: so the app of ntfy shows it on a phone. An answer other than 2xx is tried again;
-a 4xx other than 408 and 429 would not be better later, and is logged and left out. The header ``Idempotency-Key`` is
-the same when an event comes again.
+unit as the header ``Title``: so the app of ntfy shows it on a phone. Only an answer of 2xx counts as delivered. A
+redirect is not followed: it makes a GET without a body of the POST, and would give the token to another address. The
+header ``Idempotency-Key`` is the same when an event comes again.
 """
 
 from __future__ import annotations
 
 import json
-import logging
 import urllib.error
 import urllib.request
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
 from driftfit.service.settings.options import Secret
-from driftfit.service.sinks.contract import Event, Outcome, Sink, Writer
+from driftfit.service.sinks.contract import Event, Outcome, RefusedError, Sink, Writer
 
-log = logging.getLogger("driftfit.service")
 TIMEOUT = 10.0
 
 
@@ -35,6 +34,7 @@ class Webhook(Sink):
     """json, or text."""
     token: Secret | None = None
     """Sent as ``Authorization: Bearer``."""
+    one_by_one: ClassVar[bool] = True
 
     def check(self) -> None:
         """The address."""
@@ -52,16 +52,13 @@ class Webhook(Sink):
 class _Webhook(Writer):
     def __init__(self, options: Webhook) -> None:
         self.options = options
-        self.sent: set[tuple[int, str, str]] = set()
+        self.client = urllib.request.build_opener(_NoRedirect)
 
     def write(self, batch: Outcome) -> None:
-        """A request for each event; those of the batch that were sent before are left out."""
+        """A request for each event."""
         for event in batch.events:
-            key = (event.number, event.unit, event.kind)
-            if event.kind in self.options.events and key not in self.sent:
+            if event.kind in self.options.events:
                 self._send(event)
-                self.sent.add(key)
-        self.sent.clear()
 
     def _send(self, event: Event) -> None:
         content = message(event)
@@ -70,18 +67,21 @@ class _Webhook(Writer):
         else:  # in a header only characters of ASCII arrive everywhere
             title = event.unit.encode("ascii", "replace").decode()
             headers, data = {"Content-Type": "text/plain; charset=utf-8", "Title": title}, str(content["text"])
-        headers |= {"User-Agent": "driftfit", "Idempotency-Key": f"{event.number}-{event.kind}"}
+        headers |= {"User-Agent": "driftfit", "Idempotency-Key": "-".join(map(str, event.key))}
         if self.options.token is not None:
             headers["Authorization"] = f"Bearer {self.options.token.value}"
         request = urllib.request.Request(self.options.url, data.encode(), headers, method="POST")
         try:
-            with urllib.request.urlopen(request, timeout=TIMEOUT):
+            with self.client.open(request, timeout=TIMEOUT):
                 pass
         except urllib.error.HTTPError as error:
             with error:
-                if not 400 <= error.code < 500 or error.code in (408, 429):
-                    raise ConnectionError(f"{urlsplit(self.options.url).hostname} answered {error.code}") from None
-                log.error("webhook refused", extra={"unit": event.unit, "detail": f"status {error.code}"})
+                raise RefusedError(f"{urlsplit(self.options.url).hostname} answered {error.code}") from None
+
+
+class _NoRedirect(urllib.request.HTTPRedirectHandler):
+    def redirect_request(self, *args: Any) -> None:
+        """Leave an answer of 3xx as the error that it is."""
 
 
 def message(event: Event) -> dict[str, object]:

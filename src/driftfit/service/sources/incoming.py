@@ -11,12 +11,14 @@ from typing import Any
 
 import msgspec
 
-from driftfit.service.sources.samples import NO_SIGNAL, Batch, Receipt, Samples, ShapeError, decode
+from driftfit.service.sources.samples import NO_SIGNAL, TOO_MANY_NEW, Batch, Receipt, Samples, ShapeError, decode
 
 WAIT = 30.0
 """Seconds after which a request that is not yet journaled is answered with an error."""
 KNOWN = frozenset({"late", "duplicate"})
 """Reasons for which a sender need not mend anything: it has sent the samples before, or others were faster."""
+SLOWER = frozenset({"flood", TOO_MANY_NEW})
+"""Reasons for which a sender has to wait."""
 _BODY = msgspec.json.Decoder(dict[str, msgspec.Raw])
 
 
@@ -26,7 +28,9 @@ class Incoming:
     def __init__(self, most: int = 256) -> None:
         self.queue: queue.Queue[Batch] = queue.Queue(most)
 
-    def offer(self, topic: str, body: bytes, foreign: Callable[[str], list[str]] = lambda topic: []) -> dict[str, Any]:
+    def offer(
+        self, topic: str, body: bytes, client: str = "", foreign: Callable[[str], list[str]] = lambda topic: []
+    ) -> dict[str, Any]:
         """Decode a request, wait until it is in the journal, and report what was received and what was left out.
 
         Nothing is taken if ``foreign`` names units of a topic, which the sender may not touch: the status is then 403.
@@ -38,7 +42,7 @@ class Incoming:
             if units:
                 return {"error": f"this sender may not send samples of {', '.join(units)} ({name}).", "status": 403}
         done, receipt = threading.Event(), Receipt()
-        batch = Batch(samples, done.set, refused=len(refused), arrived=time.monotonic(), receipt=receipt)
+        batch = Batch(samples, done.set, client=client, refused=len(refused), arrived=time.monotonic(), receipt=receipt)
         try:
             self.queue.put(batch, timeout=WAIT)
         except queue.Full:
@@ -56,7 +60,7 @@ class Incoming:
         if left_out.total() < receipt.offered or reasons <= KNOWN:
             return answer
         why = ", ".join(f"{reason} ({count})" for reason, count in left_out.items())
-        return answer | {"error": f"no sample was taken: {why}.", "status": 429 if "flood" in left_out else 422}
+        return answer | {"error": f"no sample was taken: {why}.", "status": 429 if SLOWER & left_out.keys() else 422}
 
 
 INCOMING = Incoming()

@@ -42,7 +42,7 @@ class Kafka(Source):
 class _Kafka(Reader):
     def __init__(self, options: Kafka, position: dict[str, int]) -> None:
         kafka = library()
-        self.position = position
+        self.position, self.noticed = position, ""
         given = {"bootstrap.servers": options.brokers, "group.id": f"driftfit-{options.name}",
                  "enable.auto.commit": False, "auto.offset.reset": options.begin} | options.settings  # fmt: skip
         self.consumer = kafka.Consumer(given)
@@ -53,14 +53,21 @@ class _Kafka(Reader):
                 raise ConnectionError(str(known.error))
             for part in known.partitions:
                 at = position.get(f"{topic}/{part}")
-                if at is None:  # noted now, so that nothing is skipped if the service stops before the first message
-                    ends = self.consumer.get_watermark_offsets(kafka.TopicPartition(topic, part), START)
-                    at = position[f"{topic}/{part}"] = ends[options.begin == "latest"]
+                ends = self.consumer.get_watermark_offsets(kafka.TopicPartition(topic, part), START)
+                if at is None:
+                    at = ends[options.begin == "latest"]
+                elif not ends[0] <= at <= ends[1]:  # the library would go on at one of the ends, without a word
+                    self.noticed = f"{topic}/{part} has no message {at}: it is read from its first, {ends[0]}."
+                    at = ends[0]
+                position[f"{topic}/{part}"] = at  # noted now: nothing is skipped if the service stops before a message
                 places.append(kafka.TopicPartition(topic, part, at))
         self.consumer.assign(places)
 
     def read(self, wait: float) -> Batch | None:
         """The messages that have arrived."""
+        if self.noticed:
+            noticed, self.noticed = self.noticed, ""
+            return Batch([], noticed=noticed)
         found = self.consumer.consume(MOST, wait)
         if not found:
             return None

@@ -1,11 +1,13 @@
 """Replay: a recorded file at a chosen speed, for trials and demonstrations.
 
 ``speed`` is in rows per second for a file without times, and a multiple of real time with ``time``; 0 is as fast as
-possible. The position is the number of rows that were read.
+possible. The position is the number of rows that were read, with a digest of the file; another file is read from its
+start, and an event says so.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
 from dataclasses import dataclass
@@ -14,6 +16,7 @@ from typing import Any
 
 import polars as pl
 
+from driftfit.data.formats.packed import read_parquet
 from driftfit.service.sources.contract import END, FileSource, Reader
 from driftfit.service.sources.samples import Batch, Samples, seconds
 
@@ -42,15 +45,19 @@ class Replay(FileSource):
 
     def open(self, position: Any) -> Reader:
         """Continue after the rows that were read."""
-        table = pl.read_parquet(self.path) if self.path.endswith(".parquet") else pl.read_csv(self.path)
-        return _Replay(self, table, int(position or 0))
+        table = read_parquet(self.path, self.path)[1] if self.path.endswith(".parquet") else pl.read_csv(self.path)
+        with open(self.path, "rb") as file:
+            digest = hashlib.file_digest(file, "blake2b").hexdigest()
+        return _Replay(self, table, digest, position or [0, digest])
 
 
 class _Replay(Reader):
-    def __init__(self, options: Replay, table: pl.DataFrame, at: int) -> None:
-        self.options, self.table, self.at = options, table, at
+    def __init__(self, options: Replay, table: pl.DataFrame, digest: str, position: list[Any]) -> None:
+        self.options, self.table, self.digest = options, table, digest
+        self.at = position[0] if position[1] == digest else 0
+        self.noticed = "" if position[1] == digest else f"{options.path} is another file: it is read from its start."
         self.clock = [seconds(_plain(cell), 1.0) for cell in table[options.time]] if options.time else []
-        self.begun, self.first = time.monotonic(), at
+        self.begun, self.first = time.monotonic(), self.at
 
     def _due(self) -> int:
         """Rows up to which it is time."""
@@ -83,7 +90,8 @@ class _Replay(Reader):
             )
             for part in parts
         ]  # fmt: skip
-        return Batch(samples, position=self.at, arrived=time.monotonic())
+        noticed, self.noticed = self.noticed, ""
+        return Batch(samples, position=[self.at, self.digest], noticed=noticed, arrived=time.monotonic())
 
 
 def _plain(cell: Any) -> Any:

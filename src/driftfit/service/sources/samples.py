@@ -36,6 +36,7 @@ _DECODE = msgspec.json.Decoder(dict[str, Cell | list[Cell]] | list[dict[str, Cel
 FIRST = 20
 """Samples of a message that an answer names."""
 
+TOO_MANY_NEW = "too many new units"
 NO_SIGNAL = "no signal"
 """Why a unit that reads a topic took no sample of it."""
 
@@ -81,6 +82,10 @@ class Batch(NamedTuple):
     """To be called once the samples are in the journal."""
     position: Any = None
     """Where the source continues after these samples, as plain data; None if the sender keeps that."""
+    client: str = ""
+    """Who sent it, if the source has several clients."""
+    noticed: str = ""
+    """What the source noticed, which becomes an event."""
     refused: int = 0
     """Messages that could not be decoded."""
     arrived: float = 0.0
@@ -165,7 +170,8 @@ def seconds(cell: Any, scale: float) -> float:
 def numbers_of(cells: list[Any]) -> Array:
     """Cells as numbers, as `number` gives them."""
     try:
-        return np.array(cells, float)
+        found = np.array(cells, float)
+        return found if found.ndim == 1 else np.array([number(cell) for cell in cells])
     except (TypeError, ValueError, OverflowError):
         return np.array([number(cell) for cell in cells])
 

@@ -1,12 +1,14 @@
 """Tail: a CSV file (with a header line) or a file of JSON lines that grows; also one that is replaced (rotated).
 
-The position is the byte up to which complete lines were read, with the number of the file, so a restart continues
-there. A line is read once it ends; a longer one than 1 MB is refused.
+The position is the byte up to which complete lines were read, with a digest of what is before it, so a restart
+continues there. Where a file has other bytes before the position, or fewer, it was cut or is another one: it is read
+from its start, and an event says so. A line is read once it ends; a longer one than 1 MB is refused.
 """
 
 from __future__ import annotations
 
 import csv
+import hashlib
 import os
 import time
 from dataclasses import dataclass
@@ -18,6 +20,8 @@ from driftfit.service.sources.samples import Batch, Samples, decode
 
 PIECE = 1 << 20
 """Most bytes that are read at once, and of one line."""
+BEFORE = 1 << 16
+"""Bytes before the position by which a file is recognised."""
 LOOK = 0.05
 """Seconds between two looks at a file that does not grow."""
 
@@ -40,12 +44,27 @@ class _Tail(Reader):
         self._open(position)
 
     def _open(self, position: Any) -> None:
-        self.file = open(self.path, "rb")  # noqa: SIM115  (closed by `close`)
-        self.inode = os.fstat(self.file.fileno()).st_ino
+        self.file = open(self.path, "rb", buffering=0)  # noqa: SIM115  (closed by `close`)
         json_lines = self.path.suffix.lower() in (".jsonl", ".ndjson", ".json")
-        self.header = None if json_lines else self._cells(self.file.readline())
-        if position is not None and position[0] == self.inode and position[1] <= os.path.getsize(self.path):
-            self.file.seek(position[1])
+        head = b"\n" if json_lines else self.file.readline(PIECE)
+        if not head.endswith(b"\n"):
+            self.file.close()
+            raise ValueError(f"{self.path} has no complete header line yet.")
+        self.header = None if json_lines else self._cells(head)
+        self.at, self.noticed = self.file.tell(), ""
+        self.before = self._read(self.at, 0)
+        if position is not None and position[0] != self.at:
+            before = self._read(position[0], 0)
+            if _digest(before) == position[1]:
+                self.at, self.before = position[0], before
+            else:
+                self.noticed = f"{self.path} does not continue at byte {position[0]}: it is read from its start."
+
+    def _read(self, at: int, count: int) -> bytes:
+        """Some bytes before ``at``, and ``count`` bytes from there on, in one piece: another may write meanwhile."""
+        begin = max(0, at - BEFORE)
+        self.file.seek(begin)
+        return self.file.read(at - begin + count)
 
     def _cells(self, line: bytes) -> list[str]:
         text = line.decode("utf-8-sig", "replace").strip("\r\n")
@@ -55,13 +74,26 @@ class _Tail(Reader):
         """Complete lines that have been added."""
         until = time.monotonic() + wait
         while True:
-            begin = self.file.tell()
-            piece = self.file.read(PIECE)
+            if self.noticed:
+                noticed, self.noticed = self.noticed, ""
+                return Batch([], noticed=noticed)
+            renamed = self._renamed()  # what was written to the old file before is read below
+            found = self._read(self.at, PIECE)
+            if not found.startswith(self.before):
+                self.close()
+                self._open((self.at, ""))
+                continue
+            piece = found[len(self.before) :]
             end = piece.rfind(b"\n") + 1
-            self.file.seek(begin + (end or (len(piece) if len(piece) == PIECE else 0)))
-            if end or len(piece) == PIECE:
-                return self._batch(piece[:end])
-            if self._replaced():
+            lines = piece[:end]
+            if not end and len(piece) == PIECE:
+                end = PIECE  # no line is so long
+            elif not end and renamed:
+                lines, end = piece, len(piece)
+            if end:
+                self.at, self.before = self.at + end, found[: len(self.before) + end][-BEFORE:]
+                return self._batch(lines)
+            if renamed:
                 self.close()
                 self._open(None)
             elif time.monotonic() >= until:
@@ -69,13 +101,12 @@ class _Tail(Reader):
             else:
                 time.sleep(LOOK)
 
-    def _replaced(self) -> bool:
-        """Whether another file has the name now, or this one was cut."""
+    def _renamed(self) -> bool:
+        """Whether another file has the name now."""
         try:
-            now = os.stat(self.path)
+            return os.stat(self.path).st_ino != os.fstat(self.file.fileno()).st_ino
         except FileNotFoundError:
             return False
-        return now.st_ino != self.inode or now.st_size < self.file.tell()
 
     def _batch(self, piece: bytes) -> Batch:
         rows: dict[str, list[dict[str, Any]]] = {}
@@ -106,8 +137,7 @@ class _Tail(Reader):
         for topic, many in rows.items():
             names = {name for row in many for name in row}
             samples.append(Samples(topic, len(many), {name: [row.get(name) for row in many] for name in names}))
-        position = [self.inode, self.file.tell()]
-        return Batch(samples, position=position, refused=refused, arrived=time.monotonic())
+        return Batch(samples, position=[self.at, _digest(self.before)], refused=refused, arrived=time.monotonic())
 
     def _topic(self, row: Any) -> str:
         return self.options.topic_of(row.get(self.options.by, ""))
@@ -115,3 +145,7 @@ class _Tail(Reader):
     def close(self) -> None:
         """Close the file."""
         self.file.close()
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()

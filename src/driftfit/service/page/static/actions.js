@@ -23,7 +23,7 @@ export class Actions {
   show(about, user) {
     at("acts").hidden = user?.role !== "operator";
     const { state: it } = about;
-    const wanted = JSON.stringify([about.unit, it.held, it.acknowledged, it.failure]);
+    const wanted = JSON.stringify([about.unit, it.held, it.acknowledged, it.failure, it.unarmed]);
     if (this.wanted === wanted) { this.about = about; return; }
     this.wanted = wanted; this.about = about;
     const home = at("buttons");
@@ -35,7 +35,7 @@ export class Actions {
     add("Reset", () => this.reset());
     add("New limits", () => this.limits());
     if (it.acknowledged === false) add("Acknowledge alarm", () => this.open("acknowledge", "Acknowledge alarm", "", () => {}, () => ({})));
-    if (it.failure) add("Restart", () => this.open("restart", "Restart", "The unit begins again without its past.", () => {}, () => ({})));
+    if (it.failure || Object.keys(it.unarmed ?? {}).length) add("Restart", () => this.open("restart", "Restart", "The unit begins again without its past.", () => {}, () => ({})));
   }
   reset() {
     let which, p;

@@ -66,8 +66,9 @@ const rate = { at: 0, samples: 0, value: null };
 const receive = (message) => {
   const { status } = message;
   link(status.alive ? "live" : "engine away", status.alive ? "good" : "bad");
-  at("problem").hidden = !status.problem;
-  at("problem").textContent = status.problem ?? "";
+  const told = [status.problem, ...(status.reasons ?? []).slice(0, 5)].filter(Boolean);
+  at("problem").hidden = !told.length;
+  at("problem").textContent = told.join("; ");
   const now = performance.now();
   if (now - rate.at > 1500) {
     if (rate.at && status.samples >= rate.samples) rate.value = (status.samples - rate.samples) / (now - rate.at) * 1e3;
@@ -111,8 +112,9 @@ const fill = (tr, one, most) => {
   tr.classList.toggle("alarm", one.alarm);
   const cells = tr.cells;
   set(cells[0], one.unit);
-  set(cells[1].firstChild, one.alarm ? "alarm" : one.silent ? "silent" : "normal");
-  cells[1].firstChild.className = `pill ${one.alarm ? "bad" : one.silent ? "" : "good"}`;
+  const bad = one.trouble.length ? one.trouble.join(", ") : one.alarm ? "alarm" : "";
+  set(cells[1].firstChild, bad || (one.silent ? "silent" : "normal"));
+  cells[1].firstChild.className = `pill ${bad ? "bad" : one.silent ? "" : "good"}`;
   const [bar, text] = cells[2].firstChild.children;
   bar.style.width = `${Math.round(85 * Math.min(1, one.drift / most))}%`;
   set(text, one.drift.toFixed(1));
@@ -189,7 +191,8 @@ const described = ({ about, now, state: it }) => {
   if (now.alarm) make("span", "alarm", badges, "pill bad");
   if (it.acknowledged === false) make("span", "not acknowledged", badges, "pill bad");
   if (it.held) make("span", "held", badges, "pill");
-  if (it.calibrated === false) make("span", "finding limits", badges, "pill");
+  if (it.unarmed === null) make("span", "finding limits", badges, "pill");
+  for (const [kind, why] of Object.entries(it.unarmed ?? {})) make("span", `alarm ${kind} is not armed: ${why}`, badges, "pill bad");
   const counts = Object.entries(it.counts ?? {}).map(([what, n]) => `${n.toLocaleString()} ${what}`).join(", ");
   at("model").textContent = `${about.model}, ${about.tracker}. ${counts}.`;
   for (const kind of ["csv", "arrow"]) {
