@@ -249,7 +249,7 @@ def _ordinary(unit: Unit) -> Counter[str]:
     operations = {function.name: function.operations for function in unit.functions.values()}
     if "advance" not in operations:
         return operations["sample"]
-    parts = (operations.get(name, Counter()) for name in ("regress", "clean", "needs_begin", "advance", "push"))
+    parts = (operations.get(name, Counter()) for name in ("regress", "clean", "advance", "push"))
     return sum(parts, Counter[str]())
 
 

@@ -286,12 +286,17 @@ def _advance(tracker: TrackerSteps) -> Any:
             correct(s, l)
         for l in range(s.theta.shape[1]):
             report(s, l)
-        if both:
-            some = 0.0
-            for l in range(s.theta.shape[1]):
-                some = max(some, s.late[l])
-            if some > 0.0:
-                called(s)
+
+    @kernel
+    def advance_or_wait(s: State) -> None:
+        advance(s)
+        some = 0.0
+        for l in range(s.theta.shape[1]):
+            some = max(some, s.late[l])
+        if some > 0.0:
+            called(s)
+
+    usual = advance_or_wait if both else advance
 
     if tracker.start is None:
         return advance
@@ -326,7 +331,7 @@ def _advance(tracker: TrackerSteps) -> Any:
         if some > 0:
             started(s)
         else:
-            advance(s)
+            usual(s)
 
     return advance_or_start
 
