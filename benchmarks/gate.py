@@ -179,7 +179,7 @@ def nothing(s, l):
 
 def loop_of(regress: Callable, push: Callable, gate: Callable) -> Callable:
     @njit(error_model="numpy")
-    def loop(tile, Y, U, first, theta, reason):
+    def loop(tile, Y, U, first, theta, reason, errors):
         """Samples from ``first`` on; returns the number of those that are done."""
         s, l = tile[0], 0
         for t in range(first, len(Y)):
@@ -190,6 +190,7 @@ def loop_of(regress: Callable, push: Callable, gate: Callable) -> Callable:
             predict(s, l)
             forecast(s, l)
             variance(s, l)
+            errors[t, 0], errors[t, 1] = s.e[l], s.s[l]
             gate(s, l)
             variance(s, l)
             correct(s, l)
@@ -200,6 +201,20 @@ def loop_of(regress: Callable, push: Callable, gate: Callable) -> Callable:
         return len(Y)
 
     return loop
+
+
+@dataclass
+class Result:
+    """What a run gave."""
+
+    theta: np.ndarray
+    """Estimates (T, n)."""
+    reason: np.ndarray
+    """What the gate decided of each sample (T,)."""
+    errors: np.ndarray
+    """e and s (T, 2) as the gate found them."""
+    tile: np.ndarray
+    """The state at the end."""
 
 
 @dataclass
@@ -217,39 +232,38 @@ class Bench:
         self.gated = loop_of(regress, push, gate_step(self.gate, self.n, self.m, ages, refuse))
         self.plain = loop_of(regress, push, nothing)
 
-    def run(self, kind: int, y: np.ndarray, u: np.ndarray, gated: bool, q: float, r: float) -> tuple[Any, Any, Any]:
-        """theta (T, n), reasons (T,) and the tile at the end."""
+    def run(self, kind: int, y: np.ndarray, u: np.ndarray, gated: bool, q: float, r: float) -> Result:
+        """The whole record, and first samples once more if they had codes."""
         own = fields(self.n, self.m, self.na, self.nb, kind, self.gate, q, r)
         own["scale"] = r if kind == KALMAN else 1.0
         tile, loop = tile_of(own), self.gated if gated else self.plain
-        theta, reason = np.zeros((len(y), self.n)), np.zeros(len(y), np.int64)
-        done = loop(tile, y, u, 0, theta, reason)
-        if done < len(y) or tile["gate_replay"][0, 0] > 0:
+        result = Result(np.zeros((len(y), self.n)), np.zeros(len(y), np.int64), np.zeros((len(y), 2)), tile)
+        out = result.theta, result.reason, result.errors
+        done = loop(tile, y, u, 0, *out)
+        if tile["gate_replay"][0, 0] > 0:
             first = replayed({name: tile[name][0, ..., 0] for name in tile.dtype.names}, self.m)
-            tile, k = tile_of(own | {"gate_decided": 1}), len(first.y)
-            loop(tile, first.y, first.u, 0, np.zeros((k, self.n)), np.zeros(k, np.int64))
-            reason[done - k + np.flatnonzero(first.codes.any(1))] = AT_START
-            loop(tile, y, u, done, theta, reason)
-        return theta, reason, tile
+            result.tile, k = tile_of(own | {"gate_decided": 1}), len(first.y)
+            loop(result.tile, first.y, first.u, 0, *(np.zeros_like(one[:k]) for one in out))
+            result.reason[done - k + np.flatnonzero(first.codes.any(1))] = AT_START
+            loop(result.tile, y, u, done, *out)
+        return result
 
 
 def measured(bench: Bench, case: Case, kind: int) -> tuple[float, float, float, float]:
     """Good readings refused, codes let in, and errors of theta with the gate and without, as multiples of what the same
     tracker has without the codes."""
     settings = {"q": case.q, "r": case.r}
-    theta, reason, _ = bench.run(kind, case.y, case.u, True, **settings)
-    plain, _, _ = bench.run(kind, case.y, case.u, False, **settings)
-    whole, _, _ = bench.run(kind, *case.without_codes(), False, **settings)
-    ends = np.flatnonzero(np.diff(np.r_[case.bad | case.bad_u, False][case.at :].astype(int)) < 0)
+    one = bench.run(kind, case.y, case.u, True, **settings)
+    plain = bench.run(kind, case.y, case.u, False, **settings)
+    whole = bench.run(kind, *case.without_codes(), False, **settings)
+    bad = case.bad | case.bad_u
+    ends = np.flatnonzero(np.diff(np.r_[bad, False][case.at :].astype(int)) < 0)
     later = slice(max(case.at + (ends[0] if len(ends) else 0) + 20, 60), None)
-    gated, ungated, least = (np.sqrt(np.mean((one - case.theta)[later] ** 2)) for one in (theta, plain, whole))
-    refused = reason != USED
-    known = case.without_codes()
-    window = bench.nb + 1  # an input code spoils the samples that remember it
-    spoilt = np.convolve(case.bad_u, np.ones(window))[: len(case.y)] > 0 if case.bad_u.any() else case.bad
-    del known
-    good = ~case.bad & ~spoilt
-    return float(np.sum(refused & good)), float(np.sum(~refused & case.bad)), gated / least, ungated / least
+    gated, ungated, least = (np.sqrt(np.mean((run.theta - case.theta)[later] ** 2)) for run in (one, plain, whole))
+    refused = one.reason != USED
+    spoilt = np.convolve(case.bad_u, np.ones(bench.nb + 1))[: len(bad)] > 0.0  # samples that remember an input code
+    lost, let_in = refused & ~case.bad & ~spoilt, ~refused & case.bad
+    return float(lost.sum()), float(let_in.sum()), gated / least, ungated / least
 
 
 def table(benches: dict[str, Bench], cases: dict[str, Callable], runs: int, show: bool = True) -> dict[str, np.ndarray]:

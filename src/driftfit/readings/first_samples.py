@@ -204,7 +204,7 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
             same &= s.u[j, l] == s.gate_first[k, U + j, l]
         for i in range(n):
             same &= s.phi[i, l] == s.gate_first[k, PHI + i, l]
-        return same
+        return same  # type: ignore[no-any-return]
 
     @kernel
     def drop_oldest(s: State, l: int) -> None:
@@ -250,7 +250,7 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
 @kernel
 def reading_now(s: State, l: int) -> float:
     """The reading as it was measured, NaN if it is missing."""
-    return s.y[l] + s.shift[l] if s.observed[l] > 0.0 else np.nan  # type: ignore[no-any-return]
+    return s.y[l] + s.shift[l] if s.observed[l] > 0.0 else np.nan
 
 
 class First(NamedTuple):

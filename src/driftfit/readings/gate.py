@@ -44,7 +44,8 @@ MEMORY = 1000.0
 CLIPPED = 10.0
 """Variances of the readings that one which contradicts its forecast adds, at most."""
 LONGER = 4
-"""Times `Gate.hold` after which a code is taken for a level although the forecast moves."""
+"""Times `Gate.hold` for which a code is held back on a signal that does not repeat by nature, as a new level would not
+either."""
 GROWTH = 1.02
 """Growth in one sample of the error of a settled tracker, at most."""
 USED, REFUSED, FROZEN, INPUT, AT_START = range(5)
@@ -157,7 +158,9 @@ def output_rule(gate: Gate) -> Step:
         if (apart == 0.0) | turns:
             s.gate_same[l] += 1
             s.gate_pulses[l] += 1 if unmoved & strikes else 0
-            return (s.gate_same[l] < hold) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
+            held = (s.gate_same[l] < (hold if natural(s, l) else LONGER * hold)) & (s.gate_pulses[l] < believed)
+            s.gate_chance[l] = s.gate_chance[l] if held else np.inf  # a level that repeats is not frozen either
+            return held  # type: ignore[no-any-return]
         alike = unmoved | ((y - s.gate_last[l]) ** 2 < near2)
         s.gate_run[l] += 1
         s.gate_pulses[l] = (s.gate_pulses[l] + 1 if alike else 1) if unusual | unmoved else 0
@@ -198,15 +201,7 @@ def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, in
     notice, blame = input_rules(gate, m, ages, refuse)
     hold_frozen, judge = frozen_rule(gate.frozen, gate.natural), output_rule(gate)
     resolve = resolution(gate.coarse)
-    sure, rare, longest = float(gate.sure) ** 2, float(gate.rare) ** 2, LONGER * gate.hold
-
-    @kernel
-    def outlasts(s: State, l: int) -> bool:
-        """Whether a far reading repeats for so long that it is a level although the forecast moves."""
-        s.gate_same[l] += 1 if s.gate_same[l] > 0 else 0
-        if s.gate_same[l] >= longest:
-            s.gate_chance[l] = np.inf
-        return s.gate_same[l] >= longest  # type: ignore[no-any-return]
+    sure, rare = float(gate.sure) ** 2, float(gate.rare) ** 2
 
     @kernel
     def step(s: State, l: int) -> None:
@@ -219,7 +214,7 @@ def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, in
         if s.ok[l] > 0.0 and blame(s, contradicts, off * off <= rare * s.gate_variance[l], l):
             s.ok[l], s.reason[l] = 0.0, INPUT
         if (s.observed[l] > 0.0) & (s.reason[l] == USED):
-            if hold_frozen(s, variance_of_error(s, l), l) and not outlasts(s, l):
+            if hold_frozen(s, variance_of_error(s, l), l) & (s.gate_same[l] == 0):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, FROZEN
             else:
                 contradicts = judge(s, l)
