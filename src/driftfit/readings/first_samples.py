@@ -42,6 +42,8 @@ FEW = 3
 """Values that differ from the median, from which on their distance is usual."""
 ROUNDED = 1e-20
 """Share of the sum of squares of y that may be an error of rounding."""
+MADE_ROOM = -1
+"""Value of ``gate_decided`` when samples were dropped for others; 0 before that, 1 when it is decided."""
 Y, READING, OK, DT, NOISE, DRIFT, TIMES, DOUBT, U = range(9)
 CODES = Y
 """Columns of a kept sample: output and reading (NaN if missing), whether there is a row, intervals since the last
@@ -189,9 +191,11 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
 
     @partial(kernel, inline=False)
     def decide(s: State, l: int) -> None:
-        s.gate_decided[l] = 1
+        """Where samples made room for others they were judged one by one, unless they are the codes themselves."""
+        whole, s.gate_decided[l] = s.gate_decided[l] == 0, 1
         count = doubt(s, l)
-        if (count > 0) & (2 * count < N) and contradicted(s, l):
+        whole |= s.gate_first[0, DOUBT, l] == 1.0
+        if (count > 0) & (2 * count < N) & whole and contradicted(s, l):
             mark(s, l)
             s.gate_replay[l] = 1
 
@@ -211,7 +215,7 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
         for k in range(1, N):
             for column in range(U + m + n):
                 s.gate_first[k - 1, column, l] = s.gate_first[k, column, l]
-        s.gate_kept[l] = N - 1
+        s.gate_kept[l], s.gate_decided[l] = N - 1, MADE_ROOM
 
     @kernel
     def keep(s: State, k: int, times: float, l: int) -> None:
@@ -241,7 +245,7 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
 
     @kernel
     def remember(s: State, l: int) -> None:
-        if s.gate_decided[l] == 0:
+        if s.gate_decided[l] < 1:
             remember_one(s, l)
 
     return remember  # type: ignore[no-any-return]

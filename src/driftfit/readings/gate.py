@@ -44,8 +44,7 @@ MEMORY = 1000.0
 CLIPPED = 10.0
 """Variances of the readings that one which contradicts its forecast adds, at most."""
 LONGER = 4
-"""Times `Gate.hold` for which a code is held back on a signal that does not repeat by nature, as a new level would not
-either."""
+"""Times `Gate.hold` for which a code is held back where the forecast moves and readings do not repeat by nature."""
 GROWTH = 1.02
 """Growth in one sample of the error of a settled tracker, at most."""
 USED, REFUSED, FROZEN, INPUT, AT_START = range(5)
@@ -158,7 +157,8 @@ def output_rule(gate: Gate) -> Step:
         if (apart == 0.0) | turns:
             s.gate_same[l] += 1
             s.gate_pulses[l] += 1 if unmoved & strikes else 0
-            held = (s.gate_same[l] < (hold if natural(s, l) else LONGER * hold)) & (s.gate_pulses[l] < believed)
+            told = (s.gate_chance[l] < 1.0) & (not natural(s, l))  # a level would not repeat where the forecast moves
+            held = (s.gate_same[l] < (LONGER * hold if told else hold)) & (s.gate_pulses[l] < believed)
             s.gate_chance[l] = s.gate_chance[l] if held else np.inf  # a level that repeats is not frozen either
             return held  # type: ignore[no-any-return]
         alike = unmoved | ((y - s.gate_last[l]) ** 2 < near2)
