@@ -189,12 +189,20 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
                 s.gate_first[k, CODES, l] += hit if outside else 0.0
             bit *= 2.0
 
+    @kernel
+    def times_of_first(s: State, l: int) -> int:
+        """How many of the samples have the reading of the first: a rest comes again, codes of a start are over."""
+        count = 0
+        for k in range(N):
+            count += 1 if s.gate_first[k, READING, l] == s.gate_first[0, READING, l] else 0
+        return count
+
     @partial(kernel, inline=False)
     def decide(s: State, l: int) -> None:
         """Where samples made room for others they were judged one by one, unless they are the codes themselves."""
         whole, s.gate_decided[l] = s.gate_decided[l] == 0, 1
         count = doubt(s, l)
-        whole |= s.gate_first[0, DOUBT, l] == 1.0
+        whole |= (s.gate_first[0, DOUBT, l] == 1.0) & (times_of_first(s, l) == 1)
         if (count > 0) & (2 * count < N) & whole and contradicted(s, l):
             mark(s, l)
             s.gate_replay[l] = 1

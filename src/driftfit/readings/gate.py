@@ -158,9 +158,7 @@ def output_rule(gate: Gate) -> Step:
             s.gate_same[l] += 1
             s.gate_pulses[l] += 1 if unmoved & strikes else 0
             told = (s.gate_chance[l] < 1.0) & (not natural(s, l))  # a level would not repeat where the forecast moves
-            held = (s.gate_same[l] < (LONGER * hold if told else hold)) & (s.gate_pulses[l] < believed)
-            s.gate_chance[l] = s.gate_chance[l] if held else np.inf  # a level that repeats is not frozen either
-            return held  # type: ignore[no-any-return]
+            return (s.gate_same[l] < (LONGER * hold if told else hold)) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
         alike = unmoved | ((y - s.gate_last[l]) ** 2 < near2)
         s.gate_run[l] += 1
         s.gate_pulses[l] = (s.gate_pulses[l] + 1 if alike else 1) if unusual | unmoved else 0
@@ -180,10 +178,13 @@ def output_rule(gate: Gate) -> Step:
         if not contradicts:
             settled = predicted & (e2 <= sure * s.gate_settled[l])
             s.gate_run[l] = max(min(s.gate_run[l], 2 * believed) - 1, 0) if settled else s.gate_run[l]
-            s.gate_same[l] = 0
+            if s.gate_same[l] > 0:  # a level that repeats is not frozen either
+                s.gate_chance[l], s.gate_same[l] = np.inf, 0
         elif beyond & (s.gate_count[l] >= FIRST):
             if held_back(s, y, usual > s.gate_variance[l], l):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, REFUSED
+            elif s.gate_same[l] > 0:
+                s.gate_chance[l] = np.inf
         else:
             s.gate_run[l] += 1
         return contradicts  # type: ignore[no-any-return]
