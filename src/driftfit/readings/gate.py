@@ -203,8 +203,8 @@ def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, in
     ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
     memory.
     """
-    remember = first_samples(gate.first, n, m, ages)
-    notice, blame = input_rules(gate, m, ages, refuse)
+    remember = first_samples(ages)
+    notice, blame = input_rules(gate, ages, refuse)
     hold_frozen, judge = frozen_rule(gate.frozen, gate.natural), output_rule(gate)
     resolve = resolution(gate.coarse)
     sure, rare = float(gate.sure) ** 2, float(gate.rare) ** 2
