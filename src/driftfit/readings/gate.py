@@ -127,9 +127,9 @@ def learn_usual(s: State, seen: bool, contradicts: bool, clip: float, l: int) ->
     ever, more of them are usual in the end.
     """
     known = s.gate_count[l] >= FIRST
+    s.gate_count[l] += 1.0 if seen else 0.0
+    share, v = 1.0 / max(min(s.gate_count[l], MEMORY), 1.0), s.gate_variance[l]
     if seen:
-        s.gate_count[l] += 1.0
-        share, v = 1.0 / min(s.gate_count[l], MEMORY), s.gate_variance[l]
         off = reading(s, l) - s.gate_mean[l]
         if contradicts & known:
             most = np.sqrt(CLIPPED * v)
@@ -140,7 +140,7 @@ def learn_usual(s: State, seen: bool, contradicts: bool, clip: float, l: int) ->
     if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
         ratio = s.e[l] * s.e[l] / own
         ratio = min(ratio, clip * usual_ratio(s, l)) if known else ratio
-        s.gate_ratio[l] += (ratio - s.gate_ratio[l]) / min(s.gate_count[l], MEMORY)
+        s.gate_ratio[l] += share * (ratio - s.gate_ratio[l])
         s.gate_settled[l] = min(variance_of_error(s, l), GROWTH * s.gate_settled[l])
 
 
