@@ -1,11 +1,11 @@
 """What the gate does to records with and without faults, for three trackers, and what each of its rules pays.
 
-    python benchmarks/gate.py                 # the table of cases
-    python benchmarks/gate.py --rules         # what leaving out each rule costs
-    python benchmarks/gate.py --runs 20 --only jump,code
+    python -m benchmarks.gate                 # the table of cases
+    python -m benchmarks.gate --rules         # what leaving out each rule costs
+    python -m benchmarks.gate --runs 20 --only jump,code
 
-Columns of a case, for each tracker: good readings refused, codes let in, and the error of theta (root mean square over
-the second half of the samples after the event, median over records) as a multiple of that of the same tracker without
+Columns of a case, for each tracker: good readings refused and codes let in (the most of all records), and the error of
+theta (root mean square from 20 samples after the event on, median over records) as a multiple of that of the same tracker without
 a gate which is given the codes as missing; then that multiple for the tracker without a gate on the record as it is.
 The trackers are Kalman(q, r) with given numbers, RLS(0.98) with estimated noise, and a mixture of three drifts.
 """
