@@ -5,8 +5,9 @@
     python -m benchmarks.gate --runs 20 --only jump,code
 
 Columns of a case, for each tracker: good readings refused and codes let in (the most of all records), and the error of
-theta (root mean square from 20 samples after the event on, median over records) as a multiple of that of the same tracker without
-a gate which is given the codes as missing; then that multiple for the tracker without a gate on the record as it is.
+theta (root mean square from 20 samples after the event on, median over records) as a multiple of that of the same
+tracker without a gate which is given the codes as missing; then that multiple for the tracker without a gate on the
+record as it is.
 The trackers are Kalman(q, r) with given numbers, RLS(0.98) with estimated noise, and a mixture of three drifts.
 """
 
