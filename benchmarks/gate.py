@@ -1,12 +1,13 @@
 """What the gate does to records with and without faults, for three trackers, and what each of its rules pays.
 
-    python benchmarks/gate.py                 # the table of cases
-    python benchmarks/gate.py --rules         # what leaving out each rule costs
-    python benchmarks/gate.py --runs 20 --only jump,code
+    python -m benchmarks.gate                 # the table of cases
+    python -m benchmarks.gate --rules         # what leaving out each rule costs
+    python -m benchmarks.gate --runs 20 --only jump,code
 
-Columns of a case, for each tracker: good readings refused, codes let in, and the error of theta (root mean square over
-the second half of the samples after the event, median over records) as a multiple of that of the same tracker without
-a gate which is given the codes as missing; then that multiple for the tracker without a gate on the record as it is.
+Columns of a case, for each tracker: good readings refused and codes let in (the most of all records), and the error of
+theta (root mean square from 20 samples after the event on, median over records) as a multiple of that of the same
+tracker without a gate which is given the codes as missing; then that multiple for the tracker without a gate on the
+record as it is.
 The trackers are Kalman(q, r) with given numbers, RLS(0.98) with estimated noise, and a mixture of three drifts.
 """
 
@@ -18,10 +19,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from benchmarks.gate_cases import CODES, MODELS, REAL, STARTS, Case
-from driftfit.engine.kernel import kernel
+from driftfit.engine.kernel import Driver, kernel
 from driftfit.readings.first_samples import replayed
 from driftfit.readings.gate import AT_START, USED, Gate, gate_step, start
 
@@ -55,7 +55,7 @@ def tile_of(given: dict[str, Any]) -> np.ndarray:
     return tile
 
 
-@njit(error_model="numpy")
+@kernel
 def forecast(s, l):
     """y_hat, e and s of all modes together."""
     n, s.y_hat[l] = s.phi.shape[0], 0.0
@@ -71,7 +71,7 @@ def forecast(s, l):
     s.e[l] = s.y[l] - s.y_hat[l]
 
 
-@njit(error_model="numpy")
+@kernel
 def variance(s, l):
     """s from h and the noise."""
     h = 0.0
@@ -82,7 +82,7 @@ def variance(s, l):
         s.s[l] = np.inf
 
 
-@njit(error_model="numpy")
+@kernel
 def predict(s, l):
     n = s.phi.shape[0]
     if s.kind[l] == RLS:
@@ -98,7 +98,7 @@ def predict(s, l):
             s.w[k, l] = 0.97 * s.w[k, l] + 0.01
 
 
-@njit(error_model="numpy")
+@kernel
 def correct(s, l):
     n, total = s.phi.shape[0], 0.0
     if s.ok[l] <= 0.0:
@@ -132,7 +132,7 @@ def model_of(na: int, nb: int, m: int, intercept: bool) -> tuple[Callable, Calla
     present = nb == 0
     n = na + m * max(nb, 1) + intercept
 
-    @njit(error_model="numpy")
+    @kernel
     def regress(s, l):
         for i in range(na):
             s.phi[i, l] = s.lags[i, l]
@@ -149,7 +149,7 @@ def model_of(na: int, nb: int, m: int, intercept: bool) -> tuple[Callable, Calla
                 s.phi[i, l], s.valid[l] = 0.0, 0.0
         s.ok[l] = s.valid[l] * s.observed[l]
 
-    @njit(error_model="numpy")
+    @kernel
     def push(s, l):
         fills = (s.observed[l] <= 0.0) & (s.valid[l] > 0.0) & (s.filled[l] < na)
         s.filled[l] = s.filled[l] + 1 if fills else (0 if s.observed[l] > 0.0 else s.filled[l])
@@ -172,14 +172,13 @@ def model_of(na: int, nb: int, m: int, intercept: bool) -> tuple[Callable, Calla
     return regress, push, refuse, n, nb
 
 
-@njit(error_model="numpy", forceinline=True)
+@kernel
 def nothing(s, l):
     s.reason[l] = 0
 
 
 def loop_of(regress: Callable, push: Callable, gate: Callable) -> Callable:
-    @njit(error_model="numpy")
-    def loop(tile, Y, U, first, theta, reason):
+    def loop(tile, Y, U, first, theta, reason, errors):
         """Samples from ``first`` on; returns the number of those that are done."""
         s, l = tile[0], 0
         for t in range(first, len(Y)):
@@ -190,6 +189,7 @@ def loop_of(regress: Callable, push: Callable, gate: Callable) -> Callable:
             predict(s, l)
             forecast(s, l)
             variance(s, l)
+            errors[t, 0], errors[t, 1] = s.e[l], s.s[l]
             gate(s, l)
             variance(s, l)
             correct(s, l)
@@ -199,7 +199,21 @@ def loop_of(regress: Callable, push: Callable, gate: Callable) -> Callable:
                 return t + 1
         return len(Y)
 
-    return loop
+    return Driver(loop)
+
+
+@dataclass
+class Result:
+    """What a run gave."""
+
+    theta: np.ndarray
+    """Estimates (T, n)."""
+    reason: np.ndarray
+    """What the gate decided of each sample (T,)."""
+    errors: np.ndarray
+    """e and s (T, 2) as the gate found them."""
+    tile: np.ndarray
+    """The state at the end."""
 
 
 @dataclass
@@ -217,39 +231,38 @@ class Bench:
         self.gated = loop_of(regress, push, gate_step(self.gate, self.n, self.m, ages, refuse))
         self.plain = loop_of(regress, push, nothing)
 
-    def run(self, kind: int, y: np.ndarray, u: np.ndarray, gated: bool, q: float, r: float) -> tuple[Any, Any, Any]:
-        """theta (T, n), reasons (T,) and the tile at the end."""
+    def run(self, kind: int, y: np.ndarray, u: np.ndarray, gated: bool, q: float, r: float) -> Result:
+        """The whole record, and first samples once more if they had codes."""
         own = fields(self.n, self.m, self.na, self.nb, kind, self.gate, q, r)
         own["scale"] = r if kind == KALMAN else 1.0
         tile, loop = tile_of(own), self.gated if gated else self.plain
-        theta, reason = np.zeros((len(y), self.n)), np.zeros(len(y), np.int64)
-        done = loop(tile, y, u, 0, theta, reason)
-        if done < len(y) or tile["gate_replay"][0, 0] > 0:
+        result = Result(np.zeros((len(y), self.n)), np.zeros(len(y), np.int64), np.zeros((len(y), 2)), tile)
+        out = result.theta, result.reason, result.errors
+        done = loop(tile, y, u, 0, *out)
+        if tile["gate_replay"][0, 0] > 0:
             first = replayed({name: tile[name][0, ..., 0] for name in tile.dtype.names}, self.m)
-            tile, k = tile_of(own | {"gate_decided": 1}), len(first.y)
-            loop(tile, first.y, first.u, 0, np.zeros((k, self.n)), np.zeros(k, np.int64))
-            reason[done - k + np.flatnonzero(first.codes.any(1))] = AT_START
-            loop(tile, y, u, done, theta, reason)
-        return theta, reason, tile
+            result.tile, k = tile_of(own | {"gate_decided": 1}), len(first.y)
+            loop(result.tile, first.y, first.u, 0, *(np.zeros_like(one[:k]) for one in out))
+            result.reason[done - k + np.flatnonzero(first.codes.any(1))] = AT_START
+            loop(result.tile, y, u, done, *out)
+        return result
 
 
 def measured(bench: Bench, case: Case, kind: int) -> tuple[float, float, float, float]:
     """Good readings refused, codes let in, and errors of theta with the gate and without, as multiples of what the same
     tracker has without the codes."""
     settings = {"q": case.q, "r": case.r}
-    theta, reason, _ = bench.run(kind, case.y, case.u, True, **settings)
-    plain, _, _ = bench.run(kind, case.y, case.u, False, **settings)
-    whole, _, _ = bench.run(kind, *case.without_codes(), False, **settings)
-    ends = np.flatnonzero(np.diff(np.r_[case.bad | case.bad_u, False][case.at :].astype(int)) < 0)
+    one = bench.run(kind, case.y, case.u, True, **settings)
+    plain = bench.run(kind, case.y, case.u, False, **settings)
+    whole = bench.run(kind, *case.without_codes(), False, **settings)
+    bad = case.bad | case.bad_u
+    ends = np.flatnonzero(np.diff(np.r_[bad, False][case.at :].astype(int)) < 0)
     later = slice(max(case.at + (ends[0] if len(ends) else 0) + 20, 60), None)
-    gated, ungated, least = (np.sqrt(np.mean((one - case.theta)[later] ** 2)) for one in (theta, plain, whole))
-    refused = reason != USED
-    known = case.without_codes()
-    window = bench.nb + 1  # an input code spoils the samples that remember it
-    spoilt = np.convolve(case.bad_u, np.ones(window))[: len(case.y)] > 0 if case.bad_u.any() else case.bad
-    del known
-    good = ~case.bad & ~spoilt
-    return float(np.sum(refused & good)), float(np.sum(~refused & case.bad)), gated / least, ungated / least
+    gated, ungated, least = (np.sqrt(np.mean((run.theta - case.theta)[later] ** 2)) for run in (one, plain, whole))
+    refused = one.reason != USED
+    spoilt = np.convolve(case.bad_u, np.ones(bench.nb + 1))[: len(bad)] > 0.0  # samples that remember an input code
+    lost, let_in = refused & ~case.bad & ~spoilt, ~refused & case.bad
+    return float(lost.sum()), float(let_in.sum()), gated / least, ungated / least
 
 
 def table(benches: dict[str, Bench], cases: dict[str, Callable], runs: int, show: bool = True) -> dict[str, np.ndarray]:

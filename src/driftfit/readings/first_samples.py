@@ -42,6 +42,8 @@ FEW = 3
 """Values that differ from the median, from which on their distance is usual."""
 ROUNDED = 1e-20
 """Share of the sum of squares of y that may be an error of rounding."""
+MADE_ROOM = -1
+"""Value of ``gate_decided`` when samples were dropped for others; 0 before that, 1 when it is decided."""
 Y, READING, OK, DT, NOISE, DRIFT, TIMES, DOUBT, U = range(9)
 CODES = Y
 """Columns of a kept sample: output and reading (NaN if missing), whether there is a row, intervals since the last
@@ -58,199 +60,235 @@ def no_samples(first: int, n: int, m: int) -> Mapping[str, Any]:
     }  # fmt: skip
 
 
-def first_samples(first: int, n: int, m: int, ages: int) -> Step:
-    """``remember(s, l)``: keep the sample, and decide when there are enough."""
-    N, PHI = (first + n if first > 0 else 1), U + m
-
-    @kernel
-    def usual_value(s: State, column: int, center: float, apart: bool, l: int) -> float:
-        """The lower median of a column; with ``apart``, of the distances from center that are not 0, or 0 if there are
-        fewer than `FEW`."""
-        count = 0
-        for k in range(N):
-            x = abs(s.gate_first[k, column, l] - center) if apart else s.gate_first[k, column, l]
-            count += 1 if (x == x) & ((not apart) | (x > 0.0)) else 0
-        if apart & (count < FEW):
-            return 0.0
-        for k in range(N):
-            value = abs(s.gate_first[k, column, l] - center) if apart else s.gate_first[k, column, l]
-            less, same = 0, 0
-            for other in range(N):
-                x = abs(s.gate_first[other, column, l] - center) if apart else s.gate_first[other, column, l]
-                if (x == x) & ((not apart) | (x > 0.0)):
-                    less += 1 if x < value else 0
-                    same += 1 if x == value else 0
-            if (less <= (count - 1) // 2) & ((count - 1) // 2 < less + same):
-                return value  # type: ignore[no-any-return]
-        return np.nan
-
-    @kernel
-    def reach(s: State, column: int, center: float, l: int) -> float:
-        """The distance from center beyond which a value is outlying."""
-        return OUTLYING * usual_value(s, column, center, True, l)  # type: ignore[no-any-return]
-
-    @kernel
-    def doubt(s: State, l: int) -> int:
-        """Write into each sample 1 if its reading is outlying, 2 if a regressor is; count those with one of the two."""
-        center = usual_value(s, READING, 0.0, False, l)
-        most, count = reach(s, READING, center, l), 0
-        for k in range(N):
-            s.gate_first[k, DOUBT, l] = 1.0 if abs(s.gate_first[k, READING, l] - center) > most else 0.0
-        for i in range(n):
-            center = usual_value(s, PHI + i, 0.0, False, l)
-            most = reach(s, PHI + i, center, l)
-            for k in range(N):
-                x, d = s.gate_first[k, PHI + i, l], s.gate_first[k, DOUBT, l]
-                same = (abs(x) == abs(s.gate_first[k, READING, l])) & (d == 1.0)
-                if (abs(x - center) > most) & (d < 2.0) & (not same):
-                    s.gate_first[k, DOUBT, l] = d + 2.0
-        for k in range(N):
-            d = s.gate_first[k, DOUBT, l]
-            count += 1 if (d == 1.0) | (d == 2.0) else 0
-        return count
-
-    @kernel
-    def rotate_in(s: State, k: int, l: int) -> float:
-        """Givens rotations of one row into the triangle ``gate_fit``, [phi' y]; returns the square that it adds."""
-        for i in range(n):
-            s.gate_fit[n, i, l] = s.gate_first[k, PHI + i, l]
-        s.gate_fit[n, n, l] = s.gate_first[k, Y, l]
-        for i in range(n):
-            a, b = s.gate_fit[i, i, l], s.gate_fit[n, i, l]
-            larger = max(abs(a), abs(b))
-            if larger > 0.0:
-                r = larger * np.sqrt((a / larger) ** 2 + (b / larger) ** 2)
-                for j in range(i, n + 1):
-                    up, down = s.gate_fit[i, j, l], s.gate_fit[n, j, l]
-                    s.gate_fit[i, j, l] = (a * up + b * down) / r
-                    s.gate_fit[n, j, l] = (a * down - b * up) / r
-        return s.gate_fit[n, n, l] ** 2  # type: ignore[no-any-return]
-
-    @kernel
-    def fit(s: State, every: bool, l: int) -> float:
-        """Sum of squares of least squares on all rows, or on those that are not doubtful."""
-        for i in range(n + 1):
-            for j in range(n + 1):
-                s.gate_fit[i, j, l] = 0.0
-        left = 0.0
-        for k in range(N):
-            d = s.gate_first[k, DOUBT, l]
-            if (s.gate_first[k, OK, l] > 0.0) & (every | (d == 0.0) | (d == 3.0)):
-                left += rotate_in(s, k, l)
-        return left
-
-    @kernel
-    def solve(s: State, l: int) -> None:
-        """theta in place of the last column; 0 in directions without information."""
-        largest = 0.0
-        for i in range(n):
-            largest = max(largest, abs(s.gate_fit[i, i, l]))
-        for back in range(n):
-            i = n - 1 - back
-            for j in range(i + 1, n):
-                s.gate_fit[i, n, l] -= s.gate_fit[i, j, l] * s.gate_fit[j, n, l]
-            pivot = s.gate_fit[i, i, l]
-            s.gate_fit[i, n, l] = s.gate_fit[i, n, l] / pivot if abs(pivot) > 1e-12 * largest else 0.0
-
-    @kernel
-    def contradicted(s: State, l: int) -> bool:
-        """Whether the samples that are not doubtful contradict those that are."""
-        fit(s, True, l)
-        solve(s, l)
-        rows, squares, total = 0, 0.0, 0.0
-        for k in range(N):
-            d = s.gate_first[k, DOUBT, l]
-            if (s.gate_first[k, OK, l] > 0.0) & ((d == 0.0) | (d == 3.0)):
-                y = s.gate_first[k, Y, l]
-                e = y
-                for i in range(n):
-                    e -= s.gate_first[k, PHI + i, l] * s.gate_fit[i, n, l]
-                rows, squares, total = rows + 1, squares + e * e, total + y * y
-        alone = fit(s, False, l)
-        spare = rows - n
-        return (spare >= RESIDUALS) & ((squares - alone) * spare > WORSE * (alone + ROUNDED * total))  # type: ignore[no-any-return]
-
-    @kernel
-    def mark(s: State, l: int) -> None:
-        """The signals that made samples doubtful, as bits in the column of y: 1 for the output, 2, 4, .. for inputs."""
-        for k in range(N):
-            s.gate_first[k, CODES, l] = 1.0 if s.gate_first[k, DOUBT, l] == 1.0 else 0.0
-        bit = 2.0
-        for j in range(m):
-            center = usual_value(s, U + j, 0.0, False, l)
-            most = reach(s, U + j, center, l)
-            for k in range(N):
-                hit = 0.0
-                for later in range(k, min(k + ages + 1, N)):
-                    hit = bit if s.gate_first[later, DOUBT, l] == 2.0 else hit
-                outside = abs(s.gate_first[k, U + j, l] - center) > most
-                s.gate_first[k, CODES, l] += hit if outside else 0.0
-            bit *= 2.0
-
-    @partial(kernel, inline=False)
-    def decide(s: State, l: int) -> None:
-        s.gate_decided[l] = 1
-        count = doubt(s, l)
-        if (count > 0) & (2 * count < N) and contradicted(s, l):
-            mark(s, l)
-            s.gate_replay[l] = 1
-
-    @kernel
-    def repeats(s: State, k: int, l: int) -> bool:
-        """Whether the present sample is that kept as number k once more."""
-        same = (reading_now(s, l) == s.gate_first[k, READING, l]) & (s.dt[l] == s.gate_first[k, DT, l])
-        same &= (s.noise[l] == s.gate_first[k, NOISE, l]) & (s.drift[l] == s.gate_first[k, DRIFT, l])
-        for j in range(m):
-            same &= s.u[j, l] == s.gate_first[k, U + j, l]
-        for i in range(n):
-            same &= s.phi[i, l] == s.gate_first[k, PHI + i, l]
-        return same
-
-    @kernel
-    def drop_oldest(s: State, l: int) -> None:
-        for k in range(1, N):
-            for column in range(U + m + n):
-                s.gate_first[k - 1, column, l] = s.gate_first[k, column, l]
-        s.gate_kept[l] = N - 1
-
-    @kernel
-    def keep(s: State, k: int, times: float, l: int) -> None:
-        observed = s.observed[l] > 0.0
-        s.gate_first[k, Y, l] = s.y[l] if observed else np.nan
-        s.gate_first[k, READING, l] = reading_now(s, l)
-        s.gate_first[k, OK, l], s.gate_first[k, DT, l] = s.ok[l], s.dt[l]
-        s.gate_first[k, NOISE, l], s.gate_first[k, DRIFT, l] = s.noise[l], s.drift[l]
-        s.gate_first[k, TIMES, l] = times
-        for j in range(m):
-            s.gate_first[k, U + j, l] = s.u[j, l]
-        for i in range(n):
-            s.gate_first[k, PHI + i, l] = s.phi[i, l] if s.valid[l] > 0.0 else np.nan
-
-    @partial(kernel, inline=False)
-    def remember_one(s: State, l: int) -> None:
-        last = s.gate_kept[l] - 1
-        if last >= 0 and repeats(s, last, l):
-            keep(s, last, s.gate_first[last, TIMES, l] + 1.0, l)
-            return
-        if s.gate_kept[l] == N:
-            drop_oldest(s, l)
-        keep(s, s.gate_kept[l], 1.0, l)
-        s.gate_kept[l] += 1
-        if (s.gate_kept[l] == N) & (s.gate_first[0, READING, l] != s.gate_first[1, READING, l]):
-            decide(s, l)
-
-    @kernel
-    def remember(s: State, l: int) -> None:
-        if s.gate_decided[l] == 0:
-            remember_one(s, l)
-
-    return remember  # type: ignore[no-any-return]
-
-
 @kernel
 def reading_now(s: State, l: int) -> float:
     """The reading as it was measured, NaN if it is missing."""
-    return s.y[l] + s.shift[l] if s.observed[l] > 0.0 else np.nan  # type: ignore[no-any-return]
+    return s.y[l] + s.shift[l] if s.observed[l] > 0.0 else np.nan
+
+
+@kernel
+def usual_value(s: State, column: int, center: float, apart: bool, l: int) -> float:
+    """The lower median of a column; with ``apart``, of the distances from center that are not 0, or 0 if there are
+    fewer than `FEW`."""
+    N = s.gate_first.shape[0]
+    count = 0
+    for k in range(N):
+        x = abs(s.gate_first[k, column, l] - center) if apart else s.gate_first[k, column, l]
+        count += 1 if (x == x) & ((not apart) | (x > 0.0)) else 0
+    if apart & (count < FEW):
+        return 0.0
+    for k in range(N):
+        value = abs(s.gate_first[k, column, l] - center) if apart else s.gate_first[k, column, l]
+        less, same = 0, 0
+        for other in range(N):
+            x = abs(s.gate_first[other, column, l] - center) if apart else s.gate_first[other, column, l]
+            if (x == x) & ((not apart) | (x > 0.0)):
+                less += 1 if x < value else 0
+                same += 1 if x == value else 0
+        if (less <= (count - 1) // 2) & ((count - 1) // 2 < less + same):
+            return value  # type: ignore[no-any-return]
+    return np.nan
+
+
+@kernel
+def reach(s: State, column: int, center: float, l: int) -> float:
+    """The distance from center beyond which a value is outlying."""
+    return OUTLYING * usual_value(s, column, center, True, l)  # type: ignore[no-any-return]
+
+
+@kernel
+def doubt(s: State, l: int) -> int:
+    """Write into each sample 1 if its reading is outlying, 2 if a regressor is; count those with one of the two."""
+    N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
+    center = usual_value(s, READING, 0.0, False, l)
+    most, count = reach(s, READING, center, l), 0
+    for k in range(N):
+        s.gate_first[k, DOUBT, l] = 1.0 if abs(s.gate_first[k, READING, l] - center) > most else 0.0
+    for i in range(n):
+        center = usual_value(s, PHI + i, 0.0, False, l)
+        most = reach(s, PHI + i, center, l)
+        for k in range(N):
+            x, d = s.gate_first[k, PHI + i, l], s.gate_first[k, DOUBT, l]
+            same = (abs(x) == abs(s.gate_first[k, READING, l])) & (d == 1.0)
+            if (abs(x - center) > most) & (d < 2.0) & (not same):
+                s.gate_first[k, DOUBT, l] = d + 2.0
+    for k in range(N):
+        d = s.gate_first[k, DOUBT, l]
+        count += 1 if (d == 1.0) | (d == 2.0) else 0
+    return count
+
+
+@kernel
+def rotate_in(s: State, k: int, l: int) -> float:
+    """Givens rotations of one row into the triangle ``gate_fit``, [phi' y]; returns the square that it adds."""
+    n, PHI = s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
+    for i in range(n):
+        s.gate_fit[n, i, l] = s.gate_first[k, PHI + i, l]
+    s.gate_fit[n, n, l] = s.gate_first[k, Y, l]
+    for i in range(n):
+        a, b = s.gate_fit[i, i, l], s.gate_fit[n, i, l]
+        larger = max(abs(a), abs(b))
+        if larger > 0.0:
+            r = larger * np.sqrt((a / larger) ** 2 + (b / larger) ** 2)
+            for j in range(i, n + 1):
+                up, down = s.gate_fit[i, j, l], s.gate_fit[n, j, l]
+                s.gate_fit[i, j, l] = (a * up + b * down) / r
+                s.gate_fit[n, j, l] = (a * down - b * up) / r
+    return s.gate_fit[n, n, l] ** 2  # type: ignore[no-any-return]
+
+
+@kernel
+def fit(s: State, every: bool, l: int) -> float:
+    """Sum of squares of least squares on all rows, or on those that are not doubtful."""
+    N, n = s.gate_first.shape[0], s.phi.shape[0]
+    for i in range(n + 1):
+        for j in range(n + 1):
+            s.gate_fit[i, j, l] = 0.0
+    left = 0.0
+    for k in range(N):
+        d = s.gate_first[k, DOUBT, l]
+        if (s.gate_first[k, OK, l] > 0.0) & (every | (d == 0.0) | (d == 3.0)):
+            left += rotate_in(s, k, l)
+    return left
+
+
+@kernel
+def solve(s: State, l: int) -> None:
+    """theta in place of the last column; 0 in directions without information."""
+    n = s.phi.shape[0]
+    largest = 0.0
+    for i in range(n):
+        largest = max(largest, abs(s.gate_fit[i, i, l]))
+    for back in range(n):
+        i = n - 1 - back
+        for j in range(i + 1, n):
+            s.gate_fit[i, n, l] -= s.gate_fit[i, j, l] * s.gate_fit[j, n, l]
+        pivot = s.gate_fit[i, i, l]
+        s.gate_fit[i, n, l] = s.gate_fit[i, n, l] / pivot if abs(pivot) > 1e-12 * largest else 0.0
+
+
+@kernel
+def contradicted(s: State, l: int) -> bool:
+    """Whether the samples that are not doubtful contradict those that are."""
+    N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
+    fit(s, True, l)
+    solve(s, l)
+    rows, squares, total = 0, 0.0, 0.0
+    for k in range(N):
+        d = s.gate_first[k, DOUBT, l]
+        if (s.gate_first[k, OK, l] > 0.0) & ((d == 0.0) | (d == 3.0)):
+            y = s.gate_first[k, Y, l]
+            e = y
+            for i in range(n):
+                e -= s.gate_first[k, PHI + i, l] * s.gate_fit[i, n, l]
+            rows, squares, total = rows + 1, squares + e * e, total + y * y
+    alone = fit(s, False, l)
+    spare = rows - n
+    return (spare >= RESIDUALS) & ((squares - alone) * spare > WORSE * (alone + ROUNDED * total))  # type: ignore[no-any-return]
+
+
+@kernel
+def mark(s: State, ages: int, l: int) -> None:
+    """The signals that made samples doubtful, as bits in the column of y: 1 for the output, 2, 4, .. for inputs."""
+    N, PHI = s.gate_first.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
+    for k in range(N):
+        s.gate_first[k, CODES, l] = 1.0 if s.gate_first[k, DOUBT, l] == 1.0 else 0.0
+    bit = 2.0
+    for j in range(PHI - U):
+        center = usual_value(s, U + j, 0.0, False, l)
+        most = reach(s, U + j, center, l)
+        for k in range(N):
+            hit = 0.0
+            for later in range(k, min(k + ages + 1, N)):
+                hit = bit if s.gate_first[later, DOUBT, l] == 2.0 else hit
+            outside = abs(s.gate_first[k, U + j, l] - center) > most
+            s.gate_first[k, CODES, l] += hit if outside else 0.0
+        bit *= 2.0
+
+
+@kernel
+def times_of_first(s: State, l: int) -> int:
+    """How many of the samples have the reading of the first: a rest comes again, codes of a start are over."""
+    N = s.gate_first.shape[0]
+    count = 0
+    for k in range(N):
+        count += 1 if s.gate_first[k, READING, l] == s.gate_first[0, READING, l] else 0
+    return count
+
+
+@partial(kernel, inline=False)
+def decide(s: State, ages: int, l: int) -> None:
+    """Where samples made room for others they were judged one by one, unless they are the codes themselves."""
+    N = s.gate_first.shape[0]
+    whole, s.gate_decided[l] = s.gate_decided[l] == 0, 1
+    count = doubt(s, l)
+    whole |= (s.gate_first[0, DOUBT, l] == 1.0) & (times_of_first(s, l) == 1)
+    if (count > 0) & (2 * count < N) & whole and contradicted(s, l):
+        mark(s, ages, l)
+        s.gate_replay[l] = 1
+
+
+@kernel
+def repeats(s: State, k: int, l: int) -> bool:
+    """Whether the present sample is that kept as number k once more."""
+    n, PHI = s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
+    same = (reading_now(s, l) == s.gate_first[k, READING, l]) & (s.dt[l] == s.gate_first[k, DT, l])
+    same &= (s.noise[l] == s.gate_first[k, NOISE, l]) & (s.drift[l] == s.gate_first[k, DRIFT, l])
+    for j in range(PHI - U):
+        same &= s.u[j, l] == s.gate_first[k, U + j, l]
+    for i in range(n):
+        same &= s.phi[i, l] == s.gate_first[k, PHI + i, l]
+    return same  # type: ignore[no-any-return]
+
+
+@kernel
+def drop_oldest(s: State, l: int) -> None:
+    N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
+    for k in range(1, N):
+        for column in range(PHI + n):
+            s.gate_first[k - 1, column, l] = s.gate_first[k, column, l]
+    s.gate_kept[l], s.gate_decided[l] = N - 1, MADE_ROOM
+
+
+@kernel
+def keep(s: State, k: int, times: float, l: int) -> None:
+    n, PHI = s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
+    observed = s.observed[l] > 0.0
+    s.gate_first[k, Y, l] = s.y[l] if observed else np.nan
+    s.gate_first[k, READING, l] = reading_now(s, l)
+    s.gate_first[k, OK, l], s.gate_first[k, DT, l] = s.ok[l], s.dt[l]
+    s.gate_first[k, NOISE, l], s.gate_first[k, DRIFT, l] = s.noise[l], s.drift[l]
+    s.gate_first[k, TIMES, l] = times
+    for j in range(PHI - U):
+        s.gate_first[k, U + j, l] = s.u[j, l]
+    for i in range(n):
+        s.gate_first[k, PHI + i, l] = s.phi[i, l] if s.valid[l] > 0.0 else np.nan
+
+
+@partial(kernel, inline=False)
+def remember_one(s: State, ages: int, l: int) -> None:
+    N = s.gate_first.shape[0]
+    last = s.gate_kept[l] - 1
+    if last >= 0 and repeats(s, last, l):
+        keep(s, last, s.gate_first[last, TIMES, l] + 1.0, l)
+        return
+    if s.gate_kept[l] == N:
+        drop_oldest(s, l)
+    keep(s, s.gate_kept[l], 1.0, l)
+    s.gate_kept[l] += 1
+    if (s.gate_kept[l] == N) & (s.gate_first[0, READING, l] != s.gate_first[1, READING, l]):
+        decide(s, ages, l)
+
+
+def first_samples(ages: int) -> Step:
+    """``remember(s, l)``: keep the sample and decide when there are enough; inputs stay for ``ages`` samples."""
+
+    @kernel
+    def remember(s: State, l: int) -> None:
+        if s.gate_decided[l] < 1:
+            remember_one(s, ages, l)
+
+    return remember  # type: ignore[no-any-return]
 
 
 class First(NamedTuple):

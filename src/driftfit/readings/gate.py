@@ -1,26 +1,32 @@
 """The gate between ``forecast`` and ``correct``: whether a reading is used.
 
 A tracker is its equations; fault codes, spikes, frozen sensors and strange inputs are judged here, before it sees them.
-With m and v the usual mean and variance of the readings y, y_hat the forecast, e = y - y_hat, and s the tracker's own
-variance of e, a sample *contradicts* the forecast, and its reading is *far*, if
+With m and v the usual mean and variance of the readings y, y_hat the forecast, e the error and s the tracker's own
+variance of it, a sample contradicts its forecast, and its reading is far besides, if
 
     contradicts    e^2 > SURE^2 s g,    g = max(1, mean of e^2 / s)
-    far            contradicts    and    min(e^2, (y - m)^2) > FAR^2 v
+    far            (y - m)^2 > FAR^2 v
 
 where (y_hat - m)^2 takes the place of v if it is larger than RARE^2 v: a response that is itself unusual, as that to a
-pulse, may be FAR times as large as predicted. A far reading is refused. A change is not a fault, however: the
-third sample in a row that contradicts is believed, whatever its size, and so is the third of far responses to rare
-pulses that agree with one another. Codes come in runs: a far reading that repeats one of the last two far ones in all
-digits, with either sign, is not counted, and believed only with the `hold`-th. On a signal that repeats by nature a
-repeat is no sign of a code. A sample that agrees with its forecast ends the run. s = inf (start) contradicts nothing,
-a tracker without s (NaN) gets the mean of e^2 in its place, and a reading without a forecast is judged by v alone.
+pulse, may be FAR times as large as predicted. A far reading is refused. A change is not a fault, however:
 
-Inputs are judged in `driftfit.readings.inputs`, coarse meters and readings that stay the same in `repeats`, and
-the first samples, which have nothing to be compared with, in `first_samples`.
+    a run      the third sample in a row that contradicts is believed, whatever its size; each that agrees with the
+               forecast, by the errors of a settled tracker, counts the run down
+    pulses     of far responses to rare pulses, and of readings far from a signal that never moved, the third is
+               believed, whatever lies between
+    codes      come in runs: a far reading that repeats one of the last two far ones in all digits, with either sign,
+               is not counted, and believed only with the `hold`-th; with `LONGER` times as many if the forecast moved
+               meanwhile, so that a level would not have repeated, and readings do not repeat by nature
 
-Source: three in a row is the classical rule of confirmation for step changes; bounded leverage is Mallows's, see
-Hampel, Ronchetti, Rousseeuw and Stahel, Robust Statistics (1986), section 6.3; the rest is ours. Cost per ordinary
-sample: some forty operations, and O(n + m).
+s = inf (start) contradicts nothing, a tracker without s (NaN) is lent the mean of e^2, and a reading without a forecast
+is judged by v alone. v counts a reading that contradicts its forecast as `CLIPPED` variances at most, so that spikes do
+not become usual, but what is far in one of ten readings does.
+
+Inputs are judged in `driftfit.readings.inputs`, coarse meters and frozen sensors in `repeats`, and the first samples,
+which have nothing to be compared with, in `first_samples`.
+
+Source: ours; confirmation by a second and third outlier is an old rule of process control (Western Electric, 1956).
+Cost per ordinary sample: some forty operations, and O(m).
 """
 
 from __future__ import annotations
@@ -35,7 +41,7 @@ from driftfit.engine.kernel import State, Step, kernel
 from driftfit.engine.settings import Settings, numbers, whole
 from driftfit.readings.first_samples import first_samples, no_samples
 from driftfit.readings.inputs import input_rules, no_inputs
-from driftfit.readings.repeats import frozen_rule, no_repeats, reading, repeats_by_nature, resolution
+from driftfit.readings.repeats import BELIEVED, frozen_rule, no_repeats, reading, repeats_by_nature, resolution
 
 FIRST = 10.0
 """Readings after which a mean and a variance are known."""
@@ -44,7 +50,7 @@ MEMORY = 1000.0
 CLIPPED = 10.0
 """Variances of the readings that one which contradicts its forecast adds, at most."""
 LONGER = 4
-"""Times `Gate.hold` after which a code is taken for a level although the forecast moves."""
+"""Times `Gate.hold` for which a code is held back where the forecast moves and readings do not repeat by nature."""
 GROWTH = 1.02
 """Growth in one sample of the error of a settled tracker, at most."""
 USED, REFUSED, FROZEN, INPUT, AT_START = range(5)
@@ -88,7 +94,7 @@ class Gate(Settings):
 def start(gate: Gate, n: int, m: int) -> Mapping[str, Any]:
     """Fields of the gate's state and their values before the first sample, for n parameters and m inputs."""
     return {
-        "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0, "gate_ratios": 0.0,
+        "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0,
         "gate_settled": np.inf, "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan,
         "gate_other": np.nan, "reason": 0,
         **no_repeats(), **no_inputs(m), **no_samples(gate.first, n, m),
@@ -102,10 +108,15 @@ def own_variance(s: State, l: int) -> float:
 
 
 @kernel
+def usual_ratio(s: State, l: int) -> float:
+    """g: how much larger than the tracker's variance errors were so far."""
+    return max(s.gate_ratio[l], 1.0) if s.s[l] == s.s[l] else s.gate_ratio[l]  # type: ignore[no-any-return]
+
+
+@kernel
 def variance_of_error(s: State, l: int) -> float:
     """The variance with which e is compared: the tracker's, or larger if errors so far were."""
-    ratio = max(s.gate_ratio[l], 1.0) if s.s[l] == s.s[l] else s.gate_ratio[l]
-    return own_variance(s, l) * ratio  # type: ignore[no-any-return]
+    return own_variance(s, l) * usual_ratio(s, l)  # type: ignore[no-any-return]
 
 
 @kernel
@@ -115,21 +126,21 @@ def learn_usual(s: State, seen: bool, contradicts: bool, clip: float, l: int) ->
     A reading that contradicts its forecast counts as no farther than `CLIPPED` variances: one in ten may be far for
     ever, more of them are usual in the end.
     """
+    known = s.gate_count[l] >= FIRST
+    s.gate_count[l] += 1.0 if seen else 0.0
+    share, v = 1.0 / max(min(s.gate_count[l], MEMORY), 1.0), s.gate_variance[l]
     if seen:
-        s.gate_count[l] += 1.0
-        share, v = 1.0 / min(s.gate_count[l], MEMORY), s.gate_variance[l]
         off = reading(s, l) - s.gate_mean[l]
-        most = np.sqrt(CLIPPED * v)
-        off = min(max(off, -most), most) if contradicts & (s.gate_count[l] > FIRST) else off
+        if contradicts & known:
+            most = np.sqrt(CLIPPED * v)
+            off = min(max(off, -most), most)
         s.gate_mean[l] += share * off
         s.gate_variance[l] += share * ((1.0 - share) * off * off - v)
     own = own_variance(s, l)
     if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
-        s.gate_ratios[l] += 1.0
-        most = clip * max(s.gate_ratio[l], 1.0) if s.s[l] == s.s[l] else clip * s.gate_ratio[l]
         ratio = s.e[l] * s.e[l] / own
-        ratio = min(ratio, most) if s.gate_ratios[l] > FIRST else ratio
-        s.gate_ratio[l] += (ratio - s.gate_ratio[l]) / min(s.gate_ratios[l], MEMORY)
+        ratio = min(ratio, clip * usual_ratio(s, l)) if known else ratio
+        s.gate_ratio[l] += share * (ratio - s.gate_ratio[l])
         s.gate_settled[l] = min(variance_of_error(s, l), GROWTH * s.gate_settled[l])
 
 
@@ -138,14 +149,6 @@ def output_rule(gate: Gate) -> Step:
     far, rare = float(gate.far) ** 2, float(gate.rare) ** 2
     sure, believed, hold = float(gate.sure) ** 2, gate.believed, gate.hold
     natural = repeats_by_nature(gate.natural)
-
-    @kernel
-    def usual_square(s: State, l: int) -> float:
-        """The square with which distances are compared: v, or that of a forecast which is unusual itself."""
-        v = max(s.gate_variance[l], s.gate_finest[l] * s.gate_finest[l] if s.gate_steps[l] > 0.0 else 0.0)
-        predicted = s.y_hat[l] + s.shift[l] - s.gate_mean[l]
-        unusual = (s.valid[l] > 0.0) & (predicted * predicted > rare * v)
-        return predicted * predicted if unusual else v  # type: ignore[no-any-return]
 
     @kernel
     def held_back(s: State, y: float, unusual: bool, l: int) -> bool:
@@ -157,7 +160,11 @@ def output_rule(gate: Gate) -> Step:
         if (apart == 0.0) | turns:
             s.gate_same[l] += 1
             s.gate_pulses[l] += 1 if unmoved & strikes else 0
-            return (s.gate_same[l] < hold) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
+            told = (s.gate_stuck[l] > 0.5) & (
+                not natural(s, l)
+            )  # a level does not repeat where the forecast is elsewhere
+            longest = LONGER * hold if told else hold
+            return (s.gate_same[l] < longest) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
         alike = unmoved | ((y - s.gate_last[l]) ** 2 < near2)
         s.gate_run[l] += 1
         s.gate_pulses[l] = (s.gate_pulses[l] + 1 if alike else 1) if unusual | unmoved else 0
@@ -170,17 +177,21 @@ def output_rule(gate: Gate) -> Step:
         """Whether the sample contradicts its forecast."""
         y, e2, v = reading(s, l), s.e[l] * s.e[l], variance_of_error(s, l)
         off = y - s.gate_mean[l]
-        predicted = s.valid[l] > 0.0
-        usual = usual_square(s, l)
-        beyond = off * off > far * usual
+        predicted, step = s.valid[l] > 0.0, s.gate_finest[l] if s.gate_steps[l] > 0.0 else 0.0
+        spread, response = max(s.gate_variance[l], step * step), s.y_hat[l] + s.shift[l] - s.gate_mean[l]
+        unusual = predicted & (response * response > rare * spread)
+        beyond = off * off > far * (response * response if unusual else spread)
         contradicts = e2 > sure * v if predicted else beyond
         if not contradicts:
             settled = predicted & (e2 <= sure * s.gate_settled[l])
             s.gate_run[l] = max(min(s.gate_run[l], 2 * believed) - 1, 0) if settled else s.gate_run[l]
-            s.gate_same[l] = 0
+            if s.gate_same[l] > 0:  # a level that repeats is not frozen either
+                s.gate_stuck[l], s.gate_same[l] = BELIEVED, 0
         elif beyond & (s.gate_count[l] >= FIRST):
-            if held_back(s, y, usual > s.gate_variance[l], l):
+            if held_back(s, y, unusual, l):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, REFUSED
+            elif s.gate_same[l] > 0:
+                s.gate_stuck[l] = BELIEVED
         else:
             s.gate_run[l] += 1
         return contradicts  # type: ignore[no-any-return]
@@ -194,19 +205,11 @@ def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, in
     ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
     memory.
     """
-    remember = first_samples(gate.first, n, m, ages)
-    notice, blame = input_rules(gate, m, ages, refuse)
+    remember = first_samples(ages)
+    notice, blame = input_rules(gate, ages, refuse)
     hold_frozen, judge = frozen_rule(gate.frozen), output_rule(gate)
     resolve = resolution(gate.coarse)
-    sure, rare, longest = float(gate.sure) ** 2, float(gate.rare) ** 2, LONGER * gate.hold
-
-    @kernel
-    def outlasts(s: State, l: int) -> bool:
-        """Whether a far reading repeats for so long that it is a level although the forecast moves."""
-        s.gate_same[l] += 1 if s.gate_same[l] > 0 else 0
-        if s.gate_same[l] >= longest:
-            s.gate_stuck[l] = 0.0
-        return s.gate_same[l] >= longest  # type: ignore[no-any-return]
+    sure, rare = float(gate.sure) ** 2, float(gate.rare) ** 2
 
     @kernel
     def step(s: State, l: int) -> None:
@@ -219,7 +222,7 @@ def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, in
         if s.ok[l] > 0.0 and blame(s, contradicts, off * off <= rare * s.gate_variance[l], l):
             s.ok[l], s.reason[l] = 0.0, INPUT
         if (s.observed[l] > 0.0) & (s.reason[l] == USED):
-            if hold_frozen(s, variance_of_error(s, l), l) and not outlasts(s, l):
+            if hold_frozen(s, variance_of_error(s, l), l) & (s.gate_same[l] == 0):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, FROZEN
             else:
                 contradicts = judge(s, l)

@@ -34,59 +34,62 @@ def no_inputs(m: int) -> Mapping[str, Any]:
     }  # fmt: skip
 
 
+@kernel
+def widen(s: State, j: int, low: float, high: float, l: int) -> None:
+    """The range of input j takes in what was believed."""
+    s.gate_low[j, l] = min(s.gate_low[j, l], low)
+    s.gate_high[j, l] = max(s.gate_high[j, l], high)
+
+
+@kernel
+def forget(s: State, j: int, l: int) -> None:
+    """Nothing is outside any more."""
+    s.gate_outside[j, l] = 0
+    s.gate_lowest[j, l], s.gate_highest[j, l] = np.inf, -np.inf
+
+
+@kernel
+def notice_one(s: State, j: int, away: float, l: int) -> None:
+    """Set the bit of the present sample if the input is outside its range, which takes it in otherwise."""
+    u, low, high = s.u[j, l], s.gate_low[j, l], s.gate_high[j, l]
+    if abs(u) < np.inf:
+        if abs(2.0 * u - (low + high)) > away * (high - low):
+            s.gate_lowest[j, l] = min(s.gate_lowest[j, l], u)
+            s.gate_highest[j, l] = max(s.gate_highest[j, l], u)
+            s.gate_outside[j, l] |= 1
+        else:
+            widen(s, j, u, u, l)
+
+
 def input_rules(
-    gate: Any, m: int, ages: int, refuse: Callable[[State, int, int, int], None]
+    gate: Any, ages: int, refuse: Callable[[State, int, int, int], None]
 ) -> tuple[Callable[[State, bool, int], None], Callable[[State, bool, bool, int], bool]]:
     """``notice(s, known, l)``, which takes in the inputs of a sample, and ``blame(s, contradicts, usual, l)``, whether
-    they are blamed for it.
+    they are blamed for it, of a model that remembers the inputs of ``ages`` samples besides the present.
     """
     away, trust, ages = float(gate.away), gate.trust, min(ages, LONGEST)
     all_ages = (1 << (ages + 1)) - 1
 
     @kernel
-    def widen(s: State, j: int, low: float, high: float, l: int) -> None:
-        s.gate_low[j, l] = min(s.gate_low[j, l], low)
-        s.gate_high[j, l] = max(s.gate_high[j, l], high)
-
-    @kernel
-    def settle(s: State, j: int, l: int) -> None:
-        """Forget what would widen the range."""
-        s.gate_lowest[j, l], s.gate_highest[j, l] = np.inf, -np.inf
-
-    @kernel
     def notice(s: State, known: bool, l: int) -> None:
-        for j in range(m):
-            u, outside = s.u[j, l], s.gate_outside[j, l]
-            if (outside >> ages) & 1 > 0:  # leaves the memory without blame
+        for j in range(s.gate_low.shape[0]):
+            if (s.gate_outside[j, l] >> ages) & 1 > 0:  # leaves the memory without blame
                 widen(s, j, s.gate_lowest[j, l], s.gate_highest[j, l], l)
-                settle(s, j, l)
-                outside = 0
-            outside = (outside << 1) & all_ages
-            if abs(u) < np.inf:
-                middle, half = (
-                    0.5 * (s.gate_low[j, l] + s.gate_high[j, l]),
-                    0.5 * (s.gate_high[j, l] - s.gate_low[j, l]),
-                )
-                if known & (abs(u - middle) > away * half):
-                    s.gate_lowest[j, l] = min(s.gate_lowest[j, l], u)
-                    s.gate_highest[j, l] = max(s.gate_highest[j, l], u)
-                    outside |= 1
-                else:
-                    widen(s, j, u, u, l)
-            s.gate_outside[j, l] = outside
+                forget(s, j, l)
+            s.gate_outside[j, l] = (s.gate_outside[j, l] << 1) & all_ages
+            notice_one(s, j, away if known else np.inf, l)
 
     @kernel
     def take_out(s: State, j: int, l: int) -> None:
         for age in range(ages + 1):
             if (s.gate_outside[j, l] >> age) & 1 > 0:
                 refuse(s, j, age, l)
-        s.gate_outside[j, l] = 0
-        settle(s, j, l)
+        forget(s, j, l)
 
     @kernel
     def blame(s: State, contradicts: bool, usual: bool, l: int) -> bool:
         strange = 0
-        for j in range(m):
+        for j in range(s.gate_low.shape[0]):
             strange |= s.gate_outside[j, l]
         if strange == 0:
             s.gate_blamed[l] = s.gate_blamed[l] if contradicts else 0
@@ -94,7 +97,7 @@ def input_rules(
         blamed = contradicts & usual & (s.gate_blamed[l] < trust)
         if blamed:
             s.gate_blamed[l] += 1
-            for j in range(m):
+            for j in range(s.gate_low.shape[0]):
                 take_out(s, j, l)
         return blamed  # type: ignore[no-any-return]
 

@@ -14,16 +14,16 @@ or because a value is held, the other steps have all sizes, and none is frequent
 
 A frozen sensor repeats its last value although the system moves. Whether it is frozen is a two-state chain, which
 enters with the probability `Gate.frozen` at every reading and stays with `STAY`. A frozen sensor repeats its last
-reading for certain; one that works, where the forecast is elsewhere, with at most the probability max(delta p, a) <= 1,
+reading for certain; one that works, where the forecast has moved, with at most the probability max(delta p, a) <= 1,
 with delta the smallest step of the readings, p the density that the forecast gives to the values that are rounded to
 the reading, and a the share of readings that repeated. So the probability pi that it is frozen is
 
     pi <- prior / (prior + (1 - prior) max(delta p, a)),    prior = frozen (1 - pi) + STAY pi
 
-if the reading repeats, 0 if it does not, and the prior where the forecast is not elsewhere: a plant at rest, and one
-whose meter is too coarse to show a movement, repeat their readings too. It is elsewhere if it differs from the reading
-by more than half of its own standard deviation and more than delta. A reading with pi above one half is refused. A code that stays is
-refused in this way, however long.
+if the reading repeats, 0 if it does not, and the prior where the forecast has not moved: a plant at rest, and one whose
+meter is too coarse to show a movement, repeat their readings too. The forecast has moved if it differs from the one
+before by more than half of its own standard deviation and more than delta. A reading with pi above one half is refused.
+A code that stays is refused in this way, however long.
 
 Source: quantum^2 / 12 is Sheppard's (1898); the chain is a hidden Markov model; the rest is ours. Cost per sample: a
 few comparisons.
@@ -39,10 +39,12 @@ import numpy as np
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import State, Step, exp, kernel
 
-ELSEWHERE = 0.25
-"""Share of its variance by which the square of its distance from the reading puts a forecast elsewhere."""
+MOVED = 0.25
+"""Share of the variance of the forecast by which the square of its change counts as a movement."""
 STAY = 0.98
 """Probability per reading that a frozen sensor stays frozen."""
+BELIEVED = -1.0
+"""In place of the probability that a sensor is frozen, until the reading changes: it is a level that repeats."""
 ENOUGH = 5.0
 """Number of repeats, and of steps of the size of the quantum, before they count."""
 
@@ -51,7 +53,7 @@ def no_repeats() -> Mapping[str, Any]:
     """Fields before the first reading."""
     return {
         "gate_before": np.nan, "gate_finest": np.inf, "gate_smallest": 0.0, "gate_steps": 0.0, "gate_repeats": 0.0,
-        "gate_stuck": 0.0, "floor": 0.0, "shift": 0.0,
+        "gate_stuck": 0.0, "gate_forecast": np.nan, "floor": 0.0, "shift": 0.0,
     }  # fmt: skip
 
 
@@ -116,14 +118,18 @@ def frozen_rule(enter: float) -> Callable[[State, float, int], bool]:
 
     @kernel
     def frozen(s: State, v: float, l: int) -> bool:
-        found = 0.0
-        if repeats_last(s, l) & (s.gate_steps[l] >= 2.0 * ENOUGH):
+        found, repeats = 0.0, repeats_last(s, l)
+        if repeats & (s.gate_stuck[l] < 0.0):
+            found = BELIEVED
+        elif repeats & (s.gate_steps[l] >= 2.0 * ENOUGH):
             prior = enter * (1.0 - s.gate_stuck[l]) + STAY * s.gate_stuck[l]
             quantum, tells = s.gate_finest[l], (s.valid[l] > 0.0) & (v > 0.0) & (v < np.inf)
-            tells &= s.e[l] * s.e[l] > max(ELSEWHERE * v, quantum * quantum)
+            moved = s.y_hat[l] + s.shift[l] - s.gate_forecast[l]
+            tells &= moved * moved > max(MOVED * v, quantum * quantum)
             chance = chance_of_repeat(s, v, l) if tells else 1.0
             found = prior / (prior + (1.0 - prior) * chance)
         s.gate_stuck[l] = found
+        s.gate_forecast[l] = s.y_hat[l] + s.shift[l] if s.valid[l] > 0.0 else s.gate_forecast[l]
         return found > 0.5  # type: ignore[no-any-return]
 
     return frozen  # type: ignore[no-any-return]
