@@ -130,6 +130,6 @@ def frozen_rule(enter: float) -> Callable[[State, float, int], bool]:
             found = prior / (prior + (1.0 - prior) * chance)
         s.gate_stuck[l] = found
         s.gate_forecast[l] = s.y_hat[l] + s.shift[l] if s.valid[l] > 0.0 else s.gate_forecast[l]
-        return found > 0.5  # type: ignore[no-any-return]
+        return found > 0.5
 
     return frozen  # type: ignore[no-any-return]
