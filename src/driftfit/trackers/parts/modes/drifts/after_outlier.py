@@ -27,12 +27,12 @@ import numpy as np
 
 from driftfit.engine.kernel import State, kernel
 from driftfit.trackers.parts.coarse.resolution import lasting
+from driftfit.trackers.parts.modes.drifts.at_rest import CONFIRMED
 from driftfit.trackers.parts.modes.ladder import JUMP, RARE, TOP
 from driftfit.trackers.parts.modes.noise_levels import OUTLIER, noise_at
 
-REFUTED, CONFIRMED = 0.001, 0.5
-"""The jump did not happen if the filter is less probable than this share of its first probability, and did if it is
-more probable than this."""
+REFUTED = 0.001
+"""The jump did not happen if the filter is less probable than this share of its first probability."""
 USUAL = 0.5
 """Least sum of w_i phi_i^2 at which a jump is supposed."""
 

@@ -10,6 +10,9 @@ change that filter j follows is over, filter j of the largest e_j mu_j replaces 
 e_j is that of `OVER`, divided by how many times more often jumps end than expected
 (`driftfit.trackers.parts.modes.ladder`): where they come every ten samples, none of them ends in rest.
 
+The filter that took the last outlier for a jump (`driftfit.trackers.parts.modes.drifts.after_outlier`) has e_j = 1 as
+soon as that is confirmed: it is free for the next outlier, and the jump is over.
+
 While nothing changes, the last filter has hardly any probability, and costs nothing. After a jump it is the one that
 learns the new level as fast as constant parameters are learned.
 
@@ -28,6 +31,8 @@ from driftfit.engine.kernel import Array, State, kernel
 
 OVER = {1.0: 0.5, 0.2: 0.1}
 """Probability that a change of a drift ratio is over."""
+CONFIRMED = 0.5
+"""Probability from which on a jump at the last outlier is confirmed."""
 
 
 def no_rest(rungs: Array) -> dict[str, Any]:
@@ -40,7 +45,8 @@ def come_to_rest(s: State, l: int) -> None:
     """Replace the last filter, if another has come to rest more probably."""
     last, best, most = s.modes[l] - 1, 0, 0.0
     for j in range(last):
-        share = s.over[j, l] / s.busy[l]
+        confirmed = (j == last - 1) & (s.mu[j, l] >= CONFIRMED)
+        share = 1.0 if confirmed else s.over[j, l] / s.busy[l]
         if share * s.mu[j, l] > most:
             best, most = j, share * s.mu[j, l]
     gained = most - s.mu[last, l]
