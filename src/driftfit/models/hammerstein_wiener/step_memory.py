@@ -37,8 +37,8 @@ ROW = GRID + 1
     CELL, Y, DT, BELIEVED, OK, FACTOR, LEAST, SCALE, HEAD,
 ) = range(24)  # fmt: skip
 """Numbers: the grid, the range of accepted outputs, where the output block is defined, results, whether all lags are
-known, whether theta is xi, the given noise factor, the output as given, sigma^2 or 0, whether the range changed, whether
-a level is stored in place of the prediction, its cell of the grid, what steps and compiled routine exchange, whether
+known, whether theta is xi, the given noise factor, the output as given, sigma^2 or 0, whether the range changed,
+whether a level is stored in place of the prediction, its cell of the grid, what steps and compiled routine exchange, whether
 the output becomes a lag, whether the sample was used, the noise factor of the equation, the least variance that sigma
 adds to it, and the scale of y that the basis gives; HEAD is their number.
 """

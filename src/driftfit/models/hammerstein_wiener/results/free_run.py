@@ -20,7 +20,7 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.curves.basis import Thresholds
-from driftfit.models.hammerstein_wiener.output_curve import OUTERMOST, WIDER
+from driftfit.models.hammerstein_wiener.output_curve import WIDER
 from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
 from driftfit.models.hammerstein_wiener.separation.paths import Blocks
 from driftfit.models.hammerstein_wiener.step_memory import GRID
@@ -102,25 +102,9 @@ def reflected(a: Array) -> Array:
 
 
 def believed(y: Array) -> tuple[Array, Array]:
-    """Least and largest accepted output up to each sample, (T,), by the rule of
-    `driftfit.models.hammerstein_wiener.output_curve`.
-    """
-    known = np.abs(y) < LARGEST
-    outputs = y[known]
-    low, high = outputs.copy(), outputs.copy()
-    if len(outputs) > 2:
-        middle = np.median(np.stack([outputs[:-2], outputs[1:-1], outputs[2:]]), axis=0)
-        bottom, top = np.minimum.accumulate(middle), np.maximum.accumulate(middle)
-        margin = OUTERMOST * (top - bottom)
-        bottom, top = bottom - margin, top + margin
-        low[2:], high[2:] = np.maximum(outputs[2:], bottom), np.minimum(outputs[2:], top)
-        low[:2], high[:2] = np.nan, np.nan
-    last = np.cumsum(known)  # the number of known outputs up to each sample
-    none = [np.nan]
-    return (
-        np.concatenate([none, np.fmin.accumulate(low)])[last],
-        np.concatenate([none, np.fmax.accumulate(high)])[last],
-    )
+    """Least and largest output up to each sample, (T,); NaN before the first."""
+    known = np.where(np.abs(y) < LARGEST, y, np.nan)
+    return np.fmin.accumulate(known), np.fmax.accumulate(known)
 
 
 class _Grid:
