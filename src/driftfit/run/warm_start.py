@@ -65,7 +65,7 @@ class End(NamedTuple):
         """
         header, arrays = storage.expand(data, KINDS)
         model, trackers, extra = read(header)
-        programs = programs_of(model, by_output(model, trackers), model.m, gate_from(header))
+        programs = programs_of(model, by_output(model, trackers), model.m, gate_from(header) or False)
         tile = tile_of(programs)
         restore("what was given", programs, header, arrays, tile)
         states = tuple(state_of(tile, lane) for lane in range(len(programs)))
@@ -74,7 +74,7 @@ class End(NamedTuple):
 
 ABSENT: Mapping[str, Any] = {
     "dt": None, "zone": None, "limits": None, "last": None, "ignored": 0, "lag": 0, "awaits": 0, "cold": False,
-    "windows": (), "alarms": (),
+    "windows": (), "alarms": (), "samples": 0, "left_out": [],
 }  # fmt: skip
 """Values that are not written for a stream, because they are the default."""
 
@@ -99,10 +99,10 @@ def read(header: Mapping[str, Any]) -> tuple[Model, tuple[Tracker, ...], dict[st
     return storage.rebuild(header["model"], Model), trackers, {**ABSENT, **header["extra"]}
 
 
-def gate_from(header: Mapping[str, Any]) -> Gate | bool:
-    """The gate of a header that `written` made; False for none."""
-    given = header.get("gate")
-    return False if given is None else Gate.from_settings(given)
+def gate_from(header: Mapping[str, Any]) -> Gate | None:
+    """The gate of a header; None for none."""
+    given = header["gate"]
+    return None if given is None else Gate.from_settings(given)
 
 
 def by_output(model: Model, trackers: Sequence[Tracker]) -> Any:

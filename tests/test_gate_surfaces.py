@@ -1,0 +1,99 @@
+"""The gate wherever a tracker runs: what is said of it, saved with it, and decided for many."""
+
+import numpy as np
+import pytest
+
+from driftfit import ARX, Gate, Kalman, Live, Outputs, Track, track
+from driftfit.readings.left_out import KEPT
+
+PLANT, TRACKER = ARX(1, 1), Kalman(q=1e-6, r=1e-4)
+
+
+def plant(T=200, codes=()):
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal(T), np.zeros(T)
+    for t in range(1, T):
+        y[t] = 0.8 * y[t - 1] + u[t - 1] + 0.01 * rng.standard_normal()
+    y[list(codes)] = 9999.0
+    return y, u
+
+
+def test_what_was_left_out_is_a_table():
+    run = track(PLANT, TRACKER, *plant(codes=[5, 100]), gate=True)
+    lines = str(run.left_out).splitlines()
+    assert [line.split()[:3] for line in lines[1:]] == [["5", "y", "9999"], ["100", "y", "9999"]]
+    assert str(track(PLANT, TRACKER, *plant(), gate=True).left_out) == "nothing left out"
+
+
+@pytest.mark.parametrize("way", ["update", "update_many"])
+def test_a_stream_counts_what_it_left_out_and_keeps_the_last(way):
+    y, u = plant(codes=[5, *range(40, 200, 8)])
+    run, live = track(PLANT, TRACKER, y, u, gate=True), Live(PLANT, TRACKER, gate=True)
+    if way == "update":
+        for t in range(200):
+            live.update(y[t], u[t])
+    else:
+        for part in (slice(0, 11), slice(11, 90), slice(90, 200)):
+            live.update_many(y[part], u[part])
+    assert live.left_out.counts == run.left_out.counts
+    assert live.left_out.last == tuple(run.left_out)[-KEPT:]
+    again = Live.from_bytes(live.to_bytes())
+    assert (again.left_out.counts, again.left_out.last) == (live.left_out.counts, live.left_out.last)
+
+
+def test_decisions_of_a_stream_with_times_have_them():
+    y, u = plant(codes=[5, 100])
+    live = Live(PLANT, TRACKER, gate=True)
+    for t in range(200):
+        live.update(y[t], u[t], 1000.0 + t)
+    assert [one.sample for one in live.left_out] == [1005.0, 1100.0]
+
+
+def test_smoothers_covariances_and_likelihood_take_the_decisions():
+    y, u = plant(codes=[5, 100])
+    run = track(PLANT, TRACKER, y, u, gate=True)
+    missing = track(PLANT, TRACKER, np.where(y == 9999.0, np.nan, y), u)
+    assert run.loglik == pytest.approx(missing.loglik, rel=1e-12)
+    np.testing.assert_allclose(run.smooth().theta, missing.smooth().theta, rtol=1e-9)
+    np.testing.assert_array_equal(run.cov(-1), missing.cov(-1))
+    np.testing.assert_array_equal(run.ok[20:], missing.ok[20:])
+
+
+def test_a_gate_is_saved_with_results_and_states(tmp_path):
+    y, u = plant(codes=[100])
+    gate = Gate(far=12.0)
+    run = track(PLANT, TRACKER, y, u, gate=gate)
+    run.save(tmp_path / "run")
+    loaded = Track.load(tmp_path / "run")
+    assert loaded.program.gate == gate
+    assert list(loaded.left_out) == list(run.left_out)
+    fleet = track(PLANT, TRACKER, np.stack([y, y]), np.stack([u, u]), by="row", gate=gate)
+    fleet.save(tmp_path / "fleet")
+    assert list(type(fleet).load(tmp_path / "fleet")[1].left_out) == list(run.left_out)
+    live = Live(PLANT, TRACKER, warm_start=run, gate=gate)
+    assert Live.from_bytes(live.to_bytes()).programs[0].gate == gate
+    with pytest.raises(ValueError, match="gate of the earlier run"):
+        Live(PLANT, TRACKER, warm_start=run, gate=True)
+    with pytest.raises(ValueError, match="another model, tracker, gate"):
+        track(PLANT, TRACKER, y, u, gate=True).program.unpack(run.program.pack(run.program.tile()))
+
+
+def test_states_of_older_formats_are_refused_with_the_remedy():
+    live = Live(PLANT, TRACKER)
+    old = bytearray(live.to_bytes())
+    old[8] = 2
+    with pytest.raises(ValueError, match="older driftfit.*run the record again"):
+        Live.from_bytes(bytes(old))
+    old = bytearray(live.program.pack(live.program.tile()))
+    old[4] = 1
+    with pytest.raises(ValueError, match="older driftfit.*run the record again"):
+        live.program.unpack(bytes(old))
+
+
+def test_every_output_has_a_gate():
+    y, u = plant()
+    other = plant(codes=[100])[0]
+    run = track(ARX(1, 1, ny=2), TRACKER, np.column_stack([y, other]), u, gate=True)
+    assert isinstance(run, Outputs)
+    assert [len(run[name].left_out) for name in run.outputs] == [0, 1]
+    assert (~run.ok[101:]).sum() == 0
