@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftfit import ARX, Gate, Kalman, Live, Outputs, Track, track
+from driftfit import ARX, DataWarning, Gate, Kalman, Live, Outputs, Track, track
 from driftfit.readings.left_out import KEPT
 
 PLANT, TRACKER = ARX(1, 1), Kalman(q=1e-6, r=1e-4)
@@ -85,3 +85,27 @@ def test_every_output_has_a_gate():
     assert isinstance(run, Outputs)
     assert [len(run[name].left_out) for name in run.outputs] == [0, 1]
     assert (~run.ok[101:]).sum() == 0
+
+
+def test_off_is_said_once_with_the_values_and_the_remedy():
+    y, u = plant(codes=[100, 150])
+    with pytest.warns(DataWarning, match=r"^track: y: 2 values look like fault codes \(9999\)\. .*gate=True") as said:
+        track(PLANT, TRACKER, y, u)
+    assert len(said) == 1
+    clean, strange = plant()[0], u.copy()
+    strange[60] = -9999.0
+    with pytest.warns(DataWarning, match=r"y: 2 values .*\(9999\); u: 1 value looks .*\(-9999\)") as said:
+        track(PLANT, TRACKER, np.stack([y, clean, clean]), np.stack([u, u, strange]), by="row")
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize("what", ["nothing", "jump", "pulse"])
+def test_what_is_no_code_is_not_warned_of(what):
+    y, u = plant()
+    if what == "jump":
+        y[100:] += 1000.0
+    if what == "pulse":
+        u[100] = 1000.0
+        for t in range(1, 200):
+            y[t] = 0.8 * y[t - 1] + u[t - 1]
+    track(PLANT, TRACKER, y, u)

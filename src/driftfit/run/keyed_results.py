@@ -119,6 +119,10 @@ class KeyedResults(Plain):
         """Keys and results."""
         return ((key, self._run(j)) for key, j in self._index.items())
 
+    def some(self, wanted: Array) -> Iterator[Track]:
+        """The results of some lanes, of which ``wanted`` has an entry for each."""
+        return (self._run(j) for j in self._index.values() if wanted[j])
+
     def ends(self) -> Iterator[tuple[Program, dict[str, Array]]]:
         """The program of each lane, and its state after the last sample."""
         for j in self._index.values():

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -12,10 +13,12 @@ import numpy as np
 
 from driftfit.data import outputs
 from driftfit.data.arguments import check_roles
-from driftfit.data.limits import code_text, shared_code
-from driftfit.data.record import Reading, Records, one_series, rows
+from driftfit.data.record import Reading, Record, Records, one_series, rows
 from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
+from driftfit.readings.gate import INPUT, REFUSED, Gate
+from driftfit.readings.remarks import ungated
+from driftfit.readings.screen import Review, screen, suspect
 from driftfit.run.fleet import Fleet, run_fleet
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
@@ -59,11 +62,7 @@ def track(
     warn_astray(run)
     if isinstance(run, Track) and (doubt := run.tracker.doubts(run)):
         warn(f"{type(run.tracker).__name__}: {doubt}.", UserWarning)
-    value, places = shared_code(records.y, records.u)
-    if len(places):
-        warn(
-            f"{code_text('track', value, places)} Give limits=, such as limits={{'y': (low, high), 'u': (low, high)}}."
-        )
+    warn_ungated(run)
     return run  # type: ignore[no-any-return]
 
 
@@ -244,6 +243,52 @@ def warn_astray(run: Track | KeyedResults) -> None:
             "from them; gradients (RLS) are more robust than instruments.",
             UserWarning,
         )
+
+
+def warn_ungated(run: Result) -> None:
+    """Warn of readings that look like codes and that no gate judged: once, whatever the number of series."""
+    programs = [run.program] if isinstance(run, Track) else run.programs
+    if all(one.gate is not None or one.shared is not None for one in programs):
+        return
+    given = run.record if isinstance(run, Track) else run.records
+    y, T = given.y.reshape(len(given.y), -1), len(given.y)
+    first, length = (np.zeros(1, int), np.array([T])) if isinstance(given, Record) else (given.first, given.length)
+    inputs = np.any([screen(signal, first, length) for signal in given.u.T], axis=0) if given.u.shape[-1] else False
+    may = np.stack([screen(signal, first, length) | inputs for signal in y.T], axis=1).ravel()
+    if not may.any():
+        return
+    found: defaultdict[str, list[float]] = defaultdict(list)
+    for one in [run] if isinstance(run, Track) else run.some(may):
+        for name, values in {} if one.program.gate else _codes(one).items():
+            found[name] += values
+    if found:
+        linear = run.model.hidden is None and not (run.model.implicit or run.model.settling)
+        warn(f"track: {ungated(found, linear)}")
+
+
+def _codes(run: Track) -> dict[str, list[float]]:
+    """The values of each signal of a run without a gate that one would have refused."""
+    y, u, model = run.record.y, run.record.u, run.program.model
+    strange = [suspect(signal) for signal in u.T]
+    if not (suspect(y).any() or any(one.any() for one in strange)):
+        return {}
+    e, s, y_hat = (run.in_rows(name).astype(float) for name in ("e", "s", "y_hat"))
+    y_hat = np.where(np.isfinite(e), y - e, y_hat) if model.implicit else y_hat
+    reason = _review(model.m, model.input_memory)(y, u, y_hat, s, np.isfinite(y_hat))
+    blamed = np.flatnonzero(reason == INPUT)[:, None] - np.arange(model.input_memory + 1)
+    names = (
+        run.labels.u or model.input_names or (("u",) if model.m == 1 else tuple(f"u{j + 1}" for j in range(model.m)))
+    )
+    found = {run.labels.y: y[reason == REFUSED]}
+    for name, signal, mark in zip(names, u.T, strange, strict=True):
+        found[name] = signal[np.intersect1d(blamed, np.flatnonzero(mark))]
+    return {name: values.tolist() for name, values in found.items() if len(values)}
+
+
+@lru_cache
+def _review(m: int, ages: int) -> Review:
+    """The gate for finished records, which is compiled once."""
+    return Review(Gate(), m, ages)
 
 
 def warn_unlearned(run: Track | KeyedResults) -> None:

@@ -24,13 +24,11 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.limits import code_text, shared_code
 from driftfit.data.record import Reading
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import one_of, warn, whole
+from driftfit.engine.settings import one_of, whole
 from driftfit.models.base import Model
-from driftfit.models.fault_codes import ABSURD, absurd
 from driftfit.run.track import records_of
 from driftfit.trackers.base import Tracker
 from driftfit.tune.intervals import intervals_of
@@ -40,9 +38,6 @@ from driftfit.tune.outputs import TunedOutputs, tune_outputs
 from driftfit.tune.parametrisation import find_knobs
 from driftfit.tune.search import Counted, Search, minimise
 from driftfit.tune.tuned import METHODS, Tuned
-
-RESPONSE = 20
-"""Samples within which a test and its response are absurd."""
 
 
 def tune(
@@ -132,7 +127,6 @@ def _tuned(
     """Tune on a checked record."""
     if order_by is not None:
         task = along(task, tracker, order_by)
-    task = _without_fault_codes(task)
     knobs = find_knobs(task, tracker, groups, bounds)
     f = Counted(Criterion(task, knobs, method, h))
     search = Search(f, knobs, minimise(f, knobs))
@@ -181,48 +175,6 @@ def _without_noise(task: Task) -> str:
         "tune: there is no noise to tune on: parameters explain every usable sample up to rounding, as if y had been "
         "computed from the inputs. Give the settings instead, such as Kalman(q=1e-4, r=1.0)."
     )
-
-
-def _without_fault_codes(task: Task) -> Task:
-    """The task with absurd values as missing ones, which would decide the likelihood of all settings alone.
-
-    An input near which the output is absurd too is a test: both are kept.
-    """
-    records = []
-    for record in task.records:
-        if record.y.ndim == 1 and record.u.ndim == 2:
-            signals = np.column_stack([record.y, record.u])
-            value, codes = shared_code(record.y, record.u)
-            if len(codes):
-                signals[codes] = np.nan
-                warn(
-                    f"{code_text('tune', value, codes)} They count as missing here; give limits= to `track` too.",
-                    UserWarning,
-                )
-            places = [absurd(x) for x in signals.T]
-            of_inputs = np.concatenate([np.empty(0, int), *places[1:]])
-            for k, found in enumerate(places):
-                others = places[0] if k else of_inputs
-                apart = np.abs(found[:, None] - others).min(axis=1, initial=RESPONSE + 1)
-                _leave_out(
-                    signals[:, k], "y" if k == 0 else f"u{k}" if len(places) > 2 else "u", found[apart > RESPONSE]
-                )
-            record = replace(record, y=signals[:, 0].copy(), u=signals[:, 1:].copy())
-        records.append(record)
-    return task._replace(records=tuple(records))
-
-
-def _leave_out(x: Array, name: str, places: Array) -> None:
-    """Make values of a signal missing, and warn of it."""
-    if len(places):
-        warnings.warn(
-            f"tune: {name} is {x[places[0]]:.6g} at sample {places[0]}, more than {ABSURD:.0f} times its usual "
-            f"deviation ({len(places)} such values), and no other signal is near it: they count as missing here. If "
-            f'they are fault codes, give limits={{"{name}": (low, high)}}, to `track` too.',
-            UserWarning,
-            stacklevel=5,
-        )
-        x[places] = np.nan
 
 
 def _warn(search: Search) -> None:
