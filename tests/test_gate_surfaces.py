@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftfit import ARX, DataWarning, Gate, Kalman, Live, Outputs, Track, track
+from driftfit import ARX, DataWarning, Gate, Kalman, Live, Outputs, Track, grid, select, track, tune
 from driftfit.readings.left_out import KEPT
 
 PLANT, TRACKER = ARX(1, 1), Kalman(q=1e-6, r=1e-4)
@@ -109,3 +109,29 @@ def test_what_is_no_code_is_not_warned_of(what):
         for t in range(1, 200):
             y[t] = 0.8 * y[t - 1] + u[t - 1]
     track(PLANT, TRACKER, y, u)
+
+
+def test_tuning_takes_the_decisions_of_one_reference_run():
+    """Settings are compared on the same readings, and the final run has the likelihood that was found."""
+    y, u = plant(codes=[5, 100, 150])
+    tuned = tune(PLANT, Kalman(), y, u, gate=True)
+    assert tuned.left_out.sample.tolist() == [5, 100, 150]
+    run = track(PLANT, tuned.tracker, y, u, gate=tuned.left_out)
+    assert run.loglik == pytest.approx(tuned.loglik, rel=1e-9)
+    missing = tune(PLANT, Kalman(), np.where(y == 9999.0, np.nan, y), u)
+    assert tuned.noise == pytest.approx(missing.noise, rel=1e-6)
+    assert "2 samples far outside" in str(tuned)
+
+
+def test_tuning_without_a_gate_uses_every_reading_and_says_so():
+    with pytest.warns(UserWarning, match="tune: ") as said:
+        assert tune(PLANT, Kalman(), *plant(codes=[100])).noise > 1.0
+    assert sum("y: 1 value looks like a fault code (9999)" in str(one.message) for one in said) == 1
+
+
+def test_structures_are_compared_on_the_same_readings():
+    y, u = plant(codes=[100])
+    found = select(grid(ARX, na=[1, 2], nb=[1]), y, u, gate=True)
+    assert [one.sample.tolist() for one in found.left_out.values()] == [[100]]
+    assert found.simplest.startswith("ARX(na=1")
+    assert "left out: 1 sample far" in str(found)

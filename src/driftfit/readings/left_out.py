@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.readings.gate import INPUT
-from driftfit.readings.remarks import SAID, counts
+from driftfit.readings.remarks import SAID, counts, remarks
 
 KEPT = 16
 """Decisions of which a stream keeps everything."""
@@ -96,6 +96,12 @@ def left_out_of(reason: Array, y: Array, ok: Array, ages: int) -> LeftOut:
     after = np.unique(after[after < len(y)])
     unused = after[~ok[after] & (reason[after] == 0) & np.isfinite(y[after])]
     return LeftOut(sample, reason[sample].astype(int), y[sample], unused)
+
+
+def remarks_of(several: Iterable[LeftOut]) -> tuple[tuple[str, str], ...]:
+    """The lines on what was left out of several records together."""
+    codes = [one.code for one in several]
+    return remarks(counts(np.concatenate(codes))) if codes else ()
 
 
 class Tally:

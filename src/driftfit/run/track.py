@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
@@ -17,6 +17,7 @@ from driftfit.data.record import Reading, Record, Records, one_series, rows
 from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
 from driftfit.readings.gate import INPUT, REFUSED, Gate
+from driftfit.readings.left_out import LeftOut
 from driftfit.readings.remarks import ungated
 from driftfit.readings.screen import Review, screen, suspect
 from driftfit.run.fleet import Fleet, run_fleet
@@ -24,6 +25,7 @@ from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, programs_of, tile_of
 from driftfit.run.result import Lane, Lanes, Track
+from driftfit.run.states.reference import decided
 from driftfit.run.warm_start import Run, carried, first_interval
 from driftfit.trackers.base import Tracker
 
@@ -106,7 +108,9 @@ def _task(
         raise ValueError("track: keep='theta' is for models of one output.")
     reading = Reading() if reading is None else reading
     model, records, failed = records_of(model, y, u, reading, data, by)
-    records = records.for_model(model, reading)
+    records, gate = records.for_model(model, reading), reading.gate
+    if isinstance(gate, LeftOut | Mapping):
+        (records, _), gate = decided(records, gate), False
     # several trackers, other than one for each output
     grid = not alone and not (isinstance(tracker, Mapping) and bool(records.outputs))
     many = grid or by is not None
@@ -115,7 +119,7 @@ def _task(
     if grid and by is None:
         records = records.repeated(tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker))))  # type: ignore[arg-type]
     trackers = (_per_series(tracker, records) if grid else [tracker] * len(records.keys)) or _any_of(tracker)
-    programs, records = _prepared(model, trackers, records, kept.keep, kept.prob, reading.gate)
+    programs, records = _prepared(model, trackers, records, kept.keep, kept.prob, gate)
     return programs, records, failed, many
 
 
@@ -224,7 +228,7 @@ def _one(programs: Sequence[Program], records: Records, keep: str, before: Run |
         each = np.arange(records.ny)
         lanes = Lanes([(out, tile, each, each)], np.full(records.ny, len(record)))
         return Outputs(programs, records._replace(known=record.known), lanes, {}, dict(enumerate(starts)))
-    return Track(program, record, Lane(out, tile), *starts)
+    return Track(program, record, Lane(out, tile), starts[0] if starts else None)
 
 
 def warn_astray(run: Track | KeyedResults) -> None:
@@ -257,13 +261,19 @@ def warn_ungated(run: Result) -> None:
     may = np.stack([screen(signal, first, length) | inputs for signal in y.T], axis=1).ravel()
     if not may.any():
         return
+    warn_of_codes("track", [run] if isinstance(run, Track) else run.some(may))
+
+
+def warn_of_codes(verb: str, runs: Iterable[Track]) -> None:
+    """Warn of the readings of runs without a gate that one would have refused."""
     found: defaultdict[str, list[float]] = defaultdict(list)
-    for one in [run] if isinstance(run, Track) else run.some(may):
-        for name, values in {} if one.program.gate else _codes(one).items():
+    linear = True
+    for run in runs:
+        for name, values in {} if run.program.gate else _codes(run).items():
             found[name] += values
+            linear &= run.model.hidden is None and not (run.model.implicit or run.model.settling)
     if found:
-        linear = run.model.hidden is None and not (run.model.implicit or run.model.settling)
-        warn(f"track: {ungated(found, linear)}")
+        warn(f"{verb}: {ungated(found, linear)}")
 
 
 def _codes(run: Track) -> dict[str, list[float]]:

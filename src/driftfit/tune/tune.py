@@ -29,7 +29,12 @@ from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, whole
 from driftfit.models.base import Model
-from driftfit.run.track import records_of
+from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
+from driftfit.readings.screen import screen
+from driftfit.run.program import Program
+from driftfit.run.result import track_record
+from driftfit.run.states.reference import Decisions, decide
+from driftfit.run.track import records_of, warn_of_codes
 from driftfit.trackers.base import Tracker
 from driftfit.tune.intervals import intervals_of
 from driftfit.tune.lanes import Task, score
@@ -60,6 +65,7 @@ def tune(
     drift: Any = 1.0,
     limits: Any = None,
     exclude: Any = None,
+    gate: Any = None,
 ) -> Tuned | TunedOutputs:
     """Estimate the missing settings of a tracker: ``FLS()``, ``Kalman()``, ``Kalman(r=0.1)``, ``RLS()`` ...
 
@@ -84,6 +90,9 @@ def tune(
         T^2)), for r in units of the residual variance of constant parameters, for the memory of RLS in samples.
     level : number
         Level of the intervals.
+    gate : bool, `Gate`, decisions of a run or None
+        As for `track`. The gate decides once, by a run of `AdaptiveKalman`, and what it leaves out is left out for all
+        settings: ``tuned.left_out``, which ``track(model, tuned.tracker, y, u, gate=tuned.left_out)`` takes.
     by : names of columns, "row" or None
         As for `track`: several records, which share the settings but not theta. The criterion is that of all of them
         together, such as the sum of their log-likelihoods, and every record begins with an unknown theta.
@@ -115,9 +124,11 @@ def tune(
         raise ValueError(f"tune: {type(tracker).__name__} has no variance, so {method!r} is undefined; use 'h-step'.")
     if len(model.outputs) > 1:
         options = (method, groups, h, bounds, level, order_by)
+        if gate:
+            raise ValueError("tune: gate= is for one output; tune one output after the other, or leave gate= out.")
         known = {"time": time, "dt": dt, "weights": weights, "drift": drift, "limits": limits, "exclude": exclude}
         return tune_outputs(model, tracker, y, u, known, data, by, lambda task: _tuned(task, tracker, *options))
-    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
+    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, gate=gate)
     return _tuned(_task(model, tracker, y, u, reading, data, by), tracker, method, groups, h, bounds, level, order_by)
 
 
@@ -135,14 +146,18 @@ def _tuned(
     if knobs.profiled and tracker.covariance and not sigma2 > (ROUNDING * _largest(task)) ** 2:
         raise ValueError(_without_noise(task))
     _warn(search)
+    tuned = knobs.build(search.x, sigma2)
+    if task.left_out is None and not task.model.shared:
+        _warn_ungated(task, tuned)
     return Tuned(
-        tracker=knobs.build(search.x, sigma2),
+        tracker=tuned,
         method=method,
         loglik=float(final.loglik(knobs.profiled)[0]) if tracker.covariance else float("nan"),
         noise=sigma2 if knobs.profiled else float(getattr(knobs.run(search.x), "r", np.nan)),
         at_bound=tuple(name for name, i in zip(knobs.names, knobs.owner, strict=True) if search.at_bound(i)),
         interval=intervals_of(search, task, method, tracker, level),
         level=level,
+        left_out=_of_one(task.left_out or {}),
         _search=search,
     )
 
@@ -193,8 +208,25 @@ def _warn(search: Search) -> None:
         )
 
 
+def _of_one(left_out: Decisions) -> LeftOut | Decisions:
+    """The decisions of a single record without its key."""
+    return left_out if len(left_out) > 1 else next(iter(left_out.values()), NOTHING_LEFT_OUT)
+
+
+def _warn_ungated(task: Task, tracker: Tracker) -> None:
+    """Warn of readings that look like codes, all of which were used."""
+    program, at = Program(task.model, tracker), np.zeros(1, int)
+    strange = (
+        record
+        for record in task.records
+        if any(screen(signal, at, np.array([len(record)])).any() for signal in (record.y, *record.u.T))
+    )
+    warn_of_codes("tune", (track_record(program, record) for record in strange))
+
+
 def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any, by: Any) -> Task:
     records = records_of(model, y, u, reading, data, by)[1].for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
+    records, left_out = decide(bound, tracker, records, reading.gate)
     records = records.for_trackers(bound, [tracker])
-    return Task(bound, tuple(replace(records.part(k), time=None) for k in range(len(records.keys))))
+    return Task(bound, tuple(replace(records.part(k), time=None) for k in range(len(records.keys))), left_out or None)

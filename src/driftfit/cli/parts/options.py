@@ -98,6 +98,14 @@ class Given:
     exclude: Annotated[
         Names, typer.Option(help="Interval to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
     ] = None
+    gate: Annotated[
+        bool | None,
+        typer.Option(
+            "--gate/--no-gate",
+            help="Leave out readings that look like fault codes, or use all. Default: as the tracker asks.",
+            show_default=False,
+        ),
+    ] = None
     start: Annotated[
         Path | None, typer.Option(help="Continue from a saved run (.npz) or live state, with its model and tracker.")
     ] = None
@@ -151,7 +159,7 @@ class Given:
             rows = self.read()
         data: Any = self.file if rows is None else rows.table(self.time, self.by or [])
         signals = {"y": outputs if len(outputs) > 1 else outputs[0], "u": self.inputs, "data": data, "time": self.time}
-        signals |= self.part().restrictions(self.time is not None)
+        signals |= {**self.part().restrictions(self.time is not None), "gate": self.gate}
         return signals | {"by": self.by or None, "dt": parse_interval(self.dt), "units": parse_units(self.unit) or None}
 
     def read(self, *more: str) -> Rows:
@@ -171,6 +179,8 @@ class Given:
             )
         signals: Any = self.signals(rows)
         more: Any = {} if before is None else {"warm_start": before}
+        if before is not None and self.gate is None:
+            signals["gate"] = before.end().programs[0].gate or False
         with progress.status("tracking"):
             return track(model, tracker or chosen, **signals, **more)
 
@@ -202,7 +212,7 @@ class Given:
         if restrictions["limits"]:
             restrictions["limits"] = {places[name]: one for name, one in restrictions["limits"].items()}
         known = {"y": read.numbers[outputs[0]][order], "u": u, "time": time, "dt": parse_interval(self.dt)}
-        return known | restrictions
+        return known | restrictions | {"gate": self.gate}
 
 
 def saved(path: Path) -> Any:

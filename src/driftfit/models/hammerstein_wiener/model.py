@@ -54,6 +54,7 @@ from driftfit.models.hammerstein_wiener.products import Structure
 from driftfit.models.hammerstein_wiener.run_time_orders import RunTimeOrders
 from driftfit.models.hammerstein_wiener.step_memory import memory, places_of
 from driftfit.models.hammerstein_wiener.steps import applying, build, refusing
+from driftfit.readings.screen import suspect
 
 IDENTITY = Polynomial(1)
 FLATTEST = 1e-3
