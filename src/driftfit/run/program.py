@@ -126,11 +126,10 @@ class Program:
         """The tracker's fields before the first sample."""
         alone = None if self.output is None else self.alone
         own = self.tracker.state_for(self.model if alone is None else alone.model)
-        return (
-            own
-            if self.gate is None
-            else {**own, **gate_start(self.gate, self.model.n, self.model.m), "raw_e": np.array(np.nan)}
-        )
+        if self.gate is None:
+            return own
+        begun = gate_start(self.gate, self.model.n, self.model.m)
+        return {**own, **begun, "raw_e": np.array(np.nan), "gate_refused": np.array(0)}
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -242,6 +241,7 @@ class Program:
         fresh = self.tile({"gate_decided": np.array(1)})
         known = np.stack([first.dt, first.noise, first.drift], axis=1)[:, :, None]
         self.drivers().run(fresh, first.y[:, None], first.u[:, :, None], known, self.written(fresh, len(first.y)))
+        fresh["gate_refused"][0, 0] = np.sum(first.codes.any(axis=1))
         tile.view(np.uint8)[:] = fresh.view(np.uint8)
         at = np.flatnonzero(first.codes.any(axis=1))
         after = np.cumsum(first.dt[::-1])[::-1] - first.dt

@@ -14,9 +14,10 @@ import numpy as np
 from driftfit.data import outputs
 from driftfit.data.arguments import check_roles
 from driftfit.data.record import Reading, Record, Records, one_series, rows
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
-from driftfit.readings.gate import INPUT, REFUSED, Gate
+from driftfit.readings.gate import AT_START, INPUT, REFUSED, Gate
 from driftfit.readings.left_out import LeftOut
 from driftfit.readings.remarks import ungated
 from driftfit.readings.screen import Review, screen, suspect
@@ -24,7 +25,7 @@ from driftfit.run.fleet import Fleet, run_fleet
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, programs_of, tile_of
-from driftfit.run.result import Lane, Lanes, Track
+from driftfit.run.result import Lane, Lanes, Track, track_record
 from driftfit.run.states.reference import decided
 from driftfit.run.warm_start import Run, carried, first_interval
 from driftfit.trackers.base import Tracker
@@ -38,6 +39,9 @@ With four times as many a series costs a quarter more, in memory that the proces
 """
 ASTRAY = 1.0
 """Median prediction error, in deviations of the output, above which estimates went astray."""
+
+BEGUN = 100
+"""Samples among which codes may be the first that a run has."""
 
 Result = Track | Fleet | Outputs
 """The result of `track`, which depends on the number of series, of settings and of outputs."""
@@ -284,15 +288,26 @@ def _codes(run: Track) -> dict[str, list[float]]:
         return {}
     e, s, y_hat = (run.in_rows(name).astype(float) for name in ("e", "s", "y_hat"))
     y_hat = np.where(np.isfinite(e), y - e, y_hat) if model.implicit else y_hat
+    begun = _codes_at_start(run, suspect(y))
+    y, early = np.where(begun, np.nan, y), y[begun]
     reason = _review(model.m, model.input_memory)(y, u, y_hat, s, np.isfinite(y_hat))
     blamed = np.flatnonzero(reason == INPUT)[:, None] - np.arange(model.input_memory + 1)
     names = (
         run.labels.u or model.input_names or (("u",) if model.m == 1 else tuple(f"u{j + 1}" for j in range(model.m)))
     )
-    found = {run.labels.y: y[reason == REFUSED]}
+    found = {run.labels.y: np.append(early, y[reason == REFUSED])}
     for name, signal, mark in zip(names, u.T, strange, strict=True):
         found[name] = signal[np.intersect1d(blamed, np.flatnonzero(mark))]
     return {name: values.tolist() for name, values in found.items() if len(values)}
+
+
+def _codes_at_start(run: Track, strange: Array) -> Array:
+    """Which readings (T,) a gate would have found to be codes among the first, some of which are ``strange``."""
+    first, found = slice(0, min(BEGUN, len(run))), np.zeros(len(run), bool)
+    if run.start is None and strange[first].any():
+        left = track_record(replace(run.program, gate=Gate()), run.record.part(first)).left_out
+        found[left.sample[left.code == AT_START]] = True
+    return found & strange
 
 
 @lru_cache

@@ -107,11 +107,12 @@ class Layout:
         words_of(tile)[self.rows(tile)[:, None], lanes] = words.reshape(-1, self.size).T
 
     def field(self, words: Array, name: str) -> Array:
-        """A field of numbers of states (.., W), as (.., k)."""
+        """A field of states (.., W), as (.., k)."""
         at = 0
-        for one, (_, shape) in self.shapes.items():
+        for one, (kind, shape) in self.shapes.items():
             if one == name:
-                return np.ascontiguousarray(words[..., at : at + prod(shape)]).view(np.float64)
+                found = np.ascontiguousarray(words[..., at : at + prod(shape)])
+                return found if kind == "i" else found.view(np.float64)
             at += prod(shape)
         raise KeyError(name)
 

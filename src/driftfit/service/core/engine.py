@@ -300,4 +300,5 @@ class Engine:
             "samples": self.samples, "next": self.next, "units": len(self.units), "waiting": self.intake.waiting,
             "held_back": self.intake.held_back, "refused": dict(self.units.refused), "problem": self.problem,
             "dirty": len(self._dirty), "recovered": self.recovered, "positions": dict(self.positions),
+            "left_out": self.units.left_out,
         }  # fmt: skip

@@ -44,7 +44,8 @@ create index if not exists event_of_unit on event (unit, id);
 create table if not exists position (name text primary key, value text);
 """
 PRAGMAS = ("page_size=8192", "journal_mode=wal", "synchronous=full", "wal_autocheckpoint=2000", "temp_store=memory")
-FORMAT = "2"
+FORMAT = "3"
+REMEDY = "driftfit serve FILE --rebuild computes the states again from the journal"
 RESULTS_FROM, NEEDED_FROM = "results from", "needed from"
 """Keys of ``meta``: of `Journal.first_without_results` and `Journal.first_needed`."""
 NAME = "driftfit.db"
@@ -117,7 +118,7 @@ _RESULTS = msgspec.msgpack.Decoder(tuple[list[tuple[bytes, bytes, bytes, bytes]]
 class Journal:
     """The database, opened by the one process that writes it."""
 
-    def __init__(self, folder: Path, read_only: bool = False) -> None:
+    def __init__(self, folder: Path, read_only: bool = False, rebuild: bool = False) -> None:
         self.path = folder / NAME
         if read_only:
             uri = f"{self.path.resolve().as_uri()}?mode=ro"
@@ -131,8 +132,24 @@ class Journal:
         self.db.executescript(SCHEMA)
         self.db.execute("insert or ignore into meta values ('format', ?)", (FORMAT,))
         found = self.meta("format")
-        if found != FORMAT:
+        if found == "2" and not rebuild:
+            raise ValueError(
+                f"{self.path} was written by an older driftfit, whose states are of no use here; {REMEDY}."
+            )
+        if found not in ("2", FORMAT):
             raise ValueError(f"{self.path} has the format {found}; this version reads {FORMAT}. Use another folder.")
+        if rebuild:
+            self._rebuild()
+
+    def _rebuild(self) -> None:
+        """Forget all states, so that they are computed again from the samples that the log still has."""
+        oldest = self.db.execute("select coalesce(min(first), 1) from log").fetchone()[0]
+        self.db.execute("begin immediate")
+        for table in ("snapshot", "program"):
+            self.db.execute(f"delete from {table}")
+        values = {"format": FORMAT, NEEDED_FROM: str(oldest)}
+        self.db.executemany("insert or replace into meta values (?, ?)", values.items())
+        self.db.execute("commit")
 
     def close(self) -> None:
         self.db.close()

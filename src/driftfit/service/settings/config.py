@@ -71,6 +71,8 @@ class UnitSettings:
     alarm: AlarmSettings | None = None
     rate: float = 10_000.0
     """Samples a second that one unit may send, on average over ten seconds."""
+    gate: bool = True
+    """Whether readings are judged before they are used."""
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -79,7 +81,7 @@ class UnitSettings:
 
     def live(self) -> Live:
         """A new stream."""
-        return Live(self.model, self.tracker, dt=self.dt)
+        return Live(self.model, self.tracker, dt=self.dt, gate=self.gate)
 
 
 @dataclass(frozen=True)
@@ -188,7 +190,7 @@ class _Reader:
     def unit(self, k: int) -> UnitSettings:
         given = dict(self.tables("unit")[k])
         known = ["match", "name", "y", "u", "time", "time_unit", "dt", "model", "tracker", "limits", "alarm",
-                 "hold_back", "rate"]  # fmt: skip
+                 "hold_back", "rate", "gate"]  # fmt: skip
         for key in given:
             if key not in known:
                 raise KeyProblemError((key,), f"unit has no setting {key!r}; {near(key, known)}")
@@ -214,6 +216,7 @@ class _Reader:
             at("limits", lambda: _limits(given.get("limits", {}), (given["y"], *u))),
             at("alarm", lambda: _alarm(given.get("alarm"), dt)),
             at("rate", lambda: _positive("rate", given.get("rate", 10_000.0))),
+            at("gate", lambda: _gate(given.get("gate", True))),
         )  # fmt: skip
         if settings.time is None and (settings.hold_back or dt is not None):
             raise KeyProblemError(
@@ -238,6 +241,13 @@ def at(key: str, make: Callable[[], Made]) -> Made:
         return make()
     except (ValueError, TypeError) as error:
         raise KeyProblemError((key,), f"{key}: {error}") from None
+
+
+def _gate(given: Any) -> bool:
+    """Whether there is a gate."""
+    if not isinstance(given, bool):
+        raise ValueError(f"gate must be true or false; got {given!r}.")
+    return given
 
 
 def _dt(given: Any) -> float | None:

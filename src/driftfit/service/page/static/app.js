@@ -190,7 +190,7 @@ const described = ({ about, now, state: it }) => {
   if (it.held) make("span", "held", badges, "pill");
   if (it.calibrated === false) make("span", "finding limits", badges, "pill");
   const counts = Object.entries(it.counts ?? {}).map(([what, n]) => `${n.toLocaleString()} ${what}`).join(", ");
-  at("model").textContent = `${about.model}, ${about.tracker}. ${counts}.`;
+  at("model").textContent = `${about.model}, ${about.tracker}, ${about.gate ? "with" : "without"} a gate. ${counts}.`;
   for (const kind of ["csv", "arrow"]) {
     at(kind).href = `/api/export?unit=${encodeURIComponent(state.unit)}&format=${kind}${span()}`;
   }
