@@ -25,18 +25,21 @@ from service_support import (
     settled,
 )  # fmt: skip
 
-from driftfit import ARX, track
+from driftfit import ARX, DataWarning, track
 from driftfit.run.states.advance import advance
 from driftfit.service.core.archive import export
 from driftfit.service.core.engine import KEPT
 from driftfit.service.core.intake import Intake
 from driftfit.service.core.section import Section
 from driftfit.service.sources.samples import Batch
+from driftfit.service.start import rebuild
 from driftfit.service.supervisor import Service
 
 
 def run_of(y, u, time=None, **more):
-    return track(MODEL, TRACKER, y, u, time=np.arange(len(y)) * 1.0 if time is None else time, dt=1.0, **more)
+    return track(
+        MODEL, TRACKER, y, u, time=np.arange(len(y)) * 1.0 if time is None else time, dt=1.0, gate=True, **more
+    )
 
 
 @pytest.fixture
@@ -435,12 +438,93 @@ def test_states_are_carried_over_to_other_settings_of_the_tracker(tmp_path):
     feed(engine, message("plant/a", range(50, 100), y[50:], u[50:]))
     other = replace(TRACKER, q=1e-2)
     time = np.arange(100.0)
-    rest = track(MODEL, other, y[50:], u[50:], time=time[50:], dt=1.0, warm_start=run_of(y[:50], u[:50]))
+    before = run_of(y[:50], u[:50])
+    rest = track(MODEL, other, y[50:], u[50:], time=time[50:], dt=1.0, gate=True, warm_start=before)
     assert np.array_equal(engine.units.get(1).live.theta, rest.theta[-1])
     assert engine.units.get(2).failure == ""
     engine.close()
     engine = opened(configured(UNIT.replace("ARX(1, 1)", "ARX(2, 1)")), tmp_path)
     assert "follows" in engine.units.get(1).failure
+    engine.close()
+
+
+def coded():
+    y, u = record(100)
+    y[[5, 60]] = 9999.0
+    return y, u
+
+
+@pytest.mark.parametrize("size", [1, 40])
+def test_what_gates_leave_out_is_counted_by_reason(tmp_path, size):
+    """Also what is found among the first samples, whether they came in one message or one by one."""
+    y, u = coded()
+    engine = opened(configured(), tmp_path)
+    for k in range(0, 100, size):
+        feed(engine, message("plant/a", range(k, min(k + size, 100)), y[k : k + size], u[k : k + size]))
+    wanted = {name.lower(): count for name, count in run_of(y, u).left_out.counts.items()}
+    assert wanted == {"left out": 1, "left out at the start": 1}
+    assert engine.status()["left_out"] == wanted
+    assert wanted.items() <= engine.units.get(1).counts.items()
+    assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])
+    engine.close()
+
+
+def test_states_of_another_gate_are_refused_and_computed_again(tmp_path):
+    y, u = coded()
+    engine = opened(configured(), tmp_path)
+    feed(engine, message("plant/a", range(100), y, u))
+    engine._store_states(everything=True)
+    engine._commit()
+    engine.close()
+    without = configured(UNIT + "gate = false\n")
+    engine = opened(without, tmp_path)
+    assert "driftfit serve FILE --rebuild" in engine.units.get(1).failure
+    engine.close()
+    rebuild(tmp_path)
+    engine = opened(without, tmp_path)
+    assert engine.recovered == 100
+    with pytest.warns(DataWarning, match="y: 2 values look like fault codes"):
+        run = track(MODEL, TRACKER, y, u, time=np.arange(100.0), dt=1.0)
+    assert np.array_equal(engine.units.get(1).live.theta, run.theta[-1])
+    engine.close()
+
+
+OLDER = {
+    "meta": ("key text primary key, value text", "key, value"),
+    "unit": ("id integer primary key, name text unique, section integer, topic text, born integer, about text",
+             "id, name, section, topic, born, about"),
+    "log": ("first integer primary key, count integer, at real, items blob", "first, count, at, items"),
+    "result": ("first integer primary key, count integer, at real, rows blob", "first, count, at, rows"),
+    "program": ("tag blob primary key, about text", "tag, about"),
+    "snapshot": ("unit integer primary key, number integer, state blob", "unit, number, state"),
+    "block": ("unit integer, first integer, last integer, start real, stop real, count integer, rows blob, "
+              "extremes blob, primary key (unit, first)", "unit, first, last, start, stop, count, x'90', extremes"),
+    "event": ("id integer primary key, number integer, unit integer, at real, kind text, detail text",
+              "rowid, number, unit, at, kind, detail"),
+    "position": ("name text primary key, value text", "name, value"),
+}  # fmt: skip
+"""Columns and values of the tables of the older format."""
+
+
+def test_a_journal_of_an_older_format_is_refused_and_rebuilt(tmp_path):
+    y, u = coded()
+    engine = opened(configured(), tmp_path)
+    feed(engine, message("plant/a", range(100), y, u))
+    engine.close()
+    with sqlite3.connect(tmp_path / "driftfit.db") as db:
+        for table, (columns, values) in OLDER.items():
+            db.execute(f"create table older ({columns})")
+            db.execute(f"insert into older select {values} from {table}")
+            db.execute(f"drop table {table}")
+            db.execute(f"alter table older rename to {table}")
+        db.execute("drop table chain")
+        db.execute("update meta set value = '2' where key = 'format'")
+    db.close()
+    with pytest.raises(ValueError, match=r"older driftfit.*--rebuild"):
+        opened(configured(), tmp_path)
+    rebuild(tmp_path)
+    engine = opened(configured(), tmp_path)
+    assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])
     engine.close()
 
 

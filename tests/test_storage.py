@@ -14,7 +14,6 @@ from support import arx_record, same
 from driftfit import ARX, RLS, DataWarning, Kalman, Live, Track, track
 from driftfit.data import storage
 from driftfit.run.states import layout as states
-from driftfit.run.warm_start import ABSENT
 
 Y, U = arx_record(60, 1)
 
@@ -257,17 +256,6 @@ def test_a_state_of_another_version_is_matched_by_the_names_of_its_fields(tmp_pa
 def sizes(field):
     """Words of a field of a layout."""
     return math.prod(int(size) for size in field.partition(":")[2][1:].split(",") if size)
-
-
-def test_a_state_that_was_written_as_npz_is_read(tmp_path):
-    live = Live(ARX(2, 2), Kalman(q=1e-3, r=0.1))
-    for t in range(60):
-        live.update(Y[t], U[t])
-    header, _ = live._written()
-    header = {"kind": "state", "model": header["model"], "tracker": header["tracker"], "extra": dict(ABSENT)}
-    storage.write(tmp_path / "old", header, {f"state_{name}": value for name, value in live.lane().items()})
-    again = Live.load(tmp_path / "old")
-    assert same(again.update(1.0, 2.0), live.update(1.0, 2.0))
 
 
 def test_a_failure_while_writing_leaves_the_old_file(saved, monkeypatch):

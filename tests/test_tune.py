@@ -8,7 +8,6 @@ import pytest
 from support import arx_record
 
 from driftfit import ARX, FLS, RLS, AdaptiveKalman, AugmentedFLS, Kalman, Regression, Tracker, frontier, track, tune
-from driftfit.models.fault_codes import absurd
 from driftfit.models.regression import Regression as Base
 from driftfit.systems.drift import RandomWalk, paths
 from driftfit.systems.time_varying import EXAMPLES, example
@@ -425,34 +424,8 @@ def test_rounding_is_no_noise(method, gain, offset):
         tune(Regression(2, intercept=True), Kalman(), y, u, method=method)
 
 
-@pytest.mark.parametrize("code", [-200.0, 9999.0])
-def test_a_code_in_all_columns_is_missing_here_and_named_by_track(code):
-    """An absurd output beside an absurd input is a test, but not if both are the same number."""
-    y, u = arx_record(400, 1)
-    y, u = y + 5.0, u + 2.0
-    clean = tune(ARX(1, 1, intercept=True), Kalman(), y, u).noise
-    y[200:230], u[200:230] = code, code
-    with pytest.warns(UserWarning, match=f"tune: all signals are {code:g} at 30 samples, first at 200"):
-        assert tune(ARX(1, 1, intercept=True), Kalman(), y, u).noise == pytest.approx(clean, rel=0.3)
-    with pytest.warns(UserWarning, match=f"track: all signals are {code:g} at 30 samples, first at 200.*limits="):
-        track(ARX(1, 1, intercept=True), Kalman(q=1e-4, r=0.1), y, u)
-    track(ARX(1, 1, intercept=True), Kalman(q=1e-4, r=0.1), y, u, limits={"y": (-99.0, 99.0), "u": (-99.0, 99.0)})
-
-
 def test_signals_that_are_equal_within_their_range_hold_no_code():
     y, u = arx_record(400, 1)
     y[100:120], u[100:120] = 0.0, 0.0
     y[200:220], u[200:220] = u.max(), u.max()
     track(ARX(1, 1), Kalman(q=1e-4, r=0.1), y, u)
-
-
-def test_a_storm_is_no_code():
-    """Rain is near 0 on most days, so a storm is as many usual deviations away as a code, but not far from the next."""
-    rain = np.exp(np.random.default_rng(1).normal(-2.0, 2.0, 400))
-    assert rain.max() > 300.0 * np.median(rain)
-    assert not len(absurd(rain))
-    for codes in ([9999.0], [-9999.0, 99999.0], [1e6] * 30):
-        spoilt = rain.copy()
-        spoilt[50 : 50 + len(codes)] = codes
-        assert absurd(spoilt).tolist() == list(range(50, 50 + len(codes)))
-    assert absurd(np.append(np.tile([4.0, 5.0, 6.0], 20), [1e4, 1.1e4])).tolist() == [60, 61]

@@ -34,6 +34,7 @@ from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.models.polynomial import ARMAX, OE, BoxJenkins, PolynomialModel
 from driftfit.models.regression import Regression
 from driftfit.models.state_space import StateSpace
+from driftfit.readings.gate import Gate
 from driftfit.results import Track
 from driftfit.run.live.conformal import ConformalFactor
 from driftfit.smooth.augmented import augmented
@@ -92,6 +93,7 @@ __all__ = [
     "FirstFloor",
     "Fleet",
     "Functions",
+    "Gate",
     "HammersteinWiener",
     "Hybrid",
     "InstrumentalVariables",

@@ -149,10 +149,11 @@ def track(
     exclude : list of (from, to), or a mapping from the keys of a fleet to such lists
         Intervals to leave out, both ends included, in times or, without time, in sample numbers: nothing in them is
         used or enters a lag, and the summary counts their samples (`driftfit.data.limits`).
-    gate : bool, `Gate` or None
+    gate : bool, `Gate`, decisions of an earlier run or None
         Whether readings are judged before the tracker uses them: fault codes, spikes, frozen sensors, inputs to which
-        the output does not respond (`driftfit.readings.gate`). ``run.left_out`` lists what was refused. None: as the
-        tracker asks; those that are given their numbers have no gate, and use every reading as their textbook does.
+        the output does not respond (`driftfit.readings.gate`). ``run.left_out`` lists what was refused; given here, it
+        applies the same decisions (of several series a mapping from their keys). None: as the tracker asks; those that
+        are given their numbers have no gate, and use every reading as their textbook does.
     missing : text or number, or several
         What signals hold where there is no value, such as ``["Offline", -999]``. Texts of tables are known already if
         spreadsheets and historians use them (`driftfit.data.columns`). The summary counts numbers.
@@ -190,7 +191,7 @@ def track(
     -----
     DataWarning
         If most samples cannot be used because of ``dt``; if rows are left out because their time repeats, or are sorted
-        by dates that were not named as the time.
+        by dates that were not named as the time; if there is no gate and readings look like fault codes.
     """
     reading = Reading(time, dt, weights, drift, units, limits, exclude, missing, gate)
     if to is not None:

@@ -45,6 +45,9 @@ def serve(
     demo: Annotated[bool, typer.Option("--demo", help="A simulated plant; no file, broker or network needed.")] = False,
     port: Annotated[int | None, typer.Option(help="Port of the page.")] = None,
     folder: Annotated[Path | None, typer.Option(help="Where journal and results are stored.")] = None,
+    rebuild: Annotated[
+        bool, typer.Option("--rebuild", help="First compute all states again from the journal, as with another gate.")
+    ] = False,
     make_hash: Annotated[bool, typer.Option("--hash", help="Ask for a password and print its hash.")] = False,
     make_token: Annotated[bool, typer.Option("--token", help="Print a new token and its hash.")] = False,
 ) -> None:
@@ -74,4 +77,6 @@ def serve(
         with tempfile.TemporaryDirectory(prefix="driftfit-demo-") as temporary:
             home = Path(temporary) if demo and folder is None else home
             progress.print(start.greeting(config, home), markup=False, highlight=False, soft_wrap=True)
+            if rebuild:
+                start.rebuild(home)
             start.run(config, home)

@@ -26,12 +26,8 @@ import numpy as np
 
 from driftfit.data.times.instants import instant, with_hyphens
 from driftfit.data.times.periods import span
-from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
-
-NO_CODE = float("nan"), np.zeros(0, int)
-"""What `shared_code` finds nearly always."""
 
 
 class Limits:
@@ -96,41 +92,6 @@ class StreamLimits:
 
     def restore(self, counts: Sequence[int]) -> None:
         self._counts[:] = counts
-
-
-def shared_code(y: Array, u: Array) -> tuple[float, Array]:
-    """(number, samples): what outputs (T, ..) and inputs (T, m) all hold at once, far from what they hold otherwise.
-
-    A logger that loses its connection writes one code into every column. The number occurs twice at least, and each
-    column is away from it by more than the range of its other values; without such a number no sample is returned.
-    """
-    if not u.shape[1]:
-        return NO_CODE
-    first = y if y.ndim == 1 else y[:, 0]
-    (same,) = (first == u[:, 0]).nonzero()
-    if not len(same):  # nearly always, so it must cost little
-        return NO_CODE
-    same = same[np.abs(first[same]) < LARGEST]  # larger numbers count as missing
-    for column in (*y.reshape(len(y), -1).T[1:], *u.T[1:]):
-        same = same[column[same] == first[same]]
-    if len(same) > 1:
-        signals = np.column_stack([y, u])
-        values, counts = np.unique(signals[same, 0], return_counts=True)
-        for value in values[counts > 1].tolist():
-            rest = np.where((signals == value) | ~np.isfinite(signals), np.nan, signals)
-            if np.isfinite(rest).any(axis=0).all():
-                low, high = np.nanmin(rest, axis=0), np.nanmax(rest, axis=0)
-                if (np.maximum(low - value, value - high) > high - low).all():
-                    return value, same[signals[same, 0] == value]
-    return NO_CODE
-
-
-def code_text(verb: str, value: float, places: Array) -> str:
-    """What a warning says of `shared_code`."""
-    return (
-        f"{verb}: all signals are {value:.6g} at {len(places)} samples, first at {places[0]}, far from all "
-        "that they are otherwise: this looks like a code for missing values."
-    )
 
 
 def _bounds(key: Any, bounds: Any) -> tuple[float, float]:

@@ -4,7 +4,7 @@ Results are .npz files. States are small and there may be millions of them, so t
 the names and sizes of the arrays are in the header: with all numbers little-endian,
 
     bytes 0 .. 7      "driftfit"
-          8, 9        format, 2
+          8, 9        format, 3
          10, 11       0
          12 .. 15     CRC-32 of all that follows
          16 .. 19     length of the header
@@ -38,10 +38,12 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, place_of
 from driftfit.engine.tiles import held_in
 
-FORMAT = 1
+FORMAT = 2
 """Version of the format of .npz files."""
-MAGIC, COMPACT = b"driftfit", 2
+MAGIC, COMPACT = b"driftfit", 3
 """The first bytes of a packed state, and the version of its format."""
+REMEDY = "whose trackers judged readings by rules of their own: run the record again"
+"""Why older states and results are refused, and what to do."""
 HEAD = Struct("<8sHHII")
 CHECKED = 16
 """Number of the first byte that the CRC covers."""
@@ -185,9 +187,9 @@ def _length(text: bytes) -> bytes:
 def _expand(data: bytes) -> tuple[dict[str, Any], dict[str, Array]]:
     """The inverse of `compact`; ValueError if it is damaged."""
     _, version, unused, check, length = HEAD.unpack_from(data)
-    if version <= COMPACT and (zlib.crc32(data[CHECKED:]) != check or version < COMPACT or unused):
+    if version <= COMPACT and (zlib.crc32(data[CHECKED:]) != check or unused):
         raise ValueError("its check sum does not fit its content")
-    if version > COMPACT:
+    if version != COMPACT:
         return {"format": version}, {}
     header = json.loads(data[HEAD.size : HEAD.size + length], object_hook=_decode)
     arrays, at = {}, HEAD.size + length
@@ -217,6 +219,8 @@ def expand(data: bytes, kinds: Sequence[str], name: str = "what was given") -> t
         raise ValueError(f"{name} is not a driftfit file, or it is damaged.") from error
     if header.get("format", 0) > reads:
         raise ValueError(f"{name} was written by a newer driftfit (format {header['format']}); this one reads {reads}.")
+    if header.get("format", reads) < reads:
+        raise ValueError(f"{name} was written by an older driftfit (format {header['format']}), {REMEDY}.")
     if header.get("kind") not in kinds:
         raise ValueError(f"{name} holds a {header.get('kind')}, not a {' or a '.join(kinds)}.")
     return header, arrays

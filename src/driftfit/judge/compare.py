@@ -21,7 +21,6 @@ from driftfit.data.record import Record
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_errors, constant_least_squares
-from driftfit.judge.left_out import without_left_out
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.run.result import Track, burn_in, root_mean_square
@@ -80,8 +79,8 @@ def errors(run: Track, record: Record, burn: int | None = None, steady: Array | 
     """One-step errors of a run, of persistence, of constants without and with lags, and of constant ARX.
 
     Where lags are missing, the constants without lags predict. The first ``burn`` complete samples are not scored; by
-    default those of `left_at_start`. ``record`` is what they learn from
-    (`driftfit.judge.left_out.without_left_out`); ``steady`` are the constants of the run, if they are known.
+    default those of `left_at_start`. ``record`` is what they learn from (`Track.used_record`); ``steady`` are the
+    constants of the run, if they are known.
     """
     y, u = np.where(np.abs(record.y) < LARGEST, record.y, np.nan), record.u
     steady = constant_least_squares(run.model, record) if steady is None else steady
@@ -122,7 +121,7 @@ def _with_lags(model: Model, steady: Array, y: Array, constant: Array, noise: Ar
 
 def compare(run: Track) -> Comparison:
     """Score a run against persistence, constant least squares and constant ARX."""
-    made = errors(run, without_left_out(run))
+    made = errors(run, run.used_record)
     shown = (made.tracked, made.persistence, made.constant_ls, made.constant_arx)
     tracked, last, ls, constant = (root_mean_square(error[made.scored]) for error in shown)
     return Comparison(tracked, last, ls, constant, int(made.scored.sum()))

@@ -11,7 +11,6 @@ from driftfit.data.record import Record
 from driftfit.engine.kernel import Array
 from driftfit.judge.compare import Errors, errors
 from driftfit.judge.constant_fit import constant_least_squares
-from driftfit.judge.left_out import without_left_out
 from driftfit.judge.regressors import Distinct, Rows, judged_by_others, regressors
 from driftfit.judge.segments.noise_of_regressors import relative_size
 from driftfit.judge.statistics.constancy import Constancy, constancy
@@ -44,7 +43,7 @@ class Evidence:
 
     @cached_property
     def _record(self) -> Record:
-        return without_left_out(self.run)
+        return self.run.used_record
 
     @cached_property
     def _steady(self) -> Array:

@@ -39,13 +39,13 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.compare import left_at_start
 from driftfit.judge.evidence import Evidence
-from driftfit.judge.left_out import stuck
 from driftfit.judge.regressors import Rows
 from driftfit.judge.statistics.attribution import Attribution, alike, attribute
 from driftfit.judge.statistics.constancy import Constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
 from driftfit.judge.statistics.whiteness import grows_with, whiteness
+from driftfit.readings.gate import FROZEN
 from driftfit.run.result import Track, root_mean_square
 from driftfit.show.parts.text import Printed, digits, facts, table_of
 
@@ -132,7 +132,7 @@ class Verdict(Printed):
         The parameters that the test takes for 0, so that it can judge the others: one or more of every group, and
         those whose regressors are 0 in every sample that can be used but one at most.
     stuck : int
-        Readings of a stuck sensor, which are left out.
+        Readings of a frozen sensor, which the gate left out.
     """
 
     drifts: bool | None
@@ -307,8 +307,8 @@ class Verdict(Printed):
             )
         if self.stuck:
             text += (
-                f"{self.stuck} readings repeat the one before while the inputs move, as those of a stuck sensor do: "
-                "they are left out."
+                f"{self.stuck} readings repeat the one before although the forecast moved, as those of a frozen sensor "
+                "do: they are left out."
             )
         return text.strip()
 
@@ -437,7 +437,7 @@ def judged(known: Evidence, level: float) -> Verdict:
         spread_with=_spread_with(names, *known.unweighted) if drifts is False else (),
         dependent=groups,
         held=tuple(name for name in run.model.names if name not in names),
-        stuck=int(stuck(run.y, run.u).sum()),
+        stuck=int(np.sum(run.left_out.code == FROZEN)),
     )
 
 

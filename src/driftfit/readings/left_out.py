@@ -1,58 +1,147 @@
-"""What a gate left out of a run, as a table."""
+"""What a gate left out, as a table; of a stream, counts and the last of it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.readings.gate import INPUT
-from driftfit.readings.remarks import SAID, counts
+from driftfit.readings.remarks import SAID, counts, remarks
+
+KEPT = 16
+"""Decisions of which a stream keeps everything."""
+SHOWN = 20
+"""Rows of a printed table at most."""
 
 
 class Decision(NamedTuple):
-    """One sample that was not used: its number, the signal, its reading of y, and why."""
+    """One sample that was not used: its number (in a stream its time, if it has one), the signal, its reading of y, and
+    why."""
 
-    sample: int
+    sample: Any
     signal: str
     value: float
     reason: str
 
 
-@dataclass(frozen=True)
+def decision(sample: Any, code: int, value: float, name: str = "y") -> Decision:
+    """The decision that a code stands for."""
+    return Decision(sample, "u" if code == INPUT else name, value, SAID[code][1])
+
+
+@dataclass(frozen=True, repr=False)
 class LeftOut:
     """The decisions of a gate in the order of the samples: ``sample`` (k,), ``code`` (k,) of the reason
-    (`driftfit.readings.gate`), and ``value`` (k,), the readings of y there.
+    (`driftfit.readings.gate`), and ``value`` (k,), the readings of y there. ``unused`` (j,) are the samples that could
+    not be used because a refused input is among their lags. Given as ``gate=``, these decisions are applied again.
     """
 
     sample: Array
     code: Array
     value: Array
+    unused: Array
 
     def __len__(self) -> int:
         return len(self.sample)
 
     def __iter__(self) -> Iterator[Decision]:
         for t, code, value in zip(self.sample.tolist(), self.code.tolist(), self.value.tolist(), strict=True):
-            yield Decision(t, "u" if code == INPUT else "y", value, SAID[code][1])
+            yield decision(t, code, value)
 
     @property
     def counts(self) -> dict[str, int]:
         """How many samples there are for each reason, by the name that summaries use."""
         return {SAID[code][0]: count for code, count in counts(self.code).items()}
 
-    def __str__(self) -> str:
-        lines = [f"{count:6d}  {SAID[code][1]}" for code, count in counts(self.code).items()]
-        return "\n".join(lines) if lines else "nothing left out"
+    def applied(self, y: Array, noise: Array) -> tuple[Array, Array]:
+        """Readings y (T,) and factors of the noise variance (T,) with these decisions: refused readings are NaN, and
+        samples with a refused input have an infinite variance."""
+        y, noise = y.copy(), np.array(np.broadcast_to(noise, len(y)))
+        y[self.sample[self.code != INPUT]] = np.nan
+        noise[self.sample[self.code == INPUT]] = np.inf
+        noise[self.unused] = np.inf
+        return y, noise
+
+    def __repr__(self) -> str:
+        return table(self, len(self))
+
+    __str__ = __repr__
 
 
-NOTHING_LEFT_OUT = LeftOut(np.empty(0, int), np.empty(0, int), np.empty(0))
+def table(decisions: Any, count: int) -> str:
+    """Decisions as text, at most `SHOWN` of them."""
+    if count == 0:
+        return "nothing left out"
+    rows = [Decision(*row) for row, _ in zip(decisions, range(SHOWN), strict=False)]
+    wide = max(6, *(len(str(row.sample)) for row in rows))
+    lines = [f"{'sample':>{wide}}  signal    reading of y  reason"]
+    lines += [f"{row.sample!s:>{wide}}  {row.signal:<6}  {row.value:>14.6g}  {row.reason}" for row in rows]
+    more = [f"{'':>{wide}}  and {count - len(rows)} more"] if count > len(rows) else []
+    return "\n".join([*lines, *more])
 
 
-def left_out_of(reason: Array, y: Array) -> LeftOut:
-    """The decisions in a run, from what its gate stored for every sample (T,), and its readings."""
+NOTHING_LEFT_OUT = LeftOut(np.empty(0, int), np.empty(0, int), np.empty(0), np.empty(0, int))
+
+
+def left_out_of(reason: Array, y: Array, ok: Array, ages: int) -> LeftOut:
+    """The decisions in a run, from what its gate stored for every sample (T,), its readings, which samples were used
+    once all was decided, and how many samples its model remembers inputs."""
     sample = np.flatnonzero(reason)
-    return LeftOut(sample, reason[sample].astype(int), y[sample])
+    after = (sample[:, None] + np.arange(1, ages + 1)).ravel()
+    after = np.unique(after[after < len(y)])
+    unused = after[~ok[after] & (reason[after] == 0) & np.isfinite(y[after])]
+    return LeftOut(sample, reason[sample].astype(int), y[sample], unused)
+
+
+def remarks_of(several: Iterable[LeftOut]) -> tuple[tuple[str, str], ...]:
+    """The lines on what was left out of several records together."""
+    codes = [one.code for one in several]
+    return remarks(counts(np.concatenate(codes))) if codes else ()
+
+
+class Tally:
+    """What the gate of a stream left out: ``counts`` by reason, and the `last` decisions, the newest at the end."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._last: deque[Decision] = deque(maxlen=KEPT)
+
+    def __len__(self) -> int:
+        return self._counts.total()
+
+    def __iter__(self) -> Iterator[Decision]:
+        return iter(self.last)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many samples there are for each reason, by the name that summaries use."""
+        return dict(self._counts)
+
+    @property
+    def last(self) -> tuple[Decision, ...]:
+        """The last 16 decisions."""
+        return tuple(self._last)
+
+    def add(self, sample: Any, code: int, value: float, name: str = "y") -> None:
+        """Count a sample that was not used."""
+        self._counts[SAID[code][0]] += 1
+        self._last.append(decision(sample, code, value, name))
+
+    def __repr__(self) -> str:
+        said = ", ".join(f"{name}: {count}" for name, count in self._counts.items())
+        return f"{said}\n{table(self._last, len(self._last))}" if said else "nothing left out"
+
+    def plain(self) -> list[Any]:
+        """The state as plain data; `restore` takes it."""
+        return [dict(self._counts), [list(one) for one in self._last]] if self._counts else []
+
+    def restore(self, state: list[Mapping[str, int] | Any]) -> None:
+        """The inverse of `plain`."""
+        if state:
+            self._counts.update(state[0])
+            self._last.extend(Decision(*one) for one in state[1])

@@ -39,9 +39,16 @@ def floor_remark(floor: float) -> tuple[tuple[str, str], ...]:
     return (("Resolution", said),) if floor > 0.0 else ()
 
 
-def ungated(name: str, values: Sequence[float]) -> str:
-    """What is warned of after a run without a gate, given the readings of a signal that look like codes."""
+def ungated(found: Mapping[str, Sequence[float]], linear: bool) -> str:
+    """What is warned of after a run without a gate, given the values of each signal that look like codes, and whether
+    the model is linear in theta."""
+    said = "; ".join(_codes(name, values) for name, values in found.items())
+    lasting = "" if linear else " An estimate of a model that is not linear in theta may not come back from them."
+    return f"{said}. They entered the estimate; gate=True leaves such readings out.{lasting}"
+
+
+def _codes(name: str, values: Sequence[float]) -> str:
     different = list(dict.fromkeys(values))
     named = ", ".join(f"{value:g}" for value in different[:SHOWN]) + (", .." if len(different) > SHOWN else "")
     which = "value looks like a fault code" if len(values) == 1 else "values look like fault codes"
-    return f"{name}: {len(values)} {which} ({named}) and entered the estimate; gate=True leaves such readings out."
+    return f"{name}: {len(values)} {which} ({named})"

@@ -1,8 +1,8 @@
 """Codes in the record of a run that had no gate: said afterwards, because such a run uses whatever it is given.
 
-`suspect` is one vectorised look at the signals. Only where it finds something, `Review` runs the gate's step over the
-finished record, with the forecasts and variances of that run, and lists what a gate would have refused. A run that was
-spoilt by one code may say little of later ones.
+`screen` is one vectorised look at a signal of all series. Where it and `suspect` find something, `Review` runs the
+gate's step over the finished record, with the forecasts and variances of that run, and lists what a gate would have
+refused. A run that was spoilt by one code may say little of later ones.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ SUSPECT = 30.0
 """Usual distances from the median beyond which a value may be a code."""
 FEWEST = 20
 """Values that a usual distance needs."""
+SAMPLED = 64
+"""Values of a series that a first look takes for its usual ones."""
 
 
 def suspect(signal: Array) -> Array:
@@ -33,9 +35,33 @@ def suspect(signal: Array) -> Array:
     return np.asarray(away > limit)
 
 
-def screen(y: Array, u: Array) -> bool:
-    """Whether any value of y (T,) or of an input in u (T, m) may be a code."""
-    return any(bool(suspect(signal).any()) for signal in (y, *u.T))
+def screen(signal: Array, first: Array, length: Array) -> Array:
+    """Which series (K,) of a signal (N,), ``length`` samples each from ``first`` on, may hold a `suspect` value.
+
+    The median and the usual distance are those of `SAMPLED` values of a series, so a value is looked for within half of
+    `SUSPECT` distances; a series with fewer values that differ from its median is looked at whole.
+    """
+    found = np.zeros(len(first), bool)
+    series = np.flatnonzero(length >= FEWEST)
+    if not len(series):
+        return found
+    begin, count = first[series, None], length[series, None]
+    some = signal[begin + np.arange(SAMPLED) * count // SAMPLED]
+    some[~np.isfinite(some)] = np.nan
+    center = _middle(some)
+    away = np.abs(some - center[:, None])
+    away[away == 0.0] = np.nan
+    few = np.sum(away > 0.0, axis=1) < np.minimum(FEWEST, count[:, 0] // 2)
+    ends, padded = np.hstack([begin, begin + count]).ravel(), np.append(signal, np.nan)
+    high, low = (reduce(padded, ends)[::2] for reduce in (np.fmax.reduceat, np.fmin.reduceat))
+    found[series] = few | (np.fmax(high - center, center - low) > 0.5 * SUSPECT * _middle(away))
+    return found
+
+
+def _middle(rows: Array) -> Array:
+    """The lower median of each row (K, N), NaN left out; NaN if there is nothing else."""
+    known = np.sum(np.isfinite(rows), axis=1)
+    return np.asarray(np.sort(rows, axis=1)[np.arange(len(rows)), np.maximum(known - 1, 0) // 2])
 
 
 @kernel

@@ -21,6 +21,7 @@ from driftfit.data.record import Labels, Records
 from driftfit.engine.kernel import Array
 from driftfit.engine.tiles import repeat_tile
 from driftfit.models.base import Model
+from driftfit.readings.gate import Gate
 from driftfit.run.program import Program, State, kept, programs_of, state_of
 from driftfit.run.public_class import Plain
 from driftfit.run.result import Lane, Lanes, Track, names_of
@@ -122,6 +123,10 @@ class KeyedResults(Plain):
         """Keys and results."""
         return ((key, self._run(j)) for key, j in self._index.items())
 
+    def some(self, wanted: Array) -> Iterator[Track]:
+        """The results of some lanes, of which ``wanted`` has an entry for each."""
+        return (self._run(j) for j in self._index.values() if wanted[j])
+
     def ends(self) -> Iterator[tuple[Program, dict[str, Array]]]:
         """The program of each lane, and its state after the last sample."""
         for j in self._index.values():
@@ -152,11 +157,12 @@ class KeyedResults(Plain):
         Keys must be text, numbers, times, or tuples of them.
         """
         records, programs = self.records, self._programs
-        trackers = list(dict.fromkeys(one.tracker for one in programs))
-        place = {one: k for k, one in enumerate(trackers)}
+        kinds = list(dict.fromkeys((one.tracker, one.gate) for one in programs))
+        place = {one: k for k, one in enumerate(kinds)}
         header: dict[str, Any] = {"kind": self._kind, "model": storage.describe(programs[0].whole)}
-        header |= {"trackers": [storage.describe(one) for one in trackers], "labels": asdict(records.labels)}
-        header |= {"tracker": [place[one.tracker] for one in programs], "inputs": programs[0].model.m}
+        header |= {"trackers": [storage.describe(one) for one, _ in kinds], "labels": asdict(records.labels)}
+        header |= {"gates": [None if gate is None else gate.settings() for _, gate in kinds]}
+        header |= {"tracker": [place[one.tracker, one.gate] for one in programs], "inputs": programs[0].model.m}
         header |= {"keys": list(records.keys), "outputs": list(records.outputs)}
         counts = {"failed": self.failed, "dropped": records.dropped, "missing": records.missing}
         header |= {name: list(found.items()) for name, found in counts.items()}
@@ -200,7 +206,9 @@ class KeyedResults(Plain):
         trackers = [storage.rebuild(one, Tracker, classes) for one in header["trackers"]]
         for g in range(header["groups"]):
             storage.check_size(path, model, trackers[0], arrays[f"out{g}_theta"].shape[-1])
-        made = [programs_of(model, tracker, header["inputs"]) for tracker in trackers]
+        gates = [False if gate is None else Gate.from_settings(gate) for gate in header["gates"]]
+        kinds = zip(trackers, gates, strict=True)
+        made = [programs_of(model, tracker, header["inputs"], gate) for tracker, gate in kinds]
         outputs = tuple(header["outputs"])
         programs = [made[k][j % max(len(outputs), 1)] for j, k in enumerate(header["tracker"])]
         keys = tuple(map(_key, header["keys"]))

@@ -20,8 +20,8 @@ import numpy as np
 from driftfit.data.record import Record
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
-from driftfit.engine.tiles import output_type
 from driftfit.models.regression import Regression
+from driftfit.readings.left_out import NOTHING_LEFT_OUT, left_out_of
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.columns import Columns
 from driftfit.run.keyed_results import KeyedResults
@@ -133,7 +133,7 @@ class Outputs(KeyedResults, Columns):
     def replayed(self, store: Any, fields: tuple[str, ...]) -> Array:
         """The run again, (T,) records of a lane for each output, with these fields as ``store`` writes them."""
         tile = tile_of(self._programs, [self._starts[j] for j in sorted(self._starts)])
-        out = np.empty(len(self), output_type(tile, fields))
+        out = self._programs[0].inspected(tile, len(self), fields)
         steps = self._programs[0].steps._replace(store=store)
         self._programs[0].drivers(steps=steps).run(tile, *lanes_of(self.record), out)
         return out
@@ -153,7 +153,8 @@ class Outputs(KeyedResults, Columns):
 
     def _track(self, j: int) -> Track:
         """One output alone, as a regression whose regressors may contain the other outputs."""
-        alone, u, lane = self._programs[j].alone, self.u, self._lanes[j]
+        alone, y, u, lane = self._programs[j].alone, self.y[:, j], self.u, self._lanes[j]
+        left = NOTHING_LEFT_OUT
         known, names, units = self.record.known.for_output(j), self.labels.u, dict(self.labels.units)
         if alone is None:
             found, names = self._collected, self.names[j]
@@ -161,6 +162,10 @@ class Outputs(KeyedResults, Columns):
             held = zip(names, self.model.sources, strict=True)
             units |= {name: units[source] for name, source in held if source in units}
             u = np.where(found["valid"][:, j, None] > 0.0, found["phi"][..., j], np.nan)
+            if self._programs[j].gate is not None:
+                left = left_out_of(lane.written("reason"), y, lane.written("ok") > 0.0, 0)
+                y, noise = left.applied(y, known.noise)
+                known = known.changed(noise=noise)
         tile = alone.tile()
         shapes = {name: value.shape for name, value in state_of(tile).items() if name != "u"}
         state = state_of(lane.tile, lane.lane)
@@ -174,8 +179,8 @@ class Outputs(KeyedResults, Columns):
         others = tuple(f"of {name} " for name in self.outputs if name != self.outputs[j])
         missing = {reason: c for reason, c in self.record.labels.missing.items() if not reason.startswith(others)}
         labels = replace(self.record.labels, y=self.outputs[j], u=names, missing=missing, units=units)
-        record = Record(self.y[:, j], u, known, self.record.time, labels)
-        return Track(alone, record, Lane(out, tile), start)
+        record = Record(y, u, known, self.record.time, labels)
+        return Track(alone, record, Lane(out, tile), start, left)
 
     def __contains__(self, output: object) -> bool:
         return output in self.outputs

@@ -21,7 +21,7 @@ from driftfit.data import storage
 from driftfit.data.record import Record
 from driftfit.data.signals import check_ready
 from driftfit.engine.drivers import GATED, NOWHERE, Drivers, TrackerSteps, drivers
-from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.kernel import Array
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
@@ -29,7 +29,9 @@ from driftfit.readings.first_samples import replayed
 from driftfit.readings.gate import AT_START, Gate, gate_step
 from driftfit.readings.gate import start as gate_start
 from driftfit.run.collected_samples import COLLECTED, collecting
+from driftfit.run.states.gating import AtStart, gate_of, readings_of, without_start
 from driftfit.run.states.layout import Layout, words_of
+from driftfit.run.states.rows import put_columns
 from driftfit.trackers.base import Tracker
 
 CHUNK = 1_000_000
@@ -47,9 +49,6 @@ unroll a loop over that many, and then does not vectorise the loop over lanes.
 """
 
 _NOTHING: tuple[Array, ...] = ()
-
-SHORT = 32
-"""Rows of fewer numbers are copied column by column: NumPy takes 30 ns for each row."""
 
 State = Mapping[str, Array]
 """Fields of one lane of a tile, by name."""
@@ -131,11 +130,10 @@ class Program:
         """The tracker's fields before the first sample."""
         alone = None if self.output is None else self.alone
         own = self.tracker.state_for(self.model if alone is None else alone.model)
-        return (
-            own
-            if self.gate is None
-            else {**own, **gate_start(self.gate, self.model.n, self.model.m), "raw_e": np.array(np.nan)}
-        )
+        if self.gate is None:
+            return own
+        begun = gate_start(self.gate, self.model.n, self.model.m)
+        return {**own, **begun, "raw_e": np.array(np.nan), "gate_refused": np.array(0)}
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -182,6 +180,7 @@ class Program:
             "model": storage.describe(self.model),
             "tracker": storage.describe(self.tracker),
             "output": self.output,
+            "gate": None if self.gate is None else self.gate.settings(),
         }
         record = self.tile().dtype
         return Layout(record, held_in(record, self.tracker_start), self.tracker.scratch, owner)
@@ -217,14 +216,20 @@ class Program:
         return found
 
     def _decided(
-        self, run: Any, tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE
-    ) -> int:
-        """Run to the end, with the first samples once more without the codes that were found among them."""
+        self, run: Any, tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE,
+        found_too: list[tuple[int, AtStart]] | None = None,
+    ) -> int:  # fmt: skip
+        """Run to the end, with the first samples once more without the codes that were found among them.
+
+        ``found_too`` takes the sample at which they were found, and the codes.
+        """
         done: int = run(tile, y, u, known, out, theta)
         if tile["gate_replay"][0, 0] > 0:
-            refused = self.replay(tile)
+            found = self.replay(tile)
+            if found_too is not None:
+                found_too.append((done - 1, found))
             if "reason" in (out.dtype.names or ()) and theta is NOWHERE:
-                at = done - 1 - refused
+                at = done - 1 - found.ago
                 out["reason"][at[at >= 0], 0] = AT_START
             rest = slice(done, None)
             known = known if len(known) == 1 else known[rest]
@@ -234,17 +239,17 @@ class Program:
                 self._decided(run, tile, y[rest], u[rest], known, out, theta[rest])
         return len(y)
 
-    def replay(self, tile: Array) -> Array:
-        """Bring a tile, whose gate has found codes among the first samples, to where it is without them.
-
-        Returns how many samples ago these were: 0 for the last.
-        """
-        first = replayed(state_of(tile), self.model.m)
+    def replay(self, tile: Array) -> AtStart:
+        """Bring a tile, whose gate has found codes among the first samples, to where it is without them."""
+        first, raw = replayed(state_of(tile), self.model.m), readings_of(state_of(tile))
         fresh = self.tile({"gate_decided": np.array(1)})
         known = np.stack([first.dt, first.noise, first.drift], axis=1)[:, :, None]
         self.drivers().run(fresh, first.y[:, None], first.u[:, :, None], known, self.written(fresh, len(first.y)))
+        fresh["gate_refused"][0, 0] = np.sum(first.codes.any(axis=1))
         tile.view(np.uint8)[:] = fresh.view(np.uint8)
-        return len(first.y) - 1 - np.flatnonzero(first.codes.any(axis=1))
+        at = np.flatnonzero(first.codes.any(axis=1))
+        after = np.cumsum(first.dt[::-1])[::-1] - first.dt
+        return AtStart(len(first.y) - 1 - at, after[at], raw[at], first.codes[at])
 
     @property
     def width(self) -> int:
@@ -279,6 +284,10 @@ class Program:
         record = output_record(tile.dtype, self.outputs, keep, dtype)
         return np.ndarray(T, record, np.empty(T * record.itemsize, np.uint8))  # np.empty goes through all fields
 
+    def inspected(self, tile: Array, T: int, fields: tuple[str, ...], keep: str = "std") -> Array:
+        """An array for T samples of which other steps than the tracker's store these ``fields``."""
+        return np.empty(T, output_type(tile, tuple(dict.fromkeys((*fields, *(GATED if self.gate else ())))), keep))
+
     def loop(self, tile: Array, T: int, keep: str, dtype: Any, collected: bool) -> tuple[Any, Array]:
         """(the routine that runs tiles like this one, an array for the results of T samples).
 
@@ -286,8 +295,8 @@ class Program:
         """
         if not collected:
             return self.fill, self.written(tile, T, keep, dtype)
-        fields = dict.fromkeys((*self.outputs, *COLLECTED))
-        return self.drivers(steps=collecting(self.steps)).run, np.empty(T, output_type(tile, tuple(fields)))
+        fields = (*self.outputs, *COLLECTED)
+        return self.drivers(steps=collecting(self.steps)).run, self.inspected(tile, T, fields)
 
     def run(self, tile: Array, record: Record, keep: str = "std", dtype: Any = np.float64) -> Array:
         """Run a tile over a record, a lane for each output; returns what is kept, (T,) of `output_type`."""
@@ -345,33 +354,6 @@ def _copy(results: Array, out: Array) -> None:
         return
     for name in names:
         put_columns(results[name], out[name])
-
-
-def put_columns(given: Array, into: Array) -> None:
-    """Copy an array (T, ..) whose rows may be short and far apart."""
-    T = len(into)
-    given, into = given.reshape(T, -1), into.reshape(T, -1)
-    if into.shape[1] >= SHORT:
-        into[...] = given
-        return
-    for k in range(into.shape[1]):
-        into[:, k] = given[:, k]
-
-
-def put_fields(rows: Array, into: Mapping[str, Array], first: int) -> None:
-    """Copy fields of rows of eight-byte numbers to rows ``first`` and following of arrays of the same types."""
-    words = rows.view(np.int64).reshape(len(rows), -1)
-    fields: Mapping[str, Any] = rows.dtype.fields or {}
-    for name, values in into.items():
-        put_words(words, fields[name][1] // 8, values.view(np.int64).reshape(len(values), -1), first)
-
-
-@Driver
-def put_words(words: Array, column: int, into: Array, first: int) -> None:
-    """Copy columns of words, row by row: NumPy takes 30 ns for each short row, or reads all rows for each column."""
-    for t in range(words.shape[0]):
-        for k in range(into.shape[1]):
-            into[first + t, k] = words[t, column + k]
 
 
 def kept(rows: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:
@@ -462,10 +444,16 @@ def programs_of(
             raise ValueError(f"several outputs take one tracker, or one for each output by its name; got {tracker!r}.")
         check_ready(one)
     if model.shared:
+        if gate:
+            raise ValueError(
+                "gate: outputs that share one theta have no gate; leave gate= out, and give the ranges of the sensors, "
+                "such as limits={'y1': (0, 80)}."
+            )
         return (Program(_row_model(model, tracker, inputs), tracker, shared=model),)
     bound = model.bind(inputs)
     programs = tuple(
-        Program(bound, one, name, gate=gate_of(one, gate)) for one, name in zip(trackers, model.outputs, strict=True)
+        Program(bound, one, name, gate=without_start(gate_of(one, gate)))
+        for one, name in zip(trackers, model.outputs, strict=True)
     )
     if len({one.steps for one in programs}) > 1 or len({one.shapes for one in programs}) > 1:
         raise ValueError(f"the trackers of several outputs must be of one kind and form; got {shown(trackers)}.")
@@ -476,15 +464,6 @@ def programs_of(
 def _programs(model: Model, tracker: Tracker, inputs: int | tuple[str, ...], gate: Gate | None) -> tuple[Program, ...]:
     """The programs are cached for the next record, since settings are compared by value."""
     return (Program(model.bind(inputs), check_ready(tracker), gate=gate),)
-
-
-def gate_of(tracker: Tracker, gate: Gate | bool | None) -> Gate | None:
-    """The gate before a tracker: one with its settings, True for the usual one, False for none; None: as it asks."""
-    if isinstance(gate, Gate):
-        return gate
-    if gate is not None and not isinstance(gate, bool):
-        raise ValueError(f"gate must be True, False, None or a Gate; got {gate!r}.")
-    return Gate() if (tracker.gated if gate is None else gate) else None
 
 
 def _row_model(model: Model, tracker: Tracker, inputs: int | Sequence[str]) -> Model:

@@ -16,12 +16,14 @@ from driftfit.data.known import Known
 from driftfit.data.record import Labels, Record, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.readings.gate import AT_START
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, left_out_of
 from driftfit.run.columns import Columns
 from driftfit.run.live.conformal import quantile, widened
 from driftfit.run.program import Program, State, kept, lanes_of, state_of
 from driftfit.run.public_class import Plain
-from driftfit.run.warm_start import End
+from driftfit.run.states.gating import AtStart
+from driftfit.run.warm_start import End, gate_from
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.student import log_student, residuals_before, wider
 
@@ -118,13 +120,21 @@ class Track(Plain, Columns):
         Names of the parameters.
     """
 
-    def __init__(self, program: Program, record: Record, lane: Lane, start: State | None = None) -> None:
+    def __init__(
+        self,
+        program: Program,
+        record: Record,
+        lane: Lane,
+        start: State | None = None,
+        left_out: LeftOut = NOTHING_LEFT_OUT,
+    ) -> None:
+        """``left_out`` was decided before: the record of a program without a gate is then without it."""
         self.program, self.record, self.start = program, record, start
-        self._lane = lane
+        self._lane, self._left_out = lane, left_out
 
     def __reduce__(self) -> Any:
         """A copy, or a run sent to another process, does not contain the other series of a fleet's tile."""
-        return type(self), (self.program, self.record, self._lane.alone(self.program), self.start)
+        return type(self), (self.program, self.record, self._lane.alone(self.program), self.start, self._left_out)
 
     @property
     def rows_per_instant(self) -> int:
@@ -260,6 +270,8 @@ class Track(Plain, Columns):
         """
         if not self.tracker.covariance:
             return float("nan")
+        if self.decided is not self:
+            return self.decided.loglik
         total = np.nansum(self.log_density)
         if "F" in self.state:
             total -= 0.5 * np.sum(np.log(self.state["F"]))
@@ -275,6 +287,8 @@ class Track(Plain, Columns):
         """
         if self.program.shared is not None:
             return self.by_row(self.rows.log_density)
+        if self.decided is not self:
+            return self.decided.log_density
         s, e = (np.asarray(part, dtype=np.float64) for part in (self.innovation_var, self.innovation))
         counted = self.ok & np.isfinite(s) & (s > 0.0)
         own = self.tracker.log_density(self._complete.out)
@@ -338,8 +352,40 @@ class Track(Plain, Columns):
     def left_out(self) -> LeftOut:
         """What the gate decided of samples that it did not use as they are; empty without a gate."""
         if self.program.gate is None:
-            return NOTHING_LEFT_OUT
-        return left_out_of(self.in_rows("reason"), self.record.y)
+            return self._left_out
+        used, ages = self.decided.in_rows("ok") > 0.0, self.program.model.input_memory
+        return left_out_of(self.in_rows("reason"), self.record.y, used, ages)
+
+    @cached_property
+    def decided(self) -> Track:
+        """The run without the codes that its gate found among the first samples, on which smoothers, likelihood and
+        judgements rest; the run itself if it found none.
+        """
+        if self.program.gate is None or AT_START not in self.in_rows("reason"):
+            return self
+        found: list[tuple[int, AtStart]] = []
+        tile = self.fresh()
+        out = self.program.written(tile, len(self))
+        self.program.drivers().run(tile, *lanes_of(self.record), out, found_too=found)
+        (last, start), (y, u) = found[0], (self.record.y.copy(), self.record.u.copy())
+        at, codes = last - start.ago, start.codes
+        y[at[codes[:, 0]]] = np.nan
+        u[at] = np.where(codes[:, 1:], np.nan, u[at])
+        begun = {**(self.start or {}), "gate_decided": np.array(1)}
+        return track_record(self.program, replace(self.record, y=y, u=u), start=begun)
+
+    @cached_property
+    def used_record(self) -> Record:
+        """The record with the decisions of the gate: refused readings are missing, and samples with a refused input
+        have no weight, so that others learn from the same readings.
+        """
+        left, record = self.left_out, self.record
+        if self.program.gate is None or not len(left):
+            return record
+        y, noise = left.applied(record.y, self.known.noise)
+        if self.model.implicit:  # the reading is in the regressor, too
+            y = np.where(np.isinf(noise), np.nan, y)
+        return replace(record, y=y, known=self.known.changed(noise=noise))
 
     def cov(self, t: int) -> Array:
         """Covariance (n, n) of theta after sample t (negative t counts from the end).
@@ -398,6 +444,7 @@ class Track(Plain, Columns):
             "tracker": storage.describe(self.tracker),
             "labels": asdict(self.labels),
             "keep": kept(self._lane.out.dtype)[0],
+            "gate": None if self.program.gate is None else self.program.gate.settings(),
         }
         if self.program.shared is not None:
             header |= {"kind": KINDS[1], "shared": storage.describe(self.program.shared)}
@@ -424,7 +471,7 @@ class Track(Plain, Columns):
         model = storage.rebuild(header["model"], Model, classes)
         tracker = storage.rebuild(header["tracker"], Tracker, classes)
         storage.check_size(path, model, tracker, arrays["out_theta"].shape[-1])
-        program = Program(model, tracker, shared=shared)
+        program = Program(model, tracker, shared=shared, gate=gate_from(header))
         record = Record(
             arrays["y"], arrays["u"], Known(arrays["known"]), arrays.get("time"), Labels(**header["labels"])
         )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -12,15 +13,20 @@ import numpy as np
 
 from driftfit.data import outputs
 from driftfit.data.arguments import check_roles
-from driftfit.data.limits import code_text, shared_code
-from driftfit.data.record import Reading, Records, one_series, rows
+from driftfit.data.record import Reading, Record, Records, one_series, rows
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
+from driftfit.readings.gate import AT_START, INPUT, REFUSED, Gate
+from driftfit.readings.left_out import LeftOut
+from driftfit.readings.remarks import ungated
+from driftfit.readings.screen import Review, screen, suspect
 from driftfit.run.fleet import Fleet, run_fleet
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, programs_of, tile_of
-from driftfit.run.result import Lane, Lanes, Track
+from driftfit.run.result import Lane, Lanes, Track, track_record
+from driftfit.run.states.reference import decided
 from driftfit.run.warm_start import Run, carried, ended, first_interval
 from driftfit.trackers.base import Tracker
 
@@ -33,6 +39,9 @@ With four times as many a series costs a quarter more, in memory that the proces
 """
 ASTRAY = 1.0
 """Median prediction error, in deviations of the output, above which estimates went astray."""
+
+BEGUN = 100
+"""Samples among which codes may be the first that a run has."""
 
 Result = Track | Fleet | Outputs
 """The result of `track`, which depends on the number of series, of settings and of outputs."""
@@ -59,11 +68,7 @@ def track(
     warn_astray(run)
     if isinstance(run, Track) and (doubt := run.tracker.doubts(run)):
         warn(f"{type(run.tracker).__name__}: {doubt}.", UserWarning)
-    value, places = shared_code(records.y, records.u)
-    if len(places):
-        warn(
-            f"{code_text('track', value, places)} Give limits=, such as limits={{'y': (low, high), 'u': (low, high)}}."
-        )
+    warn_ungated(run)
     return run  # type: ignore[no-any-return]
 
 
@@ -108,7 +113,9 @@ def _task(
         raise ValueError("track: keep='theta' is for models of one output.")
     reading = Reading() if reading is None else reading
     model, records, failed = records_of(model, y, u, reading, data, by)
-    records = records.for_model(model, reading)
+    records, gate = records.for_model(model, reading), reading.gate
+    if isinstance(gate, LeftOut | Mapping):
+        (records, _), gate = decided(records, gate), False
     # several trackers, other than one for each output
     grid = not alone and not (isinstance(tracker, Mapping) and bool(records.outputs))
     many = grid or by is not None
@@ -117,7 +124,7 @@ def _task(
     if grid and by is None:
         records = records.repeated(tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker))))  # type: ignore[arg-type]
     trackers = (_per_series(tracker, records) if grid else [tracker] * len(records.keys)) or _any_of(tracker)
-    programs, records = _prepared(model, trackers, records, kept.keep, kept.prob, reading.gate)
+    programs, records = _prepared(model, trackers, records, kept.keep, kept.prob, gate)
     return programs, records, failed, many
 
 
@@ -227,7 +234,7 @@ def _one(programs: Sequence[Program], records: Records, keep: str, before: Run |
         each = np.arange(records.ny)
         lanes = Lanes([(out, tile, each, each)], np.full(records.ny, len(record)))
         return Outputs(programs, records._replace(known=record.known), lanes, {}, dict(enumerate(starts)))
-    return Track(program, record, Lane(out, tile), *starts)
+    return Track(program, record, Lane(out, tile), starts[0] if starts else None)
 
 
 def warn_astray(run: Track | KeyedResults) -> None:
@@ -246,6 +253,69 @@ def warn_astray(run: Track | KeyedResults) -> None:
             "from them; gradients (RLS) are more robust than instruments.",
             UserWarning,
         )
+
+
+def warn_ungated(run: Result) -> None:
+    """Warn of readings that look like codes and that no gate judged: once, whatever the number of series."""
+    programs = [run.program] if isinstance(run, Track) else run.programs
+    if all(one.gate is not None or one.shared is not None for one in programs):
+        return
+    given = run.record if isinstance(run, Track) else run.records
+    y, T = given.y.reshape(len(given.y), -1), len(given.y)
+    first, length = (np.zeros(1, int), np.array([T])) if isinstance(given, Record) else (given.first, given.length)
+    inputs = np.any([screen(signal, first, length) for signal in given.u.T], axis=0) if given.u.shape[-1] else False
+    may = np.stack([screen(signal, first, length) | inputs for signal in y.T], axis=1).ravel()
+    if not may.any():
+        return
+    warn_of_codes("track", [run] if isinstance(run, Track) else run.some(may))
+
+
+def warn_of_codes(verb: str, runs: Iterable[Track]) -> None:
+    """Warn of the readings of runs without a gate that one would have refused."""
+    found: defaultdict[str, list[float]] = defaultdict(list)
+    linear = True
+    for run in runs:
+        for name, values in {} if run.program.gate else _codes(run).items():
+            found[name] += values
+            linear &= run.model.hidden is None and not (run.model.implicit or run.model.settling)
+    if found:
+        warn(f"{verb}: {ungated(found, linear)}")
+
+
+def _codes(run: Track) -> dict[str, list[float]]:
+    """The values of each signal of a run without a gate that one would have refused."""
+    y, u, model = run.record.y, run.record.u, run.program.model
+    strange = [suspect(signal) for signal in u.T]
+    if not (suspect(y).any() or any(one.any() for one in strange)):
+        return {}
+    e, s, y_hat = (run.in_rows(name).astype(float) for name in ("e", "s", "y_hat"))
+    y_hat = np.where(np.isfinite(e), y - e, y_hat) if model.implicit else y_hat
+    begun = _codes_at_start(run, suspect(y))
+    y, early = np.where(begun, np.nan, y), y[begun]
+    reason = _review(model.m, model.input_memory)(y, u, y_hat, s, np.isfinite(y_hat))
+    blamed = np.flatnonzero(reason == INPUT)[:, None] - np.arange(model.input_memory + 1)
+    names = (
+        run.labels.u or model.input_names or (("u",) if model.m == 1 else tuple(f"u{j + 1}" for j in range(model.m)))
+    )
+    found = {run.labels.y: np.append(early, y[reason == REFUSED])}
+    for name, signal, mark in zip(names, u.T, strange, strict=True):
+        found[name] = signal[np.intersect1d(blamed, np.flatnonzero(mark))]
+    return {name: values.tolist() for name, values in found.items() if len(values)}
+
+
+def _codes_at_start(run: Track, strange: Array) -> Array:
+    """Which readings (T,) a gate would have found to be codes among the first, some of which are ``strange``."""
+    first, found = slice(0, min(BEGUN, len(run))), np.zeros(len(run), bool)
+    if run.start is None and strange[first].any():
+        left = track_record(replace(run.program, gate=Gate()), run.record.part(first)).left_out
+        found[left.sample[left.code == AT_START]] = True
+    return found & strange
+
+
+@lru_cache
+def _review(m: int, ages: int) -> Review:
+    """The gate for finished records, which is compiled once."""
+    return Review(Gate(), m, ages)
 
 
 def warn_unlearned(run: Track | KeyedResults) -> None:

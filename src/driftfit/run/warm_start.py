@@ -66,7 +66,7 @@ class End(NamedTuple):
         header, arrays = storage.expand(data, KINDS)
         with storage.reading("what was given"):
             model, trackers, extra = read("what was given", header, arrays, classes)
-            programs = programs_of(model, by_output(model, trackers), model.m, gate_from(header))
+            programs = programs_of(model, by_output(model, trackers), model.m, gate_from(header) or False)
             tile = tile_of(programs)
             restore("what was given", programs, header, arrays, tile)
             states = tuple(state_of(tile, lane) for lane in range(len(programs)))
@@ -75,7 +75,7 @@ class End(NamedTuple):
 
 ABSENT: Mapping[str, Any] = {
     "dt": None, "zone": None, "limits": None, "last": None, "samples": 0, "ignored": 0, "lag": 0, "awaits": 0,
-    "cold": False, "windows": (), "alarms": (),
+    "cold": False, "windows": (), "alarms": (), "left_out": [],
 }  # fmt: skip
 """Values that are not written for a stream, because they are the default."""
 
@@ -107,10 +107,10 @@ def read(
     return model, trackers, {**ABSENT, **header["extra"]}
 
 
-def gate_from(header: Mapping[str, Any]) -> Gate | bool:
-    """The gate of a header that `written` made; False for none."""
-    given = header.get("gate")
-    return False if given is None else Gate.from_settings(given)
+def gate_from(header: Mapping[str, Any]) -> Gate | None:
+    """The gate of a header; None for none."""
+    given = header["gate"]
+    return None if given is None else Gate.from_settings(given)
 
 
 def by_output(model: Model, trackers: Sequence[Tracker]) -> Any:

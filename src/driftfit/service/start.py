@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from driftfit.service.core.journal import Journal
 from driftfit.service.settings.config import Config, ProblemsError, read
 from driftfit.service.supervisor import Service, log_to_stderr
 
-__all__ = ["DEMO", "ProblemsError", "configured", "described", "greeting", "run"]
+__all__ = ["DEMO", "ProblemsError", "configured", "described", "greeting", "rebuild", "run"]
 DEMO = Path(__file__).parent / "demo.toml"
 
 
@@ -26,7 +27,10 @@ def described(config: Config) -> str:
              f"{len(config.sinks)} sinks."]  # fmt: skip
     for unit in config.units:
         inputs = ", ".join(unit.u) or "its own past"
-        lines.append(f"  {unit.match.text}: {unit.y} from {inputs}, {unit.model!r}, {unit.tracker!r}")
+        lines.append(
+            f"  {unit.match.text}: {unit.y} from {inputs}, {unit.model!r}, {unit.tracker!r}"
+            + ("" if unit.gate else ", without a gate")
+        )
     return "\n".join(lines)
 
 
@@ -36,6 +40,11 @@ def greeting(config: Config, folder: Path) -> str:
     scheme = "https" if page.certificate else "http"
     where = f"{scheme}://{page.host}:{page.port}/" if page.enabled else "no page"
     return f"driftfit serve: {where}  (data in {folder}; Ctrl-C stops)"
+
+
+def rebuild(folder: Path) -> None:
+    """Let the service compute all states again from its journal."""
+    Journal(folder, rebuild=True).close()
 
 
 def run(config: Config, folder: Path) -> None:

@@ -21,7 +21,6 @@ from rich.text import Text
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.compare import persistence
-from driftfit.judge.left_out import without_left_out
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, counts, facts, key_text, table_of, together
@@ -146,7 +145,7 @@ def _median(excursion: Array) -> Array:
 
 def _unit(key: Hashable, run: Track, path: _Path, moved: Array) -> Unit:
     i = int(np.argmax(np.where(np.isfinite(moved), moved, -1.0)))
-    errors = np.stack([run.innovation, run.y - persistence(without_left_out(run).y)])[:, path.begin :]
+    errors = np.stack([run.innovation, run.y - persistence(run.used_record.y)])[:, path.begin :]
     error, last = (root_mean_square(e) for e in errors[:, np.isfinite(errors).all(axis=0)])
     return Unit(
         key, len(run), int(run.ok.sum()), float(moved[i]), run.names[i], float(path.start[i]),

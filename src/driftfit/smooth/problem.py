@@ -14,10 +14,10 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, Driver, State, kernel
-from driftfit.engine.tiles import output_type
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.program import lanes_of, put_fields
+from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
+from driftfit.run.states.rows import put_fields
 from driftfit.smooth.parts.pooled_drift import average_drift
 from driftfit.smooth.parts.walk import DRIFT, NONE, WEIGHT, Walk, Y, free, room_for_signals
 from driftfit.trackers.base import RandomWalk
@@ -57,10 +57,11 @@ def blocks(run: Track) -> Iterator[tuple[int, Array]]:
     The fields are phi, y, dt, valid, used_noise (the factor of the noise variance), ok, observed, e, and the tracker's
     ``smoother_fields``. A block stays in the cache, and the next one takes its place.
     """
+    run = run.decided
     program, T = run.program, len(run)
     tile = run.fresh()
     names = (*run.tracker.smoother_fields, *COLLECTED, "used_noise", "ok", "e")
-    block = np.empty(min(ROWS, T), output_type(tile, names, "own"))
+    block = program.inspected(tile, min(ROWS, T), names, "own")
     loop = program.drivers("own", collecting_for_smoother(program.steps)).run
     y, u, known = lanes_of(run.record)
     for a in range(0, T, ROWS):
@@ -123,7 +124,6 @@ def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -
         prior = free(run.model.n) if tracker.smoother_fields else tracker.random_walk(run.model)
     phi, signals, fields = collected(run)
     weight, drift = signals[:, WEIGHT], signals[:, DRIFT]
-    weight[tracker.left_out(fields.__getitem__ if fields else run.ended_with, phi, signals[:, Y], weight)] = 0.0
     dt = drift.copy() if prior.slopes or fields else NONE
     first = int(np.argmax(drift > 0.0)) + 1
     drift *= run.known.drift

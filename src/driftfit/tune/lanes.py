@@ -27,6 +27,7 @@ from driftfit.engine.tiles import output_type
 from driftfit.models.base import Model
 from driftfit.run.program import Program, spread, tile_of
 from driftfit.run.result import burn_in
+from driftfit.run.states.reference import Decisions
 from driftfit.trackers.base import Tracker
 
 BLOCK = 1024
@@ -38,6 +39,8 @@ class Task(NamedTuple):
 
     model: Model
     records: tuple[Record, ...]
+    left_out: Decisions | None = None
+    """What a gate left out of each record, by its key; None without a gate."""
 
     @property
     def longest(self) -> int:

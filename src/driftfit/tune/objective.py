@@ -29,7 +29,7 @@ def along(task: Task, tracker: Tracker, order_by: Any) -> Task:
     walk, _ = ordered(walk_of(run), order_by)
     with np.errstate(divide="ignore"):
         known = Known.of(noise=1.0 / walk.weight)
-    return Task(Regression(task.model.names), (Record(walk.y, walk.phi, known),))
+    return Task(Regression(task.model.names), (Record(walk.y, walk.phi, known),), task.left_out)
 
 
 @dataclass(frozen=True)

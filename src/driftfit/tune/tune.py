@@ -24,15 +24,18 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.limits import code_text, shared_code
 from driftfit.data.outputs import columns_as_outputs
 from driftfit.data.record import Reading
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import one_of, warn, whole
+from driftfit.engine.settings import one_of, whole
 from driftfit.models.base import Model
-from driftfit.models.fault_codes import ABSURD, absurd
-from driftfit.run.track import records_of
+from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
+from driftfit.readings.screen import screen
+from driftfit.run.program import Program
+from driftfit.run.result import track_record
+from driftfit.run.states.reference import Decisions, decide
+from driftfit.run.track import records_of, warn_of_codes
 from driftfit.trackers.base import Tracker
 from driftfit.tune.intervals import intervals_of
 from driftfit.tune.lanes import Task, score
@@ -41,9 +44,6 @@ from driftfit.tune.outputs import TunedOutputs, tune_outputs
 from driftfit.tune.parametrisation import find_knobs
 from driftfit.tune.search import Counted, Search, minimise
 from driftfit.tune.tuned import METHODS, Tuned
-
-RESPONSE = 20
-"""Samples within which a test and its response are absurd."""
 
 
 def tune(
@@ -67,6 +67,7 @@ def tune(
     limits: Any = None,
     exclude: Any = None,
     missing: Any = (),
+    gate: Any = None,
 ) -> Tuned | TunedOutputs:
     """Estimate the missing settings of a tracker: ``FLS()``, ``Kalman()``, ``Kalman(r=0.1)``, ``RLS()`` ...
 
@@ -93,6 +94,9 @@ def tune(
         samples, scales from 1e-3 to 1e3.
     level : number
         Level of the intervals.
+    gate : bool, `Gate`, decisions of a run or None
+        As for `track`. The gate decides once, by a run of `AdaptiveKalman`, and what it leaves out is left out for all
+        settings: ``tuned.left_out``, which ``track(model, tuned.tracker, y, u, gate=tuned.left_out)`` takes.
     by : names of columns, "row" or None
         As for `track`: several records, which share the settings but not theta. The criterion is that of all of them
         together, such as the sum of their log-likelihoods, and every record begins with an unknown theta.
@@ -126,7 +130,10 @@ def tune(
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing)
     if len(model.outputs) > 1:
         options = (method, groups, h, bounds, level, order_by)
+        if gate:
+            raise ValueError("tune: gate= is for one output; tune one output after the other, or leave gate= out.")
         return tune_outputs(model, tracker, y, u, reading, data, by, lambda task: _tuned(task, tracker, *options))
+    reading = reading._replace(gate=gate)
     return _tuned(_task(model, tracker, y, u, reading, data, by), tracker, method, groups, h, bounds, level, order_by)
 
 
@@ -136,7 +143,6 @@ def _tuned(
     """Tune on a checked record."""
     if order_by is not None:
         task = along(task, tracker, order_by)
-    task = _without_fault_codes(task)
     knobs = find_knobs(task, tracker, groups, bounds)
     f = Counted(Criterion(task, knobs, method, h))
     search = Search(f, knobs, minimise(f, knobs))
@@ -146,6 +152,8 @@ def _tuned(
         raise ValueError(_without_noise(task))
     _warn(search)
     built = knobs.build(search.x, sigma2)
+    if task.left_out is None and not task.model.shared:
+        _warn_ungated(task, built)
     runs = run_task(task, built)
     return Tuned(
         tracker=built,
@@ -156,6 +164,7 @@ def _tuned(
         at_bound=tuple(name for name, i in zip(knobs.names, knobs.owner, strict=True) if search.at_bound(i)),
         interval=intervals_of(search, task, method, tracker, level),
         level=level,
+        left_out=_of_one(task.left_out or {}),
         _search=search,
     )
 
@@ -190,48 +199,6 @@ def _without_noise(task: Task) -> str:
     )
 
 
-def _without_fault_codes(task: Task) -> Task:
-    """The task with absurd values as missing ones, which would decide the likelihood of all settings alone.
-
-    An input near which the output is absurd too is a test: both are kept.
-    """
-    records = []
-    for record in task.records:
-        if record.y.ndim == 1 and record.u.ndim == 2:
-            signals = np.column_stack([record.y, record.u])
-            value, codes = shared_code(record.y, record.u)
-            if len(codes):
-                signals[codes] = np.nan
-                warn(
-                    f"{code_text('tune', value, codes)} They count as missing here; give limits= to `track` too.",
-                    UserWarning,
-                )
-            places = [absurd(x) for x in signals.T]
-            of_inputs = np.concatenate([np.empty(0, int), *places[1:]])
-            for k, found in enumerate(places):
-                others = places[0] if k else of_inputs
-                apart = np.abs(found[:, None] - others).min(axis=1, initial=RESPONSE + 1)
-                _leave_out(
-                    signals[:, k], "y" if k == 0 else f"u{k}" if len(places) > 2 else "u", found[apart > RESPONSE]
-                )
-            record = replace(record, y=signals[:, 0].copy(), u=signals[:, 1:].copy())
-        records.append(record)
-    return task._replace(records=tuple(records))
-
-
-def _leave_out(x: Array, name: str, places: Array) -> None:
-    """Make values of a signal missing, and warn of it."""
-    if len(places):
-        warnings.warn(
-            f"tune: {name} is {x[places[0]]:.6g} at sample {places[0]}, more than {ABSURD:.0f} times its usual "
-            f"deviation ({len(places)} such values), and no other signal is near it: they count as missing here. If "
-            f'they are fault codes, give limits={{"{name}": (low, high)}}, to `track` too.',
-            UserWarning,
-            stacklevel=5,
-        )
-        x[places] = np.nan
-
-
 def _warn(search: Search) -> None:
     """Warn of settings that ended at a bound of the search; zero is a valid result."""
     stuck = [
@@ -248,8 +215,25 @@ def _warn(search: Search) -> None:
         )
 
 
+def _of_one(left_out: Decisions) -> LeftOut | Decisions:
+    """The decisions of a single record without its key."""
+    return left_out if len(left_out) > 1 else next(iter(left_out.values()), NOTHING_LEFT_OUT)
+
+
+def _warn_ungated(task: Task, tracker: Tracker) -> None:
+    """Warn of readings that look like codes, all of which were used."""
+    program, at = Program(task.model, tracker), np.zeros(1, int)
+    strange = (
+        record
+        for record in task.records
+        if any(screen(signal, at, np.array([len(record)])).any() for signal in (record.y, *record.u.T))
+    )
+    warn_of_codes("tune", (track_record(program, record) for record in strange))
+
+
 def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any, by: Any) -> Task:
     records = records_of(model, y, u, reading, data, by)[1].for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
+    records, left_out = decide(bound, tracker, records, reading.gate)
     records = records.for_trackers(bound, [tracker])
-    return Task(bound, tuple(replace(records.part(k), time=None) for k in range(len(records.keys))))
+    return Task(bound, tuple(replace(records.part(k), time=None) for k in range(len(records.keys))), left_out or None)

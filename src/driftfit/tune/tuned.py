@@ -10,6 +10,8 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.engine.kernel import Array
+from driftfit.readings.left_out import LeftOut, remarks_of
+from driftfit.run.states.reference import Decisions
 from driftfit.show.parts.axes import BLUE, RED, panels
 from driftfit.show.parts.text import Printed, facts, shortened, table_of
 from driftfit.trackers.base import Tracker
@@ -54,6 +56,8 @@ class Tuned(Printed):
         chi-square quantile. NaN for other methods.
     level : float
         The level of the intervals.
+    left_out : LeftOut, or a mapping from keys to LeftOut
+        What a gate left out for all settings; give it to `track` as ``gate=``. Empty without a gate.
     """
 
     tracker: Tracker
@@ -64,6 +68,7 @@ class Tuned(Printed):
     at_bound: tuple[str, ...]
     interval: dict[str, tuple[float, float]]
     level: float
+    left_out: LeftOut | Decisions
     _search: Search = field(repr=False, compare=False)
 
     @property
@@ -92,6 +97,7 @@ class Tuned(Printed):
             ("Criterion", METHODS[self.method]),
             *([("Log-likelihood", f"{self.loglik:.6g} of {self.used} samples")] if np.isfinite(self.loglik) else []),
             ("Noise variance", f"{self.noise:.4g}"),
+            *remarks_of([self.left_out] if isinstance(self.left_out, LeftOut) else self.left_out.values()),
         )
         ends = (f"[{0.5 - self.level / 2:.3g}", f"{0.5 + self.level / 2:.3g}]")
         table = table_of("Settings", "", "estimate", *ends)

@@ -102,6 +102,14 @@ class Given:
     exclude: Annotated[
         Names, typer.Option(help="Interval to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
     ] = None
+    gate: Annotated[
+        bool | None,
+        typer.Option(
+            "--gate/--no-gate",
+            help="Leave out readings that look like fault codes, or use all. Default: as the tracker asks.",
+            show_default=False,
+        ),
+    ] = None
     start: Annotated[
         Path | None, typer.Option(help="Continue from a saved run (.npz) or live state, with its model and tracker.")
     ] = None
@@ -156,7 +164,7 @@ class Given:
             rows = self.read()
         data: Any = self.file if rows is None else rows.table(self.time, self.by or [])
         signals = {"y": outputs if len(outputs) > 1 else outputs[0], "u": self.inputs, "data": data, "time": self.time}
-        signals |= self.part().restrictions(self.time is not None)
+        signals |= {**self.part().restrictions(self.time is not None), "gate": self.gate}
         units = {**({} if rows is None else rows.units), **parse_units(self.unit)}
         return signals | {"by": self.by or None, "dt": parse_interval(self.dt), "units": units or None}
 
@@ -177,6 +185,8 @@ class Given:
             )
         signals: Any = self.signals(rows)
         more: Any = {} if before is None else {"warm_start": before}
+        if before is not None and self.gate is None:
+            signals["gate"] = before.end().programs[0].gate or False
         with progress.status("tracking"):
             return track(model, tracker or chosen, **signals, **more)
 

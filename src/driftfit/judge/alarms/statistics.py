@@ -13,7 +13,6 @@ import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import plain
-from driftfit.engine.tiles import output_type
 from driftfit.judge.alarms.bootstrap import RECORDS, limits, simulated
 from driftfit.judge.alarms.frozen import Rows, frozen_model
 from driftfit.judge.alarms.onsets import (
@@ -71,7 +70,7 @@ def samples_of(run: Track) -> Samples:
     that are `judgeable`."""
     steps = run.program.steps._replace(store=collect)
     tile = run.fresh()
-    out = np.empty(len(run), output_type(tile, COLLECTED))
+    out = run.program.inspected(tile, len(run), COLLECTED)
     y, u, known = lanes_of(run.record)
     run.program.drivers(steps=steps).run(tile, y, u, known, out)
     noise = np.broadcast_to(run.known.noise, len(run))

@@ -53,6 +53,8 @@ from driftfit.judge.structures.several_outputs import pools_of
 from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
+from driftfit.readings.left_out import remarks_of
+from driftfit.run.states.reference import Decisions, decide
 from driftfit.run.track import records_of
 from driftfit.show.parts.by_output import ByOutput
 from driftfit.show.parts.text import Printed, table_of
@@ -96,6 +98,8 @@ class Selection(Printed):
         error of it.
     scored : int
         Samples in the loglik.
+    left_out : mapping from records to LeftOut
+        What a gate left out for all structures; empty without a gate.
     """
 
     rows: tuple[Row, ...]
@@ -105,6 +109,7 @@ class Selection(Printed):
     structures: tuple[Candidate, ...] = field(repr=False, compare=False)
     predictions: tuple[Predicted, ...] = field(repr=False, compare=False)
     judged: Array = field(repr=False, compare=False)
+    left_out: Decisions = field(default_factory=dict, compare=False)
 
     @property
     def best(self) -> str:
@@ -189,6 +194,8 @@ class Selection(Printed):
         yield Text(f" best: {self.best}")
         yield Text(f" simplest within one standard error: {self.simplest}")
         yield Text(f" on {self.scored} samples that all could predict", "dim")
+        for name, said in remarks_of(self.left_out.values()):
+            yield Text(f" {name.lower()}: {said}", "dim")
 
     def plot(self, most: int = 20, ax: Any = None) -> Figure:
         """Distances from the best structure, with standard errors, and where in time the structures lost.
@@ -239,6 +246,7 @@ def select(
     limits: Any = None,
     exclude: Any = None,
     missing: Any = (),
+    gate: Any = None,
 ) -> Selection | ByOutput[Selection]:
     """Compare structures by predictive likelihood.
 
@@ -255,6 +263,9 @@ def select(
         Estimates their parameters; by default AdaptiveKalman(), and FLS(inf) beside it where structures are columns of
         one regression: their predictions are mixed. Its settings must fit every number of parameters: one
         q, not a vector.
+    gate : bool, `Gate`, decisions of a run or None
+        As for `track`. The gate decides once, by a run of `AdaptiveKalman` on the largest model, and what it leaves out
+        is left out for all structures: ``selection.left_out``, by record.
     keep : names
         Regressors that every subset contains, such as ("intercept",).
     most : int or None
@@ -285,6 +296,8 @@ def select(
     columns = [columns_as_outputs(model, y, data) for model in candidates]
     candidates, y = [model for model, _ in columns], columns[0][1]
     if any(len(model.outputs) > 1 for model in candidates):
+        if gate:
+            raise ValueError("select: gate= is for one output; select for one output after the other.")
         pools = pools_of(candidates, y, u, reading, data, by)
         found = {name: _selected(*pool, tracker, search, beside) for name, pool in pools.items()}
         return found["rows"] if candidates[0].shared else ByOutput(found)
@@ -296,9 +309,10 @@ def select(
     named = max(candidates, key=lambda model: len(model.input_names))
     records = records.for_model(named, reading, max(model.reach for model in candidates))
     bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
+    records, left_out = decide(max(bound, key=lambda model: model.n), tracker, records, gate)
     names = [repr(model) for model in candidates]
     pool, structures = pool_of(bound, names, [replace(records.part(k), time=None) for k in range(len(records.keys))])
-    return _selected(pool, structures, tracker, search, beside)
+    return replace(_selected(pool, structures, tracker, search, beside), left_out=left_out)
 
 
 def _selected(

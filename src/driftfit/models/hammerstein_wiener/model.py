@@ -47,7 +47,6 @@ from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import numbers, output_names, warn, whole
 from driftfit.models.base import Model
-from driftfit.models.fault_codes import absurd
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.curves.settled_thresholds import settled
 from driftfit.models.hammerstein_wiener.evaluate_bases import DIGITS
@@ -56,6 +55,7 @@ from driftfit.models.hammerstein_wiener.run_time_orders import RunTimeOrders
 from driftfit.models.hammerstein_wiener.step_memory import memory, places_of
 from driftfit.models.hammerstein_wiener.steps import applying, build, refusing
 from driftfit.models.inputs import CountedInputs
+from driftfit.readings.screen import suspect
 
 IDENTITY = Polynomial(1)
 FLATTEST = 1e-3
@@ -377,7 +377,7 @@ class HammersteinWiener(CountedInputs):
                 )
             if not (isinstance(basis, Polynomial) and basis.degree > 1):
                 continue
-            values = np.delete(values, absurd(values))  # which say nothing of the unit of the others
+            values = values[~suspect(values)]  # which say nothing of the unit of the others
             size = float(np.sqrt(values @ values / values.size)) if values.size else 0.0
             if size and not 1.0 / UNIT <= size <= UNIT:
                 powers = np.abs(values[:, None] ** [1, basis.degree])

@@ -22,6 +22,8 @@ from driftfit.data.times.instants import instant
 from driftfit.engine.drivers import DRIFT, INTERVAL, NOISE
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.readings.gate import AT_START
+from driftfit.readings.left_out import Tally
 from driftfit.run.columns import SCALARS, Columns
 from driftfit.run.live.alarm import LiveAlarm
 from driftfit.run.live.fixed_lag import Window
@@ -29,6 +31,7 @@ from driftfit.run.live.interventions import HELD
 from driftfit.run.live.late_input import check_applied
 from driftfit.run.live.rule import FROZEN
 from driftfit.run.program import Program, lanes_of
+from driftfit.run.states.gating import AtStart
 from driftfit.run.track import records_of
 from driftfit.trackers.base import Tracker
 
@@ -93,6 +96,7 @@ class Batched(ABC):
     _samples: int
     _windows: list[Window]
     _watching: list[tuple[int, LiveAlarm]]
+    left_out: Tally
 
     @property
     @abstractmethod
@@ -216,15 +220,55 @@ class Batched(ABC):
     def _drive(self, y: Array, u: Array, known: Array, out: Array, time: Any = None) -> None:
         """Drive the tile over rows, of which ``time`` has the times, and let alarms and windows see each of them."""
         if not self._windows and not any(alarm.rule.kind in FROZEN for _, alarm in self._watching):
-            self._loop(self._state_tile(), y, u, known, out)
+            self._judged(y, u, known, out, time)
             for lane, alarm in self._watching:
                 noise = np.broadcast_to(known[:, NOISE, min(lane, known.shape[2] - 1)], len(y))
                 alarm.take_many(out, lane, y[:, lane], noise, time)
             return
         for t in range(len(y)):
             row, own = slice(t, t + 1), known[t : t + 1] if len(known) > 1 else known
-            self._loop(self._state_tile(), y[row], u[row], own, out[row])
+            self._judged(y[row], u[row], own, out[row], None if time is None else time[row])
             self._keep(y[t], out["e"][t], out["s"][t], own[0], None if time is None else instant(time[t]))
+
+    def _judged(self, y: Array, u: Array, known: Array, out: Array, time: Any) -> None:
+        """Drive the tile over rows, and note what a gate leaves out."""
+        if self.programs[0].gate is None:
+            self._loop(self._state_tile(), y, u, known, out)
+            return
+        found: list[tuple[int, AtStart]] = []
+        self._loop(self._state_tile(), y, u, known, out, found_too=found)
+        starts = dict(found)
+        for t in sorted({*np.flatnonzero(out["reason"].any(axis=1)).tolist(), *starts}):
+            at = None if time is None else instant(time[t])
+            for lane in np.flatnonzero(out["reason"][t]).tolist():
+                if out["reason"][t, lane] != AT_START:
+                    self._note(self._samples + t, at, out["reason"].item(t, lane), y.item(t, lane), lane)
+            if t in starts:
+                self._note_start(self._samples + t, at, starts[t])
+        self._samples += len(out)
+
+    def _noting(self, step: Any) -> Any:
+        """The compiled step behind a gate, which notes what the gate leaves out."""
+
+        def noting(tile: Any, y: float, u: Any) -> Any:
+            found = step(tile, y, u)
+            self._samples += 1
+            if not found[3] and (code := self._state_tile()["reason"].item(0, 0)):
+                self._note(self._samples - 1, self._last, code, y)
+            return found
+
+        return noting
+
+    def _note(self, sample: int, time: Any, code: int, y: float, lane: int = 0) -> None:
+        """Count a sample that the gate refused."""
+        name = self.programs[lane].output or "y"
+        self.left_out.add(sample if time is None else time, code, y, name)
+
+    def _note_start(self, sample: int, time: Any, found: AtStart) -> None:
+        """Count the codes that the gate found among the first samples, at the present one."""
+        times = None if time is None else self._clock.moved(time, -found.intervals)
+        for k, (ago, y) in enumerate(zip(found.ago.tolist(), found.value.tolist(), strict=True)):
+            self._note(sample - ago, None if times is None else times[k], AT_START, y)
 
     def _keep(self, y: Array, e: Sequence[float], s: Sequence[float], known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""

@@ -102,8 +102,10 @@ class Live(Operated, Stream):
         self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
         self._undecided = False
         if self._single:
-            self._update = self._stepper()
-            self._undecided = self.programs[0].gate is not None and not bool(tile["gate_decided"][0, 0])
+            self._update = self._look = self._stepper()
+            if self.programs[0].gate is not None:
+                self._update = self._noting(self._look)
+                self._undecided = not bool(tile["gate_decided"][0, 0])
             self._compiled, self._compiled_scratch = as_compiled(tile), as_compiled(self._scratch)  # views
         self._expect(self._awaits)
 
@@ -292,7 +294,7 @@ class Live(Operated, Stream):
         """See whether the gate has judged the first samples, and take the codes that it found out of the state."""
         tile = self._state_tile()
         if tile["gate_replay"][0, 0] > 0:
-            self.program.replay(tile)
+            self._note_start(self._samples - 1, self._last, self.program.replay(tile))
         self._undecided = not bool(tile["gate_decided"][0, 0])
         self._expect(self._awaits)
 
@@ -335,7 +337,7 @@ class Live(Operated, Stream):
         inputs = self._inputs(u) if self._limits is None else self._limits.inputs(self._inputs(u))
         self._put(self._scratch, inputs)
         if self._single:
-            y_hat, _, s, _ = self._update(self._compiled_scratch, np.nan, one_or_all(inputs))
+            y_hat, _, s, _ = self._look(self._compiled_scratch, np.nan, one_or_all(inputs))
         else:
             missing = np.full(len(self.model.outputs), np.nan)
             y_hat, _, s, _ = self._passed(self._scratch, missing, inputs, self.resting)

@@ -17,6 +17,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.engine.tiles import as_compiled
 from driftfit.models.base import Model
+from driftfit.readings.left_out import Tally
 from driftfit.run.live.alarm import LiveAlarm, check_rule
 from driftfit.run.live.batch import Batched
 from driftfit.run.live.fixed_lag import Window
@@ -68,7 +69,8 @@ class Stream(Batched, Plain, storage.Kept):
         self._last: Any = None if before is None else before.last
         self._awaits = NOTHING if before is None else before.awaits
         self._cold = before is None
-        self._samples = self._ignored = 0
+        self._ignored = self._samples = 0
+        self.left_out = Tally()
         self._place: Any = None
         self._windows: list[Window] = []
         self._watching: list[tuple[int, LiveAlarm]] = []
@@ -220,6 +222,7 @@ class Stream(Batched, Plain, storage.Kept):
             "last": self._last, "samples": self._samples, "ignored": self._ignored, "lag": self.lag,
             "awaits": self._awaits, "cold": self._cold, "windows": tuple(window.plain() for window in self._windows),
             "alarms": tuple([lane, alarm.plain()] for lane, alarm in self._watching),
+            "left_out": self.left_out.plain(),
         }  # fmt: skip
         tile = self._state_tile()
         return written(self.programs, [one.pack(tile, lane) for lane, one in enumerate(self.programs)], extra)
@@ -244,22 +247,18 @@ class Stream(Batched, Plain, storage.Kept):
         limits, outside = extra["limits"] or ([], [])
         make: Any = cls
         clock = Clock.of(extra["dt"], extra["zone"])
-        gate = gate_from(header)
+        gate = gate_from(header) or False
         live: Self = make(model, by_output(model, trackers), clock, extra["lag"], limits=dict(limits), gate=gate)
         if live._limits is not None:
             live._limits.restore(outside)
         live._last, live._cold = extra["last"], extra["cold"]
         live._samples, live._ignored = extra["samples"], extra["ignored"]
+        live.left_out.restore(extra["left_out"])
         for window, state in zip(live._windows, extra["windows"], strict=True):
             window.restore(state)
         live._watching = [
             (lane, LiveAlarm.of(state, trackers[lane], live.programs[lane].names)) for lane, state in extra["alarms"]
         ]
-        if "fields" in header:
-            restore(source, live.programs, header, arrays, live._state_tile())
-        else:  # an .npz of arrays, as states were written before they were packed
-            fields = {name: live._state_tile()[name][0] for name in storage.fields(live._state_tile())}
-            several = len(model.outputs) > 1
-            storage.restore(source, trackers[0], arrays, "state_", fields if several else state_of(live._state_tile()))
+        restore(source, live.programs, header, arrays, live._state_tile())
         live._expect(extra["awaits"])
         return live

@@ -49,6 +49,16 @@ class Advanced:
             first, length = self.records.first[series], self.records.length[series]
             _natural(words, np.concatenate(begin), lanes, first, length, output, into)
 
+    def reasons(self) -> Array:
+        """What the gate decided of every sample, (N,), of series with one output (`driftfit.readings.gate`)."""
+        into = np.zeros(len(self.records.y), int)
+        for job in self.jobs:
+            for lane in np.flatnonzero(job.live).tolist():
+                k = job.lanes[lane]
+                first, length = self.records.first[k], self.records.length[k]
+                into[first : first + length] = job.out["reason"][:length, lane]
+        return into
+
     @cached_property
     def lanes(self) -> Lanes:
         """The lane of each program."""

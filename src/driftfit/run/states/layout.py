@@ -7,7 +7,7 @@ matrix (words, lanes) with the same rows. The words of the fields that a tracker
 A packed state is, with all numbers little-endian,
 
     bytes  0 .. 3     "DFst"
-           4, 5       format, 1
+           4, 5       format, 2
            6, 7       1 if only the words that are not 0 are stored, after a bit for each word; otherwise 0
            8 .. 11    CRC-32 of all that follows
           12 .. 19    fingerprint of model, tracker and layout (`Layout.tag`)
@@ -31,9 +31,10 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.data import storage
 from driftfit.engine.kernel import Array
 
-MAGIC, FORMAT = b"DFst", 1
+MAGIC, FORMAT = b"DFst", 2
 HEAD = Struct("<4sHHI8sI")
 CHECKED = 12
 """The first byte that the CRC covers."""
@@ -106,11 +107,12 @@ class Layout:
         words_of(tile)[self.rows(tile)[:, None], lanes] = words.reshape(-1, self.size).T
 
     def field(self, words: Array, name: str) -> Array:
-        """A field of numbers of states (.., W), as (.., k)."""
+        """A field of states (.., W), as (.., k)."""
         at = 0
-        for one, (_, shape) in self.shapes.items():
+        for one, (kind, shape) in self.shapes.items():
             if one == name:
-                return np.ascontiguousarray(words[..., at : at + prod(shape)]).view(np.float64)
+                found = np.ascontiguousarray(words[..., at : at + prod(shape)])
+                return found if kind == "i" else found.view(np.float64)
             at += prod(shape)
         raise KeyError(name)
 
@@ -123,9 +125,9 @@ class Layout:
         tag, words = unpacked(data)
         if tag != self.tag or len(words) != self.size:
             raise ValueError(
-                f"the bytes hold a state of another model, tracker, setting or version: their fingerprint is "
-                f"{tag.hex()}, that of {self.owner} is {self.tag.hex()}. Use the model and tracker with which they "
-                "were made, or carry the state over field by field with warm_start=."
+                f"the bytes hold a state of another model, tracker, gate, setting or version: their fingerprint is "
+                f"{tag.hex()}, that of {self.owner} is {self.tag.hex()}. Use the model, tracker and gate with which "
+                "they were made, or carry the state over field by field with warm_start=."
             )
         return words
 
@@ -149,6 +151,8 @@ def unpacked(data: bytes) -> tuple[bytes, Array]:
     _, version, sparse, check, tag, count = HEAD.unpack_from(data)
     if version > FORMAT:
         raise ValueError(f"the state was packed by a newer driftfit (format {version}); this one reads {FORMAT}.")
+    if version < FORMAT:
+        raise ValueError(f"the state was packed by an older driftfit (format {version}), {storage.REMEDY}.")
     if zlib.crc32(memoryview(data)[CHECKED:]) != check or sparse > 1:
         raise ValueError("the packed state is damaged: its check sum does not fit its content.")
     if not sparse:

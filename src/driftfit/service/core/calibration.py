@@ -17,7 +17,9 @@ def rules_of(settings: UnitSettings, rows: Array) -> dict[str, Any]:
     rules, refused = [], {}
     try:
         time = None if settings.time is None else rows[:, 0]
-        run = track(settings.model, settings.tracker, rows[:, 1], rows[:, 2:], time=time, dt=settings.dt)
+        run = track(
+            settings.model, settings.tracker, rows[:, 1], rows[:, 2:], time=time, dt=settings.dt, gate=settings.gate
+        )
     except Exception as error:
         return {"do": "calibrated", "rules": [], "refused": dict.fromkeys(alarm.on, str(error))}
     for kind in alarm.on:

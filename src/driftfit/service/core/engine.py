@@ -376,4 +376,5 @@ class Engine:
             "reasons": [f"{unit}: {what} ({why})" for unit, found in shown.items() for what, why in found.items()]
             + [f"{len(trouble) - TROUBLED} more units"] * (len(trouble) > TROUBLED),
             "dirty": len(self._dirty), "recovered": self.recovered, "positions": dict(self.positions),
+            "left_out": self.units.left_out,
         }  # fmt: skip

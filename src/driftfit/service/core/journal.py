@@ -63,9 +63,17 @@ create table if not exists evicted (unit integer primary key);
 """
 log = logging.getLogger("driftfit.service")
 PRAGMAS = ("page_size=8192", "journal_mode=wal", "synchronous=full", "wal_autocheckpoint=2000", "temp_store=memory")
-FORMAT = "3"
+FORMAT, OLDER = "3", "2"
+REMEDY = "driftfit serve FILE --rebuild computes the states again from the journal"
 RESULTS_FROM, NEEDED_FROM, HEAD = "results from", "needed from", "head"
 """Keys of ``meta``: of `Journal.first_without_results`, `Journal.first_needed` and `Journal.head`."""
+CARRIED = {
+    "meta": ("meta", "*"), "unit": ("unit", "*"), "log": ("log", "*"), "result": ("result", "*"),
+    "block": ("block", "unit, first, last, start, stop, count, extremes"),
+    "history": ("block", "unit, first, last, count, rows"), "event": ("event", "number, unit, at, kind, detail"),
+    "position": ("position", "*"),
+}  # fmt: skip
+"""What `OLDER` journals hold of the present tables: (their table, its columns)."""
 NAME = "driftfit.db"
 
 
@@ -157,7 +165,7 @@ def linked(before: bytes, group: Sequence[Any]) -> bytes:
 class Journal:
     """The database, opened by the one process that writes it."""
 
-    def __init__(self, folder: Path, read_only: bool = False) -> None:
+    def __init__(self, folder: Path, read_only: bool = False, rebuild: bool = False) -> None:
         self.path = folder / NAME
         if read_only:
             uri = f"{self.path.resolve().as_uri()}?mode=ro"
@@ -168,12 +176,50 @@ class Journal:
         self.path.chmod(0o600)
         for line in PRAGMAS:
             self.db.execute(f"pragma {line}")
-        self.db.executescript(SCHEMA)
-        row = self.db.execute("select value from meta where key = 'format'").fetchone()
-        if row is None:
-            self.db.execute("insert into meta values (?, ?, ?)", ("format", FORMAT, sum_of("format", FORMAT)))
-        elif row[0] != FORMAT:
+        row = self.db.execute("select value from meta where key = 'format'").fetchone() if self._has("meta") else None
+        if row is not None and row[0] not in (FORMAT, OLDER):
             raise ValueError(f"{self.path} has the format {row[0]}; this version reads {FORMAT}. Use another folder.")
+        if row == (OLDER,) and not rebuild:
+            raise ValueError(f"{self.path} was written by an older driftfit; {REMEDY}.")
+        if row == (OLDER,):
+            self._carry_over()
+        self.db.executescript(SCHEMA)
+        if row is None:
+            self._put("meta", ("format", FORMAT))
+        if rebuild:
+            self._forget_states()
+
+    def _has(self, table: str) -> bool:
+        return self.db.execute("select 1 from sqlite_master where name = ?", (table,)).fetchone() is not None
+
+    def _put(self, table: str, row: Sequence[Any]) -> None:
+        self.db.execute(f"insert or replace into {table} values ({'?, ' * len(row)}?)", (*row, sum_of(*row)))
+
+    def _carry_over(self) -> None:
+        """Write the tables of the older format, whose rows have no sums, in the present one."""
+        self.db.execute("begin immediate")
+        old = sorted({source for source, _ in CARRIED.values()} | {"program", "snapshot"})
+        for table in old:
+            self.db.execute(f"alter table {table} rename to old_{table}")
+        self.db.execute("drop index if exists event_of_unit")
+        for statement in filter(str.strip, SCHEMA.split(";")):
+            self.db.execute(statement)
+        for table, (source, columns) in CARRIED.items():
+            for row in self.db.execute(f"select {columns} from old_{source}").fetchall():
+                self._put(table, row)
+        self._put("meta", ("format", FORMAT))
+        for table in old:
+            self.db.execute(f"drop table old_{table}")
+        self.db.execute("commit")
+
+    def _forget_states(self) -> None:
+        """Forget all states, so that they are computed again from the samples that the log still has."""
+        oldest = self.db.execute("select coalesce(min(first), 1) from log").fetchone()[0]
+        self.db.execute("begin immediate")
+        for table in ("snapshot", "program"):
+            self.db.execute(f"delete from {table}")
+        self._put("meta", (NEEDED_FROM, str(oldest)))
+        self.db.execute("commit")
 
     def close(self) -> None:
         self.db.close()

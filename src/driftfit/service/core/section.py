@@ -20,6 +20,9 @@ from driftfit.data.known import Known
 from driftfit.data.record import Records
 from driftfit.engine.drivers import INTERVAL, NOISE
 from driftfit.engine.kernel import Array
+from driftfit.readings.gate import AT_START
+from driftfit.readings.gate import USED as USED_READING
+from driftfit.readings.remarks import SAID
 from driftfit.run.live.interventions import HELD
 from driftfit.run.live.rule import FROZEN
 from driftfit.run.parallel_lanes import FEWEST
@@ -56,6 +59,8 @@ class Section:
         self.streams = Streams(index, settings)
         self.units: dict[int, Unit] = {}
         """By their places."""
+        self.left_out: Counter[str] = Counter()
+        """What the gates left out since the service began, by reason."""
         self.blocks = Blocks(THETA + 2 * self.streams.program.model.n)
 
     def add(self, number: int, name: str) -> Unit:
@@ -165,10 +170,31 @@ class Section:
                 part = slice(a, b)
                 self._run(places[part], None if time is None else time[part], values[part], number[part], out)
             return
+        refused = self._refused_before(own)
         self.streams.words[own], self.streams.begun[own] = found.states(), True
+        if self.streams.program.gate is not None:
+            self._count_refused(found, places, own, self._refused_before(own) - refused)
         if time is not None:
             self.streams.last[own] = time[first + length - 1]
         self._tell(found, Rows(self.streams.index, places, time, values), known[:, NOISE], number, out)
+
+    def _refused_before(self, own: Array) -> Array:
+        """How many first samples of units (K,) their gates refused."""
+        if self.streams.program.gate is None:
+            return np.zeros(len(own), int)
+        words = self.streams.program.layout.field(self.streams.words[own], "gate_refused")[:, 0]
+        return np.where(self.streams.begun[own], words, 0)
+
+    def _count_refused(self, found: Advanced, places: Array, own: Array, first: Array) -> None:
+        """Count what gates left out, by reason: samples at ``places`` (N,), and ``first`` samples of units (K,)."""
+        reason = found.reasons()
+        for k in np.flatnonzero((reason != USED_READING) & (reason != AT_START)).tolist():
+            self._count(places[k], reason.item(k), 1)
+        for k in np.flatnonzero(first > 0).tolist():
+            self._count(own[k], AT_START, first.item(k))
+
+    def _count(self, place: int, code: int, count: int) -> None:
+        tally((self.units[place].rare, self.left_out), SAID[code][0].lower(), count)
 
     def _known(self, places: Array, own: Array, first: Array, time: Array | None) -> Array:
         """What is known of the samples (N, 3), or of all of them (1, 3)."""

@@ -14,10 +14,12 @@ from driftfit.data.clock import Clock
 from driftfit.data.storage import describe, rebuild
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.readings.gate import Gate
 from driftfit.run.program import Program, programs_of, state_of
 from driftfit.run.states.late import HoldBack
 from driftfit.run.states.layout import unpacked
 from driftfit.run.warm_start import End
+from driftfit.service.core.journal import REMEDY
 from driftfit.service.settings.config import UnitSettings
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
@@ -47,7 +49,7 @@ class Streams:
 
     def __init__(self, index: int, settings: UnitSettings) -> None:
         self.index, self.settings = index, settings
-        (self.program,) = programs_of(settings.model, settings.tracker, settings.model.m)
+        (self.program,) = programs_of(settings.model, settings.tracker, settings.model.m, settings.gate)
         self.clock = Clock.of(settings.dt)
         width = len(settings.columns)
         self.count = 0
@@ -112,7 +114,7 @@ class Streams:
             tile, last = self.program.tile(), float(self.last[place])
             self.program.layout.put(tile, 0, self.words[place])
             before = End((self.program,), (state_of(tile),), None if math.isnan(last) else last)
-        live = Live(settings.model, settings.tracker, dt=settings.dt, warm_start=before)
+        live = Live(settings.model, settings.tracker, dt=settings.dt, warm_start=before, gate=settings.gate)
         live.hold(bool(self.held[place]))
         return live
 
@@ -131,7 +133,9 @@ class Streams:
     @cached_property
     def about(self) -> tuple[bytes, str]:
         """(the fingerprint of states, what made them)."""
+        gate = self.program.gate
         described = {"model": describe(self.settings.model), "tracker": describe(self.settings.tracker)}
+        described["gate"] = {} if gate is None else gate.settings()
         return self.program.layout.tag, json.dumps(described)
 
     def packed(self, place: int) -> list[Any]:
@@ -155,8 +159,11 @@ class Streams:
             self.words[place] = self.program.layout.unpack(state)
         else:
             made = json.loads(programs[tag])
-            old = Program(rebuild(made["model"], Model), rebuild(made["tracker"], Tracker))
-            end = End((old,), (state_of(old.unpack(state)),), None)
-            live = Live(self.settings.model, self.settings.tracker, dt=self.settings.dt, warm_start=end)
+            gate = Gate.from_settings(made["gate"]) if made["gate"] else None
+            old = Program(rebuild(made["model"], Model), rebuild(made["tracker"], Tracker), gate=gate)
+            if gate != self.program.gate:
+                raise ValueError(f"it was made with gate={gate!r}, not {self.program.gate!r}; {REMEDY}.")
+            end, settings = End((old,), (state_of(old.unpack(state)),), None), self.settings
+            live = Live(settings.model, settings.tracker, dt=settings.dt, warm_start=end, gate=settings.gate)
             self.continue_from(place, live)
         self.begun[place] = True

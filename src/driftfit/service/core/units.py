@@ -128,6 +128,11 @@ class Units:
         return len(self._known)
 
     @property
+    def left_out(self) -> dict[str, int]:
+        """What the gates of all units left out since the service began, by reason."""
+        return dict(sum((section.left_out for section in self.sections), Counter()))
+
+    @property
     def resident(self) -> list[Unit]:
         """The units in memory."""
         return list(self._units.values())
@@ -267,7 +272,7 @@ class Units:
         settings = made.settings
         about = {"names": made.streams.program.names, "y": settings.y, "u": settings.u,
                  "parts": settings.match.match(topic), "model": repr(settings.model),
-                 "tracker": repr(settings.tracker)}  # fmt: skip
+                 "tracker": repr(settings.tracker), "gate": settings.gate}  # fmt: skip
         pending.units.append((unit, name, section, topic, born, msgspec.json.encode(about).decode()))
         self._known[unit], self.names[name], self._units[unit] = (name, section), unit, made
         self.since[unit] = born

@@ -34,6 +34,8 @@ def _lines(feed: Feed, viewers: int) -> Iterator[str]:
     yield from _many("driftfit_latency_seconds", "gauge", "From arrival to result, of recent batches.", latency)
     refused = {f'reason="{_label(why)}"': count for why, count in status.get("refused", {}).items()}
     yield from _many("driftfit_refused_total", "counter", "What was refused, by reason.", refused)
+    left_out = {f'reason="{_label(why)}"': count for why, count in status.get("left_out", {}).items()}
+    yield from _many("driftfit_left_out_total", "counter", "Samples that gates left out, by reason.", left_out)
     for what in ("source", "sink"):
         runners: dict[str, Any] = status.get(f"{what}s", {})
         up = {f'{what}="{_label(name)}"': int(one["state"] == "running") for name, one in runners.items()}

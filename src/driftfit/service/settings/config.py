@@ -79,6 +79,8 @@ class UnitSettings:
     """Seconds that a time may be ahead of both the newest of its unit and the clock of this machine."""
     rate: float = 10_000.0
     """Samples a second that one unit may send, on average over ten seconds."""
+    gate: bool = True
+    """Whether readings are judged before they are used."""
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -87,7 +89,7 @@ class UnitSettings:
 
     def live(self) -> Live:
         """A new stream."""
-        return Live(self.model, self.tracker, dt=self.dt)
+        return Live(self.model, self.tracker, dt=self.dt, gate=self.gate)
 
 
 @dataclass(frozen=True)
@@ -196,7 +198,7 @@ class _Reader:
     def unit(self, k: int) -> UnitSettings:
         given = dict(self.tables("unit")[k])
         known = ["match", "name", "y", "u", "time", "time_unit", "dt", "model", "tracker", "limits", "alarm",
-                 "hold_back", "ahead", "rate"]  # fmt: skip
+                 "hold_back", "ahead", "rate", "gate"]  # fmt: skip
         for key in given:
             if key not in known:
                 raise KeyProblemError((key,), f"unit has no setting {key!r}; {near(key, known)}")
@@ -223,6 +225,7 @@ class _Reader:
             at("alarm", lambda: _alarm(given.get("alarm"), dt)),
             at("ahead", lambda: _seconds("ahead", given.get("ahead", 300.0))),
             at("rate", lambda: _positive("rate", given.get("rate", 10_000.0))),
+            at("gate", lambda: _gate(given.get("gate", True))),
         )  # fmt: skip
         if settings.time is None and (settings.hold_back or dt is not None):
             raise KeyProblemError(
@@ -250,6 +253,13 @@ def at(key: str, make: Callable[[], Made]) -> Made:
         return make()
     except (ValueError, TypeError) as error:
         raise KeyProblemError((key,), f"{key}: {error}") from None
+
+
+def _gate(given: Any) -> bool:
+    """Whether there is a gate."""
+    if not isinstance(given, bool):
+        raise ValueError(f"gate must be true or false; got {given!r}.")
+    return given
 
 
 def _dt(given: Any) -> float | None:

@@ -185,7 +185,7 @@ def judgeable(fields: Any, lane: int, y: Array, noise: Array) -> Array:
 
     A tracker refuses readings that contradict all before, or repeat the last one, since it would lose its estimate. An
     alarm that left them out would never report a sensor that fails again and again; its scores are bounded. Where a
-    model refused a reading (`driftfit.models.fault_codes`), y is -0, and none is left.
+    gate refused a reading, y is -0, and none is left.
     """
     ok, valid, observed = (fields[name][..., lane] > 0.0 for name in ("ok", "valid", "observed"))
     refused = (fields["y"][..., lane] == 0.0) & np.signbit(fields["y"][..., lane])

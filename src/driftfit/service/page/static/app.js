@@ -194,7 +194,7 @@ const described = ({ about, now, state: it }) => {
   if (it.unarmed === null) make("span", "finding limits", badges, "pill");
   for (const [kind, why] of Object.entries(it.unarmed ?? {})) make("span", `alarm ${kind} is not armed: ${why}`, badges, "pill bad");
   const counts = Object.entries(it.counts ?? {}).map(([what, n]) => `${n.toLocaleString()} ${what}`).join(", ");
-  at("model").textContent = `${about.model}, ${about.tracker}. ${counts}.`;
+  at("model").textContent = `${about.model}, ${about.tracker}, ${about.gate ? "with" : "without"} a gate. ${counts}.`;
   for (const kind of ["csv", "arrow"]) {
     at(kind).href = `/api/export?unit=${encodeURIComponent(state.unit)}&format=${kind}${span()}`;
   }

@@ -1,0 +1,137 @@
+"""The gate wherever a tracker runs: what is said of it, saved with it, and decided for many."""
+
+import numpy as np
+import pytest
+
+from driftfit import ARX, DataWarning, Gate, Kalman, Live, Outputs, Track, grid, select, track, tune
+from driftfit.readings.left_out import KEPT
+
+PLANT, TRACKER = ARX(1, 1), Kalman(q=1e-6, r=1e-4)
+
+
+def plant(T=200, codes=()):
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal(T), np.zeros(T)
+    for t in range(1, T):
+        y[t] = 0.8 * y[t - 1] + u[t - 1] + 0.01 * rng.standard_normal()
+    y[list(codes)] = 9999.0
+    return y, u
+
+
+def test_what_was_left_out_is_a_table():
+    run = track(PLANT, TRACKER, *plant(codes=[5, 100]), gate=True)
+    lines = str(run.left_out).splitlines()
+    assert [line.split()[:3] for line in lines[1:]] == [["5", "y", "9999"], ["100", "y", "9999"]]
+    assert str(track(PLANT, TRACKER, *plant(), gate=True).left_out) == "nothing left out"
+
+
+@pytest.mark.parametrize("way", ["update", "update_many"])
+def test_a_stream_counts_what_it_left_out_and_keeps_the_last(way):
+    y, u = plant(codes=[5, *range(40, 200, 8)])
+    run, live = track(PLANT, TRACKER, y, u, gate=True), Live(PLANT, TRACKER, gate=True)
+    if way == "update":
+        for t in range(200):
+            live.update(y[t], u[t])
+    else:
+        for part in (slice(0, 11), slice(11, 90), slice(90, 200)):
+            live.update_many(y[part], u[part])
+    assert live.left_out.counts == run.left_out.counts
+    assert live.left_out.last == tuple(run.left_out)[-KEPT:]
+    again = Live.from_bytes(live.to_bytes())
+    assert (again.left_out.counts, again.left_out.last) == (live.left_out.counts, live.left_out.last)
+
+
+def test_decisions_of_a_stream_with_times_have_them():
+    y, u = plant(codes=[5, 100])
+    live = Live(PLANT, TRACKER, gate=True)
+    for t in range(200):
+        live.update(y[t], u[t], 1000.0 + t)
+    assert [one.sample for one in live.left_out] == [1005.0, 1100.0]
+
+
+def test_smoothers_covariances_and_likelihood_take_the_decisions():
+    y, u = plant(codes=[5, 100])
+    run = track(PLANT, TRACKER, y, u, gate=True)
+    missing = track(PLANT, TRACKER, np.where(y == 9999.0, np.nan, y), u)
+    assert run.loglik == pytest.approx(missing.loglik, rel=1e-12)
+    np.testing.assert_allclose(run.smooth().theta, missing.smooth().theta, rtol=1e-9)
+    np.testing.assert_array_equal(run.cov(-1), missing.cov(-1))
+    np.testing.assert_array_equal(run.ok[20:], missing.ok[20:])
+
+
+def test_a_gate_is_saved_with_results_and_states(tmp_path):
+    y, u = plant(codes=[100])
+    gate = Gate(far=12.0)
+    run = track(PLANT, TRACKER, y, u, gate=gate)
+    run.save(tmp_path / "run")
+    loaded = Track.load(tmp_path / "run")
+    assert loaded.program.gate == gate
+    assert list(loaded.left_out) == list(run.left_out)
+    fleet = track(PLANT, TRACKER, np.stack([y, y]), np.stack([u, u]), by="row", gate=gate)
+    fleet.save(tmp_path / "fleet")
+    assert list(type(fleet).load(tmp_path / "fleet")[1].left_out) == list(run.left_out)
+    live = Live(PLANT, TRACKER, warm_start=run, gate=gate)
+    assert Live.from_bytes(live.to_bytes()).programs[0].gate == gate
+    with pytest.raises(ValueError, match="gate of the earlier run"):
+        Live(PLANT, TRACKER, warm_start=run, gate=True)
+    with pytest.raises(ValueError, match="another model, tracker, gate"):
+        track(PLANT, TRACKER, y, u, gate=True).program.unpack(run.program.pack(run.program.tile()))
+
+
+def test_every_output_has_a_gate():
+    y, u = plant()
+    other = plant(codes=[100])[0]
+    run = track(ARX(1, 1, ny=2), TRACKER, np.column_stack([y, other]), u, gate=True)
+    assert isinstance(run, Outputs)
+    assert [len(run[name].left_out) for name in run.outputs] == [0, 1]
+    assert (~run.ok[101:]).sum() == 0
+
+
+def test_off_is_said_once_with_the_values_and_the_remedy():
+    y, u = plant(codes=[100, 150])
+    with pytest.warns(DataWarning, match=r"^track: y: 2 values look like fault codes \(9999\)\. .*gate=True") as said:
+        track(PLANT, TRACKER, y, u)
+    assert len(said) == 1
+    clean, strange = plant()[0], u.copy()
+    strange[60] = -9999.0
+    with pytest.warns(DataWarning, match=r"y: 2 values .*\(9999\); u: 1 value looks .*\(-9999\)") as said:
+        track(PLANT, TRACKER, np.stack([y, clean, clean]), np.stack([u, u, strange]), by="row")
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize("what", ["nothing", "jump", "pulse"])
+def test_what_is_no_code_is_not_warned_of(what):
+    y, u = plant()
+    if what == "jump":
+        y[100:] += 1000.0
+    if what == "pulse":
+        u[100] = 1000.0
+        for t in range(1, 200):
+            y[t] = 0.8 * y[t - 1] + u[t - 1]
+    track(PLANT, TRACKER, y, u)
+
+
+def test_tuning_takes_the_decisions_of_one_reference_run():
+    """Settings are compared on the same readings, and the final run has the likelihood that was found."""
+    y, u = plant(codes=[5, 100, 150])
+    tuned = tune(PLANT, Kalman(), y, u, gate=True)
+    assert tuned.left_out.sample.tolist() == [5, 100, 150]
+    run = track(PLANT, tuned.tracker, y, u, gate=tuned.left_out)
+    assert run.loglik == pytest.approx(tuned.loglik, rel=1e-9)
+    missing = tune(PLANT, Kalman(), np.where(y == 9999.0, np.nan, y), u)
+    assert tuned.noise == pytest.approx(missing.noise, rel=1e-6)
+    assert "2 samples far outside" in str(tuned)
+
+
+def test_tuning_without_a_gate_uses_every_reading_and_says_so():
+    with pytest.warns(UserWarning, match="tune: ") as said:
+        assert tune(PLANT, Kalman(), *plant(codes=[100])).noise > 1.0
+    assert sum("y: 1 value looks like a fault code (9999)" in str(one.message) for one in said) == 1
+
+
+def test_structures_are_compared_on_the_same_readings():
+    y, u = plant(codes=[100])
+    found = select(grid(ARX, na=[1, 2], nb=[1]), y, u, gate=True)
+    assert [one.sample.tolist() for one in found.left_out.values()] == [[100]]
+    assert found.simplest.startswith("ARX(na=1")
+    assert "left out: 1 sample far" in str(found)
