@@ -1,8 +1,9 @@
 """Fault codes among the first samples, before there is anything with which they could be compared.
 
 The signals of the first samples are kept, and judged together when there are ``first`` + n of them. Samples that repeat
-the one before are kept once, with their number, and while the record has shown one reading only, the oldest sample
-makes room for the newest: a plant at rest, and a run of codes at the start, are judged when something happens. A
+the one before are kept once, with their number, and while the record begins with so many equal readings that they and
+the samples of which they are lags are half of all, the oldest makes room for the newest: a plant at rest, and a run of
+codes at the start, are judged when something happens. A
 value is outlying if it is `OUTLYING` usual distances from the median, the usual distance being the median of those that
 are not 0. A sample is doubtful if
 
@@ -207,6 +208,14 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
         return same
 
     @kernel
+    def at_rest(s: State, l: int) -> bool:
+        """Whether the first samples repeat one reading too often to be judged."""
+        equal = 1
+        while (equal < N) and (s.gate_first[equal, READING, l] == s.gate_first[0, READING, l]):
+            equal += 1
+        return (equal > 1) & (2 * (equal + n) >= N)
+
+    @kernel
     def drop_oldest(s: State, l: int) -> None:
         for k in range(1, N):
             for column in range(U + m + n):
@@ -236,7 +245,7 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
             drop_oldest(s, l)
         keep(s, s.gate_kept[l], 1.0, l)
         s.gate_kept[l] += 1
-        if (s.gate_kept[l] == N) & (s.gate_first[0, READING, l] != s.gate_first[1, READING, l]):
+        if s.gate_kept[l] == N and not at_rest(s, l):
             decide(s, l)
 
     @kernel
