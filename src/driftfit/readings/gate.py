@@ -26,7 +26,7 @@ sample: some forty operations, and O(n + m).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -188,15 +188,19 @@ def output_rule(gate: Gate) -> Step:
     return judge  # type: ignore[no-any-return]
 
 
-def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None]) -> Step:
+def gate_step(
+    gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False
+) -> Step:
     """The gate of a model with n parameters and m inputs, of which it remembers ``ages`` samples besides the present.
 
     ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
-    memory.
+    memory. y_hat of an ``implicit`` model, whose regressors contain the reading, is no forecast of it: a code would be as
+    large as predicted. There y is compared with v alone.
     """
     remember = first_samples(gate.first, n, m, ages)
     notice, blame = input_rules(gate, m, ages, refuse)
-    hold_frozen, judge = frozen_rule(gate.frozen, gate.natural), output_rule(gate)
+    judge = output_rule(replace(gate, rare=np.inf) if implicit else gate)
+    hold_frozen = frozen_rule(gate.frozen, gate.natural)
     resolve = resolution(gate.coarse)
     sure, rare, longest = float(gate.sure) ** 2, float(gate.rare) ** 2, LONGER * gate.hold
 
