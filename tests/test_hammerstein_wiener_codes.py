@@ -19,8 +19,12 @@ def record(seed, u=None):
     return LEVEL + 2.7 * np.where(x > 0.0, 0.7 * x, x), u
 
 
+def gated(*given):
+    return track(*given, gate=True)
+
+
 def error(tracker, y, u, after, truth):
-    run = track(PLANT, tracker, y, u)
+    run = gated(PLANT, tracker, y, u)
     return run, np.sqrt(np.nanmean((run.prediction - truth)[after : after + 200] ** 2))
 
 
@@ -36,7 +40,7 @@ def test_a_code_in_the_output_is_no_part_of_its_curve(tracker, code, at):
         run, wrong = error(tracker, codes, u, max(at) + 4, y)
         _, missing = error(tracker, gaps, u, max(at) + 4, y)
         found.append(wrong < 1.5 * missing)
-        assert run.state["refused"] <= len(at) + 1
+        assert len(run.left_out) <= len(at) + 1
     assert sum(found) >= 2
 
 
@@ -46,17 +50,17 @@ def test_responses_to_large_inputs_and_new_levels_are_learned():
     pulses = np.where(rng.random(600) < 0.02, 20.0, 0.0) + 0.1 * rng.normal(size=600)
     for y, u in (record(1, pulses), record(2)):
         stepped = y + np.where(np.arange(600) > 400, 150.0, 0.0)
-        assert track(PLANT, RLS(1.0), y, u).state["refused"] <= 3
-        assert track(PLANT, RLS(1.0), stepped, u).ok[410:].mean() > 0.97
+        assert len(gated(PLANT, RLS(1.0), y, u).left_out) <= 3
+        assert gated(PLANT, RLS(1.0), stepped, u).ok[410:].mean() > 0.97
 
 
 def test_minimal_parameters_and_the_likelihood_of_a_single_knot():
     y, u = record(3)
     y[[300, 301]] = -999.0
-    run = track(PLANT, ExtendedKalman(q=1e-7, r=0.02, theta0=0.3), y, u)
-    assert run.state["refused"] == 2
+    run = gated(PLANT, ExtendedKalman(q=1e-7, r=0.02, theta0=0.3), y, u)
+    assert len(run.left_out) == 2
     assert np.isfinite(run.loglik)
-    assert any(name == "Refused" for name, _ in run.summary().remarks)
+    assert any(name == "Left out" for name, _ in run.summary().remarks)
 
 
 @pytest.mark.parametrize("signal", ["y", "u"])
@@ -69,8 +73,7 @@ def test_a_code_does_not_mislead_the_filter_of_minimal_parameters(signal, output
         codes, gaps = {"y": y.copy(), "u": u.copy()}, {"y": y.copy(), "u": u.copy()}
         for at, code in (([100], -999.0), ([200, 201, 202], 9999.0), ([350], 0.0 if signal == "y" else 30.0)):
             codes[signal][at], gaps[signal][at] = code, np.nan
-        run, missing = (track(plant, tracker, record["y"], record["u"]) for record in (codes, gaps))
+        run, missing = (gated(plant, tracker, record["y"], record["u"]) for record in (codes, gaps))
         wrong, least = (np.sqrt(np.nanmean((one.prediction - y)[360:] ** 2)) for one in (run, missing))
         assert wrong < 1.2 * least
-        assert (run.state["inputs_out"] > 0) == (signal == "u")
-        assert any(name == ("Refused" if signal == "y" else "Inputs left out") for name, _ in run.summary().remarks)
+        assert any(name == ("Left out" if signal == "y" else "Inputs left out") for name, _ in run.summary().remarks)

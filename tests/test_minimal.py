@@ -410,12 +410,12 @@ def test_a_free_run_has_the_unit_of_the_output():
 
 
 @pytest.mark.filterwarnings("ignore:[yu] has a root mean square")
-def test_the_extended_filter_refuses_a_fault_code():
+def test_the_extended_filter_sees_no_fault_code_behind_a_gate():
     """One reading of 9999 took every parameter to where no sample brought it back."""
     s = record(400, noise=0.01)
     ekf = ExtendedKalman(q=1e-6, r=1e-3, p0=0.1, theta0=s.xi[0] + 0.05)
     y = s.y.copy()
     y[200] = 9999.0
-    run, whole = track(SMALL, ekf, y, s.u), track(SMALL, ekf, s.y, s.u)
+    run, whole = (track(SMALL, ekf, one, s.u, gate=True) for one in (y, s.y))
     assert np.abs(run.theta - whole.theta)[220:].max() < 0.02
-    assert "1 readings out of all proportion" in str(run.summary())
+    assert run.left_out.sample.tolist() == [200]

@@ -327,12 +327,11 @@ def test_readings_are_judged_and_not_what_a_shift_leaves_of_them():
     y = 20.0 + signal.lfilter([0.0, 0.5], [1.0, -0.8], u) + 0.05 * rng.normal(size=600)
     model = BoxJenkins(offset=True)
     coarse = track(model, AdaptiveKalman(), 0.5 * np.round(y / 0.5), u).state
-    assert coarse["quantum"] == pytest.approx(0.5)
-    assert coarse["coarse"] > 0.0
+    assert coarse["floor"] == pytest.approx(0.5**2 / 12.0)
     y[400], y[500:520] = 40.0, y[499]
     run = track(model, AdaptiveKalman(), y, u)
-    assert run.state["left_out"] == 1.0
-    assert run.state["frozen_readings"] >= 19.0
+    assert run.left_out.counts["Left out"] == 1
+    assert run.left_out.counts["Frozen"] >= 19
     left_out = np.flatnonzero(~run.ok)
     assert {400, *range(501, 520)} <= set(left_out[left_out > 20]) <= {400, 401, *range(500, 521)}
 

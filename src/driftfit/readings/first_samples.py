@@ -1,10 +1,10 @@
 """Fault codes among the first samples, before there is anything with which they could be compared.
 
 The signals of the first samples are kept, and judged together when there are ``first`` + n of them. Samples that repeat
-the one before are kept once, with their number, and while the record has shown one reading only, the oldest sample
-makes room for the newest: a plant at rest, and a run of codes at the start, are judged when something happens. A
-value is outlying if it is `OUTLYING` usual distances from the median, the usual distance being the median of those that
-are not 0. A sample is doubtful if
+the one before are kept once, with their number. While the record begins with so many equal readings that they and the
+samples of which they are lags are half of all, the oldest makes room for the newest: a plant at rest, and a run of
+codes at the start, are judged when something happens. A value is outlying if it is `OUTLYING` usual distances from the
+median, the usual distance being the median of those that are not 0. A sample is doubtful if
 
     its reading is outlying and no regressor is: probably a fault code;
     or a regressor is outlying and the reading is not: a code of an input, or of an earlier output, now a lag.
@@ -207,13 +207,21 @@ def mark(s: State, ages: int, l: int) -> None:
 
 
 @kernel
-def times_of_first(s: State, l: int) -> int:
-    """How many of the samples have the reading of the first: a rest comes again, codes of a start are over."""
-    N = s.gate_first.shape[0]
-    count = 0
-    for k in range(N):
-        count += 1 if s.gate_first[k, READING, l] == s.gate_first[0, READING, l] else 0
-    return count
+def beginning(s: State, l: int) -> int:
+    """With how many equal readings the samples begin."""
+    N, equal = s.gate_first.shape[0], 1
+    while (equal < N) and (s.gate_first[equal, READING, l] == s.gate_first[0, READING, l]):
+        equal += 1
+    return equal
+
+
+@kernel
+def comes_again(s: State, l: int) -> bool:
+    """Whether the reading of the beginning comes again: a rest does, codes of a start are over."""
+    again = False
+    for k in range(beginning(s, l), s.gate_first.shape[0]):
+        again |= s.gate_first[k, READING, l] == s.gate_first[0, READING, l]
+    return again
 
 
 @partial(kernel, inline=False)
@@ -222,7 +230,7 @@ def decide(s: State, ages: int, l: int) -> None:
     N = s.gate_first.shape[0]
     whole, s.gate_decided[l] = s.gate_decided[l] == 0, 1
     count = doubt(s, l)
-    whole |= (s.gate_first[0, DOUBT, l] == 1.0) & (times_of_first(s, l) == 1)
+    whole |= (s.gate_first[0, DOUBT, l] == 1.0) & (not comes_again(s, l))
     if (count > 0) & (2 * count < N) & whole and contradicted(s, l):
         mark(s, ages, l)
         s.gate_replay[l] = 1
@@ -276,7 +284,8 @@ def remember_one(s: State, ages: int, l: int) -> None:
         drop_oldest(s, l)
     keep(s, s.gate_kept[l], 1.0, l)
     s.gate_kept[l] += 1
-    if (s.gate_kept[l] == N) & (s.gate_first[0, READING, l] != s.gate_first[1, READING, l]):
+    equal = beginning(s, l) if s.gate_kept[l] == N else N
+    if (equal == 1) | (2 * (equal + s.phi.shape[0]) < N):
         decide(s, ages, l)
 
 

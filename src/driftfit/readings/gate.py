@@ -32,7 +32,7 @@ Cost per ordinary sample: some forty operations, and O(m).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -199,15 +199,19 @@ def output_rule(gate: Gate) -> Step:
     return judge  # type: ignore[no-any-return]
 
 
-def gate_step(gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None]) -> Step:
+def gate_step(
+    gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False
+) -> Step:
     """The gate of a model with n parameters and m inputs, of which it remembers ``ages`` samples besides the present.
 
     ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
-    memory.
+    memory. The regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be
+    as large as predicted. There y is compared with the usual readings alone.
     """
     remember = first_samples(ages)
     notice, blame = input_rules(gate, ages, refuse)
-    hold_frozen, judge = frozen_rule(gate.frozen), output_rule(gate)
+    hold_frozen = frozen_rule(gate.frozen)
+    judge = output_rule(replace(gate, rare=np.inf) if implicit else gate)
     resolve = resolution(gate.coarse)
     sure, rare = float(gate.sure) ** 2, float(gate.rare) ** 2
 

@@ -208,7 +208,7 @@ class Program:
             model, own = self.model, self.steps if steps is None else steps
             gate = None
             if self.gate is not None:
-                gate = gate_step(self.gate, model.n, model.m, model.input_memory, model.refuse)
+                gate = gate_step(self.gate, model.n, model.m, model.input_memory, model.refuse, model.implicit)
             found = drivers(model.steps_for(self.steps), own, keep, gate)
             if gate is not None:
                 found = found._replace(run=partial(self._decided, found.run))

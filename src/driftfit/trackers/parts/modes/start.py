@@ -65,7 +65,7 @@ def keep(s: State, l: int) -> None:
 @kernel
 def forecast_start(s: State, l: int) -> None:
     """Prediction of least squares, and its variance in units of the noise so far."""
-    bound_leverage(s, l)  # the drift is in units of scales that such a regressor did not move much either
+    bound_leverage(s, l)
     forecast_on_roots(s, l)
     s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l] * s.leverage[l]) if s.h[l] < np.inf else np.inf
 
@@ -76,6 +76,7 @@ def take_start(s: State, l: int) -> None:
     s.waited[l] += s.dt[l] * s.drift[l]
     learn_scales(s, l)
     learn_means(s, l)
+    bound_leverage(s, l)  # the drift is in units of scales that such a regressor did not move much either
     noise, v = s.noise[l], s.s[l]
     s.noise[l] = noise * s.leverage[l]
     learn_information(s, s.noise[l], l)
