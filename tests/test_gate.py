@@ -158,7 +158,7 @@ def test_codes_of_a_run_without_a_gate_are_listed(s):
     assert counts(reason)[REFUSED] + counts(reason).get(2, 0) == 8
     assert reason[400] == INPUT
     assert "far outside" in remarks(counts(reason))[0][1]
-    assert "8 values look like fault codes (9999)" in ungated("y", case.y[case.bad].tolist())
+    assert "8 values look like fault codes (9999)" in ungated({"y": case.y[case.bad].tolist()}, linear=True)
 
 
 @pytest.mark.parametrize("make", [honest("tails"), honest("steps"), level_50(honest("t3", LEVEL))])

@@ -93,7 +93,7 @@ def test_the_file_of_sessions_opens_none(service, client):  # noqa: F811
     assert cookie not in (service[2] / "sessions.json").read_text()
 
 
-@pytest.mark.parametrize("beside", ["Basic QW5uOng=", "Bearer ", f"Bearer {GATEWAY[0]}"])
+@pytest.mark.parametrize("beside", ["Basic QW5uOng=", "Bearer ", f"Bearer {GATEWAY[0]}"], ids=["Basic", "empty", "key"])
 def test_a_cookie_beside_any_authorization_needs_its_origin(client, beside):  # noqa: F811
     ask, act = client(user=[ANN, SENDER]), {"unit": "a", "do": "no", "why": "an attack"}
     status, body = ask("POST", "/api/actions", act, authorization=beside, **logged_in(ask))

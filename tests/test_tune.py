@@ -219,7 +219,7 @@ def test_a_bound_is_reported():
         (FLS(), (1e-2, 1.0), lambda t: [t.mu]),
         (RLS(), (0.01, 0.1), lambda t: [t.forgetting]),
     ],
-    ids=repr,
+    ids=["Kalman(q)", "Kalman(r)", "Kalman", "Kalman(p0)", "FLS", "RLS"],
 )
 def test_bounds_are_those_of_the_setting_itself(tracker, bounds, setting):
     """Whatever the units of y and of the inputs; the best is beyond one of the bounds, and zero is too."""
