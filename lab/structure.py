@@ -89,7 +89,8 @@ class Structure:
         inside = {name.removeprefix("driftfit").removeprefix(".") for name in found if name.split(".")[0] == "driftfit"}
         return {name if name in self.modules else name.rpartition(".")[0] for name in inside} - {module}
 
-    def _reached(self, module: str) -> set[str]:
+    def reached(self, module: str) -> set[str]:
+        """The modules that one imports, directly or through others."""
         reached: set[str] = set()
         waiting = list(self.imports[module])
         while waiting:
@@ -102,7 +103,7 @@ class Structure:
     @cached_property
     def circles(self) -> list[tuple[str, ...]]:
         """Groups of modules that import each other, directly or through others."""
-        reached = {module: self._reached(module) for module in self.imports}
+        reached = {module: self.reached(module) for module in self.imports}
         knots = {tuple(sorted(o for o in reached[m] if m in reached.get(o, ()))) for m in reached if m in reached[m]}
         return sorted(knots)
 

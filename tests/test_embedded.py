@@ -113,13 +113,13 @@ def same_numbers(one, other):
     return bool(np.all((one == other) | nan))
 
 
-def agree(folder, model, tracker, T, **options):
+def agree(folder, model, tracker, T, gate=None, **options):
     """Run both over a record with holes, an outage and inputs that fall silent, and compare every step and state."""
-    export_c(model, tracker, folder, **options)
-    live = Live(model, tracker)
+    export_c(model, tracker, folder, gate=gate, **options)
+    live = Live(model, tracker, gate=gate)
     ours = Exported(folder, live, **options)
     assert same_numbers(ours.state, to_struct(live, **options))
-    y, u = record(live.model, T, seed=3)
+    y, u = record(live.model, T, seed=3, codes=bool(gate))
     u[2 * T // 5 : 3 * T // 5] = 0.0
     steps, found = np.empty((T, 4)), np.empty((T, 4))
     for t in range(T):
@@ -164,6 +164,17 @@ def test_a_fixed_rate_changes_no_bit(tmp_path, name):
     live.lane()["interval"][...] = 2.0
     with pytest.raises(ValueError, match=r"the field 'interval' is \[?2"):
         to_struct(live, fixed_rate=True)
+
+
+@needs_gcc
+@pytest.mark.parametrize("fixed_rate", [False, True])
+@pytest.mark.parametrize("tracker", [Kalman(q=1e-4, r=0.01), RLS(0.99)], ids=["Kalman", "RLS"])
+def test_a_gate_decides_as_it_does_in_a_stream(tmp_path, tracker, fixed_rate):
+    """Also on fault codes among the first samples, which are taken in once more without them."""
+    live, _ = agree(tmp_path, ARX(2, 2), tracker, 400, gate=True, fixed_rate=fixed_rate)
+    counts = live.left_out.counts
+    assert counts["Left out at the start"] == 2
+    assert counts["Left out"] > 2
 
 
 def test_numbers_that_are_only_zero_or_one_are_integers_in_c(tmp_path):

@@ -28,12 +28,13 @@ def to_c(
     p: Annotated[list[str] | None, typer.Option("-p", help="Setting of the tracker; repeat it.")] = None,
     own: Annotated[str | None, typer.Option("--with", metavar="MODULE:CLASS", help="Your own tracker.")] = None,
     fixed_rate: Annotated[bool, typer.Option("--fixed-rate", help="No uneven intervals, no known factors.")] = False,
+    gate: Annotated[bool | None, typer.Option("--gate/--no-gate", help="Judge readings first.")] = None,
 ) -> None:
     """Write a tracker as C99 for a controller: tracker.h, tracker.c, a self-test and a README."""
     from driftfit.embedded import export_c
 
     with helpful():
-        export_c(parse_model(model), parse_tracker(tracker, p or [], own), out, fixed_rate=fixed_rate)
+        export_c(parse_model(model), parse_tracker(tracker, p or [], own), out, fixed_rate=fixed_rate, gate=gate)
         readme = (out / "README.md").read_text(encoding="utf-8")
         state = readme.split("State: ")[1].split(".")[0]
         say(facts(("Written", str(out)), ("State", state), ("Check it", f"see {out / 'README.md'}")))

@@ -14,12 +14,21 @@ from driftfit.data.signals import check_ready
 from driftfit.embedded.project import files_of, write
 from driftfit.embedded.translation import translation
 from driftfit.models.base import Model
+from driftfit.readings.gate import Gate
 from driftfit.run.program import Program
+from driftfit.run.states.gating import gate_of
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
 
 
-def export_c(model: Model, tracker: Tracker, path: str | PathLike[str], *, fixed_rate: bool = False) -> None:
+def export_c(
+    model: Model,
+    tracker: Tracker,
+    path: str | PathLike[str],
+    *,
+    fixed_rate: bool = False,
+    gate: Gate | bool | None = None,
+) -> None:
     """Write a tracker as C99 into a folder: ``tracker.h``, ``tracker.c``, a self-test, an S-function and ``README.md``.
 
     Parameters
@@ -33,6 +42,8 @@ def export_c(model: Model, tracker: Tracker, path: str | PathLike[str], *, fixed
         ``drift`` of the next sample are 1, as constants of the code. The results are the same, in less time and
         memory. (``noise`` remains where the steps themselves change it within a sample, as those of
         `AdaptiveKalman` do.)
+    gate : bool, `Gate` or None
+        As for `track`: whether readings are judged before they are used.
 
     Raises
     ------
@@ -48,7 +59,9 @@ def export_c(model: Model, tracker: Tracker, path: str | PathLike[str], *, fixed
     if len(model.outputs) > 1:
         raise ValueError(f"export_c: one output at a time; export a tracker for each of {', '.join(model.outputs)}.")
     bound = model.bind(model.m)
-    write(Path(path), files_of(Program(bound, check_ready(tracker)), f"{bound!r}, {tracker!r}", fixed_rate))
+    program = Program(bound, check_ready(tracker), gate=gate_of(tracker, gate))
+    what = f"{bound!r}, {tracker!r}" + ("" if program.gate is None else ", with a gate")
+    write(Path(path), files_of(program, what, fixed_rate))
 
 
 def to_struct(live: Live, *, fixed_rate: bool = False) -> bytes:
@@ -64,17 +77,19 @@ def to_struct(live: Live, *, fixed_rate: bool = False) -> bytes:
     return translation(live.program, fixed_rate).bytes_of(live.lane())
 
 
-def from_struct(model: Model, tracker: Tracker, state: bytes, *, fixed_rate: bool = False) -> Live:
+def from_struct(
+    model: Model, tracker: Tracker, state: bytes, *, fixed_rate: bool = False, gate: Gate | bool | None = None
+) -> Live:
     """A stream that continues from the bytes of a ``tracker_state`` of the double-precision build.
 
-    ``fixed_rate`` must be that of `export_c`.
+    ``fixed_rate`` and ``gate`` must be those of `export_c`.
 
     Raises
     ------
     ValueError
         If the number of bytes is not the one that this model and tracker need.
     """
-    live = Live(model, tracker)
+    live = Live(model, tracker, gate=gate)
     made = translation(live.program, fixed_rate)
     size = made.layout(8).itemsize
     if len(state) != size:

@@ -13,6 +13,8 @@ from driftfit.embedded.simulink import SFUNCTION
 from driftfit.embedded.translation import Translation, translation
 from driftfit.embedded.unit import Unit
 from driftfit.embedded.values import assigned, number
+from driftfit.readings.first_samples import CODES, DRIFT, DT, NOISE, READING, TIMES
+from driftfit.readings.first_samples import U as INPUTS
 from driftfit.run.program import Program
 
 HEADER = """\
@@ -96,6 +98,38 @@ typedef tracker_real real;
 
 """
 
+AGAIN = """\
+/* The first samples once more, without the fault codes that the gate has found among them. */
+static void first_samples_again(tracker_state *s) {{
+    tracker_step step;
+    real rows[{rows}][{columns}], u[{m}];
+    const int64_t kept = s->gate_kept;
+{kept}
+    for (int k = 0; k < {rows}; k++) {{
+        for (int j = 0; j < {columns}; j++) {{ rows[k][j] = s->gate_first[k * {columns} + j]; }}
+    }}
+    *s = START;
+{restored}
+    s->gate_decided = 1;
+    for (int k = 0; k < kept; k++) {{
+        const int64_t codes = (int64_t)rows[k][{codes}];
+        const real y = codes % 2 == 1 ? R(NAN) : rows[k][{reading}];
+        for (int j = 0; j < TRACKER_INPUTS; j++) {{
+            u[j] = (codes >> (j + 1)) % 2 == 1 ? R(NAN) : rows[k][{inputs} + j];
+        }}
+        for (int64_t i = 0; i < (int64_t)rows[k][{times}]; i++) {{
+{factors}
+            {entry}(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);
+        }}
+    }}
+}}
+"""
+
+GATED = """
+* A gate stands before the tracker: it leaves out fault codes, spikes and frozen readings. Once, after the first
+  samples, it may take them in again without the codes among them: up to {rows} different samples, each as often as it
+  came."""
+
 SUPPORT = {
     "real_minimum": "static real real_minimum(real a, real b) { return b < a ? b : a; }",
     "real_maximum": "static real real_maximum(real a, real b) { return b > a ? b : a; }",
@@ -143,7 +177,7 @@ README = """\
 * Parameters: {names}.
 * State: {doubles} bytes in double precision, {singles} with `-DTRACKER_SINGLE`. No heap, no global state, no recursion.
 * An update takes at most {ops}.
-  Loops are counted at their longest, and of two branches the dearer.{ordinary}
+  Loops are counted at their longest, and of two branches the dearer.{ordinary}{gate}
 * From the library: `sqrt` and `fabs` where they are used; with `-DTRACKER_SINGLE` also `expf` and `logf`.
 * `-ffp-contract=off` keeps products and sums apart, which gcc in its default mode may fuse; never use `-ffast-math`.
 
@@ -170,12 +204,13 @@ def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
         names=comment(", ".join(program.names)), fields=_fields(made),
         known=FIXED_RATE if fixed_rate else KNOWN,
     )  # fmt: skip
-    source = SOURCE.format(what=comment(what)) + _source(made, set(program.model.memory_for(program.steps)))
+    source = SOURCE.format(what=comment(what)) + _source(made, program)
     readme = README.format(
         what=literal(what), names=", ".join(map(literal, program.names)), doubles=made.layout(8).itemsize,
         singles=made.layout(4).itemsize, ops=_counted(made.entry.operations), ordinary=_after_the_start(made),
+        gate="" if program.gate is None else GATED.format(rows=made.start["gate_first"].shape[1]),
     )  # fmt: skip
-    test = selftest(program.model, program.tracker)
+    test = selftest(program.model, program.tracker, program.gate)
     return {
         "tracker.h": header, "tracker.c": source, "selftest.c": test, "tracker_sfun.c": SFUNCTION, "README.md": readme
     }  # fmt: skip
@@ -189,13 +224,38 @@ def _fields(made: Translation) -> str:
     return "\n".join(lines)
 
 
-def _source(made: Translation, memory: set[str]) -> str:
+def _source(made: Translation, program: Program) -> str:
     """Tables, functions and the public interface."""
+    memory = set(program.model.memory_for(program.steps))
     steps = "\n\n".join(function.text for function in made.unit.functions.values())
     support = _support(steps)
     start = f"static const tracker_state START = {{\n{_initial(made)}\n}};"
     tables = [body % name for body, name in made.unit.tables.items()]
-    return "\n\n".join([*support, *tables, start, steps, _face(made, memory)]) + "\n"
+    again = [] if program.gate is None else [_again(made, program)]
+    return "\n\n".join([*support, *tables, start, steps, *again, _face(made, memory, bool(again))]) + "\n"
+
+
+def _again(made: Translation, program: Program) -> str:
+    """The function that takes in the first samples once more; settings that the caller has changed stay."""
+    settings = [identifier(name) for name in made.names if name in program.tracker.settings()]
+    sizes = {identifier(name): made.start[name][0].size for name in made.names}
+    kept, restored = [], []
+    for name in settings:
+        size = sizes[name]
+        if size == 1:
+            kept.append(f"    const real {name} = s->{name};")
+            restored.append(f"    s->{name} = {name};")
+        else:
+            loop = f"    for (int i = 0; i < {size}; i++) {{ %s }}"
+            kept += [f"    real {name}[{size}];", loop % f"{name}[i] = s->{name}[i];"]
+            restored.append(loop % f"s->{name}[i] = {name}[i];")
+    columns = {"interval": DT, "noise": NOISE, "drift": DRIFT}
+    factors = [f"            s->{name} = rows[k][{column}];" for name, column in columns.items() if name in made.names]
+    rows, width = made.start["gate_first"].shape[1:3]
+    return AGAIN.format(
+        rows=rows, columns=width, m=max(program.model.m, 1), kept="\n".join(kept), restored="\n".join(restored),
+        codes=CODES, reading=READING, inputs=INPUTS, times=TIMES, factors="\n".join(factors), entry=made.entry.name,
+    ).rstrip()  # fmt: skip
 
 
 def _support(steps: str) -> list[str]:
@@ -215,7 +275,7 @@ def _initial(made: Translation) -> str:
     return "\n".join(lines)
 
 
-def _face(made: Translation, memory: set[str]) -> str:
+def _face(made: Translation, memory: set[str], gated: bool) -> str:
     copies = []
     for name in made.names:
         if name in memory:
@@ -230,7 +290,7 @@ def _face(made: Translation, memory: set[str]) -> str:
         "NOT_INLINED tracker_step tracker_update(tracker_state *s, tracker_real y, const tracker_real *u) {",
         "    tracker_step step;",
         f"    {made.entry.name}(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);",
-        "    return step;", "}", "",
+        *(["    if (s->gate_replay > 0) { first_samples_again(s); }"] if gated else []), "    return step;", "}", "",
         "tracker_step tracker_predict(const tracker_state *s, tracker_state *scratch, const tracker_real *u) {",
         "    *scratch = *s;", "    return tracker_update(scratch, NAN, u);", "}", "",
         "void tracker_reset(tracker_state *s) {", *copies, "}",

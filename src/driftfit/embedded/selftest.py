@@ -8,6 +8,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.readings.gate import Gate
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
 
@@ -62,8 +63,10 @@ BOUND = 0.001
 """Largest error of single precision, as a share of the largest result."""
 
 
-def record(model: Model, T: int = SAMPLES, seed: int = 0) -> tuple[Array, Array]:
-    """y (T,), u (T, m): a stable system whose gain doubles, with missing data, an outage and constant inputs."""
+def record(model: Model, T: int = SAMPLES, seed: int = 0, codes: bool = False) -> tuple[Array, Array]:
+    """y (T,), u (T, m): a stable system whose gain doubles, with missing data, an outage and constant inputs, and with
+    fault codes, some of them among the first samples.
+    """
     rng = np.random.default_rng(seed)
     m = max(model.m, 1)
     u = rng.standard_normal((T, m))
@@ -75,13 +78,15 @@ def record(model: Model, T: int = SAMPLES, seed: int = 0) -> tuple[Array, Array]
     y[rng.random(T) < 0.03] = np.nan
     y[3 * T // 4 : 3 * T // 4 + 5] = np.inf
     u[rng.random((T, m)) < 0.01] = np.nan
+    if codes:
+        y[[5, T // 4, T // 4 + 1, T // 2 + 40]], u[[8, T // 3 + 20], 0] = 9999.0, -999.0
     return y, u
 
 
-def selftest(model: Model, tracker: Tracker) -> str:
+def selftest(model: Model, tracker: Tracker, gate: Gate | None) -> str:
     """The text of the test program."""
-    y, u = record(model)
-    live = Live(model, tracker)
+    y, u = record(model, codes=gate is not None)
+    live = Live(model, tracker, gate=gate or False)
     steps = np.array([live.update(float(y[t]), u[t, : model.m]) for t in range(SAMPLES)], dtype=float)
     scales = [max(float(np.max(np.abs(_finite(part)), initial=0.0)), 1e-30) for part in
               (y, steps[:, 2], live.theta)]  # fmt: skip

@@ -23,7 +23,6 @@ from driftfit.embedded.functions import translate
 from driftfit.embedded.names import identifier
 from driftfit.embedded.unit import Function, Unit
 from driftfit.embedded.values import Value
-from driftfit.engine.drivers import drivers
 from driftfit.engine.kernel import Array
 from driftfit.run.program import Program, State
 
@@ -88,8 +87,7 @@ class Translation:
 def translation(program: Program, fixed_rate: bool = False) -> Translation:
     """Translate the steps of a model and a tracker."""
     tile = program.tile()
-    steps = program.steps
-    update = drivers(program.model.steps_for(steps), steps).update.function
+    update = program.drivers().update.function
     u = Value("array", "u", shape=(program.model.m,), strides=(1,))
     factors = () if fixed_rate else FACTORS
     constant = frozenset(fields(tile)) - {*factors, *RESULTS, *program.tracker.settings()}

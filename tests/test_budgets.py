@@ -1,0 +1,23 @@
+"""The budgets of the house: no figure rises above its limit, and a limit is what was earned last."""
+
+import pytest
+
+from lab.budgets import LIMITS, budgets
+
+FIGURES = budgets()
+SLACK = 0.03
+
+
+def test_every_figure_has_a_limit():
+    assert list(FIGURES) == list(LIMITS)
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_nothing_is_above_its_limit(name):
+    assert FIGURES[name] <= LIMITS[name], f"{name}: {FIGURES[name]:,}, limit {LIMITS[name]:,} (lab/budgets.py)"
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_what_is_earned_is_kept(name):
+    """A limit far above the figure would let what was earned be spent."""
+    assert FIGURES[name] >= (1 - SLACK) * LIMITS[name], f"{name}: lower the limit to {FIGURES[name]:,} (lab/budgets.py)"
