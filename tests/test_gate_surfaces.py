@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftfit import ARX, DataWarning, Gate, Kalman, Live, Outputs, Track, grid, select, track, tune
+from driftfit import ARX, DataWarning, Gate, Kalman, Live, LiveSelection, Outputs, Track, grid, select, track, tune
 from driftfit.readings.left_out import KEPT
 
 PLANT, TRACKER = ARX(1, 1), Kalman(q=1e-6, r=1e-4)
@@ -135,3 +135,61 @@ def test_structures_are_compared_on_the_same_readings():
     assert [one.sample.tolist() for one in found.left_out.values()] == [[100]]
     assert found.simplest.startswith("ARX(na=1")
     assert "left out: 1 sample far" in str(found)
+
+
+def test_candidates_on_line_take_the_decisions_of_one_reference():
+    y, u = plant(codes=[100])
+    one = LiveSelection([ARX(1, 1), ARX(2, 1)], TRACKER, gate=True)
+    two = LiveSelection([ARX(1, 1), ARX(2, 1)], TRACKER)
+    for t in range(200):
+        one.update(y[t], u[t])
+        two.update(np.nan if t == 100 else y[t], u[t])
+    assert [decision.sample for decision in one.reference.left_out] == [100]
+    np.testing.assert_array_equal(one.weights, two.weights)
+    again = LiveSelection.from_bytes(one.to_bytes())
+    assert again.reference.left_out.counts == {"Left out": 1}
+
+
+def by_sklearn(y, u, gate):
+    pytest.importorskip("sklearn")
+    from driftfit.bridges.sklearn import TrackedRegressor
+
+    return TrackedRegressor(TRACKER, gate=gate).fit(u[:, None], y).run_.left_out.counts
+
+
+def by_river(y, u, gate):
+    pytest.importorskip("river")
+    from driftfit.bridges.river import TrackedRegressor
+
+    model = TrackedRegressor(TRACKER, gate=gate)
+    for output, x in zip(y, u, strict=True):
+        model.learn_one({"x": x}, output)
+    return model._live.left_out.counts
+
+
+def by_sktime(y, u, gate):
+    pd = pytest.importorskip("pandas")
+    pytest.importorskip("sktime")
+    from driftfit.bridges.sktime import TrackedForecaster
+
+    return TrackedForecaster(TRACKER, lags=1, gate=gate).fit(pd.Series(y)).run_.left_out.counts
+
+
+def by_formula(y, u, gate):
+    pd = pytest.importorskip("pandas")
+    pytest.importorskip("formulaic")
+    from driftfit.bridges.formula import TimeVaryingRegression
+
+    found = TimeVaryingRegression.from_formula("y ~ x", pd.DataFrame({"y": y, "x": u}), TRACKER, gate).fit()
+    assert ("Left out" in found.summary().as_text()) == gate
+    return found.run.left_out.counts
+
+
+@pytest.mark.parametrize("bridge", [by_sklearn, by_river, by_sktime, by_formula])
+def test_bridges_have_the_argument(bridge):
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(200)
+    y = u + 0.01 * rng.standard_normal(200)
+    assert bridge(y, u, False) == {}
+    y[100] = 9999.0
+    assert bridge(y, u, True) == {"Left out": 1}

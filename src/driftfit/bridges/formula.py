@@ -22,6 +22,7 @@ import pandas as pd
 from scipy.special import ndtr, ndtri
 
 from driftfit.models.regression import Regression
+from driftfit.readings.left_out import remarks_of
 from driftfit.results import Track
 from driftfit.show.parts.axes import BLUE, RED, panels
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
@@ -56,14 +57,17 @@ class TimeVaryingRegression:
         Regressors by name. A column "Intercept" is the constant.
     tracker : Tracker or None
         None is ``AdaptiveKalman()``, which needs no settings. ``RLS(1.0)`` gives recursive least squares.
+    gate : bool, Gate or None
+        Whether readings are judged before they are used, as for `driftfit.track`.
     """
 
     endog: pd.Series
     exog: pd.DataFrame
     tracker: Tracker | None = None
+    gate: Any = None
 
     @classmethod
-    def from_formula(cls, formula: str, data: Any, tracker: Tracker | None = None) -> Self:
+    def from_formula(cls, formula: str, data: Any, tracker: Tracker | None = None, gate: Any = None) -> Self:
         """Read a formula such as ``"y ~ x1 + log(x2) + C(region)"``; rows with missing cells are kept.
 
         ValueError for a formula without a left-hand side, or with more than one output.
@@ -74,7 +78,7 @@ class TimeVaryingRegression:
         left, right = pd.DataFrame(matrices.lhs), pd.DataFrame(matrices.rhs)
         if left.shape[1] != 1:
             raise ValueError(f"from_formula: {formula!r} has {left.shape[1]} outputs; a regression has one.")
-        return cls(left.iloc[:, 0], right, tracker)
+        return cls(left.iloc[:, 0], right, tracker, gate)
 
     def fit(self) -> TimeVaryingResults:
         """Track the coefficients through all rows."""
@@ -82,7 +86,7 @@ class TimeVaryingRegression:
         model = Regression(tuple(names), intercept=_INTERCEPT in self.exog.columns)
         tracker = AdaptiveKalman() if self.tracker is None else self.tracker
         y, X = self.endog.to_numpy(dtype=float), self.exog.drop(columns=_INTERCEPT, errors="ignore")
-        run = track(model, tracker, y, X.to_numpy(dtype=float) if names else None)
+        run = track(model, tracker, y, X.to_numpy(dtype=float) if names else None, gate=self.gate)
         columns = [*names, *([_INTERCEPT] if model.intercept else [])]
         return TimeVaryingResults(run, self.endog, pd.Index(columns))
 
@@ -245,6 +249,7 @@ class TimeVaryingResults:
         facts = {
             "Dep. Variable": str(self.endog.name), "Tracker": repr(self.run.tracker), "Model": repr(self.run.model),
             "No. Observations": str(self.nobs), "Log-Likelihood": f"{self.llf:.3f}",
+            **dict(remarks_of([self.run.left_out])),
         }  # fmt: skip
         return CoefficientTable(facts, table)
 
