@@ -151,7 +151,7 @@ def test_states_survive_other_settings_and_another_version(model):
         assert stream.rows().select(expected.columns).equals(expected)
     foreign = ByHand(model, AdaptiveKalman(), hold=0.0, origins=())
     foreign.kept = list(old.kept)
-    with pytest.raises(ValueError, match="a state of another model, tracker, setting or version"):
+    with pytest.raises(ValueError, match="a state of another model, tracker, gate, setting or version"):
         foreign.batch(rest)
 
 
@@ -275,7 +275,7 @@ def test_a_unit_with_keyed_state_continues_with_other_settings():
     begun = new.begun({"state": ended["state"], "watch": None, "last": ended["t"], "newest": ended["t"], **counts})
     again = new.step(begun, given[1])[1]
     assert same([one["std_b1[pressure<-u]"] for one in again], run.std[:, 1, 2])
-    with pytest.raises(ValueError, match="a state of another model, tracker, setting or version"):
+    with pytest.raises(ValueError, match="a state of another model, tracker, gate, setting or version"):
         replace(new, before=None).step(state, given[1])
 
 
