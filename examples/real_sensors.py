@@ -57,7 +57,7 @@ def codes() -> None:
         record[where][begin : begin + count] = code
         cells = []
         for tracker in (AdaptiveKalman(), FORGET, WALK):
-            away = np.abs(track(ARX(1, 1), tracker, **record).theta - [0.7, 2.0]).max(axis=1)
+            away = np.abs(track(ARX(1, 1), tracker, gate=True, **record).theta - [0.7, 2.0]).max(axis=1)
             cells.append(f"{away[begin + count + 4]:.3f}, {away[begin + count + 499]:.3f}")
         print(f"  {f'{code:g}, {count} in {where}, from {begin}':22}" + "".join(f"{cell:>18}" for cell in cells))
 
