@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, Driver, State, kernel
 from driftfit.readings.gate import Gate, gate_step, start
 
@@ -25,8 +26,8 @@ SAMPLED = 64
 
 def suspect(signal: Array) -> Array:
     """Which values (T,) of a signal are more than `SUSPECT` usual distances from its median: the median distance of
-    those that differ from it. Missing and infinite values are not."""
-    known = np.isfinite(signal)
+    those that differ from it. Missing values, and those too large to be used, are not."""
+    known = np.abs(signal) < LARGEST
     if np.count_nonzero(known) < FEWEST:
         return np.zeros(len(signal), bool)
     away = np.abs(np.where(known, signal, np.nan) - np.median(signal[known]))
@@ -47,7 +48,7 @@ def screen(signal: Array, first: Array, length: Array) -> Array:
         return found
     begin, count = first[series, None], length[series, None]
     some = signal[begin + np.arange(SAMPLED) * count // SAMPLED]
-    some[~np.isfinite(some)] = np.nan
+    some[~(np.abs(some) < LARGEST)] = np.nan
     center = _middle(some)
     away = np.abs(some - center[:, None])
     away[away == 0.0] = np.nan

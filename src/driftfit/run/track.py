@@ -14,6 +14,7 @@ import numpy as np
 from driftfit.data import outputs
 from driftfit.data.arguments import check_roles
 from driftfit.data.record import Reading, Record, Records, one_series, rows
+from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
@@ -282,7 +283,8 @@ def warn_of_codes(verb: str, runs: Iterable[Track]) -> None:
 
 def _codes(run: Track) -> dict[str, list[float]]:
     """The values of each signal of a run without a gate that one would have refused."""
-    y, u, model = run.record.y, run.record.u, run.program.model
+    model = run.program.model
+    y, u = (np.where(np.abs(x) < LARGEST, x, np.nan) for x in (run.record.y, run.record.u))
     strange = [suspect(signal) for signal in u.T]
     if not (suspect(y).any() or any(one.any() for one in strange)):
         return {}
