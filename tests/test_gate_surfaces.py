@@ -193,3 +193,12 @@ def test_bridges_have_the_argument(bridge):
     assert bridge(y, u, False) == {}
     y[100] = 9999.0
     assert bridge(y, u, True) == {"Left out": 1}
+
+
+def test_settings_of_a_grid_take_the_decisions_of_one_reference():
+    y, u = plant(codes=[100])
+    y[60] = 3.0  # far for the small noise variance, and for it alone
+    fleet = track(PLANT, [Kalman(q=1e-6, r=1e-8), Kalman(q=1e-6, r=1.0)], y, u, gate=True)
+    assert [one.left_out.sample.tolist() for one in fleet.values()] == [[100]] * 2
+    assert [one.ok.sum() for one in fleet.values()] == [198] * 2
+    assert "2 samples far outside" in str(fleet.summary())
