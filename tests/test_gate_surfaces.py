@@ -67,6 +67,8 @@ def test_a_gate_is_saved_with_results_and_states(tmp_path):
     loaded = Track.load(tmp_path / "run")
     assert loaded.program.gate == gate
     assert list(loaded.left_out) == list(run.left_out)
+    track(PLANT, TRACKER, y, u, gate=run.left_out).save(tmp_path / "decided")
+    assert list(Track.load(tmp_path / "decided").left_out) == list(run.left_out)
     fleet = track(PLANT, TRACKER, np.stack([y, y]), np.stack([u, u]), by="row", gate=gate)
     fleet.save(tmp_path / "fleet")
     assert list(type(fleet).load(tmp_path / "fleet")[1].left_out) == list(run.left_out)
