@@ -126,7 +126,7 @@ def test_states_survive_other_settings_and_another_version(model):
     old = ByHand(model, hold=0.0)
     old.batch(first)
     layout = old.flow.task.joint_for(None).programs[0].layout
-    names = [name for name in reversed(layout.text.split()) if not name.startswith("farthest:")]
+    names = [name for name in reversed(layout.text.split()) if not name.startswith("floor:")]
     text = " ".join([*names, "gone:f2"])
     assert len(names) == len(layout.text.split()) - 1
 
@@ -151,7 +151,7 @@ def test_states_survive_other_settings_and_another_version(model):
         assert stream.rows().select(expected.columns).equals(expected)
     foreign = ByHand(model, AdaptiveKalman(), hold=0.0, origins=())
     foreign.kept = list(old.kept)
-    with pytest.raises(ValueError, match="a state of another model, tracker, setting or version"):
+    with pytest.raises(ValueError, match="a state of another model, tracker, gate, setting or version"):
         foreign.batch(rest)
 
 
@@ -275,7 +275,7 @@ def test_a_unit_with_keyed_state_continues_with_other_settings():
     begun = new.begun({"state": ended["state"], "watch": None, "last": ended["t"], "newest": ended["t"], **counts})
     again = new.step(begun, given[1])[1]
     assert same([one["std_b1[pressure<-u]"] for one in again], run.std[:, 1, 2])
-    with pytest.raises(ValueError, match="a state of another model, tracker, setting or version"):
+    with pytest.raises(ValueError, match="a state of another model, tracker, gate, setting or version"):
         replace(new, before=None).step(state, given[1])
 
 
@@ -311,3 +311,16 @@ def test_a_table_without_a_usable_unit_gives_reasons():
     assert stream.found["failed"][0]["failed"].to_list() == ["rows without a unit"]
     late = pl.concat(stream.found["late"])
     assert late["failed"].to_list() == ["without a time", "rows without a unit"]
+
+
+def test_units_have_a_gate():
+    """Results are those of one machine, and a state of another gate is refused."""
+    rows = rows_of(4, 3, 60).with_columns(y=pl.when(pl.col("t") == 30.0).then(9999.0).otherwise("y"))
+    gated = replace(task_of(), gate=True)
+    _, samples = pieces_of(rows.sort("unit", "t"), gated, "samples")
+    fleet = track(MODEL, K, "y", "u", data=rows, by="unit", time="t", gate=True)
+    assert sum(len(run.left_out) for run in fleet.values()) > 0
+    assert samples.select(fleet.to_table().columns).equals(fleet.to_table())
+    joint = gated.joint_for(None)
+    with pytest.raises(ValueError, match="another model, tracker, gate"):
+        task_of().joint_for(None).unpack(joint.start)

@@ -137,6 +137,21 @@ def test_valid_ranges_and_intervals_left_out(table):
     assert "FROM..TO" in fails("track", *SIGNALS, "--exclude", "4")
 
 
+@pytest.mark.parametrize("command", [["track"], ["verdict"], ["detect", "--reference", "150"], ["tune"], ["smooth"]])
+def test_a_gate_leaves_out_codes_in_every_command_that_reads_records(table, command):
+    y = table["flow"].to_numpy().copy()
+    y[100] = 9999.0
+    table.with_columns(flow=y).write_csv("pump.csv")
+    tuned = command == ["tune"]
+    options = SIGNALS[: -2 if tuned else None]
+    printed = " ".join(run(command[0], *options, *command[1:], "--gate").split())
+    if command[0] in ("track", "tune"):
+        assert "1 sample far outside" in printed
+    with pytest.warns(UserWarning, match="tune: |track: ") as said:
+        run(command[0], *options, *command[1:], "--no-gate")
+    assert any("gate=True leaves them out" in str(one.message) for one in said)
+
+
 def test_a_saved_run_or_stream_is_continued(table):
     run("track", *SIGNALS, "--rows", ":200", "--out", "first.npz")
     y, u, _ = simulate()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftfit import ARX, DataWarning, Gate, Kalman, Live, Outputs, Track, grid, select, track, tune
+from driftfit import ARX, DataWarning, Gate, Kalman, Live, LiveSelection, Outputs, Track, grid, select, track, tune
 from driftfit.readings.left_out import KEPT
 
 PLANT, TRACKER = ARX(1, 1), Kalman(q=1e-6, r=1e-4)
@@ -67,6 +67,8 @@ def test_a_gate_is_saved_with_results_and_states(tmp_path):
     loaded = Track.load(tmp_path / "run")
     assert loaded.program.gate == gate
     assert list(loaded.left_out) == list(run.left_out)
+    track(PLANT, TRACKER, y, u, gate=run.left_out).save(tmp_path / "decided")
+    assert list(Track.load(tmp_path / "decided").left_out) == list(run.left_out)
     fleet = track(PLANT, TRACKER, np.stack([y, y]), np.stack([u, u]), by="row", gate=gate)
     fleet.save(tmp_path / "fleet")
     assert list(type(fleet).load(tmp_path / "fleet")[1].left_out) == list(run.left_out)
@@ -135,3 +137,70 @@ def test_structures_are_compared_on_the_same_readings():
     assert [one.sample.tolist() for one in found.left_out.values()] == [[100]]
     assert found.simplest.startswith("ARX(na=1")
     assert "left out: 1 sample far" in str(found)
+
+
+def test_candidates_on_line_take_the_decisions_of_one_reference():
+    y, u = plant(codes=[100])
+    one = LiveSelection([ARX(1, 1), ARX(2, 1)], TRACKER, gate=True)
+    two = LiveSelection([ARX(1, 1), ARX(2, 1)], TRACKER)
+    for t in range(200):
+        one.update(y[t], u[t])
+        two.update(np.nan if t == 100 else y[t], u[t])
+    assert [decision.sample for decision in one.reference.left_out] == [100]
+    np.testing.assert_array_equal(one.weights, two.weights)
+    again = LiveSelection.from_bytes(one.to_bytes())
+    assert again.reference.left_out.counts == {"Left out": 1}
+
+
+def by_sklearn(y, u, gate):
+    pytest.importorskip("sklearn")
+    from driftfit.bridges.sklearn import TrackedRegressor
+
+    return TrackedRegressor(TRACKER, gate=gate).fit(u[:, None], y).run_.left_out.counts
+
+
+def by_river(y, u, gate):
+    pytest.importorskip("river")
+    from driftfit.bridges.river import TrackedRegressor
+
+    model = TrackedRegressor(TRACKER, gate=gate)
+    for output, x in zip(y, u, strict=True):
+        model.learn_one({"x": x}, output)
+    return model._live.left_out.counts
+
+
+def by_sktime(y, u, gate):
+    pd = pytest.importorskip("pandas")
+    pytest.importorskip("sktime")
+    from driftfit.bridges.sktime import TrackedForecaster
+
+    return TrackedForecaster(TRACKER, lags=1, gate=gate).fit(pd.Series(y)).run_.left_out.counts
+
+
+def by_formula(y, u, gate):
+    pd = pytest.importorskip("pandas")
+    pytest.importorskip("formulaic")
+    from driftfit.bridges.formula import TimeVaryingRegression
+
+    found = TimeVaryingRegression.from_formula("y ~ x", pd.DataFrame({"y": y, "x": u}), TRACKER, gate).fit()
+    assert ("Left out" in found.summary().as_text()) == gate
+    return found.run.left_out.counts
+
+
+@pytest.mark.parametrize("bridge", [by_sklearn, by_river, by_sktime, by_formula])
+def test_bridges_have_the_argument(bridge):
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(200)
+    y = u + 0.01 * rng.standard_normal(200)
+    assert bridge(y, u, False) == {}
+    y[100] = 9999.0
+    assert bridge(y, u, True) == {"Left out": 1}
+
+
+def test_settings_of_a_grid_take_the_decisions_of_one_reference():
+    y, u = plant(codes=[100])
+    y[60] = 3.0  # far for the small noise variance, and for it alone
+    fleet = track(PLANT, [Kalman(q=1e-6, r=1e-8), Kalman(q=1e-6, r=1.0)], y, u, gate=True)
+    assert [one.left_out.sample.tolist() for one in fleet.values()] == [[100]] * 2
+    assert [one.ok.sum() for one in fleet.values()] == [198] * 2
+    assert "2 samples far outside" in str(fleet.summary())

@@ -29,6 +29,7 @@ from scipy.special import ndtr, stdtr
 
 from driftfit.data.labels import chronological
 from driftfit.models.regression import Regression
+from driftfit.readings.left_out import remarks_of
 from driftfit.results import Track
 from driftfit.show.parts.axes import BLUE, RED, panels
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
@@ -63,14 +64,17 @@ class TimeVaryingRegression:
         Regressors by name. A column "Intercept" is the constant.
     tracker : Tracker or None
         None is ``AdaptiveKalman()``, which needs no settings. ``RLS(1.0)`` gives recursive least squares.
+    gate : bool, Gate or None
+        Whether readings are judged before they are used, as for `driftfit.track`.
     """
 
     endog: pd.Series
     exog: pd.DataFrame
     tracker: Tracker | None = None
+    gate: Any = None
 
     @classmethod
-    def from_formula(cls, formula: str, data: Any, tracker: Tracker | None = None) -> Self:
+    def from_formula(cls, formula: str, data: Any, tracker: Tracker | None = None, gate: Any = None) -> Self:
         """Read a formula such as ``"y ~ x1 + log(x2) + C(region)"``.
 
         A row in which a number or a category is missing is kept, and is not used. ValueError for a formula without a
@@ -83,7 +87,7 @@ class TimeVaryingRegression:
         left, right = (_numbers(side, materializer.factor_cache) for side in (matrices.lhs, matrices.rhs))
         if left.shape[1] != 1:
             raise ValueError(f"from_formula: {formula!r} has {left.shape[1]} outputs; a regression has one.")
-        return cls(left.iloc[:, 0], right, tracker)
+        return cls(left.iloc[:, 0], right, tracker, gate)
 
     def fit(self) -> TimeVaryingResults:
         """Track the coefficients through all rows."""
@@ -92,7 +96,8 @@ class TimeVaryingRegression:
         tracker = AdaptiveKalman() if self.tracker is None else self.tracker
         rows = chronological(self.endog.index)
         endog, exog = self.endog.iloc[rows], self.exog.iloc[rows]
-        run = track(model, tracker, endog, exog.drop(columns=_INTERCEPT, errors="ignore") if names else None)
+        X = exog.drop(columns=_INTERCEPT, errors="ignore") if names else None
+        run = track(model, tracker, endog, X, gate=self.gate)
         columns = [*names, *([_INTERCEPT] if model.intercept else [])]
         return TimeVaryingResults(run, endog, pd.Index(columns))
 
@@ -279,7 +284,7 @@ class TimeVaryingResults:
         facts = {
             "Dep. Variable": str(self.endog.name), "Tracker": repr(self.run.tracker), "Model": repr(self.run.model),
             "No. Observations": str(self.nobs), "Df Residuals": f"{self.df_resid:g}",
-            "Log-Likelihood": f"{self.llf:.3f}",
+            "Log-Likelihood": f"{self.llf:.3f}", **dict(remarks_of([self.run.left_out])),
         }  # fmt: skip
         apart = float(np.sqrt(np.mean((self.forecasts - self.fittedvalues)[self.run.ok] ** 2)))
         if apart > 1e-9 * float(np.sqrt(np.mean(self.run.y[self.run.ok] ** 2))):

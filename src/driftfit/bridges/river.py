@@ -39,6 +39,8 @@ class TrackedRegressor(base.Regressor):
         Whether the model has an intercept, which drifts too.
     window
         Number of samples that are kept, to be learned again when the features outgrow the model.
+    gate
+        Whether readings are judged before they are used, as for `driftfit.Live`.
 
     Notes
     -----
@@ -62,10 +64,13 @@ class TrackedRegressor(base.Regressor):
 
     """
 
-    def __init__(self, tracker: Tracker | None = None, fit_intercept: bool = True, window: int = 200) -> None:
+    def __init__(
+        self, tracker: Tracker | None = None, fit_intercept: bool = True, window: int = 200, gate: Any = None
+    ) -> None:
         self.tracker = tracker
         self.fit_intercept = fit_intercept
         self.window = window
+        self.gate = gate
         self._columns: dict[Any, int] = {}
         self._past: deque[tuple[dict[Any, Any], float]] = deque(maxlen=window)
         self._count = 0
@@ -138,7 +143,7 @@ class TrackedRegressor(base.Regressor):
     def _widen(self, m: int) -> Live:
         """A stream with m columns, for which the samples that are kept are learned again."""
         tracker = AdaptiveKalman() if self.tracker is None else self.tracker
-        live = Live(Regression(max(m, 1), intercept=self.fit_intercept), tracker)
+        live = Live(Regression(max(m, 1), intercept=self.fit_intercept), tracker, gate=self.gate)
         for x, y in self._past:
             live.update(y, self._row(x, live.model.m))
         self._hold(live)

@@ -48,6 +48,8 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
         fitted rows, and uses its own predictions as outputs.
     fit_intercept : bool
         Whether the model has an intercept, which drifts too.
+    gate : bool, Gate or None
+        Whether readings are judged before they are used, as for `driftfit.track`; ``run_.left_out`` lists what was not.
 
     Attributes
     ----------
@@ -63,10 +65,13 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
         As in every estimator.
     """
 
-    def __init__(self, tracker: Tracker | None = None, lags: int = 0, fit_intercept: bool = True) -> None:
+    def __init__(
+        self, tracker: Tracker | None = None, lags: int = 0, fit_intercept: bool = True, gate: Any = None
+    ) -> None:
         self.tracker = tracker
         self.lags = lags
         self.fit_intercept = fit_intercept
+        self.gate = gate
 
     def fit(self, X: Any, y: Any) -> Self:
         """Track rows X (n_rows, n_features) with outputs y (n_rows,), in order of time. NaN is missing in both."""
@@ -114,7 +119,7 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
             raise ValueError("y holds no number: every output is NaN, so there is nothing to fit.")
         before = None if first else self.run_
         tracker = AdaptiveKalman() if self.tracker is None else self.tracker
-        self.run_: Track = track(self._model(X.shape[1]), tracker, y, X, warm_start=before)
+        self.run_: Track = track(self._model(X.shape[1]), tracker, y, X, gate=self.gate, warm_start=before)
         lags, m = self.lags, X.shape[1]
         self.coef_path_: Array = self.run_.theta[:, lags : lags + m]
         self.coef_: Array = self.coef_path_[-1].copy()

@@ -43,6 +43,8 @@ class TrackedForecaster(BaseForecaster):
         Number of output lags.
     fit_intercept : bool
         Whether the model has an intercept, which drifts too.
+    gate : bool, Gate or None
+        Whether readings are judged before they are used, as for `driftfit.track`; ``run_.left_out`` lists what was not.
 
     Attributes
     ----------
@@ -76,22 +78,26 @@ class TrackedForecaster(BaseForecaster):
 
     _config: ClassVar[dict[str, Any]] = {"remember_data": False}  # the state contains what the past is needed for
 
-    def __init__(self, tracker: Tracker | None = None, lags: int = 2, fit_intercept: bool = True) -> None:
+    def __init__(
+        self, tracker: Tracker | None = None, lags: int = 2, fit_intercept: bool = True, gate: Any = None
+    ) -> None:
         self.tracker = tracker
         self.lags = lags
         self.fit_intercept = fit_intercept
+        self.gate = gate
         super().__init__()
 
     def _fit(self, y: pd.Series, X: pd.DataFrame | None, fh: Any) -> Self:
         self._columns, self._name = [] if X is None else list(X.columns), y.name
         tracker = AdaptiveKalman() if self.tracker is None else self.tracker
-        self.run_: Track = track(self._model(), tracker, *self._signals(y, X))
+        self.run_: Track = track(self._model(), tracker, *self._signals(y, X), gate=self.gate)
         return self
 
     def _update(self, y: pd.Series, X: pd.DataFrame | None = None, update_params: bool = True) -> Self:
         weights = 1.0 if update_params else 0.0
         before = self.run_
-        self.run_ = track(before.model, before.tracker, *self._signals(y, X), weights=weights, warm_start=before)
+        signals: Any = self._signals(y, X)
+        self.run_ = track(before.model, before.tracker, *signals, weights=weights, gate=self.gate, warm_start=before)
         return self
 
     def _predict(self, fh: Any, X: pd.DataFrame | None) -> pd.Series:

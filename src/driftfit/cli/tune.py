@@ -12,6 +12,7 @@ from driftfit.cli.parts.options import Given, reads
 from driftfit.cli.parts.program import app, progress, say
 from driftfit.cli.track import Plot
 from driftfit.parsing.settings import given_fields
+from driftfit.readings.left_out import LeftOut, remarks_of
 from driftfit.show.parts.text import facts, shortened, table_of
 
 
@@ -41,6 +42,7 @@ def tune(
         ("Model", repr(models[0])),
         ("Tracker", shortened(repr(tuned.tracker))),
         ("Log-likelihood", f"{tuned.loglik:.6g} of {tuned.used} samples"),
+        *remarks_of([tuned.left_out] if isinstance(tuned.left_out, LeftOut) else tuned.left_out.values()),
     ]
     say(facts(*rows))
     table = table_of(f"Settings by {method}", "", "chosen", f"{level:.0%} from", "to")

@@ -26,6 +26,7 @@ from driftfit.data.times.instants import instants
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, axes, factor
 from driftfit.models.base import Model
+from driftfit.readings.left_out import LeftOut
 from driftfit.trackers.base import Tracker
 
 
@@ -156,6 +157,8 @@ class Records(NamedTuple):
     drifts: Array | None = None
     missing: Mapping[Hashable, Mapping[str, int]] = _NONE
     outputs: tuple[str, ...] = ()
+    left_out: Mapping[Hashable, LeftOut] = _NONE
+    """What was left out of each series by decisions that were made before."""
 
     @property
     def ny(self) -> int:
@@ -229,7 +232,8 @@ class Records(NamedTuple):
             {key: counts.get(self.keys[0], {}) for key in keys} for counts in (self.dropped, self.missing)
         )
         first, length = np.repeat(self.first, len(keys)), np.repeat(self.length, len(keys))
-        return self._replace(keys=keys, first=first, length=length, dropped=dropped, missing=missing)
+        left_out = dict.fromkeys(keys, self.left_out[self.keys[0]]) if self.left_out else self.left_out
+        return self._replace(keys=keys, first=first, length=length, dropped=dropped, missing=missing, left_out=left_out)
 
     def labels_of(self, k: int) -> Labels:
         """The labels of series k."""

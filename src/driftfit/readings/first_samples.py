@@ -255,7 +255,7 @@ def drop_oldest(s: State, l: int) -> None:
     for k in range(1, N):
         for column in range(PHI + n):
             s.gate_first[k - 1, column, l] = s.gate_first[k, column, l]
-    s.gate_kept[l], s.gate_decided[l] = N - 1, MADE_ROOM
+    s.gate_kept[l] = N - 1
 
 
 @kernel
@@ -281,10 +281,12 @@ def remember_one(s: State, ages: int, l: int) -> None:
         keep(s, last, s.gate_first[last, TIMES, l] + 1.0, l)
         return
     if s.gate_kept[l] == N:
+        s.gate_decided[l] = MADE_ROOM if s.gate_first[0, READING, l] == s.gate_first[0, READING, l] else 0
         drop_oldest(s, l)
     keep(s, s.gate_kept[l], 1.0, l)
     s.gate_kept[l] += 1
-    equal = beginning(s, l) if s.gate_kept[l] == N else N
+    known = s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
+    equal = beginning(s, l) if (s.gate_kept[l] == N) & known else N
     if (equal == 1) | (2 * (equal + s.phi.shape[0]) < N):
         decide(s, ages, l)
 

@@ -44,7 +44,7 @@ def ungated(found: Mapping[str, Sequence[float]], linear: bool) -> str:
     the model is linear in theta."""
     said = "; ".join(_codes(name, values) for name, values in found.items())
     lasting = "" if linear else " An estimate of a model that is not linear in theta may not come back from them."
-    return f"{said}. They entered the estimate; gate=True leaves such readings out.{lasting}"
+    return f"{said}. Such readings enter the estimate; gate=True leaves them out.{lasting}"
 
 
 def _codes(name: str, values: Sequence[float]) -> str:

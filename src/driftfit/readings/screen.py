@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, Driver, State, kernel
 from driftfit.readings.gate import Gate, gate_step, start
 
@@ -25,8 +26,8 @@ SAMPLED = 64
 
 def suspect(signal: Array) -> Array:
     """Which values (T,) of a signal are more than `SUSPECT` usual distances from its median: the median distance of
-    those that differ from it. Missing and infinite values are not."""
-    known = np.isfinite(signal)
+    those that differ from it. Missing values, and those too large to be used, are not."""
+    known = np.abs(signal) < LARGEST
     if np.count_nonzero(known) < FEWEST:
         return np.zeros(len(signal), bool)
     away = np.abs(np.where(known, signal, np.nan) - np.median(signal[known]))
@@ -42,12 +43,14 @@ def screen(signal: Array, first: Array, length: Array) -> Array:
     `SUSPECT` distances; a series with fewer values that differ from its median is looked at whole.
     """
     found = np.zeros(len(first), bool)
+    if len(first) == 1 and _quiet(signal[first[0] : first[0] + length[0]]):
+        return found
     series = np.flatnonzero(length >= FEWEST)
     if not len(series):
         return found
     begin, count = first[series, None], length[series, None]
     some = signal[begin + np.arange(SAMPLED) * count // SAMPLED]
-    some[~np.isfinite(some)] = np.nan
+    some[~(np.abs(some) < LARGEST)] = np.nan
     center = _middle(some)
     away = np.abs(some - center[:, None])
     away[away == 0.0] = np.nan
@@ -56,6 +59,17 @@ def screen(signal: Array, first: Array, length: Array) -> Array:
     high, low = (reduce(padded, ends)[::2] for reduce in (np.fmax.reduceat, np.fmin.reduceat))
     found[series] = few | (np.fmax(high - center, center - low) > 0.5 * SUSPECT * _middle(away))
     return found
+
+
+def _quiet(signal: Array) -> bool:
+    """Whether a complete signal holds no such value; a quarter of the cost for a short record, of which most are."""
+    some = np.sort(signal[:: len(signal) // SAMPLED + 1])
+    if len(some) < FEWEST:
+        return False
+    center = some[len(some) // 2]
+    away = np.sort(np.abs(some - center))
+    limit = 0.5 * SUSPECT * away[len(away) // 2]
+    return bool((signal.max() - center < limit) & (center - signal.min() < limit))  # not where one is missing
 
 
 def _middle(rows: Array) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 
 from driftfit.data.record import Records
 from driftfit.engine.settings import warn
+from driftfit.readings.left_out import NOTHING_LEFT_OUT
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.parallel_lanes import run_lanes
@@ -82,7 +83,8 @@ class Fleet(KeyedResults):
             whole = self._whole(k)
             assert isinstance(whole, Outputs)
             return whole[output]
-        return Track(self._programs[j], self.records.part(j), self._lanes[j], self._starts.get(j))
+        left_out = self.records.left_out.get(self.records.keys[j], NOTHING_LEFT_OUT)
+        return Track(self._programs[j], self.records.part(j), self._lanes[j], self._starts.get(j), left_out)
 
     def _absent(self, key: Hashable) -> str:
         if key in self.failed:

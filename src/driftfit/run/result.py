@@ -454,6 +454,7 @@ class Track(Plain, Columns):
         arrays |= {f"out_{name}": self.in_rows(name) for name in self.stores()}
         arrays |= {f"state_{name}": value for name, value in self.state.items()}
         arrays |= {f"start_{name}": value for name, value in (self.start or {}).items()}
+        arrays |= {f"decided_{name}": value for name, value in vars(self._left_out).items()}
         storage.write(path, header, arrays)
 
     @classmethod
@@ -480,7 +481,8 @@ class Track(Plain, Columns):
         out = program.written(tile, len(record), header["keep"], arrays["out_theta"].dtype)
         storage.restore(path, program.tracker, arrays, "out_", {name: out[name][..., 0] for name in names_of(out)})
         start = {name.removeprefix("start_"): arrays[name] for name in arrays if name.startswith("start_")}
-        return cls(program, record, Lane(out, tile), start or None)
+        left_out = LeftOut(**{name: arrays[f"decided_{name}"] for name in vars(NOTHING_LEFT_OUT)})
+        return cls(program, record, Lane(out, tile), start or None, left_out)
 
 
 def track_record(program: Program, record: Record, keep: str = "std", start: State | None = None) -> Track:

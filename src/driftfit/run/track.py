@@ -14,11 +14,12 @@ import numpy as np
 from driftfit.data import outputs
 from driftfit.data.arguments import check_roles
 from driftfit.data.record import Reading, Record, Records, one_series, rows
+from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
 from driftfit.readings.gate import AT_START, INPUT, REFUSED, Gate
-from driftfit.readings.left_out import LeftOut
+from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
 from driftfit.readings.remarks import ungated
 from driftfit.readings.screen import Review, screen, suspect
 from driftfit.run.fleet import Fleet, run_fleet
@@ -26,7 +27,7 @@ from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, programs_of, tile_of
 from driftfit.run.result import Lane, Lanes, Track, track_record
-from driftfit.run.states.reference import decided
+from driftfit.run.states.reference import decide, decided
 from driftfit.run.warm_start import Run, carried, ended, first_interval
 from driftfit.trackers.base import Tracker
 
@@ -122,6 +123,8 @@ def _task(
     if kept.prob is not None and (many or len(model.outputs) > 1):
         raise ValueError("track: prob= is for one series and one tracker.")
     if grid and by is None:
+        if gate and not records.outputs:  # one decision for all settings
+            records, gate = decide(model.bind(records.labels.u or records.u.shape[-1]), records, gate)[0], False
         records = records.repeated(tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker))))  # type: ignore[arg-type]
     trackers = (_per_series(tracker, records) if grid else [tracker] * len(records.keys)) or _any_of(tracker)
     programs, records = _prepared(model, trackers, records, kept.keep, kept.prob, gate)
@@ -234,7 +237,8 @@ def _one(programs: Sequence[Program], records: Records, keep: str, before: Run |
         each = np.arange(records.ny)
         lanes = Lanes([(out, tile, each, each)], np.full(records.ny, len(record)))
         return Outputs(programs, records._replace(known=record.known), lanes, {}, dict(enumerate(starts)))
-    return Track(program, record, Lane(out, tile), starts[0] if starts else None)
+    left_out = records.left_out.get(records.keys[0], NOTHING_LEFT_OUT)
+    return Track(program, record, Lane(out, tile), starts[0] if starts else None, left_out)
 
 
 def warn_astray(run: Track | KeyedResults) -> None:
@@ -284,7 +288,8 @@ def warn_of_codes(verb: str, runs: Iterable[Track]) -> None:
 
 def _codes(run: Track) -> dict[str, list[float]]:
     """The values of each signal of a run without a gate that one would have refused."""
-    y, u, model = run.record.y, run.record.u, run.program.model
+    model = run.program.model
+    y, u = (np.where(np.abs(x) < LARGEST, x, np.nan) for x in (run.record.y, run.record.u))
     strange = [suspect(signal) for signal in u.T]
     if not (suspect(y).any() or any(one.any() for one in strange)):
         return {}

@@ -21,6 +21,7 @@ from rich.text import Text
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.compare import persistence
+from driftfit.readings.left_out import remarks_of
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, counts, facts, key_text, table_of, together
@@ -61,6 +62,7 @@ class FleetSummary(Printed):
     dropped: dict[str, int]
     scaled: bool
     missing: dict[str, int] = field(default_factory=dict)
+    left_out: tuple[tuple[str, str], ...] = ()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         samples, used = sum(unit.samples for unit in self.units), sum(unit.used for unit in self.units)
@@ -75,6 +77,7 @@ class FleetSummary(Printed):
             pairs.append(("Rows left out", counts(self.dropped)))
         if self.missing:
             pairs.append(("Taken as missing", counts(self.missing)))
+        pairs += self.left_out
         yield facts(*pairs)
         yield from self._ranking()
         for key, reason in list(self.failed.items())[:SHOWN]:
@@ -108,8 +111,9 @@ def summarise(fleet: KeyedResults) -> FleetSummary:
     for run in runs:
         missing.update(run.labels.missing)
     return FleetSummary(
-        repr(fleet.model), trackers, tuple(units), dict(fleet.failed), fleet.dropped, scaled, dict(missing)
-    )
+        repr(fleet.model), trackers, tuple(units), dict(fleet.failed), fleet.dropped, scaled, dict(missing),
+        remarks_of(run.left_out for run in runs),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

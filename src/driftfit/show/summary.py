@@ -143,10 +143,10 @@ def _signals(labels: Labels) -> str:
 
 def _gate(run: Track) -> tuple[tuple[str, str], ...]:
     """What the gate left out, a line for each reason; nothing without a gate."""
+    left = remarks_of(counts_of(run.left_out.code))
     if run.program.gate is None:
-        return ()
-    left = run.left_out.code
-    return (*remarks_of(counts_of(left)), *floor_remark(float(run.state["floor"]))) or (("Gate", "nothing left out"),)
+        return left
+    return (*left, *floor_remark(float(run.state["floor"]))) or (("Gate", "nothing left out"),)
 
 
 def _missing(run: Track) -> tuple[tuple[str, str], ...]:

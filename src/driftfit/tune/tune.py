@@ -234,6 +234,6 @@ def _warn_ungated(task: Task, tracker: Tracker) -> None:
 def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any, by: Any) -> Task:
     records = records_of(model, y, u, reading, data, by)[1].for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
-    records, left_out = decide(bound, tracker, records, reading.gate)
+    records, left_out = decide(bound, records, tracker.gated if reading.gate is None else reading.gate)
     records = records.for_trackers(bound, [tracker])
     return Task(bound, tuple(replace(records.part(k), time=None) for k in range(len(records.keys))), left_out or None)

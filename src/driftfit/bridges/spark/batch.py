@@ -55,7 +55,7 @@ VERDICT = {"drifts": "boolean", "p": "double", "pays": "boolean", "moved": "stri
 def track(
     df: Any, model: Model, tracker: Tracker | Mapping[str, Tracker], *, y: str | Sequence[str],
     by: str | Sequence[str], time: str, u: str | Sequence[str] | None = None, dt: Any = None, settings: Any = None,
-    outputs: str = "samples", arrays: bool = False,
+    outputs: str = "samples", arrays: bool = False, gate: Any = None,
 ) -> Any:  # fmt: skip
     """Track every unit of a data frame of Spark.
 
@@ -83,6 +83,8 @@ def track(
         tracker's variances hold) and counts; the same with what `Track.verdict` says (whether parameters move, its p,
         whether tracking pays, the parameter that moves most clearly), for which a unit is held in memory; or a row per
         unit with its state, from which `follow` begins.
+    gate : bool, Gate or None
+        As for `driftfit.track`; ``ok`` is false for what it leaves out.
     arrays : bool
         Put the parameters of a sample into the array columns ``theta`` and ``std``.
 
@@ -103,7 +105,7 @@ def track(
         If PySpark or Java is missing.
     """
     one_of("spark.track", "outputs", outputs, OUTPUTS)
-    task = task_of(df, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, settings, arrays)
+    task = task_of(df, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, settings, arrays, gate)
     rows = rows_of(df, task, settings)
     order = [*task.by, task.time, *task.y, *task.u]
     sorted_rows = rows.repartition(*task.by).sortWithinPartitions(*order)

@@ -22,6 +22,7 @@ from driftfit.bridges.spark.task import SETTING, Task, results_schema, trackers_
 from driftfit.data.clock import Clock
 from driftfit.data.storage import describe, parts_of, rebuild
 from driftfit.models.base import Model
+from driftfit.readings.gate import Gate
 from driftfit.run.live.rule import AlarmRule
 from driftfit.trackers.base import Tracker
 
@@ -32,8 +33,9 @@ STATE = {"state": "binary", "settings": "string", **dict.fromkeys(COUNTS, "bigin
 def follow(
     stream: Any, model: Model, tracker: Tracker | Mapping[str, Tracker], *, path: str, y: str | Sequence[str],
     by: str | Sequence[str], time: str, u: str | Sequence[str] | None = None, dt: Any = None, settings: Any = None,
-    arrays: bool = False, hold: Any = 0, rule: AlarmRule | Mapping[str, AlarmRule] | None = None, expire: Any = None,
-    initial: Any = None, migrate: bool = False, sink: Any = None, trigger: Mapping[str, Any] | None = None,
+    arrays: bool = False, gate: Any = None, hold: Any = 0, rule: AlarmRule | Mapping[str, AlarmRule] | None = None,
+    expire: Any = None, initial: Any = None, migrate: bool = False, sink: Any = None,
+    trigger: Mapping[str, Any] | None = None,
 ) -> Any:  # fmt: skip
     """Follow every unit of a stream of Spark.
 
@@ -41,7 +43,7 @@ def follow(
     ----------
     stream : pyspark.sql.DataFrame
         A streaming data frame; one row per sample.
-    model, tracker, y, u, by, time, dt, settings, arrays
+    model, tracker, y, u, by, time, dt, settings, arrays, gate
         As for `driftfit.bridges.spark.track`. Rows of a unit whose settings cannot run in a batch are kept with the
         reason (`Store.late`), and its state stays as it is.
     path : str
@@ -78,7 +80,7 @@ def follow(
     ImportError
         If PySpark or Java is missing.
     """
-    task = task_of(stream, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, settings, arrays)
+    task = task_of(stream, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, settings, arrays, gate)
     kinds = dict(rows_of(stream, task, None).dtypes)
     dated = kinds[time].startswith("timestamp")
     rules = rules_of(task, rule)
@@ -121,6 +123,7 @@ def _origins(store: Store, task: Task, schema: Mapping[str, str], migrate: bool)
     results = [name for name in schema if name not in ("kind", *STATE, "last", "newest", "failed")]
     about: dict[str, Any] = {"model": describe(task.model), "fields": text, "results": results}
     about["tracker"] = [describe(one) for one in trackers_of(task.tracker)]
+    about["gate"] = task.gate.settings() if isinstance(task.gate, Gate) else task.gate
     about |= {"schema": ", ".join(f"`{name}` {kind}" for name, kind in {"batch": "int", **schema}.items())}
     about |= {"rows": list(task.columns), "states": [*task.by, *STATE, "last", "newest"]}
     found = store.abouts()
@@ -133,6 +136,11 @@ def _origins(store: Store, task: Task, schema: Mapping[str, str], migrate: bool)
         raise ValueError(
             f"spark.follow: the states in {store.path} were made with {followed!r}, not with {task.model!r}; begin in "
             "another folder."
+        )
+    if last.get("gate", "older") != about["gate"]:
+        raise ValueError(
+            f"spark.follow: the states in {store.path} were made with another gate, and a gate must know all readings "
+            "from the first on; give gate= as it was, or begin in another folder with the whole stream."
         )
     origins = tuple(_origin(task, one) for one in reversed(found))
     if not migrate and (origins[0].tracker != task.tracker or last["fields"] != text):

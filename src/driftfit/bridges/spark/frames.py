@@ -22,8 +22,9 @@ TIMES = ("timestamp", "timestamp_ntz", "date", "tinyint", "smallint", "int", "bi
 
 
 def task_of(
-    df: Any, model: Model, tracker: Any, columns: Mapping[str, Any], dt: Any, settings: Any, arrays: bool
-) -> Task:
+    df: Any, model: Model, tracker: Any, columns: Mapping[str, Any], dt: Any, settings: Any, arrays: bool,
+    gate: Any = None,
+) -> Task:  # fmt: skip
     """The task for a data frame; ``columns`` are y, u, by and time. ValueError for what cannot run."""
     if problem := missing():
         raise ImportError(problem)
@@ -53,7 +54,7 @@ def task_of(
     dated = kind in ("timestamp", "timestamp_ntz", "date")
     zone = df.sparkSession.conf.get("spark.sql.session.timeZone") if kind == "timestamp" else None
     own = () if settings is None else _settings(settings, tracker, names["by"])
-    task = Task(model, tracker, names["y"], names["u"], names["by"], names["time"][0], dt, zone, own, arrays)
+    task = Task(model, tracker, names["y"], names["u"], names["by"], names["time"][0], dt, zone, own, arrays, gate)
     task.clock.steps(np.array([0, 1], "M8[us]") if dated else np.array([0.0, 1.0]))
     if not own:
         task.joint_of(None, tracker)

@@ -39,7 +39,8 @@ EVENT = "_event"
 def follow_keyed(
     stream: Any, model: Model, tracker: Tracker | Mapping[str, Tracker], *, y: str | Sequence[str],
     by: str | Sequence[str], time: str, u: str | Sequence[str] | None = None, dt: Any = None, arrays: bool = False,
-    hold: Any = 0, rule: AlarmRule | Mapping[str, AlarmRule] | None = None, expire: Any = None, initial: Any = None,
+    gate: Any = None, hold: Any = 0, rule: AlarmRule | Mapping[str, AlarmRule] | None = None, expire: Any = None,
+    initial: Any = None,
     before: Any = None,
 ) -> Any:  # fmt: skip
     """Follow every unit of a stream with Spark's own keyed state; PySpark 4.1 or later.
@@ -74,7 +75,7 @@ def follow_keyed(
     from pyspark.sql import functions as F  # noqa: N812
     from pyspark.sql.group import GroupedData
 
-    task = task_of(stream, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, None, arrays)
+    task = task_of(stream, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, None, arrays, gate)
     rules = rules_of(task, rule)
     if not hasattr(GroupedData, "transformWithState"):
         raise ImportError("spark.follow_keyed needs transformWithState on rows: pip install 'pyspark>=4.1'.")

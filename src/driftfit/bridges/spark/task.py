@@ -47,6 +47,7 @@ class Task:
     zone: str | None = None
     settings: tuple[str, ...] = ()
     arrays: bool = False
+    gate: Any = None
 
     @cached_property
     def clock(self) -> Clock:
@@ -89,7 +90,7 @@ class Task:
 
     def joint_of(self, settings: str | None, tracker: Any) -> JointLayout:
         """The programs of a unit with these settings (JSON); ValueError if they are not complete."""
-        return JointLayout(programs_of(self.model, _with(tracker, settings), self.order))
+        return JointLayout(programs_of(self.model, _with(tracker, settings), self.order, self.gate))
 
     def joint_for(self, settings: str | None) -> JointLayout | str:
         """The programs of a unit with these settings (JSON) of its own, or why there are none."""

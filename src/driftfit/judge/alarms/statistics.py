@@ -28,6 +28,7 @@ from driftfit.judge.alarms.reference import burn, first_third, least, normal_sam
 from driftfit.judge.regressors import refuse_hidden
 from driftfit.judge.statistics.parts.coarse_readings import explained, step_of
 from driftfit.judge.statistics.robust import orthonormal
+from driftfit.readings import gate
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.live.frozen.likelihood_ratio import scan
 from driftfit.run.live.frozen.reference_model import (
@@ -148,12 +149,10 @@ def _drawn(phi: Array, y: Array, step: float, root: Array, ok: Array) -> tuple[A
 
 
 def _stuck(run: Track) -> Array:
-    """Samples (T,) that the tracker refused because their readings repeat the one before, from the third in a row on.
-
-    Other readings that it refused are normal if they are in the reference.
-    """
-    repeated = np.append([False] * 3, run.y[1:] == run.y[:-1]) & np.append([False] * 2, ~run.ok)
-    return np.asarray(repeated[2:] & repeated[1:-1] & repeated[:-2])
+    """Samples (T,) of a frozen sensor; other readings that a gate refused are normal if they are in the reference."""
+    left, found = run.left_out, np.zeros(len(run), bool)
+    found[left.sample[left.code == gate.FROZEN]] = True
+    return found
 
 
 def _band(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:

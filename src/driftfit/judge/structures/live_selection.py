@@ -27,7 +27,10 @@ from driftfit.data.storage import Kept
 from driftfit.engine.kernel import Array
 from driftfit.judge.structures.shared_streams import SharedStream, share
 from driftfit.models.base import Model
+from driftfit.readings.gate import FROZEN, INPUT, REFUSED
 from driftfit.run.live.live import Live
+from driftfit.run.states.gating import gate_of
+from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.student import log_student
 
@@ -45,6 +48,10 @@ class LiveSelection(Kept):
         The weight of a log-likelihood one sample later: the memory is 1 / (1 - forgetting) samples. A smaller one finds
         a change sooner, and is misled by noise more often.
     dt : as for `Live`
+    gate : bool, Gate or None
+        As for `Live`. The gate decides once, before a stream of `AdaptiveKalman` on the largest model (``reference``),
+        and what it leaves out is left out for all candidates, other than codes among the first samples, which are only
+        recognised later: ``selection.reference.left_out``.
 
     Raises
     ------
@@ -55,7 +62,9 @@ class LiveSelection(Kept):
 
     _kind: ClassVar[str] = "selection"
 
-    def __init__(self, models: Sequence[Model], tracker: Tracker, forgetting: float = 0.99, dt: Any = None) -> None:
+    def __init__(
+        self, models: Sequence[Model], tracker: Tracker, forgetting: float = 0.99, dt: Any = None, gate: Any = None
+    ) -> None:
         for model in models:
             check_roles("LiveSelection", model, tracker)
         if not models or any(len(model.outputs) > 1 for model in models):
@@ -67,10 +76,14 @@ class LiveSelection(Kept):
             )
         if not 0.0 < forgetting <= 1.0:
             raise ValueError(f"LiveSelection: forgetting must be in (0, 1]; got {forgetting!r}.")
-        self._follow([SharedStream(model, tracker, dt=dt) for model in models], forgetting)
+        judge = gate_of(tracker, gate)
+        largest = max(models, key=lambda model: model.bind(model.input_names or model.m).n)
+        reference = None if judge is None else Live(largest, AdaptiveKalman(), dt=dt, gate=judge)
+        self._follow([SharedStream(model, tracker, dt=dt, gate=False) for model in models], forgetting, reference)
 
-    def _follow(self, streams: Sequence[SharedStream], forgetting: float) -> None:
+    def _follow(self, streams: Sequence[SharedStream], forgetting: float, reference: Live | None) -> None:
         share(streams)
+        self.reference, self._blamed = reference, 0
         self.streams, self.forgetting = tuple(streams), float(forgetting)
         self._logs, self._residuals = np.zeros((2, len(self.streams)))
 
@@ -86,12 +99,25 @@ class LiveSelection(Kept):
         ``u`` and what is ``known`` (time, weight, drift) are as for `Live.update`.
         """
         weights = self.weights
+        if self.reference is not None:
+            y, known = self._judged(y, u, known)
         steps = [live.update(y, u, **known) for live in self.streams]
         terms = np.array([self._log_density(k, y, step) for k, step in enumerate(steps)])
         if np.isfinite(terms).all():
             logs = self.forgetting * self._logs + terms
             self._logs = logs - logs.max()
         return float(weights @ [step[0] for step in steps])
+
+    def _judged(self, y: float, u: Any, known: dict[str, Any]) -> tuple[float, dict[str, Any]]:
+        """(y, NaN if the gate refused it; what is known, without weight while a refused input is among the lags)."""
+        assert self.reference is not None
+        *_, ok = self.reference.update(y, u, **known)
+        reason = int(self.reference.lane()["reason"])
+        if reason == INPUT:
+            self._blamed = self.reference.model.input_memory + 1
+        unused = self._blamed > 0 and not ok
+        self._blamed = max(self._blamed - 1, 0)
+        return (np.nan if reason in (REFUSED, FROZEN) else y), {**known, "weight": 0.0} if unused else known
 
     def _log_density(self, k: int, y: float, step: tuple[float, float, float, bool]) -> float:
         """Log density of a sample under candidate k given those before it, NaN without one; `Track.log_density`."""
@@ -124,6 +150,9 @@ class LiveSelection(Kept):
     def _written(self) -> tuple[dict[str, Any], dict[str, Array]]:
         header = {"kind": self._kind, "forgetting": self.forgetting}
         streams = {f"stream{k}": np.frombuffer(live.to_bytes(), np.uint8) for k, live in enumerate(self.streams)}
+        header["blamed"] = self._blamed
+        if self.reference is not None:
+            streams["reference"] = np.frombuffer(self.reference.to_bytes(), np.uint8)
         return header, streams | {"logs": self._logs, "residuals": self._residuals}
 
     @classmethod
@@ -131,6 +160,8 @@ class LiveSelection(Kept):
         found = cls.__new__(cls)
         count = len(arrays["logs"])
         streams = [SharedStream.from_bytes(arrays[f"stream{k}"].tobytes(), classes) for k in range(count)]
-        found._follow(streams, header["forgetting"])
+        judge = Live.from_bytes(arrays["reference"].tobytes(), classes) if "reference" in arrays else None
+        found._follow(streams, header["forgetting"], judge)
+        found._blamed = header["blamed"]
         found._logs, found._residuals = np.array(arrays["logs"]), np.array(arrays["residuals"])
         return found

@@ -309,7 +309,8 @@ def select(
     named = max(candidates, key=lambda model: len(model.input_names))
     records = records.for_model(named, reading, max(model.reach for model in candidates))
     bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
-    records, left_out = decide(max(bound, key=lambda model: model.n), tracker, records, gate)
+    gate = tracker.gated if gate is None else gate
+    records, left_out = decide(max(bound, key=lambda model: model.n), records, gate)
     names = [repr(model) for model in candidates]
     pool, structures = pool_of(bound, names, [replace(records.part(k), time=None) for k in range(len(records.keys))])
     return replace(_selected(pool, structures, tracker, search, beside), left_out=left_out)

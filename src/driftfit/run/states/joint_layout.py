@@ -78,7 +78,7 @@ class JointLayout:
         tag, words = unpacked(data)
         if tag != self.tag or len(words) != self.size:
             raise ValueError(
-                f"the bytes hold a state of another model, tracker, setting or version: their fingerprint is "
+                f"the bytes hold a state of another model, tracker, gate, setting or version: their fingerprint is "
                 f"{tag.hex()}, that of {self.programs} is {self.tag.hex()}."
             )
         return words

@@ -19,26 +19,26 @@ from driftfit.run.program import Program
 from driftfit.run.result import track_record
 from driftfit.run.states.gating import gate_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
-from driftfit.trackers.base import Tracker
 
 Decisions = Mapping[Hashable, LeftOut]
 """What was left out of each series, by its key."""
 
 
-def decide(model: Model, tracker: Tracker, records: Records, gate: Any) -> tuple[Records, Decisions]:
+def decide(model: Model, records: Records, gate: Any) -> tuple[Records, Decisions]:
     """(the series as every candidate takes them, what was left out of each), given the largest model, bound, and a
-    gate, or decisions that were made before; ValueError for a model that the reference does not follow.
+    gate (None or False: none), or decisions that were made before; ValueError for a model that the reference does not
+    follow.
     """
+    if gate is None or gate is False:
+        return records, {}
     if not isinstance(gate, LeftOut | Mapping):
-        judge = gate_of(tracker, gate)
-        if judge is None:
-            return records, {}
         if model.hidden is not None:
             raise ValueError(
                 f"gate: {type(model).__name__} has no reference run that could decide; give the decisions of a run, "
                 "gate=track(model, tracker, y, u, gate=True).left_out."
             )
-        program = Program(model, AdaptiveKalman(), gate=judge)
+        reference = AdaptiveKalman()
+        program = Program(model, reference, gate=gate_of(reference, gate))
         parts = zip(records.keys, map(records.part, range(len(records.keys))), strict=True)
         gate = {key: track_record(program, part).left_out for key, part in parts}
     return decided(records, gate)
@@ -57,4 +57,4 @@ def decided(records: Records, gate: LeftOut | Decisions) -> tuple[Records, Decis
         if key in gate:
             part = slice(begin, begin + count)
             y[part], noise[part] = gate[key].applied(y[part], noise[part])
-    return records._replace(y=y, known=records.known.changed(noise=noise)), gate
+    return records._replace(y=y, known=records.known.changed(noise=noise), left_out=gate), gate

@@ -20,8 +20,7 @@ from driftfit.data.known import Known
 from driftfit.data.record import Records
 from driftfit.engine.drivers import INTERVAL, NOISE
 from driftfit.engine.kernel import Array
-from driftfit.readings.gate import AT_START
-from driftfit.readings.gate import USED as USED_READING
+from driftfit.readings import gate
 from driftfit.readings.remarks import SAID
 from driftfit.run.live.interventions import HELD
 from driftfit.run.live.rule import FROZEN
@@ -188,10 +187,10 @@ class Section:
     def _count_refused(self, found: Advanced, places: Array, own: Array, first: Array) -> None:
         """Count what gates left out, by reason: samples at ``places`` (N,), and ``first`` samples of units (K,)."""
         reason = found.reasons()
-        for k in np.flatnonzero((reason != USED_READING) & (reason != AT_START)).tolist():
+        for k in np.flatnonzero((reason != gate.USED) & (reason != gate.AT_START)).tolist():
             self._count(places[k], reason.item(k), 1)
         for k in np.flatnonzero(first > 0).tolist():
-            self._count(own[k], AT_START, first.item(k))
+            self._count(own[k], gate.AT_START, first.item(k))
 
     def _count(self, place: int, code: int, count: int) -> None:
         tally((self.units[place].rare, self.left_out), SAID[code][0].lower(), count)

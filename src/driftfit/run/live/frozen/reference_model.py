@@ -180,12 +180,12 @@ def size_of(n: int) -> int:
 
 
 def judgeable(fields: Any, lane: int, y: Array, noise: Array) -> Array:
-    """`OK` of samples (T,): 1 for those that the tracker used, and complete ones whose reading y it refused; `BLAMED`
-    for those whose inputs it blames; 0 for those that cannot be judged.
+    """`OK` of samples (T,): 1 for those that the tracker used, and complete ones whose reading y a gate refused;
+    `BLAMED` for those whose inputs it blames; 0 for those that cannot be judged.
 
-    A tracker refuses readings that contradict all before, or repeat the last one, since it would lose its estimate. An
-    alarm that left them out would never report a sensor that fails again and again; its scores are bounded. Where a
-    gate refused a reading, y is -0, and none is left.
+    A gate refuses readings that contradict all before, or repeat the last one, since the tracker would lose its
+    estimate. An alarm that left them out would never report a sensor that fails again and again; its scores are
+    bounded. Where a model has no reading, y is -0, and none is left.
     """
     ok, valid, observed = (fields[name][..., lane] > 0.0 for name in ("ok", "valid", "observed"))
     refused = (fields["y"][..., lane] == 0.0) & np.signbit(fields["y"][..., lane])
