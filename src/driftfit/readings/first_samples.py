@@ -281,7 +281,8 @@ def remember_one(s: State, ages: int, l: int) -> None:
         keep(s, last, s.gate_first[last, TIMES, l] + 1.0, l)
         return
     if s.gate_kept[l] == N:
-        s.gate_decided[l] = MADE_ROOM if s.gate_first[0, READING, l] == s.gate_first[0, READING, l] else 0
+        known = s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
+        s.gate_decided[l] = MADE_ROOM if known else s.gate_decided[l]
         drop_oldest(s, l)
     keep(s, s.gate_kept[l], 1.0, l)
     s.gate_kept[l] += 1
