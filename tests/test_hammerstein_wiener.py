@@ -18,7 +18,6 @@ from driftfit.models.hammerstein_wiener.curves.basis import (
     Polynomial,
 )
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.results.free_run import believed
 from driftfit.systems.drift import RandomWalk
 from driftfit.systems.hammerstein_wiener import CUBIC, NotMonotoneError, example, invert, simulate
 from driftfit.trackers.base import Tracker

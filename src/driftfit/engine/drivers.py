@@ -419,7 +419,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
     else:
         phases = _looking(tracker), _learning(tracker)
         look, learn = (outlined(phase) for phase in phases) if tracker.outlined else phases
-        between = _gated(look, gate, learn, part)
+        between, model = _gated(look, gate, learn, part), model._replace(regress=_raw_kept(model.regress))
     sample = _sample(model, tracker.note, between, part)
     keep_more = covariance if keep == "cov" else nothing_more
     common = nothing_common if keep == "own" else write_common
@@ -499,6 +499,17 @@ def _gated(look: Any, gate: Step, learn: Any, part: Any) -> Any:
         learn(part(s))
 
     return between
+
+
+def _raw_kept(regress: Step) -> Step:
+    """``regress``, which may put a function of the reading in its place, with the reading in ``s.raw_y``."""
+
+    @kernel
+    def regress_and_keep(s: State, l: int) -> None:
+        s.raw_y[l] = s.y[l]
+        regress(s, l)
+
+    return regress_and_keep  # type: ignore[no-any-return]
 
 
 @kernel

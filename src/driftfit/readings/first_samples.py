@@ -10,7 +10,8 @@ are not 0. A sample is doubtful if
     its reading is outlying and no regressor is: probably a fault code;
     or a regressor is outlying and the reading is not: a code of an input, or of an earlier output, now a lag.
 
-A large output after a large input is neither; a lag with the same fault code as the reading does not explain it.
+A large output after a large input is neither; a lag with the same fault code as the reading does not explain it, and
+where the model is ``implicit``, its regressors contain functions of the reading, and none of them does.
 Doubtful samples are left out if the others contradict them: if least squares on all leaves the others a sum of squares
 Q, and least squares on themselves only q with nu residuals, and
 
@@ -55,11 +56,11 @@ def no_samples(first: int, n: int, m: int) -> Mapping[str, Any]:
     N = first + n if first > 0 else 1
     return {
         "gate_first": np.full((N, U + m + n), np.nan), "gate_kept": 0, "gate_decided": 0 if first > 0 else 1,
-        "gate_replay": 0, "gate_fit": np.zeros((n + 1, n + 1)),
+        "gate_replay": 0, "gate_fit": np.zeros((n + 1, n + 1)), "raw_y": np.nan,
     }  # fmt: skip
 
 
-def first_samples(first: int, n: int, m: int, ages: int) -> Step:
+def first_samples(first: int, n: int, m: int, ages: int, implicit: bool = False) -> Step:
     """``remember(s, l)``: keep the sample, and decide when there are enough."""
     N, PHI = (first + n if first > 0 else 1), U + m
 
@@ -102,7 +103,7 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
             most = reach(s, PHI + i, center, l)
             for k in range(N):
                 x, d = s.gate_first[k, PHI + i, l], s.gate_first[k, DOUBT, l]
-                same = (abs(x) == abs(s.gate_first[k, READING, l])) & (d == 1.0)
+                same = (implicit | (abs(x) == abs(s.gate_first[k, READING, l]))) & (d == 1.0)
                 if (abs(x - center) > most) & (d < 2.0) & (not same):
                     s.gate_first[k, DOUBT, l] = d + 2.0
         for k in range(N):
@@ -258,8 +259,8 @@ def first_samples(first: int, n: int, m: int, ages: int) -> Step:
 
 @kernel
 def reading_now(s: State, l: int) -> float:
-    """The reading as it was measured, NaN if it is missing."""
-    return s.y[l] + s.shift[l] if s.observed[l] > 0.0 else np.nan  # type: ignore[no-any-return]
+    """The reading as it was measured, which a model may have replaced by a function of it; NaN if it is missing."""
+    return s.raw_y[l] if s.observed[l] > 0.0 else np.nan  # type: ignore[no-any-return]
 
 
 class First(NamedTuple):

@@ -128,9 +128,11 @@ def learn_usual(s: State, seen: bool, contradicts: bool, clip: float, l: int) ->
         s.gate_ratios[l] += 1.0
         most = clip * max(s.gate_ratio[l], 1.0) if s.s[l] == s.s[l] else clip * s.gate_ratio[l]
         ratio = s.e[l] * s.e[l] / own
-        ratio = min(ratio, most) if s.gate_ratios[l] > FIRST else ratio
+        begun = s.gate_ratios[l] > FIRST
+        # a start may claim any precision for a sample, but the first error of a tracker without s is all there is
+        ratio = min(ratio, most) if begun | (s.s[l] == s.s[l]) else ratio
         s.gate_ratio[l] += (ratio - s.gate_ratio[l]) / min(s.gate_ratios[l], MEMORY)
-        s.gate_settled[l] = min(variance_of_error(s, l), GROWTH * s.gate_settled[l])
+        s.gate_settled[l] = min(variance_of_error(s, l), GROWTH * s.gate_settled[l]) if begun else np.inf
 
 
 def output_rule(gate: Gate) -> Step:
@@ -194,10 +196,10 @@ def gate_step(
     """The gate of a model with n parameters and m inputs, of which it remembers ``ages`` samples besides the present.
 
     ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
-    memory. y_hat of an ``implicit`` model, whose regressors contain the reading, is no forecast of it: a code would be as
-    large as predicted. There y is compared with v alone.
+    memory. y_hat of an ``implicit`` model, whose regressors contain the reading, is no forecast of it: a code would be
+    as large as predicted. There y is compared with v alone.
     """
-    remember = first_samples(gate.first, n, m, ages)
+    remember = first_samples(gate.first, n, m, ages, implicit)
     notice, blame = input_rules(gate, m, ages, refuse)
     judge = output_rule(replace(gate, rare=np.inf) if implicit else gate)
     hold_frozen = frozen_rule(gate.frozen, gate.natural)
