@@ -170,8 +170,9 @@ class TrackerSteps(NamedTuple):
     the fields of the tracker and those that every record has but for ``u``, so that they are compiled once for all
     models (`driftfit.engine.tracker_part`); with ``reads_model`` they see those of the model too. ``outlined`` steps
     are compiled apart from the drivers, which call them (`driftfit.engine.outlined`): for trackers that take so long
-    that a call costs nothing; ``start`` always is. ``note`` comes before all of them and may write what they change
-    later.
+    that a call costs nothing; ``start`` always is. With ``learns_scale`` s.scale is the noise variance that the
+    tracker estimates, which a gate keeps above that of the rounding of a coarse meter. ``note`` comes before all of
+    them and may write what they change later.
     """
 
     predict: Step
@@ -190,6 +191,7 @@ class TrackerSteps(NamedTuple):
     instruments: bool = False
     reads_model: bool = False
     outlined: bool = False
+    learns_scale: bool = False
     note: Step = nothing
 
 
@@ -352,6 +354,12 @@ def _looking(tracker: TrackerSteps) -> Any:
     return look_at_once if tracker.start is None else look
 
 
+@kernel
+def floored(s: State, l: int) -> None:
+    """A scale that was learned from readings of a coarse meter is not below the variance of their rounding."""
+    s.scale[l] = max(s.scale[l], s.floor[l]) if s.floor[l] > 0.0 else s.scale[l]
+
+
 def _learning(tracker: TrackerSteps) -> Any:
     """Correction of all lanes, and reports, after a gate, which may have raised the noise and the floor of r."""
     variance, correct, report = tracker.variance, tracker.correct, tracker.report
@@ -359,13 +367,14 @@ def _learning(tracker: TrackerSteps) -> Any:
     variance_first, correct_first, report_first = first.variance, first.correct, first.report
     both = first.take_over is not None
     check, late = (keeps_digits, _late(tracker)) if both else (none_late, nothing)
+    bound_scale = floored if tracker.learns_scale else nothing
 
     @kernel
     def corrected(s: State, l: int) -> None:
         variance(s, l)
         check(s, l)
         correct(s, l)
-        s.scale[l] = max(s.scale[l], s.floor[l]) if s.floor[l] > 0.0 else s.scale[l]
+        bound_scale(s, l)
         report(s, l)
 
     @kernel
@@ -373,7 +382,7 @@ def _learning(tracker: TrackerSteps) -> Any:
         variance_first(s, l)
         s.late[l] = 0.0
         correct_first(s, l)
-        s.scale[l] = max(s.scale[l], s.floor[l]) if s.floor[l] > 0.0 else s.scale[l]
+        bound_scale(s, l)
         report_first(s, l)
 
     @kernel
