@@ -26,7 +26,7 @@ def test_coarse_readings_bound_the_noise(tracker):
     assert -2.0 * T < run.loglik < 0.5 * T
     assert np.mean(np.abs(run.innovation[300:]) < 1.96 * run.innovation_std[300:]) > 0.93
     assert "steps of 1" in str(run.summary())
-    for unit in (1e-9, 1e9):
+    for unit in (2.0**-30, 2.0**30):
         scaled = track(MODEL, tracker, y * unit, u, gate=True)
         np.testing.assert_allclose(scaled.innovation_std[300:] / unit, run.innovation_std[300:], rtol=1e-6)
 

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from driftfit import AdaptiveKalman, Kalman, Live, Regression, track
-from driftfit.trackers.parts.faults.first_samples import PHI
 from driftfit.trackers.parts.modes.drifts.one_direction import ASSUMED, STEPS, B, M
 from driftfit.trackers.parts.modes.weights import ASSUMED as P
-from driftfit.trackers.parts.modes.weights import BLOCK, FADE, PRECISION, SPAN, WINDOW, E
+from driftfit.trackers.parts.modes.weights import BLOCK, FADE, PHI, PRECISION, SPAN, WINDOW, E
 
 COMMON = np.array([1.0, 0.7, -0.5, 0.9])
 
