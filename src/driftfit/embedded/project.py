@@ -244,12 +244,13 @@ def _after_the_start(made: Translation) -> str:
 
 
 def _ordinary(unit: Unit) -> Counter[str]:
-    """Operations of an ordinary sample after the start: those of routines that only others call are left out."""
+    """Operations of an ordinary sample after the start: those of routines that only others call are left out, as are
+    those of a `late` sample."""
     operations = {function.name: function.operations for function in unit.functions.values()}
     if "advance" not in operations:
         return operations["sample"]
-    parts = (operations.get(name, Counter()) for name in ("regress", "clean", "needs_begin", "advance", "push"))
-    return sum(parts, Counter[str]())
+    parts = (operations.get(name, Counter()) for name in ("regress", "clean", "advance", "push"))
+    return sum(parts, Counter[str]()) - operations.get("late", Counter())
 
 
 def _counted(ops: Counter[str]) -> str:
