@@ -33,7 +33,7 @@ MOVED = "fbfc0a9"
 
 LAYERS = (
     ("engine",),
-    ("models", "systems"),
+    ("models", "systems", "readings"),
     ("trackers", "models.hammerstein_wiener.trackers"),
     # the arithmetic of smoothers works on arrays and not on runs: a stream smooths its last samples with it
     ("data", "smooth.parts"),

@@ -198,7 +198,9 @@ def test_a_controllers_state_opens_as_a_saved_stream(tmp_path):
 
 def test_what_no_step_writes_is_left_out_of_the_structure(tmp_path):
     given, nothing = (Live(ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=p0)) for p0 in (1.0, None))
-    assert len(to_struct(given)) == len(to_struct(nothing)) == 1280  # a given prior may be wide, and start on square roots
+    assert (
+        len(to_struct(given)) == len(to_struct(nothing)) == 1280
+    )  # a given prior may be wide, and start on square roots
     export_c(ARX(2, 2), given.program.tracker, tmp_path)
     source = (tmp_path / "tracker.c").read_text()
     assert re.search(r"s->P\[.*\] \+ \(s->q\[i\] \* time\)", source)  # no factors of one

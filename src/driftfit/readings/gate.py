@@ -18,8 +18,7 @@ a tracker without s (NaN) gets the mean of e^2 in its place, and a reading witho
 Inputs are judged in `driftfit.readings.inputs`, coarse meters and readings that stay the same in `repeats`, and
 the first samples, which have nothing to be compared with, in `first_samples`.
 
-Source: three in a row is the classical rule of confirmation for step changes; bounded leverage is Mallows's, see
-Hampel, Ronchetti, Rousseeuw and Stahel, Robust Statistics (1986), section 6.3; the rest is ours. Cost per ordinary
+Source: three in a row is the classical rule of confirmation for step changes; the rest is ours. Cost per ordinary
 sample: some forty operations, and O(n + m).
 """
 
