@@ -206,7 +206,7 @@ def first_samples(first: int, n: int, m: int, ages: int, implicit: bool = False)
             same &= s.u[j, l] == s.gate_first[k, U + j, l]
         for i in range(n):
             same &= s.phi[i, l] == s.gate_first[k, PHI + i, l]
-        return same
+        return same  # type: ignore[no-any-return]
 
     @kernel
     def at_rest(s: State, l: int) -> bool:
@@ -260,7 +260,7 @@ def first_samples(first: int, n: int, m: int, ages: int, implicit: bool = False)
 @kernel
 def reading_now(s: State, l: int) -> float:
     """The reading as it was measured, which a model may have replaced by a function of it; NaN if it is missing."""
-    return s.raw_y[l] if s.observed[l] > 0.0 else np.nan  # type: ignore[no-any-return]
+    return s.raw_y[l] if s.observed[l] > 0.0 else np.nan
 
 
 class First(NamedTuple):
