@@ -18,10 +18,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from benchmarks.gate_cases import CODES, MODELS, REAL, STARTS, Case
-from driftfit.engine.kernel import kernel
+from driftfit.engine.kernel import Driver, kernel
 from driftfit.readings.first_samples import replayed
 from driftfit.readings.gate import AT_START, USED, Gate, gate_step, start
 
@@ -55,7 +54,7 @@ def tile_of(given: dict[str, Any]) -> np.ndarray:
     return tile
 
 
-@njit(error_model="numpy")
+@kernel
 def forecast(s, l):
     """y_hat, e and s of all modes together."""
     n, s.y_hat[l] = s.phi.shape[0], 0.0
@@ -71,7 +70,7 @@ def forecast(s, l):
     s.e[l] = s.y[l] - s.y_hat[l]
 
 
-@njit(error_model="numpy")
+@kernel
 def variance(s, l):
     """s from h and the noise."""
     h = 0.0
@@ -82,7 +81,7 @@ def variance(s, l):
         s.s[l] = np.inf
 
 
-@njit(error_model="numpy")
+@kernel
 def predict(s, l):
     n = s.phi.shape[0]
     if s.kind[l] == RLS:
@@ -98,7 +97,7 @@ def predict(s, l):
             s.w[k, l] = 0.97 * s.w[k, l] + 0.01
 
 
-@njit(error_model="numpy")
+@kernel
 def correct(s, l):
     n, total = s.phi.shape[0], 0.0
     if s.ok[l] <= 0.0:
@@ -132,7 +131,7 @@ def model_of(na: int, nb: int, m: int, intercept: bool) -> tuple[Callable, Calla
     present = nb == 0
     n = na + m * max(nb, 1) + intercept
 
-    @njit(error_model="numpy")
+    @kernel
     def regress(s, l):
         for i in range(na):
             s.phi[i, l] = s.lags[i, l]
@@ -149,7 +148,7 @@ def model_of(na: int, nb: int, m: int, intercept: bool) -> tuple[Callable, Calla
                 s.phi[i, l], s.valid[l] = 0.0, 0.0
         s.ok[l] = s.valid[l] * s.observed[l]
 
-    @njit(error_model="numpy")
+    @kernel
     def push(s, l):
         fills = (s.observed[l] <= 0.0) & (s.valid[l] > 0.0) & (s.filled[l] < na)
         s.filled[l] = s.filled[l] + 1 if fills else (0 if s.observed[l] > 0.0 else s.filled[l])
@@ -172,13 +171,13 @@ def model_of(na: int, nb: int, m: int, intercept: bool) -> tuple[Callable, Calla
     return regress, push, refuse, n, nb
 
 
-@njit(error_model="numpy", forceinline=True)
+@kernel
 def nothing(s, l):
     s.reason[l] = 0
 
 
 def loop_of(regress: Callable, push: Callable, gate: Callable) -> Callable:
-    @njit(error_model="numpy")
+    @Driver
     def loop(tile, Y, U, first, theta, reason):
         """Samples from ``first`` on; returns the number of those that are done."""
         s, l = tile[0], 0

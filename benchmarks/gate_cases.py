@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from driftfit.engine.kernel import Driver
 
 T, AT = 600, 300
 LEVEL, ONE, TWO, SHIFTED = "gain and level", "ARX(1,1)", "ARX(2,2)", "ARX(2,2) and level"
@@ -36,7 +37,7 @@ class Case:
         return np.where(self.bad, np.nan, self.y), np.where(self.bad_u[:, None], np.nan, self.u)
 
 
-@njit
+@Driver
 def respond(theta: Any, u: Any, e: Any, na: int, nb: int) -> Any:
     """The output of an ARX plant at rest before the record."""
     y = np.zeros(len(u))
