@@ -60,9 +60,8 @@ def no_samples(first: int, n: int, m: int) -> Mapping[str, Any]:
     }  # fmt: skip
 
 
-def first_samples(first: int, n: int, m: int, ages: int, implicit: bool = False) -> Step:
-    """``remember(s, l)``: keep the sample, and decide when there are enough."""
-    N, PHI = (first + n if first > 0 else 1), U + m
+def usual_values(N: int) -> tuple[Any, Any]:
+    """``usual_value(s, column, center, apart, l)``, and ``reach(s, column, center, l)``, of N samples."""
 
     @kernel
     def usual_value(s: State, column: int, center: float, apart: bool, l: int) -> float:
@@ -91,6 +90,14 @@ def first_samples(first: int, n: int, m: int, ages: int, implicit: bool = False)
         """The distance from center beyond which a value is outlying."""
         return OUTLYING * usual_value(s, column, center, True, l)  # type: ignore[no-any-return]
 
+    return usual_value, reach
+
+
+def doubts(N: int, n: int, m: int, ages: int, implicit: bool) -> tuple[Any, Any]:
+    """``doubt(s, l)``, and ``mark(s, l)`` once the doubtful samples are contradicted."""
+    PHI = U + m
+    usual_value, reach = usual_values(N)
+
     @kernel
     def doubt(s: State, l: int) -> int:
         """Write into each sample 1 if its reading is outlying, 2 if a regressor is; count those with one of the two."""
@@ -110,6 +117,30 @@ def first_samples(first: int, n: int, m: int, ages: int, implicit: bool = False)
             d = s.gate_first[k, DOUBT, l]
             count += 1 if (d == 1.0) | (d == 2.0) else 0
         return count
+
+    @kernel
+    def mark(s: State, l: int) -> None:
+        """The signals that made samples doubtful, as bits in the column of y: 1 for the output, 2, 4, .. for inputs."""
+        for k in range(N):
+            s.gate_first[k, CODES, l] = 1.0 if s.gate_first[k, DOUBT, l] == 1.0 else 0.0
+        bit = 2.0
+        for j in range(m):
+            center = usual_value(s, U + j, 0.0, False, l)
+            most = reach(s, U + j, center, l)
+            for k in range(N):
+                hit = 0.0
+                for later in range(k, min(k + ages + 1, N)):
+                    hit = bit if s.gate_first[later, DOUBT, l] == 2.0 else hit
+                outside = abs(s.gate_first[k, U + j, l] - center) > most
+                s.gate_first[k, CODES, l] += hit if outside else 0.0
+            bit *= 2.0
+
+    return doubt, mark
+
+
+def least_squares(N: int, n: int, m: int) -> tuple[Any, Any]:
+    """``fit(s, every, l)`` and ``solve(s, l)``, with the triangle of the last fit in ``gate_fit``."""
+    PHI = U + m
 
     @kernel
     def rotate_in(s: State, k: int, l: int) -> float:
@@ -154,6 +185,14 @@ def first_samples(first: int, n: int, m: int, ages: int, implicit: bool = False)
             pivot = s.gate_fit[i, i, l]
             s.gate_fit[i, n, l] = s.gate_fit[i, n, l] / pivot if abs(pivot) > 1e-12 * largest else 0.0
 
+    return fit, solve
+
+
+def contradictions(N: int, n: int, m: int) -> Any:
+    """``contradicted(s, l)``."""
+    PHI = U + m
+    fit, solve = least_squares(N, n, m)
+
     @kernel
     def contradicted(s: State, l: int) -> bool:
         """Whether the samples that are not doubtful contradict those that are."""
@@ -172,30 +211,12 @@ def first_samples(first: int, n: int, m: int, ages: int, implicit: bool = False)
         spare = rows - n
         return (spare >= RESIDUALS) & ((squares - alone) * spare > WORSE * (alone + ROUNDED * total))  # type: ignore[no-any-return]
 
-    @kernel
-    def mark(s: State, l: int) -> None:
-        """The signals that made samples doubtful, as bits in the column of y: 1 for the output, 2, 4, .. for inputs."""
-        for k in range(N):
-            s.gate_first[k, CODES, l] = 1.0 if s.gate_first[k, DOUBT, l] == 1.0 else 0.0
-        bit = 2.0
-        for j in range(m):
-            center = usual_value(s, U + j, 0.0, False, l)
-            most = reach(s, U + j, center, l)
-            for k in range(N):
-                hit = 0.0
-                for later in range(k, min(k + ages + 1, N)):
-                    hit = bit if s.gate_first[later, DOUBT, l] == 2.0 else hit
-                outside = abs(s.gate_first[k, U + j, l] - center) > most
-                s.gate_first[k, CODES, l] += hit if outside else 0.0
-            bit *= 2.0
+    return contradicted
 
-    @partial(kernel, inline=False)
-    def decide(s: State, l: int) -> None:
-        s.gate_decided[l] = 1
-        count = doubt(s, l)
-        if (count > 0) & (2 * count < N) and contradicted(s, l):
-            mark(s, l)
-            s.gate_replay[l] = 1
+
+def buffer(N: int, n: int, m: int) -> tuple[Any, Any, Any, Any]:
+    """``repeats``, ``at_rest``, ``drop_oldest`` and ``keep`` of a buffer of N samples."""
+    PHI = U + m
 
     @kernel
     def repeats(s: State, k: int, l: int) -> bool:
@@ -235,6 +256,23 @@ def first_samples(first: int, n: int, m: int, ages: int, implicit: bool = False)
             s.gate_first[k, U + j, l] = s.u[j, l]
         for i in range(n):
             s.gate_first[k, PHI + i, l] = s.phi[i, l] if s.valid[l] > 0.0 else np.nan
+
+    return repeats, at_rest, drop_oldest, keep
+
+
+def first_samples(first: int, n: int, m: int, ages: int, implicit: bool = False) -> Step:
+    """``remember(s, l)``: keep the sample, and decide when there are enough."""
+    N = first + n if first > 0 else 1
+    doubt, mark = doubts(N, n, m, ages, implicit)
+    contradicted, (repeats, at_rest, drop_oldest, keep) = contradictions(N, n, m), buffer(N, n, m)
+
+    @partial(kernel, inline=False)
+    def decide(s: State, l: int) -> None:
+        s.gate_decided[l] = 1
+        count = doubt(s, l)
+        if (count > 0) & (2 * count < N) and contradicted(s, l):
+            mark(s, l)
+            s.gate_replay[l] = 1
 
     @partial(kernel, inline=False)
     def remember_one(s: State, l: int) -> None:

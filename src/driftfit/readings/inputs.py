@@ -34,6 +34,18 @@ def no_inputs(m: int) -> Mapping[str, Any]:
     }  # fmt: skip
 
 
+@kernel
+def widen(s: State, j: int, low: float, high: float, l: int) -> None:
+    s.gate_low[j, l] = min(s.gate_low[j, l], low)
+    s.gate_high[j, l] = max(s.gate_high[j, l], high)
+
+
+@kernel
+def settle(s: State, j: int, l: int) -> None:
+    """Forget what would widen the range."""
+    s.gate_lowest[j, l], s.gate_highest[j, l] = np.inf, -np.inf
+
+
 def input_rules(
     gate: Any, m: int, ages: int, refuse: Callable[[State, int, int, int], None]
 ) -> tuple[Callable[[State, bool, int], None], Callable[[State, bool, bool, int], bool]]:
@@ -42,16 +54,6 @@ def input_rules(
     """
     away, trust, ages = float(gate.away), gate.trust, min(ages, LONGEST)
     all_ages = (1 << (ages + 1)) - 1
-
-    @kernel
-    def widen(s: State, j: int, low: float, high: float, l: int) -> None:
-        s.gate_low[j, l] = min(s.gate_low[j, l], low)
-        s.gate_high[j, l] = max(s.gate_high[j, l], high)
-
-    @kernel
-    def settle(s: State, j: int, l: int) -> None:
-        """Forget what would widen the range."""
-        s.gate_lowest[j, l], s.gate_highest[j, l] = np.inf, -np.inf
 
     @kernel
     def notice(s: State, known: bool, l: int) -> None:
@@ -63,10 +65,8 @@ def input_rules(
                 outside = 0
             outside = (outside << 1) & all_ages
             if abs(u) < np.inf:
-                middle, half = (
-                    0.5 * (s.gate_low[j, l] + s.gate_high[j, l]),
-                    0.5 * (s.gate_high[j, l] - s.gate_low[j, l]),
-                )
+                low, high = s.gate_low[j, l], s.gate_high[j, l]
+                middle, half = 0.5 * (low + high), 0.5 * (high - low)
                 if known & (abs(u - middle) > away * half):
                     s.gate_lowest[j, l] = min(s.gate_lowest[j, l], u)
                     s.gate_highest[j, l] = max(s.gate_highest[j, l], u)
