@@ -182,7 +182,7 @@ def loop_of(regress: Callable, push: Callable, gate: Callable) -> Callable:
         """Samples from ``first`` on; returns the number of those that are done."""
         s, l = tile[0], 0
         for t in range(first, len(Y)):
-            s.y[l], s.noise[l], s.dt[l] = Y[t], 1.0, 1.0
+            s.y[l], s.raw_y[l], s.noise[l], s.dt[l] = Y[t], Y[t], 1.0, 1.0
             for j in range(U.shape[1]):
                 s.u[j, l] = U[t, j]
             regress(s, l)

@@ -23,7 +23,7 @@ def records(T, positions, values=VALUES):
     return Y, U, cases
 
 
-def failures(model, tracker, positions, T, values=VALUES, at_once=None):
+def failures(model, tracker, positions, T, values=VALUES, at_once=None, gate=None):
     """What went wrong, a line for each record: (place, value, signal, what).
 
     Records run side by side in lanes, or few at a time one after another, which compiles less.
@@ -31,7 +31,8 @@ def failures(model, tracker, positions, T, values=VALUES, at_once=None):
     Y, U, cases = records(T, positions, values)
     at_once = at_once or len(Y)
     fleets = [
-        track(model, tracker, Y[k : k + at_once], U[k : k + at_once], by="row") for k in range(0, len(Y), at_once)
+        track(model, tracker, Y[k : k + at_once], U[k : k + at_once], by="row", gate=gate)
+        for k in range(0, len(Y), at_once)
     ]
     found = []
     for k, (t, value, in_y) in enumerate(cases, 1):

@@ -26,9 +26,9 @@ from driftfit import (
 from driftfit.smooth.parts.pooled_drift import pooled
 from driftfit.systems import scenarios
 from driftfit.systems.arc_furnace import switching
-from driftfit.trackers.parts.faults.outlying_readings import LEVERAGE
 from driftfit.trackers.parts.modes.filters import UNSURE
 from driftfit.trackers.parts.modes.noise_levels import OUTLIER, level_chain
+from driftfit.trackers.parts.proportion import LEVERAGE
 
 T = 1500
 MODEL, PLANT = Regression(3), ARX(2, 2)

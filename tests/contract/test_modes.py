@@ -80,7 +80,7 @@ def test_several_samples_at_once_leave_what_one_after_the_other_leave(model, tra
 def test_a_lane_says_what_the_record_says(model, tracker):
     series = [damaged(*arx_record(T, lane), seed=lane, share=0.01 * lane) for lane in range(tracker.width)]
     known = [factors(lane) for lane in range(tracker.width)]
-    runs = [track(model, tracker, y, u, **k) for (y, u), k in zip(series, known, strict=True)]
+    runs = [track(model, tracker, y, u, gate=False, **k) for (y, u), k in zip(series, known, strict=True)]
     y, u = (np.stack(signal, axis=1) for signal in zip(*series, strict=True))
     out, _ = run_lanes(
         model, [tracker] * tracker.width, y, u[:, None, :], np.stack([run.known.columns for run in runs], axis=2)

@@ -23,6 +23,7 @@ from numba import types
 from driftfit.engine.compile_notice import compiling
 from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
+from driftfit.engine.phases import advancing, at_once, gated, learning, looking, raw_kept
 from driftfit.engine.simd import fill_four, four_of, in_fours, load_four, store_four, times
 from driftfit.engine.tiles import as_compiled, inputs_and_lanes, tile_type
 from driftfit.engine.tracker_part import tracker_part, whole_record
@@ -41,11 +42,6 @@ of the drift; and how many columns every tracker reads."""
 ROUNDING = 1e-12
 """A result below this share of the numbers that it was computed from may be rounding: each of a few thousand operations
 adds up to 2^-53 of its terms, and decimal readings carry as much."""
-
-
-WIDE = 1e9
-"""A sample of which the variance h is this multiple of its noise is taken in on square roots: the covariance after it
-would keep seven of sixteen digits."""
 
 
 INPUTS = types.Array(types.float64, 1, "A", readonly=True)
@@ -170,8 +166,9 @@ class TrackerSteps(NamedTuple):
     the fields of the tracker and those that every record has but for ``u``, so that they are compiled once for all
     models (`driftfit.engine.tracker_part`); with ``reads_model`` they see those of the model too. ``outlined`` steps
     are compiled apart from the drivers, which call them (`driftfit.engine.outlined`): for trackers that take so long
-    that a call costs nothing; ``start`` always is. ``note`` comes before all of them and may write what they change
-    later.
+    that a call costs nothing; ``start`` always is. With ``learns_scale`` s.scale is the noise variance that the
+    tracker estimates, which a gate keeps above that of the rounding of a coarse meter. ``note`` comes before all of
+    them and may write what they change later.
     """
 
     predict: Step
@@ -190,6 +187,7 @@ class TrackerSteps(NamedTuple):
     instruments: bool = False
     reads_model: bool = False
     outlined: bool = False
+    learns_scale: bool = False
     note: Step = nothing
 
 
@@ -225,180 +223,6 @@ def one_or_all(u: Array) -> Any:
     return u.item() if u.size == 1 else u
 
 
-def _forecasting(tracker: TrackerSteps) -> Any:
-    """predict, forecast, and the variance of the error, of one lane."""
-    predict, forecast, variance = tracker.predict, tracker.forecast, tracker.variance
-
-    @kernel
-    def forecasts(s: State, l: int) -> None:
-        predict(s, l)
-        forecast(s, l)
-        variance(s, l)
-
-    return forecasts
-
-
-@kernel
-def keeps_digits(s: State, l: int) -> None:
-    """Whether a covariance can take the sample in; otherwise it is ``late``, and not used before that."""
-    wide = (s.h[l] > WIDE * (s.r[l] * s.noise[l])) & (s.h[l] < np.inf)
-    s.late[l] = s.ok[l] if wide else 0.0
-    s.ok[l] = 0.0 if wide else s.ok[l]
-
-
-def _late(tracker: TrackerSteps) -> Any:
-    """The samples that `keeps_digits` found to be late, by the form of the start."""
-    assert tracker.start is not None
-    take_over, correct, report = tracker.start.take_over, tracker.start.correct, tracker.start.report
-    assert take_over is not None
-    forecast, variance = tracker.start.forecast, tracker.start.variance
-
-    def late(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            if s.late[l] > 0.0:
-                s.ok[l] = s.late[l]
-                take_over(s, l)
-                forecast(s, l)
-                variance(s, l)
-                correct(s, l)
-                report(s, l)
-
-    return kernel(late, inline=False)
-
-
-@kernel
-def none_late(s: State, l: int) -> None:
-    """All samples are taken in at once."""
-
-
-def _advance(tracker: TrackerSteps) -> Any:
-    """One sample of all lanes of a tile; lanes whose ``s.root`` is 1 take the steps of the ``start``."""
-    forecasts, correct, report = _forecasting(tracker), tracker.correct, tracker.report
-    both = tracker.start is not None and tracker.start.take_over is not None
-    check, late = (keeps_digits, _late(tracker)) if both else (none_late, nothing)
-    called = outlined(late, short=True) if both else late
-
-    @kernel
-    def advance(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            forecasts(s, l)
-            check(s, l)
-            correct(s, l)
-        for l in range(s.theta.shape[1]):
-            report(s, l)
-
-    @kernel
-    def advance_or_wait(s: State) -> None:
-        advance(s)
-        some = 0.0
-        for l in range(s.theta.shape[1]):
-            some = max(some, s.late[l])
-        if some > 0.0:
-            called(s)
-
-    usual = advance_or_wait if both else advance
-
-    if tracker.start is None:
-        return advance
-    first = tracker.start
-    forecasts_first, correct_first, report_first = _forecasting(first), first.correct, first.report
-
-    def start(s: State) -> None:
-        alone = s.theta.shape[1] == 1  # a constant, for which there is no code of the others
-        for l in range(s.theta.shape[1]):
-            s.late[l] = 0.0
-            if alone or s.root[l] > 0:
-                forecasts_first(s, l)
-                correct_first(s, l)
-                report_first(s, l)
-            else:
-                forecasts(s, l)
-                check(s, l)
-                correct(s, l)
-                report(s, l)
-        if both and not alone:
-            late(s)
-
-    started = kernel(start, inline=False)  # seldom run: the lane loop is better without it
-    if not tracker.outlined:  # else it is called together with the rest
-        started = outlined(started, short=True)
-
-    @kernel
-    def advance_or_start(s: State) -> None:
-        some = 0
-        for l in range(s.theta.shape[1]):
-            some = max(some, s.root[l])
-        if some > 0:
-            started(s)
-        else:
-            usual(s)
-
-    return advance_or_start
-
-
-def _looking(tracker: TrackerSteps) -> Any:
-    """Time update and forecast of all lanes, before a gate."""
-    forecasts = _forecasting(tracker)
-    first = forecasts if tracker.start is None else _forecasting(tracker.start)
-
-    @kernel
-    def look(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            if s.root[l] > 0:
-                first(s, l)
-            else:
-                forecasts(s, l)
-
-    @kernel
-    def look_at_once(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            forecasts(s, l)
-
-    return look_at_once if tracker.start is None else look
-
-
-def _learning(tracker: TrackerSteps) -> Any:
-    """Correction of all lanes, and reports, after a gate, which may have raised the noise and the floor of r."""
-    variance, correct, report = tracker.variance, tracker.correct, tracker.report
-    first = tracker if tracker.start is None else tracker.start
-    variance_first, correct_first, report_first = first.variance, first.correct, first.report
-    both = first.take_over is not None
-    check, late = (keeps_digits, _late(tracker)) if both else (none_late, nothing)
-
-    @kernel
-    def corrected(s: State, l: int) -> None:
-        variance(s, l)
-        check(s, l)
-        correct(s, l)
-        s.scale[l] = max(s.scale[l], s.floor[l]) if s.floor[l] > 0.0 else s.scale[l]
-        report(s, l)
-
-    @kernel
-    def corrected_first(s: State, l: int) -> None:
-        variance_first(s, l)
-        s.late[l] = 0.0
-        correct_first(s, l)
-        s.scale[l] = max(s.scale[l], s.floor[l]) if s.floor[l] > 0.0 else s.scale[l]
-        report_first(s, l)
-
-    @kernel
-    def learn(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            if s.root[l] > 0:
-                corrected_first(s, l)
-            else:
-                corrected(s, l)
-        if both:
-            late(s)
-
-    @kernel
-    def learn_at_once(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            corrected(s, l)
-
-    return learn_at_once if tracker.start is None else learn
-
-
 @lru_cache(maxsize=256)
 def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: Step | None = None) -> Drivers:
     """Build the drivers of a (model, tracker) pair, with a ``gate`` between forecast and correction or without.
@@ -419,12 +243,12 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
     driver = partial(Driver, instead=tracker.instead)
     part = whole_record if tracker.reads_model else tracker_part
     if gate is None:
-        advance = _advance(tracker)
-        between = _at_once(outlined(advance) if tracker.outlined else advance, part)
+        advance = advancing(tracker)
+        between = at_once(outlined(advance) if tracker.outlined else advance, part)
     else:
-        phases = _looking(tracker), _learning(tracker)
+        phases = looking(tracker), learning(tracker)
         look, learn = (outlined(phase) for phase in phases) if tracker.outlined else phases
-        between = _gated(look, gate, learn, part)
+        between, model = gated(look, gate, learn, part), model._replace(regress=raw_kept(model.regress))
     sample = _sample(model, tracker.note, between, part)
     keep_more = covariance if keep == "cov" else nothing_more
     common = nothing_common if keep == "own" else write_common
@@ -474,36 +298,6 @@ def _stored_too(store: Any) -> Any:
         store_decision(o, s, l)
 
     return both
-
-
-def _at_once(advance: Any, part: Any) -> Any:
-    """The steps of a tracker without a gate."""
-
-    @kernel
-    def between(s: State) -> None:
-        advance(part(s))
-
-    return between
-
-
-def _gated(look: Any, gate: Step, learn: Any, part: Any) -> Any:
-    """The steps of a tracker with a gate, which sees the inputs and the memory of the model too."""
-
-    @partial(kernel, inline=False)
-    def judge(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
-            gate(s, l)
-
-    judged = outlined(judge)
-
-    @kernel
-    def between(s: State) -> None:
-        look(part(s))
-        judged(s)
-        learn(part(s))
-
-    return between
 
 
 @kernel
@@ -583,7 +377,7 @@ def _sample(model: ModelSteps, note: Step, between: Any, part: Any) -> Any:
     return sample
 
 
-def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: Any, part: Any, gated: bool) -> Driver:
+def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: Any, part: Any, judged: bool) -> Driver:
     """The loop over the samples of a record, which a gate may end early."""
 
     @driver
@@ -613,7 +407,7 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: A
                 store_theta(s, theta, t)
             if not alone or t == last:
                 write(out[t * kept], s)
-            if gated:  # a constant, without which the field would be missing  # noqa: SIM102
+            if judged:  # a constant, without which the field would be missing  # noqa: SIM102
                 if s.gate_replay[0] > 0:
                     return t + 1
         return int(y.shape[0])

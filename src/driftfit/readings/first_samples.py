@@ -9,7 +9,8 @@ median, the usual distance being the median of those that are not 0. A sample is
     its reading is outlying and no regressor is: probably a fault code;
     or a regressor is outlying and the reading is not: a code of an input, or of an earlier output, now a lag.
 
-A large output after a large input is neither; a lag with the same fault code as the reading does not explain it.
+A large output after a large input is neither; a lag with the same fault code as the reading does not explain it, and
+where the model is ``implicit``, its regressors contain functions of the reading, and none of them does.
 Doubtful samples are left out if the others contradict them: if least squares on all leaves the others a sum of squares
 Q, and least squares on themselves only q with nu residuals, and
 
@@ -56,14 +57,14 @@ def no_samples(first: int, n: int, m: int) -> Mapping[str, Any]:
     N = first + n if first > 0 else 1
     return {
         "gate_first": np.full((N, U + m + n), np.nan), "gate_kept": 0, "gate_decided": 0 if first > 0 else 1,
-        "gate_replay": 0, "gate_fit": np.zeros((n + 1, n + 1)),
+        "gate_replay": 0, "gate_fit": np.zeros((n + 1, n + 1)), "raw_y": np.nan,
     }  # fmt: skip
 
 
 @kernel
 def reading_now(s: State, l: int) -> float:
-    """The reading as it was measured, NaN if it is missing."""
-    return s.y[l] + s.shift[l] if s.observed[l] > 0.0 else np.nan
+    """The reading as it was measured, which a model may have replaced by a function of it; NaN if it is missing."""
+    return s.raw_y[l] if s.observed[l] > 0.0 else np.nan
 
 
 @kernel
@@ -97,7 +98,7 @@ def reach(s: State, column: int, center: float, l: int) -> float:
 
 
 @kernel
-def doubt(s: State, l: int) -> int:
+def doubt(s: State, implicit: bool, l: int) -> int:
     """Write into each sample 1 if its reading is outlying, 2 if a regressor is; count those with one of the two."""
     N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
     center = usual_value(s, READING, 0.0, False, l)
@@ -109,7 +110,7 @@ def doubt(s: State, l: int) -> int:
         most = reach(s, PHI + i, center, l)
         for k in range(N):
             x, d = s.gate_first[k, PHI + i, l], s.gate_first[k, DOUBT, l]
-            same = (abs(x) == abs(s.gate_first[k, READING, l])) & (d == 1.0)
+            same = (implicit | (abs(x) == abs(s.gate_first[k, READING, l]))) & (d == 1.0)
             if (abs(x - center) > most) & (d < 2.0) & (not same):
                 s.gate_first[k, DOUBT, l] = d + 2.0
     for k in range(N):
@@ -225,11 +226,11 @@ def comes_again(s: State, l: int) -> bool:
 
 
 @partial(kernel, inline=False)
-def decide(s: State, ages: int, l: int) -> None:
+def decide(s: State, ages: int, implicit: bool, l: int) -> None:
     """Where samples made room for others they were judged one by one, unless they are the codes themselves."""
     N = s.gate_first.shape[0]
     whole, s.gate_decided[l] = s.gate_decided[l] == 0, 1
-    count = doubt(s, l)
+    count = doubt(s, implicit, l)
     whole |= (s.gate_first[0, DOUBT, l] == 1.0) & (not comes_again(s, l))
     if (count > 0) & (2 * count < N) & whole and contradicted(s, l):
         mark(s, ages, l)
@@ -274,7 +275,7 @@ def keep(s: State, k: int, times: float, l: int) -> None:
 
 
 @partial(kernel, inline=False)
-def remember_one(s: State, ages: int, l: int) -> None:
+def remember_one(s: State, ages: int, implicit: bool, l: int) -> None:
     N = s.gate_first.shape[0]
     last = s.gate_kept[l] - 1
     if last >= 0 and repeats(s, last, l):
@@ -289,16 +290,16 @@ def remember_one(s: State, ages: int, l: int) -> None:
     known = s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
     equal = beginning(s, l) if (s.gate_kept[l] == N) & known else N
     if (equal == 1) | (2 * (equal + s.phi.shape[0]) < N):
-        decide(s, ages, l)
+        decide(s, ages, implicit, l)
 
 
-def first_samples(ages: int) -> Step:
+def first_samples(ages: int, implicit: bool = False) -> Step:
     """``remember(s, l)``: keep the sample and decide when there are enough; inputs stay for ``ages`` samples."""
 
     @kernel
     def remember(s: State, l: int) -> None:
         if s.gate_decided[l] < 1:
-            remember_one(s, ages, l)
+            remember_one(s, ages, implicit, l)
 
     return remember  # type: ignore[no-any-return]
 

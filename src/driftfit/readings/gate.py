@@ -139,9 +139,10 @@ def learn_usual(s: State, seen: bool, contradicts: bool, clip: float, l: int) ->
     own = own_variance(s, l)
     if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
         ratio = s.e[l] * s.e[l] / own
-        ratio = min(ratio, clip * usual_ratio(s, l)) if known else ratio
+        # a start may claim any precision for a sample, but the first error of a tracker without s is all there is
+        ratio = min(ratio, clip * usual_ratio(s, l)) if known | (s.s[l] == s.s[l]) else ratio
         s.gate_ratio[l] += share * (ratio - s.gate_ratio[l])
-        s.gate_settled[l] = min(variance_of_error(s, l), GROWTH * s.gate_settled[l])
+        s.gate_settled[l] = min(variance_of_error(s, l), GROWTH * s.gate_settled[l]) if known else np.inf
 
 
 def output_rule(gate: Gate) -> Step:
@@ -208,7 +209,7 @@ def gate_step(
     memory. The regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be
     as large as predicted. There y is compared with the usual readings alone.
     """
-    remember = first_samples(ages)
+    remember = first_samples(ages, implicit)
     notice, blame = input_rules(gate, ages, refuse)
     hold_frozen = frozen_rule(gate.frozen)
     judge = output_rule(replace(gate, rare=np.inf) if implicit else gate)

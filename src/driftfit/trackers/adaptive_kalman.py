@@ -17,22 +17,18 @@ filter the levels are merged at once, by a rank-one update (`driftfit.trackers.p
 never below that due to coarse readings (`driftfit.trackers.parts.coarse.resolution`). If innovations are correlated,
 the previous one is an additional regressor (`driftfit.trackers.parts.modes.coloured`).
 
-Three kinds of samples are left out: readings far outside the usual range
-(`driftfit.trackers.parts.faults.outlying_readings`), inputs far outside theirs to which the output does not respond
-(`driftfit.trackers.parts.faults.strange_inputs`), and readings of a sensor that is frozen at its last value
-(`driftfit.trackers.parts.faults.frozen_readings`). Outliers that keep coming are a change of level: a leap of the
-parameters (`driftfit.trackers.parts.modes.ladder`), or more noise.
+Readings are judged by a gate (`driftfit.readings.gate`), which is on for this tracker, and not here. Outliers that keep
+coming are a change of level: a leap of the parameters (`driftfit.trackers.parts.modes.ladder`), or more noise.
 
 The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
 estimates themselves (`driftfit.trackers.parts.modes.filters`). The one-step variance excludes the outlier level, so its
 band is for samples that are not outliers.
 
 The start is exact diffuse least squares without drift, in which regressors out of proportion count less too, until
-there are enough residuals to estimate r; its bands are Student's (`driftfit.trackers.parts.few_residuals`). Fault
-codes among these samples are found then, and least squares repeated without them
-(`driftfit.trackers.parts.faults.first_samples`). Every filter starts from generalised least squares with
-its own drift over the same samples (`driftfit.trackers.parts.modes.start`), in the directions that the regressors span.
-Scaling inputs or outputs changes only the units.
+there are enough residuals to estimate r; its bands are Student's (`driftfit.trackers.parts.few_residuals`). Every
+filter starts from generalised least squares with its own drift over the same samples
+(`driftfit.trackers.parts.modes.start`), in the directions that the regressors span. Scaling inputs or outputs changes
+only the units.
 
 Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Which parameters drift is learned
 in a few hundred samples; ``groups`` specifies it from the start.
@@ -77,12 +73,6 @@ from driftfit.trackers.parts.excitation import (
     not_learned,
     window,
 )
-from driftfit.trackers.parts.faults.outlying_readings import (
-    FIRST,
-    bound_leverage,
-    learn_proportion,
-    no_proportion,
-)
 from driftfit.trackers.parts.few_residuals import RESIDUALS, widen_estimates, wider
 from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.drifts.about_means import learn_means
@@ -102,6 +92,12 @@ from driftfit.trackers.parts.modes.noise_levels import any_level, finest, learn_
 from driftfit.trackers.parts.modes.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
 from driftfit.trackers.parts.modes.start import begin_with_drift, forecast_start, start_density, take_start
 from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
+from driftfit.trackers.parts.proportion import (
+    FIRST,
+    bound_leverage,
+    learn_proportion,
+    no_proportion,
+)
 
 
 @kernel

@@ -191,6 +191,6 @@ class FLS(Tracker):
 
 
 STEPS = started(
-    TrackerSteps(drift, forecast, correct, read_extra=read_drift),
+    TrackerSteps(drift, forecast, correct, read_extra=read_drift, learns_scale=True),
     TrackerSteps(drift_root_form, forecast_on_roots, correct_root_form, spanned_variance),
 )

@@ -210,7 +210,9 @@ def steps(refined: bool) -> TrackerSteps:
         follow(s, l)
 
     start = TrackerSteps(forget_root_form, forecast_first, correct_first, spanned_variance)
-    return TrackerSteps(forget, forecast, correct, start=start, instruments=refined, machines=MACHINES)
+    return TrackerSteps(
+        forget, forecast, correct, start=start, instruments=refined, machines=MACHINES, learns_scale=True
+    )
 
 
 @dataclass(frozen=True)

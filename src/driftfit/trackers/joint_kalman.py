@@ -181,12 +181,15 @@ def at_point(s: State, j: int, l: int) -> None:
         s.point[i, l] = s.theta[i, l] + (up - down)
 
 
-@lru_cache
-def _unscented(equations: str, inputs: tuple[str, ...], n: int, hidden: int, timed: bool) -> TrackerSteps:
-    _, transition, _, output = equations_of(equations, inputs)
+def _sigma(n: int) -> tuple[float, float, float]:
+    """The scale of sigma points of n numbers, and the weights of the outer ones and of the central one."""
     centre = max(3.0 - n, 0.0)
-    scale, first, points = float(np.sqrt(n + centre)), n - hidden, 2 * n + 1
-    other, own = 0.5 / (n + centre), centre / (n + centre)
+    return float(np.sqrt(n + centre)), 0.5 / (n + centre), centre / (n + centre)
+
+
+def _moving(transition: Step, n: int, hidden: int) -> Step:
+    """The hidden states of all sigma points move by one sample."""
+    (scale, other, own), first, points = _sigma(n), n - hidden, 2 * n + 1
 
     @kernel
     def move(s: State, l: int) -> None:
@@ -218,6 +221,13 @@ def _unscented(equations: str, inputs: tuple[str, ...], n: int, hidden: int, tim
                         total += other * s.moved[i, j, l] * s.moved[k, j, l]
                     s.P[first + i, first + k, l] = total
 
+    return move  # type: ignore[no-any-return]
+
+
+def _forecasting(output: Step, n: int) -> Step:
+    """The mean and variance of the outputs of all sigma points."""
+    (scale, other, own), points = _sigma(n), 2 * n + 1
+
     @kernel
     def forecast(s: State, l: int) -> None:
         factorise(s, scale, l)
@@ -241,8 +251,14 @@ def _unscented(equations: str, inputs: tuple[str, ...], n: int, hidden: int, tim
         else:
             unusable(s, l)
 
-    predict = _repeated(move if hidden else _still, timed)
-    return TrackerSteps(predict, forecast, correct, read_extra=read_drift, reads_model=True)
+    return forecast  # type: ignore[no-any-return]
+
+
+@lru_cache
+def _unscented(equations: str, inputs: tuple[str, ...], n: int, hidden: int, timed: bool) -> TrackerSteps:
+    _, transition, _, output = equations_of(equations, inputs)
+    predict = _repeated(_moving(transition, n, hidden) if hidden else _still, timed)
+    return TrackerSteps(predict, _forecasting(output, n), correct, read_extra=read_drift, reads_model=True)
 
 
 @dataclass(frozen=True)

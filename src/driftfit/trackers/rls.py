@@ -252,11 +252,11 @@ def correct_direction_root_form(s: State, l: int) -> None:
 
 
 EXPONENTIAL = started(
-    TrackerSteps(forget, forecast, correct),
+    TrackerSteps(forget, forecast, correct, learns_scale=True),
     TrackerSteps(forget_root_form, forecast_on_roots, correct_root_form, spanned_variance),
 )
 DIRECTIONAL = started(
-    TrackerSteps(nothing, forecast, correct_direction),
+    TrackerSteps(nothing, forecast, correct_direction, learns_scale=True),
     TrackerSteps(nothing, forecast_direction, correct_direction_root_form, spanned_variance),
 )
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.coarse.resolution import reading
-from driftfit.trackers.parts.faults.outlying_readings import FIRST
+from driftfit.trackers.parts.proportion import FIRST
 
 MEMORY = 50.0
 """Memory of the mean square of a regressor, in samples."""

@@ -145,6 +145,6 @@ def correct_root_form(s: State, l: int) -> None:
 
 
 STEPS = TrackerSteps(
-    drift, forecast, correct, read_extra=read_drift, machines=MACHINES,
+    drift, forecast, correct, read_extra=read_drift, machines=MACHINES, learns_scale=True,
     start=TrackerSteps(drifted, forecast_root_form, correct_root_form, spanned_variance),
 )  # fmt: skip

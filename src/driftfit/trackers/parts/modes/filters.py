@@ -29,13 +29,13 @@ from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.trackers.parts.coarse.resolution import lasting
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.covariance import LEFT
-from driftfit.trackers.parts.faults.outlying_readings import SURE
 from driftfit.trackers.parts.modes.drifts.about_means import drift_about
 from driftfit.trackers.parts.modes.drifts.one_direction import drift_along
 from driftfit.trackers.parts.modes.drifts.trend import bend_slopes, level_slopes, move_along
 from driftfit.trackers.parts.modes.ladder import TOP, leap
 from driftfit.trackers.parts.modes.noise_levels import OUTLIER, noise_at
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
+from driftfit.trackers.parts.proportion import SURE
 
 LEAST = 1e-100
 """Probability that a filter is never below."""

@@ -27,7 +27,7 @@ how often rungs of ratio 1 end: what never changed in thousands of samples is ex
 (`learn_rate`).
 
 The top filter may also *leap*: if a move as large as the innovation, in directions 1 / c_i and up to LEAP standard
-deviations of the output (times p of `driftfit.trackers.parts.faults.outlying_readings`), at this regressor and at one
+deviations of the output (times p of `driftfit.trackers.parts.proportion`), at this regressor and at one
 of mean square c_i, explains the sample better by more than a factor 1 / RARE, its covariance grows by that move.
 
 Source: Blom and Bar-Shalom (1988); the ladders and their transitions are ours. Cost per sample: O(K n^2) for K modes,

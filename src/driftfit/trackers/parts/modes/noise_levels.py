@@ -32,7 +32,7 @@ START = 0.7
 MEMORY = 70.0
 """Memory of r, in samples."""
 IN_A_ROW, RISE = 4.0, 0.3
-"""From the third outlier in a row on (`driftfit.trackers.parts.faults.outlying_readings`), log r rises by this with
+"""From the third outlier in a row on (`driftfit.trackers.parts.proportion`), log r rises by this with
 each."""
 MISFIT, SETTLED, EARLY = 0.5, 20.0, 140.0
 """Among the first `EARLY` samples, if the mean of e^2 / s, with a memory of `SETTLED`, is below `MISFIT`, r falls by as

@@ -25,11 +25,11 @@ from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.trackers.parts.coarse.resolution import learn_resolved_scale
 from driftfit.trackers.parts.diffuse import absorb_on_roots, forecast_on_roots
 from driftfit.trackers.parts.excitation import learn_information, learn_scales
-from driftfit.trackers.parts.faults.outlying_readings import bound_leverage, learn_proportion
 from driftfit.trackers.parts.modes.drifts.about_means import learn_means
 from driftfit.trackers.parts.modes.filters import absorb, project, wander
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
 from driftfit.trackers.parts.modes.weights import PHI, WINDOW
+from driftfit.trackers.parts.proportion import bound_leverage, learn_proportion
 
 Y, NOISE, SPAN = range(3)
 """Entries of a stored sample of the start before its regressor, at `PHI`: the output, the noise factor, and intervals

@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, kernel, machine, shared
-from driftfit.trackers.parts.faults.outlying_readings import LEVERAGE
 from driftfit.trackers.parts.modes.drifts.one_direction import (
     FACTOR,
     TIME,
@@ -40,6 +39,7 @@ from driftfit.trackers.parts.modes.drifts.one_direction import (
     turn,
 )
 from driftfit.trackers.parts.modes.rows import sum_of_row
+from driftfit.trackers.parts.proportion import LEVERAGE
 
 BLOCK, WINDOW = 50, 100
 """Samples between two passes, and samples of a pass."""

@@ -26,7 +26,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.excitation import DULL, LARGE, MEMORY
-from driftfit.trackers.parts.faults.outlying_readings import FIRST
+from driftfit.trackers.parts.proportion import FIRST
 
 ABOUT = (1e-3, 1e-2, 0.1, 1.0)
 """Drift ratios of the filters."""

@@ -1,1 +1,0 @@
-"""Fault codes: samples that contradict all others."""
