@@ -187,7 +187,7 @@ class Live(Operated, Stream):
         if type(u) is not float or self._m != 1:
             if u is LATER and self._m:
                 return self._update_later(y) if time is None else self._sample(y, u, time, weight, drift)
-            if type(u) is _ARRAY and self._m == 1 and u.size == 1:
+            if self._m == 1 and (type(u) is np.float64 or (type(u) is _ARRAY and u.size == 1)):
                 u = u.item()
             if type(u) is not float or self._m != 1:
                 u = self._floats(u)

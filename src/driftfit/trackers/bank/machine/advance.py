@@ -77,7 +77,7 @@ from driftfit.trackers.bank.leaves.leaf_matrix import (
     standstill,
     variance_factor,
 )
-from driftfit.trackers.bank.machine.ancestry import marginals, pick, shift, summary, write_out
+from driftfit.trackers.bank.machine.ancestry import chained, marginals, pick, shift, summary, write_out
 from driftfit.trackers.bank.machine.gaps.chain_gap import add_covariance, add_variance, further, go_on, origins, split
 from driftfit.trackers.bank.machine.gaps.gap import chances, close, covariances, extend, odds, take_back, widen
 from driftfit.trackers.bank.machine.grow import grow
@@ -122,21 +122,6 @@ def increments_now(t: Any) -> None:
     """Covariances of the changes in this interval; where it is one level, a change happens in one nominal sample."""
     time, dt = t.sample[IN_TIME], t.sample[IN_DT]
     increments(t, time, time / dt if t.apart > 0 and dt > 0.0 else time)
-
-
-@shared
-def chained(given: Array, P: Array, Hm: int, moving: Array) -> None:
-    """The chain of joint events for another chain of the changes; sensors are as after the first change."""
-    H = len(P)
-    Hd = H // Hm
-    for j in range(Hm):
-        for to in range(Hm):
-            share = 0.0
-            for i in range(Hd):
-                share += P[j, i * Hm + to]
-            for i in range(Hd):
-                for k in range(Hd):
-                    moving[i * Hm + j, k * Hm + to] = given[i * Hd + k] * share
 
 
 @shared

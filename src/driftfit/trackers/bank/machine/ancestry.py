@@ -20,6 +20,21 @@ from driftfit.trackers.bank.layout import EXPANDED, FLIPPED, PARENTS, flip
 from driftfit.trackers.bank.leaves.leaf_matrix import WEIGHT
 
 
+@shared
+def chained(given: Array, P: Array, Hm: int, moving: Array) -> None:
+    """The chain of joint events for another chain of the changes; sensors are as after the first change."""
+    H = len(P)
+    Hd = H // Hm
+    for j in range(Hm):
+        for to in range(Hm):
+            share = 0.0
+            for i in range(Hd):
+                share += P[j, i * Hm + to]
+            for i in range(Hd):
+                for k in range(Hd):
+                    moving[i * Hm + j, k * Hm + to] = given[i * Hd + k] * share
+
+
 def news_of(H: int, Hm: int, width: int) -> Array:
     """What each of H joint events adds to a history (the first Hm change nothing), and the factors. The last row is
     padding for SIMD vectors.
