@@ -150,12 +150,6 @@ class Tracker(Settings, ABC):
         """phi (T, n) and y (T,) as the tracker used them; ``fields`` as in `estimated_variances`."""
         return phi, y
 
-    def left_out(self, field: Callable[[str], Any], phi: Array, y: Array, ok: Array) -> Array:
-        """Which of the used samples, ok (T,) not 0, it left out later; ``field`` gives a field by its name, as
-        `estimated_variances` takes them, or, without smoother fields, one of the last state.
-        """
-        return np.zeros(len(y), bool)
-
     def estimated_variances(
         self, model: Model, fields: Mapping[str, Array], phi: Array, e: Array, time: Array
     ) -> tuple[Array, Array, Array, Array]:
