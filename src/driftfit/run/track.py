@@ -312,7 +312,7 @@ def _codes(run: Track) -> dict[str, list[float]]:
 def _begins_change(y: Array, reason: Array) -> Array:
     """Which readings (T,) are the first one or two of a change: the next is as strange, differs, and is believed."""
     change = np.append((reason == USED)[1:] & suspect(y)[1:] & (np.diff(y) != 0.0), False)
-    return change | np.append((change & (reason == REFUSED))[1:], False)
+    return np.asarray(change | np.append((change & (reason == REFUSED))[1:], False))
 
 
 def _codes_at_start(run: Track, strange: Array) -> Array:
