@@ -140,7 +140,7 @@ def test_false_readings_of_an_input_do_not_correct_its_gain(kind):
         y = 0.3 * u + 1.0 + rng.normal(size=2300)
         bad = (np.arange(2300) >= 300) & (rng.random(2300) < 0.01)
         u[bad] += 30.0 * rng.choice([-1.0, 1.0], bad.sum())
-        alarms = track(GAIN, HELD, y, u).detect(kind, every=1000.0, reference=300, records=64)
+        alarms = track(GAIN, HELD, y, u, gate=True).detect(kind, every=1000.0, reference=300, records=64)
         false += len(alarms.onsets)
     assert false <= 20  # 12 are set
 
@@ -148,12 +148,12 @@ def test_false_readings_of_an_input_do_not_correct_its_gain(kind):
 @pytest.mark.parametrize("kind", ["glr", "cusum"])
 @pytest.mark.parametrize("moves", [0.0, 1.0])
 def test_a_large_input_without_response_is_reported(kind, moves):
-    """A stuck valve: the input goes far beyond its range, and y does not follow; the tracker blames the input."""
+    """A stuck valve: the input goes far beyond its range, and y does not follow; the gate blames the input."""
     for seed in range(4):
         rng, stuck = np.random.default_rng([seed, 7]), np.arange(1200) >= 1000
         u, v = rng.normal(size=(2, 1200))
         u = np.where(stuck, 12.0 + moves * u, u)
-        run = track(GAIN, HELD, np.where(stuck, 1.0, 0.6 * u + 1.0) + 0.5 * v, u)
+        run = track(GAIN, HELD, np.where(stuck, 1.0, 0.6 * u + 1.0) + 0.5 * v, u, gate=True)
         assert not run.ok[1000:1005].any()
         alarms = run.detect(kind, every=1000.0, reference=800, records=64)
         assert alarms.active[1010:1020].all()
@@ -166,11 +166,11 @@ def test_an_input_sensor_that_fails_again_and_again_is_reported_and_single_false
         rng, at = np.random.default_rng([seed, 8]), np.arange(2000)
         u, v = rng.normal(size=(2, 2000))
         y, code = 2.0 * u + 1.0 + v, rng.random(2000) < 0.2
-        single = track(GAIN, HELD, y, np.where((at >= 800) & (at % 60 == 0), 9999.0, u))
+        single = track(GAIN, HELD, y, np.where((at >= 800) & (at % 60 == 0), 9999.0, u), gate=True)
         alarms = single.detect(kind, every=1000.0, reference=800, records=64)
         begun += len(alarms.onsets)
-        often = track(GAIN, HELD, y, np.where((at >= 1000) & code, 9999.0, u)).detect(alarms.rule, start=800)
-        found += bool(often.active[1000:1100].any())
+        often = track(GAIN, HELD, y, np.where((at >= 1000) & code, 9999.0, u), gate=True)
+        found += bool(often.detect(alarms.rule, start=800).active[1000:1100].any())
     assert begun <= 10  # 5 are set
     assert found == 4
 
@@ -181,7 +181,7 @@ def test_a_false_input_is_a_lag_for_some_samples_and_raises_no_alarm():
     y = signal.lfilter([0.0, 1.0, 0.4], [1.0, -1.2, 0.5], u) + signal.lfilter([0.3], [1.0, -1.2, 0.5], v)
     clean = track(ARX(2, 2), HELD, y, u).detect(every=1000.0, reference=1000, records=16)
     u[1100:3000:100] = 9999.0
-    faulty = track(ARX(2, 2), HELD, y, u).detect(clean.rule, start=1000)
+    faulty = track(ARX(2, 2), HELD, y, u, gate=True).detect(clean.rule, start=1000)
     assert len(faulty.onsets) <= len(clean.onsets) + 1
 
 

@@ -238,7 +238,8 @@ def test_one_fault_code_is_survived(code):
     assert not run.ok[[100, 250, 251]].any()
     assert np.abs(run.theta - clean.theta)[20:].max() < 0.05
     assert run.innovation_std[260:].max() < 1.2 * clean.innovation_std[260:].max()
-    assert "3 samples beyond 100" in str(run.summary())
+    assert run.left_out.sample.tolist() == [100, 250, 251]
+    assert "3 samples far outside the range" in str(run.summary())
     lasting = y + np.where(np.arange(400) >= 200, 1e5, 0.0)  # what keeps coming is believed
     assert track(ARX(1, 1, intercept=True), Bank(), lasting, u).ok[205:].all()
 

@@ -18,7 +18,7 @@ from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
-from driftfit.readings.gate import AT_START, INPUT, REFUSED, Gate
+from driftfit.readings.gate import AT_START, INPUT, REFUSED, USED, Gate
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
 from driftfit.readings.remarks import ungated
 from driftfit.readings.screen import Review, screen, suspect
@@ -302,10 +302,17 @@ def _codes(run: Track) -> dict[str, list[float]]:
     names = (
         run.labels.u or model.input_names or (("u",) if model.m == 1 else tuple(f"u{j + 1}" for j in range(model.m)))
     )
-    found = {run.labels.y: np.append(early, y[reason == REFUSED])}
+    entered = (reason == REFUSED) & ~_begins_change(y, reason) & (run.ok | np.isnan(y_hat))
+    found = {run.labels.y: np.append(early, y[entered])}
     for name, signal, mark in zip(names, u.T, strange, strict=True):
         found[name] = signal[np.intersect1d(blamed, np.flatnonzero(mark))]
     return {name: values.tolist() for name, values in found.items() if len(values)}
+
+
+def _begins_change(y: Array, reason: Array) -> Array:
+    """Which readings (T,) are the first one or two of a change: the next is as strange, differs, and is believed."""
+    change = np.append((reason == USED)[1:] & suspect(y)[1:] & (np.diff(y) != 0.0), False)
+    return np.asarray(change | np.append((change & (reason == REFUSED))[1:], False))
 
 
 def _codes_at_start(run: Track, strange: Array) -> Array:
