@@ -214,6 +214,7 @@ def test_a_run_of_codes_is_a_gap(tracker, run):
         assert len(fleet[k].left_out) == np.sum(np.isfinite(bad[k]) & (bad[k] != y[k]))
 
 
+@pytest.mark.filterwarnings("ignore:.*2 values look like fault codes")  # the two that the jump costs behind a gate
 @pytest.mark.parametrize("tracker", [RLS(0.99), Kalman(q=1e-4, r=0.01)], ids=repr)
 @pytest.mark.parametrize("level", [100.0, 1e4])
 @pytest.mark.parametrize("gap", [0, 5])

@@ -399,7 +399,7 @@ class Letters(Tracker):
 
     @property
     def steps(self):
-        return TrackerSteps(still, follow, unknown_variance)
+        return TrackerSteps(still, still, follow, unknown_variance, still)
 
 
 @needs_gcc

@@ -69,6 +69,7 @@ def test_a_heat_exchanger_that_fouls_is_followed_within_its_bands():
     assert 0.88 < np.mean(inside) < 0.99
 
 
+@pytest.mark.filterwarnings("ignore:.*1 value looks like a fault code")  # the first of the three that push it there
 def test_a_point_outside_of_the_domain_is_left_again():
     """sqrt(theta.k): the estimate is pushed below 0, where there is no value, and comes back."""
     rng = np.random.default_rng(1)
@@ -165,7 +166,7 @@ def test_a_missing_input_is_missing_in_functions_that_have_a_value_without_it(fo
     y, u = data(60)
     u = u[:, 0].copy()
     u[30] = np.nan
-    y[30 + ("[-1]" in form)] = 50.0
+    y[30 + ("[-1]" in form)] = 5.0
     run = track(Equation(f"y = theta.k * {form} + theta.c"), Kalman(q=0.0, r=1.0, p0=1.0), y, u)
     at = 30 + ("[-1]" in form)
     assert not run.ok[at]
