@@ -38,6 +38,9 @@ from driftfit import (
 )
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 
+# that codes are used is the promise; `test_gate_surfaces` is about the warning of them
+pytestmark = pytest.mark.filterwarnings("ignore:track. .*fault code:driftfit.DataWarning")
+
 EIGHT = settings(max_examples=8, phases=[Phase.generate])  # a record of a seed is not made smaller
 SIGMA = 0.1
 OUTAGES = ("missing", "gap", "weight", "drift")

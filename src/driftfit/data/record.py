@@ -251,7 +251,7 @@ class Records(NamedTuple):
         of ``reach`` samples, or those of the model.
         """
         u, names = ordered(model, self.u, self.labels.u)
-        warn_of_sizes(self.outputs or (self.labels.y,), self.y.reshape(len(self.y), -1))
+        warn_of_sizes(self.outputs or (self.labels.y,), self.y.reshape(len(self.y), self.ny))
         if m := u.shape[-1]:
             warn_of_sizes(names or [f"u{j + 1}" for j in range(m)], u.reshape(-1, m))
         found = self if u is self.u else self._replace(u=u, labels=replace(self.labels, u=names))

@@ -67,11 +67,17 @@ def none_late(s: State, l: int) -> None:
     """All samples are taken in at once."""
 
 
+def _wide_samples(tracker: Any) -> tuple[bool, Step, Any]:
+    """Whether the start takes in what a covariance cannot, the step that finds it, and the one that takes it in."""
+    if tracker.start is None or tracker.start.take_over is None:
+        return False, none_late, nothing
+    return True, keeps_digits, _late(tracker)
+
+
 def advancing(tracker: Any) -> Any:
     """One sample of all lanes of a tile; lanes whose ``s.root`` is 1 take the steps of the ``start``."""
     forecasts, correct, report = forecasting(tracker), tracker.correct, tracker.report
-    both = tracker.start is not None and tracker.start.take_over is not None
-    check, late = (keeps_digits, _late(tracker)) if both else (none_late, nothing)
+    both, check, late = _wide_samples(tracker)
     called = outlined(late, short=True) if both else late
 
     @kernel
@@ -93,7 +99,6 @@ def advancing(tracker: Any) -> Any:
             called(s)
 
     usual = advance_or_wait if both else advance
-
     if tracker.start is None:
         return advance
     first = tracker.start
@@ -164,8 +169,7 @@ def learning(tracker: Any) -> Any:
     variance, correct, report = tracker.variance, tracker.correct, tracker.report
     first = tracker if tracker.start is None else tracker.start
     variance_first, correct_first, report_first = first.variance, first.correct, first.report
-    both = first.take_over is not None
-    check, late = (keeps_digits, _late(tracker)) if both else (none_late, nothing)
+    both, check, late = _wide_samples(tracker)
     bound_scale = floored if tracker.learns_scale else nothing
 
     @kernel

@@ -73,6 +73,12 @@ def track(
     return run  # type: ignore[no-any-return]
 
 
+def in_rows_only(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any = None) -> Result:
+    """`track` of one series for its regressors and readings: nothing is said of estimates that are not looked at."""
+    programs, records, _, _ = _task(model, tracker, y, u, reading, data, None, Kept())
+    return _one(programs, records, "std", None, "float64")
+
+
 def parts(
     model: Model, tracker: Trackers, y: Any, u: Any = None, reading: Reading | None = None, *, data: Any = None,
     by: str | Sequence[str] | None = None, keep: str = "std", dtype: Any = "float64",
@@ -265,7 +271,7 @@ def warn_ungated(run: Result) -> None:
     if all(one.gate is not None or one.shared is not None for one in programs):
         return
     given = run.record if isinstance(run, Track) else run.records
-    y, T = given.y.reshape(len(given.y), -1), len(given.y)
+    y, T = given.y.reshape(len(given.y), len(run.model.outputs) or 1), len(given.y)
     first, length = (np.zeros(1, int), np.array([T])) if isinstance(given, Record) else (given.first, given.length)
     inputs = np.any([screen(signal, first, length) for signal in given.u.T], axis=0) if given.u.shape[-1] else False
     may = np.stack([screen(signal, first, length) | inputs for signal in y.T], axis=1).ravel()
