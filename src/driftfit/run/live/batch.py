@@ -220,19 +220,18 @@ class Batched(ABC):
     def _drive(self, y: Array, u: Array, known: Array, out: Array, time: Any = None) -> None:
         """Drive the tile over rows, of which ``time`` has the times, and let alarms and windows see each of them."""
         if not self._windows and not any(alarm.rule.kind in FROZEN for _, alarm in self._watching):
-            self._judged(y, u, known, out, time, self._samples - len(y))
+            self._judged(y, u, known, out, time)
             for lane, alarm in self._watching:
                 noise = np.broadcast_to(known[:, NOISE, min(lane, known.shape[2] - 1)], len(y))
                 alarm.take_many(out, lane, y[:, lane], noise, time)
             return
         for t in range(len(y)):
             row, own = slice(t, t + 1), known[t : t + 1] if len(known) > 1 else known
-            before = self._samples - len(y) + t
-            self._judged(y[row], u[row], own, out[row], None if time is None else time[row], before)
+            self._judged(y[row], u[row], own, out[row], None if time is None else time[row])
             self._keep(y[t], out["e"][t], out["s"][t], own[0], None if time is None else instant(time[t]))
 
-    def _judged(self, y: Array, u: Array, known: Array, out: Array, time: Any, before: int) -> None:
-        """Drive the tile over rows, with so many samples ``before`` them, and note what a gate leaves out."""
+    def _judged(self, y: Array, u: Array, known: Array, out: Array, time: Any) -> None:
+        """Drive the tile over rows, and note what a gate leaves out."""
         if self.programs[0].gate is None:
             self._loop(self._state_tile(), y, u, known, out)
             return
@@ -243,15 +242,17 @@ class Batched(ABC):
             at = None if time is None else instant(time[t])
             for lane in np.flatnonzero(out["reason"][t]).tolist():
                 if out["reason"][t, lane] != AT_START:
-                    self._note(before + t, at, out["reason"].item(t, lane), y.item(t, lane), lane)
+                    self._note(self._samples + t, at, out["reason"].item(t, lane), y.item(t, lane), lane)
             if t in starts:
-                self._note_start(before + t, at, starts[t])
+                self._note_start(self._samples + t, at, starts[t])
+        self._samples += len(out)
 
     def _noting(self, step: Any) -> Any:
         """The compiled step behind a gate, which notes what the gate leaves out."""
 
         def noting(tile: Any, y: float, u: Any) -> Any:
             found = step(tile, y, u)
+            self._samples += 1
             if not found[3] and (code := self._state_tile()["reason"].item(0, 0)):
                 self._note(self._samples - 1, self._last, code, y)
             return found
