@@ -305,7 +305,7 @@ def machine_correct(fields: int, n: int, N: int, L: int, l: int) -> None:
     show(law, x, C, A, theta, cubes(at[0, AT_P], n, n, L)[:, :, l], var)
 
 
-def calling(routine: Any) -> Any:
+def calling(machine_of_laws: Any) -> Any:
     """A kernel that calls a routine with the addresses of the fields."""
 
     @kernel
@@ -317,7 +317,7 @@ def calling(routine: Any) -> Any:
             s.P.ctypes.data, s.var.ctypes.data, s.L.ctypes.data, s.work.ctypes.data, s.now.ctypes.data,
             s.F.ctypes.data,
         ))  # fmt: skip
-        routine(fields, s.theta.shape[0], N, L, l)
+        machine_of_laws(fields, s.theta.shape[0], N, L, l)
 
     return call
 
