@@ -230,6 +230,7 @@ def noise_of(kind, T, rng):
     return e
 
 
+@pytest.mark.filterwarnings("ignore:.*fault code")  # the tail of Student's law
 @pytest.mark.parametrize("kind", ["normal", "t3", "AR(.6)", "GARCH"])
 def test_rates_of_false_alarms(kind):
     """Five references of 1000 samples, 5000 more from each, one alarm in 100 set: within four standard errors."""

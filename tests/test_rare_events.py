@@ -52,6 +52,7 @@ def test_the_response_to_rare_pulses_changes(change):
     assert max(constancy(*pulses(seed, change)).p_own[0] for seed in range(10)) < 0.05
 
 
+@pytest.mark.filterwarnings("ignore:.*fault code")
 def test_noise_that_is_louder_in_rare_pulses():
     """Segments that hold one pulse fit it exactly, and rows of equal weight let pulses decide: of 100 constant records,
     57 were rejected."""

@@ -83,7 +83,7 @@ def test_page_says_which_readings_the_tracker_left_out():
     y, u = arx_record(300, 1)
     y[[120, 180, 240]] = 9999.0
     run = track(ARX(1, 1), AdaptiveKalman(), y, u)
-    assert "<dt>Left out</dt><dd>3 samples out of all proportion to those before" in page(run)
+    assert "<dt>Left out</dt><dd>3 samples far outside the range of the others" in page(run)
 
 
 def test_pictures_take_the_colours_of_the_page(run):
