@@ -160,11 +160,11 @@ def test_a_forecast_has_the_variance_of_the_kalman_filter_and_samples_are_no_reg
         assert ahead.y_std[k] == pytest.approx(np.sqrt(g @ P @ g + 0.5), rel=1e-9)
     compared = run.summary().comparison
     assert np.isnan(compared.constant_ls)
-    assert compared.samples == 30
+    assert compared.samples == 72  # after a tenth
     assert "all three" in str(run.summary())
     health, truth = run.diagnose(), run.verdict()
     assert np.isnan([health["excitation"].value, health["constancy (p)"].value]).all()
-    assert (truth.drifts, truth.pays, truth.samples, truth.scored) == (None, None, 0, 30)
+    assert (truth.drifts, truth.pays, truth.samples, truth.scored) == (None, None, 0, 72)
     assert np.isnan(truth.rivals[1].p)
     assert "hidden states" in truth.sentences[0]
     assert "constant ARX (p = " in truth.sentences[0]
