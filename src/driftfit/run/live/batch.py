@@ -174,8 +174,8 @@ class Batched(ABC):
         out = np.empty(rows * len(records.y), self._row_type)
         if len(out):
             record = (records.in_rows() if self.model.shared else records).part(0)
-            self._drive(*lanes_of(record), out, record.time)
             self._samples += len(records.y)
+            self._drive(*lanes_of(record), out, record.time)
             self._settle(resting, extra)
         if before is not None and not taken.all():
             out = with_ignored(out, before, np.repeat(taken, rows))
@@ -220,31 +220,32 @@ class Batched(ABC):
     def _drive(self, y: Array, u: Array, known: Array, out: Array, time: Any = None) -> None:
         """Drive the tile over rows, of which ``time`` has the times, and let alarms and windows see each of them."""
         if not self._windows and not any(alarm.rule.kind in FROZEN for _, alarm in self._watching):
-            self._judged(y, u, known, out, time)
+            self._judged(y, u, known, out, time, self._samples - len(y))
             for lane, alarm in self._watching:
                 noise = np.broadcast_to(known[:, NOISE, min(lane, known.shape[2] - 1)], len(y))
                 alarm.take_many(out, lane, y[:, lane], noise, time)
             return
         for t in range(len(y)):
             row, own = slice(t, t + 1), known[t : t + 1] if len(known) > 1 else known
-            self._judged(y[row], u[row], own, out[row], None if time is None else time[row], t)
+            before = self._samples - len(y) + t
+            self._judged(y[row], u[row], own, out[row], None if time is None else time[row], before)
             self._keep(y[t], out["e"][t], out["s"][t], own[0], None if time is None else instant(time[t]))
 
-    def _judged(self, y: Array, u: Array, known: Array, out: Array, time: Any, before: int = 0) -> None:
-        """Drive the tile over rows, and note what a gate leaves out; ``before`` rows of the batch are done."""
+    def _judged(self, y: Array, u: Array, known: Array, out: Array, time: Any, before: int) -> None:
+        """Drive the tile over rows, with so many samples ``before`` them, and note what a gate leaves out."""
         if self.programs[0].gate is None:
             self._loop(self._state_tile(), y, u, known, out)
             return
         found: list[tuple[int, AtStart]] = []
         self._loop(self._state_tile(), y, u, known, out, found_too=found)
-        starts, first = dict(found), self._samples + before
+        starts = dict(found)
         for t in sorted({*np.flatnonzero(out["reason"].any(axis=1)).tolist(), *starts}):
             at = None if time is None else instant(time[t])
             for lane in np.flatnonzero(out["reason"][t]).tolist():
                 if out["reason"][t, lane] != AT_START:
-                    self._note(first + t, at, out["reason"].item(t, lane), y.item(t, lane), lane)
+                    self._note(before + t, at, out["reason"].item(t, lane), y.item(t, lane), lane)
             if t in starts:
-                self._note_start(first + t, at, starts[t])
+                self._note_start(before + t, at, starts[t])
 
     def _noting(self, step: Any) -> Any:
         """The compiled step behind a gate, which notes what the gate leaves out."""
