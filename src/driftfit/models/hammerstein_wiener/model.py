@@ -363,9 +363,9 @@ class HammersteinWiener(CountedInputs):
         for what, basis, data in (*zip(names, self.bases, u.T, strict=True), ("y", self.out, y)):
             if basis.n == 1 and not np.isfinite(basis.expected).any():
                 continue
-            with np.errstate(invalid="ignore", over="ignore"):
-                total = float(data.sum())
-            values = data if abs(total) < LARGEST else data[np.abs(data) < LARGEST]  # usually no value is missing
+            with np.errstate(over="ignore"):
+                total = float(np.abs(data).sum())
+            values = data if total < LARGEST else data[np.abs(data) < LARGEST]  # usually no value is missing
             low, high = basis.expected
             outside = int(np.sum((values < low) | (values > high))) if low > -np.inf or high < np.inf else 0
             if outside:
