@@ -227,32 +227,32 @@ class Batched(ABC):
             return
         for t in range(len(y)):
             row, own = slice(t, t + 1), known[t : t + 1] if len(known) > 1 else known
-            self._judged(y[row], u[row], own, out[row], None if time is None else time[row])
+            later = len(y) - t - 1
+            self._judged(y[row], u[row], own, out[row], None if time is None else time[row], later)
             self._keep(y[t], out["e"][t], out["s"][t], own[0], None if time is None else instant(time[t]))
 
-    def _judged(self, y: Array, u: Array, known: Array, out: Array, time: Any) -> None:
-        """Drive the tile over rows, and note what a gate leaves out."""
+    def _judged(self, y: Array, u: Array, known: Array, out: Array, time: Any, later: int = 0) -> None:
+        """Drive the tile over rows, after which ``later`` rows of those counted follow; note what a gate leaves out."""
         if self.programs[0].gate is None:
             self._loop(self._state_tile(), y, u, known, out)
             return
         found: list[tuple[int, AtStart]] = []
         self._loop(self._state_tile(), y, u, known, out, found_too=found)
-        starts = dict(found)
+        starts, rows = dict(found), self._rows_per_instant
+        first = self._samples * rows - later - len(out)
         for t in sorted({*np.flatnonzero(out["reason"].any(axis=1)).tolist(), *starts}):
             at = None if time is None else instant(time[t])
             for lane in np.flatnonzero(out["reason"][t]).tolist():
                 if out["reason"][t, lane] != AT_START:
-                    self._note(self._samples + t, at, out["reason"].item(t, lane), y.item(t, lane), lane)
+                    self._note((first + t) // rows, at, out["reason"].item(t, lane), y.item(t, lane), lane)
             if t in starts:
-                self._note_start(self._samples + t, at, starts[t])
-        self._samples += len(out)
+                self._note_start((first + t) // rows, at, starts[t])
 
     def _noting(self, step: Any) -> Any:
         """The compiled step behind a gate, which notes what the gate leaves out."""
 
         def noting(tile: Any, y: float, u: Any) -> Any:
             found = step(tile, y, u)
-            self._samples += 1
             if not found[3] and (code := self._state_tile()["reason"].item(0, 0)):
                 self._note(self._samples - 1, self._last, code, y)
             return found
