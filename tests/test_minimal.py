@@ -203,7 +203,7 @@ def test_as_many_products_as_minimal_parameters(kind):
     y += 0.05 * rng.normal(size=400)
     model, tracker = HammersteinWiener(1, 1, input=P2), kind(q=0.0, r=0.0025, p0=0.5, theta0=[-0.4, 0.6, 0.3])
     run = track(model, tracker, y, u)
-    assert run.names == ("a1", "b1", "c2")
+    assert run.names == ("A1", "b1", "c2")
     assert_allclose(run.theta[-1], [-0.5, 0.8, 0.5], atol=0.03)
     assert_allclose(run.blocks().c[-1], [1.0, run.theta[-1, 2]])
     assert np.sqrt(np.nanmean((y - run.ahead(3).y_hat)[300:] ** 2)) < 0.065

@@ -25,7 +25,6 @@ from driftfit import (
     ParticleFilter,
     StateSpace,
     track,
-    tune,
 )
 
 T, AT = 900, 400
@@ -136,12 +135,3 @@ def test_a_change_of_level_is_accepted():
     run = track(Equation("y = theta.c"), Kalman(q=0.1, r=1.0, p0=10.0), y, gate=True)
     assert 0 < len(run.left_out) <= 2
     assert abs(run.theta[-1, 0] - 100.0) < 2.0
-
-
-def test_tune_names_a_reading_that_decides_the_likelihood_alone():
-    rng = np.random.default_rng(2)
-    u = rng.normal(size=300)
-    y = u + 0.1 * rng.normal(size=300)
-    y[100] = 9999.0
-    with pytest.warns(UserWarning, match=r"y is 9999 at sample 100.*limits=\{\"y\""):
-        tune(Equation("y = theta.g * u"), Kalman(p0=1.0), y, u)

@@ -69,6 +69,7 @@ def test_two_peaks_where_kalman_filters_fail():
     assert 0.9 < np.mean(inside) < 0.98
 
 
+@pytest.mark.filterwarnings("ignore:.*fault code")
 def test_live_saved_and_in_lanes_it_has_the_bits_of_the_record(tmp_path):
     y, u, _ = bending(120, 9)
     y[50:55], y[80], u[90] = np.nan, 1e9, np.nan

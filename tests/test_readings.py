@@ -36,6 +36,7 @@ EVERY = PolynomialModel(na=1, nb=1, nc=1, nd=1, nf=1)
 CUBIC = HammersteinWiener(1, 1, 1, input=Polynomial(3), output=Polynomial(2)).bind(1)
 
 
+@pytest.mark.filterwarnings("ignore:.*fault code")
 @pytest.mark.parametrize("tracker", TRACKERS.values(), ids=TRACKERS)
 def test_no_reading_leaves_a_trace_that_is_not_a_number(tracker):
     model = model_of(tracker, ARX(2, 2).bind(1))
@@ -45,6 +46,7 @@ def test_no_reading_leaves_a_trace_that_is_not_a_number(tracker):
 
 
 @pytest.mark.filterwarnings("ignore:.*root mean square:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*fault code")
 @pytest.mark.parametrize(
     "tracker", [ready(Kalman), RLS(0.98), AdaptiveKalman(), ready(ExtendedKalman), ready(OutputError)], ids=repr
 )
