@@ -92,8 +92,8 @@ def test_sketches_run(page, namespace):
 def test_the_tracker_of_the_page_is_the_example():
     page = DOCS / "own_tracker.md"
     example = (DOCS.parent / "examples" / "own_tracker.py").read_text()
-    shown, rare, test = blocks(page)
-    for part in re.split(r"\n\n\n?", f"{shown}\n\n{rare}"):
+    shown, test = blocks(page)
+    for part in re.split(r"\n\n\n?", shown):
         assert part in example, part
     assert test == "def test_my_tracker():\n    assert check_tracker(SignLMS(gain=0.02)) == []"
 

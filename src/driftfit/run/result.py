@@ -22,7 +22,7 @@ from driftfit.run.columns import Columns
 from driftfit.run.live.conformal import quantile, widened
 from driftfit.run.program import Program, State, kept, lanes_of, state_of
 from driftfit.run.public_class import Plain
-from driftfit.run.states.gating import AtStart
+from driftfit.run.states.gating import AtStart, without_codes
 from driftfit.run.warm_start import End, gate_from
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.student import log_student, residuals_before, wider
@@ -358,34 +358,27 @@ class Track(Plain, Columns):
 
     @cached_property
     def decided(self) -> Track:
-        """The run without the codes that its gate found among the first samples, on which smoothers, likelihood and
-        judgements rest; the run itself if it found none.
-        """
+        """The run without the codes that its gate found among the first samples, for smoothers and judgements."""
         if self.program.gate is None or AT_START not in self.in_rows("reason"):
             return self
         found: list[tuple[int, AtStart]] = []
         tile = self.fresh()
         out = self.program.written(tile, len(self))
         self.program.drivers().run(tile, *lanes_of(self.record), out, found_too=found)
-        (last, start), (y, u) = found[0], (self.record.y.copy(), self.record.u.copy())
-        at, codes = last - start.ago, start.codes
-        y[at[codes[:, 0]]] = np.nan
-        u[at] = np.where(codes[:, 1:], np.nan, u[at])
         begun = {**(self.start or {}), "gate_decided": np.array(1)}
-        return track_record(self.program, replace(self.record, y=y, u=u), start=begun)
+        return track_record(self.program, without_codes(self.record, *found[0]), start=begun)
 
     @cached_property
     def used_record(self) -> Record:
         """The record with the decisions of the gate: refused readings are missing, and samples with a refused input
         have no weight, so that others learn from the same readings.
         """
-        left, record = self.left_out, self.record
-        if self.program.gate is None or not len(left):
-            return record
-        y, noise = left.applied(record.y, self.known.noise)
+        if self.program.gate is None or not len(self.left_out):
+            return self.record
+        y, noise = self.left_out.applied(self.record.y, self.known.noise)
         if self.model.implicit:  # the reading is in the regressor, too
             y = np.where(np.isinf(noise), np.nan, y)
-        return replace(record, y=y, known=self.known.changed(noise=noise))
+        return replace(self.record, y=y, known=self.known.changed(noise=noise))
 
     def cov(self, t: int) -> Array:
         """Covariance (n, n) of theta after sample t (negative t counts from the end).

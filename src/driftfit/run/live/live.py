@@ -97,15 +97,13 @@ class Live(Operated, Stream):
         self._bytes, self._scratch_bytes = tile.view(np.uint8), self._scratch.view(np.uint8)
         self._m = self._rows.m
         self._shape = (len(self.model.outputs), self._m) if self.model.shared else (self._m,)
-        self._unknown = np.full(self._shape, np.nan)
-        self._interval = tile["interval"][0]
+        self._unknown, self._interval = np.full(self._shape, np.nan), tile["interval"][0]
         self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
-        self._undecided = False
+        gated = self._single and self.programs[0].gate is not None
+        self._undecided = gated and not tile["gate_decided"][0, 0]
         if self._single:
-            self._update = self._look = self._stepper()
-            if self.programs[0].gate is not None:
-                self._update = self._noting(self._look)
-                self._undecided = not bool(tile["gate_decided"][0, 0])
+            self._look = self._stepper()
+            self._update = self._noting(self._look) if gated else self._look
             self._compiled, self._compiled_scratch = as_compiled(tile), as_compiled(self._scratch)  # views
         self._expect(self._awaits)
 

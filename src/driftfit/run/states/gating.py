@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from driftfit.data.record import Record
 from driftfit.engine.kernel import Array
 from driftfit.readings.first_samples import READING, TIMES
 from driftfit.readings.gate import Gate
@@ -45,3 +46,11 @@ def readings_of(lane: Mapping[str, Array]) -> Array:
     """The readings of the first samples that a gate remembers, as they were given."""
     rows = lane["gate_first"][: int(lane["gate_kept"])]
     return np.array(np.repeat(rows[:, READING], rows[:, TIMES].astype(int)))
+
+
+def without_codes(record: Record, last: int, start: AtStart) -> Record:
+    """A record without the codes that were found among its first samples, at sample ``last``."""
+    (y, u), at = (record.y.copy(), record.u.copy()), last - start.ago
+    y[at[start.codes[:, 0]]] = np.nan
+    u[at] = np.where(start.codes[:, 1:], np.nan, u[at])
+    return replace(record, y=y, u=u)
