@@ -1,8 +1,10 @@
 """The budgets of the house: no figure rises above its limit, and a limit is what was earned last."""
 
 import pytest
+from typer.testing import CliRunner
 
 from lab.budgets import LIMITS, budgets
+from lab.program import app
 
 FIGURES = budgets()
 SLACK = 0.03
@@ -21,3 +23,9 @@ def test_nothing_is_above_its_limit(name):
 def test_what_is_earned_is_kept(name):
     """A limit far above the figure would let what was earned be spent."""
     assert FIGURES[name] >= (1 - SLACK) * LIMITS[name], f"{name}: lower the limit to {FIGURES[name]:,} (lab/budgets.py)"
+
+
+def test_the_command_prints_every_figure():
+    printed = CliRunner().invoke(app, ["budgets"])
+    assert printed.exit_code == 0
+    assert all(name in printed.output for name in LIMITS)

@@ -39,6 +39,7 @@ ELSEWHERE = {
     "driftfit serve": ("tests/service_support.py", '"driftfit", "serve", *(what or ["--demo"])'),
     "python examples/controller.py": ("tests/test_embedded.py", '["controller.py"]'),
     "python -m lab bench accuracy": ("lab/tests/test_bench.py", '["bench", "accuracy", "--quick"'),
+    "python -m lab budgets": ("tests/test_budgets.py", '["budgets"]'),
     "python -m lab structure": ("lab/tests/test_structure.py", '["structure", "--picture"'),
     "python -m benchmarks.spark": ("tests/test_bridge_spark.py", 'costs(True, "streams")'),
     "python -m lab bench speed": ("lab/tests/test_bench.py", '["bench", "speed", "--quick"'),
