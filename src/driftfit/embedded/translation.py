@@ -1,12 +1,11 @@
 """The parts of an exported tracker: the translated steps, and the fields of the record that they need.
 
 A field that no step writes keeps the value that it starts with. Where all its entries are equal, that value becomes a
-constant of the text, and branches that it excludes are left out: a `Kalman` that is given ``p0`` does not contain the
-exact diffuse start. A field to which steps assign only 0 and 1 becomes an integer, because comparing numbers in double
-precision takes 50 cycles on a processor that does it in software. To find these fields we assume that none is written,
-and that all contain 0 or 1, translate, give up the assumptions that turned out wrong, and repeat until none does.
-Everything that the caller may change remains a field: the settings of the tracker and, unless the samples come at a
-fixed rate, the known factors of the next sample.
+constant of the text, and branches that it excludes are left out. A field to which steps assign only 0 and 1 becomes an
+integer, because comparing numbers in double precision takes 50 cycles on a processor that does it in software. To find
+these fields we assume that none is written, and that all contain 0 or 1, translate, give up the assumptions that turned
+out wrong, and repeat until none does. Everything that the caller may change remains a field: the settings of the
+tracker and, unless the samples come at a fixed rate, the known factors of the next sample.
 """
 
 from __future__ import annotations
