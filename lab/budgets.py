@@ -23,7 +23,7 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 73_557,
+    "lines of the library": 73_556,
     "statements": 47_444,
     "modules": 496,
     "levels of folders": 4,
@@ -43,7 +43,7 @@ LIMITS = {
     "state fields of a gate": 33,
     "bytes of state of Kalman": 848,
     "bytes of state of AdaptiveKalman": 22_792,
-    "lines of tests": 34_498,
+    "lines of tests": 34_500,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 

@@ -467,8 +467,10 @@ def test_readme_and_header_say_what_there_is(tmp_path):
     export_c(ARX(2, 2), Kalman(q=1e-3, r=0.1), tmp_path)
     readme, header = (tmp_path / "README.md").read_text(), (tmp_path / "tracker.h").read_text()
     page = " ".join((Path(__file__).parent.parent / "docs/embedded.md").read_text().split())
-    assert "1280 bytes in double precision" in readme and "state of `Kalman` has 1280 bytes" in page
-    assert "at most 3675 multiplications" in readme and "of the start at most 3675" in page
+    assert "1280 bytes in double precision" in readme
+    assert "state of `Kalman` has 1280 bytes" in page
+    assert "at most 3675 multiplications" in readme
+    assert "of the start at most 3675" in page
     counted = re.search(r"at\s+most (\d+) multiplications, (\d+) additions and 1 division\.", readme)
     assert 60 <= int(counted[1]) <= 110  # 2.5 n^2 + 8 n or so
     assert 60 <= int(counted[2]) <= 110
