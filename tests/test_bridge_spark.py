@@ -237,6 +237,7 @@ def test_the_chapter_is_followed_word_by_word(session, tmp_path, capsys):
     assert capsys.readouterr().out.split() == table.split()
 
 
+@pytest.mark.filterwarnings("ignore:time. .* rows repeat:driftfit.DataWarning")
 def test_benchmarks_run_quickly(session, capsys):
     """Those of streams; `benchmarks/spark_kill.py --quick` kills processes, and can wait for minutes afterwards."""
     costs = importlib.import_module("benchmarks.spark").main

@@ -286,7 +286,7 @@ class Program:
 
     def inspected(self, tile: Array, T: int, fields: tuple[str, ...], keep: str = "std") -> Array:
         """An array for T samples of which other steps than the tracker's store these ``fields``."""
-        return np.empty(T, output_type(tile, tuple(dict.fromkeys((*fields, *(GATED if self.gate else ())))), keep))
+        return np.empty(T, output_type(tile, tuple(dict.fromkeys((*(GATED if self.gate else ()), *fields))), keep))
 
     def loop(self, tile: Array, T: int, keep: str, dtype: Any, collected: bool) -> tuple[Any, Array]:
         """(the routine that runs tiles like this one, an array for the results of T samples).
