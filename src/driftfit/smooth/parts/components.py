@@ -1,0 +1,370 @@
+"""Components of a mixture: unnormalised Gaussians in square-root form, and what a smoother does to them.
+
+A component is exp(c) exp(-|S theta - d|^2 / 2) with S an upper triangle and A = [S | d]: a density of theta, or the
+likelihood of later samples. Only rotations are done to it, so a component without information on some direction, from
+collinear regressors or a part of a record in which nothing excites it, is like any other.
+
+Source: Bierman, Factorization Methods for Discrete Sequential Estimation (1977), chapters 5 and 6, for the rotations;
+Runnalls (2007), equation 24, for the measure by which components are merged. Cost: O(n^2) to absorb a sample, O(n^3)
+for everything else.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, part, shared
+
+LOG, MODE, MOVE, COST, SHARE = range(5)
+"""Of a component: c, its mode, its last move, the sum of e^2 / s on its path, and the log of its integral."""
+UNLIKELY = 14.0
+"""Log of the ratio to the most probable below which a component is dropped."""
+JOIN, SQUEEZE = 1e-4, 100.0
+"""Weighted divergence below which a component joins another, and the factor of it when there is no room."""
+
+
+class Components(NamedTuple):
+    """K components."""
+
+    A: Array
+    """(K, n, n + 1): [S | d]."""
+    facts: Array
+    """(K, 5): `LOG` to `SHARE`."""
+
+
+class Moves(NamedTuple):
+    """What may happen between two samples, in the order of the modes that are left, in one direction of time."""
+
+    begin: Array
+    """(S + 1,): the first move out of each mode."""
+    kind: Array
+    """(M, 6): the mode that is entered; the event, 0 for none; the roots of the drift and of the event, -1 for none;
+    the columns of the factors of either."""
+    log_prob: Array
+    """(U, M): U tables of log probabilities."""
+    roots: Array
+    """(k, n, n): upper triangles G with G G' the covariance."""
+
+
+class Noises(NamedTuple):
+    """The noises of a sample."""
+
+    kind: Array
+    """(L, 2): factor of the noise variance, and offset."""
+    log_prob: Array
+    """(S, L): log probabilities in each mode."""
+
+
+class Room(NamedTuple):
+    """Scratch space of a pass: children, their order, factors of kept components, facts of merging, squares, a row."""
+
+    children: Components
+    order: Array
+    factors: Array
+    merged: Array
+    squares: Array
+    row: Array
+
+
+def room_for(n: int, most: int, moves: int) -> Room:
+    """Scratch space for so many components, and moves out of a mode."""
+    C = most * moves
+    children = Components(np.empty((C, n, n + 1)), np.empty((C, 5)))
+    return Room(
+        children, np.empty(C, np.int64), np.empty((most + 1, n, n + 1)), np.empty((most, 3)), np.zeros((4, n, n + 1)),
+        np.empty(n + 1),
+    )  # fmt: skip
+
+
+@part
+def absorb(A: Array, row: Array) -> float:
+    """Rotate the row [phi | y] of noise variance 1 into A = [S | d], and return what is left of y."""
+    n = A.shape[0]
+    for i in range(n):
+        b = row[i]
+        if b != 0.0:
+            a = A[i, i]
+            r = np.sqrt(a * a + b * b)
+            c, s = a / r, b / r
+            A[i, i] = r
+            for j in range(i + 1, n + 1):
+                x, z = A[i, j], row[j]
+                A[i, j], row[j] = c * x + s * z, c * z - s * x
+    return float(row[n])
+
+
+@part
+def convolve(A: Array, G: Array, size: float, row: Array) -> float:
+    """theta <- theta + size G w, w ~ N(0, I), in A = [S | d]; returns by how much c falls."""
+    n, logs = A.shape[0], 0.0
+    for q in range(n if size > 0.0 else 0):
+        if G[q, q] == 0.0:
+            continue
+        top = 1.0
+        for j in range(n + 1):
+            row[j] = 0.0
+        for i in range(q, -1, -1):
+            z = 0.0
+            for j in range(i, q + 1):
+                z -= A[i, j] * G[j, q]
+            z *= size
+            r = np.sqrt(top * top + z * z)
+            c, s = top / r, z / r
+            top = r
+            for j in range(i, n + 1):
+                x = row[j]
+                row[j], A[i, j] = c * x + s * A[i, j], c * A[i, j] - s * x
+        logs += np.log(top)
+    return logs
+
+
+@part
+def log_det(A: Array) -> float:
+    """log |S|."""
+    product, logs = 1.0, 0.0
+    for i in range(A.shape[0]):
+        product *= A[i, i]
+        if not 1e-200 < product < 1e200:
+            logs, product = logs + np.log(product), 1.0
+    return float(logs + np.log(product))
+
+
+@part
+def moments(A: Array, R: Array, m: Array) -> None:
+    """R = S^-1, an upper triangle with R R' the covariance, and m = R d."""
+    n = A.shape[0]
+    for j in range(n):
+        R[j, j] = 1.0 / A[j, j]
+        for i in range(j - 1, -1, -1):
+            t = 0.0
+            for k in range(i + 1, j + 1):
+                t -= A[i, k] * R[k, j]
+            R[i, j] = t / A[i, i]
+    for i in range(n):
+        m[i] = 0.0
+        for j in range(i, n):
+            m[i] += R[i, j] * A[j, n]
+
+
+@shared
+def grow(K: int, now: Components, moves: Moves, logp: Array, sizes: Array, room: Room) -> int:
+    """All moves of K components; returns the number of the children."""
+    X, facts, Y, more, row = now.A, now.facts, room.children.A, room.children.facts, room.row
+    C, best, n = 0, -np.inf, X.shape[1]
+    for k in range(K):
+        best = max(best, facts[k, SHARE])
+    for k in range(K):
+        mode = int(facts[k, MODE])
+        for at in range(moves.begin[mode], moves.begin[mode + 1]):
+            if facts[k, SHARE] + logp[at] < best - UNLIKELY:
+                continue
+            for i in range(n):
+                for j in range(i, n + 1):
+                    Y[C, i, j] = X[k, i, j]
+            c = facts[k, LOG] + logp[at]
+            for which in range(2):
+                G = moves.kind[at, 2 + which]
+                if G >= 0:
+                    c -= convolve(Y[C], moves.roots[G], sizes[moves.kind[at, 4 + which]], row)
+            more[C, LOG], more[C, MODE], more[C, MOVE] = c, moves.kind[at, 0], at
+            more[C, COST], more[C, SHARE] = facts[k, COST], facts[k, SHARE] + logp[at]
+            C += 1
+    return C
+
+
+@shared
+def observe(C: int, room: Room, phi: Array, y: float, r: float, noises: Noises) -> None:
+    """Update C children by a sample; of several noises, by the one measurement with the same two moments."""
+    Y, more, row, logs, noise_of = room.children.A, room.children.facts, room.row, noises.log_prob, noises.kind
+    n, L = len(phi), len(noise_of)
+    for k in range(C):
+        A = Y[k]
+        if L == 1:
+            root = 1.0 / np.sqrt(r)
+            for i in range(n):
+                row[i] = phi[i] * root
+            row[n] = y * root
+            e = absorb(A, row)
+            more[k, LOG] -= 0.5 * (e * e + np.log(r))
+            more[k, COST] += e * e
+            more[k, SHARE] = more[k, LOG] - log_det(A)
+            continue
+        h, f = 0.0, y  # the forecast: y - f, of variance h before noise
+        for i in range(n):
+            t = phi[i]
+            for j in range(i):
+                t -= A[j, i] * row[j]
+            row[i] = t / A[i, i]
+            h += row[i] * row[i]
+            f -= row[i] * A[i, n]
+        mode, top = int(more[k, MODE]), -np.inf
+        for l in range(L):
+            v, e = h + r * noise_of[l, 0], f - noise_of[l, 1]
+            top = max(top, logs[mode, l] - 0.5 * (e * e / v + np.log(v)))
+        total, mean, square, cost = 0.0, 0.0, 0.0, 0.0
+        for l in range(L):
+            v, e = h + r * noise_of[l, 0], f - noise_of[l, 1]
+            p = np.exp(logs[mode, l] - 0.5 * (e * e / v + np.log(v)) - top)
+            at = h * e / v
+            total, mean, cost = total + p, mean + p * at, cost + p * e * e / v
+            square += p * (h * r * noise_of[l, 0] / v + at * at)
+        mean, square, cost = mean / total, square / total, cost / total
+        square -= mean * mean
+        more[k, SHARE] += top + np.log(total)
+        more[k, COST] += cost
+        if square < h:
+            noise = 1.0 / (1.0 / square - 1.0 / h)
+            root = 1.0 / np.sqrt(noise)
+            row[n] = (y - f + noise * mean / square) * root
+            for i in range(n):
+                row[i] = phi[i] * root
+            absorb(A, row)
+        more[k, LOG] = more[k, SHARE] + log_det(A)
+
+
+@shared
+def pool(R: Array, m: Array, share: float, other: Array, mean: Array, row: Array) -> None:
+    """Merge N(mean, other other') with this share into N(m, R R'), by their first two moments."""
+    n = len(m)
+    for i in range(n):
+        for j in range(i, n):
+            R[i, j] *= np.sqrt(1.0 - share)
+    for q in range(n + 1):
+        for i in range(n):
+            if q < n:
+                row[i] = np.sqrt(share) * other[i, q] if i <= q else 0.0
+            else:
+                row[i] = np.sqrt(share * (1.0 - share)) * (mean[i] - m[i])
+        for i in range(min(q, n - 1), -1, -1):
+            b = row[i]
+            if b != 0.0:
+                a = R[i, i]
+                r = np.sqrt(a * a + b * b)
+                c, s = a / r, b / r
+                R[i, i] = r
+                for k in range(i):
+                    x, z = R[k, i], row[k]
+                    R[k, i], row[k] = c * x + s * z, c * z - s * x
+    for i in range(n):
+        m[i] += share * (mean[i] - m[i])
+
+
+@part
+def divergence(A: Array, R: Array, m: Array, ahead: float, mean: Array, root: Array, limit: float, d: Array) -> float:
+    """KL of N(mean, root root') from the component A with N(m, R R'), where ``ahead`` is the difference of log |S|; inf
+    where it exceeds the limit.
+    """
+    n, squares = len(m), 0.0
+    for i in range(n):
+        t = 0.0
+        for j in range(i, n):
+            t += A[i, j] * (mean[j] - m[j])
+        squares += t * t
+    if 0.5 * squares > limit:
+        return np.inf
+    for i in range(n):
+        for j in range(i, n):
+            t = 0.0
+            for k in range(i, j + 1):
+                t += A[i, k] * root[k, j]
+            squares += t * t
+    return 0.5 * (squares - n) + ahead
+
+
+@shared
+def restore(A: Array, R: Array, m: Array) -> None:
+    """A = [S | d] from R = S^-1 and m = R d."""
+    n = len(m)
+    for i in range(n):
+        A[i, i] = 1.0 / R[i, i]
+    for q in range(n):
+        for i in range(q - 1, -1, -1):
+            t = 0.0
+            for k in range(i + 1, q + 1):
+                t -= R[i, k] * A[k, q]
+            A[i, q] = t / R[i, i]
+    for i in range(n):
+        A[i, n] = 0.0
+        for q in range(i, n):
+            A[i, n] += A[i, q] * m[q]
+
+
+@shared
+def reduce(C: int, room: Room, keep: int, now: Components) -> int:
+    """C children, the largest first, to at most ``keep`` components; returns their number."""
+    Y, more, order, merged, row = room.children.A, room.children.facts, room.order, room.merged, room.row
+    X, facts, scratch = now.A, now.facts, room.factors
+    n, N, best = X.shape[1], 0, -np.inf
+    for k in range(C):
+        best = max(best, more[k, SHARE])
+    count = 0
+    for k in range(C):
+        if more[k, SHARE] >= best - UNLIKELY:
+            at = count
+            while at > 0 and more[order[at - 1], SHARE] < more[k, SHARE]:
+                order[at] = order[at - 1]
+                at -= 1
+            order[at] = k
+            count += 1
+    root, mean = scratch[len(X), :, :n], scratch[len(X), :, n]
+    total = 0.0
+    for o in range(count):
+        k = order[o]
+        w = np.exp(more[k, SHARE] - best)
+        total += w
+        if count > 1:
+            moments(Y[k], root, mean)
+        logs = more[k, LOG] - more[k, SHARE]
+        to, least = -1, np.inf
+        for j in range(N):
+            if facts[j, MODE] == more[k, MODE]:
+                limit = min(least, SQUEEZE * JOIN * total / w)
+                apart = divergence(
+                    X[j],
+                    scratch[j, :, :n],
+                    scratch[j, :, n],
+                    logs - facts[j, LOG] + merged[j, 1],
+                    mean,
+                    root,
+                    limit,
+                    row,
+                )
+                if apart < least:
+                    to, least = j, apart
+        if to >= 0 and w * least < (JOIN if keep > N else SQUEEZE * JOIN) * total:
+            j = to
+            share = w / (w + np.exp(merged[j, 0] - best))
+            pool(scratch[j, :, :n], scratch[j, :, n], share, root, mean, row)
+            facts[j, COST] += share * (more[k, COST] - facts[j, COST])
+            merged[j, 0] = np.log(w + np.exp(merged[j, 0] - best)) + best
+            merged[j, 2] = 1.0
+        elif keep > N:
+            for i in range(n):
+                for j in range(i, n + 1):
+                    X[N, i, j] = Y[k, i, j]
+                    scratch[N, i, j] = root[i, j] if j < n else 0.0
+                scratch[N, i, n] = mean[i]
+            for i in range(facts.shape[1]):
+                facts[N, i] = more[k, i]
+            merged[N, 0], merged[N, 1], merged[N, 2] = more[k, SHARE], more[k, SHARE], 0.0
+            N += 1
+    for j in range(N):
+        if merged[j, 2] > 0.0:
+            restore(X[j], scratch[j, :, :n], scratch[j, :, n])
+            facts[j, SHARE] = merged[j, 0]
+            facts[j, LOG] = merged[j, 0] + log_det(X[j])
+    return N
+
+
+@shared
+def lowered(K: int, facts: Array) -> float:
+    """Make the largest share 1; returns the log of what it was."""
+    best = -np.inf
+    for k in range(K):
+        best = max(best, facts[k, SHARE])
+    for k in range(K):
+        facts[k, SHARE] -= best
+        facts[k, LOG] -= best
+    return best
