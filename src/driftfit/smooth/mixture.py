@@ -29,6 +29,7 @@ from driftfit.smooth.parts.components import (
     LOG,
     MODE,
     MOVE,
+    ROOMY,
     SHARE,
     UNLIKELY,
     Components,
@@ -48,11 +49,11 @@ from driftfit.smooth.parts.rank import column_sizes
 
 BLOCK = 1000
 """Samples between checkpoints."""
-KEPT, MOST = 12, 48
-"""Components that are kept at first, and at most where the evidence is not constant."""
+MOST = 48
+"""Components that are kept at most, where the evidence is not constant; `ROOMY` elsewhere."""
 NEAR = 25
 """Samples to either side of such a place that get more components."""
-CONSTANT = 0.02
+CONSTANT = 0.2
 """Change of the log evidence from one sample to the next that is accepted."""
 VAGUE = 1e-11
 """Information on theta outside the record, as a share of the root of that in one sample."""
@@ -280,7 +281,7 @@ def forwards(
     for t in range(len(y)):
         C = grow(K, now, moves, moves.log_prob[table[t]], sizes[t], room)
         if r[t] < np.inf:
-            observe(C, room, phi[t], y[t], r[t], noises)
+            C = observe(C, room, phi[t], y[t], r[t], noises)
         K = reduce(C, room, keep[t], now)
         level[t + 1] = level[t] + lowered(K, now.facts)
         if store:
@@ -316,7 +317,7 @@ def backwards(
                     found.cov[t, i, j] = out[1 + i, j]
             found.cov[t, i, min(i, found.cov.shape[2] - 1)] = out[1 + i, i]
         if r[t] < np.inf:
-            observe(C, room, phi[t], y[t], r[t], noises)
+            C = observe(C, room, phi[t], y[t], r[t], noises)
         K = reduce(C, room, keep[t], now)
         behind[0] += lowered(K, now.facts)
     count[0] = K
@@ -327,7 +328,7 @@ def smooth(problem: Problem, covariances: bool = False) -> Mixture:
 
     Where the evidence is not constant, twice as many components are allowed, up to `MOST`; see `Mixture.uneven`.
     """
-    keep = np.full(len(problem.y), KEPT)
+    keep = np.full(len(problem.y), ROOMY)
     while True:
         found = Passes(problem, keep).smoothed(covariances)
         more = keep.copy()
@@ -360,7 +361,8 @@ class Passes:
         self.scale = column_sizes(phi[used]) if used.any() else np.ones(n)
         modes, most = len(problem.noises.log_prob), max(int(keep.max()), len(problem.noises.log_prob))
         self.ways = [problem.alternatives.moves(self.scale, back) for back in (False, True)]
-        self.room = room_for(n, most, max(int(np.diff(way.begin).max()) for way in self.ways))
+        children = max(int(np.diff(way.begin).max()) for way in self.ways) * len(problem.noises.kind)
+        self.room = room_for(n, most, children)
         after = np.append(np.arange(1, T), 0)
         regressors = phi / self.scale
         self.samples = [

@@ -21,8 +21,11 @@ LOG, MODE, MOVE, COST, SHARE = range(5)
 """Of a component: c, its mode, its last move, the sum of e^2 / s on its path, and the log of its integral."""
 UNLIKELY = 14.0
 """Log of the ratio to the most probable below which a component is dropped."""
-JOIN, SQUEEZE = 1e-4, 100.0
-"""Weighted divergence below which a component joins another, and the factor of it when there is no room."""
+ROOMY = 12
+"""Components that are usually enough."""
+JOIN, SQUEEZE = 1e-3, 100.0
+"""Weighted divergence below which a component joins another, falling with the square of the components that are allowed
+beyond `ROOMY`; and the factor of it when there is no room."""
 
 
 class Components(NamedTuple):
@@ -68,9 +71,9 @@ class Room(NamedTuple):
     row: Array
 
 
-def room_for(n: int, most: int, moves: int) -> Room:
-    """Scratch space for so many components, and moves out of a mode."""
-    C = most * moves
+def room_for(n: int, most: int, children: int) -> Room:
+    """Scratch space for so many components, and children of each."""
+    C = most * children
     children = Components(np.empty((C, n, n + 1)), np.empty((C, 5)))
     return Room(
         children, np.empty(C, np.int64), np.empty((most + 1, n, n + 1)), np.empty((most, 3)), np.zeros((4, n, n + 1)),
@@ -175,53 +178,33 @@ def grow(K: int, now: Components, moves: Moves, logp: Array, sizes: Array, room:
 
 
 @shared
-def observe(C: int, room: Room, phi: Array, y: float, r: float, noises: Noises) -> None:
-    """Update C children by a sample; of several noises, by the one measurement with the same two moments."""
-    Y, more, row, logs, noise_of = room.children.A, room.children.facts, room.row, noises.log_prob, noises.kind
-    n, L = len(phi), len(noise_of)
+def observe(C: int, room: Room, phi: Array, y: float, r: float, noises: Noises) -> int:
+    """Update C children by a sample, each by every noise; returns the number of children that come of it."""
+    Y, more, row, n = room.children.A, room.children.facts, room.row, len(phi)
+    count = C
     for k in range(C):
-        A = Y[k]
-        if L == 1:
-            root = 1.0 / np.sqrt(r)
+        mode = int(more[k, MODE])
+        for l in range(len(noises.kind) - 1, -1, -1):  # the first noise takes the place of the child
+            logp, v = noises.log_prob[mode, l], r * noises.kind[l, 0]
+            to = k if l == 0 else count
+            if l > 0:
+                if more[k, SHARE] + logp < -UNLIKELY:
+                    continue
+                count += 1
+                for i in range(n):
+                    for j in range(i, n + 1):
+                        Y[to, i, j] = Y[k, i, j]
+                for i in range(more.shape[1]):
+                    more[to, i] = more[k, i]
+            root = 1.0 / np.sqrt(v)
             for i in range(n):
                 row[i] = phi[i] * root
-            row[n] = y * root
-            e = absorb(A, row)
-            more[k, LOG] -= 0.5 * (e * e + np.log(r))
-            more[k, COST] += e * e
-            more[k, SHARE] = more[k, LOG] - log_det(A)
-            continue
-        h, f = 0.0, y  # the forecast: y - f, of variance h before noise
-        for i in range(n):
-            t = phi[i]
-            for j in range(i):
-                t -= A[j, i] * row[j]
-            row[i] = t / A[i, i]
-            h += row[i] * row[i]
-            f -= row[i] * A[i, n]
-        mode, top = int(more[k, MODE]), -np.inf
-        for l in range(L):
-            v, e = h + r * noise_of[l, 0], f - noise_of[l, 1]
-            top = max(top, logs[mode, l] - 0.5 * (e * e / v + np.log(v)))
-        total, mean, square, cost = 0.0, 0.0, 0.0, 0.0
-        for l in range(L):
-            v, e = h + r * noise_of[l, 0], f - noise_of[l, 1]
-            p = np.exp(logs[mode, l] - 0.5 * (e * e / v + np.log(v)) - top)
-            at = h * e / v
-            total, mean, cost = total + p, mean + p * at, cost + p * e * e / v
-            square += p * (h * r * noise_of[l, 0] / v + at * at)
-        mean, square, cost = mean / total, square / total, cost / total
-        square -= mean * mean
-        more[k, SHARE] += top + np.log(total)
-        more[k, COST] += cost
-        if square < h:
-            noise = 1.0 / (1.0 / square - 1.0 / h)
-            root = 1.0 / np.sqrt(noise)
-            row[n] = (y - f + noise * mean / square) * root
-            for i in range(n):
-                row[i] = phi[i] * root
-            absorb(A, row)
-        more[k, LOG] = more[k, SHARE] + log_det(A)
+            row[n] = (y - noises.kind[l, 1]) * root
+            e = absorb(Y[to], row)
+            more[to, LOG] += logp - 0.5 * (e * e + np.log(v))
+            more[to, COST] += e * e
+            more[to, SHARE] = more[to, LOG] - log_det(Y[to])
+    return count
 
 
 @shared
@@ -296,6 +279,7 @@ def reduce(C: int, room: Room, keep: int, now: Components) -> int:
     """C children, the largest first, to at most ``keep`` components; returns their number."""
     Y, more, order, merged, row = room.children.A, room.children.facts, room.order, room.merged, room.row
     X, facts, scratch = now.A, now.facts, room.factors
+    join = JOIN * (ROOMY / max(keep, ROOMY)) ** 2
     n, N, best = X.shape[1], 0, -np.inf
     for k in range(C):
         best = max(best, more[k, SHARE])
@@ -320,7 +304,7 @@ def reduce(C: int, room: Room, keep: int, now: Components) -> int:
         to, least = -1, np.inf
         for j in range(N):
             if facts[j, MODE] == more[k, MODE]:
-                limit = min(least, SQUEEZE * JOIN * total / w)
+                limit = min(least, SQUEEZE * join * total / w)
                 apart = divergence(
                     X[j],
                     scratch[j, :, :n],
@@ -333,7 +317,7 @@ def reduce(C: int, room: Room, keep: int, now: Components) -> int:
                 )
                 if apart < least:
                     to, least = j, apart
-        if to >= 0 and w * least < (JOIN if keep > N else SQUEEZE * JOIN) * total:
+        if to >= 0 and w * least < (join if keep > N else SQUEEZE * join) * total:
             j = to
             share = w / (w + np.exp(merged[j, 0] - best))
             pool(scratch[j, :, :n], scratch[j, :, n], share, root, mean, row)
