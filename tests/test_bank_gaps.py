@@ -133,7 +133,7 @@ def test_small_jumps_are_found_and_dated_at_their_level():
         u = rng.standard_normal((400, N))
         theta = np.where((np.arange(400)[:, None] // 133) % 2 == 0, 1.0, [1.8, 1.0])
         y = (u * theta).sum(axis=1) + 0.5 * rng.standard_normal(400)
-        events = track(Regression(N), Bank(), y, u).hypotheses.dated()
+        events = track(Regression(N), Bank(), y, u).changes()
         for jump in (133, 266):
             near = [e for e in events if abs(e.span.date - jump) <= 30]
             found += bool(near)

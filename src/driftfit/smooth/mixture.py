@@ -32,7 +32,7 @@ from driftfit.smooth.parts.components import (
     ROOMY,
     SHARE,
     UNLIKELY,
-    Components,
+    Filter,
     Moves,
     Noises,
     Room,
@@ -113,8 +113,6 @@ class Mixture(NamedTuple):
     shift: Array
     shift_var: Array
     """(T, n): mean and variance of theta_t - theta_{t-1} if there was an event other than 0."""
-    spread: Array
-    """(T,): phi_t' C_t phi_t."""
     evidence: Array
     """(T,): log evidence as computed at each sample, without the constant of a start without information."""
     kept: Array
@@ -166,14 +164,14 @@ def join(mean: Array, cov: Array, share: float, m: Array, R: Array, d: Array) ->
 
 @shared
 def step(
-    A: Array, move: Array, roots: Array, sizes: Array, R: Array, m: Array, share: float, shift: Array, shift_var: Array,
-    Q: Array, V: Array, row: Array,
+    A: Array, move: Array, roots: Array, sizes: Array, work: Array, share: float, out: Array, row: Array
 ) -> None:  # fmt: skip
     """The same for the change w of a move, from the posterior N(m, R R') of theta before it and the likelihood A:
 
     E w = Q S' (d - S m),   Var w = Q - Q S' S Q + (R' S' S Q)' (R' S' S Q)
     """
-    n = len(m)
+    n = len(A)
+    R, m, Q, V, shift, shift_var = work[1, :, :n], work[1, :, n], work[2], work[3], out[n + 1], out[n + 2]
     for i in range(n):
         for j in range(n):
             Q[i, j] = 0.0
@@ -221,8 +219,7 @@ def meet(
     """
     K, Y, more, row, work = len(X), room.children.A, room.children.facts, room.row, room.squares
     n, top, total, moved = X.shape[1], -np.inf, 0.0, 0.0
-    W, R, m, Q, V = work[0], work[1, :, :n], work[1, :, n], work[2], work[3]
-    mean, cov, shift, shift_var = out[0], out[1 : n + 1], out[n + 1], out[n + 2]
+    W, R, m, mean, cov = work[0], work[1, :, :n], work[1, :, n], out[0], out[1 : n + 1]
     for i in range(n + 3):
         for j in range(n):
             out[i, j] = 0.0
@@ -258,7 +255,7 @@ def meet(
             events[label] += w
             if label > 0:
                 moved += w
-                step(Y[k], moves.kind[at], moves.roots, sizes, R, m, w / moved, shift, shift_var, Q, V, row)
+                step(Y[k], moves.kind[at], moves.roots, sizes, work, w / moved, out, row)
     for e in range(len(events)):
         events[e] /= total
     return float(top + np.log(total))
@@ -266,38 +263,31 @@ def meet(
 
 @Driver
 def forwards(
-    samples: Samples,
-    moves: Moves,
-    noises: Noises,
-    now: Components,
-    count: Array,
-    stored: Stored,
-    room: Room,
-    store: bool,
-) -> None:
-    """The filter through a block, from the components ``now``, which it replaces."""
+    samples: Samples, moves: Moves, noises: Noises, now: Filter, stored: Stored, room: Room, store: bool
+) -> None:  # fmt: skip
+    """The filter through a block of samples, whose components are stored if ``store`` says so."""
     phi, y, r, table, sizes, keep = samples
-    K, level = count[0], stored.level
+    K = now.many[0]
+    stored.level[0] = now.level[0]
     for t in range(len(y)):
         C = grow(K, now, moves, moves.log_prob[table[t]], sizes[t], room)
         if r[t] < np.inf:
             C = observe(C, room, phi[t], y[t], r[t], noises)
         K = reduce(C, room, keep[t], now)
-        level[t + 1] = level[t] + lowered(K, now.facts)
+        now.level[0] += lowered(K, now.facts)
         if store:
-            stored.many[t] = K
+            stored.many[t], stored.level[t + 1] = K, now.level[0]
             stored.A[t, :K], stored.facts[t, :K] = now.A[:K], now.facts[:K]
-    count[0] = K
+    now.many[0] = K
 
 
 @Driver
 def backwards(
-    samples: Samples, moves: Moves, noises: Noises, now: Components, count: Array, stored: Stored, room: Room,
-    last: bool, behind: Array, found: Mixture,
+    samples: Samples, moves: Moves, noises: Noises, now: Filter, stored: Stored, room: Room, last: bool, found: Mixture
 ) -> None:  # fmt: skip
     """The likelihood through a block, and where it meets the filter; ``last``: the record ends with the block."""
     phi, y, r, table, sizes, keep = samples
-    K, n = count[0], phi.shape[1]
+    K, n, wide = now.many[0], phi.shape[1], found.cov.shape[2]
     out = np.zeros((n + 3, n))
     for t in range(len(y) - 1, -1, -1):
         if last and t == len(y) - 1:
@@ -307,20 +297,17 @@ def backwards(
             C = grow(K, now, moves, moves.log_prob[table[t]], sizes[t], room)
         X, facts = stored.A[t, : stored.many[t]], stored.facts[t]
         total = meet(X, facts, C, moves, sizes[t], room, out, found.events[t])
-        found.evidence[t] = stored.level[t + 1] + behind[0] + total
+        found.evidence[t] = stored.level[t + 1] + now.level[0] + total
         found.theta[t], found.shift[t], found.shift_var[t] = out[0], out[n + 1], out[n + 2]
-        found.spread[t] = 0.0
         for i in range(n):
-            for j in range(n):
-                found.spread[t] += phi[t, i] * out[1 + i, j] * phi[t, j]
-                if found.cov.shape[2] == n:
-                    found.cov[t, i, j] = out[1 + i, j]
-            found.cov[t, i, min(i, found.cov.shape[2] - 1)] = out[1 + i, i]
+            for j in range(wide if wide > 1 else 0):
+                found.cov[t, i, j] = out[1 + i, j]
+            found.cov[t, i, min(i, wide - 1)] = out[1 + i, i]
         if r[t] < np.inf:
             C = observe(C, room, phi[t], y[t], r[t], noises)
         K = reduce(C, room, keep[t], now)
-        behind[0] += lowered(K, now.facts)
-    count[0] = K
+        now.level[0] += lowered(K, now.facts)
+    now.many[0] = K
 
 
 def smooth(problem: Problem, covariances: bool = False) -> Mixture:
@@ -344,10 +331,9 @@ def filtered(problem: Problem, keep: int) -> tuple[float, float]:
     """The log evidence, and the expected sum of e_t^2 / s_t, from a filter with this number of components."""
     passes = Passes(problem, np.full(len(problem.y), keep))
     passes.forward()
-    facts = passes.now.facts[: passes.count[0]]
+    facts = passes.ahead.facts[: passes.ahead.many[0]]
     weight = np.exp(facts[:, SHARE])
-    used = np.isfinite(problem.r).sum()
-    evidence = passes.stored.level[passes.length] + np.log(weight.sum()) - 0.5 * used * np.log(2.0 * np.pi)
+    evidence = passes.ahead.level[0] + np.log(weight.sum()) + passes.constant
     return float(evidence), float(weight @ facts[:, COST] / weight.sum())
 
 
@@ -355,31 +341,29 @@ class Passes:
     """The two filters over one record, in units in which columns of regressors have unit size."""
 
     def __init__(self, problem: Problem, keep: Array) -> None:
-        phi, r = problem.phi, problem.r
-        self.problem, used = problem, np.isfinite(r)
+        phi, r, noises = problem.phi, problem.r, problem.noises
+        self.problem, self.keep, used = problem, keep, np.isfinite(r)
         T, n = phi.shape
+        S, most = len(noises.log_prob), max(int(keep.max()), len(noises.log_prob))
+        self.constant = -0.5 * used.sum() * np.log(2.0 * np.pi)
         self.scale = column_sizes(phi[used]) if used.any() else np.ones(n)
-        modes, most = len(problem.noises.log_prob), max(int(keep.max()), len(problem.noises.log_prob))
         self.ways = [problem.alternatives.moves(self.scale, back) for back in (False, True)]
-        children = max(int(np.diff(way.begin).max()) for way in self.ways) * len(problem.noises.kind)
+        children = max(int(np.diff(way.begin).max()) for way in self.ways) * len(noises.kind)
         self.room = room_for(n, most, children)
-        after = np.append(np.arange(1, T), 0)
-        regressors = phi / self.scale
+        scaled, now, after = phi / self.scale, np.arange(T), np.append(np.arange(1, T), 0)
         self.samples = [
-            Samples(regressors, problem.y, r, problem.table[at], problem.sizes[at], keep)
-            for at in (np.arange(T), after)
+            Samples(scaled, problem.y, r, problem.table[at], problem.sizes[at], keep) for at in (now, after)
         ]
         unit = VAGUE / np.sqrt(np.median(r[used])) if used.any() else VAGUE
-        self.end = unit * np.eye(n, n + 1)
-        rows = problem.start / np.append(self.scale, 1.0)
-        self.now = Components(np.zeros((most, n, n + 1)), np.zeros((most, 5)))
-        self.now.A[0] = triangle(np.vstack([rows, self.end]))
-        size = np.sum(np.log(np.diag(self.now.A[0])))
-        self.now.facts[0, LOG], self.now.facts[0, SHARE] = (size, 0.0) if len(rows) >= n else (0.0, -size)
-        self.count = np.ones(1, np.int64)
-        self.behind = Components(np.zeros((most, n, n + 1)), np.zeros((most, 5)))
-        self.behind.A[:modes] = self.end
-        self.behind.facts[:modes, MODE], self.behind.facts[:modes, SHARE] = np.arange(modes), -n * np.log(unit)
+        end, rows = unit * np.eye(n, n + 1), problem.start / np.append(self.scale, 1.0)
+        self.ahead, self.behind = (
+            Filter(np.zeros((most, n, n + 1)), np.zeros((most, 5)), np.full(1, many), np.zeros(1)) for many in (1, S)
+        )
+        self.ahead.A[0] = triangle(np.vstack([rows, end]))
+        size = np.sum(np.log(np.diag(self.ahead.A[0])))
+        self.ahead.facts[0, LOG], self.ahead.facts[0, SHARE] = (size, 0.0) if len(rows) >= n else (0.0, -size)
+        self.behind.A[:S] = end
+        self.behind.facts[:S, MODE], self.behind.facts[:S, SHARE] = np.arange(S), -n * np.log(unit)
         size = min(T, BLOCK)
         self.stored = Stored(
             np.zeros((size, most, n, n + 1)), np.zeros((size, most, 5)), np.zeros(size, np.int64), np.zeros(size + 1)
@@ -389,18 +373,14 @@ class Passes:
         return Samples(*(values[a : a + BLOCK] for values in self.samples[which]))
 
     def _forward(self, a: int, store: bool) -> None:
-        samples = self._block(a, 0)
-        forwards(samples, self.ways[0], self.problem.noises, self.now, self.count, self.stored, self.room, store)
-        self.length = len(samples.y)
+        forwards(self._block(a, 0), self.ways[0], self.problem.noises, self.ahead, self.stored, self.room, store)
 
-    def forward(self) -> list[tuple[Array, Array, Array, float]]:
-        """The filter over the record; the components before every block. Those of the last block are stored."""
-        places, T, level = [], len(self.problem.y), self.stored.level
-        for a in range(0, T, BLOCK):
-            places.append((self.now.A.copy(), self.now.facts.copy(), self.count.copy(), float(level[0])))
-            self._forward(a, a + BLOCK >= T)
-            if a + BLOCK < T:
-                level[0] = level[self.length]
+    def forward(self) -> list[Filter]:
+        """The filter over the record; its components before every block. Those of the last block are stored."""
+        places = []
+        for a in range(0, len(self.keep), BLOCK):
+            places.append(Filter(*(values.copy() for values in self.ahead)))
+            self._forward(a, a + BLOCK >= len(self.keep))
         return places
 
     def smoothed(self, covariances: bool) -> Mixture:
@@ -409,33 +389,30 @@ class Passes:
         E = int(self.problem.alternatives.event.max()) + 1
         found = Mixture(
             np.empty((T, n)), np.empty((T, n, n if covariances else 1)), np.zeros((T + 1, E)), np.zeros((T + 1, n)),
-            np.zeros((T + 1, n)), np.empty(T), np.empty(T), self.samples[0].keep,
+            np.zeros((T + 1, n)), np.empty(T), self.keep,
         )  # fmt: skip
-        count, behind = np.full(1, len(self.problem.noises.log_prob)), np.zeros(1)
         for a, place in reversed([*zip(range(0, T, BLOCK), self.forward(), strict=True)]):
-            b = min(a + BLOCK, T)
-            if b < T:
-                self.now.A[:], self.now.facts[:], self.count[:], self.stored.level[0] = place
+            here, after = slice(a, min(a + BLOCK, T)), slice(a + 1, min(a + BLOCK, T) + 1)
+            if here.stop < T:
+                for values, before in zip(self.ahead, place, strict=True):
+                    values[:] = before
                 self._forward(a, True)
-            after = slice(a + 1, b + 1)
             part = Mixture(
-                found.theta[a:b], found.cov[a:b], found.events[after], found.shift[after], found.shift_var[after],
-                found.spread[a:b], found.evidence[a:b], found.kept[a:b],
+                found.theta[here], found.cov[here], found.events[after], found.shift[after], found.shift_var[after],
+                found.evidence[here], found.kept[here],
             )  # fmt: skip
-            backwards(
-                self._block(a, 1), self.ways[1], self.problem.noises, self.behind, count, self.stored, self.room,
-                b == T, behind, part,
-            )  # fmt: skip
+            samples, last = self._block(a, 1), here.stop == T
+            backwards(samples, self.ways[1], self.problem.noises, self.behind, self.stored, self.room, last, part)
         found.events[0] = np.eye(1, E)
         scale = self.scale
         return Mixture(
             found.theta / scale, found.cov / np.outer(scale, scale) if covariances else found.cov[:, :, 0] / scale**2,
-            found.events[:T], found.shift[:T] / scale, found.shift_var[:T] / scale**2, found.spread,
-            found.evidence - 0.5 * np.isfinite(self.problem.r).sum() * np.log(2.0 * np.pi), found.kept,
+            found.events[:T], found.shift[:T] / scale, found.shift_var[:T] / scale**2, found.evidence + self.constant,
+            self.keep,
         )  # fmt: skip
 
 
 def triangle(rows: Array) -> Array:
     """[S | d] of at least n rows [phi | y]."""
-    R: Array = np.linalg.qr(rows, mode="r")[: rows.shape[1] - 1]
+    R = np.asarray(np.linalg.qr(rows, mode="r"))[: rows.shape[1] - 1]
     return np.triu(R * np.where(np.diag(R) < 0.0, -1.0, 1.0)[:, None])

@@ -19,6 +19,8 @@ from driftfit.engine.kernel import Array, part, shared
 
 LOG, MODE, MOVE, COST, SHARE = range(5)
 """Of a component: c, its mode, its last move, the sum of e^2 / s on its path, and the log of its integral."""
+TOTAL, FIRST, MIXED = range(3)
+"""Of one that others join: the log of the integral of all, of the first, and whether there are others."""
 UNLIKELY = 14.0
 """Log of the ratio to the most probable below which a component is dropped."""
 ROOMY = 12
@@ -35,6 +37,17 @@ class Components(NamedTuple):
     """(K, n, n + 1): [S | d]."""
     facts: Array
     """(K, 5): `LOG` to `SHARE`."""
+
+
+class Filter(NamedTuple):
+    """The present components of a filter."""
+
+    A: Array
+    facts: Array
+    many: Array
+    """(1,): the number of components."""
+    level: Array
+    """(1,): log of the factors that were taken out of them."""
 
 
 class Moves(NamedTuple):
@@ -74,9 +87,9 @@ class Room(NamedTuple):
 def room_for(n: int, most: int, children: int) -> Room:
     """Scratch space for so many components, and children of each."""
     C = most * children
-    children = Components(np.empty((C, n, n + 1)), np.empty((C, 5)))
+    born = Components(np.empty((C, n, n + 1)), np.empty((C, 5)))
     return Room(
-        children, np.empty(C, np.int64), np.empty((most + 1, n, n + 1)), np.empty((most, 3)), np.zeros((4, n, n + 1)),
+        born, np.empty(C, np.int64), np.empty((most + 1, n, n + 1)), np.empty((most, 3)), np.zeros((4, n, n + 1)),
         np.empty(n + 1),
     )  # fmt: skip
 
@@ -152,7 +165,7 @@ def moments(A: Array, R: Array, m: Array) -> None:
 
 
 @shared
-def grow(K: int, now: Components, moves: Moves, logp: Array, sizes: Array, room: Room) -> int:
+def grow(K: int, now: Filter, moves: Moves, logp: Array, sizes: Array, room: Room) -> int:
     """All moves of K components; returns the number of the children."""
     X, facts, Y, more, row = now.A, now.facts, room.children.A, room.children.facts, room.row
     C, best, n = 0, -np.inf, X.shape[1]
@@ -235,15 +248,15 @@ def pool(R: Array, m: Array, share: float, other: Array, mean: Array, row: Array
 
 
 @part
-def divergence(A: Array, R: Array, m: Array, ahead: float, mean: Array, root: Array, limit: float, d: Array) -> float:
-    """KL of N(mean, root root') from the component A with N(m, R R'), where ``ahead`` is the difference of log |S|; inf
-    where it exceeds the limit.
+def divergence(A: Array, m: Array, ahead: float, other: Array, limit: float, d: Array) -> float:
+    """KL of a Gaussian from the component A with mean m; inf beyond the limit. ``other`` are [S^-1 | mean] of the
+    Gaussian, ``ahead`` is its log |S| less that of A.
     """
     n, squares = len(m), 0.0
     for i in range(n):
         t = 0.0
         for j in range(i, n):
-            t += A[i, j] * (mean[j] - m[j])
+            t += A[i, j] * (other[j, n] - m[j])
         squares += t * t
     if 0.5 * squares > limit:
         return np.inf
@@ -251,7 +264,7 @@ def divergence(A: Array, R: Array, m: Array, ahead: float, mean: Array, root: Ar
         for j in range(i, n):
             t = 0.0
             for k in range(i, j + 1):
-                t += A[i, k] * root[k, j]
+                t += A[i, k] * other[k, j]
             squares += t * t
     return 0.5 * (squares - n) + ahead
 
@@ -275,70 +288,70 @@ def restore(A: Array, R: Array, m: Array) -> None:
 
 
 @shared
-def reduce(C: int, room: Room, keep: int, now: Components) -> int:
-    """C children, the largest first, to at most ``keep`` components; returns their number."""
-    Y, more, order, merged, row = room.children.A, room.children.facts, room.order, room.merged, room.row
-    X, facts, scratch = now.A, now.facts, room.factors
-    join = JOIN * (ROOMY / max(keep, ROOMY)) ** 2
-    n, N, best = X.shape[1], 0, -np.inf
+def ranked(C: int, shares: Array, order: Array) -> int:
+    """Put the children that are not `UNLIKELY` in order, the largest first; returns their number."""
+    count, best = 0, -np.inf
     for k in range(C):
-        best = max(best, more[k, SHARE])
-    count = 0
+        best = max(best, shares[k])
     for k in range(C):
-        if more[k, SHARE] >= best - UNLIKELY:
+        if shares[k] >= best - UNLIKELY:
             at = count
-            while at > 0 and more[order[at - 1], SHARE] < more[k, SHARE]:
+            while at > 0 and shares[order[at - 1]] < shares[k]:
                 order[at] = order[at - 1]
                 at -= 1
             order[at] = k
             count += 1
+    return count
+
+
+@shared
+def nearest(N: int, now: Filter, room: Room, k: int, limit: float) -> tuple[int, float]:
+    """The component of the same mode from which child k has the least divergence below the limit, or -1."""
+    more, merged, n, most = room.children.facts, room.merged, now.A.shape[1], len(now.A)
+    to, least, logs = -1, limit, more[k, LOG] - more[k, SHARE]
+    for j in range(N):
+        if now.facts[j, MODE] == more[k, MODE]:
+            ahead = logs - now.facts[j, LOG] + merged[j, FIRST]
+            apart = divergence(now.A[j], room.factors[j, :, n], ahead, room.factors[most], least, room.row)
+            if apart < least:
+                to, least = j, apart
+    return to, least
+
+
+@shared
+def reduce(C: int, room: Room, keep: int, now: Filter) -> int:
+    """C children, the largest first, to at most ``keep`` components; returns their number."""
+    Y, more, order, merged, scratch = room.children.A, room.children.facts, room.order, room.merged, room.factors
+    X, facts, n, N = now.A, now.facts, now.A.shape[1], 0
+    join = JOIN * (ROOMY / max(keep, ROOMY)) ** 2
+    count = ranked(C, more[:, SHARE], order)
+    best, total = more[order[0], SHARE], 0.0
     root, mean = scratch[len(X), :, :n], scratch[len(X), :, n]
-    total = 0.0
     for o in range(count):
         k = order[o]
         w = np.exp(more[k, SHARE] - best)
         total += w
         if count > 1:
             moments(Y[k], root, mean)
-        logs = more[k, LOG] - more[k, SHARE]
-        to, least = -1, np.inf
-        for j in range(N):
-            if facts[j, MODE] == more[k, MODE]:
-                limit = min(least, SQUEEZE * join * total / w)
-                apart = divergence(
-                    X[j],
-                    scratch[j, :, :n],
-                    scratch[j, :, n],
-                    logs - facts[j, LOG] + merged[j, 1],
-                    mean,
-                    root,
-                    limit,
-                    row,
-                )
-                if apart < least:
-                    to, least = j, apart
-        if to >= 0 and w * least < (join if keep > N else SQUEEZE * join) * total:
-            j = to
-            share = w / (w + np.exp(merged[j, 0] - best))
-            pool(scratch[j, :, :n], scratch[j, :, n], share, root, mean, row)
-            facts[j, COST] += share * (more[k, COST] - facts[j, COST])
-            merged[j, 0] = np.log(w + np.exp(merged[j, 0] - best)) + best
-            merged[j, 2] = 1.0
+        j, apart = nearest(N, now, room, k, SQUEEZE * join * total / w)
+        if j >= 0 and w * apart < (join if keep > N else SQUEEZE * join) * total:
+            both = w + np.exp(merged[j, TOTAL] - best)
+            pool(scratch[j, :, :n], scratch[j, :, n], w / both, root, mean, room.row)
+            facts[j, COST] += w / both * (more[k, COST] - facts[j, COST])
+            merged[j, TOTAL], merged[j, MIXED] = np.log(both) + best, 1.0
         elif keep > N:
             for i in range(n):
-                for j in range(i, n + 1):
-                    X[N, i, j] = Y[k, i, j]
-                    scratch[N, i, j] = root[i, j] if j < n else 0.0
-                scratch[N, i, n] = mean[i]
+                for q in range(i, n + 1):
+                    X[N, i, q], scratch[N, i, q] = Y[k, i, q], scratch[len(X), i, q]
             for i in range(facts.shape[1]):
                 facts[N, i] = more[k, i]
-            merged[N, 0], merged[N, 1], merged[N, 2] = more[k, SHARE], more[k, SHARE], 0.0
+            merged[N, TOTAL], merged[N, FIRST], merged[N, MIXED] = more[k, SHARE], more[k, SHARE], 0.0
             N += 1
     for j in range(N):
-        if merged[j, 2] > 0.0:
+        if merged[j, MIXED] > 0.0:
             restore(X[j], scratch[j, :, :n], scratch[j, :, n])
-            facts[j, SHARE] = merged[j, 0]
-            facts[j, LOG] = merged[j, 0] + log_det(X[j])
+            facts[j, SHARE] = merged[j, TOTAL]
+            facts[j, LOG] = merged[j, TOTAL] + log_det(X[j])
     return N
 
 

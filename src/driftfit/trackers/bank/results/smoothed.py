@@ -16,8 +16,8 @@ one factor at a time about the greatest. The prior is half-way between one that 
 drift, after which paths at rest have 18 % more error, and one that is flat in its logarithm, after which bands of walks
 in 150 samples cover 85 per cent. Noises of `Bank()` are `NOISES`: spikes and bursts of noise would be jumps otherwise.
 
-Source: Kitagawa (1994) for the smoother; Gelman (2006, section 7.1) for priors of a standard deviation. Cost: 30 us per sample for two
-parameters and changes; for `Bank()` some fifty filters more.
+Source: Kitagawa (1994) for the smoother; Gelman (2006, section 7.1) for priors of a standard deviation. Cost: 30 us per
+sample for two parameters and changes; for `Bank()` that for each likely drift, and some fifty filters.
 """
 
 from __future__ import annotations
@@ -135,15 +135,22 @@ class SmoothedMixture:
         return self.theta - half, self.theta + half
 
     def increment(self, first: int, last: int) -> tuple[Array, Array]:
-        """Mean and standard deviation (n,) of theta_t - theta_{t-1} if there was a change at one of these samples."""
+        """Mean and standard deviation (n,) of how far theta moved by changes at these samples, if there was one.
+
+        Two changes at neighbouring samples have some probability, and each of them may then have been of any size. The
+        mean is therefore that of their sum, and the variance at most that of the path before and after together.
+        """
         part = slice(first, last + 1)
-        p = 1.0 - self.change_prob[part, 0]
-        p = (p / p.sum())[:, None]
-        mean = np.sum(p * self.shift[part], axis=0)
-        return mean, np.sqrt(np.sum(p * (self.shift_std[part] ** 2 + (self.shift[part] - mean) ** 2), axis=0))
+        p = 1.0 - self.change_prob[part, :1]
+        mean = np.sum(p * self.shift[part], axis=0) / min(p.sum(), 1.0)
+        each = self.shift[part]
+        center = np.sum(p * each, axis=0) / p.sum()
+        var = np.sum(p * (self.shift_std[part] ** 2 + (each - center) ** 2), axis=0) / p.sum()
+        return mean, np.sqrt(np.minimum(var, self.std[max(first - 1, 0)] ** 2 + self.std[last] ** 2))
 
 
 NO = np.zeros(0)
+"""No factors."""
 
 
 def moving(run: Track) -> Array:
@@ -196,35 +203,24 @@ class Priors:
         self.Hd, Hm = len(bank.all_changes), len(bank.all_sensors)
         H = self.Hd * Hm
         known = run.known.over(T)
-        extra = (
-            known.extra
-            if known.extra.size
-            else np.hstack([np.full((1, H + self.Hd**2), np.nan), np.ones((1, self.Hd))])
-        )
-        self.drift, self.factors = known.drift, extra[:, H + self.Hd**2 :]
-        given = np.broadcast_to(extra[:, : H + self.Hd**2], (T, H + self.Hd**2))
+        plain = np.concatenate([np.full(H + self.Hd**2, np.nan), np.ones(self.Hd)])[None]
+        given, self.factors = np.split(known.extra if known.extra.size else plain, [H + self.Hd**2], axis=1)
+        self.drift, self.Hm = known.drift, Hm
         P, self.initial = bank.event_probabilities
         self.noise_of = [j for j, sensor in enumerate(bank.all_sensors) if not away(sensor)]
-        self.P = (
-            self._without(P.reshape(H, self.Hd, Hm))
-            .reshape(self.Hd, Hm, -1)[:, self.noise_of]
-            .reshape(-1, self.Hd * len(self.noise_of))
-        )
-        self.chained = not bank._alike or not np.isnan(given[:, H:]).all()
-        first = np.arange(T) == 0
-        keys = (
-            np.column_stack([first, dt])
-            if not extra.shape[0] > 1
-            else np.column_stack([first, dt, np.nan_to_num(given, nan=-1.0)])
-        )
-        self.rows, self.table = np.unique(keys, axis=0, return_inverse=True)
-        self.table = self.table.reshape(-1)
-        self.Hm = Hm
+        kept = self._without(P.reshape(H, self.Hd, Hm)).reshape(self.Hd, Hm, -1)[:, self.noise_of]
+        self.P = kept.reshape(kept.shape[0] * kept.shape[1], -1)
+        self.chained = not bank.independent or not np.isnan(given[:, H:]).all()
+        keys = [np.arange(T) == 0, dt]
+        if len(given) > 1:
+            keys += [*np.nan_to_num(given, nan=-1.0).T]
+        self.rows, table = np.unique(np.column_stack(keys), axis=0, return_inverse=True)
+        self.table = np.asarray(table).reshape(-1)
 
     def _without(self, p: Array) -> Array:
         """Probabilities (.., H_d, H_m) of the sensors that are noises, as shares."""
         p = p[..., self.noise_of] + np.finfo(float).tiny
-        return p / p.sum(axis=(-2, -1), keepdims=True)
+        return np.asarray(p / p.sum(axis=(-2, -1), keepdims=True))
 
     def _row(self, row: Array) -> Array:
         """Transition (H, H) before a sample, H the joint events of changes and noises."""
@@ -267,7 +263,7 @@ class Priors:
         time = np.repeat(self.dt[:, None], self.Hd, axis=1)
         if not self.chained:
             time[:, 1:] = time[:, 1:] > 0.0
-        return np.sqrt(self.drift[:, None] * self.factors * time)
+        return np.asarray(np.sqrt(self.drift[:, None] * self.factors * time))
 
     def noises(self) -> Noises:
         """The sensors that are noises."""
