@@ -13,7 +13,7 @@ from support import arx_record, same
 
 from driftfit import ARX, RLS, DataWarning, Kalman, Live, Track, track
 from driftfit.data import storage
-from driftfit.run.states import layout as states
+from driftfit.run import layout as states
 
 Y, U = arx_record(60, 1)
 

@@ -17,15 +17,13 @@ from typing import Any
 import narwhals as nw
 import numpy as np
 
+from driftfit.data.arguments import dated, noise_of, warn_of_order, warn_of_repeats, warn_of_skipped_periods
 from driftfit.data.clock import LABEL, Clock
 from driftfit.data.columns import Columns, Wanted
 from driftfit.data.files import read
-from driftfit.data.known import Known
-from driftfit.data.labels import dated, warn_of_order, warn_of_repeats, warn_of_skipped_periods
+from driftfit.data.instants import warn_of_counted_years, warn_of_summer_time, warn_of_written_numbers
 from driftfit.data.limits import marks
-from driftfit.data.record import Labels, Reading, Records, drift_of
-from driftfit.data.signals import noise_of
-from driftfit.data.times.instants import warn_of_counted_years, warn_of_summer_time, warn_of_written_numbers
+from driftfit.data.record import Known, Labels, Reading, Records, drift_of
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import warn
 

@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from driftfit.data import storage
-from driftfit.data.known import Known
-from driftfit.data.record import Labels, Records
+from driftfit.data.record import Known, Labels, Records
 from driftfit.engine.kernel import Array
 from driftfit.engine.tiles import repeat_tile
 from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
+from driftfit.run.columns import Plain
 from driftfit.run.program import Program, State, kept, programs_of, state_of
-from driftfit.run.public_class import Plain
 from driftfit.run.result import Lane, Lanes, Track, names_of
 from driftfit.trackers.base import Tracker
 

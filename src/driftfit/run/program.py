@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from driftfit.data import storage
+from driftfit.data.arguments import check_ready
 from driftfit.data.record import Record
-from driftfit.data.signals import check_ready
 from driftfit.engine.drivers import GATED, NOWHERE, Drivers, TrackerSteps, drivers
 from driftfit.engine.kernel import Array
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
@@ -28,10 +28,9 @@ from driftfit.models.regression import Regression
 from driftfit.readings.first_samples import replayed
 from driftfit.readings.gate import AT_START, Gate, gate_step
 from driftfit.readings.gate import start as gate_start
-from driftfit.run.collected_samples import COLLECTED, collecting
-from driftfit.run.states.gating import AtStart, gate_of, readings_of, without_start
-from driftfit.run.states.layout import Layout, words_of
-from driftfit.run.states.rows import put_columns
+from driftfit.run.columns import COLLECTED, collecting, put_columns
+from driftfit.run.gating import AtStart, gate_of, readings_of, without_start
+from driftfit.run.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
 CHUNK = 1_000_000
@@ -186,7 +185,7 @@ class Program:
         return Layout(record, held_in(record, self.tracker_start), self.tracker.scratch, owner)
 
     def pack(self, tile: Array, lane: int = 0) -> bytes:
-        """The state of a lane as bytes (`driftfit.run.states.layout`)."""
+        """The state of a lane as bytes (`driftfit.run.layout`)."""
         return self.layout.pack(words_of(tile)[self.layout.rows(tile), lane])
 
     def unpack(self, data: bytes, tile: Array | None = None, lane: int = 0) -> Array:

@@ -12,17 +12,15 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from driftfit.data import storage
-from driftfit.data.known import Known
-from driftfit.data.record import Labels, Record, time_text
+from driftfit.data.record import Known, Labels, Record, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.readings.gate import AT_START
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, left_out_of
-from driftfit.run.columns import Columns
+from driftfit.run.columns import Columns, Plain
+from driftfit.run.gating import AtStart, without_codes
 from driftfit.run.live.conformal import quantile, widened
 from driftfit.run.program import Program, State, kept, lanes_of, state_of
-from driftfit.run.public_class import Plain
-from driftfit.run.states.gating import AtStart, without_codes
 from driftfit.run.warm_start import End, gate_from
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.student import log_student, residuals_before, wider

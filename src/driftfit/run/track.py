@@ -1,4 +1,11 @@
-"""Record mode: whole series in one call, causal at every sample. The public function is `driftfit.track`."""
+"""Record mode: whole series in one call, causal at every sample. The public function is `driftfit.track`.
+
+One decision for many candidates: which readings are left out is decided by one run, and holds for all of them.
+
+The reference is `AdaptiveKalman` on the largest of the models, so the decision depends neither on the settings that are
+tried nor on their number. Refused readings are missing for every candidate, and samples with a refused input have no
+weight, so that likelihoods are of the same readings.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.data import outputs
+from driftfit.data import arrays
 from driftfit.data.arguments import check_roles
 from driftfit.data.record import Reading, Record, Records, one_series, rows
 from driftfit.engine.drivers import LARGEST
@@ -23,12 +30,13 @@ from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
 from driftfit.readings.remarks import ungated
 from driftfit.readings.screen import Review, screen, suspect
 from driftfit.run.fleet import Fleet, run_fleet
+from driftfit.run.gating import gate_of
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, programs_of, tile_of
 from driftfit.run.result import Lane, Lanes, Track, track_record
-from driftfit.run.states.reference import decide, decided
 from driftfit.run.warm_start import Run, carried, ended, first_interval
+from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 
 Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
@@ -112,7 +120,7 @@ def _task(
     """(the program of each output of each series, the checked series, units without data with the reasons, whether the
     result is a fleet)."""
     alone = check_roles("track", model, tracker, several=True)
-    model, y = outputs.columns_as_outputs(model, y, data)
+    model, y = arrays.columns_as_outputs(model, y, data)
     one_of("track", "keep", kept.keep, ("std", "cov", "theta"))
     if kept.dtype != "float64":  # the default, whose name NumPy would look up for a microsecond
         one_of("track", "dtype", np.dtype(kept.dtype).name, ("float64", "float32"))
@@ -190,9 +198,9 @@ def records_of(
         u = model.input_names or None
     if len(model.outputs) > 1:
         if data is not None:
-            model, records, failed = outputs.of_table(model, y, u, data, by, reading)
+            model, records, failed = arrays.of_table(model, y, u, data, by, reading)
         else:
-            model, records = (outputs.of_rows if by == "row" else outputs.of_arrays)(model, y, u, reading)
+            model, records = (arrays.of_rows if by == "row" else arrays.of_arrays)(model, y, u, reading)
     elif data is not None:
         # imported here, because narwhals and polars take as long to import as everything else
         from driftfit.data.tables import read_records
@@ -364,3 +372,43 @@ def warn_unlearned(run: Track | KeyedResults) -> None:
         "constant or repeat another.",
         UserWarning,
     )
+
+
+Decisions = Mapping[Hashable, LeftOut]
+"""What was left out of each series, by its key."""
+
+
+def decide(model: Model, records: Records, gate: Any) -> tuple[Records, Decisions]:
+    """(the series as every candidate takes them, what was left out of each), given the largest model, bound, and a
+    gate (None or False: none), or decisions that were made before; ValueError for a model that the reference does not
+    follow.
+    """
+    if gate is None or gate is False:
+        return records, {}
+    if not isinstance(gate, LeftOut | Mapping):
+        if model.hidden is not None:
+            raise ValueError(
+                f"gate: {type(model).__name__} has no reference run that could decide; give the decisions of a run, "
+                "gate=track(model, tracker, y, u, gate=True).left_out."
+            )
+        reference = AdaptiveKalman()
+        program = Program(model, reference, gate=gate_of(reference, gate))
+        parts = zip(records.keys, map(records.part, range(len(records.keys))), strict=True)
+        gate = {key: track_record(program, part).left_out for key, part in parts}
+    return decided(records, gate)
+
+
+def decided(records: Records, gate: LeftOut | Decisions) -> tuple[Records, Decisions]:
+    """The series with decisions that were made before: of one series, or by its key."""
+    if records.outputs:
+        raise ValueError("gate: decisions are those of one output; give gate=True, or take one output after the other.")
+    if isinstance(gate, LeftOut):
+        if len(records.keys) > 1:
+            raise ValueError("gate: decisions of one run are for one series; give a mapping from every key to its own.")
+        gate = {records.keys[0]: gate}
+    y, noise = records.y.copy(), np.array(np.broadcast_to(records.known.noise, len(records.y)))
+    for key, begin, count in zip(records.keys, records.first.tolist(), records.length.tolist(), strict=True):
+        if key in gate:
+            part = slice(begin, begin + count)
+            y[part], noise[part] = gate[key].applied(y[part], noise[part])
+    return records._replace(y=y, known=records.known.changed(noise=noise), left_out=gate), gate

@@ -27,7 +27,7 @@ from driftfit.engine.tiles import output_type
 from driftfit.models.base import Model
 from driftfit.run.program import Program, spread, tile_of
 from driftfit.run.result import burn_in
-from driftfit.run.states.reference import Decisions
+from driftfit.run.track import Decisions
 from driftfit.trackers.base import Tracker
 
 BLOCK = 1024

@@ -45,7 +45,7 @@ from driftfit.judge.verdict import verdict
 from driftfit.models.base import Model
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
-from driftfit.run.states.joint_layout import JointLayout
+from driftfit.run.warm_start import JointLayout
 from driftfit.trackers.base import Tracker
 
 OUTPUTS = ("samples", "summary", "verdict", "states")

@@ -20,11 +20,11 @@ from driftfit.bridges.spark.pieces import COUNTS, SAMPLES, USED, alarms_of, alar
 from driftfit.bridges.spark.task import Task
 from driftfit.engine.drivers import INTERVAL
 from driftfit.engine.kernel import Array
+from driftfit.run import late
+from driftfit.run.layout import tag_of
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.result import Lane
-from driftfit.run.states import late
-from driftfit.run.states.joint_layout import JointLayout
-from driftfit.run.states.layout import tag_of
+from driftfit.run.warm_start import JointLayout
 
 HEAD = Struct(f"<{len(COUNTS)}q8s8sqq")
 MICROS = "M8[us]"

@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.data.known import Known
-from driftfit.data.record import Record, Records
+from driftfit.data.record import Known, Record, Records
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.models.arx import ARX

@@ -2,6 +2,8 @@
 
 It needs the memory of the window, or of the sums of "glr". Cost: some ten microseconds per sample in addition to the
 update.
+
+A change that an alarm with a frozen reference model found: what changed, by how much and since when.
 """
 
 from __future__ import annotations
@@ -9,16 +11,32 @@ from __future__ import annotations
 from base64 import b64decode, b64encode
 from collections import deque
 from collections.abc import Mapping, Sequence
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from driftfit.data.instants import instant
 from driftfit.data.storage import describe, rebuild
-from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array, Driver
-from driftfit.run.live.change import Change, change_of
-from driftfit.run.live.frozen.likelihood_ratio import scan
-from driftfit.run.live.frozen.reference_model import NOISE_FACTOR, OK, ROW, Y, judgeable, memory_of
+from driftfit.run.live.likelihood_ratio import scan
+from driftfit.run.live.reference_model import (
+    NOISE_FACTOR,
+    NOISE_WINDOW,
+    OK,
+    RATIO,
+    RAW,
+    ROW,
+    SCALE,
+    SIZE,
+    SPREAD,
+    STD,
+    WHICH,
+    WINDOW,
+    Y,
+    judgeable,
+    memory_of,
+)
 from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits, last_power_and_mean
 from driftfit.trackers.base import Tracker
 
@@ -110,7 +128,7 @@ class LiveAlarm:
         ----------
         rows : (T,) of the driver's output
             For "glr" and "cusum" the rows must contain the samples as well
-            (`driftfit.run.collected_samples.COLLECTED`).
+            (`driftfit.run.columns.COLLECTED`).
         lane : int
         y : (T,)
             The readings as they were given.
@@ -273,3 +291,41 @@ def check_rule(rule: Any) -> AlarmRule:
             f"got {type(rule).__name__}."
         )
     return rule
+
+
+SURE = NormalDist().inv_cdf(0.975)
+
+
+class Change(NamedTuple):
+    """A change in the window with the largest likelihood ratio, with a band of 95 %.
+
+    Of a parameter, ``size`` is the difference from its value in the reference; of the noise, the factor of its standard
+    deviation; it is NaN where the window with the largest likelihood ratio names another cause. ``since`` is the first
+    of the used samples in that window. At the onset of an alarm the size is somewhat too large, because the noise of a
+    window that is beyond its limit tends to be on its side.
+    """
+
+    name: str
+    size: float
+    low: float
+    high: float
+    since: int
+
+
+def change_of(rule: AlarmRule, findings: Array, t: int) -> Change:
+    """The change that the statistics ``findings`` of sample t show."""
+    model = rule.reference
+    cause = rule.names[rule.cause(findings[rule.entries])]
+    if cause == "noise" and np.isfinite(findings[RATIO]):
+        L = findings[NOISE_WINDOW]
+        error = 0.5 * np.sqrt(model.numbers[SPREAD] / L) / model.numbers[RAW]
+        size, half = findings[RATIO], SURE * findings[RATIO] * error
+    elif np.isfinite(findings[WHICH]) and (
+        rule.kind == "glr" or cause in ("noise", rule.parameters[int(findings[WHICH])])
+    ):
+        which, L = int(findings[WHICH]), findings[WINDOW]
+        unit = model.numbers[SCALE] / model.unit[which]
+        cause, size, half = rule.parameters[which], findings[SIZE] * unit, SURE * findings[STD] * unit
+    else:
+        return Change(cause, np.nan, np.nan, np.nan, t)
+    return Change(cause, float(size), float(size - half), float(size + half), max(t + 1 - int(L), 0))

@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.data.arguments import Held, as_inputs, held, intervals, noise_of, order_of, ordered, times_of, together
 from driftfit.data.clock import LABEL, Clock
-from driftfit.data.known import Known
-from driftfit.data.labels import Held, held, order_of, ordered, times_of, together
-from driftfit.data.record import PLAIN, Reading, Records
-from driftfit.data.signals import as_inputs, intervals, noise_of
+from driftfit.data.record import PLAIN, Known, Reading, Records
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, factor
 from driftfit.models.base import Model
