@@ -9,9 +9,9 @@ import pytest
 from support import arx_record, damaged, same
 
 from driftfit import ARX, Kalman, Live, track
+from driftfit.data import late
+from driftfit.data.late import LATE, RELEASED, REPEATED, UNTIMED, WAITING, HoldBack, sort_out
 from driftfit.data.record import Known, Records
-from driftfit.run import late
-from driftfit.run.late import LATE, RELEASED, REPEATED, UNTIMED, WAITING, HoldBack, sort_out
 from driftfit.run.layout import MANY, packed, unpacked
 from driftfit.run.parallel_lanes import advance
 from driftfit.run.program import Program

@@ -21,7 +21,6 @@ import numpy as np
 
 from driftfit.data.clock import LABEL, Clock
 from driftfit.data.instants import instants, warn_of_counted_years, warn_of_written_numbers, zone_name
-from driftfit.engine.drivers import LARGEST, SMALLEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, as_numbers, factor, missing_settings, warn
 from driftfit.models.base import Model
@@ -37,7 +36,7 @@ def check_roles(owner: str, model: Any, tracker: Any, several: bool = False) -> 
     write instead.
     """
     kinds: tuple[type, type] = type(model), type(tracker)
-    if _fit(*kinds):
+    if fits(*kinds):
         return True
     if _is(model, Tracker) and _is(tracker, Model):
         raise TypeError(
@@ -54,7 +53,7 @@ def check_roles(owner: str, model: Any, tracker: Any, several: bool = False) -> 
 
 
 @lru_cache(maxsize=256)
-def _fit(model: type, tracker: type) -> bool:
+def fits(model: type, tracker: type) -> bool:
     """Whether these are a model and a tracker; asked once for each pair, because abstract classes answer slowly."""
     return issubclass(model, Model) and issubclass(tracker, Tracker)
 
@@ -319,8 +318,6 @@ def by_name(model: Any, u: Any) -> Any:
 
 
 S = TypeVar("S", bound=Settings)
-ENOUGH = 1000
-"""Numbers of a signal that are looked at to find its size."""
 
 
 def check_ready(tracker: S) -> S:
@@ -360,23 +357,6 @@ def as_inputs(u: Any, T: int) -> Array:
         hint = f" u.T has shape {array.T.shape}." if array.shape[1] == T else ""
         raise ValueError(f"y has {T} samples but u has shape {array.shape}: the first axis must be time.{hint}")
     return array
-
-
-def warn_of_sizes(names: Sequence[str], values: Array) -> None:
-    """Warn of columns (N, k) most numbers of which are so large that they count as missing, or so small that they count
-    as 0, by a thousand numbers of each.
-    """
-    for name, column in zip(names, values[:: len(values) // ENOUGH + 1].T, strict=True):
-        size = np.abs(column)
-        if SMALLEST < size.max(initial=0.0) < LARGEST:  # nearly always, so it must cost little
-            continue
-        size = size[(size > 0.0) & (size < np.inf)]
-        odd = size[(size <= SMALLEST) | (size >= LARGEST)]
-        if 2 * len(odd) > len(size):
-            warn(
-                f"most numbers of {name} are like {odd[0]:g}: sizes of {LARGEST:g} or more count as missing, those of "
-                f"{SMALLEST:g} or less as 0. Give the signal in another unit."
-            )
 
 
 def noise_of(weights: Any, T: int | None = None) -> Any:

@@ -18,23 +18,12 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from driftfit.data.arguments import (
-    as_inputs,
-    as_output,
-    held,
-    intervals,
-    noise_of,
-    ordered,
-    times_of,
-    together,
-    warn_of_sizes,
-)
-from driftfit.data.clock import LABEL, Clock, warn_of_gaps
-from driftfit.data.instants import instants
+from driftfit.data.arguments import ordered
+from driftfit.data.clock import Clock, warn_of_gaps
 from driftfit.data.limits import Limits, marked, marks, within_each
-from driftfit.engine.drivers import COMMON, DRIFT, INTERVAL, NOISE
+from driftfit.engine.drivers import COMMON, DRIFT, INTERVAL, LARGEST, NOISE, SMALLEST
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import as_numbers, axes, factor
+from driftfit.engine.settings import warn
 from driftfit.models.base import Model
 from driftfit.readings.left_out import LeftOut
 from driftfit.trackers.base import Tracker
@@ -79,12 +68,6 @@ PLAIN = Labels()
 _NONE: Mapping[Any, Any] = {}
 
 
-@lru_cache(maxsize=256)
-def labels_of_series(y: str, u: tuple[str, ...], time: str | None, zone: str | None, dt: float | str | None) -> Labels:
-    """The labels of one series, of which nothing has been left out yet; made once for all series with the same."""
-    return Labels(y, u, time, zone=zone, dt=dt)
-
-
 def time_text(time: Any, zone: str | None) -> str:
     """A time as text, dates in a time zone; midnight without a zone is the date alone.
 
@@ -99,6 +82,27 @@ def time_text(time: Any, zone: str | None) -> str:
     shown = date if zone is None else date.replace(tzinfo=UTC).astimezone(ZoneInfo(zone))
     part = f".{date.microsecond:06d}".rstrip("0") if date.microsecond else ""
     return f"{shown:%Y-%m-%d %H:%M:%S}{part}{'' if zone is None else f'{shown: %Z}'}"
+
+
+SIZED = 1000
+"""Numbers of a signal that are looked at to find its size."""
+
+
+def warn_of_sizes(names: Sequence[str], values: Array) -> None:
+    """Warn of columns (N, k) most numbers of which are so large that they count as missing, or so small that they count
+    as 0, by a thousand numbers of each.
+    """
+    for name, column in zip(names, values[:: len(values) // SIZED + 1].T, strict=True):
+        size = np.abs(column)
+        if SMALLEST < size.max(initial=0.0) < LARGEST:  # nearly always, so it must cost little
+            continue
+        size = size[(size > 0.0) & (size < np.inf)]
+        odd = size[(size <= SMALLEST) | (size >= LARGEST)]
+        if 2 * len(odd) > len(size):
+            warn(
+                f"most numbers of {name} are like {odd[0]:g}: sizes of {LARGEST:g} or more count as missing, those of "
+                f"{SMALLEST:g} or less as 0. Give the signal in another unit."
+            )
 
 
 class Reading(NamedTuple):
@@ -170,6 +174,12 @@ class Records(NamedTuple):
     left_out: Mapping[Hashable, LeftOut] = _NONE
     """What was left out of each series by decisions that were made before."""
 
+    @classmethod
+    def of(cls, record: Record) -> Records:
+        """A single series of one output, called 0."""
+        first, length = np.zeros(1, int), np.array([len(record)])
+        return cls((0,), first, length, record.y, record.u, record.known, record.time, record.labels)
+
     @property
     def ny(self) -> int:
         """Number of outputs of every series."""
@@ -203,15 +213,8 @@ class Records(NamedTuple):
         """Records that contain only series k; their arrays are views."""
         one = self.part(k)
         first, length = np.zeros(1, dtype=int), np.array([len(one)])
-        return self._replace(
-            keys=self.keys[k : k + 1],
-            first=first,
-            length=length,
-            y=one.y,
-            u=one.u,
-            known=one.known,
-            time=one.time,
-        )
+        keys = self.keys[k : k + 1]
+        return self._replace(keys=keys, first=first, length=length, y=one.y, u=one.u, known=one.known, time=one.time)
 
     def in_rows(self) -> Records:
         """Series with several outputs as series of one output, whose samples are the outputs of every instant in order.
@@ -260,7 +263,7 @@ class Records(NamedTuple):
         Warns if most numbers of a signal are out of range, and if most samples cannot be used because of dt, with lags
         of ``reach`` samples, or those of the model.
         """
-        u, names = ordered(model, self.u, self.labels.u)
+        u, names = ordered(model, self.u, self.labels.u) if self.labels.u else (self.u, ())
         warn_of_sizes(self.outputs or (self.labels.y,), self.y.reshape(len(self.y), self.ny))
         if m := u.shape[-1]:
             warn_of_sizes(names or [f"u{j + 1}" for j in range(m)], u.reshape(-1, m))
@@ -292,106 +295,6 @@ class Records(NamedTuple):
         u[out_u] = np.nan
         y[excluded], u[excluded] = np.nan, np.nan
         return self._replace(y=y, u=u, missing=missing)
-
-
-FIRST = np.zeros(1, dtype=int)
-"""Where a single series begins."""
-
-
-def one_series(y: Any, u: Any, reading: Reading) -> Records:
-    """One series; y (T,), u (T,), (T, m) or None."""
-    time, dt, weights, drift, *_ = reading
-    if type(y) is type(u) is np.ndarray and time is dt is None and type(weights) is type(drift) is float:
-        # what most calls give has neither names nor an index
-        output = as_output(y)
-        T = len(output)
-        known = row_of(1.0, noise_of(weights, T), factor("drift", drift))
-        return Records((0,), FIRST, np.array((T,)), output, as_inputs(u, T), known)
-    given_y, given_u = held("y", y), held("u", u)
-    given_weights, given_drift = held("weights", weights), held("drift", drift)
-    together(y=given_y, u=given_u, weights=given_weights, drift=given_drift)
-    weights, drift = given_weights.values, given_drift.values
-    output = as_output(given_y.values)
-    T = len(output)
-    times = times_of(time, (given_y, given_u) if reading.indexed else (), dt)
-    dt = LABEL if times.labels and dt is None else dt
-    axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
-    common, drifts = (1.0, as_numbers("drift", drift)) if axes(drift) == 2 else (drift, None)
-    known = Known.of(gaps, noise_of(weights, T), factor("drift", common, T))
-    name = given_y.names[0] if given_y.names else "y"
-    labels = labels_of_series(name, given_u.names, times.name, times.zone, Clock.of(dt).plain)
-    inputs = as_inputs(given_u.values, T)
-    return Records((0,), FIRST, np.array((T,)), output, inputs, known, axis, labels, drifts=drifts)
-
-
-def rows(y: Any, u: Any, reading: Reading) -> Records:
-    """Series as rows: y (units, T), u (units, T), (units, T, m) or None, time (T,) or (units, T) or None."""
-    time, dt, weights, drift = reading.time, reading.dt, reading.weights, reading.drift
-    output = as_numbers("y", y)
-    if output.ndim != 2 or output.size == 0:
-        raise ValueError(f'by="row": y must be (units, T), not empty; got shape {output.shape}.')
-    units, T = output.shape
-    each = as_numbers("drift", drift) if np.ndim(drift) == 3 else None
-    if each is not None and each.shape[:2] != (units, T):
-        raise ValueError(
-            f'by="row": drift with a column for each parameter must be ({units}, {T}, n); got shape {each.shape}.'
-        )
-    known, axis = _known_of_rows(units, T, time, dt, weights, drift if each is None else 1.0)
-    return Records(
-        tuple(range(units)), np.arange(units) * T, np.full(units, T), output.ravel(),
-        _inputs_of_rows(u, units, T), known, axis, Labels(dt=Clock.of(dt).plain),
-        drifts=None if each is None else each.reshape(units * T, -1),
-    )  # fmt: skip
-
-
-def _inputs_of_rows(u: Any, units: int, T: int) -> Array:
-    """u as (units * T, m)."""
-    if u is None:
-        return np.zeros((units * T, 0))
-    inputs = as_numbers("u", u)
-    if inputs.ndim == 2:
-        inputs = inputs[:, :, None]
-    if inputs.ndim != 3 or inputs.shape[:2] != (units, T):
-        raise ValueError(
-            f'by="row": y is {units} units of {T} samples, so u must be ({units}, {T}) or ({units}, {T}, m); '
-            f"got shape {np.shape(u)}."
-        )
-    return inputs.reshape(units * T, inputs.shape[2])
-
-
-def _known_of_rows(units: int, T: int, time: Any, dt: Any, weights: Any, drift: Any) -> tuple[Known, Array | None]:
-    """What is known of units * T samples, and time (units * T,) or None."""
-    shape = (units, T)
-    axis: Array | None = None
-    gaps: Any = 1.0
-    if time is not None:
-        given, zone = instants(time)
-        dt = Clock.of(dt, zone)
-        if given.ndim == 1:
-            axis, gaps = intervals(given, dt, T)
-            axis = np.broadcast_to(axis, shape)
-        elif given.shape == shape:
-            axis, gaps = (np.stack(part) for part in zip(*(intervals(row, dt, T) for row in given), strict=True))
-        else:
-            raise ValueError(f'by="row": time must be ({T},) or {shape}; got shape {given.shape}.')
-    factors = [gaps, _per_row("weights", weights, shape, noise_of), _per_row("drift", drift, shape, drift_of)]
-    flat = [np.broadcast_to(f, shape).ravel() if np.ndim(f) else f for f in factors]
-    return Known.of(*flat), None if axis is None else axis.ravel()
-
-
-def drift_of(value: Any, T: int | None = None) -> Any:
-    """Known factors of the drift."""
-    return factor("drift", value, T)
-
-
-def _per_row(name: str, value: Any, shape: tuple[int, int], convert: Any) -> Array:
-    """A factor given as one number, (T,) for all rows, or (units, T)."""
-    array = np.asarray(value)
-    if array.ndim < 2:
-        return np.asarray(convert(value, shape[1]))
-    if array.shape != shape:
-        raise ValueError(f'by="row": {name} must be a number, ({shape[1]},) or {shape}; got shape {array.shape}.')
-    return np.asarray(convert(array.ravel(), array.size)).reshape(shape)
 
 
 @dataclass(frozen=True)

@@ -21,12 +21,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from functools import cached_property, lru_cache
-from typing import Any, ClassVar, Self
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps
+from driftfit.engine.drivers import TrackerSteps, stored_too
 from driftfit.engine.kernel import Array, Driver, State, kernel
 
 SCALARS = ("y_hat", "e", "s", "ok")
@@ -105,26 +105,6 @@ class Columns(ABC):
         return self.written("ok") > 0.0
 
 
-class Plain:
-    """A result or a stream as data: ``Kind(...)`` makes an instance of its public class."""
-
-    _public: ClassVar[dict[type, type]] = {}
-
-    def __init_subclass__(cls, public: bool = False, **settings: Any) -> None:
-        super().__init_subclass__(**settings)
-        if public:
-            plain = next(one for one in cls.__mro__[1:] if one.__name__ == cls.__name__)
-            Plain._public[plain] = cls
-
-    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        return object.__new__(Plain._public.get(cls, cls))
-
-    @classmethod
-    def public(cls) -> type[Self]:
-        """The class that users get."""
-        return Plain._public.get(cls, cls)
-
-
 COLLECTED = ("phi", "y", "dt", "valid", "observed")
 """Fields that `collect` stores."""
 
@@ -140,17 +120,9 @@ def collect(o: State, s: State, l: int) -> None:
     o.valid[l], o.observed[l] = s.valid[l], s.observed[l]
 
 
-@lru_cache(maxsize=256)
 def collecting(steps: TrackerSteps) -> TrackerSteps:
     """The steps of a tracker that store its own outputs and the sample."""
-    own = steps.store
-
-    @kernel
-    def both(o: State, s: State, l: int) -> None:
-        own(o, s, l)
-        collect(o, s, l)
-
-    return steps._replace(store=both)
+    return steps._replace(store=stored_too(steps.store, collect))
 
 
 SHORT = 32

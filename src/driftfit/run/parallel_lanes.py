@@ -34,9 +34,9 @@ import numpy as np
 from driftfit.data.record import Records
 from driftfit.engine.kernel import Array, Driver
 from driftfit.engine.tiles import repeat_tile
+from driftfit.run.lanes import Lanes
 from driftfit.run.layout import words_of
 from driftfit.run.program import Program, State, progress, tile_of
-from driftfit.run.result import Lanes
 
 BLOCK = 256
 """Number of samples that are copied into lane order at a time: a block of a tile fits into the second-level cache."""

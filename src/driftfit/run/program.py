@@ -103,6 +103,21 @@ class Program:
         return self.model if self.shared is None else self.shared
 
     @cached_property
+    def settling(self) -> float:
+        """`Model.settling` of the whole model."""
+        return self.whole.settling
+
+    @cached_property
+    def inspects(self) -> bool:
+        """Whether the model looks at the whole record before a run."""
+        return type(self.model).inspect is not Model.inspect
+
+    @cached_property
+    def doubts(self) -> bool:
+        """Whether the tracker looks at a run after it."""
+        return type(self.tracker).doubts is not Tracker.doubts
+
+    @cached_property
     def alone(self) -> Program | None:
         """The program of its output alone; None if the model needs the other outputs, or has none."""
         model = None if self.output is None else self.model.alone(self.output)
@@ -401,12 +416,6 @@ def lanes_of(record: Record) -> tuple[Array, Array, Array]:
     return record.y[:, None], record.u[:, :, None], record.known.lanes
 
 
-def spread(record: Record, L: int) -> tuple[Array, Array, Array]:
-    """(y, u, known) of a record, the same in each of L lanes."""
-    y, u, known = (np.repeat(part[..., None], L, axis=-1) for part in (record.y, record.u, record.known.columns))
-    return y, u, known
-
-
 def state_of(tile: Array, lane: int = 0) -> dict[str, Array]:
     """The fields of a lane, by name, as views."""
     return {name: tile[name][0, ..., lane : lane + 1][..., 0] for name in storage.fields(tile)}
@@ -428,7 +437,8 @@ def programs_of(
     if len(model.outputs) == 1:
         if not isinstance(tracker, Tracker):
             raise ValueError(f"a model with one output takes one tracker for each series; got {tracker!r}.")
-        return _programs(model, tracker, inputs if isinstance(inputs, int) else tuple(inputs), gate_of(tracker, gate))
+        gate = gate if gate is None or isinstance(gate, bool) else gate_of(tracker, gate)
+        return _programs(model, tracker, inputs if isinstance(inputs, int) else tuple(inputs), gate)
     if isinstance(tracker, Mapping) and not model.shared:
         if set(tracker) != set(model.outputs):
             raise ValueError(
@@ -460,9 +470,11 @@ def programs_of(
 
 
 @lru_cache(maxsize=64)
-def _programs(model: Model, tracker: Tracker, inputs: int | tuple[str, ...], gate: Gate | None) -> tuple[Program, ...]:
+def _programs(
+    model: Model, tracker: Tracker, inputs: int | tuple[str, ...], gate: Gate | bool | None
+) -> tuple[Program, ...]:
     """The programs are cached for the next record, since settings are compared by value."""
-    return (Program(model.bind(inputs), check_ready(tracker), gate=gate),)
+    return (Program(model.bind(inputs), check_ready(tracker), gate=gate_of(tracker, gate)),)
 
 
 def _row_model(model: Model, tracker: Tracker, inputs: int | Sequence[str]) -> Model:

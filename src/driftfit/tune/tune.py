@@ -125,7 +125,8 @@ def tune(
         everything that `track` does not accept.
     """
     check_roles("tune", model, tracker)
-    model, y = columns_as_outputs(model, y, data)
+    if data is not None:
+        model, y = columns_as_outputs(model, y)
     one_of("tune", "method", method, tuple(METHODS))
     whole("tune", "h", h, 1)
     if not 0.0 < level < 1.0:

@@ -37,8 +37,8 @@ from driftfit.bridges.spark.task import (
     units_of,
     words_after,
 )
+from driftfit.data import late
 from driftfit.engine.kernel import Array
-from driftfit.run import late
 from driftfit.run.layout import tag_of, unpacked
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.parallel_lanes import Advanced
@@ -50,7 +50,7 @@ OLD, WAITED, NEW = range(3)
 PLACES = {late.LATE: LATE, late.REPEATED: REPEATED, late.UNTIMED: UNTIMED}
 """Where rows that are left out are counted."""
 REFUSED = -1
-"""The fate of a row of a unit that cannot run, besides those of `driftfit.run.late`."""
+"""The fate of a row of a unit that cannot run, besides those of `driftfit.data.late`."""
 
 
 class Origin(NamedTuple):

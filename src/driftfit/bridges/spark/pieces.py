@@ -13,11 +13,12 @@ import pyarrow.compute as pc
 from driftfit.bridges.spark.task import Series, Task, lists
 from driftfit.data.storage import describe
 from driftfit.engine.kernel import Array
+from driftfit.run.lanes import Lane
 from driftfit.run.live.alarm import LiveAlarm, check_rule
 from driftfit.run.live.rule import FROZEN, AlarmRule
 from driftfit.run.parallel_lanes import Advanced
 from driftfit.run.program import Program
-from driftfit.run.result import Lane, burn_in
+from driftfit.run.result import burn_in
 from driftfit.run.warm_start import JointLayout
 
 ARROW = {

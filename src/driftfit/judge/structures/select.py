@@ -290,7 +290,7 @@ def select(
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing)
     search = (keep, most) if isinstance(models, Model) else None
-    columns = [columns_as_outputs(model, y, data) for model in candidates]
+    columns = [(model, y) if data is None else columns_as_outputs(model, y) for model in candidates]
     candidates, y = [model for model, _ in columns], columns[0][1]
     if any(len(model.outputs) > 1 for model in candidates):
         if gate:

@@ -24,12 +24,11 @@ from driftfit.engine.settings import as_numbers, factor, near, numbers, vector, 
 from driftfit.engine.tiles import as_compiled, tile_type
 from driftfit.models.base import Model
 from driftfit.readings.left_out import Tally
-from driftfit.run.columns import Plain
 from driftfit.run.live.alarm import LiveAlarm, check_rule
 from driftfit.run.live.fixed_lag import Window
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import programs_of, state_of, tile_of
-from driftfit.run.result import burn_in
+from driftfit.run.result import Plain, burn_in
 from driftfit.run.warm_start import (
     ABSENT,
     KINDS,

@@ -1,7 +1,7 @@
 """The units of a section [[unit]]: what arrives is sorted, judged and run for all of them at once.
 
 Samples with times wait until the newest time of their unit is ``hold_back`` after them, and are then processed in the
-order of their times (`driftfit.run.late`). What is late, repeated, without a time, or far in the future is
+order of their times (`driftfit.data.late`). What is late, repeated, without a time, or far in the future is
 counted and does not enter the journal (`Section.admit`). What the journal has is processed in the lanes of tiles
 (`driftfit.run.parallel_lanes`), so the states are those of `track` on the journal's rows, bit for bit.
 """
@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.data import late
 from driftfit.data.record import Known, Records
 from driftfit.engine.drivers import INTERVAL, NOISE
 from driftfit.engine.kernel import Array
 from driftfit.readings import gate
 from driftfit.readings.remarks import SAID
-from driftfit.run import late
 from driftfit.run.live.rule import FROZEN
 from driftfit.run.live.stream import HELD
 from driftfit.run.parallel_lanes import FEWEST, Advanced, advance
