@@ -209,13 +209,6 @@ class Records(NamedTuple):
             time=None if self.time is None else self.time[rows],
         )
 
-    def only(self, k: int) -> Records:
-        """Records that contain only series k; their arrays are views."""
-        one = self.part(k)
-        first, length = np.zeros(1, dtype=int), np.array([len(one)])
-        keys = self.keys[k : k + 1]
-        return self._replace(keys=keys, first=first, length=length, y=one.y, u=one.u, known=one.known, time=one.time)
-
     def in_rows(self) -> Records:
         """Series with several outputs as series of one output, whose samples are the outputs of every instant in order.
 

@@ -76,7 +76,7 @@ class Fleet(KeyedResults):
         lanes = range(k * self.records.ny, (k + 1) * self.records.ny)
         starts = {place: self._starts[j] for place, j in enumerate(lanes) if j in self._starts}
         programs = [self._programs[j] for j in lanes]
-        return Outputs(programs, self.records.only(k), self._lanes.part(lanes), {}, starts)
+        return Outputs(programs, self.records.some(k, k + 1), self._lanes.part(lanes), {}, starts)
 
     def _run(self, j: int) -> Track:
         if self.records.outputs:

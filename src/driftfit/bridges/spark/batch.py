@@ -219,7 +219,7 @@ class Partition:
             runs = (
                 [Track(programs[0], found.records.part(j), own[0])]
                 if ny == 1
-                else Outputs(programs, found.records.only(j), own, {}, {}).values()
+                else Outputs(programs, found.records.some(j, j + 1), own, {}, {}).values()
             )
             for run, of in zip(runs, self.task.suffixes, strict=True):
                 truth = verdict(run)

@@ -23,7 +23,6 @@ from driftfit.run.live.likelihood_ratio import scan
 from driftfit.run.live.reference_model import (
     NOISE_FACTOR,
     NOISE_WINDOW,
-    OK,
     RATIO,
     RAW,
     ROW,
@@ -37,7 +36,7 @@ from driftfit.run.live.reference_model import (
     judgeable,
     memory_of,
 )
-from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits, last_power_and_mean
+from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits
 from driftfit.trackers.base import Tracker
 
 KEPT = 256
@@ -114,21 +113,13 @@ class LiveAlarm:
         self._onsets.clear()
         return found
 
-    def take(self, tile: Array, lane: int, y: float, e: float, s: float, time: Any = None) -> None:
-        """Judge the sample y that a lane of the tile has just processed; e is its innovation, with variance s."""
-        judged = self._wait == 0
-        if judged:
-            self._compare(tile, lane, y, e, s)
-        self._note(judged, judged and bool(self.rule.exceeded(self.statistic)), time)
-
     def take_many(self, rows: Array, lane: int, y: Array, noise: Array, time: Array | None = None) -> list[str | None]:
-        """Judge T samples that a lane has processed, as `take` does one after the other; the cause wherever it is on.
+        """Judge T samples that a lane has processed; the cause of the alarm wherever it is on.
 
         Parameters
         ----------
-        rows : (T,) of the driver's output
-            For "glr" and "cusum" the rows must contain the samples as well
-            (`driftfit.run.columns.COLLECTED`).
+        rows : (T,) of the driver's output, or the tile after a single sample
+            For "glr" and "cusum" the rows must contain the samples as well (`driftfit.run.columns.COLLECTED`).
         lane : int
         y : (T,)
             The readings as they were given.
@@ -137,7 +128,7 @@ class LiveAlarm:
         time : (T,) or None
         """
         T, first = len(rows), min(self._wait, len(rows))
-        statistic, findings = self._compare_many(rows[first:], lane, y[first:], noise[first:])
+        statistic, findings = self._compare(rows[first:], lane, y[first:], noise[first:])
         on = np.zeros(T, bool)
         on[first:] = self.rule.exceeded(statistic)
         if not self._left and not on.any():  # nothing begins or ends
@@ -172,32 +163,7 @@ class LiveAlarm:
         if self.rule.kind in FROZEN:
             self._findings[...] = findings
 
-    def _compare(self, tile: Array, lane: int, y: float, e: float, s: float) -> None:
-        """The statistic after a sample; without a new one the last is kept."""
-        rule = self.rule
-        if rule.kind in FROZEN:
-            row, phi = self._row[0], tile["phi"][0, :, lane]
-            row[: len(phi)] = phi
-            for place, name in enumerate(ROW, len(rule.parameters)):
-                row[place] = tile[name][0, lane]
-            row[len(rule.parameters) + OK] = judgeable(tile[0], lane, np.array(y), tile["noise"][0, lane])
-            self._draw(self._row)
-            scan(self._row, self._frozen, self._memory, self._findings, np.zeros(1, np.int8))
-            self.statistic = self._findings[0, rule.entries]
-        elif rule.kind == "band":
-            theta, var = (tile[name][0, self._columns, lane] for name in ("theta", "var"))
-            self.statistic = rule.outside(theta, np.sqrt(var))
-        elif rule.kind == "probability":
-            fields = {name: tile[name][0, ..., lane] for name in self._tracker.outputs}
-            self.statistic = np.array([change_probability(self._tracker, fields)])
-        else:
-            g = float(rule.scores(np.array(e), np.sqrt(s)))
-            if np.isfinite(g):
-                self._scores.append(g)
-                if len(self._scores) == rule.window:
-                    self.statistic = last_power_and_mean(np.array(self._scores))
-
-    def _compare_many(self, rows: Array, lane: int, y: Array, noise: Array) -> tuple[Array, Array]:
+    def _compare(self, rows: Array, lane: int, y: Array, noise: Array) -> tuple[Array, Array]:
         """(statistics (T, c) after samples, findings of a frozen model)."""
         rule, T = self.rule, len(rows)
         findings = np.empty((T, 0))

@@ -5,7 +5,6 @@ It gives the same bits as `update` for one sample after the other, because both 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -184,7 +183,7 @@ class Batched(Stream):
             row, own = slice(t, t + 1), known[t : t + 1] if len(known) > 1 else known
             before = self._samples - len(y) + t
             self._judged(y[row], u[row], own, out[row], None if time is None else time[row], before)
-            self._keep(y[t], out["e"][t], out["s"][t], own[0], None if time is None else instant(time[t]))
+            self._keep(y[t], own[0], None if time is None else instant(time[t]))
 
     def _judged(self, y: Array, u: Array, known: Array, out: Array, time: Any, before: int) -> None:
         """Drive the tile over rows, with so many samples ``before`` them, and note what a gate leaves out."""
@@ -224,10 +223,12 @@ class Batched(Stream):
         for k, (ago, y) in enumerate(zip(found.ago.tolist(), found.value.tolist(), strict=True)):
             self._note(sample - ago, None if times is None else times[k], AT_START, y)
 
-    def _keep(self, y: Array, e: Sequence[float], s: Sequence[float], known: Array, time: Any) -> None:
+    def _keep(self, y: Array, known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""
+        tile, at = self._state_tile(), None if time is None else np.array([time])
         for lane, alarm in self._watching:
-            alarm.take(self._state_tile(), lane, float(y[lane]), float(e[lane]), float(s[lane]), time)
+            own = slice(lane, lane + 1)
+            alarm.take_many(tile, lane, y[own], tile["noise"][0, own], at)
         for lane, window in enumerate(self._windows):
             window.push(self._state_tile(), (known[INTERVAL, lane], known[NOISE, lane], known[DRIFT, lane]), lane)
 

@@ -235,7 +235,7 @@ class Live(Batched):
             if self._undecided:
                 self._decide()
             if self._watching or self._windows:
-                self._keep(y, step[1:2], step[2:3], np.reshape(known, (3, 1)), time)
+                self._keep(y, np.reshape(known, (3, 1)), time)
         else:
             out = np.empty(len(y) if self.model.shared else 1, self._row_type)
             self._drive(*self._row(y, u, known), out, None if time is None else [time] * len(out))

@@ -242,11 +242,6 @@ def power_and_mean(g: Array, window: int) -> Array:
     return np.stack([power, np.abs(mean)], axis=1)
 
 
-def last_power_and_mean(g: Array) -> Array:
-    """The last row of `power_and_mean` for a window of all of g, (2,)."""
-    return np.array([np.cumsum(g * g)[-1], np.abs(np.cumsum(g)[-1])])
-
-
 def change_probability(tracker: Any, fields: Any) -> float:
     """The probability of a change in the tracker's window, from the fields of one lane."""
     if CHANGE in tracker.outputs:
