@@ -84,7 +84,7 @@ def time_text(time: Any, zone: str | None) -> str:
     return f"{shown:%Y-%m-%d %H:%M:%S}{part}{'' if zone is None else f'{shown: %Z}'}"
 
 
-SIZED = 1000
+SIZES_SAMPLED = 1000
 """Numbers of a signal that are looked at to find its size."""
 
 
@@ -92,7 +92,7 @@ def warn_of_sizes(names: Sequence[str], values: Array) -> None:
     """Warn of columns (N, k) most numbers of which are so large that they count as missing, or so small that they count
     as 0, by a thousand numbers of each.
     """
-    for name, column in zip(names, values[:: len(values) // SIZED + 1].T, strict=True):
+    for name, column in zip(names, values[:: len(values) // SIZES_SAMPLED + 1].T, strict=True):
         size = np.abs(column)
         if SMALLEST < size.max(initial=0.0) < LARGEST:  # nearly always, so it must cost little
             continue

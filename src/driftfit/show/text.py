@@ -127,7 +127,7 @@ def facts(*pairs: tuple[str, str]) -> Table:
     return table
 
 
-SHORT = 10
+UNWRAPPED = 10
 """A cell of at most this many characters stays on one line: numbers, and p-values such as < 0.0001."""
 
 
@@ -175,7 +175,7 @@ class Numbers(Table):
 
 
 def _widen(column: Column, text: str) -> None:
-    words = [text] if len(text) <= SHORT else text.split()
+    words = [text] if len(text) <= UNWRAPPED else text.split()
     column.min_width = max(column.min_width or 0, *map(cell_len, words), 0)
 
 

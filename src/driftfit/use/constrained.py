@@ -219,11 +219,11 @@ def _linear(node: ast.expr, places: dict[str, int], names: Sequence[str], text: 
     )
 
 
-SWEEPS, SETTLED = 100, 1e-10
+SWEEPS, SETTLED_MOVE = 100, 1e-10
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(60)
 EXPONENT = 80.0
 """Twice the exponent at which a tail ends."""
-LEAST = 1e-14
+KNOWN_SHARE = 1e-14
 """Share of a variance below which a direction is known, and cannot be cut."""
 
 
@@ -261,7 +261,7 @@ def cut(mu: Array, S: Array, within: Sequence[HalfSpace]) -> tuple[Array, Array,
         for k, one in cuts:
             Sg = S @ one.g
             v, m = Sg @ one.g, mu @ one.g
-            open_ = v > LEAST * (scale @ one.g**2)
+            open_ = v > KNOWN_SHARE * (scale @ one.g**2)
             v = np.where(open_, v, 1.0)
             cavity = 1.0 / (1.0 / v - tau[:, k])
             left = cavity * (m / v - nu[:, k])
@@ -275,6 +275,6 @@ def cut(mu: Array, S: Array, within: Sequence[HalfSpace]) -> tuple[Array, Array,
             S = S - dt[:, None, None] * gain[:, :, None] * Sg[:, None, :]
             tau[:, k], nu[:, k], without[:, k], spread[:, k] = fresh, shift, left, np.where(open_, cavity, 0.0)
             moved = max(moved, float(np.max(np.abs(dt) * v + np.abs(dn) * np.sqrt(v), initial=0.0)))
-        if moved < SETTLED:
+        if moved < SETTLED_MOVE:
             break
     return mu, S, without, spread

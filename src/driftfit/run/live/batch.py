@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.arguments import times_of
-from driftfit.data.clock import LOOK
+from driftfit.data.clock import PACE_SAMPLES
 from driftfit.data.instants import instant
 from driftfit.data.record import Known, Reading, Records
 from driftfit.engine.drivers import DRIFT, INTERVAL, NOISE
@@ -157,7 +157,7 @@ class Batched(Stream):
             taken, gaps = clock.arrivals(self._last, axis)
             self._clock, axis = clock, axis[taken]
             self._ignored += T - len(axis)
-            for gap in gaps[: LOOK + 1]:
+            for gap in gaps[: PACE_SAMPLES + 1]:
                 self._pace.see(gap)
             known = records.known if records.known.constant else Known(records.known.columns[taken])
             if len(axis):

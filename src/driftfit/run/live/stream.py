@@ -17,7 +17,7 @@ from driftfit.data import storage
 from driftfit.data.arguments import by_name, noise_of, order_of
 from driftfit.data.clock import Clock, Pace
 from driftfit.data.instants import instant
-from driftfit.data.limits import StreamLimits
+from driftfit.data.limits import Limits
 from driftfit.engine.drivers import INPUTS
 from driftfit.engine.kernel import Array, Driver, Step
 from driftfit.engine.settings import as_numbers, factor, near, numbers, vector, whole
@@ -30,7 +30,6 @@ from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import programs_of, state_of, tile_of
 from driftfit.run.result import Plain, burn_in
 from driftfit.run.warm_start import (
-    ABSENT,
     KINDS,
     End,
     Run,
@@ -128,9 +127,7 @@ class Stream(Plain, storage.Kept):
         self._clock = Clock.of(dt)
         self.dt = self._clock.plain
         self._pace = Pace(self._clock, self.model.reach)
-        self._limits = (
-            StreamLimits(limits, self.model.outputs, self._rows.input_names, self._rows.m) if limits else None
-        )
+        self._limits = Limits(limits, self.model.outputs, self._rows.input_names, self._rows.m) if limits else None
         self.lag = whole("Live", "lag", lag, 0)
         if lag and warm_start is not None:
             raise ValueError("Live: lag= and warm_start= cannot be combined; give one of them.")
@@ -341,23 +338,12 @@ class Stream(Plain, storage.Kept):
         tile = self._state_tile()
         return written(self.programs, [one.pack(tile, lane) for lane, one in enumerate(self.programs)], extra)
 
+    def __reduce__(self) -> Any:
+        return type(self).from_bytes, (self.to_bytes(), tuple(storage.parts_of((self.model, *self.trackers))))
+
     @classmethod
     def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array], classes: Iterable[Any]) -> Self:
         model, trackers, extra = read(source, header, arrays, classes)
-        return cls._again(source, (model, trackers), {**header, "extra": extra}, arrays)
-
-    def __reduce__(self) -> Any:
-        header, arrays = self._written()
-        header["extra"] = {**ABSENT, **header["extra"]}
-        return type(self)._again, ("the copy", (self.model, self.trackers), header, arrays)
-
-    @classmethod
-    def _again(
-        cls, source: str, settings: tuple[Model, tuple[Tracker, ...]], header: Mapping[str, Any],
-        arrays: Mapping[str, Array],
-    ) -> Self:  # fmt: skip
-        """The stream that continues from a stored state."""
-        (model, trackers), extra = settings, header["extra"]
         limits, outside = extra["limits"] or ([], [])
         make: Any = cls
         clock = Clock.of(extra["dt"], extra["zone"])
