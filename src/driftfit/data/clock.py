@@ -12,8 +12,7 @@ months. A number of steps within a tenth of an integer is rounded to it, so that
 of every month are one step apart. Days and months are those of the time zone. A weekend has no business time: from
 Saturday to Monday 0 steps pass. Every interval depends only on a sample and the one before it, so a stream counts
 intervals as its record does.
-
-Gaps: intervals across which lags do not reach, and warnings where a wrong dt makes most samples unusable.
+Lags do not reach across a gap; a warning says where a wrong dt makes most samples unusable.
 """
 
 from __future__ import annotations

@@ -6,9 +6,8 @@ which spreadsheets write. A row of units may follow it. Blank lines are left out
 missing readings, unless every line is followed by one. Separators at the end of a line are left out; a line with more
 cells than the header is an error. Text that is neither UTF-8 nor UTF-16 is taken as Windows-1252.
 
-Numbers with a decimal comma, and with dots between thousands: 1.234,5.
-
-Columns are cells without blanks around them, null for those without a value (`driftfit.data.columns.present`).
+Numbers may have a decimal comma, and dots between thousands: 1.234,5. Columns are cells without blanks around them,
+null for those without a value (`driftfit.data.columns.present`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Files: CSV (`driftfit.data.formats`) and Parquet, one or several, read with polars.
+"""Files: CSV (`driftfit.data.csv_files`) and Parquet, one or several, read with polars.
 
-If some of several files cannot be read, they are left out with a warning and kept with their reasons.
-
-Packed files: how large they become is looked at before they are unpacked, and what is damaged gives one error.
+If some of several files cannot be read, they are left out with a warning and kept with their reasons. How
+large a packed file becomes is looked at before it is unpacked, and what is damaged gives one error.
 """
 
 from __future__ import annotations

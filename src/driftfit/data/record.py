@@ -2,8 +2,7 @@
 
 Every run reads its samples from here, whether they came from a table, from rows of an array, or from one series with
 several settings: a lane reads ``length`` samples, beginning at ``first``.
-
-Known numbers of every sample in addition to its signals: elapsed time, noise, and how far theta may move.
+What is `Known` of every sample besides its signals is elapsed time, noise, and how far theta may move.
 """
 
 from __future__ import annotations

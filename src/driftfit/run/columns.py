@@ -5,16 +5,7 @@ Its rows are successive samples between which no time passes: correcting with on
 correction with all of them, for independent noises of variance r / weight. The prediction of the second output uses
 the first one. What belongs to a single row is then (T, ny), and the state after an instant is that after its last row.
 
-Results as plain data, and the public classes that replace them.
-
-A verb such as `smooth` takes a result and is in a higher layer, so a result cannot have it as a method without a
-circular import. Below the verbs, results are plain data. The facade (`driftfit.results`, `driftfit.streams`) declares a
-class of each kind that also has the verbs as methods, with ``public=True``; from then on the plain class makes
-instances of that class.
-
-Samples as a tracker receives them, after the model and the missing-data rule.
-
-Rows of results copied column by column.
+`collect` stores samples as a tracker receives them; `put_columns` and `put_fields` copy rows column by column.
 """
 
 from __future__ import annotations

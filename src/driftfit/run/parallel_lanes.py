@@ -10,12 +10,9 @@ lane o G + g is output o of series g; lanes beyond ny G repeat others and are ig
 Series are sorted by length, so that those of one tile end at about the same time. A lane whose series has ended
 continues with dt = 0 and no output, which changes only the lags of its model; its state is copied when its series ends.
 
-Many series continued from their states, in the lanes of tiles; results as columns in the order of their samples.
-
-This is what a process needs that receives a few samples of many series, with their states, and must be fast: no
-`Track` is made for a series. The samples, results and states of a series are those of its record, bit for bit.
-
-Of K series with ny outputs each, programs and states have K ny entries, those of a series one after the other.
+`advance` continues many series from their states, for a process that receives a few samples of each and must be fast:
+results are columns in the order of the samples, and no `Track` is made. They are those of the records, bit for bit. Of
+K series with ny outputs each, programs and states have K ny entries, those of a series one after the other.
 """
 
 from __future__ import annotations

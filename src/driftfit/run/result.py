@@ -26,7 +26,12 @@ from driftfit.trackers.student import log_student, residuals_before, wider
 
 
 class Plain:
-    """A result or a stream as data: ``Kind(...)`` makes an instance of its public class."""
+    """A result or a stream as data: ``Kind(...)`` makes an instance of its public class.
+
+    A verb such as `smooth` takes a result and is in a higher layer, so a result cannot have it as a method without a
+    circular import. The facade (`driftfit.results`, `driftfit.streams`) declares a class of each kind that also has the
+    verbs as methods, with ``public=True``; from then on the plain class makes instances of that class.
+    """
 
     _public: ClassVar[dict[type, type]] = {}
 

@@ -1,7 +1,6 @@
 """Record mode: whole series in one call, causal at every sample. The public function is `driftfit.track`.
 
-One decision for many candidates: which readings are left out is decided by one run, and holds for all of them.
-
+`decide` makes one decision for many candidates: which readings are left out is decided by one run, and holds for all.
 The reference is `AdaptiveKalman` on the largest of the models, so the decision depends neither on the settings that are
 tried nor on their number. Refused readings are missing for every candidate, and samples with a refused input have no
 weight, so that likelihoods are of the same readings.

@@ -2,7 +2,7 @@
 
 Everything carries over: the parameters, their covariance, the lags of the model, and the time of the last sample, so
 a record cut in two gives the same bits as the whole. A setting that differs between the two trackers takes its new
-value, for example a larger q.
+value, for example a larger q. `JointLayout` holds the states of all outputs of a series as one.
 """
 
 from __future__ import annotations

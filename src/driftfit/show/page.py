@@ -1,6 +1,5 @@
-"""Parts of an HTML page: sections, tables, and pictures as SVG in the colours of the page.
-
-The parts common to all reports: the style sheet (light, dark and print), and the section "How to read this".
+"""Parts of an HTML page: sections, tables, and pictures as SVG in the colours of the page. The
+style sheet (light, dark and print) and the section "How to read this" are those of all reports.
 """
 
 from __future__ import annotations

@@ -189,9 +189,10 @@ def _checks(health: Diagnosis) -> str:
 
 def _settings(run: Track, summary: Summary) -> str:
     missing_y, missing_u = int(np.sum(~np.isfinite(run.y))), int(np.sum(~np.isfinite(run.u).all(axis=1)))
+    skipped = summary.samples - summary.used
     pairs = [
         ("Model", summary.model), ("Tracker", summary.tracker), ("Signals", summary.signals), ("Time", summary.span),
-        ("Samples", f"{summary.samples}, of which {summary.used} were used and {summary.samples - summary.used} skipped"),
+        ("Samples", f"{summary.samples}, of which {summary.used} were used and {skipped} skipped"),
         ("Missing", f"{missing_y} outputs, {missing_u} samples with a missing input"),
         ("Rows left out", summary.dropped), *summary.remarks, ("Log-likelihood", f"{summary.loglik:.6g}"),
         ("Made by", f"driftfit {__version__}"),

@@ -1,7 +1,4 @@
-"""Text of results: tables no wider than `WIDTH`, the same on a terminal, in a file and in a notebook.
-
-Results of several outputs, by the name of the output.
-"""
+"""Text of results: tables no wider than `WIDTH`, the same on a terminal, in a file and in a notebook."""
 
 from __future__ import annotations
 

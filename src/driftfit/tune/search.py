@@ -7,8 +7,8 @@
                by chi2 / 2, on either side; with one knob this is the profile itself
 
 The objective is minimised; it maps points (S, p) to values (S,), +inf for impossible points.
-
-Intervals of settings: profiles of the likelihood, also of a noise variance that was estimated in closed form.
+It is minus the log-likelihood, or the logarithm of a mean square of errors (`Criterion`). Intervals of settings are
+profiles of the likelihood, also of a noise variance that was estimated in closed form.
 """
 
 from __future__ import annotations

@@ -2,22 +2,15 @@
 
     p(theta_t | data, constraints) ~ N(theta_t; theta, P) prod_k 1[low_k <= g_k' theta_t <= high_k]
 
-The filter runs free, and its Gaussian at each sample is cut to where theta is known to be
-(`driftfit.use.constrained`): mean, standard deviation and quantiles of what is left. For constant parameters
-this is Bayes' rule itself, because the constraint is the same at all samples. For parameters that drift it is the
-distribution given the constraint *at that sample*; that it held before as well could narrow it further. The cut is
-never fed back into the filter: a filter that learns from the same inequality again at every sample shrinks its
-covariance without data, and leaves the bound for no reason.
+The filter runs free, and its Gaussian at each sample is cut to where theta is known to be: mean, standard deviation and
+quantiles of what is left. For constant parameters this is Bayes' rule itself, because the constraint is the same at all
+samples. For parameters that drift it is the distribution given the constraint *at that sample*; that it held before as
+well could narrow it further. The cut is never fed back into the filter: a filter that learns from the same inequality
+again at every sample shrinks its covariance without data, and leaves the bound for no reason.
 
 ``prob`` is the probability that the free filter gives to each constraint. Where it is small, data and constraint
 contradict each other, and the constraint may be wrong. Cost per sample: O(k n^2) for each sweep, some ten sweeps for
 several constraints that matter together.
-
-Constraints as text: "b1 >= 0", "0 <= a1 + a2 <= 1", "b1 + b2 == 1"; each is low <= g' theta <= high.
-
-Moments of Gaussians that are cut to half-spaces, for all samples at once.
-
-    p(theta) ~ N(theta; mu, S) prod_k 1[low_k <= g_k' theta <= high_k]
 
 A plane, low = high, is exact conditioning. Half-spaces are taken by expectation propagation: each is replaced by a
 Gaussian factor exp(-tau z^2 / 2 + nu z) of z = g' theta, such that mean and variance of z are those of the cut Gaussian

@@ -2,8 +2,7 @@
 
 It needs the memory of the window, or of the sums of "glr". Cost: some ten microseconds per sample in addition to the
 update.
-
-A change that an alarm with a frozen reference model found: what changed, by how much and since when.
+A `Change` says what an alarm with a frozen reference model found: what changed, by how much and since when.
 """
 
 from __future__ import annotations

@@ -100,8 +100,8 @@ def widened(e: Array, s: Array, level: float, name: str) -> Array:
         t = int(np.argmax(found > WARNED_FACTOR))
         warnings.warn(
             f"{name}: outputs are outside their {level:.0%} bands so often that the bands are widened by a factor "
-            f"above {WARNED_FACTOR:g} after {t} samples, and up to {found.max():.1f}: the model or the noise is not what "
-            "the tracker assumes; run.diagnose() shows which.",
+            f"above {WARNED_FACTOR:g} after {t} samples, and up to {found.max():.1f}: the model or the noise is not "
+            "what the tracker assumes; run.diagnose() shows which.",
             stacklevel=3,
         )
     return found

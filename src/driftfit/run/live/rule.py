@@ -10,7 +10,7 @@ streams.
 
 A record and a stream use the same operations in the same order, so their results agree bit for bit.
 
-Readings of a coarse sensor, drawn again within their step.
+Readings of a coarse sensor are drawn again within their step:
 
     z = m + S Phi^-1(Phi(a) + U (Phi(b) - Phi(a))),   a, b = (y -+ h - m) / S,   U uniform
 
