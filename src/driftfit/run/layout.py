@@ -122,14 +122,19 @@ class Layout:
 
     def unpack(self, data: bytes) -> Array:
         """The inverse of `pack`; ValueError for anything else."""
-        tag, words = unpacked(data)
-        if tag != self.tag or len(words) != self.size:
-            raise ValueError(
-                f"the bytes hold a state of another model, tracker, gate, setting or version: their fingerprint is "
-                f"{tag.hex()}, that of {self.owner} is {self.tag.hex()}. Use the model, tracker and gate with which "
-                "they were made, or carry the state over field by field with warm_start=."
-            )
-        return words
+        return own_words(data, self.tag, self.size, self.owner)
+
+
+def own_words(data: bytes, tag: bytes, size: int, owner: Any) -> Array:
+    """The words of a packed state with this fingerprint and size; ValueError for anything else."""
+    found, words = unpacked(data)
+    if found != tag or len(words) != size:
+        raise ValueError(
+            "the bytes hold a state of another model, tracker, gate, setting or version: their fingerprint is "
+            f"{found.hex()}, that of {owner} is {tag.hex()}. Use the model, tracker and gate that made them, "
+            "or carry the state over field by field with warm_start=."
+        )
+    return words
 
 
 def packed(tag: bytes, words: Array) -> bytes:
