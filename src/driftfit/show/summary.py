@@ -90,10 +90,10 @@ class Summary(Printed):
         yield facts(
             ("Model", self.model),
             ("Tracker", self.tracker),
-            *([("Signals", self.signals)] if self.signals else []),
-            *([("Time", self.span)] if self.span else []),
+            ("Signals", self.signals),
+            ("Time", self.span),
             ("Samples", f"{self.samples}, {self.used} used, {self.samples - self.used} skipped"),
-            *([("Rows left out", self.dropped)] if self.dropped else []),
+            ("Rows left out", self.dropped),
             ("Log-likelihood", f"{self.loglik:.6g}"),
             *self.remarks,
         )
@@ -299,18 +299,15 @@ class FleetSummary(Printed):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         samples, used = sum(unit.samples for unit in self.units), sum(unit.used for unit in self.units)
         settings = self.trackers[0] if len(self.trackers) == 1 else f"{len(self.trackers)} different settings"
-        pairs = [
+        yield facts(
             ("Model", self.model),
             ("Tracker", settings),
             ("Series", f"{len(self.units)}, {len(self.failed)} without a result"),
             ("Samples", f"{samples}, {used} used, {samples - used} skipped"),
-        ]
-        if self.dropped:
-            pairs.append(("Rows left out", counts(self.dropped)))
-        if self.missing:
-            pairs.append(("Taken as missing", counts(self.missing)))
-        pairs += self.left_out
-        yield facts(*pairs)
+            ("Rows left out", counts(self.dropped)),
+            ("Taken as missing", counts(self.missing)),
+            *self.left_out,
+        )
         yield from self._ranking()
         for key, reason in list(self.failed.items())[:ROWS_SHOWN]:
             yield Text(f" no result for {key_text(key)}: {reason}")

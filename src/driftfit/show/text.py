@@ -117,10 +117,11 @@ def together(*values: float, std: float = float("nan"), least: int = 4) -> tuple
 
 
 def facts(*pairs: tuple[str, str]) -> Table:
-    """Names and values side by side, as plain text, since b1[flow] is not markup."""
+    """Names and values side by side, as plain text, since b1[flow] is not markup; what is empty is left out."""
     table = Table.grid(padding=(0, 2), pad_edge=True)
     for name, value in pairs:
-        table.add_row(Text(name, "bold"), Text(value))
+        if value:
+            table.add_row(Text(name, "bold"), Text(value))
     return table
 
 

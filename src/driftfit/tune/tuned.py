@@ -250,7 +250,7 @@ class Tuned(Printed):
         yield facts(
             ("Tracker", shortened(repr(self.tracker))),
             ("Criterion", METHODS[self.method]),
-            *([("Log-likelihood", f"{self.loglik:.6g} of {self.used} samples")] if np.isfinite(self.loglik) else []),
+            ("Log-likelihood", f"{self.loglik:.6g} of {self.used} samples" if np.isfinite(self.loglik) else ""),
             ("Noise variance", f"{self.noise:.4g}"),
             *remarks_of([self.left_out] if isinstance(self.left_out, LeftOut) else self.left_out.values()),
         )

@@ -186,7 +186,7 @@ class Stream(Plain, storage.Kept):
         return interval, noise, 1.0 if drift == 1.0 else float(factor("drift", drift))
 
     def _checked(self, y: Any, u: Any) -> tuple[Array, Array]:
-        outputs, inputs = self._outputs(y), self._inputs(u)
+        outputs, inputs = self._outputs(y), self.inputs_of(u)
         return (outputs, inputs) if self._limits is None else self._limits.sample(outputs, inputs)
 
     def _outputs(self, y: Any) -> Array:
@@ -201,7 +201,7 @@ class Stream(Plain, storage.Kept):
             raise ValueError(f"Live.update: y must be {wanted}; got shape {given.shape}.")
         return given.reshape(-1)
 
-    def _inputs(self, u: Any) -> Array:
+    def inputs_of(self, u: Any) -> Array:
         """u as floats (m,), or (ny, m) where outputs share one theta."""
         if u is None or u is LATER:
             return self._unknown
@@ -272,7 +272,7 @@ class Stream(Plain, storage.Kept):
             If no sample is waiting for its input, or u does not have m numbers.
         """
         check_expected(self._awaits)
-        self._put(self._state_tile(), self._within(self._inputs(u)))
+        self._put(self._state_tile(), self._within(self.inputs_of(u)))
         self._expect(NOTHING)
 
     def _put(self, tile: Array, inputs: Array) -> None:
