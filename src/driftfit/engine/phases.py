@@ -149,7 +149,7 @@ def _of_lanes(usual: Step, first: Step | None) -> Any:
     def by_root(s: State) -> None:
         for l in range(s.theta.shape[1]):
             if s.root[l] > 0:
-                first(s, l)
+                first(s, l)  # type: ignore[misc]
             else:
                 usual(s, l)
 

@@ -76,6 +76,8 @@ class Track(Plain, OfRecord):
         Names of the parameters.
     """
 
+    record: Record
+
     def __init__(
         self,
         program: Program,

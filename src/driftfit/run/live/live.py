@@ -75,7 +75,6 @@ class Live(Batched):
     ) -> None:  # fmt: skip
         check_roles("Live", model, tracker, several=isinstance(model, Model) and len(model.outputs) > 1)
         self._begin(model, tracker, dt, lag, warm_start, limits, gate)
-        self._single = len(self.model.outputs) == 1
         if lag:
             regression = self._rows if self._single else Regression(self._rows.n)
             rows = (lag + 1) * len(self.model.outputs) - 1 if self.model.shared else lag
@@ -87,9 +86,7 @@ class Live(Batched):
         tile = self._state_tile()
         self._scratch = tile.copy()
         self._bytes, self._scratch_bytes = tile.view(np.uint8), self._scratch.view(np.uint8)
-        self._m = self._rows.m
-        self._shape = (len(self.model.outputs), self._m) if self.model.shared else (self._m,)
-        self._unknown, self._interval = np.full(self._shape, np.nan), tile["interval"][0]
+        self._interval = tile["interval"][0]
         self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
         gated = self._single and self.programs[0].gate is not None
         self._undecided = gated and not tile["gate_decided"][0, 0]

@@ -141,6 +141,9 @@ class Stream(Plain, storage.Kept):
         self._windows: list[Window] = []
         self._watching: list[tuple[int, LiveAlarm]] = []
         self._tile = tile_of(self.programs, carried(before, self.programs))
+        self._single, self._m = len(self.model.outputs) == 1, self._rows.m
+        self._shape = (len(self.model.outputs), self._m) if self.model.shared else (self._m,)
+        self._unknown: Array = np.full(self._shape, np.nan)
 
     def _state_tile(self) -> Array:
         """The tile, with the present state in it."""
