@@ -28,12 +28,12 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 72_975,
-    "statements": 46_964,
+    "lines of the library": 73_012,
+    "statements": 46_982,
     "modules": 452,
     "levels of folders": 4,
     "constants of modules with numbers": 707,
-    "numbers in the source": 2_714,
+    "numbers in the source": 2_715,
     "private names of Numba and llvmlite": 45,
     "modules that the Kalman filter imports": 24,
     "lines of them": 5_709,
