@@ -18,8 +18,8 @@ from driftfit.cli.parts.program import app, helpful, progress, say
 from driftfit.engine.disk_cache import contents, folder
 from driftfit.parsing.settings import parse_model, parse_tracker
 from driftfit.results import Track
-from driftfit.run.parallel_lanes import FEWEST
-from driftfit.show.parts.text import facts
+from driftfit.run.parallel_lanes import FEWEST_LANES
+from driftfit.show.text import facts
 
 SAMPLES = 600
 """Length of the simulated record, of which half is the reference of the alarms."""
@@ -54,8 +54,8 @@ def warm(
                 lacking = _used(run)
                 Live(run.model, chosen).update(0.0, None if u is None else u[0])
                 if fleet:
-                    many = np.tile(y, (FEWEST, 1))
-                    _used(track(bound, chosen, many, None if u is None else np.tile(u, (FEWEST, 1, 1)), by="row"))
+                    many = np.tile(y, (FEWEST_LANES, 1))
+                    _used(track(bound, chosen, many, None if u is None else np.tile(u, (FEWEST_LANES, 1, 1)), by="row"))
             for verb, reason in lacking.items():
                 say(Text(f" {text}, without {verb}: {reason}", "dim"))
         after = contents()

@@ -5,6 +5,9 @@ header determines whether cells are separated by comma, semicolon, tab or bar, o
 which spreadsheets write. A row of units may follow it. Blank lines are left out; in a file of one column they are
 missing readings, unless every line is followed by one. Separators at the end of a line are left out; a line with more
 cells than the header is an error. Text that is neither UTF-8 nor UTF-16 is taken as Windows-1252.
+
+Numbers may have a decimal comma, and dots between thousands: 1.234,5. Columns are cells without blanks around them,
+null for those without a value (`driftfit.data.columns.present`).
 """
 
 from __future__ import annotations
@@ -13,17 +16,16 @@ import csv
 import io
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
 from driftfit.data.columns import ERROR, FILE, HISTORIANS, Wanted, plain_names, present
-from driftfit.data.formats.decimal_commas import points, with_points
-from driftfit.data.times.dates import is_date
+from driftfit.data.instants import is_date
 
-PROBE = 1 << 16
+PROBE_BYTES = 1 << 16
 """The bytes from which the separator, the decimal sign and units are judged."""
 
 RUN = r"^[=+\-@\t\r]"
@@ -32,7 +34,7 @@ RUN = r"^[=+\-@\t\r]"
 DECLARED = re.compile(r"\ufeff?sep=(.)\s*$", re.IGNORECASE)
 """A first line with which spreadsheets say what separates cells."""
 
-CHECKED = 1 << 26
+WHOLE_BYTES = 1 << 26
 """Bytes of a file up to which all columns are read: only then polars reports lines with more cells than the header."""
 
 SEPARATORS = ",;\t|"
@@ -60,9 +62,9 @@ def without_formulas(table: pl.DataFrame) -> pl.DataFrame:
 def start_of(source: str | bytes) -> bytes:
     """The header and the first cells of a file, given by its path or its contents."""
     if isinstance(source, bytes):
-        return source[:PROBE]
+        return source[:PROBE_BYTES]
     with open(source, "rb") as file:
-        return file.read(PROBE)
+        return file.read(PROBE_BYTES)
 
 
 def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFrame, dict[str, str]]:
@@ -73,9 +75,9 @@ def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFra
     those of a file whose cells are not separated by commas.
     """
     content = source if isinstance(source, bytes) else Path(source).read_bytes()
-    if encoding := _encoding(content[:PROBE]):
+    if encoding := _encoding(content[:PROBE_BYTES]):
         content = content.decode(encoding, errors="replace").encode()
-    start = content[:PROBE]
+    start = content[:PROBE_BYTES]
     end = b"\r" if b"\r" in start and b"\n" not in start else b"\n"
     lines = _lines(start)
     declared = DECLARED.match(lines[0]) if lines else None
@@ -90,7 +92,7 @@ def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFra
     again = [copy[1] for copy in copies if copy and copy[1] in raw]
     names = plain_names(raw, [name for name in wanted.names if name != FILE])
     chosen = {old: new for old, new in zip(raw, names, strict=True) if new in wanted.names}
-    read = None if len(content) <= CHECKED else list(chosen)
+    read = None if len(content) <= WHOLE_BYTES else list(chosen)
     try:
         every = pl.read_csv(content, columns=read, **options)
     except pl.exceptions.ComputeError as error:
@@ -119,7 +121,7 @@ def _mended(content: bytes, end: bytes, sign: str, alone: bool) -> bytes:
     """
     after = rb"(?=[ \t]*(?:" + re.escape(sign.encode()) + rb"|[\r\n]|\Z))"
     content = re.sub(end + rb"(" + ERROR.encode() + rb")" + after, end + rb'"\1"', content, flags=re.IGNORECASE)
-    if alone and any(line.strip() for line in content[:PROBE].split(end)[1::2]):
+    if alone and any(line.strip() for line in content[:PROBE_BYTES].split(end)[1::2]):
         return content
     return re.sub(end + rb"[ \t\r]*(?=" + end + rb")", b"", content)
 
@@ -127,7 +129,7 @@ def _mended(content: bytes, end: bytes, sign: str, alone: bool) -> bytes:
 def _lines(start: bytes) -> list[str]:
     """The first lines of a file, without blank ones, comments, and one that the end of the probe cuts off."""
     lines = start.decode(errors="replace").removeprefix("\ufeff").splitlines()
-    whole = lines[:-1] if len(start) == PROBE and len(lines) > 1 else lines
+    whole = lines[:-1] if len(start) == PROBE_BYTES and len(lines) > 1 else lines
     return [line for line in whole if line.strip() and not COMMENT.match(line)]
 
 
@@ -192,3 +194,65 @@ def _whole(text: pl.Series) -> pl.Series:
     """A column that names units. In a file of text it has no type; it becomes integers if every cell is one."""
     whole = text.cast(pl.Int64, strict=False)
     return whole if whole.cast(pl.String).eq_missing(text).all() else text
+
+
+COMMA = r"^[+-]?(\d+|\d{1,3}(\.\d{3})+)?(,\d*)?([eE][+-]?\d+)?$"
+"""A number with a decimal comma, perhaps with dots between thousands."""
+
+GROUPED = r"^[+-]?([1-9]\d{0,2}(\.\d{3})+|\d+)$"
+"""A whole number, perhaps with dots between thousands."""
+
+POINT = r"^[+-]?\d*\.(\d{0,2}|\d{4,})([eE][+-]?\d+)?$"
+"""A number with a decimal point, which cannot be between thousands."""
+
+
+def with_points(columns: Sequence[pl.Series], others: Iterable[pl.Series]) -> list[pl.Series]:
+    """Columns of a file with decimal points instead of decimal commas, and without dots between thousands.
+
+    ``others`` are all columns of the file, or the beginning of each: decimal commas in one of them say that the dots in
+    columns of whole numbers are between thousands, and a decimal point that commas may be between thousands. If there
+    are both, or text among the decimal commas, such dots raise a ValueError.
+    """
+    if not any(map(_doubtful, columns)):
+        return [_with_points(column, False, False) for column in columns]
+    every = [column.drop_nulls() for column in [*columns, *others]]
+    pointed = any(column.str.contains(POINT).any() for column in every)
+    commas = [column for column in every if (column.str.contains(COMMA) & column.str.contains(",", literal=True)).any()]
+    pure = bool(commas) and not pointed and all(column.str.contains(COMMA).all() for column in commas)
+    for column in columns if commas and not pure else ():
+        if _doubtful(column) and not column.str.contains(",", literal=True).any():
+            dot = column.filter(column.str.contains(".", literal=True).fill_null(False))[0]
+            raise ValueError(
+                f"the dot in {dot} of column {column.name!r} may be a decimal point or stand between thousands: "
+                f"the file has decimal commas and {'decimal points' if pointed else 'text among them'}. Give "
+                "--decimal , or --decimal . on the command line, or pass the table that "
+                "polars.read_csv(.., decimal_comma=True) reads."
+            )
+    return [_with_points(column, pure, pointed) for column in columns]
+
+
+def _doubtful(text: pl.Series) -> bool:
+    """Whether only other columns can show if all signs of a column are decimal ones or between thousands."""
+    known = text.drop_nulls()
+    commas = known.filter(known.str.contains(",", literal=True))
+    if len(commas):
+        return bool(commas.str.contains(r",\d{3}$").all())
+    return bool(known.str.contains(".", literal=True).any() and known.str.contains(GROUPED).all())
+
+
+def points(text: pl.Series) -> pl.Series:
+    """A column with a decimal point instead of a comma; points that group thousands are removed."""
+    plain = text.str.replace_all(".", "", literal=True).str.replace(",", ".", literal=True)
+    return plain.zip_with(text.str.contains(COMMA).fill_null(False), text)
+
+
+def _with_points(text: pl.Series, commas: bool, pointed: bool) -> pl.Series:
+    """One column of a file in which others have decimal ``commas``, or some cells are ``pointed``."""
+    known = text.drop_nulls()
+    comma = known.filter(known.str.contains(",", literal=True))
+    if not len(comma):
+        return points(text) if commas and known.str.contains(GROUPED).all() else text
+    mixed = not comma.str.contains(COMMA).all() or known.str.contains(POINT).any()
+    if mixed or (pointed and comma.str.contains(r",\d{3}$").all()):
+        return text  # the error message names the cell
+    return points(text)

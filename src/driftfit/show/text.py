@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from copy import copy
 from io import StringIO
 from itertools import pairwise
@@ -117,14 +117,15 @@ def together(*values: float, std: float = float("nan"), least: int = 4) -> tuple
 
 
 def facts(*pairs: tuple[str, str]) -> Table:
-    """Names and values side by side, as plain text, since b1[flow] is not markup."""
+    """Names and values side by side, as plain text, since b1[flow] is not markup; what is empty is left out."""
     table = Table.grid(padding=(0, 2), pad_edge=True)
     for name, value in pairs:
-        table.add_row(Text(name, "bold"), Text(value))
+        if value:
+            table.add_row(Text(name, "bold"), Text(value))
     return table
 
 
-SHORT = 10
+UNWRAPPED = 10
 """A cell of at most this many characters stays on one line: numbers, and p-values such as < 0.0001."""
 
 
@@ -172,7 +173,7 @@ class Numbers(Table):
 
 
 def _widen(column: Column, text: str) -> None:
-    words = [text] if len(text) <= SHORT else text.split()
+    words = [text] if len(text) <= UNWRAPPED else text.split()
     column.min_width = max(column.min_width or 0, *map(cell_len, words), 0)
 
 
@@ -191,3 +192,30 @@ def table_of(title: str, *heads: str, names: int = 1, group: int = 1) -> Table:
         table.add_column(Text(head), justify="left" if place < names else "right", overflow="fold")
         _widen(table.columns[-1], head)
     return table
+
+
+Result = TypeVar("Result")
+
+
+class ByOutput(Printed, Mapping[str, Result]):
+    """What a verb found for each output of a record, by name; printing it shows one after the other."""
+
+    def __init__(self, results: Mapping[str, Result]) -> None:
+        self._results = dict(results)
+
+    def __getitem__(self, output: str) -> Result:
+        return self._results[output]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._results)
+
+    def __len__(self) -> int:
+        return len(self._results)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(f'{name}: {one!r}' for name, one in self.items())})"
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for place, (name, one) in enumerate(self.items()):
+            yield Text(f"\n{name}" if place else name, "bold")
+            yield one if hasattr(one, "__rich_console__") else Text(repr(one))
