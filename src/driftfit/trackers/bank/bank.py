@@ -207,6 +207,7 @@ class Bank(Tracker):
 
     @property
     def independent(self) -> bool:
+        """Whether every event is independent of earlier ones."""
         P = self.event_probabilities[0]
         return bool((P[0] == P).all())
 
@@ -305,8 +306,8 @@ class Bank(Tracker):
             arrays["root"][:, 0], scale = arrays["leaves"][:, 0], 1.0
         q0, Q0 = arrays["walks"][0, : n * (n + 1) // 2], np.zeros((n, n))
         numbers = {
-            "n": n, "output_lags": na, "unknown": nominal.r is None, "independent": self.independent, "apart": self._apart,
-            "plain": na == 0 and self.form == "covariance",
+            "n": n, "output_lags": na, "unknown": nominal.r is None, "independent": self.independent,
+            "apart": self._apart, "plain": na == 0 and self.form == "covariance",
         }  # fmt: skip
         Q0[np.tril_indices(n)] = q0
         return {  # memory first, where a cache line begins
