@@ -187,7 +187,7 @@ class AdaptiveNew(Tracker):
         return TrackerSteps(
             predict, forecast, correct, report, nothing,
             TrackerSteps(predict, forecast_first, correct_first, nothing, nothing),
-            store=keep_density, machines=(*FRAME, machine_drift), doubts=True, outlined=True,
+            store=keep_density, machines=(*FRAME, machine_drift), outlined=True,
         )
 
     def learning(self, lane: Mapping[str, Array]) -> Array:

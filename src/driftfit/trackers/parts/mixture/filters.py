@@ -48,8 +48,9 @@ JUMP, ARRIVE = 1.5e-3, 1e-5
 """Probabilities from the whole bank: into all modes with ratios of 1 and more, and into each other one."""
 EVENTS, RAREST, OFTENEST, SPAN = 3.0, 0.05, 3.0, 2e4
 """Jumps that the prior of their rate counts for, its bounds, and its memory in samples."""
-AT_REST, ALL = 0.3, 0.45
-"""Probabilities before the first sample: of no drift, and of the other common ratios."""
+AT_REST, ALL, SELDOM = 0.3, 0.45, 0.02
+"""Probabilities before the first sample: of no drift at least, of the other common ratios, and the share of jumps in
+these and those of the other ladders."""
 FADING, BEND = 0.05, 0.1
 """Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""
 FLOOR = 0.002
@@ -79,7 +80,8 @@ def table(n: int, groups: Any) -> dict[str, Array]:
     for kind, share in ((alone, 0.5), (~alone, 0.5 if each else 1.0)):
         arrive[jump & kind] *= share / max(np.sum(jump & kind), 1)
     start = np.where(of == -3, ALL / (len(COMMON) - 1), (1.0 - AT_REST - ALL) / np.sum(of != -3))
-    start[0] = AT_REST
+    start[ratio >= 1.0] *= SELDOM
+    start[0] = 1.0 - start[1:].sum()
     first = np.full(n, -1)
     for g, members in enumerate(each):
         first[list(members)] = np.argmax(of == g)
@@ -176,9 +178,19 @@ def wander(s: State, size: float, l: int) -> None:
 
 
 @kernel
+def widest_jumps(s: State, l: int) -> None:
+    """The largest jumps may move the output by as much as it varies, however small the noise."""
+    ratio = max(COMMON[-1], s.spread[l] / s.r[l])
+    s.ratio[len(COMMON) - 1, l] = ratio
+    for k in range(FIRST_ALONE + s.rungs[l] - 1, s.modes[l], s.rungs[l]):
+        s.ratio[k, l] = ratio
+
+
+@kernel
 def predict(s: State, l: int) -> None:
     """Drift and trends of the time since the last sample."""
     if s.settled[l] > 0 and s.dt[l] > 0.0:
+        widest_jumps(s, l)
         wander(s, s.r[l] * s.dt[l] * s.drift[l], l)
         time = s.dt[l] * min(s.drift[l], 1.0)
         for j in range(s.slope.shape[1]):
@@ -224,8 +236,9 @@ def innovate(s: State, l: int) -> None:
         s.e_k[k, l] += s.explained[l]
         s.row[k, l] = s.prior[k, l] * s.e_k[k, l]
     mean = sum_of_row(s, l)
-    for k in range(K):
-        s.row[k, l] = s.prior[k, l] * (s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2)
+    for k in range(K):  # the band is for samples at which no jump begins
+        p = s.prior[k, l] - (s.kappa[l] * s.arrive[k, l] if s.ratio[k, l] >= 1.0 else 0.0)
+        s.row[k, l] = max(p, 0.0) * (s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2)
     v = sum_of_row(s, l)
     for j in range(STATES - 1):
         v += s.nu_prior[j, l] / (1.0 - OUTLIER) * variance_in(s, j, l)
