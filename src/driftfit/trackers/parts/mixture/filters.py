@@ -32,19 +32,19 @@ import numpy as np
 from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.covariance import LEFT
-from driftfit.trackers.parts.mixture.noise import OUTLIER, STATES, variance_in
+from driftfit.trackers.parts.mixture.noise import STATES, variance_in
 from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
 
 COMMON = (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
 TREND = (1e-3, 1e-2, 0.1)
 LEARNED = (1e-3, 1e-2, 0.1, 1.0)
-ALONE, GROUP = (0.03, 1.0, 30.0), (1e-3, 1e-2, 0.1, 1.0, 30.0)
+ALONE, GROUP = (0.003, 0.05, 30.0), (1e-3, 1e-2, 0.1, 1.0, 30.0)
 """Drift ratios of the ladders."""
 MOST_ALONE = 8
 """Number of parameters up to which each has a ladder of its own."""
 UP, DOWN, BACK = 2e-4, 1e-3, 0.05
 """Probabilities: to the next larger ratio, to the next smaller one, and the latter from ratios of 1 and more."""
-JUMP, ARRIVE = 1.5e-3, 1e-5
+JUMP, ARRIVE = 3e-3, 1e-5
 """Probabilities from the whole bank: into all modes with ratios of 1 and more, and into each other one."""
 EVENTS, RAREST, OFTENEST, SPAN = 3.0, 0.05, 3.0, 2e4
 """Jumps that the prior of their rate counts for, its bounds, and its memory in samples."""
@@ -241,7 +241,7 @@ def innovate(s: State, l: int) -> None:
         s.row[k, l] = max(p, 0.0) * (s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2)
     v = sum_of_row(s, l)
     for j in range(STATES - 1):
-        v += s.nu_prior[j, l] / (1.0 - OUTLIER) * variance_in(s, j, l)
+        v += s.nu_prior[j, l] / (1.0 - s.outlying[l]) * variance_in(s, j, l)
     for k in range(K):
         s.e_k[k, l] = s.y[l] - s.e_k[k, l]
     s.y_hat[l] = mean
@@ -323,7 +323,7 @@ def weigh(s: State, more: float, l: int) -> None:
     s.outlier[l] = s.nu[STATES - 1, l]
     # an outlier says nothing about the state of ordinary noise
     for j in range(STATES - 1):
-        s.nu[j, l] += s.nu[STATES - 1, l] * s.nu_prior[j, l] / (1.0 - OUTLIER)
+        s.nu[j, l] += s.nu[STATES - 1, l] * s.nu_prior[j, l] / (1.0 - s.outlying[l])
 
 
 @partial(kernel, inline=False)

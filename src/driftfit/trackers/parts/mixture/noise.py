@@ -26,15 +26,15 @@ from driftfit.engine.kernel import State, exp, kernel
 from driftfit.trackers.parts.modes.rows import sum_of_row
 
 STATES = 3
-OUTLIER = 0.035
-"""Probability of an outlier."""
+OUTLIER, RARITY, FADE = 0.035, 50.0, 0.999
+"""Probability of an outlier before the first sample, samples that this counts for, and fading of those since."""
 STAY, CALM = 0.985, 0.95
 """Probabilities that quiet noise stays quiet, and that restless noise stays restless."""
 QUIET = 0.8
 """Probability of quiet noise before the first sample."""
-MEMORY, QUICK = 70.0, 5.0
+MEMORY, QUICK = 70.0, 10.0
 """Memories of r and f, in samples."""
-LEAST_RESTLESS, LARGE, WILDEST = 0.06, 100.0, 1e8
+LEAST_RESTLESS, LARGE, WILDEST = 6.0, 100.0, 1e8
 """Least f, the variance of outliers at least, and the largest f, in units of r."""
 LEAST_SHARE = 1e-26
 """r is never below this share of the mean square of y, for rounding in the sums of a prediction."""
@@ -44,7 +44,7 @@ def any_noise() -> dict[str, Any]:
     """Fields before the first sample."""
     return {
         "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.zeros(STATES), "restless": 1.0, "outlier": 0.0,
-        "precision": 0.0, "finest": np.inf, "reading": np.nan, "repeats": 0.0,
+        "precision": 0.0, "outliers": 0.0, "watched": 0.0, "outlying": OUTLIER, "finest": np.inf, "reading": np.nan, "repeats": 0.0,
     }  # fmt: skip
 
 
@@ -64,10 +64,10 @@ def variance_in(s: State, j: int, l: int) -> float:
 @kernel
 def noise_prior(s: State, l: int) -> None:
     """Probabilities of the states before the sample."""
-    usual = 1.0 - OUTLIER
+    usual = 1.0 - s.outlying[l]
     s.nu_prior[0, l] = usual * (STAY * s.nu[0, l] + (1.0 - CALM) * s.nu[1, l])
     s.nu_prior[1, l] = usual * ((1.0 - STAY) * s.nu[0, l] + CALM * s.nu[1, l])
-    s.nu_prior[2, l] = OUTLIER
+    s.nu_prior[2, l] = s.outlying[l]
 
 
 @kernel
@@ -113,6 +113,9 @@ def learn_noise(s: State, l: int) -> None:
             share += sum_of_row(s, l)
             ordinary += moment
     s.count[l] += 1.0
+    s.outliers[l] = FADE * s.outliers[l] + s.outlier[l]
+    s.watched[l] = FADE * s.watched[l] + 1.0
+    s.outlying[l] = (OUTLIER * RARITY + s.outliers[l]) / (RARITY + s.watched[l])
     move = (ordinary / s.r[l] - share) / min(s.count[l] + 1.0, MEMORY)
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
     s.restless[l] += (min(every, WILDEST * s.r[l]) - s.restless[l]) / QUICK
