@@ -33,7 +33,7 @@ from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.covariance import LEFT
 from driftfit.trackers.parts.mixture.noise import STATES, variance_in
-from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
+from driftfit.trackers.parts.mixture.rows import least_of_row, sum_of_row
 
 COMMON = (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
 TREND = (1e-3, 1e-2, 0.1)

@@ -33,7 +33,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, shared
 from driftfit.trackers.parts.excitation import DULL, LARGE, MEMORY
 from driftfit.trackers.parts.mixture.filters import FIRST_ALONE, FIRST_LEARNED, FLOOR
-from driftfit.trackers.parts.modes.rows import sum_of_row
+from driftfit.trackers.parts.mixture.rows import sum_of_row
 
 BLOCK, WINDOW = 50, 100
 """Samples between two passes, and samples of a pass."""

@@ -23,7 +23,7 @@ import numpy as np
 
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import State, exp, kernel
-from driftfit.trackers.parts.modes.rows import sum_of_row
+from driftfit.trackers.parts.mixture.rows import sum_of_row
 
 STATES = 3
 OUTLIER, RARITY, FADE = 0.035, 50.0, 0.999
@@ -44,7 +44,7 @@ def any_noise() -> dict[str, Any]:
     """Fields before the first sample."""
     return {
         "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.zeros(STATES), "restless": 1.0, "outlier": 0.0,
-        "precision": 0.0, "outliers": 0.0, "watched": 0.0, "outlying": OUTLIER, "finest": np.inf, "reading": np.nan, "repeats": 0.0,
+        "precision": 0.0, "certainty": 0.0, "outliers": 0.0, "watched": 0.0, "outlying": OUTLIER, "finest": np.inf, "reading": np.nan, "repeats": 0.0,
     }  # fmt: skip
 
 
@@ -94,7 +94,10 @@ def repeated_rounding(s: State, l: int) -> float:
 @partial(kernel, inline=False)
 def learn_noise(s: State, l: int) -> None:
     """r and f from the moments of the noise of this sample."""
-    K = s.modes[l]
+    K, more = s.modes[l], repeated_rounding(s, l)
+    usual = s.nu[0, l] / (variance_in(s, 0, l) + more) + s.nu[1, l] / (variance_in(s, 1, l) + more)
+    far = max(variance_in(s, STATES - 1, l), s.e[l] * s.e[l]) + more
+    s.certainty[l] = s.noise[l] * ((1.0 - s.outlier[l]) * usual + s.outlier[l] / far)
     if s.repeats[l] > 0.0:
         return
     ordinary, share, every = 0.0, 0.0, 0.0

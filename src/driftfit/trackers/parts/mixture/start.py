@@ -24,7 +24,7 @@ from driftfit.trackers.parts.excitation import learn_information, learn_scales
 from driftfit.trackers.parts.mixture.filters import absorb, project, wander
 from driftfit.trackers.parts.mixture.learned import PHI, WINDOW, learn_means
 from driftfit.trackers.parts.mixture.noise import note_reading
-from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
+from driftfit.trackers.parts.mixture.rows import least_of_row, sum_of_row
 
 Y, SPAN = range(2)
 """Entries of a stored sample of the start before its regressor, at `PHI`: the output over the root of the noise factor,
