@@ -69,7 +69,6 @@ from driftfit.trackers.parts.excitation import (
 )
 from driftfit.trackers.parts.few_residuals import RESIDUALS, widen_estimates, wider
 from driftfit.trackers.parts.mixture.filters import (
-    bank,
     enter_filters,
     innovate,
     mix,
@@ -88,6 +87,7 @@ from driftfit.trackers.parts.mixture.learned import (
     nothing_learned,
     whiten_noise,
 )
+from driftfit.trackers.parts.mixture.modes import bank
 from driftfit.trackers.parts.mixture.noise import (
     any_noise,
     learn_noise,
