@@ -433,7 +433,7 @@ class RunTimeOrders(Wider):
     def memory(self) -> Mapping[str, Any]:
         own = self.model.memory()
         blocks = np.append(own["blocks"], np.zeros(self.size_of_blocks - own["blocks"].size))
-        return {**own, "blocks": blocks, "orders": np.array(_places(self.model))}  # type: ignore[arg-type]
+        return {**own, "blocks": blocks, "orders": np.array(_places(self.model))}
 
     @property
     def steps(self) -> ModelSteps:

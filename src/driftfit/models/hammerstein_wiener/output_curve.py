@@ -50,7 +50,7 @@ def values_of(kind: Kind, numbers: int, following: int, count: int) -> Any:
     common ones, are computed inline.
     """
     evaluate, code = kind
-    inline = {POWERS: powers, LEGENDRE: legendre}.get(code)
+    inline: Any = {POWERS: powers, LEGENDRE: legendre}.get(code)
 
     def called(m: Array, p: Places, x: float, at: int, slopes: int) -> None:
         own, L = p[numbers], m.shape[1]
