@@ -121,7 +121,8 @@ def _reach(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     changed = np.flatnonzero((replay(track(model, still, y, u))["phi"] != replay(run)["phi"])[..., 0].any(axis=1))
     if changed.size and changed[0] < AT:
         yield f"It looks ahead: signals of sample {AT} are in the regressors of sample {changed[0]}."
-    if changed.size and changed[-1] > AT + model.reach and not model.recursive:
+    endless = model.hidden is not None or model.held_at(run.theta[-1]) is not None  # regressors hold its own results
+    if changed.size and changed[-1] > AT + model.reach and not endless:
         yield f"reach is {model.reach}, but signals of sample {AT} are in the regressors of sample {changed[-1]}."
 
 

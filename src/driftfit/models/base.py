@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -260,11 +261,6 @@ class Model(Settings, ABC):
         """This model with its linearisation held at theta (n,), so that a run is a linear regression; None without."""
         return None
 
-    @property
-    def recursive(self) -> bool:
-        """Whether regressors hold earlier results of the model itself, so that a sample acts on all after it."""
-        return False
-
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
         """Run systems forward: the outputs (D, h) that inputs and noise cause, each fed back as a lag.
 
@@ -299,3 +295,23 @@ class Model(Settings, ABC):
     def follows(self, other: Model) -> bool:
         """Whether the memory of the other model is that of this one, so that its run can be continued."""
         return (self.n, self.m, self.steps) == (other.n, other.m, other.steps)
+
+
+@dataclass(frozen=True)
+class Wider(Model):
+    """A bound model in the record of a larger one of ``size`` parameters: regressors after its own are 0."""
+
+    model: Model
+    size: int
+
+    def bind(self, inputs: int | Sequence[str]) -> Self:
+        return self
+
+    @property
+    def m(self) -> int:
+        return self.model.m
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        own = self.model.names
+        return (*own, *(f"absent{i + 1}" for i in range(self.size - len(own))))

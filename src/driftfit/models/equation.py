@@ -42,7 +42,7 @@ from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.models.base import GAP, refuse_lag
 from driftfit.models.formula import Formula, compiled, parse, start_values
 from driftfit.models.inputs import NamedInputs
-from driftfit.models.lags.output_lags import shift_inputs
+from driftfit.models.lags import shift_inputs
 from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
 
 SETTLING = 10.0

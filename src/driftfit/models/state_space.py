@@ -147,10 +147,6 @@ class StateSpace(NamedInputs):
         return np.array([given.get(name, float(name not in self.hidden)) for name in self.names])
 
     @property
-    def recursive(self) -> bool:
-        return True
-
-    @property
     def input_memory(self) -> int:
         return self.system.reach
 
