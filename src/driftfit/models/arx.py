@@ -36,8 +36,8 @@ import numpy as np
 from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import one_of, output_names, whole
-from driftfit.models.base import GAP, Model, Term, Wider, refuse_lag
-from driftfit.models.inputs import CountedInputs
+from driftfit.models.base import GAP, Model, Term, refuse_lag
+from driftfit.models.inputs import CountedInputs, Wider
 from driftfit.models.lags import doubted, no_doubts, shift_doubts, shift_inputs, take_output, wait_for_lags
 
 PAST, ONE, ABSENT = -1, -2, -3

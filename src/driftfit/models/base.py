@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -295,23 +294,3 @@ class Model(Settings, ABC):
     def follows(self, other: Model) -> bool:
         """Whether the memory of the other model is that of this one, so that its run can be continued."""
         return (self.n, self.m, self.steps) == (other.n, other.m, other.steps)
-
-
-@dataclass(frozen=True)
-class Wider(Model):
-    """A bound model in the record of a larger one of ``size`` parameters: regressors after its own are 0."""
-
-    model: Model
-    size: int
-
-    def bind(self, inputs: int | Sequence[str]) -> Self:
-        return self
-
-    @property
-    def m(self) -> int:
-        return self.model.m
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        own = self.model.names
-        return (*own, *(f"absent{i + 1}" for i in range(self.size - len(own))))

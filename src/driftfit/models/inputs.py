@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 from warnings import warn
 
@@ -15,8 +15,8 @@ from driftfit.engine.settings import input_names, numbers, whole
 from driftfit.models.base import Model
 
 TAIL, DEVIATIONS = 0.02, 2.0
-"""An input is far from 0 if all but the share `TAIL` of its values are, by `DEVIATIONS` times their usual deviation from their
-median."""
+"""An input is far from 0 if all but the share `TAIL` of its values are, by `DEVIATIONS` times their usual deviation
+from their median."""
 
 
 class CountedInputs(Model):
@@ -184,3 +184,23 @@ class NamedInputs(Model):
     @property
     def input_names(self) -> tuple[str, ...]:
         return self.inputs or ()
+
+
+@dataclass(frozen=True)
+class Wider(Model):
+    """A bound model in the record of a larger one of ``size`` parameters: regressors after its own are 0."""
+
+    model: Model
+    size: int
+
+    def bind(self, inputs: int | Sequence[str]) -> Self:
+        return self
+
+    @property
+    def m(self) -> int:
+        return self.model.m
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        own = self.model.names
+        return (*own, *(f"absent{i + 1}" for i in range(self.size - len(own))))

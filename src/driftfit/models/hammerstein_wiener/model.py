@@ -45,13 +45,13 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import numbers, output_names, warn, whole
-from driftfit.models.base import Model, Wider
+from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.forward import play
 from driftfit.models.hammerstein_wiener.steps import DIGITS, applying, build, build_any, refusing
 from driftfit.models.hammerstein_wiener.structure import Structure, memory, places_of
 from driftfit.models.hammerstein_wiener.thresholds import settled
-from driftfit.models.inputs import CountedInputs
+from driftfit.models.inputs import CountedInputs, Wider
 from driftfit.readings.screen import suspect
 
 IDENTITY = Polynomial(1)
