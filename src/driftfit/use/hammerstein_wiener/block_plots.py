@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftfit.show.parts.axes import date_axis, frame, panels, settled, time_label
+from driftfit.show.axes import date_axis, frame, panels, settled, time_label
 from driftfit.use.hammerstein_wiener.run_blocks import blocks_of
 
 if TYPE_CHECKING:
