@@ -197,10 +197,6 @@ class Model(Settings, ABC):
         """theta (.., n) from parameters (.., k) that a tracker follows instead; None where they do not define it."""
         return None
 
-    def polynomials(self, theta: Array) -> tuple[Array, list[Array]]:
-        """A(z) and B(z) at theta (.., n) in powers of z^-1; ValueError for a model that has none."""
-        raise ValueError(f"polynomials: {type(self).__name__} has no polynomials; use ARX.")
-
     def transfers(self, theta: Array) -> tuple[Array, list[tuple[Array, Array]]]:
         """The poles' polynomial at theta (.., n), and numerator and denominator from each input, in powers of z^-1.
 
