@@ -23,12 +23,12 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 71_464,
-    "statements": 46_087,
+    "lines of the library": 71_501,
+    "statements": 46_105,
     "modules": 432,
     "levels of folders": 4,
     "constants of modules with numbers": 705,
-    "numbers in the source": 2_696,
+    "numbers in the source": 2_697,
     "private names of Numba and llvmlite": 45,
     "modules that the Kalman filter imports": 24,
     "lines of them": 5_709,
@@ -43,7 +43,7 @@ LIMITS = {
     "state fields of a gate": 33,
     "bytes of state of Kalman": 848,
     "bytes of state of AdaptiveKalman": 22_792,
-    "lines of tests": 34_195,
+    "lines of tests": 34_161,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 
