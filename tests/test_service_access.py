@@ -15,7 +15,7 @@ from driftfit.service.control import Control
 from driftfit.service.page.passwords import hashed, new_token
 from driftfit.service.page.sockets import Sockets
 from driftfit.service.settings.options import UserOptions
-from driftfit.service.sources.incoming import INCOMING
+from driftfit.service.sources.http import INCOMING
 
 GATEWAY = [line.split(": ")[1] for line in new_token()]
 ANN = UserOptions("Ann", "operator", PASSWORD)

@@ -362,7 +362,7 @@ def test_replay(tmp_path):
 
 
 def test_a_request_that_one_of_two_units_takes_is_not_refused(tmp_path):
-    from driftfit.service.sources.incoming import INCOMING
+    from driftfit.service.sources.http import INCOMING
 
     config = configured(UNIT + UNIT.replace('"y"', '"p"').replace('["u"]', '["q"]'), source=HTTP)
     engine = opened(config, tmp_path)
@@ -375,7 +375,7 @@ def test_a_request_that_one_of_two_units_takes_is_not_refused(tmp_path):
 
 
 def test_http_samples_are_answered_when_they_are_in_the_journal(tmp_path):
-    from driftfit.service.sources.incoming import INCOMING
+    from driftfit.service.sources.http import INCOMING
 
     config = configured(source=HTTP)
     engine = opened(config, tmp_path)

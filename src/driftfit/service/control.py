@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from driftfit.service.core.engine import Engine
-from driftfit.service.sources.incoming import INCOMING, WAIT
+from driftfit.service.sources.http import ANSWER_SECONDS, INCOMING
 
 MOST = 64
 LONGEST = 16 << 20
@@ -86,7 +86,7 @@ class Control(threading.Thread):
             problems: queue.Queue[str] = queue.Queue()
             self.engine.act(name, header["action"], problems.put)
             try:
-                problem = problems.get(timeout=WAIT)
+                problem = problems.get(timeout=ANSWER_SECONDS)
             except queue.Empty:
                 return {"error": "the journal does not answer", "status": 503}
             return {"error": problem, "status": 400} if problem else {"done": True}

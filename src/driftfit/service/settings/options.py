@@ -168,10 +168,13 @@ def _converted(key: str, value: Any, hint: Any) -> Any:
     """A value of a table in the type of an option."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
-        inner = next(one for one in args if one is not type(None))
-        return _converted(key, value, inner)
+        return _converted(key, value, next(one for one in args if one is not type(None)))
     if hint is Secret:
         return Secret.of(value)
+    if origin is typing.Literal:
+        if value not in args:
+            raise ValueError(f"{key} must be {' or '.join(args)}; got {value!r}.")
+        return value
     if origin is list:
         if not isinstance(value, list):
             raise ValueError(f"{key} must be a list; got {value!r}.")

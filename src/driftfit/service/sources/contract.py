@@ -1,14 +1,4 @@
-"""A source consists of options and two methods. A new source is one file in this folder, with a class of its name.
-
-    class Mine(Source):                         # src/driftfit/service/sources/mine.py, kind = "mine"
-        url: str                                # options are the fields of a frozen dataclass
-        def open(self, position): ...           # connect; position is where the last run had come to, or None
-        def read(self, wait): ...               # a Batch with an acknowledgement, or None if nothing came
-
-`read` is called repeatedly in a separate thread. It blocks for at most ``wait`` seconds. The acknowledgement
-of a batch is called, from the thread of the journal, after its samples are on disk. An exception means that the source
-is away: it is closed, and opened again after a pause of 1 s, 2 s, ... 60 s.
-"""
+"""What a source is, and what it gives: batches of samples."""
 
 from __future__ import annotations
 
@@ -17,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from driftfit.service.connector import Connector
 from driftfit.service.sources.samples import Batch
 
 END = Batch([], position="end")
@@ -24,14 +15,8 @@ END = Batch([], position="end")
 
 
 @dataclass(frozen=True)
-class Source(ABC):
+class Source(Connector):
     """A source of samples."""
-
-    name: str
-
-    def check(self) -> None:
-        """Raise ValueError or ImportError if the options cannot work."""
-        return None
 
     @abstractmethod
     def open(self, position: Any) -> Reader:

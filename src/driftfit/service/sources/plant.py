@@ -36,7 +36,6 @@ class Plant(Source):
     seed: int = 1
 
     def open(self, position: Any) -> Reader:
-        """Begin."""
         return _Plant(self)
 
 

@@ -107,7 +107,7 @@ def decode(topic: str, payload: bytes | str) -> Samples:
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         data = _with_nan(payload)
     if isinstance(data, list):
-        return _of_rows(topic, data)
+        return _bounded_rows(topic, data)
     if len(data) > MOST_FIELDS:
         raise ShapeError(f"{len(data)} fields; at most {MOST_FIELDS} are read.")
     sizes = {name: len(value) for name, value in data.items() if isinstance(value, list)}
@@ -129,12 +129,26 @@ def _with_nan(payload: bytes | str) -> Any:
         raise ValueError("not JSON.") from None
 
 
-def _of_rows(topic: str, rows: list[dict[str, Cell]]) -> Samples:
-    names = {name for row in rows[:MOST_SAMPLES] for name in row}
-    if len(names) > MOST_FIELDS:
-        raise ShapeError(f"{len(names)} fields; at most {MOST_FIELDS} are read.")
-    count = bounded(len(rows))
-    return Samples(topic, count, {name: [row.get(name) for row in rows] for name in names})
+def _bounded_rows(topic: str, rows: list[dict[str, Cell]]) -> Samples:
+    bounded(len(rows))
+    found = of_rows(topic, rows)
+    if len(found.columns) > MOST_FIELDS:
+        raise ShapeError(f"{len(found.columns)} fields; at most {MOST_FIELDS} are read.")
+    return found
+
+
+def of_rows(topic: str, rows: list[dict[str, Any]]) -> Samples:
+    """A sample for each row, missing where it has no cell."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return Samples(topic, len(rows), {name: [row.get(name) for row in rows] for name in names})
+
+
+def by_topic(rows: Iterable[tuple[str, dict[str, Any]]]) -> list[Samples]:
+    """The samples of each topic, from rows with their topics."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for topic, row in rows:
+        found.setdefault(topic, []).append(row)
+    return [of_rows(topic, own) for topic, own in found.items()]
 
 
 def bounded(count: int) -> int:

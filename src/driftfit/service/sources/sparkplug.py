@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from struct import unpack_from
 from typing import Any
 
-from driftfit.service.sources.samples import MOST_FIELDS, Samples, bounded
+from driftfit.service.sources.samples import MOST_FIELDS, Samples, bounded, of_rows
 
 PREFIX = "spBv1.0"
 BIRTHS, DATA = ("NBIRTH", "DBIRTH"), ("NDATA", "DDATA")
@@ -98,8 +98,8 @@ def _samples(topic: str, rows: dict[int, dict[str, Any]], before: dict[str, Any]
     for time in sorted(rows):
         known |= rows[time]
         filled.append(known | {"timestamp": time})
-    names = filled[-1].keys()
-    return Samples(topic, bounded(len(filled)), {name: [row.get(name) for row in filled] for name in names})
+    bounded(len(filled))
+    return of_rows(topic, filled)
 
 
 def value_of(metric: dict[int, Any]) -> Any:
