@@ -30,8 +30,8 @@ from driftfit import (
 )  # fmt: skip
 from driftfit.cli import app
 from driftfit.embedded import export_c, from_struct, to_struct
-from driftfit.embedded.selftest import record
-from driftfit.embedded.unit import TranslationError
+from driftfit.embedded.project import record
+from driftfit.embedded.values import TranslationError
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import kernel
 from driftfit.trackers.base import Tracker

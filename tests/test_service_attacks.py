@@ -39,9 +39,9 @@ from service_support import (
 )  # fmt: skip
 
 from driftfit import track
+from driftfit.service.control import health
 from driftfit.service.core.section import Section
-from driftfit.service.health import health
-from driftfit.service.page import metrics
+from driftfit.service.page.app import metrics_of
 from driftfit.service.page.feed import Feed
 from driftfit.service.settings.config import ProblemsError
 from driftfit.service.settings.matching import Pattern
@@ -185,7 +185,7 @@ def test_alarms_that_are_not_armed_and_units_that_have_failed_are_shown(tmp_path
     page.rank()
     shown = {one["unit"]: one["trouble"] for one in page.fleet}
     assert shown == {"a": ["alarm glr is not armed"], "b": ["failed"]}
-    text = metrics.text(page, 0)
+    text = metrics_of(page, 0)
     assert "driftfit_units_failed 1\n" in text
     assert 'driftfit_trouble{unit="a",what="alarm glr is not armed",why="detect: ' in text
     engine.act("b", {"do": "restart"})

@@ -32,8 +32,7 @@ from driftfit.service.core.engine import KEPT
 from driftfit.service.core.intake import Intake
 from driftfit.service.core.section import Section
 from driftfit.service.sources.samples import Batch
-from driftfit.service.start import rebuild
-from driftfit.service.supervisor import Service
+from driftfit.service.supervisor import Service, rebuild
 
 
 def run_of(y, u, time=None, **more):

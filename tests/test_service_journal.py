@@ -14,9 +14,8 @@ from typer.testing import CliRunner
 from driftfit import track
 from driftfit.cli import app
 from driftfit.service.core.archive import export
-from driftfit.service.core.journal import DAMAGED, NAME, Journal, sum_of
-from driftfit.service.page import history
-from driftfit.service.verify import verify
+from driftfit.service.core.journal import DAMAGED, NAME, Journal, sum_of, verify
+from driftfit.service.page import feed as history
 
 Y, U = record(400)
 AUDIT = "[service]\naudit = true\n"
@@ -88,7 +87,7 @@ def test_a_damaged_group_is_left_out_and_named(folder):
     [("result", "rows", lambda journal: journal.outcomes(0)), ("snapshot", "state", lambda journal: journal.state(1)),
      ("block", "extremes", lambda journal: history.reduced(journal, 1, [], 0.0, 1e9, 5)),
      ("history", "rows", lambda journal: history.samples(journal, 1, [], 0.0, 1e9)),
-     ("history", "rows", lambda journal: history.latest(journal, 1, [])),
+     ("history", "rows", lambda journal: history.newest_blocks(journal, 1, [])),
      ("event", "detail", lambda journal: [*journal.rows("event")])],
     ids=["result", "snapshot", "block", "history", "latest", "event"],
 )  # fmt: skip

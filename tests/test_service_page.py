@@ -26,10 +26,10 @@ from service_support import configured, feed, free_port, message, opened, record
 
 from driftfit.service.control import Control
 from driftfit.service.core.journal import sum_of
-from driftfit.service.page import history
+from driftfit.service.core.results import extremes_of
+from driftfit.service.page.access import Sessions, hashed, new_token, password_fits, token_fits
 from driftfit.service.page.app import Page
-from driftfit.service.page.feed import Feed
-from driftfit.service.page.passwords import Sessions, hashed, new_token, password_fits, token_fits
+from driftfit.service.page.feed import Feed, reduced
 from driftfit.service.settings.options import PageOptions, UserOptions
 
 TOKEN, HASH = (line.split(": ")[1] for line in new_token())
@@ -177,11 +177,11 @@ def test_a_million_samples_are_reduced_by_blocks(tmp_path):
     for k in range(2000):
         values = np.column_stack([np.arange(64.0) + 64 * k, rng.normal(size=(64, 8))])
         row = (1, 100 + 64 * k, 163 + 64 * k, values[0, 0].item(), values[-1, 0].item(), 64)
-        row = (*row, history.extremes_of(values).tobytes())
+        row = (*row, extremes_of(values).tobytes())
         db.execute("insert into block values (?, ?, ?, ?, ?, ?, ?, ?)", (*row, sum_of(*row)))
     db.execute("commit")
     begun = time.process_time()
-    answer = history.reduced(engine.journal, 1, [], -np.inf, np.inf, 500)
+    answer = reduced(engine.journal, 1, [], -np.inf, np.inf, 500)
     assert time.process_time() - begun < 2.0
     assert answer["count"] == 128_000
     assert len(answer["mean"][1]) == 500

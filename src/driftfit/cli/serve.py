@@ -26,7 +26,7 @@ def verify(
     """Check the sum of every row, and the chain of digests; exit code 1 if something is wrong."""
     with helpful():
         try:
-            from driftfit.service.verify import verify as faults_of
+            from driftfit.service.core.journal import verify as faults_of
         except ImportError as error:
             raise ValueError(NEEDED.format(error)) from None
         found, faults = faults_of(folder, digest)
@@ -54,11 +54,12 @@ def serve(
     """Follow the units of a plant: sensors in, parameters, bands and alarms out, and a page to watch."""
     with helpful():
         try:
-            from driftfit.service import start
+            from driftfit.service import supervisor as service
+            from driftfit.service.settings.config import ProblemsError
         except ImportError as error:
             raise ValueError(NEEDED.format(error)) from None
         if make_hash or make_token:
-            from driftfit.service.page.passwords import hashed, new_token
+            from driftfit.service.page.access import hashed, new_token
 
             for line in [hashed(getpass.getpass("Password: "))] if make_hash else new_token():
                 say(line, soft_wrap=True)
@@ -66,17 +67,17 @@ def serve(
         if demo == (file is not None):
             raise ValueError("name a configuration, as in driftfit serve plant.toml, or try driftfit serve --demo.")
         try:
-            config, home = start.configured(start.DEMO if file is None else file, port, folder)
-        except start.ProblemsError as error:
+            config, home = service.configured(service.DEMO if file is None else file, port, folder)
+        except ProblemsError as error:
             for problem in error.messages:
                 typer.echo(f"driftfit: {problem}", err=True)
             raise typer.Exit(2) from None
         if check:
-            say(start.described(config), soft_wrap=True)
+            say(service.described(config), soft_wrap=True)
             return
         with tempfile.TemporaryDirectory(prefix="driftfit-demo-") as temporary:
             home = Path(temporary) if demo and folder is None else home
-            progress.print(start.greeting(config, home), markup=False, highlight=False, soft_wrap=True)
+            progress.print(service.greeting(config, home), markup=False, highlight=False, soft_wrap=True)
             if rebuild:
-                start.rebuild(home)
-            start.run(config, home)
+                service.rebuild(home)
+            service.run(config, home)

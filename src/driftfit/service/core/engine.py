@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from driftfit.service.core.archive import Archive
-from driftfit.service.core.calibration import rules_of
 from driftfit.service.core.intake import Action, Arrived, Intake
 from driftfit.service.core.journal import (
     DAMAGED,
@@ -35,7 +34,7 @@ from driftfit.service.core.journal import (
     Pending,
     check_storable,
 )
-from driftfit.service.core.unit import Out, Unit
+from driftfit.service.core.unit import Out, Unit, rules_of
 from driftfit.service.core.units import Units
 from driftfit.service.settings.config import Config
 

@@ -27,11 +27,9 @@ from driftfit.run.live.rule import FROZEN
 from driftfit.run.parallel_lanes import FEWEST
 from driftfit.run.states import late
 from driftfit.run.states.advance import Advanced, advance
-from driftfit.service.core.blocks import Blocks
 from driftfit.service.core.journal import Rows
-from driftfit.service.core.results import ALARM, OK, THETA, TIME, Y_HAT, Results, Y
-from driftfit.service.core.streams import SAMPLES, USED, Streams
-from driftfit.service.core.unit import Out, Unit
+from driftfit.service.core.results import ALARM, OK, THETA, TIME, Y_HAT, Blocks, Results, Y
+from driftfit.service.core.unit import SAMPLES, USED, Out, Streams, Unit
 from driftfit.service.settings.config import UnitSettings
 
 COLUMNS = ("y_hat", "e", "s", "theta", "var", "ok")

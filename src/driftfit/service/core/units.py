@@ -14,8 +14,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.service.core.journal import Journal, Pending, Rows
 from driftfit.service.core.section import CounterOf, Section, tally
-from driftfit.service.core.streams import SAMPLES
-from driftfit.service.core.unit import Unit
+from driftfit.service.core.unit import SAMPLES, Unit
 from driftfit.service.settings.config import UnitSettings
 from driftfit.service.settings.matching import valid_name
 from driftfit.service.settings.options import ServiceOptions

@@ -161,28 +161,29 @@ def build(kind: type[Made], given: dict[str, Any]) -> Made:
     for key, one in known.items():
         if key not in given and one.default is MISSING and one.default_factory is MISSING:
             raise ValueError(f"the option {key} is missing.")
-    return kind(**{key: _converted(key, value, hints[key]) for key, value in given.items()})
+    return kind(**{key: converted(key, value, hints[key]) for key, value in given.items()})
 
 
-def _converted(key: str, value: Any, hint: Any) -> Any:
+def converted(key: str, value: Any, hint: Any) -> Any:
     """A value of a table in the type of an option."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
-        return _converted(key, value, next(one for one in args if one is not type(None)))
+        return converted(key, value, next(one for one in args if one is not type(None)))
     if hint is Secret:
         return Secret.of(value)
     if origin is typing.Literal:
         if value not in args:
             raise ValueError(f"{key} must be {' or '.join(args)}; got {value!r}.")
         return value
-    if origin is list:
-        if not isinstance(value, list):
+    if origin in (list, tuple):
+        each = [value] if origin is tuple and isinstance(value, str) else value
+        if not isinstance(each, list):
             raise ValueError(f"{key} must be a list; got {value!r}.")
-        return [_converted(key, one, args[0]) for one in value]
+        return origin(converted(key, one, args[0]) for one in each)
     if origin is dict:
         if not isinstance(value, dict):
             raise ValueError(f"{key} must be a table; got {value!r}.")
-        return {name: _converted(f"{key}.{name}", one, args[1]) for name, one in value.items()}
+        return {name: converted(f"{key}.{name}", one, args[1]) for name, one in value.items()}
     if isinstance(value, dict):
         return build(hint, value)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
