@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 import driftfit
 from driftfit import ARX, Kalman, Regression, Track, cli, track, trackers
 from driftfit.cli import main
-from driftfit.cli.parts.arguments import parse_interval
+from driftfit.cli.reading import parse_interval
 from driftfit.data.clock import Clock
 from driftfit.data.files import read_columns
 from driftfit.models.hammerstein_wiener.curves.basis import BSpline, DeadZone, Legendre, PiecewiseLinear, Polynomial

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from driftfit import ARX, Kalman, Live, Track, cli, track
-from driftfit.cli.parts.reading import Part, rows_of
+from driftfit.cli.reading import Part, rows_of
 
 K = Kalman(q=1e-4, r=0.01)
 KALMAN = ["--tracker", "kalman", "-p", "q=1e-4", "-p", "r=0.01"]
@@ -171,7 +171,7 @@ def test_verdict_and_tables_of_eighty_columns(table, monkeypatch):
     printed = run("verdict", *DATED)
     of_run = expected().verdict()
     assert f"p = {of_run.p:.2g}" in " ".join(printed.split()) or "p < 0.0001" in printed
-    monkeypatch.setattr(cli.parts.program.out, "width", 80)
+    monkeypatch.setattr(cli.program.out, "width", 80)
     printed = run("verdict", *DATED)
     assert "…" not in printed
     assert "< 0.0001" in printed

@@ -49,7 +49,7 @@ from driftfit.service.sinks.contract import Event, Outcome
 from driftfit.service.sinks.sqlite import Sqlite
 from driftfit.service.sinks.webhook import Webhook
 from driftfit.service.sources.samples import Batch, Receipt, Samples
-from driftfit.service.threads import TRIES, SinkThread, SourceThread
+from driftfit.service.threads import EVENT_TRIES, SinkThread, SourceThread
 
 
 @contextmanager
@@ -69,7 +69,7 @@ def test_an_event_that_is_refused_is_tried_again_and_then_set_aside(tmp_path, mo
     """A redirect was followed, to another address too, and its answer counted; a 5xx held up all alarms behind it."""
     monkeypatch.setattr("driftfit.service.threads.FIRST_PAUSE", 1e-3)
     monkeypatch.setattr("driftfit.service.threads.LONGEST_PAUSE", 1e-2)
-    with receiver(*[status] * (TRIES + 2)) as url:
+    with receiver(*[status] * (EVENT_TRIES + 2)) as url:
         sink = f'[[sink]]\nkind = "webhook"\nurl = "{url}"\nevents = ["action"]\n'
         config = configured(more=sink)
         engine = opened(config, tmp_path)
@@ -78,18 +78,18 @@ def test_an_event_that_is_refused_is_tried_again_and_then_set_aside(tmp_path, mo
         with running(engine, runner):
             for k in range(3):
                 engine.act("a", {"do": "hold", "on": True, "who": "Ann", "why": f"test {k}"})
-            until(lambda: len(Receiver.got) == TRIES + 4 and engine.progress)
+            until(lambda: len(Receiver.got) == EVENT_TRIES + 4 and engine.progress)
         engine.close()
     with pytest.raises(ValueError, match="without a password"):
         Webhook("w", "https://me:secret@host/").check()
     keys = [key for key, *_ in Receiver.got]
-    assert [keys.count(key) for key in dict.fromkeys(keys)] == [TRIES, 3, 1]  # each is sent once it is taken
+    assert [keys.count(key) for key in dict.fromkeys(keys)] == [EVENT_TRIES, 3, 1]  # each is sent once it is taken
     assert runner.status()["set_aside"] == 1
-    assert runner.failures == TRIES + 1
+    assert runner.failures == EVENT_TRIES + 1
     with sqlite3.connect(tmp_path / "driftfit.db") as db:
         ((name, unit, tries, why, detail),) = db.execute("select sink, unit, tries, why, detail from undelivered")
     db.close()
-    assert (name, unit, tries, why) == ("webhook-1", "a", TRIES, f"127.0.0.1 answered {status}")
+    assert (name, unit, tries, why) == ("webhook-1", "a", EVENT_TRIES, f"127.0.0.1 answered {status}")
     assert json.loads(detail)["why"] == "test 0"
 
 
@@ -309,12 +309,12 @@ def test_new_units_are_limited_by_client_and_those_that_had_few_samples_are_forg
     assert left["too many new units"] == engine.units.refused["too many new units"] == 60
     engine._store_states(everything=True)
     settled(engine)
-    monkeypatch.setattr("driftfit.service.core.units.QUIET", -1.0)
+    monkeypatch.setattr("driftfit.service.core.units.QUIET_SECONDS", -1.0)
     for _ in range(2):
         engine.step(0.0)
     assert [one.name for one in engine.units.resident] == ["good"]
     capacity = engine.units.sections[0].streams.capacity
-    monkeypatch.setattr("driftfit.service.core.units.QUIET", 1e9)
+    monkeypatch.setattr("driftfit.service.core.units.QUIET_SECONDS", 1e9)
     for k in range(15):
         feed(engine, message(f"plant/other{k}", [0.0], y[:1], u[:1]))
     for again in range(2):  # a unit that was forgotten is there again, as it was; also for another process

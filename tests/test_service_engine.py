@@ -28,7 +28,7 @@ from service_support import (
 from driftfit import ARX, DataWarning, track
 from driftfit.run.states.advance import advance
 from driftfit.service.core.archive import export
-from driftfit.service.core.engine import KEPT
+from driftfit.service.core.engine import KEPT_GROUPS
 from driftfit.service.core.intake import Intake
 from driftfit.service.core.section import Section
 from driftfit.service.sources.samples import Batch
@@ -63,9 +63,9 @@ def test_states_and_results_are_those_of_track(engine):
 
 
 def test_sinks_see_results_once_before_and_after_these_are_stored(engine):
-    y, u = record(KEPT + 6)
+    y, u = record(KEPT_GROUPS + 6)
     seen, at = [], 0
-    for k in range(KEPT + 5):
+    for k in range(KEPT_GROUPS + 5):
         feed(engine, message("plant/a", [k], y[k : k + 1], u[k : k + 1]))
         found = engine.after(at, engine.journal) if k % 7 == 0 else []  # sometimes slower than memory reaches back
         seen += [row for group in found for part in group.parts for row in part.rows()]
@@ -78,7 +78,7 @@ def test_sinks_see_results_once_before_and_after_these_are_stored(engine):
         seen += [row for group in found for part in group.parts for row in part.rows()]
         at = found[-1].first
     assert repr(seen) == repr(results_of(engine))
-    assert len(seen) == KEPT + 5
+    assert len(seen) == KEPT_GROUPS + 5
 
 
 def test_a_new_process_continues_with_the_same_bits(tmp_path):
@@ -272,7 +272,7 @@ def test_alarms_from_a_frozen_reference(tmp_path):
 
 
 def test_a_full_disk_holds_back_and_loses_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr("driftfit.service.core.engine.RETRY", 0.2)
+    monkeypatch.setattr("driftfit.service.core.engine.RETRY_SECONDS", 0.2)
     y, u = record(100)
     engine = opened(configured(), tmp_path)
     feed(engine, message("plant/a", range(50), y[:50], u[:50]))
@@ -380,7 +380,7 @@ def test_old_journals_become_parquet(tmp_path, monkeypatch):
     assert export(tmp_path, engine.journal.first_needed(), time.time() + 1) == 0  # the states are not stored
     engine._store_states(everything=True)
     engine._commit()
-    monkeypatch.setattr("driftfit.service.core.archive.EVERY", -1.0)
+    monkeypatch.setattr("driftfit.service.core.archive.SEARCH_SECONDS", -1.0)
     for _ in range(100):
         engine.step(0.0)
         if not engine.journal.rows_of(1)[0]:

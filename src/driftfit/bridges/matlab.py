@@ -236,7 +236,6 @@ def _plain(value: Any) -> Any:
 
 
 def _texts(value: Any) -> tuple[str, ...]:
-    """Text as a tuple of strings."""
     if value is None:
         return ()
     if isinstance(value, tuple):

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 from rich.text import Text
 
-from driftfit.cli.parts.options import Given, reads
-from driftfit.cli.parts.program import app, say
-from driftfit.cli.parts.reading import interval_from, moment
-from driftfit.cli.track import Plot, Report
+from driftfit.cli.options import Given, Plot, Report, Table, check_table, reads
+from driftfit.cli.program import app, say
+from driftfit.cli.reading import interval_from, moment
 from driftfit.engine.settings import marks
 from driftfit.results import Track
 from driftfit.show.export import write_table
@@ -50,15 +48,14 @@ def detect(
     labels: Annotated[
         str | None, typer.Option(help="Column of labels, 0 or 1, that mark faults; the alarms are scored.")
     ] = None,
-    write_to: Annotated[Path | None, typer.Option("--out", help="Write the alarms to .csv or .parquet.")] = None,
+    write_to: Table = None,
     plot: Plot = None,
     report: Report = None,
 ) -> None:
     """Find alarms at a set rate of false alarms; with labels, score them."""
     if labels is not None and (given.by or len(given.outputs) > 1):
         raise ValueError("--labels: labels are for one series of one output; leave out --by and further --y.")
-    if write_to is not None and write_to.suffix.lower() not in (".csv", ".parquet"):
-        raise ValueError(f"--out {write_to}: alarms are written to .csv or .parquet.")
+    check_table(write_to, "alarms are")
     if report is not None:
         check_path(report)
     rows = given.read(labels) if labels is not None else None
@@ -73,8 +70,7 @@ def detect(
         found = f" Labels: {score.found} of {score.events} found{late};"
         say(Text(f"{found} {score.false} false alarms in {score.normal} normal samples."), soft_wrap=True)
     if write_to is not None:
-        found = alarms.table
-        write_table(found, write_to)
+        write_table(alarms.table, write_to)
     if plot is not None:
         if not isinstance(run, Track):
             raise ValueError("--plot: alarms are drawn for one series; use --report for a fleet.")

@@ -8,9 +8,9 @@ import numpy as np
 import typer
 from rich.text import Text
 
-from driftfit.cli.parts.options import Given, reads
-from driftfit.cli.parts.program import app, progress, say
-from driftfit.cli.track import Plot
+from driftfit.cli.options import Given, Plot, reads
+from driftfit.cli.program import app, progress, say
+from driftfit.cli.reading import listed
 from driftfit.parsing.settings import given_fields
 from driftfit.readings.left_out import LeftOut, remarks_of
 from driftfit.show.parts.text import facts, shortened, table_of
@@ -72,3 +72,27 @@ def _typed(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return str(value).lower()
     return ",".join(f"{x:.6g}" for x in np.ravel(value)) if np.ndim(value) or isinstance(value, float) else str(value)
+
+
+@app.command()
+@reads
+def select(
+    given: Given,
+    keep: Annotated[list[str] | None, typer.Option(help="Regressor that every subset contains; repeat it.")] = None,
+    most: Annotated[int | None, typer.Option(help="Largest number of regressors in a subset.")] = None,
+    plot: Plot = None,
+) -> None:
+    """Compare models (repeat --model), or the regressors of one, by how well they predict."""
+    from driftfit.judge.structures.select import Selection
+    from driftfit.judge.structures.select import select as compare
+
+    models = given.models()
+    with progress.status("comparing"):
+        selection = compare(
+            models if len(models) > 1 else models[0], tracker=given.chosen_tracker(), keep=tuple(listed(keep)),
+            most=most, **given.arrays(),
+        )  # fmt: skip
+    say(selection)
+    assert isinstance(selection, Selection)  # `arrays` are of one output
+    if plot is not None:
+        selection.plot().savefig(plot, dpi=150)

@@ -69,7 +69,6 @@ class Expressions:
         raise TranslationError(f"{self.source.__qualname__}: no translation of `{ast.unparse(node)}`.")
 
     def value(self, node: ast.expr, statement: bool = False) -> Value:
-        """Translate an expression."""
         if isinstance(node, ast.Call):
             return self.call(node, statement)
         handler = getattr(self, f"of_{type(node).__name__.lower()}", None)

@@ -45,7 +45,8 @@ def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
     )  # fmt: skip
     test = selftest(program.model, program.tracker, program.gate)
     return {
-        "tracker.h": header, "tracker.c": source, "selftest.c": test, "tracker_sfun.c": templates.SFUNCTION, "README.md": readme
+        "tracker.h": header, "tracker.c": source, "selftest.c": test, "tracker_sfun.c": templates.SFUNCTION,
+        "README.md": readme,
     }  # fmt: skip
 
 
@@ -120,7 +121,6 @@ def _face(made: Translation, memory: set[str], gated: bool) -> str:
 
 
 def _copied(to: str, source: str, size: int) -> str:
-    """A statement that copies a field."""
     return f"{to} = {source};" if size == 1 else f"for (int i = 0; i < {size}; i++) {{ {to}[i] = {source}[i]; }}"
 
 

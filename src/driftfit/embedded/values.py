@@ -46,7 +46,6 @@ class Value:
 
     @property
     def known(self) -> bool:
-        """Whether its value is a constant."""
         return self.constant is not None
 
     def key(self) -> tuple[Any, ...]:
@@ -58,7 +57,6 @@ class Value:
 
 
 def number(value: Any) -> Value:
-    """A constant number."""
     if isinstance(value, bool | np.bool_):
         return Value("bool", "1" if value else "0", bool(value))
     if isinstance(value, int | np.integer):
@@ -239,7 +237,6 @@ class Unit:
         """The largest extent in the record: the upper bound of loops about which nothing else is known."""
 
     def field(self, name: str) -> Value:
-        """A field of the record."""
         return field(name, self.record[name][0], name in self.flags)
 
     def start_of(self, name: str) -> Any:

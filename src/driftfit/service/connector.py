@@ -42,7 +42,6 @@ class EventLoop:
         return asyncio.run_coroutine_threadsafe(work, self.loop).result(seconds)
 
     def end(self) -> None:
-        """Stop the loop and its thread."""
         self.loop.call_soon_threadsafe(self.loop.stop)
         self.thread.join(5.0)
         self.loop.close()

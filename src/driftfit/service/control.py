@@ -51,7 +51,6 @@ class Control(threading.Thread):
             threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
 
     def close(self) -> None:
-        """Stop listening."""
         self.listener.close()
         self.path.unlink(missing_ok=True)
 
@@ -119,7 +118,6 @@ def receive(file: Any) -> tuple[dict[str, Any], bytes] | None:
 
 
 def packed(header: dict[str, Any], body: bytes = b"") -> bytes:
-    """A message."""
     text = json.dumps(header).encode()
     return struct.pack(">I", len(text)) + text + struct.pack(">I", len(body)) + body
 

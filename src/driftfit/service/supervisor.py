@@ -48,7 +48,6 @@ class JsonLines(logging.Formatter):
 
 
 def log_to_stderr(level: str) -> None:
-    """Structured logs."""
     handler = logging.StreamHandler()
     handler.setFormatter(JsonLines())
     log.handlers[:] = [handler]
@@ -116,7 +115,6 @@ class Service:
         }  # fmt: skip
 
     def run(self, signals: bool = True) -> None:
-        """Work until `stop`."""
         if signals:
             for one in (signal.SIGTERM, signal.SIGINT):
                 signal.signal(one, lambda *_: self.stop())
@@ -139,7 +137,6 @@ class Service:
             self._end_page()
 
     def stop(self) -> None:
-        """Let `run` return."""
         self._stopping.set()
         for one in self.sources:
             one.stop()
@@ -219,7 +216,6 @@ def configured(file: Path, port: int | None, folder: Path | None) -> tuple[Confi
 
 
 def described(config: Config) -> str:
-    """A valid configuration in words."""
     lines = [f"The configuration is valid: {len(config.sources)} sources, {len(config.units)} sections of units, "
              f"{len(config.sinks)} sinks."]  # fmt: skip
     for unit in config.units:
@@ -232,7 +228,6 @@ def described(config: Config) -> str:
 
 
 def greeting(config: Config, folder: Path) -> str:
-    """The messages at the start."""
     page = config.page
     scheme = "https" if page.certificate else "http"
     where = f"{scheme}://{page.host}:{page.port}/" if page.enabled else "no page"
@@ -245,6 +240,5 @@ def rebuild(folder: Path) -> None:
 
 
 def run(config: Config, folder: Path) -> None:
-    """Run until a signal."""
     log_to_stderr(config.service.log)
     Service(config, folder).run()

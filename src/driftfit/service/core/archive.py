@@ -19,11 +19,11 @@ from driftfit.service.core.journal import Act, Journal, Pending
 from driftfit.service.settings.options import ServiceOptions
 
 log = logging.getLogger("driftfit.service")
-EVERY = 60.0
+SEARCH_SECONDS = 60.0
 """Seconds between two searches."""
-PIECE = 2_000
+PIECE_GROUPS = 2_000
 """Groups of one piece."""
-DAY = 86_400.0
+DAY_SECONDS = 86_400.0
 OLD = "stop < ? and stop > 1e8"
 """Which blocks of the history are older than a time; those of units without times are kept."""
 
@@ -47,7 +47,7 @@ class Archive:
                 pending.forget.append(("delete from log where first < ?", (upto,)))
                 pending.forget.append(("delete from chain where number < ?", (upto,)))
             self._writing = None
-        if time.monotonic() - self._looked < EVERY or self._writing is not None:
+        if time.monotonic() - self._looked < SEARCH_SECONDS or self._writing is not None:
             return
         self._looked = time.monotonic()
         self.begin(pending, journal, sinks_at)
@@ -56,19 +56,19 @@ class Archive:
         """Look for old rows; results that no sink has written yet are not deleted without an event."""
         now, needed = time.time(), journal.first_needed()
         query = "select count(*) from result where at < ? and first > ?"
-        ((lost,),) = journal.db.execute(query, (now - DAY * self.options.results, sinks_at))
+        ((lost,),) = journal.db.execute(query, (now - DAY_SECONDS * self.options.results, sinks_at))
         if lost:
             why = f"{lost} groups of results are older than {self.options.results} days, and a sink was away"
             log.error("lost", extra={"detail": why})
             pending.add_event(sinks_at, 0, now, "lost", {"why": why})
-        old = now - DAY * self.options.history
+        old = now - DAY_SECONDS * self.options.history
         pending.forget += [
             ("delete from result where at < ? and first < ?", (now - 60.0, min(needed, sinks_at))),
-            ("delete from result where at < ?", (now - DAY * self.options.results,)),
+            ("delete from result where at < ?", (now - DAY_SECONDS * self.options.results,)),
             (f"delete from history where (unit, first) in (select unit, first from block where {OLD})", (old,)),
             (f"delete from block where {OLD}", (old,)),
         ]
-        self._writing = self._pool.submit(export, self.folder, needed, now - DAY * self.options.keep)
+        self._writing = self._pool.submit(export, self.folder, needed, now - DAY_SECONDS * self.options.keep)
 
 
 def export(folder: Path, needed: int, before: float) -> int:
@@ -79,7 +79,7 @@ def export(folder: Path, needed: int, before: float) -> int:
     journal = Journal(folder, read_only=True)
     try:
         query = "select first, count from log where at < ? and first + count <= ? order by first limit ?"
-        found = journal.db.execute(query, (before, needed, PIECE)).fetchall()
+        found = journal.db.execute(query, (before, needed, PIECE_GROUPS)).fetchall()
         if not found:
             return 0
         first, upto = found[0][0], found[-1][0] + found[-1][1]

@@ -60,7 +60,6 @@ class Intake:
         return True
 
     def act(self, action: Action) -> None:
-        """Add an action."""
         with self._changed:
             self._actions.append(action)
             self._changed.notify_all()

@@ -95,18 +95,15 @@ class Rows(NamedTuple):
         return len(self.unit)
 
     def some(self, which: Array) -> Rows:
-        """Some of the samples."""
         time = None if self.time is None else self.time[which]
         return Rows(self.section, self.unit[which], time, self.values[which])
 
     def plain(self) -> list[Any]:
-        """The columns as bytes."""
         time = None if self.time is None else self.time.tobytes()
         return [self.section, self.unit.tobytes(), time, self.values.tobytes()]
 
     @classmethod
     def of(cls, section: int, unit: bytes, time: bytes | None, values: bytes) -> Rows:
-        """The inverse of `plain`."""
         units = np.frombuffer(unit, np.int32)
         times = None if time is None else np.frombuffer(time)
         return cls(section, units, times, np.frombuffer(values).reshape(len(units), -1))
@@ -120,7 +117,6 @@ class Act(NamedTuple):
     length: int = 1
 
     def plain(self) -> list[Any]:
-        """As numbers, texts and so on."""
         return [self.unit, self.action]
 
 
@@ -244,7 +240,6 @@ class Journal:
         return str(rows[0][1]) if rows else None
 
     def next_number(self) -> int:
-        """The number of the next sample."""
         return int(self.meta("next") or 1)
 
     def head(self) -> bytes:
@@ -260,7 +255,6 @@ class Journal:
         return int(self.meta(NEEDED_FROM) or 1)
 
     def positions(self) -> dict[str, Any]:
-        """The positions of sources and sinks."""
         return {name: msgspec.json.decode(value) for name, value in self.certain("position")}
 
     def groups(self, first: int) -> Iterator[tuple[int, list[Item]]]:
@@ -404,7 +398,6 @@ class Names:
         self.about: dict[str, dict[str, Any]] = {}
 
     def read(self) -> None:
-        """Add the units that are new."""
         for number, name, section, topic, _, about in self._journal.units(max(self.names, default=0)):
             self.names[number] = name
             self.about[name] = msgspec.json.decode(about) | {"topic": topic, "section": section, "number": number}

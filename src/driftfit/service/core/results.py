@@ -33,7 +33,6 @@ class Results(NamedTuple):
 
     @property
     def n(self) -> int:
-        """Number of parameters."""
         return int(self.values.shape[1] - THETA) // 2
 
     @property
@@ -47,7 +46,6 @@ class Results(NamedTuple):
         return self.values[:, THETA + self.n :]
 
     def some(self, which: Any) -> Results:
-        """Some of the rows."""
         return Results(*(column[which] for column in self))
 
     def last(self) -> Results:
@@ -65,18 +63,16 @@ class Results(NamedTuple):
         return found
 
     def plain(self) -> tuple[bytes, bytes, bytes, bytes]:
-        """The columns as bytes."""
         return self.number.tobytes(), self.unit.tobytes(), self.flags.tobytes(), self.values.tobytes()
 
     @classmethod
     def of(cls, number: bytes, unit: bytes, flags: bytes, values: bytes) -> Results:
-        """The inverse of `plain`."""
         numbers = np.frombuffer(number, np.int64)
         shaped = np.frombuffer(values).reshape(len(numbers), -1)
         return cls(numbers, np.frombuffer(unit, np.int32), np.frombuffer(flags, np.uint8), shaped)
 
 
-SIZE = 64
+BLOCK_SAMPLES = 64
 FIXED = ("time", "y", "y_hat", "e", "e_std")
 
 
@@ -84,37 +80,34 @@ class Blocks:
     """The results of the units of a section that are not yet in the history; a unit is known by its place."""
 
     def __init__(self, columns: int) -> None:
-        self._values = np.empty((0, SIZE, columns))
+        self._values = np.empty((0, BLOCK_SAMPLES, columns))
         self._state: Array = np.zeros((0, 3), np.int64)
         """(count, first number, last number) of each unit."""
 
     @property
     def capacity(self) -> int:
-        """Units for which there is room."""
         return len(self._state)
 
     @property
     def columns(self) -> int:
-        """Numbers of a result."""
         return int(self._values.shape[2])
 
     def grow(self, capacity: int) -> None:
-        """Make room for more units."""
         more = capacity - self.capacity
         self._values = np.concatenate([self._values, np.empty((more, *self._values.shape[1:]))])
         self._state = np.concatenate([self._state, np.zeros((more, 3), np.int64)])
 
     def add(self, places: Array, results: Results) -> list[tuple[Any, ...]]:
         """Add results, sorted by place (N,); the rows of the table ``block`` for the blocks that they complete."""
-        most = len(places) // SIZE + np.count_nonzero(places[1:] != places[:-1]) + 1
-        rows, about = np.empty((most, SIZE, self.columns)), np.zeros((most + 1, 3), np.int64)
+        most = len(places) // BLOCK_SAMPLES + np.count_nonzero(places[1:] != places[:-1]) + 1
+        rows, about = np.empty((most, BLOCK_SAMPLES, self.columns)), np.zeros((most + 1, 3), np.int64)
         _add(results.number, places, results.values, self._values, self._state, rows, about)
         about = about[: about[-1, 0]]
         rows = rows[: len(about)]
         units, extremes = results.unit[about[:, 0]].tolist(), extremes_of(rows)
         start, stop = (rows[:, k, TIME].tolist() for k in (0, -1))
         return [
-            (*one, SIZE, rows[k].tobytes(), extremes[k].tobytes())
+            (*one, BLOCK_SAMPLES, rows[k].tobytes(), extremes[k].tobytes())
             for k, one in enumerate(zip(units, *about[:, 1:].T.tolist(), start, stop, strict=True))
         ]
 
@@ -151,8 +144,8 @@ def _add(number: Array, places: Array, given: Array, values: Array, state: Array
             state[p, 1] = number[i]
         if k == 0 or number[i] > state[p, 2]:
             state[p, 2] = number[i]
-        if k + 1 == SIZE:
-            for t in range(SIZE):
+        if k + 1 == BLOCK_SAMPLES:
+            for t in range(BLOCK_SAMPLES):
                 for c in range(given.shape[1]):
                     rows[complete, t, c] = values[p, t, c]
             about[complete, 0], about[complete, 1], about[complete, 2] = i, state[p, 1], state[p, 2]

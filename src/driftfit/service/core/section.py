@@ -61,7 +61,6 @@ class Section:
         self.blocks = Blocks(THETA + 2 * self.streams.program.model.n)
 
     def add(self, number: int, name: str) -> Unit:
-        """A new unit."""
         unit = Unit(number, name, self.streams, self.streams.add(number))
         if unit.place == self.blocks.capacity:
             self.blocks.grow(self.streams.capacity)

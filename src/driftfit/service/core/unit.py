@@ -57,7 +57,6 @@ class Unit:
 
     @property
     def settings(self) -> UnitSettings:
-        """Those of its streams."""
         return self.streams.settings
 
     @property
@@ -79,12 +78,10 @@ class Unit:
 
     @property
     def limits(self) -> dict[str, tuple[float, float]]:
-        """Valid ranges by signal."""
         return dict(zip(self.settings.columns, map(tuple, self.streams.limits[self.place].tolist()), strict=True))
 
     @property
     def live(self) -> Live:
-        """Its stream, as a copy."""
         return self.streams.stream(self.place)
 
     @property
@@ -185,7 +182,6 @@ class Unit:
         return dict(zip(now.names, now.lag_prob[0].tolist(), strict=False))
 
     def state(self) -> bytes:
-        """The state as bytes."""
         alarms = [alarm.plain() for alarm in self.alarms]
         kept = [self.streams.packed(self.place), dict(self.rare), self.failure, self.acknowledged, self.unarmed,
                 self.reference.tobytes(), alarms, self.alarmed]  # fmt: skip
@@ -213,7 +209,6 @@ class Out:
         self.to_calibrate: list[int] = []
 
     def event(self, number: int, unit: int, kind: str, detail: Mapping[str, Any]) -> None:
-        """Note an event."""
         self.events.append([number, unit, wall.time(), kind, detail])
 
 
@@ -262,7 +257,6 @@ class Streams:
 
     @property
     def capacity(self) -> int:
-        """Units for which there is room."""
         return len(self.begun)
 
     def add(self, number: int) -> int:
@@ -301,7 +295,6 @@ class Streams:
         return known
 
     def stream(self, place: int) -> Live:
-        """The stream of a unit, as a copy."""
         settings, before = self.settings, None
         if self.begun[place]:
             tile, last = self.program.tile(), float(self.last[place])
@@ -332,7 +325,6 @@ class Streams:
         return self.program.layout.tag, json.dumps(described)
 
     def packed(self, place: int) -> list[Any]:
-        """The state of a unit as plain data."""
         time, rows = self.waiting.of(place)
         state = self.program.layout.pack(self.words[place]) if self.begun[place] else b""
         return [state, self.last[place].item(), self.newest[place].item(), bool(self.held[place]),

@@ -35,7 +35,6 @@ def main() -> None:
 
 
 def _watch() -> None:
-    """End with the service."""
     while sys.stdin.read(1):
         pass
     os._exit(0)

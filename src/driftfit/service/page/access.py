@@ -36,9 +36,9 @@ LOCAL = UserOptions("local", "operator", token="sha256$")
 OPEN = ("/healthz", "/api/login", "/login", "/static/", "/favicon.ico")
 """Paths that need no user."""
 SAMPLES = "/api/samples"
-BURST = 4.0
+BURST_SECONDS = 4.0
 """Seconds of a client's rate that it may use at once."""
-CLIENTS = 10_000
+KNOWN_CLIENTS = 10_000
 HEADERS = [
     (b"content-security-policy", b"default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
      b"frame-ancestors 'none'; base-uri 'none'; form-action 'self'"),
@@ -51,17 +51,16 @@ HEADERS = [
 class Rates:
     """Token buckets by client."""
 
-    def __init__(self, rate: float, burst: float = BURST) -> None:
+    def __init__(self, rate: float, burst: float = BURST_SECONDS) -> None:
         self.rate, self.most = rate, rate * burst
         self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def allows(self, client: str) -> bool:
-        """Whether the client may ask now."""
         now = time.monotonic()
         left, then = self._left.pop(client, (self.most, now))
         left = min(self.most, left + (now - then) * self.rate)
         self._left[client] = (left - (left >= 1.0), now)
-        if len(self._left) > CLIENTS:
+        if len(self._left) > KNOWN_CLIENTS:
             self._left.popitem(last=False)
         return left >= 1.0
 
@@ -177,9 +176,9 @@ def _without_port(host: str) -> str:
     return name.lower() if colon and port.isdigit() else host.lower()
 
 
-N, R, P = 1 << 14, 8, 1
+SCRYPT_N, SCRYPT_R, SCRYPT_P = 1 << 14, 8, 1
 """Cost of scrypt: 16 MB and some fifty milliseconds."""
-SESSION = 12 * 3600.0
+SESSION_SECONDS = 12 * 3600.0
 """Seconds for which a session is valid."""
 
 
@@ -188,15 +187,15 @@ def hashed(password: str) -> str:
     if len(password) < 10:
         raise ValueError("a password needs at least 10 characters.")
     salt = secrets.token_bytes(16)
-    return f"scrypt${N}${base64.b64encode(salt).decode()}${base64.b64encode(_scrypt(password, salt, N)).decode()}"
+    parts = (base64.b64encode(one).decode() for one in (salt, _scrypt(password, salt, SCRYPT_N)))
+    return "$".join(["scrypt", str(SCRYPT_N), *parts])
 
 
 def _scrypt(password: str, salt: bytes, n: int) -> bytes:
-    return hashlib.scrypt(password.encode(), salt=salt, n=n, r=R, p=P, maxmem=64 << 20, dklen=32)
+    return hashlib.scrypt(password.encode(), salt=salt, n=n, r=SCRYPT_R, p=SCRYPT_P, maxmem=64 << 20, dklen=32)
 
 
 def password_fits(password: str, stored: str) -> bool:
-    """Whether a password has the stored hash."""
     try:
         _, n, salt, key = stored.split("$")
         return hmac.compare_digest(_scrypt(password, base64.b64decode(salt), int(n)), base64.b64decode(key))
@@ -211,12 +210,10 @@ def new_token() -> list[str]:
 
 
 def token_hash(token: str) -> str:
-    """The hash of a token."""
     return f"sha256${hashlib.sha256(token.encode()).hexdigest()}"
 
 
 def token_fits(token: str, stored: str) -> bool:
-    """Whether a token has the stored hash."""
     return hmac.compare_digest(token_hash(token), stored)
 
 
@@ -224,8 +221,8 @@ class Sessions:
     """Open sessions: random tokens, of which only hashes are stored.
 
     They are in the service's folder, so they outlive a restart of the page. An absent, empty or damaged file holds no
-    session: everybody logs in again. A session ends at its logout, after `SESSION` seconds, and when the password of
-    its user is another one.
+    session: everybody logs in again. A session ends at its logout, after `SESSION_SECONDS`, and when its user has
+    another password.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -239,7 +236,7 @@ class Sessions:
         """The token of a new session."""
         token, now = secrets.token_urlsafe(32), time.time()
         self._open = {one: about for one, about in self._open.items() if about[1] > now}
-        self._open[token_hash(token)] = (_login_of(user), now + SESSION)
+        self._open[token_hash(token)] = (_login_of(user), now + SESSION_SECONDS)
         self._store()
         return token
 
@@ -249,7 +246,6 @@ class Sessions:
         return next((one for one in users if _login_of(one) == login and until > time.time()), None)
 
     def end(self, token: str) -> None:
-        """Log out."""
         if self._open.pop(token_hash(token), None) is not None:
             self._store()
 

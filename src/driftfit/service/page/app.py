@@ -26,7 +26,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from driftfit.data.formats.csv_files import without_formulas
 from driftfit.service.control import health
-from driftfit.service.page.access import COOKIE, SESSION, Access, Rates, Sessions, password_fits
+from driftfit.service.page.access import COOKIE, SESSION_SECONDS, Access, Rates, Sessions, password_fits
 from driftfit.service.page.feed import Feed, column_names, columns_of, newest_blocks, reduced, samples
 from driftfit.service.page.openapi import ACTIONS, OPERATIONS, description
 from driftfit.service.settings.options import PageOptions
@@ -50,7 +50,6 @@ class Page:
         self.scrypt = asyncio.Semaphore(1)
 
     def app(self) -> Starlette:
-        """The application."""
         api: list[BaseRoute] = [
             *(Route(one.path, getattr(self, one.name), methods=[one.method.upper()]) for one in OPERATIONS),
             Route("/api/openapi.json", lambda request: JSONResponse(description())),
@@ -96,7 +95,6 @@ class Page:
         return found
 
     async def units(self, request: Request) -> Response:
-        """The units that drift most, or those whose name contains ``search``."""
         search = request.query_params.get("search", "").lower()[:200]
         if not search:
             return Answer({"units": self.feed.fleet, "count": len(self.feed.names.names)})
@@ -109,7 +107,6 @@ class Page:
         return Answer({"units": found, "count": len(found)})
 
     async def unit(self, request: Request) -> Response:
-        """Everything about a unit now."""
         name = request.path_params["unit"]
         number = self.number(name)
         row = self.feed.latest.get(number)
@@ -129,7 +126,6 @@ class Page:
         return Answer({"unit": name, "about": about, "now": now, "state": state})
 
     async def history(self, request: Request) -> Response:
-        """Least, largest and mean of each column of a range, in at most ``points`` parts."""
         start, stop = _range(request)
         points = min(max(int(_number(request, "points", 600.0)), 10), 5000)
         name = request.query_params.get("unit", "")
@@ -139,7 +135,6 @@ class Page:
         return Answer({"unit": name, "columns": column_names(self.feed.names.about[name]), **found})
 
     async def export(self, request: Request) -> Response:
-        """All columns of a range, as CSV or an Arrow file."""
         start, stop = _range(request)
         name, kind = request.query_params.get("unit", ""), request.query_params.get("format", "csv")
         number = self.number(name)
@@ -163,7 +158,6 @@ class Page:
         return Response(await run_in_threadpool(made), media_type=types[kind], headers=headers)
 
     async def events(self, request: Request) -> Response:
-        """The last events, of one unit or of all."""
         limit = min(max(int(_number(request, "limit", 100.0)), 1), 1000)
         name = request.query_params.get("unit")
         where, values = ("where unit = ?", [self.number(name)]) if name else ("", [])
@@ -176,16 +170,13 @@ class Page:
         return Answer({"events": found})
 
     async def status(self, request: Request) -> Response:
-        """Numbers of the service."""
         return Answer(self.feed.status | {"viewers": self.sockets.count, "healthy": self.feed.healthy})
 
     async def me(self, request: Request) -> Response:
-        """Who asks."""
         user = request.scope["user"]
         return Answer({"name": user.name, "role": user.role, "login": bool(self.options.user)})
 
     async def samples(self, request: Request) -> Response:
-        """Take samples; the answer comes when they are in the journal."""
         user = request.scope["user"]
         if user.role == "viewer":
             raise HTTPException(403, f"{user.name} is a viewer; this needs a sender or an operator")
@@ -210,7 +201,6 @@ class Page:
         return await self.asked({"do": "act", "unit": name, "action": given})
 
     async def asked(self, header: dict[str, Any], body: bytes = b"") -> Response:
-        """The engine's answer."""
         try:
             answer = await self.feed.ask(header, body)
         except (OSError, asyncio.IncompleteReadError):
@@ -218,14 +208,12 @@ class Page:
         return Answer(answer, answer.pop("status", 200))
 
     def operator(self, request: Request) -> str:
-        """The name of the user, who must be an operator."""
         user = request.scope["user"]
         if user.role != "operator":
             raise HTTPException(403, f"{user.name} is a viewer; this needs an operator")
         return str(user.name)
 
     async def login(self, request: Request) -> Response:
-        """A session, for a name and a password."""
         client = request.client.host if request.client else "local"
         if not self.logins.allows(client):
             raise HTTPException(429, "too many attempts; wait a while")
@@ -243,23 +231,20 @@ class Page:
         response = Answer({"name": name, "role": found.role})
         secure = bool(self.options.certificate) or self.options.behind_proxy
         response.set_cookie(
-            COOKIE, self.sessions.new(found), max_age=int(SESSION), httponly=True, samesite="strict", secure=secure
+            COOKIE, self.sessions.new(found), int(SESSION_SECONDS), httponly=True, samesite="strict", secure=secure
         )
         return response
 
     async def logout(self, request: Request) -> Response:
-        """End the session."""
         self.sessions.end(request.cookies.get(COOKIE, ""))
         response = Answer({})
         response.delete_cookie(COOKIE)
         return response
 
     async def metrics(self, request: Request) -> Response:
-        """For Prometheus."""
         return PlainTextResponse(metrics_of(self.feed, self.sockets.count), media_type=METRICS_TYPE)
 
     async def healthz(self, request: Request) -> Response:
-        """200 if the engine answers and the journal can be written; with what does not work besides."""
         return JSONResponse(*health(self.feed.status, self.feed.alive, request.scope["user"] is not None))
 
 

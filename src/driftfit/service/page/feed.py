@@ -137,7 +137,6 @@ class Feed:
 
     @property
     def trouble(self) -> dict[str, dict[str, str]]:
-        """By unit: what does not work, and why."""
         return dict(self.status.get("trouble", {}))
 
     def shown(self, name: str, now: float) -> dict[str, Any]:
@@ -158,7 +157,6 @@ class Feed:
         }  # fmt: skip
 
     def find(self, name: str) -> int | None:
-        """The number of a unit."""
         about = self.names.about.get(name)
         if about is None:
             self.names.read()
@@ -205,7 +203,6 @@ class Feed:
 
     @property
     def alive(self) -> bool:
-        """Whether the engine answers."""
         return time.monotonic() - self.answered < 10.0
 
     @property
@@ -215,7 +212,6 @@ class Feed:
 
 
 def column_names(about: Any) -> list[str]:
-    """Names of the columns."""
     return [*FIXED, *about["names"], *(f"std {name}" for name in about["names"])]
 
 
@@ -296,7 +292,6 @@ def _joined(blocks: list[tuple[Array, int]]) -> tuple[Array, int]:
 
 
 def _as_lists(found: list[tuple[Array, int]]) -> dict[str, Any]:
-    """Columns as lists."""
     kinds = ("low", "high", "mean")
     columns = {kind: np.stack([one[k] for one, _ in found]).T.tolist() if found else [] for k, kind in enumerate(kinds)}
     return {"count": sum(count for _, count in found), **columns}

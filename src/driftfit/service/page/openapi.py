@@ -39,7 +39,6 @@ class Operation(NamedTuple):
     method: str = "get"
 
     def described(self) -> dict[str, Any]:
-        """The operation in OpenAPI."""
         found: dict[str, Any] = {
             "summary": self.summary,
             "responses": {
@@ -63,7 +62,6 @@ class Operation(NamedTuple):
 
     @property
     def public(self) -> str:
-        """The path in OpenAPI."""
         return self.path.replace("{unit:path}", "{id}").replace(":path", "")
 
 
@@ -89,7 +87,6 @@ OPERATIONS = (
 
 
 def description() -> dict[str, Any]:
-    """The description of the interface."""
     return {
         "openapi": "3.1.0",
         "info": {"title": "driftfit serve", "version": __version__},

@@ -1,0 +1,1 @@
+"""The configuration: options of a TOML file, and the topics of units."""

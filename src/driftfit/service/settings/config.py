@@ -93,11 +93,9 @@ class UnitSettings:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the output and the inputs."""
         return (self.y, *self.u)
 
     def live(self) -> Live:
-        """A new stream."""
         return Live(self.model, self.tracker, dt=self.dt, gate=self.gate)
 
 
@@ -118,7 +116,6 @@ def read(path: Path) -> Config:
 
 
 def parse(text: str, name: str = "configuration") -> Config:
-    """The configuration in a text."""
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -256,7 +253,6 @@ def at(key: str, make: Callable[[], Made]) -> Made:
 
 
 def _seconds(name: str, given: Any, low: float = 0.0) -> float:
-    """A number of seconds, or a duration as text."""
     if isinstance(given, str):
         clock = Clock.of(given)
         if clock.duration is None:
@@ -294,7 +290,6 @@ READ: dict[str, Callable[[Any], Any]] = {
 
 
 def valid_ranges(given: Any, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:
-    """Valid ranges by name."""
     if not isinstance(given, dict):
         raise ValueError("give a range for each signal, such as { flow = [0, 80] }.")
     return {name: valid_range(name, bounds, names) for name, bounds in given.items()}

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from string import Formatter
 
-LONGEST = 200
+NAME_CHARACTERS = 200
 """Characters of a topic and of the name of a unit."""
 
 
@@ -26,8 +26,8 @@ class Pattern:
 
     def __post_init__(self) -> None:
         fields = [field for level in self.text.split("/") for field in _fields(level)]
-        if not self.text or len(self.text) > LONGEST:
-            raise ValueError(f"match must have 1 to {LONGEST} characters; got {len(self.text)}.")
+        if not self.text or len(self.text) > NAME_CHARACTERS:
+            raise ValueError(f"match must have 1 to {NAME_CHARACTERS} characters; got {len(self.text)}.")
         if len(set(fields)) < len(fields) or not all(field.isidentifier() for field in fields):
             raise ValueError(f"match {self.text!r}: give each part in braces a name of its own, such as {{pump}}.")
         unknown = [field for field in _fields(self.name) if field not in fields]
@@ -99,4 +99,4 @@ def _fields(text: str) -> list[str]:
 
 def valid_name(topic: str) -> bool:
     """Whether a topic from outside may name a unit."""
-    return 0 < len(topic) <= LONGEST and topic.isprintable()
+    return 0 < len(topic) <= NAME_CHARACTERS and topic.isprintable()

@@ -32,7 +32,6 @@ class Secret:
 
     @property
     def value(self) -> str:
-        """The text itself."""
         return self._value
 
     @classmethod

@@ -69,12 +69,10 @@ class Outcome:
     """By unit: names of parameters, y and u, topic and the parts that its pattern matched."""
 
     def __len__(self) -> int:
-        """How many results there are."""
         return sum(len(one.number) for one in self.parts)
 
     @cached_property
     def results(self) -> list[Result]:
-        """The results one by one."""
         return self._listed(self.parts)
 
     @cached_property

@@ -40,7 +40,6 @@ class _Kafka(Writer):
         self.failed: list[str] = []
 
     def write(self, batch: Outcome) -> None:
-        """Send, and wait until the cluster has it."""
         for unit, is_event, body in messages(batch, self.options.every_result):
             topic = self.options.topic + "-events" * is_event
             self.producer.produce(topic, body, unit.encode(), on_delivery=self._delivered)

@@ -58,7 +58,6 @@ class _Mqtt(Writer):
         self.client.loop_start()
 
     def write(self, batch: Outcome) -> None:
-        """Send, and wait for the broker's acknowledgements."""
         until = time.monotonic() + ACKNOWLEDGED_SECONDS
         options, sent = self.options, []
         for unit, is_event, body in messages(batch, options.every_result):
@@ -70,7 +69,6 @@ class _Mqtt(Writer):
                 raise ConnectionError(f"{options.url} does not acknowledge")
 
     def close(self) -> None:
-        """Publish the status and disconnect."""
         self.client.publish(self.options.status, "offline", qos=1, retain=True)
         self.client.disconnect()
         self.client.loop_stop()

@@ -52,7 +52,6 @@ class _Opcua(Writer):
         await self.server.start()
 
     def write(self, batch: Outcome) -> None:
-        """Set the variables to the last result of each unit."""
         self.loop.call(self._write(batch), CALL_SECONDS)
 
     async def _write(self, batch: Outcome) -> None:

@@ -53,7 +53,6 @@ class _Parquet(Writer):
 
 
 def table_of(batch: Outcome, part: Results) -> pl.DataFrame:
-    """Results as a table."""
     columns = {name: part.values[:, k] for k, name in enumerate(("time", "y", "y_hat", "e", "s"))}
     given = {"number": part.number, "unit": [batch.names[k] for k in part.unit.tolist()], **columns}
     given |= {"ok": (part.flags & OK) > 0, "alarm": (part.flags & ALARM) > 0}

@@ -50,7 +50,6 @@ class _Webhook(Writer):
         self.client = urllib.request.build_opener(_NoRedirect)
 
     def write(self, batch: Outcome) -> None:
-        """A request for each event."""
         for event in batch.events:
             if event.kind in self.options.events:
                 self._send(event)
@@ -80,7 +79,6 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
 
 
 def message(event: Event) -> dict[str, object]:
-    """An event as JSON."""
     detail = dict(event.detail)
     at = datetime.fromtimestamp(event.at, UTC).isoformat(timespec="seconds")
     text = f"{event.unit}: {event.kind}"

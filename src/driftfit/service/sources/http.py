@@ -34,7 +34,6 @@ class Http(Source):
 
 class _Http(Reader):
     def read(self, wait: float) -> Batch | None:
-        """The next request."""
         try:
             return INCOMING.queue.get(timeout=wait)
         except queue.Empty:

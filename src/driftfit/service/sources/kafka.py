@@ -62,7 +62,6 @@ class _Kafka(Reader):
         self.consumer.assign(places)
 
     def read(self, wait: float) -> Batch | None:
-        """The messages that have arrived."""
         if self.noticed:
             noticed, self.noticed = self.noticed, ""
             return Batch([], noticed=noticed)

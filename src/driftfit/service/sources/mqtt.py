@@ -23,7 +23,7 @@ from urllib.parse import urlsplit
 from driftfit.service.connector import client_library
 from driftfit.service.settings.options import Secret
 from driftfit.service.sources.contract import Reader, Source
-from driftfit.service.sources.samples import LARGEST, Batch, Samples, decode
+from driftfit.service.sources.samples import MESSAGE_BYTES, Batch, Samples, decode
 from driftfit.service.sources.sparkplug import REBIRTH, Sparkplug, UnknownAliasError, rebirth_topic
 
 BATCH_MESSAGES = 2_000
@@ -114,7 +114,7 @@ class _Mqtt(Reader):
         if message.qos:
             heard.identifiers.append(message.mid)
         try:
-            if len(message.payload) > LARGEST:
+            if len(message.payload) > MESSAGE_BYTES:
                 raise ValueError
             read = self._decode(message.topic, message.payload)
         except ValueError:  # it is acknowledged like any other: sent again it would not be better
@@ -123,7 +123,6 @@ class _Mqtt(Reader):
             heard.samples += [] if read is None else [read]
 
     def read(self, wait: float) -> Batch | None:
-        """The messages that have arrived."""
         until = time.monotonic() + wait
         while not self.batch.count:
             self._send()
@@ -162,7 +161,6 @@ class _Mqtt(Reader):
             self.woken.recv(4096)
 
     def _receive(self) -> None:
-        """Read what is there."""
         self.more = True
         while self.more and self.batch.count < BATCH_MESSAGES:  # a call reads one packet
             before = self.batch.count

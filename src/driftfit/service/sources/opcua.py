@@ -98,7 +98,6 @@ class _Opcua(Reader):
         self.error = ConnectionError(f"subscription: {status}")
 
     def read(self, wait: float) -> Batch | None:
-        """The changes that have arrived."""
         try:
             found = [self.changes.get(timeout=wait)]
         except queue.Empty:

@@ -59,7 +59,6 @@ class _Plant(Reader):
         return GAIN + share * (CLOSED - GAIN)
 
     def read(self, wait: float) -> Batch | None:
-        """The samples measured since the last call."""
         step = self.options.interval
         due = int((time.time() - self.zero) / step) + self.options.before
         if due <= self.count:

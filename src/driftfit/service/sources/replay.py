@@ -69,7 +69,6 @@ class _Replay(Reader):
         return upto
 
     def read(self, wait: float) -> Batch | None:
-        """The rows that are due."""
         if self.at >= len(self.table):
             return END
         until = time.monotonic() + wait

@@ -23,17 +23,17 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 
-MOST_SAMPLES = 10_000
+MESSAGE_SAMPLES = 10_000
 """Samples of one message."""
-MOST_FIELDS = 256
+MESSAGE_FIELDS = 256
 """Fields of one message."""
-LARGEST = 4 << 20
+MESSAGE_BYTES = 4 << 20
 """Bytes of one message."""
 
 Cell = float | int | bool | str | None
 _DECODE = msgspec.json.Decoder(dict[str, Cell | list[Cell]] | list[dict[str, Cell]])
 
-FIRST = 20
+NAMED_SAMPLES = 20
 """Samples of a message that an answer names."""
 
 TOO_MANY_NEW = "too many new units"
@@ -71,7 +71,7 @@ class Receipt:
                 places = [] if math.isfinite(number(cells)) else list(range(samples.length))
             if places:
                 signals = self.missing.setdefault(samples.topic, {})
-                signals[name] = {"count": len(places), "first": places[:FIRST]}
+                signals[name] = {"count": len(places), "first": places[:NAMED_SAMPLES]}
 
 
 class Batch(NamedTuple):
@@ -100,16 +100,16 @@ class ShapeError(ValueError):
 
 def decode(topic: str, payload: bytes | str) -> Samples:
     """The samples of one message; ValueError if it is not one of the three forms."""
-    if len(payload) > LARGEST:
-        raise ValueError(f"a message of {len(payload)} bytes; at most {LARGEST} are read.")
+    if len(payload) > MESSAGE_BYTES:
+        raise ValueError(f"a message of {len(payload)} bytes; at most {MESSAGE_BYTES} are read.")
     try:
         data = _DECODE.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         data = _with_nan(payload)
     if isinstance(data, list):
         return _bounded_rows(topic, data)
-    if len(data) > MOST_FIELDS:
-        raise ShapeError(f"{len(data)} fields; at most {MOST_FIELDS} are read.")
+    if len(data) > MESSAGE_FIELDS:
+        raise ShapeError(f"{len(data)} fields; at most {MESSAGE_FIELDS} are read.")
     sizes = {name: len(value) for name, value in data.items() if isinstance(value, list)}
     lengths = set(sizes.values())
     if len(lengths) > 1:
@@ -132,8 +132,8 @@ def _with_nan(payload: bytes | str) -> Any:
 def _bounded_rows(topic: str, rows: list[dict[str, Cell]]) -> Samples:
     bounded(len(rows))
     found = of_rows(topic, rows)
-    if len(found.columns) > MOST_FIELDS:
-        raise ShapeError(f"{len(found.columns)} fields; at most {MOST_FIELDS} are read.")
+    if len(found.columns) > MESSAGE_FIELDS:
+        raise ShapeError(f"{len(found.columns)} fields; at most {MESSAGE_FIELDS} are read.")
     return found
 
 
@@ -153,8 +153,8 @@ def by_topic(rows: Iterable[tuple[str, dict[str, Any]]]) -> list[Samples]:
 
 def bounded(count: int) -> int:
     """A number of samples that one message may have; ValueError for another."""
-    if not 0 < count <= MOST_SAMPLES:
-        raise ShapeError(f"{count} samples in one message; 1 to {MOST_SAMPLES} are read.")
+    if not 0 < count <= MESSAGE_SAMPLES:
+        raise ShapeError(f"{count} samples in one message; 1 to {MESSAGE_SAMPLES} are read.")
     return count
 
 
@@ -182,7 +182,6 @@ def seconds(cell: Any, scale: float) -> float:
 
 
 def numbers_of(cells: list[Any]) -> Array:
-    """Cells as numbers, as `number` gives them."""
     try:
         found = np.array(cells, float)
         return found if found.ndim == 1 else np.array([number(cell) for cell in cells])
@@ -191,7 +190,6 @@ def numbers_of(cells: list[Any]) -> Array:
 
 
 def seconds_of(cells: list[Any], scale: float) -> Array:
-    """Times as seconds, as `seconds` gives them."""
     if str in set(map(type, cells)):
         return np.array([seconds(cell, scale) for cell in cells])
     return numbers_of(cells) * scale

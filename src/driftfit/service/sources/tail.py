@@ -70,7 +70,6 @@ class _Tail(Reader):
         return next(csv.reader([text], delimiter=self.options.separator), [])
 
     def read(self, wait: float) -> Batch | None:
-        """Complete lines that have been added."""
         until = time.monotonic() + wait
         while True:
             if self.noticed:

@@ -10,14 +10,16 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from driftfit.cli.parts.arguments import listed, parse_interval, parse_units
-from driftfit.cli.parts.program import helpful, progress, writable
-from driftfit.cli.parts.reading import (
+from driftfit.cli.program import progress, writable
+from driftfit.cli.reading import (
     Part,
     Rows,
     decimal_from,
     interval_from,
     limits_from,
+    listed,
+    parse_interval,
+    parse_units,
     rows_from,
     rows_of,
     separator_from,
@@ -31,6 +33,20 @@ from driftfit.trackers.base import Tracker
 Names = list[str] | None
 WRITTEN = {"write_to": "--out", "plot": "--plot", "system": "--system", "report": "--report"}
 """Arguments of commands that are files to be written."""
+
+
+Own = Annotated[str | None, typer.Option("--with", metavar="MODULE:CLASS", help="Your own tracker.")]
+Setting = Annotated[Names, typer.Option("-p", help="Setting of the tracker; repeat it.")]
+Out = Annotated[Path | None, typer.Option("--out", help="Write the result to .csv, .parquet or .npz (complete).")]
+Table = Annotated[Path | None, typer.Option("--out", help="Write the result to .csv or .parquet.")]
+Plot = Annotated[Path | None, typer.Option(help="Save a picture (.png, .pdf, .svg).")]
+Report = Annotated[Path | None, typer.Option(help="Write a page (.html) to send to someone; a fleet has one page.")]
+
+
+def check_table(path: Path | None, what: str) -> None:
+    """ValueError for a file whose ending is not that of a table."""
+    if path is not None and path.suffix.lower() not in (".csv", ".parquet"):
+        raise ValueError(f"--out {path}: {what} written to .csv or .parquet.")
 
 
 @dataclass(frozen=True)
@@ -116,7 +132,6 @@ class Given:
 
     @property
     def outputs(self) -> list[str]:
-        """Names of the outputs."""
         names = listed(self.y)
         if not names:
             raise ValueError("--y names no column.")
@@ -126,7 +141,6 @@ class Given:
 
     @property
     def inputs(self) -> list[str]:
-        """Names of the inputs."""
         names = listed(self.u)
         if both := [name for name in names if name in listed(self.y)]:
             raise ValueError(
@@ -143,7 +157,6 @@ class Given:
         return [model if one else model.bind(self.inputs) for model, one in zip(found, alone, strict=True)]
 
     def chosen_tracker(self) -> Tracker:
-        """The tracker with its settings."""
         return parse_tracker(self.tracker, self.p or [], self.own)
 
     def part(self) -> Part:
@@ -204,10 +217,14 @@ class Given:
         before = saved(self.start, [own_tracker(self.own)] if self.own else [])
         return before.model, before.tracker, before
 
+    def check_single(self, verb: str) -> None:
+        """Raise ValueError for several series or outputs."""
+        if self.by or len(self.outputs) > 1:
+            raise ValueError(f"{verb}: one series of one output at a time; leave out --by and further --y.")
+
     def arrays(self) -> dict[str, Any]:
         """One series in the form that `tune` and `select` take."""
-        outputs = self.outputs
-        if self.by or len(outputs) > 1 or self.start is not None:
+        if self.by or len(self.outputs) > 1 or self.start is not None:
             raise ValueError("this command takes one series of one output; leave out --by, --start and further --y.")
         signals = self.signals()
         return {name: signals[name] for name in signals if name not in ("by", "units")}
@@ -241,11 +258,10 @@ def reads(command: Callable[..., None]) -> Callable[..., None]:
             options.append(one.replace(kind=inspect.Parameter.KEYWORD_ONLY))
 
     def run(**typed: Any) -> None:
-        with helpful():
-            for name, option in WRITTEN.items():
-                writable(typed.get(name), option)
-            grouped = {name: kind(**{f.name: typed.pop(f.name) for f in fields(kind)}) for name, kind in groups.items()}
-            command(**grouped, **typed)
+        for name, option in WRITTEN.items():
+            writable(typed.get(name), option)
+        grouped = {name: kind(**{f.name: typed.pop(f.name) for f in fields(kind)}) for name, kind in groups.items()}
+        command(**grouped, **typed)
 
     vars(run)["__signature__"] = inspect.Signature(options)
     run.__annotations__ = {one.name: one.annotation for one in options}
