@@ -65,6 +65,13 @@ def settled(engine):
         engine.step(0.0)
 
 
+def stored(engine):
+    """Store the states, and close."""
+    engine._store_states(everything=True)
+    engine._commit()
+    engine.close()
+
+
 def results_of(engine):
     """All stored results, as rows."""
     settled(engine)
@@ -182,3 +189,27 @@ class Receiver(http.server.BaseHTTPRequestHandler):
 
     def log_message(self, *args):
         pass
+
+
+@contextlib.contextmanager
+def receiver(*answers):
+    """The address of a server on this machine that gives these answers, then 200."""
+    Receiver.got.clear()
+    Receiver.answers[:] = answers
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Receiver)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}/x"
+    server.shutdown()
+    server.server_close()
+
+
+@contextlib.contextmanager
+def serving(*what):
+    """The port of a service in a process of its own."""
+    port = free_port()
+    process = started(port, *what)
+    try:
+        yield port
+    finally:
+        stopped(process)
+        process.stderr.close()

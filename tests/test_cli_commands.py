@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from typer.testing import CliRunner
+from cli_support import fails, run
 
 from driftfit import ARX, Kalman, Live, Track, cli, track
 from driftfit.cli.reading import Part, rows_of
@@ -38,19 +38,6 @@ def table(tmp_path, monkeypatch):
     )
     frame.write_csv("pump.csv")
     return frame
-
-
-def run(*arguments, stdin=None):
-    result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments], input=stdin)
-    assert result.exit_code == 0, result.output
-    return result.stdout
-
-
-def fails(*arguments):
-    result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
-    assert result.exit_code == 2, result.output
-    (line,) = result.stderr.strip().splitlines()
-    return line
 
 
 SIGNALS = ["pump.csv", "--y", "flow", "--u", "valve", "--model", "arx:1,1", *KALMAN]

@@ -56,7 +56,6 @@ def test_units_of_a_sender_are_named_in_every_section(tmp_path):
     assert control._foreign(["p:y", "p:z"])("plant/p") == []
     assert control._foreign([])("plant/q") == []
     control.close()
-    engine.close()
 
 
 def test_a_session_ends_at_its_logout(service, client):  # noqa: F811

@@ -23,6 +23,7 @@ from service_support import (
     record,
     results_of,
     settled,
+    stored,
 )  # fmt: skip
 
 from driftfit import ARX, DataWarning, track
@@ -97,7 +98,6 @@ def test_a_new_process_continues_with_the_same_bits(tmp_path):
     blocks = engine.journal.db.execute("select sum(count), count(*) from block").fetchone()
     assert blocks[0] <= 400
     assert engine.journal.rows_of(1)[0] == list(range(400))
-    engine.close()
 
 
 def test_late_rows_are_put_in_order(tmp_path):
@@ -124,7 +124,6 @@ def test_late_rows_are_put_in_order(tmp_path):
     for before, after in zip(streams.waiting.of(0), again.streams.waiting.of(0), strict=True):
         assert np.array_equal(before, after)
     assert np.array_equal(again.live.theta, run.theta[-1])
-    engine.close()
 
 
 def test_clocks_that_jump(engine):
@@ -147,7 +146,6 @@ def test_limits_are_those_of_track(tmp_path):
     run = run_of(y, u, limits={"y": (-50, 50), "u": (-60, 60)})
     assert np.array_equal(engine.units.get(1).live.theta, run.theta[-1])
     assert engine.units.get(1).counts["y outside its limits"] == 1
-    engine.close()
 
 
 def test_one_unit_fails_and_the_others_go_on(engine, monkeypatch):
@@ -203,7 +201,6 @@ def test_actions_are_part_of_the_journal(tmp_path):
         ("hold", "Ann", False), ("hold", "Ann", False), ("reset", "Ann", False), ("limits", "Ann", False),
         ("reset", "Ann", True), ("nonsense", "Ann", True),
     ]  # fmt: skip
-    engine.close()
 
 
 @pytest.mark.parametrize(
@@ -268,7 +265,6 @@ def test_alarms_from_a_frozen_reference(tmp_path):
     engine = opened(config, tmp_path)
     assert [alarm.plain() for alarm in engine.units.get(1).alarms] == before
     assert len(events(engine, "alarm")) == len(found)
-    engine.close()
 
 
 def test_a_full_disk_holds_back_and_loses_nothing(tmp_path, monkeypatch):
@@ -297,7 +293,6 @@ def test_a_full_disk_holds_back_and_loses_nothing(tmp_path, monkeypatch):
     assert "full" in problems[0]
     assert engine.problem == ""
     assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])
-    engine.close()
 
 
 def test_a_torn_write_leaves_a_whole_journal(tmp_path):
@@ -323,7 +318,6 @@ def test_a_torn_write_leaves_a_whole_journal(tmp_path):
         lengths.append(len(times))
         again.close()
     assert len(set(lengths)) > 3
-    engine.close()
 
 
 def test_a_unit_that_floods_is_cut_off_alone(tmp_path):
@@ -334,7 +328,6 @@ def test_a_unit_that_floods_is_cut_off_alone(tmp_path):
     feed(engine, message("plant/b", range(90), y[:90], u[:90]))
     assert engine.units.get(1).counts == {"samples": 90, "used": 89, "flood": 100}
     assert engine.units.get(2).counts["samples"] == 90
-    engine.close()
 
 
 def test_the_queue_is_bounded():
@@ -396,7 +389,6 @@ def test_old_journals_become_parquet(tmp_path, monkeypatch):
     assert engine.next == 102
     feed(engine, message("plant/a", [100.0], [0.0], [0.0]))
     assert engine.units.get(1).counts["samples"] == 101
-    engine.close()
 
 
 def test_a_folder_of_another_configuration_is_refused(tmp_path):
@@ -413,16 +405,13 @@ def test_a_state_that_cannot_be_read_stops_its_unit_alone(tmp_path):
     engine = opened(configured(), tmp_path)
     for pump in "ab":
         feed(engine, message(f"plant/{pump}", range(50), y, u))
-    engine._store_states(everything=True)
-    engine._commit()
-    engine.close()
+    stored(engine)
     with sqlite3.connect(tmp_path / "driftfit.db") as db:
         db.execute("update snapshot set state = x'00' where unit = 1")
     db.close()
     engine = opened(configured(), tmp_path)
     assert "cannot be read" in engine.units.get(1).failure
     assert np.array_equal(engine.units.get(2).live.theta, run_of(y, u).theta[-1])
-    engine.close()
 
 
 def test_states_are_carried_over_to_other_settings_of_the_tracker(tmp_path):
@@ -430,9 +419,7 @@ def test_states_are_carried_over_to_other_settings_of_the_tracker(tmp_path):
     engine = opened(configured(), tmp_path)
     for pump in "ab":
         feed(engine, message(f"plant/{pump}", range(50), y[:50], u[:50]))
-    engine._store_states(everything=True)
-    engine._commit()
-    engine.close()
+    stored(engine)
     engine = opened(configured(UNIT.replace("q=1e-4", "q=1e-2")), tmp_path)
     feed(engine, message("plant/a", range(50, 100), y[50:], u[50:]))
     other = replace(TRACKER, q=1e-2)
@@ -444,7 +431,6 @@ def test_states_are_carried_over_to_other_settings_of_the_tracker(tmp_path):
     engine.close()
     engine = opened(configured(UNIT.replace("ARX(1, 1)", "ARX(2, 1)")), tmp_path)
     assert "follows" in engine.units.get(1).failure
-    engine.close()
 
 
 def coded():
@@ -465,16 +451,13 @@ def test_what_gates_leave_out_is_counted_by_reason(tmp_path, size):
     assert engine.status()["left_out"] == wanted
     assert wanted.items() <= engine.units.get(1).counts.items()
     assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])
-    engine.close()
 
 
 def test_states_of_another_gate_are_refused_and_computed_again(tmp_path):
     y, u = coded()
     engine = opened(configured(), tmp_path)
     feed(engine, message("plant/a", range(100), y, u))
-    engine._store_states(everything=True)
-    engine._commit()
-    engine.close()
+    stored(engine)
     without = configured(UNIT + "gate = false\n")
     engine = opened(without, tmp_path)
     assert "driftfit serve FILE --rebuild" in engine.units.get(1).failure
@@ -485,7 +468,6 @@ def test_states_of_another_gate_are_refused_and_computed_again(tmp_path):
     with pytest.warns(DataWarning, match="y: 2 values look like fault codes"):
         run = track(MODEL, TRACKER, y, u, time=np.arange(100.0), dt=1.0)
     assert np.array_equal(engine.units.get(1).live.theta, run.theta[-1])
-    engine.close()
 
 
 OLDER = {
@@ -524,7 +506,6 @@ def test_a_journal_of_an_older_format_is_refused_and_rebuilt(tmp_path):
     rebuild(tmp_path)
     engine = opened(configured(), tmp_path)
     assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])
-    engine.close()
 
 
 def test_many_units_with_few_rows_are_those_of_track(tmp_path):
@@ -558,4 +539,3 @@ def test_many_units_with_few_rows_are_those_of_track(tmp_path):
     rows = [row for row in results_of(engine) if row[1] == held.number]
     assert {row[7] for row in rows[-5:]} == {False}
     assert np.array_equal(held.live.theta, rows[-5][8])
-    engine.close()

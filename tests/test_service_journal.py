@@ -79,7 +79,6 @@ def test_a_damaged_group_is_left_out_and_named(folder):
     rows = [row for row in results_of(engine) if row[0] <= 350]
     assert np.array_equal([row[8] for row in rows], run.theta)
     assert [line.partition(":")[0] for line in verify(folder)[1]] == ["log", "log"]  # its sum, and its link
-    engine.close()
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.text import Text
+from typer import Option
 
 from driftfit.cli.options import Own, Setting
 from driftfit.cli.program import app, progress, say
@@ -25,9 +25,9 @@ from driftfit.show.parts.text import facts
 @app.command()
 def cache(
     remove: Annotated[
-        bool, typer.Option("--prune", help="Remove what other versions made, and what was not used for --days.")
+        bool, Option("--prune", help="Remove what other versions made, and what was not used for --days.")
     ] = False,
-    days: Annotated[float, typer.Option(help="With --prune: days without use; 0 removes everything.")] = 30.0,
+    days: Annotated[float, Option(help="With --prune: days without use; 0 removes everything.")] = 30.0,
 ) -> None:
     """Show where compiled code is stored and how much of it there is, or prune it."""
     if days < 0.0:
@@ -58,13 +58,13 @@ RECORD_LENGTH = 600
 @app.command()
 def warm(
     model: Annotated[
-        list[str] | None, typer.Option(help="As in `driftfit track`; repeat it. Default: arx:2,2,intercept.")
+        list[str] | None, Option(help="As in `driftfit track`; repeat it. Default: arx:2,2,intercept.")
     ] = None,
-    tracker: Annotated[str, typer.Option(help="Tracker, as `driftfit trackers` lists them.")] = "adaptive-kalman",
+    tracker: Annotated[str, Option(help="Tracker, as `driftfit trackers` lists them.")] = "adaptive-kalman",
     p: Setting = None,
     own: Own = None,
-    inputs: Annotated[int, typer.Option(help="Number of inputs of the record.")] = 1,
-    fleet: Annotated[bool, typer.Option("--fleet", help="Compile for fleets as well.")] = False,
+    inputs: Annotated[int, Option(help="Number of inputs of the record.")] = 1,
+    fleet: Annotated[bool, Option("--fleet", help="Compile for fleets as well.")] = False,
 ) -> None:
     """Compile and store what models and a tracker need: record, stream, summary, verdict, alarms, smoother, report."""
     from driftfit.streams import Live
@@ -88,12 +88,7 @@ def warm(
         for verb, reason in lacking.items():
             say(Text(f" {text}, without {verb}: {reason}", "dim"))
     after = contents()
-    say(
-        facts(
-            *stored(after, f"{after.files - before.files} new"),
-            ("Seconds", f"{time.perf_counter() - start:.0f}"),
-        )
-    )
+    say(facts(*stored(after, f"{after.files - before.files} new"), ("Seconds", f"{time.perf_counter() - start:.0f}")))
     if folder() is None:
         raise ValueError("no folder can be written, so nothing was kept; set NUMBA_CACHE_DIR.")
 

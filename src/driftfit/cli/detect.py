@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.text import Text
+from typer import Option
 
 from driftfit.cli.options import Given, Plot, Report, Table, check_table, reads
 from driftfit.cli.program import app, say
@@ -22,17 +22,15 @@ from driftfit.show.report import check_path
 class AlarmOptions:
     """The options that define an alarm."""
 
-    kind: Annotated[str, typer.Option(help="glr, cusum, band, innovation or probability.")] = "glr"
-    every: Annotated[float, typer.Option(help="Samples in which one false alarm may begin.")] = 10_000.0
+    kind: Annotated[str, Option(help="glr, cusum, band, innovation or probability.")] = "glr"
+    every: Annotated[float, Option(help="Samples in which one false alarm may begin.")] = 10_000.0
     reference: Annotated[
         list[str] | None,
-        typer.Option(
-            help="What is normal: a number of first samples, FROM..TO in times, or name=low:high; repeat the last."
-        ),
+        Option(help="What is normal: a number of first samples, FROM..TO in times, or name=low:high; repeat the last."),
     ] = None
-    window: Annotated[int, typer.Option(help="Samples in the sums of the innovation alarm.")] = 50
-    hold: Annotated[int, typer.Option(help="Samples for which an alarm stays on after its cause.")] = 0
-    calibrate: Annotated[bool, typer.Option("--calibrate", help="Find the limits by simulation.")] = False
+    window: Annotated[int, Option(help="Samples in the sums of the innovation alarm.")] = 50
+    hold: Annotated[int, Option(help="Samples for which an alarm stays on after its cause.")] = 0
+    calibrate: Annotated[bool, Option("--calibrate", help="Find the limits by simulation.")] = False
 
     def find(self, run: Any) -> Any:
         """The alarms of a run, an `Outputs` or a fleet."""
@@ -46,7 +44,7 @@ def detect(
     given: Given,
     options: AlarmOptions,
     labels: Annotated[
-        str | None, typer.Option(help="Column of labels, 0 or 1, that mark faults; the alarms are scored.")
+        str | None, Option(help="Column of labels, 0 or 1, that mark faults; the alarms are scored.")
     ] = None,
     write_to: Table = None,
     plot: Plot = None,

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from driftfit.cli.options import Own, Setting
 from driftfit.cli.program import app, say
@@ -23,13 +24,13 @@ def _languages() -> None:
 
 @export.command(name="c")
 def to_c(
-    model: Annotated[str, typer.Option(help="As in `driftfit track`: arx:2,2 or 'ARX(2, 2)'.")],
-    out: Annotated[Path, typer.Option(help="The folder to write into.")],
-    tracker: Annotated[str, typer.Option(help="Tracker, by its name or as in Python.")] = "adaptive-kalman",
+    model: Annotated[str, Option(help="As in `driftfit track`: arx:2,2 or 'ARX(2, 2)'.")],
+    out: Annotated[Path, Option(help="The folder to write into.")],
+    tracker: Annotated[str, Option(help="Tracker, by its name or as in Python.")] = "adaptive-kalman",
     p: Setting = None,
     own: Own = None,
-    fixed_rate: Annotated[bool, typer.Option("--fixed-rate", help="No uneven intervals, no known factors.")] = False,
-    gate: Annotated[bool | None, typer.Option("--gate/--no-gate", help="Judge readings first.")] = None,
+    fixed_rate: Annotated[bool, Option("--fixed-rate", help="No uneven intervals, no known factors.")] = False,
+    gate: Annotated[bool | None, Option("--gate/--no-gate", help="Judge readings first.")] = None,
 ) -> None:
     """Write a tracker as C99 for a controller: tracker.h, tracker.c, a self-test and a README."""
     from driftfit.embedded import export_c

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import numpy as np
 import polars as pl
-import typer
 from rich.text import Text
+from typer import Option
 
 from driftfit.cli.options import Given, Plot, Table, check_table, reads
 from driftfit.cli.program import app, progress, say
@@ -29,11 +29,9 @@ FORECAST_ROWS, SMOOTHED_ROWS = 40, 5
 @reads
 def forecast(
     given: Given,
-    ahead: Annotated[
-        int | None, typer.Option("--ahead", help="Samples to forecast; as many as --future has rows.")
-    ] = None,
-    future: Annotated[str | None, typer.Option(help="File of future inputs, with the columns of --u.")] = None,
-    level: Annotated[float, typer.Option(help="Level of the bands.")] = 0.95,
+    ahead: Annotated[int | None, Option("--ahead", help="Samples to forecast; as many as --future has rows.")] = None,
+    future: Annotated[str | None, Option(help="File of future inputs, with the columns of --u.")] = None,
+    level: Annotated[float, Option(help="Level of the bands.")] = 0.95,
     write_to: Table = None,
 ) -> None:
     """Forecast the outputs, and the parameters, after the end of the record."""
@@ -74,11 +72,7 @@ def _inputs(given: Given, future: str) -> Array:
 
 @app.command()
 @reads
-def smooth(
-    given: Given,
-    write_to: Table = None,
-    plot: Plot = None,
-) -> None:
+def smooth(given: Given, write_to: Table = None, plot: Plot = None) -> None:
     """Estimate the parameters at every sample from the whole record; settings that are left out are tuned first."""
     check_table(write_to, "a path is")
     given.check_single("smooth")

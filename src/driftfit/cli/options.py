@@ -8,7 +8,7 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
-import typer
+from typer import Argument, Option
 
 from driftfit.cli.program import progress, writable
 from driftfit.cli.reading import (
@@ -35,12 +35,12 @@ WRITTEN = {"write_to": "--out", "plot": "--plot", "system": "--system", "report"
 """Arguments of commands that are files to be written."""
 
 
-Own = Annotated[str | None, typer.Option("--with", metavar="MODULE:CLASS", help="Your own tracker.")]
-Setting = Annotated[Names, typer.Option("-p", help="Setting of the tracker; repeat it.")]
-Out = Annotated[Path | None, typer.Option("--out", help="Write the result to .csv, .parquet or .npz (complete).")]
-Table = Annotated[Path | None, typer.Option("--out", help="Write the result to .csv or .parquet.")]
-Plot = Annotated[Path | None, typer.Option(help="Save a picture (.png, .pdf, .svg).")]
-Report = Annotated[Path | None, typer.Option(help="Write a page (.html) to send to someone; a fleet has one page.")]
+Own = Annotated[str | None, Option("--with", metavar="MODULE:CLASS", help="Your own tracker.")]
+Setting = Annotated[Names, Option("-p", help="Setting of the tracker; repeat it.")]
+Out = Annotated[Path | None, Option("--out", help="Write the result to .csv, .parquet or .npz (complete).")]
+Table = Annotated[Path | None, Option("--out", help="Write the result to .csv or .parquet.")]
+Plot = Annotated[Path | None, Option(help="Save a picture (.png, .pdf, .svg).")]
+Report = Annotated[Path | None, Option(help="Write a page (.html) to send to someone; a fleet has one page.")]
 
 
 def check_table(path: Path | None, what: str) -> None:
@@ -55,79 +55,71 @@ class Given:
 
     file: Annotated[
         list[str],
-        typer.Argument(
-            help="CSV files with a header line, or Parquet files, or patterns such as 'runs/*.csv'; - is stdin."
-        ),
+        Argument(help="CSV files with a header line, or Parquet files, or patterns such as 'runs/*.csv'; - is stdin."),
     ]
     y: Annotated[
         list[str],
-        typer.Option(
-            help="Column of the output; repeat it, or separate names by commas, for several (ARX, Regression)."
-        ),
+        Option(help="Column of the output; repeat it, or separate names by commas, for several (ARX, Regression)."),
     ]
-    u: Annotated[Names, typer.Option(help="Column of an input; repeat it, or separate names by commas.")] = None
+    u: Annotated[Names, Option(help="Column of an input; repeat it, or separate names by commas.")] = None
     model: Annotated[
         Names,
-        typer.Option(
+        Option(
             help="Model and settings by position or name: arx:2,2,nk=1,intercept; one value per input with a slash: "
             "arx:2,2/1,nk=0/1; regression:intercept; or as in Python: 'ARX(2, [2, 1])'. Default: arx:2,2,intercept, "
             "without inputs arx:2,0,intercept."
         ),
     ] = None
     tracker: Annotated[
-        str, typer.Option(help="Tracker, as `driftfit trackers` lists them, or as in Python: 'Kalman(q=1e-4, r=0.1)'.")
+        str, Option(help="Tracker, as `driftfit trackers` lists them, or as in Python: 'Kalman(q=1e-4, r=0.1)'.")
     ] = "adaptive-kalman"
-    p: Annotated[
-        Names, typer.Option("-p", help="Setting of the tracker: q=1e-4, q=1e-4,0,0 or p0=none; repeat it.")
-    ] = None
-    time: Annotated[str | None, typer.Option(help="Column of the time: numbers or dates.")] = None
+    p: Annotated[Names, Option("-p", help="Setting of the tracker: q=1e-4, q=1e-4,0,0 or p0=none; repeat it.")] = None
+    time: Annotated[str | None, Option(help="Column of the time: numbers or dates.")] = None
     by: Annotated[
-        Names, typer.Option(help="Column that identifies the series of a fleet, or `file`; repeat it for several.")
+        Names, Option(help="Column that identifies the series of a fleet, or `file`; repeat it for several.")
     ] = None
-    unit: Annotated[Names, typer.Option(help="Unit of a column: flow=l/min; repeat it.")] = None
+    unit: Annotated[Names, Option(help="Unit of a column: flow=l/min; repeat it.")] = None
     own: Annotated[
-        str | None,
-        typer.Option("--with", metavar="MODULE:CLASS", help="Your own tracker, from a module in this folder."),
+        str | None, Option("--with", metavar="MODULE:CLASS", help="Your own tracker, from a module in this folder.")
     ] = None
     dt: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Nominal interval: a number; for dates 10ms, 1s, 15min, 1h, 1d, 1w, 'business day', month, quarter, "
             "year, or label if samples are one step apart whatever their dates."
         ),
     ] = None
-    first: Annotated[str | None, typer.Option("--from", help="First time to use, with --time.")] = None
-    last: Annotated[str | None, typer.Option("--to", help="Last time to use, with --time.")] = None
+    first: Annotated[str | None, Option("--from", help="First time to use, with --time.")] = None
+    last: Annotated[str | None, Option("--to", help="Last time to use, with --time.")] = None
     rows: Annotated[
-        str | None,
-        typer.Option(help="Rows to use of each file, counted from 1 after the header: 100:500, 100: or :500."),
+        str | None, Option(help="Rows to use of each file, counted from 1 after the header: 100:500, 100: or :500.")
     ] = None
     separator: Annotated[
         str | None,
-        typer.Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
+        Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
     ] = None
     decimal: Annotated[
-        str | None, typer.Option(help="Decimal sign of the numbers: . or , (by default the file shows it).")
+        str | None, Option(help="Decimal sign of the numbers: . or , (by default the file shows it).")
     ] = None
     missing: Annotated[
-        Names, typer.Option(help="What the file holds where there is no reading: Offline or -999; repeat it.")
+        Names, Option(help="What the file holds where there is no reading: Offline or -999; repeat it.")
     ] = None
     limits: Annotated[
-        Names, typer.Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
+        Names, Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
     ] = None
     exclude: Annotated[
-        Names, typer.Option(help="Interval to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
+        Names, Option(help="Interval to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
     ] = None
     gate: Annotated[
         bool | None,
-        typer.Option(
+        Option(
             "--gate/--no-gate",
             help="Leave out readings that look like fault codes, or use all. Default: as the tracker asks.",
             show_default=False,
         ),
     ] = None
     start: Annotated[
-        Path | None, typer.Option(help="Continue from a saved run (.npz) or live state, with its model and tracker.")
+        Path | None, Option(help="Continue from a saved run (.npz) or live state, with its model and tracker.")
     ] = None
 
     @property

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from typer import Option
 from typer.core import TyperGroup
 
 from driftfit import __version__
@@ -91,7 +92,7 @@ def _version(wanted: bool) -> None:
 @app.callback(help="Track the parameters of a system while they change.")
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and stop.")
+        bool, Option("--version", callback=_version, is_eager=True, help="Print the version and stop.")
     ] = False,
 ) -> None:
     pass

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from driftfit.cli.program import app, progress, say
 
@@ -20,8 +21,8 @@ app.add_typer(journal, name="journal")
 
 @journal.command()
 def verify(
-    folder: Annotated[Path, typer.Argument(help="The folder of the service, which may run meanwhile.")],
-    digest: Annotated[str, typer.Option(help="A digest that was printed earlier; the chain must have it.")] = "",
+    folder: Annotated[Path, Argument(help="The folder of the service, which may run meanwhile.")],
+    digest: Annotated[str, Option(help="A digest that was printed earlier; the chain must have it.")] = "",
 ) -> None:
     """Check the sum of every row, and the chain of digests; exit code 1 if something is wrong."""
     try:
@@ -37,18 +38,16 @@ def verify(
 
 @app.command()
 def serve(
-    file: Annotated[
-        Path | None, typer.Argument(help="Configuration, a TOML file; docs/service.md explains it.")
-    ] = None,
-    check: Annotated[bool, typer.Option("--check", help="Only say whether the configuration is valid.")] = False,
-    demo: Annotated[bool, typer.Option("--demo", help="A simulated plant; no file, broker or network needed.")] = False,
-    port: Annotated[int | None, typer.Option(help="Port of the page.")] = None,
-    folder: Annotated[Path | None, typer.Option(help="Where journal and results are stored.")] = None,
+    file: Annotated[Path | None, Argument(help="Configuration, a TOML file; docs/service.md explains it.")] = None,
+    check: Annotated[bool, Option("--check", help="Only say whether the configuration is valid.")] = False,
+    demo: Annotated[bool, Option("--demo", help="A simulated plant; no file, broker or network needed.")] = False,
+    port: Annotated[int | None, Option(help="Port of the page.")] = None,
+    folder: Annotated[Path | None, Option(help="Where journal and results are stored.")] = None,
     rebuild: Annotated[
-        bool, typer.Option("--rebuild", help="First compute all states again from the journal, as with another gate.")
+        bool, Option("--rebuild", help="First compute all states again from the journal, as with another gate.")
     ] = False,
-    make_hash: Annotated[bool, typer.Option("--hash", help="Ask for a password and print its hash.")] = False,
-    make_token: Annotated[bool, typer.Option("--token", help="Print a new token and its hash.")] = False,
+    make_hash: Annotated[bool, Option("--hash", help="Ask for a password and print its hash.")] = False,
+    make_token: Annotated[bool, Option("--token", help="Print a new token and its hash.")] = False,
 ) -> None:
     """Follow the units of a plant: sensors in, parameters, bands and alarms out, and a page to watch."""
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Option
 
 from driftfit.cli.options import Given, Out, Plot, Report, reads
 from driftfit.cli.program import app, say
@@ -23,7 +23,7 @@ def track(
     write_to: Out = None,
     plot: Plot = None,
     system: Annotated[
-        Path | None, typer.Option(help="Save a picture of responses, poles and gain over time (ARX, one output).")
+        Path | None, Option(help="Save a picture of responses, poles and gain over time (ARX, one output).")
     ] = None,
     report: Report = None,
 ) -> None:
@@ -57,8 +57,8 @@ def plot_system(run: Any) -> Figure:
 @reads
 def verdict(
     given: Given,
-    level: Annotated[float, typer.Option(help="Error rate of the test; for a fleet, the false discovery rate.")] = 0.05,
-    lags: Annotated[int | None, typer.Option(help="Lags of correlation of the noise to allow for.")] = None,
+    level: Annotated[float, Option(help="Error rate of the test; for a fleet, the false discovery rate.")] = 0.05,
+    lags: Annotated[int | None, Option(help="Lags of correlation of the noise to allow for.")] = None,
     report: Report = None,
 ) -> None:
     """Report whether the parameters move, which ones and when, and whether tracking them pays."""

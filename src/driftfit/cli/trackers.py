@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
+from typer import Option
 
 from driftfit import trackers as known
 from driftfit.cli.program import app, out, progress, say
@@ -32,9 +32,7 @@ def trackers() -> None:
 
 
 @app.command()
-def demo(
-    plot: Annotated[Path, typer.Option(help="File of the picture.")] = Path("driftfit-demo.png"),
-) -> None:
+def demo(plot: Annotated[Path, Option(help="File of the picture.")] = Path("driftfit-demo.png")) -> None:
     """Track the US demand for money from 1959 to 2009."""
     from driftfit.demo.demo import show
 

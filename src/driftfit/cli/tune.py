@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.text import Text
+from typer import Option
 
 from driftfit.cli.options import Given, Plot, reads
 from driftfit.cli.program import app, progress, say
@@ -20,12 +20,12 @@ from driftfit.show.parts.text import facts, shortened, table_of
 @reads
 def tune(
     given: Given,
-    method: Annotated[str, typer.Option(help="ml, h-step, loo or gcv.")] = "ml",
-    ahead: Annotated[int, typer.Option("--ahead", help="Samples ahead, for h-step.")] = 1,
+    method: Annotated[str, Option(help="ml, h-step, loo or gcv.")] = "ml",
+    ahead: Annotated[int, Option("--ahead", help="Samples ahead, for h-step.")] = 1,
     groups: Annotated[
-        str | None, typer.Option(help="each: a separate drift for each parameter; or one label per parameter, a,a,b.")
+        str | None, Option(help="each: a separate drift for each parameter; or one label per parameter, a,a,b.")
     ] = None,
-    level: Annotated[float, typer.Option(help="Level of the intervals.")] = 0.95,
+    level: Annotated[float, Option(help="Level of the intervals.")] = 0.95,
     plot: Plot = None,
 ) -> None:
     """Estimate the settings that a tracker is missing: --tracker kalman estimates q and r."""
@@ -78,8 +78,8 @@ def _typed(value: Any) -> str:
 @reads
 def select(
     given: Given,
-    keep: Annotated[list[str] | None, typer.Option(help="Regressor that every subset contains; repeat it.")] = None,
-    most: Annotated[int | None, typer.Option(help="Largest number of regressors in a subset.")] = None,
+    keep: Annotated[list[str] | None, Option(help="Regressor that every subset contains; repeat it.")] = None,
+    most: Annotated[int | None, Option(help="Largest number of regressors in a subset.")] = None,
     plot: Plot = None,
 ) -> None:
     """Compare models (repeat --model), or the regressors of one, by how well they predict."""

@@ -7,15 +7,16 @@ moment leaves every sample in at least one of the two, and a piece that is writt
 from __future__ import annotations
 
 import logging
-import os
 import time
+from collections.abc import Mapping
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
-from driftfit.service.core.journal import Act, Journal, Pending
+from driftfit.data.storage import replace_file
+from driftfit.service.core.journal import Act, Item, Journal, Pending
 from driftfit.service.settings.options import ServiceOptions
 
 log = logging.getLogger("driftfit.service")
@@ -26,6 +27,9 @@ PIECE_GROUPS = 2_000
 DAY_SECONDS = 86_400.0
 OLD = "stop < ? and stop > 1e8"
 """Which blocks of the history are older than a time; those of units without times are kept."""
+TYPES: dict[str, Any] = {
+    "number": pl.Int64, "unit": pl.String, "time": pl.Float64, "values": pl.List(pl.Float64), "action": pl.String,
+}  # fmt: skip
 
 
 class Archive:
@@ -84,39 +88,31 @@ def export(folder: Path, needed: int, before: float) -> int:
             return 0
         first, upto = found[0][0], found[-1][0] + found[-1][1]
         names = {number: name for number, name, *_ in journal.units()}
-        rows: dict[str, list[Any]] = {"number": [], "unit": [], "time": [], "values": [], "action": []}
-        for start, items in journal.groups(first):
-            if start >= upto:
+        tables = []
+        for number, items in journal.groups(first):
+            if number >= upto:
                 break
-            number = start
             for item in items:
-                count = item.length
-                rows["number"] += range(number, number + count)
-                number += count
-                if isinstance(item, Act):
-                    rows["unit"].append(names[item.unit])
-                    rows["time"].append(None)
-                    rows["values"].append([])
-                    rows["action"].append(str(item.action))
-                    continue
-                rows["unit"] += [names[unit] for unit in item.unit.tolist()]
-                rows["time"] += [None] * count if item.time is None else item.time.tolist()
-                rows["values"] += item.values.tolist()
-                rows["action"] += [None] * count
+                tables.append(table_of(number, item, names))
+                number += item.length
     finally:
         journal.close()
     target = folder / "journal" / f"{first:016d}-{upto - 1:016d}.parquet"
     target.parent.mkdir(exist_ok=True)
-    types: dict[str, Any] = {
-        "number": pl.Int64,
-        "unit": pl.String,
-        "time": pl.Float64,
-        "values": pl.List(pl.Float64),
-        "action": pl.String,
-    }
-    partial = target.with_suffix(".part")
-    pl.DataFrame(rows, schema=types).write_parquet(partial)
-    with open(partial, "rb") as handle:
-        os.fsync(handle.fileno())
-    partial.replace(target)
+    replace_file(target, pl.concat(tables).write_parquet)
     return int(upto)
+
+
+def table_of(number: int, item: Item, names: Mapping[int, str]) -> pl.DataFrame:
+    """An entry of the log, whose first sample has a number, as a table."""
+    count = item.length
+    columns: dict[str, Any] = {"number": range(number, number + count)}
+    if isinstance(item, Act):
+        columns |= {"unit": [names[item.unit]], "time": [None], "values": [[]], "action": [str(item.action)]}
+    else:
+        columns |= {
+            "unit": [names[unit] for unit in item.unit.tolist()],
+            "time": [None] * count if item.time is None else item.time,
+        }
+        columns |= {"values": item.values.tolist(), "action": [None] * count}
+    return pl.DataFrame(columns, schema=TYPES)

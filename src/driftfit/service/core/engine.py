@@ -24,16 +24,7 @@ import numpy as np
 
 from driftfit.service.core.archive import Archive
 from driftfit.service.core.intake import Action, Arrived, Intake
-from driftfit.service.core.journal import (
-    DAMAGED,
-    NEEDED_FROM,
-    Act,
-    Group,
-    Item,
-    Journal,
-    Pending,
-    check_storable,
-)
+from driftfit.service.core.journal import DAMAGED, NEEDED_FROM, Act, Group, Item, Journal, Pending, check_storable
 from driftfit.service.core.unit import Out, Unit, rules_of
 from driftfit.service.core.units import Units
 from driftfit.service.settings.config import Config
