@@ -16,9 +16,9 @@ import urllib.request
 import numpy as np
 
 from driftfit import ARX, Kalman
+from driftfit.service.config import parse
 from driftfit.service.core.engine import Engine
-from driftfit.service.settings.config import parse
-from driftfit.service.sources.samples import Batch, decode
+from driftfit.service.sources.contract import Batch, decode
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-4, r=0.1)
 UNIT = """

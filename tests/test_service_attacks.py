@@ -37,16 +37,16 @@ from service_support import (
 )  # fmt: skip
 
 from driftfit import track
+from driftfit.service.config import ProblemsError
 from driftfit.service.control import health
 from driftfit.service.core.section import Section
+from driftfit.service.options import Pattern
 from driftfit.service.page.app import metrics_of
 from driftfit.service.page.feed import Feed
-from driftfit.service.settings.config import ProblemsError
-from driftfit.service.settings.matching import Pattern
 from driftfit.service.sinks.contract import Event, Outcome
 from driftfit.service.sinks.sqlite import Sqlite
 from driftfit.service.sinks.webhook import Webhook
-from driftfit.service.sources.samples import Batch, Receipt, Samples
+from driftfit.service.sources.contract import Batch, Receipt, Samples
 from driftfit.service.threads import EVENT_TRIES, SinkThread, SourceThread
 
 

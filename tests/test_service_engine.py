@@ -29,10 +29,9 @@ from service_support import (
 from driftfit import ARX, DataWarning, track
 from driftfit.run.states.advance import advance
 from driftfit.service.core.archive import export
-from driftfit.service.core.engine import KEPT_GROUPS
-from driftfit.service.core.intake import Intake
+from driftfit.service.core.engine import KEPT_GROUPS, Intake
 from driftfit.service.core.section import Section
-from driftfit.service.sources.samples import Batch
+from driftfit.service.sources.contract import Batch
 from driftfit.service.supervisor import Service, rebuild
 
 

@@ -39,10 +39,10 @@ from service_support import (
 from driftfit.service.control import Control
 from driftfit.service.core.journal import sum_of
 from driftfit.service.core.results import extremes_of
+from driftfit.service.options import PageOptions, UserOptions
 from driftfit.service.page.access import Sessions, hashed, new_token, password_fits, token_fits
 from driftfit.service.page.app import Page
 from driftfit.service.page.feed import Feed, reduced
-from driftfit.service.settings.options import PageOptions, UserOptions
 
 TOKEN, HASH = (line.split(": ")[1] for line in new_token())
 WATCHER = [line.split(": ")[1] for line in new_token()]

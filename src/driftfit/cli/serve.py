@@ -52,7 +52,7 @@ def serve(
     """Follow the units of a plant: sensors in, parameters, bands and alarms out, and a page to watch."""
     try:
         from driftfit.service import supervisor as service
-        from driftfit.service.settings.config import ProblemsError
+        from driftfit.service.config import ProblemsError
     except ImportError as error:
         raise ValueError(NEEDED.format(error)) from None
     if make_hash or make_token:

@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from driftfit.engine import __version__
+from driftfit.service.config import Config, read
 from driftfit.service.control import Control, Health, health
 from driftfit.service.core.engine import Engine
 from driftfit.service.core.journal import Journal
-from driftfit.service.settings.config import Config, read
 from driftfit.service.threads import SinkThread, SourceThread, WorkerThread
 
 log = logging.getLogger("driftfit.service")

@@ -17,7 +17,7 @@ import polars as pl
 
 from driftfit.data.storage import replace_file
 from driftfit.service.core.journal import Act, Item, Journal, Pending
-from driftfit.service.settings.options import ServiceOptions
+from driftfit.service.options import ServiceOptions
 
 log = logging.getLogger("driftfit.service")
 SEARCH_SECONDS = 60.0

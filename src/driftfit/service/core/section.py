@@ -27,10 +27,10 @@ from driftfit.run.live.rule import FROZEN
 from driftfit.run.parallel_lanes import FEWEST
 from driftfit.run.states import late
 from driftfit.run.states.advance import Advanced, advance
+from driftfit.service.config import UnitSettings
 from driftfit.service.core.journal import Rows
 from driftfit.service.core.results import ALARM, OK, THETA, TIME, Y_HAT, Blocks, Results, Y
 from driftfit.service.core.unit import SAMPLES, USED, Out, Streams, Unit
-from driftfit.service.settings.config import UnitSettings
 
 COLUMNS = ("y_hat", "e", "s", "theta", "var", "ok")
 """Fields of a tracker's output, in the order of the results; the last becomes a flag."""

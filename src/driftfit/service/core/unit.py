@@ -29,8 +29,8 @@ from driftfit.run.program import Program, programs_of, state_of
 from driftfit.run.states.late import HoldBack
 from driftfit.run.states.layout import unpacked
 from driftfit.run.warm_start import End
+from driftfit.service.config import UnitSettings, valid_ranges
 from driftfit.service.core.journal import REMEDY
-from driftfit.service.settings.config import UnitSettings, valid_ranges
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
 from driftfit.tracking import track

@@ -13,10 +13,10 @@ from typing import Any
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from driftfit.service.options import PageOptions, build
 from driftfit.service.page.access import Sessions
 from driftfit.service.page.app import Page
 from driftfit.service.page.feed import Feed
-from driftfit.service.settings.options import PageOptions, build
 
 
 def main() -> None:

@@ -28,7 +28,7 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from driftfit.data.storage import replace_file
-from driftfit.service.settings.options import PageOptions, UserOptions
+from driftfit.service.options import PageOptions, UserOptions
 
 COOKIE = "driftfit"
 LOCAL = UserOptions("local", "operator", token="sha256$")

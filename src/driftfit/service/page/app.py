@@ -26,10 +26,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from driftfit.data.formats.csv_files import without_formulas
 from driftfit.service.control import health
+from driftfit.service.options import PageOptions
 from driftfit.service.page.access import COOKIE, SESSION_SECONDS, Access, Rates, Sessions, password_fits
 from driftfit.service.page.feed import Feed, column_names, columns_of, newest_blocks, reduced, samples
 from driftfit.service.page.openapi import ACTIONS, OPERATIONS, description
-from driftfit.service.settings.options import PageOptions
 
 STATIC = Path(__file__).parent / "static"
 LOGIN_RATE = 0.1

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from driftfit.service.settings.matching import Pattern
+from driftfit.service.options import Pattern
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
 from driftfit.service.sources.mqtt import Broker, connected, paho, secure
 

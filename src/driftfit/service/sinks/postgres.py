@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from functools import partial
 
 from driftfit.service.connector import client_library
-from driftfit.service.settings.options import Secret
+from driftfit.service.options import Secret
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
 
 SCHEMA = """

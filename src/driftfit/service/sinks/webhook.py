@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from typing import Any, ClassVar, Literal
 from urllib.parse import urlsplit
 
-from driftfit.service.settings.options import Secret
+from driftfit.service.options import Secret
 from driftfit.service.sinks.contract import Event, Outcome, RefusedError, Sink, Writer
 
 ANSWER_SECONDS = 10.0

@@ -12,8 +12,17 @@ from typing import Any
 
 import msgspec
 
-from driftfit.service.sources.contract import Reader, Source
-from driftfit.service.sources.samples import NO_SIGNAL, TOO_MANY_NEW, Batch, Receipt, Samples, ShapeError, decode
+from driftfit.service.sources.contract import (
+    NO_SIGNAL,
+    TOO_MANY_NEW,
+    Batch,
+    Reader,
+    Receipt,
+    Samples,
+    ShapeError,
+    Source,
+    decode,
+)
 
 ANSWER_SECONDS = 30.0
 """After this time a request that is not yet journaled is answered with an error."""

@@ -11,8 +11,7 @@ from functools import partial
 from typing import Any, Literal
 
 from driftfit.service.connector import client_library
-from driftfit.service.sources.contract import Reader, Source
-from driftfit.service.sources.samples import Batch, Samples, decode
+from driftfit.service.sources.contract import Batch, Reader, Samples, Source, decode
 
 BATCH_MESSAGES = 2_000
 CONNECT_SECONDS = 20.0

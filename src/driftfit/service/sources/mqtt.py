@@ -21,9 +21,8 @@ from typing import Any, Literal
 from urllib.parse import urlsplit
 
 from driftfit.service.connector import client_library
-from driftfit.service.settings.options import Secret
-from driftfit.service.sources.contract import Reader, Source
-from driftfit.service.sources.samples import MESSAGE_BYTES, Batch, Samples, decode
+from driftfit.service.options import Secret
+from driftfit.service.sources.contract import MESSAGE_BYTES, Batch, Reader, Samples, Source, decode
 from driftfit.service.sources.sparkplug import REBIRTH, Sparkplug, UnknownAliasError, rebirth_topic
 
 BATCH_MESSAGES = 2_000

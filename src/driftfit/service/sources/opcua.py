@@ -15,9 +15,8 @@ from functools import partial
 from typing import Any
 
 from driftfit.service.connector import EventLoop, client_library
-from driftfit.service.settings.options import Secret
-from driftfit.service.sources.contract import Reader, Source
-from driftfit.service.sources.samples import Batch, by_topic
+from driftfit.service.options import Secret
+from driftfit.service.sources.contract import Batch, Reader, Source, by_topic
 
 QUEUED_CHANGES = 100_000
 """Changes that wait to be read; those beyond are dropped, and counted as refused."""

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.service.sources.contract import Reader, Source
-from driftfit.service.sources.samples import Batch, Samples
+from driftfit.service.sources.contract import Batch, Reader, Samples, Source
 
 PUMPS = 6
 CLOSING = 3

@@ -17,8 +17,7 @@ from typing import Any
 import polars as pl
 
 from driftfit.data.formats.packed import read_parquet
-from driftfit.service.sources.contract import END, FileSource, Reader
-from driftfit.service.sources.samples import Batch, Samples, seconds
+from driftfit.service.sources.contract import END, Batch, FileSource, Reader, Samples, seconds
 
 BATCH_ROWS = 1000
 

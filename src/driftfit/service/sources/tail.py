@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from driftfit.service.sources.contract import FileSource, Reader
-from driftfit.service.sources.samples import Batch, Samples, by_topic, decode
+from driftfit.service.sources.contract import Batch, FileSource, Reader, Samples, by_topic, decode
 
 PIECE_BYTES = 1 << 20
 """Most bytes that are read at once, and of one line."""

@@ -21,8 +21,7 @@ from driftfit.models.base import Model
 from driftfit.parsing.settings import parse_model, tracker_of
 from driftfit.run.live.rule import KINDS
 from driftfit.run.program import Program
-from driftfit.service.settings.matching import Pattern
-from driftfit.service.settings.options import PageOptions, ServiceOptions, build, converted, kinds
+from driftfit.service.options import PageOptions, Pattern, ServiceOptions, build, converted, kinds
 from driftfit.service.sinks.contract import Sink
 from driftfit.service.sources.contract import Source
 from driftfit.streams import Live
