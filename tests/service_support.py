@@ -15,7 +15,7 @@ import urllib.request
 
 import numpy as np
 
-from driftfit import ARX, Kalman
+from driftfit import ARX, Kalman, track
 from driftfit.service.config import parse
 from driftfit.service.core.engine import Engine
 from driftfit.service.sources.contract import Batch, decode
@@ -43,6 +43,18 @@ def record(T=400, seed=0):
     u, y = rng.normal(size=T), np.zeros(T)
     for t in range(1, T):
         y[t] = 0.8 * y[t - 1] + 0.5 * u[t - 1] + 0.1 * rng.normal()
+    return y, u
+
+
+def run_of(y, u, time=None, **more):
+    return track(
+        MODEL, TRACKER, y, u, time=np.arange(len(y)) * 1.0 if time is None else time, dt=1.0, gate=True, **more
+    )
+
+
+def coded():
+    y, u = record(100)
+    y[[5, 60]] = 9999.0
     return y, u
 
 

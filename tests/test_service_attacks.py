@@ -198,21 +198,6 @@ def test_a_time_far_ahead_mutes_no_unit(tmp_path):
     assert (engine.units.get(1).counts["late"], engine.units.get(1).counts["samples"]) == (1, 13)
 
 
-@pytest.mark.parametrize(
-    "action",
-    [{"do": "hold", "on": True, "x": 10**21}, {"do": "hold", "on": True, "x": "\ud800"}, {"do": "reset", "x": {3j}}],
-)
-def test_an_action_that_cannot_be_stored_is_refused(tmp_path, action):
-    """The first of these ended the service."""
-    engine, told = opened(configured(), tmp_path), []
-    y, u = record(40)
-    feed(engine, message("plant/a", range(20), y[:20], u[:20]))
-    engine.act("a", action, told.append)
-    assert "cannot be stored" in told[0]
-    assert feed(engine, message("plant/a", range(20, 40), y[20:], u[20:]))
-    assert events(engine, "action") == []
-
-
 def test_a_message_that_is_not_understood_harms_no_other(tmp_path):
     """Sources hand on what devices send: lists as values, and lists of another length than they say."""
     engine = opened(configured(), tmp_path)
