@@ -14,7 +14,7 @@ from cli_support import fails
 from cli_support import run as command
 
 from driftfit import ARX, Kalman, track
-from driftfit.data.formats.csv_files import without_formulas
+from driftfit.data.csv_files import without_formulas
 from driftfit.fleets import Fleet, Outputs
 from driftfit.show import export
 

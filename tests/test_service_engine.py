@@ -29,7 +29,7 @@ from service_support import (
 )  # fmt: skip
 
 from driftfit import ARX, DataWarning, track
-from driftfit.run.states.advance import advance
+from driftfit.run.parallel_lanes import advance
 from driftfit.service.core.engine import KEPT_GROUPS, Intake
 from driftfit.service.core.section import Section
 from driftfit.service.sources.contract import Batch

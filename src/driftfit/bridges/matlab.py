@@ -28,7 +28,7 @@ import numpy as np
 from scipy.io import loadmat, savemat
 from scipy.io.matlab import matfile_version
 
-from driftfit.data.formats.packed import check_unpacked
+from driftfit.data.files import check_unpacked
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 

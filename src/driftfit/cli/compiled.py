@@ -19,7 +19,7 @@ from driftfit.engine.disk_cache import Contents, contents, folder, prune
 from driftfit.parsing.settings import parse_model, parse_tracker
 from driftfit.results import Track
 from driftfit.run.parallel_lanes import FEWEST
-from driftfit.show.parts.text import facts
+from driftfit.show.text import facts
 
 
 @app.command()

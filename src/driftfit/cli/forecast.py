@@ -17,7 +17,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import missing_settings
 from driftfit.results import Track
 from driftfit.show.export import write_table
-from driftfit.show.parts.text import digits, facts, table_of
+from driftfit.show.text import digits, facts, table_of
 from driftfit.tune.tune import tune
 from driftfit.tune.tuned import Tuned
 

@@ -17,8 +17,8 @@ from typer import Option
 from typer.core import TyperGroup
 
 from driftfit import __version__
-from driftfit.show.parts.axes import check_picture
-from driftfit.show.parts.text import WIDTH
+from driftfit.show.axes import check_picture
+from driftfit.show.text import WIDTH
 
 
 @contextmanager

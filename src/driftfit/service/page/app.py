@@ -24,7 +24,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from driftfit.data.formats.csv_files import without_formulas
+from driftfit.data.csv_files import without_formulas
 from driftfit.service.control import health
 from driftfit.service.options import PageOptions
 from driftfit.service.page.access import COOKIE, SESSION_SECONDS, Access, Rates, Sessions, password_fits
