@@ -9,6 +9,9 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
+ANSWER_SECONDS = 20.0
+"""In this time a broker or a server must have answered."""
+
 
 @dataclass(frozen=True)
 class Connector(ABC):
@@ -37,7 +40,7 @@ class EventLoop:
         self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
         self.thread.start()
 
-    def call(self, work: Any, seconds: float) -> Any:
+    def call(self, work: Any, seconds: float = ANSWER_SECONDS) -> Any:
         """The result of a coroutine."""
         return asyncio.run_coroutine_threadsafe(work, self.loop).result(seconds)
 

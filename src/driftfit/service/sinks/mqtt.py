@@ -16,12 +16,10 @@ from dataclasses import dataclass
 
 import msgspec
 
+from driftfit.service.connector import ANSWER_SECONDS
 from driftfit.service.options import Pattern
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
 from driftfit.service.sources.mqtt import Broker, connected, paho, secure
-
-ACKNOWLEDGED_SECONDS = 20.0
-"""In this time the broker must have acknowledged a batch."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +56,7 @@ class _Mqtt(Writer):
         self.client.loop_start()
 
     def write(self, batch: Outcome) -> None:
-        until = time.monotonic() + ACKNOWLEDGED_SECONDS
+        until = time.monotonic() + ANSWER_SECONDS
         options, sent = self.options, []
         for unit, is_event, body in messages(batch, options.every_result):
             topic = topic_of(options.topic, batch, unit) + "/event" * is_event

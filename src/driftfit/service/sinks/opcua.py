@@ -12,8 +12,6 @@ from driftfit.service.connector import EventLoop
 from driftfit.service.sinks.contract import Outcome, Result, Sink, Writer
 from driftfit.service.sources.opcua import library
 
-CALL_SECONDS = 30.0
-
 
 @dataclass(frozen=True)
 class Opcua(Sink):
@@ -39,7 +37,7 @@ class _Opcua(Writer):
         self.folders: dict[str, Any] = {}
         self.loop = EventLoop()
         try:
-            self.loop.call(self._start(url), CALL_SECONDS)
+            self.loop.call(self._start(url))
         except BaseException:
             self.loop.end()
             raise
@@ -52,7 +50,7 @@ class _Opcua(Writer):
         await self.server.start()
 
     def write(self, batch: Outcome) -> None:
-        self.loop.call(self._write(batch), CALL_SECONDS)
+        self.loop.call(self._write(batch))
 
     async def _write(self, batch: Outcome) -> None:
         for one in batch.last:
@@ -73,7 +71,7 @@ class _Opcua(Writer):
 
     def close(self) -> None:
         try:
-            self.loop.call(self.server.stop(), CALL_SECONDS)
+            self.loop.call(self.server.stop())
         finally:
             self.loop.end()
 

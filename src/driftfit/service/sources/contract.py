@@ -64,6 +64,8 @@ class Reader(ABC):
         return None
 
 
+BATCH_MESSAGES = 2_000
+"""Messages that a source reads at once, at most."""
 MESSAGE_SAMPLES = 10_000
 """Samples of one message."""
 MESSAGE_FIELDS = 256

@@ -10,11 +10,9 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal
 
-from driftfit.service.connector import client_library
-from driftfit.service.sources.contract import Batch, Reader, Samples, Source, decode
+from driftfit.service.connector import ANSWER_SECONDS, client_library
+from driftfit.service.sources.contract import BATCH_MESSAGES, Batch, Reader, Samples, Source, decode
 
-BATCH_MESSAGES = 2_000
-CONNECT_SECONDS = 20.0
 library = partial(client_library, "kafka", "confluent_kafka", "confluent-kafka", "kafka")
 
 
@@ -45,12 +43,12 @@ class _Kafka(Reader):
         self.consumer = kafka.Consumer(given)
         places = []
         for topic in options.topics:
-            known = self.consumer.list_topics(topic, CONNECT_SECONDS).topics[topic]
+            known = self.consumer.list_topics(topic, ANSWER_SECONDS).topics[topic]
             if known.error is not None:
                 raise ConnectionError(str(known.error))
             for part in known.partitions:
                 at = position.get(f"{topic}/{part}")
-                ends = self.consumer.get_watermark_offsets(kafka.TopicPartition(topic, part), CONNECT_SECONDS)
+                ends = self.consumer.get_watermark_offsets(kafka.TopicPartition(topic, part), ANSWER_SECONDS)
                 if at is None:
                     at = ends[options.begin == "latest"]
                 elif not ends[0] <= at <= ends[1]:  # the library would go on at one of the ends, without a word

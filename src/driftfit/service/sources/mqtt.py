@@ -20,14 +20,11 @@ from functools import partial
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
-from driftfit.service.connector import client_library
+from driftfit.service.connector import ANSWER_SECONDS, client_library
 from driftfit.service.options import Secret
-from driftfit.service.sources.contract import MESSAGE_BYTES, Batch, Reader, Samples, Source, decode
+from driftfit.service.sources.contract import BATCH_MESSAGES, MESSAGE_BYTES, Batch, Reader, Samples, Source, decode
 from driftfit.service.sources.sparkplug import REBIRTH, Sparkplug, UnknownAliasError, rebirth_topic
 
-BATCH_MESSAGES = 2_000
-CONNECT_SECONDS = 20.0
-"""In this time the broker must have accepted a connection."""
 CLOSE_SECONDS = 1.0
 """For this time a reader that is closed waits for acknowledgements."""
 REBIRTH_SECONDS = 30.0
@@ -150,7 +147,7 @@ class _Mqtt(Reader):
     def _wait(self, seconds: float) -> None:
         """Until messages arrive, or acknowledgements are to be sent."""
         socket = self.client.socket()
-        if socket is None or (not self.client.is_connected() and time.monotonic() - self.begun > CONNECT_SECONDS):
+        if socket is None or (not self.client.is_connected() and time.monotonic() - self.begun > ANSWER_SECONDS):
             raise ConnectionError(f"no connection to {self.options.url}")
         if self.more or (isinstance(socket, ssl.SSLSocket) and socket.pending()):
             return

@@ -16,12 +16,10 @@ from typing import Any
 
 from driftfit.service.connector import EventLoop, client_library
 from driftfit.service.options import Secret
-from driftfit.service.sources.contract import Batch, Reader, Source, by_topic
+from driftfit.service.sources.contract import BATCH_MESSAGES, Batch, Reader, Source, by_topic
 
 QUEUED_CHANGES = 100_000
 """Changes that wait to be read; those beyond are dropped, and counted as refused."""
-BATCH_CHANGES = 2_000
-CALL_SECONDS = 20.0
 library = partial(client_library, "opcua", "asyncua", "asyncua", "opcua")
 
 
@@ -59,7 +57,7 @@ class _Opcua(Reader):
         self.places: dict[str, tuple[str, str]] = {}
         self.loop = EventLoop()
         try:
-            self.loop.call(self._connect(), CALL_SECONDS)
+            self.loop.call(self._connect())
         except BaseException:
             self.close()
             raise
@@ -102,10 +100,10 @@ class _Opcua(Reader):
         except queue.Empty:
             if self.error is not None:
                 raise self.error from None
-            self.loop.call(self.client.check_connection(), CALL_SECONDS)
+            self.loop.call(self.client.check_connection())
             return None
         arrived = time.monotonic()
-        while len(found) < BATCH_CHANGES and not self.changes.empty():
+        while len(found) < BATCH_MESSAGES and not self.changes.empty():
             found.append(self.changes.get())
         refused, self.dropped = self.dropped, 0
         return Batch(by_topic(found), refused=refused, arrived=arrived)
