@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from driftfit.service.connector import EventLoop
+from driftfit.service.connector import ANSWER_SECONDS, EventLoop
 from driftfit.service.sinks.contract import Outcome, Result, Sink, Writer
 from driftfit.service.sources.opcua import library
 
@@ -37,7 +37,7 @@ class _Opcua(Writer):
         self.folders: dict[str, Any] = {}
         self.loop = EventLoop()
         try:
-            self.loop.call(self._start(url))
+            self.loop.call(self._start(url), 2 * ANSWER_SECONDS)
         except BaseException:
             self.loop.end()
             raise
