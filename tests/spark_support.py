@@ -9,8 +9,8 @@ import pyarrow as pa
 
 from driftfit import ARX, Kalman, track
 from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow, Known
-from driftfit.bridges.spark.follow import schema_of
-from driftfit.bridges.spark.pieces import ARROW, STATE
+from driftfit.bridges.spark.follow import STATE, _schema
+from driftfit.bridges.spark.pieces import ARROW
 from driftfit.bridges.spark.task import SETTING, Task
 from driftfit.run import layout
 
@@ -57,17 +57,14 @@ def task_of(model=MODEL, tracker=K):
 KINDS = {"unit": "string", "t": "double", "u": "double"}
 
 
-def flow_of(task, hold=HOLD, rules=None, origins=()):
-    rules = (None,) * len(task.y) if rules is None else rules
-    return Flow(task, schema_of(task, KINDS | dict.fromkeys(task.y, "double"), rules), hold, rules, origins)
-
-
 class ByHand:
     """A stream whose batches are given one by one: what Spark does for `driftfit.bridges.spark.follow`."""
 
     def __init__(self, model=MODEL, tracker=K, rules=None, hold=HOLD, origins=(), settings=()):
         task = replace(task_of(model, tracker), settings=tuple(settings))
-        self.flow = flow_of(task, hold, rules, origins)
+        rules = (None,) * len(task.y) if rules is None else rules
+        kinds = KINDS | dict.fromkeys(task.y, "double")
+        self.flow = Flow(task, _schema(task, kinds, rules), hold, rules, origins)
         self.kept = []
         self.found = {}
 

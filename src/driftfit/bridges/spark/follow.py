@@ -16,7 +16,7 @@ import numpy as np
 
 from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow, Origin
 from driftfit.bridges.spark.frames import rows_of, task_of
-from driftfit.bridges.spark.pieces import STATE, alarms_schema, rules_of
+from driftfit.bridges.spark.pieces import COUNTS, alarms_schema, rules_of
 from driftfit.bridges.spark.store import NEXT, Store
 from driftfit.bridges.spark.task import SETTING, Task, results_schema, trackers_of
 from driftfit.data.clock import Clock
@@ -25,6 +25,9 @@ from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
 from driftfit.run.live.rule import AlarmRule
 from driftfit.trackers.base import Tracker
+
+STATE = {"state": "binary", "settings": "string", **dict.fromkeys(COUNTS, "bigint"), "watch": "string"}
+"""Columns of states, after those of their unit and their times."""
 
 
 def follow(
@@ -81,7 +84,7 @@ def follow(
     kinds = dict(rows_of(stream, task, None).dtypes)
     dated = kinds[time].startswith("timestamp")
     rules = rules_of(task, rule)
-    schema = schema_of(task, kinds, rules)
+    schema = _schema(task, kinds, rules)
     store = Store(stream.sparkSession, path)
     flow = Flow(task, schema, duration("hold", hold, dated), rules, _origins(store, task, schema, migrate))
     run = _Batches(store, flow, settings, initial, None if expire is None else duration("expire", expire, dated), sink)
@@ -103,7 +106,7 @@ def duration(name: str, value: Any, dated: bool) -> Any:
     return span
 
 
-def schema_of(task: Task, kinds: Mapping[str, str], rules: Sequence[AlarmRule | None]) -> dict[str, str]:
+def _schema(task: Task, kinds: Mapping[str, str], rules: Sequence[AlarmRule | None]) -> dict[str, str]:
     """Columns and types of the table."""
     own = {name: kinds[name] for name in task.columns} | results_schema(task) | alarms_schema(task, rules)
     times = {"last": kinds[task.time], "newest": kinds[task.time]}
@@ -193,7 +196,7 @@ class _Batches:
                 flow = replace(flow, expired=self._oldest(kept))
         else:
             if self.initial is not None:
-                parts.append(begun(self.initial, task).withColumn("_kind", F.lit(OLD)))
+                parts.append(_begun(self.initial, task).withColumn("_kind", F.lit(OLD)))
         every = parts[0]
         for part in parts[1:]:
             every = every.unionByName(part, allowMissingColumns=True)
@@ -215,7 +218,7 @@ class _Batches:
         return newest - self.expire if isinstance(newest, float) else np.datetime64(newest, "us") - self.expire
 
 
-def begun(initial: Any, task: Task) -> Any:
+def _begun(initial: Any, task: Task) -> Any:
     """States to begin with, from a batch run or from another stream."""
     from pyspark.sql import functions as F  # noqa: N812
 

@@ -27,8 +27,6 @@ ARROW = {
 }  # fmt: skip
 COUNTS = ("samples", "used", "without_time", "repeated", "late")
 """Counts that a unit has."""
-STATE = {"state": "binary", "settings": "string", **dict.fromkeys(COUNTS, "bigint"), "watch": "string"}
-"""Columns of states, after those of their unit and their times."""
 SAMPLES, USED, UNTIMED, REPEATED, LATE = range(len(COUNTS))
 SQUARES, STANDARD, JUDGED = range(3)
 """Sums of each output: of e^2, of e^2 / s, and how many terms the latter has."""
