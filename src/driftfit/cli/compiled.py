@@ -18,7 +18,7 @@ from driftfit.cli.program import app, progress, say
 from driftfit.engine.disk_cache import Contents, contents, folder, prune
 from driftfit.parsing.settings import parse_model, parse_tracker
 from driftfit.results import Track
-from driftfit.run.parallel_lanes import FEWEST
+from driftfit.run.parallel_lanes import FEWEST_LANES
 from driftfit.show.text import facts
 
 
@@ -83,8 +83,8 @@ def warm(
             lacking = _used(run)
             Live(run.model, chosen).update(0.0, None if u is None else u[0])
             if fleet:
-                many = np.tile(y, (FEWEST, 1))
-                _used(track(bound, chosen, many, None if u is None else np.tile(u, (FEWEST, 1, 1)), by="row"))
+                many = np.tile(y, (FEWEST_LANES, 1))
+                _used(track(bound, chosen, many, None if u is None else np.tile(u, (FEWEST_LANES, 1, 1)), by="row"))
         for verb, reason in lacking.items():
             say(Text(f" {text}, without {verb}: {reason}", "dim"))
     after = contents()

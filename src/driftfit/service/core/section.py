@@ -24,7 +24,7 @@ from driftfit.readings import gate
 from driftfit.readings.remarks import SAID
 from driftfit.run.live.rule import FROZEN
 from driftfit.run.live.stream import HELD
-from driftfit.run.parallel_lanes import FEWEST, Advanced, advance
+from driftfit.run.parallel_lanes import FEWEST_LANES, Advanced, advance
 from driftfit.service.config import UnitSettings
 from driftfit.service.core.journal import Rows
 from driftfit.service.core.results import ALARM, OK, THETA, TIME, Y_HAT, Blocks, Results, Y
@@ -73,7 +73,7 @@ class Section:
 
     def prepare(self) -> None:
         """Compile what the first samples need, so that they do not wait; lanes only if there are units for them."""
-        for count in (1, FEWEST) if len(self.units) >= FEWEST else (1,):
+        for count in (1, FEWEST_LANES) if len(self.units) >= FEWEST_LANES else (1,):
             trial = Section(self.streams.index, self.streams.settings)
             for k in range(count):
                 trial.add(k, "")
