@@ -59,8 +59,7 @@ from driftfit.tune.tune import tune
 from driftfit.use import prepare
 from driftfit.use.hammerstein_wiener.diagnostics import diagnose_blocks
 from driftfit.use.hammerstein_wiener.free_run import free_run
-from driftfit.use.rational import rational_model
-from driftfit.use.system_from_path import static_curve
+from driftfit.use.system_from_path import rational_model, static_curve
 
 __all__ = [
     "ARMAX",
