@@ -24,7 +24,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from driftfit.show.parts.text import table_of
+from driftfit.show.text import table_of
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = "src/driftfit"
@@ -34,13 +34,13 @@ MOVED = "fbfc0a9"
 LAYERS = (
     ("engine",),
     ("models", "systems", "readings"),
-    ("trackers", "models.hammerstein_wiener.trackers"),
+    ("trackers", "models.hammerstein_wiener.extended_kalman", "models.hammerstein_wiener.output_error"),
     # the arithmetic of smoothers works on arrays and not on runs: a stream smooths its last samples with it
     ("data", "smooth.parts"),
     ("run",),
     # how tables and pictures of all results look, which each verb's result needs to print and draw itself
-    ("show.parts",),
-    ("smooth", "tune", "judge", "use", "models.hammerstein_wiener.results", "trackers.bank.results"),
+    ("show.text", "show.axes"),
+    ("smooth", "tune", "judge", "use", "trackers.bank.results"),
     ("show",),
     # the facade binds verbs to results
     ("", "results", "fleets", "streams", "tracking", "checks", "extend", "parsing"),
@@ -204,7 +204,7 @@ Room = tuple[str, int]
 
 def draw(found: Mapping[str, Structure], file: str) -> None:
     """Folders as boxes in their layers, and imports between them: red where they point up, wider where more go."""
-    from driftfit.show.parts.axes import GREY, RED, new_figure
+    from driftfit.show.axes import GREY, RED, new_figure
 
     figure = new_figure(6.4 * len(found), 7.0)
     for axis, (name, one) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items(), strict=True):

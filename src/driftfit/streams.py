@@ -6,12 +6,13 @@ from functools import cached_property
 from typing import Any
 
 from driftfit.judge.structures import shared_streams
-from driftfit.models.hammerstein_wiener.separation.paths import Groups, Separator
+from driftfit.models.hammerstein_wiener.blocks import Separator
+from driftfit.models.hammerstein_wiener.separation import Groups
 from driftfit.run.live import live
 from driftfit.trackers.bank.results.live_results import LiveHypotheses
-from driftfit.use.constraints.constrained import Constrained, constrain_stream
+from driftfit.use.constrained import Constrained, constrain_stream
 from driftfit.use.forecast import Forecast, forecast_stream
-from driftfit.use.live_system import LiveSystem
+from driftfit.use.system import LiveSystem
 
 
 class Live(live.Live, public=True):
@@ -45,7 +46,7 @@ class Live(live.Live, public=True):
 
     @property
     def system(self) -> LiveSystem:
-        """The present `ARX` system: poles, gains, responses with bands; see `driftfit.use.live_system`."""
+        """The present `ARX` system: poles, gains, responses with bands; see `driftfit.use.system`."""
         return LiveSystem(self)
 
 

@@ -9,6 +9,10 @@ lane o G + g is output o of series g; lanes beyond ny G repeat others and are ig
 
 Series are sorted by length, so that those of one tile end at about the same time. A lane whose series has ended
 continues with dt = 0 and no output, which changes only the lags of its model; its state is copied when its series ends.
+
+`advance` continues many series from their states, for a process that receives a few samples of each and must be fast:
+results are columns in the order of the samples, and no `Track` is made. They are those of the records, bit for bit. Of
+K series with ny outputs each, programs and states have K ny entries, those of a series one after the other.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ import threading
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -26,22 +31,19 @@ import numpy as np
 from driftfit.data.record import Records
 from driftfit.engine.kernel import Array, Driver
 from driftfit.engine.tiles import repeat_tile
-from driftfit.run.program import Program, State, progress, tile_of
-from driftfit.run.result import Lanes
-from driftfit.run.states.layout import words_of
+from driftfit.run.lanes import Lanes
+from driftfit.run.layout import words_of
+from driftfit.run.program import PROGRESS_SAMPLES, Program, State, progress, tile_of
 
-BLOCK = 256
+BLOCK_SAMPLES = 256
 """Number of samples that are copied into lane order at a time: a block of a tile fits into the second-level cache."""
 
-FEWEST = 10
+FEWEST_LANES = 10
 """Fewer series than this are run one by one: a tile of 32 lanes costs as much as about ten single lanes."""
 
-TURNS, MOST_TILES = 16, 16
+BATCHES_PER_THREAD = TILES_PER_BATCH = 16
 """Batches that a thread runs at least, and tiles of a batch at most: handing over a tile costs 50 us, as much as a
 quarter of its hundred samples."""
-
-SHOWN = 1_000_000
-"""Samples above which a progress bar appears."""
 
 
 _thread = threading.local()
@@ -110,7 +112,7 @@ def _groups(programs: Sequence[Program]) -> list[list[int]]:
 
 def width_of(program: Program, count: int, ny: int = 1) -> int:
     """Lanes of the tiles for ``count`` series with ny outputs."""
-    wide = 1 if count * ny < FEWEST else program.width
+    wide = 1 if count * ny < FEWEST_LANES else program.width
     return ny if wide < 2 * ny else wide
 
 
@@ -160,10 +162,10 @@ def run_jobs(jobs: Sequence[Job], records: Records, threads: int | None = None) 
     for job in {(job.run, job.tile.dtype, job.out.dtype): job for job in jobs}.values():
         _drive(job, records, 0)  # compiles, so that threads do not wait for each other
     threads = threads or cores()
-    most = min(MOST_TILES, max(1, len(jobs) // (TURNS * threads)))
+    most = min(TILES_PER_BATCH, max(1, len(jobs) // (BATCHES_PER_THREAD * threads)))
     batches = [jobs[k : k + most] for k in range(0, len(jobs), most)]
     total = sum(map(_samples, batches))
-    with progress("tracking", total, total > SHOWN) as advance, ThreadPoolExecutor(threads) as pool:
+    with progress("tracking", total, total > PROGRESS_SAMPLES) as advance, ThreadPoolExecutor(threads) as pool:
         waiting = {pool.submit(_drive_all, batch, records): batch for batch in batches}
         try:
             for future in as_completed(waiting):
@@ -197,9 +199,9 @@ def _drive(job: Job, records: Records, stop: int) -> None:
     first, length = records.first[series], records.length[series]
     columns = records.known.columns
     given, factors = records.y.reshape(N, -1), columns.reshape(*columns.shape[:2], -1)
-    y, u, known = _block(L, records.u.shape[1], min(BLOCK, len(columns)), columns.shape[1])
+    y, u, known = _block(L, records.u.shape[1], min(BLOCK_SAMPLES, len(columns)), columns.shape[1])
     finals: list[tuple[Array, Array]] = []
-    bounds = sorted({*range(0, stop, BLOCK), *(int(end) for end in length if end < stop), stop})
+    bounds = sorted({*range(0, stop, BLOCK_SAMPLES), *(int(end) for end in length if end < stop), stop})
     for a, b in pairwise(bounds) if stop else [(0, 0)]:
         size = b - a
         start = np.where(b <= length, first + a, -1)
@@ -214,7 +216,7 @@ def _drive(job: Job, records: Records, stop: int) -> None:
 
 def _block(L: int, m: int, factors: int, columns: int) -> tuple[Array, Array, Array]:
     """This thread's memory for a block in lane order; fresh memory for every tile would cost as much as the filter."""
-    shapes = (BLOCK, L), (BLOCK, m, L), (factors, columns, L)
+    shapes = (BLOCK_SAMPLES, L), (BLOCK_SAMPLES, m, L), (factors, columns, L)
     if getattr(_thread, "shapes", None) != shapes:
         _thread.shapes, _thread.block = shapes, tuple(np.empty(shape) for shape in shapes)
     block: tuple[Array, Array, Array] = _thread.block
@@ -249,3 +251,84 @@ def _gather_factors(known: Array, start: Array, column: Array, to_known: Array) 
         for j in range(known.shape[1]):
             for l in range(len(start)):
                 to_known[t, j, l] = known[(start[l] + t) * changing, j, column[l]] if start[l] >= 0 else 1.0 * (j > 0)
+
+
+class Advanced:
+    """The results of a driver for all series of ``records``, and their final states."""
+
+    def __init__(self, programs: Sequence[Program], records: Records, jobs: Sequence[Job]) -> None:
+        self.programs, self.records, self.jobs = programs, records, jobs
+
+    def column(self, name: str) -> Array:
+        """A field of the driver's output at every sample: (N, ..), or (N, ny, ..) for several outputs."""
+        shape, ny = self.jobs[0].out[name].shape[1:-1], self.records.ny
+        into = np.empty((len(self.records.y), ny, int(np.prod(shape))))
+        self.columns([name], into)
+        return into.reshape(-1, *((ny,) if self.records.outputs else ()), *shape)
+
+    def columns(self, names: Sequence[str], into: Array) -> None:
+        """Write fields of the output at every sample next to each other ``into`` (N, k), or (N, ny, k) for several
+        outputs.
+        """
+        into = into[:, None] if into.ndim == 2 else into
+        for job in self.jobs:
+            lanes, L = np.flatnonzero(job.live), len(job.lanes)
+            series, output = np.divmod(job.lanes[lanes], self.records.ny)
+            fields: Mapping[str, Any] = job.out.dtype.fields or {}
+            places = (fields[name][:2] for name in names)
+            begin = [np.arange(at, at + kind.itemsize, 8 * L) // 8 for kind, at in places]
+            words = job.out.view(np.float64).reshape(len(job.out), -1)
+            first, length = self.records.first[series], self.records.length[series]
+            _natural(words, np.concatenate(begin), lanes, first, length, output, into)
+
+    def reasons(self) -> Array:
+        """What the gate decided of every sample, (N,), of series with one output (`driftfit.readings.gate`)."""
+        into = np.zeros(len(self.records.y), int)
+        for job in self.jobs:
+            for lane in np.flatnonzero(job.live).tolist():
+                k = job.lanes[lane]
+                first, length = self.records.first[k], self.records.length[k]
+                into[first : first + length] = job.out["reason"][:length, lane]
+        return into
+
+    @cached_property
+    def lanes(self) -> Lanes:
+        """The lane of each program."""
+        return lanes_in(self.jobs, self.records)
+
+    def states(self) -> Array:
+        """The words (K ny, W) after the last samples; of a layout with fewer words the first of them."""
+        layouts = [self.programs[job.lanes[0]].layout for job in self.jobs]
+        found = np.zeros((len(self.programs), max(one.size for one in layouts)), np.int64)
+        for job, layout in zip(self.jobs, layouts, strict=True):
+            found[job.lanes[job.live], : layout.size] = layout.taken(job.tile)[job.live]
+        return found
+
+
+def advance(
+    programs: Sequence[Program], records: Records, states: Array, begun: Array, threads: int | None = None,
+    collected: bool = False,
+) -> Advanced:  # fmt: skip
+    """Run every series by its programs, from their states if they have ``begun``.
+
+    ``states`` (K ny, W) are the words of the states (`Layout.unpack`), as `Advanced.states` returns them; a program
+    that has not ``begun`` (K ny,) is at its start. With ``collected`` the fields of `collected_samples.COLLECTED` are
+    kept too.
+    """
+    jobs = prepare(programs, records, "std", collected=collected)
+    for job in jobs:
+        lanes = np.flatnonzero(begun[job.lanes])
+        if lanes.size:
+            layout = programs[job.lanes[0]].layout
+            layout.put(job.tile, lanes, states[job.lanes[lanes], : layout.size])
+    run_jobs(jobs, records, threads)
+    return Advanced(programs, records, jobs)
+
+
+@Driver
+def _natural(words: Array, begin: Array, lanes: Array, first: Array, length: Array, output: Array, into: Array) -> None:
+    """Copy lanes of an output (T, words), whose fields ``begin`` (k,) at these words, to their rows of (N, ny, k)."""
+    for j in range(len(lanes)):
+        for t in range(length[j]):
+            for i in range(len(begin)):
+                into[first[j] + t, output[j], i] = words[t, begin[i] + lanes[j]]

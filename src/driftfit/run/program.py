@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from driftfit.data import storage
+from driftfit.data.arguments import check_ready
 from driftfit.data.record import Record
-from driftfit.data.signals import check_ready
 from driftfit.engine.drivers import GATED, NOWHERE, Drivers, TrackerSteps, drivers
 from driftfit.engine.kernel import Array
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
@@ -28,22 +28,21 @@ from driftfit.models.regression import Regression
 from driftfit.readings.first_samples import replayed
 from driftfit.readings.gate import AT_START, Gate, gate_step
 from driftfit.readings.gate import start as gate_start
-from driftfit.run.collected_samples import COLLECTED, collecting
-from driftfit.run.states.gating import AtStart, gate_of, readings_of, without_start
-from driftfit.run.states.layout import Layout, words_of
-from driftfit.run.states.rows import put_columns
+from driftfit.run.columns import COLLECTED, collecting, put_columns
+from driftfit.run.gating import AtStart, gate_of, readings_of, without_start
+from driftfit.run.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
-CHUNK = 1_000_000
+PROGRESS_SAMPLES = 1_000_000
 """Samples beyond which a progress bar is shown."""
 
-FEW, PART = 1024, 0.1
+FIRST_PART, PART_SECONDS = 1024, 0.1
 """Samples of the first part of a record, and about the seconds that a part takes: Ctrl-C is heard between two parts."""
 
-BLOCK = 4096
+SINGLE_BLOCK = 4096
 """Samples of a block of results that are kept in single precision."""
 
-MOST = 10
+WIDEST_LANES = 10
 """With more parameters than this loops over lanes are slower than single lanes (docs/design.md): the compiler does not
 unroll a loop over that many, and then does not vectorise the loop over lanes.
 """
@@ -102,6 +101,21 @@ class Program:
     def whole(self) -> Model:
         """The model that the user gave, with all its outputs."""
         return self.model if self.shared is None else self.shared
+
+    @cached_property
+    def settling(self) -> float:
+        """`Model.settling` of the whole model."""
+        return self.whole.settling
+
+    @cached_property
+    def inspects(self) -> bool:
+        """Whether the model looks at the whole record before a run."""
+        return type(self.model).inspect is not Model.inspect
+
+    @cached_property
+    def doubts(self) -> bool:
+        """Whether the tracker looks at a run after it."""
+        return type(self.tracker).doubts is not Tracker.doubts
 
     @cached_property
     def alone(self) -> Program | None:
@@ -186,7 +200,7 @@ class Program:
         return Layout(record, held_in(record, self.tracker_start), self.tracker.scratch, owner)
 
     def pack(self, tile: Array, lane: int = 0) -> bytes:
-        """The state of a lane as bytes (`driftfit.run.states.layout`)."""
+        """The state of a lane as bytes (`driftfit.run.layout`)."""
         return self.layout.pack(words_of(tile)[self.layout.rows(tile), lane])
 
     def unpack(self, data: bytes, tile: Array | None = None, lane: int = 0) -> Array:
@@ -254,7 +268,7 @@ class Program:
     @property
     def width(self) -> int:
         """The number of lanes of a tile of many series, or of many settings."""
-        return 1 if self.model.n > MOST or self.gate is not None else min(self.model.width, self.tracker.width)
+        return 1 if self.model.n > WIDEST_LANES or self.gate is not None else min(self.model.width, self.tracker.width)
 
     def lanes(self, count: int) -> Array:
         """A tile with this program in every lane, at its start. It is made once and must not be changed."""
@@ -302,16 +316,16 @@ class Program:
         """Run a tile over a record, a lane for each output; returns what is kept, (T,) of `output_type`."""
         T = len(record)
         out = self.written(tile, T, keep, dtype)
-        if FEW >= T:
+        if FIRST_PART >= T:
             self.fill(tile, *lanes_of(record), out)
             return out
-        a, count = 0, FEW
-        with progress("tracking", T, T > CHUNK) as advance:
+        a, count = 0, FIRST_PART
+        with progress("tracking", T, T > PROGRESS_SAMPLES) as advance:
             while a < T:
                 begun, part = perf_counter(), slice(a, min(a + count, T))
                 self.fill(tile, *lanes_of(record.part(part)), out[part])
                 advance(part.stop - a)
-                a, count = part.stop, 2 * count if perf_counter() - begun < PART else max(1, count // 2)
+                a, count = part.stop, 2 * count if perf_counter() - begun < PART_SECONDS else max(1, count // 2)
         return out
 
     def fill(self, tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
@@ -325,9 +339,9 @@ class Program:
         if out.dtype == rows.base:
             run(tile, y, u, known, *last, out)
             return
-        block = np.empty(min(BLOCK, len(out)), rows)
-        for a in range(0, len(out), BLOCK):
-            part = slice(a, min(a + BLOCK, len(out)))
+        block = np.empty(min(SINGLE_BLOCK, len(out)), rows)
+        for a in range(0, len(out), SINGLE_BLOCK):
+            part = slice(a, min(a + SINGLE_BLOCK, len(out)))
             results = block[: part.stop - a]
             run(tile, y[part], u[part], known if len(known) == 1 else known[part], *last, results)
             _copy(results, out[part])
@@ -402,12 +416,6 @@ def lanes_of(record: Record) -> tuple[Array, Array, Array]:
     return record.y[:, None], record.u[:, :, None], record.known.lanes
 
 
-def spread(record: Record, L: int) -> tuple[Array, Array, Array]:
-    """(y, u, known) of a record, the same in each of L lanes."""
-    y, u, known = (np.repeat(part[..., None], L, axis=-1) for part in (record.y, record.u, record.known.columns))
-    return y, u, known
-
-
 def state_of(tile: Array, lane: int = 0) -> dict[str, Array]:
     """The fields of a lane, by name, as views."""
     return {name: tile[name][0, ..., lane : lane + 1][..., 0] for name in storage.fields(tile)}
@@ -429,7 +437,8 @@ def programs_of(
     if len(model.outputs) == 1:
         if not isinstance(tracker, Tracker):
             raise ValueError(f"a model with one output takes one tracker for each series; got {tracker!r}.")
-        return _programs(model, tracker, inputs if isinstance(inputs, int) else tuple(inputs), gate_of(tracker, gate))
+        gate = gate if gate is None or isinstance(gate, bool) else gate_of(tracker, gate)
+        return _programs(model, tracker, inputs if isinstance(inputs, int) else tuple(inputs), gate)
     if isinstance(tracker, Mapping) and not model.shared:
         if set(tracker) != set(model.outputs):
             raise ValueError(
@@ -461,9 +470,11 @@ def programs_of(
 
 
 @lru_cache(maxsize=64)
-def _programs(model: Model, tracker: Tracker, inputs: int | tuple[str, ...], gate: Gate | None) -> tuple[Program, ...]:
+def _programs(
+    model: Model, tracker: Tracker, inputs: int | tuple[str, ...], gate: Gate | bool | None
+) -> tuple[Program, ...]:
     """The programs are cached for the next record, since settings are compared by value."""
-    return (Program(model.bind(inputs), check_ready(tracker), gate=gate),)
+    return (Program(model.bind(inputs), check_ready(tracker), gate=gate_of(tracker, gate)),)
 
 
 def _row_model(model: Model, tracker: Tracker, inputs: int | Sequence[str]) -> Model:

@@ -1,4 +1,4 @@
-"""Pictures of results. matplotlib is imported only here."""
+"""Pictures of runs, of many runs and of pages; `driftfit.show.axes` draws their parts."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from driftfit.engine.settings import near
 from driftfit.run.fleet import Fleet
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
-from driftfit.show.fleet_summary import summarise
-from driftfit.show.parts.axes import date_axis, draw_innovation, draw_parameter, draw_prediction, panels, time_label
-from driftfit.show.parts.text import key_text
+from driftfit.show.axes import date_axis, draw_innovation, draw_parameter, draw_prediction, panels, time_label
+from driftfit.show.summary import summarise_fleet
+from driftfit.show.text import key_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,9 +34,32 @@ def plot_track(run: Track, level: float = 0.95, ax: Any = None) -> Figure:
     return figure
 
 
+def plot_parameters(run: Track) -> Figure:
+    """The parameters with their bands, for a page."""
+    n = len(run.names)
+    columns = 1 if n <= 3 else 2
+    figure, axes = panels(None, (9.5, 1.55 * -(-n // columns) + 0.5), n, columns, sharex=True)
+    for i, axis in enumerate(axes):
+        draw_parameter(axis, run, i)
+        date_axis(axis, run)
+    for axis in axes[-columns:]:
+        axis.set_xlabel(time_label(run))
+    return figure
+
+
+def plot_signals(run: Track) -> Figure:
+    """The output with its prediction, and the innovations, for a page."""
+    figure, (signal, error) = panels(None, (9.5, 4.6), 2, sharex=True, heights=[2.0, 1.3])
+    draw_prediction(signal, run)
+    draw_innovation(error, run)
+    error.set_xlabel(time_label(run))
+    date_axis(error, run)
+    return figure
+
+
 def plot_fleet(fleet: Fleet, which: str | None = None, most: int = 12, level: float = 0.95, ax: Any = None) -> Figure:
     """One parameter of the results that moved most and have it, one panel per result, all on one scale."""
-    units = summarise(fleet).units
+    units = summarise_fleet(fleet).units
     if not units:
         raise ValueError("plot: no series has a result to draw; fleet.failed has the reasons.")
     if which is None:

@@ -45,7 +45,7 @@ from driftfit.judge.verdict import verdict
 from driftfit.models.base import Model
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
-from driftfit.run.states.joint_layout import JointLayout
+from driftfit.run.warm_start import JointLayout
 from driftfit.trackers.base import Tracker
 
 OUTPUTS = ("samples", "summary", "verdict", "states")
@@ -130,7 +130,6 @@ def schema_of(task: Task, kinds: Mapping[str, str], outputs: str) -> dict[str, s
 def _worker(
     task: Task, outputs: str, schema: Mapping[str, str]
 ) -> Callable[[Iterator[pa.RecordBatch]], Iterator[pa.RecordBatch]]:
-    """What a partition runs."""
 
     def work(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
         part = Partition(task, outputs, schema)
@@ -219,7 +218,7 @@ class Partition:
             runs = (
                 [Track(programs[0], found.records.part(j), own[0])]
                 if ny == 1
-                else Outputs(programs, found.records.only(j), own, {}, {}).values()
+                else Outputs(programs, found.records.some(j, j + 1), own, {}, {}).values()
             )
             for run, of in zip(runs, self.task.suffixes, strict=True):
                 truth = verdict(run)

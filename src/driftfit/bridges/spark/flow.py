@@ -37,21 +37,20 @@ from driftfit.bridges.spark.task import (
     units_of,
     words_after,
 )
+from driftfit.data import late
 from driftfit.engine.kernel import Array
+from driftfit.run.layout import tag_of, unpacked
 from driftfit.run.live.rule import AlarmRule
+from driftfit.run.parallel_lanes import Advanced
 from driftfit.run.program import state_of
-from driftfit.run.states import late
-from driftfit.run.states.advance import Advanced
-from driftfit.run.states.joint_layout import JointLayout
-from driftfit.run.states.layout import tag_of, unpacked
-from driftfit.run.warm_start import End, carried
+from driftfit.run.warm_start import End, JointLayout, carried
 
 OLD, WAITED, NEW = range(3)
 """Values of the column ``_kind``: a state, a row that waits, a row that has come."""
 PLACES = {late.LATE: LATE, late.REPEATED: REPEATED, late.UNTIMED: UNTIMED}
 """Where rows that are left out are counted."""
 REFUSED = -1
-"""The fate of a row of a unit that cannot run, besides those of `driftfit.run.states.late`."""
+"""The fate of a row of a unit that cannot run, besides those of `driftfit.data.late`."""
 
 
 class Origin(NamedTuple):
@@ -231,15 +230,12 @@ class Known(NamedTuple):
 
     @property
     def old(self) -> Array:
-        """Which units have a state."""
         return np.asarray(self.kind[self.first] == OLD)
 
     def reasons(self, which: Array) -> list[str]:
-        """Why units cannot run."""
         return [one if isinstance(one := self.joints[k], str) else "rows without a unit" for k in which.tolist()]
 
     def keys(self, which: Array) -> dict[str, Any]:
-        """The names of units."""
         return {name: self.table.column(name).take(pa.array(self.first[which])) for name in self.flow.task.by}
 
     def unpacked(self, keys: Array) -> dict[int, Array]:
@@ -252,7 +248,6 @@ class Known(NamedTuple):
         return self.words
 
     def packed(self, k: int) -> bytes:
-        """The state of a unit as bytes."""
         if k in self.arrived and k not in self.words:
             return self.arrived[k]
         joint = self.joints[k]

@@ -15,24 +15,19 @@ from typing import Any, overload
 import numpy as np
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.labels import by_name, order_of
-from driftfit.data.signals import noise_of
-from driftfit.data.times.instants import instant
+from driftfit.data.instants import instant
 from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import as_numbers, factor
+from driftfit.engine.settings import as_numbers
 from driftfit.engine.tiles import as_compiled
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.live.alarm import LiveAlarm
-from driftfit.run.live.batch import Batch
+from driftfit.run.live.batch import Batch, Batched, LiveOutput
 from driftfit.run.live.fixed_lag import FixedLag, Window
-from driftfit.run.live.interventions import HELD, Operated
-from driftfit.run.live.late_input import INPUT, LATER, NOTHING
 from driftfit.run.live.rule import AlarmRule
-from driftfit.run.live.stream import Stream
-from driftfit.run.live_output import LiveOutput
-from driftfit.run.program import Program, state_of
+from driftfit.run.live.stream import HELD, INPUT, LATER, NOTHING, Factors
+from driftfit.run.program import Program
 from driftfit.run.warm_start import Run
 from driftfit.trackers.base import Tracker
 
@@ -42,16 +37,13 @@ Step = tuple[float, float, float, bool]
 Steps = tuple[Array, Array, Array, Array]
 """The same for several outputs, each (ny,)."""
 
-Factors = tuple[float, Any, float]
-"""Interval, factor of the noise variance (one, or one per output), factor of the drift."""
-
 ROWS = "rows"
 """The name of the alarm of outputs that share one theta."""
 
 _FLOAT, _ARRAY = np.dtype(np.float64), np.ndarray
 
 
-class Live(Operated, Stream):
+class Live(Batched):
     """Track a stream.
 
     With several outputs y and all that `update` returns are (ny,); ``theta`` and ``std`` are (ny, n), or (n,) where the
@@ -83,7 +75,6 @@ class Live(Operated, Stream):
     ) -> None:  # fmt: skip
         check_roles("Live", model, tracker, several=isinstance(model, Model) and len(model.outputs) > 1)
         self._begin(model, tracker, dt, lag, warm_start, limits, gate)
-        self._single = len(self.model.outputs) == 1
         if lag:
             regression = self._rows if self._single else Regression(self._rows.n)
             rows = (lag + 1) * len(self.model.outputs) - 1 if self.model.shared else lag
@@ -95,9 +86,7 @@ class Live(Operated, Stream):
         tile = self._state_tile()
         self._scratch = tile.copy()
         self._bytes, self._scratch_bytes = tile.view(np.uint8), self._scratch.view(np.uint8)
-        self._m = self._rows.m
-        self._shape = (len(self.model.outputs), self._m) if self.model.shared else (self._m,)
-        self._unknown, self._interval = np.full(self._shape, np.nan), tile["interval"][0]
+        self._interval = tile["interval"][0]
         self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
         gated = self._single and self.programs[0].gate is not None
         self._undecided = gated and not tile["gate_decided"][0, 0]
@@ -198,7 +187,7 @@ class Live(Operated, Stream):
         """The inputs as the compiled step takes them; it reads m floats from any address, so they must exist."""
         if type(u) is _ARRAY and u.dtype is _FLOAT and u.shape == self._shape and self._m != 1:
             return u
-        return one_or_all(self._inputs(u))
+        return one_or_all(self.inputs_of(u))
 
     def _update_at(self, y: float, u: Any, time: Any) -> Any:
         """A sample whose only known factor is its time: the interval is written for this step alone."""
@@ -234,43 +223,6 @@ class Live(Operated, Stream):
             if each or prob is not None:
                 self._set_extra(None, None)
 
-    def _set_extra(self, prob: Any, drift: Any) -> None:
-        """Set the known factors of the next sample that only some trackers have; None is the default."""
-        for lane, tracker in enumerate(self.trackers):
-            tracker.set_extra(self.lane(lane), self._rows, prob, drift)
-
-    def _factors(self, interval: float, weight: Any, drift: Any) -> Factors:
-        noise: Any = 1.0
-        if not self._single:
-            noise = noise_of(weight, len(self.model.outputs))
-        elif weight != 1.0:
-            noise = float(noise_of(weight))
-        return interval, noise, 1.0 if drift == 1.0 else float(factor("drift", drift))
-
-    def _checked(self, y: Any, u: Any) -> tuple[Array, Array]:
-        outputs, inputs = self._outputs(y), self._inputs(u)
-        return (outputs, inputs) if self._limits is None else self._limits.sample(outputs, inputs)
-
-    def _outputs(self, y: Any) -> Array:
-        """y as floats (ny,)."""
-        outputs = self.model.outputs
-        if hasattr(y, "keys"):
-            order_of("Live.update: the model", outputs, list(y.keys()), "outputs")
-            y = [y[name] for name in outputs]
-        given = as_numbers("y", y)
-        if given.shape != (len(outputs),) and not (self._single and given.size == 1):
-            wanted = "one number" if self._single else f"({len(outputs)},)"
-            raise ValueError(f"Live.update: y must be {wanted}; got shape {given.shape}.")
-        return given.reshape(-1)
-
-    def _nothing(self) -> Any:
-        nan = np.full(len(self.model.outputs), np.nan)
-        return (
-            (np.nan, np.nan, np.nan, False)
-            if self._single
-            else (nan, nan.copy(), nan.copy(), np.zeros(nan.shape, bool))
-        )
-
     def _step(self, y: Array, u: Array, known: Any, time: Any) -> Any:
         resting = self.resting
         known = HELD if resting == HELD else known
@@ -280,7 +232,7 @@ class Live(Operated, Stream):
             if self._undecided:
                 self._decide()
             if self._watching or self._windows:
-                self._keep(y, step[1:2], step[2:3], np.reshape(known, (3, 1)), time)
+                self._keep(y, np.reshape(known, (3, 1)), time)
         else:
             out = np.empty(len(y) if self.model.shared else 1, self._row_type)
             self._drive(*self._row(y, u, known), out, None if time is None else [time] * len(out))
@@ -312,11 +264,6 @@ class Live(Operated, Stream):
         batch = Batch(out, self._rows_per_instant)
         return batch.prediction[0], batch.innovation[0], batch.innovation_var[0], batch.ok[0]
 
-    def _settle(self, resting: tuple[float, float, float], extra: bool) -> None:
-        self._rest(resting)
-        if extra:
-            self._set_extra(None, None)
-
     def _update_later(self, y: float) -> Step:
         """A sample without known factors, whose input comes with `apply`."""
         self._placing()
@@ -332,7 +279,7 @@ class Live(Operated, Stream):
         receive, so that candidates can be compared.
         """
         self._scratch_bytes[:] = self._bytes  # copying a record field by field takes ten times as long
-        inputs = self._inputs(u) if self._limits is None else self._limits.inputs(self._inputs(u))
+        inputs = self.inputs_of(u) if self._limits is None else self._limits.inputs(self.inputs_of(u))
         self._put(self._scratch, inputs)
         if self._single:
             y_hat, _, s, _ = self._look(self._compiled_scratch, np.nan, one_or_all(inputs))
@@ -344,7 +291,7 @@ class Live(Operated, Stream):
     def pass_by(self, y: Array, u: Any) -> None:
         """Let one nominal sample of several outputs pass: y goes to the lags and is not used."""
         resting = self.resting
-        self._passed(self._state_tile(), y, self._inputs(u), (1.0, np.inf, 1.0))
+        self._passed(self._state_tile(), y, self.inputs_of(u), (1.0, np.inf, 1.0))
         self._rest(resting)
 
     def _passed(self, tile: Array, y: Array, u: Array, known: Factors) -> Steps:
@@ -421,10 +368,6 @@ class Live(Operated, Stream):
             return tuple(alarm for _, alarm in self._watching)
         return {ROWS if self.model.shared else self.model.outputs[lane]: alarm for lane, alarm in self._watching}
 
-    def lane(self, lane: int = 0) -> dict[str, Array]:
-        """The fields of the record, or of that of one of several outputs, as views."""
-        return state_of(self._state_tile(), lane)
-
     def before(self, steps: float) -> Any:
         """The time so many nominal intervals before the last sample; None where samples have no times."""
         time = None if self._last is None else self._clock.moved(self._last, np.array([-steps]))
@@ -443,22 +386,6 @@ class Live(Operated, Stream):
                 self._placing()(as_compiled(tile), inputs[0])
             inputs = np.vstack([inputs[1:], np.full((1, self._m), np.nan)])
         return copies, inputs
-
-    def inputs_of(self, u: Any) -> Array:
-        """u as floats, NaN where it is not known."""
-        return self._inputs(u)
-
-    def _inputs(self, u: Any) -> Array:
-        """u as floats (m,), or (ny, m) where outputs share one theta."""
-        if u is None or u is LATER:
-            return self._unknown
-        given = as_numbers("u", u if self.model.shared else by_name(self.model, u))
-        if given.shape != self._shape:
-            if given.size != self._unknown.size:
-                wanted = f"shape {self._shape}" if self.model.shared else f"{self._m} inputs"
-                raise ValueError(f"Live.update: the model has {wanted}, but u has shape {given.shape}.")
-            given = given.reshape(self._shape)
-        return given
 
     @property
     def theta(self) -> Array:
