@@ -173,8 +173,9 @@ def look_back(past: Array, gains: Array, newest: int, t: Array) -> None:
         t[SCORE, i] = 0.0
         t[SLOPE, i] *= FADE
         for j in range(n):
-            for row in (A, B, M):
-                t[row + 6 * i, j] *= FADE
+            t[A + 6 * i, j] *= FADE
+            t[B + 6 * i, j] *= FADE
+            t[M + 6 * i, j] *= FADE
             t[N + 6 * i, j], t[T + 6 * i, j] = 0.0, 0.0
     for back in range(WINDOW):
         step_back(past, gains, (newest + WINDOW - back) % WINDOW, t)

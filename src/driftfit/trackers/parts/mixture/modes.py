@@ -42,7 +42,7 @@ def table(n: int, groups: Any) -> dict[str, Array]:
     jump, alone = ratio >= 1.0, of >= 0
     arrive = np.where(jump, JUMP, ARRIVE)
     for kind, share in ((alone, 0.5), (~alone, 0.5 if each else 1.0)):
-        arrive[jump & kind] *= share / max(np.sum(jump & kind), 1)
+        arrive[jump & kind] *= share / max(int(np.sum(jump & kind)), 1)
     start = np.where(of == -3, ALL / (len(COMMON) - 1), (1.0 - AT_REST - ALL) / np.sum(of != -3))
     start[ratio >= 1.0] *= SELDOM
     start[0] = 1.0 - start[1:].sum()
