@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 33,
     "bytes of state of Kalman": 848,
     "bytes of state of AdaptiveKalman": 17_328,
-    "lines of tests": 34_106,
+    "lines of tests": 34_107,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 
@@ -88,7 +88,7 @@ def budgets() -> dict[str, int]:
         "state fields of a gate": len(gated.layout.shapes) - fields["state fields of Kalman"],
         "bytes of state of Kalman": 8 * programs["Kalman"].layout.size,
         "bytes of state of AdaptiveKalman": 8 * programs["AdaptiveKalman"].layout.size,
-        "lines of tests": 34_106,
+        "lines of tests": sum(len(one.read_text(encoding="utf-8").splitlines()) for one in tests),
     }
 
 

@@ -132,4 +132,5 @@ def test_equal_steps_that_an_input_explains_are_no_rounding():
         running[t] = np.clip(running[t - 1] + rng.choice([-1.0, 1.0]), 0.0, 3.0)
     power = np.where(running > 0.0, 75.0 * running + 0.3 * rng.normal(size=600), 0.0)
     run = track(Regression(1), AdaptiveKalman(), power, running)
-    assert run.std[-1, 0] < 0.5
+    assert run.std[-1, 0] < 2.0  # it may have jumped while none runs
+    assert np.abs(run.theta[50:, 0] - 75.0).max() < 0.1
