@@ -126,7 +126,7 @@ def test_jumps_in_an_outage_are_found():
 
 
 def test_small_jumps_are_found_and_dated_at_their_level():
-    """Two jumps of 1.6 standard deviations of the noise: a fifth is as likely to be drift, which `Bank()` allows for."""
+    """Two jumps of 1.6 standard deviations of the noise; `Bank()` finds some four fifths of them."""
     held = found = 0
     for seed in range(40):
         rng = np.random.default_rng(seed)

@@ -11,7 +11,7 @@ from scipy.io import savemat
 
 from driftfit import RLS, DataWarning, Regression, track
 from driftfit.bridges.matlab import read_mat
-from driftfit.cli.parts.reading import Part, moment, rows_of
+from driftfit.cli.reading import Part, moment, rows_of
 from driftfit.data.clock import Clock
 from driftfit.data.files import read_columns
 from driftfit.data.instants import warn_of_counted_years, warn_of_written_numbers

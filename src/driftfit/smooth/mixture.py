@@ -75,6 +75,13 @@ class Alternatives(NamedTuple):
     column: Array
     """(M, 2): which column of ``Problem.sizes`` multiplies either."""
 
+    def first(self) -> Array:
+        """(U, E): the probabilities of the events out of mode 0."""
+        probs = np.zeros((len(self.log_prob), self.event.max() + 1))
+        for move in np.flatnonzero(self.source == 0):
+            probs[:, self.event[move]] += np.exp(self.log_prob[:, move])
+        return probs
+
     def moves(self, scale: Array, back: bool = False) -> Moves:
         """The same in one direction of time, for theta multiplied by ``scale``."""
         source, target = (self.target, self.source) if back else (self.source, self.target)
@@ -310,12 +317,14 @@ def backwards(
     now.many[0] = K
 
 
-def smooth(problem: Problem, covariances: bool = False) -> Mixture:
+def smooth(problem: Problem, covariances: bool = False, kept: Array | None = None) -> Mixture:
     """Smooth a record; with ``covariances`` of every sample, and otherwise variances.
+
+    ``kept`` (T,) says how many components another smoother of the record needed, with which this one begins.
 
     Where the evidence is not constant, twice as many components are allowed, up to `MOST`; see `Mixture.uneven`.
     """
-    keep = np.full(len(problem.y), ROOMY)
+    keep = np.full(len(problem.y), ROOMY) if kept is None else kept
     while True:
         found = Passes(problem, keep).smoothed(covariances)
         more = keep.copy()

@@ -25,12 +25,10 @@ from driftfit.readings.remarks import SAID
 from driftfit.run.live.rule import FROZEN
 from driftfit.run.live.stream import HELD
 from driftfit.run.parallel_lanes import FEWEST_LANES, Advanced, advance
-from driftfit.service.core.blocks import Blocks
+from driftfit.service.config import UnitSettings
 from driftfit.service.core.journal import Rows
-from driftfit.service.core.results import ALARM, OK, THETA, TIME, Y_HAT, Results, Y
-from driftfit.service.core.streams import SAMPLES, USED, Streams
-from driftfit.service.core.unit import Out, Unit
-from driftfit.service.settings.config import UnitSettings
+from driftfit.service.core.results import ALARM, OK, THETA, TIME, Y_HAT, Blocks, Results, Y
+from driftfit.service.core.unit import SAMPLES, USED, Out, Streams, Unit
 
 COLUMNS = ("y_hat", "e", "s", "theta", "var", "ok")
 """Fields of a tracker's output, in the order of the results; the last becomes a flag."""
@@ -61,7 +59,6 @@ class Section:
         self.blocks = Blocks(THETA + 2 * self.streams.program.model.n)
 
     def add(self, number: int, name: str) -> Unit:
-        """A new unit."""
         unit = Unit(number, name, self.streams, self.streams.add(number))
         if unit.place == self.blocks.capacity:
             self.blocks.grow(self.streams.capacity)

@@ -203,7 +203,9 @@ class Hypotheses:
     def _smoothed_changes(self, found: list[Event], threshold: float) -> list[Event]:
         """Changes with their credible sets of dates, and when the filter knew of them."""
         smoothed, W, last = self.smoothed, self.lags[-1] + 1, len(self.run) - 1
-        p = gathered(smoothed.change_prob, self.run.ok)
+        p, prior = (gathered(one, self.run.ok) for one in (smoothed.change_prob, smoothed.prior))
+        # no more likely than before the record was seen: at the end of a record, say
+        p = np.where(p[:, :1] < prior[:, :1], p, np.eye(1, p.shape[1]))
         total = np.r_[np.zeros(W), np.cumsum(1.0 - p[:, 0])]
         given = Probabilities(p, total[W:] - total[:-W], self.run.ok, W, self.tracker.change_names, ("nominal",))
         known = [event.span for event in found if event.kind == "change"]

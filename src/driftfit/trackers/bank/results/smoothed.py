@@ -61,6 +61,8 @@ class SmoothedMixture:
         Mean and standard deviation of the mixture; std is inf for parameters that the record never distinguished.
     change_prob : (T, H_d)
         Probabilities of the changes of the bank between the sample before and this one.
+    prior : (T, H_d)
+        The same before the record is seen.
     moved : (T, n)
         Probability that each parameter was part of a change other than the normal course.
     shift, shift_std : (T, n)
@@ -80,8 +82,9 @@ class SmoothedMixture:
         problem = problem_of(run, faults)
         free = bank.all_sensors[0].r is None and bank.all_sensors[0].guess is None
         self._weighed = averaged(problem, free) if bank.changes is None else [(1.0, matched(problem, free), NO)]
-        found = [mixture.smooth(one) for _, one, _ in self._weighed]
+        found = self._smoothed(None)
         self._mixtures, self._weights = found, np.array([weight for weight, _, _ in self._weighed])
+        self.prior = problem.alternatives.first()[problem.table]
         self.theta = self._mean([one.theta for one in found])
         self.change_prob = self._mean([one.events for one in found])
         self.moved = self.change_prob[:, 1:] @ (moving(run) > 0.0)[1:]
@@ -92,6 +95,11 @@ class SmoothedMixture:
         scales = np.array([one.r[used] / problem.r[used] for _, one, _ in self._weighed])
         self.r = float(noise_variance(bank, run) * np.sum(self._weights * np.where(scales > 0.0, scales, 1.0)))
         self.uneven = np.any([one.uneven for one in found], axis=0)
+
+    def _smoothed(self, kept: Array | None, covariances: bool = False) -> list[mixture.Mixture]:
+        """The record with each of the drifts; as many components are kept as the likeliest of them needed."""
+        first = mixture.smooth(self._weighed[0][1], covariances, kept)
+        return [first, *(mixture.smooth(one, covariances, first.kept) for _, one, _ in self._weighed[1:])]
 
     def _mean(self, values: list[Array]) -> Array:
         return np.asarray(np.einsum("k,k...->...", self._weights, np.array(values)))
@@ -125,7 +133,7 @@ class SmoothedMixture:
     @cached_property
     def covs(self) -> Array:
         """(T, n, n); computed again, with n n numbers for each sample."""
-        found = [mixture.smooth(one, covariances=True) for _, one, _ in self._weighed]
+        found = self._smoothed(self._mixtures[0].kept, covariances=True)
         away = [one.theta - self.theta for one in found]
         return self._mean([one.cov + d[:, :, None] * d[:, None, :] for one, d in zip(found, away, strict=True)])
 
