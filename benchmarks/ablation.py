@@ -3,7 +3,7 @@
 *ratio* is the error of theta over that of an oracle that is given the kind of drift and learns its size in hindsight
 (`benchmarks.held_out.oracle`), *of LABEL* over that of stored results; *step* is the one-step error over the oracle's;
 *moving*, *still* and *output* are shares within 95 % bands; *wrong* is the share of |theta - truth| > 5 std in per
-cent. All are means over seeds.
+cent. All are means over seeds, seconds are the least.
 
 Run: python -m benchmarks.ablation [--seeds 5] [--only NAME ..] [--baseline PATH] [--store LABEL] [--against LABEL]
          [--function LABEL=PATH:NAME] [--quick]

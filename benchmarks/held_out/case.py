@@ -37,7 +37,8 @@ class Case:
     known (T,)         the part of v that follows from earlier v (coloured noise)
     moves (n, k)       directions in which theta walks, in units of the parameters; default all axes
     interval (T,)      by which the drift of each sample is multiplied
-    kind               "constant", "walk", "slopes" (they walk), or "jumps" with variances ``jumps`` (J, n, n), each at ``rate``
+    kind               "constant", "walk", "slopes" (they walk) or "jumps"
+    jumps, rate        variances (J, n, n) of the jumps, and the probability of each
     reading            further arguments of `driftfit.track`
     burn               samples that are not scored
     least              the smallest error of theta that matters, in units of y, where there is no noise
@@ -85,7 +86,7 @@ class Case:
 
 
 def case(model: Model, y: Array, u: Array, phi: Array, theta: Array, noise: Array, **more: Any) -> Case:
-    """A `Case` with white noise of constant variance, no codes and independent walks, unless ``more`` says otherwise."""
+    """A `Case` with white noise of constant variance, no codes and independent walks, unless ``more`` differs."""
     length, n = phi.shape
     usual: dict[str, Any] = {
         "r": np.full(length, np.mean(noise**2)),

@@ -1,9 +1,10 @@
 """The filter that a scenario is judged by: it is given the kind of drift, and learns its size in hindsight.
 
-Where theta is constant, it is least squares. Where theta or its slope walks, it is the Kalman filter whose drift variances, one for each direction in which theta can
-move, and noise variance have the largest likelihood of the whole record. Where theta jumps, it knows the noise, how
-often and how far theta jumps, and not when: it keeps the `HISTORIES` most probable histories. It works in coordinates
-in which the regressors of the record are white, so that offsets of inputs cost no digits.
+Where theta is constant, it is least squares. Where theta or its slope walks, it is the Kalman filter whose drift
+variances, one for each direction in which theta can move, and noise variance have the largest likelihood of the whole
+record. Where theta jumps, it knows the noise, how often and how far theta jumps, and not when: it keeps the `HISTORIES`
+most probable histories. It works in coordinates in which the regressors of the record are white, so that offsets of
+inputs cost no digits.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ STARTS = (-7.0, -5.0, -4.0, -3.0, -2.0, -1.0, 0.0)
 
 @Driver
 def walking(z: Array, y: Array, r: Array, Q: Array, P0: Array, theta: Array, e: Array) -> float:
-    """theta (T, d) and errors e (T,) of a random walk with drift Q_t (T, d, d) / T or, with d = 2 m, of slopes that walk.
-    Returns the log-likelihood with the scale of noise and drift concentrated out. NaN is skipped."""
+    """theta (T, m) and errors e (T,) of a random walk with drift Q (d, d) r[1] in noise of variance r[0]; d = 2 m: of
+    slopes that walk. Returns the log-likelihood with the scale of noise and drift concentrated out. NaN is skipped."""
     T, m = z.shape
     d = len(Q)
     P, x, g = P0.copy(), np.zeros(d), np.zeros(d)

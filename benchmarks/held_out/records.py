@@ -81,11 +81,11 @@ def coarse_arx(rng: Generator) -> Case:
 
 
 def step_test(rng: Generator) -> Case:
-    """One step after 100 samples of rest, and no noise; a slow plant."""
+    """One step after 100 samples of rest, and a ten thousandth of noise; a plant of second order."""
     length, at = 400, 80 + int(rng.integers(40))
     u = (np.arange(length) >= at).astype(float)
-    path = walk(rng, [0.95, 0.1], 0.0, length)
-    return arx(rng, path, (1, 1, 1), u, 0.0, kind="constant", burn=at + 20, least=1e-3)
+    path = walk(rng, [1.5, -0.56, 0.05, 0.02], 0.0, length)
+    return arx(rng, path, (2, 2, 1), u, 1e-4, kind="constant", burn=at + 20, least=1e-3)
 
 
 def saturated_valve(rng: Generator) -> Case:
