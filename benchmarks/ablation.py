@@ -15,7 +15,8 @@ regressors (T, n) and y (T,) that returns theta, std, prediction and its varianc
 from __future__ import annotations
 
 import argparse
-import runpy
+import sys
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,11 @@ def function(text: str) -> tuple[str, Method]:
     """(label, method) of LABEL=PATH:NAME."""
     label, rest = text.split("=", 1)
     path, name = rest.rsplit(":", 1)
-    return label, of_function(runpy.run_path(path)[name])
+    spec = spec_from_file_location(Path(path).stem, path)
+    assert spec is not None and spec.loader is not None
+    module = sys.modules[spec.name] = module_from_spec(spec)  # a cache of compiled functions looks for it there
+    spec.loader.exec_module(module)
+    return label, of_function(getattr(module, name))
 
 
 def cells(name: str, row: Scores, before: Scores | None) -> str:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -90,8 +91,9 @@ def distance(case: Case, theta: Array) -> float:
 
 
 def step_error(case: Case, prediction: Array) -> float:
-    """Root mean square of the one-step errors that there are."""
-    return float(np.sqrt(np.nanmean((case.readings - prediction)[case.burn :] ** 2) + case.least**2))
+    """Root mean square of the one-step errors where y and its regressors are known; no prediction counts as 0."""
+    off = np.where(np.isfinite(case.regressors).all(axis=1), case.readings - np.nan_to_num(prediction), np.nan)
+    return float(np.sqrt(np.nanmean(off[case.burn :] ** 2) + case.least**2))
 
 
 def within(off: Array, std: Array) -> float:
@@ -156,7 +158,9 @@ class Kept:
 
     def write(self) -> None:
         if self.path is not None:
-            self.path.write_text(json.dumps(self.scores, indent=0))
+            unfinished = self.path.with_suffix(f".{os.getpid()}")
+            unfinished.write_text(json.dumps(self.scores, indent=0))
+            unfinished.replace(self.path)
 
 
 def means(kept: Kept, name: str, seeds: Iterable[int], label: str, method: Method | None = None) -> Scores | None:
