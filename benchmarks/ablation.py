@@ -31,7 +31,8 @@ def function(text: str) -> tuple[str, Method]:
     label, rest = text.split("=", 1)
     path, name = rest.rsplit(":", 1)
     spec = spec_from_file_location(Path(path).stem, path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = sys.modules[spec.name] = module_from_spec(spec)  # a cache of compiled functions looks for it there
     spec.loader.exec_module(module)
     return label, of_function(getattr(module, name))

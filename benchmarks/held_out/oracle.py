@@ -125,7 +125,7 @@ def jumping(z: Array, y: Array, r: Array, J: Array, logs: Array, P0: Array, thet
 def oracle(case: Case) -> tuple[Array, Array]:
     """theta (T, n), and the prediction (T,) of y before each sample."""
     phi, y = case.regressors, case.readings - case.known
-    usable: Array = np.isfinite(phi).all(axis=1)
+    usable: Array = np.asarray(np.isfinite(phi).all(axis=1))
     scale = np.sqrt(np.mean(phi[usable] ** 2, axis=0))
     R = np.linalg.qr(phi[usable] / scale)[1] * scale / np.sqrt(usable.sum())
     back = np.linalg.inv(R)

@@ -1,8 +1,8 @@
 """Real records: one-step error and log score of the default, of fixed Kalman filters and of RLS.
 
-The folder holds the files of which `RECORDS` reads the columns (river Le Leguer, INRAE; heated building, darkgreybox; gas
-furnace, Box and Jenkins; heat exchanger, DaISy; UCI air quality; SKAB pump loop; US consumption, fpp2). None of them is
-part of the project. Records of installed packages are `lab.bench.real`'s.
+The folder holds the files of which `RECORDS` reads the columns (river Le Leguer, INRAE; heated building, darkgreybox;
+gas furnace, Box and Jenkins; heat exchanger, DaISy; UCI air quality; SKAB pump loop; US consumption, fpp2). None of
+them is part of the project. Records of installed packages are `lab.bench.real`'s.
 """
 
 from __future__ import annotations
