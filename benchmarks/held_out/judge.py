@@ -27,7 +27,7 @@ import numpy as np
 from benchmarks.held_out import changes, plants, records
 from benchmarks.held_out.case import Case
 from benchmarks.held_out.oracle import oracle
-from driftfit import AdaptiveKalman, track
+from driftfit import track
 from driftfit.engine.kernel import Array
 from driftfit.trackers.base import Tracker
 
@@ -132,7 +132,13 @@ class Kept:
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
-        self.scores: dict[str, Scores] = json.loads(path.read_text()) if path is not None and path.exists() else {}
+        self.scores: dict[str, Scores] = {}
+        self.read()
+
+    def read(self) -> None:
+        """What the file has."""
+        if self.path is not None and self.path.exists():
+            self.scores |= json.loads(self.path.read_text())
 
     def of(self, name: str, seed: int, label: str, method: Method | None) -> Scores | None:
         """Scores under a label, computed by the method if they are not there; None if there is no method either.
@@ -151,6 +157,13 @@ class Kept:
             else:
                 self.scores[key] = scored(case, method)
         return self.scores[key]
+
+    def real(self, name: str, label: str, compute: Callable[[], Scores] | None) -> Scores | None:
+        """Scores on a real record, computed if they are not there; None if there is nothing to compute them."""
+        key = f"{label}/record {name}"
+        if key not in self.scores and compute is not None:
+            self.scores[key] = compute()
+        return self.scores.get(key)
 
     def forget(self, label: str) -> None:
         """Compute what has this label anew."""
@@ -176,8 +189,3 @@ def means(kept: Kept, name: str, seeds: Iterable[int], label: str, method: Metho
         found = {head: float(np.nanmean([row[head] for row in rows])) for head in rows[0]}
     # the first run compiles
     return {**found, "seconds": min(row["seconds"] for row in rows)}
-
-
-def default() -> Method:
-    """Today's default."""
-    return of_tracker(AdaptiveKalman())

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from driftfit import ARX, RLS, AdaptiveKalman, Kalman, Regression, track
+from driftfit import ARX, RLS, Kalman, Regression, track
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
@@ -124,38 +124,39 @@ def read(folder: Path) -> dict[str, Series]:
     return found
 
 
-def followed(series: Series, tracker: Tracker) -> tuple[Array, Array]:
-    """Errors (T,) and their standard deviations of a run, NaN where nothing is predicted."""
+def regressors(series: Series) -> Array:
+    """phi (T, n); NaN where it is not known."""
+    return Record(series.model.bind(series.u.shape[1]), series.y, series.u).phi
+
+
+def scored(series: Series, tracker: Tracker) -> dict[str, float]:
+    """``rms`` of the one-step errors and mean ``log`` density, after the first samples.
+
+    Filters that were given r = 1 have the noise variance of largest likelihood instead. No density is that of a
+    standard deviation below a thousandth of the rms.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         run = track(series.model, tracker, series.y, series.u if series.u.shape[1] else None)
-    e, std = series.y - run.prediction, np.asarray(run.innovation_std)
-    return np.where(np.isfinite(std), e, np.nan), std
+    e, s = series.y - run.prediction, np.asarray(run.innovation_std) ** 2
+    n, T = regressors(series).shape[1], len(e)
+    judged = np.isfinite(e) & np.isfinite(s) & (np.arange(T) >= min(max(50, 5 * n), T // 3))
+    e, s = e[judged], s[judged]
+    s = s * np.mean(e**2 / s) if isinstance(tracker, Kalman) else s
+    s = np.maximum(s, 1e-6 * np.mean(e**2))
+    log = -0.5 * np.mean(np.log(2.0 * np.pi * s) + e**2 / s)
+    return {"rms": float(np.sqrt(np.mean(e**2))), "log": float(log), "samples": float(judged.sum())}
 
 
-def rivals(series: Series) -> dict[str, Tracker]:
-    """Kalman filters with every ratio of drift to noise, and RLS."""
-    phi = Record(series.model.bind(series.u.shape[1]), series.y, series.u).phi
-    c = np.maximum(np.nanmean(phi**2, axis=0), 1e-12)
-    kalman: dict[str, Tracker] = {f"Kalman {ratio:g}": Kalman(q=ratio / c, r=1.0) for ratio in RATIOS}
-    return {**kalman, "RLS 1": RLS(1.0), "RLS .99": RLS(0.99)}
+def best_fixed(series: Series) -> dict[str, float]:
+    """The least rms and the largest log score of Kalman filters with one ratio of drift to noise, in hindsight."""
+    c = np.maximum(np.nanmean(regressors(series) ** 2, axis=0), 1e-12)
+    rows = [scored(series, Kalman(q=ratio / c, r=1.0)) for ratio in RATIOS]
+    return {"rms": min(row["rms"] for row in rows), "log": max(row["log"] for row in rows)}
 
 
-def scores(series: Series) -> dict[str, dict[str, float]]:
-    """By method: one-step error ``rms``, and ``log``, the mean log density, after the first samples.
-
-    All are scored on the samples that all predict. The fixed filters have the noise variance of largest likelihood.
-    """
-    found = {name: followed(series, tracker) for name, tracker in rivals(series).items()}
-    found["default"] = followed(series, AdaptiveKalman())
-    judged = np.all([np.isfinite(e) for e, _ in found.values()], axis=0)
-    n = len(Record(series.model.bind(series.u.shape[1]), series.y, series.u).phi[0])
-    judged &= np.arange(len(judged)) >= min(max(50, 5 * n), len(judged) // 3)
-    table = {}
-    for name, (e, std) in found.items():
-        e, s = e[judged], std[judged] ** 2
-        s = s if name == "default" or name.startswith("RLS") else s * np.mean(e**2 / s)
-        log = -0.5 * np.mean(np.log(2.0 * np.pi * s) + e**2 / s)
-        table[name] = {"rms": float(np.sqrt(np.mean(e**2))), "log": float(log)}
-    table["samples"] = {"rms": float(judged.sum()), "log": 0.0}
-    return table
+METHODS: dict[str, Callable[[Series], dict[str, float]]] = {
+    "Kalman": best_fixed,
+    "RLS .99": lambda series: scored(series, RLS(0.99)),
+    "RLS 1": lambda series: scored(series, RLS(1.0)),
+}

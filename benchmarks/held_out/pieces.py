@@ -1,0 +1,119 @@
+"""What the default tracker consists of, and the tracker without a piece of it.
+
+A piece is left out in one of two ways. Modes and fields of the state are changed before the first sample, by a
+subclass. Rules are changed in a copy of the source, by text that must occur in it exactly once, and run in a process of
+their own. So the tracker itself has no switches.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+import driftfit
+from driftfit import AdaptiveKalman
+from driftfit.engine.kernel import Array
+
+HOME = Path(driftfit.__file__).parent
+ROOT = Path(__file__).parent.parent.parent
+BANK, NOISE, LEARNED = (f"trackers/parts/mixture/{name}.py" for name in ("filters", "noise", "learned"))
+State = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """``modes`` (K,) tells which modes to leave out, and ``state`` what fields are instead; or ``edits`` of a file, an
+    old text and a new one. ``functions`` are those that would go with the piece, "file:name"."""
+
+    modes: Callable[[State], Array] | None = None
+    state: Mapping[str, Any] = field(default_factory=dict)
+    edits: tuple[tuple[str, str, str], ...] = ()
+    functions: tuple[str, ...] = ()
+
+    def lines(self) -> int:
+        """Lines of the functions that would go."""
+        total = 0
+        for one in self.functions:
+            name, function = one.split(":")
+            nodes = ast.walk(ast.parse((HOME / name).read_text()))
+            (found,) = (node for node in nodes if isinstance(node, ast.FunctionDef) and node.name == function)
+            total += (found.end_lineno or found.lineno) - found.lineno + 1 + len(found.decorator_list)
+        return total
+
+
+def never(state: dict[str, Any], out: Array) -> None:
+    """Change transitions so that modes are never entered; jumps together stay as likely as they were."""
+    jump = state["ratio"] >= 1.0
+    before = state["arrive"][jump].sum()
+    arrive = np.where(out, 0.0, state["arrive"])
+    arrive[jump] *= before / max(arrive[jump].sum(), 1e-300)
+    below = np.append(out[1:] & (state["ladder"][1:] == state["ladder"][:-1]), False)
+    start = np.where(out, 0.0, state["mu"])
+    state["up"] = np.where(below | out, 0.0, state["up"])
+    state["arrive"], state["arrivals"], state["jumping"] = arrive, arrive.sum(), arrive[jump].sum()
+    state["mu"] = state["prior"] = start / start.sum()
+
+
+@dataclass(frozen=True)
+class Without(AdaptiveKalman):
+    """The default without a piece that is not a rule."""
+
+    piece: str = ""
+
+    def state(self, n: int) -> Mapping[str, Any]:
+        state = dict(super().state(n))
+        piece = PIECES[self.piece]
+        if piece.modes is not None:
+            never(state, piece.modes(state))
+        return {**state, **piece.state}
+
+
+def top(state: State) -> Array:
+    """The largest ratio of each ladder that jumps."""
+    return np.asarray((state["ratio"] >= 1.0) & (state["up"] == 0.0))
+
+
+PIECES: dict[str, Piece] = {
+    "trend": Piece(lambda s: s["ladder"] == -2),
+    "learned drift": Piece(lambda s: s["ladder"] == -1),
+    "single ladders": Piece(lambda s: s["ladder"] >= 0),
+    "second size of jumps": Piece(top),
+    "jumps": Piece(lambda s: s["ratio"] >= 1.0),
+    "slowest drift": Piece(lambda s: s["ratio"] == 1e-5),
+    "learned rate of changes": Piece(state={"left": 1e15, "expected": 1e15}),
+    "arrivals in all modes": Piece(edits=((BANK, "JUMP, ARRIVE = 1.5e-3, 1e-5", "JUMP, ARRIVE = 1.5e-3, 1e-9"),)),
+}
+
+
+def copied(piece: Piece, folder: Path) -> Path:
+    """The source with the edits of a piece."""
+    shutil.copytree(HOME, folder / "driftfit", ignore=shutil.ignore_patterns("__pycache__"))
+    for name, old, new in piece.edits:
+        path = folder / "driftfit" / name
+        text = path.read_text()
+        if text.count(old) != 1:
+            raise ValueError(f"{name} has {text.count(old)} times the text that a piece replaces: {old!r}.")
+        path.write_text(text.replace(old, new))
+    return folder
+
+
+def run_without(piece: Piece, arguments: Iterable[str]) -> None:
+    """``python -m benchmarks.ablation`` with these arguments on the source without a piece."""
+    with TemporaryDirectory() as folder:
+        source = copied(piece, Path(folder))
+        paths = [str(source), os.environ.get("PYTHONPATH", "")]
+        command = [sys.executable, "-m", "benchmarks.ablation", *arguments]
+        subprocess.run(
+            command, cwd=ROOT, env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)}, check=True,
+            stdout=subprocess.DEVNULL,
+        )  # fmt: skip
