@@ -99,6 +99,10 @@ class Bench:
         self.seeds = range(1 if given.quick else given.seeds)
         self.series = real.read(given.data) if given.data else {}
 
+    def forget(self, label: str) -> None:
+        """Compute what has this label anew."""
+        self.kept.forget(label, [*(f"{name}/" for name in self.names), *(f"record {name}" for name in self.series)])
+
     def scores(self, label: str, method: Method | None, tracker: Tracker | None) -> tuple[Rows, Rows]:
         """Scores by scenario and by real record; computed if there is a method and a tracker."""
         rows, records = {}, {}
@@ -163,7 +167,7 @@ class Bench:
                 one = Without(piece=piece)
                 rows, records = self.scores(label, of_tracker(one), one)
             print(self.cost(piece, rows, records, whole, whole_records), flush=True)
-            self.kept.forget(label)
+            self.forget(label)
 
     def cost(self, piece: str, rows: Rows, records: Rows, whole: Rows, whole_records: Rows) -> str:
         """A line of the table of pieces."""
@@ -203,7 +207,7 @@ def main() -> None:
         kept = Kept(path)
         bench = Bench(given, kept)
         label, method = given.function or (given.store or "now", of_tracker(AdaptiveKalman()))
-        kept.forget(given.store or label)
+        bench.forget(given.store or label)
         if given.without is None:
             bench.compare(given.store or label, method, None if given.function else AdaptiveKalman())
         else:
@@ -211,7 +215,7 @@ def main() -> None:
             arguments = ["--seeds", str(len(bench.seeds)), "--only", *bench.names, "--baseline", str(path)]
             bench.without(pieces, arguments + (["--data", str(given.data)] if given.data else []))
         if given.store is None:
-            kept.forget(label)
+            bench.forget(label)
         kept.write()
 
 

@@ -165,9 +165,10 @@ class Kept:
             self.scores[key] = compute()
         return self.scores.get(key)
 
-    def forget(self, label: str) -> None:
-        """Compute what has this label anew."""
-        self.scores = {key: value for key, value in self.scores.items() if not key.startswith(f"{label}/")}
+    def forget(self, label: str, names: Iterable[str]) -> None:
+        """Compute what has this label, of these scenarios and records, anew."""
+        begins = tuple(f"{label}/{name}" for name in names)
+        self.scores = {key: value for key, value in self.scores.items() if not key.startswith(begins)}
 
     def write(self) -> None:
         if self.path is not None:
