@@ -28,6 +28,8 @@ HOME = Path(driftfit.__file__).parent
 ROOT = Path(__file__).parent.parent.parent
 BANK, NOISE, LEARNED = (f"trackers/parts/mixture/{name}.py" for name in ("filters", "noise", "learned"))
 State = Mapping[str, Any]
+NEXT_TO_NEVER = 1e-30
+"""Probability of entering a mode that is left out; at 0 its moments would be 0 / 0."""
 
 
 @dataclass(frozen=True)
@@ -51,15 +53,15 @@ class Piece:
         return total
 
 
-def never(state: dict[str, Any], out: Array) -> None:
+def never(state: dict[str, Any], ladder: Array, out: Array) -> None:
     """Change transitions so that modes are never entered; jumps together stay as likely as they were."""
     jump = state["ratio"] >= 1.0
     before = state["arrive"][jump].sum()
-    arrive = np.where(out, 0.0, state["arrive"])
-    arrive[jump] *= before / max(arrive[jump].sum(), 1e-300)
-    below = np.append(out[1:] & (state["ladder"][1:] == state["ladder"][:-1]), False)
-    start = np.where(out, 0.0, state["mu"])
-    state["up"] = np.where(below | out, 0.0, state["up"])
+    arrive = np.where(out, NEXT_TO_NEVER, state["arrive"])
+    arrive[jump] *= before / arrive[jump].sum()
+    leads = np.append(out[1:] & (ladder[1:] == ladder[:-1]), False)
+    start = np.where(out, NEXT_TO_NEVER, state["mu"])
+    state["up"] = np.where(leads | out, NEXT_TO_NEVER * (state["up"] > 0.0), state["up"])
     state["arrive"], state["arrivals"], state["jumping"] = arrive, arrive.sum(), arrive[jump].sum()
     state["mu"] = state["prior"] = start / start.sum()
 
@@ -71,25 +73,26 @@ class Without(AdaptiveKalman):
     piece: str = ""
 
     def state(self, n: int) -> Mapping[str, Any]:
-        state = dict(super().state(n))
-        piece = PIECES[self.piece]
+        from driftfit.trackers.parts.mixture.filters import table
+
+        state, piece, modes = dict(super().state(n)), PIECES[self.piece], table(n, self.groups)
         if piece.modes is not None:
-            never(state, piece.modes(state))
+            never(state, modes["ladder"], piece.modes(modes))
         return {**state, **piece.state}
 
 
-def top(state: State) -> Array:
+def largest(modes: State) -> Array:
     """The largest ratio of each ladder that jumps."""
-    return np.asarray((state["ratio"] >= 1.0) & (state["up"] == 0.0))
+    return np.asarray((modes["ratio"] >= 1.0) & (modes["up"] == 0.0))
 
 
 PIECES: dict[str, Piece] = {
-    "trend": Piece(lambda s: s["ladder"] == -2),
-    "learned drift": Piece(lambda s: s["ladder"] == -1),
-    "single ladders": Piece(lambda s: s["ladder"] >= 0),
-    "second size of jumps": Piece(top),
-    "jumps": Piece(lambda s: s["ratio"] >= 1.0),
-    "slowest drift": Piece(lambda s: s["ratio"] == 1e-5),
+    "trend": Piece(lambda modes: modes["ladder"] == -2),
+    "learned drift": Piece(lambda modes: modes["ladder"] == -1),
+    "single ladders": Piece(lambda modes: modes["ladder"] >= 0),
+    "second size of jumps": Piece(largest),
+    "jumps": Piece(lambda modes: modes["ratio"] >= 1.0),
+    "slowest drift": Piece(lambda modes: modes["ratio"] == 1e-5),
     "learned rate of changes": Piece(state={"left": 1e15, "expected": 1e15}),
     "arrivals in all modes": Piece(edits=((BANK, "JUMP, ARRIVE = 1.5e-3, 1e-5", "JUMP, ARRIVE = 1.5e-3, 1e-9"),)),
 }
