@@ -173,18 +173,8 @@ class Smoothed:
 
     def _std(self, var: Array) -> Array:
         """Standard deviations from variances relative to the noise, in their place."""
-        var *= self.r * self._fold
+        var *= self.r
         return np.sqrt(var, out=var)
-
-    @property
-    def _fold(self) -> float:
-        """The factor by which variances grow because readings share errors of rounding
-        (`driftfit.trackers.parts.coarse.shared_rounding`), from the mean r phi' V phi of the used samples.
-        """
-        found = self.run.ended_with("common")
-        common = 0.0 if found is None else float(found)
-        undecided = self.r * self._path.spread / max(self._data.used, 1) if common > 0.0 else 0.0
-        return 1.0 + len(self.run.names) * common / undecided if undecided > 0.0 else 1.0
 
     @property
     def slope(self) -> Array:

@@ -1,14 +1,13 @@
-"""The start of the filters: each from generalised least squares with its own drift, on the samples so far.
+"""The start of the bank: every filter sees the first samples again, with its own drift.
 
-Least squares without drift determine the coordinates z and their estimate d. When there are residuals, every filter
-runs again over the samples so far, from m = d and C = `LOOSE` I in units of r, in which least squares have C = I, so
-that next to nothing of this prior is left:
+Filters that began from least squares without drift would be certain of something wrong where the parameters moved
+while the samples were collected. So each of the samples so far runs through all of them, from m = d and C = `LOOSE` I
+in units of r, in which least squares have C = I, so that next to nothing of this prior is left:
 
     m_k, C_k,    S_k = sum e_k^2 / s_k,    log p_k = -1/2 sum log s_k - (nu / 2) log S_k
 
-with nu the number of residuals, and p_k Student's density of the samples given the drift of filter k, whatever r. The
-filters start with probabilities proportional to p_k, and with r the mean of S_k / nu. Parameters that move from the
-first sample on are therefore neither taken for noise nor for estimates that many samples agree on.
+with nu the number of residuals, and p_k Student's density of the samples given the drift of mode k, whatever r. The
+modes start with probabilities proportional to p_k, and with r the mean of S_k / nu.
 
 Source: marginal likelihood under an inverse-gamma variance, West and Harrison, Bayesian Forecasting and Dynamic Models
 (1997), section 4.5. Cost: O(K n^2) for each sample of the start, once.
@@ -19,22 +18,17 @@ from __future__ import annotations
 import math
 from functools import partial
 
-import numpy as np
-
 from driftfit.engine.kernel import State, exp, kernel, log
-from driftfit.trackers.parts.coarse.resolution import learn_resolved_scale
 from driftfit.trackers.parts.diffuse import absorb_on_roots, forecast_on_roots
 from driftfit.trackers.parts.excitation import learn_information, learn_scales
-from driftfit.trackers.parts.modes.drifts.about_means import learn_means
-from driftfit.trackers.parts.modes.filters import absorb, project, wander
-from driftfit.trackers.parts.modes.rows import least_of_row, sum_of_row
-from driftfit.trackers.parts.modes.weights import PHI, WINDOW
-from driftfit.trackers.parts.proportion import bound_leverage, learn_proportion
+from driftfit.trackers.parts.mixture.filters import absorb, project, wander
+from driftfit.trackers.parts.mixture.learned import PHI, WINDOW, learn_means
+from driftfit.trackers.parts.mixture.noise import note_reading
+from driftfit.trackers.parts.mixture.rows import least_of_row, sum_of_row
 
-Y, NOISE, SPAN = range(3)
-"""Entries of a stored sample of the start before its regressor, at `PHI`: the output, the noise factor, and intervals
-of drift since the one before."""
-
+Y, SPAN = range(2)
+"""Entries of a stored sample of the start before its regressor, at `PHI`: the output over the root of the noise factor,
+and intervals of drift since the one before. The regressor is over that root too."""
 LOOSE = 1e4
 """Variance of each coordinate before the first sample, in units of what least squares leave. A larger one would cost
 as many digits of the estimates."""
@@ -51,13 +45,13 @@ def start_density(e: float, s: float, nu: float) -> float:
 
 @kernel
 def keep(s: State, l: int) -> None:
-    """Store a sample of the start, where those of `driftfit.trackers.parts.modes.weights` will be."""
+    """Store a sample of the start, where those of `driftfit.trackers.parts.mixture.learned` will be."""
     if s.ok[l] > 0.0:
         if s.remembered[l] < WINDOW:
-            at = s.remembered[l]
+            at, root = s.remembered[l], 1.0 / math.sqrt(s.noise[l])
             for i in range(s.theta.shape[0]):
-                s.samples[at, PHI + i, l] = s.phi[i, l]
-            s.samples[at, Y, l], s.samples[at, SPAN, l], s.samples[at, NOISE, l] = s.y[l], s.waited[l], s.noise[l]
+                s.samples[at, PHI + i, l] = root * s.phi[i, l]
+            s.samples[at, Y, l], s.samples[at, SPAN, l] = root * s.y[l], s.waited[l]
         s.remembered[l] += 1
         s.waited[l] = 0.0
 
@@ -65,29 +59,24 @@ def keep(s: State, l: int) -> None:
 @kernel
 def forecast_start(s: State, l: int) -> None:
     """Prediction of least squares, and its variance in units of the noise so far."""
-    bound_leverage(s, l)
     forecast_on_roots(s, l)
-    s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l] * s.leverage[l]) if s.h[l] < np.inf else np.inf
+    s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l]) if s.h[l] < math.inf else math.inf
 
 
 @partial(kernel, short=True)
 def take_start(s: State, l: int) -> None:
-    """A sample of least squares, and its residual."""
+    """A sample of least squares, and its residual if the reading did not repeat the one before."""
     s.waited[l] += s.dt[l] * s.drift[l]
+    note_reading(s, l)
     learn_scales(s, l)
     learn_means(s, l)
-    bound_leverage(s, l)  # the drift is in units of scales that such a regressor did not move much either
-    noise, v = s.noise[l], s.s[l]
-    s.noise[l] = noise * s.leverage[l]
     learn_information(s, s.noise[l], l)
-    learn_proportion(s, l, 0.0)
     absorb_on_roots(s, l)
-    if s.h[l] < np.inf:
-        s.s[l] = s.h[l] + s.r[l] * s.noise[l]
-        learn_resolved_scale(s, l)
-    s.s[l] = v
+    if (s.h[l] < math.inf) & (s.repeats[l] < 1.0):
+        s.squares[l] += s.ok[l] * s.e[l] * s.e[l] / (s.h[l] + s.r[l] * s.noise[l])
+        s.count[l] += s.ok[l]
+        s.scale[l] = s.squares[l] / s.count[l]  # NaN until there is a residual
     keep(s, l)
-    s.noise[l] = noise
 
 
 @kernel
@@ -102,10 +91,10 @@ def whitened(s: State, at: int, l: int) -> None:
 
 @kernel
 def run_again(s: State, l: int) -> None:
-    """Every filter over the stored samples, in units of r; sums of squares in ``weighted``, of logs in ``mu_next``."""
+    """Every filter over the stored samples, in units of r; sums of squares in ``mu``, of logs in ``prior``."""
     n, K = s.theta.shape[0], s.modes[l]
     for k in range(K):
-        s.weighted[k, l], s.mu_next[k, l] = 0.0, 0.0
+        s.mu[k, l], s.prior[k, l] = 0.0, 0.0
     for i in range(n):
         for k in range(K):
             s.C[i, i, k, l] *= LOOSE
@@ -115,33 +104,37 @@ def run_again(s: State, l: int) -> None:
         whitened(s, at, l)
         project(s, l)
         for k in range(K):
-            e, v = s.samples[at, Y, l] - s.e_k[k, l], s.h_k[k, l] + s.samples[at, NOISE, l]
-            s.weighted[k, l] += e * e / v
-            s.mu_next[k, l] += log(v)
-            s.step[k, l], s.h_k[k, l] = e / v, 1.0 / v
+            e, v = s.samples[at, Y, l] - s.e_k[k, l], s.h_k[k, l] + 1.0
+            s.mu[k, l] += e * e / v
+            s.prior[k, l] += log(v)
+            s.step[k, l], s.curve[k, l] = e / v, 1.0 / v
         absorb(s, l)
 
 
 @partial(kernel, short=True)
 def begin_with_drift(s: State, least: float, l: int) -> None:
     """Estimates, r, which is at least ``least``, and probabilities of the filters, which have m = d and C = I."""
-    n, K = s.theta.shape[0], s.modes[l]
+    n, K, count = s.theta.shape[0], s.modes[l], s.count[l]
     if s.remembered[l] <= WINDOW:
+        for k in range(K):
+            s.share[0, k, l] = s.mu[k, l]
         run_again(s, l)
         for k in range(K):
             # residuals below the floor of r are rounding, and say nothing about the drift
-            s.weighted[k, l] = max(s.weighted[k, l] / s.count[l], least)
-            s.row[k, l] = s.mu_next[k, l] + s.count[l] * log(s.weighted[k, l])
+            s.step[k, l] = max(s.mu[k, l] / count, least)
+            s.curve[k, l] = s.prior[k, l] + count * log(s.step[k, l])
+            s.row[k, l] = s.curve[k, l]
         nearest = least_of_row(s, l)
         for k in range(K):
-            s.row[k, l] = s.mu[k, l] * exp(-0.5 * (s.mu_next[k, l] + s.count[l] * log(s.weighted[k, l]) - nearest))
+            s.row[k, l] = s.share[0, k, l] * exp(-0.5 * (s.curve[k, l] - nearest))
         share = 1.0 / sum_of_row(s, l)
         for k in range(K):
             s.mu[k, l] = s.row[k, l] * share
-            s.row[k, l] = s.mu[k, l] * s.weighted[k, l]
+            s.row[k, l] = s.mu[k, l] * s.step[k, l]
         s.r[l] = sum_of_row(s, l)
     for i in range(n):
         for j in range(i + 1):
             for k in range(K):
                 s.C[i, j, k, l] *= s.r[l]
+    s.restless[l] = s.r[l]
     s.remembered[l] = 0
