@@ -26,7 +26,8 @@ from driftfit.engine.kernel import Array
 
 HOME = Path(driftfit.__file__).parent
 ROOT = Path(__file__).parent.parent.parent
-BANK, NOISE, LEARNED = (f"trackers/parts/mixture/{name}.py" for name in ("filters", "noise", "learned"))
+BANK, NOISE, LEARNED, START = (f"trackers/parts/mixture/{name}.py" for name in ("filters", "noise", "learned", "start"))
+TRACKER = "trackers/adaptive_kalman.py"
 State = Mapping[str, Any]
 NEXT_TO_NEVER = 1e-30
 """Probability of entering a mode that is left out; at 0 its moments would be 0 / 0."""
@@ -58,7 +59,7 @@ def never(state: dict[str, Any], ladder: Array, out: Array) -> None:
     jump = state["ratio"] >= 1.0
     before = state["arrive"][jump].sum()
     arrive = np.where(out, NEXT_TO_NEVER, state["arrive"])
-    arrive[jump] *= before / arrive[jump].sum()
+    arrive[jump] *= before / arrive[jump].sum() if (jump & ~out).any() else 1.0
     leads = np.append(out[1:] & (ladder[1:] == ladder[:-1]), False)
     start = np.where(out, NEXT_TO_NEVER, state["mu"])
     state["up"] = np.where(leads | out, NEXT_TO_NEVER * (state["up"] > 0.0), state["up"])
@@ -86,15 +87,78 @@ def largest(modes: State) -> Array:
     return np.asarray((modes["ratio"] >= 1.0) & (modes["up"] == 0.0))
 
 
+def of(file: str, *names: str) -> tuple[str, ...]:
+    """Names of functions of a file."""
+    return tuple(f"{file}:{name}" for name in names)
+
+
 PIECES: dict[str, Piece] = {
     "trend": Piece(lambda modes: modes["ladder"] == -2),
-    "learned drift": Piece(lambda modes: modes["ladder"] == -1),
+    "learned drift": Piece(
+        lambda modes: modes["ladder"] == -1,
+        functions=of(
+            LEARNED,
+            "step_back",
+            "look_back",
+            "diagonal",
+            "whitened",
+            "rotate",
+            "turn",
+            "machine_drift",
+            "remember",
+            "end_block",
+            "learn_drift",
+        ),
+    ),
     "single ladders": Piece(lambda modes: modes["ladder"] >= 0),
-    "second size of jumps": Piece(largest),
-    "jumps": Piece(lambda modes: modes["ratio"] >= 1.0),
+    "jumps": Piece(lambda modes: modes["ratio"] >= 1.0, functions=of(BANK, "widest_jumps", "learn_rate")),
+    "common jumps": Piece(lambda modes: (modes["ladder"] == -3) & (modes["ratio"] >= 1.0)),
+    "jumps of size 1": Piece(lambda modes: modes["ratio"] == 1.0),
+    "largest jumps": Piece(lambda modes: modes["ratio"] > 1.0),
     "slowest drift": Piece(lambda modes: modes["ratio"] == 1e-5),
-    "learned rate of changes": Piece(state={"left": 1e15, "expected": 1e15}),
-    "arrivals in all modes": Piece(edits=((BANK, "JUMP, ARRIVE = 1.5e-3, 1e-5", "JUMP, ARRIVE = 1.5e-3, 1e-9"),)),
+    "learned rate of changes": Piece(state={"left": 1e15, "expected": 1e15}, functions=of(BANK, "learn_rate")),
+    "leading direction": Piece(
+        edits=((LEARNED, "share = t[N + 6 * best, best] / positive if sound else 0.0", "share = 0.0"),),
+        functions=of(LEARNED, "whitened", "rotate", "turn"),
+    ),
+    "arrivals in all modes": Piece(edits=((BANK, "\nJUMP, ARRIVE = 3e-3, 1e-5\n", "\nJUMP, ARRIVE = 3e-3, 1e-9\n"),)),
+    "jumps as large as y": Piece(
+        edits=((BANK, "ratio = max(COMMON[-1], s.spread[l] / s.r[l])", "ratio = COMMON[-1]"),),
+        functions=of(BANK, "widest_jumps"),
+    ),
+    "Student's density": Piece(edits=((BANK, "\nSTUDENT = 60.0\n", "\nSTUDENT = 0.0\n"),)),
+    "drift about means": Piece(
+        edits=((LEARNED, "\nFAR = 9.0\n", "\nFAR = 1e300\n"),), functions=of(LEARNED, "learn_means")
+    ),
+    "slow variance at rest": Piece(
+        edits=((LEARNED, "v = max(s.variance[i, l], s.long_variance[i, l])", "v = s.variance[i, l]"),)
+    ),
+    "coloured noise": Piece(
+        edits=((LEARNED, "s.colour[l] = max(-MOST, min(MOST, known))", "s.colour[l] = 0.0 * known"),),
+        functions=of(LEARNED, "whiten_noise", "learn_colour", "colour"),
+    ),
+    "restless noise": Piece(edits=((NOISE, "\nSTAY, CALM = 0.985, 0.95\n", "\nSTAY, CALM = 1.0 - 1e-9, 1e-9\n"),)),
+    "outliers": Piece(edits=((NOISE, "RARITY, FADE = 0.035, 50.0, 0.999", "RARITY, FADE = 1e-9, 1e12, 0.999"),)),
+    "learned rate of outliers": Piece(edits=((NOISE, "RARITY, FADE = 0.035, 50.0,", "RARITY, FADE = 0.035, 1e12,"),)),
+    "repeated rounding": Piece(
+        edits=(
+            (
+                NOISE,
+                "return s.repeats[l] * min(share, s.noise[l] * s.r[l]) if s.repeats[l] > 0.0 else 0.0",
+                "return 0.0",
+            ),
+            (NOISE, "    if s.repeats[l] > 0.0:\n        return\n", ""),
+        ),
+        functions=of(NOISE, "note_reading", "repeated_rounding"),
+    ),
+    "start with drift": Piece(
+        edits=((TRACKER, "    begin_with_drift(s, least_noise(s, l), l)\n", ""),),
+        functions=of(START, "keep", "whitened", "run_again", "begin_with_drift"),
+    ),
+    "late columns that dominate": Piece(
+        edits=((TRACKER, "column = s.column[l] if s.column[l] >= 0 else outgrown(s, l)", "column = s.column[l]"),),
+        functions=of(BANK, "outgrown"),
+    ),
 }
 
 
