@@ -1,13 +1,9 @@
 """`AdaptiveKalman` after a jump, and where one parameter walks as fast as the noise or faster."""
 
-from itertools import product
-
 import numpy as np
 import pytest
 
 from driftfit import ARX, RLS, AdaptiveKalman, Kalman, Regression, track
-from driftfit.trackers.parts.modes.ladder import chain
-from driftfit.trackers.parts.modes.smoother import modes_given_all
 
 T, AT, NOISE = 500, 300, 0.3
 
@@ -49,47 +45,6 @@ def test_one_parameter_that_walks_fast(std, limit):
         inside.append(np.mean(np.abs(run.theta - theta)[150:] < 1.96 * run.std[150:]))
     assert np.mean(ratios) < limit
     assert 0.93 < np.mean(inside) < 0.98
-
-
-def test_probabilities_given_all_are_those_of_all_paths():
-    """Where a state replaces the last one before a transition, its path may go on there, and that of the last in it.
-    Where the last but one begins anew, any path may lead to it."""
-    rng = np.random.default_rng(0)
-    K, steps, began, share = 4, 6, 4, 0.2
-    by, over = np.array([-1, 0, -1, 1, 0, -1]), np.array([0.5, 0.2, 0.0, 0.0])
-    arrive, climb, descend, back = 0.1 * rng.random((4, K))
-    climb[-1] = descend[0] = back[0] = 0.0
-    stay, change = chain(np.array([climb, descend, back]), arrive)
-    moves, likelihood = [], rng.random((steps, K))
-    for at in by:
-        into = np.eye(K)
-        if at >= 0:
-            into[at, at], into[at, -1] = 1.0 - over[at], over[at]
-            into[-1, at], into[-1, -1] = 1.0, 0.0
-        moves.append(into @ (stay + 0.7 * change))
-    after, ahead = np.empty((steps, K)), np.empty((steps, K))
-    before = np.full(K, 1.0 / K)
-    for t in range(steps):
-        after[t] = before * likelihood[t] / (before @ likelihood[t])
-        if t == began:
-            likelihood[t] *= (1.0 - share) / (1.0 - after[t, -2])
-            new = share * (before @ likelihood[t]) * (1.0 - after[t, -2]) / (1.0 - share)
-            after[t] *= (1.0 - share) / (1.0 - after[t, -2])
-            after[t, -2] = share
-        before = ahead[t] = after[t] @ moves[t]
-    expected = np.zeros((steps, K))
-    for path in product(range(K), repeat=steps):
-        p = 1.0
-        for t, state in enumerate(path):
-            begins = t == began and state == K - 2
-            p *= new if begins else likelihood[t, state] * (moves[t - 1][path[t - 1], state] if t else 1.0)
-        expected[np.arange(steps), path] += p
-    fields = {
-        "joint": after[:, None], "prior": ahead, "replaced_by": by, "jumped": (np.arange(steps) == began)[:, None],
-        "calm": np.full(steps, 0.7), "busy": np.ones(steps), "weighed": np.ones(steps),
-    }  # fmt: skip
-    found = modes_given_all(fields, {"over": over, "moves": np.array([climb, descend, back]), "arrive": arrive})
-    np.testing.assert_allclose(found, expected / expected.sum(axis=1, keepdims=True), rtol=1e-12)
 
 
 @pytest.mark.parametrize("model", [Regression(1), Regression(1, intercept=True), ARX(1, 1, intercept=True)])

@@ -281,6 +281,7 @@ class AdaptiveKalman(Tracker):
             "settled": 0,
             "column": -1,
             "shift": 0.0,
+            "vague": 0.0,
             **knowing_nothing(n),
             **no_excitation(n),
             **nothing_learned(n),
@@ -304,6 +305,7 @@ class AdaptiveKalman(Tracker):
             store=keep_density,
             store_for_smoother=store_for_smoother,
             machines=(*FRAME, machine_drift),
+            doubts=True,
             outlined=True,
         )
 

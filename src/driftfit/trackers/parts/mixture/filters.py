@@ -57,6 +57,9 @@ FLOOR = 0.002
 """Share of the common drift in the learned one."""
 STUDENT = 60.0
 """Samples from which on Student's density is taken for normal."""
+UNSURE = 4.5
+"""The covariance that is reported is that of the mixture times 1 + this over the square root of the number of samples,
+because the probabilities of the filters, and r, are estimates."""
 LEAST = 1e-100
 """Probability that a mode is never below."""
 FIRST_LEARNED = len(COMMON) + len(TREND)
@@ -239,9 +242,9 @@ def innovate(s: State, l: int) -> None:
     for k in range(K):  # the band is for samples at which no jump begins
         p = s.prior[k, l] - (s.kappa[l] * s.arrive[k, l] if s.ratio[k, l] >= 1.0 else 0.0)
         s.row[k, l] = max(p, 0.0) * (s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2)
-    v = sum_of_row(s, l)
-    for j in range(STATES - 1):
-        v += s.nu_prior[j, l] / (1.0 - s.outlying[l]) * variance_in(s, j, l)
+    v = sum_of_row(s, l) + s.vague[l]
+    quiet, restless = variance_in(s, 0, l), s.nu_prior[1, l] / (1.0 - s.outlying[l])
+    v += quiet * exp(restless * log(variance_in(s, 1, l) / quiet))  # their arithmetic mean is that of rare large noise
     for k in range(K):
         s.e_k[k, l] = s.y[l] - s.e_k[k, l]
     s.y_hat[l] = mean
@@ -286,7 +289,7 @@ def likelihoods(s: State, more: float, l: int) -> float:
 def predictive_density(s: State, nearest: float, l: int) -> None:
     """The log density of the sample under its prediction, with a Cauchy tail for outliers, which integrates to 1."""
     K, few = s.modes[l], s.count[l]
-    noise = variance_in(s, STATES - 1, l)
+    noise = variance_in(s, STATES - 1, l) + s.vague[l]
     for k in range(K):
         v = s.h_k[k, l] + noise
         s.row[k, l] = s.prior[k, l] * s.nu_prior[STATES - 1, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
@@ -303,12 +306,15 @@ def predictive_density(s: State, nearest: float, l: int) -> None:
 
 @partial(kernel, inline=False)
 def weigh(s: State, more: float, l: int) -> None:
-    """Joint probabilities of modes and states of the noise after the sample, and its density before it."""
+    """Joint probabilities of modes and states of the noise after the sample, and its density before it.
+
+    ``more`` is the variance of rounding that repeats; ``s.vague`` is that of lags that the model doubts.
+    """
     K = s.modes[l]
-    nearest = likelihoods(s, 0.0, l)
+    nearest = likelihoods(s, s.vague[l], l)
     predictive_density(s, nearest, l)
     if more > 0.0:
-        likelihoods(s, more, l)
+        likelihoods(s, s.vague[l] + more, l)
     for k in range(K):
         s.row[k, l] = s.joint[0, k, l] + s.joint[1, k, l] + s.joint[2, k, l]
     share = 1.0 / sum_of_row(s, l)
@@ -380,7 +386,7 @@ def enter_filters(s: State, j: int, l: int) -> None:
     z_j; then z_j = y - sum_{i<j} x_i z_i - v, which is correlated with them also by v.
     """
     n, K, fresh = s.parameters[l], s.modes[l], s.S[j, j, l] == 0.0
-    noise = variance_in(s, 0, l)
+    noise = variance_in(s, 0, l) + s.vague[l]
     for k in range(K):
         s.curve[k, l] = 0.0 if fresh or s.h_k[k, l] == 0.0 else 1.0 / (s.h_k[k, l] + noise)
         s.step[k, l] = s.curve[k, l] * s.e_k[k, l]
@@ -423,10 +429,10 @@ def mixture(s: State, l: int) -> None:
             s.Z[0, i, j, l] = sum_of_row(s, l)
             s.P[i, j, l] = s.Z[0, i, j, l]
     in_units_of_theta(s, l)
-    wide = 1.0 + 1.0 / np.sqrt(max(s.count[l], 1.0))
+    wide = 1.0 + UNSURE / np.sqrt(max(s.count[l], 1.0))
     for i in range(n):
         for j in range(i + 1):
-            s.P[i, j, l] *= wide * wide
+            s.P[i, j, l] *= wide
         s.var[i, l] = s.P[i, i, l]
 
 

@@ -94,7 +94,7 @@ def repeated_rounding(s: State, l: int) -> float:
 @partial(kernel, inline=False)
 def learn_noise(s: State, l: int) -> None:
     """r and f from the moments of the noise of this sample."""
-    K, more = s.modes[l], repeated_rounding(s, l)
+    K, more = s.modes[l], s.vague[l] + repeated_rounding(s, l)
     usual = s.nu[0, l] / (variance_in(s, 0, l) + more) + s.nu[1, l] / (variance_in(s, 1, l) + more)
     far = max(variance_in(s, STATES - 1, l), s.e[l] * s.e[l]) + more
     s.certainty[l] = s.noise[l] * ((1.0 - s.outlier[l]) * usual + s.outlier[l] / far)
