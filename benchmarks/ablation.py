@@ -12,10 +12,11 @@ error over that of the whole default (geometric mean, worst, number of scenarios
 one-step errors on real records.
 
 Run: python -m benchmarks.ablation [--seeds 5] [--only NAME ..] [--without PIECE ..|all] [--data PATH] [--quick]
-         [--baseline PATH] [--store LABEL] [--against LABEL] [--function LABEL=PATH:NAME]
+         [--baseline PATH] [--store LABEL] [--against LABEL] [--tracker NAME] [--function LABEL=PATH:NAME]
 
-``--baseline`` keeps the oracle's scores, and under ``--store`` those of this run. ``--function`` judges a function of
-regressors (T, n) and y (T,) that returns theta, std, prediction and its variance, instead of the default.
+``--baseline`` keeps the oracle's scores, and under ``--store`` those of this run. ``--tracker`` judges another tracker
+instead of the default, *faults* being a `Bank` with a hypothesis for outliers; ``--function`` a function of regressors
+(T, n) and y (T,) that returns theta, std, prediction and its variance.
 """
 
 from __future__ import annotations
@@ -32,11 +33,16 @@ import numpy as np
 from benchmarks.held_out import real
 from benchmarks.held_out.judge import Kept, Method, Scores, means, of_function, of_tracker, scenarios
 from benchmarks.held_out.pieces import PIECES, Without, run_without
-from driftfit import AdaptiveKalman
+from driftfit import AdaptiveKalman, Bank, Sensor
 from driftfit.trackers.base import Tracker
 
 HEADS = ("ratio", "step", "moving", "still", "output")
 QUICK, QUICK_PIECE = ("common_walk", "single_walk", "two_jumps"), "single ladders"
+TRACKERS: dict[str, Tracker] = {
+    "default": AdaptiveKalman(),
+    "bank": Bank(),
+    "faults": Bank(sensors=[Sensor.nominal(), Sensor.outlier(10.0, prob=0.02)]),
+}
 Rows = dict[str, Scores]
 
 
@@ -195,6 +201,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--baseline", type=Path)
     parser.add_argument("--store", metavar="LABEL")
     parser.add_argument("--against", metavar="LABEL", default="today")
+    parser.add_argument("--tracker", choices=TRACKERS, default="default")
     parser.add_argument("--function", metavar="LABEL=PATH:NAME", type=function)
     parser.add_argument("--quick", action="store_true", help="one seed of three scenarios, and one piece")
     return parser.parse_args()
@@ -206,10 +213,12 @@ def main() -> None:
         path = given.baseline or Path(folder) / "scores.json"
         kept = Kept(path)
         bench = Bench(given, kept)
-        label, method = given.function or (given.store or "now", of_tracker(AdaptiveKalman()))
-        bench.forget(given.store or label)
+        tracker = None if given.function else TRACKERS[given.tracker]
+        label, method = given.function or ("now", of_tracker(TRACKERS[given.tracker]))
+        label = given.store or label
+        bench.forget(label)
         if given.without is None:
-            bench.compare(given.store or label, method, None if given.function else AdaptiveKalman())
+            bench.compare(label, method, tracker)
         else:
             pieces = [QUICK_PIECE] if given.quick else list(PIECES) if "all" in given.without else given.without
             arguments = ["--seeds", str(len(bench.seeds)), "--only", *bench.names, "--baseline", str(path)]
