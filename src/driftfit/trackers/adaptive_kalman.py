@@ -157,6 +157,9 @@ def follow(s: State, l: int) -> None:
         update_filters(s, l)
         learn_drift(s, l)
         learn_noise(s, l)
+    else:
+        for k in range(s.modes[l]):
+            s.mu[k, l] = s.prior[k, l]
     learn_colour(s, weighed, l)
     learn_scales(s, l)
     learn_means(s, l)
@@ -249,7 +252,7 @@ class AdaptiveKalman(Tracker):
     gated: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
         "pivot", "at_start", "gain", "e_k", "step", "h_k", "curve", "inverse", "joint", "share", "row", "walk", "Z",
-        "away",
+        "away", "certainty",
     )  # fmt: skip
     """Not H and work, which `driftfit.trackers.parts.coordinates.frame` fills only where the coordinates change."""
 
