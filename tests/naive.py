@@ -14,8 +14,8 @@ def full(lower):
 
 
 def ratios(lane):
-    """Drift ratios (K,) in a sample: the last rung of jumps is the variance of the output."""
-    rho, jump = lane["ratio"].copy(), max(COMMON[-1], lane["spread"] / lane["r"])
+    """Drift ratios (K,) in a sample: the last rung of jumps is the variance of the output, or the last outlier."""
+    rho, jump = lane["ratio"].copy(), max(COMMON[-1], max(lane["spread"], lane["outlier"] * lane["e"] ** 2) / lane["r"])
     rho[len(COMMON) - 1] = jump
     rho[FIRST_ALONE + lane["rungs"] - 1 :: lane["rungs"]] = jump
     return rho

@@ -59,7 +59,7 @@ def test_a_sample_and_the_interaction_against_matrices(groups):
 
 def test_transitions_are_probabilities_and_the_smoother_knows_the_same():
     y, u = record()
-    (one, two), = lanes(y, u, Regression(3), AdaptiveKalman(), (300,)).values()
+    ((one, two),) = lanes(y, u, Regression(3), AdaptiveKalman(), (300,)).values()
     mu, m, C, _ = naive.sample(one, u[300], y[300])
     T = naive.interaction(one, mu, m, C, 0.7)[-1]
     np.testing.assert_allclose(T.sum(axis=1), 1.0, rtol=1e-12)
@@ -87,7 +87,14 @@ def test_a_pass_of_scores_against_matrices():
             break
         live.update(y[t], u[t])
     newest = int(before["remembered"])
-    r, N, moved, block, right, squares = np.zeros(4), np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4)), np.zeros(4), 0
+    r, N, moved, block, right, squares = (
+        np.zeros(4),
+        np.zeros((4, 4)),
+        np.zeros((4, 4)),
+        np.zeros((4, 4)),
+        np.zeros(4),
+        0,
+    )
     p = after["sums"][ASSUMED]
     for back in range(WINDOW):
         one, k = after["samples"][(newest - back) % WINDOW], after["gains"][(newest - back) % WINDOW]

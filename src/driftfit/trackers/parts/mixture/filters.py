@@ -1,7 +1,8 @@
 """A bank of Kalman filters that differ in how the parameters drift: forecast, correction and interaction.
 
     e_k = y - x' m_k,     g_k = C_k x,     h_k = x' g_k,     s_kj = h_k + v_kj
-    p_kj  proportional to c_k nu_j t(e_k; s_kj),    a_k = sum_j p_(j|k) / s_kj,    d_k = sum_j p_(j|k) (1 / s_kj - a_k)^2
+    p_kj  proportional to c_k nu_j t(e_k; s_kj)
+    a_k = sum_j p_(j|k) / s_kj,    d_k = sum_j p_(j|k) (1 / s_kj - a_k)^2
     m_k   <- m_k + g_k a_k e_k,        C_k <- C_k - g_k g_k' (a_k - d_k e_k^2)
 
 with c_k and nu_j the probabilities of mode k and of state j of the noise (`driftfit.trackers.parts.mixture.noise`), and
@@ -182,8 +183,9 @@ def wander(s: State, size: float, l: int) -> None:
 
 @kernel
 def widest_jumps(s: State, l: int) -> None:
-    """The largest jumps may move the output by as much as it varies, however small the noise."""
-    ratio = max(COMMON[-1], s.spread[l] / s.r[l])
+    """The largest jumps may move the output by as much as it varies, however small the noise, and by as much as an
+    outlier was off in the sample before: it may have been the first one after a jump."""
+    ratio = max(COMMON[-1], max(s.spread[l], s.outlier[l] * s.e[l] * s.e[l]) / s.r[l])
     s.ratio[len(COMMON) - 1, l] = ratio
     for k in range(FIRST_ALONE + s.rungs[l] - 1, s.modes[l], s.rungs[l]):
         s.ratio[k, l] = ratio

@@ -53,8 +53,7 @@ E, PRECISION, PHI = range(3)
 """Entries of a stored sample before its regressor: the innovation over its variance, and the inverse variance, both in
 units of r."""
 ASSUMED, SLOPE, WEIGHT, DIRECTION, SCORE, SHIFT, A, B, M, N, T, V = range(12)
-"""Rows (n,) of the estimation: the diagonal of P, the right side, q, a, u, N k; then the rows of the sums of squares, of
-B, of M, of N and of a scratch matrix by turns."""
+"""Rows (n,) of the estimation: the diagonal of P, the right side, q, a, u, N k; then those of the sums of squares, of B, of M, of N and of a scratch matrix by turns."""
 COLOUR_FADE, SHRUNK, BOUND, MOST, GAP = 0.995, 5.0, 2.0, 0.95, 1.5
 """Fading of the sums for c; the square of its t value up to which noise is white; the bound of innovations in standard
 deviations; the largest c; and the interval that separates a sample from its past."""
@@ -91,12 +90,14 @@ def learn_means(s: State, l: int) -> None:
         square = off * (s.phi[i, l] - s.mean[i, l]) / s.noise[l]
         most = LARGE * own if s.moved[i, l] > 10.0 else np.inf
         s.variance[i, l] += share * (min(square, most) - own)
-        s.long_variance[i, l] += s.ok[l] * (s.variance[i, l] - s.long_variance[i, l]) / min(max(s.moved[i, l], 1.0), LONG)
+        slowly = s.ok[l] / min(max(s.moved[i, l], 1.0), LONG)
+        s.long_variance[i, l] += slowly * (s.variance[i, l] - s.long_variance[i, l])
         constant = i if (s.variance[i, l] <= STILL * s.c[i, l]) & (s.mean[i, l] != 0.0) else constant
     s.constant[l] = constant
     for i in range(s.parameters[l]):
         v = max(s.variance[i, l], s.long_variance[i, l])
-        beside = (constant >= 0) & (i != constant) & (s.mean[i, l] ** 2 > FAR * s.variance[i, l]) & (v > STILL * s.c[i, l])
+        far = (s.mean[i, l] ** 2 > FAR * s.variance[i, l]) & (v > STILL * s.c[i, l])
+        beside = (constant >= 0) & (i != constant) & far
         s.unit[i, l] = 1.0 / v if beside else 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
         s.offset[i, l] = s.mean[i, l] / s.mean[constant, l] if beside else 0.0
 

@@ -44,7 +44,8 @@ def any_noise() -> dict[str, Any]:
     """Fields before the first sample."""
     return {
         "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.zeros(STATES), "restless": 1.0, "outlier": 0.0,
-        "precision": 0.0, "certainty": 0.0, "outliers": 0.0, "watched": 0.0, "outlying": OUTLIER, "finest": np.inf, "reading": np.nan, "repeats": 0.0,
+        "precision": 0.0, "certainty": 0.0, "outliers": 0.0, "watched": 0.0, "outlying": OUTLIER,
+        "finest": np.inf, "reading": np.nan, "repeats": 0.0,
     }  # fmt: skip
 
 

@@ -42,7 +42,7 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
 
 
 def transitions(state: Mapping[str, Any]) -> tuple[Array, Array]:
-    """Transitions (K, K) of the modes as A + kappa B, from the fields of `driftfit.trackers.parts.mixture.filters.bank`."""
+    """Transitions (K, K) of the modes as A + kappa B, from the fields of a bank."""
     up, down, foot, arrive = state["up"], state["down"], state["foot"], state["arrive"]
     A = np.diag(1.0 - down - foot) + np.diag(down[1:], -1)
     A[:, 0] += foot
@@ -71,7 +71,8 @@ def estimated_variances(
     running = fields["settled"] > 0
     used = running & (fields["certainty"] > 0.0)
     r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
-    size, centred = modes_given_all(fields, used, state) * fields["ratio"] * (r * time)[:, None], fields["offset"] != 0.0
+    size = modes_given_all(fields, used, state) * fields["ratio"] * (r * time)[:, None]
+    centred = fields["offset"] != 0.0
     learned = size[:, FIRST_LEARNED:FIRST_ALONE].sum(axis=1)
     common = (size[:, :FIRST_LEARNED].sum(axis=1) + FLOOR * learned)[:, None] * fields["unit"]
     own = learned[:, None] * (fields["weight"] + fields["direction"] ** 2)
