@@ -123,8 +123,17 @@ PIECES: dict[str, Piece] = {
     ),
     "arrivals in all modes": Piece(edits=((BANK, "\nJUMP, ARRIVE = 3e-3, 1e-5\n", "\nJUMP, ARRIVE = 3e-3, 1e-9\n"),)),
     "jumps as large as y": Piece(
-        edits=((BANK, "ratio = max(COMMON[-1], s.spread[l] / s.r[l])", "ratio = COMMON[-1]"),),
+        edits=(
+            (
+                BANK,
+                "ratio = max(COMMON[-1], max(s.spread[l], s.outlier[l] * s.e[l] * s.e[l]) / s.r[l])",
+                "ratio = COMMON[-1]",
+            ),
+        ),
         functions=of(BANK, "widest_jumps"),
+    ),
+    "jumps as large as outliers": Piece(
+        edits=((BANK, "max(s.spread[l], s.outlier[l] * s.e[l] * s.e[l]) / s.r[l])", "s.spread[l] / s.r[l])"),)
     ),
     "Student's density": Piece(edits=((BANK, "\nSTUDENT = 60.0\n", "\nSTUDENT = 0.0\n"),)),
     "drift about means": Piece(
