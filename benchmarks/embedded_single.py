@@ -35,7 +35,7 @@ from driftfit import (
     track,
 )
 from driftfit.embedded import export_c
-from driftfit.embedded.selftest import record
+from driftfit.embedded.project import record
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 
 LOOP = """

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from driftfit.cli.parts.program import helpful
+from driftfit.cli.program import helpful
 from driftfit.engine.settings import near
 from lab import budgets, pages, same_numbers, structure
 from lab.bench import commands as bench

@@ -63,8 +63,7 @@ from driftfit.tune.frontier import frontier
 from driftfit.tune.pool import pool
 from driftfit.tune.tune import tune
 from driftfit.use import prepare
-from driftfit.use.rational import rational_model
-from driftfit.use.system_from_path import static_curve
+from driftfit.use.system_from_path import rational_model, static_curve
 
 __all__ = [
     "ARMAX",

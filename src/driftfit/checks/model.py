@@ -17,7 +17,7 @@ from driftfit.models.base import Model
 from driftfit.models.equation import Equation
 from driftfit.models.state_space import StateSpace
 from driftfit.results import Track
-from driftfit.run.parallel_lanes import FEWEST
+from driftfit.run.parallel_lanes import FEWEST_LANES
 from driftfit.smooth.problem import replay
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
@@ -110,7 +110,7 @@ def _live(model: Model, still: Tracker, run: Track) -> Iterator[str]:
 
 
 def _lanes(model: Model, still: Tracker, run: Track) -> Iterator[str]:
-    count = max(FEWEST, still.width) + 1
+    count = max(FEWEST_LANES, still.width) + 1
     y, u = (np.stack(part) for part in zip(*(signals(model.m, seed) for seed in range(count)), strict=True))
     fleet = track(model, still, y, u, by="row")
     for key in (1, count - 1):

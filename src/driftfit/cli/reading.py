@@ -6,6 +6,7 @@ intervals are passed on unchanged (`driftfit.data.limits`).
 
 from __future__ import annotations
 
+import csv
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -16,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 
+from driftfit.data.clock import Clock
 from driftfit.data.columns import Columns, Wanted, convert
 from driftfit.data.files import paths_of, read_file
 from driftfit.data.instants import EXAMPLES, dates, span
@@ -213,3 +215,42 @@ def moment(text: str, axis: Array, zone: str | None, end: bool = False) -> Any:
         )
     instant = found.to_numpy()[0]
     return instant + np.timedelta64(1, "D") - np.timedelta64(1, "us") if end else instant
+
+
+def listed(given: Sequence[str] | None) -> list[str]:
+    """Names that were given in several options, or separated by commas; one with a comma is quoted, as in a CSV file.
+
+    In a shell that is ``--u '"flow, cold",temperature'``. Blanks, parentheses and other signs need no quotes here.
+    """
+    try:
+        rows = [next(csv.reader([entry], skipinitialspace=True, strict=True), []) for entry in given or []]
+    except csv.Error:
+        raise ValueError(
+            f"{', '.join(given or [])}: a name with a comma is quoted as in a CSV file, in a shell as "
+            "--u '\"flow, cold\",temperature'."
+        ) from None
+    return [name.strip() for row in rows for name in row if name.strip()]
+
+
+def parse_units(given: Sequence[str] | None) -> dict[str, str]:
+    """``flow=l/min`` as a name and its unit."""
+    pairs = {entry: entry.rpartition("=") for entry in given or []}
+    for entry, (name, _, unit) in pairs.items():
+        if not name.strip() or not unit.strip():
+            raise ValueError(f"--unit {entry}: give a unit as column=unit, such as --unit flow=l/min.")
+    return {name.strip(): unit.strip() for name, _, unit in pairs.values()}
+
+
+def parse_interval(text: str | None) -> float | str | None:
+    """``0.5`` as a number; a duration or a step of the calendar as text, in which ``m`` after a number is minutes."""
+    if text is None:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        given = re.sub(r"(\d\s*)m\s*$", r"\1min", text)
+    try:
+        Clock.of(given)
+    except ValueError as error:
+        raise ValueError(f"--dt {text}: {error}") from None
+    return given

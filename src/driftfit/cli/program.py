@@ -13,14 +13,35 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from typer import Option
+from typer.core import TyperGroup
 
 from driftfit import __version__
 from driftfit.show.axes import check_picture
 from driftfit.show.text import WIDTH
 
+
+@contextmanager
+def helpful(program: str = "driftfit") -> Iterator[None]:
+    """Turn errors that a user can correct into one line and exit code 2."""
+    try:
+        yield
+    except (ValueError, OSError, ImportError) as error:
+        typer.echo(f"{program}: {' '.join(_text(error).split())}", err=True)
+        raise typer.Exit(2) from None
+
+
+class Commands(TyperGroup):
+    """All commands report errors of a user in the same way."""
+
+    def invoke(self, ctx: Any) -> Any:
+        with helpful():
+            return super().invoke(ctx)
+
+
 app = typer.Typer(
-    no_args_is_help=True, add_completion=False, help="Track the parameters of a system while they change.",
-    rich_markup_mode=None,
+    cls=Commands, no_args_is_help=True, add_completion=False, rich_markup_mode=None,
+    help="Track the parameters of a system while they change.",
 )  # fmt: skip
 progress = Console(stderr=True)
 
@@ -43,16 +64,6 @@ def main() -> None:
     """Run the installed program."""
     warnings.formatwarning = lambda message, *place: f"driftfit: warning: {message}\n"
     app()
-
-
-@contextmanager
-def helpful(program: str = "driftfit") -> Iterator[None]:
-    """Turn errors that a user can correct into one line and exit code 2."""
-    try:
-        yield
-    except (ValueError, OSError, ImportError) as error:
-        typer.echo(f"{program}: {' '.join(_text(error).split())}", err=True)
-        raise typer.Exit(2) from None
 
 
 def _text(error: Exception) -> str:
@@ -81,7 +92,7 @@ def _version(wanted: bool) -> None:
 @app.callback(help="Track the parameters of a system while they change.")
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and stop.")
+        bool, Option("--version", callback=_version, is_eager=True, help="Print the version and stop.")
     ] = False,
 ) -> None:
     pass

@@ -5,9 +5,10 @@ Every problem names its line and a way out; all of them are reported at once (`P
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,9 +21,7 @@ from driftfit.models.base import Model
 from driftfit.parsing.settings import parse_model, tracker_of
 from driftfit.run.live.rule import KINDS
 from driftfit.run.program import Program
-from driftfit.service.settings.matching import Pattern
-from driftfit.service.settings.options import PageOptions, ServiceOptions, build, kinds
-from driftfit.service.settings.toml_lines import Lines
+from driftfit.service.options import PageOptions, Pattern, ServiceOptions, build, converted, kinds
 from driftfit.service.sinks.contract import Sink
 from driftfit.service.sources.contract import Source
 from driftfit.streams import Live
@@ -44,13 +43,22 @@ class ProblemsError(ValueError):
 class AlarmSettings:
     """When a unit raises an alarm; its limits come from its own first samples, which are then frozen."""
 
-    every: float
+    every: float = 10_000.0
     """Samples in which one false alarm may begin."""
     on: tuple[str, ...] = ("innovation",)
     reference: int = 500
     """Number of first samples that are normal."""
     window: int = 50
     hold: int = 0
+
+    def __post_init__(self) -> None:
+        _positive("every", self.every)
+        for kind in self.on:
+            if kind not in KINDS:
+                raise ValueError(f"on: there is no alarm {kind!r}; {near(kind, KINDS)}")
+        for key, low in (("reference", 1), ("window", 1), ("hold", 0)):
+            if getattr(self, key) < low:
+                raise ValueError(f"{key} must be a whole number of samples; got {getattr(self, key)!r}.")
 
     @property
     def each(self) -> float:
@@ -84,11 +92,9 @@ class UnitSettings:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the output and the inputs."""
         return (self.y, *self.u)
 
     def live(self) -> Live:
-        """A new stream."""
         return Live(self.model, self.tracker, dt=self.dt, gate=self.gate)
 
 
@@ -109,7 +115,6 @@ def read(path: Path) -> Config:
 
 
 def parse(text: str, name: str = "configuration") -> Config:
-    """The configuration in a text."""
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -196,9 +201,8 @@ class _Reader:
         return self.tried((what, key), made)
 
     def unit(self, k: int) -> UnitSettings:
-        given = dict(self.tables("unit")[k])
-        known = ["match", "name", "y", "u", "time", "time_unit", "dt", "model", "tracker", "limits", "alarm",
-                 "hold_back", "ahead", "rate", "gate"]  # fmt: skip
+        given = self.tables("unit")[k]
+        known = [one.name for one in fields(UnitSettings)] + ["name"]
         for key in given:
             if key not in known:
                 raise KeyProblemError((key,), f"unit has no setting {key!r}; {near(key, known)}")
@@ -207,29 +211,21 @@ class _Reader:
                 raise KeyProblemError(
                     (key,), f"unit needs {key} = a text" + ("; write a [[unit]] for each output." * (key == "y"))
                 )
-        u = given.get("u", [])
-        if not (isinstance(u, str) or (isinstance(u, list) and all(isinstance(one, str) for one in u))):
-            raise KeyProblemError(("u",), f'u must be names of fields, such as ["pressure", "current"]; got {u!r}.')
-        u = (u,) if isinstance(u, str) else tuple(u)
+        u = at("u", lambda: converted("u", given.get("u", []), tuple[str, ...]))
         model = at("model", lambda: parse_model(str(given.get("model", f"ARX(2, {2 if u else 0}, intercept=True)"))))
         model = at("model", lambda: model.bind(list(u)))
         if len(model.outputs) > 1:
             raise KeyProblemError(("model",), "a unit has one output; write one [[unit]] for each.")
         tracker = at("tracker", lambda: tracker_of(str(given.get("tracker", "AdaptiveKalman()"))))
-        dt = at("dt", lambda: _dt(given.get("dt")))
+        own = {key: at(key, partial(READ[key], given[key])) for key in READ if key in given}
         settings = UnitSettings(
             at("match", lambda: Pattern(given["match"], given.get("name", ""))), given["y"], u, model, tracker,
-            given.get("time"), at("time_unit", lambda: _time_unit(given.get("time_unit", "s"))), dt,
-            at("hold_back", lambda: _seconds("hold_back", given.get("hold_back", 0.0))),
-            at("limits", lambda: valid_ranges(given.get("limits", {}), (given["y"], *u))),
-            at("alarm", lambda: _alarm(given.get("alarm"), dt)),
-            at("ahead", lambda: _seconds("ahead", given.get("ahead", 300.0))),
-            at("rate", lambda: _positive("rate", given.get("rate", 10_000.0))),
-            at("gate", lambda: _gate(given.get("gate", True))),
+            limits=at("limits", lambda: valid_ranges(given.get("limits", {}), (given["y"], *u))),
+            alarm=at("alarm", lambda: _alarm(given.get("alarm"), own.get("dt"))), **own,
         )  # fmt: skip
-        if settings.time is None and (settings.hold_back or dt is not None):
+        if settings.time is None and (settings.hold_back or settings.dt is not None):
             raise KeyProblemError(
-                ("dt" if dt is not None else "hold_back",),
+                ("dt" if settings.dt is not None else "hold_back",),
                 "dt and hold_back need the name of the field of times: time = ...",
             )
         program = at("tracker", lambda: Program(model, check_ready(tracker)))
@@ -255,20 +251,7 @@ def at(key: str, make: Callable[[], Made]) -> Made:
         raise KeyProblemError((key,), f"{key}: {error}") from None
 
 
-def _gate(given: Any) -> bool:
-    """Whether there is a gate."""
-    if not isinstance(given, bool):
-        raise ValueError(f"gate must be true or false; got {given!r}.")
-    return given
-
-
-def _dt(given: Any) -> float | None:
-    """The nominal interval in seconds."""
-    return None if given is None else _seconds("dt", given, low=1e-12)
-
-
 def _seconds(name: str, given: Any, low: float = 0.0) -> float:
-    """A number of seconds, or a duration as text."""
     if isinstance(given, str):
         clock = Clock.of(given)
         if clock.duration is None:
@@ -293,8 +276,19 @@ def _time_unit(given: Any) -> float:
     return TIME_UNITS[given]
 
 
+READ: dict[str, Callable[[Any], Any]] = {
+    "time": lambda given: converted("time", given, str),
+    "time_unit": _time_unit,
+    "dt": partial(_seconds, "dt", low=1e-12),
+    "hold_back": partial(_seconds, "hold_back"),
+    "ahead": partial(_seconds, "ahead"),
+    "rate": partial(_positive, "rate"),
+    "gate": lambda given: converted("gate", given, bool),
+}
+"""How a setting of [[unit]] is read that no other setting matters for."""
+
+
 def valid_ranges(given: Any, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:
-    """Valid ranges by name."""
     if not isinstance(given, dict):
         raise ValueError("give a range for each signal, such as { flow = [0, 80] }.")
     return {name: valid_range(name, bounds, names) for name, bounds in given.items()}
@@ -315,28 +309,50 @@ def valid_range(name: str, bounds: Any, names: tuple[str, ...]) -> tuple[float, 
 def _alarm(given: Any, dt: float | None) -> AlarmSettings | None:
     if given is None:
         return None
-    known = ("every", "on", "reference", "window", "hold")
-    unknown = [key for key in given if key not in known]
-    if unknown:
-        raise ValueError(f"there is no setting {unknown[0]!r}; {near(unknown[0], known)}")
-    every = given.get("every", 10_000)
+    every = given.get("every")
     if isinstance(every, str):
         if dt is None:
             raise ValueError(f"every = {every!r} needs dt, the interval between samples; or give a number of samples.")
-        every = _seconds("every", every.replace(" ", "")) / dt
-    on = given.get("on", ["innovation"])
-    on = (on,) if isinstance(on, str) else tuple(on)
-    for kind in on:
-        if kind not in KINDS:
-            raise ValueError(f"on: there is no alarm {kind!r}; {near(str(kind), KINDS)}")
-    whole = {key: given.get(key, default) for key, default in (("reference", 500), ("window", 50), ("hold", 0))}
-    for key, value in whole.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < (key != "hold"):
-            raise ValueError(f"{key} must be a whole number of samples; got {value!r}.")
-    return AlarmSettings(_positive("every", every), on, **whole)
+        given = given | {"every": _seconds("every", every.replace(" ", "")) / dt}
+    return build(AlarmSettings, given)
 
 
 def _check_alarms(program: Program, alarm: AlarmSettings) -> None:
     """Raise ValueError if an alarm cannot be set from its reference."""
     for kind in alarm.on:
         check_alarm(program, asked_for(kind, alarm.each, alarm.window, alarm.hold), alarm.reference)
+
+
+HEADER = re.compile(r"\s*(\[\[?)\s*([^\]]+?)\s*\]")
+KEY = re.compile(r"\s*((?:[\w-]+|\"[^\"]*\"|'[^']*')(?:\s*\.\s*(?:[\w-]+|\"[^\"]*\"|'[^']*'))*)\s*=")
+
+
+class Lines:
+    """In which line of a TOML file a key is written, which `tomllib` does not report.
+
+    The path of a key has numbers for the entries of an array of tables: ("unit", 0, "model").
+    """
+
+    def __init__(self, text: str) -> None:
+        self._lines: dict[tuple[Any, ...], int] = {(): 1}
+        counts: dict[tuple[Any, ...], int] = {}
+        table: tuple[Any, ...] = ()
+        for number, line in enumerate(text.splitlines(), 1):
+            if header := HEADER.match(line):
+                table = _parts(header[2])
+                if header[1] == "[[":
+                    counts[table] = counts.get(table, -1) + 1
+                    table = (*table, counts[table])
+                self._lines[table] = number
+            elif key := KEY.match(line):
+                self._lines.setdefault((*table, *_parts(key[1])), number)
+
+    def of(self, path: tuple[Any, ...]) -> int:
+        """The line of a key, or of the nearest table that contains it."""
+        while path not in self._lines:
+            path = path[:-1]
+        return self._lines[path]
+
+
+def _parts(text: str) -> tuple[str, ...]:
+    return tuple(part.strip().strip("\"'") for part in text.split("."))

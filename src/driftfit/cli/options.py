@@ -8,16 +8,18 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
-import typer
+from typer import Argument, Option
 
-from driftfit.cli.parts.arguments import listed, parse_interval, parse_units
-from driftfit.cli.parts.program import helpful, progress, writable
-from driftfit.cli.parts.reading import (
+from driftfit.cli.program import progress, writable
+from driftfit.cli.reading import (
     Part,
     Rows,
     decimal_from,
     interval_from,
     limits_from,
+    listed,
+    parse_interval,
+    parse_units,
     rows_from,
     rows_of,
     separator_from,
@@ -33,90 +35,95 @@ WRITTEN = {"write_to": "--out", "plot": "--plot", "system": "--system", "report"
 """Arguments of commands that are files to be written."""
 
 
+Own = Annotated[str | None, Option("--with", metavar="MODULE:CLASS", help="Your own tracker.")]
+Setting = Annotated[Names, Option("-p", help="Setting of the tracker; repeat it.")]
+Out = Annotated[Path | None, Option("--out", help="Write the result to .csv, .parquet or .npz (complete).")]
+Table = Annotated[Path | None, Option("--out", help="Write the result to .csv or .parquet.")]
+Plot = Annotated[Path | None, Option(help="Save a picture (.png, .pdf, .svg).")]
+Report = Annotated[Path | None, Option(help="Write a page (.html) to send to someone; a fleet has one page.")]
+
+
+def check_table(path: Path | None, what: str) -> None:
+    """ValueError for a file whose ending is not that of a table."""
+    if path is not None and path.suffix.lower() not in (".csv", ".parquet"):
+        raise ValueError(f"--out {path}: {what} written to .csv or .parquet.")
+
+
 @dataclass(frozen=True)
 class Given:
     """The options that commands share, as given on the command line."""
 
     file: Annotated[
         list[str],
-        typer.Argument(
-            help="CSV files with a header line, or Parquet files, or patterns such as 'runs/*.csv'; - is stdin."
-        ),
+        Argument(help="CSV files with a header line, or Parquet files, or patterns such as 'runs/*.csv'; - is stdin."),
     ]
     y: Annotated[
         list[str],
-        typer.Option(
-            help="Column of the output; repeat it, or separate names by commas, for several (ARX, Regression)."
-        ),
+        Option(help="Column of the output; repeat it, or separate names by commas, for several (ARX, Regression)."),
     ]
-    u: Annotated[Names, typer.Option(help="Column of an input; repeat it, or separate names by commas.")] = None
+    u: Annotated[Names, Option(help="Column of an input; repeat it, or separate names by commas.")] = None
     model: Annotated[
         Names,
-        typer.Option(
+        Option(
             help="Model and settings by position or name: arx:2,2,nk=1,intercept; one value per input with a slash: "
             "arx:2,2/1,nk=0/1; regression:intercept; or as in Python: 'ARX(2, [2, 1])'. Default: arx:2,2,intercept, "
             "without inputs arx:2,0,intercept."
         ),
     ] = None
     tracker: Annotated[
-        str, typer.Option(help="Tracker, as `driftfit trackers` lists them, or as in Python: 'Kalman(q=1e-4, r=0.1)'.")
+        str, Option(help="Tracker, as `driftfit trackers` lists them, or as in Python: 'Kalman(q=1e-4, r=0.1)'.")
     ] = "adaptive-kalman"
-    p: Annotated[
-        Names, typer.Option("-p", help="Setting of the tracker: q=1e-4, q=1e-4,0,0 or p0=none; repeat it.")
-    ] = None
-    time: Annotated[str | None, typer.Option(help="Column of the time: numbers or dates.")] = None
+    p: Annotated[Names, Option("-p", help="Setting of the tracker: q=1e-4, q=1e-4,0,0 or p0=none; repeat it.")] = None
+    time: Annotated[str | None, Option(help="Column of the time: numbers or dates.")] = None
     by: Annotated[
-        Names, typer.Option(help="Column that identifies the series of a fleet, or `file`; repeat it for several.")
+        Names, Option(help="Column that identifies the series of a fleet, or `file`; repeat it for several.")
     ] = None
-    unit: Annotated[Names, typer.Option(help="Unit of a column: flow=l/min; repeat it.")] = None
+    unit: Annotated[Names, Option(help="Unit of a column: flow=l/min; repeat it.")] = None
     own: Annotated[
-        str | None,
-        typer.Option("--with", metavar="MODULE:CLASS", help="Your own tracker, from a module in this folder."),
+        str | None, Option("--with", metavar="MODULE:CLASS", help="Your own tracker, from a module in this folder.")
     ] = None
     dt: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Nominal interval: a number; for dates 10ms, 1s, 15min, 1h, 1d, 1w, 'business day', month, quarter, "
             "year, or label if samples are one step apart whatever their dates."
         ),
     ] = None
-    first: Annotated[str | None, typer.Option("--from", help="First time to use, with --time.")] = None
-    last: Annotated[str | None, typer.Option("--to", help="Last time to use, with --time.")] = None
+    first: Annotated[str | None, Option("--from", help="First time to use, with --time.")] = None
+    last: Annotated[str | None, Option("--to", help="Last time to use, with --time.")] = None
     rows: Annotated[
-        str | None,
-        typer.Option(help="Rows to use of each file, counted from 1 after the header: 100:500, 100: or :500."),
+        str | None, Option(help="Rows to use of each file, counted from 1 after the header: 100:500, 100: or :500.")
     ] = None
     separator: Annotated[
         str | None,
-        typer.Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
+        Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
     ] = None
     decimal: Annotated[
-        str | None, typer.Option(help="Decimal sign of the numbers: . or , (by default the file shows it).")
+        str | None, Option(help="Decimal sign of the numbers: . or , (by default the file shows it).")
     ] = None
     missing: Annotated[
-        Names, typer.Option(help="What the file holds where there is no reading: Offline or -999; repeat it.")
+        Names, Option(help="What the file holds where there is no reading: Offline or -999; repeat it.")
     ] = None
     limits: Annotated[
-        Names, typer.Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
+        Names, Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
     ] = None
     exclude: Annotated[
-        Names, typer.Option(help="Interval to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
+        Names, Option(help="Interval to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
     ] = None
     gate: Annotated[
         bool | None,
-        typer.Option(
+        Option(
             "--gate/--no-gate",
             help="Leave out readings that look like fault codes, or use all. Default: as the tracker asks.",
             show_default=False,
         ),
     ] = None
     start: Annotated[
-        Path | None, typer.Option(help="Continue from a saved run (.npz) or live state, with its model and tracker.")
+        Path | None, Option(help="Continue from a saved run (.npz) or live state, with its model and tracker.")
     ] = None
 
     @property
     def outputs(self) -> list[str]:
-        """Names of the outputs."""
         names = listed(self.y)
         if not names:
             raise ValueError("--y names no column.")
@@ -126,7 +133,6 @@ class Given:
 
     @property
     def inputs(self) -> list[str]:
-        """Names of the inputs."""
         names = listed(self.u)
         if both := [name for name in names if name in listed(self.y)]:
             raise ValueError(
@@ -143,7 +149,6 @@ class Given:
         return [model if one else model.bind(self.inputs) for model, one in zip(found, alone, strict=True)]
 
     def chosen_tracker(self) -> Tracker:
-        """The tracker with its settings."""
         return parse_tracker(self.tracker, self.p or [], self.own)
 
     def part(self) -> Part:
@@ -204,10 +209,14 @@ class Given:
         before = saved(self.start, [own_tracker(self.own)] if self.own else [])
         return before.model, before.tracker, before
 
+    def check_single(self, verb: str) -> None:
+        """Raise ValueError for several series or outputs."""
+        if self.by or len(self.outputs) > 1:
+            raise ValueError(f"{verb}: one series of one output at a time; leave out --by and further --y.")
+
     def arrays(self) -> dict[str, Any]:
         """One series in the form that `tune` and `select` take."""
-        outputs = self.outputs
-        if self.by or len(outputs) > 1 or self.start is not None:
+        if self.by or len(self.outputs) > 1 or self.start is not None:
             raise ValueError("this command takes one series of one output; leave out --by, --start and further --y.")
         signals = self.signals()
         return {name: signals[name] for name in signals if name not in ("by", "units")}
@@ -241,11 +250,10 @@ def reads(command: Callable[..., None]) -> Callable[..., None]:
             options.append(one.replace(kind=inspect.Parameter.KEYWORD_ONLY))
 
     def run(**typed: Any) -> None:
-        with helpful():
-            for name, option in WRITTEN.items():
-                writable(typed.get(name), option)
-            grouped = {name: kind(**{f.name: typed.pop(f.name) for f in fields(kind)}) for name, kind in groups.items()}
-            command(**grouped, **typed)
+        for name, option in WRITTEN.items():
+            writable(typed.get(name), option)
+        grouped = {name: kind(**{f.name: typed.pop(f.name) for f in fields(kind)}) for name, kind in groups.items()}
+        command(**grouped, **typed)
 
     vars(run)["__signature__"] = inspect.Signature(options)
     run.__annotations__ = {one.name: one.annotation for one in options}
