@@ -36,7 +36,7 @@ from driftfit import (
 )
 from driftfit.embedded import export_c
 from driftfit.embedded.project import record
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.basis import Polynomial
 
 LOOP = """
 #include "tracker.c"

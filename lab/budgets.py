@@ -40,7 +40,7 @@ LIMITS = {
     "modules that detection imports": 185,
     "modules that a second call of track passes": 9,
     "members of Tracker": 39,
-    "members of Model": 49,
+    "members of Model": 47,
     "members of TrackerSteps": 18,
     "state fields of Kalman": 37,
     "state fields of RLS": 47,

@@ -4,7 +4,7 @@ import numpy as np
 from scipy import stats
 
 from driftfit.trackers.parts.mixture import filters, noise
-from driftfit.trackers.parts.mixture.filters import COMMON, FIRST_ALONE, FIRST_LEARNED
+from driftfit.trackers.parts.mixture.modes import COMMON, FIRST_ALONE, FIRST_LEARNED
 
 
 def full(lower):
@@ -94,7 +94,6 @@ def sample(lane, phi, y):
 def interaction(lane, mu, m, C, kappa):
     """The same after it, with the full matrix of transitions."""
     up, down, foot, arrive = (lane[name] for name in ("up", "down", "foot", "arrive"))
-    K = len(mu)
     T = np.diag(1.0 - down - foot - kappa * (up + arrive.sum())) + np.diag(down[1:], -1) + kappa * np.diag(up[:-1], 1)
     T[:, 0] += foot
     T += kappa * arrive

@@ -6,7 +6,7 @@ import pytest
 from driftfit import ARX, AdaptiveKalman, Kalman, Live, Regression, track
 from driftfit.systems import scenarios
 from driftfit.trackers.parts.excitation import learned, window
-from driftfit.trackers.parts.mixture.filters import COMMON
+from driftfit.trackers.parts.mixture.modes import COMMON
 
 BURN = 200
 MODELS = {"regression": Regression(3), "arx": ARX(2, 2)}

@@ -13,8 +13,9 @@ from driftfit.cli import main
 from driftfit.cli.reading import parse_interval
 from driftfit.data.clock import Clock
 from driftfit.data.files import read_columns
-from driftfit.models.hammerstein_wiener.curves.basis import BSpline, DeadZone, Legendre, PiecewiseLinear, Polynomial
+from driftfit.models.hammerstein_wiener.basis import BSpline, Legendre, PiecewiseLinear, Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.thresholds import DeadZone
 from driftfit.parsing import settings
 from driftfit.show.export import as_table
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from driftfit import ARX, AdaptiveKalman, Live, Regression, track
-from driftfit.trackers.parts.mixture.filters import COMMON, table
 from driftfit.trackers.parts.mixture.learned import ASSUMED, BLOCK, FADE, PHI, PRECISION, WINDOW, A, B, E, M
+from driftfit.trackers.parts.mixture.modes import COMMON, table
 from driftfit.trackers.parts.mixture.smoother import modes_given_all, transitions
 
 
@@ -59,7 +59,7 @@ def test_a_sample_and_the_interaction_against_matrices(groups):
 
 def test_transitions_are_probabilities_and_the_smoother_knows_the_same():
     y, u = record()
-    ((one, two),) = lanes(y, u, Regression(3), AdaptiveKalman(), (300,)).values()
+    ((one, _),) = lanes(y, u, Regression(3), AdaptiveKalman(), (300,)).values()
     mu, m, C, _ = naive.sample(one, u[300], y[300])
     T = naive.interaction(one, mu, m, C, 0.7)[-1]
     np.testing.assert_allclose(T.sum(axis=1), 1.0, rtol=1e-12)

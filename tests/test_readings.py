@@ -20,7 +20,7 @@ from driftfit import (
     PolynomialModel,
     Sensor,
 )
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.run.parallel_lanes import FEWEST_LANES
 
 SENSORS = [Sensor.nominal(0.1), Sensor.outlier(kind="additive"), Sensor.frozen(0.01)]

@@ -9,7 +9,7 @@ from benchmarks import select_orders
 from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Kalman, Regression, grid, select, track
 from driftfit.judge.structures.candidates import Predicted, mixed
 from driftfit.models.base import Model
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 
 K = Kalman(q=1e-4, r=0.01)

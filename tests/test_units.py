@@ -19,8 +19,8 @@ from driftfit import (
     track,
     tune,
 )
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
-from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
+from driftfit.models.hammerstein_wiener.basis import Polynomial
+from driftfit.models.hammerstein_wiener.output_error import OutputError
 
 MODEL = Regression(2, intercept=True)
 TRACKERS = {

@@ -5,7 +5,7 @@ import pytest
 
 from driftfit import HammersteinWiener, Kalman, Live, Regression, track
 from driftfit.engine.kernel import Driver
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.run.parallel_lanes import FEWEST_LANES, width_of
 from driftfit.run.program import WIDEST_LANES, Program
 from driftfit.trackers.parts.covariance import reduce_covariance, symmetric_product

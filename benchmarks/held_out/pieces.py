@@ -74,7 +74,7 @@ class Without(AdaptiveKalman):
     piece: str = ""
 
     def state(self, n: int) -> Mapping[str, Any]:
-        from driftfit.trackers.parts.mixture.filters import table
+        from driftfit.trackers.parts.mixture.modes import table
 
         state, piece, modes = dict(super().state(n)), PIECES[self.piece], table(n, self.groups)
         if piece.modes is not None:
@@ -116,12 +116,12 @@ PIECES: dict[str, Piece] = {
     "jumps of size 1": Piece(lambda modes: modes["ratio"] == 1.0),
     "largest jumps": Piece(lambda modes: modes["ratio"] > 1.0),
     "slowest drift": Piece(lambda modes: modes["ratio"] == 1e-5),
-    "learned rate of changes": Piece(state={"left": 1e15, "expected": 1e15}, functions=of(BANK, "learn_rate")),
+    "learned rate of changes": Piece(state={"left_behind": 1e15, "expected": 1e15}, functions=of(BANK, "learn_rate")),
     "leading direction": Piece(
         edits=((LEARNED, "share = t[N + 6 * best, best] / positive if sound else 0.0", "share = 0.0"),),
         functions=of(LEARNED, "whitened", "rotate", "turn"),
     ),
-    "arrivals in all modes": Piece(edits=((BANK, "\nJUMP, ARRIVE = 3e-3, 1e-5\n", "\nJUMP, ARRIVE = 3e-3, 1e-9\n"),)),
+    "arrivals in all modes": Piece(edits=((MODES, "\nJUMP, ARRIVE = 3e-3, 1e-5\n", "\nJUMP, ARRIVE = 3e-3, 1e-9\n"),)),
     "jumps as large as y": Piece(
         edits=(
             (

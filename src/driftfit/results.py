@@ -11,9 +11,7 @@ from driftfit.judge.alarms.detect import Alarms, detect
 from driftfit.judge.diagnose import Diagnosis, diagnose
 from driftfit.judge.segment import Segmentation, segmented
 from driftfit.judge.verdict import Verdict, verdict
-from driftfit.models.hammerstein_wiener.results.plots import plot_blocks
-from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
-from driftfit.models.hammerstein_wiener.separation.paths import Blocks
+from driftfit.models.hammerstein_wiener.blocks import Blocks
 from driftfit.run import result
 from driftfit.run.live.rule import AlarmRule
 from driftfit.show.plots import plot_track
@@ -29,6 +27,8 @@ from driftfit.use.constrained import Constrained, constrain
 from driftfit.use.conversion import Transfer, transfer
 from driftfit.use.crossing import Crossing, crossing
 from driftfit.use.forecast import Forecast, forecast
+from driftfit.use.hammerstein_wiener.block_plots import plot_blocks
+from driftfit.use.hammerstein_wiener.run_blocks import blocks_of
 from driftfit.use.simulate import Prediction
 from driftfit.use.system import FrequencyResponse, LongRun, Response
 from driftfit.use.system_plots import plot_system, plot_validation
@@ -126,8 +126,8 @@ class Track(result.Track, Exported, public=True):
         """Coefficients of the blocks of a `HammersteinWiener` model, sample by sample: ``.a``, ``.b``, ``.c``, ``.d``.
 
         ``method`` is "average", "svd", "svd-joint" or "gls" (with standard deviations), see
-        `driftfit.models.hammerstein_wiener.separation.separate`; ``input``, ``output`` and ``at`` choose the gauge,
-        see `driftfit.models.hammerstein_wiener.separation.paths.Blocks.gauge`; None is "unit", or "c1" for a tracker
+        `driftfit.models.hammerstein_wiener.separation`; ``input``, ``output`` and ``at`` choose the gauge,
+        see `driftfit.models.hammerstein_wiener.blocks.Blocks.gauge`; None is "unit", or "c1" for a tracker
         of the minimal parameters.
         """
         return blocks_of(self, method, input, output, at)

@@ -100,6 +100,8 @@ class Expressions:
             for one in (self.unit.written, self.unit.beyond):  # perhaps, by whoever receives the array
                 one.add(node.attr)
             return self.unit.field(node.attr)
+        if owner.kind == "table" and hasattr(owner.constant, node.attr):  # a named tuple
+            return lifted(getattr(owner.constant, node.attr))
         if owner.kind == "python" and owner.constant in (np, math):
             return lifted(getattr(owner.constant, node.attr))
         return self.refuse(node)  # type: ignore[no-any-return]

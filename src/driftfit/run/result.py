@@ -12,6 +12,7 @@ import numpy as np
 
 from driftfit.data.record import Known, Record, Records, time_text
 from driftfit.engine.kernel import Array
+from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.readings.gate import AT_START
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, left_out_of
@@ -362,6 +363,8 @@ class Track(Plain, OfRecord):
 
     def polynomials(self) -> tuple[Array, list[Array]]:
         """A(z) and B(z) of an ARX model in powers of z^-1, (T, .) each; see `ARX.polynomials`."""
+        if not isinstance(self.model, ARX):
+            raise ValueError(f"polynomials: {type(self.model).__name__} has no polynomials; use ARX.")
         return self.model.polynomials(self.theta)
 
     def save(self, path: str | PathLike[str]) -> None:

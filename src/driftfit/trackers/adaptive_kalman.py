@@ -5,14 +5,14 @@
 
 | ladder | Q, in units of noise variance over input power | rho |
 |---|---|---|
-| common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-5 .. .01 by tens, .04, .2, 1, J |
+| common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-5 .. .01, .04, .2, 1, J |
 | trend | as common; theta moves on along its slope | .001, .01, .1 |
 | learned | the drift covariance found by a backward pass of scores over the last 100 samples | .001, .01, .1, 1 |
 | single i | 1 / c_i for parameter i alone (two to eight parameters) | .003, .05, J |
 | group g | 1 / c_i for the parameters of a group, instead of single | .001, .01, .1, 1, J |
 
 J, the largest jump, is the variance of the output or the square of an outlier before, in units of r, and at least 30.
-Every mode is a Kalman filter. They are merged after every sample (`driftfit.trackers.parts.mixture.filters`), where the transitions between them are.
+Every mode is a Kalman filter. They are merged after every sample (`driftfit.trackers.parts.mixture.filters`).
 Noise is quiet, restless, or an outlier of any size, and coarse readings that repeat share their rounding
 (`driftfit.trackers.parts.mixture.noise`). Scales, means, colour of the noise and covariance of the drift are learned
 (`driftfit.trackers.parts.mixture.learned`). Readings are judged by a gate (`driftfit.readings.gate`), which is on for
@@ -69,7 +69,6 @@ from driftfit.trackers.parts.excitation import (
 )
 from driftfit.trackers.parts.few_residuals import RESIDUALS, widen_estimates, wider
 from driftfit.trackers.parts.mixture.filters import (
-    bank,
     enter_filters,
     innovate,
     mix,
@@ -88,6 +87,7 @@ from driftfit.trackers.parts.mixture.learned import (
     nothing_learned,
     whiten_noise,
 )
+from driftfit.trackers.parts.mixture.modes import bank
 from driftfit.trackers.parts.mixture.noise import (
     any_noise,
     learn_noise,

@@ -30,9 +30,10 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, shared
+from driftfit.engine.kernel import Array, State, cubes, kernel, machine, shared
 from driftfit.trackers.parts.excitation import DULL, LARGE, MEMORY
-from driftfit.trackers.parts.mixture.filters import FIRST_ALONE, FIRST_LEARNED, FLOOR
+from driftfit.trackers.parts.mixture.filters import FLOOR
+from driftfit.trackers.parts.mixture.modes import FIRST_ALONE, FIRST_LEARNED
 from driftfit.trackers.parts.mixture.rows import sum_of_row
 
 BLOCK, WINDOW = 50, 100
@@ -53,7 +54,8 @@ E, PRECISION, PHI = range(3)
 """Entries of a stored sample before its regressor: the innovation over its variance, and the inverse variance, both in
 units of r."""
 ASSUMED, SLOPE, WEIGHT, DIRECTION, SCORE, SHIFT, A, B, M, N, T, V = range(12)
-"""Rows (n,) of the estimation: the diagonal of P, the right side, q, a, u, N k; then those of the sums of squares, of B, of M, of N and of a scratch matrix by turns."""
+"""Rows (n,) of the estimation: the diagonal of P, the right side, q, a, u, N k; then those of the sums of squares, of
+B, of M, of N and of two scratch matrices by turns."""
 COLOUR_FADE, SHRUNK, BOUND, MOST, GAP = 0.995, 5.0, 2.0, 0.95, 1.5
 """Fading of the sums for c; the square of its t value up to which noise is white; the bound of innovations in standard
 deviations; the largest c; and the interval that separates a sample from its past."""

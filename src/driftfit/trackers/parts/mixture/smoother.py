@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.mixture.filters import FIRST_ALONE, FIRST_LEARNED, FLOOR
+from driftfit.trackers.parts.mixture.filters import FLOOR
+from driftfit.trackers.parts.mixture.modes import FIRST_ALONE, FIRST_LEARNED
 
 SMOOTHER_FIELDS = (
     "mu", "prior", "kappa", "r", "certainty", "ratio", "c", "unit", "offset", "weight", "direction", "white",

@@ -21,9 +21,9 @@ from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, exp, kernel, log
 from driftfit.engine.settings import numbers
 
-LONGEST = 20000
+FORMULA_LENGTH = 20000
 """Characters of a formula."""
-LONGEST_LAG = 10_000
+LAG_LIMIT = 10_000
 """Samples: so many of each signal are a part of the state."""
 FUNCTIONS = {
     "abs": 1, "cos": 1, "exp": 1, "log": 1, "max": 2, "min": 2, "sin": 1, "sqrt": 1, "tanh": 1,
@@ -112,9 +112,9 @@ def parse(text: str, known: bool = False) -> Formula:
 
     A formula without parameters is an error unless it may be ``known``.
     """
-    if not isinstance(text, str) or len(text) > LONGEST:
+    if not isinstance(text, str) or len(text) > FORMULA_LENGTH:
         raise ValueError(
-            f"Equation: give a text of at most {LONGEST} characters, as 'y = theta.k * sqrt(u) - theta.c'."
+            f"Equation: give a text of at most {FORMULA_LENGTH} characters, as 'y = theta.k * sqrt(u) - theta.c'."
         )
     left, equals, right = text.partition("=")
     output = left.strip()
@@ -152,7 +152,7 @@ def _check(node: ast.expr, parameters: dict[str, None], lags: dict[tuple[str, in
             return
         case ast.Subscript(
             value=ast.Name(id=name), slice=ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int(lag)))
-        ) if type(lag) is not bool and lag <= LONGEST_LAG:
+        ) if type(lag) is not bool and lag <= LAG_LIMIT:
             lags[name, lag] = None
             return
         case ast.UnaryOp(op=ast.USub() | ast.UAdd()):
@@ -168,7 +168,7 @@ def _check(node: ast.expr, parameters: dict[str, None], lags: dict[tuple[str, in
         case _:
             raise ValueError(
                 f"Equation: {ast.unparse(node)!r} is not understood. Use theta.NAME for parameters, NAME and NAME[-1] "
-                f"for signals, back to [-{LONGEST_LAG}], numbers below {LARGEST:g}, + - * / **, comparisons, "
+                f"for signals, back to [-{LAG_LIMIT}], numbers below {LARGEST:g}, + - * / **, comparisons, "
                 f"'A if B else C', pi and {', '.join(FUNCTIONS)}."
             )
     for one in within:

@@ -6,15 +6,16 @@
     forecast  H = phi' J(xi);  e = z - phi' g(xi);  h = (1 + inflation) H P H';  s = h + r / w;  K = P H' / s
     correct   xi <- xi + K e;  P <- P - s K K'
 
-with phi, z of the model and g, J of `driftfit.models.hammerstein_wiener.products`. theta of the run is xi = (a, b, c_2
+with phi, z of the model and g, J of `driftfit.models.hammerstein_wiener.structure`. theta of the run is xi = (a, b, c_2
 .., d_2 ..), n_x numbers instead of n products, each with its own drift. inflation = 1 takes smaller steps while errors
 are large.
 
-Use it if an initial value near the truth is known, as from `hand_off`; from a distant one it can fail where stage one
-cannot. It is not iterated: the iterated filter failed in 17 % of the runs of example 1 of Feng and Hong (2021).
+Use it if an initial value near the truth is known, as from the separation of stage one; from a distant one it can fail
+where stage one cannot. It is not iterated: the iterated filter failed in 17 % of the runs of example 1 of Feng and Hong
+(2021).
 
-Source: the implicit-measurement form of Jazwinski (1970), section 8.3; inflation and hand-off are ours. Only one
-triangle of P is kept. Cost per sample: O(n_x^2 + n).
+Source: the implicit-measurement form of Jazwinski (1970), section 8.3; the inflation is ours. Only one triangle of P is
+kept. Cost per sample: O(n_x^2 + n).
 """
 
 from __future__ import annotations
@@ -27,14 +28,77 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import State, kernel
-from driftfit.engine.settings import matrix, vector
+from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.settings import covariance, matrix, numbers, vector
 from driftfit.models.base import Model
-from driftfit.models.hammerstein_wiener.products import Structure
-from driftfit.models.hammerstein_wiener.trackers.minimal import Minimal, minimal_memory, structure_of
+from driftfit.models.hammerstein_wiener.basis import PiecewiseLinear
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.structure import NUMBER, Structure
+from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import drift, drift_matrix
 from driftfit.trackers.parts.covariance import correct, product_with
 from driftfit.trackers.parts.varying_drift import read_drift
+
+
+def structure_of(owner: str, model: Model) -> Structure:
+    """The structure of a Hammerstein-Wiener model; ValueError for any other model, and if xi is ambiguous."""
+    if not isinstance(model, HammersteinWiener):
+        raise ValueError(
+            f"{owner}: works on the minimal parameters of a HammersteinWiener model; got {type(model).__name__}."
+        )
+    structure = model.structure
+    if structure.n == structure.n_x and structure.names != structure.minimal_names and structure.n_out > 1:
+        raise ValueError(
+            f"{owner}: without lags of y, and with nb = {structure.nb}, there are as many products as minimal "
+            "parameters, so where those of the output block are is not known; track the products with Kalman and "
+            "separate them."
+        )
+    return structure
+
+
+def minimal_memory(model: Model) -> Array:
+    """The memory of the model with the mark that theta is xi."""
+    blocks = np.array(model.memory()["blocks"])
+    blocks[NUMBER.minimal] = 1.0
+    return blocks
+
+
+class Minimal(Tracker):
+    """A tracker whose theta is xi, the minimal parameters of a `HammersteinWiener` model."""
+
+    q: Any
+    r: float | None
+    p0: Any
+    theta0: Any
+
+    required: ClassVar[tuple[str, ...]] = ("q", "r")
+    replaces: ClassVar[tuple[str, ...]] = ("blocks",)
+
+    def _check(self, *variances: str) -> None:
+        """Check the settings that both have, and those named, which are nonnegative numbers."""
+        owner = type(self).__name__
+        if self.q is not None:
+            self._set("q", covariance(owner, "q", self.q))
+        if self.r is not None:
+            self._set("r", numbers(owner, "r", self.r, ndim=0, low=0.0, strict=True))
+        self._set("p0", covariance(owner, "p0", self.p0))
+        self._set("theta0", numbers(owner, "theta0", self.theta0))
+        for name in variances:
+            self._set(name, numbers(owner, name, getattr(self, name), ndim=0, low=0.0))
+
+    @classmethod
+    def own_model(cls, na: int, nb: int, nk: int) -> HammersteinWiener:
+        """A model with a bend in the input block, if there are lags that distinguish c_2 from b; on linear records c_2
+        is 0.
+        """
+        return HammersteinWiener(na, nb, nk, input=PiecewiseLinear([0.0]) if nb > 1 else None)
+
+    @property
+    def steps(self) -> TrackerSteps:
+        raise ValueError(f"{type(self).__name__}: the steps depend on the model; see steps_for.")
+
+    def names_for(self, model: Model) -> tuple[str, ...]:
+        return structure_of(type(self).__name__, model).minimal_names
 
 
 @lru_cache

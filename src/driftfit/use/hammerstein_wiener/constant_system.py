@@ -26,9 +26,9 @@ from driftfit.data.arguments import as_inputs, as_output
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.separation.paths import Groups, minimal, split
+from driftfit.models.hammerstein_wiener.separation import Groups, minimal, split
 
 POINTS = 2000
 """Points of the grid on which the output block is inverted."""

@@ -25,8 +25,8 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of, covariances
 from driftfit.smooth.problem import replay
+from driftfit.use.hammerstein_wiener.run_blocks import blocks_of, covariances
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track

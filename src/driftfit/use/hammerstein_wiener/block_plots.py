@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
 from driftfit.show.axes import date_axis, frame, panels, settled, time_label
+from driftfit.use.hammerstein_wiener.run_blocks import blocks_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -25,20 +25,11 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
 from driftfit.models.base import Model
-from driftfit.models.hammerstein_wiener.curves.basis import Thresholds
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.separation.separate import METHODS, separate
+from driftfit.models.hammerstein_wiener.separation import METHODS, Groups, split
+from driftfit.models.hammerstein_wiener.thresholds import Thresholds
 
 INPUTS, OUTPUTS = ("unit", "c1", "b1"), ("d1", "unit", "slope")
-
-
-class Groups(NamedTuple):
-    """a (.., na), b (.., nb), c (.., n_in), d (.., n_out)."""
-
-    a: Array
-    b: Array
-    c: Array
-    d: Array
 
 
 @dataclass(frozen=True)
@@ -127,7 +118,8 @@ class Blocks:
         """v of input i at inputs u (...), with the coefficients of sample t."""
         basis, c = self.model.bases[i], self.of_input(i)[1][t]
         if isinstance(basis, Thresholds):
-            basis = basis.known(c[1] / c[0], c[2] / c[0])
+            x = np.asarray(u, dtype=float)
+            return np.asarray(basis.split(x, x >= c[1] / c[0], x <= c[2] / c[0]) @ c)
         return np.asarray(basis.value(u) @ c)
 
     def output_curve(self, y: Any, t: int = -1) -> Array:
@@ -267,57 +259,18 @@ def deviations(model: HammersteinWiener, var: Array) -> Groups:
     return Groups(*np.split(std, np.cumsum([na, sum(nb), sum(n_in), n_out]), axis=1)[:4])
 
 
-def empty(model: HammersteinWiener, T: int) -> tuple[Array, Array]:
-    """Empty arrays of (a, b, c, d), one after the other, and of quality."""
-    na, nb, n_in, n_out, _ = model.structure
-    return np.empty((T, na + sum(nb) + sum(n_in) + n_out)), np.empty((T, 2))
-
-
-def apart(model: HammersteinWiener, groups: Array) -> list[Array]:
-    """Split (a, b, c, d) into its four arrays."""
-    na, nb, n_in, _, _ = model.structure
-    return np.split(groups, np.cumsum([na, sum(nb), sum(n_in)]), axis=1)
-
-
 class Separator:
-    """Separates one theta after another, for streams; its arrays are allocated once."""
+    """Separates one theta after another, for streams."""
 
     def __init__(self, model: Model, names: tuple[str, ...]) -> None:
         """``names`` of the parameters: those of the model, or of the minimal ones."""
         if not isinstance(model, HammersteinWiener):
             raise ValueError(f"blocks: {type(model).__name__} has no blocks; use a HammersteinWiener model.")
         self.model, self._minimal = model, names != model.names
-        self._theta, (self._groups, self._quality) = np.empty((1, model.n)), empty(model, 1)
-        self._sizes, self._rise = model.structure.sizes, model.rise
 
     def __call__(self, theta: Array, method: str) -> Groups:
         """a, b, c, d from one theta (n,), or from minimal parameters."""
         if self._minimal:
             return Groups(*self.model.structure.groups(theta))
-        if method not in METHODS[:3]:
-            one_of("blocks", "method", method, METHODS[:3])
-        na, _, _, n_out, _ = self.model.structure
-        orders = (na, n_out, METHODS.index(method))
-        self._theta[0] = theta
-        separate(self._theta, orders, self._sizes, self._rise, self._groups, self._quality)
-        return Groups(*(group[0].copy() for group in apart(self.model, self._groups)))
-
-
-def split(model: HammersteinWiener, theta: Array, method: str) -> tuple[Array, Array, Array, Array, Array]:
-    """a, b, c, d and quality from theta (T, n) by one of the first three methods; gauge "unit" and "d1"."""
-    groups, quality = empty(model, len(theta))
-    na, _, _, n_out, _ = model.structure
-    orders, path = (na, n_out, METHODS.index(method)), np.ascontiguousarray(theta, dtype=float)
-    separate(path, orders, model.structure.sizes, model.rise, groups, quality)
-    a, b, c, d = apart(model, groups)
-    return a, b, c, d, quality
-
-
-def minimal(model: HammersteinWiener, groups: Groups, intercept: Any = None) -> Array:
-    """xi (n_x,) from a, b, c, d of one sample in any gauge with d_1 = 1; not finite where c_1 = 0."""
-    structure = model.structure
-    pairs = zip(structure.of_inputs(groups.b, structure.nb), structure.of_inputs(groups.c, structure.n_in), strict=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scaled = [(b * c[0], c / c[0]) for b, c in pairs]
-    b, c = (np.concatenate(part) for part in zip(*scaled, strict=True))
-    return structure.minimal(groups.a, b, c, groups.d, intercept)
+        one_of("blocks", "method", method, METHODS[:3])
+        return Groups(*(group[0] for group in split(self.model, theta[None], method)[:4]))

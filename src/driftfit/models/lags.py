@@ -1,4 +1,6 @@
-"""Output lags that may be wrong: readings that a tracker took for outliers.
+"""What the models with lags share: how inputs age, when a record begins, which value an output has as a lag.
+
+With a tracker that marks outliers, lags of outputs may be wrong, and are doubted.
 
 A reading y far from its prediction y_hat is one of two things, and the reading alone does not tell which. Either the
 sensor was wrong and the plant did not move (an additive outlier): later samples have the prediction as their lag, with
@@ -31,30 +33,68 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import State, exp, kernel
+from driftfit.models.base import GAP
 
-FALSE = 0.3
+ADDITIVE_SHARE = 0.3
 """Share of outliers that are taken to be additive before the first one."""
-COUNT, MEMORY = 1.0, 100.0
+SHARE_COUNT, SHARE_MEMORY = 1.0, 100.0
 """Number of outliers that this share counts for, and over how many it is remembered."""
-SMALLEST = 0.02
+SMALLEST_DOUBT = 0.02
 """A probability d below this is 0."""
-OUTLIER = 0.02
+OUTLIER_SHARE = 0.02
 """Probability that a sample is an outlier itself, and no evidence."""
+
+
+@kernel
+def shift_inputs(s: State, m: int, l: int) -> None:
+    """Inputs become lags, which a long interval breaks; the present input is lag 0."""
+    broken = s.dt[l] > GAP
+    for j in range(m):
+        for i in range(s.u_lag.shape[1] - 1, 0, -1):
+            lag = s.u_lag[j, i - 1, l]
+            s.u_lag[j, i, l] = np.nan if broken else lag
+        s.u_lag[j, 0, l] = s.u[j, l]
+
+
+@kernel
+def wait_for_lags(s: State, l: int) -> None:
+    """No time passes for the tracker until every regressor has been there once: "drop" of `ARX`."""
+    before, dt, complete = s.started[l], s.dt[l], 1.0
+    for i in range(s.phi.shape[0]):
+        complete = complete if abs(s.phi[i, l]) < LARGEST else 0.0
+    started = 1.0 if complete > 0.0 else before
+    s.started[l] = started
+    s.dt[l] = dt if started > 0.0 else 0.0
+
+
+@kernel
+def take_output(s: State, na: int, l: int) -> None:
+    """The output is its first lag; where it is missing its prediction, for na samples in a row.
+
+    A prediction of infinite variance carries no information (a diffuse start) and must not become a lag.
+    """
+    y, y_hat, filled, observed = s.y[l], s.y_hat[l], s.filled[l], s.observed[l] > 0.0
+    known = (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf)) & (filled < na)
+    fill = y_hat if known else np.nan
+    s.filled[l] = 0.0 if observed else filled + 1.0
+    if na > 0:
+        s.y_lag[0, l] = y if observed else fill
 
 
 def no_doubts(ny: int, na: int) -> Mapping[str, Any]:
     """Fields for the lags (ny, na) before the first sample."""
     zero = np.zeros((ny, na))
-    share = {"false_share": np.full(ny, FALSE), "false_count": np.full(ny, COUNT)}
+    share = {"false_share": np.full(ny, ADDITIVE_SHARE), "false_count": np.full(ny, SHARE_COUNT)}
     return {"doubt": zero, "suspect": zero, "aside": zero, "blur": zero, **share}
 
 
 @kernel
 def density(e: float, v: float) -> float:
     """Density of an innovation, up to a constant factor."""
-    body = (1.0 - OUTLIER) * exp(-0.5 * min(e * e / v, 1400.0)) / np.sqrt(2.0 * np.pi * v)
-    return body + OUTLIER * np.sqrt(v) / (np.pi * (v + e * e))  # type: ignore[no-any-return]
+    body = (1.0 - OUTLIER_SHARE) * exp(-0.5 * min(e * e / v, 1400.0)) / np.sqrt(2.0 * np.pi * v)
+    return body + OUTLIER_SHARE * np.sqrt(v) / (np.pi * (v + e * e))  # type: ignore[no-any-return]
 
 
 @kernel
@@ -87,7 +127,7 @@ def judge(s: State, o: int, i: int, l: int, first: int, step: int, ny: int) -> N
                 wrong *= density(s.e[p] - a * (1.0 - d) * away, rest + a * a * s.blur[o, i, l])
                 right *= density(s.e[p] + a * d * away, rest)
         d = wrong / (wrong + right) if wrong + right > 0.0 else d
-        s.doubt[o, i, l] = d if d > SMALLEST else 0.0
+        s.doubt[o, i, l] = d if d > SMALLEST_DOUBT else 0.0
 
 
 @kernel
@@ -97,7 +137,7 @@ def learn_share(s: State, o: int, l: int, na: int) -> None:
     p, d, share = s.suspect[o, last, l], s.doubt[o, last, l], s.false_share[o, l]
     if p > 0.0:
         moved = (1.0 - d) * p * (1.0 - share) / (1.0 - p * share)
-        s.false_count[o, l] = min(s.false_count[o, l] + d + moved, MEMORY)
+        s.false_count[o, l] = min(s.false_count[o, l] + d + moved, SHARE_MEMORY)
         s.false_share[o, l] += (d - (d + moved) * share) / s.false_count[o, l]
 
 
@@ -115,7 +155,7 @@ def shift_doubts(s: State, o: int, l: int, own: int, first: int, step: int, ny: 
         s.aside[o, i, l], s.blur[o, i, l] = s.aside[o, i - 1, l], s.blur[o, i - 1, l]
     outlier, observed, known = s.outlier[own], s.observed[own] > 0.0, s.s[own] < np.inf
     doubt = s.false_share[o, l] * outlier
-    some = observed & known & (doubt > SMALLEST)
+    some = observed & known & (doubt > SMALLEST_DOUBT)
     s.suspect[o, 0, l] = outlier if some else 0.0
     s.doubt[o, 0, l] = doubt if some else (0.0 if observed else 1.0)
     s.aside[o, 0, l] = s.y_hat[own] - s.y[own] if some else 0.0

@@ -10,10 +10,9 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
+from driftfit.models.hammerstein_wiener.blocks import Blocks, deviations
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.separation.least_squares import refine
-from driftfit.models.hammerstein_wiener.separation.paths import Blocks, Groups, deviations, split
-from driftfit.models.hammerstein_wiener.separation.separate import METHODS
+from driftfit.models.hammerstein_wiener.separation import METHODS, Groups, LeastSquares, split
 from driftfit.run.program import lanes_of
 
 if TYPE_CHECKING:
@@ -115,19 +114,16 @@ def _by_least_squares(run: Track, model: HammersteinWiener, path: Array, pieces:
     a, b, c, d, quality = split(model, path, "svd-joint")
     rest, at = _intercept(model, path), a.shape[1] + b.shape[1] + c.shape[1]
     zeta = np.concatenate([a, b, c, d[:, 1:], *([] if rest is None else [rest[:, None]])], axis=1)
-    T, n_z = zeta.shape
-    cov, cost = np.empty((T, n_z, n_z)), np.empty(T)
-    orders, sizes = (model.na, model.out.n), model.structure.sizes
+    fit, found = LeastSquares(model.structure), []
     for first, P in pieces:
         part = slice(first, first + len(P))
-        theta = np.ascontiguousarray(path[part])
-        refine(theta, P, orders, sizes, zeta[part], cov[part], cost[part])
+        found.append(fit.refine(path[part], P, zeta[part]))
+    zeta, cov, cost = (np.concatenate(part) for part in zip(*found, strict=True))
     cov = np.insert(np.insert(cov, at, 0.0, axis=1), at, 0.0, axis=2)  # the row and column of d_1
     x = np.insert(zeta, at, 1.0, axis=1)
     a, b, c, d, more = np.split(x, np.cumsum([a.shape[1], b.shape[1], c.shape[1], d.shape[1]]), axis=1)
     std, intercept = deviations(model, np.einsum("tii->ti", cov)), more[:, 0] if model.intercept else None
-    found = Blocks(model, "gls", a, b, c, d, quality, std, intercept, cov, cost, ("free", "d1"))
-    return found.gauge()
+    return Blocks(model, "gls", a, b, c, d, quality, std, intercept, cov, cost, ("free", "d1")).gauge()
 
 
 def covariances(run: Track) -> Iterator[tuple[int, Array]]:
