@@ -26,7 +26,9 @@ from driftfit.engine.kernel import Array
 
 HOME = Path(driftfit.__file__).parent
 ROOT = Path(__file__).parent.parent.parent
-BANK, NOISE, LEARNED, START = (f"trackers/parts/mixture/{name}.py" for name in ("filters", "noise", "learned", "start"))
+BANK, MODES, NOISE, LEARNED, START = (
+    f"trackers/parts/mixture/{name}.py" for name in ("filters", "modes", "noise", "learned", "start")
+)
 TRACKER = "trackers/adaptive_kalman.py"
 State = Mapping[str, Any]
 NEXT_TO_NEVER = 1e-30
