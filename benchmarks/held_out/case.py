@@ -65,12 +65,14 @@ class Case:
     @property
     def readings(self) -> Array:
         """y (T,); NaN where it is a code or its regressors are."""
-        return np.where(self.blind, np.nan, self.y)
+        y: Array = np.where(self.blind, np.nan, self.y)
+        return y
 
     @property
     def regressors(self) -> Array:
         """phi (T, n); NaN where a regressor is a code."""
-        return np.where(self.blind[:, None], np.nan, self.phi)
+        phi: Array = np.where(self.blind[:, None], np.nan, self.phi)
+        return phi
 
     def weight(self) -> Array:
         """W (n, n): off' W off is the square of an error of theta in units of y, with regressors taken as independent.
@@ -101,12 +103,14 @@ def case(model: Model, y: Array, u: Array, phi: Array, theta: Array, noise: Arra
 def walk(rng: Generator, start: Any, std: Any, length: int = T) -> Array:
     """Path (T, n) of a random walk; ``std`` is (n,) or (T, n)."""
     std = np.broadcast_to(np.asarray(std, float), (length, np.size(start)))
-    return np.asarray(start) + np.cumsum(rng.normal(size=std.shape) * std, axis=0)
+    path: Array = np.asarray(start) + np.cumsum(rng.normal(size=std.shape) * std, axis=0)
+    return path
 
 
 def only(n: int, which: int, size: float) -> Array:
     """(n,) with one entry that is not 0."""
-    return size * (np.arange(n) == which)
+    entries: Array = size * (np.arange(n) == which)
+    return entries
 
 
 def slow(rng: Generator, length: int, pole: float, std: float) -> Array:

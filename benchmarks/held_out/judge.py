@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -26,7 +27,7 @@ import numpy as np
 from benchmarks.held_out import changes, plants, records
 from benchmarks.held_out.case import Case
 from benchmarks.held_out.oracle import oracle
-from driftfit import AdaptiveKalman, track
+from driftfit import track
 from driftfit.engine.kernel import Array
 from driftfit.trackers.base import Tracker
 
@@ -90,8 +91,9 @@ def distance(case: Case, theta: Array) -> float:
 
 
 def step_error(case: Case, prediction: Array) -> float:
-    """Root mean square of the one-step errors that there are."""
-    return float(np.sqrt(np.nanmean((case.readings - prediction)[case.burn :] ** 2) + case.least**2))
+    """Root mean square of the one-step errors where y and its regressors are known; no prediction counts as 0."""
+    off = np.where(np.isfinite(case.regressors).all(axis=1), case.readings - np.nan_to_num(prediction), np.nan)
+    return float(np.sqrt(np.nanmean(off[case.burn :] ** 2) + case.least**2))
 
 
 def within(off: Array, std: Array) -> float:
@@ -130,7 +132,13 @@ class Kept:
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
-        self.scores: dict[str, Scores] = json.loads(path.read_text()) if path is not None and path.exists() else {}
+        self.scores: dict[str, Scores] = {}
+        self.read()
+
+    def read(self) -> None:
+        """What the file has."""
+        if self.path is not None and self.path.exists():
+            self.scores |= json.loads(self.path.read_text())
 
     def of(self, name: str, seed: int, label: str, method: Method | None) -> Scores | None:
         """Scores under a label, computed by the method if they are not there; None if there is no method either.
@@ -150,13 +158,23 @@ class Kept:
                 self.scores[key] = scored(case, method)
         return self.scores[key]
 
-    def forget(self, label: str) -> None:
-        """Compute what has this label anew."""
-        self.scores = {key: value for key, value in self.scores.items() if not key.startswith(f"{label}/")}
+    def real(self, name: str, label: str, compute: Callable[[], Scores] | None) -> Scores | None:
+        """Scores on a real record, computed if they are not there; None if there is nothing to compute them."""
+        key = f"{label}/record {name}"
+        if key not in self.scores and compute is not None:
+            self.scores[key] = compute()
+        return self.scores.get(key)
+
+    def forget(self, label: str, names: Iterable[str]) -> None:
+        """Compute what has this label, of these scenarios and records, anew."""
+        begins = tuple(f"{label}/{name}" for name in names)
+        self.scores = {key: value for key, value in self.scores.items() if not key.startswith(begins)}
 
     def write(self) -> None:
         if self.path is not None:
-            self.path.write_text(json.dumps(self.scores, indent=0))
+            unfinished = self.path.with_suffix(f".{os.getpid()}")
+            unfinished.write_text(json.dumps(self.scores, indent=0))
+            unfinished.replace(self.path)
 
 
 def means(kept: Kept, name: str, seeds: Iterable[int], label: str, method: Method | None = None) -> Scores | None:
@@ -172,8 +190,3 @@ def means(kept: Kept, name: str, seeds: Iterable[int], label: str, method: Metho
         found = {head: float(np.nanmean([row[head] for row in rows])) for head in rows[0]}
     # the first run compiles
     return {**found, "seconds": min(row["seconds"] for row in rows)}
-
-
-def default() -> Method:
-    """Today's default."""
-    return of_tracker(AdaptiveKalman())

@@ -125,7 +125,7 @@ def jumping(z: Array, y: Array, r: Array, J: Array, logs: Array, P0: Array, thet
 def oracle(case: Case) -> tuple[Array, Array]:
     """theta (T, n), and the prediction (T,) of y before each sample."""
     phi, y = case.regressors, case.readings - case.known
-    usable = np.isfinite(phi).all(axis=1)
+    usable: Array = np.asarray(np.isfinite(phi).all(axis=1))
     scale = np.sqrt(np.mean(phi[usable] ** 2, axis=0))
     R = np.linalg.qr(phi[usable] / scale)[1] * scale / np.sqrt(usable.sum())
     back = np.linalg.inv(R)
@@ -156,7 +156,7 @@ def likeliest(case: Case, z: Array, y: Array, R: Array, noise: float, wide: floa
     def loss(logs: Array) -> float:
         q = 10.0 ** (logs - (3.0 if slopes else 0.0)) / centred**2
         Q[first:, first:] = (M * q) @ M.T
-        return -walking(z, y, r, Q, P0, theta, e)
+        return -float(walking(z, y, r, Q, P0, theta, e))
 
     if M.shape[1] == 0:
         loss(np.zeros(0))

@@ -391,9 +391,9 @@ def learn_rate(s: State, l: int) -> None:
     for k in range(s.modes[l]):
         s.row[k, l] = s.mu[k, l] * (s.down[k, l] + s.foot[k, l]) if s.ratio[k, l] >= 1.0 else 0.0
     fade = 1.0 - 1.0 / SPAN
-    s.left[l] = fade * s.left[l] + sum_of_row(s, l)
+    s.left_behind[l] = fade * s.left_behind[l] + sum_of_row(s, l)
     s.expected[l] = fade * s.expected[l] + s.jumping[l]
-    s.kappa[l] = min(OFTENEST, max(RAREST, (EVENTS + s.left[l]) / (EVENTS + s.expected[l])))
+    s.kappa[l] = min(OFTENEST, max(RAREST, (EVENTS + s.left_behind[l]) / (EVENTS + s.expected[l])))
 
 
 @partial(kernel, inline=False)

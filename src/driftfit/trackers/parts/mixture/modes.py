@@ -73,7 +73,7 @@ def bank(n: int, groups: Any) -> dict[str, Any]:
         "rungs": len(ALONE if groups is None else GROUP),
         "arrivals": modes["arrive"].sum(),
         "jumping": modes["arrive"][modes["ratio"] >= 1.0].sum(),
-        "left": 0.0,
+        "left_behind": 0.0,
         "expected": 0.0,
         "kappa": 1.0,
         "mu": modes["start"],
