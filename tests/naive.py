@@ -27,7 +27,7 @@ def walks(lane):
     away = np.eye(n)
     if lane["offset"].any():
         away[lane["constant"]] -= lane["offset"]
-    common = (away * lane["unit"]) @ away.T
+    common = (away * lane["drift_unit"]) @ away.T
     a = np.divide(lane["direction"], np.sqrt(c), out=np.zeros(n), where=c > 0.0)
     inverse = np.divide(1.0, c, out=np.zeros(n), where=c > 0.0)
     learned = np.diag(lane["weight"] * inverse) + filters.FLOOR * common + np.outer(a, a)
@@ -42,7 +42,7 @@ def walks(lane):
 def moved_along(lane, time=1.0):
     """Means (n, K) after an interval."""
     m = lane["m"].copy()
-    m[:, len(COMMON) : FIRST_LEARNED] += time * lane["slope"]
+    m[:, len(COMMON) : FIRST_LEARNED] += time * lane["trend"]
     return m
 
 

@@ -271,7 +271,7 @@ def test_a_slope_is_one_of_time_whatever_the_rows(rows):
     run = track(Regression(1), AdaptiveKalman(), y[kept], u[kept], time=time[kept])
     follows = slice(len(COMMON), len(COMMON) + 3)
     share = run.state["mu"][follows]
-    slopes = run.state["slope"][0] / run.state["S"][0, 0]
+    slopes = run.state["trend"][0] / run.state["S"][0, 0]
     assert share.sum() > 0.5
     assert abs(slopes @ share / share.sum() - 0.02) < 0.01
 

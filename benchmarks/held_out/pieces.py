@@ -118,7 +118,9 @@ PIECES: dict[str, Piece] = {
     "jumps of size 1": Piece(lambda modes: modes["ratio"] == 1.0),
     "largest jumps": Piece(lambda modes: modes["ratio"] > 1.0),
     "slowest drift": Piece(lambda modes: modes["ratio"] == 1e-5),
-    "learned rate of changes": Piece(state={"left_behind": 1e15, "expected": 1e15}, functions=of(BANK, "learn_rate")),
+    "learned rate of changes": Piece(
+        state={"left_behind": 1e15, "jumps_expected": 1e15}, functions=of(BANK, "learn_rate")
+    ),
     "leading direction": Piece(
         edits=((LEARNED, "share = t[N + 6 * best, best] / positive if sound else 0.0", "share = 0.0"),),
         functions=of(LEARNED, "whitened", "rotate", "turn"),

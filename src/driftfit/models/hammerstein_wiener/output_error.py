@@ -262,14 +262,14 @@ def output_error(out: Kind, p: tuple[int, ...]) -> Any:
 
 
 @lru_cache
-def _steps(routine: Any) -> TrackerSteps:
+def _steps(machine_pair: Any) -> TrackerSteps:
     @kernel
     def call(s: State, correcting: int) -> None:
         fields = packed((
             s.blocks.ctypes.data, s.theta.ctypes.data, s.phi.ctypes.data, s.q.ctypes.data, s.w.ctypes.data,
             s.S.ctypes.data, s.scratch.ctypes.data, s.own.ctypes.data, s.P.ctypes.data,
         ))  # fmt: skip
-        routine(fields, s.theta.shape[0], s.phi.shape[0], correcting)
+        machine_pair(fields, s.theta.shape[0], s.phi.shape[0], correcting)
 
     @kernel
     def forecast(s: State, l: int) -> None:

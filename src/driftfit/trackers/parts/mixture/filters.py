@@ -67,7 +67,7 @@ def walks(s: State, l: int) -> None:
             s.away[0, a, l] = s.S[a, i, l] - (s.offset[i, l] * s.S[a, k, l] if s.offset[i, l] != 0.0 else 0.0)
             s.away[1, a, l] += s.S[a, i, l] * s.direction[i, l] * root
             for b in range(a + 1):
-                s.walk[0, a, b, l] += s.unit[i, l] * s.away[0, a, l] * s.away[0, b, l]
+                s.walk[0, a, b, l] += s.drift_unit[i, l] * s.away[0, a, l] * s.away[0, b, l]
                 s.walk[1, a, b, l] += own * s.S[a, i, l] * s.S[b, i, l]
     for a in range(n):
         for b in range(a + 1):
@@ -113,12 +113,12 @@ def predict(s: State, l: int) -> None:
         widest_jumps(s, l)
         wander(s, s.r[l] * s.dt[l] * s.drift[l], l)
         time = s.dt[l] * min(s.drift[l], 1.0)
-        for j in range(s.slope.shape[1]):
+        for j in range(s.trend.shape[1]):
             k = len(COMMON) + j
             fading = 1.0 / (1.0 + FADING * np.sqrt(s.ratio[k, l]) * time)
             for i in range(s.parameters[l]):
-                s.m[i, k, l] += time * s.slope[i, j, l]
-                s.slope[i, j, l] *= fading
+                s.m[i, k, l] += time * s.trend[i, j, l]
+                s.trend[i, j, l] *= fading
 
 
 @partial(kernel, inline=False)
@@ -278,11 +278,11 @@ def update_filters(s: State, l: int) -> None:
         s.row[k, l] = s.mu[k, l] * a
     s.precision[l] = sum_of_row(s, l)
     absorb(s, l)
-    for j in range(s.slope.shape[1]):
+    for j in range(s.trend.shape[1]):
         k = len(COMMON) + j
         share = BEND * np.sqrt(s.ratio[k, l]) * s.step[k, l]
         for i in range(s.parameters[l]):
-            s.slope[i, j, l] += share * s.gain[i, k, l]
+            s.trend[i, j, l] += share * s.gain[i, k, l]
 
 
 @kernel
@@ -310,8 +310,8 @@ def enter_filters(s: State, j: int, l: int) -> None:
         s.mu[k, l] = s.prior[k, l]
     absorb(s, l)
     sign = new_row(s, s.white, j, l)
-    for t in range(s.slope.shape[1]):
-        s.slope[j, t, l] = 0.0
+    for t in range(s.trend.shape[1]):
+        s.trend[j, t, l] = 0.0
     for i in range(j, n):
         s.x[i, l] = 0.0
     for k in range(K):
@@ -392,8 +392,8 @@ def learn_rate(s: State, l: int) -> None:
         s.row[k, l] = s.mu[k, l] * (s.down[k, l] + s.foot[k, l]) if s.ratio[k, l] >= 1.0 else 0.0
     fade = 1.0 - 1.0 / SPAN
     s.left_behind[l] = fade * s.left_behind[l] + sum_of_row(s, l)
-    s.expected[l] = fade * s.expected[l] + s.jumping[l]
-    s.kappa[l] = min(OFTENEST, max(RAREST, (EVENTS + s.left_behind[l]) / (EVENTS + s.expected[l])))
+    s.jumps_expected[l] = fade * s.jumps_expected[l] + s.jumping[l]
+    s.kappa[l] = min(OFTENEST, max(RAREST, (EVENTS + s.left_behind[l]) / (EVENTS + s.jumps_expected[l])))
 
 
 @partial(kernel, inline=False)
@@ -435,8 +435,8 @@ def mix(s: State, l: int) -> None:
         for k in range(K):
             s.m[a, k, l] = s.d[a, l] + s.gain[a, k, l]
         before = 0.0
-        for j in range(s.slope.shape[1]):
-            k, here = len(COMMON) + j, s.slope[a, j, l]
-            ahead = s.slope[a, min(j + 1, s.slope.shape[1] - 1), l]
-            s.slope[a, j, l] = s.share[0, k, l] * here + s.curve[k, l] * before + s.step[k, l] * ahead
+        for j in range(s.trend.shape[1]):
+            k, here = len(COMMON) + j, s.trend[a, j, l]
+            ahead = s.trend[a, min(j + 1, s.trend.shape[1] - 1), l]
+            s.trend[a, j, l] = s.share[0, k, l] * here + s.curve[k, l] * before + s.step[k, l] * ahead
             before = here

@@ -65,7 +65,7 @@ def nothing_learned(n: int) -> dict[str, Any]:
     """Fields before the first sample."""
     return {
         "mean": np.zeros(n), "variance": np.zeros(n), "long_variance": np.zeros(n), "moved": np.zeros(n),
-        "middle": 0.0, "spread": 0.0, "readings": 0.0, "constant": -1, "unit": np.zeros(n), "offset": np.zeros(n),
+        "middle": 0.0, "spread": 0.0, "readings": 0.0, "constant": -1, "drift_unit": np.zeros(n), "offset": np.zeros(n),
         "samples": np.zeros((WINDOW, PHI + n)), "gains": np.zeros((WINDOW, n)), "remembered": 0, "assumed": np.zeros(n),
         "sums": np.zeros((A + 6 * n, n)), "weight": np.ones(n), "direction": np.zeros(n),
         "white": np.zeros(n), "past": np.zeros(n), "past_y": 0.0, "explained": 0.0, "colour": 0.0, "psi": 0.0,
@@ -100,7 +100,7 @@ def learn_means(s: State, l: int) -> None:
         v = max(s.variance[i, l], s.long_variance[i, l])
         far = (s.mean[i, l] ** 2 > FAR * s.variance[i, l]) & (v > STILL * s.c[i, l])
         beside = (constant >= 0) & (i != constant) & far
-        s.unit[i, l] = 1.0 / v if beside else 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        s.drift_unit[i, l] = 1.0 / v if beside else 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
         s.offset[i, l] = s.mean[i, l] / s.mean[constant, l] if beside else 0.0
 
 

@@ -24,7 +24,7 @@ from driftfit.trackers.parts.mixture.filters import FLOOR
 from driftfit.trackers.parts.mixture.modes import FIRST_ALONE, FIRST_LEARNED
 
 SMOOTHER_FIELDS = (
-    "mu", "prior", "kappa", "r", "certainty", "ratio", "c", "unit", "offset", "weight", "direction", "white",
+    "mu", "prior", "kappa", "r", "certainty", "ratio", "c", "drift_unit", "offset", "weight", "direction", "white",
     "explained", "settled", "constant",
 )  # fmt: skip
 """Fields that are stored at every sample."""
@@ -36,7 +36,7 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
     for k in range(s.mu.shape[0]):
         o.mu[k, l], o.prior[k, l], o.ratio[k, l] = s.mu[k, l], s.prior[k, l], s.ratio[k, l]
     for i in range(s.c.shape[0]):
-        o.c[i, l], o.unit[i, l], o.offset[i, l] = s.c[i, l], s.unit[i, l], s.offset[i, l]
+        o.c[i, l], o.drift_unit[i, l], o.offset[i, l] = s.c[i, l], s.drift_unit[i, l], s.offset[i, l]
         o.weight[i, l], o.direction[i, l], o.white[i, l] = s.weight[i, l], s.direction[i, l], s.white[i, l]
     o.kappa[l], o.r[l], o.certainty[l], o.explained[l] = s.kappa[l], s.r[l], s.certainty[l], s.explained[l]
     o.settled[l], o.constant[l] = s.settled[l], s.constant[l]
@@ -75,7 +75,7 @@ def estimated_variances(
     size = modes_given_all(fields, used, state) * fields["ratio"] * (r * time)[:, None]
     centred = fields["offset"] != 0.0
     learned = size[:, FIRST_LEARNED:FIRST_ALONE].sum(axis=1)
-    common = (size[:, :FIRST_LEARNED].sum(axis=1) + FLOOR * learned)[:, None] * fields["unit"]
+    common = (size[:, :FIRST_LEARNED].sum(axis=1) + FLOOR * learned)[:, None] * fields["drift_unit"]
     own = learned[:, None] * (fields["weight"] + fields["direction"] ** 2)
     for i, first in enumerate(state["alone"]):
         if first >= 0:
