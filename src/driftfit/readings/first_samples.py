@@ -2,9 +2,10 @@
 
 The signals of the first samples are kept, and judged together when there are ``first`` + n of them. Samples that repeat
 the one before are kept once, with their number. While the record begins with so many equal readings that they and the
-samples of which they are lags are half of all, the oldest makes room for the newest: a plant at rest, and a run of
-codes at the start, are judged when something happens. A value is outlying if it is `OUTLYING` usual distances from the
-median, the usual distance being the median of those that are not 0. A sample is doubtful if
+samples of which they are lags are half of all, the oldest makes room for the newest, and ``gate_decided`` counts down:
+a plant at rest, and a run of codes at the start, are judged when something happens. A value is outlying if it is
+`OUTLYING` usual distances from the median, the usual distance being the median of those that are not 0. A sample is
+doubtful if
 
     its reading is outlying and no regressor is: probably a fault code;
     or a regressor is outlying and the reading is not: a code of an input, or of an earlier output, now a lag.
@@ -43,8 +44,6 @@ FEW = 3
 """Values that differ from the median, from which on their distance is usual."""
 ROUNDED = 1e-20
 """Share of the sum of squares of y that may be an error of rounding."""
-MADE_ROOM = -1
-"""Value of ``gate_decided`` when samples were dropped for others; 0 before that, 1 when it is decided."""
 Y, READING, OK, DT, NOISE, DRIFT, TIMES, DOUBT, U = range(9)
 CODES = Y
 """Columns of a kept sample: output and reading (NaN if missing), whether there is a row, intervals since the last
@@ -229,12 +228,12 @@ def comes_again(s: State, l: int) -> bool:
 def decide(s: State, ages: int, implicit: bool, l: int) -> None:
     """Where samples made room for others they were judged one by one, unless they are the codes themselves."""
     N = s.gate_first.shape[0]
-    whole, s.gate_decided[l] = s.gate_decided[l] == 0, 1
+    dropped, s.gate_decided[l] = -s.gate_decided[l], 1
     count = doubt(s, implicit, l)
-    whole |= (s.gate_first[0, DOUBT, l] == 1.0) & (not comes_again(s, l))
+    whole = (dropped == 0) | (s.gate_first[0, DOUBT, l] == 1.0) & (not comes_again(s, l))
     if (count > 0) & (2 * count < N) & whole and contradicted(s, l):
         mark(s, ages, l)
-        s.gate_replay[l] = 1
+        s.gate_replay[l] = 1 + dropped
 
 
 @kernel
@@ -283,7 +282,7 @@ def remember_one(s: State, ages: int, implicit: bool, l: int) -> None:
         return
     if s.gate_kept[l] == N:
         known = s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
-        s.gate_decided[l] = MADE_ROOM if known else s.gate_decided[l]
+        s.gate_decided[l] -= int(s.gate_first[0, TIMES, l]) if known else 0
         drop_oldest(s, l)
     keep(s, s.gate_kept[l], 1.0, l)
     s.gate_kept[l] += 1
@@ -319,6 +318,8 @@ class First(NamedTuple):
     """Factors (k,) of the drift."""
     codes: Array
     """Which signals (k, 1 + m), the output first, are left out as codes."""
+    dropped: int
+    """How many samples with the reading of the first came before it, all of them codes."""
 
 
 def replayed(lane: Mapping[str, Array], m: int) -> First:
@@ -327,4 +328,4 @@ def replayed(lane: Mapping[str, Array], m: int) -> First:
     rows = np.repeat(rows, rows[:, TIMES].astype(int), axis=0)
     codes = (rows[:, [CODES]].astype(int) >> np.arange(1 + m)) % 2 == 1
     y, u = np.where(codes[:, 0], np.nan, rows[:, READING]), np.where(codes[:, 1:], np.nan, rows[:, U : U + m])
-    return First(y, u, rows[:, DT], rows[:, NOISE], rows[:, DRIFT], codes)
+    return First(y, u, rows[:, DT], rows[:, NOISE], rows[:, DRIFT], codes, int(lane["gate_replay"]) - 1)

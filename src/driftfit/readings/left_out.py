@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.readings.gate import INPUT
+from driftfit.readings.gate import SIGNAL
 from driftfit.readings.remarks import SAID, counts, remarks
 
 KEPT = 16
@@ -29,29 +29,28 @@ class Decision(NamedTuple):
     reason: str
 
 
-def decision(sample: Any, code: int, value: float, name: str = "y") -> Decision:
-    """The decision that a code stands for."""
-    return Decision(sample, "u" if code == INPUT else name, value, SAID[code][1])
-
-
 @dataclass(frozen=True, repr=False)
 class LeftOut:
     """The decisions of a gate in the order of the samples: ``sample`` (k,), ``code`` (k,) of the reason
-    (`driftfit.readings.gate`), and ``value`` (k,), the readings of y there. ``unused`` (j,) are the samples that could
-    not be used because a refused input is among their lags. Given as ``gate=``, these decisions are applied again.
+    (`driftfit.readings.gate`), ``value`` (k,), the readings of y there, and ``signal`` (k,), the name of the signal.
+    ``refused`` (i,) are the samples whose reading was refused, and ``unused`` (j,) those that could not be used because
+    a refused input is in their regressors. Given as ``gate=``, these decisions are applied again.
     """
 
     sample: Array
     code: Array
     value: Array
+    signal: Array
+    refused: Array
     unused: Array
 
     def __len__(self) -> int:
         return len(self.sample)
 
     def __iter__(self) -> Iterator[Decision]:
-        for t, code, value in zip(self.sample.tolist(), self.code.tolist(), self.value.tolist(), strict=True):
-            yield decision(t, code, value)
+        columns = (one.tolist() for one in (self.sample, self.signal, self.value, self.code))
+        for sample, signal, value, code in zip(*columns, strict=True):
+            yield Decision(sample, signal, value, SAID[code][1])
 
     @property
     def counts(self) -> dict[str, int]:
@@ -62,8 +61,7 @@ class LeftOut:
         """Readings y (T,) and factors of the noise variance (T,) with these decisions: refused readings are NaN, and
         samples with a refused input have an infinite variance."""
         y, noise = y.copy(), np.array(np.broadcast_to(noise, len(y)))
-        y[self.sample[self.code != INPUT]] = np.nan
-        noise[self.sample[self.code == INPUT]] = np.inf
+        y[self.refused] = np.nan
         noise[self.unused] = np.inf
         return y, noise
 
@@ -85,17 +83,20 @@ def table(decisions: Any, count: int) -> str:
     return "\n".join([*lines, *more])
 
 
-NOTHING_LEFT_OUT = LeftOut(np.empty(0, int), np.empty(0, int), np.empty(0), np.empty(0, int))
+NONE = np.empty(0, int)
+NOTHING_LEFT_OUT = LeftOut(NONE, NONE, np.empty(0), np.empty(0, "<U1"), NONE, NONE)
 
 
-def left_out_of(reason: Array, y: Array, ok: Array, ages: int) -> LeftOut:
+def left_out_of(decided: Array, y: Array, ok: Array, ages: int, names: Sequence[str]) -> LeftOut:
     """The decisions in a run, from what its gate stored for every sample (T,), its readings, which samples were used
-    once all was decided, and how many samples its model remembers inputs."""
-    sample = np.flatnonzero(reason)
-    after = (sample[:, None] + np.arange(1, ages + 1)).ravel()
-    after = np.unique(after[after < len(y)])
-    unused = after[~ok[after] & (reason[after] == 0) & np.isfinite(y[after])]
-    return LeftOut(sample, reason[sample].astype(int), y[sample], unused)
+    once all was decided, how many samples its model remembers inputs, and the names of the output and the inputs."""
+    sample = np.flatnonzero(decided)
+    signal, code = np.divmod(decided[sample].astype(int), SIGNAL)
+    refused = sample[signal == 0]
+    after = (sample[:, None] + np.arange(ages + 1)).ravel()
+    after = np.setdiff1d(after[after < len(y)], refused)
+    unused = after[~ok[after] & np.isfinite(y[after])]
+    return LeftOut(sample, code, y[sample], np.array(names)[signal], refused, unused)
 
 
 def remarks_of(several: Iterable[LeftOut]) -> tuple[tuple[str, str], ...]:
@@ -127,10 +128,16 @@ class Tally:
         """The last 16 decisions."""
         return tuple(self._last)
 
-    def add(self, sample: Any, code: int, value: float, name: str = "y") -> None:
-        """Count a sample that was not used."""
+    def clear(self) -> None:
+        """Nothing was left out."""
+        self._counts.clear()
+        self._last.clear()
+
+    def add(self, sample: Any, decided: int, value: float, names: Sequence[str]) -> None:
+        """Count a sample that was not used, with the names of the output and the inputs."""
+        signal, code = divmod(int(decided), SIGNAL)
         self._counts[SAID[code][0]] += 1
-        self._last.append(decision(sample, code, value, name))
+        self._last.append(Decision(sample, names[signal], value, SAID[code][1]))
 
     def __repr__(self) -> str:
         said = ", ".join(f"{name}: {count}" for name, count in self._counts.items())

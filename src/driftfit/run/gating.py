@@ -30,7 +30,7 @@ def without_start(gate: Gate | None) -> Gate | None:
 
 
 class AtStart(NamedTuple):
-    """Codes that were found among the first samples."""
+    """What was decided of the first samples, which were judged together, and of some of them once more one by one."""
 
     ago: Array
     """How many samples (k,) ago: 0 for the last."""
@@ -40,6 +40,8 @@ class AtStart(NamedTuple):
     """The readings (k,) of y."""
     codes: Array
     """Which signals (k, 1 + m), the output first, were codes."""
+    decided: Array
+    """The decisions (k,) as a gate stores them."""
 
 
 def readings_of(lane: Mapping[str, Array]) -> Array:
@@ -51,6 +53,7 @@ def readings_of(lane: Mapping[str, Array]) -> Array:
 def without_codes(record: Record, last: int, start: AtStart) -> Record:
     """A record without the codes that were found among its first samples, at sample ``last``."""
     (y, u), at = (record.y.copy(), record.u.copy()), last - start.ago
-    y[at[start.codes[:, 0]]] = np.nan
-    u[at] = np.where(start.codes[:, 1:], np.nan, u[at])
+    codes, at = start.codes[at >= 0], at[at >= 0]
+    y[at[codes[:, 0]]] = np.nan
+    u[at] = np.where(codes[:, 1:], np.nan, u[at])
     return replace(record, y=y, u=u)

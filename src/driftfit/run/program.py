@@ -26,7 +26,7 @@ from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, outpu
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.readings.first_samples import replayed
-from driftfit.readings.gate import AT_START, Gate, gate_step
+from driftfit.readings.gate import AT_START, SIGNAL, Gate, gate_step
 from driftfit.readings.gate import start as gate_start
 from driftfit.run.columns import COLLECTED, collecting, put_columns
 from driftfit.run.gating import AtStart, gate_of, readings_of, without_start
@@ -130,6 +130,13 @@ class Program:
             return _distinct(self.tracker.names_for(self.model))
         own = () if self.alone is None else self.alone.names
         return tuple(f"{name}[{self.output}]" for name in own) or _distinct(self.model.names_of(self.output))
+
+    @cached_property
+    def signals(self) -> tuple[str, ...]:
+        """Names of the output and of the inputs."""
+        m = self.model.m
+        inputs = self.model.input_names or (("u",) if m == 1 else tuple(f"u{j + 1}" for j in range(m)))
+        return (self.output or "y", *inputs)
 
     @property
     def start(self) -> State:
@@ -244,7 +251,8 @@ class Program:
                 found_too.append((done - 1, found))
             if "reason" in (out.dtype.names or ()) and theta is NOWHERE:
                 at = done - 1 - found.ago
-                out["reason"][at[at >= 0], 0] = AT_START
+                out["reason"][:done] = 0.0
+                out["reason"][at[at >= 0], 0] = found.decided[at >= 0]
             rest = slice(done, None)
             known = known if len(known) == 1 else known[rest]
             if theta is NOWHERE:
@@ -258,12 +266,17 @@ class Program:
         first, raw = replayed(state_of(tile), self.model.m), readings_of(state_of(tile))
         fresh = self.tile({"gate_decided": np.array(1)})
         known = np.stack([first.dt, first.noise, first.drift], axis=1)[:, :, None]
-        self.drivers().run(fresh, first.y[:, None], first.u[:, :, None], known, self.written(fresh, len(first.y)))
-        fresh["gate_refused"][0, 0] = np.sum(first.codes.any(axis=1))
+        out = self.written(fresh, len(first.y))
+        self.drivers().run(fresh, first.y[:, None], first.u[:, :, None], known, out)
+        code = first.codes.any(axis=1)
+        decided = np.where(code, AT_START + SIGNAL * np.argmax(first.codes, axis=1), out["reason"][:, 0])
+        fresh["gate_refused"][0, 0] = first.dropped + np.sum(code)
         tile.view(np.uint8)[:] = fresh.view(np.uint8)
-        at = np.flatnonzero(first.codes.any(axis=1))
-        after = np.cumsum(first.dt[::-1])[::-1] - first.dt
-        return AtStart(len(first.y) - 1 - at, after[at], raw[at], first.codes[at])
+        before = np.arange(-first.dropped, 0)
+        at = np.append(before, np.flatnonzero(decided))
+        row, after = np.maximum(at, 0), np.cumsum(first.dt[::-1])[::-1] - first.dt
+        ago, intervals = len(first.y) - 1 - at, after[row] + (row - at) * first.dt[0]
+        return AtStart(ago, intervals, raw[row], first.codes[row], decided[row])
 
     @property
     def width(self) -> int:

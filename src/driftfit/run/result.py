@@ -14,7 +14,7 @@ from driftfit.data.record import Known, Record, Records, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
-from driftfit.readings.gate import AT_START
+from driftfit.readings.gate import AT_START, SIGNAL
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, left_out_of
 from driftfit.run.columns import OfRecord
 from driftfit.run.gating import AtStart, without_codes
@@ -290,12 +290,12 @@ class Track(Plain, OfRecord):
         if self.program.gate is None:
             return self._left_out
         used, ages = self.decided.in_rows("ok") > 0.0, self.program.model.input_memory
-        return left_out_of(self.in_rows("reason"), self.record.y, used, ages)
+        return left_out_of(self.in_rows("reason"), self.record.y, used, ages, self.program.signals)
 
     @cached_property
     def decided(self) -> Track:
         """The run without the codes that its gate found among the first samples, for smoothers and judgements."""
-        if self.program.gate is None or AT_START not in self.in_rows("reason"):
+        if self.program.gate is None or AT_START not in self.in_rows("reason") % SIGNAL:
             return self
         found: list[tuple[int, AtStart]] = []
         tile = self.fresh()
