@@ -12,6 +12,7 @@ from driftfit import (
     RLS,
     AdaptiveKalman,
     BoxJenkins,
+    ContinuousTransfer,
     InstrumentalVariables,
     JointKalman,
     Kalman,
@@ -230,14 +231,12 @@ def test_a_new_level_costs_two_samples_also_after_a_gap(tracker, level, gap):
     assert errors[0] < 1.1 * errors[1]
 
 
-UNJUDGED = pytest.mark.xfail(reason="inputs are not judged at samples that miss a refused one", strict=True)
-
-
+@pytest.mark.parametrize("codes", [1, 4, 10])
 @pytest.mark.parametrize(
-    ("model", "tracker", "codes"),
+    ("model", "tracker"),
     [
-        (PLANT, RLS(1.0), 10), *((OE(2, 2), one, 1) for one in (RLS(1.0), InstrumentalVariables(0.99))),
-        (ARMAX(2, 2, 1), RLS(0.99), 10), pytest.param(OE(2, 2), InstrumentalVariables(0.99), 10, marks=UNJUDGED),
+        (PLANT, RLS(1.0)), (OE(2, 2), RLS(1.0)), (OE(2, 2), InstrumentalVariables(0.99)), (ARMAX(2, 2, 1), RLS(0.99)),
+        (ContinuousTransfer(2, 1), RLS(0.99)), (ContinuousTransfer(2, 1, delay=2), InstrumentalVariables(0.99)),
     ],
 )  # fmt: skip
 def test_an_input_with_codes_and_a_simulated_output(model, tracker, codes):

@@ -64,7 +64,7 @@ from driftfit.models.polynomials.steps import (
     U,
     Y,
     places,
-    refuse_held,
+    refusing,
     steps,
     taking_inputs,
 )
@@ -189,7 +189,7 @@ class PolynomialModel(LinearisedTransfer):
 
     @property
     def refuse(self) -> Any:
-        return refuse_held
+        return refusing(self._places)
 
     @property
     def steps(self) -> ModelSteps:
