@@ -60,8 +60,7 @@ def dead_zone(x: float, p: Array, out: Array, slopes: Array) -> None:
     out[0] = held if above or below or x != x else 0.0
     out[1] = -1.0 if above else 0.0
     out[2] = -1.0 if below else 0.0
-    for k in range(slopes.shape[0]):
-        slopes[k] = 0.0
+    slopes[1], slopes[2] = 0.0, 0.0
     slopes[0] = 1.0 if (above or below) and abs(x) <= p[4] else 0.0
 
 
@@ -71,8 +70,7 @@ def saturation(x: float, p: Array, out: Array, slopes: Array) -> None:
     out[0] = 0.0 if (above or below) and abs(x) < LARGEST else x
     out[1] = 1.0 if above else 0.0
     out[2] = 1.0 if below else 0.0
-    for k in range(slopes.shape[0]):
-        slopes[k] = 0.0
+    slopes[1], slopes[2] = 0.0, 0.0
     slopes[0] = 0.0 if above or below else 1.0
 
 
