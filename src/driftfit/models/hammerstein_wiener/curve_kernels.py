@@ -129,8 +129,7 @@ def splines(x: float, p: Array, out: Array, slopes: Array) -> None:
     work, anchor = 2 + count, 2 + count + order + 1
     inside = x >= p[2] and x <= p[1 + count]
     for k in range(out.shape[0]):
-        out[k] = -p[anchor + k] if inside else np.nan
-        slopes[k] = 0.0 if inside else np.nan
+        out[k], slopes[k] = -p[anchor + k] if inside else np.nan, 0.0 if inside else np.nan
     if inside:
         span = local_splines(x, p, order)
         for r in range(order + 1):
