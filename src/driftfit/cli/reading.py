@@ -1,4 +1,4 @@
-"""Read parts of files: ranges of rows and times, decimal commas, separators, stdin; valid ranges and exclusions.
+"""Read parts of files: ranges of rows and times, separators, stdin; valid ranges and exclusions.
 
 Rows are counted from 1 after the header, as in messages about cells, and ranges include both ends. Valid ranges and
 intervals are passed on unchanged (`driftfit.data.limits`).
@@ -36,7 +36,8 @@ class Part:
     last: str | None = None
     rows: tuple[int, int | None] = (1, None)
     separator: str | None = None
-    decimal: str | None = None
+    decimal: str = "."
+    dates: str | None = None
     missing: tuple[str, ...] = ()
     limits: tuple[tuple[str, Range], ...] = ()
     exclude: tuple[tuple[str, str], ...] = ()
@@ -113,9 +114,9 @@ def interval_from(entry: str, option: str = "--exclude") -> tuple[str, str]:
     return first.strip(), last.strip()
 
 
-def decimal_from(text: str | None) -> str | None:
-    """The decimal sign; None: the file shows it."""
-    if text not in (None, ".", ","):
+def decimal_from(text: str) -> str:
+    """The decimal sign."""
+    if text not in (".", ","):
         raise ValueError(f"--decimal {text}: the decimal sign must be a point or a comma.")
     return text
 
@@ -147,7 +148,8 @@ def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Se
     """Read columns of several files in the order of the files."""
     if (part.first or part.last) and time is None:
         raise ValueError("--from and --to are times, so they need --time; rows are chosen with --rows.")
-    wanted = Wanted(tuple(dict.fromkeys(names)), time, tuple(by), marks(part.missing)[0], part.separator, part.decimal)
+    how = marks(part.missing)[0], part.separator, part.decimal, part.dates
+    wanted = Wanted(tuple(dict.fromkeys(names)), time, tuple(by), *how)
     read = [_one(path, wanted, part) for path in (["-"] if "-" in files else paths_of(list(files)))]
     if len({one.time.dtype.kind for one in read if one.time is not None}) > 1:
         raise ValueError("the times of some files are numbers, those of others are dates.")
@@ -202,7 +204,7 @@ def moment(text: str, axis: Array, zone: str | None, end: bool = False) -> Any:
         text, end = (str(days[1] - timedelta(1)), True) if end else (str(days[0]), False)
     else:
         end = end and ":" not in text
-    found = dates(pl.Series("time", [text]), "the command line")
+    found = dates(pl.Series("time", [text]))
     if found.has_nulls():
         raise ValueError(
             f"{text!r} is not a date; write 2024-01-31, '2024-01-31 12:00:00', or a period as in {EXAMPLES}."
