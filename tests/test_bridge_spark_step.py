@@ -17,10 +17,9 @@ from driftfit import AdaptiveKalman, Kalman, Live, track
 from driftfit.bridges import spark
 from driftfit.bridges.spark import task as tasks
 from driftfit.bridges.spark.batch import Partition, schema_of
-from driftfit.bridges.spark.flow import Flow, Origin
+from driftfit.bridges.spark.flow import Flow
 from driftfit.bridges.spark.frames import java, missing
 from driftfit.bridges.spark.unit import Unit
-from driftfit.run.layout import packed as pack
 
 TYPES = {"unit": pa.string(), **dict.fromkeys(("t", "y", "flow", "pressure", "u"), pa.float64())}
 
@@ -115,8 +114,7 @@ def test_outputs_have_alarms_each():
 
 
 @pytest.mark.parametrize("model", [MODEL, PAIR])
-def test_states_survive_other_settings_and_another_version(model):
-    """States of an earlier version have another order of fields, one that is gone, and lack one."""
+def test_states_survive_other_settings(model):
     rows = rows_of(5, 7, 40, y=model.outputs)
     first, rest = rows.filter(pl.col("t") < 20.0), rows.filter(pl.col("t") >= 20.0)
     other = replace(K, r=0.3)
@@ -125,30 +123,10 @@ def test_states_survive_other_settings_and_another_version(model):
     expected = fleet_of(rest, other, model, warm).to_table().sort("unit", "t")
     old = ByHand(model, hold=0.0)
     old.batch(first)
-    layout = old.flow.task.joint_for(None).programs[0].layout
-    names = [name for name in reversed(layout.text.split()) if not name.startswith("floor:")]
-    text = " ".join([*names, "gone:f2"])
-    assert len(names) == len(layout.text.split()) - 1
-
-    def earlier(state):
-        joint = old.flow.task.joint_for(None)
-        words = joint.unpack(state).reshape(len(joint.programs), -1)
-        places, at = {}, 0
-        for one in layout.text.split():
-            shape = layout.shapes[one.partition(":")[0]][1]
-            places[one] = slice(at, at + int(np.prod(shape)))
-            at = places[one].stop
-        lanes = [np.concatenate([*(lane[places[name]] for name in names), [0, 0]]) for lane in words]
-        return pack(joint._tag([one.layout.tag_with(text) for one in joint.programs]), np.concatenate(lanes))
-
-    for version in (False, True):
-        stream = ByHand(model, other, hold=0.0, origins=(Origin(other, "theta:f1"), Origin(K, text)))
-        stream.kept = list(old.kept)
-        if version:
-            states = [earlier(state) for state in old.kept[0]["state"]]
-            stream.kept = [old.kept[0].with_columns(state=pl.Series(states, dtype=pl.Binary))]
-        stream.batch(rest)
-        assert stream.rows().select(expected.columns).equals(expected)
+    stream = ByHand(model, other, hold=0.0, origins=(other, K))
+    stream.kept = list(old.kept)
+    stream.batch(rest)
+    assert stream.rows().select(expected.columns).equals(expected)
     foreign = ByHand(model, AdaptiveKalman(), hold=0.0, origins=())
     foreign.kept = list(old.kept)
     with pytest.raises(ValueError, match="a state of another model, tracker, gate, setting or version"):

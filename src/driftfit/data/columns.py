@@ -79,7 +79,7 @@ class Columns:
 
 
 def convert(frame: nw.DataFrame[Any], wanted: Wanted, where: str, base: int, rows: slice | None = None) -> Columns:
-    """The wanted columns of one table as arrays, of ``rows`` alone if given; ``base`` is the number of its first row."""
+    """The wanted columns of a table, or of some of its ``rows``, as arrays; ``base`` is the number of its first row."""
     names = plain_names(frame.columns, wanted.names)
     if names != frame.columns:
         frame = frame.rename(dict(zip(frame.columns, names, strict=True)))
@@ -220,11 +220,11 @@ def _dates_of_text(text: pl.Series, where: str, base: int, form: str | None) -> 
     found = dates(text, form) if begin is None else pl.Series(text.name, begin)
     wrong = (found.is_null() & text.is_not_null()).arg_true()
     if len(wrong):
+        form = form or f"2024-01-31, 2024-01-31 12:00:00, or a period as in {EXAMPLES}"
         raise ValueError(
             f"{where}, row {wrong[0] + base} of column {text.name!r} holds {text[wrong[0]]!r}, which is neither a "
-            f"number nor a date in the form {form or '2024-01-31, 2024-01-31 12:00:00, or a period as in ' + EXAMPLES}; "
-            "for another form give --dates '%d.%m.%Y %H:%M' on the command line, or pass the table with "
-            f"polars.col({text.name!r}).str.to_datetime('%d.%m.%Y %H:%M')."
+            f"number nor a date in the form {form}; for another give --dates '%d.%m.%Y %H:%M' on the command line, "
+            f"or pass the table with polars.col({text.name!r}).str.to_datetime('%d.%m.%Y %H:%M')."
         )
     return found
 

@@ -101,7 +101,9 @@ def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFra
     frame = every.slice(bool(units)).select(list(chosen)).rename(chosen)
     if wanted.decimal == ",":
         words = (*HISTORIANS, *wanted.missing)
-        frame = frame.with_columns(points(present(frame[name], words)) for name in wanted.signals if name in frame.columns)
+        frame = frame.with_columns(
+            points(present(frame[name], words)) for name in wanted.signals if name in frame.columns
+        )
     keys = frame.select(pl.col(name).str.strip_chars() for name in wanted.by if name in frame.columns)
     return [*names, *again], frame.with_columns(_whole(column) for column in keys), units
 

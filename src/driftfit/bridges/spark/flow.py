@@ -53,18 +53,11 @@ REFUSED = -1
 """The fate of a row of a unit that cannot run, besides those of `driftfit.data.late`."""
 
 
-class Origin(NamedTuple):
-    """What made states: the tracker, or that of each output, and the fields of a state in the version of that time."""
-
-    tracker: Any
-    fields: str
-
-
 @dataclass(frozen=True)
 class Flow:
     """The settings of a stream that a worker receives in addition to its task.
 
-    ``rules`` has the rule of each output. ``origins`` are the trackers and versions that made states before; units
+    ``rules`` has the rule of each output. ``origins`` are the trackers that made states before; units
     whose newest time is before ``expired`` end.
     """
 
@@ -72,7 +65,7 @@ class Flow:
     schema: Mapping[str, str]
     hold: Any
     rules: tuple[AlarmRule | None, ...]
-    origins: tuple[Origin, ...] = ()
+    origins: tuple[Any, ...] = ()
     expired: Any = None
 
     def work(self, batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
@@ -255,17 +248,17 @@ class Known(NamedTuple):
         return joint.pack(self.words[k]) if k in self.words else joint.start
 
 
-def migrated(task: Task, now: JointLayout, state: bytes, settings: str | None, origins: Sequence[Origin]) -> Array:
-    """The words of a state that other settings of the tracker or another version made.
+def migrated(task: Task, now: JointLayout, state: bytes, settings: str | None, origins: Sequence[Any]) -> Array:
+    """The words of a state that other settings of the tracker made.
 
-    What depends on settings begins with the new ones, all else is carried over; fields are matched by their names.
+    What depends on settings begins with the new ones, all else is carried over.
     ``settings`` are those of the unit at that time. ValueError for a state that none of ``origins`` made.
     """
     tag, words = unpacked(state)
-    for tracker, fields in ((task.tracker, now.text), *origins):
+    for tracker in (task.tracker, *origins):
         old = task.joint_of(settings, tracker)
-        if old.tag == tag or old.made_by(tag, fields):
-            tile = old.filled(words) if old.tag == tag else old.filled(old.matched(words, fields))
+        if old.tag == tag:
+            tile = old.filled(words)
             states = tuple(state_of(tile, lane) for lane in range(len(old.programs)))
             return now.taken(now.tile(carried(End(old.programs, states, None), now.programs)))
     return now.unpack(state)  # which says that it is another's

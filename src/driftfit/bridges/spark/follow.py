@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow, Origin
+from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow
 from driftfit.bridges.spark.frames import rows_of, task_of
 from driftfit.bridges.spark.pieces import COUNTS, alarms_schema, rules_of
 from driftfit.bridges.spark.store import NEXT, Store
@@ -61,8 +61,8 @@ def follow(
     initial : pyspark.sql.DataFrame or None
         States to begin with: ``track(..., outputs="states")``, or those of another stream, ``Store.states()``.
     migrate : bool
-        Go on from states that another tracker's settings, or another version of this library, made: what depends on
-        settings takes its new value, all else is carried over; fields are matched by their names.
+        Go on from states that other settings of the tracker made: what depends on settings takes its new value, all
+        else is carried over.
     sink : callable or None
         ``sink(results, batch)`` is called after a batch is written, and may be called again for the same batch after a
         crash: it must be idempotent, as a MERGE by unit and time, or a write that replaces the batch.
@@ -113,8 +113,8 @@ def _schema(task: Task, kinds: Mapping[str, str], rules: Sequence[AlarmRule | No
     return {"kind": "string", **own, "failed": "string", **STATE, **times}
 
 
-def _origins(store: Store, task: Task, schema: Mapping[str, str], migrate: bool) -> tuple[Origin, ...]:
-    """The trackers and versions that made the states so far, the newest first; notes what is followed from now on.
+def _origins(store: Store, task: Task, schema: Mapping[str, str], migrate: bool) -> tuple[Any, ...]:
+    """The trackers that made the states so far, the newest first; notes what is followed from now on.
 
     Those before the newest count too: a batch that was cut off before it was complete has not carried states over.
     """
@@ -131,11 +131,12 @@ def _origins(store: Store, task: Task, schema: Mapping[str, str], migrate: bool)
         store.begin(about)
         return ()
     last = found[-1]
-    if last["model"] != about["model"]:
-        followed = rebuild(last["model"], Model, parts_of(task.model))
+    if last["model"] != about["model"] or last["fields"] != text:
+        same = last["model"] == about["model"]
+        made = "in another version" if same else f"with {rebuild(last['model'], Model, parts_of(task.model))!r}"
         raise ValueError(
-            f"spark.follow: the states in {store.path} were made with {followed!r}, not with {task.model!r}; begin in "
-            "another folder."
+            f"spark.follow: the states in {store.path} were made {made}, not with {task.model!r} in this one; begin in "
+            "another folder, with the whole stream."
         )
     if last.get("gate", "older") != about["gate"]:
         raise ValueError(
@@ -143,10 +144,9 @@ def _origins(store: Store, task: Task, schema: Mapping[str, str], migrate: bool)
             "from the first on; give gate= as it was, or begin in another folder with the whole stream."
         )
     origins = tuple(_origin(task, one) for one in reversed(found))
-    if not migrate and (origins[0].tracker != task.tracker or last["fields"] != text):
-        other = f"not with {task.tracker!r}" if origins[0].tracker != task.tracker else "in another version"
+    if not migrate and origins[0] != task.tracker:
         raise ValueError(
-            f"spark.follow: the states in {store.path} were made with {origins[0].tracker!r}, {other}: give "
+            f"spark.follow: the states in {store.path} were made with {origins[0]!r}, not with {task.tracker!r}: give "
             "migrate=True to carry them over, or begin in another folder."
         )
     if last != about:
@@ -154,12 +154,12 @@ def _origins(store: Store, task: Task, schema: Mapping[str, str], migrate: bool)
     return origins
 
 
-def _origin(task: Task, about: Mapping[str, Any]) -> Origin:
-    """What made states, from what was noted of it."""
+def _origin(task: Task, about: Mapping[str, Any]) -> Any:
+    """The tracker that made states, or that of each output, from what was noted of it."""
     own = tuple(parts_of(trackers_of(task.tracker)))
     trackers: list[Tracker] = [rebuild(one, Tracker, own) for one in about["tracker"]]
     several = len(trackers) > 1
-    return Origin(dict(zip(task.y, trackers, strict=True)) if several else trackers[0], about["fields"])
+    return dict(zip(task.y, trackers, strict=True)) if several else trackers[0]
 
 
 class _Batches:

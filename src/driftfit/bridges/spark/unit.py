@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.bridges.spark.flow import PLACES, Origin, migrated
+from driftfit.bridges.spark.flow import PLACES, migrated
 from driftfit.bridges.spark.pieces import COUNTS, SAMPLES, USED, alarms_of, alarms_schema, collects, watched
 from driftfit.bridges.spark.task import Task
 from driftfit.data import late
@@ -134,7 +134,7 @@ class Unit:
         joint = self.joint
         if self.before is None or tag_of(packed) == joint.tag:
             return joint.unpack(packed)
-        return migrated(self.task, joint, packed, None, [Origin(self.before, joint.text)])
+        return migrated(self.task, joint, packed, None, [self.before])
 
     def _packed(self, words: Array | None) -> bytes:
         return self.joint.start if words is None else self.joint.pack(words)
