@@ -11,11 +11,11 @@ from scipy.io import savemat
 
 from driftfit import RLS, DataWarning, Regression, track
 from driftfit.bridges.matlab import read_mat
-from driftfit.cli.reading import Part, moment, rows_of
+from driftfit.cli.reading import Part, rows_of
 from driftfit.data.clock import Clock
 from driftfit.data.files import read_columns
 from driftfit.data.instants import warn_of_counted_years, warn_of_written_numbers
-from driftfit.data.limits import within
+from driftfit.data.limits import end_of, within
 from driftfit.data.storage import read
 
 
@@ -200,14 +200,15 @@ def test_compressed_files_and_utf_16_without_a_mark(tmp_path):
 
 def test_times_on_the_command_line():
     axis = np.array(["2024-01-31"], "datetime64[us]")
-    for text in ("20240201", "2024-02-01", "2024/02/01"):
-        assert str(moment(text, axis, None)) == "2024-02-01T00:00:00.000000"
-        assert str(moment(text, axis, None, end=True)) == "2024-02-01T23:59:59.999999"
-    assert str(moment("2024", axis, None)) == "2024-01-01T00:00:00.000000"
-    assert str(moment("2024", axis, None, end=True)) == "2024-12-31T23:59:59.999999"
+    for text in ("20240201", "2024-02-01"):
+        assert end_of("--to", text, axis, None, 0) == np.datetime64("2024-02-01")
+        assert end_of("--to", text, axis, None, 1) == np.datetime64("2024-02-01T23:59:59.999999")
+    assert [end_of("", "2024", axis, None, k) for k in (0, 1)] == [
+        np.datetime64(t) for t in ("2024-01-01", "2024-12-31T23:59:59.999999")
+    ]
     for text in ("01/02/2024", "2024-02-31", "yesterday"):
-        with pytest.raises(ValueError, match=f"'{text}'"):
-            moment(text, axis, None)
+        with pytest.raises(ValueError, match=f"--from: .* must be a date or a datetime.*'{text}'"):
+            end_of("--from", text, axis, None, 0)
 
 
 def test_intervals_that_are_excluded_are_days_without_hyphens_too():

@@ -11,7 +11,6 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import timedelta
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,8 +19,7 @@ import polars as pl
 from driftfit.data.clock import Clock
 from driftfit.data.columns import Columns, Wanted, convert
 from driftfit.data.files import paths_of, read_file
-from driftfit.data.instants import EXAMPLES, dates, span
-from driftfit.data.limits import marks
+from driftfit.data.limits import end_of, marks
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
@@ -180,43 +178,14 @@ def _between(rows: Rows, part: Part) -> Rows:
     axis = rows.time
     keep = np.ones(len(axis), bool)
     if part.first is not None:
-        keep &= axis >= moment(part.first, axis, rows.zone)
+        keep &= axis >= end_of("--from", part.first, axis, rows.zone, 0)
     if part.last is not None:
-        keep &= axis <= moment(part.last, axis, rows.zone, end=True)
+        keep &= axis <= end_of("--to", part.last, axis, rows.zone, 1)
     if not keep.any():
         raise ValueError(f"no row is between --from {part.first or '...'} and --to {part.last or '...'}.")
     by = [[value for value, kept in zip(column, keep.tolist(), strict=True) if kept] for column in rows.by]
     numbers = {name: column[keep] for name, column in rows.numbers.items()}
     return Rows(numbers, axis[keep], rows.zone, by, rows.units)
-
-
-def moment(text: str, axis: Array, zone: str | None, end: bool = False) -> Any:
-    """A time from text, of the kind of ``axis``: a number, or a date in its zone; ``end``: its day's last instant."""
-    if axis.dtype.kind != "M":
-        try:
-            return float(text)
-        except ValueError:
-            raise ValueError(f"{text!r} is not a number, but the times of the record are.") from None
-    text = text.strip()
-    if re.fullmatch(r"\d{4}", text):
-        text += "-12-31" if end else "-01-01"
-    elif (days := span(text)) is not None:
-        text, end = (str(days[1] - timedelta(1)), True) if end else (str(days[0]), False)
-    else:
-        end = end and ":" not in text
-    found = dates(pl.Series("time", [text]))
-    if found.has_nulls():
-        raise ValueError(
-            f"{text!r} is not a date; write 2024-01-31, '2024-01-31 12:00:00', or a period as in {EXAMPLES}."
-        )
-    if zone is not None:
-        found = (
-            found.dt.replace_time_zone(zone, ambiguous="earliest")
-            .dt.convert_time_zone("UTC")
-            .dt.replace_time_zone(None)
-        )
-    instant = found.to_numpy()[0]
-    return instant + np.timedelta64(1, "D") - np.timedelta64(1, "us") if end else instant
 
 
 def listed(given: Sequence[str] | None) -> list[str]:

@@ -219,27 +219,3 @@ def warn_of_counted_years(time: Array) -> None:
             f"time: all dates lie {since[0]:.0f} to {since[-1]:.0f} nanoseconds after the beginning of 1970. They look "
             "like years that were read as nanoseconds: convert them with pd.to_datetime(years, format='%Y')."
         )
-
-
-def warn_of_summer_time(repeated: Array, zone: str | None) -> bool:
-    """Whether times that are left out because they occur twice look like the hour at the end of summer time; then warn.
-
-    That is a night from Saturday to Sunday in spring or autumn, as clocks are changed in every country with a rule.
-    """
-    if zone is not None or repeated.dtype.kind != "M":
-        return False
-    hours = np.unique(repeated.astype("datetime64[h]"))
-    days, months = hours.astype("datetime64[D]"), hours.astype("datetime64[M]").astype(int) % 12 + 1
-    sunday = (days.astype(int) + 4) % 7 == 0
-    night = hours[sunday & np.isin((hours - days).astype(int), (1, 2, 3)) & np.isin(months, (3, 4, 9, 10, 11))]
-    if len(night):
-        count = int(np.isin(repeated.astype("datetime64[h]"), night).sum())
-        named = ", ".join(str(hour).replace("T", " ") + ":00" for hour in night[:3])
-        warn(
-            f"time: {count} row{' repeats' if count == 1 else 's repeat'} times of the hour from {named}"
-            f"{', ..' if len(night) > 3 else ''} and {'is' if count == 1 else 'are'} left out. This looks like local "
-            "time, in which the hour at the end of summer time occurs twice, and an hour in spring is missing. Give "
-            "the times in UTC, or with their zone or offset, such as 2024-10-27 02:30+01:00.",
-            UserWarning,
-        )
-    return bool(len(night))
