@@ -8,7 +8,7 @@ import pytest
 from benchmarks.gate import NAMES, Bench, measured
 from benchmarks.gate_cases import AT, CODES, LEVEL, MODELS, REAL, STARTS, honest, level_50, record
 from driftfit.readings.gate import INPUT, REFUSED, SIGNAL, USED, Gate
-from driftfit.readings.remarks import counts, floor_remark, remarks, ungated
+from driftfit.readings.left_out import counts, floor_remark, remarks, ungated
 from driftfit.readings.screen import Review, screen
 
 SEEDS = range(10)

@@ -56,6 +56,7 @@ from driftfit.engine.settings import whole
 from driftfit.models.inputs import LinearisedTransfer
 from driftfit.models.linearised import MEMORY
 from driftfit.models.polynomials.instruments import MORE, instrumental_steps
+from driftfit.models.polynomials.refusal import refusing
 from driftfit.models.polynomials.steps import (
     EACH,
     OWN,
@@ -64,7 +65,6 @@ from driftfit.models.polynomials.steps import (
     U,
     Y,
     places,
-    refusing,
     steps,
     taking_inputs,
 )

@@ -12,16 +12,16 @@ doubtful if
 
 A large output after a large input is neither; a lag with the same fault code as the reading does not explain it, and
 where the model is ``implicit``, its regressors contain functions of the reading, and none of them does.
-Doubtful samples are left out if the others contradict them: if least squares on all leaves the others a sum of squares
-Q, and least squares on themselves only q with nu residuals, and
+Doubtful samples are left out if the others contradict them: if least squares on all leaves a sum of squares Q, and
+least squares on the others only q with nu residuals, and with k doubtful samples
 
-    nu (Q - q) > WORSE q
+    nu (Q - q) > WORSE k q
 
 Then the signals that made samples doubtful are marked, ``gate_replay`` is set, and the driver restores
 the state before the first sample and replays whole samples without the codes, once.
 
-Source: the median deviation as a scale is Hampel's (1974), the recursive QR decomposition Gentleman's (1974); the rule
-is ours. Cost: a copy of the sample, and O(N^2 (n + m) + N n^2) once.
+Source: the test is Chow's (1960), the median deviation as a scale Hampel's (1974), the recursive QR decomposition
+Gentleman's (1974); what is doubtful is ours. Cost: a copy of the sample, and O(N^2 (n + m) + N n^2) once.
 """
 
 from __future__ import annotations
@@ -153,38 +153,18 @@ def fit(s: State, every: bool, l: int) -> float:
 
 
 @kernel
-def solve(s: State, l: int) -> None:
-    """theta in place of the last column; 0 in directions without information."""
-    n = s.phi.shape[0]
-    largest = 0.0
-    for i in range(n):
-        largest = max(largest, abs(s.gate_fit[i, i, l]))
-    for back in range(n):
-        i = n - 1 - back
-        for j in range(i + 1, n):
-            s.gate_fit[i, n, l] -= s.gate_fit[i, j, l] * s.gate_fit[j, n, l]
-        pivot = s.gate_fit[i, i, l]
-        s.gate_fit[i, n, l] = s.gate_fit[i, n, l] / pivot if abs(pivot) > 1e-12 * largest else 0.0
-
-
-@kernel
 def contradicted(s: State, l: int) -> bool:
     """Whether the samples that are not doubtful contradict those that are."""
-    N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
-    fit(s, True, l)
-    solve(s, l)
-    rows, squares, total = 0, 0.0, 0.0
-    for k in range(N):
+    rows, some, total = 0, 0, 0.0
+    for k in range(s.gate_first.shape[0]):
         d = s.gate_first[k, DOUBT, l]
-        if (s.gate_first[k, OK, l] > 0.0) & ((d == 0.0) | (d == 3.0)):
-            y = s.gate_first[k, Y, l]
-            e = y
-            for i in range(n):
-                e -= s.gate_first[k, PHI + i, l] * s.gate_fit[i, n, l]
-            rows, squares, total = rows + 1, squares + e * e, total + y * y
-    alone = fit(s, False, l)
-    spare = rows - n
-    return (spare >= RESIDUALS) & ((squares - alone) * spare > WORSE * (alone + ROUNDED * total))  # type: ignore[no-any-return]
+        if s.gate_first[k, OK, l] > 0.0:
+            sure = (d == 0.0) | (d == 3.0)
+            rows, some = rows + (1 if sure else 0), some + (0 if sure else 1)
+            total += s.gate_first[k, Y, l] ** 2 if sure else 0.0
+    alone, spare = fit(s, False, l), rows - s.phi.shape[0]
+    more = fit(s, True, l) - alone
+    return (spare >= RESIDUALS) & (more * spare > WORSE * some * (alone + ROUNDED * total))  # type: ignore[no-any-return]
 
 
 @kernel
@@ -310,14 +290,12 @@ class First(NamedTuple):
     """Readings (k,)."""
     u: Array
     """Inputs (k, m)."""
-    dt: Array
-    """Intervals (k,) since the sample before."""
-    noise: Array
-    """Factors (k,) of the noise variance."""
-    drift: Array
-    """Factors (k,) of the drift."""
+    known: Array
+    """Intervals since the sample before, factors of the noise variance and of the drift (k, 3)."""
     codes: Array
     """Which signals (k, 1 + m), the output first, are left out as codes."""
+    readings: Array
+    """Readings (k,), of codes too."""
     dropped: int
     """How many samples with the reading of the first came before it, all of them codes."""
 
@@ -328,4 +306,4 @@ def replayed(lane: Mapping[str, Array], m: int) -> First:
     rows = np.repeat(rows, rows[:, TIMES].astype(int), axis=0)
     codes = (rows[:, [CODES]].astype(int) >> np.arange(1 + m)) % 2 == 1
     y, u = np.where(codes[:, 0], np.nan, rows[:, READING]), np.where(codes[:, 1:], np.nan, rows[:, U : U + m])
-    return First(y, u, rows[:, DT], rows[:, NOISE], rows[:, DRIFT], codes, int(lane["gate_replay"]) - 1)
+    return First(y, u, rows[:, [DT, NOISE, DRIFT]], codes, rows[:, READING], int(lane["gate_replay"]) - 1)

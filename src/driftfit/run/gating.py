@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,8 +9,8 @@ import numpy as np
 
 from driftfit.data.record import Record
 from driftfit.engine.kernel import Array
-from driftfit.readings.first_samples import READING, TIMES
-from driftfit.readings.gate import Gate
+from driftfit.readings.first_samples import First
+from driftfit.readings.gate import AT_START, SIGNAL, Gate
 from driftfit.trackers.base import Tracker
 
 
@@ -44,10 +43,13 @@ class AtStart(NamedTuple):
     """The decisions (k,) as a gate stores them."""
 
 
-def readings_of(lane: Mapping[str, Array]) -> Array:
-    """The readings of the first samples that a gate remembers, as they were given."""
-    rows = lane["gate_first"][: int(lane["gate_kept"])]
-    return np.array(np.repeat(rows[:, READING], rows[:, TIMES].astype(int)))
+def at_start(first: First, reason: Array) -> AtStart:
+    """What was decided, given the first samples and the decisions (k,) when they were taken in again."""
+    decided = np.where(first.codes.any(axis=1), AT_START + SIGNAL * np.argmax(first.codes, axis=1), reason)
+    at = np.append(np.arange(-first.dropped, 0), np.flatnonzero(decided))
+    row, dt = np.maximum(at, 0), first.known[:, 0]
+    intervals = (np.cumsum(dt[::-1])[::-1] - dt)[row] + (row - at) * dt[0]
+    return AtStart(len(dt) - 1 - at, intervals, first.readings[row], first.codes[row], decided[row])
 
 
 def without_codes(record: Record, last: int, start: AtStart) -> Record:

@@ -26,10 +26,10 @@ from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, outpu
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.readings.first_samples import replayed
-from driftfit.readings.gate import AT_START, SIGNAL, Gate, gate_step
+from driftfit.readings.gate import Gate, gate_step
 from driftfit.readings.gate import start as gate_start
 from driftfit.run.columns import COLLECTED, collecting, put_columns
-from driftfit.run.gating import AtStart, gate_of, readings_of, without_start
+from driftfit.run.gating import AtStart, at_start, gate_of, without_start
 from driftfit.run.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
@@ -261,20 +261,13 @@ class Program:
 
     def replay(self, tile: Array) -> AtStart:
         """Bring a tile, whose gate has found codes among the first samples, to where it is without them."""
-        first, raw = replayed(state_of(tile), self.model.m), readings_of(state_of(tile))
+        first = replayed(state_of(tile), self.model.m)
         fresh = self.tile({"gate_decided": np.array(1)})
-        known = np.stack([first.dt, first.noise, first.drift], axis=1)[:, :, None]
         out = self.written(fresh, len(first.y))
-        self.drivers().run(fresh, first.y[:, None], first.u[:, :, None], known, out)
-        code = first.codes.any(axis=1)
-        decided = np.where(code, AT_START + SIGNAL * np.argmax(first.codes, axis=1), out["reason"][:, 0])
-        fresh["gate_refused"][0, 0] = first.dropped + np.sum(code)
+        self.drivers().run(fresh, first.y[:, None], first.u[:, :, None], first.known[:, :, None], out)
+        fresh["gate_refused"][0, 0] = first.dropped + np.sum(first.codes.any(axis=1))
         tile.view(np.uint8)[:] = fresh.view(np.uint8)
-        before = np.arange(-first.dropped, 0)
-        at = np.append(before, np.flatnonzero(decided))
-        row, after = np.maximum(at, 0), np.cumsum(first.dt[::-1])[::-1] - first.dt
-        ago, intervals = len(first.y) - 1 - at, after[row] + (row - at) * first.dt[0]
-        return AtStart(ago, intervals, raw[row], first.codes[row], decided[row])
+        return at_start(first, out["reason"][:, 0])
 
     @property
     def width(self) -> int:

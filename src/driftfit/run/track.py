@@ -25,8 +25,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
 from driftfit.readings.gate import AT_START, INPUT, REFUSED, SIGNAL, USED, Gate
-from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
-from driftfit.readings.remarks import ungated
+from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, ungated
 from driftfit.readings.screen import Review, screen, suspect
 from driftfit.run.fleet import Fleet, run_fleet
 from driftfit.run.gating import gate_of

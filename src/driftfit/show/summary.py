@@ -28,10 +28,10 @@ from driftfit.judge.compare import Comparison, compare, left_at_start, persisten
 from driftfit.models.base import GAP
 from driftfit.models.equation import Equation
 from driftfit.models.state_space import StateSpace
+from driftfit.readings.left_out import counts as counts_of
+from driftfit.readings.left_out import floor_remark
+from driftfit.readings.left_out import remarks as remarks_of
 from driftfit.readings.left_out import remarks_of as remarks_of_many
-from driftfit.readings.remarks import counts as counts_of
-from driftfit.readings.remarks import floor_remark
-from driftfit.readings.remarks import remarks as remarks_of
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.live.conformal import quantile
 from driftfit.run.outputs import Outputs

@@ -21,7 +21,7 @@ from driftfit.data.record import Known, Records
 from driftfit.engine.drivers import INTERVAL, NOISE
 from driftfit.engine.kernel import Array
 from driftfit.readings import gate
-from driftfit.readings.remarks import SAID
+from driftfit.readings.left_out import SAID
 from driftfit.run.live.rule import FROZEN
 from driftfit.run.live.stream import HELD
 from driftfit.run.parallel_lanes import FEWEST_LANES, Advanced, advance
