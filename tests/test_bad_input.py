@@ -67,18 +67,6 @@ def test_names_and_tables_of_the_wrong_kind():
     assert "column 'u' is of type List" in message(ValueError, "flow", "u", data=data)
 
 
-@pytest.mark.parametrize("tracker", KINDS, ids=repr)
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, None, 1e200])
-def test_no_value_anywhere_poisons(tracker, bad):
-    data = table(60)
-    for name in ("flow", "u"):
-        column = pl.Series([bad if k in (0, 20, 59) else v for k, v in enumerate(data[name])])
-        run = track(MODEL, tracker, "flow", "u", data=data.with_columns(column.alias(name)))
-        assert np.isfinite(run.theta).all()
-        assert not run.ok[20 if name == "flow" else 21]
-        assert run.ok[25:59].all()
-
-
 @pytest.mark.parametrize("which", ["y", "u"])
 def test_complex_signals_are_refused(which):
     """Their imaginary parts were left out."""
@@ -116,17 +104,6 @@ def test_signals_of_impossible_size_are_named(size, counted, which):
 
 
 @pytest.mark.parametrize("tracker", KINDS, ids=repr)
-@pytest.mark.parametrize("level", [0.0, 5.0])
-def test_constant_inputs_for_a_hundred_thousand_steps(tracker, level):
-    T = 100_000
-    noise = np.random.default_rng(0).normal(size=T)
-    run = track(MODEL, tracker, 0.1 * noise, np.full(T, level))
-    assert np.isfinite(run.theta).all()
-    assert np.abs(run.theta).max() < 1e3
-    assert not np.isnan(run.std[100:]).any() or not tracker.covariance
-
-
-@pytest.mark.parametrize("tracker", KINDS, ids=repr)
 def test_one_sample_and_no_usable_sample(tracker):
     for y, u in (([1.0], [2.0]), ([np.nan] * 20, [1.0] * 20), ([1.0] * 20, [np.nan] * 20)):
         run = track(MODEL, tracker, y, u)
@@ -161,13 +138,6 @@ def test_more_parameters_than_samples():
     assert np.isinf(run.std).all()
     assert np.isfinite(run.theta).all()
     run.summary()
-
-
-def test_a_stream_ignores_times_that_do_not_increase():
-    live = Live(MODEL, TRACKER)
-    for time in (0.0, 1.0, 1.0, 0.5, 2.0):
-        live.update(1.0, 1.0, time=time)
-    assert live.ignored == 2
 
 
 def test_units_with_one_row_nothing_usable_or_no_time():
