@@ -10,16 +10,15 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 import pytest
-from spark_support import HOLD, KINDS, MODEL, PAIR, ByHand, K, arriving, fleet_of, packed, rows_of, task_of
+from spark_support import HOLD, KINDS, MODEL, PAIR, ByHand, K, arriving, fleet_of, flow_of, packed, rows_of, task_of
 from support import same
 
 from driftfit import AdaptiveKalman, Kalman, Live, track
 from driftfit.bridges import spark
 from driftfit.bridges.spark import task as tasks
 from driftfit.bridges.spark.batch import Partition, schema_of
-from driftfit.bridges.spark.flow import Flow
 from driftfit.bridges.spark.frames import java, missing
-from driftfit.bridges.spark.unit import Unit
+from driftfit.bridges.spark.keyed import Unit
 
 TYPES = {"unit": pa.string(), **dict.fromkeys(("t", "y", "flow", "pressure", "u"), pa.float64())}
 
@@ -121,9 +120,8 @@ def test_states_survive_other_settings(model):
     before = fleet_of(first, model=model)
     warm = {key: run for key, run in before.series().items() if key in rest["unit"]}
     expected = fleet_of(rest, other, model, warm).to_table().sort("unit", "t")
-    old = ByHand(model, hold=0.0)
+    old, stream = ByHand(model, hold=0.0), ByHand(model, other, hold=0.0, origins=(other, K))
     old.batch(first)
-    stream = ByHand(model, other, hold=0.0, origins=(other, K))
     stream.kept = list(old.kept)
     stream.batch(rest)
     assert stream.rows().select(expected.columns).equals(expected)
@@ -138,7 +136,7 @@ def test_outputs_have_trackers_each():
     rows = rows_of(2, 7, 60, y=PAIR.outputs)
     own = {"flow": K, "pressure": replace(K, r=0.4)}
     _, table = pieces_of(rows.sort("unit", "t"), task_of(PAIR, own), "samples")
-    stream, unit = ByHand(PAIR, own, hold=0.0), Unit(task_of(PAIR, own), 0.0, False, (None, None))
+    stream, unit = ByHand(PAIR, own, hold=0.0), Unit(flow_of(task_of(PAIR, own), 0.0))
     for part in (rows.filter(pl.col("t") < 20.0), rows.filter(pl.col("t") >= 20.0)):
         stream.batch(part)
     assert stream.rows().select(table.columns).equals(table)
@@ -210,24 +208,24 @@ def test_a_unit_with_keyed_state_gives_what_the_sorted_table_gives():
         hold = np.timedelta64(4, "s") if dated else HOLD
         task = replace(task_of(), dt="1s" if dated else None)
         time = (t * 1e6).astype("M8[us]") if dated else t
-        unit, state, found = Unit(task, hold, dated, (rule,)), None, []
+        unit, state, found = Unit(flow_of(task, hold, (rule,), time="timestamp" if dated else "double")), None, []
         order = np.argsort(t + np.random.default_rng(1).uniform(0.0, 3.5, len(t)), kind="stable")
         for part in np.array_split(order, 12):
             stamps = time[part].astype(int) if dated else time[part]
             given = list(zip(stamps.tolist(), y[part].tolist(), u[part].tolist(), strict=True))
             state, some = unit.step(state, [*given, given[0], (None, 1.0, 1.0)])
             found += some
-        assert unit.newest(state) == t[-1] * (1e6 if dated else 1.0)
+        assert state["newest"] == t[-1] * (1e6 if dated else 1.0)
         *rest, end = unit.ended(state, "silent")
         assert 0 < len(rest) < 6
         found += rest
         fleet = fleet_of(rows)
         run = fleet["0"]
         assert end["state"][24:] == packed(fleet)["0"]
-        good = [one for one in found if "failed" not in one]
+        good = [one for one in found if one["failed"] is None]
         for name, path in (("prediction", run.prediction), ("theta_b1[u]", run.theta[:, 2]), ("std_a1", run.std[:, 0])):
             assert same([one[name] for one in good], path)
-        assert sorted({one["failed"] for one in found if "failed" in one}) == ["at a repeated time", "without a time"]
+        assert sorted({one["failed"] for one in found} - {None}) == ["at a repeated time", "without a time"]
         live, watch = Live(MODEL, K, dt="1s" if dated else None), []
         alarm = live.detect(rule)
         stamps = np.array([one["t"] for one in good]).astype("M8[us]") if dated else t
@@ -243,7 +241,9 @@ def test_a_unit_with_keyed_state_continues_with_other_settings():
     other = replace(K, r=0.3)
     before = fleet_of(first, model=PAIR)
     run = fleet_of(rest, other, PAIR, dict(before.series()))["0"]
-    old, new = Unit(task_of(PAIR), 0.0, False, (None, None)), Unit(task_of(PAIR, other), 0.0, False, (None, None), K)
+    old, new, foreign = (
+        Unit(flow_of(task_of(PAIR, one), 0.0, origins=made)) for one, made in ((K, ()), (other, (K,)), (other, ()))
+    )
     given = [part.select("t", "flow", "pressure", "u").rows() for part in (first, rest)]
     state, _ = old.step(None, given[0])
     _, found = new.step(state, given[1])
@@ -254,13 +254,13 @@ def test_a_unit_with_keyed_state_continues_with_other_settings():
     again = new.step(begun, given[1])[1]
     assert same([one["std_b1[pressure<-u]"] for one in again], run.std[:, 1, 2])
     with pytest.raises(ValueError, match="a state of another model, tracker, gate, setting or version"):
-        replace(new, before=None).step(state, given[1])
+        foreign.step(state, given[1])
 
 
 def test_a_flow_is_pickled_without_what_it_has_made():
     task = task_of()
     assert task.joint_for(None).programs[0].names == task.names[0]
-    again = pickle.loads(pickle.dumps(Flow(task, {}, 0.0, (None,))))
+    again = pickle.loads(pickle.dumps(flow_of(task)))
     assert again.task == task
     assert not again.task._made
 

@@ -186,9 +186,9 @@ def _linear(node: ast.expr, places: dict[str, int]) -> Array:
             if isinstance(sign, ast.Add | ast.Sub):
                 return a + b if isinstance(sign, ast.Add) else a - b
             if isinstance(sign, ast.Mult) and not (a[:-1].any() and b[:-1].any()):
-                return a[-1] * b if b[:-1].any() else a * b[-1]
+                return np.asarray(a[-1] * b if b[:-1].any() else a * b[-1])
             if isinstance(sign, ast.Div) and not b[:-1].any():
-                return a / b[-1]
+                return np.asarray(a / b[-1])
     raise ValueError
 
 
