@@ -430,7 +430,7 @@ add_products = _named("add_products", _add_products)
 at + k columns of an array.
 """
 in_blocks = _named("in_blocks", _one_wide_lane)
-"""Whether a record has one lane and more parameters than are unrolled, as its type says. Steps that are compiled once for
+"""Whether a record has one lane and more than `UNROLLED` parameters, as its type says. Steps that are compiled once for
 all sizes, and those that are exported to C, do without vectors.
 """
 sum_of = _named("sum_of", _sum)
