@@ -100,7 +100,7 @@ def wander(s: State, size: float, l: int) -> None:
 def widest_jumps(s: State, l: int) -> None:
     """The largest jumps may move the output by as much as it varies, however small the noise, and by as much as an
     outlier was off in the sample before: it may have been the first one after a jump."""
-    ratio = max(COMMON[-1], max(s.spread[l], s.outlier[l] * s.e[l] * s.e[l]) / s.r[l])
+    ratio = max(COMMON[-1], max(s.spread[l], s.outlier[l] * s.e[l] * s.e[l] / s.noise[l]) / s.r[l])
     s.ratio[len(COMMON) - 1, l] = ratio
     for k in range(FIRST_ALONE + s.rungs[l] - 1, s.modes[l], s.rungs[l]):
         s.ratio[k, l] = ratio

@@ -80,7 +80,7 @@ def learn_means(s: State, l: int) -> None:
     share = s.ok[l] / min(max(s.readings[l], 1.0), LONG)
     away = s.y[l] - s.middle[l]
     s.middle[l] += share * away
-    s.spread[l] += share * ((1.0 - share) * away * away - s.spread[l])
+    s.spread[l] += share * ((1.0 - share) * away * away / s.noise[l] - s.spread[l])
     constant = -1
     for i in range(s.parameters[l]):
         off = s.phi[i, l] - s.mean[i, l]
@@ -98,7 +98,7 @@ def learn_means(s: State, l: int) -> None:
     s.constant[l] = constant
     for i in range(s.parameters[l]):
         v = max(s.variance[i, l], s.long_variance[i, l])
-        far = (s.mean[i, l] ** 2 > FAR * s.variance[i, l]) & (v > STILL * s.c[i, l])
+        far = (s.c[i, l] > (1.0 + FAR) * s.variance[i, l]) & (v > STILL * s.c[i, l])
         beside = (constant >= 0) & (i != constant) & far
         s.drift_unit[i, l] = 1.0 / v if beside else 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
         s.offset[i, l] = s.mean[i, l] / s.mean[constant, l] if beside else 0.0
