@@ -82,7 +82,9 @@ def wander(s: State, size: float, l: int) -> None:
     for a in range(n):
         for b in range(a + 1):
             moved = size * s.walk[0, a, b, l]
-            for k in range(FIRST_LEARNED):
+            for k in range(len(COMMON) - 1):
+                s.C[a, b, k, l] += s.ratio[k, l] * moved
+            for k in range(len(COMMON), FIRST_LEARNED):
                 s.C[a, b, k, l] += s.ratio[k, l] * moved
             moved = size * s.walk[1, a, b, l]
             for k in range(FIRST_LEARNED, FIRST_ALONE):
@@ -92,25 +94,40 @@ def wander(s: State, size: float, l: int) -> None:
         for a in range(i + 1 if first >= 0 else 0):
             for b in range(a + 1):
                 moved = own * s.S[a, i, l] * s.S[b, i, l]
-                for k in range(first, first + s.rungs[l]):
+                for k in range(first, first + s.rungs[l] - 1):
                     s.C[a, b, k, l] += s.ratio[k, l] * moved
 
 
-@kernel
-def widest_jumps(s: State, l: int) -> None:
-    """The largest jumps may move the output by as much as it varies, however small the noise, and by as much as an
-    outlier was off in the sample before: it may have been the first one after a jump."""
-    ratio = max(COMMON[-1], max(s.spread[l], s.outlier[l] * s.e[l] * s.e[l] / s.noise[l]) / s.r[l])
-    s.ratio[len(COMMON) - 1, l] = ratio
-    for k in range(FIRST_ALONE + s.rungs[l] - 1, s.modes[l], s.rungs[l]):
-        s.ratio[k, l] = ratio
+@partial(kernel, inline=False)
+def jump(s: State, l: int) -> None:
+    """The largest jumps of this sample may move the output by as much as its innovation."""
+    n, k = s.parameters[l], len(COMMON) - 1
+    ratio = max(COMMON[-1], min(s.spread[l], s.e[l] * s.e[l] / s.noise[l]) / s.r[l])
+    size = ratio * s.r[l] * s.dt[l] * s.drift[l]
+    s.ratio[k, l] = ratio
+    for a in range(n):
+        total = 0.0
+        for b in range(n):
+            total += s.walk[0, max(a, b), min(a, b), l] * s.x[b, l]
+            if b <= a:
+                s.C[a, b, k, l] += size * s.walk[0, a, b, l]
+        s.gain[a, k, l] += size * total
+        s.h_k[k, l] += size * total * s.x[a, l]
+    for i in range(n):
+        if s.alone[i, l] >= 0 and s.c[i, l] > 0.0:
+            k, own = s.alone[i, l] + s.rungs[l] - 1, size / s.c[i, l]
+            s.ratio[k, l] = ratio
+            for a in range(i + 1):
+                for b in range(a + 1):
+                    s.C[a, b, k, l] += own * s.S[a, i, l] * s.S[b, i, l]
+                s.gain[a, k, l] += own * s.S[a, i, l] * s.white[i, l]
+            s.h_k[k, l] += own * s.white[i, l] * s.white[i, l]
 
 
 @kernel
 def predict(s: State, l: int) -> None:
     """Drift and trends of the time since the last sample."""
     if s.settled[l] > 0 and s.dt[l] > 0.0:
-        widest_jumps(s, l)
         wander(s, s.r[l] * s.dt[l] * s.drift[l], l)
         time = s.dt[l] * min(s.drift[l], 1.0)
         for j in range(s.trend.shape[1]):
@@ -228,6 +245,7 @@ def weigh(s: State, more: float, l: int) -> None:
     ``more`` is the variance of rounding that repeats; ``s.vague`` is that of lags that the model doubts.
     """
     K = s.modes[l]
+    jump(s, l)
     nearest = likelihoods(s, s.vague[l], l)
     predictive_density(s, nearest, l)
     if more > 0.0:
