@@ -45,7 +45,7 @@ SWEEPS, ROTATIONS = 30, 6
 ROUNDED = 1e-6
 """Added to the diagonal of M, relative to it."""
 LONG = 1000.0
-"""Memory of the variance of a regressor that rests, in samples."""
+"""Memory of the variance of y, in samples."""
 FAR = 9.0
 """Square of the mean of a regressor, in units of its variance, from which on it drifts about the mean."""
 STILL = 1e-24
@@ -64,7 +64,7 @@ deviations; the largest c; and the interval that separates a sample from its pas
 def nothing_learned(n: int) -> dict[str, Any]:
     """Fields before the first sample."""
     return {
-        "mean": np.zeros(n), "variance": np.zeros(n), "long_variance": np.zeros(n), "moved": np.zeros(n),
+        "mean": np.zeros(n), "variance": np.zeros(n), "moved": np.zeros(n),
         "middle": 0.0, "spread": 0.0, "readings": 0.0, "constant": -1, "drift_unit": np.zeros(n), "offset": np.zeros(n),
         "samples": np.zeros((WINDOW, PHI + n)), "gains": np.zeros((WINDOW, n)), "remembered": 0, "assumed": np.zeros(n),
         "sums": np.zeros((A + 6 * n, n)), "weight": np.ones(n), "direction": np.zeros(n),
@@ -92,12 +92,10 @@ def learn_means(s: State, l: int) -> None:
         square = off * (s.phi[i, l] - s.mean[i, l]) / s.noise[l]
         most = LARGE * own if s.moved[i, l] > 10.0 else np.inf
         s.variance[i, l] += share * (min(square, most) - own)
-        slowly = s.ok[l] / min(max(s.moved[i, l], 1.0), LONG)
-        s.long_variance[i, l] += slowly * (s.variance[i, l] - s.long_variance[i, l])
         constant = i if (s.variance[i, l] <= STILL * s.c[i, l]) & (s.mean[i, l] != 0.0) else constant
     s.constant[l] = constant
     for i in range(s.parameters[l]):
-        v = max(s.variance[i, l], s.long_variance[i, l])
+        v = s.variance[i, l]
         far = (s.c[i, l] > (1.0 + FAR) * s.variance[i, l]) & (v > STILL * s.c[i, l])
         beside = (constant >= 0) & (i != constant) & far
         s.drift_unit[i, l] = 1.0 / v if beside else 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0

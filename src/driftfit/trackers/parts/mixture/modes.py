@@ -9,7 +9,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.trackers.parts.mixture.noise import STATES
 
-COMMON = (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
+COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
 TREND = (1e-3, 1e-2, 0.1)
 LEARNED = (1e-3, 1e-2, 0.1, 1.0)
 ALONE, GROUP = (0.003, 0.05, 30.0), (1e-3, 1e-2, 0.1, 1.0, 30.0)

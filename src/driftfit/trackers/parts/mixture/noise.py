@@ -2,7 +2,7 @@
 
     quiet      variance r, the mean of E(e^2 | y) with a memory of `MEMORY` samples
     restless   variance f, the same with a memory of `QUICK`
-    outlier    of any size: variance max(100 r, e^2), with a fixed probability
+    outlier    of any size: variance max(30 r, e^2), with a fixed probability
 
 v being the noise of a sample and p the joint probabilities of modes and kinds, E(v^2 | y) = sum p (r - r^2 / s + (r e /
 s)^2), exactly; a noise variance that is learned so needs no bounds. Equal readings in a row repeat one error of
@@ -28,13 +28,13 @@ from driftfit.trackers.parts.mixture.rows import sum_of_row
 STATES = 3
 OUTLIER, RARITY, FADE = 0.035, 50.0, 0.999
 """Probability of an outlier before the first sample, samples that this counts for, and fading of those since."""
-STAY, CALM = 0.985, 0.95
+STAY, CALM = 0.99, 0.95
 """Probabilities that quiet noise stays quiet, and that restless noise stays restless."""
 QUIET = 0.8
 """Probability of quiet noise before the first sample."""
 MEMORY, QUICK = 70.0, 10.0
 """Memories of r and f, in samples."""
-LEAST_RESTLESS, LARGE, WILDEST = 6.0, 100.0, 1e8
+LEAST_RESTLESS, LARGE, WILDEST = 6.0, 30.0, 1e8
 """Least f, the variance of outliers at least, and the largest f, in units of r."""
 LEAST_SHARE = 1e-26
 """r is never below this share of the mean square of y, for rounding in the sums of a prediction."""
