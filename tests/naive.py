@@ -13,17 +13,10 @@ def full(lower):
     return np.where(np.tri(len(lower), dtype=bool).reshape(lower.shape[:2] + (1,) * (lower.ndim - 2)), lower, other)
 
 
-def ratios(lane):
-    """Drift ratios (K,) in a sample: the last rung of jumps is the variance of the output, or the last outlier."""
-    rho, jump = lane["ratio"].copy(), max(COMMON[-1], max(lane["spread"], lane["outlier"] * lane["e"] ** 2) / lane["r"])
-    rho[len(COMMON) - 1] = jump
-    rho[FIRST_ALONE + lane["rungs"] - 1 :: lane["rungs"]] = jump
-    return rho
-
-
-def walks(lane):
-    """Drift covariances (K, n, n) of the modes in a nominal interval, in units of theta."""
-    rho, n, c = lane["r"] * ratios(lane), len(lane["c"]), lane["c"]
+def walks(lane, jump=COMMON[-1]):
+    """Drift covariances (K, n, n) of the modes in a nominal interval, in units of theta; ``jump`` is the last rung."""
+    n, c = len(lane["c"]), lane["c"]
+    rho = lane["r"] * np.where(lane["ratio"] == COMMON[-1], jump, lane["ratio"])
     away = np.eye(n)
     if lane["offset"].any():
         away[lane["constant"]] -= lane["offset"]
@@ -46,13 +39,29 @@ def moved_along(lane, time=1.0):
     return m
 
 
-def before(lane, phi):
+def before(lane, phi, jump=COMMON[-1]):
     """x, means (n, K), covariances (K, n, n) and variances (3,) of the noise before a sample."""
-    S = lane["S"]
-    C = np.moveaxis(full(lane["C"]), -1, 0) + S @ walks(lane) @ S.T
-    r = lane["r"]
+    S, r = lane["S"], lane["r"]
+    C = np.moveaxis(full(lane["C"]), -1, 0) + S @ walks(lane, jump) @ S.T
     v = lane["noise"] * np.array([r, max(lane["restless"], noise.LEAST_RESTLESS * r), noise.LARGE * r])
     return np.linalg.solve(S.T, phi), moved_along(lane), C, v
+
+
+def expected(lane, phi):
+    """Prediction, and its variance if nothing unusual happens."""
+    x, m, C, v = before(lane, phi)
+    jumps = lane["kappa"] * lane["arrive"] * (lane["ratio"] >= 1.0)
+    mean, restless = x @ m @ lane["prior"], states(lane)[1] / (1.0 - lane["outlying"])
+    spread = np.maximum(lane["prior"] - jumps, 0.0) @ (np.einsum("i,kij,j->k", x, C, x) + (x @ m - mean) ** 2)
+    return mean, spread + v[0] ** (1.0 - restless) * v[1] ** restless
+
+
+def after_jump(lane, phi, y):
+    """The same as `before`, with jumps as large as an unusual innovation."""
+    mean, variance = expected(lane, phi)
+    square, most = (y - mean) ** 2, max(lane["spread"], lane["astray"])
+    leaps = square > COMMON[-1] * variance
+    return before(lane, phi, max(COMMON[-1], min(most, square / lane["noise"]) / lane["r"] if leaps else 0.0))
 
 
 def states(lane):
@@ -77,7 +86,7 @@ def density(lane, phi, y):
 
 def sample(lane, phi, y):
     """Probabilities (K,), means (n, K) and covariances (K, n, n) after a sample, before and after the interaction."""
-    (x, m, C, v), K, count = before(lane, phi), len(lane["prior"]), float(lane["count"])
+    (x, m, C, v), K, count = after_jump(lane, phi, y), len(lane["prior"]), float(lane["count"])
     e, g = y - x @ m, C @ x
     h = g @ x
     s = h + np.stack([np.full(K, v[0]), np.full(K, v[1]), np.maximum(v[2], e**2)])

@@ -146,7 +146,7 @@ def look_ahead(s: State, entering: int, l: int) -> None:
 @partial(kernel, inline=False)
 def follow(s: State, l: int) -> None:
     """One sample of the running filters."""
-    s.outlier[l], s.certainty[l], weighed = 0.0, 0.0, 0.0
+    s.outlier[l], s.certainty[l], s.leap[l], weighed = 0.0, 0.0, 0.0, 0.0
     note_reading(s, l)
     column = s.column[l] if s.column[l] >= 0 else outgrown(s, l)
     if s.ok[l] > 0.0 and column >= 0:

@@ -82,9 +82,7 @@ def wander(s: State, size: float, l: int) -> None:
     for a in range(n):
         for b in range(a + 1):
             moved = size * s.walk[0, a, b, l]
-            for k in range(len(COMMON) - 1):
-                s.C[a, b, k, l] += s.ratio[k, l] * moved
-            for k in range(len(COMMON), FIRST_LEARNED):
+            for k in range(FIRST_LEARNED):
                 s.C[a, b, k, l] += s.ratio[k, l] * moved
             moved = size * s.walk[1, a, b, l]
             for k in range(FIRST_LEARNED, FIRST_ALONE):
@@ -94,29 +92,25 @@ def wander(s: State, size: float, l: int) -> None:
         for a in range(i + 1 if first >= 0 else 0):
             for b in range(a + 1):
                 moved = own * s.S[a, i, l] * s.S[b, i, l]
-                for k in range(first, first + s.rungs[l] - 1):
+                for k in range(first, first + s.rungs[l]):
                     s.C[a, b, k, l] += s.ratio[k, l] * moved
 
 
-@partial(kernel, inline=False)
-def jump(s: State, l: int) -> None:
-    """The largest jumps of this sample may move the output by as much as its innovation."""
+@partial(kernel, short=True)
+def leap(s: State, more: float, l: int) -> None:
+    """The last rungs of jumps get ``more`` variance, in units of the drift; so do gain and variance of the sample."""
     n, k = s.parameters[l], len(COMMON) - 1
-    ratio = max(COMMON[-1], min(s.spread[l], s.e[l] * s.e[l] / s.noise[l]) / s.r[l])
-    size = ratio * s.r[l] * s.dt[l] * s.drift[l]
-    s.ratio[k, l] = ratio
     for a in range(n):
         total = 0.0
         for b in range(n):
-            total += s.walk[0, max(a, b), min(a, b), l] * s.x[b, l]
-            if b <= a:
-                s.C[a, b, k, l] += size * s.walk[0, a, b, l]
-        s.gain[a, k, l] += size * total
-        s.h_k[k, l] += size * total * s.x[a, l]
+            moved = more * s.walk[0, max(a, b), min(a, b), l]
+            s.C[a, b, k, l] += moved if b <= a else 0.0
+            total += moved * s.x[b, l]
+        s.gain[a, k, l] += total
+        s.h_k[k, l] += total * s.x[a, l]
     for i in range(n):
         if s.alone[i, l] >= 0 and s.c[i, l] > 0.0:
-            k, own = s.alone[i, l] + s.rungs[l] - 1, size / s.c[i, l]
-            s.ratio[k, l] = ratio
+            k, own = s.alone[i, l] + s.rungs[l] - 1, more / s.c[i, l]
             for a in range(i + 1):
                 for b in range(a + 1):
                     s.C[a, b, k, l] += own * s.S[a, i, l] * s.S[b, i, l]
@@ -245,10 +239,15 @@ def weigh(s: State, more: float, l: int) -> None:
     ``more`` is the variance of rounding that repeats; ``s.vague`` is that of lags that the model doubts.
     """
     K = s.modes[l]
-    jump(s, l)
     nearest = likelihoods(s, s.vague[l], l)
     predictive_density(s, nearest, l)
-    if more > 0.0:
+    square = s.e[l] * s.e[l] / s.noise[l]
+    far = min(max(s.spread[l], s.astray[l]), square) / s.r[l] - COMMON[-1]
+    unusual = s.e[l] * s.e[l] > COMMON[-1] * s.s[l]
+    s.leap[l] = far if unusual & (far > 0.0) & (s.drift[l] > 0.0) else 0.0
+    if s.leap[l] > 0.0:
+        leap(s, s.leap[l] * s.r[l] * s.dt[l] * s.drift[l], l)
+    if more > 0.0 or s.leap[l] > 0.0:
         likelihoods(s, s.vague[l] + more, l)
     for k in range(K):
         s.row[k, l] = s.joint[0, k, l] + s.joint[1, k, l] + s.joint[2, k, l]
@@ -262,6 +261,7 @@ def weigh(s: State, more: float, l: int) -> None:
             s.row[k, l] = s.joint[j, k, l]
         s.nu[j, l] = sum_of_row(s, l)
     s.outlier[l] = s.nu[STATES - 1, l]
+    s.astray[l] = s.outlier[l] * square
     # an outlier says nothing about the state of ordinary noise
     for j in range(STATES - 1):
         s.nu[j, l] += s.nu[STATES - 1, l] * s.nu_prior[j, l] / (1.0 - s.outlying[l])

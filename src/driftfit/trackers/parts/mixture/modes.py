@@ -76,6 +76,8 @@ def bank(n: int, groups: Any) -> dict[str, Any]:
         "left_behind": 0.0,
         "jumps_expected": 0.0,
         "kappa": 1.0,
+        "leap": 0.0,
+        "astray": 0.0,
         "mu": modes["start"],
         "prior": modes["start"],
         "m": np.zeros((n, K)),

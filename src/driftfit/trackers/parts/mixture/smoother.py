@@ -21,10 +21,10 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.mixture.filters import FLOOR
-from driftfit.trackers.parts.mixture.modes import FIRST_ALONE, FIRST_LEARNED
+from driftfit.trackers.parts.mixture.modes import COMMON, FIRST_ALONE, FIRST_LEARNED
 
 SMOOTHER_FIELDS = (
-    "mu", "prior", "kappa", "r", "certainty", "ratio", "c", "drift_unit", "offset", "weight", "direction", "white",
+    "mu", "prior", "kappa", "r", "certainty", "leap", "c", "drift_unit", "offset", "weight", "direction", "white",
     "explained", "settled", "constant",
 )  # fmt: skip
 """Fields that are stored at every sample."""
@@ -34,12 +34,12 @@ SMOOTHER_FIELDS = (
 def store_for_smoother(o: State, s: State, l: int) -> None:
     """Store the fields of the smoother."""
     for k in range(s.mu.shape[0]):
-        o.mu[k, l], o.prior[k, l], o.ratio[k, l] = s.mu[k, l], s.prior[k, l], s.ratio[k, l]
+        o.mu[k, l], o.prior[k, l] = s.mu[k, l], s.prior[k, l]
     for i in range(s.c.shape[0]):
         o.c[i, l], o.drift_unit[i, l], o.offset[i, l] = s.c[i, l], s.drift_unit[i, l], s.offset[i, l]
         o.weight[i, l], o.direction[i, l], o.white[i, l] = s.weight[i, l], s.direction[i, l], s.white[i, l]
     o.kappa[l], o.r[l], o.certainty[l], o.explained[l] = s.kappa[l], s.r[l], s.certainty[l], s.explained[l]
-    o.settled[l], o.constant[l] = s.settled[l], s.constant[l]
+    o.settled[l], o.constant[l], o.leap[l] = s.settled[l], s.constant[l], s.leap[l]
 
 
 def transitions(state: Mapping[str, Any]) -> tuple[Array, Array]:
@@ -72,7 +72,8 @@ def estimated_variances(
     running = fields["settled"] > 0
     used = running & (fields["certainty"] > 0.0)
     r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
-    size = modes_given_all(fields, used, state) * fields["ratio"] * (r * time)[:, None]
+    ratio = state["ratio"] + np.where(state["ratio"] == COMMON[-1], fields["leap"][:, None], 0.0)
+    size = modes_given_all(fields, used, state) * ratio * (r * time)[:, None]
     centred = fields["offset"] != 0.0
     learned = size[:, FIRST_LEARNED:FIRST_ALONE].sum(axis=1)
     common = (size[:, :FIRST_LEARNED].sum(axis=1) + FLOOR * learned)[:, None] * fields["drift_unit"]
