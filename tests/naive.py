@@ -3,8 +3,9 @@
 import numpy as np
 from scipy import stats
 
-from driftfit.trackers.parts.mixture import filters, noise
-from driftfit.trackers.parts.mixture.modes import COMMON, FIRST_ALONE, FIRST_LEARNED
+from driftfit.trackers.mixture import filters
+from driftfit.trackers.mixture import states as of_noise
+from driftfit.trackers.mixture.states import COMMON, FIRST_ALONE, FIRST_LEARNED, FLOOR
 
 
 def full(lower):
@@ -23,7 +24,7 @@ def walks(lane, jump=COMMON[-1]):
     common = (away * lane["drift_unit"]) @ away.T
     a = np.divide(lane["direction"], np.sqrt(c), out=np.zeros(n), where=c > 0.0)
     inverse = np.divide(1.0, c, out=np.zeros(n), where=c > 0.0)
-    learned = np.diag(lane["weight"] * inverse) + filters.FLOOR * common + np.outer(a, a)
+    learned = np.diag(lane["weight"] * inverse) + FLOOR * common + np.outer(a, a)
     Q = np.zeros((len(rho), n, n))
     Q[:FIRST_LEARNED], Q[FIRST_LEARNED:FIRST_ALONE] = common, learned
     for i, first in enumerate(lane["alone"]):
@@ -43,7 +44,7 @@ def before(lane, phi, jump=COMMON[-1]):
     """x, means (n, K), covariances (K, n, n) and variances (3,) of the noise before a sample."""
     S, r = lane["S"], lane["r"]
     C = np.moveaxis(full(lane["C"]), -1, 0) + S @ walks(lane, jump) @ S.T
-    v = lane["noise"] * np.array([r, max(lane["restless"], noise.LEAST_RESTLESS * r), noise.LARGE * r])
+    v = lane["noise"] * np.array([r, max(lane["restless"], of_noise.LEAST_RESTLESS * r), of_noise.LARGE * r])
     return np.linalg.solve(S.T, phi), moved_along(lane), C, v
 
 
@@ -67,7 +68,7 @@ def after_jump(lane, phi, y):
 def states(lane):
     """Probabilities (3,) of the states of the noise before a sample."""
     (quiet, restless, _), o = lane["nu"], lane["outlying"]
-    usual = np.array([[noise.STAY, 1.0 - noise.STAY], [1.0 - noise.CALM, noise.CALM]])
+    usual = np.array([[of_noise.STAY, 1.0 - of_noise.STAY], [1.0 - of_noise.CALM, of_noise.CALM]])
     return np.append((1.0 - o) * np.array([quiet, restless]) @ usual, o)
 
 

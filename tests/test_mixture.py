@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from driftfit import ARX, AdaptiveKalman, Live, Regression, track
-from driftfit.trackers.parts.mixture.learned import ASSUMED, BLOCK, FADE, PHI, PRECISION, WINDOW, A, B, E, M
-from driftfit.trackers.parts.mixture.modes import COMMON, table
-from driftfit.trackers.parts.mixture.smoother import modes_given_all, transitions
+from driftfit.trackers.mixture.learned import ASSUMED, BLOCK, FADE, PHI, PRECISION, WINDOW, A, B, E, M
+from driftfit.trackers.mixture.states import COMMON, modes_given_all, table, transitions
 
 
 def record(T=400, n=3, seed=0):

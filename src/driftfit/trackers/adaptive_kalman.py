@@ -12,10 +12,10 @@
 | group g | 1 / c_i for the parameters of a group, instead of single | .001, .01, .1, 1, J |
 
 J, the largest jump, is the variance of the output or the square of an outlier before, in units of r, and at least 30.
-Every mode is a Kalman filter. They are merged after every sample (`driftfit.trackers.parts.mixture.filters`).
+Every mode is a Kalman filter. They are merged after every sample (`driftfit.trackers.mixture.filters`).
 Noise is quiet, restless, or an outlier of any size, and coarse readings that repeat share their rounding
-(`driftfit.trackers.parts.mixture.noise`). Scales, means, colour of the noise and covariance of the drift are learned
-(`driftfit.trackers.parts.mixture.learned`). Readings are judged by a gate (`driftfit.readings.gate`), which is on for
+(`driftfit.trackers.mixture.states`). Scales, means, colour of the noise and covariance of the drift are learned
+(`driftfit.trackers.mixture.learned`). Readings are judged by a gate (`driftfit.readings.gate`), which is on for
 this tracker, and not here.
 
 The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
@@ -23,7 +23,7 @@ estimates themselves. The variance before a sample is for samples that are no ou
 
 The start is exact diffuse least squares without drift, until there are enough residuals to estimate r; its bands are
 Student's (`driftfit.trackers.parts.few_residuals`). Every filter starts from generalised least squares with its own
-drift over the same samples (`driftfit.trackers.parts.mixture.start`), in the directions that the regressors span.
+drift over the same samples (`driftfit.trackers.mixture.learned`), in the directions that the regressors span.
 Scaling inputs or outputs changes only the units.
 
 Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Which parameters drift is learned
@@ -47,6 +47,41 @@ from driftfit.engine.kernel import Array, State, kernel, nothing
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.mixture.filters import (
+    enter_filters,
+    innovate,
+    mix,
+    mixture,
+    outgrown,
+    predict,
+    update_filters,
+    weigh,
+)
+from driftfit.trackers.mixture.learned import (
+    begin_with_drift,
+    colour,
+    forecast_start,
+    learn_colour,
+    learn_drift,
+    learn_means,
+    machine_drift,
+    nothing_learned,
+    start_density,
+    take_start,
+    whiten_noise,
+)
+from driftfit.trackers.mixture.states import (
+    SMOOTHER_FIELDS,
+    any_noise,
+    bank,
+    estimated_variances,
+    learn_noise,
+    least_noise,
+    noise_prior,
+    note_reading,
+    repeated_rounding,
+    store_for_smoother,
+)
 from driftfit.trackers.parts.coordinates import (
     FRAME,
     frame,
@@ -68,36 +103,6 @@ from driftfit.trackers.parts.excitation import (
     window,
 )
 from driftfit.trackers.parts.few_residuals import RESIDUALS, widen_estimates, wider
-from driftfit.trackers.parts.mixture.filters import (
-    enter_filters,
-    innovate,
-    mix,
-    mixture,
-    outgrown,
-    predict,
-    update_filters,
-    weigh,
-)
-from driftfit.trackers.parts.mixture.learned import (
-    colour,
-    learn_colour,
-    learn_drift,
-    learn_means,
-    machine_drift,
-    nothing_learned,
-    whiten_noise,
-)
-from driftfit.trackers.parts.mixture.modes import bank
-from driftfit.trackers.parts.mixture.noise import (
-    any_noise,
-    learn_noise,
-    least_noise,
-    noise_prior,
-    note_reading,
-    repeated_rounding,
-)
-from driftfit.trackers.parts.mixture.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
-from driftfit.trackers.parts.mixture.start import begin_with_drift, forecast_start, start_density, take_start
 
 
 @kernel

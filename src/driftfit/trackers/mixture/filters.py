@@ -5,7 +5,7 @@
     a_k = sum_j p_(j|k) / s_kj,    d_k = sum_j p_(j|k) (1 / s_kj - a_k)^2
     m_k   <- m_k + g_k a_k e_k,        C_k <- C_k - g_k g_k' (a_k - d_k e_k^2)
 
-with c_k and nu_j the probabilities of mode k and of state j of the noise (`driftfit.trackers.parts.mixture.noise`), and
+with c_k and nu_j the probabilities of mode k and of state j of the noise (`driftfit.trackers.mixture.states`), and
 t the normal density, or Student's while the noise variance rests on few samples. Modes are merged by their moments
 after every sample, c_j = sum_i mu_i T_ij. T moves a mode up or down its ladder, from the foot of a ladder to rest, and
 leads from the whole bank to mode j with the same small probability a_j, so that it costs O(K) instead of O(K^2):
@@ -30,18 +30,22 @@ from functools import partial
 import numpy as np
 
 from driftfit.engine.kernel import State, exp, kernel, log
+from driftfit.trackers.mixture.states import (
+    COMMON,
+    FIRST_ALONE,
+    FIRST_LEARNED,
+    FLOOR,
+    STATES,
+    sum_of_row,
+    variance_in,
+)
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.covariance import LEFT
-from driftfit.trackers.parts.mixture.modes import COMMON, FIRST_ALONE, FIRST_LEARNED
-from driftfit.trackers.parts.mixture.noise import STATES, variance_in
-from driftfit.trackers.parts.mixture.rows import least_of_row, sum_of_row
 
 EVENTS, RAREST, OFTENEST, SPAN = 3.0, 0.05, 3.0, 2e4
 """Jumps that the prior of their rate counts for, its bounds, and its memory in samples."""
 FADING, BEND = 0.05, 0.1
 """Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""
-FLOOR = 0.002
-"""Share of the common drift in the learned one."""
 STUDENT = 60.0
 """Samples from which on Student's density is taken for normal."""
 UNSURE = 4.5
@@ -181,40 +185,25 @@ def innovate(s: State, l: int) -> None:
 
 
 @partial(kernel, inline=False)
-def likelihoods(s: State, more: float, l: int) -> float:
-    """joint[j, k] = c_k nu_j times the density, relative to that of the nearest, of which e^2 / s is returned.
+def likelihoods(s: State, more: float, l: int) -> None:
+    """joint[j, k] = c_k nu_j times the density, up to a factor. That of an outlier is never small, and needs no unit.
 
     ``more`` is added to the variance of the noise.
     """
-    K, few = s.modes[l], s.count[l]
-    for k in range(K):
-        s.row[k, l] = np.inf
+    few = s.count[l]
     for j in range(STATES):
         noise = variance_in(s, j, l) + more
         widest = np.inf if j == STATES - 1 else 0.0
-        for k in range(K):
+        for k in range(s.modes[l]):
             square = s.e_k[k, l] * s.e_k[k, l]
             v = 1.0 / (s.h_k[k, l] + max(noise, min(square, widest)))
+            far = square * v if few > STUDENT else (few + 1.0) * log(1.0 + square * v / few)
             s.inverse[j, k, l] = v
-            s.joint[j, k, l] = square * v
-            s.row[k, l] = min(s.row[k, l], square * v)
-    nearest = least_of_row(s, l)
-    if few > STUDENT:
-        for j in range(STATES):
-            for k in range(K):
-                p = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(s.inverse[j, k, l])
-                s.joint[j, k, l] = p * exp(-0.5 * (s.joint[j, k, l] - nearest))
-    else:
-        base = 1.0 / (1.0 + nearest / few)
-        for j in range(STATES):
-            for k in range(K):
-                p = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(s.inverse[j, k, l])
-                s.joint[j, k, l] = p * exp(-0.5 * (few + 1.0) * log((1.0 + s.joint[j, k, l] / few) * base))
-    return nearest  # type: ignore[no-any-return]
+            s.joint[j, k, l] = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(v) * exp(-0.5 * far)
 
 
 @partial(kernel, inline=False)
-def predictive_density(s: State, nearest: float, l: int) -> None:
+def predictive_density(s: State, l: int) -> None:
     """The log density of the sample under its prediction, with a Cauchy tail for outliers, which integrates to 1."""
     K, few = s.modes[l], s.count[l]
     noise = variance_in(s, STATES - 1, l) + s.vague[l]
@@ -224,11 +213,9 @@ def predictive_density(s: State, nearest: float, l: int) -> None:
     tail = log(sum_of_row(s, l) / np.pi)
     for k in range(K):
         s.row[k, l] = s.joint[0, k, l] + s.joint[1, k, l]
-    body, height = sum_of_row(s, l), -0.5 * nearest
-    if few <= STUDENT:
-        x = 0.25 / few
-        height = log(1.0 - x + 0.5 * x * x) - 0.5 * (few + 1.0) * log(1.0 + nearest / few)
-    body = log(body / np.sqrt(2.0 * np.pi)) + height if body > 0.0 else -np.inf
+    x = 0.25 / few if few <= STUDENT else 0.0
+    body = sum_of_row(s, l) * (1.0 - x + 0.5 * x * x) / np.sqrt(2.0 * np.pi)
+    body = log(body) if body > 0.0 else -np.inf
     s.density[l] = tail + log(1.0 + exp(body - tail)) if body < tail else body + log(1.0 + exp(tail - body))
 
 
@@ -239,8 +226,8 @@ def weigh(s: State, more: float, l: int) -> None:
     ``more`` is the variance of rounding that repeats; ``s.vague`` is that of lags that the model doubts.
     """
     K = s.modes[l]
-    nearest = likelihoods(s, s.vague[l], l)
-    predictive_density(s, nearest, l)
+    likelihoods(s, s.vague[l], l)
+    predictive_density(s, l)
     square = s.e[l] * s.e[l] / s.noise[l]
     far = min(max(s.spread[l], s.astray[l]), square) / s.r[l] - COMMON[-1]
     unusual = s.e[l] * s.e[l] > COMMON[-1] * s.s[l]
