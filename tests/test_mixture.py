@@ -38,10 +38,8 @@ def test_a_sample_and_the_interaction_against_matrices(groups):
     y, u = record()
     model, leaps = Regression(3, intercept=True), []
     for t, (one, two) in lanes(y, u, model, AdaptiveKalman(groups=groups), (40, 133, 134, 201, 399)).items():
-        if one["colour"] != 0.0:
-            continue
-        phi = np.append(u[t], 1.0)
-        mu, m, C, joint = naive.sample(one, phi, y[t])
+        phi, left = two["white"], y[t] - float(two["explained"])  # without the part of the noise that is known
+        mu, m, C, joint = naive.sample(one, phi, left)
         assert two["s"] == pytest.approx(naive.expected(one, phi)[1], rel=1e-8)
         leaps.append(float(two["leap"]))
         np.testing.assert_allclose(two["mu"], mu, rtol=1e-6, atol=1e-12)
@@ -51,8 +49,8 @@ def test_a_sample_and_the_interaction_against_matrices(groups):
         np.testing.assert_allclose((two["m"] - mean) / size, 0.0, atol=1e-5)
         np.testing.assert_allclose(np.moveaxis(naive.full(two["C"]), -1, 0), cov, rtol=1e-5, atol=1e-7 * cov.max())
         # E(v^2 | y) of ordinary noise
-        x, moved, before, v = naive.after_jump(one, phi, y[t])
-        e2, h = (y[t] - x @ moved) ** 2, np.einsum("i,kij,j->k", x, before, x)
+        x, moved, before, v = naive.after_jump(one, phi, left)
+        e2, h = (left - x @ moved) ** 2, np.einsum("i,kij,j->k", x, before, x)
         moment = sum((joint[j] * (v[j] * h / (h + v[j]) + (v[j] / (h + v[j])) ** 2 * e2)).sum() for j in (0, 1))
         step = (moment / one["r"] - joint[:2].sum()) / min(one["count"] + 2.0, 70.0)
         assert two["r"] == pytest.approx(one["r"] * np.exp(np.clip(step, -1.0, 1.0)), rel=1e-8)
