@@ -87,14 +87,7 @@ def test_a_pass_of_scores_against_matrices():
             break
         live.update(y[t], u[t])
     newest = int(before["remembered"])
-    r, N, moved, block, right, squares = (
-        np.zeros(4),
-        np.zeros((4, 4)),
-        np.zeros((4, 4)),
-        np.zeros((4, 4)),
-        np.zeros(4),
-        0,
-    )
+    (r, right), (N, moved, block), squares = np.zeros((2, 4)), np.zeros((3, 4, 4)), 0
     p = after["sums"][ASSUMED]
     for back in range(WINDOW):
         one, k = after["samples"][(newest - back) % WINDOW], after["gains"][(newest - back) % WINDOW]

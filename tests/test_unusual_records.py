@@ -132,9 +132,11 @@ def test_a_plant_at_rest_has_shown_nothing_of_its_range(tracker):
         np.testing.assert_allclose(run.prediction[150:], y[150:], atol=0.15)
 
 
-@pytest.mark.xfail(reason="a stuck sensor moves the default", strict=False)
-@pytest.mark.parametrize("first", [200, 400])
-@pytest.mark.parametrize("tracker", [AdaptiveKalman(), RLS(1.0)], ids=repr)
+FOLLOWED = pytest.mark.xfail(reason="the default follows a sensor that is stuck until the end", strict=False)
+STUCK = [(AdaptiveKalman(), 200), (RLS(1.0), 200), (RLS(1.0), 400), pytest.param(AdaptiveKalman(), 400, marks=FOLLOWED)]
+
+
+@pytest.mark.parametrize(("tracker", "first"), STUCK)
 def test_a_stretch_of_a_stuck_sensor_is_no_drift(tracker, first):
     rng = np.random.default_rng(first)
     u, y, e = rng.normal(size=600), np.zeros(600), 0.1 * rng.normal(size=600)

@@ -63,7 +63,7 @@ def never(state: dict[str, Any], ladder: Array, out: Array) -> None:
     leads = np.append(out[1:] & (ladder[1:] == ladder[:-1]), False)
     start = np.where(out, NEXT_TO_NEVER, state["mu"])
     state["up"] = np.where(leads | out, NEXT_TO_NEVER * (state["up"] > 0.0), state["up"])
-    state["arrive"], state["arrivals"], state["jumping"] = arrive, arrive.sum(), arrive[jump].sum()
+    state["arrive"] = arrive
     state["mu"] = state["prior"] = start / start.sum()
 
 

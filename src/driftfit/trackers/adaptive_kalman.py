@@ -5,13 +5,13 @@
 
 | ladder | Q, in units of noise variance over input power | rho |
 |---|---|---|
-| common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-5 .. .01, .04, .2, 1, J |
+| common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-4 .. .01, .04, .2, 1, J |
 | trend | as common; theta moves on along its slope | .001, .01, .1 |
 | learned | the drift covariance found by a backward pass of scores over the last 100 samples | .001, .01, .1, 1 |
 | single i | 1 / c_i for parameter i alone (two to eight parameters) | .003, .05, J |
 | group g | 1 / c_i for the parameters of a group, instead of single | .001, .01, .1, 1, J |
 
-J, the largest jump, is the variance of the output or the square of an outlier before, in units of r, and at least 30.
+J, the largest jump, is 30. Where e^2 > 30 s it is e^2 / r, but no more than the variance of y or the last outlier.
 Every mode is a Kalman filter. They are merged after every sample (`driftfit.trackers.mixture.filters`).
 Noise is quiet, restless, or an outlier of any size, and coarse readings that repeat share their rounding
 (`driftfit.trackers.mixture.states`). Scales, means, colour of the noise and covariance of the drift are learned
@@ -30,7 +30,7 @@ Use it if nothing is known; if q and r are known, `Kalman` is as good and far ch
 in a few hundred samples; ``groups`` specifies it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the modes and what is learned are ours. Cost per
-sample: O(K n^2) for K modes; without groups K = 16 + 3 n for two to eight parameters, and 16 for more.
+sample: O(K n^2) for K modes; without groups K = 15 + 3 n for two to eight parameters, and 15 for more.
 """
 
 from __future__ import annotations

@@ -35,6 +35,7 @@ from driftfit.trackers.mixture.states import (
     FIRST_ALONE,
     FIRST_LEARNED,
     FLOOR,
+    JUMP,
     STATES,
     sum_of_row,
     variance_in,
@@ -363,7 +364,9 @@ def find_shares(s: State, l: int) -> None:
     """Prior probabilities of the next sample, and of what comes before it: the mode, all modes, and in ``curve`` and
     ``step`` those below and above."""
     K, kappa = s.modes[l], s.kappa[l]
-    leave = kappa * s.arrivals[l]
+    for k in range(K):
+        s.row[k, l] = s.arrive[k, l]
+    leave = kappa * sum_of_row(s, l)
     for k in range(K):
         s.share[0, k, l] = s.mu[k, l] * (1.0 - leave - kappa * s.up[k, l] - s.down[k, l] - s.foot[k, l])
         s.share[1, k, l] = kappa * s.arrive[k, l]
@@ -397,7 +400,7 @@ def learn_rate(s: State, l: int) -> None:
         s.row[k, l] = s.mu[k, l] * (s.down[k, l] + s.foot[k, l]) if s.ratio[k, l] >= 1.0 else 0.0
     fade = 1.0 - 1.0 / SPAN
     s.left_behind[l] = fade * s.left_behind[l] + sum_of_row(s, l)
-    s.jumps_expected[l] = fade * s.jumps_expected[l] + s.jumping[l]
+    s.jumps_expected[l] = fade * s.jumps_expected[l] + JUMP
     s.kappa[l] = min(OFTENEST, max(RAREST, (EVENTS + s.left_behind[l]) / (EVENTS + s.jumps_expected[l])))
 
 

@@ -91,7 +91,7 @@ def nothing_learned(n: int) -> dict[str, Any]:
     """Fields before the first sample."""
     return {
         "mean": np.zeros(n), "variance": np.zeros(n), "moved": np.zeros(n),
-        "middle": 0.0, "spread": 0.0, "readings": 0.0, "constant": -1, "drift_unit": np.zeros(n), "offset": np.zeros(n),
+        "middle": 0.0, "spread": 0.0, "constant": -1, "drift_unit": np.zeros(n), "offset": np.zeros(n),
         "samples": np.zeros((WINDOW, PHI + n)), "gains": np.zeros((WINDOW, n)), "remembered": 0, "assumed": np.zeros(n),
         "sums": np.zeros((A + 6 * n, n)), "weight": np.ones(n), "direction": np.zeros(n),
         "white": np.zeros(n), "past": np.zeros(n), "past_y": 0.0, "explained": 0.0, "colour": 0.0, "psi": 0.0,
@@ -102,8 +102,7 @@ def nothing_learned(n: int) -> dict[str, Any]:
 @kernel
 def learn_means(s: State, l: int) -> None:
     """Means and variances of the regressors, and the drift of each: 1 / v_i and m_i / m_k, or 1 / c_i and 0."""
-    s.readings[l] += s.ok[l]
-    share = s.ok[l] / min(max(s.readings[l], 1.0), LONG)
+    share = s.ok[l] / min(max(s.power_samples[l], 1.0), LONG)
     away = s.y[l] - s.middle[l]
     s.middle[l] += share * away
     s.spread[l] += share * ((1.0 - share) * away * away / s.noise[l] - s.spread[l])

@@ -115,8 +115,6 @@ def bank(n: int, groups: Any) -> dict[str, Any]:
         "arrive": modes["arrive"],
         "alone": modes["first"],
         "rungs": len(ALONE if groups is None else GROUP),
-        "arrivals": modes["arrive"].sum(),
-        "jumping": modes["arrive"][modes["ratio"] >= 1.0].sum(),
         "left_behind": 0.0,
         "jumps_expected": 0.0,
         "kappa": 1.0,
