@@ -192,7 +192,8 @@ def test_states_travel_both_ways(tmp_path, p0):
     live, ours = agree(tmp_path, ARX(2, 2), tracker, 500)
     there = Live.from_bytes(from_struct(ARX(2, 2), tracker, ours.state).to_bytes())
     assert bits(there.theta) == bits(live.theta)
-    assert same_numbers(to_struct(there), to_struct(live))
+    held = [name for name in live.lane() if name not in tracker.scratch]  # never saved
+    assert all(np.array_equal(there.lane()[name], live.lane()[name], equal_nan=True) for name in held)
     assert bits(ours.predict([0.3])[::2]) == bits(live.predict(0.3))
     assert same_numbers(ours.state, to_struct(live))  # a prediction changes nothing
     assert bits(there.update(0.1, 0.2)) == bits(live.update(0.1, 0.2)) == bits(ours.update(0.1, [0.2]))
@@ -272,7 +273,7 @@ def selftest(folder, name, compiler, run):
 def test_a_wrong_bit_fails_the_self_test(tmp_path):
     export_c(ARX(2, 2), AdaptiveKalman(), tmp_path)
     source = tmp_path / "tracker.c"
-    source.write_text(source.read_text().replace("R(0.99)", "R(0.99000000000001)"))
+    source.write_text(source.read_text().replace("R(0.97)", "R(0.97000000000001)"))
     command = ["gcc", *STRICT, "-o", str(tmp_path / "st"), str(source), str(tmp_path / "selftest.c"), "-lm"]
     subprocess.run(command, check=True)
     assert subprocess.run([str(tmp_path / "st")], capture_output=True, check=False).returncode == 1
