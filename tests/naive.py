@@ -61,8 +61,8 @@ def after_jump(lane, phi, y):
     """The same as `before`, with jumps as large as an unusual innovation."""
     mean, variance = expected(lane, phi)
     square, most = (y - mean) ** 2, max(lane["spread"], lane["astray"])
-    leaps = square > COMMON[-1] * variance
-    return before(lane, phi, max(COMMON[-1], min(most, square / lane["noise"]) / lane["r"] if leaps else 0.0))
+    jump = min(most, square / lane["noise"]) / lane["r"] if square > COMMON[-1] * variance else 0.0
+    return before(lane, phi, max(COMMON[-1], jump))
 
 
 def states(lane):

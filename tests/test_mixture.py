@@ -35,8 +35,7 @@ def lanes(y, u, model, tracker, at):
 
 @pytest.mark.parametrize("groups", [None, [[0, 2], [1]]])
 def test_a_sample_and_the_interaction_against_matrices(groups):
-    y, u = record()
-    model, leaps = Regression(3, intercept=True), []
+    (y, u), model, leaps = record(), Regression(3, intercept=True), []
     for t, (one, two) in lanes(y, u, model, AdaptiveKalman(groups=groups), (40, 133, 134, 201, 399)).items():
         phi, left = two["white"], y[t] - float(two["explained"])  # without the part of the noise that is known
         mu, m, C, joint = naive.sample(one, phi, left)
