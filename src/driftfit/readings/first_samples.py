@@ -66,28 +66,30 @@ def reading_now(s: State, l: int) -> float:
     return s.raw_y[l] if s.observed[l] > 0.0 else np.nan
 
 
+@kernel
+def entry(s: State, k: int, column: int, center: float, apart: bool, l: int) -> float:
+    """The entry of sample k in a column; with ``apart`` its distance from center, NaN if that is 0."""
+    x = s.gate_first[k, column, l]
+    away = abs(x - center)
+    return (away if away > 0.0 else np.nan) if apart else x  # type: ignore[no-any-return]
+
+
 @partial(kernel, short=True)
 def usual_value(s: State, column: int, center: float, apart: bool, l: int) -> float:
-    """The lower median of a column; with ``apart``, of the distances from center that are not 0, or 0 if there are
-    fewer than `FEW`."""
-    N = s.gate_first.shape[0]
-    count = 0
+    """The lower median of the entries of a column; of fewer than `FEW` distances 0."""
+    N, count = s.gate_first.shape[0], 0
     for k in range(N):
-        x = abs(s.gate_first[k, column, l] - center) if apart else s.gate_first[k, column, l]
-        count += 1 if (x == x) & ((not apart) | (x > 0.0)) else 0
-    if apart & (count < FEW):
-        return 0.0
-    for k in range(N):
-        value = abs(s.gate_first[k, column, l] - center) if apart else s.gate_first[k, column, l]
-        less, same = 0, 0
+        x = entry(s, k, column, center, apart, l)
+        count += 1 if x == x else 0
+    for k in range(0 if apart & (count < FEW) else N):
+        value, less, same = entry(s, k, column, center, apart, l), 0, 0
         for other in range(N):
-            x = abs(s.gate_first[other, column, l] - center) if apart else s.gate_first[other, column, l]
-            if (x == x) & ((not apart) | (x > 0.0)):
-                less += 1 if x < value else 0
-                same += 1 if x == value else 0
+            x = entry(s, other, column, center, apart, l)
+            less += 1 if x < value else 0
+            same += 1 if x == value else 0
         if (less <= (count - 1) // 2) & ((count - 1) // 2 < less + same):
             return value  # type: ignore[no-any-return]
-    return np.nan
+    return 0.0 if apart else np.nan
 
 
 @kernel

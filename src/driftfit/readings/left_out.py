@@ -22,9 +22,7 @@ SAID: Mapping[int, tuple[str, str]] = {
 NAMED = 3
 """Values that a warning names at most."""
 KEPT = 16
-"""Decisions of which a stream keeps everything."""
-SHOWN = 20
-"""Rows of a printed table at most."""
+"""Decisions that a stream keeps, and rows of a printed table at most."""
 
 
 def counts(reason: Array) -> dict[int, int]:
@@ -114,10 +112,10 @@ class LeftOut:
 
 
 def table(decisions: Any, count: int) -> str:
-    """Decisions as text, at most `SHOWN` of them."""
+    """Decisions as text, at most `KEPT` of them."""
     if count == 0:
         return "nothing left out"
-    rows = [Decision(*row) for row, _ in zip(decisions, range(SHOWN), strict=False)]
+    rows = [Decision(*row) for row, _ in zip(decisions, range(KEPT), strict=False)]
     wide = max(6, *(len(str(row.sample)) for row in rows))
     lines = [f"{'sample':>{wide}}  signal    reading of y  reason"]
     lines += [f"{row.sample!s:>{wide}}  {row.signal:<6}  {row.value:>14.6g}  {row.reason}" for row in rows]
