@@ -71,7 +71,7 @@ def entry(s: State, k: int, column: int, center: float, apart: bool, l: int) -> 
     """The entry of sample k in a column; with ``apart`` its distance from center, NaN if that is 0."""
     x = s.gate_first[k, column, l]
     away = abs(x - center)
-    return (away if away > 0.0 else np.nan) if apart else x  # type: ignore[no-any-return]
+    return (away if away > 0.0 else np.nan) if apart else x
 
 
 @partial(kernel, short=True)
