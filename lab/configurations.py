@@ -89,7 +89,7 @@ EVERY_PART: dict[str, Any] = {
     "forgetting": Bank(FORGETTING, [Sensor.nominal(r=0.01)], reduce=Beam(7), p0=2.0),
     "forgetting, IMM": Bank(FORGETTING, [Sensor.nominal(r=0.01)], reduce=IMM(), p0=2.0),
     "unknown noise, GPB(2)": Bank(CHANGES, [Sensor.nominal(guess=0.1)], reduce=GPB(2), p0=2.0),
-    "unknown noise, limits": Bank(CHANGES, [Sensor.nominal(limit=4.0)], reduce=Beam(80)),
+    "unknown noise, many leaves": Bank(CHANGES, [Sensor.nominal()], reduce=Beam(80)),
     "waiting": Bank(CHANGES, SENSORS, reduce=WAITING, p0=2.0),
     "waiting, unknown noise": Bank(CHANGES, [Sensor.nominal()], reduce=WAITING),
     "FirstFloor, prior": Bank(CHANGES, [Sensor.nominal(r=0.01)], reduce=FirstFloor(3, "prior"), p0=2.0),

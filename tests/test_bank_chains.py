@@ -115,12 +115,12 @@ def test_a_stream_with_gaps_says_what_the_record_says(reduce):
     rng = np.random.default_rng(4)
     y, z = rng.standard_normal(80), rng.standard_normal((80, N))
     y[rng.random(80) < 0.4] = np.nan
-    y[40] = 500.0  # refused, in an interval of its own
+    y[40] = 500.0  # refused by the gate, in an interval of its own
     time = np.cumsum(rng.choice([1.0, 2.0, 7.0, 0.5], 80))
     P, q = CHAINS["both"]
     bank = Bank([Change(each, prob=None if i == 0 else 0.01) for i, each in enumerate(q)],
-                [Sensor.nominal(R, limit=20.0), Sensor.outlier(prob=0.05)], (P, None), reduce, p0=0.1)  # fmt: skip
-    run, live = track(Regression(N), bank, y, z, time=time), Live(Regression(N), bank)
+                [Sensor.nominal(R), Sensor.outlier(prob=0.05)], (P, None), reduce, p0=0.1)  # fmt: skip
+    run, live = track(Regression(N), bank, y, z, time=time, gate=True), Live(Regression(N), bank, gate=True)
     assert not run.ok[40]
     assert np.isfinite(run.theta).all()
     np.testing.assert_allclose(reported(run, "lag_prob")[:, 0].sum(axis=1), 1.0, atol=1e-9)

@@ -116,8 +116,8 @@ def bank_of(rng: np.random.Generator, n: int, form: str) -> Any:
                 Change(forget=0.8, prob=p), Change(forget=0.9, kind="directional", prob=p),
                 Change(2.0, prob=p, reset=True),
             ][kind])  # fmt: skip
-        nominal = [Sensor.nominal(0.1), Sensor.nominal(), Sensor.nominal(guess=0.1), Sensor.nominal(limit=30.0)]
-        sensors = [nominal[int(rng.integers(4))]]
+        nominal = [Sensor.nominal(0.1), Sensor.nominal(), Sensor.nominal(guess=0.1)]
+        sensors = [nominal[int(rng.integers(3))]]
         others = [Sensor.outlier(prob=0.05), Sensor.outlier(kind="additive", prob=0.05), Sensor.offset(value=2.0)]
         others += [Sensor.frozen(0.01), Sensor.own(heavy, prob=0.05, cleans=True)]
         sensors += [others[k] for k in rng.permutation(5)[: int(rng.integers(0, 3))]]

@@ -48,12 +48,8 @@ from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.layout import (
     COUNT,
     FADE,
-    FAULTS,
     HEAD,
-    HIGHEST,
     LEAVES,
-    LIMIT,
-    LOWEST,
     MOST_REPORTED,
     READING,
     ROW,
@@ -70,7 +66,6 @@ from driftfit.trackers.bank.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.prior import chains, events, per_sample
 from driftfit.trackers.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.trackers.bank.sensor import Sensor
-from driftfit.trackers.bank.spikes import LARGE, evident
 from driftfit.trackers.bank.variants import steps_of
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.coarse.resolution import resolution, unresolved
@@ -290,8 +285,7 @@ class Bank(Tracker):
         P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
         theta0 = vector("Bank", "theta0", self.theta0, n)
         sample, counters = np.zeros(SIZE), np.zeros(COUNT, int)
-        sample[READING], sample[R], sample[LIMIT] = np.nan, 1.0, nominal.limit or np.inf
-        sample[LOWEST], sample[HIGHEST] = np.inf, -np.inf
+        sample[READING], sample[R] = np.nan, 1.0
         sample[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
         count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
         squares *= nominal.guess or 0.0
@@ -416,11 +410,6 @@ class Bank(Tracker):
         if len(self.all_sensors) > 1:
             text += f", {wrong} fault{'' if wrong == 1 else 's'} of the sensor"
         facts = [("Events", f"{text}; see run.hypotheses.events()")]
-        if doubt := self.doubts(run):
-            facts.append(("Spikes", doubt))
-        faults = int(run.state["counters"][FAULTS])
-        if faults:
-            facts.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
         if hypotheses.impossible:
             facts.append(
                 ("Impossible", f"{hypotheses.impossible} samples that every hypothesis ruled out, left unused")
@@ -429,16 +418,6 @@ class Bank(Tracker):
         if (never := np.isinf(lane["var"])).any():
             facts.append(not_learned(run, np.array(run.names)[never]))
         return (*facts, *(resolution(lane) if self.all_sensors[0].r is None else ()))
-
-    def doubts(self, run: Any) -> str:
-        count = evident(run) if self.changes is None and self.sensors is None else 0
-        if not count:
-            return ""
-        return (
-            f"after {count} innovations of more than {LARGE:g} standard deviations the parameters returned to where "
-            "they were, so these look like spikes rather than jumps; give "
-            "Bank(sensors=[Sensor.nominal(), Sensor.outlier()])"
-        )
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
         """Which entries of theta the regressors have distinguished so far, (n,) bool."""

@@ -47,28 +47,26 @@ from driftfit.trackers.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
 
 (
     LEAVES, PARENTS, GROUPS, TREE_LEVELS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED,
-    OPEN, REFUSED, FAULTS, AGAIN, TAKEN, CHAINED, ALIKE, WIDE, PARTED, PHASE, LOOKED, COUNT,
-) = range(24)  # fmt: skip
+    OPEN, TAKEN, CHAINED, ALIKE, WIDE, PARTED, PHASE, LOOKED, COUNT,
+) = range(21)  # fmt: skip
 """Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY if
 it begins with the next sample. OPEN levels have passed since the last used sample
-(`driftfit.trackers.bank.machine.gaps`); REFUSED samples in a row were too far from what was expected, FAULTS in all;
-AGAIN is 1 if the present one was just refused; TAKEN steps of its interval are already in the table of a gap. Four
-counters are flags of the present sample: CHAINED if the user gave a chain of changes, ALIKE if all leaves have the same
-prior, WIDE if its level is not that of one nominal interval, PARTED if leaves are continued as two
+(`driftfit.trackers.bank.machine.gaps`); TAKEN steps of its interval are already in the table of a gap. Four counters
+are flags of the present sample: CHAINED if the user gave a chain of changes, ALIKE if all leaves have the same prior,
+WIDE if its level is not that of one nominal interval, PARTED if leaves are continued as two
 (`machine.gaps.chain_gap`). PHASE says what the routine is called for, LOOKED for which kind of sample its forecast was.
 """
 WAITING, READY = 0, -1
 LEARN, FORECAST = 0, 1
 (
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_OBSERVED, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
-    SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SHIFT, READING, LOWEST, HIGHEST, DOUBTS, ENTERS, SIZE,
-) = range(28)  # fmt: skip
+    SQUARES, TIMES, ELAPSED, MOST, FREEDOM, SHIFT, READING, ENTERS, SIZE,
+) = range(24)  # fmt: skip
 """Numbers of the present sample: inputs and results. MOST is the largest mean square that a leaf's own prediction may
 have in its output lags (`driftfit.trackers.bank.leaves.lags`). FREEDOM is the degrees of freedom of an estimated noise
 variance before the tree grows, the number of residuals until then; inf for a variance that is given. The reading is y +
 SHIFT (`driftfit.trackers.parts.coarse.resolution`). READING is the last accepted reading, LAST the same minus the
-present shift; LOWEST and HIGHEST are the limits of all accepted readings. DOUBTS is the recent number of refused
-samples within them. ENTERS is the length of the regressor along a direction in which it is the first
+present shift. ENTERS is the length of the regressor along a direction in which it is the first
 (`machine.late_direction`), else 0.
 """
 NEVER = 1e9

@@ -254,8 +254,6 @@ def learn(s: State, l: int) -> None:
     """The tree takes the sample, unless a gate refused it."""
     s.sample[IN_OK, l], s.sample[IN_OBSERVED, l] = s.ok[l], s.observed[l]
     run(s, l)
-    # a sample beyond the limit of its sensor counts as missing, in lags too
-    s.ok[l], s.observed[l] = s.sample[IN_OK, l], s.sample[IN_OBSERVED, l]
 
 
 @kernel
