@@ -56,8 +56,6 @@ class Settings(Protocol):
     def chained(self) -> bool: ...
     @property
     def lag_variance(self) -> bool: ...
-    @property
-    def form(self) -> str: ...
 
 
 def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
@@ -69,11 +67,10 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
     tri, K, W = n * (n + 1) // 2, shape.children * twice, shape.levels
     rows = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0)
     forgets = any(one.forgets for one in bank.all_changes)
-    more = na + (tri + 2 * n if forgets else 0)
+    more = 2 * na + (tri + 2 * n if forgets else 0)
+    square = n * n if any(one.resets_some for one in bank.all_changes) else 0
     parents, children = _room(max(shape.parents * twice, K // H), Hd, Hm)
     more += ANSWERS if any(sensor.kind == "own" for sensor in bank.all_sensors) else 0
-    if bank.form == "sqrt":
-        parents, more = parents + WIDTH, more + n + -(-(2 * tri + 4 * n) * WIDTH // children)
     remembered, links = _whole_vectors(W * (H + 1)), _whole_vectors(K + 1)
     refilters, waits = shape.knobs[selection.KIND] == selection.REFILTER, shape.knobs[selection.WAIT] > 0.0
     return _of_changes(bank, n, unit, theta0) | {
@@ -88,6 +85,7 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
         "components": np.zeros((4 + NODES, K * H if waits else 1)), "root": np.zeros((rows, WIDTH)),
         "samples": np.zeros((int(shape.knobs[selection.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
         "path": path_of(H, Hd, _whole_vectors(tri) if bank.chained else 0),
+        "spare_square": np.zeros((square, children)), "lag_rows": np.zeros((na, n + 1)),
         "ring": np.zeros((RING, SAMPLE_HEAD + H)), "new_events": news_of(H, Hm, remembered),
         "lag_prob": np.zeros((W, H)), "newest": np.zeros((min(W, MOST_REPORTED), H)),
         "decided": np.full((shape.held, 3), -1.0),
@@ -109,9 +107,9 @@ def _of_changes(bank: Settings, n: int, unit: float, theta0: Array) -> dict[str,
     return {
         "walks": walks, "fixed_walks": walks,
         "relative_walks": np.array([sizes if scaled else sizes[:0] for _, sizes in steps]), "drift": np.ones(Hd),
-        "Q": np.zeros((Hd + 1, wide)), "maps": maps, "maps_nominal": maps, "places": places, "transition": transition,
-        "chain": transition.copy(),
-        "initial": initial, "given_chain": np.full(Hd * Hd, np.nan), "gap": _closed(Hd, wide),
+        "Q": np.zeros((Hd + 1, wide)), "maps": maps, "maps_nominal": maps, "places": places, "fixed_places": places,
+        "transition": transition, "chain": transition.copy(), "initial": initial,
+        "given_chain": np.full(Hd * Hd, np.nan), "gap": _closed(Hd, wide),
     }  # fmt: skip
 
 
@@ -125,9 +123,10 @@ def windows(n: int, na: int, rows: int) -> dict[str, tuple[int, int]]:
     tri = n * (n + 1) // 2
     g, scores = tri + 2 * n, _named_rows(n)
     return {
-        "C": (0, tri), "m": (tri, n), "z": (tri + n, n), "g": (g, n), "from_g": (g, rows - g), "expected": (g + n, 2),
-        "scores": (scores, 3), "spare": (scores + 1, rows - scores - 1), "spare_lags": (rows - na, na),
-        "narrow": (scores + 3, rows - scores - 3), "answers": (rows - na - ANSWERS, ANSWERS),
+        "z": (0, n), "from_C": (n, rows - n), "C": (n, tri), "m": (tri + n, n), "g": (g, n), "from_g": (g, rows - g),
+        "expected": (g + n, 2), "scores": (scores, 3), "spare": (scores + 1, rows - scores - 1),
+        "spare_lags": (rows - na, na), "lag_coefficients": (rows - 2 * na, na),
+        "answers": (rows - 2 * na - ANSWERS, ANSWERS),
     }  # fmt: skip
 
 
@@ -147,8 +146,6 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
     start, rows, columns = table[ROW["scratch"]]
     for name, (first, count) in windows(n, na, rows).items():
         table[ROW[name]] = start + 8 * first * columns, count, columns
-    first, count = windows(n, na, rows)["narrow"]
-    table[ROW["narrow"], 1:] = count * columns // WIDTH, WIDTH
     for name in ("phi", "powers", "theta"):
         table[ROW[name]] = 0, 1, n
     table[ROW["report"]], table[ROW["cov"]] = (0, 1, HEAD), (0, n, n)

@@ -27,10 +27,11 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, floats, kernel, machine, shared
 from driftfit.engine.simd import WIDTH
-from driftfit.trackers.bank.layout import READING, SHIFT
+from driftfit.trackers.bank.layout import READING, ROW, SHIFT
 from driftfit.trackers.bank.leaves.callback import address_of, call
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
 
+OWN_AT = ROW["own_likelihoods"]
 LARGEST, LEAST = 1e12, 1e-12
 """Limits of noise variances: at most this multiple of the forecast's variance, which has no effect, and at least this
 share of the nominal one.
@@ -93,14 +94,14 @@ def clean_all(t: Any, at: int, columns: int) -> None:
 
 
 @kernel
-def own_address(s: State) -> int:
-    """The address of the functions of a bank; most banks have none."""
-    return 0
+def no_own_sensor(s: State, l: int) -> None:
+    """Most banks have no functions of the user's."""
+    s.table[OWN_AT, 0, l] = 0
 
 
 @cache
 def entry_of(functions: tuple[Callable[..., Any], ...]) -> tuple[Any, Any]:
-    """The functions, numbered from 1, as a compiled routine; and the kernel that replaces `own_address`."""
+    """The functions, numbered from 1, as a compiled routine; and the step that writes their address."""
     chosen = _chosen(functions)
 
     def likelihoods(which: float, y: float, y_hat: float, h: float, r: float, last: float, out: int) -> None:
@@ -111,10 +112,10 @@ def entry_of(functions: tuple[Callable[..., Any], ...]) -> tuple[Any, Any]:
     entry = machine(likelihoods)
 
     @kernel
-    def address(s: State) -> int:
-        return address_of(entry)  # type: ignore[no-any-return]
+    def point_out(s: State, l: int) -> None:
+        s.table[OWN_AT, 0, l] = address_of(entry)
 
-    return entry, address
+    return entry, point_out
 
 
 def _chosen(functions: Sequence[Callable[..., Any]]) -> Any:

@@ -17,7 +17,6 @@ from driftfit.trackers.bank.layout import (
     CHAINED,
     CLOCK,
     ELAPSED,
-    ENTERS,
     EVIDENCE,
     EXPANDED,
     FLIPPED,
@@ -49,6 +48,7 @@ from driftfit.trackers.bank.layout import (
     STORED,
     TAKEN,
     TREE_LEVELS,
+    UNIT,
     WIDE,
     WINDOW,
     Y_HAT,
@@ -65,7 +65,6 @@ from driftfit.trackers.bank.leaves.leaf_matrix import (
     mixture,
     normalise,
     priors,
-    ready,
     regressors,
     standstill,
     variance_factor,
@@ -74,7 +73,6 @@ from driftfit.trackers.bank.machine.ancestry import chained, marginals, pick, sh
 from driftfit.trackers.bank.machine.gaps.chain_gap import add_covariance, add_variance, further, go_on, origins, split
 from driftfit.trackers.bank.machine.gaps.gap import chances, close, covariances, extend, odds, take_back, widen
 from driftfit.trackers.bank.machine.grow import grow
-from driftfit.trackers.bank.machine.late_direction import determine
 from driftfit.trackers.bank.machine.start import limit_forgetting, wait
 from driftfit.trackers.bank.reducing.merge import combine, mix, sort, take
 from driftfit.trackers.bank.reducing.refilter import NOISE, TIME, Y, histories, refilter
@@ -136,7 +134,6 @@ def prepare(t: Any) -> None:
     if wide:
         odds(t.gap, t.row, Hm, dt, given)
         covariances(t.gap, dt, used, t.Q)
-    ready(t)
     if t.walks_only == 0:
         for_interval(t.maps_nominal, dt, t.maps)
 
@@ -287,7 +284,6 @@ def take_in(t: Any) -> None:
     K = reduce(t)
     if again:
         increments_now(t)
-        ready(t)
     if again or waits:
         keep_sample(t)
     counters[EXPANDED] = 0
@@ -319,7 +315,6 @@ def take_in(t: Any) -> None:
     counters[TREE_LEVELS] += 1
     if counters[WIDE] > 0 and waits:  # the next interval is nominal
         increments(t, 1.0, 1.0)
-        ready(t)
     choose(t, counters[LEAVES])
 
 
@@ -383,16 +378,14 @@ def advance(t: Any) -> None:
         take_in(t)
     else:
         let_pass(t, counters[LEAVES])
-        if sample[ENTERS] != 0.0:
-            determine(t, counters[LEAVES])
     counters[CLOCK] += 1
     L = counters[LEAVES]
     mixture(t.n, t, L)
+    sample[UNIT] = weighted(t.leaves, L, t.from_C, t.n) if t.unknown > 0 else 1.0
     if counters[OPEN] > 0 and counters[PARTED] > 0:
         add_covariance(t, L)
     elif counters[OPEN] > 0:
-        variance_factor(t, t.scratch, 0, L)
-        widen(t.gap, weighted(t.leaves, L, t.scratch, 0), t.cov)
+        widen(t.gap, sample[UNIT], t.cov)
     sample[WINDOW] = marginals(t, L)
 
 

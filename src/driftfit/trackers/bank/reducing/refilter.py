@@ -13,7 +13,7 @@ from typing import Any
 
 from driftfit.engine.kernel import Array, shared
 from driftfit.trackers.bank.layout import FLIPPED
-from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, LOG, WEIGHT, increments, normalise, ready
+from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, LOG, WEIGHT, increments, normalise
 from driftfit.trackers.bank.machine.grow import grow
 from driftfit.trackers.bank.reducing.selection import DEPTH, PRIOR
 
@@ -50,7 +50,6 @@ def refilter(t: Any, L: int) -> int:
         for l in range(L):
             weight[int(B[CODE, l] // top)] += B[WEIGHT, l]
     increments(t, samples[0, TIME], samples[0, TIME])
-    ready(t)
     widen(t, weight, t.scratch[1:])
     for e in range(H):  # the change is in the root: the oldest sample is one of no change and no increment
         prior[e, 0] = 0.0
@@ -70,7 +69,6 @@ def refilter(t: Any, L: int) -> int:
             for l in range(L):
                 prior[e, l] = row[e]
         increments(t, samples[at, TIME], samples[at, TIME])
-        ready(t)
         L = grow_level(t, L, samples[at])
         normalise(B, L)
         for k in range(len(root)):

@@ -124,7 +124,7 @@ def add_variance(t: Any, L: int) -> None:
 @shared
 def add_covariance(t: Any, L: int) -> None:
     """Add to the covariance of the mixture what the gap adds on average."""
-    P, B, X, path, H, Hd = t.cov, t.leaves, t.scratch, t.path, len(t.row), len(t.walks)
+    P, B, X, path, H, Hd = t.cov, t.leaves, t.from_C, t.path, len(t.row), len(t.walks)
     variance_factor(t, X, 0, L)
     for s in range(H):
         weight, at = 0.0, 0
