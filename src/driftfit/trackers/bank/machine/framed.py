@@ -181,7 +181,8 @@ def machine_changes(fields: int, unit: float, size: int, n: int, L: int, l: int)
         of = t[3 * RELATIVE] // 8 + i * sizes if sizes > 0 else -1
         places = t[3 * WALKS] // 8 + i * wide, t[3 * FIXED] // 8 + i * wide, of
         walk(m, places, M, c, unit, W)
-    seen_inverse(M, R, H, W)
+    if t[3 * OUTPUT_LAGS] > 0 or t[3 * PLACES + 1] > ANCHORS:
+        seen_inverse(M, R, H, W)
     pulled(m, t, M, W)
     for k in range(t[3 * OUTPUT_LAGS]):
         row = t[3 * LAG_ROWS] // 8 + k * (n + 1)
