@@ -29,7 +29,7 @@ With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m s
     root, samples           the start and the samples from which the tree is grown again (`reducing.refilter`)
     ring                    recent samples, for the events of a stream
     new_events              the entries that an event adds to a history
-    gap, path               changes that may have happened since the last used sample (`machine.gaps`)
+    gap, path               changes that may have happened since the last used sample (`machine.gap`)
     lag_prob, newest        marginals of the events of all levels; of the levels that are reported
     C, m, z, g              for the columns that a sample updates: covariance, mean, regressor, C z
     expected                z'C z and z'm of these columns
@@ -55,10 +55,10 @@ from driftfit.trackers.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
 ) = range(21)  # fmt: skip
 """Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY if
 it begins with the next sample. OPEN levels have passed since the last used sample
-(`driftfit.trackers.bank.machine.gaps`); TAKEN steps of its interval are already in the table of a gap. Four counters
+(`driftfit.trackers.bank.machine.gap`); TAKEN steps of its interval are already in the table of a gap. Four counters
 are flags of the present sample: CHAINED if the user gave a chain of changes, ALIKE if all leaves have the same prior,
 WIDE if its level is not that of one nominal interval, PARTED if leaves are continued as two
-(`machine.gaps.chain_gap`). PHASE says what the routine is called for, LOOKED for which kind of sample its forecast was.
+(`machine.markov_gap`). PHASE says what the routine is called for, LOOKED for which kind of sample its forecast was.
 """
 WAITING, READY = 0, -1
 LEARN, FORECAST = 0, 1

@@ -27,7 +27,7 @@ from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 from driftfit.trackers.bank.machine.ancestry import news_of
-from driftfit.trackers.bank.machine.gaps.gap import SINCE
+from driftfit.trackers.bank.machine.gap import SINCE
 from driftfit.trackers.bank.reducing import selection
 from driftfit.trackers.bank.reducing.lookahead import NODES
 from driftfit.trackers.bank.reduction import Reduction
@@ -160,12 +160,12 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
 
 
 def path_of(H: int, Hd: int, wide: int) -> Array:
-    """The table of `driftfit.trackers.bank.machine.gaps.chain_gap`; empty if there is none."""
+    """The table of `driftfit.trackers.bank.machine.markov_gap`; empty if there is none."""
     return np.zeros((3 * H + Hd + 1 if wide else 0, max(H, wide) + 1))
 
 
 def _closed(Hd: int, wide: int) -> Array:
-    """The table of a gap (`driftfit.trackers.bank.machine.gaps.gap`) while there is no gap."""
+    """The table of a gap (`driftfit.trackers.bank.machine.gap`) while there is no gap."""
     table = np.zeros((Hd, wide + WIDTH))
     table[0, wide + SINCE] = 1.0
     return table

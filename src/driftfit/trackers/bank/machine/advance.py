@@ -2,7 +2,7 @@
 
 A sample that is not used only lets time pass: every leaf makes its time update under the nominal change, no weight
 changes, and no leaf is dropped. Other changes that may have happened, and the reduction that was planned, wait for the
-next sample that can be used (`driftfit.trackers.bank.machine.gaps.gap`).
+next sample that can be used (`driftfit.trackers.bank.machine.gap`).
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ from driftfit.trackers.bank.leaves.leaf_matrix import (
     variance_factor,
 )
 from driftfit.trackers.bank.machine.ancestry import chained, marginals, pick, shift, summary, write_out
-from driftfit.trackers.bank.machine.gaps.chain_gap import add_covariance, add_variance, further, go_on, origins, split
-from driftfit.trackers.bank.machine.gaps.gap import chances, close, covariances, extend, odds, take_back, widen
+from driftfit.trackers.bank.machine.gap import chances, close, covariances, extend, odds, take_back, widen
 from driftfit.trackers.bank.machine.grow import grow
+from driftfit.trackers.bank.machine.markov_gap import add_covariance, add_variance, further, go_on, origins, split
 from driftfit.trackers.bank.machine.start import limit_forgetting, wait
 from driftfit.trackers.bank.reducing.merge import combine, mix, sort, take
 from driftfit.trackers.bank.reducing.refilter import NOISE, TIME, Y, histories, refilter

@@ -11,7 +11,7 @@ from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.layout import HELD, LEAVES, NEVER, OPEN, SETTLED
 from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CODE, FIRST, NU, WEIGHT, S
 from driftfit.trackers.bank.machine.framed import in_theta
-from driftfit.trackers.bank.machine.gaps.gap import SINCE
+from driftfit.trackers.bank.machine.gap import SINCE
 
 if TYPE_CHECKING:
     from driftfit.trackers.bank.bank import Bank
