@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
-from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.layout import (
     COUNT,
     HEAD,
@@ -30,8 +29,7 @@ from driftfit.trackers.bank.machine.ancestry import news_of
 from driftfit.trackers.bank.machine.gap import SINCE
 from driftfit.trackers.bank.reducing import selection
 from driftfit.trackers.bank.reducing.lookahead import NODES
-from driftfit.trackers.bank.reduction import Reduction
-from driftfit.trackers.bank.sensor import Sensor, table_of
+from driftfit.trackers.bank.sensor import table_of
 
 SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
@@ -41,24 +39,7 @@ RING = 256
 """Samples of which a stream remembers probabilities, for events."""
 
 
-class Settings(Protocol):
-    """The settings of a `Bank`, as far as its memory depends on them."""
-
-    @property
-    def all_changes(self) -> tuple[Change, ...]: ...
-    @property
-    def all_sensors(self) -> tuple[Sensor, ...]: ...
-    @property
-    def reduction(self) -> Reduction: ...
-    @property
-    def event_probabilities(self) -> tuple[Array, Array]: ...
-    @property
-    def chained(self) -> bool: ...
-    @property
-    def lag_variance(self) -> bool: ...
-
-
-def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
+def arrays_of(bank: Any, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
     """The arrays of `driftfit.trackers.bank.layout` before the first sample, but for fields of the state and
     windows of the scratch; covariances are multiplied by ``unit``.
     """
@@ -92,7 +73,7 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
     }  # fmt: skip
 
 
-def _of_changes(bank: Settings, n: int, unit: float, theta0: Array) -> dict[str, Array]:
+def _of_changes(bank: Any, n: int, unit: float, theta0: Array) -> dict[str, Array]:
     """The arrays of the changes of theta."""
     changes, Hd, tri = bank.all_changes, len(bank.all_changes), n * (n + 1) // 2
     steps, lower, wide = [one.increments(n) for one in changes], np.tril_indices(n), _whole_vectors(tri)

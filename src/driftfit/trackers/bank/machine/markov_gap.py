@@ -139,7 +139,7 @@ def add_covariance(t: Any, L: int) -> None:
 
 @shared
 def widen_leaf(t: Any, k: int, q: Array) -> None:
-    """C + q of one parent; q is a lower triangle and may be overwritten."""
+    """C + q of one parent; q is a lower triangle."""
     for i in range(t.n * (t.n + 1) // 2):
         t.parents[FIRST + t.n + i, k] += q[i]
 

@@ -22,15 +22,6 @@ Y, NOISE, TIME = 0, 1, 2
 
 
 @shared
-def widen(t: Any, weight: Array, X: Array) -> None:
-    """C + sum w_i Q_i of the root; X is spare."""
-    root, n, Q = t.root, t.n, t.Q
-    for k in range(n * (n + 1) // 2):
-        for e in range(len(t.walks)):
-            root[FIRST + n + k, 0] += weight[e] * Q[e, k]
-
-
-@shared
 def grow_level(t: Any, K: int, sample: Array) -> int:
     """One level of the new tree, with a stored sample."""
     return int(grow(t, K, False, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE]))
@@ -50,7 +41,9 @@ def refilter(t: Any, L: int) -> int:
         for l in range(L):
             weight[int(B[CODE, l] // top)] += B[WEIGHT, l]
     increments(t, samples[0, TIME], samples[0, TIME])
-    widen(t, weight, t.scratch[1:])
+    for k in range(t.n * (t.n + 1) // 2):
+        for e in range(H):
+            root[FIRST + t.n + k, 0] += weight[e] * Q[e, k]
     for e in range(H):  # the change is in the root: the oldest sample is one of no change and no increment
         prior[e, 0] = 0.0
         for k in range(Q.shape[1]):
