@@ -347,9 +347,9 @@ def take_known(s: State, known: Array, t: int, l: int) -> None:
 
 
 STEPS = TrackerSteps(
-    nothing, forecast, correct, read, nothing,
-    start=TrackerSteps(nothing, forecast_first, correct_first, read_first, nothing),
-    store=keep, read_extra=take_known, machines=(*FRAME, *FRAMED, bank), outlined=True, note=no_own_sensor,
+    no_own_sensor, forecast, correct, read, nothing,
+    start=TrackerSteps(no_own_sensor, forecast_first, correct_first, read_first, nothing),
+    store=keep, read_extra=take_known, machines=(*FRAME, *FRAMED, bank), outlined=True,
 )  # fmt: skip
 
 
@@ -359,4 +359,6 @@ def steps_of(own: tuple[Callable[..., Any], ...]) -> TrackerSteps:
     if not own:
         return STEPS
     entry, point_out = entry_of(own)
-    return STEPS._replace(note=point_out, machines=(*STEPS.machines, entry))
+    assert STEPS.start is not None
+    start = STEPS.start._replace(predict=point_out)
+    return STEPS._replace(predict=point_out, start=start, machines=(*STEPS.machines, entry))
