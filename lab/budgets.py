@@ -28,15 +28,15 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 69_152,
-    "statements": 44_587,
+    "lines of the library": 69_154,
+    "statements": 44_589,
     "modules": 377,
     "levels of folders": 3,
     "constants of modules with numbers": 663,
     "numbers in the source": 2_651,
     "private names of Numba and llvmlite": 45,
     "modules that the Kalman filter imports": 24,
-    "lines of them": 5_700,
+    "lines of them": 5_716,
     "modules that detection imports": 165,
     "modules that a second call of track passes": 9,
     "members of Tracker": 38,
