@@ -126,7 +126,7 @@ def test_jumps_in_an_outage_are_found():
 
 
 def test_small_jumps_are_found_and_dated_at_their_level():
-    """Two jumps of 1.6 standard deviations of the noise; `Bank()` finds some four fifths of them."""
+    """Two jumps of 1.6 standard deviations of the noise; `Bank()` finds some nine tenths of them."""
     held = found = 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -138,8 +138,8 @@ def test_small_jumps_are_found_and_dated_at_their_level():
             near = [e for e in events if abs(e.span.date - jump) <= 30]
             found += bool(near)
             held += any(e.span.first <= jump <= e.span.last for e in near)
-    assert found >= 60
-    assert held >= 0.93 * found
+    assert found >= 68
+    assert held >= 0.9 * found
 
 
 def test_the_log_likelihood_is_the_log_evidence():
