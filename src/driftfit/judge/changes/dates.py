@@ -1,0 +1,292 @@
+"""How many breaks there are, when, and the parameters between them.
+
+    log L(t) = -(N - q) / 2 log rss(t)        a break at t, the others where they are, q coefficients
+
+The number grows from none while one further break, or a pair, gains more than draws of constants do. Each date is the
+most likely one given its neighbours, among all rows between them, and its interval the shortest that holds 95 % of the
+likelihood. Parameters are weighted least squares of all rows of a segment, by the rows of `driftfit.judge.changes.scan`.
+Their covariance is White's, plus what they vary by while a date moves within its likelihood.
+
+Source: Bai and Perron (1998); Yao (1987) for the likelihood of a date; White (1980). Cost: O(N n^2 + N K^3 n^3).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.changes.fit import (
+    MOST,
+    estimated,
+    grid,
+    noise_of,
+    order_of,
+    partitions,
+    regressed,
+    shortest,
+    split,
+    white_rows,
+)
+from driftfit.judge.changes.null import Draws, Model, Tested, gains, price, problem_of, radius
+from driftfit.judge.changes.scan import SINGULAR, SMALL, Work, _increments
+
+LEVEL = 0.95
+"""Share of the likelihood in the interval of a date."""
+SHARE = 5.0
+"""A further break has the level of the test divided by this."""
+SWEEPS = 4
+DATES = 20_000
+"""Places, at most, at which the likelihood of a date is computed."""
+MOVED = 40
+"""Dates within an interval, at most, for which the parameters are computed again."""
+
+
+class Exact:
+    """Sums of squares with breaks at any of some places, for one autoregression."""
+
+    def __init__(self, model: Model, places: Array, ar: Array) -> None:
+        N, n = model.X.shape
+        self.model, self.places, self.ar = model, places, ar
+        problem = problem_of(model, np.zeros((0, n)))._replace(places=places)
+        self.work, rss = Work.of(N, n, problem), np.zeros(1)
+        _increments(model.X, model.y, problem, ar, self.work, rss)
+        self.rss, self.theta, n = float(rss[0]), self.work.theta.copy(), n
+        self.least = SINGULAR * float(np.abs(np.einsum("tj,tj->j", self.work.Z, self.work.Z)[:n]).max()) + SMALL
+
+    def _system(self, at: Array) -> tuple[Array, Array]:
+        """M (.., K n, K n) and s (.., K n) of breaks at places at (.., K)."""
+        work, n, K = self.work, self.model.X.shape[1], at.shape[-1]
+        M = np.zeros((*at.shape[:-1], K, n, K, n))
+        for k in range(K):
+            M[..., k, :, k, :] = work.Q[at[..., k]]
+            for m in range(k + 1, K):
+                b, c = at[..., k], at[..., m]
+                own = work.B[c] - np.swapaxes(work.B[b], -1, -2) @ work.U[c]
+                M[..., k, :, m, :], M[..., m, :, k, :] = own, np.swapaxes(own, -1, -2)
+        M = M.reshape(*at.shape[:-1], K * n, K * n)
+        return M + self.least * np.eye(K * n), work.s[at].reshape(*at.shape[:-1], K * n)
+
+    def of(self, at: Array) -> Array:
+        """Sums of squares (..) with breaks at places at (.., K)."""
+        M, s = self._system(at)
+        left = self.rss - np.sum(s * np.linalg.solve(M, s[..., None])[..., 0], axis=-1)
+        return np.asarray(np.maximum(left, self.model.floor))
+
+    def profile(self, at: Array, k: int, gap: int) -> tuple[int, Array]:
+        """The first place, and the sums of squares with break k there and at those after it, up to its neighbours."""
+        N, place, work, n = len(self.model.y), self.places, self.work, self.model.X.shape[1]
+        low = (place[at[k - 1]] if k else 0) + gap
+        high = (place[at[k + 1]] if k + 1 < len(at) else N) - gap
+        first, last = (int(one) for one in np.searchsorted(place, [low, high + 1]))
+        if last <= first:
+            first, last = int(at[k]), int(at[k]) + 1
+        own = slice(first, last)
+        M, s, taken = work.Q[own] + self.least * np.eye(n), work.s[own], 0.0
+        others = np.delete(at, k)
+        if len(others):
+            A, t = self._system(others)
+            ties = np.concatenate([
+                work.B[own] - work.U[b].T @ work.B[own] if j < k
+                else np.swapaxes(work.B[b] - np.swapaxes(work.B[own], 1, 2) @ work.U[b], 1, 2)
+                for j, b in enumerate(others)
+            ], axis=1)  # fmt: skip
+            solved = np.linalg.solve(A, ties)
+            M, s = M - np.swapaxes(ties, 1, 2) @ solved, s - np.swapaxes(solved, 1, 2) @ t
+            taken = float(t @ np.linalg.solve(A, t))
+        left = self.rss - taken - np.sum(s * np.linalg.solve(M, s[..., None])[..., 0], axis=-1)
+        return first, np.asarray(np.maximum(left, self.model.floor))
+
+    def settled(self, at: Array, gap: int) -> Array:
+        """Places, each the best given its neighbours."""
+        at = at.copy()
+        for _ in range(SWEEPS):
+            before = at.copy()
+            for k in range(len(at)):
+                first, rss = self.profile(at, k, gap)
+                at[k] = first + int(np.argmin(rss))
+            if (at == before).all():
+                break
+        return at
+
+    def thetas(self, at: Array) -> Array:
+        """Parameters of the segments (.., K + 1, n) in the basis."""
+        M, s = self._system(at)
+        K, n = at.shape[-1], self.model.X.shape[1]
+        delta = np.linalg.solve(M, s[..., None]).reshape(*at.shape[:-1], K, n)
+        start = self.theta - np.einsum("...kij,...kj->...i", self.work.U[at], delta)
+        return np.cumsum(np.concatenate([start[..., None, :], delta], axis=-2), axis=-2)
+
+
+class Dated(NamedTuple):
+    """Segments with constant parameters."""
+
+    breaks: Array
+    """(K,): rows that begin a segment."""
+    spans: Array
+    """(K, 2): first and last row of the interval of each."""
+    theta: Array
+    """(K + 1, n), in units of the model."""
+    std: Array
+    """(K + 1, n): standard errors; inf where the rows of a segment do not determine a parameter."""
+    changed: Array
+    """(K, n): standard errors of the changes."""
+    ar: Array
+    """(p,)"""
+    rss: float
+    prices: tuple[float, float]
+    """What a further break, and a pair, must gain."""
+
+
+def stepwise(gain: Array, prices: tuple[float, float]) -> int:
+    """The number of breaks, of gains (K + 1,) of 0 .. K breaks over none: one more, two or three while they pay."""
+    K, (one, two) = 0, prices
+    needed = (one, two, one + two)
+    while True:
+        for more, least in enumerate(needed, 1):
+            if K + more < len(gain) and gain[K + more] - gain[K] >= least:
+                K += more
+                break
+        else:
+            return K
+
+
+Partition = tuple[float, Array, Array]
+"""Sum of squares, breaks, autoregression."""
+
+
+def refined(model: Model, start: Array, breaks: Array) -> Partition:
+    """A partition on cells with its own autoregression, and dates that are the best given each other."""
+    X, y, lags, g = model.X, model.y, model.noise.lags, model.noise.g
+    if len(lags):
+        start = regressed(noise_of(X, y, estimated(X, y, (lags, start, g), breaks)[0], breaks), g, lags)
+    places = grid(len(y))[0]
+    exact = Exact(model, places, start)
+    at = exact.settled(np.searchsorted(places, breaks), shortest(X.shape[1], lags))
+    return float(exact.of(at)), places[at], start
+
+
+def numbered(found: list[Partition], prices: tuple[float, float], N: int, least: int) -> int:
+    """The number of breaks that pay, ``least`` or more."""
+    gain = N * np.log(found[0][0] / np.array([one[0] for one in found]))
+    return stepwise(gain, prices) or min(least, len(found) - 1)
+
+
+def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Array, Array, tuple[float, float]]:
+    """(breaks, autoregression, prices), given that constants are rejected."""
+    X, y, noise = model.X, model.y, model.noise
+    N, n = X.shape
+    found: list[Partition] = [
+        (float(test.rss[k]), test.breaks[k], test.ar[k]) for k in range(3) if np.isfinite(test.rss[k])
+    ]
+    first = 1 if test.p_each[:2].min() <= test.p_each[2] else 2
+    prices = (price(test.gains[:, 0], level / SHARE), price(test.gains[:, 1], level / SHARE))
+    most = max(0, min(MOST, N // shortest(n, noise.lags) - 1))
+    starts = [test.ar[len(found) - 1], noise.ar] if len(noise.lags) else [noise.ar]
+    lists = [partitions(X, y, (noise.lags, start, noise.g), most, shortest(n, noise.lags)) for start in starts]
+    for K in range(3, most + 1):
+        if K >= len(lists[0]) or K > numbered(found, prices, N, first) + 3:
+            break
+        tried = (refined(model, start, own[K]) for start, own in zip(starts, lists, strict=True) if K < len(own))
+        found.append(min(tried, key=lambda one: one[0]))
+    K = numbered(found, prices, N, first)
+    if K and (len(noise.lags) or len(model.lags.columns)):  # changes made the dynamics of constants too slow
+        _, breaks, ar = found[K]
+        theta, _ = estimated(X, y, (noise.lags, ar, noise.g), breaks)
+        mean = model.basis @ (np.diff(np.concatenate([[0], breaks, [N]])) / N @ theta)
+        if max(radius(ar, noise.lags), draws.of_outputs(mean)) < 1.0:
+            rss, _, _, _ = draws.of(mean, ar, len(test.gains), True)
+            again = gains(rss[np.isfinite(rss[:, 0])], N)
+            prices = (price(again[:, 0], level / SHARE), price(again[:, 1], level / SHARE))
+            K = numbered(found, prices, N, first)
+    return found[K][1], found[K][2], prices
+
+
+def shortest_interval(weight: Array, level: float) -> tuple[int, int]:
+    """First and last place of the shortest interval with this share of the weights (m,)."""
+    total = np.concatenate([[0.0], np.cumsum(weight / weight.sum())])
+    last = np.searchsorted(total, total[:-1] + level * (1.0 - 1e-12))
+    inside = np.flatnonzero(last < len(total))
+    best = inside[np.argmin(last[inside] - inside)] if len(inside) else 0
+    return int(best), int(min(last[best], len(weight)) - 1)
+
+
+def dated(model: Model, breaks: Array, ar: Array, prices: tuple[float, float], level: float = LEVEL) -> Dated:
+    """Dates at full resolution with their intervals, and the parameters of the segments."""
+    X, y, noise = model.X, model.y, model.noise
+    N, n = X.shape
+    K, first = len(breaks), order_of(noise.lags)
+    gap, spans = max(n + 1, first + 1, 3), np.zeros((K, 2), np.int64)
+    moved = np.zeros((K + 1, n))
+    if K:
+        places = np.arange(N) if N <= DATES else np.unique(np.append(np.linspace(0, N - 1, DATES).astype(int), breaks))
+        at = np.searchsorted(places, breaks)
+        for _ in range(2 if len(ar) else 1):
+            exact = Exact(model, places, ar)
+            at = exact.settled(at, gap)
+            if len(ar):
+                theta, _ = estimated(X, y, (noise.lags, ar, noise.g), places[at])
+                ar = regressed(noise_of(X, y, theta, places[at]), noise.g, noise.lags)
+        exact = Exact(model, places, ar)
+        breaks = places[at]
+        for k in range(K):
+            low, rss = exact.profile(at, k, gap)
+            loglik = -0.5 * max(N - (K + 1) * n - first, 5) * np.log(rss / rss.min())
+            weight = np.exp(loglik) / np.exp(loglik).sum()
+            spans[k] = places[low + np.array(shortest_interval(weight, level))]
+            moved[k : k + 2] += _moved(exact, at, k, low, weight)[k : k + 2]
+    parts = (noise.lags, ar, noise.g)
+    theta, rss = estimated(X, y, parts, breaks)
+    std, changed = _errors(model, breaks, parts, theta, moved)
+    return Dated(breaks, spans, theta @ model.basis.T, std, changed, ar, rss, prices)
+
+
+def _moved(exact: Exact, at: Array, k: int, low: int, weight: Array) -> Array:
+    """Variances (K + 1, n) of the parameters while date k moves, in units of the model."""
+    likely = np.flatnonzero(weight > 1e-3 * weight.max())
+    likely = likely[np.unique(np.linspace(0, len(likely) - 1, min(MOVED, len(likely))).astype(int))]
+    many = np.tile(at, (len(likely), 1))
+    many[:, k] = low + likely
+    theta = exact.thetas(many) @ exact.model.basis.T
+    share = weight[likely] / weight[likely].sum()
+    mean = np.einsum("m,mkj->kj", share, theta)
+    return np.asarray(np.einsum("m,mkj->kj", share, (theta - mean) ** 2))
+
+
+def _errors(
+    model: Model, breaks: Array, parts: tuple[Array, Array, Array], theta: Array, moved: Array
+) -> tuple[Array, Array]:
+    """Standard errors of the parameters (K + 1, n) and of their changes (K, n), in units of the model."""
+    N, n = model.X.shape
+    K = len(breaks)
+    Z, z = white_rows(split(model.X, breaks), model.y, *parts)
+    steps = np.concatenate([theta[:1], np.diff(theta, axis=0)]).ravel()
+    e = z - Z @ steps
+    inverse = np.linalg.pinv(Z.T @ Z, rcond=SINGULAR, hermitian=True)
+    scores = Z * e[:, None]
+    V = inverse @ (scores.T @ scores) @ inverse * len(z) / max(len(z) - Z.shape[1], 1)
+    basis = np.kron(np.eye(K + 1), model.basis)
+    V = basis @ V @ basis.T
+    total = np.kron(np.tril(np.ones((K + 1, K + 1))), np.eye(n))
+    own = np.diag(total @ V @ total.T).reshape(K + 1, n)
+    change = np.diag(V).reshape(K + 1, n)[1:] + moved[:-1] + moved[1:]
+    edges = np.concatenate([[0], breaks, [N]])
+    std = np.sqrt(np.maximum(own + moved, 0.0))
+    for k in range(K + 1):
+        std[k] = np.where(undetermined(model.phi[edges[k] : edges[k + 1]]), np.inf, std[k])
+    return std, np.sqrt(np.maximum(change, 0.0))
+
+
+COMPONENT = 1e-6
+"""Smallest component, in units of the regressors, that a direction has in a parameter."""
+
+
+def undetermined(phi: Array) -> Array:
+    """Which parameters (n,) have a component in a direction that rows phi (N, n) do not vary in."""
+    from driftfit.judge.statistics.robust import orthonormal
+
+    basis = orthonormal(phi)
+    _, size, directions = np.linalg.svd(basis.R)
+    rank = int(np.sum(size > basis.negligible))
+    return np.asarray(np.linalg.norm(directions[rank:], axis=0) > COMPONENT)

@@ -1,0 +1,249 @@
+"""Segments and their noise, found together: an autoregression, a slowly changing level, and outliers.
+
+    y_t = x_t' theta_s + v_t,   v_t = sum a_l v_(t-l) + c_t e_t,   weight_t = min(1, 3 c_t / |c_t e_t|) / c_t^2
+
+Breaks and correlation explain the same residuals. For each start, the white noise and the correlation of the residuals
+of constants, the best partition on cells (Jackson et al., 2005) and the lags of the noise follow each other until they
+stay; the pair with the smaller criterion counts. A break costs (n + 2) log N there (Zhang and Siegmund, 2007), a lag
+log N, and a lag of a season 2 log of their number more (Chen and Chen, 2008). Weights are Huber's, at three levels from
+the fit of segments. Cost: O(N n^2) and O(c^2 n^3) for c cells.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.changes.scan import CELLS, PLACES, SINGULAR, SMALL
+from driftfit.judge.statistics.robust import deviation
+
+HELD = 3.0
+"""Levels of the noise from the fit at which a residual is limited."""
+ORDER = 6
+"""Largest order of the autoregression; a season may add one further lag."""
+SEASON = 24
+ROUNDS = 4
+MOST = 12
+"""Largest number of breaks."""
+WINDOWS = 12
+"""Parts of a record, at most, whose noise may have a level of its own."""
+
+
+class Noise(NamedTuple):
+    """The noise of a record, and the segments that it was found with."""
+
+    lags: Array
+    """(p,): lags of the autoregression."""
+    ar: Array
+    """(p,)"""
+    level: Array
+    """(N,): standard deviation of white residuals."""
+    g: Array
+    """(N,): roots of the weights."""
+    e: Array
+    """(N,): white residuals of the segments, 0 in the first rows."""
+    breaks: Array
+
+
+def shortest(n: int, lags: Array) -> int:
+    """Rows in the shortest segment that is searched, of n parameters."""
+    return max(10, 4 * n, order_of(lags) + n + 1)
+
+
+def order_of(lags: Array) -> int:
+    """The last lag; 0 if there is none."""
+    return int(lags[-1]) if len(lags) else 0
+
+
+def grid(N: int) -> tuple[Array, int]:
+    """Places where there may be a break, and how many of them are in a cell."""
+    m = int(np.clip(N // 8, 4, CELLS))
+    stride = max(1, min(PLACES, N) // m)
+    return np.linspace(0, N, m * stride + 1).astype(np.int64)[:-1], stride
+
+
+def white_rows(X: Array, y: Array, lags: Array, ar: Array, g: Array) -> tuple[Array, Array]:
+    """Rows X (N, ..) and outputs after whitening, times g (N,), without the first rows."""
+    Z, z, first = X.copy(), y.copy(), order_of(lags)
+    for lag, a in zip(lags, ar, strict=True):
+        Z[lag:] -= a * X[:-lag]
+        z[lag:] -= a * y[:-lag]
+    return Z[first:] * g[first:, None], z[first:] * g[first:]
+
+
+def split(X: Array, breaks: Array) -> Array:
+    """Rows (N, (K + 1) n) of theta of the first segment and of what each break adds."""
+    t = np.arange(len(X))[:, None]
+    return np.hstack([X, *(X * (t >= b) for b in breaks)])
+
+
+def estimated(X: Array, y: Array, noise: tuple[Array, Array, Array], breaks: Array) -> tuple[Array, float]:
+    """theta of the segments (K + 1, n) and the sum of squares, for noise of (lags, ar, g).
+
+    What the rows of a segment do not determine stays as in the one before.
+    """
+    Z, z = white_rows(split(X, breaks), y, *noise)
+    n, K = X.shape[1], len(breaks)
+    G = Z.T @ Z
+    ridge = SINGULAR * np.trace(G[:n, :n]) / n * np.append(np.zeros(n), np.ones(K * n)) + SMALL
+    beta = np.linalg.lstsq(np.vstack([Z, np.diag(np.sqrt(ridge))]), np.append(z, np.zeros(len(ridge))), rcond=None)[0]
+    r = z - Z @ beta
+    return np.cumsum(beta.reshape(K + 1, n), axis=0), float(r @ r)
+
+
+def noise_of(X: Array, y: Array, theta: Array, breaks: Array) -> Array:
+    """v (N,): residuals of segments."""
+    part = np.searchsorted(breaks, np.arange(len(y)), side="right")
+    return np.asarray(y - np.einsum("tj,tj->t", X, theta[part]))
+
+
+def regressed(v: Array, g: Array, lags: Array) -> Array:
+    """Autoregression (p,) of v (N,)."""
+    first = order_of(lags)
+    past = np.column_stack([v[first - lag : len(v) - lag] for lag in lags]) if len(lags) else np.zeros((len(v), 0))
+    w = g[first:]
+    return np.linalg.lstsq(past * w[:, None], v[first:] * w, rcond=None)[0]
+
+
+def lags_of(v: Array, most: int) -> Array:
+    """Lags of the autoregression of v (N,): those up to an order of least BIC, and one of a season if it is clear."""
+    N = len(v)
+    limit = HELD * deviation(v)
+    v = np.clip(v, -limit, limit) if limit > 0.0 else v
+    longest = max(most, min(SEASON, N // 12))
+    if most < 1 or longest >= N // 3:
+        return np.zeros(0, np.int64)
+    rows = np.column_stack([v[longest - lag : N - lag] for lag in range(longest + 1)])
+    G = rows.T @ rows + SMALL * np.eye(longest + 1)
+    count, price = N - longest, np.log(N)
+
+    def criterion(lags: list[int]) -> float:
+        if not lags:
+            return float(count * np.log(G[0, 0]))
+        A = G[np.ix_(lags, lags)]
+        A = A + SINGULAR * np.diag(np.diag(A))
+        left = G[0, 0] - G[0, lags] @ np.linalg.solve(A, G[lags, 0])
+        return float(count * np.log(max(left, SINGULAR * G[0, 0])) + price * len(lags))
+
+    best = min((list(range(1, p + 1)) for p in range(most + 1)), key=criterion)
+    seasons = [[*best, lag] for lag in range(most + 1, longest + 1)]
+    if seasons:
+        one = min(seasons, key=criterion)
+        if criterion(one) + 2.0 * np.log(len(seasons)) < criterion(best):
+            best = one
+    return np.array(best, np.int64)
+
+
+def level_of(e: Array, first: int) -> Array:
+    """c (N,): the slowly changing level of white residuals e, constant where windows differ by no more than chance."""
+    N, used = len(e), e[first:]
+    s = max(deviation(used), 1e-3 * float(np.std(used)), SMALL)
+    m = max(3, min(WINDOWS, N // 20))
+    edges = np.linspace(first, N, m + 1).astype(int)
+    parts = [np.abs(e[a:b]) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    held = (np.minimum(part, HELD * max(deviation(part), 0.05 * s)) for part in parts)
+    own = np.log([max(np.sqrt(np.mean(part**2)), 0.05 * s) for part in held])
+    chance = 0.6 * m / N  # variance of the logarithm of a deviation of N / m Gaussians
+    share = max(0.0, 1.0 - 1.5 * chance / max(float(own.var()), chance))
+    middle = float(np.median(own))
+    return np.exp(middle + np.interp(np.arange(N), 0.5 * (edges[:-1] + edges[1:]), share * (own - middle)))
+
+
+def partitions(X: Array, y: Array, noise: tuple[Array, Array, Array], most: int, least: int) -> list[Array]:
+    """The best partitions on cells with 0 .. breaks; rows that belong to two segments are left out."""
+    places, stride = grid(len(y))
+    edges, N, n = np.append(places[::stride], len(y)), len(y), X.shape[1]
+    lags, m, first = noise[0], len(edges) - 1, order_of(noise[0])
+    Z = np.zeros((N, n + 1))
+    Z[first:, :n], Z[first:, n] = white_rows(X, y, *noise)
+    own = np.array([Z[a:b].T @ Z[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    lost = np.array([Z[a : a + first].T @ Z[a : a + first] for a in edges[:-1]])
+    lost[0] = 0.0
+    C = np.concatenate([np.zeros((1, n + 1, n + 1)), np.cumsum(own, axis=0)])
+    i, j = np.triu_indices(m + 1, 1)
+    long = edges[j] - edges[i] >= least
+    i, j = i[long], j[long]
+    G = C[j] - C[i] - lost[i]
+    A = G[:, :n, :n] + (SINGULAR * np.trace(C[-1]) + SMALL) * np.eye(n)
+    cost = np.full((m + 1, m + 1), np.inf)
+    cost[i, j] = G[:, n, n] - np.einsum("ka,ka->k", G[:, :n, n], np.linalg.solve(A, G[:, :n, n, None])[:, :, 0])
+    best, back, found = cost[0], [np.zeros(m + 1, int)], [np.zeros(0, np.int64)]
+    for K in range(1, most + 1):
+        total = best[:, None] + cost
+        best, where = total.min(axis=0), total.argmin(axis=0)
+        back.append(where)
+        if not np.isfinite(best[m]):
+            break
+        path = [m]
+        for k in range(K, 0, -1):
+            path.append(int(back[k][path[-1]]))
+        found.append(edges[path[:0:-1]])
+    return found
+
+
+def divided(X: Array, y: Array, lags: Array, g: Array, most: int) -> tuple[Array, Array, float]:
+    """(breaks, ar, criterion) of the best partition whose noise has these lags."""
+    N, n = X.shape
+    found = (np.zeros(0, np.int64), np.zeros(len(lags)), np.inf)
+    ar, seen = np.zeros(len(lags)), []
+    theta, _ = estimated(X, y, (lags, ar, g), found[0])
+    if len(lags):
+        ar = regressed(noise_of(X, y, theta, found[0]), g, lags)
+    for _ in range(ROUNDS if len(lags) else 1):
+        for breaks in partitions(X, y, (lags, ar, g), most, shortest(n, lags)):
+            own = ar
+            theta, rss = estimated(X, y, (lags, own, g), breaks)
+            if len(lags):
+                own = regressed(noise_of(X, y, theta, breaks), g, lags)
+                theta, rss = estimated(X, y, (lags, own, g), breaks)
+            criterion = N * np.log(max(rss, SMALL)) + (n + 2) * np.log(N) * len(breaks)
+            if criterion < found[2]:
+                found = breaks, own, float(criterion)
+        if any(np.array_equal(found[0], one) for one in seen):
+            break
+        seen.append(found[0])
+        ar = found[1]
+    return found
+
+
+def together(X: Array, y: Array, g: Array, orders: int, most: int) -> tuple[Array, Array, Array]:
+    """(lags, ar, breaks), chosen together."""
+    N = len(y)
+    theta, _ = estimated(X, y, (np.zeros(0, np.int64), np.zeros(0), g), np.zeros(0, np.int64))
+    best: tuple[float, Array, Array, Array] | None = None
+    tried: list[list[int]] = []
+    for lags in (lags_of((y - X @ theta[0]) * g, orders), np.zeros(0, np.int64)):
+        for _ in range(ROUNDS):
+            if lags.tolist() in tried:
+                break
+            tried.append(lags.tolist())
+            breaks, ar, criterion = divided(X, y, lags, g, most)
+            criterion += len(lags) * np.log(N)
+            if best is None or criterion < best[0]:
+                best = criterion, lags, ar, breaks
+            theta, _ = estimated(X, y, (lags, ar, g), breaks)
+            lags = lags_of(noise_of(X, y, theta, breaks) * g, orders)
+    assert best is not None
+    return best[1:]
+
+
+def noise(X: Array, y: Array, lags: int | None = None) -> Noise:
+    """The noise of y (N,) on X (N, n), X' X = N I; of an autoregression of order ``lags`` if that is given."""
+    N, n = X.shape
+    most = max(0, min(MOST, N // shortest(n, np.zeros(0)) - 1))
+    orders, given = min(ORDER, N // 20), None if lags is None else np.arange(1, lags + 1)
+    g, e, level = np.ones(N), y, np.ones(N)
+    for _ in range(2):
+        if given is None:
+            chosen, ar, breaks = together(X, y, g, orders, most)
+        else:
+            chosen, (breaks, ar, _) = given, divided(X, y, given, g, most)
+        theta, _ = estimated(X, y, (chosen, ar, g), breaks)
+        first = order_of(chosen)
+        v = noise_of(X, y, theta, breaks)
+        e = np.append(np.zeros(first), white_rows(v[:, None], v, chosen, ar, np.ones(N))[1])
+        level = level_of(e, first)
+        g = np.sqrt(np.minimum(1.0, HELD * level / np.maximum(np.abs(e), SMALL))) / level
+    return Noise(chosen, ar, level, g, e, breaks)

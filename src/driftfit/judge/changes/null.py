@@ -1,0 +1,242 @@
+"""One test of constancy, from records that the model of constants draws itself.
+
+    y*_t = x*_t' theta + v*_t,   v*_t = sum a_l v*_(t-l) + s_t e_t,   s_t = -1 or 1,   x* with the lags of y*
+
+e are the residuals of the segments, limited at three levels: residuals of constants would count a change as noise. theta
+and a are those of constants, less the bias that the same draws show (Kilian, 1998), with no root beyond 1. For every
+draw everything is estimated again, and three statistics are computed: Nyblom's, which sees a slow drift, the gain of one
+break, a step, and the gain of two, a temporary change. p is that of the smallest of their p-values among those of
+the draws, beyond the largest draws by their exponential tail.
+
+Source: Wu (1986) and Liu (1988) for wild residuals; Hansen (2000) for fixed regressors, Goncalves and Kilian (2004) for
+the recursion. Cost: `DRAWS` searches; records that are clearly constant stop after the first `FEW`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.changes.fit import HELD, Noise, grid, order_of, shortest
+from driftfit.judge.changes.scan import SMALL, Found, Problem, Recursion, Work, _draws, _search
+from driftfit.judge.statistics.robust import orthonormal
+
+DRAWS, FEW = 199, 39
+CLEAR = 0.3
+"""p of the first draws above which no others are drawn."""
+BIASED = 40
+"""Draws of constants from which their bias comes."""
+UNIT = 0.9999
+"""Largest root of the noise."""
+ROUNDS = 5
+"""Rounds of constants and their autoregression."""
+ROUNDING = 1e-15
+"""Standard deviation of rounding, as a share of the outputs."""
+
+
+class Lags(NamedTuple):
+    """Which columns of a regression are earlier outputs of it."""
+
+    columns: Array
+    """(k,)"""
+    source: Array
+    """(N, k): the row whose output they are; negative where it is none of these rows."""
+    ratio: Array
+    """(N, k): what they are times that output."""
+
+    @classmethod
+    def none(cls, N: int) -> Lags:
+        """No column is."""
+        return cls(np.zeros(0, np.int64), np.zeros((N, 0), np.int64), np.zeros((N, 0)))
+
+
+class Tested(NamedTuple):
+    """A test of constancy."""
+
+    p: float
+    p_each: Array
+    """(3,): of Nyblom's statistic, of one break, of two."""
+    L: Array
+    """(1 + 2 n,): Nyblom's statistic of all scores, of that of each parameter, and of the path of each estimate."""
+    p_path: Array
+    """(2 n,): p-values of the last two."""
+    gains: Array
+    """(R, 2): gains of one and of two breaks of the draws."""
+    rss: Array
+    """(3,): sum of squares with no, one and two breaks."""
+    breaks: tuple[Array, Array, Array]
+    """Their dates."""
+    ar: Array
+    """(3, p): their autoregressions."""
+    theta: Array
+    """(n,): constants, in units of the model."""
+    root: float
+    """Largest root of the dynamics: of the lags of the output, and of the noise."""
+
+
+class Model(NamedTuple):
+    """A regression, its orthonormal basis, the outputs that are its regressors, and its noise."""
+
+    phi: Array
+    y: Array
+    X: Array
+    basis: Array
+    """(n, n): X = phi basis."""
+    lags: Lags
+    root: Array
+    """(N,): what each row was multiplied by."""
+    noise: Noise
+
+    @property
+    def floor(self) -> float:
+        """Sum of squares of rounding."""
+        return float(np.sum((ROUNDING * self.y * self.noise.g) ** 2)) + SMALL
+
+
+def in_basis(phi: Array) -> tuple[Array, Array]:
+    """X (N, n) with X' X = N I, and the matrix that makes it of phi."""
+    basis = orthonormal(phi)
+    return basis.Q, np.linalg.inv(basis.R) / basis.size[:, None]
+
+
+def problem_of(model: Model, paths: Array) -> Problem:
+    """What all draws share."""
+    N, n = model.X.shape
+    places, stride = grid(N)
+    lags = model.noise.lags
+    sizes = np.array([stride, shortest(n, lags), ROUNDS, 2])
+    return Problem(model.noise.g, lags, places, np.ascontiguousarray(paths), sizes, np.array([model.floor]))
+
+
+def radius(a: Array, lags: Array) -> float:
+    """Largest root of an autoregression with these lags."""
+    p = order_of(lags)
+    if not p:
+        return 0.0
+    companion = np.eye(p, k=-1)
+    companion[0, lags - 1] = a
+    return float(np.abs(np.linalg.eigvals(companion)).max())
+
+
+class Draws:
+    """Records that a model of constants draws, and what is found in them."""
+
+    def __init__(self, model: Model, problem: Problem, held: Array, seed: int = 0) -> None:
+        N, n = model.X.shape
+        self.model, self.problem, self.e = model, problem, held
+        self.work, self.found = Work.of(N, n, problem), Found.of(n, problem)
+        self.rng = np.random.default_rng(seed)
+        self.phi, self.X, self.y = np.zeros((N, n)), np.zeros((N, n)), np.zeros(N)
+
+    def of(self, theta: Array, ar: Array, count: int, whole: bool) -> tuple[Array, Array, Array, Array]:
+        """(sums of squares (R, 3), Nyblom's (R, ..), constants (R, n) in the basis, their autoregressions (R, p)) of
+        draws from constants theta (n,) in units of the model."""
+        model, problem = self.model, self.problem
+        N, n = model.X.shape
+        lags = model.lags
+        way = Recursion(
+            model.phi, model.X, model.basis, lags.columns, lags.source, lags.ratio, theta, ar,
+            model.y - model.phi @ theta, self.e,
+        )  # fmt: skip
+        signs = self.rng.integers(0, 2, (count, N)) * 2.0 - 1.0
+        out = (np.full((count, 3), np.inf), np.zeros((count, 1 + len(problem.paths))), np.zeros((count, n)),
+               np.zeros((count, len(ar))))  # fmt: skip
+        _draws(way, signs, problem, np.array([int(whole)]), self.work, self.found, self.phi, self.X, self.y, *out)
+        return out
+
+    def unbiased(self, theta: Array, ar: Array) -> tuple[Array, Array]:
+        """Constants and their autoregression without the bias of the dynamics, as far as they remain stable."""
+        columns, lags = self.model.lags.columns, self.problem.lags
+        if not len(columns) and not len(lags):
+            return theta, ar
+        _, _, drawn, own = self.of(theta, ar, BIASED, False)
+        shift = np.median(drawn @ self.model.basis.T, axis=0) - theta
+        turn = np.median(own, axis=0) - ar
+        if not (np.isfinite(shift).all() and np.isfinite(turn).all()):
+            return theta, ar
+        for share in np.linspace(1.0, 0.0, 21):
+            moved, less = theta - share * shift, ar - share * turn
+            if max(self.of_outputs(moved), radius(less, lags)) <= UNIT:
+                return moved, less
+        return theta, ar
+
+    def of_outputs(self, theta: Array) -> float:
+        """Largest root of the lags of the output."""
+        back = self.model.lags
+        if not len(back.columns):
+            return 0.0
+        known = [np.flatnonzero(one >= 0)[-1] for one in back.source.T]
+        lags = np.array([row - source[row] for row, source in zip(known, back.source.T, strict=True)])
+        order = np.argsort(lags)
+        ratio = np.array([back.ratio[row, i] for i, row in enumerate(known)])
+        return radius((theta[back.columns] * ratio)[order], lags[order])
+
+
+def p_of(x: float, drawn: Array) -> float:
+    """p-value of x among draws (R,): its rank, beyond the largest ones by an exponential tail."""
+    R = len(drawn)
+    ordered = np.sort(drawn)
+    if x <= ordered[-6]:
+        return float((1 + np.sum(drawn >= x)) / (R + 1))
+    top = ordered[-max(10, R // 10) :]
+    mean = float(np.mean(top[1:] - top[0])) if len(top) > 1 else 0.0
+    return float(len(top) / (R + 1) * np.exp(-(x - top[0]) / max(mean, SMALL)))
+
+
+def price(drawn: Array, level: float) -> float:
+    """What draws (R,) exceed with probability ``level``, which may be below 1 / R."""
+    R = len(drawn)
+    top = np.sort(drawn)[-max(10, R // 10) :]
+    return float(top[0] + np.mean(top[1:] - top[0]) * np.log(len(top) / (R + 1) / level))
+
+
+def smallest(x: Array, drawn: Array) -> tuple[float, Array]:
+    """p-value of the smallest of the p-values of statistics x (k,) among those of draws (R, k), and each of them."""
+    R = len(drawn)
+    ranks = np.argsort(np.argsort(-drawn, axis=0), axis=0) + 1
+    least = (ranks / (R + 1.0)).min(axis=1)
+    each = np.array([p_of(float(one), column) for one, column in zip(x, drawn.T, strict=True)])
+    p = float(each.min())
+    few = 6.0 / (R + 1)
+    if p >= few:
+        return float((1 + np.sum(least <= p)) / (R + 1)), each
+    return float(p / few * (1 + np.sum(least <= few)) / (R + 1)), each
+
+
+def tested(model: Model) -> tuple[Tested, Draws]:
+    """The test of constancy, and the draws for further ones."""
+    N, n = model.X.shape
+    noise = model.noise
+    first = order_of(noise.lags)
+    Z = model.X * noise.g[:, None]
+    paths = np.vstack([np.linalg.inv(model.basis).T, model.basis @ np.linalg.inv(Z.T @ Z)])
+    size = np.sqrt(np.sum((paths @ (Z.T @ Z)) * paths, axis=1))
+    problem = problem_of(model, paths / np.maximum(size, SMALL)[:, None])
+    work, found = Work.of(N, n, problem), Found.of(n, problem)
+    _search(model.X, model.y, problem, work, found)
+    lost = (len(noise.breaks) + 1) * n + first
+    held = np.clip(noise.e, -HELD * noise.level, HELD * noise.level) * np.sqrt(N / max(N - lost, N // 2))
+    draws = Draws(model, problem, held)
+    theta, ar = draws.unbiased(model.basis @ found.theta, found.ar[0])
+    x = np.append(found.L[0], gains(found.rss[None], N)[0])
+    R, L = np.zeros((0, 2)), np.zeros((0, len(found.L)))
+    for count in (FEW, DRAWS - FEW):
+        rss, own, _, _ = draws.of(theta, ar, count, True)
+        fine = np.isfinite(own).all(axis=1) & (rss[:, 0] < np.inf)
+        R, L = np.vstack([R, gains(rss[fine], N)]), np.vstack([L, own[fine]])
+        p, each = smallest(x, np.column_stack([L[:, 0], R]))
+        if p > CLEAR:
+            break
+    p_path = np.array([p_of(float(one), drawn) for one, drawn in zip(found.L[1:], L.T[1:], strict=True)])
+    root = max(draws.of_outputs(theta), radius(ar, noise.lags))
+    dates = tuple(problem.places[found.at[k, :k]] for k in range(3))
+    constants = model.basis @ found.theta
+    return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, root), draws  # type: ignore[arg-type]
+
+
+def gains(rss: Array, N: int) -> Array:
+    """N log(rss_0 / rss_k), k = 1, 2, of sums of squares (R, 3); 0 where there is no room."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(np.isfinite(rss[:, 1:]), N * np.log(rss[:, :1] / rss[:, 1:]), 0.0)

@@ -1,0 +1,587 @@
+"""The best one and two breaks of a regression in autoregressive noise, and Nyblom's statistic, compiled.
+
+    y_t = x_t' theta + sum over breaks b of x_t' delta_b [t >= b] + v_t,    v_t = sum a_l v_(t-l) + e_t / g_t
+    Z, z = rows and outputs times g after whitening,    D_b = the same of x_t [t >= b],    A = Z' Z,    r = residuals of Z
+    gain of breaks b, c, ..  =  s' M^-1 s,   s_b = D_b' r,   M_bc = D_b' D_c - D_b' Z A^-1 Z' D_c
+
+A row of the first p after a break holds the lags of both segments. D_b differs from Z in these rows only, so that
+D_b' D_c = Z' D_c for b < c at least p rows apart, and the matrices B_b = Z' D_b, Q_b = D_b' D_b give every set of
+breaks exactly. Every number of breaks has its own autoregression: breaks and coefficients of the noise are improved in
+turn, once from the noise of constants and once from white noise, since each explains the residuals that the other leaves.
+
+Source: Bai and Perron (1998) for the gain; Cochrane and Orcutt (1949) for the turns; Nyblom (1989), Hansen (1992).
+Cost: O(N n^2) and O(c^2 n^3) for c cells, ten times in correlated noise.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, Driver, shared
+from driftfit.judge.statistics.robust import cholesky, solved
+
+CELLS = 32
+"""Cells between which pairs of breaks are compared."""
+PLACES = 400
+"""Places at which a single break is compared, at most."""
+SINGULAR = 1e-9
+"""Information below this share of that of the whole record is none."""
+SMALL = 1e-300
+"""Added to a diagonal, so that it can be inverted."""
+
+
+class Problem(NamedTuple):
+    """What stays the same in all draws from a record."""
+
+    g: Array
+    """(N,): roots of the weights."""
+    lags: Array
+    """(p,) of whole numbers, ascending: lags of the autoregression."""
+    places: Array
+    """(F,): where there may be a break; every ``stride`` of them bounds a cell."""
+    paths: Array
+    """(m, n): combinations of scores for which Nyblom's statistic is returned beside that of all."""
+    sizes: Array
+    """(4,): stride; fewest rows of a segment; rounds of the fit of constants; largest number of breaks, 1 or 2."""
+    floor: Array
+    """(1,): smallest sum of squares, that of rounding."""
+
+
+class Work(NamedTuple):
+    """Scratch space for N rows of n regressors, F places and p lags."""
+
+    Z: Array
+    v: Array
+    r: Array
+    G: Array
+    inverse: Array
+    B: Array
+    Q: Array
+    U: Array
+    s: Array
+    M: Array
+    H: Array
+    R: Array
+    row: Array
+    theta: Array
+    delta: Array
+    a: Array
+    sums: Array
+    at: Array
+
+    @classmethod
+    def of(cls, N: int, n: int, problem: Problem) -> Work:
+        """Empty space for one record."""
+        F, p = len(problem.places), len(problem.lags)
+        shapes = (
+            (N, n + 1), (N,), (N,), (n + 1, n + 1), (n, n), (F, n, n), (F, n, n), (F, n, n), (F, n),
+            (n + 1, n + 1), (p + 1, p + 1), (n, n), (n,), (n,), (2 * n,), (p,), (n + 1,),
+        )  # fmt: skip
+        return cls(*(np.zeros(shape) for shape in shapes), np.zeros(2, np.int64))
+
+
+class Found(NamedTuple):
+    """What `search` fills in for one record."""
+
+    rss: Array
+    """(3,): sum of squares with no, one and two breaks; inf where there is no room."""
+    at: Array
+    """(3, 2): their places, as indices."""
+    ar: Array
+    """(3, p): their autoregressions."""
+    theta: Array
+    """(n,): constants."""
+    L: Array
+    """(1 + m,): Nyblom's statistics."""
+
+    @classmethod
+    def of(cls, n: int, problem: Problem) -> Found:
+        """Nothing found yet."""
+        p = len(problem.lags)
+        L = np.zeros(1 + len(problem.paths))
+        return cls(np.full(3, np.inf), np.zeros((3, 2), np.int64), np.zeros((3, p)), np.zeros(n), L)
+
+
+@shared
+def whiten(X: Array, y: Array, g: Array, lags: Array, a: Array, Z: Array) -> None:
+    """Z (N, n + 1): rows and outputs after whitening, times g; the rows before the last lag are 0."""
+    N, n, p = X.shape[0], X.shape[1], lags.shape[0]
+    first = lags[p - 1] if p > 0 else 0
+    for t in range(N):
+        for j in range(n + 1):
+            Z[t, j] = 0.0
+        if t < first:
+            continue
+        for j in range(n):
+            value = X[t, j]
+            for i in range(p):
+                value -= a[i] * X[t - lags[i], j]
+            Z[t, j] = value * g[t]
+        value = y[t]
+        for i in range(p):
+            value -= a[i] * y[t - lags[i]]
+        Z[t, n] = value * g[t]
+
+
+@shared
+def constants(Z: Array, G: Array, theta: Array) -> float:
+    """theta (n,) of least squares of rows Z (N, n + 1); returns the sum of squares and leaves the factor in G."""
+    N, n = Z.shape[0], theta.shape[0]
+    for i in range(n + 1):
+        for j in range(i + 1):
+            total = 0.0
+            for t in range(N):
+                total += Z[t, i] * Z[t, j]
+            G[i, j] = total
+    rss: float = cholesky(G, n)
+    solved(G, theta)
+    return rss
+
+
+@shared
+def autoregression(v: Array, g: Array, lags: Array, H: Array, a: Array) -> None:
+    """Weighted least squares of v (N,) on its lags: a (p,)."""
+    p = lags.shape[0]
+    for i in range(p + 1):
+        for j in range(i + 1):
+            H[i, j] = 0.0
+    for t in range(lags[p - 1], v.shape[0]):
+        w = g[t] * g[t]
+        for i in range(p + 1):
+            left = w * (v[t] if i == p else v[t - lags[i]])
+            for j in range(i + 1):
+                H[i, j] += left * (v[t] if j == p else v[t - lags[j]])
+    for i in range(p):
+        H[i, i] += SINGULAR * H[i, i] + SMALL
+    cholesky(H, p)
+    solved(H, a)
+
+
+@shared
+def settle(X: Array, y: Array, problem: Problem, rounds: int, a: Array, work: Work) -> float:
+    """Constants and their autoregression in turn; returns the sum of squares."""
+    rss = 0.0
+    for round in range(rounds):
+        whiten(X, y, problem.g, problem.lags, a, work.Z)
+        rss = constants(work.Z, work.G, work.theta)
+        if a.shape[0] == 0:
+            break
+        if round < rounds - 1:
+            for t in range(X.shape[0]):
+                work.v[t] = y[t]
+                for j in range(X.shape[1]):
+                    work.v[t] -= X[t, j] * work.theta[j]
+            autoregression(work.v, problem.g, problem.lags, work.H, a)
+    return rss
+
+
+@shared
+def invert(work: Work) -> None:
+    """The inverse of A from its factor G, and the residuals r."""
+    n, N = work.theta.shape[0], work.Z.shape[0]
+    for c in range(n):
+        for i in range(n):
+            total = 1.0 if i == c else 0.0
+            for k in range(i):
+                total -= work.G[i, k] * work.inverse[k, c]
+            work.inverse[i, c] = total / work.G[i, i] if work.G[i, i] > 0.0 else 0.0
+        for i in range(n - 1, -1, -1):
+            total = work.inverse[i, c]
+            for k in range(i + 1, n):
+                total -= work.G[k, i] * work.inverse[k, c]
+            work.inverse[i, c] = total / work.G[i, i] if work.G[i, i] > 0.0 else 0.0
+    for t in range(N):
+        work.r[t] = work.Z[t, n]
+        for j in range(n):
+            work.r[t] -= work.Z[t, j] * work.theta[j]
+
+
+@shared
+def later(X: Array, problem: Problem, a: Array, t: int, first: int, row: Array) -> None:
+    """Row t of D_b, b = first."""
+    for j in range(X.shape[1]):
+        value = X[t, j]
+        for i in range(a.shape[0]):
+            if t - problem.lags[i] >= first:
+                value -= a[i] * X[t - problem.lags[i], j]
+        row[j] = value * problem.g[t]
+
+
+@shared
+def increments(X: Array, problem: Problem, a: Array, work: Work) -> None:
+    """B, U = A^-1 B, Q less B' U, and s of every place, from the last to the first."""
+    N, n, p = X.shape[0], X.shape[1], a.shape[0]
+    order = problem.lags[p - 1] if p > 0 else 0
+    R, end = work.R, N
+    for i in range(n):
+        work.sums[i] = 0.0
+        for j in range(n):
+            R[i, j] = 0.0
+    for f in range(problem.places.shape[0] - 1, -1, -1):
+        first = problem.places[f]
+        whole = min(max(first + order, order), N)
+        for t in range(whole, end):
+            for i in range(n):
+                work.sums[i] += work.Z[t, i] * work.r[t]
+                for j in range(i + 1):
+                    R[i, j] += work.Z[t, i] * work.Z[t, j]
+        end = whole
+        for i in range(n):
+            work.s[f, i] = work.sums[i]
+            for j in range(n):
+                work.B[f, i, j] = work.Q[f, i, j] = R[max(i, j), min(i, j)]
+        for t in range(max(first, order), whole):
+            later(X, problem, a, t, first, work.row)
+            for i in range(n):
+                work.s[f, i] += work.row[i] * work.r[t]
+                for j in range(n):
+                    work.B[f, i, j] += work.Z[t, i] * work.row[j]
+                    work.Q[f, i, j] += work.row[i] * work.row[j]
+        for i in range(n):
+            for j in range(n):
+                total = 0.0
+                for k in range(n):
+                    total += work.inverse[i, k] * work.B[f, k, j]
+                work.U[f, i, j] = total
+        for i in range(n):
+            for j in range(n):
+                for k in range(n):
+                    work.Q[f, i, j] -= work.B[f, k, i] * work.U[f, k, j]
+
+
+@shared
+def factored(M: Array, k: int, least: float) -> float:
+    """The factor of M (k + 1, k + 1), in place, whose last row is s; returns s' M^-1 s. Directions below ``least`` are
+    left out."""
+    found = 0.0
+    for j in range(k):
+        pivot = M[j, j]
+        for i in range(j):
+            pivot -= M[j, i] * M[j, i]
+        root = np.sqrt(pivot) if pivot > least else 0.0
+        M[j, j] = root
+        for r in range(j + 1, k + 1):
+            total = M[r, j]
+            for i in range(j):
+                total -= M[r, i] * M[j, i]
+            M[r, j] = total / root if root > 0.0 else 0.0
+        found += M[k, j] * M[k, j]
+    return found
+
+
+@shared
+def alone(work: Work, b: int, least: float) -> float:
+    """What a break at place b explains; its factor stays in M."""
+    n = work.row.shape[0]
+    for i in range(n):
+        work.M[n, i] = work.s[b, i]
+        for j in range(i + 1):
+            work.M[i, j] = work.Q[b, i, j]
+    return factored(work.M, n, least)  # type: ignore[no-any-return]
+
+
+@shared
+def beside(work: Work, b: int, c: int, least: float) -> float:
+    """What a break at c explains beside that at b < c, whose factor is in M; its own goes to G, and what ties the two
+    to R."""
+    n, M, G, R = work.row.shape[0], work.M, work.G, work.R
+    for j in range(n):
+        for i in range(n):
+            total = work.B[c, i, j]
+            for k in range(n):
+                total -= work.U[b, k, i] * work.B[c, k, j]
+            for k in range(i):
+                total -= M[i, k] * R[k, j]
+            R[i, j] = total / M[i, i] if M[i, i] > 0.0 else 0.0
+    for i in range(n):
+        total = work.s[c, i]
+        for k in range(n):
+            total -= R[k, i] * M[n, k]
+        G[n, i] = total
+        for j in range(i + 1):
+            total = work.Q[c, i, j]
+            for k in range(n):
+                total -= R[k, i] * R[k, j]
+            G[i, j] = total
+    return factored(G, n, least)  # type: ignore[no-any-return]
+
+
+@shared
+def least_information(work: Work) -> float:
+    """Information that counts as none."""
+    most = 0.0
+    for i in range(work.row.shape[0]):
+        total = 0.0
+        for t in range(work.Z.shape[0]):
+            total += work.Z[t, i] * work.Z[t, i]
+        most = max(most, total)
+    return SINGULAR * most
+
+
+@shared
+def room(problem: Problem, N: int, b: int, c: int) -> bool:
+    """Whether segments between places b < c are long enough."""
+    fewest, first, last = problem.sizes[1], problem.places[b], problem.places[c]
+    return first >= fewest and N - last >= fewest and (b == c or last - first >= fewest)
+
+
+@shared
+def best(problem: Problem, count: int, N: int, work: Work) -> float:
+    """What the best one or two breaks explain, and their places in ``at``; negative where there is no room.
+
+    Two are compared at the bounds of cells, and then moved to the best places within a cell, one after the other.
+    """
+    stride, F, most, at = problem.sizes[0], problem.places.shape[0], -1.0, work.at
+    least = least_information(work)
+    for b in range(0, F, 1 if count == 1 else stride):
+        if not room(problem, N, b, b):
+            continue
+        first = alone(work, b, least)
+        if count == 1:
+            if first > most:
+                most = first
+                at[0] = b
+            continue
+        for c in range(b + stride, F, stride):
+            if room(problem, N, b, c):
+                value = first + beside(work, b, c, least)
+                if value > most:
+                    most = value
+                    at[0] = b
+                    at[1] = c
+    if count == 1 or most < 0.0:
+        return most
+    for moved in (1, 0, 1, 0):
+        old, other = at[moved], at[1 - moved]
+        for f in range(max(old - stride, 0), min(old + stride + 1, F)):
+            b, c = (other, f) if moved == 1 else (f, other)
+            if b < c and room(problem, N, b, c):
+                value = alone(work, b, least) + beside(work, b, c, least)
+                if value > most:
+                    most = value
+                    at[moved] = f
+    return most
+
+
+@shared
+def residuals(X: Array, y: Array, problem: Problem, count: int, work: Work) -> None:
+    """v (N,) of the segments between the places ``at``."""
+    N, n = X.shape
+    at, M, G, R, least = work.at, work.M, work.G, work.R, least_information(work)
+    alone(work, at[0], least)
+    if count == 2:
+        beside(work, at[0], at[1], least)
+        for i in range(n - 1, -1, -1):
+            total = G[n, i]
+            for j in range(i + 1, n):
+                total -= G[j, i] * work.delta[n + j]
+            work.delta[n + i] = total / G[i, i] if G[i, i] > 0.0 else 0.0
+    for i in range(n - 1, -1, -1):
+        total = M[n, i]
+        if count == 2:
+            for j in range(n):
+                total -= R[i, j] * work.delta[n + j]
+        for j in range(i + 1, n):
+            total -= M[j, i] * work.delta[j]
+        work.delta[i] = total / M[i, i] if M[i, i] > 0.0 else 0.0
+    for i in range(n):
+        work.row[i] = work.theta[i]
+        for b in range(count):
+            for j in range(n):
+                work.row[i] -= work.U[at[b], i, j] * work.delta[b * n + j]
+    for t in range(N):
+        work.v[t] = y[t]
+        for i in range(n):
+            value = work.row[i]
+            for b in range(count):
+                if t >= problem.places[at[b]]:
+                    value += work.delta[b * n + i]
+            work.v[t] -= X[t, i] * value
+
+
+@shared
+def prepare(X: Array, y: Array, problem: Problem, a: Array, work: Work) -> float:
+    """All that `gain` needs, for the noise a; returns the sum of squares of constants."""
+    whiten(X, y, problem.g, problem.lags, a, work.Z)
+    rss = constants(work.Z, work.G, work.theta)
+    invert(work)
+    increments(X, problem, a, work)
+    return rss
+
+
+@shared
+def keep(rss: float, count: int, at: Array, a: Array, found: Found) -> None:
+    """Remember breaks that are better than those found before."""
+    if rss < found.rss[count]:
+        found.rss[count] = rss
+        for b in range(count):
+            found.at[count, b] = at[b]
+        for i in range(a.shape[0]):
+            found.ar[count, i] = a[i]
+
+
+@shared
+def nyblom(problem: Problem, work: Work, L: Array) -> None:
+    """L = sum S_t' V^-1 S_t / N of all scores, V their moments, and sum (w' S_t)^2 / (N w' V w) of every path w."""
+    N, n = work.Z.shape[0], work.theta.shape[0]
+    for k in range(L.shape[0]):
+        L[k] = 0.0
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for t in range(N):
+                total += work.Z[t, i] * work.Z[t, j] * work.r[t] * work.r[t]
+            work.R[i, j] = work.R[j, i] = total
+    for k in range(1, L.shape[0]):
+        for i in range(n):
+            for j in range(n):
+                L[k] += problem.paths[k - 1, i] * problem.paths[k - 1, j] * work.R[i, j]
+        L[k] = -max(L[k], SMALL)  # the denominator, until the sum is known
+    for i in range(n):
+        work.sums[i] = 0.0
+        work.delta[i] = 0.0
+        work.G[i, i] = work.R[i, i] + SINGULAR * work.R[i, i] + SMALL
+        for j in range(i):
+            work.G[i, j] = work.R[i, j]
+    cholesky(work.G, n)
+    for k in range(1, L.shape[0]):
+        for i in range(n):
+            work.row[i] = 0.0
+        total = 0.0
+        for t in range(N):
+            value = 0.0
+            for i in range(n):
+                work.row[i] += work.Z[t, i] * work.r[t]
+                value += problem.paths[k - 1, i] * work.row[i]
+            total += value * value
+        L[k] = -total / (N * L[k])
+    for t in range(N):
+        for i in range(n):
+            work.sums[i] += work.Z[t, i] * work.r[t]
+        for i in range(n):
+            value = work.sums[i]
+            for j in range(i):
+                value -= work.G[i, j] * work.delta[j]
+            work.delta[i] = value / work.G[i, i] if work.G[i, i] > 0.0 else 0.0
+            L[0] += work.delta[i] * work.delta[i] / N
+
+
+@shared
+def search(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> None:
+    """Everything of one record: constants, Nyblom's statistics, the best one and two breaks."""
+    N, n = X.shape
+    p, a = found.ar.shape[1], work.a
+    for count in range(3):
+        found.rss[count] = np.inf
+    for i in range(p):
+        a[i] = 0.0
+    found.rss[0] = max(settle(X, y, problem, problem.sizes[2], a, work), problem.floor[0])
+    for i in range(n):
+        found.theta[i] = work.theta[i]
+    for i in range(p):
+        found.ar[0, i] = a[i]
+    invert(work)
+    nyblom(problem, work, found.L)
+    for start in range(2 if p > 0 else 1):
+        for count in range(1, problem.sizes[3] + 1):
+            for turn in range(2 if p > 0 else 1):
+                if turn == 0:
+                    for i in range(p):
+                        a[i] = found.ar[0, i] if start == 0 else 0.0
+                if turn > 0 or count == 1 or p > 0:
+                    rss = prepare(X, y, problem, a, work)
+                value = best(problem, count, N, work)
+                if value < 0.0:
+                    break
+                keep(max(rss - value, problem.floor[0]), count, work.at, a, found)
+                if turn == 0 and p > 0:
+                    residuals(X, y, problem, count, work)
+                    autoregression(work.v, problem.g, problem.lags, work.H, a)
+
+
+class Recursion(NamedTuple):
+    """How a record of a model makes the next one: its lags of the output are those of the drawn outputs."""
+
+    phi: Array
+    """(N, n): the regressors, in units of the model."""
+    X: Array
+    """(N, n): the same, orthonormal."""
+    basis: Array
+    """(n, n): X = phi basis."""
+    columns: Array
+    """(k,): columns of phi that are lags of the output."""
+    source: Array
+    """(N, k): the row whose output they are; negative where it is none of these rows."""
+    ratio: Array
+    """(N, k): what they are times that output."""
+    theta: Array
+    """(n,): constants, in units of the model."""
+    ar: Array
+    """(p,)"""
+    start: Array
+    """(N,): noise of the first rows, as many as the autoregression has lags."""
+    e: Array
+    """(N,): white residuals, whose signs are drawn."""
+
+
+@shared
+def simulate(way: Recursion, lags: Array, signs: Array, v: Array, phi: Array, y: Array) -> None:
+    """Outputs y (N,) and their regressors phi (N, n) of one draw of signs (N,)."""
+    N, n = phi.shape
+    p, k = lags.shape[0], way.columns.shape[0]
+    first = lags[p - 1] if p > 0 else 0
+    for t in range(N):
+        v[t] = way.start[t] if t < first else way.e[t] * signs[t]
+        if t >= first:
+            for i in range(p):
+                v[t] += way.ar[i] * v[t - lags[i]]
+        y[t] = v[t]
+        for j in range(n):
+            phi[t, j] = way.phi[t, j]
+        for i in range(k):
+            if way.source[t, i] >= 0:
+                phi[t, way.columns[i]] = way.ratio[t, i] * y[way.source[t, i]]
+        for j in range(n):
+            y[t] += phi[t, j] * way.theta[j]
+
+
+def _draw(
+    way: Recursion, signs: Array, problem: Problem, whole: Array, work: Work, found: Found, phi: Array, X: Array,
+    y: Array, rss: Array, L: Array, theta: Array, ar: Array,
+) -> None:  # fmt: skip
+    """Results of all draws of signs (R, N); only constants and their autoregression unless ``whole``."""
+    N, n = phi.shape
+    for d in range(signs.shape[0]):
+        simulate(way, problem.lags, signs[d], work.v, phi, y)
+        for t in range(N):
+            for j in range(n):
+                X[t, j] = way.X[t, j]
+                if way.columns.shape[0] > 0:
+                    X[t, j] = 0.0
+                    for i in range(n):
+                        X[t, j] += phi[t, i] * way.basis[i, j]
+        if whole[0] > 0:
+            search(X, y, problem, work, found)
+            for count in range(3):
+                rss[d, count] = found.rss[count]
+            for i in range(found.L.shape[0]):
+                L[d, i] = found.L[i]
+            continue
+        for i in range(ar.shape[1]):
+            ar[d, i] = 0.0
+        settle(X, y, problem, problem.sizes[2], ar[d], work)
+        for j in range(n):
+            theta[d, j] = work.theta[j]
+
+
+def _once(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> None:
+    search(X, y, problem, work, found)
+
+
+def _prepared(X: Array, y: Array, problem: Problem, a: Array, work: Work, rss: Array) -> None:
+    rss[0] = prepare(X, y, problem, a, work)
+
+
+_search, _draws, _increments = Driver(_once), Driver(_draw), Driver(_prepared)
