@@ -29,7 +29,7 @@ from rich.console import Console
 from rich.table import Table
 
 from driftfit import ARX, Kalman, Live
-from driftfit.data.known import Known
+from driftfit.data.record import Known
 from driftfit.engine.drivers import drivers
 from driftfit.engine.kernel import Driver
 from driftfit.engine.tiles import make_tile, output_type

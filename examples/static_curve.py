@@ -10,7 +10,7 @@ import warnings
 import numpy as np
 
 from driftfit import FLS, static_curve, track, tune
-from driftfit.show.parts.axes import BLUE, GREY, RED, new_figure
+from driftfit.show.axes import BLUE, GREY, RED, new_figure
 from driftfit.systems.time_varying import hammerstein
 
 

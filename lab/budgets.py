@@ -18,7 +18,7 @@ from driftfit import ARX, FLS, RLS, AdaptiveKalman, Gate, Kalman
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.models.base import Model
 from driftfit.run.program import Program
-from driftfit.show.parts.text import table_of
+from driftfit.show.text import table_of
 from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 

@@ -24,7 +24,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from driftfit.show.parts.text import table_of
+from driftfit.show.text import table_of
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = "src/driftfit"
@@ -39,7 +39,7 @@ LAYERS = (
     ("data", "smooth.parts"),
     ("run",),
     # how tables and pictures of all results look, which each verb's result needs to print and draw itself
-    ("show.parts",),
+    ("show.text", "show.axes"),
     ("smooth", "tune", "judge", "use", "models.hammerstein_wiener.results", "trackers.bank.results"),
     ("show",),
     # the facade binds verbs to results
@@ -204,7 +204,7 @@ Room = tuple[str, int]
 
 def draw(found: Mapping[str, Structure], file: str) -> None:
     """Folders as boxes in their layers, and imports between them: red where they point up, wider where more go."""
-    from driftfit.show.parts.axes import GREY, RED, new_figure
+    from driftfit.show.axes import GREY, RED, new_figure
 
     figure = new_figure(6.4 * len(found), 7.0)
     for axis, (name, one) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items(), strict=True):

@@ -12,7 +12,7 @@ from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow, Known
 from driftfit.bridges.spark.follow import STATE, _schema
 from driftfit.bridges.spark.pieces import ARROW
 from driftfit.bridges.spark.task import SETTING, Task
-from driftfit.run.states import layout
+from driftfit.run import layout
 
 MODEL, K = ARX(2, 2), Kalman(q=1e-4, r=0.1)
 PAIR = ARX(1, 1, ny=("flow", "pressure"))

@@ -6,7 +6,7 @@ from scipy import signal
 
 from driftfit import ARX, Kalman, Live, Regression, track
 from driftfit.run.live.alarm import LiveAlarm
-from driftfit.run.live.frozen.reference_model import LEARNED
+from driftfit.run.live.reference_model import LEARNED
 
 HELD = Kalman(q=0.0, r=1.0)
 GAIN = Regression(["gain"], intercept=True)

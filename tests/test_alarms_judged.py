@@ -11,7 +11,7 @@ from driftfit.judge.alarms.bootstrap import limits, simulated
 from driftfit.judge.alarms.detect import asked_for
 from driftfit.judge.alarms.frozen import frozen_model, noise_model
 from driftfit.judge.alarms.groups import look
-from driftfit.run.live.frozen.reference_model import CLIP, EVEN, SCALE, K
+from driftfit.run.live.reference_model import CLIP, EVEN, SCALE, K
 
 HELD = Kalman(q=0.0, r=1.0)
 GAIN = Regression(["gain"], intercept=True)

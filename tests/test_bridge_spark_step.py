@@ -20,7 +20,7 @@ from driftfit.bridges.spark.batch import Partition, schema_of
 from driftfit.bridges.spark.flow import Flow, Origin
 from driftfit.bridges.spark.session import java, missing
 from driftfit.bridges.spark.unit import Unit
-from driftfit.run.states.layout import packed as pack
+from driftfit.run.layout import packed as pack
 
 TYPES = {"unit": pa.string(), **dict.fromkeys(("t", "y", "flow", "pressure", "u"), pa.float64())}
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from driftfit import ARX, Kalman, track
 from driftfit.cli import app
-from driftfit.data.formats.csv_files import without_formulas
+from driftfit.data.csv_files import without_formulas
 from driftfit.fleets import Fleet, Outputs
 from driftfit.show import export
 

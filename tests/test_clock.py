@@ -11,10 +11,8 @@ import polars as pl
 import pytest
 
 from driftfit import ARX, RLS, Kalman, Live, Regression, track
-from driftfit.data.clock import NEAR, Clock
-from driftfit.data.times.gaps import median_interval
-from driftfit.data.times.instants import instant
-from driftfit.data.times.periods import span
+from driftfit.data.clock import NEAR, Clock, median_interval
+from driftfit.data.instants import instant, span
 from driftfit.engine.settings import DataWarning
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-3, r=0.1)

@@ -12,8 +12,7 @@ import polars as pl
 import pytest
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Track, track
-from driftfit.data.known import Known
-from driftfit.data.record import Records
+from driftfit.data.record import Known, Records
 from driftfit.run import parallel_lanes
 from driftfit.run.fleet import run_fleet
 from driftfit.run.program import Program

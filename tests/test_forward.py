@@ -9,7 +9,7 @@ from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.curves.basis import DeadZone, Legendre, Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.systems.hammerstein_wiener import simulate
-from driftfit.use.draws import DRAWS, ahead_by_draws, drawn, simulate_by_draws
+from driftfit.use.simulate import DRAWS, ahead_by_draws, drawn, simulate_by_draws
 
 CURVED = HammersteinWiener(2, 2, input=Polynomial(2), output=Polynomial(3))
 A, B, C, D = [-1.2, 0.5], [0.6, 0.3], [0.4], [0.1, 0.2]

@@ -15,8 +15,8 @@ from driftfit.judge.alarms.bootstrap import START
 from driftfit.judge.alarms.frozen import frozen_model, noise_model, noise_models, slopes_of
 from driftfit.judge.alarms.onsets import onsets
 from driftfit.judge.alarms.side_by_side import SimulatedRecords, statistics_of
-from driftfit.run.live.frozen.likelihood_ratio import scan
-from driftfit.run.live.frozen.reference_model import (
+from driftfit.run.live.likelihood_ratio import scan
+from driftfit.run.live.reference_model import (
     ALPHA,
     BETA,
     BOUND,

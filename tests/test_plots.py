@@ -17,7 +17,7 @@ from driftfit import (
     piecewise,
     plot_tree,
 )
-from driftfit.show.parts.axes import panels
+from driftfit.show.axes import panels
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,7 @@ from scipy.stats import norm
 from support import damaged, same
 
 from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Law, Live, Regression, check_tracker, pool, track, tune
-from driftfit.use.constraints.constrained import Constrained
-from driftfit.use.constraints.half_spaces import half_space
-from driftfit.use.constraints.truncated import cut, moments
+from driftfit.use.constrained import Constrained, cut, half_space, moments
 
 LAWS = {"theta1": Law.returns(time=20, std=0.5), "theta2": Law.season(12, harmonics=2, q=1e-5)}
 TRACKER = Kalman(q=1e-4, r=0.04, laws=LAWS)

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Kalman, Regression, track
 from driftfit.cli import app
 from driftfit.run.live.rule import FROZEN, KINDS
-from driftfit.show.page_parts import LONG, svg
+from driftfit.show.page import LONG, svg
 from driftfit.show.report import page
 
 K = Kalman(q=1e-3, r=0.01)

@@ -26,7 +26,7 @@ from service_support import (
 )  # fmt: skip
 
 from driftfit import ARX, DataWarning, track
-from driftfit.run.states.advance import advance
+from driftfit.run.parallel_lanes import advance
 from driftfit.service.core.archive import export
 from driftfit.service.core.engine import KEPT
 from driftfit.service.core.intake import Intake

@@ -9,13 +9,12 @@ import pytest
 from support import arx_record, damaged, same
 
 from driftfit import ARX, Kalman, Live, track
-from driftfit.data.known import Known
-from driftfit.data.record import Records
+from driftfit.data import late
+from driftfit.data.late import LATE, RELEASED, REPEATED, UNTIMED, WAITING, HoldBack, sort_out
+from driftfit.data.record import Known, Records
+from driftfit.run.layout import MANY, packed, unpacked
+from driftfit.run.parallel_lanes import advance
 from driftfit.run.program import Program
-from driftfit.run.states import late
-from driftfit.run.states.advance import advance
-from driftfit.run.states.late import LATE, RELEASED, REPEATED, UNTIMED, WAITING, HoldBack, sort_out
-from driftfit.run.states.layout import MANY, packed, unpacked
 from driftfit.run.warm_start import End
 
 GOLDEN = Path(__file__).parent / "golden" / "kalman_arx22.state"

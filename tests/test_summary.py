@@ -10,7 +10,7 @@ from support import THETA, arx_record, damaged, rows_of, same
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track
 from driftfit.judge.compare import compare, persistence
-from driftfit.show.parts.text import WIDTH, digits, printed, table_of, together
+from driftfit.show.text import WIDTH, digits, printed, table_of, together
 
 K = Kalman(q=1e-3, r=0.1)
 

@@ -6,9 +6,8 @@ from scipy import signal
 from support import arx_record, damaged
 
 from driftfit import ARX, AugmentedFLS, Kalman, Regression, track
-from driftfit.use.delta_method import jacobian
 from driftfit.use.simulate import fit
-from driftfit.use.system import fieller
+from driftfit.use.system import fieller, jacobian
 
 K = Kalman(q=1e-3, r=0.01)
 

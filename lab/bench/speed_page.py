@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.show.parts.axes import BLUE, GREY, new_figure
+from driftfit.show.axes import BLUE, GREY, new_figure
 from lab.bench.causes import SPEED_CAUSES
 from lab.bench.computer import computer, markdown, versions
 from lab.bench.contest import SAME, Finish, Line

@@ -12,12 +12,10 @@ from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses,
 from driftfit.judge.joint_noise import JointNoise
 from driftfit.results import Exported, Track
 from driftfit.run import fleet, keyed_results, outputs, result
-from driftfit.show.fleet_summary import FleetSummary, summarise
-from driftfit.show.parts.by_output import ByOutput
 from driftfit.show.plots import plot_fleet, plot_outputs
-from driftfit.show.report import check_path
-from driftfit.show.report_many import page_of_many
-from driftfit.show.summary import Summary, summarise_outputs
+from driftfit.show.report import check_path, page_of_many
+from driftfit.show.summary import FleetSummary, Summary, summarise_fleet, summarise_outputs
+from driftfit.show.text import ByOutput
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.use.crossing import crossings
 from driftfit.use.forecast import Forecast, forecast_outputs
@@ -102,7 +100,7 @@ class Fleet(fleet.Fleet, Judged, public=True):
 
     def summary(self) -> FleetSummary:
         """Results ranked by how much their parameters moved; print it."""
-        return summarise(self)
+        return summarise_fleet(self)
 
     def plot(self, which: str | None = None, most: int = 12, level: float = 0.95, ax: Any = None) -> Figure:
         """Small multiples of one parameter for the results that moved most; a matplotlib figure.
@@ -142,7 +140,7 @@ class Outputs(outputs.Outputs, Judged, public=True):
 
 def _public(run: result.Track) -> Track:
     """A run of the class that users know: once the facade is imported, every run is made so
-    (`driftfit.run.public_class`).
+    (`driftfit.run.columns`).
     """
     assert isinstance(run, Track)
     return run

@@ -16,21 +16,20 @@ from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
 from driftfit.models.hammerstein_wiener.separation.paths import Blocks
 from driftfit.run import result
 from driftfit.run.live.rule import AlarmRule
-from driftfit.show.cells import cell_of
 from driftfit.show.plots import plot_track
 from driftfit.show.report import report
-from driftfit.show.summary import Summary, summarise
+from driftfit.show.summary import Summary, cell_of, summarise
 from driftfit.smooth.shared_theta import SmoothedShared
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.bank.results.decided_path import EventSmoothed
 from driftfit.trackers.bank.results.results import Hypotheses
 from driftfit.tune.refine import refine
 from driftfit.use import simulate, system
-from driftfit.use.constraints.constrained import Constrained, constrain
-from driftfit.use.continuous.conversion import Transfer, transfer
+from driftfit.use.constrained import Constrained, constrain
+from driftfit.use.conversion import Transfer, transfer
 from driftfit.use.crossing import Crossing, crossing
 from driftfit.use.forecast import Forecast, forecast
-from driftfit.use.prediction import Prediction
+from driftfit.use.simulate import Prediction
 from driftfit.use.system import FrequencyResponse, LongRun, Response
 from driftfit.use.system_plots import plot_system, plot_validation
 
@@ -57,9 +56,9 @@ class Exported:
 
     def to_xarray(self: Any) -> xarray.Dataset:
         """The result as an xarray dataset with the dimensions time and parameter, and one more for keys; see
-        `driftfit.show.datasets`.
+        `driftfit.show.export`.
         """
-        from driftfit.show.datasets import to_xarray
+        from driftfit.show.export import to_xarray
 
         return to_xarray(self)
 
@@ -180,7 +179,7 @@ class Track(result.Track, Exported, public=True):
         """theta known to be within bounds or on planes, as "b1 >= 0", "0 <= a1 + a2 <= 1", "b1 + b2 == 1".
 
         The result has ``theta``, ``std``, ``band()``, ``cov(t)`` and ``prob``; see
-        `driftfit.use.constraints.constrained`.
+        `driftfit.use.constrained`.
         """
         return constrain(self, *constraints)
 

@@ -9,9 +9,9 @@ from driftfit.judge.structures import shared_streams
 from driftfit.models.hammerstein_wiener.separation.paths import Groups, Separator
 from driftfit.run.live import live
 from driftfit.trackers.bank.results.live_results import LiveHypotheses
-from driftfit.use.constraints.constrained import Constrained, constrain_stream
+from driftfit.use.constrained import Constrained, constrain_stream
 from driftfit.use.forecast import Forecast, forecast_stream
-from driftfit.use.live_system import LiveSystem
+from driftfit.use.system import LiveSystem
 
 
 class Live(live.Live, public=True):
@@ -45,7 +45,7 @@ class Live(live.Live, public=True):
 
     @property
     def system(self) -> LiveSystem:
-        """The present `ARX` system: poles, gains, responses with bands; see `driftfit.use.live_system`."""
+        """The present `ARX` system: poles, gains, responses with bands; see `driftfit.use.system`."""
         return LiveSystem(self)
 
 

@@ -7,7 +7,7 @@ import pytest
 from support import arx_record, damaged, run_lanes, same
 
 from driftfit import Live, track
-from driftfit.data.known import Known
+from driftfit.data.record import Known
 
 T = 300
 

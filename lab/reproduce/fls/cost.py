@@ -19,7 +19,7 @@ from scipy import linalg
 from driftfit.engine.kernel import Array
 from driftfit.models.regression import Regression
 from driftfit.results import Track
-from driftfit.show.parts.axes import new_figure
+from driftfit.show.axes import new_figure
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.fls import FLS
 from driftfit.tracking import track

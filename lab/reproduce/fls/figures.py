@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.show.parts.axes import BLUE, GREY, RED, new_figure
+from driftfit.show.axes import BLUE, GREY, RED, new_figure
 from driftfit.systems.time_varying import MU, Simulated, example
 from lab.reproduce.fls import Fit, fits
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.show.parts.axes import BLUE, GREY, RED, new_figure
+from driftfit.show.axes import BLUE, GREY, RED, new_figure
 from driftfit.systems.arc_furnace import furnace, resistance, valve
 from driftfit.systems.hammerstein_wiener import CUBIC, START, Simulated, example
 from driftfit.tracking import track

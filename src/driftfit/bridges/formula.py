@@ -27,11 +27,11 @@ from formulaic.materializers import FormulaMaterializer
 from formulaic.utils.null_handling import find_nulls
 from scipy.special import ndtr, stdtr
 
-from driftfit.data.labels import chronological
+from driftfit.data.arguments import chronological
 from driftfit.models.regression import Regression
 from driftfit.readings.left_out import remarks_of
 from driftfit.results import Track
-from driftfit.show.parts.axes import BLUE, RED, panels
+from driftfit.show.axes import BLUE, RED, panels
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from driftfit.data.formats.packed import check_unpacked
+from driftfit.data.files import check_unpacked
 
 INT32, UINT32, MATRIX, COMPRESSED = 5, 6, 14, 15
 WIDTHS = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8}

@@ -27,7 +27,7 @@ from scipy.io import loadmat, savemat
 from scipy.io.matlab import matfile_version
 
 from driftfit.bridges.mat_files import readable
-from driftfit.data.formats.packed import check_unpacked
+from driftfit.data.files import check_unpacked
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 

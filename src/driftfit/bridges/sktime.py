@@ -20,7 +20,7 @@ import pandas as pd
 from scipy.special import ndtri
 from sktime.forecasting.base import BaseForecaster
 
-from driftfit.data.labels import chronological
+from driftfit.data.arguments import chronological
 from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model

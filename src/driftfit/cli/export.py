@@ -9,7 +9,7 @@ import typer
 
 from driftfit.cli.parts.program import app, helpful, say
 from driftfit.parsing.settings import parse_model, parse_tracker
-from driftfit.show.parts.text import facts
+from driftfit.show.text import facts
 
 export = typer.Typer(no_args_is_help=True, help="Write a tracker in another language.")
 app.add_typer(export, name="export")

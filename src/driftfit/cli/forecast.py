@@ -16,7 +16,7 @@ from driftfit.cli.parts.reading import rows_of
 from driftfit.engine.kernel import Array
 from driftfit.results import Track
 from driftfit.show.export import write_table
-from driftfit.show.parts.text import table_of
+from driftfit.show.text import table_of
 
 SHOWN = 40
 """Largest number of rows that are printed."""

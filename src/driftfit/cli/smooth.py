@@ -15,7 +15,7 @@ from driftfit.cli.parts.program import app, progress, say
 from driftfit.cli.track import Plot
 from driftfit.engine.settings import missing_settings
 from driftfit.show.export import write_table
-from driftfit.show.parts.text import digits, facts, table_of
+from driftfit.show.text import digits, facts, table_of
 from driftfit.tune.tune import tune
 from driftfit.tune.tuned import Tuned
 

@@ -13,7 +13,7 @@ from driftfit.cli.parts.program import app, progress, say
 from driftfit.cli.track import Plot
 from driftfit.parsing.settings import given_fields
 from driftfit.readings.left_out import LeftOut, remarks_of
-from driftfit.show.parts.text import facts, shortened, table_of
+from driftfit.show.text import facts, shortened, table_of
 
 
 @app.command()

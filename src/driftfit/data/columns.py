@@ -17,9 +17,7 @@ import narwhals as nw
 import numpy as np
 import polars as pl
 
-from driftfit.data.times.dates import dates, day_first
-from driftfit.data.times.instants import DAY, zone_name
-from driftfit.data.times.periods import EXAMPLES, periods
+from driftfit.data.instants import DAY, EXAMPLES, dates, day_first, periods, zone_name
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import ABSENT, as_numbers, near
 

@@ -24,8 +24,7 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from driftfit.data.times.instants import instant, with_hyphens
-from driftfit.data.times.periods import span
+from driftfit.data.instants import instant, span, with_hyphens
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 

@@ -2,6 +2,8 @@
 
 Every run reads its samples from here, whether they came from a table, from rows of an array, or from one series with
 several settings: a lane reads ``length`` samples, beginning at ``first``.
+
+Known numbers of every sample in addition to its signals: elapsed time, noise, and how far theta may move.
 """
 
 from __future__ import annotations
@@ -10,21 +12,18 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC
 from datetime import time as clock
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from driftfit.data.clock import LABEL, Clock
-from driftfit.data.known import Known, row_of
-from driftfit.data.labels import held, ordered, times_of, together
+from driftfit.data.arguments import ordered
+from driftfit.data.clock import Clock, warn_of_gaps
 from driftfit.data.limits import Limits, marked, marks, within_each
-from driftfit.data.signals import as_inputs, as_output, intervals, noise_of, warn_of_sizes
-from driftfit.data.times.gaps import warn_of_gaps
-from driftfit.data.times.instants import instants
+from driftfit.engine.drivers import COMMON, DRIFT, INTERVAL, LARGEST, NOISE, SMALLEST
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import as_numbers, axes, factor
+from driftfit.engine.settings import warn
 from driftfit.models.base import Model
 from driftfit.readings.left_out import LeftOut
 from driftfit.trackers.base import Tracker
@@ -69,12 +68,6 @@ PLAIN = Labels()
 _NONE: Mapping[Any, Any] = {}
 
 
-@lru_cache(maxsize=256)
-def labels_of_series(y: str, u: tuple[str, ...], time: str | None, zone: str | None, dt: float | str | None) -> Labels:
-    """The labels of one series, of which nothing has been left out yet; made once for all series with the same."""
-    return Labels(y, u, time, zone=zone, dt=dt)
-
-
 def time_text(time: Any, zone: str | None) -> str:
     """A time as text, dates in a time zone; midnight without a zone is the date alone.
 
@@ -89,6 +82,27 @@ def time_text(time: Any, zone: str | None) -> str:
     shown = date if zone is None else date.replace(tzinfo=UTC).astimezone(ZoneInfo(zone))
     part = f".{date.microsecond:06d}".rstrip("0") if date.microsecond else ""
     return f"{shown:%Y-%m-%d %H:%M:%S}{part}{'' if zone is None else f'{shown: %Z}'}"
+
+
+SIZED = 1000
+"""Numbers of a signal that are looked at to find its size."""
+
+
+def warn_of_sizes(names: Sequence[str], values: Array) -> None:
+    """Warn of columns (N, k) most numbers of which are so large that they count as missing, or so small that they count
+    as 0, by a thousand numbers of each.
+    """
+    for name, column in zip(names, values[:: len(values) // SIZED + 1].T, strict=True):
+        size = np.abs(column)
+        if SMALLEST < size.max(initial=0.0) < LARGEST:  # nearly always, so it must cost little
+            continue
+        size = size[(size > 0.0) & (size < np.inf)]
+        odd = size[(size <= SMALLEST) | (size >= LARGEST)]
+        if 2 * len(odd) > len(size):
+            warn(
+                f"most numbers of {name} are like {odd[0]:g}: sizes of {LARGEST:g} or more count as missing, those of "
+                f"{SMALLEST:g} or less as 0. Give the signal in another unit."
+            )
 
 
 class Reading(NamedTuple):
@@ -160,6 +174,12 @@ class Records(NamedTuple):
     left_out: Mapping[Hashable, LeftOut] = _NONE
     """What was left out of each series by decisions that were made before."""
 
+    @classmethod
+    def of(cls, record: Record) -> Records:
+        """A single series of one output, called 0."""
+        first, length = np.zeros(1, int), np.array([len(record)])
+        return cls((0,), first, length, record.y, record.u, record.known, record.time, record.labels)
+
     @property
     def ny(self) -> int:
         """Number of outputs of every series."""
@@ -187,20 +207,6 @@ class Records(NamedTuple):
             u=self.u[rows],
             known=self.known.part(rows),
             time=None if self.time is None else self.time[rows],
-        )
-
-    def only(self, k: int) -> Records:
-        """Records that contain only series k; their arrays are views."""
-        one = self.part(k)
-        first, length = np.zeros(1, dtype=int), np.array([len(one)])
-        return self._replace(
-            keys=self.keys[k : k + 1],
-            first=first,
-            length=length,
-            y=one.y,
-            u=one.u,
-            known=one.known,
-            time=one.time,
         )
 
     def in_rows(self) -> Records:
@@ -250,7 +256,7 @@ class Records(NamedTuple):
         Warns if most numbers of a signal are out of range, and if most samples cannot be used because of dt, with lags
         of ``reach`` samples, or those of the model.
         """
-        u, names = ordered(model, self.u, self.labels.u)
+        u, names = ordered(model, self.u, self.labels.u) if self.labels.u else (self.u, ())
         warn_of_sizes(self.outputs or (self.labels.y,), self.y.reshape(len(self.y), self.ny))
         if m := u.shape[-1]:
             warn_of_sizes(names or [f"u{j + 1}" for j in range(m)], u.reshape(-1, m))
@@ -284,101 +290,120 @@ class Records(NamedTuple):
         return self._replace(y=y, u=u, missing=missing)
 
 
-FIRST = np.zeros(1, dtype=int)
-"""Where a single series begins."""
+@dataclass(frozen=True)
+class Known:
+    """``columns`` (T, k), or (1, k) where the same holds for every sample; k is 3, or more if there are extras.
+
+    Samples of several outputs have columns (T, k, ny) or (1, k, ny); `for_output` gives those of one.
+
+    ``interval``, ``noise`` and ``drift`` are its first columns: nominal intervals since the sample before, factors of
+    the noise variance, and factors of the drift. ``extra`` (T, k - 3) is what `Tracker.extra_columns` made.
+    """
+
+    columns: Array
+
+    @classmethod
+    def of(cls, interval: Any = 1.0, noise: Any = 1.0, drift: Any = 1.0) -> Known:
+        """The columns made of numbers or of arrays (T,)."""
+        if type(interval) is type(noise) is type(drift) is float:
+            return row_of(interval, noise, drift)
+        parts = (interval, noise, drift)
+        if not (np.ndim(interval) or np.ndim(noise) or np.ndim(drift)):
+            return row_of(float(interval), float(noise), float(drift))
+        return cls(np.stack(np.broadcast_arrays(*(np.atleast_1d(np.asarray(part, float)) for part in parts)), axis=1))
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+    @cached_property
+    def lanes(self) -> Array:
+        """The columns of one output with an axis for its lane, (T, k, 1) or (1, k, 1)."""
+        return self.columns[:, :, None]
+
+    @property
+    def constant(self) -> bool:
+        """Whether one row holds for every sample."""
+        return len(self.columns) == 1
+
+    @property
+    def interval(self) -> Array:
+        """(T,) or (1,): nominal intervals since the sample before."""
+        return self.columns[:, INTERVAL]
+
+    @property
+    def noise(self) -> Array:
+        """(T,) or (1,): factors of the noise variance."""
+        return self.columns[:, NOISE]
+
+    @property
+    def drift(self) -> Array:
+        """(T,) or (1,): factors of the drift."""
+        return self.columns[:, DRIFT]
+
+    @property
+    def extra(self) -> Array:
+        """(T, k - 3): extra columns, which only some trackers read."""
+        return self.columns[:, COMMON:]
+
+    @property
+    def common(self) -> Known:
+        """The same numbers without the extra columns."""
+        return Known(self.columns[:, :COMMON])
+
+    def part(self, rows: slice | Array) -> Known:
+        """The known numbers of some of the samples."""
+        return self if self.constant else Known(self.columns[rows])
+
+    def over(self, T: int) -> Known:
+        """The same numbers with a row for each of T samples; the arrays must not be changed."""
+        return Known(np.broadcast_to(self.columns, (T, *self.columns.shape[1:])))
+
+    def changed(self, interval: Any = None, noise: Any = None) -> Known:
+        """The same numbers with other intervals or noise factors; a single row applies to all samples."""
+        given = {INTERVAL: interval, NOISE: noise}
+        T = max(len(self), *(np.size(values) for values in given.values() if values is not None))
+        columns = self.over(T).columns.copy()
+        for place, values in given.items():
+            if values is not None:
+                columns[:, place] = values if columns.ndim == 2 else np.reshape(values, (-1, 1))
+        return Known(columns)
+
+    def begun(self, factors: Mapping[int, float]) -> Known:
+        """The same numbers, with the intervals before the samples of these indices multiplied by a factor."""
+        columns = self.columns.copy()
+        for place, times in factors.items():
+            columns[place, INTERVAL] *= times
+        return Known(columns)
+
+    def with_extra(self, columns: Array) -> Known:
+        """The same numbers with extra columns (T, k) after interval, noise and drift."""
+        common = self.common.over(len(columns)).columns
+        if common.ndim > 2:
+            columns = np.repeat(columns[:, :, None], common.shape[2], axis=2)
+        return Known(np.hstack([common, columns]))
+
+    def for_outputs(self, noise: Array) -> Known:
+        """The same numbers for each of several outputs, which have separate factors of the noise variance (T, ny)."""
+        T, ny = noise.shape
+        columns = np.repeat(self.over(T).columns[:, :, None], ny, axis=2)
+        columns[:, NOISE] = noise
+        return Known(columns)
+
+    def for_output(self, output: int) -> Known:
+        """The known numbers of one of several outputs."""
+        return Known(self.columns[..., output])
+
+    def in_rows(self, T: int) -> Known:
+        """(T ny, k): one row for each output of each instant; no time passes between the rows of an instant."""
+        ny = self.columns.shape[2]
+        columns = np.moveaxis(self.over(T).columns, 1, 2).flatten().reshape(T * ny, -1)
+        columns[np.arange(T * ny) % ny > 0, INTERVAL] = 0.0
+        return Known(columns)
 
 
-def one_series(y: Any, u: Any, reading: Reading) -> Records:
-    """One series; y (T,), u (T,), (T, m) or None."""
-    time, dt, weights, drift, *_ = reading
-    if type(y) is type(u) is np.ndarray and time is dt is None and type(weights) is type(drift) is float:
-        # what most calls give has neither names nor an index
-        output = as_output(y)
-        T = len(output)
-        known = row_of(1.0, noise_of(weights, T), factor("drift", drift))
-        return Records((0,), FIRST, np.array((T,)), output, as_inputs(u, T), known)
-    given_y, given_u = held("y", y), held("u", u)
-    given_weights, given_drift = held("weights", weights), held("drift", drift)
-    together(y=given_y, u=given_u, weights=given_weights, drift=given_drift)
-    weights, drift = given_weights.values, given_drift.values
-    output = as_output(given_y.values)
-    T = len(output)
-    times = times_of(time, (given_y, given_u) if reading.indexed else (), dt)
-    dt = LABEL if times.labels and dt is None else dt
-    axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
-    common, drifts = (1.0, as_numbers("drift", drift)) if axes(drift) == 2 else (drift, None)
-    known = Known.of(gaps, noise_of(weights, T), factor("drift", common, T))
-    name = given_y.names[0] if given_y.names else "y"
-    labels = labels_of_series(name, given_u.names, times.name, times.zone, Clock.of(dt).plain)
-    inputs = as_inputs(given_u.values, T)
-    return Records((0,), FIRST, np.array((T,)), output, inputs, known, axis, labels, drifts=drifts)
-
-
-def rows(y: Any, u: Any, reading: Reading) -> Records:
-    """Series as rows: y (units, T), u (units, T), (units, T, m) or None, time (T,) or (units, T) or None."""
-    time, dt, weights, drift = reading.time, reading.dt, reading.weights, reading.drift
-    output = as_numbers("y", y)
-    if output.ndim != 2 or output.size == 0:
-        raise ValueError(f'by="row": y must be (units, T), not empty; got shape {output.shape}.')
-    units, T = output.shape
-    each = as_numbers("drift", drift) if np.ndim(drift) == 3 else None
-    if each is not None and each.shape[:2] != (units, T):
-        raise ValueError(
-            f'by="row": drift with a column for each parameter must be ({units}, {T}, n); got shape {each.shape}.'
-        )
-    known, axis = _known_of_rows(units, T, time, dt, weights, drift if each is None else 1.0)
-    return Records(
-        tuple(range(units)), np.arange(units) * T, np.full(units, T), output.ravel(),
-        _inputs_of_rows(u, units, T), known, axis, Labels(dt=Clock.of(dt).plain),
-        drifts=None if each is None else each.reshape(units * T, -1),
-    )  # fmt: skip
-
-
-def _inputs_of_rows(u: Any, units: int, T: int) -> Array:
-    """u as (units * T, m)."""
-    if u is None:
-        return np.zeros((units * T, 0))
-    inputs = as_numbers("u", u)
-    if inputs.ndim == 2:
-        inputs = inputs[:, :, None]
-    if inputs.ndim != 3 or inputs.shape[:2] != (units, T):
-        raise ValueError(
-            f'by="row": y is {units} units of {T} samples, so u must be ({units}, {T}) or ({units}, {T}, m); '
-            f"got shape {np.shape(u)}."
-        )
-    return inputs.reshape(units * T, inputs.shape[2])
-
-
-def _known_of_rows(units: int, T: int, time: Any, dt: Any, weights: Any, drift: Any) -> tuple[Known, Array | None]:
-    """What is known of units * T samples, and time (units * T,) or None."""
-    shape = (units, T)
-    axis: Array | None = None
-    gaps: Any = 1.0
-    if time is not None:
-        given, zone = instants(time)
-        dt = Clock.of(dt, zone)
-        if given.ndim == 1:
-            axis, gaps = intervals(given, dt, T)
-            axis = np.broadcast_to(axis, shape)
-        elif given.shape == shape:
-            axis, gaps = (np.stack(part) for part in zip(*(intervals(row, dt, T) for row in given), strict=True))
-        else:
-            raise ValueError(f'by="row": time must be ({T},) or {shape}; got shape {given.shape}.')
-    factors = [gaps, _per_row("weights", weights, shape, noise_of), _per_row("drift", drift, shape, drift_of)]
-    flat = [np.broadcast_to(f, shape).ravel() if np.ndim(f) else f for f in factors]
-    return Known.of(*flat), None if axis is None else axis.ravel()
-
-
-def drift_of(value: Any, T: int | None = None) -> Any:
-    """Known factors of the drift."""
-    return factor("drift", value, T)
-
-
-def _per_row(name: str, value: Any, shape: tuple[int, int], convert: Any) -> Array:
-    """A factor given as one number, (T,) for all rows, or (units, T)."""
-    array = np.asarray(value)
-    if array.ndim < 2:
-        return np.asarray(convert(value, shape[1]))
-    if array.shape != shape:
-        raise ValueError(f'by="row": {name} must be a number, ({shape[1]},) or {shape}; got shape {array.shape}.')
-    return np.asarray(convert(array.ravel(), array.size)).reshape(shape)
+@lru_cache(maxsize=256)
+def row_of(interval: float, noise: float, drift: float) -> Known:
+    """A row that holds for every sample; it is made once and cannot be written to."""
+    columns = np.array([[interval, noise, drift]])
+    columns.flags.writeable = False
+    return Known(columns)

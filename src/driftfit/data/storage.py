@@ -38,11 +38,11 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, place_of
 from driftfit.engine.tiles import held_in
 
-FORMAT = 2
+FORMAT = 3
 """Version of the format of .npz files."""
 MAGIC, COMPACT = b"driftfit", 3
 """The first bytes of a packed state, and the version of its format."""
-REMEDY = "whose trackers judged readings by rules of their own: run the record again"
+REMEDY = "which stored results and states otherwise: run the record again"
 """Why older states and results are refused, and what to do."""
 HEAD = Struct("<8sHHII")
 CHECKED = 16

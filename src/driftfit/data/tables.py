@@ -12,22 +12,23 @@ from __future__ import annotations
 import os
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import narwhals as nw
 import numpy as np
 
+from driftfit.data.arguments import dated, noise_of, ordered, warn_of_order, warn_of_repeats, warn_of_skipped_periods
+from driftfit.data.arrays import named_outputs, noise_of_outputs
 from driftfit.data.clock import LABEL, Clock
 from driftfit.data.columns import Columns, Wanted
 from driftfit.data.files import read
-from driftfit.data.known import Known
-from driftfit.data.labels import dated, warn_of_order, warn_of_repeats, warn_of_skipped_periods
+from driftfit.data.instants import warn_of_counted_years, warn_of_summer_time, warn_of_written_numbers
 from driftfit.data.limits import marks
-from driftfit.data.record import Labels, Reading, Records, drift_of
-from driftfit.data.signals import noise_of
-from driftfit.data.times.instants import warn_of_counted_years, warn_of_summer_time, warn_of_written_numbers
+from driftfit.data.record import Known, Labels, Reading, Records
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import warn
+from driftfit.engine.settings import factor, warn
+from driftfit.models.base import Model
 
 
 def read_records(
@@ -79,9 +80,9 @@ def read_records(
     known = Known.of(
         1.0 if times is None else _gaps(times, first, clock),
         _factor(weights, values, noise_of),
-        _factor(1.0 if each else drift, values, drift_of),
+        _factor(1.0 if each else drift, values, partial(factor, "drift")),
     )
-    drifts = np.stack([_factor(name, values, drift_of) for name in each], axis=1) if each else None
+    drifts = np.stack([_factor(name, values, partial(factor, "drift")) for name in each], axis=1) if each else None
     signals = np.stack([values[name] for name in inputs], axis=1) if inputs else np.zeros((len(order), 0))
     units = {**columns.units, **(reading.units or {})}
     labels = Labels(y, inputs, axis, units, columns.zone, {}, keyed, dt=clock.plain)
@@ -200,3 +201,42 @@ def _factor(given: Any, values: Mapping[str, Array], convert: Any) -> Array:
         return np.asarray(convert(given))
     column = np.where(np.isfinite(values[given]), values[given], 1.0)
     return np.asarray(convert(column, len(column)))
+
+
+def from_table(
+    model: Model, y: Any, u: Any, data: Any, by: Any, reading: Reading
+) -> tuple[Model, Records, Mapping[Hashable, str]]:
+    """(the model with its outputs named, a series for each unit, the reasons of units without one) from a table.
+
+    ``y`` names the column of the output, or lists those of several; ``u`` those of the inputs (with shared=True a list
+    for each output). Errors are those of `read_records`.
+    """
+    u, ny = model.input_names or None if u is None else u, len(model.outputs)
+    if ny == 1:
+        return model, *read_records(data, y, u, by, reading)
+    given = [y] if isinstance(y, str) else list(y)
+    if len(given) != ny:
+        raise ValueError(f"track: y must name {ny} columns, one for each output; got {y!r}.")
+    model, place = named_outputs(model, given)
+    given = [given[j] for j in place]
+    inputs = [] if u is None else [u] if isinstance(u, str) else list(u)
+    if model.shared:
+        inputs = [name for row in inputs for name in ([row] if isinstance(row, str) else row)]
+    weights: Any = reading.weights
+    own = [] if isinstance(weights, str) or np.ndim(weights) == 0 else list(weights)
+    own = [own[j] for j in place] if len(own) == ny else own
+    common = reading._replace(weights=1.0 if own else weights)
+    read, failed = read_records(data, given[0], [*given[1:], *inputs, *own], by, common)
+    N, end = len(read.y), ny - 1 + len(inputs)
+    outputs, signals, factors = np.split(read.u, [ny - 1, end], axis=1)
+    signals, names = np.ascontiguousarray(signals), tuple[str, ...]()
+    if model.shared:
+        signals = signals.reshape(N, ny, -1)
+    else:
+        signals, names = ordered(model, signals, inputs)
+    noise = np.repeat(read.known.over(N).noise[:, None], ny, axis=1)
+    if own:
+        noise = noise_of_outputs(np.where(np.isfinite(factors), factors, 1.0), N, ny)
+    labels = replace(read.labels, y="y", u=names)
+    both, known = np.column_stack([read.y, outputs]), read.known.for_outputs(noise)
+    return model, read._replace(y=both, u=signals, known=known, labels=labels, outputs=model.outputs), failed

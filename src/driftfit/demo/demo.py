@@ -31,7 +31,7 @@ from driftfit.data.files import read_columns
 from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.results import Track
-from driftfit.show.parts.axes import GREY, RED, draw_innovation, draw_parameter, draw_prediction, new_figure
+from driftfit.show.axes import GREY, RED, draw_innovation, draw_parameter, draw_prediction, new_figure
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.kalman import Kalman
 from driftfit.tracking import track

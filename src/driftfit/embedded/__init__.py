@@ -10,13 +10,13 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
-from driftfit.data.signals import check_ready
+from driftfit.data.arguments import check_ready
 from driftfit.embedded.project import files_of, write
 from driftfit.embedded.translation import translation
 from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
+from driftfit.run.gating import gate_of
 from driftfit.run.program import Program
-from driftfit.run.states.gating import gate_of
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
 

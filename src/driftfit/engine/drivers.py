@@ -25,7 +25,7 @@ from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
 from driftfit.engine.phases import advancing, at_once, gated, learning, looking, raw_kept
 from driftfit.engine.simd import fill_four, four_of, in_fours, load_four, store_four, times
-from driftfit.engine.tiles import as_compiled, inputs_and_lanes, tile_type
+from driftfit.engine.tiles import as_compiled, inputs_and_lanes, is_open, tile_type
 from driftfit.engine.tracker_part import tracker_part, whole_record
 
 LARGEST = 1e38
@@ -252,7 +252,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
     sample = _sample(model, tracker.note, between, part)
     keep_more = covariance if keep == "cov" else nothing_more
     common = nothing_common if keep == "own" else write_common
-    store = tracker.store if gate is None or keep == "own" else _stored_too(tracker.store)
+    store = tracker.store if gate is None or keep == "own" else stored_too(tracker.store, store_decision)
     run = _run(driver, sample, tracker.read_extra, _written(common, store, keep_more, part), part, gate is not None)
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE) -> int:
@@ -272,7 +272,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
             if len(out) != 1 or theta.shape[1:] != tile["theta"].shape[1:]:
                 raise ValueError(f"run: out must have one row beside theta, which has shape {theta.shape}.")
         ready(L)
-        given = as_compiled(tile), y, u, known, out, theta
+        given = as_compiled(tile) if is_open(tile.dtype) else tile, y, u, known, out, theta
         done: int = run.of_kind((tile.dtype, out.dtype), given) if plain else run(*given)
         return done
 
@@ -289,13 +289,14 @@ def store_decision(o: State, s: State, l: int) -> None:
     o.reason[l], o.raw_e[l] = s.reason[l], s.raw_e[l]
 
 
-def _stored_too(store: Any) -> Any:
-    """What a tracker stores, and what a gate decided."""
+@lru_cache(maxsize=256)
+def stored_too(first: Any, then: Any) -> Any:
+    """A step that stores what two others store of a sample, which is compiled once for both."""
 
     @kernel
     def both(o: State, s: State, l: int) -> None:
-        store(o, s, l)
-        store_decision(o, s, l)
+        first(o, s, l)
+        then(o, s, l)
 
     return both
 

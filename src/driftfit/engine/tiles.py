@@ -121,9 +121,15 @@ def inputs_and_lanes(tile: np.dtype[Any]) -> tuple[int, int]:
     return m, L
 
 
+@lru_cache(maxsize=256)
+def is_open(tile: np.dtype[Any]) -> bool:
+    """Whether a record has open fields (`OPEN`)."""
+    return OPEN[0] in (tile.fields or ())
+
+
 def as_compiled(tile: Array) -> Array:
     """The tile as compiled code takes it: of its open fields (`OPEN`) only the beginning."""
-    if OPEN[0] not in (tile.dtype.fields or ()):  # of the names all would be compared
+    if not is_open(tile.dtype):
         return tile
     return np.ndarray(tile.shape, _beginning(tile.dtype), tile)
 

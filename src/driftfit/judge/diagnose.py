@@ -40,7 +40,7 @@ from driftfit.judge.statistics.robust import core
 from driftfit.judge.statistics.whiteness import Whiteness, crossing, whiteness
 from driftfit.judge.verdict import p_text, rounded
 from driftfit.run.result import Track, burn_in, root_mean_square
-from driftfit.show.parts.text import Printed, table_of
+from driftfit.show.text import Printed, table_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

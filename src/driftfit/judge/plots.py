@@ -15,7 +15,7 @@ from driftfit.judge.statistics.constancy import Constancy
 from driftfit.judge.statistics.whiteness import Whiteness
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.result import Track
-from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, panels, time_label
+from driftfit.show.axes import BLUE, GREY, RED, date_axis, panels, time_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -47,8 +47,8 @@ from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
 from driftfit.run.track import in_rows_only
-from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, panels, time_label
-from driftfit.show.parts.text import Printed, digits, table_of
+from driftfit.show.axes import BLUE, GREY, RED, date_axis, panels, time_label
+from driftfit.show.text import Printed, digits, table_of
 from driftfit.trackers.rls import RLS
 
 if TYPE_CHECKING:

@@ -47,7 +47,7 @@ from driftfit.judge.statistics.paired import Paired, paired
 from driftfit.judge.statistics.whiteness import grows_with, whiteness
 from driftfit.readings.gate import FROZEN
 from driftfit.run.result import Track, root_mean_square
-from driftfit.show.parts.text import Printed, digits, facts, table_of
+from driftfit.show.text import Printed, digits, facts, table_of
 
 LEVEL = 0.05
 """Error rate of the statement that the parameters move, where none is given."""

@@ -13,10 +13,11 @@ from driftfit.data.record import Records
 from driftfit.engine.settings import warn
 from driftfit.readings.left_out import NOTHING_LEFT_OUT
 from driftfit.run.keyed_results import KeyedResults
+from driftfit.run.lanes import Lanes
 from driftfit.run.outputs import Outputs
 from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program, State
-from driftfit.run.result import Lanes, Track
+from driftfit.run.result import Track
 from driftfit.run.warm_start import Run, carried, ended, first_interval
 
 
@@ -75,7 +76,7 @@ class Fleet(KeyedResults):
         lanes = range(k * self.records.ny, (k + 1) * self.records.ny)
         starts = {place: self._starts[j] for place, j in enumerate(lanes) if j in self._starts}
         programs = [self._programs[j] for j in lanes]
-        return Outputs(programs, self.records.only(k), self._lanes.part(lanes), {}, starts)
+        return Outputs(programs, self.records.some(k, k + 1), self._lanes.part(lanes), {}, starts)
 
     def _run(self, j: int) -> Track:
         if self.records.outputs:

@@ -22,11 +22,11 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 from driftfit.models.regression import Regression
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, left_out_of
-from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.columns import Columns
+from driftfit.run.columns import COLLECTED, Columns, collect
 from driftfit.run.keyed_results import KeyedResults
+from driftfit.run.lanes import Lane, names_of
 from driftfit.run.program import Program, kept, lanes_of, shown, state_of, tile_of
-from driftfit.run.result import Lane, Track, names_of
+from driftfit.run.result import Track
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
 

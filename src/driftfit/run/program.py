@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from driftfit.data import storage
+from driftfit.data.arguments import check_ready
 from driftfit.data.record import Record
-from driftfit.data.signals import check_ready
 from driftfit.engine.drivers import GATED, NOWHERE, Drivers, TrackerSteps, drivers
 from driftfit.engine.kernel import Array
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
@@ -28,10 +28,9 @@ from driftfit.models.regression import Regression
 from driftfit.readings.first_samples import replayed
 from driftfit.readings.gate import AT_START, Gate, gate_step
 from driftfit.readings.gate import start as gate_start
-from driftfit.run.collected_samples import COLLECTED, collecting
-from driftfit.run.states.gating import AtStart, gate_of, readings_of, without_start
-from driftfit.run.states.layout import Layout, words_of
-from driftfit.run.states.rows import put_columns
+from driftfit.run.columns import COLLECTED, collecting, put_columns
+from driftfit.run.gating import AtStart, gate_of, readings_of, without_start
+from driftfit.run.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
 CHUNK = 1_000_000
@@ -102,6 +101,21 @@ class Program:
     def whole(self) -> Model:
         """The model that the user gave, with all its outputs."""
         return self.model if self.shared is None else self.shared
+
+    @cached_property
+    def settling(self) -> float:
+        """`Model.settling` of the whole model."""
+        return self.whole.settling
+
+    @cached_property
+    def inspects(self) -> bool:
+        """Whether the model looks at the whole record before a run."""
+        return type(self.model).inspect is not Model.inspect
+
+    @cached_property
+    def doubts(self) -> bool:
+        """Whether the tracker looks at a run after it."""
+        return type(self.tracker).doubts is not Tracker.doubts
 
     @cached_property
     def alone(self) -> Program | None:
@@ -186,7 +200,7 @@ class Program:
         return Layout(record, held_in(record, self.tracker_start), self.tracker.scratch, owner)
 
     def pack(self, tile: Array, lane: int = 0) -> bytes:
-        """The state of a lane as bytes (`driftfit.run.states.layout`)."""
+        """The state of a lane as bytes (`driftfit.run.layout`)."""
         return self.layout.pack(words_of(tile)[self.layout.rows(tile), lane])
 
     def unpack(self, data: bytes, tile: Array | None = None, lane: int = 0) -> Array:
@@ -402,12 +416,6 @@ def lanes_of(record: Record) -> tuple[Array, Array, Array]:
     return record.y[:, None], record.u[:, :, None], record.known.lanes
 
 
-def spread(record: Record, L: int) -> tuple[Array, Array, Array]:
-    """(y, u, known) of a record, the same in each of L lanes."""
-    y, u, known = (np.repeat(part[..., None], L, axis=-1) for part in (record.y, record.u, record.known.columns))
-    return y, u, known
-
-
 def state_of(tile: Array, lane: int = 0) -> dict[str, Array]:
     """The fields of a lane, by name, as views."""
     return {name: tile[name][0, ..., lane : lane + 1][..., 0] for name in storage.fields(tile)}
@@ -429,7 +437,8 @@ def programs_of(
     if len(model.outputs) == 1:
         if not isinstance(tracker, Tracker):
             raise ValueError(f"a model with one output takes one tracker for each series; got {tracker!r}.")
-        return _programs(model, tracker, inputs if isinstance(inputs, int) else tuple(inputs), gate_of(tracker, gate))
+        gate = gate if gate is None or isinstance(gate, bool) else gate_of(tracker, gate)
+        return _programs(model, tracker, inputs if isinstance(inputs, int) else tuple(inputs), gate)
     if isinstance(tracker, Mapping) and not model.shared:
         if set(tracker) != set(model.outputs):
             raise ValueError(
@@ -461,9 +470,11 @@ def programs_of(
 
 
 @lru_cache(maxsize=64)
-def _programs(model: Model, tracker: Tracker, inputs: int | tuple[str, ...], gate: Gate | None) -> tuple[Program, ...]:
+def _programs(
+    model: Model, tracker: Tracker, inputs: int | tuple[str, ...], gate: Gate | bool | None
+) -> tuple[Program, ...]:
     """The programs are cached for the next record, since settings are compared by value."""
-    return (Program(model.bind(inputs), check_ready(tracker), gate=gate),)
+    return (Program(model.bind(inputs), check_ready(tracker), gate=gate_of(tracker, gate)),)
 
 
 def _row_model(model: Model, tracker: Tracker, inputs: int | Sequence[str]) -> Model:

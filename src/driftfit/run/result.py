@@ -2,100 +2,51 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from functools import cached_property
 from os import PathLike
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from driftfit.data import storage
-from driftfit.data.known import Known
-from driftfit.data.record import Labels, Record, time_text
+from driftfit.data.record import Known, Labels, Record, Records, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.readings.gate import AT_START
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, left_out_of
 from driftfit.run.columns import Columns
+from driftfit.run.gating import AtStart, without_codes
+from driftfit.run.lanes import Lane, Lanes, Results, names_of, read_results, write_results
 from driftfit.run.live.conformal import quantile, widened
 from driftfit.run.program import Program, State, kept, lanes_of, state_of
-from driftfit.run.public_class import Plain
-from driftfit.run.states.gating import AtStart, without_codes
-from driftfit.run.warm_start import End, gate_from
+from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.student import log_student, residuals_before, wider
 
 
-class Lane(NamedTuple):
-    """Where the result of one series is stored: the driver's output for its tile, the end state, the lane."""
+class Plain:
+    """A result or a stream as data: ``Kind(...)`` makes an instance of its public class."""
 
-    out: Array
-    tile: Array
-    lane: int = 0
+    _public: ClassVar[dict[type, type]] = {}
 
-    def written(self, name: str) -> Array:
-        """A field of the output of the driver."""
-        field: Array = self.out[name][..., self.lane]
-        return field
+    def __init_subclass__(cls, public: bool = False, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        if public:
+            plain = next(one for one in cls.__mro__[1:] if one.__name__ == cls.__name__)
+            Plain._public[plain] = cls
 
-    def alone(self, program: Program) -> Lane:
-        """A copy in a separate tile, without the other series."""
-        if self.tile["theta"].shape[-1] == 1:
-            return self
-        tile = program.tile(state_of(self.tile, self.lane))
-        out = program.written(tile, len(self.out), *kept(self.out.dtype))
-        for name in names_of(out):
-            out[name][..., 0] = self.written(name)
-        return Lane(out, tile)
-
-
-class Lanes:
-    """The results of many lanes: a `Lane` is made when it is asked for; a million of them would take a second.
-
-    ``tiles`` are (output of the driver, end state, numbers of the lanes that have a result, their places in the tile),
-    ``length`` the number of samples of each lane.
-    """
-
-    def __init__(self, tiles: Sequence[tuple[Array, Array, Array, Array]], length: Array) -> None:
-        self.tiles, self.length = tiles, length
-        self._tile, self._place = np.full(len(length), -1), np.zeros(len(length), int)
-        for k, (_, _, lanes, places) in enumerate(tiles):
-            self._tile[lanes], self._place[lanes] = k, places
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        return object.__new__(Plain._public.get(cls, cls))
 
     @classmethod
-    def of(cls, lanes: Mapping[int, Lane], count: int) -> Self:
-        """Lanes that exist, by their number among ``count``."""
-        tiles = [(lane.out, lane.tile, np.array([j]), np.array([lane.lane])) for j, lane in lanes.items()]
-        return cls(tiles, np.array([len(lanes[j].out) if j in lanes else 0 for j in range(count)], int))
-
-    def part(self, numbers: Sequence[int]) -> Lanes:
-        """Some lanes, in this order."""
-        return Lanes.of({k: self[j] for k, j in enumerate(numbers)}, len(numbers))
-
-    @property
-    def done(self) -> Array:
-        """Which lanes have a result."""
-        return self._tile >= 0
-
-    def __len__(self) -> int:
-        return len(self.length)
-
-    def __getitem__(self, j: int) -> Lane:
-        k = self._tile.item(j)
-        if k < 0:
-            raise KeyError(j)
-        out, tile, _, _ = self.tiles[k]
-        return Lane(out[: self.length.item(j)], tile, self._place.item(j))
-
-    def __iter__(self) -> Iterator[Lane]:
-        """Those that have a result."""
-        return map(self.__getitem__, np.flatnonzero(self.done).tolist())
+    def public(cls) -> type[Self]:
+        """The class that users get."""
+        return Plain._public.get(cls, cls)
 
 
-KINDS = ("track", "shared outputs")
-"""Kinds of files that hold a run of one output, and of outputs that share one theta."""
+KIND = "track"
+"""The kind of a file that holds one run."""
 
 
 class Track(Plain, Columns):
@@ -431,51 +382,20 @@ class Track(Plain, Columns):
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the result to one file without pickle, completely or not at all."""
-        header: dict[str, Any] = {
-            "kind": KINDS[0],
-            "model": storage.describe(self.program.model),
-            "tracker": storage.describe(self.tracker),
-            "labels": asdict(self.labels),
-            "keep": kept(self._lane.out.dtype)[0],
-            "gate": None if self.program.gate is None else self.program.gate.settings(),
-        }
-        if self.program.shared is not None:
-            header |= {"kind": KINDS[1], "shared": storage.describe(self.program.shared)}
-        arrays = {"y": self.record.y, "u": self.record.u, "known": self.known.columns}
-        if self.record.time is not None:
-            arrays["time"] = self.record.time
-        arrays |= {f"out_{name}": self.in_rows(name) for name in self.stores()}
-        arrays |= {f"state_{name}": value for name, value in self.state.items()}
-        arrays |= {f"start_{name}": value for name, value in (self.start or {}).items()}
-        arrays |= {f"decided_{name}": value for name, value in vars(self._left_out).items()}
-        storage.write(path, header, arrays)
+        one, number = Records.of(self.record), np.zeros(1, int)
+        lanes = Lanes(
+            [(self._lane.out, self._lane.tile, number, number + self._lane.lane)], np.array([len(self.record)])
+        )
+        records = one._replace(left_out={0: self._left_out} if len(self._left_out) else {})
+        results = Results((self.program,), records, lanes, {}, {} if self.start is None else {0: self.start})
+        write_results(path, KIND, results)
 
     @classmethod
     def load(cls, path: str | PathLike[str], classes: Iterable[Any] = ()) -> Self:
         """Read a file that `save` wrote; ``classes`` are classes and functions of your own that it needs."""
-        header, arrays = storage.read(path, *KINDS)
-        with storage.reading(os.fspath(path)):
-            return cls._read(path, header, arrays, tuple(classes))
-
-    @classmethod
-    def _read(
-        cls, path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array], classes: tuple[Any, ...]
-    ) -> Self:
-        shared = storage.rebuild(header["shared"], Model, classes) if header["kind"] == KINDS[1] else None
-        model = storage.rebuild(header["model"], Model, classes)
-        tracker = storage.rebuild(header["tracker"], Tracker, classes)
-        storage.check_size(path, model, tracker, arrays["out_theta"].shape[-1])
-        program = Program(model, tracker, shared=shared, gate=gate_from(header))
-        record = Record(
-            arrays["y"], arrays["u"], Known(arrays["known"]), arrays.get("time"), Labels(**header["labels"])
-        )
-        tile = program.tile()
-        storage.restore(path, program.tracker, arrays, "state_", state_of(tile))
-        out = program.written(tile, len(record), header["keep"], arrays["out_theta"].dtype)
-        storage.restore(path, program.tracker, arrays, "out_", {name: out[name][..., 0] for name in names_of(out)})
-        start = {name.removeprefix("start_"): arrays[name] for name in arrays if name.startswith("start_")}
-        left_out = LeftOut(**{name: arrays[f"decided_{name}"] for name in vars(NOTHING_LEFT_OUT)})
-        return cls(program, record, Lane(out, tile), start or None, left_out)
+        (program,), records, lanes, _, starts = read_results(path, KIND, classes)
+        left_out = records.left_out.get(0, NOTHING_LEFT_OUT)
+        return cls(program, records.part(0), lanes[0], starts.get(0), left_out)
 
 
 def track_record(program: Program, record: Record, keep: str = "std", start: State | None = None) -> Track:
@@ -487,11 +407,6 @@ def track_record(program: Program, record: Record, keep: str = "std", start: Sta
 def burn_in(n: int) -> int:
     """Number of samples at the start of a run of n parameters that are not judged, because they depend on the start."""
     return max(50, 5 * n)
-
-
-def names_of(records: Array) -> tuple[str, ...]:
-    """Fields of an array of records."""
-    return records.dtype.names or ()
 
 
 def root_mean_square(values: Any) -> float:

@@ -1,4 +1,11 @@
-"""Record mode: whole series in one call, causal at every sample. The public function is `driftfit.track`."""
+"""Record mode: whole series in one call, causal at every sample. The public function is `driftfit.track`.
+
+One decision for many candidates: which readings are left out is decided by one run, and holds for all of them.
+
+The reference is `AdaptiveKalman` on the largest of the models, so the decision depends neither on the settings that are
+tried nor on their number. Refused readings are missing for every candidate, and samples with a refused input have no
+weight, so that likelihoods are of the same readings.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +18,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.data import outputs
-from driftfit.data.arguments import check_roles
-from driftfit.data.record import Reading, Record, Records, one_series, rows
+from driftfit.data.arguments import check_roles, fits
+from driftfit.data.arrays import columns_as_outputs, from_arrays
+from driftfit.data.record import Reading, Record, Records
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, one_of, warn
@@ -23,13 +30,17 @@ from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
 from driftfit.readings.remarks import ungated
 from driftfit.readings.screen import Review, screen, suspect
 from driftfit.run.fleet import Fleet, run_fleet
+from driftfit.run.gating import gate_of
 from driftfit.run.keyed_results import KeyedResults
+from driftfit.run.lanes import Lane, Lanes
 from driftfit.run.outputs import Outputs
-from driftfit.run.program import Program, programs_of, tile_of
-from driftfit.run.result import Lane, Lanes, Track, track_record
-from driftfit.run.states.reference import decide, decided
+from driftfit.run.program import Program, State, programs_of, tile_of
+from driftfit.run.result import Track, track_record
 from driftfit.run.warm_start import Run, carried, ended, first_interval
+from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
+
+KEPT = ("std", "cov", "theta")
 
 Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
 """One tracker for all, or one per setting of a grid or per series."""
@@ -67,7 +78,7 @@ def track(
         run = _one(programs, records, keep, warm_start, dtype)
     warn_unlearned(run)
     warn_astray(run)
-    if isinstance(run, Track) and (doubt := run.tracker.doubts(run)):
+    if isinstance(run, Track) and run.program.doubts and (doubt := run.tracker.doubts(run)):
         warn(f"{type(run.tracker).__name__}: {doubt}.", UserWarning)
     warn_ungated(run)
     return run  # type: ignore[no-any-return]
@@ -111,9 +122,11 @@ def _task(
 ) -> tuple[list[Program], Records, Mapping[Hashable, str], bool]:
     """(the program of each output of each series, the checked series, units without data with the reasons, whether the
     result is a fleet)."""
-    alone = check_roles("track", model, tracker, several=True)
-    model, y = outputs.columns_as_outputs(model, y, data)
-    one_of("track", "keep", kept.keep, ("std", "cov", "theta"))
+    alone = fits(type(model), type(tracker)) or check_roles("track", model, tracker, several=True)
+    if data is not None:
+        model, y = columns_as_outputs(model, y)
+    if kept.keep not in KEPT:
+        one_of("track", "keep", kept.keep, KEPT)
     if kept.dtype != "float64":  # the default, whose name NumPy would look up for a microsecond
         one_of("track", "dtype", np.dtype(kept.dtype).name, ("float64", "float32"))
     if kept.keep == "theta" and len(model.outputs) > 1:
@@ -154,9 +167,11 @@ def _prepared(
     for lane, program in enumerate(programs[: records.ny]):
         if program.shared is None:
             y = records.y[:, lane] if records.outputs else records.y
-            (program.model if program.alone is None else program.alone.model).inspect(y, records.u)
+            own = program if program.alone is None else program.alone
+            if own.inspects:
+                own.model.inspect(y, records.u)
     records = records.for_trackers(programs[0].model, (program.tracker for program in programs), prob)
-    return programs, records.in_rows() if model.shared else records
+    return programs, records if programs[0].shared is None else records.in_rows()
 
 
 def _any_of(tracker: Any) -> list[Any]:
@@ -186,20 +201,13 @@ def records_of(
     if data is None and reading.units is not None:
         raise ValueError("track: units= maps the names of columns to their units, so data= is needed.")
     failed: Mapping[Hashable, str] = {}
-    if data is not None and u is None:
-        u = model.input_names or None
-    if len(model.outputs) > 1:
-        if data is not None:
-            model, records, failed = outputs.of_table(model, y, u, data, by, reading)
-        else:
-            model, records = (outputs.of_rows if by == "row" else outputs.of_arrays)(model, y, u, reading)
-    elif data is not None:
-        # imported here, because narwhals and polars take as long to import as everything else
-        from driftfit.data.tables import read_records
-
-        records, failed = read_records(data, y, u, by, reading)
+    if data is None:
+        model, records = from_arrays(model, y, u, reading, by == "row")
     else:
-        records = (rows if by == "row" else one_series)(y, u, reading)
+        # imported here, because narwhals and polars take as long to import as everything else
+        from driftfit.data.tables import from_table
+
+        model, records, failed = from_table(model, y, u, data, by, reading)
     columns = _flat(y, u, reading.time) if reading.units else []
     for name in reading.units or ():
         if name not in columns:
@@ -232,9 +240,10 @@ def _per_series(tracker: Trackers, records: Records) -> list[Any]:
 def _one(programs: Sequence[Program], records: Records, keep: str, before: Run | None, dtype: Any) -> Track | Outputs:
     """Run one series."""
     program, record = programs[0], records.part(0)
-    before = None if before is None else ended(before, programs)
-    starts = carried(before, programs)
+    starts: tuple[State, ...] = ()
     if before is not None:
+        before = ended(before, programs)
+        starts = carried(before, programs)
         begins = None if record.time is None else record.time[0]
         record = replace(record, known=record.known.begun({0: first_interval(before, begins, record.labels)}))
     tile = tile_of(programs, starts)
@@ -249,8 +258,7 @@ def _one(programs: Sequence[Program], records: Records, keep: str, before: Run |
 
 def warn_astray(run: Track | KeyedResults) -> None:
     """Warn of a model linearised at its estimates whose predictions are no longer of the size of the output."""
-    settling = run.model.settling
-    if not settling > 0.0 or not isinstance(run, Track) or len(run) < 2.0 * settling:
+    if not isinstance(run, Track) or not 0.0 < 2.0 * run.program.settling <= len(run):
         return
     late = slice(len(run) // 2, None)
     e, y = run.innovation[late], run.record.y[late]
@@ -364,3 +372,43 @@ def warn_unlearned(run: Track | KeyedResults) -> None:
         "constant or repeat another.",
         UserWarning,
     )
+
+
+Decisions = Mapping[Hashable, LeftOut]
+"""What was left out of each series, by its key."""
+
+
+def decide(model: Model, records: Records, gate: Any) -> tuple[Records, Decisions]:
+    """(the series as every candidate takes them, what was left out of each), given the largest model, bound, and a
+    gate (None or False: none), or decisions that were made before; ValueError for a model that the reference does not
+    follow.
+    """
+    if gate is None or gate is False:
+        return records, {}
+    if not isinstance(gate, LeftOut | Mapping):
+        if model.hidden is not None:
+            raise ValueError(
+                f"gate: {type(model).__name__} has no reference run that could decide; give the decisions of a run, "
+                "gate=track(model, tracker, y, u, gate=True).left_out."
+            )
+        reference = AdaptiveKalman()
+        program = Program(model, reference, gate=gate_of(reference, gate))
+        parts = zip(records.keys, map(records.part, range(len(records.keys))), strict=True)
+        gate = {key: track_record(program, part).left_out for key, part in parts}
+    return decided(records, gate)
+
+
+def decided(records: Records, gate: LeftOut | Decisions) -> tuple[Records, Decisions]:
+    """The series with decisions that were made before: of one series, or by its key."""
+    if records.outputs:
+        raise ValueError("gate: decisions are those of one output; give gate=True, or take one output after the other.")
+    if isinstance(gate, LeftOut):
+        if len(records.keys) > 1:
+            raise ValueError("gate: decisions of one run are for one series; give a mapping from every key to its own.")
+        gate = {records.keys[0]: gate}
+    y, noise = records.y.copy(), np.array(np.broadcast_to(records.known.noise, len(records.y)))
+    for key, begin, count in zip(records.keys, records.first.tolist(), records.length.tolist(), strict=True):
+        if key in gate:
+            part = slice(begin, begin + count)
+            y[part], noise[part] = gate[key].applied(y[part], noise[part])
+    return records._replace(y=y, known=records.known.changed(noise=noise), left_out=gate), gate

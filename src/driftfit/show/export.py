@@ -4,6 +4,18 @@ One row per sample. The columns are those that identify the series of a fleet, t
 signals under their own names, ``prediction``, ``innovation``, ``innovation_std``, ``ok``, and for every parameter
 ``theta_<name>`` and ``std_<name>``, or all in the array columns ``theta`` and ``std``. Units are stored where each
 format has room for them: ``attrs`` in pandas, the metadata of fields in pyarrow, the metadata of the file in Parquet.
+
+Results as xarray datasets, with labelled dimensions.
+
+    run.to_xarray()      dimensions time (or sample), parameter, input
+    fleet.to_xarray()    the same and one dimension more, `unit`, over the union of all times (absent samples are NaN)
+
+Variables: ``theta``, ``theta_std`` (time, parameter); ``y``, ``prediction``, ``innovation``, ``innovation_std``,
+``used`` (time); ``u`` (time, input). Of several outputs with one theta each, `output` is the further dimension; of
+outputs that share one theta, y and what follows it are (time, output). Units are attributes. Times are UTC where the
+record had a time zone; ``attrs`` names it.
+
+Needs xarray (``pip install "driftfit[xarray]"``).
 """
 
 from __future__ import annotations
@@ -12,20 +24,25 @@ import json
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, TypeGuard
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import numpy as np
 import polars as pl
 
-from driftfit.data.formats.csv_files import without_formulas
+from driftfit.data.csv_files import without_formulas
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import of_series, one_of
 from driftfit.run.fleet import Fleet
 from driftfit.run.keyed_results import KeyedResults, table_by_key
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
+from driftfit.show.text import key_text
 from driftfit.trackers.base import Tracker
 from driftfit.use.forecast import forecast, forecast_outputs
+
+if TYPE_CHECKING:
+    import xarray
+
 
 Result = Track | KeyedResults
 Single = Track | Outputs
@@ -257,3 +274,43 @@ def write_table(table: pl.DataFrame, path: Path) -> None:
         without_formulas(table).write_csv(path)
     else:
         table.write_parquet(path)
+
+
+def to_xarray(result: Track | KeyedResults) -> xarray.Dataset:
+    """A result as a dataset; ImportError without xarray."""
+    try:
+        import xarray
+    except ImportError:
+        raise ImportError('to_xarray needs xarray: pip install "driftfit[xarray]"') from None
+    if isinstance(result, KeyedResults):
+        dimension = "output" if isinstance(result, Outputs) else "unit"
+        keys = xarray.DataArray([key_text(key) for key in result], dims=dimension, name=dimension)
+        return xarray.concat([_dataset(xarray, run) for run in result.values()], dim=keys, join="outer")
+    return _dataset(xarray, result)
+
+
+def _dataset(xarray: Any, run: Track) -> xarray.Dataset:
+    labels = run.labels
+    time = (labels.time or "time") if run.timed else "sample"
+    rows: tuple[str, ...] = (time, "output") if run.rows_per_instant > 1 else (time,)
+    inputs = labels.u or tuple(f"u{j + 1}" for j in range(run.u.shape[-1]))
+    variables = {
+        "theta": ((time, "parameter"), run.theta),
+        "theta_std": ((time, "parameter"), run.std),
+        "y": (rows, run.y, {"long_name": labels.y, "units": labels.units.get(labels.y, "")}),
+        "prediction": (rows, run.prediction),
+        "innovation": (rows, run.innovation),
+        "innovation_std": (rows, run.innovation_std),
+        "used": (rows, run.ok.astype(bool)),
+    }
+    coordinates: dict[str, Any] = {time: run.time, "parameter": list(run.names)}
+    if inputs:
+        variables["u"] = ((*rows, "input"), run.u)
+        coordinates["input"] = list(inputs)
+    if run.rows_per_instant > 1:
+        coordinates["output"] = list(run.outputs)
+    attributes = {"model": repr(run.model), "tracker": repr(run.tracker), "loglik": float(run.loglik)}
+    if labels.zone is not None:
+        attributes["time_zone"] = str(labels.zone)
+    found: xarray.Dataset = xarray.Dataset(variables, coordinates, attributes)
+    return found.assign_coords(unit_of_parameter=("parameter", np.array(run.units, dtype=str)))

@@ -9,9 +9,9 @@ from driftfit.engine.settings import near
 from driftfit.run.fleet import Fleet
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
-from driftfit.show.fleet_summary import summarise
-from driftfit.show.parts.axes import date_axis, draw_innovation, draw_parameter, draw_prediction, panels, time_label
-from driftfit.show.parts.text import key_text
+from driftfit.show.axes import date_axis, draw_innovation, draw_parameter, draw_prediction, panels, time_label
+from driftfit.show.summary import summarise_fleet
+from driftfit.show.text import key_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,7 +36,7 @@ def plot_track(run: Track, level: float = 0.95, ax: Any = None) -> Figure:
 
 def plot_fleet(fleet: Fleet, which: str | None = None, most: int = 12, level: float = 0.95, ax: Any = None) -> Figure:
     """One parameter of the results that moved most and have it, one panel per result, all on one scale."""
-    units = summarise(fleet).units
+    units = summarise_fleet(fleet).units
     if not units:
         raise ValueError("plot: no series has a result to draw; fleet.failed has the reasons.")
     if which is None:

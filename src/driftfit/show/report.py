@@ -4,10 +4,19 @@ The page gives the verdict first, then the parameters, the comparison, the diagn
 skipped samples. Pictures are inline SVG in the colours of the page, which follow the reader's light or dark setting and
 turn light for print; nothing is loaded from elsewhere. The points of a long record are an image inside the SVG, which
 keeps the page small.
+
+Report on many runs: one self-contained page about a fleet, or about the outputs of one record.
+
+The page gives the verdict on all runs first, then a table with one row per run, pictures of those that change most
+clearly, and how often each diagnostic is out of bounds. It has the style of `driftfit.show.report`.
+
+The section about faults: the dates of labels, the alarms with dates and causes, and their picture.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Hashable, Mapping, Sequence
 from html import escape
 from os import PathLike
 from pathlib import Path
@@ -16,17 +25,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftfit.engine import __version__
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import marks
+from driftfit.judge.alarms.onsets import onsets
 from driftfit.judge.diagnose import Diagnosis, diagnosis
 from driftfit.judge.evidence import Evidence
+from driftfit.judge.fleet_verdict import Judgement, ManyDiagnoses, ManyVerdicts, verdicts_and_diagnoses
 from driftfit.judge.verdict import LEVEL, Verdict, change, judged, p_text
 from driftfit.models.arx import ARX
 from driftfit.run.result import Track, burn_in
-from driftfit.show.page_parts import document, picture, section, table
-from driftfit.show.page_style import READING
-from driftfit.show.parts.axes import date_axis, draw_innovation, draw_parameter, draw_prediction, new_figure, time_label
-from driftfit.show.parts.text import digits
-from driftfit.show.report_faults import faults
+from driftfit.show.axes import date_axis, draw_innovation, draw_parameter, draw_prediction, new_figure, time_label
+from driftfit.show.page import READING, document, picture, section, table
 from driftfit.show.summary import Summary, summarise
+from driftfit.show.text import counts, digits, key_text
 from driftfit.use.system import dc_gain, largest_pole
 
 if TYPE_CHECKING:
@@ -34,6 +45,8 @@ if TYPE_CHECKING:
 
     from driftfit.engine.kernel import Array
     from driftfit.judge.alarms.detect import Alarms
+    from driftfit.judge.alarms.fleet_alarms import ManyAlarms
+    from driftfit.run.result import Track
 
 
 def report(
@@ -215,3 +228,199 @@ def _signals(run: Track) -> Figure:
     error.set_xlabel(time_label(run))
     date_axis(error, run)
     return figure
+
+
+SERIES_LISTED = 200
+"""Most rows in the table."""
+SERIES_PICTURED = 4
+"""Most runs with pictures."""
+NAMED = 4
+"""Fewer runs, or models, than this are listed by name instead of counted."""
+
+HEADS = ("check", "series", "of")
+
+MANY = """<p>Each row was tested separately. Among many tests some reject by chance: q is the share of false rejections
+among all series with a q this small or smaller (false discovery rate).</p>"""
+
+
+def page_of_many(
+    runs: Mapping[Hashable, Track],
+    by: tuple[str, ...],
+    title: str | None,
+    failed: Mapping[Hashable, str],
+    dropped: Mapping[str, int],
+    alarms: ManyAlarms | None = None,
+    labels: Mapping[Hashable, Array] | None = None,
+) -> str:
+    """The page as HTML text; ``by`` names the parts of a key, ``failed`` gives the reasons of missing results,
+    ``dropped`` counts the rows that are left out, by reason; ``labels`` by key are true for faults.
+    """
+    if not runs:
+        raise ValueError("report: no series has a result to report.")
+    verdicts, health = verdicts_and_diagnoses(runs, by, LEVEL)
+    heading = title or (", ".join(map(key_text, runs)) if len(runs) < NAMED else f"{len(runs)} series")
+    samples, used = sum(map(len, runs.values())), sum(int(run.ok.sum()) for run in runs.values())
+    counted = f"{len(runs)} series, {samples} samples, {used} used, {samples - used} skipped"
+    shown = [row for row in verdicts.rows[:SERIES_PICTURED] if row.drifts] or list(verdicts.rows[:1])
+    return document(
+        heading,
+        [
+            f"<h1>{escape(heading)}</h1>",
+            f'<p class="soft">{escape(counted)}</p>',
+            _verdict_of_many(verdicts, health),
+            *([section("Faults and alarms", many_faults(runs, alarms, labels or {}))] if alarms or labels else []),
+            section("All series", _rows(verdicts, health)),
+            section(
+                "The series that move most clearly" if verdicts.drifting else "The clearest",
+                "".join(_pictured(row, runs[row.key]) for row in shown),
+            ),
+            section("Diagnostics", _health(health)),
+            section("Settings and omitted data", _settings_of_many(runs, failed, dropped)),
+            section("How to read this", MANY + READING),
+        ],
+    )
+
+
+def _verdict_of_many(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
+    out = sum(not one.ok for one in health.of.values())
+    known = len(health.known)
+    state = f"{out} of {known} have diagnostics out of bounds." if out else "All diagnostics are within limits."
+    if known == 0:
+        state = "No diagnostic can be computed."
+    lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*verdicts.sentences, state))
+    return f'<div class="verdict">{lines}</div>'
+
+
+def _rows(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
+    rows, known = [], set(health.known)
+    for row in verdicts.rows[:SERIES_LISTED]:
+        out = len(health[row.key].sentences)
+        marked = f'<span class="bad">{out}</span>' if out else "0" if row.key in known else ""
+        rows.append((escape(key_text(row.key)), *map(escape, row.cells), marked))
+    heads = ("", "what moves", "p", "q", "error", "of constants", "pays", "out of bounds")
+    more = f" The first {SERIES_LISTED} of {len(verdicts)}." if len(verdicts) > SERIES_LISTED else ""
+    return table(f"The clearest first.{more}", heads, rows, (1,))
+
+
+def _pictured(row: Judgement, run: Track) -> str:
+    text = escape(" ".join(row.verdict.sentences))
+    shown = picture(parameter_figure(run), run, PARAMETERS)
+    return f'<div class="one"><h3>{escape(key_text(row.key))}</h3><p>{text}</p>{shown}</div>'
+
+
+def _health(health: ManyDiagnoses) -> str:
+    computed = health.computed
+    out = [(name, str(k), str(computed[name])) for name, k in health.counts.items()]
+    counted = table("How many are out of bounds, of those for which the check can be computed.", HEADS, out)
+    worst = [key for key in health.worst[:SERIES_PICTURED] if not health[key].ok]
+    text = "".join(
+        f"<li><b>{escape(key_text(key))}</b>: {escape(' '.join(health[key].sentences))}</li>" for key in worst
+    )
+    return counted + (f"<ul>{text}</ul>" if text else "")
+
+
+def _settings_of_many(
+    runs: Mapping[Hashable, Track], failed: Mapping[Hashable, str], dropped: Mapping[str, int]
+) -> str:
+    trackers = list(dict.fromkeys(repr(run.tracker) for run in runs.values()))
+    models = list(dict.fromkeys(repr(run.model) for run in runs.values()))
+    pairs = [
+        ("Model", "; ".join(models) if len(models) < NAMED else f"{len(models)} different ones"),
+        ("Tracker", trackers[0] if len(trackers) == 1 else f"{len(trackers)} different settings"),
+        (
+            "Without a result",
+            "; ".join(f"{key_text(key)}: {reason}" for key, reason in list(failed.items())[:20]) or "none",
+        ),
+        ("Rows left out", counts(dropped) or "none"),
+        ("Taken as missing", counts(sum((Counter(run.labels.missing) for run in runs.values()), Counter())) or "none"),
+        ("Made by", f"driftfit {__version__}"),
+    ]
+    return f"<dl>{''.join(f'<dt>{escape(name)}</dt><dd>{escape(value)}</dd>' for name, value in pairs)}</dl>"
+
+
+FAULTS_LISTED = 100
+"""Most rows in a table."""
+
+ALARMS_PICTURED = 4
+"""Most pictures of alarms on a page about many series."""
+
+PICTURE = "The output, and each statistic over its limit (dashed). Red: an alarm is on. Grey: labelled as wrong."
+
+
+def faults(run: Track, alarms: Alarms | None, labels: Array | None) -> str:
+    """The section for one run: labels, alarms, and the picture of the alarms."""
+    wrong = None if labels is None else marks("report", labels, len(run))
+    parts = [] if wrong is None else [_labels(run, alarms, wrong)]
+    if alarms is not None:
+        parts += [_score(alarms, wrong), _alarms(alarms), picture(alarms.plot(wrong), run, PICTURE)]
+    return "".join(parts)
+
+
+def many_faults(runs: Mapping[Hashable, Track], alarms: ManyAlarms | None, labels: Mapping[Hashable, Array]) -> str:
+    """The section for many runs: a row for each with labels or alarms, and pictures of the most extreme."""
+    watched = {} if alarms is None else {row.key: row for row in alarms.rows}
+    strange = [key for key in labels if key not in runs]
+    if strange:
+        raise ValueError(f"report: labels name {strange[0]!r}, which has no result.")
+    rows = []
+    for key in dict.fromkeys([*watched, *labels]):
+        wrong = marks("report", labels[key], len(runs[key])) if key in labels else np.zeros(len(runs[key]), bool)
+        begun, row = onsets(wrong), watched.get(key)
+        marked = escape(runs[key].time_text(int(begun[0]))) if len(begun) else ""
+        cells: tuple[str, ...] = (escape(key_text(key)), str(len(begun)) if key in labels else "", marked)
+        if row is not None and (len(begun) or row.onsets):
+            score = row.alarms.score(wrong)
+            found = (str(score.found), str(score.false)) if key in labels else ("", "")
+            cells += (str(len(row.onsets)), escape(row.first), escape(p_text(row.q)), *found)
+        if len(cells) > 3 or len(begun):
+            rows.append((*cells, *[""] * (8 - len(cells))))
+    heads = ("", "labelled", "the first", "alarms", "the first", "q", "found", "false")
+    shown = [row for row in watched.values() if row.onsets][:ALARMS_PICTURED]
+    pictures = (
+        f'<div class="one"><h3>{escape(key_text(row.key))}</h3>'
+        f"{picture(row.alarms.plot(_given(runs, labels, row.key)), runs[row.key], PICTURE)}</div>"
+        for row in shown
+    )
+    return table(
+        f"Intervals labelled as wrong, and alarms.{_more(rows)}", heads, rows[:FAULTS_LISTED], (2, 4)
+    ) + "".join(pictures)
+
+
+def _given(runs: Mapping[Hashable, Track], labels: Mapping[Hashable, Array], key: Hashable) -> Array | None:
+    return marks("report", labels[key], len(runs[key])) if key in labels else None
+
+
+def _labels(run: Track, alarms: Alarms | None, wrong: Array) -> str:
+    rows = []
+    for first in onsets(wrong):
+        last = int(first) + int(np.argmin(np.append(wrong[first:], False)))
+        row = [escape(run.time_text(int(first))), escape(run.time_text(last - 1)), str(last - int(first))]
+        if alarms is not None:
+            begun = alarms.onsets[(alarms.onsets >= first) & (alarms.onsets < last)]
+            missed = '<span class="bad">no alarm</span>'
+            row.append(
+                f"{escape(run.time_text(int(begun[0])))}, {int(begun[0] - first)} later" if len(begun) else missed
+            )
+        rows.append(tuple(row))
+    heads = ("from", "to", "samples", "first alarm")[: 3 if alarms is None else 4]
+    return table(f"Labelled as wrong.{_more(rows)}", heads, rows[:FAULTS_LISTED], (1, 3))
+
+
+def _score(alarms: Alarms, wrong: Array | None) -> str:
+    text = (
+        f"Alarm: {alarms.kind}, one false alarm in {alarms.every:g} samples. {len(alarms.onsets)} alarms; "
+        f"A record without a fault is as extreme as this one with probability {p_text(alarms.p)}."
+    )
+    if wrong is not None:
+        score = alarms.score(wrong)
+        text += f" {score.found} of {score.events} labelled intervals found, {score.false} false alarms."
+    return f"<p>{escape(text)}</p>"
+
+
+def _alarms(alarms: Alarms) -> str:
+    rows = [tuple(map(escape, alarms.cells(int(t)))) for t in alarms.onsets]
+    return table(f"Alarms.{_more(rows)}", alarms.heads, rows[:FAULTS_LISTED], (1, 2))
+
+
+def _more(rows: Sequence[tuple[str, ...]]) -> str:
+    return f" The first {FAULTS_LISTED} of {len(rows)}." if len(rows) > FAULTS_LISTED else ""

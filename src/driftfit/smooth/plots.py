@@ -11,7 +11,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
-from driftfit.show.parts.axes import BLUE, GREY, date_axis, frame, panels, settled, time_label
+from driftfit.show.axes import BLUE, GREY, date_axis, frame, panels, settled, time_label
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

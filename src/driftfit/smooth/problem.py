@@ -14,10 +14,9 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, Driver, State, kernel
-from driftfit.run.collected_samples import COLLECTED, collect
+from driftfit.run.columns import COLLECTED, collect, put_fields
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
-from driftfit.run.states.rows import put_fields
 from driftfit.smooth.parts.pooled_drift import average_drift
 from driftfit.smooth.parts.walk import DRIFT, NONE, WEIGHT, Walk, Y, free, room_for_signals
 from driftfit.trackers.base import RandomWalk

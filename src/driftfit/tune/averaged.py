@@ -30,11 +30,11 @@ from rich.text import Text
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.run.result import Track
-from driftfit.show.parts.text import Printed, facts, table_of
+from driftfit.show.text import Printed, facts, table_of
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.tune.lanes import score
-from driftfit.tune.objective import Criterion, run_task
 from driftfit.tune.parametrisation import Knobs
+from driftfit.tune.search import Criterion, run_task
 
 if TYPE_CHECKING:
     from driftfit.tune.search import Search

@@ -25,9 +25,8 @@ from driftfit.models.base import Model
 from driftfit.run.program import Program
 from driftfit.run.result import Track, track_record
 from driftfit.run.track import track
-from driftfit.show.parts.axes import BLUE, GREY, RED, panels
-from driftfit.show.parts.by_output import ByOutput
-from driftfit.show.parts.text import printing, some_rows, table_of
+from driftfit.show.axes import BLUE, GREY, RED, panels
+from driftfit.show.text import ByOutput, printing, some_rows, table_of
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.fls import FLS
 

@@ -16,18 +16,18 @@ For a tracker that weighs hypotheses, the log-likelihood is the sum of the log d
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from driftfit.data.record import Record
+from driftfit.engine.drivers import stored_too
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.tiles import output_type
 from driftfit.models.base import Model
-from driftfit.run.program import Program, spread, tile_of
+from driftfit.run.program import Program, tile_of
 from driftfit.run.result import burn_in
-from driftfit.run.states.reference import Decisions
+from driftfit.run.track import Decisions
 from driftfit.trackers.base import Tracker
 
 BLOCK = 1024
@@ -94,16 +94,10 @@ def store_inside(o: State, s: State, l: int) -> None:
         o.phi[i, l] = s.phi[i, l]
 
 
-@cache
-def storing(store: Any) -> Any:
-    """The same, and the fields that a tracker stores itself."""
-
-    @kernel
-    def store_both(o: State, s: State, l: int) -> None:
-        store_inside(o, s, l)
-        store(o, s, l)
-
-    return store_both
+def spread(record: Record, L: int) -> tuple[Array, Array, Array]:
+    """(y, u, known) of a record, the same in each of L lanes."""
+    y, u, known = (np.repeat(part[..., None], L, axis=-1) for part in (record.y, record.u, record.known.columns))
+    return y, u, known
 
 
 def score(task: Task, trackers: Sequence[Tracker], h: int = 1) -> Scores:
@@ -125,7 +119,11 @@ def _score_tile(model: Model, record: Record, trackers: Sequence[Tracker], h: in
     T, tile = len(record), tile_of(programs)
     steps, own = programs[0].steps, trackers[0].outputs if trackers[0].density else ()
     out = np.empty(min(BLOCK, T), output_type(tile, ("scale", "phi", *own)))
-    run = programs[0].drivers(steps=steps._replace(store=storing(steps.store) if own else store_inside)).run
+    run = (
+        programs[0]
+        .drivers(steps=steps._replace(store=stored_too(store_inside, steps.store) if own else store_inside))
+        .run
+    )
     sums = _Sums(model, record, trackers[0], tile, h)
     for a in range(0, T, BLOCK):
         b = min(a + BLOCK, T)

@@ -35,7 +35,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import plain, warn
 from driftfit.run.result import Track
-from driftfit.show.parts.text import digits
+from driftfit.show.text import digits
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.kalman import Kalman
 

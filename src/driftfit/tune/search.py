@@ -7,18 +7,32 @@
                by chi2 / 2, on either side; with one knob this is the profile itself
 
 The objective is minimised; it maps points (S, p) to values (S,), +inf for impossible points.
+
+Intervals of settings: profiles of the likelihood, also of a noise variance that was estimated in closed form.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
+import scipy
 
+from driftfit.data.record import Known, Record
 from driftfit.engine.kernel import Array
-from driftfit.tune.parametrisation import Knobs
+from driftfit.models.regression import Regression
+from driftfit.run.program import Program
+from driftfit.run.result import Track, track_record
+from driftfit.smooth.parts.walk import ordered
+from driftfit.smooth.problem import walk_of
+from driftfit.smooth.smoothed import Smoothed
+from driftfit.trackers.base import Tracker
+from driftfit.tune.lanes import Task, score
+from driftfit.tune.parametrisation import Knobs, constant
 
 Objective = Callable[[Array], Array]
 DECADE = 4
@@ -247,3 +261,123 @@ class Search:
             crossing = axis[at - 1] + share * (axis[at] - axis[at - 1])
             axis = np.linspace(axis[at - 1], axis[at], 32)
         return float(crossing)
+
+
+def intervals_of(
+    search: Search, task: Task, method: str, tracker: Tracker, level: float
+) -> dict[str, tuple[float, float]]:
+    """Intervals by name of setting; NaN if the criterion is not a likelihood."""
+    knobs = search.knobs
+    if method != "ml":
+        return dict.fromkeys(knobs.names, (float("nan"), float("nan")))
+    found: dict[str, tuple[float, float]] = {}
+    ends = [search.profile(i, level) for i in range(len(search.x))]
+    for entry, (name, i) in enumerate(zip(knobs.names, knobs.owner, strict=True)):
+        low, high = (_value(knobs, search.x, i, end, entry) for end in ends[i])
+        found[name] = (low, high)
+    if knobs.profiled and "r" in tracker.required:
+        found |= _with_noise(search, task, level)
+    return found
+
+
+def _value(knobs: Knobs, x: Array, i: int, end: float, entry: int) -> float:
+    """A setting with its knob at the end of an interval."""
+    point = x.copy()
+    point[i] = end
+    return float(knobs.values(point)[entry])
+
+
+def _with_noise(search: Search, task: Task, level: float) -> dict[str, tuple[float, float]]:
+    """Intervals of q and r, if r was estimated in closed form, from their profiles.
+
+    At the knobs x the likelihood is highest at r = sigma^2(x), and less by N / 2 (log rho + 1 / rho - 1) at
+    r = rho sigma^2(x). An end is the extreme of rho sigma^2(x), or of that times q_i / r, over all x at which the
+    likelihood has not fallen by more than half the chi-square quantile. They are searched for along the ridges of log r
+    and of log q_i: C g and C (g + e_i), with g the slope of log sigma^2.
+    """
+    knobs, x, free, C = search.knobs, search.x, search.free, search.inverse
+    rise, used = half_chi2(level), score(task, [knobs.run(x)]).used[0]
+
+    def at(points: Array) -> tuple[Array, Array, Array]:
+        scores = score(task, [knobs.run(point) for point in points])
+        return points, scores.sigma2(), rise - (-scores.loglik(scores.sigma2()) - search.best)
+
+    steps = STEP * np.eye(len(x))[free]
+    found = [at(np.concatenate([x[None], x + steps, x - steps]))]
+    noise = np.log(found[0][1][1:]).reshape(2, -1)
+    g = (noise[0] - noise[1]) / (2.0 * STEP)
+    ridges = np.zeros((1 + len(x), len(x)))
+    ridges[0, free], ridges[1:] = C @ g, np.eye(len(x))
+    ridges[1 + free[:, None], free] = C * np.log(10.0) + C @ g
+    for ridge in ridges[ridges.any(axis=1) & np.isfinite(ridges).all(axis=1)]:
+        for towards in (ridge, -ridge):
+            axis = np.linspace(0.0, 1.0, 32) ** 2
+            found.append(at(search.line(towards, axis)))
+            end = int(np.argmax(np.append(found[-1][2] < 0.0, True)))
+            if end < len(axis):
+                found.append(at(search.line(towards, np.linspace(0.0, axis[end], 32))))
+    points, r, left = (np.concatenate(part) for part in zip(*found, strict=True))
+    points, r, left = points[left >= 0.0], r[left >= 0.0], left[left >= 0.0]
+    rho = [1.0 / -scipy.special.lambertw(-np.exp(-1.0 - 2.0 * left / used), k).real for k in (-1, 0)]
+    ends = {"r": (0.0 if (points >= knobs.high).any() else float(np.min(r * rho[0])), float(np.max(r * rho[1])))}
+    for name, ratio in zip(knobs.names, np.array([knobs.values(point) for point in points]).T, strict=True):
+        ends[name.removesuffix("/r")] = float(np.min(ratio * r * rho[0])), float(np.max(ratio * r * rho[1]))
+    return ends
+
+
+def along(task: Task, tracker: Tracker, order_by: Any) -> Task:
+    """The record as a regression with samples sorted by a variable; ValueError for several records."""
+    if len(task.records) > 1:
+        raise ValueError("tune: order_by= sorts the samples of one record; leave out by=.")
+    (run,) = run_task(task, constant(task, tracker))
+    walk, _ = ordered(walk_of(run), order_by)
+    with np.errstate(divide="ignore"):
+        known = Known.of(noise=1.0 / walk.weight)
+    return Task(Regression(task.model.names), (Record(walk.y, walk.phi, known),), task.left_out)
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """Maps points (S, p) to values (S,) to be minimised: minus the log-likelihood, or the log of a mean square.
+
+    In logarithms the unit of y is only an offset, so the tolerances of the search do not depend on it.
+    """
+
+    task: Task
+    knobs: Knobs
+    method: str
+    h: int
+
+    def __call__(self, points: Array) -> Array:
+        trackers = [self.knobs.run(x) for x in points]
+        if self.method == "ml":
+            scores = score(self.task, trackers)
+            return -scores.loglik(scores.sigma2() if self.knobs.profiled else 1.0)
+        if self.method == "h-step":
+            squares = score(self.task, trackers, self.h).h_step
+        else:
+            squares = np.array([_smoothed_score(self.task, tracker, self.method) for tracker in trackers])
+        tiny = np.finfo(float).tiny  # a perfect fit is the best possible result and must have a logarithm
+        return np.log(np.where(np.isfinite(squares), np.maximum(squares, tiny), np.inf))
+
+
+def run_task(task: Task, tracker: Tracker) -> list[Track]:
+    """Track the records of a task."""
+    program = Program(task.model, tracker)
+    return [track_record(program, record) for record in task.records]
+
+
+def _smoothed_score(task: Task, tracker: Tracker, method: str) -> float:
+    """Mean square of the leave-one-out residuals of the smoothed paths, or the rotation-invariant variant of it."""
+    squares, count, free, used = 0.0, 0, 0.0, 0
+    for run in run_task(task, tracker):
+        path = Smoothed.of(run, "fit")
+        weight = path.weight
+        terms = weight * path.loo**2 if method == "loo" else np.zeros(0)
+        squares += float(np.nansum(terms)) if method == "loo" else path.measurement_cost
+        count += int(np.isfinite(terms).sum())
+        free += float(np.sum(1.0 - path.leverage[weight > 0.0]))
+        used += int(np.sum(weight > 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = np.float64(squares) / count if method == "loo" else np.float64(squares) / used / (free / used) ** 2
+    return float(value) if np.isfinite(value) else np.inf

@@ -13,36 +13,41 @@ tracker that tunes itself.
 A grid runs as lanes: 32 settings cost about as much as a few. A quasi-Newton search on log settings and profile
 intervals of the likelihood follow (see `driftfit.tune`). Source: the likelihood of de Jong (1991), diffuse start;
 leave-one-out after Allen (1974), GCV after Craven and Wahba (1979).
+
+Tuning for several outputs: each output separately, or all rows of a shared theta together.
+
+Outputs with a separate theta have separate noise, so each gets its own settings: `TunedOutputs.tracker` maps the name
+of an output to its tracker, in the form that `track` and `Live` take. Regressors are those of constant parameters,
+whose predictions also fill missing lags.
 """
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.outputs import columns_as_outputs
+from driftfit.data.arrays import columns_as_outputs
 from driftfit.data.record import Reading
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, whole
+from driftfit.judge.constant_fit import constant_outputs
 from driftfit.models.base import Model
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
 from driftfit.readings.screen import screen
 from driftfit.run.program import Program
 from driftfit.run.result import track_record
-from driftfit.run.states.reference import Decisions, decide
-from driftfit.run.track import records_of, warn_of_codes
+from driftfit.run.track import Decisions, decide, records_of, warn_of_codes
+from driftfit.show.text import ByOutput
 from driftfit.trackers.base import Tracker
-from driftfit.tune.intervals import intervals_of
 from driftfit.tune.lanes import Task, score
-from driftfit.tune.objective import Criterion, along, run_task
-from driftfit.tune.outputs import TunedOutputs, tune_outputs
 from driftfit.tune.parametrisation import find_knobs
-from driftfit.tune.search import Counted, Search, minimise
+from driftfit.tune.search import Counted, Criterion, Search, along, intervals_of, minimise, run_task
 from driftfit.tune.tuned import METHODS, Tuned
 
 
@@ -105,7 +110,7 @@ def tune(
 
     Returns
     -------
-    Tuned. A model with several outputs gives `driftfit.tune.outputs.TunedOutputs`, one for each output (if they share
+    Tuned. A model with several outputs gives `driftfit.tune.tune.TunedOutputs`, one for each output (if they share
     one theta, one `Tuned` for all).
 
     Warns
@@ -120,7 +125,8 @@ def tune(
         everything that `track` does not accept.
     """
     check_roles("tune", model, tracker)
-    model, y = columns_as_outputs(model, y, data)
+    if data is not None:
+        model, y = columns_as_outputs(model, y)
     one_of("tune", "method", method, tuple(METHODS))
     whole("tune", "h", h, 1)
     if not 0.0 < level < 1.0:
@@ -237,3 +243,37 @@ def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data
     records, left_out = decide(bound, records, tracker.gated if reading.gate is None else reading.gate)
     records = records.for_trackers(bound, [tracker])
     return Task(bound, tuple(replace(records.part(k), time=None) for k in range(len(records.keys))), left_out or None)
+
+
+class TunedOutputs(ByOutput[Tuned]):
+    """The result of `tune` for a model with several outputs: one `driftfit.tune.tuned.Tuned` for each."""
+
+    def __repr__(self) -> str:
+        return f"TunedOutputs({', '.join(f'{name}: {one.tracker!r}' for name, one in self.items())})"
+
+    @property
+    def tracker(self) -> dict[str, Tracker]:
+        """The tracker of each output, by name, ready for `track` and `Live`."""
+        return {name: one.tracker for name, one in self.items()}
+
+    @property
+    def loglik(self) -> float:
+        """Sum over the outputs."""
+        return sum(one.loglik for one in self.values())
+
+    @property
+    def at_bound(self) -> dict[str, tuple[str, ...]]:
+        """Settings that ended at a bound of the search, by output."""
+        return {name: one.at_bound for name, one in self.items() if one.at_bound}
+
+
+def tune_outputs(
+    model: Model, tracker: Any, y: Any, u: Any, reading: Reading, data: Any, by: Any,
+    one: Callable[[Task], Tuned],
+) -> Tuned | TunedOutputs:  # fmt: skip
+    """Tune every output with ``one(task)``, or the rows of a shared theta at once."""
+    if not isinstance(tracker, Tracker):
+        raise ValueError(f"tune: several outputs are tuned for one kind of tracker; got {tracker!r}.")
+    runs = constant_outputs(model, y, u, reading, data, by)
+    tuned = {name: one(Task(some[0].model, tuple(run.record for run in some))) for name, some in runs.items()}
+    return tuned["rows"] if model.shared else TunedOutputs(tuned)

@@ -11,9 +11,9 @@ from rich.text import Text
 
 from driftfit.engine.kernel import Array
 from driftfit.readings.left_out import LeftOut, remarks_of
-from driftfit.run.states.reference import Decisions
-from driftfit.show.parts.axes import BLUE, RED, panels
-from driftfit.show.parts.text import Printed, facts, shortened, table_of
+from driftfit.run.track import Decisions
+from driftfit.show.axes import BLUE, RED, panels
+from driftfit.show.text import Printed, facts, shortened, table_of
 from driftfit.trackers.base import Tracker
 from driftfit.tune.averaged import Averaged, averaged
 from driftfit.tune.search import Search

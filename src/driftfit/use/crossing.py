@@ -32,8 +32,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
+from driftfit.data.arguments import inputs_for
 from driftfit.data.clock import Clock
-from driftfit.data.labels import inputs_for
 from driftfit.data.record import time_text
 from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
@@ -41,8 +41,7 @@ from driftfit.engine.settings import near, of_series, whole
 from driftfit.engine.tiles import as_compiled
 from driftfit.run.program import state_of
 from driftfit.run.result import Track
-from driftfit.use.prediction import within
-from driftfit.use.simulate import noise_at
+from driftfit.use.simulate import noise_at, within
 
 if TYPE_CHECKING:
     import polars

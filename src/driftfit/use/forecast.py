@@ -43,8 +43,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
+from driftfit.data.arguments import inputs_for
 from driftfit.data.clock import Clock
-from driftfit.data.labels import inputs_for
 from driftfit.data.record import time_text
 from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
@@ -55,8 +55,8 @@ from driftfit.run.live.live import Live
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, state_of
 from driftfit.run.result import Track
-from driftfit.show.parts.text import digits, printed, table_of
-from driftfit.use.delta_method import spread
+from driftfit.show.text import digits, printed, table_of
+from driftfit.use.system import spread
 
 if TYPE_CHECKING:
     import polars

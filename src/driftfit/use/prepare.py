@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.data.clock import Clock
-from driftfit.data.times.instants import instants
+from driftfit.data.instants import instants
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, one_of, whole
 from driftfit.run.result import Track

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.data.signals import as_inputs, as_output
+from driftfit.data.arguments import as_inputs, as_output
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 

@@ -8,16 +8,26 @@
 In an ARX model all A_j are A; in polynomial models A_j = A F_j (`Model.transfers`).
 
 At every sample the parameters of that sample are assumed to be constant: the frozen system. Standard deviations come
-from the covariance of the run by the delta method (`driftfit.use.delta_method`); for a frequency response they are
+from the covariance of the run by the delta method (`driftfit.use.system`); for a frequency response they are
 those of the logarithm of the magnitude and of the phase. Units: w in radians per sample, gains in units of y over u.
 
 In econometrics: in a model of logarithms the gain is the long-run elasticity, b / (1 - a), which `long_run` returns
 with its standard error and with the interval of Fieller (1954). Where A(1) is not clearly different from zero the delta
 method fails; Fieller's interval is then unbounded, as it should be.
+
+The delta method: standard deviations of functions of the parameters.
+
+    Cov f(theta) = J Cov(theta) J',     J = df / dtheta by central differences
+
+Steps are a hundredth of a standard deviation, so the slope is that in the region of likely theta. If f is nonlinear
+within a standard deviation (a gain whose denominator is near zero), the result is only a first-order approximation.
+
+The system behind a stream, now: poles, gains and responses with bands, as `Track` has them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -27,16 +37,16 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.arx import ARX
-from driftfit.show.parts.text import printing, some_rows, table_of
-from driftfit.use.delta_method import spread
+from driftfit.show.text import printing, some_rows, table_of
 
 if TYPE_CHECKING:
     from driftfit.models.base import Model
+    from driftfit.run.live.live import Live
     from driftfit.trackers.base import Tracker
 
 
 class Followed(Protocol):
-    """Objects with parameters over time: a `Track`, or the present of a stream (`driftfit.use.live_system`)."""
+    """Objects with parameters over time: a `Track`, or the present of a stream (`driftfit.use.system`)."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -288,3 +298,90 @@ def fieller(theta: Array, cov: Array, top: Array, over: Array, one: float, z: fl
     if not (A > 0.0 and root >= 0.0):
         return (float("nan"),) * 2 if np.isnan(A + root) else (-np.inf, np.inf)
     return (B - np.sqrt(root)) / A, (B + np.sqrt(root)) / A
+
+
+STEP = 0.01
+
+
+def jacobian(f: Callable[[Array], Array], theta: Array, std: Array) -> Array:
+    """Slopes (T, .., n) of f at theta (T, n); f maps (T, n) to (T, ..)."""
+    size = np.where(np.isfinite(std) & (std > 0.0), STEP * std, 1e-6 * np.maximum(np.abs(theta), 1e-3))
+    slopes = []
+    for i in range(theta.shape[1]):
+        h = np.zeros_like(theta)
+        h[:, i] = size[:, i]
+        up, down = f(theta + h), f(theta - h)
+        slopes.append((up - down) / (2.0 * size[:, i]).reshape(-1, *(1,) * (up.ndim - 1)))
+    return np.stack(slopes, axis=-1)
+
+
+def spread(f: Callable[[Array], Array], theta: Array, cov: Array) -> tuple[Array, Array]:
+    """(f, its standard deviation), each (T, ..), at theta (T, n) with covariance (T, n, n); NaN without one."""
+    var = np.einsum("tii->ti", cov)
+    J = jacobian(f, theta, np.sqrt(np.abs(var)))
+    with np.errstate(invalid="ignore"):
+        square = np.einsum("t...i,tij,t...j->t...", J, cov, J)
+        return f(theta), np.sqrt(square)
+
+
+class LiveSystem:
+    """The frozen system after the last sample of a stream; `Live.system` makes it.
+
+    The methods are those of `Track` for one sample, without the time axis.
+    """
+
+    def __init__(self, live: Live) -> None:
+        self.model, self.tracker, self.names = live.model, live.tracker, live.names
+        self.theta = live.theta[None]
+        self._cov = live.cov
+        linear(self)
+
+    def __len__(self) -> int:
+        return 1
+
+    def cov(self, t: int) -> Array:
+        """Covariance of theta, (n, n)."""
+        return self._cov
+
+    def covariances(self) -> Array:
+        """The same with a time axis, (1, n, n)."""
+        return self._cov[None]
+
+    def poles(self) -> Array:
+        """Poles, (na,) complex, the largest first."""
+        found: Array = poles(self)[0]
+        return found
+
+    def largest_pole(self) -> Response:
+        """Magnitude of the largest pole, with its standard deviation; below 1 the system is stable."""
+        return _now(largest_pole(self, -1))
+
+    def dc_gain(self) -> Response:
+        """Gain of every input for a constant signal, (m,), with its standard deviation."""
+        return _now(dc_gain(self, -1))
+
+    def step_response(self, h: int, input: int | str = 0) -> Response:
+        """Response (h,) to a unit step of one input."""
+        return _now(step_response(self, h, input))
+
+    def impulse_response(self, h: int, input: int | str = 0) -> Response:
+        """Response (h,) to a unit impulse of one input."""
+        return _now(impulse_response(self, h, input))
+
+    def frequency_response(self, w: Any = None, input: int | str = 0) -> FrequencyResponse:
+        """Magnitude and phase at w (k,) radians per sample, (k,) each, with standard deviations."""
+        found = frequency_response(self, w, input)
+        return FrequencyResponse(found.w, *(np.asarray(part[0]) for part in found[1:]))
+
+    def to_scipy(self, dt: float = 1.0, input: int | str = 0) -> Any:
+        """The system from one input to y as `scipy.signal.dlti`."""
+        return to_scipy(self, -1, dt, input)
+
+    def long_run(self, level: float = 0.95) -> tuple[LongRun, ...]:
+        """Long-run effect b / (1 - a) of every input, with standard error and Fieller's interval."""
+        return long_run(self, -1, level)
+
+
+def _now(response: Response) -> Response:
+    """The response of one sample, without the time axis."""
+    return Response(response.value[0], response.std[0])

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.data.signals import as_output
+from driftfit.data.arguments import as_output
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.smooth.smoothed import Smoothed

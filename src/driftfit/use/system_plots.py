@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftfit.data.signals import as_output
+from driftfit.data.arguments import as_output
 from driftfit.engine.kernel import Array
-from driftfit.show.parts.axes import BLUE, GREY, RED, frame, named, panels, settled
+from driftfit.show.axes import BLUE, GREY, RED, frame, named, panels, settled
 from driftfit.use.simulate import fit, simulate
 from driftfit.use.system import dc_gain, frequency_response, input_of, largest_pole, linear, poles, step_response
 
@@ -140,7 +140,7 @@ def _plane(axis: Axes, run: Track, first: int) -> None:
 
 
 def _gain(axis: Axes, run: Track, j: int, first: int, level: float) -> None:
-    from driftfit.show.parts.axes import date_axis, time_label
+    from driftfit.show.axes import date_axis, time_label
 
     gain, pole = dc_gain(run), largest_pole(run)
     low, high = (part[:, j] for part in gain.band(level))

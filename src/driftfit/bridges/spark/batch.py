@@ -45,7 +45,7 @@ from driftfit.judge.verdict import verdict
 from driftfit.models.base import Model
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
-from driftfit.run.states.joint_layout import JointLayout
+from driftfit.run.warm_start import JointLayout
 from driftfit.trackers.base import Tracker
 
 OUTPUTS = ("samples", "summary", "verdict", "states")
@@ -219,7 +219,7 @@ class Partition:
             runs = (
                 [Track(programs[0], found.records.part(j), own[0])]
                 if ny == 1
-                else Outputs(programs, found.records.only(j), own, {}, {}).values()
+                else Outputs(programs, found.records.some(j, j + 1), own, {}, {}).values()
             )
             for run, of in zip(runs, self.task.suffixes, strict=True):
                 truth = verdict(run)

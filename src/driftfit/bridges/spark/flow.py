@@ -37,21 +37,20 @@ from driftfit.bridges.spark.task import (
     units_of,
     words_after,
 )
+from driftfit.data import late
 from driftfit.engine.kernel import Array
+from driftfit.run.layout import tag_of, unpacked
 from driftfit.run.live.rule import AlarmRule
+from driftfit.run.parallel_lanes import Advanced
 from driftfit.run.program import state_of
-from driftfit.run.states import late
-from driftfit.run.states.advance import Advanced
-from driftfit.run.states.joint_layout import JointLayout
-from driftfit.run.states.layout import tag_of, unpacked
-from driftfit.run.warm_start import End, carried
+from driftfit.run.warm_start import End, JointLayout, carried
 
 OLD, WAITED, NEW = range(3)
 """Values of the column ``_kind``: a state, a row that waits, a row that has come."""
 PLACES = {late.LATE: LATE, late.REPEATED: REPEATED, late.UNTIMED: UNTIMED}
 """Where rows that are left out are counted."""
 REFUSED = -1
-"""The fate of a row of a unit that cannot run, besides those of `driftfit.run.states.late`."""
+"""The fate of a row of a unit that cannot run, besides those of `driftfit.data.late`."""
 
 
 class Origin(NamedTuple):

@@ -11,7 +11,7 @@ import numpy as np
 from driftfit.bridges.spark.session import missing
 from driftfit.bridges.spark.task import SETTING, Task, results_schema, trackers_of
 from driftfit.data.arguments import check_roles
-from driftfit.data.outputs import named_outputs
+from driftfit.data.arrays import named_outputs
 from driftfit.engine.settings import near
 from driftfit.models.base import Model
 

@@ -6,7 +6,7 @@ their checkpoints and their changes (RocksDB); rows of a batch that is run again
 
 Units that are silent end by a timer of event time. Spark's watermark is the newest of all times in ticks of a
 ten-thousandth of ``expire``; the column that it watches is ahead of it by `AHEAD`, so that Spark drops no row as late
-(`driftfit.run.states.late` decides that, unit by unit). A unit has one timer: when it fires and rows have come
+(`driftfit.data.late` decides that, unit by unit). A unit has one timer: when it fires and rows have come
 since, it is set again.
 """
 

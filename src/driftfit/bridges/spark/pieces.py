@@ -13,12 +13,13 @@ import pyarrow.compute as pc
 from driftfit.bridges.spark.task import Series, Task, lists
 from driftfit.data.storage import describe
 from driftfit.engine.kernel import Array
+from driftfit.run.lanes import Lane
 from driftfit.run.live.alarm import LiveAlarm, check_rule
 from driftfit.run.live.rule import FROZEN, AlarmRule
+from driftfit.run.parallel_lanes import Advanced
 from driftfit.run.program import Program
-from driftfit.run.result import Lane, burn_in
-from driftfit.run.states.advance import Advanced
-from driftfit.run.states.joint_layout import JointLayout
+from driftfit.run.result import burn_in
+from driftfit.run.warm_start import JointLayout
 
 ARROW = {
     "double": pa.float64(), "boolean": pa.bool_(), "bigint": pa.int64(), "string": pa.string(), "binary": pa.binary(),

@@ -12,15 +12,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from driftfit.data.arguments import ordered
 from driftfit.data.clock import Clock
-from driftfit.data.known import Known
-from driftfit.data.labels import ordered
-from driftfit.data.record import Labels, Records
+from driftfit.data.record import Known, Labels, Records
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.run.parallel_lanes import Advanced, advance
 from driftfit.run.program import Program, programs_of
-from driftfit.run.states.advance import Advanced, advance
-from driftfit.run.states.joint_layout import JointLayout
+from driftfit.run.warm_start import JointLayout
 from driftfit.trackers.base import Tracker
 
 ROWS = 64_000

@@ -18,13 +18,13 @@ import numpy as np
 from driftfit.bridges.spark.flow import PLACES, Origin, migrated
 from driftfit.bridges.spark.pieces import COUNTS, SAMPLES, USED, alarms_of, alarms_schema, collects, watched
 from driftfit.bridges.spark.task import Task
+from driftfit.data import late
 from driftfit.engine.drivers import INTERVAL
 from driftfit.engine.kernel import Array
+from driftfit.run.lanes import Lane
+from driftfit.run.layout import tag_of
 from driftfit.run.live.rule import AlarmRule
-from driftfit.run.result import Lane
-from driftfit.run.states import late
-from driftfit.run.states.joint_layout import JointLayout
-from driftfit.run.states.layout import tag_of
+from driftfit.run.warm_start import JointLayout
 
 HEAD = Struct(f"<{len(COUNTS)}q8s8sqq")
 MICROS = "M8[us]"

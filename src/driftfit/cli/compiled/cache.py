@@ -8,7 +8,7 @@ import typer
 
 from driftfit.cli.parts.program import app, helpful, say
 from driftfit.engine.disk_cache import Contents, contents, prune
-from driftfit.show.parts.text import facts
+from driftfit.show.text import facts
 
 
 @app.command()

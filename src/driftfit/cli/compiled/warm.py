@@ -19,7 +19,7 @@ from driftfit.engine.disk_cache import contents, folder
 from driftfit.parsing.settings import parse_model, parse_tracker
 from driftfit.results import Track
 from driftfit.run.parallel_lanes import FEWEST
-from driftfit.show.parts.text import facts
+from driftfit.show.text import facts
 
 SAMPLES = 600
 """Length of the simulated record, of which half is the reference of the alarms."""

@@ -15,8 +15,8 @@ import typer
 from rich.console import Console
 
 from driftfit import __version__
-from driftfit.show.parts.axes import check_picture
-from driftfit.show.parts.text import WIDTH
+from driftfit.show.axes import check_picture
+from driftfit.show.text import WIDTH
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, help="Track the parameters of a system while they change.",

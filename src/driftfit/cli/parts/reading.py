@@ -18,9 +18,8 @@ import polars as pl
 
 from driftfit.data.columns import Columns, Wanted, convert
 from driftfit.data.files import paths_of, read_file
+from driftfit.data.instants import EXAMPLES, dates, span
 from driftfit.data.limits import marks
-from driftfit.data.times.dates import dates
-from driftfit.data.times.periods import EXAMPLES, span
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 

@@ -35,7 +35,7 @@ from driftfit.judge.alarms.frozen import FAULTY, GARCH, Rows, noise_models, plau
 from driftfit.judge.alarms.side_by_side import SimulatedRecords, statistics_of
 from driftfit.judge.alarms.variances import residuals, variances
 from driftfit.judge.statistics.whiteness import whiteness
-from driftfit.run.live.frozen.reference_model import (
+from driftfit.run.live.reference_model import (
     ALPHA,
     BETA,
     CLIP,

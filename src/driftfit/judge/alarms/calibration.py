@@ -24,8 +24,7 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.robust import core
 from driftfit.models.base import Model
 from driftfit.run.result import Track, burn_in
-from driftfit.use.prediction import moved
-from driftfit.use.simulate import input_regressors, regresses_on_lags
+from driftfit.use.simulate import input_regressors, moved, regresses_on_lags
 
 TIMES = 50.0
 """Expected false alarms in all simulated records together."""

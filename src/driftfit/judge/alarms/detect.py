@@ -63,11 +63,11 @@ from driftfit.judge.alarms.statistics import (
 from driftfit.judge.plots import plot_alarms
 from driftfit.judge.regressors import refuse_hidden
 from driftfit.judge.verdict import p_text
-from driftfit.run.live.change import Change, change_of
+from driftfit.run.live.alarm import Change, change_of
 from driftfit.run.live.rule import FROZEN, KINDS, AlarmRule, check_fits, value_text
 from driftfit.run.program import Program
 from driftfit.run.result import Track, burn_in
-from driftfit.show.parts.text import Printed, facts, table_of
+from driftfit.show.text import Printed, facts, table_of
 from driftfit.trackers.base import Tracker
 
 if TYPE_CHECKING:

@@ -39,7 +39,7 @@ from driftfit.judge.fleet_verdict import SHOWN, discoveries
 from driftfit.judge.verdict import p_text
 from driftfit.run.keyed_results import table_by_key
 from driftfit.run.live.rule import FROZEN, AlarmRule
-from driftfit.show.parts.text import Printed, facts, key_text, table_of
+from driftfit.show.text import Printed, facts, key_text, table_of
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track

@@ -23,7 +23,7 @@ from driftfit.engine.simd import WIDTH
 from driftfit.judge.alarms.variances import losses, variances
 from driftfit.judge.statistics.robust import CLIP as OF_FIT
 from driftfit.judge.statistics.robust import LEAST, deviation, medians, noisy, robust_fit
-from driftfit.run.live.frozen.reference_model import (
+from driftfit.run.live.reference_model import (
     ALPHA,
     BETA,
     BLAMED,

@@ -26,7 +26,7 @@ from driftfit.judge.alarms.frozen import CLIPS, Rows
 from driftfit.judge.alarms.reference import in_samples
 from driftfit.judge.alarms.statistics import Reference, chance_of, findings_of, highest, modelled
 from driftfit.judge.cores.on_all_cores import on_all_cores
-from driftfit.run.live.frozen.reference_model import ALPHA, CLIP, CONSTANT
+from driftfit.run.live.reference_model import ALPHA, CLIP, CONSTANT
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.result import Track
 

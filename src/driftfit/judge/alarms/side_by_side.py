@@ -1,11 +1,11 @@
 """The statistics of simulated records, eight records side by side in SIMD vectors.
 
-The statistics of `driftfit.run.live.frozen.likelihood_ratio` and `driftfit.run.live.frozen.score_cusum`, for records in
+The statistics of `driftfit.run.live.likelihood_ratio` and `driftfit.run.live.likelihood_ratio`, for records in
 which every sample can be used: all eight then take the same branches, so that each operation on a number becomes one on
 a vector. Only what the limits need is computed, not which parameter moved, by how much and when. A matrix (rows, 8) has
 a column for each record.
 
-Source and notation: `driftfit.run.live.frozen.likelihood_ratio`. Cost: less than a seventh of eight records one by one.
+Source and notation: `driftfit.run.live.likelihood_ratio`. Cost: less than a seventh of eight records one by one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from driftfit.engine.simd import (
     store,
     times,
 )
-from driftfit.run.live.frozen.reference_model import (
+from driftfit.run.live.reference_model import (
     BLOCKS,
     BOUND,
     CONSTANT,

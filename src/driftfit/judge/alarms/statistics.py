@@ -29,9 +29,9 @@ from driftfit.judge.regressors import refuse_hidden
 from driftfit.judge.statistics.parts.coarse_readings import explained, step_of
 from driftfit.judge.statistics.robust import orthonormal
 from driftfit.readings import gate
-from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.live.frozen.likelihood_ratio import scan
-from driftfit.run.live.frozen.reference_model import (
+from driftfit.run.columns import COLLECTED, collect
+from driftfit.run.live.likelihood_ratio import scan
+from driftfit.run.live.reference_model import (
     BLAMED,
     CUSUM,
     INTERVAL,
@@ -42,8 +42,17 @@ from driftfit.run.live.frozen.reference_model import (
     judgeable,
     memory_of,
 )
-from driftfit.run.live.frozen.rounding import chances, drawn, seed_of
-from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
+from driftfit.run.live.rule import (
+    CHANGE,
+    FROZEN,
+    OFFSET,
+    AlarmRule,
+    chances,
+    check_fits,
+    drawn,
+    power_and_mean,
+    seed_of,
+)
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
 from driftfit.trackers.bank.results.results import Hypotheses

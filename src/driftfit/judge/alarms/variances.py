@@ -15,7 +15,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, kernel
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, lower, minus, over, plus, root, store, times
-from driftfit.run.live.frozen.reference_model import ALPHA, BETA, CLIP, INSIDE, V
+from driftfit.run.live.reference_model import ALPHA, BETA, CLIP, INSIDE, V
 
 
 @kernel

@@ -17,16 +17,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.data.known import Known
-from driftfit.data.record import Record, Records
+from driftfit.data.record import Known, Record, Records
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model, Term
 from driftfit.models.regression import Regression
+from driftfit.run.lanes import Lane
 from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program
-from driftfit.run.result import Lane, Track, burn_in, track_record
+from driftfit.run.result import Track, burn_in, track_record
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.common_size import SIZES, fits, padded, size_of
 

@@ -28,8 +28,8 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.structures.shared_streams import SharedStream, share
 from driftfit.models.base import Model
 from driftfit.readings.gate import FROZEN, INPUT, REFUSED
+from driftfit.run.gating import gate_of
 from driftfit.run.live.live import Live
-from driftfit.run.states.gating import gate_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.student import log_student

@@ -40,10 +40,9 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from driftfit.data.arguments import check_roles
-from driftfit.data.outputs import columns_as_outputs
+from driftfit.data.arguments import check_ready, check_roles
+from driftfit.data.arrays import columns_as_outputs
 from driftfit.data.record import Reading
-from driftfit.data.signals import check_ready
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import factor
 from driftfit.judge.plots import plot_selection
@@ -54,10 +53,8 @@ from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.readings.left_out import remarks_of
-from driftfit.run.states.reference import Decisions, decide
-from driftfit.run.track import records_of
-from driftfit.show.parts.by_output import ByOutput
-from driftfit.show.parts.text import Printed, table_of
+from driftfit.run.track import Decisions, decide, records_of
+from driftfit.show.text import ByOutput, Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.fls import FLS
@@ -293,7 +290,7 @@ def select(
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing)
     search = (keep, most) if isinstance(models, Model) else None
-    columns = [columns_as_outputs(model, y, data) for model in candidates]
+    columns = [(model, y) if data is None else columns_as_outputs(model, y) for model in candidates]
     candidates, y = [model for model, _ in columns], columns[0][1]
     if any(len(model.outputs) > 1 for model in candidates):
         if gate:

@@ -17,9 +17,9 @@ import numpy as np
 from driftfit.data import storage
 from driftfit.engine.kernel import Array
 from driftfit.engine.tiles import as_compiled
+from driftfit.run.layout import words_of
 from driftfit.run.live.live import Live
 from driftfit.run.program import Program
-from driftfit.run.states.layout import words_of
 from driftfit.trackers.parts.common_size import SIZES, padded, places
 
 

@@ -2,6 +2,8 @@
 
 It needs the memory of the window, or of the sums of "glr". Cost: some ten microseconds per sample in addition to the
 update.
+
+A change that an alarm with a frozen reference model found: what changed, by how much and since when.
 """
 
 from __future__ import annotations
@@ -9,17 +11,32 @@ from __future__ import annotations
 from base64 import b64decode, b64encode
 from collections import deque
 from collections.abc import Mapping, Sequence
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from driftfit.data.instants import instant
 from driftfit.data.storage import describe, rebuild
-from driftfit.data.times.instants import instant
 from driftfit.engine.kernel import Array, Driver
-from driftfit.run.live.change import Change, change_of
-from driftfit.run.live.frozen.likelihood_ratio import scan
-from driftfit.run.live.frozen.reference_model import NOISE_FACTOR, OK, ROW, Y, judgeable, memory_of
-from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits, last_power_and_mean
+from driftfit.run.live.likelihood_ratio import scan
+from driftfit.run.live.reference_model import (
+    NOISE_FACTOR,
+    NOISE_WINDOW,
+    RATIO,
+    RAW,
+    ROW,
+    SCALE,
+    SIZE,
+    SPREAD,
+    STD,
+    WHICH,
+    WINDOW,
+    Y,
+    judgeable,
+    memory_of,
+)
+from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits
 from driftfit.trackers.base import Tracker
 
 KEPT = 256
@@ -96,21 +113,13 @@ class LiveAlarm:
         self._onsets.clear()
         return found
 
-    def take(self, tile: Array, lane: int, y: float, e: float, s: float, time: Any = None) -> None:
-        """Judge the sample y that a lane of the tile has just processed; e is its innovation, with variance s."""
-        judged = self._wait == 0
-        if judged:
-            self._compare(tile, lane, y, e, s)
-        self._note(judged, judged and bool(self.rule.exceeded(self.statistic)), time)
-
     def take_many(self, rows: Array, lane: int, y: Array, noise: Array, time: Array | None = None) -> list[str | None]:
-        """Judge T samples that a lane has processed, as `take` does one after the other; the cause wherever it is on.
+        """Judge T samples that a lane has processed; the cause of the alarm wherever it is on.
 
         Parameters
         ----------
-        rows : (T,) of the driver's output
-            For "glr" and "cusum" the rows must contain the samples as well
-            (`driftfit.run.collected_samples.COLLECTED`).
+        rows : (T,) of the driver's output, or the tile after a single sample
+            For "glr" and "cusum" the rows must contain the samples as well (`driftfit.run.columns.COLLECTED`).
         lane : int
         y : (T,)
             The readings as they were given.
@@ -119,7 +128,7 @@ class LiveAlarm:
         time : (T,) or None
         """
         T, first = len(rows), min(self._wait, len(rows))
-        statistic, findings = self._compare_many(rows[first:], lane, y[first:], noise[first:])
+        statistic, findings = self._compare(rows[first:], lane, y[first:], noise[first:])
         on = np.zeros(T, bool)
         on[first:] = self.rule.exceeded(statistic)
         if not self._left and not on.any():  # nothing begins or ends
@@ -154,32 +163,7 @@ class LiveAlarm:
         if self.rule.kind in FROZEN:
             self._findings[...] = findings
 
-    def _compare(self, tile: Array, lane: int, y: float, e: float, s: float) -> None:
-        """The statistic after a sample; without a new one the last is kept."""
-        rule = self.rule
-        if rule.kind in FROZEN:
-            row, phi = self._row[0], tile["phi"][0, :, lane]
-            row[: len(phi)] = phi
-            for place, name in enumerate(ROW, len(rule.parameters)):
-                row[place] = tile[name][0, lane]
-            row[len(rule.parameters) + OK] = judgeable(tile[0], lane, np.array(y), tile["noise"][0, lane])
-            self._draw(self._row)
-            scan(self._row, self._frozen, self._memory, self._findings, np.zeros(1, np.int8))
-            self.statistic = self._findings[0, rule.entries]
-        elif rule.kind == "band":
-            theta, var = (tile[name][0, self._columns, lane] for name in ("theta", "var"))
-            self.statistic = rule.outside(theta, np.sqrt(var))
-        elif rule.kind == "probability":
-            fields = {name: tile[name][0, ..., lane] for name in self._tracker.outputs}
-            self.statistic = np.array([change_probability(self._tracker, fields)])
-        else:
-            g = float(rule.scores(np.array(e), np.sqrt(s)))
-            if np.isfinite(g):
-                self._scores.append(g)
-                if len(self._scores) == rule.window:
-                    self.statistic = last_power_and_mean(np.array(self._scores))
-
-    def _compare_many(self, rows: Array, lane: int, y: Array, noise: Array) -> tuple[Array, Array]:
+    def _compare(self, rows: Array, lane: int, y: Array, noise: Array) -> tuple[Array, Array]:
         """(statistics (T, c) after samples, findings of a frozen model)."""
         rule, T = self.rule, len(rows)
         findings = np.empty((T, 0))
@@ -273,3 +257,41 @@ def check_rule(rule: Any) -> AlarmRule:
             f"got {type(rule).__name__}."
         )
     return rule
+
+
+SURE = NormalDist().inv_cdf(0.975)
+
+
+class Change(NamedTuple):
+    """A change in the window with the largest likelihood ratio, with a band of 95 %.
+
+    Of a parameter, ``size`` is the difference from its value in the reference; of the noise, the factor of its standard
+    deviation; it is NaN where the window with the largest likelihood ratio names another cause. ``since`` is the first
+    of the used samples in that window. At the onset of an alarm the size is somewhat too large, because the noise of a
+    window that is beyond its limit tends to be on its side.
+    """
+
+    name: str
+    size: float
+    low: float
+    high: float
+    since: int
+
+
+def change_of(rule: AlarmRule, findings: Array, t: int) -> Change:
+    """The change that the statistics ``findings`` of sample t show."""
+    model = rule.reference
+    cause = rule.names[rule.cause(findings[rule.entries])]
+    if cause == "noise" and np.isfinite(findings[RATIO]):
+        L = findings[NOISE_WINDOW]
+        error = 0.5 * np.sqrt(model.numbers[SPREAD] / L) / model.numbers[RAW]
+        size, half = findings[RATIO], SURE * findings[RATIO] * error
+    elif np.isfinite(findings[WHICH]) and (
+        rule.kind == "glr" or cause in ("noise", rule.parameters[int(findings[WHICH])])
+    ):
+        which, L = int(findings[WHICH]), findings[WINDOW]
+        unit = model.numbers[SCALE] / model.unit[which]
+        cause, size, half = rule.parameters[which], findings[SIZE] * unit, SURE * findings[STD] * unit
+    else:
+        return Change(cause, np.nan, np.nan, np.nan, t)
+    return Change(cause, float(size), float(size - half), float(size + half), max(t + 1 - int(L), 0))

@@ -5,35 +5,24 @@ It gives the same bits as `update` for one sample after the other, because both 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from driftfit.data.clock import Clock
-from driftfit.data.known import Known
-from driftfit.data.labels import times_of
-from driftfit.data.limits import StreamLimits
-from driftfit.data.record import Reading, Records
-from driftfit.data.times.gaps import LOOK, Pace
-from driftfit.data.times.instants import instant
+from driftfit.data.arguments import times_of
+from driftfit.data.clock import LOOK
+from driftfit.data.instants import instant
+from driftfit.data.record import Known, Reading, Records
 from driftfit.engine.drivers import DRIFT, INTERVAL, NOISE
 from driftfit.engine.kernel import Array
-from driftfit.models.base import Model
 from driftfit.readings.gate import AT_START
-from driftfit.readings.left_out import Tally
 from driftfit.run.columns import SCALARS, Columns
-from driftfit.run.live.alarm import LiveAlarm
-from driftfit.run.live.fixed_lag import Window
-from driftfit.run.live.interventions import HELD
-from driftfit.run.live.late_input import check_applied
+from driftfit.run.gating import AtStart
 from driftfit.run.live.rule import FROZEN
+from driftfit.run.live.stream import HELD, Stream, check_applied
 from driftfit.run.program import Program, lanes_of
-from driftfit.run.states.gating import AtStart
 from driftfit.run.track import records_of
-from driftfit.trackers.base import Tracker
 
 
 class Batch(Columns):
@@ -80,45 +69,8 @@ def with_ignored(out: Array, before: Array, taken: Array) -> Array:
     return rows
 
 
-class Batched(ABC):
+class Batched(Stream):
     """A stream that takes several samples at once."""
-
-    programs: tuple[Program, ...]
-    model: Model
-    _rows: Model
-    _tile: Array
-    _clock: Clock
-    _pace: Pace
-    _limits: StreamLimits | None
-    _last: Any
-    _awaits: int
-    _ignored: int
-    _samples: int
-    _windows: list[Window]
-    _watching: list[tuple[int, LiveAlarm]]
-    left_out: Tally
-
-    @property
-    @abstractmethod
-    def trackers(self) -> tuple[Tracker, ...]:
-        """The tracker of each output."""
-
-    @property
-    @abstractmethod
-    def resting(self) -> tuple[float, float, float]:
-        """Interval, noise and drift of a sample that gives none."""
-
-    @abstractmethod
-    def _settle(self, resting: tuple[float, float, float], extra: bool) -> None:
-        """Set the known factors of samples that give none; ``extra`` if others than these three were given."""
-
-    def _state_tile(self) -> Array:
-        """The tile, with the present state in it."""
-        return self._tile
-
-    @property
-    def _rows_per_instant(self) -> int:
-        return len(self.model.outputs) if self.model.shared else 1
 
     @cached_property
     def _loop(self) -> Any:
@@ -176,7 +128,9 @@ class Batched(ABC):
             record = (records.in_rows() if self.model.shared else records).part(0)
             self._samples += len(records.y)
             self._drive(*lanes_of(record), out, record.time)
-            self._settle(resting, extra)
+            self._rest(resting)
+            if extra:
+                self._set_extra(None, None)
         if before is not None and not taken.all():
             out = with_ignored(out, before, np.repeat(taken, rows))
         return Batch(out, rows)
@@ -229,7 +183,7 @@ class Batched(ABC):
             row, own = slice(t, t + 1), known[t : t + 1] if len(known) > 1 else known
             before = self._samples - len(y) + t
             self._judged(y[row], u[row], own, out[row], None if time is None else time[row], before)
-            self._keep(y[t], out["e"][t], out["s"][t], own[0], None if time is None else instant(time[t]))
+            self._keep(y[t], own[0], None if time is None else instant(time[t]))
 
     def _judged(self, y: Array, u: Array, known: Array, out: Array, time: Any, before: int) -> None:
         """Drive the tile over rows, with so many samples ``before`` them, and note what a gate leaves out."""
@@ -269,9 +223,70 @@ class Batched(ABC):
         for k, (ago, y) in enumerate(zip(found.ago.tolist(), found.value.tolist(), strict=True)):
             self._note(sample - ago, None if times is None else times[k], AT_START, y)
 
-    def _keep(self, y: Array, e: Sequence[float], s: Sequence[float], known: Array, time: Any) -> None:
+    def _keep(self, y: Array, known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""
+        tile, at = self._state_tile(), None if time is None else np.array([time])
         for lane, alarm in self._watching:
-            alarm.take(self._state_tile(), lane, float(y[lane]), float(e[lane]), float(s[lane]), time)
+            own = slice(lane, lane + 1)
+            alarm.take_many(tile, lane, y[own], tile["noise"][0, own], at)
         for lane, window in enumerate(self._windows):
             window.push(self._state_tile(), (known[INTERVAL, lane], known[NOISE, lane], known[DRIFT, lane]), lane)
+
+
+class LiveOutput:
+    """A view of a stream, ``live["level"]``: it always shows the state after the last update.
+
+    ``output`` is the name of the output, ``names`` are those of its parameters.
+    """
+
+    def __init__(self, stream: Any, lane: int) -> None:
+        self._stream, self._lane = stream, lane
+        self.output: str = stream.model.outputs[lane]
+
+    def __repr__(self) -> str:
+        return f"{self.output} of {self._stream!r}"
+
+    @property
+    def program(self) -> Program:
+        """Its model and tracker."""
+        found: Program = self._stream.programs[self._lane]
+        return found
+
+    @property
+    def tracker(self) -> Any:
+        """Its tracker."""
+        return self.program.tracker
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its parameters."""
+        return self.program.names
+
+    @property
+    def theta(self) -> Array:
+        """Parameters now, (n,)."""
+        found: Array = self._stream.theta[self._lane]
+        return found
+
+    @property
+    def std(self) -> Array:
+        """Their standard deviations (n,): inf for parameters that are not determined yet, NaN without a covariance."""
+        found: Array = self._stream.std[self._lane]
+        return found
+
+    @property
+    def cov(self) -> Array:
+        """Their covariance, (n, n)."""
+        found: Array = self._stream.cov[self._lane]
+        return found
+
+    @property
+    def learning(self) -> Array:
+        """Which of them are being learned now, (n,) bool."""
+        found: Array = self._stream.learning[self._lane]
+        return found
+
+    @property
+    def alarm(self) -> Any:
+        """The alarm that watches this output, or None."""
+        return self._stream.alarms.get(self.output)

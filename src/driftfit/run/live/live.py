@@ -15,24 +15,19 @@ from typing import Any, overload
 import numpy as np
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.labels import by_name, order_of
-from driftfit.data.signals import noise_of
-from driftfit.data.times.instants import instant
+from driftfit.data.instants import instant
 from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import as_numbers, factor
+from driftfit.engine.settings import as_numbers
 from driftfit.engine.tiles import as_compiled
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.live.alarm import LiveAlarm
-from driftfit.run.live.batch import Batch
+from driftfit.run.live.batch import Batch, Batched, LiveOutput
 from driftfit.run.live.fixed_lag import FixedLag, Window
-from driftfit.run.live.interventions import HELD, Operated
-from driftfit.run.live.late_input import INPUT, LATER, NOTHING
 from driftfit.run.live.rule import AlarmRule
-from driftfit.run.live.stream import Stream
-from driftfit.run.live_output import LiveOutput
-from driftfit.run.program import Program, state_of
+from driftfit.run.live.stream import HELD, INPUT, LATER, NOTHING, Factors
+from driftfit.run.program import Program
 from driftfit.run.warm_start import Run
 from driftfit.trackers.base import Tracker
 
@@ -42,16 +37,13 @@ Step = tuple[float, float, float, bool]
 Steps = tuple[Array, Array, Array, Array]
 """The same for several outputs, each (ny,)."""
 
-Factors = tuple[float, Any, float]
-"""Interval, factor of the noise variance (one, or one per output), factor of the drift."""
-
 ROWS = "rows"
 """The name of the alarm of outputs that share one theta."""
 
 _FLOAT, _ARRAY = np.dtype(np.float64), np.ndarray
 
 
-class Live(Operated, Stream):
+class Live(Batched):
     """Track a stream.
 
     With several outputs y and all that `update` returns are (ny,); ``theta`` and ``std`` are (ny, n), or (n,) where the
@@ -234,43 +226,6 @@ class Live(Operated, Stream):
             if each or prob is not None:
                 self._set_extra(None, None)
 
-    def _set_extra(self, prob: Any, drift: Any) -> None:
-        """Set the known factors of the next sample that only some trackers have; None is the default."""
-        for lane, tracker in enumerate(self.trackers):
-            tracker.set_extra(self.lane(lane), self._rows, prob, drift)
-
-    def _factors(self, interval: float, weight: Any, drift: Any) -> Factors:
-        noise: Any = 1.0
-        if not self._single:
-            noise = noise_of(weight, len(self.model.outputs))
-        elif weight != 1.0:
-            noise = float(noise_of(weight))
-        return interval, noise, 1.0 if drift == 1.0 else float(factor("drift", drift))
-
-    def _checked(self, y: Any, u: Any) -> tuple[Array, Array]:
-        outputs, inputs = self._outputs(y), self._inputs(u)
-        return (outputs, inputs) if self._limits is None else self._limits.sample(outputs, inputs)
-
-    def _outputs(self, y: Any) -> Array:
-        """y as floats (ny,)."""
-        outputs = self.model.outputs
-        if hasattr(y, "keys"):
-            order_of("Live.update: the model", outputs, list(y.keys()), "outputs")
-            y = [y[name] for name in outputs]
-        given = as_numbers("y", y)
-        if given.shape != (len(outputs),) and not (self._single and given.size == 1):
-            wanted = "one number" if self._single else f"({len(outputs)},)"
-            raise ValueError(f"Live.update: y must be {wanted}; got shape {given.shape}.")
-        return given.reshape(-1)
-
-    def _nothing(self) -> Any:
-        nan = np.full(len(self.model.outputs), np.nan)
-        return (
-            (np.nan, np.nan, np.nan, False)
-            if self._single
-            else (nan, nan.copy(), nan.copy(), np.zeros(nan.shape, bool))
-        )
-
     def _step(self, y: Array, u: Array, known: Any, time: Any) -> Any:
         resting = self.resting
         known = HELD if resting == HELD else known
@@ -280,7 +235,7 @@ class Live(Operated, Stream):
             if self._undecided:
                 self._decide()
             if self._watching or self._windows:
-                self._keep(y, step[1:2], step[2:3], np.reshape(known, (3, 1)), time)
+                self._keep(y, np.reshape(known, (3, 1)), time)
         else:
             out = np.empty(len(y) if self.model.shared else 1, self._row_type)
             self._drive(*self._row(y, u, known), out, None if time is None else [time] * len(out))
@@ -311,11 +266,6 @@ class Live(Operated, Stream):
         """What `update` returns of the rows of a sample."""
         batch = Batch(out, self._rows_per_instant)
         return batch.prediction[0], batch.innovation[0], batch.innovation_var[0], batch.ok[0]
-
-    def _settle(self, resting: tuple[float, float, float], extra: bool) -> None:
-        self._rest(resting)
-        if extra:
-            self._set_extra(None, None)
 
     def _update_later(self, y: float) -> Step:
         """A sample without known factors, whose input comes with `apply`."""
@@ -421,10 +371,6 @@ class Live(Operated, Stream):
             return tuple(alarm for _, alarm in self._watching)
         return {ROWS if self.model.shared else self.model.outputs[lane]: alarm for lane, alarm in self._watching}
 
-    def lane(self, lane: int = 0) -> dict[str, Array]:
-        """The fields of the record, or of that of one of several outputs, as views."""
-        return state_of(self._state_tile(), lane)
-
     def before(self, steps: float) -> Any:
         """The time so many nominal intervals before the last sample; None where samples have no times."""
         time = None if self._last is None else self._clock.moved(self._last, np.array([-steps]))
@@ -447,18 +393,6 @@ class Live(Operated, Stream):
     def inputs_of(self, u: Any) -> Array:
         """u as floats, NaN where it is not known."""
         return self._inputs(u)
-
-    def _inputs(self, u: Any) -> Array:
-        """u as floats (m,), or (ny, m) where outputs share one theta."""
-        if u is None or u is LATER:
-            return self._unknown
-        given = as_numbers("u", u if self.model.shared else by_name(self.model, u))
-        if given.shape != self._shape:
-            if given.size != self._unknown.size:
-                wanted = f"shape {self._shape}" if self.model.shared else f"{self._m} inputs"
-                raise ValueError(f"Live.update: the model has {wanted}, but u has shape {given.shape}.")
-            given = given.reshape(self._shape)
-        return given
 
     @property
     def theta(self) -> Array:

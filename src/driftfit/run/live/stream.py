@@ -1,31 +1,34 @@
-"""What a stream stores in addition to its tile: time, limits, late inputs, windows and alarms; and its files."""
+"""What a stream stores in addition to its tile: time, limits, late inputs, windows and alarms; and its files.
+
+It also holds what an operator may do to a stream, and takes inputs that come after the output of their sample, as in a
+control loop: the model then stores the same as if both had come in one row of a record (`Model.apply`).
+"""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, Self
 
 import numpy as np
 
 from driftfit.data import storage
-from driftfit.data.clock import Clock
+from driftfit.data.arguments import by_name, noise_of, order_of
+from driftfit.data.clock import Clock, Pace
+from driftfit.data.instants import instant
 from driftfit.data.limits import StreamLimits
-from driftfit.data.times.gaps import Pace
-from driftfit.data.times.instants import instant
-from driftfit.engine.kernel import Array
-from driftfit.engine.settings import whole
-from driftfit.engine.tiles import as_compiled
+from driftfit.engine.drivers import INPUTS
+from driftfit.engine.kernel import Array, Driver, Step
+from driftfit.engine.settings import as_numbers, factor, near, numbers, vector, whole
+from driftfit.engine.tiles import as_compiled, tile_type
 from driftfit.models.base import Model
 from driftfit.readings.left_out import Tally
 from driftfit.run.live.alarm import LiveAlarm, check_rule
-from driftfit.run.live.batch import Batched
 from driftfit.run.live.fixed_lag import Window
-from driftfit.run.live.late_input import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import programs_of, state_of, tile_of
-from driftfit.run.public_class import Plain
-from driftfit.run.result import burn_in
+from driftfit.run.result import Plain, burn_in
 from driftfit.run.warm_start import (
     ABSENT,
     KINDS,
@@ -41,8 +44,74 @@ from driftfit.run.warm_start import (
 )
 from driftfit.trackers.base import Tracker
 
+KNOWN = ("interval", "noise", "drift")
+ORDINARY, HELD = (1.0, 1.0, 1.0), (0.0, np.inf, 1.0)
+"""The known factors of a sample: the default, and those while the stream is held."""
 
-class Stream(Batched, Plain, storage.Kept):
+
+Factors = tuple[float, Any, float]
+"""Interval, factor of the noise variance (one, or one per output), factor of the drift."""
+
+
+class _Later:
+    """Represents an input that was left out, as opposed to None, which is a missing input."""
+
+    def __repr__(self) -> str:
+        return "LATER"
+
+
+LATER: Any = _Later()
+
+NOTHING, INPUT, IGNORED = 0, 1, 2
+"""The input that `Live.apply` is expected to receive: nothing, the input of the last sample, or that of an ignored
+sample.
+"""
+
+
+def applier(model: Model, tracker: Tracker, tile: Array) -> Any:
+    """``apply(as_compiled(tile), u)`` for this type of tile; ValueError if outputs need the input of their sample."""
+    step = tracker.apply_for(model)
+    if step is None:
+        raise ValueError(
+            f"Live.update: no input was given, but {model!r} needs the input of a sample to predict its output "
+            "(a regression, or nk = 0): update(y, u), with u=None if it is not known. In a control loop, where u is "
+            "chosen after y has been read, use a model with nk of at least 1, and call update(y), then apply(u)."
+        )
+    return _compiled(step).entry(tile_type(tile), INPUTS)
+
+
+@lru_cache(maxsize=256)
+def _compiled(step: Step) -> Driver:
+    @Driver
+    def apply(tile: Array, u: Array) -> None:
+        s = tile[0]
+        for l in range(s.theta.shape[1]):
+            for j in range(u.shape[0]):
+                s.u[j, l] = u[j]
+            step(s, l)
+
+    return apply
+
+
+def check_applied(expected: int) -> None:
+    """Raise an error if a sample arrives while the input of the previous one is still outstanding."""
+    if expected != NOTHING:
+        raise ValueError(
+            "Live.update: the input of the last sample has not been given yet: apply(u) after update(y), or "
+            "apply(None) where it is not known."
+        )
+
+
+def check_expected(expected: int) -> None:
+    """Raise an error if an input arrives although no sample is waiting for it."""
+    if expected == NOTHING:
+        raise ValueError(
+            "Live.apply: no sample is waiting for its input. The order is update(y) without u, then apply(u), once per "
+            "sample."
+        )
+
+
+class Stream(Plain, storage.Kept):
     """A stream: a tile with a lane for each program, which every sample changes.
 
     `driftfit.run.live.live.Live` defines how a sample is processed, and what is reported of it.
@@ -76,6 +145,23 @@ class Stream(Batched, Plain, storage.Kept):
         self._watching: list[tuple[int, LiveAlarm]] = []
         self._tile = tile_of(self.programs, carried(before, self.programs))
 
+    def _state_tile(self) -> Array:
+        """The tile, with the present state in it."""
+        return self._tile
+
+    @property
+    def _rows_per_instant(self) -> int:
+        return len(self.model.outputs) if self.model.shared else 1
+
+    def lane(self, lane: int = 0) -> dict[str, Array]:
+        """The fields of the record, or of that of one of several outputs, as views."""
+        return state_of(self._state_tile(), lane)
+
+    def _set_extra(self, prob: Any, drift: Any) -> None:
+        """Set the known factors of the next sample that only some trackers have; None is the default."""
+        for lane, tracker in enumerate(self.trackers):
+            tracker.set_extra(self.lane(lane), self._rows, prob, drift)
+
     def __repr__(self) -> str:
         settings = ", ".join(dict.fromkeys(map(repr, self.trackers)))
         last = "" if self._last is None else f" at {self._last}"
@@ -94,21 +180,49 @@ class Stream(Batched, Plain, storage.Kept):
     def _kinds(cls) -> Mapping[str, type[storage.Kept]]:
         return dict.fromkeys(KINDS, cls)
 
-    @abstractmethod
-    def _factors(self, interval: float, weight: Any, drift: Any) -> Any:
-        """The known numbers of a sample."""
+    def _factors(self, interval: float, weight: Any, drift: Any) -> Factors:
+        noise: Any = 1.0
+        if not self._single:
+            noise = noise_of(weight, len(self.model.outputs))
+        elif weight != 1.0:
+            noise = float(noise_of(weight))
+        return interval, noise, 1.0 if drift == 1.0 else float(factor("drift", drift))
 
-    @abstractmethod
-    def _checked(self, y: Any, u: Any) -> tuple[Any, Array]:
-        """The signals of a sample as numbers, NaN where they are outside their limits."""
+    def _checked(self, y: Any, u: Any) -> tuple[Array, Array]:
+        outputs, inputs = self._outputs(y), self._inputs(u)
+        return (outputs, inputs) if self._limits is None else self._limits.sample(outputs, inputs)
 
-    @abstractmethod
-    def _nothing(self) -> Any:
-        """The result of a sample that is ignored."""
+    def _outputs(self, y: Any) -> Array:
+        """y as floats (ny,)."""
+        outputs = self.model.outputs
+        if hasattr(y, "keys"):
+            order_of("Live.update: the model", outputs, list(y.keys()), "outputs")
+            y = [y[name] for name in outputs]
+        given = as_numbers("y", y)
+        if given.shape != (len(outputs),) and not (self._single and given.size == 1):
+            wanted = "one number" if self._single else f"({len(outputs)},)"
+            raise ValueError(f"Live.update: y must be {wanted}; got shape {given.shape}.")
+        return given.reshape(-1)
 
-    @abstractmethod
     def _inputs(self, u: Any) -> Array:
-        """u as floats, NaN where it is not known."""
+        """u as floats (m,), or (ny, m) where outputs share one theta."""
+        if u is None or u is LATER:
+            return self._unknown
+        given = as_numbers("u", u if self.model.shared else by_name(self.model, u))
+        if given.shape != self._shape:
+            if given.size != self._unknown.size:
+                wanted = f"shape {self._shape}" if self.model.shared else f"{self._m} inputs"
+                raise ValueError(f"Live.update: the model has {wanted}, but u has shape {given.shape}.")
+            given = given.reshape(self._shape)
+        return given
+
+    def _nothing(self) -> Any:
+        nan = np.full(len(self.model.outputs), np.nan)
+        return (
+            (np.nan, np.nan, np.nan, False)
+            if self._single
+            else (nan, nan.copy(), nan.copy(), np.zeros(nan.shape, bool))
+        )
 
     def _sample(self, y: Any, u: Any, time: Any, weight: Any, drift: Any) -> Any:
         """Process a sample with a time, known factors, limits, or a late input."""
@@ -262,3 +376,79 @@ class Stream(Batched, Plain, storage.Kept):
         restore(source, live.programs, header, arrays, live._state_tile())
         live._expect(extra["awaits"])
         return live
+
+    def hold(self, on: bool = True) -> None:
+        """Stop learning, or with ``hold(False)`` resume: for work on the plant, a test, or while a sensor is cleaned.
+
+        While held, samples enter the lags and are predicted, but are not used (``ok`` is False), and no time passes
+        for the parameters and their covariance. Being held is part of the state that `save` writes.
+        """
+        self._rest(HELD if on else ORDINARY)
+
+    @property
+    def held(self) -> bool:
+        """Whether `hold` is on."""
+        return bool(self._state_tile()["noise"][0, 0] == np.inf)
+
+    @property
+    def resting(self) -> tuple[float, float, float]:
+        """Interval, noise and drift of a sample that gives none."""
+        return HELD if self.held else ORDINARY
+
+    def reset(self, which: str | int | Sequence[str | int] | None = None, p: Any = None, theta: Any = None) -> None:
+        """Pass an operator's knowledge to the tracker: these parameters may have changed, or have new values.
+
+        Parameters
+        ----------
+        which : name, index, several of them, or None
+            The parameters; None is all. Indices count the parameters of all outputs, one output after the other.
+        p : number or one per parameter
+            Variance of the change, in squared units of theta; it is added to the present variance. After maintenance
+            a large value lets the next samples decide.
+        theta : number or one per parameter
+            Their new values, if they are known.
+
+        Raises
+        ------
+        ValueError
+            For an unknown parameter, a negative or infinite p, or a tracker without a covariance to widen.
+        """
+        chosen = self._chosen(which)
+        if p is None and theta is None:
+            raise ValueError("Live.reset: give p= (the variance of their possible change), theta=, or both.")
+        if self._windows:
+            raise ValueError(
+                "Live.reset: smoothing with lag= does not support resets; use a second stream without lag=."
+            )
+        count = len(chosen)
+        if p is not None:
+            moved = vector("Live.reset", "p", numbers("Live.reset", "p", p, low=0.0), count)
+        if theta is not None:
+            values = vector("Live.reset", "theta", numbers("Live.reset", "theta", theta), count)
+        for number, program in enumerate(self.programs):
+            places = [k for k, (lane, _) in enumerate(chosen) if lane == number]
+            own = [chosen[k][1] for k in places]
+            if own and p is not None:
+                added = np.zeros(len(program.names))
+                added[own] = moved[places]
+                program.tracker.widen(self.lane(number), added)
+            if own and theta is not None:
+                program.tracker.place(self.lane(number), own, values[places])
+
+    def _chosen(self, which: Any) -> list[tuple[int, int]]:
+        """(output, index) of parameters."""
+        named = [(lane, i, name) for lane, one in enumerate(self.programs) for i, name in enumerate(one.names)]
+        if which is None:
+            return [(lane, i) for lane, i, _ in named]
+        chosen = []
+        for one in [which] if isinstance(which, str | int) else which:
+            found = [(lane, i) for k, (lane, i, name) in enumerate(named) if one in (name, k)]
+            if not found:
+                raise ValueError(f"Live.reset: no parameter {one!r}; {near(str(one), [name for *_, name in named])}")
+            chosen.append(found[0])
+        return chosen
+
+    def _rest(self, known: tuple[float, float, float]) -> None:
+        """Set the known factors of every sample that gives none."""
+        for name, value in zip(KNOWN, known, strict=True):
+            self._state_tile()[name] = value

@@ -1,9 +1,9 @@
 """The units of a section [[unit]]: what arrives is sorted, judged and run for all of them at once.
 
 Samples with times wait until the newest time of their unit is ``hold_back`` after them, and are then processed in the
-order of their times (`driftfit.run.states.late`). What is late, repeated, without a time, or far in the future is
+order of their times (`driftfit.data.late`). What is late, repeated, without a time, or far in the future is
 counted and does not enter the journal (`Section.admit`). What the journal has is processed in the lanes of tiles
-(`driftfit.run.states.advance`), so the states are those of `track` on the journal's rows, bit for bit.
+(`driftfit.run.parallel_lanes`), so the states are those of `track` on the journal's rows, bit for bit.
 """
 
 from __future__ import annotations
@@ -16,17 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.data.known import Known
-from driftfit.data.record import Records
+from driftfit.data import late
+from driftfit.data.record import Known, Records
 from driftfit.engine.drivers import INTERVAL, NOISE
 from driftfit.engine.kernel import Array
 from driftfit.readings import gate
 from driftfit.readings.remarks import SAID
-from driftfit.run.live.interventions import HELD
 from driftfit.run.live.rule import FROZEN
-from driftfit.run.parallel_lanes import FEWEST
-from driftfit.run.states import late
-from driftfit.run.states.advance import Advanced, advance
+from driftfit.run.live.stream import HELD
+from driftfit.run.parallel_lanes import FEWEST, Advanced, advance
 from driftfit.service.core.blocks import Blocks
 from driftfit.service.core.journal import Rows
 from driftfit.service.core.results import ALARM, OK, THETA, TIME, Y_HAT, Results, Y

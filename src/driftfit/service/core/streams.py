@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.clock import Clock
+from driftfit.data.late import HoldBack
 from driftfit.data.storage import describe, rebuild
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
+from driftfit.run.layout import unpacked
 from driftfit.run.program import Program, programs_of, state_of
-from driftfit.run.states.late import HoldBack
-from driftfit.run.states.layout import unpacked
 from driftfit.run.warm_start import End
 from driftfit.service.core.journal import REMEDY
 from driftfit.service.settings.config import UnitSettings

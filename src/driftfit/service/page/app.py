@@ -22,7 +22,7 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 
-from driftfit.data.formats.csv_files import without_formulas
+from driftfit.data.csv_files import without_formulas
 from driftfit.service.health import health
 from driftfit.service.page import history, metrics, openapi
 from driftfit.service.page.access import COOKIE, Access, Rates

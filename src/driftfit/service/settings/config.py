@@ -12,8 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from driftfit.data.arguments import check_ready
 from driftfit.data.clock import Clock
-from driftfit.data.signals import check_ready
 from driftfit.engine.settings import near
 from driftfit.judge.alarms.detect import asked_for, check_alarm
 from driftfit.models.base import Model

@@ -16,7 +16,7 @@ from typing import Any
 
 import polars as pl
 
-from driftfit.data.formats.packed import read_parquet
+from driftfit.data.files import read_parquet
 from driftfit.service.sources.contract import END, FileSource, Reader
 from driftfit.service.sources.samples import Batch, Samples, seconds
 

@@ -8,7 +8,7 @@ next level, so that sums of residuals wander although theta is constant. It has 
 q^2) at most, which a noise of half a step averages to nothing. With less noise, the tests judge z_t: if theta is
 constant, it has the errors S w_t, whatever the inputs do. A change that is smaller than the step moves z_t by less than
 the reading, and only as far as readings can tell; one that is larger moves it as much, less half a step. The U_t are
-functions of t and of all readings: the same record has the same verdict (`driftfit.run.live.frozen.rounding`).
+functions of t and of all readings: the same record has the same verdict (`driftfit.run.live.rule`).
 
 theta and S are those of greatest likelihood of the intervals, on readings near the fit. If they move, S is large, and
 the readings remain as they are. Readings of a fine sensor always remain as they are, and so do those that constants
@@ -26,7 +26,7 @@ import scipy
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.robust import robust_fit
-from driftfit.run.live.frozen.rounding import chances, drawn, seed_of
+from driftfit.run.live.rule import chances, drawn, seed_of
 
 MOST = 0.6
 """Noise in units of the step from which on rounding has no mean: its share of the step is below 0.0003."""

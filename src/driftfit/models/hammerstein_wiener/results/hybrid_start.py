@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from rich.text import Text
 
-from driftfit.data.known import Known
-from driftfit.data.record import Record
-from driftfit.data.signals import as_inputs, as_output
+from driftfit.data.arguments import as_inputs, as_output
+from driftfit.data.record import Known, Record
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
@@ -27,7 +26,7 @@ from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.run.program import Program
 from driftfit.run.result import Track, track_record
 from driftfit.run.track import track_one
-from driftfit.show.parts.text import digits, facts, printed, table_of
+from driftfit.show.text import digits, facts, printed, table_of
 from driftfit.smooth.problem import replay
 from driftfit.trackers.base import Tracker
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
-from driftfit.show.parts.axes import date_axis, frame, panels, settled, time_label
+from driftfit.show.axes import date_axis, frame, panels, settled, time_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.run.live.live import Live
 from driftfit.run.result import Track
-from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, draw_parameter, panels, time_label
+from driftfit.show.axes import BLUE, GREY, RED, date_axis, draw_parameter, panels, time_label
 from driftfit.trackers.bank.layout import LEAVES
 from driftfit.trackers.bank.leaves.leaf_matrix import CODE, WEIGHT
 from driftfit.trackers.bank.reduction import GPB, Decide

@@ -7,7 +7,7 @@ for inputs that are held between samples (zero-order hold). With companion matri
     expm([[F, g], [0, 0]] dt) = [[Phi, gamma], [0, 1]]        logm goes back
 
 A discrete pole p is exp(s dt): it needs p > 0 or a complex pair, and 0 <= w dt < pi for the logarithm to be the right
-one. Standard deviations follow by the delta method (`driftfit.use.delta_method`), on joint covariances, so that there
+one. Standard deviations follow by the delta method (`driftfit.use.system`), on joint covariances, so that there
 and back again is where it began.
 
 Source: Astrom and Wittenmark, Computer-Controlled Systems (1997), section 2.4. Cost: O(n^4) for one sample.
@@ -24,8 +24,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers
 from driftfit.models.continuous.sampling import matrices, polynomials, sampled
 from driftfit.models.continuous.transfer import ContinuousTransfer
-from driftfit.use.delta_method import jacobian
-from driftfit.use.system import Followed, Response, input_of, linear, taken
+from driftfit.use.system import Followed, Response, input_of, jacobian, linear, taken
 
 
 @dataclass(frozen=True, eq=False)

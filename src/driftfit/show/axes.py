@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+
 BLUE, RED, GREY = "#1f5fa8", "#c23b22", "#8a8a8a"
 
 

@@ -1,4 +1,7 @@
-"""Parts of an HTML page: sections, tables, and pictures as SVG in the colours of the page."""
+"""Parts of an HTML page: sections, tables, and pictures as SVG in the colours of the page.
+
+The parts common to all reports: the style sheet (light, dark and print), and the section "How to read this".
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,13 @@ from html import escape
 from io import StringIO
 from typing import TYPE_CHECKING
 
-from driftfit.show.page_style import STYLE
-from driftfit.show.parts.axes import BLUE, GREY, RED
+from driftfit.show.axes import BLUE, GREY, RED
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from driftfit.run.result import Track
+
 
 LONG = 3000
 """In longer records the points of pictures are an image inside the SVG."""
@@ -103,3 +106,45 @@ def _inked(axis: object) -> None:
     for word in (*titles, *words, *(legend.get_texts() if legend else ())):
         if word.get_color() in ("black", "k", "#000000"):
             word.set_color(INK)
+
+
+STYLE = """
+:root { color-scheme: light dark; --page: #ffffff; --ink: #1d2126; --soft: #5d6670; --rule: #d9dee3; --card: #f5f7f9;
+  --blue: #1f5fa8; --red: #c23b22; --grey: #8a8a8a; --good: #23713b; }
+@media (prefers-color-scheme: dark) { :root { --page: #14171a; --ink: #e6e9ec; --soft: #9aa4ae; --rule: #343b42;
+  --card: #1d2226; --blue: #6aa9f0; --red: #f0806a; --grey: #8f979e; --good: #6cc48a; } }
+@page { size: A4; margin: 15mm; }
+body { margin: 0; background: var(--page); color: var(--ink);
+  font: 1rem/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
+main { max-width: 64rem; margin: 0 auto; padding: 1.5rem; }
+h1 { font-size: 1.6rem; margin: 0 0 .2rem; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
+h3 { font-size: 1rem; margin: 1.4rem 0 .3rem; }
+.soft, figcaption, caption { color: var(--soft); font-size: .88rem; }
+.verdict { background: var(--card); border-left: .35rem solid var(--blue); padding: .8rem 1.1rem; margin: 1rem 0; }
+.verdict p { margin: .3rem 0; } .verdict p:first-child { font-size: 1.15rem; font-weight: 600; }
+.wide { overflow-x: auto; } table { border-collapse: collapse; width: 100%;
+  margin-bottom: 1rem; font-variant-numeric: tabular-nums; }
+caption { text-align: left; padding-bottom: .3rem; caption-side: top; }
+td { font-size: .94rem; }
+th, td { padding: .3rem .5rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap; }
+th { font-weight: 600; font-size: .88rem; } th:first-child, td:first-child, .words { text-align: left; }
+.bad { color: var(--red); font-weight: 600; } .good { color: var(--good); }
+figure { margin: 1rem 0; } figure svg { width: 100%; height: auto; display: block; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.2rem; margin: .5rem 0; }
+dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; } li { margin: .2rem 0; }
+@media print { :root { --page: #ffffff; --ink: #000000; --soft: #444444; --rule: #bbbbbb; --card: #f4f4f4;
+  --blue: #1f5fa8; --red: #c23b22; --grey: #777777; --good: #23713b; } html { font-size: 11px; }
+  figure, tr, li, .verdict, .short, .one { break-inside: avoid; }
+  h2, h3 { break-after: avoid; } main { max-width: none; padding: 0; }
+  .wide { overflow: visible; } th, td { white-space: normal; } }
+"""
+
+READING = """<p>The output is described as a sum of regressors times parameters. The parameters are estimated sample
+by sample: at every time the estimate uses the past only, and the band shows how accurate it was then.</p>
+<ul><li><b>Do the parameters move?</b> This is a test of constant parameters that is valid with outliers, changing noise
+and changing inputs. A small p means that constant parameters would hardly produce such a record.</li>
+<li><b>Does tracking them pay?</b> The table compares the error of predicting the next sample with three simple
+methods: repeating the last value (persistence), one set of constants fitted to all of the past (constant LS), and a
+small constant dynamic model (constant ARX). A p below 0.05 means that this run is better by more than chance.</li>
+<li><b>Diagnostics</b> show whether the bands can be trusted. Each that is out of bounds comes with a suggestion.</li>
+</ul>"""

@@ -5,6 +5,10 @@ header determines whether cells are separated by comma, semicolon, tab or bar, o
 which spreadsheets write. A row of units may follow it. Blank lines are left out; in a file of one column they are
 missing readings, unless every line is followed by one. Separators at the end of a line are left out; a line with more
 cells than the header is an error. Text that is neither UTF-8 nor UTF-16 is taken as Windows-1252.
+
+Numbers with a decimal comma, and with dots between thousands: 1.234,5.
+
+Columns are cells without blanks around them, null for those without a value (`driftfit.data.columns.present`).
 """
 
 from __future__ import annotations
@@ -13,15 +17,14 @@ import csv
 import io
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
 from driftfit.data.columns import ERROR, FILE, HISTORIANS, Wanted, plain_names, present
-from driftfit.data.formats.decimal_commas import points, with_points
-from driftfit.data.times.dates import is_date
+from driftfit.data.instants import is_date
 
 PROBE = 1 << 16
 """The bytes from which the separator, the decimal sign and units are judged."""
@@ -192,3 +195,65 @@ def _whole(text: pl.Series) -> pl.Series:
     """A column that names units. In a file of text it has no type; it becomes integers if every cell is one."""
     whole = text.cast(pl.Int64, strict=False)
     return whole if whole.cast(pl.String).eq_missing(text).all() else text
+
+
+COMMA = r"^[+-]?(\d+|\d{1,3}(\.\d{3})+)?(,\d*)?([eE][+-]?\d+)?$"
+"""A number with a decimal comma, perhaps with dots between thousands."""
+
+GROUPED = r"^[+-]?([1-9]\d{0,2}(\.\d{3})+|\d+)$"
+"""A whole number, perhaps with dots between thousands."""
+
+POINT = r"^[+-]?\d*\.(\d{0,2}|\d{4,})([eE][+-]?\d+)?$"
+"""A number with a decimal point, which cannot be between thousands."""
+
+
+def with_points(columns: Sequence[pl.Series], others: Iterable[pl.Series]) -> list[pl.Series]:
+    """Columns of a file with decimal points instead of decimal commas, and without dots between thousands.
+
+    ``others`` are all columns of the file, or the beginning of each: decimal commas in one of them say that the dots in
+    columns of whole numbers are between thousands, and a decimal point that commas may be between thousands. If there
+    are both, or text among the decimal commas, such dots raise a ValueError.
+    """
+    if not any(map(_doubtful, columns)):
+        return [_with_points(column, False, False) for column in columns]
+    every = [column.drop_nulls() for column in [*columns, *others]]
+    pointed = any(column.str.contains(POINT).any() for column in every)
+    commas = [column for column in every if (column.str.contains(COMMA) & column.str.contains(",", literal=True)).any()]
+    pure = bool(commas) and not pointed and all(column.str.contains(COMMA).all() for column in commas)
+    for column in columns if commas and not pure else ():
+        if _doubtful(column) and not column.str.contains(",", literal=True).any():
+            dot = column.filter(column.str.contains(".", literal=True).fill_null(False))[0]
+            raise ValueError(
+                f"the dot in {dot} of column {column.name!r} may be a decimal point or stand between thousands: "
+                f"the file has decimal commas and {'decimal points' if pointed else 'text among them'}. Give "
+                "--decimal , or --decimal . on the command line, or pass the table that "
+                "polars.read_csv(.., decimal_comma=True) reads."
+            )
+    return [_with_points(column, pure, pointed) for column in columns]
+
+
+def _doubtful(text: pl.Series) -> bool:
+    """Whether only other columns can show if all signs of a column are decimal ones or between thousands."""
+    known = text.drop_nulls()
+    commas = known.filter(known.str.contains(",", literal=True))
+    if len(commas):
+        return bool(commas.str.contains(r",\d{3}$").all())
+    return bool(known.str.contains(".", literal=True).any() and known.str.contains(GROUPED).all())
+
+
+def points(text: pl.Series) -> pl.Series:
+    """A column with a decimal point instead of a comma; points that group thousands are removed."""
+    plain = text.str.replace_all(".", "", literal=True).str.replace(",", ".", literal=True)
+    return plain.zip_with(text.str.contains(COMMA).fill_null(False), text)
+
+
+def _with_points(text: pl.Series, commas: bool, pointed: bool) -> pl.Series:
+    """One column of a file in which others have decimal ``commas``, or some cells are ``pointed``."""
+    known = text.drop_nulls()
+    comma = known.filter(known.str.contains(",", literal=True))
+    if not len(comma):
+        return points(text) if commas and known.str.contains(GROUPED).all() else text
+    mixed = not comma.str.contains(COMMA).all() or known.str.contains(POINT).any()
+    if mixed or (pointed and comma.str.contains(r",\d{3}$").all()):
+        return text  # the error message names the cell
+    return points(text)

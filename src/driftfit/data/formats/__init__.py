@@ -1,1 +1,0 @@
-"""Text files: cells of CSV files, and the signs with which their numbers are written."""

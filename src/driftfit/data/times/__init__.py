@@ -1,1 +1,0 @@
-"""Times: periods and instants as they are written, and gaps between samples."""

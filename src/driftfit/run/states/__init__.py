@@ -1,1 +1,0 @@
-"""States as bytes, and many of them continued in parallel."""

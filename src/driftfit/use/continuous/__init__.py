@@ -1,1 +1,0 @@
-"""Between discrete and continuous time."""
