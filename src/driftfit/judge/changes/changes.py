@@ -13,12 +13,10 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.changes.dates import LEVEL, Dated, counted, dated
-from driftfit.judge.changes.fit import noise
+from driftfit.judge.changes.fit import NONE, noise, order_of, white_rows
 from driftfit.judge.changes.kinds import UNIT_ROOT, Kind, kind
 from driftfit.judge.changes.null import Lags, Model, Tested, in_basis, tested
 from driftfit.judge.changes.which import Which, which
-
-NONE = np.zeros(0, np.int64)
 
 
 class Changes(NamedTuple):
@@ -39,29 +37,41 @@ class Changes(NamedTuple):
         return bool(self.test.p < self.level)
 
     @property
+    def scores(self) -> Array:
+        """(N, n): sums of the scores of constants over the root of their sum of squares."""
+        lags, g = self.model.noise.lags, self.model.noise.g
+        Z, z = white_rows(self.model.phi, self.model.y, lags, self.test.ar[0], g)
+        own = Z * (z - Z @ self.test.theta)[:, None]
+        size = np.sqrt(np.sum(own**2, axis=0))
+        return np.vstack([np.zeros((order_of(lags), Z.shape[1])), np.cumsum(own, axis=0) / np.where(size > 0, size, 1)])
+
+    @property
     def wandering_noise(self) -> bool:
         """Whether the noise may be a random walk: then a level that wanders looks the same."""
         return bool(len(self.model.noise.lags) and len(self.model.y) * (1.0 - self.test.root) < UNIT_ROOT)
 
 
-def modelled(phi: Array, y: Array, lags: Lags, root: Array, order: int | None) -> Model:
+def modelled(phi: Array, y: Array, lags: Lags, root: Array, order: int | None, fewest: int | None = None) -> Model:
     """The regression with its noise."""
     X, basis = in_basis(phi)
     phi, y, basis = (np.ascontiguousarray(one) for one in (phi, y, basis))
-    return Model(phi, y, X, basis, lags, root, noise(X, y, order))
+    return Model(phi, y, X, basis, lags, root, noise(X, y, order, fewest))
 
 
 def changes(
     phi: Array, y: Array, lags: Lags | None = None, root: Array | None = None, level: float = 0.05,
-    order: int | None = None, dates: float = LEVEL,
+    order: int | None = None, dates: float = LEVEL, fewest: int | None = None,
 ) -> Changes:  # fmt: skip
     """Judge y (N,) on phi (N, n): at which ``dates`` (the level of their intervals) its coefficients changed.
 
     ``lags``: which columns are earlier outputs. ``root`` (N,): what rows were multiplied by. ``level``: error rate of
-    the test. ``order``: that of the autoregression of the noise; None estimates it.
+    the test. ``order``: that of the autoregression of the noise; None estimates it. ``fewest``: rows
+    in a segment.
     """
     N, n = phi.shape
-    model = modelled(phi, y, Lags.none(N) if lags is None else lags, np.ones(N) if root is None else root, order)
+    model = modelled(
+        phi, y, Lags.none(N) if lags is None else lags, np.ones(N) if root is None else root, order, fewest
+    )
     test, draws = tested(model)
     breaks, ar, prices = NONE, test.ar[0], (np.nan, np.nan)
     if test.p < level:

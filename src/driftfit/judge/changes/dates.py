@@ -25,12 +25,12 @@ from driftfit.judge.changes.fit import (
     order_of,
     partitions,
     regressed,
-    shortest,
     split,
     white_rows,
 )
 from driftfit.judge.changes.null import Draws, Model, Tested, gains, price, problem_of, radius
-from driftfit.judge.changes.scan import SINGULAR, SMALL, Work, _increments
+from driftfit.judge.changes.scan import SINGULAR, SMALL, Work, prepared
+from driftfit.judge.statistics.robust import orthonormal
 
 LEVEL = 0.95
 """Share of the likelihood in the interval of a date."""
@@ -51,8 +51,8 @@ class Exact:
         self.model, self.places, self.ar = model, places, ar
         problem = problem_of(model, np.zeros((0, n)))._replace(places=places)
         self.work, rss = Work.of(N, n, problem), np.zeros(1)
-        _increments(model.X, model.y, problem, ar, self.work, rss)
-        self.rss, self.theta, n = float(rss[0]), self.work.theta.copy(), n
+        prepared(model.X, model.y, problem, ar, self.work, rss)
+        self.rss, self.theta = float(rss[0]), self.work.theta.copy()
         self.least = SINGULAR * float(np.abs(np.einsum("tj,tj->j", self.work.Z, self.work.Z)[:n]).max()) + SMALL
 
     def _system(self, at: Array) -> tuple[Array, Array]:
@@ -163,7 +163,7 @@ def refined(model: Model, start: Array, breaks: Array) -> Partition:
         start = regressed(noise_of(X, y, estimated(X, y, (lags, start, g), breaks)[0], breaks), g, lags)
     places = grid(len(y))[0]
     exact = Exact(model, places, start)
-    at = exact.settled(np.searchsorted(places, breaks), shortest(X.shape[1], lags))
+    at = exact.settled(np.searchsorted(places, breaks), model.noise.fewest)
     return float(exact.of(at)), places[at], start
 
 
@@ -182,13 +182,13 @@ def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Arr
     ]
     first = 1 if test.p_each[:2].min() <= test.p_each[2] else 2
     prices = (price(test.gains[:, 0], level / SHARE), price(test.gains[:, 1], level / SHARE))
-    most = max(0, min(MOST, N // shortest(n, noise.lags) - 1))
+    most = max(0, min(MOST, N // noise.fewest - 1))
     starts = [test.ar[len(found) - 1], noise.ar] if len(noise.lags) else [noise.ar]
-    lists = [partitions(X, y, (noise.lags, start, noise.g), most, shortest(n, noise.lags)) for start in starts]
+    lists = [partitions(X, y, (noise.lags, start, noise.g), most, noise.fewest) for start in starts]
     for K in range(3, most + 1):
-        if K >= len(lists[0]) or K > numbered(found, prices, N, first) + 3:
+        if len(lists[0]) <= K or numbered(found, prices, N, first) + 3 < K:
             break
-        tried = (refined(model, start, own[K]) for start, own in zip(starts, lists, strict=True) if K < len(own))
+        tried = (refined(model, start, own[K]) for start, own in zip(starts, lists, strict=True) if len(own) > K)
         found.append(min(tried, key=lambda one: one[0]))
     K = numbered(found, prices, N, first)
     if K and (len(noise.lags) or len(model.lags.columns)):  # changes made the dynamics of constants too slow
@@ -196,7 +196,7 @@ def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Arr
         theta, _ = estimated(X, y, (noise.lags, ar, noise.g), breaks)
         mean = model.basis @ (np.diff(np.concatenate([[0], breaks, [N]])) / N @ theta)
         if max(radius(ar, noise.lags), draws.of_outputs(mean)) < 1.0:
-            rss, _, _, _ = draws.of(mean, ar, len(test.gains), True)
+            rss = draws.of(mean, ar, len(test.gains), True).rss
             again = gains(rss[np.isfinite(rss[:, 0])], N)
             prices = (price(again[:, 0], level / SHARE), price(again[:, 1], level / SHARE))
             K = numbered(found, prices, N, first)
@@ -284,8 +284,6 @@ COMPONENT = 1e-6
 
 def undetermined(phi: Array) -> Array:
     """Which parameters (n,) have a component in a direction that rows phi (N, n) do not vary in."""
-    from driftfit.judge.statistics.robust import orthonormal
-
     basis = orthonormal(phi)
     _, size, directions = np.linalg.svd(basis.R)
     rank = int(np.sum(size > basis.negligible))

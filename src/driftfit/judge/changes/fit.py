@@ -19,6 +19,7 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.changes.scan import CELLS, PLACES, SINGULAR, SMALL
 from driftfit.judge.statistics.robust import deviation
 
+NONE = np.zeros(0, np.int64)
 HELD = 3.0
 """Levels of the noise from the fit at which a residual is limited."""
 ORDER = 6
@@ -45,11 +46,13 @@ class Noise(NamedTuple):
     e: Array
     """(N,): white residuals of the segments, 0 in the first rows."""
     breaks: Array
+    fewest: int
+    """Rows in the shortest segment that is searched."""
 
 
-def shortest(n: int, lags: Array) -> int:
-    """Rows in the shortest segment that is searched, of n parameters."""
-    return max(10, 4 * n, order_of(lags) + n + 1)
+def shortest(n: int, lags: Array, given: int | None = None) -> int:
+    """Rows in the shortest segment that is searched, of n parameters: max(10, 4 n) unless they are given."""
+    return max(max(10, 4 * n) if given is None else given, order_of(lags) + n + 1)
 
 
 def order_of(lags: Array) -> int:
@@ -114,7 +117,7 @@ def lags_of(v: Array, most: int) -> Array:
     v = np.clip(v, -limit, limit) if limit > 0.0 else v
     longest = max(most, min(SEASON, N // 12))
     if most < 1 or longest >= N // 3:
-        return np.zeros(0, np.int64)
+        return NONE
     rows = np.column_stack([v[longest - lag : N - lag] for lag in range(longest + 1)])
     G = rows.T @ rows + SMALL * np.eye(longest + 1)
     count, price = N - longest, np.log(N)
@@ -169,7 +172,7 @@ def partitions(X: Array, y: Array, noise: tuple[Array, Array, Array], most: int,
     A = G[:, :n, :n] + (SINGULAR * np.trace(C[-1]) + SMALL) * np.eye(n)
     cost = np.full((m + 1, m + 1), np.inf)
     cost[i, j] = G[:, n, n] - np.einsum("ka,ka->k", G[:, :n, n], np.linalg.solve(A, G[:, :n, n, None])[:, :, 0])
-    best, back, found = cost[0], [np.zeros(m + 1, int)], [np.zeros(0, np.int64)]
+    best, back, found = cost[0], [np.zeros(m + 1, int)], [NONE]
     for K in range(1, most + 1):
         total = best[:, None] + cost
         best, where = total.min(axis=0), total.argmin(axis=0)
@@ -183,16 +186,18 @@ def partitions(X: Array, y: Array, noise: tuple[Array, Array, Array], most: int,
     return found
 
 
-def divided(X: Array, y: Array, lags: Array, g: Array, most: int) -> tuple[Array, Array, float]:
+def divided(
+    X: Array, y: Array, lags: Array, g: Array, most: int, given: int | None = None
+) -> tuple[Array, Array, float]:
     """(breaks, ar, criterion) of the best partition whose noise has these lags."""
     N, n = X.shape
-    found = (np.zeros(0, np.int64), np.zeros(len(lags)), np.inf)
+    found = (NONE, np.zeros(len(lags)), np.inf)
     ar, seen = np.zeros(len(lags)), []
     theta, _ = estimated(X, y, (lags, ar, g), found[0])
     if len(lags):
         ar = regressed(noise_of(X, y, theta, found[0]), g, lags)
     for _ in range(ROUNDS if len(lags) else 1):
-        for breaks in partitions(X, y, (lags, ar, g), most, shortest(n, lags)):
+        for breaks in partitions(X, y, (lags, ar, g), most, shortest(n, lags, given)):
             own = ar
             theta, rss = estimated(X, y, (lags, own, g), breaks)
             if len(lags):
@@ -208,18 +213,20 @@ def divided(X: Array, y: Array, lags: Array, g: Array, most: int) -> tuple[Array
     return found
 
 
-def together(X: Array, y: Array, g: Array, orders: int, most: int) -> tuple[Array, Array, Array]:
+def together(
+    X: Array, y: Array, g: Array, orders: int, most: int, given: int | None = None
+) -> tuple[Array, Array, Array]:
     """(lags, ar, breaks), chosen together."""
     N = len(y)
-    theta, _ = estimated(X, y, (np.zeros(0, np.int64), np.zeros(0), g), np.zeros(0, np.int64))
+    theta, _ = estimated(X, y, (NONE, np.zeros(0), g), NONE)
     best: tuple[float, Array, Array, Array] | None = None
     tried: list[list[int]] = []
-    for lags in (lags_of((y - X @ theta[0]) * g, orders), np.zeros(0, np.int64)):
+    for lags in (lags_of((y - X @ theta[0]) * g, orders), NONE):
         for _ in range(ROUNDS):
             if lags.tolist() in tried:
                 break
             tried.append(lags.tolist())
-            breaks, ar, criterion = divided(X, y, lags, g, most)
+            breaks, ar, criterion = divided(X, y, lags, g, most, given)
             criterion += len(lags) * np.log(N)
             if best is None or criterion < best[0]:
                 best = criterion, lags, ar, breaks
@@ -229,21 +236,20 @@ def together(X: Array, y: Array, g: Array, orders: int, most: int) -> tuple[Arra
     return best[1:]
 
 
-def noise(X: Array, y: Array, lags: int | None = None) -> Noise:
-    """The noise of y (N,) on X (N, n), X' X = N I; of an autoregression of order ``lags`` if that is given."""
+def noise(X: Array, y: Array, order: int | None = None, fewest: int | None = None) -> Noise:
+    """The noise of y (N,) on X (N, n), X' X = N I; of an autoregression of some ``order`` if that is given."""
     N, n = X.shape
-    most = max(0, min(MOST, N // shortest(n, np.zeros(0)) - 1))
-    orders, given = min(ORDER, N // 20), None if lags is None else np.arange(1, lags + 1)
-    g, e, level = np.ones(N), y, np.ones(N)
+    most = max(0, min(MOST, N // shortest(n, NONE, fewest) - 1))
+    g, e, level, lags = np.ones(N), y, np.ones(N), NONE if order is None else np.arange(1, order + 1)
     for _ in range(2):
-        if given is None:
-            chosen, ar, breaks = together(X, y, g, orders, most)
+        if order is None:
+            lags, ar, breaks = together(X, y, g, min(ORDER, N // 20), most, fewest)
         else:
-            chosen, (breaks, ar, _) = given, divided(X, y, given, g, most)
-        theta, _ = estimated(X, y, (chosen, ar, g), breaks)
-        first = order_of(chosen)
+            breaks, ar, _ = divided(X, y, lags, g, most, fewest)
+        theta, _ = estimated(X, y, (lags, ar, g), breaks)
+        first = order_of(lags)
         v = noise_of(X, y, theta, breaks)
-        e = np.append(np.zeros(first), white_rows(v[:, None], v, chosen, ar, np.ones(N))[1])
+        e = np.append(np.zeros(first), white_rows(v[:, None], v, lags, ar, np.ones(N))[1])
         level = level_of(e, first)
         g = np.sqrt(np.minimum(1.0, HELD * level / np.maximum(np.abs(e), SMALL))) / level
-    return Noise(chosen, ar, level, g, e, breaks)
+    return Noise(lags, ar, level, g, e, breaks, shortest(n, lags, fewest))

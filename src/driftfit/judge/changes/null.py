@@ -14,13 +14,15 @@ the recursion. Cost: `DRAWS` searches; records that are clearly constant stop af
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.fit import HELD, Noise, grid, order_of, shortest
-from driftfit.judge.changes.scan import SMALL, Found, Problem, Recursion, Work, _draws, _search
+from driftfit.judge.changes.fit import HELD, Noise, grid, order_of
+from driftfit.judge.changes.recursion import Drawn, Recursion, Results, draw
+from driftfit.judge.changes.scan import SMALL, Found, Problem, Work, searched
 from driftfit.judge.statistics.robust import orthonormal
 
 DRAWS, FEW = 199, 39
@@ -50,6 +52,15 @@ class Lags(NamedTuple):
     def none(cls, N: int) -> Lags:
         """No column is."""
         return cls(np.zeros(0, np.int64), np.zeros((N, 0), np.int64), np.zeros((N, 0)))
+
+    def only(self, rows: Array, columns: Sequence[int]) -> Lags:
+        """Those of some rows and columns, given by their indices."""
+        place = np.full(len(self.source) + 1, -1)
+        place[rows] = np.arange(len(rows))
+        kept = [i for i, j in enumerate(self.columns) if j in columns]
+        new = np.array([list(columns).index(self.columns[i]) for i in kept], np.int64)
+        source = place[self.source[rows][:, kept]]
+        return Lags(new, np.ascontiguousarray(source), np.ascontiguousarray(self.ratio[rows][:, kept]))
 
 
 class Tested(NamedTuple):
@@ -106,7 +117,7 @@ def problem_of(model: Model, paths: Array) -> Problem:
     N, n = model.X.shape
     places, stride = grid(N)
     lags = model.noise.lags
-    sizes = np.array([stride, shortest(n, lags), ROUNDS, 2])
+    sizes = np.array([stride, model.noise.fewest, ROUNDS, 2])
     return Problem(model.noise.g, lags, places, np.ascontiguousarray(paths), sizes, np.array([model.floor]))
 
 
@@ -128,32 +139,31 @@ class Draws:
         self.model, self.problem, self.e = model, problem, held
         self.work, self.found = Work.of(N, n, problem), Found.of(n, problem)
         self.rng = np.random.default_rng(seed)
-        self.phi, self.X, self.y = np.zeros((N, n)), np.zeros((N, n)), np.zeros(N)
+        self.drawn = Drawn(np.zeros((N, n)), np.zeros((N, n)), np.zeros(N))
 
-    def of(self, theta: Array, ar: Array, count: int, whole: bool) -> tuple[Array, Array, Array, Array]:
-        """(sums of squares (R, 3), Nyblom's (R, ..), constants (R, n) in the basis, their autoregressions (R, p)) of
-        draws from constants theta (n,) in units of the model."""
+    def of(self, theta: Array, ar: Array, count: int, whole: bool) -> Results:
+        """Draws from constants theta (n,) in units of the model; only constants of them unless ``whole``."""
         model, problem = self.model, self.problem
         N, n = model.X.shape
-        lags = model.lags
         way = Recursion(
-            model.phi, model.X, model.basis, lags.columns, lags.source, lags.ratio, theta, ar,
-            model.y - model.phi @ theta, self.e,
+            model.phi, model.X, model.basis, *model.lags, theta, ar, model.y - model.phi @ theta, self.e
         )  # fmt: skip
         signs = self.rng.integers(0, 2, (count, N)) * 2.0 - 1.0
-        out = (np.full((count, 3), np.inf), np.zeros((count, 1 + len(problem.paths))), np.zeros((count, n)),
-               np.zeros((count, len(ar))))  # fmt: skip
-        _draws(way, signs, problem, np.array([int(whole)]), self.work, self.found, self.phi, self.X, self.y, *out)
-        return out
+        results = Results(
+            np.full((count, 3), np.inf), np.zeros((count, 1 + len(problem.paths))), np.zeros((count, n)),
+            np.zeros((count, len(ar))),
+        )  # fmt: skip
+        draw(way, signs, problem, int(whole), self.work, self.found, self.drawn, results)
+        return results
 
     def unbiased(self, theta: Array, ar: Array) -> tuple[Array, Array]:
         """Constants and their autoregression without the bias of the dynamics, as far as they remain stable."""
         columns, lags = self.model.lags.columns, self.problem.lags
         if not len(columns) and not len(lags):
             return theta, ar
-        _, _, drawn, own = self.of(theta, ar, BIASED, False)
-        shift = np.median(drawn @ self.model.basis.T, axis=0) - theta
-        turn = np.median(own, axis=0) - ar
+        drawn = self.of(theta, ar, BIASED, False)
+        shift = np.median(drawn.theta @ self.model.basis.T, axis=0) - theta
+        turn = np.median(drawn.ar, axis=0) - ar
         if not (np.isfinite(shift).all() and np.isfinite(turn).all()):
             return theta, ar
         for share in np.linspace(1.0, 0.0, 21):
@@ -215,7 +225,7 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     size = np.sqrt(np.sum((paths @ (Z.T @ Z)) * paths, axis=1))
     problem = problem_of(model, paths / np.maximum(size, SMALL)[:, None])
     work, found = Work.of(N, n, problem), Found.of(n, problem)
-    _search(model.X, model.y, problem, work, found)
+    searched(model.X, model.y, problem, work, found)
     lost = (len(noise.breaks) + 1) * n + first
     held = np.clip(noise.e, -HELD * noise.level, HELD * noise.level) * np.sqrt(N / max(N - lost, N // 2))
     draws = Draws(model, problem, held)
@@ -223,9 +233,9 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     x = np.append(found.L[0], gains(found.rss[None], N)[0])
     R, L = np.zeros((0, 2)), np.zeros((0, len(found.L)))
     for count in (FEW, DRAWS - FEW):
-        rss, own, _, _ = draws.of(theta, ar, count, True)
-        fine = np.isfinite(own).all(axis=1) & (rss[:, 0] < np.inf)
-        R, L = np.vstack([R, gains(rss[fine], N)]), np.vstack([L, own[fine]])
+        drawn = draws.of(theta, ar, count, True)
+        fine = np.isfinite(drawn.L).all(axis=1) & np.isfinite(drawn.rss[:, 0])
+        R, L = np.vstack([R, gains(drawn.rss[fine], N)]), np.vstack([L, drawn.L[fine]])
         p, each = smallest(x, np.column_stack([L[:, 0], R]))
         if p > CLEAR:
             break

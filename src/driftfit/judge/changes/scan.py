@@ -501,81 +501,6 @@ def search(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> No
                     autoregression(work.v, problem.g, problem.lags, work.H, a)
 
 
-class Recursion(NamedTuple):
-    """How a record of a model makes the next one: its lags of the output are those of the drawn outputs."""
-
-    phi: Array
-    """(N, n): the regressors, in units of the model."""
-    X: Array
-    """(N, n): the same, orthonormal."""
-    basis: Array
-    """(n, n): X = phi basis."""
-    columns: Array
-    """(k,): columns of phi that are lags of the output."""
-    source: Array
-    """(N, k): the row whose output they are; negative where it is none of these rows."""
-    ratio: Array
-    """(N, k): what they are times that output."""
-    theta: Array
-    """(n,): constants, in units of the model."""
-    ar: Array
-    """(p,)"""
-    start: Array
-    """(N,): noise of the first rows, as many as the autoregression has lags."""
-    e: Array
-    """(N,): white residuals, whose signs are drawn."""
-
-
-@shared
-def simulate(way: Recursion, lags: Array, signs: Array, v: Array, phi: Array, y: Array) -> None:
-    """Outputs y (N,) and their regressors phi (N, n) of one draw of signs (N,)."""
-    N, n = phi.shape
-    p, k = lags.shape[0], way.columns.shape[0]
-    first = lags[p - 1] if p > 0 else 0
-    for t in range(N):
-        v[t] = way.start[t] if t < first else way.e[t] * signs[t]
-        if t >= first:
-            for i in range(p):
-                v[t] += way.ar[i] * v[t - lags[i]]
-        y[t] = v[t]
-        for j in range(n):
-            phi[t, j] = way.phi[t, j]
-        for i in range(k):
-            if way.source[t, i] >= 0:
-                phi[t, way.columns[i]] = way.ratio[t, i] * y[way.source[t, i]]
-        for j in range(n):
-            y[t] += phi[t, j] * way.theta[j]
-
-
-def _draw(
-    way: Recursion, signs: Array, problem: Problem, whole: Array, work: Work, found: Found, phi: Array, X: Array,
-    y: Array, rss: Array, L: Array, theta: Array, ar: Array,
-) -> None:  # fmt: skip
-    """Results of all draws of signs (R, N); only constants and their autoregression unless ``whole``."""
-    N, n = phi.shape
-    for d in range(signs.shape[0]):
-        simulate(way, problem.lags, signs[d], work.v, phi, y)
-        for t in range(N):
-            for j in range(n):
-                X[t, j] = way.X[t, j]
-                if way.columns.shape[0] > 0:
-                    X[t, j] = 0.0
-                    for i in range(n):
-                        X[t, j] += phi[t, i] * way.basis[i, j]
-        if whole[0] > 0:
-            search(X, y, problem, work, found)
-            for count in range(3):
-                rss[d, count] = found.rss[count]
-            for i in range(found.L.shape[0]):
-                L[d, i] = found.L[i]
-            continue
-        for i in range(ar.shape[1]):
-            ar[d, i] = 0.0
-        settle(X, y, problem, problem.sizes[2], ar[d], work)
-        for j in range(n):
-            theta[d, j] = work.theta[j]
-
-
 def _once(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> None:
     search(X, y, problem, work, found)
 
@@ -584,4 +509,4 @@ def _prepared(X: Array, y: Array, problem: Problem, a: Array, work: Work, rss: A
     rss[0] = prepare(X, y, problem, a, work)
 
 
-_search, _draws, _increments = Driver(_once), Driver(_draw), Driver(_prepared)
+searched, prepared = Driver(_once), Driver(_prepared)
