@@ -13,9 +13,9 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.changes.dates import LEVEL, Dated, counted, dated
-from driftfit.judge.changes.fit import NONE, noise, order_of, white_rows
+from driftfit.judge.changes.fit import NONE, order_of, white_rows
 from driftfit.judge.changes.kinds import UNIT_ROOT, Kind, kind
-from driftfit.judge.changes.null import Lags, Model, Tested, in_basis, tested
+from driftfit.judge.changes.null import Lags, Model, Tested, modelled, tested
 from driftfit.judge.changes.which import Which, which
 
 
@@ -49,13 +49,6 @@ class Changes(NamedTuple):
     def wandering_noise(self) -> bool:
         """Whether the noise may be a random walk: then a level that wanders looks the same."""
         return bool(len(self.model.noise.lags) and len(self.model.y) * (1.0 - self.test.root) < UNIT_ROOT)
-
-
-def modelled(phi: Array, y: Array, lags: Lags, root: Array, order: int | None, fewest: int | None = None) -> Model:
-    """The regression with its noise."""
-    X, basis = in_basis(phi)
-    phi, y, basis = (np.ascontiguousarray(one) for one in (phi, y, basis))
-    return Model(phi, y, X, basis, lags, root, noise(X, y, order, fewest))
 
 
 def changes(

@@ -145,7 +145,7 @@ def stepwise(gain: Array, prices: tuple[float, float]) -> int:
     needed = (one, two, one + two)
     while True:
         for more, least in enumerate(needed, 1):
-            if K + more < len(gain) and gain[K + more] - gain[K] >= least:
+            if K + more < len(gain) and gain[K + more] - gain[K] > max(least, 0.0):
                 K += more
                 break
         else:
@@ -217,7 +217,7 @@ def dated(model: Model, breaks: Array, ar: Array, prices: tuple[float, float], l
     X, y, noise = model.X, model.y, model.noise
     N, n = X.shape
     K, first = len(breaks), order_of(noise.lags)
-    gap, spans = max(n + 1, first + 1, 3), np.zeros((K, 2), np.int64)
+    gap, spans = noise.fewest, np.zeros((K, 2), np.int64)
     moved = np.zeros((K + 1, n))
     if K:
         places = np.arange(N) if N <= DATES else np.unique(np.append(np.linspace(0, N - 1, DATES).astype(int), breaks))
@@ -237,8 +237,13 @@ def dated(model: Model, breaks: Array, ar: Array, prices: tuple[float, float], l
             spans[k] = places[low + np.array(shortest_interval(weight, level))]
             moved[k : k + 2] += _moved(exact, at, k, low, weight)[k : k + 2]
     parts = (noise.lags, ar, noise.g)
-    theta, rss = estimated(X, y, parts, breaks)
-    std, changed = _errors(model, breaks, parts, theta, moved)
+    edges = [(0, N), *_certain(breaks, spans, N, n)]
+    known = [_directions(X[a:b]) for a, b in edges]
+    rows = np.hstack([part @ one for part, one in zip(np.split(split(X, breaks), K + 1, axis=1), known, strict=True)])
+    theta, rss = estimated(X, y, parts, breaks, rows)
+    std, changed = _errors(model, rows, parts, theta, moved)
+    unknown = [undetermined(model.phi[a:b]) for a, b in _certain(np.append(0, breaks), np.vstack([[[0, 0]], spans]), N, n)]
+    std[np.array(unknown)] = np.inf
     return Dated(breaks, spans, theta @ model.basis.T, std, changed, ar, rss, prices)
 
 
@@ -255,12 +260,12 @@ def _moved(exact: Exact, at: Array, k: int, low: int, weight: Array) -> Array:
 
 
 def _errors(
-    model: Model, breaks: Array, parts: tuple[Array, Array, Array], theta: Array, moved: Array
+    model: Model, rows: Array, parts: tuple[Array, Array, Array], theta: Array, moved: Array
 ) -> tuple[Array, Array]:
     """Standard errors of the parameters (K + 1, n) and of their changes (K, n), in units of the model."""
-    N, n = model.X.shape
-    K = len(breaks)
-    Z, z = white_rows(split(model.X, breaks), model.y, *parts)
+    n = model.X.shape[1]
+    K = len(theta) - 1
+    Z, z = white_rows(rows, model.y, *parts)
     steps = np.concatenate([theta[:1], np.diff(theta, axis=0)]).ravel()
     e = z - Z @ steps
     inverse = np.linalg.pinv(Z.T @ Z, rcond=SINGULAR, hermitian=True)
@@ -271,11 +276,24 @@ def _errors(
     total = np.kron(np.tril(np.ones((K + 1, K + 1))), np.eye(n))
     own = np.diag(total @ V @ total.T).reshape(K + 1, n)
     change = np.diag(V).reshape(K + 1, n)[1:] + moved[:-1] + moved[1:]
-    edges = np.concatenate([[0], breaks, [N]])
-    std = np.sqrt(np.maximum(own + moved, 0.0))
-    for k in range(K + 1):
-        std[k] = np.where(undetermined(model.phi[edges[k] : edges[k + 1]]), np.inf, std[k])
-    return std, np.sqrt(np.maximum(change, 0.0))
+    return np.sqrt(np.maximum(own + moved, 0.0)), np.sqrt(np.maximum(change, 0.0))
+
+
+def _certain(starts: Array, spans: Array, N: int, n: int) -> list[tuple[int, int]]:
+    """Rows that certainly belong to the segments from ``starts`` on, or all of a segment that has too few of them."""
+    found = []
+    for k, start in enumerate(starts):
+        stop = int(starts[k + 1]) if k + 1 < len(starts) else N
+        sure = int(spans[k, 1]), int(spans[k + 1, 0]) if k + 1 < len(starts) else N
+        found.append(sure if sure[1] - sure[0] > n else (int(start), stop))
+    return found
+
+
+def _directions(X: Array) -> Array:
+    """The projector (n, n) on the directions that rows X (m, n) vary in."""
+    size, directions = np.linalg.svd(X, full_matrices=False)[1:]
+    kept = directions[size > np.sqrt(SINGULAR) * max(size[0], SMALL)]
+    return np.asarray(kept.T @ kept)
 
 
 COMPONENT = 1e-6

@@ -17,7 +17,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.changes.scan import CELLS, PLACES, SINGULAR, SMALL
-from driftfit.judge.statistics.robust import deviation
+from driftfit.judge.statistics.robust import deviation, robust_fit
 
 NONE = np.zeros(0, np.int64)
 HELD = 3.0
@@ -82,12 +82,14 @@ def split(X: Array, breaks: Array) -> Array:
     return np.hstack([X, *(X * (t >= b) for b in breaks)])
 
 
-def estimated(X: Array, y: Array, noise: tuple[Array, Array, Array], breaks: Array) -> tuple[Array, float]:
+def estimated(
+    X: Array, y: Array, noise: tuple[Array, Array, Array], breaks: Array, rows: Array | None = None
+) -> tuple[Array, float]:
     """theta of the segments (K + 1, n) and the sum of squares, for noise of (lags, ar, g).
 
-    What the rows of a segment do not determine stays as in the one before.
+    What the rows of a segment do not determine stays as in the one before; ``rows`` instead of those of `split`.
     """
-    Z, z = white_rows(split(X, breaks), y, *noise)
+    Z, z = white_rows(split(X, breaks) if rows is None else rows, y, *noise)
     n, K = X.shape[1], len(breaks)
     G = Z.T @ Z
     ridge = SINGULAR * np.trace(G[:n, :n]) / n * np.append(np.zeros(n), np.ones(K * n)) + SMALL
@@ -236,11 +238,19 @@ def together(
     return best[1:]
 
 
+def weights(e: Array, level: Array) -> Array:
+    """Roots of Huber's weights of residuals e (N,) over their variance."""
+    return np.asarray(np.sqrt(np.minimum(1.0, HELD * level / np.maximum(np.abs(e), SMALL))) / level)
+
+
 def noise(X: Array, y: Array, order: int | None = None, fewest: int | None = None) -> Noise:
     """The noise of y (N,) on X (N, n), X' X = N I; of an autoregression of some ``order`` if that is given."""
     N, n = X.shape
     most = max(0, min(MOST, N // shortest(n, NONE, fewest) - 1))
-    g, e, level, lags = np.ones(N), y, np.ones(N), NONE if order is None else np.arange(1, order + 1)
+    lags = NONE if order is None else np.arange(1, order + 1)
+    constants = robust_fit(X, y)
+    level, e = np.full(N, max(constants.scale, SMALL)), constants.residual
+    g = weights(e, level)
     for _ in range(2):
         if order is None:
             lags, ar, breaks = together(X, y, g, min(ORDER, N // 20), most, fewest)
@@ -251,5 +261,5 @@ def noise(X: Array, y: Array, order: int | None = None, fewest: int | None = Non
         v = noise_of(X, y, theta, breaks)
         e = np.append(np.zeros(first), white_rows(v[:, None], v, lags, ar, np.ones(N))[1])
         level = level_of(e, first)
-        g = np.sqrt(np.minimum(1.0, HELD * level / np.maximum(np.abs(e), SMALL))) / level
+        g = weights(e, level)
     return Noise(lags, ar, level, g, e, breaks, shortest(n, lags, fewest))

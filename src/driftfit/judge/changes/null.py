@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.fit import HELD, Noise, grid, order_of
+from driftfit.judge.changes.fit import HELD, Noise, grid, noise, order_of
 from driftfit.judge.changes.recursion import Drawn, Recursion, Results, draw
 from driftfit.judge.changes.scan import SMALL, Found, Problem, Work, searched
 from driftfit.judge.statistics.robust import orthonormal
@@ -36,6 +36,8 @@ ROUNDS = 5
 """Rounds of constants and their autoregression."""
 ROUNDING = 1e-15
 """Standard deviation of rounding, as a share of the outputs."""
+LOST = 1e-11
+"""Share of the sum of squares of constants that differences of sums may lose."""
 
 
 class Lags(NamedTuple):
@@ -99,17 +101,26 @@ class Model(NamedTuple):
     root: Array
     """(N,): what each row was multiplied by."""
     noise: Noise
-
-    @property
-    def floor(self) -> float:
-        """Sum of squares of rounding."""
-        return float(np.sum((ROUNDING * self.y * self.noise.g) ** 2)) + SMALL
+    floor: float
+    """Smallest sum of squares that is more than rounding."""
 
 
 def in_basis(phi: Array) -> tuple[Array, Array]:
     """X (N, n) with X' X = N I, and the matrix that makes it of phi."""
     basis = orthonormal(phi)
     return basis.Q, np.linalg.inv(basis.R) / basis.size[:, None]
+
+
+def modelled(
+    phi: Array, y: Array, lags: Lags, root: Array, order: int | None = None, fewest: int | None = None
+) -> Model:
+    """The regression with its noise."""
+    X, basis = in_basis(phi)
+    phi, y, basis = (np.ascontiguousarray(one) for one in (phi, y, basis))
+    found = noise(X, y, order, fewest)
+    r = (y - X @ np.linalg.lstsq(X * found.g[:, None], y * found.g, rcond=None)[0]) * found.g
+    floor = float(np.sum((ROUNDING * y * found.g) ** 2) + LOST * (r @ r)) + SMALL
+    return Model(phi, y, X, basis, lags, root, found, floor)
 
 
 def problem_of(model: Model, paths: Array) -> Problem:
