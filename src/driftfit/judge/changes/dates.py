@@ -231,10 +231,11 @@ def dated(model: Model, breaks: Array, ar: Array, prices: tuple[float, float], l
         exact = Exact(model, places, ar)
         breaks = places[at]
         for k in range(K):
-            low, rss = exact.profile(at, k, gap)
+            low, rss = exact.profile(at, k, max(n + 1, first + 1, 3))
             loglik = -0.5 * max(N - (K + 1) * n - first, 5) * np.log(rss / rss.min())
             weight = np.exp(loglik) / np.exp(loglik).sum()
-            spans[k] = places[low + np.array(shortest_interval(weight, level))]
+            inside = low + np.array(shortest_interval(weight, level))
+            spans[k] = places[[min(inside[0], at[k]), max(inside[1], at[k])]]
             moved[k : k + 2] += _moved(exact, at, k, low, weight)[k : k + 2]
     parts = (noise.lags, ar, noise.g)
     edges = [(0, N), *_certain(breaks, spans, N, n)]

@@ -1,12 +1,12 @@
 """Segments and their noise, found together: an autoregression, a slowly changing level, and outliers.
 
-    y_t = x_t' theta_s + v_t,   v_t = sum a_l v_(t-l) + c_t e_t,   weight_t = min(1, 3 c_t / |c_t e_t|) / c_t^2
+    y_t = x_t' theta_s + v_t,   v_t = sum a_l v_(t-l) + c_t e_t,   weight_t = min(1, 3 / |e_t|)^2 / c_t^2
 
 Breaks and correlation explain the same residuals. For each start, the white noise and the correlation of the residuals
 of constants, the best partition on cells (Jackson et al., 2005) and the lags of the noise follow each other until they
 stay; the pair with the smaller criterion counts. A break costs (n + 2) log N there (Zhang and Siegmund, 2007), a lag
-log N, and a lag of a season 2 log of their number more (Chen and Chen, 2008). Weights are Huber's, at three levels from
-the fit of segments. Cost: O(N n^2) and O(c^2 n^3) for c cells.
+log N, and a lag of a season 2 log of their number more (Chen and Chen, 2008). Weights limit what a row adds to
+the sum of squares, at three levels from the fit of segments. Cost: O(N n^2) and O(c^2 n^3) for c cells.
 """
 
 from __future__ import annotations
@@ -239,8 +239,8 @@ def together(
 
 
 def weights(e: Array, level: Array) -> Array:
-    """Roots of Huber's weights of residuals e (N,) over their variance."""
-    return np.asarray(np.sqrt(np.minimum(1.0, HELD * level / np.maximum(np.abs(e), SMALL))) / level)
+    """Roots of the weights of residuals e (N,): a row counts as a residual of three levels if its own is larger."""
+    return np.asarray(np.minimum(1.0, HELD * level / np.maximum(np.abs(e), SMALL)) / level)
 
 
 def noise(X: Array, y: Array, order: int | None = None, fewest: int | None = None) -> Noise:

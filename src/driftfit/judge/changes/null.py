@@ -2,7 +2,7 @@
 
     y*_t = x*_t' theta + v*_t,   v*_t = sum a_l v*_(t-l) + s_t e_t,   s_t = -1 or 1,   x* with the lags of y*
 
-e are the residuals of the segments, limited at three levels: residuals of constants would count a change as noise. theta
+e are the residuals of the segments, limited at three levels where they pass through dynamics: residuals of constants would count a change as noise. theta
 and a are those of constants, less the bias that the same draws show (Kilian, 1998), with no root beyond 1. For every
 draw everything is estimated again, and three statistics are computed: Nyblom's, which sees a slow drift, the gain of one
 break, a step, and the gain of two, a temporary change. p is that of the smallest of their p-values among those of
@@ -36,7 +36,7 @@ ROUNDS = 5
 """Rounds of constants and their autoregression."""
 ROUNDING = 1e-15
 """Standard deviation of rounding, as a share of the outputs."""
-LOST = 1e-11
+LOST = 1e-9
 """Share of the sum of squares of constants that differences of sums may lose."""
 
 
@@ -238,7 +238,9 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     work, found = Work.of(N, n, problem), Found.of(n, problem)
     searched(model.X, model.y, problem, work, found)
     lost = (len(noise.breaks) + 1) * n + first
-    held = np.clip(noise.e, -HELD * noise.level, HELD * noise.level) * np.sqrt(N / max(N - lost, N // 2))
+    held = noise.e * np.sqrt(N / max(N - lost, N // 2))
+    if first or len(model.lags.columns):  # an outlier of the output would be one of the dynamics
+        held = np.clip(held, -HELD * noise.level, HELD * noise.level)
     draws = Draws(model, problem, held)
     theta, ar = draws.unbiased(model.basis @ found.theta, found.ar[0])
     x = np.append(found.L[0], gains(found.rss[None], N)[0])
