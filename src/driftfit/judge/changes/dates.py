@@ -20,7 +20,6 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.changes.fit import (
     MOST,
     estimated,
-    grid,
     noise_of,
     order_of,
     partitions,
@@ -152,6 +151,11 @@ def stepwise(gain: Array, prices: tuple[float, float]) -> int:
             return K
 
 
+def places_of(N: int) -> Array:
+    """Rows at which the likelihood of a date is computed: all of N, or `DATES` of them."""
+    return np.arange(N) if N <= DATES else np.linspace(0, N - 1, DATES).astype(np.int64)
+
+
 Partition = tuple[float, Array, Array]
 """Sum of squares, breaks, autoregression."""
 
@@ -161,9 +165,9 @@ def refined(model: Model, start: Array, breaks: Array) -> Partition:
     X, y, lags, g = model.X, model.y, model.noise.lags, model.noise.g
     if len(lags):
         start = regressed(noise_of(X, y, estimated(X, y, (lags, start, g), breaks)[0], breaks), g, lags)
-    places = grid(len(y))[0]
+    places = places_of(len(y))
     exact = Exact(model, places, start)
-    at = exact.settled(np.searchsorted(places, breaks), model.noise.fewest)
+    at = exact.settled(np.minimum(np.searchsorted(places, breaks), len(places) - 1), model.noise.fewest)
     return float(exact.of(at)), places[at], start
 
 
@@ -180,6 +184,7 @@ def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Arr
     found: list[Partition] = [
         (float(test.rss[k]), test.breaks[k], test.ar[k]) for k in range(3) if np.isfinite(test.rss[k])
     ]
+    found[1:] = [min(one, refined(model, one[2], one[1]), key=lambda each: each[0]) for one in found[1:]]
     first = 1 if test.p_each[:2].min() <= test.p_each[2] else 2
     prices = (price(test.gains[:, 0], level / SHARE), price(test.gains[:, 1], level / SHARE))
     most = max(0, min(MOST, N // noise.fewest - 1))
@@ -220,7 +225,7 @@ def dated(model: Model, breaks: Array, ar: Array, prices: tuple[float, float], l
     gap, spans = noise.fewest, np.zeros((K, 2), np.int64)
     moved = np.zeros((K + 1, n))
     if K:
-        places = np.arange(N) if N <= DATES else np.unique(np.append(np.linspace(0, N - 1, DATES).astype(int), breaks))
+        places = np.union1d(places_of(N), breaks)
         at = np.searchsorted(places, breaks)
         for _ in range(2 if len(ar) else 1):
             exact = Exact(model, places, ar)
@@ -239,11 +244,13 @@ def dated(model: Model, breaks: Array, ar: Array, prices: tuple[float, float], l
             moved[k : k + 2] += _moved(exact, at, k, low, weight)[k : k + 2]
     parts = (noise.lags, ar, noise.g)
     edges = [(0, N), *_certain(breaks, spans, N, n)]
-    known = [_directions(X[a:b]) for a, b in edges]
+    known = [_directions(model, a, b) for a, b in edges]
     rows = np.hstack([part @ one for part, one in zip(np.split(split(X, breaks), K + 1, axis=1), known, strict=True)])
     theta, rss = estimated(X, y, parts, breaks, rows)
     std, changed = _errors(model, rows, parts, theta, moved)
-    unknown = [undetermined(model.phi[a:b]) for a, b in _certain(np.append(0, breaks), np.vstack([[[0, 0]], spans]), N, n)]
+    unknown = [
+        undetermined(model.phi[a:b]) for a, b in _certain(np.append(0, breaks), np.vstack([[[0, 0]], spans]), N, n)
+    ]
     std[np.array(unknown)] = np.inf
     return Dated(breaks, spans, theta @ model.basis.T, std, changed, ar, rss, prices)
 
@@ -290,11 +297,22 @@ def _certain(starts: Array, spans: Array, N: int, n: int) -> list[tuple[int, int
     return found
 
 
-def _directions(X: Array) -> Array:
-    """The projector (n, n) on the directions that rows X (m, n) vary in."""
-    size, directions = np.linalg.svd(X, full_matrices=False)[1:]
-    kept = directions[size > np.sqrt(SINGULAR) * max(size[0], SMALL)]
-    return np.asarray(kept.T @ kept)
+def _directions(model: Model, first: int, last: int) -> Array:
+    """The projector (n, n), in the basis, on changes of what rows first .. last determine, in units of the regressors."""
+    n = model.X.shape[1]
+    basis = orthonormal(model.phi[first:last])
+    size, directions = np.linalg.svd(basis.R)[1:]
+    kept = directions[size > basis.negligible]
+    if len(kept) == n:
+        return np.eye(n)
+    scale = orthonormal(model.phi).size
+    own = kept * (basis.size / scale)
+    return _projector(np.linalg.solve(model.basis, (np.linalg.qr(own.T)[0]) / scale[:, None]))
+
+
+def _projector(W: Array) -> Array:
+    Q = np.linalg.qr(W)[0]
+    return np.asarray(Q @ Q.T)
 
 
 COMPONENT = 1e-6

@@ -22,6 +22,8 @@ from driftfit.judge.statistics.robust import deviation, robust_fit
 NONE = np.zeros(0, np.int64)
 HELD = 3.0
 """Levels of the noise from the fit at which a residual is limited."""
+FLOOR = 0.01
+"""Smallest level of constants, as a share of the deviation of their residuals: half of them may be exact."""
 ORDER = 6
 """Largest order of the autoregression; a season may add one further lag."""
 SEASON = 24
@@ -194,7 +196,8 @@ def divided(
     """(breaks, ar, criterion) of the best partition whose noise has these lags."""
     N, n = X.shape
     found = (NONE, np.zeros(len(lags)), np.inf)
-    ar, seen = np.zeros(len(lags)), []
+    ar = np.zeros(len(lags))
+    seen: list[Array] = []
     theta, _ = estimated(X, y, (lags, ar, g), found[0])
     if len(lags):
         ar = regressed(noise_of(X, y, theta, found[0]), g, lags)
@@ -249,7 +252,8 @@ def noise(X: Array, y: Array, order: int | None = None, fewest: int | None = Non
     most = max(0, min(MOST, N // shortest(n, NONE, fewest) - 1))
     lags = NONE if order is None else np.arange(1, order + 1)
     constants = robust_fit(X, y)
-    level, e = np.full(N, max(constants.scale, SMALL)), constants.residual
+    e = constants.residual
+    level = np.full(N, max(constants.scale, FLOOR * float(np.std(e)), SMALL))
     g = weights(e, level)
     for _ in range(2):
         if order is None:

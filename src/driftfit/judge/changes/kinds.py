@@ -111,7 +111,7 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
     moves = list(moving)
     scores = {"rest": M * np.log(left(Z, z)) + n * price}
     if K:
-        scores["steps"] = M * np.log(changes.rss) + (changes.count + DATE * K) * price
+        scores["steps"] = M * np.log(changes.rss) + (changes.used + DATE * K) * price
     ramp, ends, slope = _ramp(Z, z, phi[:, moves], model, found, first)
     scores["gradual"] = M * np.log(ramp) + (n + len(moves) + DATE * 2) * price
     path = np.zeros((N, 0))
@@ -184,7 +184,8 @@ def _walks(
     first, K = order_of(lags), len(found.breaks)
     steps = [(k, j) for k, own in enumerate(changes.at) for j in own]
     columns = split(phi, found.breaks)[:, [*range(n), *(n * (k + 1) + j for k, j in steps)]]
-    walk, both, dates = np.inf, np.inf, ()
+    walk, both = np.inf, np.inf
+    dates: tuple[int, ...] = ()
     for ar in (found.ar, np.zeros(len(lags)))[: 2 if first else 1]:
         Z, z = white_rows(columns, model.y, lags, ar, g)
         unit = np.mean(Z[:, moves] ** 2, axis=0)

@@ -8,6 +8,8 @@ draw everything is estimated again, and three statistics are computed: Nyblom's,
 break, a step, and the gain of two, a temporary change. p is that of the smallest of their p-values among those of
 the draws, beyond the largest draws by their exponential tail.
 
+Residuals are divided by one less their leverage (MacKinnon and White, 1985).
+
 Source: Wu (1986) and Liu (1988) for wild residuals; Hansen (2000) for fixed regressors, Goncalves and Kilian (2004) for
 the recursion. Cost: `DRAWS` searches; records that are clearly constant stop after the first `FEW`.
 """
@@ -20,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.fit import HELD, Noise, grid, noise, order_of
+from driftfit.judge.changes.fit import HELD, Noise, grid, noise, order_of, split, white_rows
 from driftfit.judge.changes.recursion import Drawn, Recursion, Results, draw
 from driftfit.judge.changes.scan import SMALL, Found, Problem, Work, searched
 from driftfit.judge.statistics.robust import orthonormal
@@ -237,8 +239,10 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     problem = problem_of(model, paths / np.maximum(size, SMALL)[:, None])
     work, found = Work.of(N, n, problem), Found.of(n, problem)
     searched(model.X, model.y, problem, work, found)
-    lost = (len(noise.breaks) + 1) * n + first
-    held = noise.e * np.sqrt(N / max(N - lost, N // 2))
+    held = noise.e.copy()
+    rows, _ = white_rows(split(model.X, noise.breaks), model.y, noise.lags, noise.ar, noise.g)
+    Q = np.linalg.qr(rows)[0]
+    held[first:] /= np.maximum(1.0 - np.sum(Q * Q, axis=1), 0.1)
     if first or len(model.lags.columns):  # an outlier of the output would be one of the dynamics
         held = np.clip(held, -HELD * noise.level, HELD * noise.level)
     draws = Draws(model, problem, held)

@@ -35,7 +35,7 @@ class Which(NamedTuple):
     temporary: tuple[int, ...]
     """Dates k after which date k + 1 takes the change back."""
     rss: float
-    count: int
+    used: int
     """Coefficients in use, those of the first segment among them."""
 
 
@@ -44,8 +44,9 @@ class _Reduced:
 
     def __init__(self, Z: Array, z: Array) -> None:
         self.N = len(z)
-        R = np.linalg.qr(np.column_stack([Z, z]), mode="r")
-        self.R, self.z = R[:, :-1], R[:, -1]
+        R = np.asarray(np.linalg.qr(np.column_stack([Z, z]), mode="r"))
+        self.R: Array = R[:, :-1]
+        self.z: Array = R[:, -1]
 
     def fit(self, columns: list[int]) -> tuple[float, Array]:
         """Sum of squares, and by how much it grows without each of the columns."""
@@ -103,7 +104,8 @@ def which(model: Model, found: Dated) -> Which:
                 kept = sorted([*others, (date, flat[0])])
                 rss, _ = all_of.fit(at(kept))
         instead.append(tuple(alike))
-    count, temporary = n + len(kept), []
+    used = n + len(kept)
+    temporary: list[int] = []
     for date in range(K - 1):
         if temporary and temporary[-1] == date - 1:
             continue
@@ -116,5 +118,5 @@ def which(model: Model, found: Dated) -> Which:
         saved = len(sets[date]) + len(sets[date + 1]) - len(both)
         if all_of.loss(rss, max(float(r @ r) - rss, 0.0)) < need * saved:
             temporary.append(date)
-            count -= saved
-    return Which(tuple(sets), tuple(instead), tuple(temporary), rss, count)
+            used -= saved
+    return Which(tuple(sets), tuple(instead), tuple(temporary), rss, used)

@@ -153,7 +153,7 @@ def _clause(event: Event) -> str:
 
 def rows(found: Sequence[Event]) -> list[tuple[str, ...]]:
     """The table: kind, date, its interval, end, parameter, its values, standard error of their difference."""
-    table = []
+    table: list[tuple[str, ...]] = []
     for one in found:
         for move in one.moves:
             std = f"{move.std:.2g}" if np.isfinite(move.std) else ""
