@@ -190,6 +190,21 @@ def partitions(X: Array, y: Array, noise: tuple[Array, Array, Array], most: int,
     return found
 
 
+def moved(X: Array, y: Array, noise: tuple[Array, Array, Array], breaks: Array, gap: int) -> Array:
+    """Dates within cells: each where the residuals of the parameters before and after it are smallest together."""
+    breaks, N, first = breaks.copy(), len(y), order_of(noise[0])
+    theta, _ = estimated(X, y, noise, breaks)
+    Z, z = white_rows(X, y, *noise)
+    square = np.zeros((N, len(theta)))
+    square[first:] = (z[:, None] - Z @ theta.T) ** 2
+    for k in range(len(breaks)):
+        low = (breaks[k - 1] if k else 0) + gap
+        high = (breaks[k + 1] if k + 1 < len(breaks) else N) - gap
+        if high > low:
+            breaks[k] = low + np.argmin(np.append(0.0, np.cumsum((square[:, k] - square[:, k + 1])[low:high])))
+    return breaks
+
+
 def divided(
     X: Array, y: Array, lags: Array, g: Array, most: int, given: int | None = None
 ) -> tuple[Array, Array, float]:
@@ -204,6 +219,8 @@ def divided(
     for _ in range(ROUNDS if len(lags) else 1):
         for breaks in partitions(X, y, (lags, ar, g), most, shortest(n, lags, given)):
             own = ar
+            for _ in range(2 if len(breaks) else 0):
+                breaks = moved(X, y, (lags, own, g), breaks, shortest(n, lags, given))
             theta, rss = estimated(X, y, (lags, own, g), breaks)
             if len(lags):
                 own = regressed(noise_of(X, y, theta, breaks), g, lags)
