@@ -46,7 +46,7 @@ import json, time
 start = time.perf_counter()
 import numpy as np
 from driftfit import ARX, AdaptiveKalman, Bank, HammersteinWiener, Kalman, LiveSelection, grid, select, track
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.basis import Polynomial
 rng = np.random.default_rng(0)
 y, u = rng.standard_normal(LENGTH), rng.standard_normal(LENGTH)
 ready, spent = time.perf_counter(), time.process_time()

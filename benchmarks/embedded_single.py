@@ -35,8 +35,8 @@ from driftfit import (
     track,
 )
 from driftfit.embedded import export_c
-from driftfit.embedded.selftest import record
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.embedded.project import record
+from driftfit.models.hammerstein_wiener.basis import Polynomial
 
 LOOP = """
 #include "tracker.c"

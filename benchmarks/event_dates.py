@@ -36,7 +36,7 @@ def coverage(size: float, records: int) -> tuple[int, int, int, float]:
     """Share found, share of intervals that contain the date, false events, and the mean length of the interval."""
     found, held, false, length = 0, 0, 0, 0
     for seed in range(records):
-        events = track(Regression(2), Bank(), *record(np.random.default_rng(seed), size)).hypotheses.dated()
+        events = track(Regression(2), Bank(), *record(np.random.default_rng(seed), size)).changes()
         here = near(events, 0)
         false += len(events) - len(here)
         if here:

@@ -15,10 +15,9 @@ import numpy as np
 
 from driftfit import Kalman, Live, Regression, track
 from driftfit.engine.kernel import Array
-from driftfit.models.hammerstein_wiener.curves.basis import Legendre, Polynomial
+from driftfit.models.hammerstein_wiener.basis import Legendre, Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.separation.paths import empty
-from driftfit.models.hammerstein_wiener.separation.separate import METHODS, separate
+from driftfit.models.hammerstein_wiener.separation import METHODS, split
 from driftfit.systems.hammerstein_wiener import CUBIC, example
 from lab.reproduce.hammerstein_wiener.cost import least
 
@@ -57,10 +56,8 @@ def main(T: int = T, names: tuple[str, ...] = tuple(MODELS)) -> None:
     tracker = Kalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)
     stage, *_ = [beside_regression(name, MODELS[name], s.y, s.u, tracker) for name in names]
     run = track(CUBIC, tracker, s.y, s.u)
-    groups, quality = empty(CUBIC, T)
-    theta, parts = np.ascontiguousarray(run.theta), (CUBIC.structure.sizes, CUBIC.rise, groups, quality)
-    for place, method in enumerate(METHODS[:3]):
-        cost = least(partial(separate, theta, (CUBIC.na, CUBIC.out.n, place), *parts), T)
+    for method in METHODS[:3]:
+        cost = least(partial(split, CUBIC, run.theta, method), T)
         print(f"{method:10s} {cost:5.0f} ns a sample, {cost / stage:.2f} filter steps")
     gls = least(lambda: run.blocks("gls"), T)
     print(f"gls        {gls:5.0f} ns a sample, with the replay for P")

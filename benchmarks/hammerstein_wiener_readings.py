@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from driftfit.models.hammerstein_wiener.curves.basis import DeadZone
+from driftfit.models.hammerstein_wiener.thresholds import DeadZone
 from driftfit.systems.arc_furnace import furnace
 from driftfit.systems.hammerstein_wiener import CUBIC, Simulated, example
 from driftfit.trackers.kalman import Kalman

@@ -17,7 +17,7 @@ from rich.table import Table
 from driftfit import ARX, Kalman
 from driftfit.engine.drivers import drivers
 from driftfit.engine.tiles import WIDTH, make_tile, output_type
-from driftfit.run.parallel_lanes import BLOCK, width_of
+from driftfit.run.parallel_lanes import BLOCK_SAMPLES, width_of
 from driftfit.run.program import Program
 
 TRACKER = Kalman(q=1e-4, r=0.01)
@@ -28,8 +28,8 @@ def step_time(n: int, L: int) -> float:
     rng = np.random.default_rng(0)
     model = ARX(n - n // 2, n // 2).bind(1)
     tile = make_tile(model.n, 1, model.memory(), [TRACKER.state_for(model)] * L)
-    y, u, known = rng.normal(size=(BLOCK, L)), rng.normal(size=(BLOCK, 1, L)), np.ones((1, 3, L))
-    out = np.empty(BLOCK, output_type(tile))
+    y, u, known = rng.normal(size=(BLOCK_SAMPLES, L)), rng.normal(size=(BLOCK_SAMPLES, 1, L)), np.ones((1, 3, L))
+    out = np.empty(BLOCK_SAMPLES, output_type(tile))
     run = drivers(model.steps, TRACKER.steps).run
     run(tile, y, u, known, out)
     seconds = []
@@ -37,7 +37,7 @@ def step_time(n: int, L: int) -> float:
         start = time.perf_counter()
         run(tile, y, u, known, out)
         seconds.append(time.perf_counter() - start)
-    return float(np.median(seconds)) / BLOCK / L * 1e9
+    return float(np.median(seconds)) / BLOCK_SAMPLES / L * 1e9
 
 
 def main(quick: bool) -> None:

@@ -19,7 +19,7 @@ from contract_table import forms, model_of, ready
 from readings import AFTER, failures
 
 from driftfit import ARMAX, ARX, OE, BoxJenkins, Equation, HammersteinWiener, PolynomialModel
-from driftfit.models.hammerstein_wiener.curves.basis import BSpline, PiecewiseLinear, Polynomial
+from driftfit.models.hammerstein_wiener.basis import BSpline, PiecewiseLinear, Polynomial
 from driftfit.run.program import Program
 from driftfit.trackers import found
 

@@ -33,10 +33,10 @@ import numpy as np
 
 from driftfit import track
 from driftfit.data.storage import describe
+from driftfit.service.config import parse
 from driftfit.service.core.engine import Engine
-from driftfit.service.settings.config import parse
-from driftfit.service.sources.incoming import INCOMING, decoded
-from driftfit.service.sources.samples import Batch, decode
+from driftfit.service.sources.contract import Batch, decode
+from driftfit.service.sources.http import INCOMING, decoded
 from driftfit.service.supervisor import cut_the_tail
 from driftfit.service.threads import SinkThread, SourceThread
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from driftfit import HammersteinWiener, Kalman, OutputError, Polynomial, hand_off, track
+from driftfit import HammersteinWiener, Kalman, OutputError, Polynomial, track
 from driftfit.systems import Ramp, SineOffset
 from driftfit.systems.hammerstein_wiener import simulate
 
@@ -22,12 +22,14 @@ def main(plot: bool = False) -> None:
     aware = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(2), output_noise=s.sigma)
     stage = Kalman(q=1e-5, r=1.0, p0=1e2)
     run = track(aware, stage, s.y, s.u)
-    filtered = hand_off(aware, stage, OutputError(q=1e-5, r=s.sigma**2), s.y, s.u, at=200)
+    gls, late = run.blocks("gls"), np.arange(T) > 200  # after sample 200 the second filter goes on from the first
+    then = OutputError(q=1e-5, r=s.sigma**2, theta0=gls.xi[200], p0=gls.xi_cov[200])
+    filtered = track(aware, then, s.y, s.u, weights=late, drift=late)
     paths = {
         '"average"': run.blocks("average").xi,
         '"svd-joint"': run.blocks().xi,
-        '"gls"': run.blocks("gls").xi,
-        "output error": filtered.xi,
+        '"gls"': gls.xi,
+        "output error": filtered.theta,
     }
     print("root mean square error of A1, b1, b2, c2, d2 after the first 500 samples")
     for name, xi in paths.items():

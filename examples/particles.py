@@ -8,18 +8,10 @@ import numpy as np
 
 from driftfit import JointKalman, ParticleFilter, StateSpace, track
 
-
-def move(x, t):
-    """The next state."""
-    return {"x": 0.5 * x.x + 25 * x.x / (1 + x.x**2) + 8 * np.cos(1.2 * t)}
-
-
-def y(x, u, theta):
-    """The output."""
-    return x.x * x.x / 20 + theta.b * u
-
-
-MODEL = StateSpace([move, y], start={"b": 0.0})
+MODEL = StateSpace(
+    "x = 0.5 * x[-1] + 25 * x[-1] / (1 + x[-1] ** 2) + 8 * cos(1.2 * clock) \n y = x * x / 20 + theta.b * u",
+    start={"b": 0.0},
+)
 VARIANCES = {"q": {"b": 1e-4, "x": 10.0}, "r": 1.0, "p0": {"b": 4.0, "x": 5.0}}
 TRACKERS = {
     "JointKalman, extended": JointKalman(**VARIANCES, method="extended"),

@@ -38,7 +38,7 @@ from driftfit import (
     Sensor,
     track,
 )
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.basis import Polynomial
 
 Arrays = dict[str, np.ndarray[Any, Any]]
 Configuration = Callable[[], Arrays]

@@ -1,38 +1,105 @@
-"""Slow and obvious twins of the drifts of `AdaptiveKalman`, in plain NumPy."""
+"""A slow and obvious twin of one sample of `AdaptiveKalman`, in plain NumPy, from the fields of a stream."""
 
 import numpy as np
+from scipy import stats
 
-from driftfit.trackers.parts.modes.drifts.about_means import STILL
-from driftfit.trackers.parts.modes.drifts.trend import FADING, GROWN, LOST, SHORTEST
+from driftfit.trackers.parts.mixture import filters, noise
+from driftfit.trackers.parts.mixture.modes import COMMON, FIRST_ALONE, FIRST_LEARNED
+
+
+def full(lower):
+    """A symmetric matrix (n, n, ..) from its lower triangle."""
+    other = np.swapaxes(lower, 0, 1)
+    return np.where(np.tri(len(lower), dtype=bool).reshape(lower.shape[:2] + (1,) * (lower.ndim - 2)), lower, other)
+
+
+def ratios(lane):
+    """Drift ratios (K,) in a sample: the last rung of jumps is the variance of the output, or the last outlier."""
+    rho, jump = lane["ratio"].copy(), max(COMMON[-1], max(lane["spread"], lane["outlier"] * lane["e"] ** 2) / lane["r"])
+    rho[len(COMMON) - 1] = jump
+    rho[FIRST_ALONE + lane["rungs"] - 1 :: lane["rungs"]] = jump
+    return rho
 
 
 def walks(lane):
-    """Drift covariances (K, n, n) of the filters of `AdaptiveKalman` in a nominal interval."""
-    unit, first = np.sqrt(lane["c"]), int(lane["first_along"])
-    found = lane["r"] * np.array([np.diag(ratio) for ratio in lane["ratio"].T])
-    for j, ratio in enumerate(lane["along"]):
-        found[first + j] += lane["r"] * ratio * np.outer(lane["direction"], lane["direction"])
-    found /= np.outer(unit, unit)
-    mean, variance, first = lane["mean"], lane["variance"], int(lane["first_about"])
-    constant = np.flatnonzero((mean != 0.0) & (variance <= STILL * lane["c"]))
-    own, away = lane["c"].copy(), np.eye(len(mean))
-    if len(constant):
-        k = constant[-1]
-        others = np.arange(len(mean)) != k
-        own[others] = variance[others]
-        away[k, others] = -mean[others] / mean[k]
-    inverse = np.divide(1.0, own, out=np.zeros(len(own)), where=own > STILL * lane["c"])
-    for j, ratio in enumerate(lane["about"]):
-        found[first + j] = lane["r"] * ratio * (away * inverse) @ away.T
-    return found
+    """Drift covariances (K, n, n) of the modes in a nominal interval, in units of theta."""
+    rho, n, c = lane["r"] * ratios(lane), len(lane["c"]), lane["c"]
+    away = np.eye(n)
+    if lane["offset"].any():
+        away[lane["constant"]] -= lane["offset"]
+    common = (away * lane["drift_unit"]) @ away.T
+    a = np.divide(lane["direction"], np.sqrt(c), out=np.zeros(n), where=c > 0.0)
+    inverse = np.divide(1.0, c, out=np.zeros(n), where=c > 0.0)
+    learned = np.diag(lane["weight"] * inverse) + filters.FLOOR * common + np.outer(a, a)
+    Q = np.zeros((len(rho), n, n))
+    Q[:FIRST_LEARNED], Q[FIRST_LEARNED:FIRST_ALONE] = common, learned
+    for i, first in enumerate(lane["alone"]):
+        if first >= 0:
+            Q[first : first + lane["rungs"], i, i] = inverse[i]
+    return rho[:, None, None] * Q
 
 
-def moved_along(lane, walked, time=1.0):
-    """Means (n, K) of the filters of `AdaptiveKalman` after an interval; ``walked`` (n, K) is what it adds to C_ii."""
-    m, memory = lane["m"].copy(), time / np.sqrt(max(float(lane["apart"]), SHORTEST))
-    for j, bend in enumerate(lane["bend"]):
-        k = int(lane["trend"]) + j
-        variance = np.maximum(np.diagonal(lane["C"][..., k]) + walked[:, k], 1e-300)
-        fading = FADING + LOST * (1.0 - np.minimum(1.0, GROWN * lane["corrected"][:, j] / variance))
-        m[:, k] += lane["slopes"][:, j] * time * (1.0 / (1.0 + 0.5 * bend * fading * memory))
+def moved_along(lane, time=1.0):
+    """Means (n, K) after an interval."""
+    m = lane["m"].copy()
+    m[:, len(COMMON) : FIRST_LEARNED] += time * lane["trend"]
     return m
+
+
+def before(lane, phi):
+    """x, means (n, K), covariances (K, n, n) and variances (3,) of the noise before a sample."""
+    S = lane["S"]
+    C = np.moveaxis(full(lane["C"]), -1, 0) + S @ walks(lane) @ S.T
+    r = lane["r"]
+    v = lane["noise"] * np.array([r, max(lane["restless"], noise.LEAST_RESTLESS * r), noise.LARGE * r])
+    return np.linalg.solve(S.T, phi), moved_along(lane), C, v
+
+
+def states(lane):
+    """Probabilities (3,) of the states of the noise before a sample."""
+    (quiet, restless, _), o = lane["nu"], lane["outlying"]
+    usual = np.array([[noise.STAY, 1.0 - noise.STAY], [1.0 - noise.CALM, noise.CALM]])
+    return np.append((1.0 - o) * np.array([quiet, restless]) @ usual, o)
+
+
+def density(lane, phi, y):
+    """The predictive density of y, of any shape: Student's while r rests on few samples, and a Cauchy tail."""
+    (x, m, C, v), total, count = before(lane, phi), 0.0, float(lane["count"])
+    body = stats.norm if count > filters.STUDENT else stats.t(count)
+    for k, weight in enumerate(lane["prior"]):
+        e, h = y - x @ m[:, k], x @ C[k] @ x
+        for j, p in enumerate(states(lane)):
+            law = stats.cauchy if j == 2 else body
+            scale = np.sqrt(h + v[j])
+            total = total + weight * p * law.pdf(e / scale) / scale
+    return total
+
+
+def sample(lane, phi, y):
+    """Probabilities (K,), means (n, K) and covariances (K, n, n) after a sample, before and after the interaction."""
+    (x, m, C, v), K, count = before(lane, phi), len(lane["prior"]), float(lane["count"])
+    e, g = y - x @ m, C @ x
+    h = g @ x
+    s = h + np.stack([np.full(K, v[0]), np.full(K, v[1]), np.maximum(v[2], e**2)])
+    kernel = np.exp(-0.5 * e**2 / s) if count > filters.STUDENT else (1.0 + e**2 / s / count) ** (-0.5 * (count + 1.0))
+    joint = lane["prior"] * states(lane)[:, None] * kernel / np.sqrt(s)
+    joint /= joint.sum()
+    mu = np.maximum(joint.sum(axis=0), filters.LEAST)
+    a, a2 = (joint / s).sum(axis=0) / mu, (joint / s**2).sum(axis=0) / mu
+    m = m + g.T * (a * e)
+    C = C - ((a - np.maximum(a2 - a * a, 0.0) * e**2) * g.T).T[:, :, None] * g[:, None, :]
+    return mu, m, C, joint
+
+
+def interaction(lane, mu, m, C, kappa):
+    """The same after it, with the full matrix of transitions."""
+    up, down, foot, arrive = (lane[name] for name in ("up", "down", "foot", "arrive"))
+    T = np.diag(1.0 - down - foot - kappa * (up + arrive.sum())) + np.diag(down[1:], -1) + kappa * np.diag(up[:-1], 1)
+    T[:, 0] += foot
+    T += kappa * arrive
+    share = mu[:, None] * T
+    prior = share.sum(axis=0)
+    share /= prior
+    mean = m @ share
+    off = m[:, :, None] - mean[:, None, :]
+    return prior, mean, np.einsum("kj,kab->jab", share, C) + np.einsum("kj,akj,bkj->jab", share, off, off), T

@@ -4,8 +4,8 @@ import threading
 import time
 
 from driftfit import ARX, Kalman, Live
+from driftfit.service.config import parse
 from driftfit.service.core.engine import Engine
-from driftfit.service.settings.config import parse
 from driftfit.service.threads import SinkThread, SourceThread
 
 Live(ARX(1, 1), Kalman(q=1e-4, r=0.1), dt=1.0)  # compiled once for all processes

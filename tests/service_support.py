@@ -15,10 +15,10 @@ import urllib.request
 
 import numpy as np
 
-from driftfit import ARX, Kalman
+from driftfit import ARX, Kalman, track
+from driftfit.service.config import parse
 from driftfit.service.core.engine import Engine
-from driftfit.service.settings.config import parse
-from driftfit.service.sources.samples import Batch, decode
+from driftfit.service.sources.contract import Batch, decode
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-4, r=0.1)
 UNIT = """
@@ -46,6 +46,18 @@ def record(T=400, seed=0):
     return y, u
 
 
+def run_of(y, u, time=None, **more):
+    return track(
+        MODEL, TRACKER, y, u, time=np.arange(len(y)) * 1.0 if time is None else time, dt=1.0, gate=True, **more
+    )
+
+
+def coded():
+    y, u = record(100)
+    y[[5, 60]] = 9999.0
+    return y, u
+
+
 def message(topic, t, y, u, **more):
     columns = {"t": list(map(float, t)), "y": list(map(float, y)), "u": list(map(float, u))}
     return Batch([decode(topic, json.dumps(columns | more))], arrived=time.monotonic())
@@ -63,6 +75,13 @@ def settled(engine):
     """Store the results that wait for the next transaction."""
     while engine._pending:
         engine.step(0.0)
+
+
+def stored(engine):
+    """Store the states, and close."""
+    engine._store_states(everything=True)
+    engine._commit()
+    engine.close()
 
 
 def results_of(engine):
@@ -182,3 +201,27 @@ class Receiver(http.server.BaseHTTPRequestHandler):
 
     def log_message(self, *args):
         pass
+
+
+@contextlib.contextmanager
+def receiver(*answers):
+    """The address of a server on this machine that gives these answers, then 200."""
+    Receiver.got.clear()
+    Receiver.answers[:] = answers
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Receiver)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}/x"
+    server.shutdown()
+    server.server_close()
+
+
+@contextlib.contextmanager
+def serving(*what):
+    """The port of a service in a process of its own."""
+    port = free_port()
+    process = started(port, *what)
+    try:
+        yield port
+    finally:
+        stopped(process)
+        process.stderr.close()

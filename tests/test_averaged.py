@@ -6,7 +6,7 @@ from support import rows_of
 
 from benchmarks.settings_coverage import scores
 from driftfit import FLS, AugmentedFLS, Kalman, Regression, tune
-from driftfit.tune.averaged import _mixed
+from driftfit.tune.tuned import _mixed
 
 
 def record(T=150, q=1e-3):

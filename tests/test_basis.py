@@ -8,19 +8,18 @@ from numpy.polynomial import chebyshev, legendre
 from scipy.interpolate import BSpline as ScipyBSpline
 
 from driftfit import Kalman, Track, track
-from driftfit.models.hammerstein_wiener.curves.basis import (
+from driftfit.models.hammerstein_wiener.basis import (
     BSpline,
     Chebyshev,
-    DeadZone,
     Functions,
     Legendre,
     PiecewiseLinear,
     Polynomial,
-    Saturation,
     Sigmoid,
     basis_of,
 )
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.thresholds import DeadZone, Saturation
 from driftfit.systems.hammerstein_wiener import simulate
 
 
@@ -42,10 +41,9 @@ def test_bases_are_what_they_say():
         np.testing.assert_allclose(spline.value(x), np.stack(twin, axis=1), atol=1e-14)
         assert spline.n == len(twin) == len(spline.names)
         assert np.isnan(spline.value(3.31)).all()
-    zone = DeadZone(3.0).known(1.0, -0.5)
-    np.testing.assert_allclose(zone.value([2.0, 0.5, -2.0]) @ [1.0, 1.0, -0.5], [1.0, 0.0, -1.5])
-    limited = Saturation(3.0).known(1.0, -0.5)
-    np.testing.assert_allclose(limited.value(x) @ [1.0, 1.0, -0.5], np.clip(x, -0.5, 1.0))
+    zone, limited = (kind(3.0, start=0.7) for kind in (DeadZone, Saturation))
+    np.testing.assert_allclose(zone.value([2.0, 0.5, -2.0]) @ [1.0, 0.7, -0.7], [1.3, 0.0, -1.3])
+    np.testing.assert_allclose(limited.value(x) @ [1.0, 0.7, -0.7], np.clip(x, -0.7, 0.7))
     bent = np.tanh((x[:, None] - [-1.0, 0.5]) / 0.7) + np.tanh(np.array([-1.0, 0.5]) / 0.7)
     np.testing.assert_allclose(Sigmoid([-1.0, 0.5], 0.7).value(x), bent, atol=1e-15)
     assert np.isnan(Sigmoid([0.0], 1.0).value(np.nan)).all()

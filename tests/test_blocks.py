@@ -11,16 +11,12 @@ from numpy.testing import assert_allclose
 from support import same
 
 from driftfit import AugmentedFLS, Kalman, Live, Regression, track
-from driftfit.models.hammerstein_wiener.curves.basis import Legendre, Polynomial
+from driftfit.models.hammerstein_wiener.basis import Legendre, Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.products import Structure
-from driftfit.models.hammerstein_wiener.results.constant_system import fit_constant
-from driftfit.models.hammerstein_wiener.results.drift_ratios import track_ratios
-from driftfit.models.hammerstein_wiener.results.product_drift import product_drift, renewed, track_products
-from driftfit.models.hammerstein_wiener.separation.least_squares import jacobian, refine, residual
-from driftfit.models.hammerstein_wiener.separation.paths import Groups, minimal, split
-from driftfit.models.hammerstein_wiener.separation.separate import METHODS
-from driftfit.systems.hammerstein_wiener import CUBIC, START, example, simulate
+from driftfit.models.hammerstein_wiener.separation import METHODS, Groups, LeastSquares, minimal, split
+from driftfit.models.hammerstein_wiener.structure import Structure
+from driftfit.systems.hammerstein_wiener import CUBIC, START, simulate
+from driftfit.use.hammerstein_wiener.constant_system import fit_constant
 
 SMALL = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(2))
 K = Kalman(q=1e-6, r=1e-4, p0=1e2, theta0=0.01)
@@ -61,20 +57,6 @@ def test_exact_products_come_apart_exactly(na, nb, n_in, n_out, seed):
             assert quality.max() < 1e-12
 
 
-@given(nb=st.integers(1, 4), n_in=st.integers(1, 5), seed=st.integers(0, 99))
-def test_the_rank_one_fit_is_that_of_the_library(nb, n_in, seed):
-    model = model_of(1, nb, n_in, 2)
-    theta = np.random.default_rng(seed).normal(size=(2, model.n))
-    _, b, c, _, quality = split(model, theta, "svd")
-    at = model.structure.starts[1]
-    for t in range(2):
-        M = np.concatenate([theta[t, 1 : 1 + nb], theta[t, at : at + nb * (n_in - 1)]]).reshape(n_in, nb).T
-        U, s, V = np.linalg.svd(M)
-        assert_allclose(np.outer(b[t], c[t]), s[0] * np.outer(U[:, 0], V[0]), atol=1e-10)
-        second = s[1] / s[0] if len(s) > 1 else 0.0
-        assert quality[t, 0] == pytest.approx(second, abs=1e-10)
-
-
 def test_the_joint_fit_is_the_least_squares_fit_with_a_known_corner():
     from scipy.optimize import minimize
 
@@ -104,13 +86,11 @@ def test_the_jacobian_against_differences(intercept):
         assert_allclose(J[:, x], numeric, atol=1e-7)
     a, b, c, d = structure.groups(xi)
     zeta = np.concatenate([a, b, c, d[1:], xi[structure.n_x - intercept :]])
-    compiled, off = np.empty((len(zeta), structure.n)), np.empty(structure.n)
-    jacobian.py_func(zeta, (2, 4), structure.sizes, compiled)
-    leads = len(a) + len(b) + structure.leads
-    assert same(np.delete(compiled, leads, axis=0).T, J)
-    assert_allclose(compiled[leads[0], 2:5], b[:3])  # what c_1 moves, which xi does not have
-    residual.py_func(structure.products(xi), zeta, (2, 4), structure.sizes, off)
-    assert_allclose(off, 0.0, atol=1e-15)
+    fit, leads = LeastSquares(structure), len(a) + len(b) + structure.leads
+    free = fit.jacobian(zeta[None])[0]
+    assert same(np.delete(free, leads, axis=1), J)
+    assert_allclose(free[2:5, leads[0]], b[:3])  # what c_1 moves, which xi does not have
+    assert_allclose(fit.products(zeta[None])[0], structure.products(xi), atol=1e-15)
 
 
 def test_generalised_least_squares():
@@ -138,10 +118,8 @@ def test_generalised_least_squares():
     replayed = track(SMALL, K, s.y, s.u).blocks("gls")
     assert_allclose(replayed.xi, gls.xi, rtol=1e-12, atol=1e-12)
     assert gls.gauge("c1").std.c[:, 0].max() < 1e-12 * gls.std.c[20:].min()
-    theta, P = np.ones((1, 3)), np.full((1, 3, 3), np.inf)
-    zeta, cov, value = np.ones((1, 4)), np.empty((1, 4, 4)), np.empty(1)
-    refine(theta, P, (1, 1), np.array([[2], [1]]), zeta, cov, value)
-    assert same(zeta, np.ones((1, 4)))
+    zeta, cov, _ = LeastSquares(SMALL.structure).refine(np.ones((1, 7)), np.full((1, 7, 7), np.inf), np.ones((1, 6)))
+    assert same(zeta, np.ones((1, 6)))
     assert np.isnan(cov).all()
     with pytest.raises(ValueError, match="carries none"):
         track(SMALL, AugmentedFLS(1.0), s.y, s.u).blocks("gls")
@@ -305,49 +283,6 @@ def test_instruments_and_the_unbiased_basis_take_the_bias_away():
         fit_constant(HammersteinWiener(1, 1, output=Legendre(3, (-3, 3))), s.y, s.u, sigma=0.1)
     with pytest.raises(ValueError, match="cannot determine 14"):
         fit_constant(CUBIC, s.y[:10], s.u[:10])
-
-
-def test_ratios_choose_as_the_noise_asks():
-    """Section 9: without noise the largest ratio leads, at 20 dB a small one; and nothing looks ahead."""
-    clean, noisy = example(1, 0, T=900), example(3, 0, T=900, snr_db=20.0)
-    led = [track_ratios(s.model, s.y, s.u, rhos=(1e-3, 1e-1, 1e1)) for s in (clean, noisy)]
-    assert np.mean(led[0].rho[300:] == 10.0) > 0.98
-    assert np.mean(led[1].rho[300:] < 10.0) > 0.98
-    short = track_ratios(noisy.model, noisy.y[:500], noisy.u[:500], rhos=(1e-3, 1e-1, 1e1))
-    assert same(short.theta, led[1].theta[:500])
-    assert same(short.rho, led[1].rho[:500])
-
-
-def test_a_drift_of_the_shape_of_products():
-    """Section 4: Q is that of products of walking factors, to first order; and it lowers the error of stage one."""
-    s = example(1, 0, T=1500)
-    rng, xi = np.random.default_rng(5), s.xi[0]
-    sizes = np.repeat([1e-3, 2e-3, 3e-3, 4e-3], 2)
-    moved = np.array([s.model.structure.products(xi + sizes * rng.normal(size=8)) for _ in range(40_000)])
-    Q = product_drift(s.model, xi, tuple(float(x) ** 2 for x in sizes[::2]))
-    np.testing.assert_allclose(np.cov(moved.T), Q, atol=5e-7)
-    found = track_products(s.model, s.y, s.u, q=0.002**2, r=1e-6)
-    plain = track(s.model, Kalman(q=10.0, r=0.01, p0=1e8, theta0=0.01), s.y, s.u).blocks("svd-joint")
-    errors = [np.median(np.linalg.norm(x - s.xi, axis=1)[500:]) for x in (found.xi, plain.xi)]
-    assert errors[0] < 0.9 * errors[1]
-    assert found.theta.shape == (1500, 14)
-    with pytest.raises(ValueError, match="one variance, or four"):
-        product_drift(s.model, xi, (1.0, 2.0))
-
-
-@pytest.mark.parametrize("intercept", [False, True])
-def test_a_stream_renews_the_drift_of_products_as_a_record_does(intercept):
-    s = example(1, 1, T=120)
-    model, q = replace(s.model, intercept=intercept), (1e-6, 2e-6, 3e-6, 4e-6)
-    record = track_products(model, s.y, s.u, q=q, r=1e-6, every=40)
-    live = Live(model, Kalman(q=4e-6 * np.eye(model.n), r=1e-6, p0=1e8, theta0=0.01))
-    for t in range(120):
-        if t in (40, 80):
-            live = renewed(live, q)
-        live.update(float(s.y[t]), float(s.u[t]))
-        assert same(live.theta, record.theta[t])
-    with pytest.raises(ValueError, match="full matrix q"):
-        renewed(Live(model, Kalman(q=1e-6, r=1e-6)), q)
 
 
 def test_every_input_has_a_panel():

@@ -16,7 +16,7 @@ from support import same
 
 from driftfit import ARX, Kalman, Live, Regression, track
 from driftfit.bridges import spark
-from driftfit.bridges.spark.session import missing
+from driftfit.bridges.spark.frames import missing
 
 if reason := missing():
     pytest.skip(reason, allow_module_level=True)

@@ -18,7 +18,7 @@ from driftfit.bridges import spark
 from driftfit.bridges.spark import task as tasks
 from driftfit.bridges.spark.batch import Partition, schema_of
 from driftfit.bridges.spark.flow import Flow, Origin
-from driftfit.bridges.spark.session import java, missing
+from driftfit.bridges.spark.frames import java, missing
 from driftfit.bridges.spark.unit import Unit
 from driftfit.run.layout import packed as pack
 

@@ -30,7 +30,7 @@ from driftfit import (
 from driftfit.checks import check_model
 from driftfit.checks.model import _shown, signals
 from driftfit.models import found
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.basis import Polynomial
 
 CURVED = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(3), intercept=True, output_noise=0.1)
 SYSTEM = (-0.3, 0.5, 0.2, 0.1, 0.2, 0.1, 0.04, -0.03, -0.06, 0.1)
@@ -136,62 +136,6 @@ def test_a_parameter_that_the_output_does_not_show_is_named():
     assert list(_shown(lost, run.tracker, run)) == [
         "The output says nothing of c: no line leads from it to the output, or its effect vanishes here."
     ]
-
-
-OUTSIDE = [1.0]
-
-
-def random(u, theta):
-    return theta.k * u + np.random.normal()  # noqa: NPY002
-
-
-def writing(u, theta):
-    OUTSIDE[0] = u
-    return theta.k * OUTSIDE[0]
-
-
-def counting(u, theta):
-    global OUTSIDE
-    OUTSIDE = theta.k
-    return theta.k * u
-
-
-def two_values(u, theta):
-    return theta.k * u, theta.c
-
-
-def whole_theta(u, theta):
-    return theta * u
-
-
-def other_arguments(speed, theta):
-    return theta.k * speed
-
-
-def sometimes(u, theta):
-    if u > 0.0:
-        return theta.k * u
-
-
-def without_states(x, u, theta):
-    return x.x + theta.k * u
-
-
-def level(x):
-    return x.x
-
-
-@pytest.mark.parametrize(
-    ("given", "says"),
-    [
-        (random, "normal"), (writing, "not understood"), (counting, "not understood"), (two_values, "is no number"),
-        (whole_theta, "theta itself is no number"), (other_arguments, "takes speed"), (sometimes, "returns nothing"),
-        ([without_states, level], "must return the states by name"), (lambda u, theta: theta.k * u, "name of its own"),
-    ],
-)  # fmt: skip
-def test_functions_that_cannot_be_a_model_are_named(given, says):
-    (broken,) = check_model(given)
-    assert says in broken
 
 
 @dataclass(frozen=True)

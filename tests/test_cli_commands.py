@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from typer.testing import CliRunner
+from cli_support import fails, run
 
 from driftfit import ARX, Kalman, Live, Track, cli, track
-from driftfit.cli.parts.reading import Part, rows_of
+from driftfit.cli.reading import Part, rows_of
 
 K = Kalman(q=1e-4, r=0.01)
 KALMAN = ["--tracker", "kalman", "-p", "q=1e-4", "-p", "r=0.01"]
@@ -38,19 +38,6 @@ def table(tmp_path, monkeypatch):
     )
     frame.write_csv("pump.csv")
     return frame
-
-
-def run(*arguments, stdin=None):
-    result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments], input=stdin)
-    assert result.exit_code == 0, result.output
-    return result.stdout
-
-
-def fails(*arguments):
-    result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
-    assert result.exit_code == 2, result.output
-    (line,) = result.stderr.strip().splitlines()
-    return line
 
 
 SIGNALS = ["pump.csv", "--y", "flow", "--u", "valve", "--model", "arx:1,1", *KALMAN]
@@ -171,7 +158,7 @@ def test_verdict_and_tables_of_eighty_columns(table, monkeypatch):
     printed = run("verdict", *DATED)
     of_run = expected().verdict()
     assert f"p = {of_run.p:.2g}" in " ".join(printed.split()) or "p < 0.0001" in printed
-    monkeypatch.setattr(cli.parts.program.out, "width", 80)
+    monkeypatch.setattr(cli.program.out, "width", 80)
     printed = run("verdict", *DATED)
     assert "…" not in printed
     assert "< 0.0001" in printed

@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 
 from driftfit import ARX, RLS, Kalman, Live, Regression, track
-from driftfit.data.clock import NEAR, Clock, median_interval
+from driftfit.data.clock import ROUNDED_WITHIN, Clock, median_interval
 from driftfit.data.instants import instant, span
 from driftfit.engine.settings import DataWarning
 
@@ -147,7 +147,7 @@ def test_times_ahead_are_one_step_apart(dt):
         last = np.datetime64(start, "us") + np.timedelta64(3600, "s")
         ahead = Clock.of(dt).ahead(last, 30)
         steps = Clock.of(dt).steps(np.concatenate([[last], ahead]))
-        assert np.all(np.abs(steps - 1.0) < NEAR + 1e-9)
+        assert np.all(np.abs(steps - 1.0) < ROUNDED_WITHIN + 1e-9)
     month_ends = Clock.of("month").ahead(np.datetime64("2024-01-31", "us"), 2).astype("datetime64[D]")
     assert list(map(str, month_ends)) == ["2024-02-29", "2024-03-31"]
     assert Clock.of("label").ahead(np.datetime64("2024-01-31"), 2) is None

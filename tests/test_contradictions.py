@@ -230,19 +230,19 @@ def test_a_new_level_costs_two_samples_also_after_a_gap(tracker, level, gap):
     assert errors[0] < 1.1 * errors[1]
 
 
+UNJUDGED = pytest.mark.xfail(reason="inputs are not judged at samples that miss a refused one", strict=True)
+
+
 @pytest.mark.parametrize(
-    ("model", "tracker"),
+    ("model", "tracker", "codes"),
     [
-        (PLANT, RLS(1.0)),
-        pytest.param(
-            OE(2, 2), InstrumentalVariables(0.99),
-            marks=pytest.mark.xfail(reason="models that compute signals do not refuse an input", strict=True),
-        ),
+        (PLANT, RLS(1.0), 10), *((OE(2, 2), one, 1) for one in (RLS(1.0), InstrumentalVariables(0.99))),
+        (ARMAX(2, 2, 1), RLS(0.99), 10), pytest.param(OE(2, 2), InstrumentalVariables(0.99), 10, marks=UNJUDGED),
     ],
 )  # fmt: skip
-def test_an_input_with_a_run_of_codes_and_a_simulated_output(model, tracker):
+def test_an_input_with_codes_and_a_simulated_output(model, tracker, codes):
     y, u = plant()
-    u[250:260] = 9999.0
+    u[250 : 250 + codes] = 9999.0
     run, whole = gated(model, tracker, y, u), gated(model, tracker, *plant())
     assert np.abs(run.theta[-1] - whole.theta[-1]).max() < 0.05
 

@@ -9,7 +9,7 @@ from support import arx_record, damaged, same
 
 from driftfit import ARX, HammersteinWiener, Kalman, Live, OutputError, Regression, track
 from driftfit.data.storage import fields
-from driftfit.models.hammerstein_wiener.curves.basis import Legendre
+from driftfit.models.hammerstein_wiener.basis import Legendre
 
 K = Kalman(q=1e-3, r=0.01)
 Y, U = damaged(*arx_record(60, 1))

@@ -1,7 +1,7 @@
 """The build fails when the docs lie.
 
-Python blocks of a page run in order, in one namespace; a text block right after one is what it prints. A text block
-after a line ``Printed by `examples/NAME.py`:`` is what that script prints. Links and pictures must exist. Where an
+Python blocks of a page run in order, in one namespace; a text block right after one is what it prints. `lab.pages`
+compares the pages with what examples and reproductions of papers print. Links and pictures must exist. Where an
 optional package is absent, a page is left at the block that imports it, and the test says so.
 """
 
@@ -12,11 +12,14 @@ import runpy
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
+
+from lab import pages
+from lab.program import app
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"```(\w*)\n(.*?)```", re.S)
-SCRIPT = re.compile(r"Printed by\s`(examples/\w+\.py)`:\n\n```text\n(.*?)```", re.S)
 
 
 def squeezed(text: str) -> list[str]:
@@ -63,27 +66,27 @@ WARNED = {"examples/counts.py", "examples/segmentation.py"}
 """Scripts whose rare counts and changes of level are warned of as if they were codes, since no gate judges them."""
 
 
-def shown() -> list[object]:
-    """Each script with its output as the pages show it, the parts of one script together."""
-    result: dict[str, list[str]] = {}
-    for page in PAGES:
-        for found in SCRIPT.finditer(page.read_text()):
-            result.setdefault(found[1], []).append(found[2])
-    marks = {script: [pytest.mark.filterwarnings("ignore:.*looks? like (a )?fault code")] for script in WARNED}
-    return [
-        pytest.param(script, parts, id=Path(script).stem, marks=marks.get(script, ()))
-        for script, parts in result.items()
-    ]
+SHOWN = [
+    pytest.param(one, marks=pytest.mark.filterwarnings("ignore:.*looks? like (a )?fault code") if one in WARNED else ())
+    for one in pages.shown()
+]
 
 
-@pytest.mark.parametrize(("script", "parts"), shown())
-def test_scripts_print_what_the_docs_say(script, parts, monkeypatch):
-    monkeypatch.setattr("sys.argv", ["script"])
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        runpy.run_path(str(ROOT / script), run_name="__main__")
-    for result in parts:
-        assert squeezed(printed.getvalue()) == squeezed(result)
+@pytest.mark.parametrize("command", SHOWN)
+def test_scripts_print_what_the_docs_say(command):
+    """All that an example prints, and of the reproduction of a paper the rows that take little time."""
+    assert pages.compared(command) == []
+
+
+def test_a_page_that_no_longer_holds_is_found():
+    printed = "Errors\n────\n a   1.5\n b   2.5\n\nMilliseconds\n a   3\n"
+    blocks = ["Errors\n───\n a  1.5\n b  2.5\n", "Milliseconds\n a   4\n"]
+    assert pages.differences(printed, blocks, sample=False) == []
+    assert pages.differences("Errors\n a   1.5\n", blocks, sample=True) == []
+    assert pages.differences(printed.replace("1.5", "1.6"), blocks, sample=True) == ["+ a 1.6"]
+    assert pages.differences(printed.replace(" b   2.5\n", ""), blocks, sample=False) == ["- b 2.5"]
+    command = ["pages", "--only", "examples/jumps.py"]
+    assert CliRunner().invoke(app, command).output == "examples/jumps.py: no differences\n"
 
 
 def test_links_lead_somewhere():

@@ -27,13 +27,8 @@ INLINE = re.compile(r"`((?:python|driftfit)\s[^`]*)`")
 BEGINS = re.compile(r"^\s*(?:driftfit|python|pip) (?!\S*[:|])\S.*")
 ELSEWHERE = {
     "driftfit demo": ("tests/test_demo.py", "demo.show("),
-    "python -m lab reproduce fls": ("lab/tests/test_reproduce_fls.py", '["reproduce", "fls", "--quick"'),
-    "python -m lab reproduce hammerstein-wiener": (
-        "lab/tests/test_reproduce_hammerstein_wiener.py", '["reproduce", "hammerstein-wiener", "--quick"',
-    ),
-    "python -m lab reproduce hypotheses": (
-        "lab/tests/test_reproduce_hypotheses.py", '["reproduce", "hypotheses", "--quick"',
-    ),
+    "python -m lab reproduce": ("tests/test_docs.py", "pages.compared(command) == []"),
+    "python -m lab pages": ("tests/test_docs.py", '["pages", "--only"'),
     "driftfit warm": ("tests/test_cli_commands.py", 'run("warm", "--model", "arx:1,1", *KALMAN)'),
     "driftfit journal verify": ("tests/test_service_journal.py", '["journal", "verify", str(folder)'),
     "driftfit serve": ("tests/service_support.py", '"driftfit", "serve", *(what or ["--demo"])'),

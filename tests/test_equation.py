@@ -6,7 +6,7 @@ import pytest
 
 from driftfit import ARX, AdaptiveKalman, Equation, Kalman, Live, Regression, track
 from driftfit.models.base import Model
-from driftfit.models.formulas.text import parse
+from driftfit.models.formula import parse
 from driftfit.parsing.expressions import read
 from driftfit.smooth.problem import replay
 

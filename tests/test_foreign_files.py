@@ -11,7 +11,7 @@ from scipy.io import savemat
 
 from driftfit import RLS, DataWarning, Regression, track
 from driftfit.bridges.matlab import read_mat
-from driftfit.cli.parts.reading import Part, moment, rows_of
+from driftfit.cli.reading import Part, moment, rows_of
 from driftfit.data.clock import Clock
 from driftfit.data.files import read_columns
 from driftfit.data.instants import warn_of_counted_years, warn_of_written_numbers
@@ -327,7 +327,7 @@ def test_packed_files_are_looked_at_before_they_are_unpacked(tmp_path, monkeypat
     with pytest.raises(ValueError, match="is not a driftfit file, or it is damaged") as caught:
         read(tmp_path / "a.npz", "track")
     assert "would unpack to more" in str(caught.value.__cause__)
-    monkeypatch.setattr("driftfit.data.files.LARGE", 1000)
+    monkeypatch.setattr("driftfit.data.files.UNPACKED_BYTES", 1000)
     (tmp_path / "a.csv.gz").write_bytes(gzip.compress(b"t,y\n" + b"1,2\n" * 100_000))
     (tmp_path / "b.csv.gz").write_bytes(gzip.compress(b"t,y\n" + b"1,2\n" * 100_000)[:-4] + bytes(4))  # says nothing
     pl.DataFrame({"y": zeros}).write_parquet(tmp_path / "a.parquet")

@@ -6,8 +6,9 @@ from support import arx_record
 
 from driftfit import ARX, ExtendedKalman, Kalman, Regression, track
 from driftfit.models.base import Model
-from driftfit.models.hammerstein_wiener.curves.basis import DeadZone, Legendre, Polynomial
+from driftfit.models.hammerstein_wiener.basis import Legendre, Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.thresholds import DeadZone
 from driftfit.systems.hammerstein_wiener import simulate
 from driftfit.use.simulate import DRAWS, ahead_by_draws, drawn, simulate_by_draws
 

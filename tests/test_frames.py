@@ -43,7 +43,7 @@ def test_inputs_go_to_the_model_by_name(way):
     output, inputs, data = ways(y, X)[way]
     run = track(NAMED, TRACKER, output, inputs, data=data)
     by_place = track(NAMED, TRACKER, y.to_numpy(), X[["b", "a"]].to_numpy())
-    assert run.names == ("b", "a")
+    assert (run.names, run.model) == (("b", "a"), by_place.model)
     assert np.array_equal(run.theta, by_place.theta)
     assert np.array_equal(run.u, by_place.u)
     assert abs(run.theta[-1] - [5.0, 1.0]).max() < 0.2

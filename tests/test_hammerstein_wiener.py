@@ -10,14 +10,9 @@ from support import same
 from driftfit import ARX, RLS, ExtendedKalman, Kalman, Live, Track, track
 from driftfit.engine.drivers import TrackerSteps, unknown
 from driftfit.engine.kernel import kernel, nothing
-from driftfit.models.hammerstein_wiener.curves.basis import (
-    BSpline,
-    DeadZone,
-    Legendre,
-    PiecewiseLinear,
-    Polynomial,
-)
+from driftfit.models.hammerstein_wiener.basis import BSpline, Legendre, PiecewiseLinear, Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.thresholds import DeadZone
 from driftfit.systems.drift import RandomWalk
 from driftfit.systems.hammerstein_wiener import CUBIC, NotMonotoneError, example, invert, simulate
 from driftfit.trackers.base import Tracker

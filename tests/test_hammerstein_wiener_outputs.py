@@ -4,12 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 from support import same
 
 from driftfit import ExtendedKalman, HammersteinWiener, Kalman, Live, OutputError, track
-from driftfit.models.hammerstein_wiener.curves.basis import Legendre, Polynomial
-from driftfit.models.hammerstein_wiener.results.shared_curves import shared_curves
+from driftfit.models.hammerstein_wiener.basis import Legendre, Polynomial
 from driftfit.run.outputs import Outputs
 
 TANK = HammersteinWiener(
@@ -69,68 +67,11 @@ def test_minimal_parameters_of_several_outputs():
         track(TANK, OutputError(q=1e-7, r=1e-4), y, u)
 
 
-def test_a_shared_curve_is_better_than_each_alone():
-    """Fifty records: the rms error of c_2 from both outputs together against those of each by itself."""
-    errors = []
-    for seed in range(50):
-        y, u = record(200, seed, noise=0.03)
-        run = track(TANK, K, y, u)
-        both = shared_curves(run)
-        assert same(both["flow"].c, both["level"].c)
-        curves = [both["flow"].c[-1], *(run[name].blocks().c[-1] for name in TANK.outputs)]
-        errors.append([c[1] / c[0] - C2 for c in curves])
-    together, flow, level = np.sqrt(np.mean(np.square(errors), axis=0))
-    assert flow < level
-    assert together / flow == pytest.approx(0.93, abs=0.01)
-    assert together / level == pytest.approx(0.63, abs=0.01)
-    scaled = track(
-        HammersteinWiener(1, 2, input=Polynomial(2), output=[Legendre(2, (-7, 7)), Legendre(2, (-1.2, 1.2))]),
-        K, y * [7.0, 1e-3], u,
-    )  # fmt: skip
-    again = shared_curves(scaled)["y1"]
-    assert_allclose(again.c, both["flow"].c, atol=1e-9)
-    assert_allclose(again.b, both["flow"].b, atol=1e-9)
-
-
-def test_shared_curves_are_the_nearest_of_rank_one():
-    """Two inputs with curves of different size, by alternating least squares on the products that the names
-    describe."""
-    model = HammersteinWiener(1, (2, 1), input=[Polynomial(3), Polynomial(2)], ny=("flow", "level"))
-    rng = np.random.default_rng(0)
-    u = rng.uniform(-1.0, 1.0, (80, 2))
-    y = (0.1 * np.cumsum(rng.standard_normal((80, 2)), axis=0) + u[:, :1]) * [1.0, 1000.0]
-    run = track(model, Kalman(q=1e-4, r=1e-2, p0=1e2, theta0=0.01), y, u)
-    shared = shared_curves(run)
-    for signal, lags, size, at_c, at_b in (
-        ("u1", 2, 3, slice(0, 3), slice(0, 2)),
-        ("u2", 1, 2, slice(3, 5), slice(2, 3)),
-    ):
-        rows = []
-        for o, output in enumerate(model.outputs):
-            theta = dict(zip(run.names[o], run.theta[-1, o], strict=True))
-            weight = 1.0 / run.innovation_std[-1, o]
-            for j in range(1, lags + 1):
-                more = [theta[f"b{j}[{signal}]*c{k}[{output}]"] for k in range(2, size + 1)]
-                rows.append(weight * np.array([theta[f"b{j}[{signal}][{output}]"], *more]))
-        M = np.array(rows)
-        c = M[0]
-        for _ in range(3000):
-            b = M @ c / (c @ c)
-            c = M.T @ b / (b @ b)
-        nearest = np.outer(b, c)
-        for o, output in enumerate(model.outputs):
-            found = np.outer(shared[output].b[-1, at_b], shared[output].c[-1, at_c]) / run.innovation_std[-1, o]
-            assert_allclose(found, nearest[o * lags : (o + 1) * lags], rtol=1e-8)
-
-
 def test_settings_that_several_outputs_cannot_have_are_refused():
-    y, u = record(60)
     for wrong, message in (
         (lambda: HammersteinWiener(1, 1, output=[None, Polynomial(2)]), "bases of one kind and size"),
         (lambda: HammersteinWiener(1, 1, output=[None, None], ny=3), "3 outputs, but one entry for each"),
         (lambda: HammersteinWiener(1, 1, output_noise=[0.1, 0.0], ny=2), "output_noise"),
-        (lambda: shared_curves(track(TANK.alone("flow"), K, y[:, 0], u)), "several outputs"),
-        (lambda: shared_curves(track(TANK, ExtendedKalman(q=0.0, r=1.0), y, u)), "products"),
     ):
         with pytest.raises(ValueError, match=message):
             wrong()

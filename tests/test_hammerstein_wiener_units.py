@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from driftfit import AdaptiveKalman, ExtendedKalman, HammersteinWiener, Kalman, Legendre, OutputError, track
-from driftfit.models.hammerstein_wiener.curves.basis import Functions, PiecewiseLinear
+from driftfit.models.hammerstein_wiener.basis import Functions, PiecewiseLinear
 
 UNITS = (1e6, 1e-6)
 

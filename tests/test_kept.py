@@ -75,7 +75,7 @@ def test_fleets(tmp_path):
 
 
 def test_a_fleet_is_written_part_by_part(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys.modules["driftfit.run.track"], "PART", 30_000)
+    monkeypatch.setattr(sys.modules["driftfit.run.track"], "BYTES_AT_ONCE", 30_000)
     rng = np.random.default_rng(0)
     table = pl.DataFrame({"pump": np.repeat(np.arange(40), rng.integers(5, 40, 40)).astype(str)})
     table = table.with_columns(y=rng.standard_normal(len(table)), u=rng.standard_normal(len(table)))

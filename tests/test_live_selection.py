@@ -21,7 +21,7 @@ from driftfit import (
     select,
 )
 from driftfit.engine.drivers import drivers
-from driftfit.models.hammerstein_wiener.curves.basis import PiecewiseLinear
+from driftfit.models.hammerstein_wiener.basis import PiecewiseLinear
 
 K = Kalman(q=1e-4, r=4e-4)
 CANDIDATES = [

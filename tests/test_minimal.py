@@ -8,16 +8,16 @@ from numpy.testing import assert_allclose
 from support import same
 
 from driftfit import Kalman, Live, Regression, track, tune
-from driftfit.models.hammerstein_wiener.curves.basis import DeadZone, Legendre, Polynomial
+from driftfit.models.hammerstein_wiener.basis import Legendre, Polynomial
+from driftfit.models.hammerstein_wiener.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.results.diagnostics import diagnose_blocks
-from driftfit.models.hammerstein_wiener.results.free_run import free_run, reflected
-from driftfit.models.hammerstein_wiener.results.hybrid_start import hand_off
-from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
-from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
+from driftfit.models.hammerstein_wiener.output_error import OutputError
+from driftfit.models.hammerstein_wiener.thresholds import DeadZone
 from driftfit.systems.arc_furnace import THRESHOLDS, A, furnace, length, resistance
 from driftfit.systems.drift import RandomWalk
 from driftfit.systems.hammerstein_wiener import simulate
+from driftfit.use.hammerstein_wiener.diagnostics import diagnose_blocks
+from driftfit.use.hammerstein_wiener.free_run import free_run, reflected
 
 SMALL = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(2))
 P2 = Polynomial(2)
@@ -176,12 +176,18 @@ def test_an_idle_second_input_changes_nothing(kind):
     assert np.isfinite(holes.theta).all()
 
 
-def test_a_hand_off_with_several_inputs():
+def handed_over(model, first, then, y, u, at):
+    """The recipe of the page: the filter goes on from the separation of stage one after sample ``at``."""
+    found, after = track(model, first, y, u).blocks("gls"), np.arange(len(y)) > at
+    return track(model, replace(then, theta0=found.xi[at], p0=found.xi_cov[at]), y, u, weights=after, drift=after)
+
+
+@pytest.mark.parametrize("kind", [ExtendedKalman, OutputError])
+def test_minimal_filters_go_on_from_stage_one(kind):
     y, u = two_inputs(400)
-    for then in (ExtendedKalman(q=1e-6, r=1e-6), OutputError(q=1e-6, r=1e-6)):
-        found = hand_off(TWO, K, then, y, u, at=150)
-        assert found.then.ok.all()
-        assert_allclose(found.then.theta[-1], TRUTH, atol=0.02)
+    found = handed_over(TWO, K, kind(q=1e-6, r=1e-6), y, u, 150)
+    assert same(found.ok, np.arange(400) > 150)
+    assert_allclose(found.theta[-1], TRUTH, atol=0.02)
 
 
 def test_minimal_filters_want_their_model():
@@ -220,25 +226,6 @@ def test_predictions_by_an_unstable_system_end_in_inf_without_a_warning():
     assert not np.isfinite(run.ahead(55).y_std[55:]).all()
 
 
-def test_hand_off_continues_the_record():
-    s = record(300)
-    found = hand_off(SMALL, K, ExtendedKalman(q=1e-6, r=1e-6), s.y, s.u)
-    assert found.then.names[0] in repr(found)
-    assert len(repr(found).splitlines()) < 30
-    assert 21 <= found.at < 100
-    assert found.xi.shape == s.xi.shape
-    assert len(found.then) == 300 - found.at - 1
-    assert found.then.ok.all()  # the lags came along
-    error = np.linalg.norm(found.xi - s.xi, axis=1)
-    assert np.median(error[200:]) < 0.03
-    first = found.first.blocks("gls")
-    assert same(found.then.tracker.theta0, tuple(first.xi[-1]))
-    with pytest.raises(ValueError, match="leaves none"):
-        hand_off(SMALL, K, ExtendedKalman(q=1e-6, r=1e-6), s.y, s.u, at=299)
-    with pytest.raises(ValueError, match="no window"):
-        hand_off(SMALL, K, ExtendedKalman(q=1e-6, r=1e-6), s.y, np.zeros(300))
-
-
 def test_the_output_error_filter_is_honest_under_measurement_noise():
     """Item 15: mean NIS near 1, and no bias where stage one has one."""
     nis, errors, stage = [], [], []
@@ -246,16 +233,16 @@ def test_the_output_error_filter_is_honest_under_measurement_noise():
         s = record(1500, seed, SIGMA)
         noisy = replace(SMALL, output_noise=SIGMA)
         start = Kalman(q=1e-6, r=1.0, p0=1e2, theta0=0.01)
-        found = hand_off(noisy, start, OutputError(q=1e-6, r=SIGMA**2), s.y, s.u, at=150)
-        nis.append(np.nanmean((found.then.innovation / found.then.innovation_std) ** 2))
-        errors.append(np.median(np.linalg.norm(found.then.theta - s.xi[151:], axis=1)[-500:]))
+        found = handed_over(noisy, start, OutputError(q=1e-6, r=SIGMA**2), s.y, s.u, 150)
+        nis.append(np.nanmean((found.innovation / found.innovation_std)[151:] ** 2))
+        errors.append(np.median(np.linalg.norm(found.theta - s.xi, axis=1)[-500:]))
         run = track(noisy, start, s.y, s.u)
         stage.append(np.median(np.linalg.norm(run.blocks("gls").xi - s.xi, axis=1)[-500:]))
     assert 0.8 < np.mean(nis) < 1.25
     assert np.median(errors) < np.median(stage)
     missing = s.y.copy()
     missing[[400, 401, 700]] = np.nan
-    run = track(SMALL, replace(found.then.tracker, q_w=1e-6), missing, s.u)
+    run = track(SMALL, replace(found.tracker, q_w=1e-6), missing, s.u)
     assert np.flatnonzero(~run.ok)[-3:].tolist() == [400, 401, 700]
     assert np.isfinite(run.prediction[[400, 401, 700, 702]]).all()
     z = run.innovation / run.innovation_std

@@ -11,7 +11,7 @@ import pytest
 from naive import moved_along, walks
 
 from driftfit import AdaptiveKalman, Bank, Change, Live, Regression, Sensor, track
-from driftfit.trackers.parts.modes.filters import UNSURE
+from driftfit.trackers.parts.mixture.filters import UNSURE
 
 N, PARTED, T = 3, 40, 60
 EXACT = np.vectorize(Decimal, otypes=[object])
@@ -63,10 +63,10 @@ def test_each_filter_of_adaptive_kalman_keeps_them_too(near, seed):
     lane = {name: np.array(live.lane()[name]) for name in live.lane()}
     live.update(y[PARTED], u[PARTED])
     after = live.lane()
-    noise = float(after["noise"] * after["leverage"] * max(after["r"], after["coarse"]))
-    weights, means, covs = lane["mu"] / lane["mu"].sum(), [], []
+    noise = float(after["noise"] * after["r"])
+    weights, means, covs = lane["prior"] / lane["prior"].sum(), [], []
     drift = walks(lane)
-    moved = moved_along(lane, np.einsum("ij,kjl,il->ik", lane["S"], drift, lane["S"]))
+    moved = moved_along(lane)
     with localcontext() as context:
         context.prec = 80
         inverse = EXACT(np.eye(N))

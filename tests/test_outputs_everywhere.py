@@ -1,6 +1,5 @@
 """Several outputs wherever a single one goes: tables, fleets, files, warm starts, forecasts, tuning, windows."""
 
-from copy import copy
 from dataclasses import replace
 
 import naive_smoother as naive
@@ -300,22 +299,6 @@ def test_one_output_of_a_stream():
         _ = Live(shared, TRACKER)["flow"]
     with pytest.raises(TypeError):
         iter(live)
-
-
-def test_live_loads_a_stream_with_several_outputs(tmp_path):
-    (_, y, u, _), (shared, z, phi, _) = records()
-    for model, out, given in ((ARX(1, 1, inputs=1, ny=NAMES), y, u), (shared, z, phi)):
-        live, never = Live(model, TRACKER), Live(model, TRACKER)
-        for t in range(20):
-            never.update(out[t], given[t])
-            live.update(out[t], given[t])
-        live.save(tmp_path / "state")
-        for again in (Live.load(tmp_path / "state"), Live.from_bytes(live.to_bytes())):
-            assert type(again) is type(never)
-            for a, b in zip(again.update(out[20], given[20]), never.update(out[20], given[20]), strict=True):
-                np.testing.assert_array_equal(a, b)
-            np.testing.assert_array_equal(again.theta, never.theta)
-            never = copy(live)
 
 
 @pytest.mark.parametrize("case", records(), ids=["joint", "shared"])

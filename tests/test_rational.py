@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftfit.use.rational import rational_model
+from driftfit.use.system_from_path import rational_model
 
 TRUTH = np.array([0.3, 0.7, 0.8, 0.2])
 

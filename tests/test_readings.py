@@ -20,8 +20,8 @@ from driftfit import (
     PolynomialModel,
     Sensor,
 )
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
-from driftfit.run.parallel_lanes import FEWEST
+from driftfit.models.hammerstein_wiener.basis import Polynomial
+from driftfit.run.parallel_lanes import FEWEST_LANES
 
 SENSORS = [Sensor.nominal(0.1), Sensor.outlier(kind="additive"), Sensor.frozen(0.01)]
 """Leaves that put their own predictions into their lags: an unstable one would run away."""
@@ -70,6 +70,6 @@ def test_no_computed_signal_leaves_one_either(model, tracker):
     """
     values = (1e-37, 1e-20, -3e4, -1e5, 1e7, 1e10, 1e20, -1e30, 1e37, 1e101, float("nan"))
     places = [0, 1, 3, 8, 9, 10, 11, 13, 15, 20, 27, 33, 45, 57]
-    found, count = failures(model.bind(1), tracker, places, 170, values, at_once=FEWEST - 1, gate=True)
+    found, count = failures(model.bind(1), tracker, places, 170, values, at_once=FEWEST_LANES - 1, gate=True)
     assert count == 308
     assert not found

@@ -6,7 +6,7 @@ from scipy import signal
 from support import same
 
 from driftfit import ARX, OE, RLS, BoxJenkins, InstrumentalVariables, Live, PolynomialModel, track
-from driftfit.run.parallel_lanes import FEWEST
+from driftfit.run.parallel_lanes import FEWEST_LANES
 
 BJ, THETA = BoxJenkins(1, 1, 1, 1), np.array([1.0, 0.5, 0.9, 0.8])  # b, c, d, f
 
@@ -102,7 +102,7 @@ def test_live_lanes_and_a_saved_stream_give_the_bits_of_the_record(tmp_path):
             live = Live.load(tmp_path / "stream")
         live.update(y[t], u[t])
         assert same(live.theta, run.theta[t]), t
-    count = max(FEWEST, tracker.width) + 1
+    count = max(FEWEST_LANES, tracker.width) + 1
     fleet = track(BJ, tracker, np.stack([y] * count), np.stack([u] * count), by="row")
     assert same(fleet[count - 1].theta, run.theta)
     assert np.isfinite(run.theta).all()

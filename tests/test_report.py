@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Kalman, Regression, track
 from driftfit.cli import app
 from driftfit.run.live.rule import FROZEN, KINDS
-from driftfit.show.page import LONG, svg
+from driftfit.show.page import IMAGE_SAMPLES, svg
 from driftfit.show.report import page
 
 K = Kalman(q=1e-3, r=0.01)
@@ -96,7 +96,7 @@ def test_pictures_take_the_colours_of_the_page(run):
 
 
 def test_long_records_stay_small():
-    T = 4 * LONG
+    T = 4 * IMAGE_SAMPLES
     y, u = arx_record(T, 1)
     text = page(track(ARX(2, 2), K, y, u))
     assert "<image" in text

@@ -12,10 +12,10 @@ from service_support import UNIT, configured, opened
 from test_service_page import PASSWORD, client, service  # noqa: F401  (fixtures)
 
 from driftfit.service.control import Control
-from driftfit.service.page.passwords import hashed, new_token
-from driftfit.service.page.sockets import Sockets
-from driftfit.service.settings.options import UserOptions
-from driftfit.service.sources.incoming import INCOMING
+from driftfit.service.options import UserOptions
+from driftfit.service.page.access import hashed, new_token
+from driftfit.service.page.app import Sockets
+from driftfit.service.sources.http import INCOMING
 
 GATEWAY = [line.split(": ")[1] for line in new_token()]
 ANN = UserOptions("Ann", "operator", PASSWORD)
@@ -56,7 +56,6 @@ def test_units_of_a_sender_are_named_in_every_section(tmp_path):
     assert control._foreign(["p:y", "p:z"])("plant/p") == []
     assert control._foreign([])("plant/q") == []
     control.close()
-    engine.close()
 
 
 def test_a_session_ends_at_its_logout(service, client):  # noqa: F811

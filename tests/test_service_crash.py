@@ -95,4 +95,3 @@ def check(config, home, data):
         mine = [one for one in blocks if one[0] == unit]
         assert all(before[2] < after[1] for before, after in itertools.pairwise(mine))
     assert sum(one[3] for one in blocks) == UNITS * T
-    engine.close()

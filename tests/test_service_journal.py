@@ -2,21 +2,37 @@
 
 import shutil
 import sqlite3
+import time
+from dataclasses import replace
 
 import numpy as np
+import polars as pl
 import pytest
 
 pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
 
-from service_support import HTTP, UNIT, configured, events, feed, message, opened, record, results_of, settled
+from service_support import (
+    HTTP,
+    UNIT,
+    coded,
+    configured,
+    events,
+    feed,
+    message,
+    opened,
+    record,
+    results_of,
+    run_of,
+    settled,
+)
 from typer.testing import CliRunner
 
 from driftfit import track
 from driftfit.cli import app
 from driftfit.service.core.archive import export
-from driftfit.service.core.journal import DAMAGED, NAME, Journal, sum_of
-from driftfit.service.page import history
-from driftfit.service.verify import verify
+from driftfit.service.core.journal import DAMAGED, NAME, Journal, sum_of, verify
+from driftfit.service.page import feed as history
+from driftfit.service.supervisor import rebuild
 
 Y, U = record(400)
 AUDIT = "[service]\naudit = true\n"
@@ -80,7 +96,6 @@ def test_a_damaged_group_is_left_out_and_named(folder):
     rows = [row for row in results_of(engine) if row[0] <= 350]
     assert np.array_equal([row[8] for row in rows], run.theta)
     assert [line.partition(":")[0] for line in verify(folder)[1]] == ["log", "log"]  # its sum, and its link
-    engine.close()
 
 
 @pytest.mark.parametrize(
@@ -88,7 +103,7 @@ def test_a_damaged_group_is_left_out_and_named(folder):
     [("result", "rows", lambda journal: journal.outcomes(0)), ("snapshot", "state", lambda journal: journal.state(1)),
      ("block", "extremes", lambda journal: history.reduced(journal, 1, [], 0.0, 1e9, 5)),
      ("history", "rows", lambda journal: history.samples(journal, 1, [], 0.0, 1e9)),
-     ("history", "rows", lambda journal: history.latest(journal, 1, [])),
+     ("history", "rows", lambda journal: history.newest_blocks(journal, 1, [])),
      ("event", "detail", lambda journal: [*journal.rows("event")])],
     ids=["result", "snapshot", "block", "history", "latest", "event"],
 )  # fmt: skip
@@ -208,3 +223,60 @@ def test_a_folder_without_a_journal_is_named(tmp_path):
     done = CliRunner().invoke(app, ["journal", "verify", str(tmp_path)])
     assert done.exit_code == 2
     assert "driftfit.db" in done.output
+
+
+def test_old_journals_become_parquet(tmp_path, monkeypatch):
+    y, u = record(100)
+    config = configured()
+    engine = opened(replace(config, service=replace(config.service, keep=-1.0)), tmp_path)
+    for k in range(0, 100, 10):
+        feed(engine, message("plant/a", range(k, k + 10), y[k : k + 10], u[k : k + 10]))
+    engine.act("a", {"do": "hold", "on": True, "who": "me", "why": "test"})
+    engine.step(0.0)
+    assert export(tmp_path, engine.journal.first_needed(), time.time() + 1) == 0  # the states are not stored
+    engine._store_states(everything=True)
+    engine._commit()
+    monkeypatch.setattr("driftfit.service.core.archive.SEARCH_SECONDS", -1.0)
+    for _ in range(100):
+        engine.step(0.0)
+        if not engine.journal.rows_of(1)[0]:
+            break
+        time.sleep(0.05)
+    table = pl.concat(pl.read_parquet(file) for file in sorted((tmp_path / "journal").glob("*.parquet")))
+    samples = table.filter(pl.col("action").is_null())
+    assert samples["time"].to_list() == list(range(100))
+    run = run_of(*np.array(samples["values"].to_list()).T)
+    assert np.array_equal(run.theta[-1], engine.units.get(1).live.theta)
+    engine.close()
+    engine = opened(configured(), tmp_path)
+    assert engine.next == 102
+    feed(engine, message("plant/a", [100.0], [0.0], [0.0]))
+    assert engine.units.get(1).counts["samples"] == 101
+
+
+OLDER = {
+    "block": "unit, first, last, start, stop, count, x'90' as rows, extremes",
+    "event": "rowid as id, number, unit, at, kind, detail",
+}
+"""Columns of the older format, where they are not those of today without the sum."""
+
+
+def test_a_journal_of_an_older_format_is_refused_and_rebuilt(tmp_path):
+    y, u = coded()
+    engine = opened(configured(), tmp_path)
+    feed(engine, message("plant/a", range(100), y, u))
+    engine.close()
+    with sqlite3.connect(tmp_path / "driftfit.db") as db:
+        for table in ("meta", "unit", "log", "result", "program", "snapshot", "block", "event", "position"):
+            today = [name for _, name, *_ in db.execute(f"pragma table_info({table})") if name != "sum"]
+            db.execute(f"create table older as select {OLDER.get(table, ', '.join(today))} from {table}")
+            db.execute(f"drop table {table}")
+            db.execute(f"alter table older rename to {table}")
+        db.execute("drop table chain")
+        db.execute("update meta set value = '2' where key = 'format'")
+    db.close()
+    with pytest.raises(ValueError, match=r"older driftfit.*--rebuild"):
+        opened(configured(), tmp_path)
+    rebuild(tmp_path)
+    engine = opened(configured(), tmp_path)
+    assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])

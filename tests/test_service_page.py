@@ -1,14 +1,12 @@
 """The page and the HTTP interface: who may do what, bounds, downsampling, and a real browser."""
 
 import asyncio
-import http.server
 import io
 import json
 import os
 import random
 import re
 import signal
-import threading
 import time
 import urllib.error
 import urllib.request
@@ -22,15 +20,29 @@ pytest.importorskip("starlette", reason="the page needs driftfit[serve]")
 pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
 
 import browser
-from service_support import configured, feed, free_port, message, opened, record, settled, started, stopped
+from service_support import (
+    Receiver,
+    configured,
+    feed,
+    free_port,
+    message,
+    opened,
+    receiver,
+    record,
+    serving,
+    settled,
+    started,
+    stopped,
+    until,
+)
 
 from driftfit.service.control import Control
 from driftfit.service.core.journal import sum_of
-from driftfit.service.page import history
+from driftfit.service.core.results import extremes_of
+from driftfit.service.options import PageOptions, UserOptions
+from driftfit.service.page.access import Sessions, hashed, new_token, password_fits, token_fits
 from driftfit.service.page.app import Page
-from driftfit.service.page.feed import Feed
-from driftfit.service.page.passwords import Sessions, hashed, new_token, password_fits, token_fits
-from driftfit.service.settings.options import PageOptions, UserOptions
+from driftfit.service.page.feed import Feed, reduced
 
 TOKEN, HASH = (line.split(": ")[1] for line in new_token())
 WATCHER = [line.split(": ")[1] for line in new_token()]
@@ -89,7 +101,6 @@ def service(tmp_path_factory):
     found.rank()
     yield engine, found, folder
     control.close()
-    engine.close()
 
 
 @pytest.fixture
@@ -144,7 +155,6 @@ def test_units_that_fell_silent_before_the_page_started_are_shown_as_silent(tmp_
     for pump in "abc":
         (one,) = json.loads(ask("GET", f"/api/units?search={pump}")[1])["units"]
         assert (one["unit"], one["silent"]) == (pump, pump != "c")
-    engine.close()
 
 
 def test_exports_and_history_are_the_samples(service, client):
@@ -177,16 +187,15 @@ def test_a_million_samples_are_reduced_by_blocks(tmp_path):
     for k in range(2000):
         values = np.column_stack([np.arange(64.0) + 64 * k, rng.normal(size=(64, 8))])
         row = (1, 100 + 64 * k, 163 + 64 * k, values[0, 0].item(), values[-1, 0].item(), 64)
-        row = (*row, history.extremes_of(values).tobytes())
+        row = (*row, extremes_of(values).tobytes())
         db.execute("insert into block values (?, ?, ?, ?, ?, ?, ?, ?)", (*row, sum_of(*row)))
     db.execute("commit")
     begun = time.process_time()
-    answer = history.reduced(engine.journal, 1, [], -np.inf, np.inf, 500)
+    answer = reduced(engine.journal, 1, [], -np.inf, np.inf, 500)
     assert time.process_time() - begun < 2.0
     assert answer["count"] == 128_000
     assert len(answer["mean"][1]) == 500
     assert abs(np.mean(answer["mean"][1])) < 0.02
-    engine.close()
 
 
 def test_a_program_on_this_machine_needs_no_password_and_a_foreign_page_cannot_act(service, client):
@@ -320,50 +329,27 @@ def test_the_demo_in_a_browser(tmp_path):
         process.stderr.close()
 
 
-class Phone(http.server.BaseHTTPRequestHandler):
-    got = []  # noqa: RUF012
-
-    def do_POST(self):
-        self.got.append((self.headers["title"], self.rfile.read(int(self.headers["content-length"])).decode()))
-        self.send_response(200)
-        self.end_headers()
-
-    def log_message(self, *args):
-        pass
-
-
 def test_the_docs_lead_to_an_alarm_on_a_phone(tmp_path):
     """The file and the program of the page, word for word but for the addresses, and quicker."""
     pytest.importorskip("uvicorn", reason="the page needs driftfit[serve]")
     chapter = (Path(__file__).parent.parent / "docs" / "service.md").read_text()
     chapter = chapter[chapter.index("## An alarm on a phone") : chapter.index("## Your own plant")]
     (settings,), (program,) = (re.findall(f"```{kind}\n(.*?)```", chapter, re.S) for kind in ("toml", "py"))
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Phone)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    here, port = f"http://127.0.0.1:{server.server_port}/", free_port()
-    (tmp_path / "pump.toml").write_text(settings.replace("https://ntfy.sh/choose-a-long-name", here))
-    process = started(port, str(tmp_path / "pump.toml"), "--folder", str(tmp_path / "data"))
+    file, sent = tmp_path / "pump.toml", []
+    with receiver() as here:
+        file.write_text(settings.replace("https://ntfy.sh/choose-a-long-name", here))
+        with serving(str(file), "--folder", str(tmp_path / "data")) as port:
+            address = f"http://127.0.0.1:{port}"
 
-    def wait(seconds):
-        """Until the limits of the alarms are known, after the ten minutes of the reference."""
-        until, address = time.monotonic() + 60.0, f"http://127.0.0.1:{port}/api/events"
-        while len(sent) == 10 and b"calibrated" not in urllib.request.urlopen(address).read():
-            assert time.monotonic() < until
-            time.sleep(0.1)
+            def wait(seconds):
+                """Until the limits of the alarms are known, after the ten minutes of the reference."""
+                if len(sent) == 10:
+                    until(lambda: b"calibrated" in urllib.request.urlopen(f"{address}/api/events").read(), 60.0)
 
-    sent = []
-    try:
-        random.seed(1)
-        text = program.replace("http://127.0.0.1:8765", f"http://127.0.0.1:{port}").replace("time.sleep", "wait")
-        exec(text, {"wait": wait, "print": sent.append})
-        until = time.monotonic() + 30.0
-        while not Phone.got and time.monotonic() < until:
-            time.sleep(0.05)
-    finally:
-        stopped(process)
-        process.stderr.close()
-        server.shutdown()
-        server.server_close()
+            random.seed(1)
+            text = program.replace("http://127.0.0.1:8765", address).replace("time.sleep", "wait")
+            exec(text, {"wait": wait, "print": sent.append})
+            until(lambda: Receiver.got)
     assert any(
-        who == "pump 1" and result.startswith("pump 1: band alarm, b1[pressure] is ") for who, result in Phone.got
+        who == "pump 1" and text.startswith("pump 1: band alarm, b1[pressure] is ") for _, text, who in Receiver.got
     )

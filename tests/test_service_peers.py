@@ -125,7 +125,6 @@ def test_mqtt_through_an_absence_of_the_broker(tmp_path):
     received = {one["number"]: one for one in got["received/7"]}
     assert sorted(one["time"] for one in received.values()) == list(range(300))
     assert next(one for one in received.values() if one["time"] == 299.0)["theta"]["a1"] == run.theta[-1, 0]
-    engine.close()
 
 
 @needs("paho")
@@ -362,7 +361,7 @@ def test_replay(tmp_path):
 
 
 def test_a_request_that_one_of_two_units_takes_is_not_refused(tmp_path):
-    from driftfit.service.sources.incoming import INCOMING
+    from driftfit.service.sources.http import INCOMING
 
     config = configured(UNIT + UNIT.replace('"y"', '"p"').replace('["u"]', '["q"]'), source=HTTP)
     engine = opened(config, tmp_path)
@@ -375,7 +374,7 @@ def test_a_request_that_one_of_two_units_takes_is_not_refused(tmp_path):
 
 
 def test_http_samples_are_answered_when_they_are_in_the_journal(tmp_path):
-    from driftfit.service.sources.incoming import INCOMING
+    from driftfit.service.sources.http import INCOMING
 
     config = configured(source=HTTP)
     engine = opened(config, tmp_path)
@@ -411,4 +410,3 @@ def test_http_samples_are_answered_when_they_are_in_the_journal(tmp_path):
     names = Names(engine.journal)
     names.read()
     assert names.about["a"]["names"] == ["a1", "b1[u]"]
-    engine.close()

@@ -18,11 +18,10 @@ from typer.testing import CliRunner
 from driftfit import ARX, AdaptiveKalman, Bank, Change, Kalman, Sensor
 from driftfit.cli import app
 from driftfit.parsing.settings import parse_model, tracker_of
-from driftfit.service.settings.config import ProblemsError, parse, read
-from driftfit.service.settings.matching import Pattern
-from driftfit.service.settings.options import Secret
-from driftfit.service.sources.incoming import decoded
-from driftfit.service.sources.samples import decode, number, seconds
+from driftfit.service.config import ProblemsError, parse, read
+from driftfit.service.options import Pattern, Secret
+from driftfit.service.sources.contract import decode, number, seconds
+from driftfit.service.sources.http import decoded
 from driftfit.service.sources.sparkplug import REBIRTH, Sparkplug, UnknownAliasError, rebirth_topic
 
 

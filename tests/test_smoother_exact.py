@@ -6,7 +6,7 @@ import pytest
 from scipy.linalg import solveh_banded
 
 from driftfit import ARX, FLS, RLS, AugmentedFLS, HammersteinWiener, Kalman, Regression, track
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.smooth import exact
 from driftfit.smooth.parts.walk import DRIFT, WEIGHT, Walk, Y, room_for_signals
 

@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import minimize
 
 from driftfit import ARX, FLS, RLS, AugmentedFLS, HammersteinWiener, Kalman, Live, Regression, track
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.smooth.augmented import augmented
 from driftfit.smooth.huber import huber
 from driftfit.smooth.total_variation import total_variation

@@ -12,7 +12,7 @@ from driftfit import ARX, Kalman, Live, track
 from driftfit.data import late
 from driftfit.data.late import LATE, RELEASED, REPEATED, UNTIMED, WAITING, HoldBack, sort_out
 from driftfit.data.record import Known, Records
-from driftfit.run.layout import MANY, packed, unpacked
+from driftfit.run.layout import SPARSE_WORDS, packed, unpacked
 from driftfit.run.parallel_lanes import advance
 from driftfit.run.program import Program
 from driftfit.run.warm_start import End
@@ -114,12 +114,12 @@ def test_foreign_and_damaged_states_are_refused():
 
 
 def test_many_words_leave_out_those_that_are_zero():
-    words = np.zeros(MANY + 3, np.int64)
-    words[[0, 8, MANY + 2]] = -1, 5, 2**62
+    words = np.zeros(SPARSE_WORDS + 3, np.int64)
+    words[[0, 8, SPARSE_WORDS + 2]] = -1, 5, 2**62
     data = packed(bytes(8), words)
     assert len(data) == 24 + -(-len(words) // 8) + 3 * 8
     assert same(unpacked(data)[1], words)
-    full = np.arange(1, MANY + 4)
+    full = np.arange(1, SPARSE_WORDS + 4)
     assert len(packed(bytes(8), full)) == 24 + full.nbytes
     assert same(unpacked(packed(bytes(8), full))[1], full)
 

@@ -36,7 +36,7 @@ from driftfit import (
     StateSpace,
     track,
 )
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.basis import Polynomial
 
 # that codes are used is the promise; `test_gate_surfaces` is about the warning of them
 pytestmark = pytest.mark.filterwarnings("ignore:track. .*fault code:driftfit.DataWarning")

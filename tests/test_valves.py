@@ -11,13 +11,13 @@ from support import same
 
 from driftfit import Kalman, Live, track
 from driftfit.judge.regressors import regressors
-from driftfit.models.hammerstein_wiener.curves.basis import DeadZone, PiecewiseLinear, Polynomial, Saturation
+from driftfit.models.hammerstein_wiener.basis import PiecewiseLinear, Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.results.constant_system import fit_constant
-from driftfit.models.hammerstein_wiener.results.free_run import free_run
-from driftfit.models.hammerstein_wiener.separation.least_squares import refine
-from driftfit.models.hammerstein_wiener.separation.paths import split
+from driftfit.models.hammerstein_wiener.separation import LeastSquares, split
+from driftfit.models.hammerstein_wiener.thresholds import DeadZone, Saturation
 from driftfit.systems.arc_furnace import THRESHOLDS, valve
+from driftfit.use.hammerstein_wiener.constant_system import fit_constant
+from driftfit.use.hammerstein_wiener.free_run import free_run
 
 VALVES = HammersteinWiener(1, [2, 1], nk=[1, 2], input=[PiecewiseLinear((-0.5, 0.5)), Saturation(3.0, start=1.0)])
 K = Kalman(q=0.0, r=4e-4, p0=1e2)
@@ -39,7 +39,8 @@ def record(seed=0, T=800, limits=(-1.0, 1.0)):
 def phi_of(thresholds, y, u, t):
     """The regressors of sample t, written out."""
     f = PiecewiseLinear((-0.5, 0.5)).value(u[:, 0])
-    heat = Saturation(3.0).known(*thresholds).value(u[t - 2, 1])
+    x = u[t - 2, 1]
+    heat = Saturation(3.0).split(x, x >= thresholds[0], x <= thresholds[1])
     first, more = (
         [y[t - 1], -f[t - 1, 0], -f[t - 2, 0], -heat[0]],
         [-f[t - 1, 1], -f[t - 2, 1], -f[t - 1, 2], -f[t - 2, 2]],
@@ -88,8 +89,8 @@ def test_standard_deviations_of_unit_norm_are_those_of_draws():
     root = 0.01 * (np.eye(structure.n) + 0.3 * rng.normal(size=(structure.n, structure.n)))
     drawn = theta + rng.normal(size=(draws, structure.n)) @ root.T
     zeta = np.tile(np.r_[-0.8, *b, *c], (draws, 1))
-    truth, (cov, cost) = zeta[0].copy(), (np.empty((draws, 10, 10)), np.empty(draws))
-    refine(drawn, np.broadcast_to(root @ root.T, (draws, 10, 10)).copy(), (1, 1), structure.sizes, zeta, cov, cost)
+    truth, P = zeta[0], np.broadcast_to(root @ root.T, (draws, 10, 10))
+    zeta, cov, cost = LeastSquares(structure).refine(drawn, P, zeta)
     assert_allclose(np.linalg.norm(zeta[:, 4:7], axis=1), 1.0, rtol=1e-12)
     size = np.mean((zeta - truth) ** 2, axis=0) / np.mean(np.einsum("tii->ti", cov), axis=0)
     assert_allclose(size, 1.0, atol=0.08)  # 3.6 standard deviations of a mean of 4000 chi-squares
@@ -118,7 +119,6 @@ def test_a_valve_ends_where_it_is_fully_open():
         run = track(HammersteinWiener(1, 2, input=zone), Kalman(q=1e-8, r=1e-4, p0=1e2), y, u)
         found[limit] = run.blocks(input="c1").c[-1, 1:]
         x = np.array([-20.0, -3.0, 0.5, 3.0, 20.0])
-        assert_allclose(zone.known(1.0, -1.0).value(x) @ [1.0, 1.0, -1.0], valve(x, limit=limit or np.inf))
         assert_allclose(zone.split(x, x >= 1.0, x <= -1.0) @ [1.0, 1.0, -1.0], valve(x, limit=limit or np.inf))
     assert_allclose(found[10.0], THRESHOLDS, atol=0.01)
     assert np.abs(found[None] - THRESHOLDS).min() > 0.5

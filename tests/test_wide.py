@@ -5,9 +5,9 @@ import pytest
 
 from driftfit import HammersteinWiener, Kalman, Live, Regression, track
 from driftfit.engine.kernel import Driver
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
-from driftfit.run.parallel_lanes import FEWEST, width_of
-from driftfit.run.program import MOST, Program
+from driftfit.models.hammerstein_wiener.basis import Polynomial
+from driftfit.run.parallel_lanes import FEWEST_LANES, width_of
+from driftfit.run.program import WIDEST_LANES, Program
 from driftfit.trackers.parts.covariance import reduce_covariance, symmetric_product
 
 N = 27
@@ -72,16 +72,17 @@ K = Kalman(q=1e-3, r=0.01)
 
 
 @pytest.mark.parametrize(
-    ("tracker", "n", "lanes"), [(K, MOST, 32), (K, MOST + 1, 1), (Kalman(q=1e-3, r=0.01, form="sqrt"), 2, 1)]
+    ("tracker", "n", "lanes"),
+    [(K, WIDEST_LANES, 32), (K, WIDEST_LANES + 1, 1), (Kalman(q=1e-3, r=0.01, form="sqrt"), 2, 1)],
 )
 def test_lanes_of_a_fleet_have_the_bits_of_single_runs(tracker, n, lanes):
     rng = np.random.default_rng(3)
-    u, y = rng.normal(size=(FEWEST, 40, n)), rng.normal(size=(FEWEST, 40))
+    u, y = rng.normal(size=(FEWEST_LANES, 40, n)), rng.normal(size=(FEWEST_LANES, 40))
     y[2, 5:9], u[3, 30] = np.nan, np.nan
-    assert width_of(Program(Regression(n), tracker), FEWEST) == lanes
+    assert width_of(Program(Regression(n), tracker), FEWEST_LANES) == lanes
     if lanes > 1:
         fleet = track(Regression(n), tracker, y, u, by="row")
-        for k in range(FEWEST):
+        for k in range(FEWEST_LANES):
             run = track(Regression(n), tracker, y[k], u[k])
             for name in ("theta", "std", "innovation_std"):
                 assert np.array_equal(getattr(fleet[k], name), getattr(run, name), equal_nan=True)

@@ -120,7 +120,7 @@ def lost_table(cells: Sequence[Cell]) -> str:
     rows = [[s, kind, name, f"{ratio:.2f}", f"{100.0 * wins:.0f} %"] for s, kind, name, ratio, wins in lost]
     causes = [f"* **{name}.** {CAUSES[name]}" for name in dict.fromkeys(s for s, *_ in lost) if name in CAUSES]
     text = markdown(["scenario", "model", "better", f"RMSE / {REFERENCE}", "runs won"], rows)
-    return "\n\n".join([text, "\n".join(causes), "Measured by `benchmarks/losses.py`."])
+    return "\n\n".join([text, "\n".join(causes)])
 
 
 def real_table(result: Result) -> str:

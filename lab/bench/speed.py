@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.regression import Regression
 from driftfit.streams import Live

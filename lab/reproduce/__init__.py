@@ -23,6 +23,11 @@ class Claim(NamedTuple):
         return "\n".join(indent(fill(text, width), by) for text in (self.measured, f"Rule: {self.rule}"))
 
 
+def bound(x: float) -> str:
+    """What an error is at most, to one digit: those of rounding differ between processors."""
+    return f"{max(x, 1e-9):.0e}"
+
+
 def found() -> list[str]:
     """Their names on the command line."""
     return sorted(module.name.replace("_", "-") for module in iter_modules(__path__))

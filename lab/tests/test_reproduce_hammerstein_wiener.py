@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from driftfit.systems.hammerstein_wiener import example
 from driftfit.trackers.kalman import Kalman
 from driftfit.tracking import track
-from lab.program import app
 from lab.reproduce import found as reproductions
 from lab.reproduce.hammerstein_wiener import claims, runs, tables
 from lab.reproduce.hammerstein_wiener.figures import errors, parameters
@@ -101,15 +99,3 @@ def test_the_bias_is_the_mean_error():
     assert sizes[40.0] == pytest.approx(0.0017032, rel=1e-3)
     assert sizes[30.0] == pytest.approx(0.018280, rel=1e-3)
     assert np.median(np.linalg.norm(few[40.0], axis=1)) == pytest.approx(0.0059080, rel=1e-3)
-
-
-def test_the_command_runs():
-    result = CliRunner().invoke(app, ["reproduce", "hammerstein-wiener", "--quick"])
-    assert result.exit_code == 0, result.output
-    printed = " ".join(result.output.split())
-    assert "1 seed; largest deviation" in printed
-    assert "Estimates reach a small error from any start: holds" in printed
-    assert "A higher order is more accurate (example 4): not judged with one order" in printed
-    for example_, _, what, *_ in tables.ROWS:
-        assert f"{example_} {what}" in printed
-    assert "ns of the filter" in printed

@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from driftfit.systems.jumps import jumping, poles
-from lab.program import app
 from lab.reproduce.hypotheses.contests import contests
 from lab.reproduce.hypotheses.scores import measure
 
@@ -52,10 +50,3 @@ def test_records_are_what_they_say():
     assert np.ptp(record.y[record.bad]) > 0.0
     assert np.abs(np.diff(record.theta, axis=0)).max(axis=1)[~np.isin(np.arange(1, 600), record.jumps)].max() < 0.02
     assert jumping(3).jumps.min() > 30
-
-
-def test_the_command_prints_a_table():
-    result = CliRunner().invoke(app, ["reproduce", "hypotheses", "--quick", "--only", "regimes"])
-    assert result.exit_code == 0, result.output
-    assert "IMM Markov" in result.output
-    assert "RMSE against the reference: median" in result.output

@@ -12,25 +12,19 @@ from driftfit.models.base import Model
 from driftfit.models.continuous.process import process_model
 from driftfit.models.continuous.transfer import ContinuousTransfer
 from driftfit.models.equation import Equation
-from driftfit.models.hammerstein_wiener.curves.basis import (
+from driftfit.models.hammerstein_wiener.basis import (
+    BSpline,
     Chebyshev,
-    DeadZone,
+    Functions,
     Legendre,
+    PiecewiseLinear,
     Polynomial,
-    Saturation,
     Sigmoid,
 )
-from driftfit.models.hammerstein_wiener.curves.curve import Functions
-from driftfit.models.hammerstein_wiener.curves.splines import BSpline, PiecewiseLinear
+from driftfit.models.hammerstein_wiener.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.results.diagnostics import diagnose_blocks
-from driftfit.models.hammerstein_wiener.results.drift_ratios import track_ratios
-from driftfit.models.hammerstein_wiener.results.free_run import free_run
-from driftfit.models.hammerstein_wiener.results.hybrid_start import hand_off
-from driftfit.models.hammerstein_wiener.results.product_drift import track_products
-from driftfit.models.hammerstein_wiener.results.shared_curves import shared_curves
-from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
-from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
+from driftfit.models.hammerstein_wiener.output_error import OutputError
+from driftfit.models.hammerstein_wiener.thresholds import DeadZone, Saturation
 from driftfit.models.polynomial import ARMAX, OE, BoxJenkins, PolynomialModel
 from driftfit.models.regression import Regression
 from driftfit.models.state_space import StateSpace
@@ -63,8 +57,9 @@ from driftfit.tune.frontier import frontier
 from driftfit.tune.pool import pool
 from driftfit.tune.tune import tune
 from driftfit.use import prepare
-from driftfit.use.rational import rational_model
-from driftfit.use.system_from_path import static_curve
+from driftfit.use.hammerstein_wiener.diagnostics import diagnose_blocks
+from driftfit.use.hammerstein_wiener.free_run import free_run
+from driftfit.use.system_from_path import rational_model, static_curve
 
 __all__ = [
     "ARMAX",
@@ -124,7 +119,6 @@ __all__ = [
     "free_run",
     "frontier",
     "grid",
-    "hand_off",
     "huber",
     "piecewise",
     "plot_tree",
@@ -134,11 +128,8 @@ __all__ = [
     "rational_model",
     "segment",
     "select",
-    "shared_curves",
     "static_curve",
     "total_variation",
     "track",
-    "track_products",
-    "track_ratios",
     "tune",
 ]

@@ -4,7 +4,7 @@ from driftfit.engine.drivers import ModelSteps, TrackerSteps, diagonal, no_varia
 from driftfit.engine.kernel import Array, State, Step, exp, kernel, log, nothing
 from driftfit.engine.settings import Settings, numbers, one_of, vector, whole
 from driftfit.models.base import Model
-from driftfit.models.hammerstein_wiener.curves.curve import Basis
+from driftfit.models.hammerstein_wiener.basis import Basis
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.parts.covariance import prediction
 from driftfit.trackers.parts.varying_drift import read_drift

@@ -11,9 +11,7 @@ from driftfit.judge.alarms.detect import Alarms, detect
 from driftfit.judge.diagnose import Diagnosis, diagnose
 from driftfit.judge.segment import Segmentation, segmented
 from driftfit.judge.verdict import Verdict, verdict
-from driftfit.models.hammerstein_wiener.results.plots import plot_blocks
-from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
-from driftfit.models.hammerstein_wiener.separation.paths import Blocks
+from driftfit.models.hammerstein_wiener.blocks import Blocks
 from driftfit.run import result
 from driftfit.run.live.rule import AlarmRule
 from driftfit.show.plots import plot_track
@@ -21,14 +19,17 @@ from driftfit.show.report import report
 from driftfit.show.summary import Summary, cell_of, summarise
 from driftfit.smooth.shared_theta import SmoothedShared
 from driftfit.smooth.smoothed import Smoothed
-from driftfit.trackers.bank.results.decided_path import EventSmoothed
+from driftfit.trackers.bank.results.events import Event
 from driftfit.trackers.bank.results.results import Hypotheses
+from driftfit.trackers.bank.results.smoothed import SmoothedMixture
 from driftfit.tune.refine import refine
 from driftfit.use import simulate, system
 from driftfit.use.constrained import Constrained, constrain
 from driftfit.use.conversion import Transfer, transfer
 from driftfit.use.crossing import Crossing, crossing
 from driftfit.use.forecast import Forecast, forecast
+from driftfit.use.hammerstein_wiener.block_plots import plot_blocks
+from driftfit.use.hammerstein_wiener.run_blocks import blocks_of
 from driftfit.use.simulate import Prediction
 from driftfit.use.system import FrequencyResponse, LongRun, Response
 from driftfit.use.system_plots import plot_system, plot_validation
@@ -83,7 +84,7 @@ class Track(result.Track, Exported, public=True):
 
     def smooth(
         self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm"
-    ) -> Smoothed | EventSmoothed:
+    ) -> Smoothed | SmoothedMixture:
         """Every theta_t estimated from the whole record, past and future: the exact fixed-interval smoother.
 
         The regressors that the filter used are held fixed. keep="fit" also stores what residuals and leverages are
@@ -92,16 +93,24 @@ class Track(result.Track, Exported, public=True):
         instead of with time; the samples are sorted by it, smoothed in that order, and returned in time order. This
         needs a tracker whose drift is given.
         ``undetermined``: the value of parameters that the record does not determine, whose std is inf: "min_norm", the
-        solution nearest to theta0; "nan"; or "raise". A `Bank` is smoothed given its events
-        (`driftfit.trackers.bank.results.decided_path.EventSmoothed`). ValueError for other trackers that do not
-        describe a random walk in Gaussian noise. Of outputs that share one theta, theta is (T, n) and residuals are
+        solution nearest to theta0; "nan"; or "raise". A `Bank` is smoothed over all its
+        hypotheses (`driftfit.trackers.bank.results.smoothed.SmoothedMixture`). ValueError for other trackers that do
+        not describe a random walk in Gaussian noise. Of outputs that share one theta, theta is (T, n) and residuals are
         (T, ny).
         """
         if self.tracker.weighs and self.start is None:
-            return Hypotheses(self.rows).smooth()
+            return Hypotheses(self.rows).smoothed
         if self.rows_per_instant > 1:
             return SmoothedShared.of_shared(self, keep, order_by, undetermined)
         return Smoothed.of(self, keep, order_by, undetermined)
+
+    def changes(self, threshold: float = 0.5) -> list[Event]:
+        """The changes of parameters that are more probable than the threshold, given the whole record.
+
+        Each has the interval that contains its date with probability 0.95, its probability, the most likely of the
+        changes of the `Bank`, and by how much every parameter moved. ValueError for trackers without hypotheses.
+        """
+        return Hypotheses(self.rows).changes(threshold)
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
         """theta and y at the h nominal samples after the record, with future inputs u (h,), (h, m) or (h, ny, m)."""
@@ -126,8 +135,8 @@ class Track(result.Track, Exported, public=True):
         """Coefficients of the blocks of a `HammersteinWiener` model, sample by sample: ``.a``, ``.b``, ``.c``, ``.d``.
 
         ``method`` is "average", "svd", "svd-joint" or "gls" (with standard deviations), see
-        `driftfit.models.hammerstein_wiener.separation.separate`; ``input``, ``output`` and ``at`` choose the gauge,
-        see `driftfit.models.hammerstein_wiener.separation.paths.Blocks.gauge`; None is "unit", or "c1" for a tracker
+        `driftfit.models.hammerstein_wiener.separation`; ``input``, ``output`` and ``at`` choose the gauge,
+        see `driftfit.models.hammerstein_wiener.blocks.Blocks.gauge`; None is "unit", or "c1" for a tracker
         of the minimal parameters.
         """
         return blocks_of(self, method, input, output, at)

@@ -6,7 +6,8 @@ from functools import cached_property
 from typing import Any
 
 from driftfit.judge.structures import shared_streams
-from driftfit.models.hammerstein_wiener.separation.paths import Groups, Separator
+from driftfit.models.hammerstein_wiener.blocks import Separator
+from driftfit.models.hammerstein_wiener.separation import Groups
 from driftfit.run.live import live
 from driftfit.trackers.bank.results.live_results import LiveHypotheses
 from driftfit.use.constrained import Constrained, constrain_stream

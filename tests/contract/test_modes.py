@@ -106,7 +106,7 @@ def test_lanes_do_not_touch_each_other(model, tracker):
 def test_chunks_do_not_show(model, tracker, monkeypatch):
     y, u = damaged(*arx_record(T, 4))
     whole = track(model, tracker, y, u, **factors(1))
-    for name, value in (("CHUNK", 37), ("FEW", 37), ("PART", 0.0)):
+    for name, value in (("PROGRESS_SAMPLES", 37), ("FIRST_PART", 37), ("PART_SECONDS", 0.0)):
         monkeypatch.setattr(sys.modules["driftfit.run.program"], name, value)
     assert_same_run(whole, track(model, tracker, y, u, **factors(1)))
 

@@ -154,7 +154,7 @@ def worst_ratio(found: dict[str, Array]) -> tuple[float, str]:
 def main(
     seeds: Annotated[int, typer.Option(help="Noise seeds per example; the reference has 100.")] = SEEDS,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Three seeds and short records, no search for weights.")
+        bool, typer.Option("--quick", help="A part of the numbers: no search for weights, and no times.")
     ] = False,
     figures: Annotated[Path | None, typer.Option(help="Folder for the pictures.")] = None,
 ) -> None:
@@ -163,21 +163,22 @@ def main(
     from lab.reproduce.fls import figures as pictures
 
     out = Console(width=150, highlight=False)
-    numbers = range(3 if quick else seeds)
+    numbers = range(seeds)
     found = {name: measure(name, MU[name], numbers) for name in progress(EXAMPLES, "examples", transient=True)}
     out.print(table_of_medians(found))
     ratio, where = worst_ratio(found)
     out.print(f"{len(numbers)} seeds; largest deviation from the reference {100 * ratio:.1f} % ({where})\n")
+    times = None
     if not quick:
         out.print(selectors.table_of_examples())
         out.print(selectors.table_of_walks())
         out.print(
             table_of_weights({n: best_weights(n, numbers) for n in progress(EXAMPLES, "weights", transient=True)})
         )
-    times = cost.measure((50, 100) if quick else cost.LENGTHS)
-    out.print(cost.table(times))
+        times = cost.measure()
+        out.print("\n", cost.table(times), "\n", sep="")
     claims.show(out, claims.all_claims(found, numbers, times))
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
         pictures.draw(figures, numbers)
-        cost.plot(times).savefig(figures / "fls_paper_cost.png", dpi=80)
+        cost.plot(times or cost.measure((50, 100))).savefig(figures / "fls_paper_cost.png", dpi=80)

@@ -11,10 +11,9 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from driftfit.engine.kernel import Array
-from driftfit.models.hammerstein_wiener.curves.basis import Legendre
+from driftfit.models.hammerstein_wiener.basis import Legendre
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.separation.paths import empty
-from driftfit.models.hammerstein_wiener.separation.separate import METHODS, separate
+from driftfit.models.hammerstein_wiener.separation import METHODS, split
 from driftfit.trackers.kalman import Kalman
 from driftfit.tracking import track
 
@@ -45,11 +44,7 @@ def measure(
         y, u = rng.uniform(-3.0, 3.0, (2, samples))
         xi = rng.normal(size=(samples, model.structure.n_x))
         theta: Array = model.structure.products(xi) + 0.01 * rng.normal(size=(samples, model.n))
-        groups, quality = empty(model, samples)
-        parts = (model.structure.sizes, model.rise, groups, quality)
-        row = {}
-        for place, method in enumerate(METHODS[:3]):
-            row[method] = least(partial(separate, theta, (na, n_out, place), *parts), samples)
+        row = {method: least(partial(split, model, theta, method), samples) for method in METHODS[:3]}
         if model.n < 30:
             tracker = Kalman(q=1e-3, r=1.0, p0=1e2)
             row["filter"] = least(partial(track, model, tracker, y, u), samples)

@@ -8,23 +8,22 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.results import Track
+from driftfit.smooth import mixture
 from driftfit.smooth.piecewise import piecewise
 from driftfit.systems.jumps import MODEL, START, Jumping, jumping
 from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.bank.reduction import Beam, Decide
-from driftfit.trackers.bank.results.decided_path import problem_of
-from driftfit.trackers.bank.results.given_steps import solve
+from driftfit.trackers.bank.results.smoothed import problem_of
 from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.kalman import Kalman
 from driftfit.tracking import track
 from lab.reproduce.hypotheses.contests import CHANGES, P0, R, bank
 from lab.reproduce.hypotheses.scores import pooled
 
-STEPS = np.array([change.increments(3)[0] for change in CHANGES])
 SMOOTHING = {
     "filter, Decide d=3": 0.295, "RTS with decided events": 0.171, "RTS with true events": 0.054,
     "segments, least squares, decided events": 0.188, "RTS of one KF": 0.282, "filter, Beam(9)": None,
-    "RTS with the events of Beam(9)": None,
+    "over all hypotheses": None,
 }  # fmt: skip
 """Reference values of the RMSE, of fifty records."""
 SIGMAS = (0.1, 0.3, 1.0)
@@ -38,7 +37,7 @@ NOISE = {
 
 def given(run: Track, kinds: Array) -> Array:
     """The smoothed path if change ``kinds[t]`` happened before sample t."""
-    return solve(problem_of(run, [])._replace(Q=STEPS[kinds]))[0]
+    return mixture.smooth(problem_of(run, [], kinds)).theta
 
 
 def paths(record: Jumping) -> dict[str, Array]:

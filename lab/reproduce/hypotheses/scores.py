@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ from lab.reproduce.hypotheses.contests import Contest, Entry
 
 REACH, QUIET = 20, 50
 """Samples after a jump that belong to it, and after which the path counts as steady."""
+recorded = cache(jumping)
+"""Records, which are the same for all rows of a table."""
 HEADS = ("RMSE", "+-", "after", "steady", "det", "delay", "FA", "log p", "NEES/n", "leaves")
 """+- is the standard error of the RMSE over records."""
 
@@ -119,7 +122,7 @@ def measure(contest: Contest, name: str, runs: int) -> Measured:
     """The row of a table."""
     entry = contest.entries[name]
     seeds = range(contest.offset, contest.offset + runs)
-    scores = [score(entry, jumping(seed, contest.T, contest.fault, contest.K)) for seed in seeds]
+    scores = [score(entry, recorded(seed, contest.T, contest.fault, contest.K)) for seed in seeds]
     squares, counts = np.array([s.squares for s in scores]), np.array([s.counts for s in scores])
     rms, error = pooled(squares, counts)
     found, jumps = sum(s.found for s in scores), sum(s.jumps for s in scores)

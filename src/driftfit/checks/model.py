@@ -14,10 +14,8 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.models.equation import Equation
-from driftfit.models.state_space import StateSpace
 from driftfit.results import Track
-from driftfit.run.parallel_lanes import FEWEST
+from driftfit.run.parallel_lanes import FEWEST_LANES
 from driftfit.smooth.problem import replay
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
@@ -30,22 +28,16 @@ AT = 30
 """The sample that is changed or missing."""
 
 
-def check_model(model: Any, theta: Any = None) -> list[str]:
+def check_model(model: Model, theta: Any = None) -> list[str]:
     """The promises that a model breaks, one sentence each; an empty list if it keeps them all.
 
     Parameters
     ----------
-    model : Model, a plain function, or two
-        With one output. A function is that of an `Equation`, two are those of a `StateSpace`; what cannot be read of
-        them (random numbers, writing in place, other values than numbers, ..) is a broken promise.
+    model : Model
+        With one output.
     theta : (n,) or None
         A system of the model that is stable and, where outputs are inverted, increasing; None: 0.1 everywhere.
     """
-    if not isinstance(model, Model):
-        try:
-            model = Equation(model) if callable(model) else StateSpace(model)
-        except ValueError as error:
-            return [str(error)]
     bound = model.bind(model.m)
     broken = list(_settings(model)) + list(_named(bound))
     if broken:
@@ -110,7 +102,7 @@ def _live(model: Model, still: Tracker, run: Track) -> Iterator[str]:
 
 
 def _lanes(model: Model, still: Tracker, run: Track) -> Iterator[str]:
-    count = max(FEWEST, still.width) + 1
+    count = max(FEWEST_LANES, still.width) + 1
     y, u = (np.stack(part) for part in zip(*(signals(model.m, seed) for seed in range(count)), strict=True))
     fleet = track(model, still, y, u, by="row")
     for key in (1, count - 1):
@@ -129,7 +121,8 @@ def _reach(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     changed = np.flatnonzero((replay(track(model, still, y, u))["phi"] != replay(run)["phi"])[..., 0].any(axis=1))
     if changed.size and changed[0] < AT:
         yield f"It looks ahead: signals of sample {AT} are in the regressors of sample {changed[0]}."
-    if changed.size and changed[-1] > AT + model.reach and not model.recursive:
+    endless = model.hidden is not None or model.held_at(run.theta[-1]) is not None  # regressors hold its own results
+    if changed.size and changed[-1] > AT + model.reach and not endless:
         yield f"reach is {model.reach}, but signals of sample {AT} are in the regressors of sample {changed[-1]}."
 
 

@@ -22,7 +22,7 @@ from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.results import Track
-from driftfit.run.parallel_lanes import FEWEST
+from driftfit.run.parallel_lanes import FEWEST_LANES
 from driftfit.run.result import root_mean_square
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
@@ -119,7 +119,7 @@ def _live(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
 
 
 def _lanes(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
-    count = max(FEWEST, tracker.width) + 1
+    count = max(FEWEST_LANES, tracker.width) + 1
     y, u = (np.stack(signal) for signal in zip(*(damaged(seed) for seed in range(count)), strict=True))
     fleet = track(model, tracker, y, u, by="row")
     for key in (0, 1, count - 1):

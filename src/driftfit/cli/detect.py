@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.text import Text
+from typer import Option
 
-from driftfit.cli.parts.options import Given, reads
-from driftfit.cli.parts.program import app, say
-from driftfit.cli.parts.reading import interval_from, moment
-from driftfit.cli.track import Plot, Report
+from driftfit.cli.options import Given, Plot, Report, Table, check_table, reads
+from driftfit.cli.program import app, say
+from driftfit.cli.reading import interval_from, moment
 from driftfit.engine.settings import marks
 from driftfit.results import Track
 from driftfit.show.export import write_table
@@ -24,17 +22,15 @@ from driftfit.show.report import check_path
 class AlarmOptions:
     """The options that define an alarm."""
 
-    kind: Annotated[str, typer.Option(help="glr, cusum, band, innovation or probability.")] = "glr"
-    every: Annotated[float, typer.Option(help="Samples in which one false alarm may begin.")] = 10_000.0
+    kind: Annotated[str, Option(help="glr, cusum, band, innovation or probability.")] = "glr"
+    every: Annotated[float, Option(help="Samples in which one false alarm may begin.")] = 10_000.0
     reference: Annotated[
         list[str] | None,
-        typer.Option(
-            help="What is normal: a number of first samples, FROM..TO in times, or name=low:high; repeat the last."
-        ),
+        Option(help="What is normal: a number of first samples, FROM..TO in times, or name=low:high; repeat the last."),
     ] = None
-    window: Annotated[int, typer.Option(help="Samples in the sums of the innovation alarm.")] = 50
-    hold: Annotated[int, typer.Option(help="Samples for which an alarm stays on after its cause.")] = 0
-    calibrate: Annotated[bool, typer.Option("--calibrate", help="Find the limits by simulation.")] = False
+    window: Annotated[int, Option(help="Samples in the sums of the innovation alarm.")] = 50
+    hold: Annotated[int, Option(help="Samples for which an alarm stays on after its cause.")] = 0
+    calibrate: Annotated[bool, Option("--calibrate", help="Find the limits by simulation.")] = False
 
     def find(self, run: Any) -> Any:
         """The alarms of a run, an `Outputs` or a fleet."""
@@ -48,17 +44,16 @@ def detect(
     given: Given,
     options: AlarmOptions,
     labels: Annotated[
-        str | None, typer.Option(help="Column of labels, 0 or 1, that mark faults; the alarms are scored.")
+        str | None, Option(help="Column of labels, 0 or 1, that mark faults; the alarms are scored.")
     ] = None,
-    write_to: Annotated[Path | None, typer.Option("--out", help="Write the alarms to .csv or .parquet.")] = None,
+    write_to: Table = None,
     plot: Plot = None,
     report: Report = None,
 ) -> None:
     """Find alarms at a set rate of false alarms; with labels, score them."""
     if labels is not None and (given.by or len(given.outputs) > 1):
         raise ValueError("--labels: labels are for one series of one output; leave out --by and further --y.")
-    if write_to is not None and write_to.suffix.lower() not in (".csv", ".parquet"):
-        raise ValueError(f"--out {write_to}: alarms are written to .csv or .parquet.")
+    check_table(write_to, "alarms are")
     if report is not None:
         check_path(report)
     rows = given.read(labels) if labels is not None else None
@@ -73,8 +68,7 @@ def detect(
         found = f" Labels: {score.found} of {score.events} found{late};"
         say(Text(f"{found} {score.false} false alarms in {score.normal} normal samples."), soft_wrap=True)
     if write_to is not None:
-        found = alarms.table
-        write_table(found, write_to)
+        write_table(alarms.table, write_to)
     if plot is not None:
         if not isinstance(run, Track):
             raise ValueError("--plot: alarms are drawn for one series; use --report for a fleet.")

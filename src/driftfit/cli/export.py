@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
-from driftfit.cli.parts.program import app, helpful, say
+from driftfit.cli.options import Own, Setting
+from driftfit.cli.program import app, say
 from driftfit.parsing.settings import parse_model, parse_tracker
 from driftfit.show.text import facts
 
@@ -22,19 +24,18 @@ def _languages() -> None:
 
 @export.command(name="c")
 def to_c(
-    model: Annotated[str, typer.Option(help="As in `driftfit track`: arx:2,2 or 'ARX(2, 2)'.")],
-    out: Annotated[Path, typer.Option(help="The folder to write into.")],
-    tracker: Annotated[str, typer.Option(help="Tracker, by its name or as in Python.")] = "adaptive-kalman",
-    p: Annotated[list[str] | None, typer.Option("-p", help="Setting of the tracker; repeat it.")] = None,
-    own: Annotated[str | None, typer.Option("--with", metavar="MODULE:CLASS", help="Your own tracker.")] = None,
-    fixed_rate: Annotated[bool, typer.Option("--fixed-rate", help="No uneven intervals, no known factors.")] = False,
-    gate: Annotated[bool | None, typer.Option("--gate/--no-gate", help="Judge readings first.")] = None,
+    model: Annotated[str, Option(help="As in `driftfit track`: arx:2,2 or 'ARX(2, 2)'.")],
+    out: Annotated[Path, Option(help="The folder to write into.")],
+    tracker: Annotated[str, Option(help="Tracker, by its name or as in Python.")] = "adaptive-kalman",
+    p: Setting = None,
+    own: Own = None,
+    fixed_rate: Annotated[bool, Option("--fixed-rate", help="No uneven intervals, no known factors.")] = False,
+    gate: Annotated[bool | None, Option("--gate/--no-gate", help="Judge readings first.")] = None,
 ) -> None:
     """Write a tracker as C99 for a controller: tracker.h, tracker.c, a self-test and a README."""
     from driftfit.embedded import export_c
 
-    with helpful():
-        export_c(parse_model(model), parse_tracker(tracker, p or [], own), out, fixed_rate=fixed_rate, gate=gate)
-        readme = (out / "README.md").read_text(encoding="utf-8")
-        state = readme.split("State: ")[1].split(".")[0]
-        say(facts(("Written", str(out)), ("State", state), ("Check it", f"see {out / 'README.md'}")))
+    export_c(parse_model(model), parse_tracker(tracker, p or [], own), out, fixed_rate=fixed_rate, gate=gate)
+    readme = (out / "README.md").read_text(encoding="utf-8")
+    state = readme.split("State: ")[1].split(".")[0]
+    say(facts(("Written", str(out)), ("State", state), ("Check it", f"see {out / 'README.md'}")))

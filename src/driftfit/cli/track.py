@@ -5,19 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Option
 
-from driftfit.cli.parts.options import Given, reads
-from driftfit.cli.parts.program import app, say
+from driftfit.cli.options import Given, Out, Plot, Report, reads
+from driftfit.cli.program import app, say
 from driftfit.results import Track
 from driftfit.show.export import check_ending, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Out = Annotated[Path | None, typer.Option("--out", help="Write the result to .csv, .parquet or .npz (complete).")]
-Plot = Annotated[Path | None, typer.Option(help="Save a picture (.png, .pdf, .svg).")]
-Report = Annotated[Path | None, typer.Option(help="Write a page (.html) to send to someone; a fleet has one page.")]
 
 
 @app.command()
@@ -27,7 +23,7 @@ def track(
     write_to: Out = None,
     plot: Plot = None,
     system: Annotated[
-        Path | None, typer.Option(help="Save a picture of responses, poles and gain over time (ARX, one output).")
+        Path | None, Option(help="Save a picture of responses, poles and gain over time (ARX, one output).")
     ] = None,
     report: Report = None,
 ) -> None:
@@ -55,3 +51,18 @@ def plot_system(run: Any) -> Figure:
     if not isinstance(run, Track):
         raise ValueError("--system: this draws one series with one output; leave out --by and further --y.")
     return run.plot_system()
+
+
+@app.command()
+@reads
+def verdict(
+    given: Given,
+    level: Annotated[float, Option(help="Error rate of the test; for a fleet, the false discovery rate.")] = 0.05,
+    lags: Annotated[int | None, Option(help="Lags of correlation of the noise to allow for.")] = None,
+    report: Report = None,
+) -> None:
+    """Report whether the parameters move, which ones and when, and whether tracking them pays."""
+    run = given.run()
+    say(run.verdict(level=level, lags=lags))
+    if report is not None:
+        run.report(report)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Annotated
+
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
+from typer import Option
 
 from driftfit import trackers as known
-from driftfit.cli.parts.program import app, out, say
+from driftfit.cli.program import app, out, progress, say
 from driftfit.parsing.settings import default, given_fields
 
 
@@ -25,3 +29,11 @@ def trackers() -> None:
         table.add_section()
     say(table)
     say(Text(" ... must be given. On the command line: --tracker augmented-fls -p mu=10", "dim"))
+
+
+@app.command()
+def demo(plot: Annotated[Path, Option(help="File of the picture.")] = Path("driftfit-demo.png")) -> None:
+    """Track the US demand for money from 1959 to 2009."""
+    from driftfit.demo.demo import show
+
+    show(out, progress, plot)

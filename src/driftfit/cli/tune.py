@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.text import Text
+from typer import Option
 
-from driftfit.cli.parts.options import Given, reads
-from driftfit.cli.parts.program import app, progress, say
-from driftfit.cli.track import Plot
+from driftfit.cli.options import Given, Plot, reads
+from driftfit.cli.program import app, progress, say
+from driftfit.cli.reading import listed
 from driftfit.parsing.settings import given_fields
 from driftfit.readings.left_out import LeftOut, remarks_of
 from driftfit.show.text import facts, shortened, table_of
@@ -20,12 +20,12 @@ from driftfit.show.text import facts, shortened, table_of
 @reads
 def tune(
     given: Given,
-    method: Annotated[str, typer.Option(help="ml, h-step, loo or gcv.")] = "ml",
-    ahead: Annotated[int, typer.Option("--ahead", help="Samples ahead, for h-step.")] = 1,
+    method: Annotated[str, Option(help="ml, h-step, loo or gcv.")] = "ml",
+    ahead: Annotated[int, Option("--ahead", help="Samples ahead, for h-step.")] = 1,
     groups: Annotated[
-        str | None, typer.Option(help="each: a separate drift for each parameter; or one label per parameter, a,a,b.")
+        str | None, Option(help="each: a separate drift for each parameter; or one label per parameter, a,a,b.")
     ] = None,
-    level: Annotated[float, typer.Option(help="Level of the intervals.")] = 0.95,
+    level: Annotated[float, Option(help="Level of the intervals.")] = 0.95,
     plot: Plot = None,
 ) -> None:
     """Estimate the settings that a tracker is missing: --tracker kalman estimates q and r."""
@@ -72,3 +72,27 @@ def _typed(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return str(value).lower()
     return ",".join(f"{x:.6g}" for x in np.ravel(value)) if np.ndim(value) or isinstance(value, float) else str(value)
+
+
+@app.command()
+@reads
+def select(
+    given: Given,
+    keep: Annotated[list[str] | None, Option(help="Regressor that every subset contains; repeat it.")] = None,
+    most: Annotated[int | None, Option(help="Largest number of regressors in a subset.")] = None,
+    plot: Plot = None,
+) -> None:
+    """Compare models (repeat --model), or the regressors of one, by how well they predict."""
+    from driftfit.judge.structures.select import Selection
+    from driftfit.judge.structures.select import select as compare
+
+    models = given.models()
+    with progress.status("comparing"):
+        selection = compare(
+            models if len(models) > 1 else models[0], tracker=given.chosen_tracker(), keep=tuple(listed(keep)),
+            most=most, **given.arrays(),
+        )  # fmt: skip
+    say(selection)
+    assert isinstance(selection, Selection)  # `arrays` are of one output
+    if plot is not None:
+        selection.plot().savefig(plot, dpi=150)

@@ -1,13 +1,9 @@
-"""Check the types of the arguments model and tracker; messages recognise a class in place of an instance, and a wrong
-order.
+"""What users pass: models and trackers, arrays of numbers, series and data frames with their names and index.
 
-Series and data frames that are passed as arrays: their numbers, their names, their index.
-
-They may be anything that narwhals reads (pandas, polars, pyarrow), or mappings from name to column. Columns are matched
-with the inputs of a model by name if both have names. Rows are matched by position; if two indices of pandas differ,
-the rows do not match and an error is raised. An index of dates becomes the labels of the samples.
-
-Signals as users pass them: arrays of numbers, times, and settings that must be complete.
+Messages recognise a class in place of an instance, and a wrong order of model and tracker. Series and data frames may
+be anything that narwhals reads (pandas, polars, pyarrow), or mappings from name to column. Columns are matched with the
+inputs of a model by name if both have names. Rows are matched by position; if two indices of pandas differ, the rows do
+not match and an error is raised. An index of dates becomes the labels of the samples.
 """
 
 from __future__ import annotations

@@ -57,8 +57,9 @@ def from_arrays(model: Model, y: Any, u: Any, reading: Reading, by_row: bool = F
              for name, one in given.items()}  # fmt: skip
     together(**parts)
     signals = (parts["y"], parts["u"])
-    model, place = named_outputs(model, parts["y"].names)
-    ny = len(model.outputs)
+    ny, place = len(model.outputs), [0]
+    if ny > 1:
+        model, place = named_outputs(model, parts["y"].names)
     output = _outputs(parts["y"].values, model.outputs, by_row)
     lead = output.shape[: 1 + by_row]
     G, T, N = output.size // (lead[-1] * ny), lead[-1], output.size // ny

@@ -12,8 +12,7 @@ months. A number of steps within a tenth of an integer is rounded to it, so that
 of every month are one step apart. Days and months are those of the time zone. A weekend has no business time: from
 Saturday to Monday 0 steps pass. Every interval depends only on a sample and the one before it, so a stream counts
 intervals as its record does.
-
-Gaps: intervals across which lags do not reach, and warnings where a wrong dt makes most samples unusable.
+Lags do not reach across a gap; a warning says where a wrong dt makes most samples unusable.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ DURATIONS = {
 """Seconds of a unit, or 1 if NumPy has a unit of that name."""
 
 MONTH, DAY = np.timedelta64(1, "M"), np.timedelta64(1, "D")
-NEAR = 0.1
+ROUNDED_WITHIN = 0.1
 """A number of calendar steps this close to an integer is rounded to it."""
 
 
@@ -119,7 +118,7 @@ class Clock:
         place = self._months if self.kind == "month" else self._business_days
         steps = (place(self._local(time)) - place(self._local(last))) / self.count
         nearest = np.rint(steps)
-        return np.where((nearest >= 1.0) & (np.abs(steps - nearest) < NEAR), nearest, steps)
+        return np.where((nearest >= 1.0) & (np.abs(steps - nearest) < ROUNDED_WITHIN), nearest, steps)
 
     def _fits(self, time: Array) -> None:
         """ValueError if this clock cannot count times of this kind."""
@@ -332,7 +331,7 @@ def duration_text(length: np.timedelta64) -> str:
     return f"{length // _delta(1, size)}{size}"
 
 
-LOOK = 20
+PACE_SAMPLES = 20
 """Number of samples after which a stream warns if most of them cannot be used."""
 
 
@@ -385,13 +384,13 @@ class Pace:
 
     def see(self, interval: float) -> None:
         """Count the nominal interval before a sample."""
-        if not self._reach or self._count > LOOK:
+        if not self._reach or self._count > PACE_SAMPLES:
             return
         self._count += 1
         self._gaps += interval > GAP
-        if self._count == LOOK and self._gaps > LOOK // 2:
+        if self._count == PACE_SAMPLES and self._gaps > PACE_SAMPLES // 2:
             warn(
-                f"{self._gaps} of the first {LOOK} samples came after a gap: the last interval is {interval:g} times "
-                f"dt={1 if self._clock.plain is None else self._clock.plain}, and lags do not reach across gaps above "
-                f"{GAP} dt. Give dt= the interval between samples, or dt='label' if times are only labels."
+                f"{self._gaps} of the first {PACE_SAMPLES} samples came after a gap: the last interval is {interval:g} "
+                f"times dt={1 if self._clock.plain is None else self._clock.plain}, and lags do not reach across gaps "
+                f"above {GAP} dt. Give dt= the interval between samples, or dt='label' if times are only labels."
             )

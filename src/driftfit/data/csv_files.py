@@ -6,9 +6,8 @@ which spreadsheets write. A row of units may follow it. Blank lines are left out
 missing readings, unless every line is followed by one. Separators at the end of a line are left out; a line with more
 cells than the header is an error. Text that is neither UTF-8 nor UTF-16 is taken as Windows-1252.
 
-Numbers with a decimal comma, and with dots between thousands: 1.234,5.
-
-Columns are cells without blanks around them, null for those without a value (`driftfit.data.columns.present`).
+Numbers may have a decimal comma, and dots between thousands: 1.234,5. Columns are cells without blanks around them,
+null for those without a value (`driftfit.data.columns.present`).
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ import polars as pl
 from driftfit.data.columns import ERROR, FILE, HISTORIANS, Wanted, plain_names, present
 from driftfit.data.instants import is_date
 
-PROBE = 1 << 16
+PROBE_BYTES = 1 << 16
 """The bytes from which the separator, the decimal sign and units are judged."""
 
 RUN = r"^[=+\-@\t\r]"
@@ -35,7 +34,7 @@ RUN = r"^[=+\-@\t\r]"
 DECLARED = re.compile(r"\ufeff?sep=(.)\s*$", re.IGNORECASE)
 """A first line with which spreadsheets say what separates cells."""
 
-CHECKED = 1 << 26
+WHOLE_BYTES = 1 << 26
 """Bytes of a file up to which all columns are read: only then polars reports lines with more cells than the header."""
 
 SEPARATORS = ",;\t|"
@@ -63,9 +62,9 @@ def without_formulas(table: pl.DataFrame) -> pl.DataFrame:
 def start_of(source: str | bytes) -> bytes:
     """The header and the first cells of a file, given by its path or its contents."""
     if isinstance(source, bytes):
-        return source[:PROBE]
+        return source[:PROBE_BYTES]
     with open(source, "rb") as file:
-        return file.read(PROBE)
+        return file.read(PROBE_BYTES)
 
 
 def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFrame, dict[str, str]]:
@@ -76,9 +75,9 @@ def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFra
     those of a file whose cells are not separated by commas.
     """
     content = source if isinstance(source, bytes) else Path(source).read_bytes()
-    if encoding := _encoding(content[:PROBE]):
+    if encoding := _encoding(content[:PROBE_BYTES]):
         content = content.decode(encoding, errors="replace").encode()
-    start = content[:PROBE]
+    start = content[:PROBE_BYTES]
     end = b"\r" if b"\r" in start and b"\n" not in start else b"\n"
     lines = _lines(start)
     declared = DECLARED.match(lines[0]) if lines else None
@@ -93,7 +92,7 @@ def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFra
     again = [copy[1] for copy in copies if copy and copy[1] in raw]
     names = plain_names(raw, [name for name in wanted.names if name != FILE])
     chosen = {old: new for old, new in zip(raw, names, strict=True) if new in wanted.names}
-    read = None if len(content) <= CHECKED else list(chosen)
+    read = None if len(content) <= WHOLE_BYTES else list(chosen)
     try:
         every = pl.read_csv(content, columns=read, **options)
     except pl.exceptions.ComputeError as error:
@@ -122,7 +121,7 @@ def _mended(content: bytes, end: bytes, sign: str, alone: bool) -> bytes:
     """
     after = rb"(?=[ \t]*(?:" + re.escape(sign.encode()) + rb"|[\r\n]|\Z))"
     content = re.sub(end + rb"(" + ERROR.encode() + rb")" + after, end + rb'"\1"', content, flags=re.IGNORECASE)
-    if alone and any(line.strip() for line in content[:PROBE].split(end)[1::2]):
+    if alone and any(line.strip() for line in content[:PROBE_BYTES].split(end)[1::2]):
         return content
     return re.sub(end + rb"[ \t\r]*(?=" + end + rb")", b"", content)
 
@@ -130,7 +129,7 @@ def _mended(content: bytes, end: bytes, sign: str, alone: bool) -> bytes:
 def _lines(start: bytes) -> list[str]:
     """The first lines of a file, without blank ones, comments, and one that the end of the probe cuts off."""
     lines = start.decode(errors="replace").removeprefix("\ufeff").splitlines()
-    whole = lines[:-1] if len(start) == PROBE and len(lines) > 1 else lines
+    whole = lines[:-1] if len(start) == PROBE_BYTES and len(lines) > 1 else lines
     return [line for line in whole if line.strip() and not COMMENT.match(line)]
 
 

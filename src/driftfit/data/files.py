@@ -1,8 +1,7 @@
-"""Files: CSV (`driftfit.data.formats`) and Parquet, one or several, read with polars.
+"""Files: CSV (`driftfit.data.csv_files`) and Parquet, one or several, read with polars.
 
-If some of several files cannot be read, they are left out with a warning and kept with their reasons.
-
-Packed files: how large they become is looked at before they are unpacked, and what is damaged gives one error.
+If some of several files cannot be read, they are left out with a warning and kept with their reasons. How
+large a packed file becomes is looked at before it is unpacked, and what is damaged gives one error.
 """
 
 from __future__ import annotations
@@ -165,13 +164,13 @@ def _of_one_type(units: list[Any]) -> list[Any]:
     return [str(unit) if isinstance(unit, int) else unit for unit in units]
 
 
-LARGE, TIMES = 1 << 30, 100
+UNPACKED_BYTES, UNPACKED_RATIO = 1 << 30, 100
 """Bytes to which any file may unpack, and multiples of its own bytes."""
 
 
 def check_unpacked(where: str, packed: int, unpacked: int) -> None:
     """Raise ValueError for a file that becomes too large."""
-    most = max(LARGE, TIMES * packed)
+    most = max(UNPACKED_BYTES, UNPACKED_RATIO * packed)
     if unpacked > most:
         raise ValueError(
             f"{where} has {packed} bytes and says that it unpacks to {unpacked}, but at most {most} are unpacked; "
@@ -184,7 +183,7 @@ def gunzipped(data: bytes, where: str) -> bytes:
     check_unpacked(where, len(data), int.from_bytes(data[-4:], "little"))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:  # it may say less than it holds
-            found = file.read(max(LARGE, TIMES * len(data)) + 1)
+            found = file.read(max(UNPACKED_BYTES, UNPACKED_RATIO * len(data)) + 1)
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise ValueError(f"{where} cannot be decompressed: {error}") from None
     check_unpacked(where, len(data), len(found))

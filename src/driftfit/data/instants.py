@@ -1,18 +1,18 @@
-"""Dates in text, as spreadsheets and loggers of several countries write them.
+"""Times and dates as users give them: as floats, or as datetime64 in UTC with the name of their zone.
+
+Dates in text, as spreadsheets and loggers of several countries write them:
 
 2024-01-31  2024-01-31 12:00:00  20240131  2024-01-31 03:15 PM               the year first
 31.1.2024  31/01/2024 12:00  1/31/2024  1/31/24 3:15 PM                      the day or the month first
 01-Jan-24  1 January 2024 9:30  Jan 01, 2024                                 months by name
 
-Periods in text, as statistical offices and pandas write them; the time of a period is its first moment.
+Periods in text, as statistical offices and pandas write them; the time of a period is its first moment:
 
 1970Q1  1970-Q1  1970 Q1  1970:1Q  Q1 1970  1Q1970                           quarters
 2020M03  2020-M3  2020 Mar  March 2020  Mar-2020  2020-03  03/2020           months
 2020-W05  2020W05  2020 W5  2020-W05-3                                       weeks of ISO 8601, and days of these
 2020H1  2020-S2                                                              half-years
 2020-01-27/2020-02-02                                                        a period by its first and last day
-
-Instants: times and dates as users give them, as floats or as datetime64 in UTC, with the name of their zone.
 """
 
 from __future__ import annotations

@@ -30,12 +30,16 @@ from driftfit.engine.settings import near
 
 
 class Limits:
-    """Valid ranges of ny outputs and m inputs: ``low`` and ``high`` (ny + m,), infinite if there is no limit."""
+    """Valid ranges of ny outputs and m inputs: ``low`` and ``high`` (ny + m,), infinite if there is no limit.
+
+    A stream's replace values outside their range by NaN, and count them.
+    """
 
     def __init__(self, limits: Mapping[Any, Any], outputs: Sequence[str], inputs: Sequence[str], m: int) -> None:
-        self.ny = len(outputs)
+        self.given, self.ny = dict(limits), len(outputs)
         self.names = (*outputs, *(inputs or (f"u{j + 1}" for j in range(m))))
         self.low, self.high = np.full(self.ny + m, -np.inf), np.full(self.ny + m, np.inf)
+        self._counts = np.zeros(self.ny + m, dtype=np.int64)
         for key, bounds in limits.items():
             low, high = _bounds(key, bounds)
             for place in self._places(key, m):
@@ -59,30 +63,21 @@ class Limits:
         out_y = (y < self.low[:ny]) | (y > self.high[:ny])
         return out_y, (u < self.low[ny:]) | (u > self.high[ny:])
 
-
-class StreamLimits:
-    """Valid ranges of a stream: replaces values outside their range by NaN, and counts them."""
-
-    def __init__(self, limits: Mapping[Any, Any], outputs: Sequence[str], inputs: Sequence[str], m: int) -> None:
-        self.given = dict(limits)
-        self._limits = Limits(limits, outputs, inputs, m)
-        self._counts = np.zeros(len(self._limits.names), dtype=np.int64)
-
     @property
     def counts(self) -> dict[str, int]:
         """How many numbers were outside their range, by signal."""
-        found = zip(self._limits.names, self._counts.tolist(), strict=True)
+        found = zip(self.names, self._counts.tolist(), strict=True)
         return {name: count for name, count in found if count}
 
     def sample(self, y: Array, u: Array) -> tuple[Array, Array]:
         """Outputs (.., ny) and inputs (.., m) of one sample or several; values outside are counted."""
-        out_y, out_u = self._limits.outside(y, u)
+        out_y, out_u = self.outside(y, u)
         self._counts += np.concatenate([out.sum(axis=tuple(range(out.ndim - 1))) for out in (out_y, out_u)])
         return np.where(out_y, np.nan, y), np.where(out_u, np.nan, u)
 
     def inputs(self, u: Array) -> Array:
         """Inputs (.., m) of a query; values outside are not counted."""
-        low, high = self._limits.low[self._limits.ny :], self._limits.high[self._limits.ny :]
+        low, high = self.low[self.ny :], self.high[self.ny :]
         return np.where((u < low) | (u > high), np.nan, u)
 
     def plain(self) -> list[Any]:

@@ -2,8 +2,7 @@
 
 Every run reads its samples from here, whether they came from a table, from rows of an array, or from one series with
 several settings: a lane reads ``length`` samples, beginning at ``first``.
-
-Known numbers of every sample in addition to its signals: elapsed time, noise, and how far theta may move.
+What is `Known` of every sample besides its signals is elapsed time, noise, and how far theta may move.
 """
 
 from __future__ import annotations
@@ -84,7 +83,7 @@ def time_text(time: Any, zone: str | None) -> str:
     return f"{shown:%Y-%m-%d %H:%M:%S}{part}{'' if zone is None else f'{shown: %Z}'}"
 
 
-SIZED = 1000
+SIZES_SAMPLED = 1000
 """Numbers of a signal that are looked at to find its size."""
 
 
@@ -92,7 +91,7 @@ def warn_of_sizes(names: Sequence[str], values: Array) -> None:
     """Warn of columns (N, k) most numbers of which are so large that they count as missing, or so small that they count
     as 0, by a thousand numbers of each.
     """
-    for name, column in zip(names, values[:: len(values) // SIZED + 1].T, strict=True):
+    for name, column in zip(names, values[:: len(values) // SIZES_SAMPLED + 1].T, strict=True):
         size = np.abs(column)
         if SMALLEST < size.max(initial=0.0) < LARGEST:  # nearly always, so it must cost little
             continue

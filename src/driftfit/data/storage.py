@@ -45,7 +45,7 @@ MAGIC, COMPACT = b"driftfit", 3
 REMEDY = "which stored results and states otherwise: run the record again"
 """Why older states and results are refused, and what to do."""
 HEAD = Struct("<8sHHII")
-CHECKED = 16
+CRC_BEGIN = 16
 """Number of the first byte that the CRC covers."""
 
 
@@ -187,7 +187,7 @@ def _length(text: bytes) -> bytes:
 def _expand(data: bytes) -> tuple[dict[str, Any], dict[str, Array]]:
     """The inverse of `compact`; ValueError if it is damaged."""
     _, version, unused, check, length = HEAD.unpack_from(data)
-    if version <= COMPACT and (zlib.crc32(data[CHECKED:]) != check or unused):
+    if version <= COMPACT and (zlib.crc32(data[CRC_BEGIN:]) != check or unused):
         raise ValueError("its check sum does not fit its content")
     if version != COMPACT:
         return {"format": version}, {}

@@ -11,8 +11,8 @@ from os import PathLike
 from pathlib import Path
 
 from driftfit.data.arguments import check_ready
+from driftfit.embedded.functions import translation
 from driftfit.embedded.project import files_of, write
-from driftfit.embedded.translation import translation
 from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
 from driftfit.run.gating import gate_of

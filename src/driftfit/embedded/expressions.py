@@ -1,10 +1,11 @@
-"""Expressions of steps in C: names, numbers, array elements and arithmetic."""
+"""Expressions of steps in C: names, numbers, array elements, arithmetic, and calls."""
 
 from __future__ import annotations
 
 import ast
 import builtins
 import math
+import operator
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,16 +14,39 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.embedded.unit import TranslationError, Unit
-from driftfit.embedded.values import RANK, Value, assigned, begin_of, joined, lifted, narrow, number, plain, view
+from driftfit.embedded.values import (
+    RANK,
+    TranslationError,
+    Unit,
+    Value,
+    assigned,
+    begin_of,
+    joined,
+    lifted,
+    narrow,
+    number,
+    plain,
+    view,
+)
+from driftfit.engine import kernel, simd
+from driftfit.engine.tracker_part import tracker_part, whole_record
 
 ARITHMETIC = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "/", ast.Mod: "%"}
 BITS = {ast.BitAnd: "&", ast.BitOr: "|"}
+FOUR = {simd.fill_four: "four_of", simd.load_four: "four_at", simd.plus: "four_plus", simd.times: "four_times"}
+PYTHON = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
+    ast.FloorDiv: operator.floordiv, ast.Mod: operator.mod, ast.Pow: operator.pow, ast.BitAnd: operator.and_,
+    ast.BitOr: operator.or_, ast.BitXor: operator.xor, ast.LShift: operator.lshift, ast.RShift: operator.rshift,
+    ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge, ast.Eq: operator.eq,
+    ast.NotEq: operator.ne, ast.Is: operator.is_, ast.IsNot: operator.is_not,
+}  # fmt: skip
+"""What is folded where both values are known."""
 COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 
 
 class Expressions:
-    """The part of the translator that turns expressions into values; calls and statements build on it."""
+    """The part of the translator that turns expressions into values; statements build on it."""
 
     stored: Counter[str]
     ops: list[Counter[str]]
@@ -41,14 +65,10 @@ class Expressions:
         yield
         self.lazy -= 1
 
-    def call(self, node: ast.Call, statement: bool) -> Value:
-        raise NotImplementedError
-
     def refuse(self, node: ast.AST) -> Any:
         raise TranslationError(f"{self.source.__qualname__}: no translation of `{ast.unparse(node)}`.")
 
     def value(self, node: ast.expr, statement: bool = False) -> Value:
-        """Translate an expression."""
         if isinstance(node, ast.Call):
             return self.call(node, statement)
         handler = getattr(self, f"of_{type(node).__name__.lower()}", None)
@@ -80,6 +100,8 @@ class Expressions:
             for one in (self.unit.written, self.unit.beyond):  # perhaps, by whoever receives the array
                 one.add(node.attr)
             return self.unit.field(node.attr)
+        if owner.kind == "table" and hasattr(owner.constant, node.attr):  # a named tuple
+            return lifted(getattr(owner.constant, node.attr))
         if owner.kind == "python" and owner.constant in (np, math):
             return lifted(getattr(owner.constant, node.attr))
         return self.refuse(node)  # type: ignore[no-any-return]
@@ -156,31 +178,31 @@ class Expressions:
         one = self.value(node.left)
         return self.binary(node.op, one, self.value(node.right))
 
-    def binary(self, operator: ast.operator, one: Value, other: Value) -> Value:
+    def binary(self, operation: ast.operator, one: Value, other: Value) -> Value:
         """One operation on two numbers."""
         one, other = plain(one), plain(other)
         kind = joined(one.kind, other.kind) if {one.kind, other.kind} <= RANK.keys() else one.kind
         if one.known and other.known and kind in RANK:
-            return number(_folded(operator, one.constant, other.constant))
+            return number(_folded(operation, one.constant, other.constant))
         if one.kind == "address":  # in bytes
             moved = str(other.constant // 8) if other.known else f"{other.text} / 8"
             return one if other.constant == 0 else Value("address", f"({one.text} + {moved})")
-        if isinstance(operator, ast.Pow):
+        if isinstance(operation, ast.Pow):
             return self._square(one, other)
-        if isinstance(operator, ast.LShift | ast.RShift):
-            return _shifted(operator, one, other)
-        if type(operator) in BITS and kind == "bool" and (one.known or other.known):
+        if isinstance(operation, ast.LShift | ast.RShift):
+            return _shifted(operation, one, other)
+        if type(operation) in BITS and kind == "bool" and (one.known or other.known):
             fixed, rest = (one, other) if one.known else (other, one)
-            return rest if fixed.constant == isinstance(operator, ast.BitAnd) else fixed
-        if type(operator) in BITS:
-            return Value(kind, f"({one.text} {BITS[type(operator)]} {other.text})")
-        sign = ARITHMETIC[type(operator)]
+            return rest if fixed.constant == isinstance(operation, ast.BitAnd) else fixed
+        if type(operation) in BITS:
+            return Value(kind, f"({one.text} {BITS[type(operation)]} {other.text})")
+        sign = ARITHMETIC[type(operation)]
         if kind == "real" and sign in "*/" and 1.0 in (other.constant, one.constant if sign == "*" else None):
             kept = other if one.constant == 1.0 and sign == "*" else one  # a factor of one changes no bit
             return kept if kept.kind == "real" else Value("real", _real(kept))
         if kind != "real":
-            kind = "real" if isinstance(operator, ast.Div) else joined(kind, "int")
-            if isinstance(operator, ast.Div):
+            kind = "real" if isinstance(operation, ast.Div) else joined(kind, "int")
+            if isinstance(operation, ast.Div):
                 return Value("real", f"((real){one.text} / (real){other.text})")
             return Value(kind, f"({one.text} {sign} {other.text})", most=_most(sign, one, other))
         self.ops[-1][{"+": "add", "-": "add", "*": "multiply", "/": "divide"}[sign]] += 1
@@ -195,16 +217,16 @@ class Expressions:
     def of_compare(self, node: ast.Compare) -> Value:
         values = [self.value(one) for one in (node.left, *node.comparators)]
         if len(values) == 2 and values[0].kind == "flag" and values[1].known:
-            return _of_flag(values[0], [_compared(node.ops[0], one, values[1].constant) for one in (0.0, 1.0)])
+            return _of_flag(values[0], [PYTHON[type(node.ops[0])](one, values[1].constant) for one in (0.0, 1.0)])
         if all(one.known for one in values):
             truths = [
-                _compared(operator, one.constant, other.constant)
-                for operator, one, other in zip(node.ops, values, values[1:], strict=False)
+                PYTHON[type(kind)](one.constant, other.constant)
+                for kind, one, other in zip(node.ops, values, values[1:], strict=False)
             ]
             return number(all(truths))
         tests = [
-            f"{one.text} {COMPARISONS[type(operator)]} {other.text}"
-            for operator, one, other in zip(node.ops, values, values[1:], strict=False)
+            f"{one.text} {COMPARISONS[type(kind)]} {other.text}"
+            for kind, one, other in zip(node.ops, values, values[1:], strict=False)
         ]
         self.ops[-1]["compare"] += len(tests)
         text = f"({tests[0]})" if len(tests) == 1 else "(" + " && ".join(f"({test})" for test in tests) + ")"
@@ -233,6 +255,98 @@ class Expressions:
             return replace(_of_flag(test, [bool(other.constant), bool(one.constant)]), kind="flag")
         return Value(kind, f"({test.text} ? {assigned(one, kind)} : {assigned(other, kind)})")
 
+    # calls
+
+    def called(self, source: Any, arguments: list[Value], statement: bool) -> Value:
+        raise NotImplementedError
+
+    def call(self, node: ast.Call, statement: bool) -> Value:
+        """A call of another step, or of one of the functions that every step may use."""
+        if isinstance(node.func, ast.Attribute) and node.func.attr == "view":
+            return self._reinterpreted(node)
+        function = self.value(node.func).constant
+        arguments = [plain(self.value(one)) for one in node.args]
+        if function in (tracker_part, whole_record):
+            return arguments[0]  # in C there is one record
+        if function is kernel.packed or (function is kernel.wholes and arguments[0].kind == "items"):
+            return arguments[0]  # C passes addresses one by one
+        if function in (kernel.floats, kernel.wholes, kernel.cubes):
+            return self._at_address(arguments)
+        if function in (simd.in_blocks, simd.in_fours):
+            return number(False)
+        if function in FOUR or function is simd.reached:
+            return self._of_four(function, arguments)
+        if hasattr(function, "py_func"):
+            return self.called(function.py_func, arguments, statement)
+        return self._builtin(node, function, arguments)
+
+    def _at_address(self, arguments: list[Value]) -> Value:
+        """An array with these extents; only the first of them may be unknown."""
+        extents = [self.unit.largest if one.constant is None else int(one.constant) for one in arguments[1:]]
+        strides = [int(np.prod(extents[axis + 1 :])) for axis in range(len(extents))]
+        return Value("array", arguments[0].text, shape=tuple(extents), strides=tuple(strides))
+
+    def _builtin(self, node: ast.Call, function: Any, arguments: list[Value]) -> Value:
+        if function in (min, max):
+            made = arguments[0]
+            for one in arguments[1:]:
+                made = self._extreme(function, made, one)
+            return made
+        (one,) = arguments
+        if function is len:
+            return number(len(one.constant) if one.kind == "table" else one.shape[0])
+        if one.known and one.kind in RANK:
+            return number(function(one.constant))
+        if function is abs:
+            self.ops[-1]["add"] += 1
+            return (
+                Value("real", f"R_ABS({one.text})") if one.kind == "real" else Value(one.kind, f"whole_abs({one.text})")
+            )
+        if function in (np.sqrt, math.sqrt):
+            self.ops[-1]["square root"] += 1
+            return Value("real", f"R_SQRT({one.text})")
+        if function in (np.cos, np.sin, np.ceil):
+            self.ops[-1]["compare" if function is np.ceil else "sine"] += 1
+            return Value("real", f"R({function.__name__}({one.text}))")
+        if function in (np.int64, int):
+            return Value("long", f"((int64_t){one.text})")
+        if function in (np.float64, float):
+            return Value("real", f"((real){one.text})")
+        if function is bool:
+            return Value("bool", f"({one.text} != 0)")
+        return self.refuse(node)  # type: ignore[no-any-return]
+
+    def _extreme(self, function: Any, one: Value, other: Value) -> Value:
+        """Python's rule: return the second only if it is beyond the first, which decides NaN and signed zeros."""
+        if one.known and other.known:
+            return number(function(one.constant, other.constant))
+        kind = joined(one.kind, other.kind)
+        bounds = [value.most for value in (one, other)]
+        known = [bound for bound in bounds if bound is not None]
+        most = min(known) if function is min and known else max(known) if len(known) == 2 else None
+        self.ops[-1]["compare"] += 1
+        prefix = "real_" if kind == "real" else "whole_"
+        return Value(kind, f"{prefix}{function.__name__}imum({one.text}, {other.text})", most=most)
+
+    def _reinterpreted(self, node: ast.Call) -> Value:
+        """Reinterpret the bits of a number as another type."""
+        assert isinstance(node.func, ast.Attribute)
+        inner, to = self.value(node.func.value), self.value(node.args[0]).constant
+        return (
+            Value("real", f"from_bits({inner.text})") if to is np.float64 else Value("long", f"bits_of({inner.text})")
+        )
+
+    def _of_four(self, function: Any, arguments: list[Value]) -> Value:
+        """Four numbers at once are a structure of four."""
+        self.ops[-1]["multiply" if function is simd.times else "add"] += 4
+        if function is simd.reached:
+            one, other = arguments
+            return Value("long", f"four_reached({one.text}, {other.text})", most=4)
+        if function is simd.load_four:
+            array, row, _ = arguments
+            return Value("four", f"four_at({view(array, [row, range(4)]).text})")
+        return Value("four", f"{FOUR[function]}({', '.join(one.text for one in arguments)})")
+
 
 def _real(value: Value) -> str:
     return value.text if value.kind == "real" or value.known else f"(real){value.text}"
@@ -251,20 +365,17 @@ def _most(sign: str, one: Value, other: Value) -> int | None:
     return one.most + other.most if sign == "+" else one.most * other.most if sign == "*" else None
 
 
-def _shifted(operator: ast.operator, one: Value, other: Value) -> Value:
-    if isinstance(operator, ast.LShift):
+def _shifted(operation: ast.operator, one: Value, other: Value) -> Value:
+    if isinstance(operation, ast.LShift):
         return Value("long", f"((int64_t)((uint64_t){one.text} << {other.text}))")
     return Value("long", f"({one.text} >> {other.text})")
 
 
-def _folded(operator: ast.operator, one: Any, other: Any) -> Any:
-    node = ast.fix_missing_locations(
-        ast.Expression(ast.BinOp(ast.Name("a", ast.Load()), operator, ast.Name("b", ast.Load())))
-    )
-    if isinstance(one, float) or isinstance(operator, ast.Div):  # dividing by zero is no error in a step
+def _folded(operation: ast.operator, one: Any, other: Any) -> Any:
+    if isinstance(one, float) or isinstance(operation, ast.Div):  # dividing by zero is no error in a step
         one, other = np.float64(one), np.float64(other)
     with np.errstate(all="ignore"):
-        return eval(compile(node, "constant", "eval"), {"a": one, "b": other})
+        return PYTHON[type(operation)](one, other)
 
 
 def _of_flag(flag: Value, truths: list[bool]) -> Value:
@@ -272,8 +383,3 @@ def _of_flag(flag: Value, truths: list[bool]) -> Value:
     if truths[0] == truths[1]:
         return number(truths[0])
     return Value("bool", flag.text if truths[1] else f"(!{flag.text})")
-
-
-def _compared(operator: ast.cmpop, one: Any, other: Any) -> bool:
-    node = ast.Expression(ast.Compare(ast.Name("a", ast.Load()), [operator], [ast.Name("b", ast.Load())]))
-    return bool(eval(compile(ast.fix_missing_locations(node), "constant", "eval"), {"a": one, "b": other}))

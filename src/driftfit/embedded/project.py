@@ -7,191 +7,24 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from driftfit.embedded.names import comment, identifier, literal
-from driftfit.embedded.selftest import selftest
-from driftfit.embedded.simulink import SFUNCTION
-from driftfit.embedded.translation import Translation, translation
-from driftfit.embedded.unit import Unit
-from driftfit.embedded.values import assigned, number
+import numpy as np
+
+from driftfit.embedded import templates
+from driftfit.embedded.functions import Translation, translation
+from driftfit.embedded.values import Unit, as_code, assigned, comment, identifier, number
+from driftfit.engine.kernel import Array
+from driftfit.models.base import Model
 from driftfit.readings.first_samples import CODES, DRIFT, DT, NOISE, READING, TIMES
 from driftfit.readings.first_samples import U as INPUTS
+from driftfit.readings.gate import Gate
 from driftfit.run.program import Program
+from driftfit.streams import Live
+from driftfit.trackers.base import Tracker
 
-HEADER = """\
-/* {what}
-
-   Written by driftfit {version}: standalone C99 without heap and without global state. Compile with -ffp-contract=off:
-   the double build then gives the same bits as driftfit. -DTRACKER_SINGLE computes in single precision. */
-#ifndef DRIFTFIT_TRACKER_H
-#define DRIFTFIT_TRACKER_H
-
-#include <stdint.h>
-
-#ifdef TRACKER_SINGLE
-typedef float tracker_real;
-#else
-typedef double tracker_real;
-#endif
-
-#define TRACKER_PARAMETERS {n}
-#define TRACKER_INPUTS {m}
-/* theta: {names} */
-
-/* The state of one stream, which the caller owns. Results: theta and var (the variances of theta, INFINITY for what the
-   data have not distinguished yet). {known} */
-typedef struct {{
-{fields}
-}} tracker_state;
-
-typedef struct {{
-    tracker_real y_hat;    /* prediction of y before it came; NAN where there is none */
-    tracker_real e;        /* innovation y - y_hat; NAN where the sample was not used */
-    tracker_real variance; /* of the innovation */
-    int ok;                /* 1 where the sample was used */
-}} tracker_step;
-
-/* The state before the first sample. */
-void tracker_init(tracker_state *s);
-
-/* Take in one sample: y (NAN where it is missing) and TRACKER_INPUTS inputs. */
-tracker_step tracker_update(tracker_state *s, tracker_real y, const tracker_real *u);
-
-/* What tracker_update would predict for these inputs; only *scratch is changed. */
-tracker_step tracker_predict(const tracker_state *s, tracker_state *scratch, const tracker_real *u);
-
-/* Forget what is known of theta and keep the past signals, as after maintenance. */
-void tracker_reset(tracker_state *s);
-
-#endif
-"""
-
-KNOWN = """Known of the next samples, and kept until changed: interval (nominal intervals since
-   the sample before), noise (factor of the noise variance; INFINITY: do not use the sample) and drift (factor of the
-   drift)."""
-FIXED_RATE = """Samples come at a fixed rate and are all alike: one is left out by passing NAN,
-   not by leaving out the call."""
-
-SOURCE = """\
-/* {what}; see tracker.h. */
-#include "tracker.h"
-
-#include <math.h>
-
-typedef tracker_real real;
-
-#define R(x) ((real)(x))
-#ifdef TRACKER_SINGLE
-#define WIDE(wide, narrow) ((real)(narrow))
-#define R_SQRT(x) sqrtf(x)
-#define R_ABS(x) fabsf(x)
-#else
-#define WIDE(wide, narrow) ((real)(wide))
-#define R_SQRT(x) sqrt(x)
-#define R_ABS(x) fabs(x)
-#endif
-
-#if defined(__GNUC__) /* a copy of tracker_update in tracker_predict would cost code, and a call per sample */
-#define NOT_INLINED __attribute__((noinline))
-#else
-#define NOT_INLINED
-#endif
-
-"""
-
-AGAIN = """\
-/* The first samples once more, without the fault codes that the gate has found among them. */
-static void first_samples_again(tracker_state *s) {{
-    tracker_step step;
-    real rows[{rows}][{columns}], u[{m}];
-    const int64_t kept = s->gate_kept;
-{kept}
-    for (int k = 0; k < {rows}; k++) {{
-        for (int j = 0; j < {columns}; j++) {{ rows[k][j] = s->gate_first[k * {columns} + j]; }}
-    }}
-    *s = START;
-{restored}
-    s->gate_decided = 1;
-    for (int k = 0; k < kept; k++) {{
-        const int64_t codes = (int64_t)rows[k][{codes}];
-        const real y = codes % 2 == 1 ? R(NAN) : rows[k][{reading}];
-        for (int j = 0; j < TRACKER_INPUTS; j++) {{
-            u[j] = (codes >> (j + 1)) % 2 == 1 ? R(NAN) : rows[k][{inputs} + j];
-        }}
-        for (int64_t i = 0; i < (int64_t)rows[k][{times}]; i++) {{
-{factors}
-            {entry}(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);
-        }}
-    }}
-}}
-"""
-
-GATED = """
-* A gate stands before the tracker: it leaves out fault codes, spikes and frozen readings. Once, after the first
-  samples, it may take them in again without the codes among them: up to {rows} different samples, each as often as it
-  came."""
-
-SUPPORT = {
-    "real_minimum": "static real real_minimum(real a, real b) { return b < a ? b : a; }",
-    "real_maximum": "static real real_maximum(real a, real b) { return b > a ? b : a; }",
-    "whole_minimum": "static int64_t whole_minimum(int64_t a, int64_t b) { return b < a ? b : a; }",
-    "whole_maximum": "static int64_t whole_maximum(int64_t a, int64_t b) { return b > a ? b : a; }",
-    "whole_abs": "static int64_t whole_abs(int64_t a) { return a < 0 ? -a : a; }",
-    "real_square": "static real real_square(real a) { return a * a; }",
-    "from_bits": """static double from_bits(int64_t bits) {
-    union { int64_t whole; double number; } both;
-    both.whole = bits;
-    return both.number;
-}""",
-    "bits_of": """static int64_t bits_of(double number) {
-    union { int64_t whole; double number; } both;
-    both.number = number;
-    return both.whole;
-}""",
-    "four": "typedef struct { real at[4]; } four;",
-    "four_of": "static four four_of(real x) { four v = {{x, x, x, x}}; return v; }",
-    "four_at": "static four four_at(const real *x) { four v = {{x[0], x[1], x[2], x[3]}}; return v; }",
-    "four_plus": """static four four_plus(four a, four b) {
-    for (int i = 0; i < 4; i++) { a.at[i] = a.at[i] + b.at[i]; }
-    return a;
-}""",
-    "four_times": """static four four_times(four a, four b) {
-    for (int i = 0; i < 4; i++) { a.at[i] = a.at[i] * b.at[i]; }
-    return a;
-}""",
-    "four_reached": """static int64_t four_reached(four a, four b) {
-    int64_t count = 0;
-    for (int i = 0; i < 4; i++) { count += a.at[i] >= b.at[i]; }
-    return count;
-}""",
-}
-"""The functions that translated steps may call."""
-
-README = """\
-# {what}
-
-`tracker.h`, `tracker.c`: the tracker in C99; `selftest.c`: recorded samples and the bits that they must give;
-`tracker_sfun.c`: an S-function that makes it a Simulink block.
-
-    cc -std=c99 -O2 -ffp-contract=off -o selftest tracker.c selftest.c -lm && ./selftest
-
-* Parameters: {names}.
-* State: {doubles} bytes in double precision, {singles} with `-DTRACKER_SINGLE`. No heap, no global state, no recursion.
-* An update takes at most {ops}.
-  Loops are counted at their longest, and of two branches the dearer.{ordinary}{gate}
-* From the library: `sqrt` and `fabs` where they are used; with `-DTRACKER_SINGLE` also `expf` and `logf`.
-* `-ffp-contract=off` keeps products and sums apart, which gcc in its default mode may fuse; never use `-ffast-math`.
-
-```c
-tracker_state state;
-tracker_init(&state);
-for (;;) {{
-    tracker_step step = tracker_update(&state, y, u); /* then use state.theta, state.var, step.e */
-}}
-```
-
-`driftfit.embedded.from_struct(model, tracker, bytes)` opens a state of the double build in Python, and
-`to_struct(live)` gives the bytes back.
-"""
+SAMPLES = 200
+"""Of the self-test."""
+BOUND = 0.001
+"""Largest error of single precision, as a share of the largest usual result or of the result itself."""
 
 
 def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
@@ -199,20 +32,21 @@ def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
     from driftfit import __version__
 
     made, m = translation(program, fixed_rate), program.model.m
-    header = HEADER.format(
+    header = templates.HEADER.format(
         what=comment(what), version=__version__, n=made.start["theta"].shape[1], m=m,
         names=comment(", ".join(program.names)), fields=_fields(made),
-        known=FIXED_RATE if fixed_rate else KNOWN,
+        known=templates.FIXED_RATE if fixed_rate else templates.KNOWN,
     )  # fmt: skip
-    source = SOURCE.format(what=comment(what)) + _source(made, program)
-    readme = README.format(
-        what=literal(what), names=", ".join(map(literal, program.names)), doubles=made.layout(8).itemsize,
+    source = templates.SOURCE.format(what=comment(what)) + _source(made, program)
+    readme = templates.README.format(
+        what=as_code(what), names=", ".join(map(as_code, program.names)), doubles=made.layout(8).itemsize,
         singles=made.layout(4).itemsize, ops=_counted(made.entry.operations), ordinary=_after_the_start(made),
-        gate="" if program.gate is None else GATED.format(rows=made.start["gate_first"].shape[1]),
+        gate="" if program.gate is None else templates.GATED.format(rows=made.start["gate_first"].shape[1]),
     )  # fmt: skip
     test = selftest(program.model, program.tracker, program.gate)
     return {
-        "tracker.h": header, "tracker.c": source, "selftest.c": test, "tracker_sfun.c": SFUNCTION, "README.md": readme
+        "tracker.h": header, "tracker.c": source, "selftest.c": test, "tracker_sfun.c": templates.SFUNCTION,
+        "README.md": readme,
     }  # fmt: skip
 
 
@@ -237,22 +71,16 @@ def _source(made: Translation, program: Program) -> str:
 
 def _again(made: Translation, program: Program) -> str:
     """The function that takes in the first samples once more; settings that the caller has changed stay."""
-    settings = [identifier(name) for name in made.names if name in program.tracker.settings()]
-    sizes = {identifier(name): made.start[name][0].size for name in made.names}
     kept, restored = [], []
-    for name in settings:
-        size = sizes[name]
-        if size == 1:
-            kept.append(f"    const real {name} = s->{name};")
-            restored.append(f"    s->{name} = {name};")
-        else:
-            loop = f"    for (int i = 0; i < {size}; i++) {{ %s }}"
-            kept += [f"    real {name}[{size}];", loop % f"{name}[i] = s->{name}[i];"]
-            restored.append(loop % f"s->{name}[i] = {name}[i];")
+    for name in (one for one in made.names if one in program.tracker.settings()):
+        name, size = identifier(name), made.start[name][0].size
+        kept += [f"    const real {name} = s->{name};"] if size == 1 else [
+            f"    real {name}[{size}];", f"    {_copied(name, f's->{name}', size)}"]  # fmt: skip
+        restored.append(f"    {_copied(f's->{name}', name, size)}")
     columns = {"interval": DT, "noise": NOISE, "drift": DRIFT}
     factors = [f"            s->{name} = rows[k][{column}];" for name, column in columns.items() if name in made.names]
     rows, width = made.start["gate_first"].shape[1:3]
-    return AGAIN.format(
+    return templates.AGAIN.format(
         rows=rows, columns=width, m=max(program.model.m, 1), kept="\n".join(kept), restored="\n".join(restored),
         codes=CODES, reading=READING, inputs=INPUTS, times=TIMES, factors="\n".join(factors), entry=made.entry.name,
     ).rstrip()  # fmt: skip
@@ -261,7 +89,7 @@ def _again(made: Translation, program: Program) -> str:
 def _support(steps: str) -> list[str]:
     """The functions that the steps call; those that only the double-precision build calls are not in the other."""
     in_single = re.sub(r"^#else\n.*?^#endif", "", steps, flags=re.S | re.M)
-    used = {name: text for name, text in SUPPORT.items() if re.search(rf"\b{name}\b", steps)}
+    used = {name: text for name, text in templates.SUPPORT.items() if re.search(rf"\b{name}\b", steps)}
     return [text if re.search(rf"\b{name}\b", in_single) else f"#ifndef TRACKER_SINGLE\n{text}\n#endif"
             for name, text in used.items()]  # fmt: skip
 
@@ -277,14 +105,9 @@ def _initial(made: Translation) -> str:
 
 def _face(made: Translation, memory: set[str], gated: bool) -> str:
     copies = []
-    for name in made.names:
-        if name in memory:
-            continue
-        size, field = made.start[name][0].size, identifier(name)
-        line = f"s->{field} = START.{field};" if size == 1 else (
-            f"for (int i = 0; i < {size}; i++) {{ s->{field}[i] = START.{field}[i]; }}"
-        )  # fmt: skip
-        copies.append(f"    {line}")
+    for name in (one for one in made.names if one not in memory):
+        field = identifier(name)
+        copies.append(f"    {_copied(f's->{field}', f'START.{field}', made.start[name][0].size)}")
     return "\n".join([
         "void tracker_init(tracker_state *s) {", "    *s = START;", "}", "",
         "NOT_INLINED tracker_step tracker_update(tracker_state *s, tracker_real y, const tracker_real *u) {",
@@ -295,6 +118,10 @@ def _face(made: Translation, memory: set[str], gated: bool) -> str:
         "    *scratch = *s;", "    return tracker_update(scratch, NAN, u);", "}", "",
         "void tracker_reset(tracker_state *s) {", *copies, "}",
     ])  # fmt: skip
+
+
+def _copied(to: str, source: str, size: int) -> str:
+    return f"{to} = {source};" if size == 1 else f"for (int i = 0; i < {size}; i++) {{ {to}[i] = {source}[i]; }}"
 
 
 def _after_the_start(made: Translation) -> str:
@@ -331,3 +158,54 @@ def write(path: Path, texts: dict[str, Any]) -> None:
     path.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (path / name).write_text(text, encoding="utf-8")
+
+
+def record(model: Model, T: int = SAMPLES, seed: int = 0, codes: bool = False) -> tuple[Array, Array]:
+    """y (T,), u (T, m): a stable system whose gain doubles, with missing data, an outage and constant inputs, and with
+    fault codes, some of them among the first samples.
+    """
+    rng = np.random.default_rng(seed)
+    m = max(model.m, 1)
+    u = rng.standard_normal((T, m))
+    u[T // 2 : T // 2 + T // 8] = 0.0
+    y = np.zeros(T)
+    for t in range(2, T):
+        gain = 1.0 if t < T // 3 else 2.0
+        y[t] = 0.6 * y[t - 1] - 0.1 * y[t - 2] + gain * u[t - 1].sum() + 0.1 * rng.standard_normal()
+    y[rng.random(T) < 0.03] = np.nan
+    y[3 * T // 4 : 3 * T // 4 + 5] = np.inf
+    u[rng.random((T, m)) < 0.01] = np.nan
+    if codes:
+        y[[5, T // 4, T // 4 + 1, T // 2 + 40]], u[[8, T // 3 + 20], 0] = 9999.0, -999.0
+    return y, u
+
+
+def selftest(model: Model, tracker: Tracker, gate: Gate | None) -> str:
+    """The text of the test program."""
+    y, u = record(model, codes=gate is not None)
+    live = Live(model, tracker, gate=gate or False)
+    steps = np.array([live.update(float(y[t]), u[t, : model.m]) for t in range(SAMPLES)], dtype=float)
+    scales = [
+        max(float(np.max(np.abs(_finite(part)), initial=0.0)), 1e-30)
+        for part in (record(model)[0], steps[:, 2], live.theta)
+    ]  # without codes; fmt: skip
+    last = "state.theta[i]" if len(live.theta) > 1 else "state.theta"
+    return templates.SELFTEST.format(
+        T=SAMPLES, m=max(model.m, 1), bound=BOUND, y=_listed(y), u=_listed(u), steps=_listed(steps), last=last,
+        theta=_listed(live.theta), y_scale=repr(scales[0]), s_scale=repr(scales[1]), theta_scale=repr(scales[2]),
+    )  # fmt: skip
+
+
+def _finite(values: Array) -> Array:
+    kept: Array = values[np.isfinite(values)]
+    return kept
+
+
+def _listed(values: Any) -> str:
+    return ", ".join(_number(one) for one in np.ravel(values).tolist())
+
+
+def _number(x: float) -> str:
+    if np.isnan(x):
+        return "NAN"
+    return repr(x) if np.isfinite(x) else "INFINITY" if x > 0 else "-INFINITY"

@@ -5,13 +5,22 @@ from __future__ import annotations
 import ast
 from collections import Counter
 
-from driftfit.embedded.calls import Calls
-from driftfit.embedded.names import identifier
-from driftfit.embedded.unit import TranslationError
-from driftfit.embedded.values import RANK, Value, assigned, bare, joined, lifted, narrow, plain
+from driftfit.embedded.expressions import Expressions
+from driftfit.embedded.values import (
+    RANK,
+    TranslationError,
+    Value,
+    assigned,
+    bare,
+    identifier,
+    joined,
+    lifted,
+    narrow,
+    plain,
+)
 
 
-class Statements(Calls):
+class Statements(Expressions):
     """The part of the translator that turns statements into lines."""
 
     given: dict[str, Value]

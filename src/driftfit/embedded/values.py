@@ -13,13 +13,14 @@ table   a tuple or an array of constants; python, a function or module; nothing,
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from driftfit.embedded.names import identifier
 from driftfit.engine.kernel import Array
 
 RANK = {"bool": 0, "flag": 1, "int": 2, "long": 3, "real": 4, "four": 5}
@@ -45,7 +46,6 @@ class Value:
 
     @property
     def known(self) -> bool:
-        """Whether its value is a constant."""
         return self.constant is not None
 
     def key(self) -> tuple[Any, ...]:
@@ -57,7 +57,6 @@ class Value:
 
 
 def number(value: Any) -> Value:
-    """A constant number."""
     if isinstance(value, bool | np.bool_):
         return Value("bool", "1" if value else "0", bool(value))
     if isinstance(value, int | np.integer):
@@ -164,3 +163,94 @@ def bare(text: str) -> str:
         if depth == 0 and i < len(text) - 1:
             return text
     return text[1:-1]
+
+
+RESERVED = frozenset(
+    """auto break case char const continue default do double else enum extern float for goto if int long register return
+    short signed sizeof static struct switch typedef union unsigned void volatile while real inline restrict
+    """.split()  # noqa: SIM905
+)
+"""Words that cannot be names of variables or functions in C.
+
+Names of signals and parameters may be any text; none of it may end a comment or a line, or be read as markup.
+"""
+
+
+def identifier(name: str) -> str:
+    """A name that is valid in C: letters beyond ASCII are written as their numbers."""
+    plain = "".join(one if one.isascii() else f"_u{ord(one):04x}" for one in name)
+    return f"{plain}_" if plain in RESERVED else plain
+
+
+def printed(text: str) -> str:
+    """A text on one line; signs that are not printed, such as those that turn the direction, as their numbers."""
+    return "".join(one if one.isprintable() else f"\\u{ord(one):04x}" for one in text)
+
+
+def comment(text: str) -> str:
+    """A text within a comment of C, which it neither ends nor begins."""
+    return re.sub(r"\*(?=/)|/(?=\*)", r"\g<0> ", printed(text))
+
+
+def as_code(text: str) -> str:
+    """A text in Markdown, none of which is markup."""
+    return f"`{printed(text).replace('`', chr(39))}`"
+
+
+TYPES = {"real": "real", "int": "int", "long": "int64_t", "bool": "int", "flag": "int", "four": "four"}
+"""C types of the kinds of numbers."""
+
+
+class TranslationError(ValueError):
+    """A step uses something that has no translation."""
+
+
+@dataclass(frozen=True)
+class Function:
+    """One function in C: its text, the kinds of its results, and an upper bound of its operations."""
+
+    name: str
+    returns: tuple[str, ...]
+    text: str
+    operations: Counter[str]
+
+
+class Unit:
+    """The shared state of the functions of one file."""
+
+    def __init__(self, record: Array, constant: frozenset[str], flags: frozenset[str]) -> None:
+        self.record = record
+        self.constant = constant
+        """Fields that are assumed to keep the values that they start with."""
+        self.flags = flags
+        """Fields of one number that is assumed to be 0 or 1 at all times."""
+        self.beyond: set[str] = set()
+        """Fields that a translated function may set to other numbers than 0 and 1."""
+        self.written: set[str] = set()
+        """Fields that a translated function may write."""
+        self.replaced: set[str] = set()
+        """Fields that are replaced by their value in the text."""
+        self.functions: dict[Any, Function] = {}
+        self.tables: dict[str, str] = {}
+        self.names: Counter[str] = Counter()
+        self.largest = max((size for name in record.dtype.names or () for size in record[name].shape), default=1)
+        """The largest extent in the record: the upper bound of loops about which nothing else is known."""
+
+    def field(self, name: str) -> Value:
+        return field(name, self.record[name][0], name in self.flags)
+
+    def start_of(self, name: str) -> Any:
+        """The value that every entry of a constant field has; None if there is no such value."""
+        values = self.record[name][0].ravel()
+        if name not in self.constant or len(np.unique(values.view(np.int64))) != 1:  # 0.0 is not -0.0
+            return None
+        self.replaced.add(name)
+        return values[0].item()
+
+    def table(self, values: Any) -> tuple[str, str]:
+        """(name, kind) of a table of constants."""
+        flat = [lifted(one) for one in np.ravel(values).tolist()]
+        kind = joined(*(one.kind for one in flat))
+        text = ", ".join(one.text for one in flat)
+        body = f"static const {TYPES[kind]} %s[{len(flat)}] = {{{text}}};"
+        return self.tables.setdefault(body, f"table_{len(self.tables) + 1}"), kind

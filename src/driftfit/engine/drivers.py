@@ -25,7 +25,7 @@ from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
 from driftfit.engine.phases import advancing, at_once, gated, learning, looking, raw_kept
 from driftfit.engine.simd import fill_four, four_of, in_fours, load_four, store_four, times
-from driftfit.engine.tiles import as_compiled, inputs_and_lanes, is_open, tile_type
+from driftfit.engine.tiles import as_compiled, kind_of, tile_type
 from driftfit.engine.tracker_part import tracker_part, whole_record
 
 LARGEST = 1e38
@@ -264,7 +264,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
             y = np.ascontiguousarray(y, dtype=np.float64)
             u = np.ascontiguousarray(u, dtype=np.float64)
             known = np.ascontiguousarray(known, dtype=np.float64)
-        m, L = inputs_and_lanes(tile.dtype)
+        m, L, opened = kind_of(tile.dtype)
         if theta is NOWHERE:
             _check_shapes(m, L, len(out), y, u, known)
         else:
@@ -272,7 +272,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
             if len(out) != 1 or theta.shape[1:] != tile["theta"].shape[1:]:
                 raise ValueError(f"run: out must have one row beside theta, which has shape {theta.shape}.")
         ready(L)
-        given = as_compiled(tile) if is_open(tile.dtype) else tile, y, u, known, out, theta
+        given = as_compiled(tile) if opened else tile, y, u, known, out, theta
         done: int = run.of_kind((tile.dtype, out.dtype), given) if plain else run(*given)
         return done
 

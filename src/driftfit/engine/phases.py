@@ -137,25 +137,28 @@ def advancing(tracker: Any) -> Any:
     return advance_or_start
 
 
-def looking(tracker: Any) -> Any:
-    """Time update and forecast of all lanes, before a gate."""
-    forecasts = forecasting(tracker)
-    first = forecasts if tracker.start is None else forecasting(tracker.start)
+def _of_lanes(usual: Step, first: Step | None) -> Any:
+    """A step of all lanes; those whose ``s.root`` is 1 take the ``first``, if the tracker has a start."""
 
     @kernel
-    def look(s: State) -> None:
+    def all_alike(s: State) -> None:
+        for l in range(s.theta.shape[1]):
+            usual(s, l)
+
+    @kernel
+    def by_root(s: State) -> None:
         for l in range(s.theta.shape[1]):
             if s.root[l] > 0:
-                first(s, l)
+                first(s, l)  # type: ignore[misc]
             else:
-                forecasts(s, l)
+                usual(s, l)
 
-    @kernel
-    def look_at_once(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            forecasts(s, l)
+    return all_alike if first is None else by_root
 
-    return look_at_once if tracker.start is None else look
+
+def looking(tracker: Any) -> Any:
+    """Time update and forecast of all lanes, before a gate."""
+    return _of_lanes(forecasting(tracker), None if tracker.start is None else forecasting(tracker.start))
 
 
 @kernel
@@ -164,13 +167,15 @@ def floored(s: State, l: int) -> None:
     s.scale[l] = max(s.scale[l], s.floor[l]) if s.floor[l] > 0.0 else s.scale[l]
 
 
-def learning(tracker: Any) -> Any:
-    """Correction of all lanes, and reports, after a gate, which may have raised the noise and the floor of r."""
-    variance, correct, report = tracker.variance, tracker.correct, tracker.report
-    first = tracker if tracker.start is None else tracker.start
-    variance_first, correct_first, report_first = first.variance, first.correct, first.report
-    both, check, late = _wide_samples(tracker)
-    bound_scale = floored if tracker.learns_scale else nothing
+@kernel
+def taken_in(s: State, l: int) -> None:
+    """The form of the start takes every sample in."""
+    s.late[l] = 0.0
+
+
+def _corrected(steps: Any, check: Step, bound_scale: Step) -> Step:
+    """The correction of one lane, and its report."""
+    variance, correct, report = steps.variance, steps.correct, steps.report
 
     @kernel
     def corrected(s: State, l: int) -> None:
@@ -180,30 +185,24 @@ def learning(tracker: Any) -> Any:
         bound_scale(s, l)
         report(s, l)
 
-    @kernel
-    def corrected_first(s: State, l: int) -> None:
-        variance_first(s, l)
-        s.late[l] = 0.0
-        correct_first(s, l)
-        bound_scale(s, l)
-        report_first(s, l)
+    return corrected  # type: ignore[no-any-return]
+
+
+def learning(tracker: Any) -> Any:
+    """Correction of all lanes, and reports, after a gate, which may have raised the noise and the floor of r."""
+    both, check, late = _wide_samples(tracker)
+    bound_scale = floored if tracker.learns_scale else nothing
+    first = None if tracker.start is None else _corrected(tracker.start, taken_in, bound_scale)
+    corrected = _of_lanes(_corrected(tracker, check, bound_scale), first)
+    if not both:
+        return corrected
 
     @kernel
     def learn(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            if s.root[l] > 0:
-                corrected_first(s, l)
-            else:
-                corrected(s, l)
-        if both:
-            late(s)
+        corrected(s)
+        late(s)
 
-    @kernel
-    def learn_at_once(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            corrected(s, l)
-
-    return learn_at_once if tracker.start is None else learn
+    return learn
 
 
 def at_once(advance: Any, part: Any) -> Any:

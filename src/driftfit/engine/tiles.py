@@ -115,23 +115,15 @@ def _followed_by(dtype: np.dtype[Any], fields: Sequence[Any]) -> np.dtype[Any]:
 
 
 @lru_cache(maxsize=256)
-def inputs_and_lanes(tile: np.dtype[Any]) -> tuple[int, int]:
-    """(number of inputs, number of lanes) of a record."""
+def kind_of(tile: np.dtype[Any]) -> tuple[int, int, bool]:
+    """(number of inputs, number of lanes, whether it has open fields) of a record."""
     m, L = tile["u"].shape
-    return m, L
-
-
-@lru_cache(maxsize=256)
-def is_open(tile: np.dtype[Any]) -> bool:
-    """Whether a record has open fields (`OPEN`)."""
-    return OPEN[0] in (tile.fields or ())
+    return m, L, OPEN[0] in (tile.fields or ())  # of the names all would be compared
 
 
 def as_compiled(tile: Array) -> Array:
     """The tile as compiled code takes it: of its open fields (`OPEN`) only the beginning."""
-    if not is_open(tile.dtype):
-        return tile
-    return np.ndarray(tile.shape, _beginning(tile.dtype), tile)
+    return np.ndarray(tile.shape, _beginning(tile.dtype), tile) if kind_of(tile.dtype)[2] else tile
 
 
 @lru_cache(maxsize=256)

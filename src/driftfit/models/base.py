@@ -197,10 +197,6 @@ class Model(Settings, ABC):
         """theta (.., n) from parameters (.., k) that a tracker follows instead; None where they do not define it."""
         return None
 
-    def polynomials(self, theta: Array) -> tuple[Array, list[Array]]:
-        """A(z) and B(z) at theta (.., n) in powers of z^-1; ValueError for a model that has none."""
-        raise ValueError(f"polynomials: {type(self).__name__} has no polynomials; use ARX.")
-
     def transfers(self, theta: Array) -> tuple[Array, list[tuple[Array, Array]]]:
         """The poles' polynomial at theta (.., n), and numerator and denominator from each input, in powers of z^-1.
 
@@ -259,11 +255,6 @@ class Model(Settings, ABC):
     def held_at(self, theta: Array) -> Model | None:
         """This model with its linearisation held at theta (n,), so that a run is a linear regression; None without."""
         return None
-
-    @property
-    def recursive(self) -> bool:
-        """Whether regressors hold earlier results of the model itself, so that a sample acts on all after it."""
-        return False
 
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
         """Run systems forward: the outputs (D, h) that inputs and noise cause, each fed back as a lag.

@@ -40,10 +40,9 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.models.base import GAP, refuse_lag
-from driftfit.models.formulas.functions import equation_text
-from driftfit.models.formulas.text import Formula, compiled, parse, start_values
+from driftfit.models.formula import Formula, compiled, parse, start_values
 from driftfit.models.inputs import NamedInputs
-from driftfit.models.lags.output_lags import shift_inputs
+from driftfit.models.lags import shift_inputs
 from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
 
 SETTLING = 10.0
@@ -56,9 +55,8 @@ class Equation(NamedInputs):
 
     Parameters
     ----------
-    equation : str, or a function
-        Such as ``"y = theta.k * sqrt(p1 - p2) - theta.c"``; or a plain Python function of u, theta and y that returns
-        the output, and has its name (`driftfit.models.formulas.functions`).
+    equation : str
+        Such as ``"y = theta.k * sqrt(p1 - p2) - theta.c"``.
     start : mapping from parameter to number, or a number for all
         Where the linearisation begins; 1 for those that are not named. It is no prior: give that to the tracker, as
         ``theta0`` and ``p0``.
@@ -71,13 +69,11 @@ class Equation(NamedInputs):
         If the text is not such an equation, ``start`` names what is no parameter, or inputs are missing.
     """
 
-    equation: Any
+    equation: str
     start: Any = 1.0
     inputs: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        if callable(self.equation):
-            self._set("equation", equation_text(self.equation))
         formula = parse(self.equation)
         self._check_inputs(formula.inputs)
         self._set("start", start_values("Equation", self.start, formula.parameters))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 from warnings import warn
 
@@ -14,9 +14,9 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import input_names, numbers, whole
 from driftfit.models.base import Model
 
-LOW, FAR = 0.02, 2.0
-"""An input is far from 0 if all but the share `LOW` of its values are, by `FAR` times their usual deviation from their
-median."""
+TAIL, DEVIATIONS = 0.02, 2.0
+"""An input is far from 0 if all but the share `TAIL` of its values are, by `DEVIATIONS` times their usual deviation
+from their median."""
 
 
 class CountedInputs(Model):
@@ -133,10 +133,6 @@ class LinearisedTransfer(CountedInputs):
             raise ValueError(f"{kind}: point must have {self.n} entries, {', '.join(self.names)}; got {self.point!r}.")
 
     @property
-    def recursive(self) -> bool:
-        return True
-
-    @property
     def simulated(self) -> tuple[bool, ...]:
         """Which inputs have a response that is simulated with theta."""
         return (True,) * self.m
@@ -146,9 +142,9 @@ class LinearisedTransfer(CountedInputs):
         named = zip(self.input_names or self.suffixes, u.T, self.simulated, strict=True)
         for name, values in ((name, values) for name, values, far in named if far and self.point is None):
             known = values[np.abs(values) < LARGEST]
-            low, middle, high = np.quantile(known, (LOW, 0.5, 1.0 - LOW)) if len(known) else (0.0, 0.0, 0.0)
+            low, middle, high = np.quantile(known, (TAIL, 0.5, 1.0 - TAIL)) if len(known) else (0.0, 0.0, 0.0)
             spread = float(np.median(np.abs(known - middle))) / 0.6745 if len(known) else 0.0
-            if max(low, -high) > FAR * spread > 0.0:
+            if max(low, -high) > DEVIATIONS * spread > 0.0:
                 warn(
                     f"{type(self).__name__}: {name.strip('[]') or 'u'} varies by {spread:.3g} about {middle:.4g}, and "
                     "the simulated response to a mean far from 0 spoils the estimates, also with an offset. Subtract "
@@ -188,3 +184,23 @@ class NamedInputs(Model):
     @property
     def input_names(self) -> tuple[str, ...]:
         return self.inputs or ()
+
+
+@dataclass(frozen=True)
+class Wider(Model):
+    """A bound model in the record of a larger one of ``size`` parameters: regressors after its own are 0."""
+
+    model: Model
+    size: int
+
+    def bind(self, inputs: int | Sequence[str]) -> Self:
+        return self
+
+    @property
+    def m(self) -> int:
+        return self.model.m
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        own = self.model.names
+        return (*own, *(f"absent{i + 1}" for i in range(self.size - len(own))))

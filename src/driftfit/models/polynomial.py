@@ -56,7 +56,18 @@ from driftfit.engine.settings import whole
 from driftfit.models.inputs import LinearisedTransfer
 from driftfit.models.linearised import MEMORY
 from driftfit.models.polynomials.instruments import MORE, instrumental_steps
-from driftfit.models.polynomials.steps import EACH, OWN, SETTLING, Places, U, Y, places, steps, taking_inputs
+from driftfit.models.polynomials.steps import (
+    EACH,
+    OWN,
+    SETTLING,
+    Places,
+    U,
+    Y,
+    places,
+    refuse_held,
+    steps,
+    taking_inputs,
+)
 
 FORGOTTEN = 80.0
 """Samples for each parameter that a tracker without drift should forget again: twenty times the start."""
@@ -166,10 +177,19 @@ class PolynomialModel(LinearisedTransfer):
             "damped": np.zeros(self.n),
             "recursion": np.zeros((2, self._depth)),
             "last_input": np.zeros(max(self.m, 1)),
+            "left": np.zeros((max(self.m, 1), 3)),
             "extent": np.zeros(1 + self.m),
             **MEMORY,
             "usable": 0.0 if self.point is None else LARGEST,
         }
+
+    @property
+    def input_memory(self) -> int:
+        return max((nb + nk - 1 for nb, _, nk in self.orders), default=0)
+
+    @property
+    def refuse(self) -> Any:
+        return refuse_held
 
     @property
     def steps(self) -> ModelSteps:

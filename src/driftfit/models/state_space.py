@@ -28,7 +28,7 @@ Walther, Evaluating Derivatives (2008), chapter 3. Cost per sample: that of `Joi
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -37,11 +37,10 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.models.formulas.functions import CLOCK, system_text
-from driftfit.models.formulas.text import Formula, Writer, parse, start_values, written
+from driftfit.models.formula import Formula, Writer, parse, start_values, written
 from driftfit.models.inputs import NamedInputs
 
-TIME = "dt"
+TIME, CLOCK = "dt", "clock"
 
 
 class System(NamedTuple):
@@ -60,9 +59,9 @@ class System(NamedTuple):
 @lru_cache(maxsize=256)
 def system_of(text: str) -> System:
     """The parts of equations, one per line; ValueError names the part that is not understood."""
-    given = [line.strip() for line in str(text).strip().splitlines() if line.strip()]
+    given = [line.strip() for line in text.splitlines() if line.strip()] if isinstance(text, str) else []
     if not given:
-        raise ValueError("StateSpace: give a line for each hidden state, and one for the output.")
+        raise ValueError(f"StateSpace: give a text, a line for each hidden state and one for the output; got {text!r}.")
     lines = tuple(parse(line, known=True) for line in given)
     left = tuple(line.output for line in lines)
     if len(set(left)) < len(left) or {TIME, CLOCK} & set(left):
@@ -99,10 +98,8 @@ class StateSpace(NamedInputs):
 
     Parameters
     ----------
-    equations : str, or two functions
-        A line for each hidden state, and last one for the output. Or a list of two plain Python functions of x, u,
-        theta, y, t and dt: the first returns the states by name, as ``{"soc": x.soc - dt * u.i}``, the second returns
-        the output, and has its name (`driftfit.models.formulas.functions`).
+    equations : str
+        A line for each hidden state, and last one for the output.
     start : mapping from name to number, or a number for all
         Parameters and states before the first sample; 1 for parameters that are not named, 0 for states. It is the
         mean of the tracker's prior, unless that has its own.
@@ -115,13 +112,11 @@ class StateSpace(NamedInputs):
         If the text is not such a system, ``start`` names nothing in it, or inputs are missing.
     """
 
-    equations: Any
+    equations: str
     start: Any = ()
     inputs: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.equations, str) and isinstance(self.equations, Sequence):
-            self._set("equations", system_text(self.equations))
         system = system_of(self.equations)
         self._check_inputs(system.inputs)
         self._set("start", start_values("StateSpace", self.start, self.names))
@@ -150,10 +145,6 @@ class StateSpace(NamedInputs):
             return np.full(self.n, float(self.start))
         given = dict(self.start)
         return np.array([given.get(name, float(name not in self.hidden)) for name in self.names])
-
-    @property
-    def recursive(self) -> bool:
-        return True
 
     @property
     def input_memory(self) -> int:

@@ -81,7 +81,7 @@ def input_rules(
 
     @kernel
     def take_out(s: State, j: int, l: int) -> None:
-        for age in range(ages + 1):
+        for age in range(ages, -1, -1):
             if (s.gate_outside[j, l] >> age) & 1 > 0:
                 refuse(s, j, age, l)
         forget(s, j, l)

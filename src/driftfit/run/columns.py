@@ -5,16 +5,7 @@ Its rows are successive samples between which no time passes: correcting with on
 correction with all of them, for independent noises of variance r / weight. The prediction of the second output uses
 the first one. What belongs to a single row is then (T, ny), and the state after an instant is that after its last row.
 
-Results as plain data, and the public classes that replace them.
-
-A verb such as `smooth` takes a result and is in a higher layer, so a result cannot have it as a method without a
-circular import. Below the verbs, results are plain data. The facade (`driftfit.results`, `driftfit.streams`) declares a
-class of each kind that also has the verbs as methods, with ``public=True``; from then on the plain class makes
-instances of that class.
-
-Samples as a tracker receives them, after the model and the missing-data rule.
-
-Rows of results copied column by column.
+`collect` stores samples as a tracker receives them; `put_columns` and `put_fields` copy rows column by column.
 """
 
 from __future__ import annotations
@@ -26,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.data.record import Labels
 from driftfit.engine.drivers import TrackerSteps, stored_too
 from driftfit.engine.kernel import Array, Driver, State, kernel
 
@@ -105,6 +97,37 @@ class Columns(ABC):
         return self.written("ok") > 0.0
 
 
+class OfRecord(Columns):
+    """The same with the signals and the times of the record."""
+
+    record: Any
+
+    @property
+    def y(self) -> Array:
+        return self.by_row(self.record.y)
+
+    @property
+    def u(self) -> Array:
+        return self.by_row(self.record.u)
+
+    @property
+    def labels(self) -> Labels:
+        """Names and units of the signals, and what was left out."""
+        found: Labels = self.record.labels
+        return found
+
+    @property
+    def timed(self) -> bool:
+        """Whether samples have times; otherwise `time` numbers them."""
+        return self.record.time is not None
+
+    @property
+    def time(self) -> Array:
+        """The given times, or sample numbers."""
+        T = len(self.record) // self.rows_per_instant
+        return np.arange(T) if self.record.time is None else self.after_rows(self.record.time)
+
+
 COLLECTED = ("phi", "y", "dt", "valid", "observed")
 """Fields that `collect` stores."""
 
@@ -125,7 +148,7 @@ def collecting(steps: TrackerSteps) -> TrackerSteps:
     return steps._replace(store=stored_too(steps.store, collect))
 
 
-SHORT = 32
+SHORT_ROW = 32
 """Rows of fewer numbers are copied column by column: NumPy takes 30 ns for each row."""
 
 
@@ -133,7 +156,7 @@ def put_columns(given: Array, into: Array) -> None:
     """Copy an array (T, ..) whose rows may be short and far apart."""
     T = len(into)
     given, into = given.reshape(T, -1), into.reshape(T, -1)
-    if into.shape[1] >= SHORT:
+    if into.shape[1] >= SHORT_ROW:
         into[...] = given
         return
     for k in range(into.shape[1]):

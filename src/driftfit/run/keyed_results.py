@@ -120,14 +120,8 @@ class KeyedResults(Plain):
         """The results of some lanes, of which ``wanted`` has an entry for each."""
         return (self._run(j) for j in self._index.values() if wanted[j])
 
-    def ends(self) -> Iterator[tuple[Program, dict[str, Array]]]:
-        """The program of each lane, and its state after the last sample."""
-        for j in self._index.values():
-            lane = self._lanes[j]
-            yield self._programs[j], state_of(lane.tile, lane.lane)
-
     def undetermined(self) -> Iterator[tuple[Program, dict[str, Array]]]:
-        """The entries of `ends` whose record does not determine every parameter."""
+        """The programs and final states of the lanes whose record does not determine every parameter."""
         for _, tile, lanes, places in self._lanes.tiles:
             for k in np.flatnonzero(np.isinf(tile["var"][0]).any(axis=0)[places]).tolist():
                 yield self._programs[lanes[k]], state_of(tile, places[k])

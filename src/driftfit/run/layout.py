@@ -36,11 +36,11 @@ from driftfit.engine.kernel import Array
 
 MAGIC, FORMAT = b"DFst", 2
 HEAD = Struct("<4sHHI8sI")
-CHECKED = 12
+CRC_BEGIN = 12
 """The first byte that the CRC covers."""
 TAG = slice(12, 20)
 """The fingerprint."""
-MANY = 512
+SPARSE_WORDS = 512
 """From this number of words on, zeros are left out where that makes the bytes fewer."""
 WORD = np.dtype("<i8")
 
@@ -122,25 +122,30 @@ class Layout:
 
     def unpack(self, data: bytes) -> Array:
         """The inverse of `pack`; ValueError for anything else."""
-        tag, words = unpacked(data)
-        if tag != self.tag or len(words) != self.size:
-            raise ValueError(
-                f"the bytes hold a state of another model, tracker, gate, setting or version: their fingerprint is "
-                f"{tag.hex()}, that of {self.owner} is {self.tag.hex()}. Use the model, tracker and gate with which "
-                "they were made, or carry the state over field by field with warm_start=."
-            )
-        return words
+        return own_words(data, self.tag, self.size, self.owner)
+
+
+def own_words(data: bytes, tag: bytes, size: int, owner: Any) -> Array:
+    """The words of a packed state with this fingerprint and size; ValueError for anything else."""
+    found, words = unpacked(data)
+    if found != tag or len(words) != size:
+        raise ValueError(
+            "the bytes hold a state of another model, tracker, gate, setting or version: their fingerprint is "
+            f"{found.hex()}, that of {owner} is {tag.hex()}. Use the model, tracker and gate that made them, "
+            "or carry the state over field by field with warm_start=."
+        )
+    return words
 
 
 def packed(tag: bytes, words: Array) -> bytes:
     """Words (W,) as bytes, with a fingerprint."""
     body, sparse = words.astype(WORD, copy=False).tobytes(), 0
-    if len(words) >= MANY:
+    if len(words) >= SPARSE_WORDS:
         there = words != 0
         shorter = np.packbits(there).tobytes() + words[there].astype(WORD, copy=False).tobytes()
         body, sparse = (shorter, 1) if len(shorter) < len(body) else (body, 0)
     head = HEAD.pack(MAGIC, FORMAT, sparse, 0, tag, len(words))
-    check = zlib.crc32(body, zlib.crc32(head[CHECKED:]))
+    check = zlib.crc32(body, zlib.crc32(head[CRC_BEGIN:]))
     return HEAD.pack(MAGIC, FORMAT, sparse, check, tag, len(words)) + body
 
 
@@ -153,7 +158,7 @@ def unpacked(data: bytes) -> tuple[bytes, Array]:
         raise ValueError(f"the state was packed by a newer driftfit (format {version}); this one reads {FORMAT}.")
     if version < FORMAT:
         raise ValueError(f"the state was packed by an older driftfit (format {version}), {storage.REMEDY}.")
-    if zlib.crc32(memoryview(data)[CHECKED:]) != check or sparse > 1:
+    if zlib.crc32(memoryview(data)[CRC_BEGIN:]) != check or sparse > 1:
         raise ValueError("the packed state is damaged: its check sum does not fit its content.")
     if not sparse:
         return tag, _native(np.frombuffer(data, WORD, count, HEAD.size))

@@ -22,7 +22,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 from driftfit.models.regression import Regression
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, left_out_of
-from driftfit.run.columns import COLLECTED, Columns, collect
+from driftfit.run.columns import COLLECTED, OfRecord, collect
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.lanes import Lane, names_of
 from driftfit.run.program import Program, kept, lanes_of, shown, state_of, tile_of
@@ -31,7 +31,7 @@ from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
 
 
-class Outputs(KeyedResults, Columns):
+class Outputs(KeyedResults, OfRecord):
     """A record with several outputs, each with its own theta.
 
     Attributes
@@ -67,19 +67,6 @@ class Outputs(KeyedResults, Columns):
         return tuple(one.tracker for one in self._programs)
 
     @property
-    def y(self) -> Array:
-        return self.record.y
-
-    @property
-    def u(self) -> Array:
-        return self.record.u
-
-    @property
-    def timed(self) -> bool:
-        """Whether samples have times; otherwise `time` numbers them."""
-        return self.record.time is not None
-
-    @property
     def by(self) -> tuple[str, ...]:
         return ("output",)
 
@@ -105,11 +92,6 @@ class Outputs(KeyedResults, Columns):
     @cached_property
     def _stacked(self) -> dict[str, Array]:
         return {}
-
-    @property
-    def time(self) -> Array:
-        """The given times, or sample numbers."""
-        return np.arange(len(self)) if self.record.time is None else self.record.time
 
     @cached_property
     def loglik(self) -> float:

@@ -10,12 +10,9 @@ lane o G + g is output o of series g; lanes beyond ny G repeat others and are ig
 Series are sorted by length, so that those of one tile end at about the same time. A lane whose series has ended
 continues with dt = 0 and no output, which changes only the lags of its model; its state is copied when its series ends.
 
-Many series continued from their states, in the lanes of tiles; results as columns in the order of their samples.
-
-This is what a process needs that receives a few samples of many series, with their states, and must be fast: no
-`Track` is made for a series. The samples, results and states of a series are those of its record, bit for bit.
-
-Of K series with ny outputs each, programs and states have K ny entries, those of a series one after the other.
+`advance` continues many series from their states, for a process that receives a few samples of each and must be fast:
+results are columns in the order of the samples, and no `Track` is made. They are those of the records, bit for bit. Of
+K series with ny outputs each, programs and states have K ny entries, those of a series one after the other.
 """
 
 from __future__ import annotations
@@ -36,20 +33,17 @@ from driftfit.engine.kernel import Array, Driver
 from driftfit.engine.tiles import repeat_tile
 from driftfit.run.lanes import Lanes
 from driftfit.run.layout import words_of
-from driftfit.run.program import Program, State, progress, tile_of
+from driftfit.run.program import PROGRESS_SAMPLES, Program, State, progress, tile_of
 
-BLOCK = 256
+BLOCK_SAMPLES = 256
 """Number of samples that are copied into lane order at a time: a block of a tile fits into the second-level cache."""
 
-FEWEST = 10
+FEWEST_LANES = 10
 """Fewer series than this are run one by one: a tile of 32 lanes costs as much as about ten single lanes."""
 
-TURNS, MOST_TILES = 16, 16
+BATCHES_PER_THREAD = TILES_PER_BATCH = 16
 """Batches that a thread runs at least, and tiles of a batch at most: handing over a tile costs 50 us, as much as a
 quarter of its hundred samples."""
-
-SHOWN = 1_000_000
-"""Samples above which a progress bar appears."""
 
 
 _thread = threading.local()
@@ -118,7 +112,7 @@ def _groups(programs: Sequence[Program]) -> list[list[int]]:
 
 def width_of(program: Program, count: int, ny: int = 1) -> int:
     """Lanes of the tiles for ``count`` series with ny outputs."""
-    wide = 1 if count * ny < FEWEST else program.width
+    wide = 1 if count * ny < FEWEST_LANES else program.width
     return ny if wide < 2 * ny else wide
 
 
@@ -168,10 +162,10 @@ def run_jobs(jobs: Sequence[Job], records: Records, threads: int | None = None) 
     for job in {(job.run, job.tile.dtype, job.out.dtype): job for job in jobs}.values():
         _drive(job, records, 0)  # compiles, so that threads do not wait for each other
     threads = threads or cores()
-    most = min(MOST_TILES, max(1, len(jobs) // (TURNS * threads)))
+    most = min(TILES_PER_BATCH, max(1, len(jobs) // (BATCHES_PER_THREAD * threads)))
     batches = [jobs[k : k + most] for k in range(0, len(jobs), most)]
     total = sum(map(_samples, batches))
-    with progress("tracking", total, total > SHOWN) as advance, ThreadPoolExecutor(threads) as pool:
+    with progress("tracking", total, total > PROGRESS_SAMPLES) as advance, ThreadPoolExecutor(threads) as pool:
         waiting = {pool.submit(_drive_all, batch, records): batch for batch in batches}
         try:
             for future in as_completed(waiting):
@@ -205,9 +199,9 @@ def _drive(job: Job, records: Records, stop: int) -> None:
     first, length = records.first[series], records.length[series]
     columns = records.known.columns
     given, factors = records.y.reshape(N, -1), columns.reshape(*columns.shape[:2], -1)
-    y, u, known = _block(L, records.u.shape[1], min(BLOCK, len(columns)), columns.shape[1])
+    y, u, known = _block(L, records.u.shape[1], min(BLOCK_SAMPLES, len(columns)), columns.shape[1])
     finals: list[tuple[Array, Array]] = []
-    bounds = sorted({*range(0, stop, BLOCK), *(int(end) for end in length if end < stop), stop})
+    bounds = sorted({*range(0, stop, BLOCK_SAMPLES), *(int(end) for end in length if end < stop), stop})
     for a, b in pairwise(bounds) if stop else [(0, 0)]:
         size = b - a
         start = np.where(b <= length, first + a, -1)
@@ -222,7 +216,7 @@ def _drive(job: Job, records: Records, stop: int) -> None:
 
 def _block(L: int, m: int, factors: int, columns: int) -> tuple[Array, Array, Array]:
     """This thread's memory for a block in lane order; fresh memory for every tile would cost as much as the filter."""
-    shapes = (BLOCK, L), (BLOCK, m, L), (factors, columns, L)
+    shapes = (BLOCK_SAMPLES, L), (BLOCK_SAMPLES, m, L), (factors, columns, L)
     if getattr(_thread, "shapes", None) != shapes:
         _thread.shapes, _thread.block = shapes, tuple(np.empty(shape) for shape in shapes)
     block: tuple[Array, Array, Array] = _thread.block

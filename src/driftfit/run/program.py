@@ -33,16 +33,16 @@ from driftfit.run.gating import AtStart, gate_of, readings_of, without_start
 from driftfit.run.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
-CHUNK = 1_000_000
+PROGRESS_SAMPLES = 1_000_000
 """Samples beyond which a progress bar is shown."""
 
-FEW, PART = 1024, 0.1
+FIRST_PART, PART_SECONDS = 1024, 0.1
 """Samples of the first part of a record, and about the seconds that a part takes: Ctrl-C is heard between two parts."""
 
-BLOCK = 4096
+SINGLE_BLOCK = 4096
 """Samples of a block of results that are kept in single precision."""
 
-MOST = 10
+WIDEST_LANES = 10
 """With more parameters than this loops over lanes are slower than single lanes (docs/design.md): the compiler does not
 unroll a loop over that many, and then does not vectorise the loop over lanes.
 """
@@ -268,7 +268,7 @@ class Program:
     @property
     def width(self) -> int:
         """The number of lanes of a tile of many series, or of many settings."""
-        return 1 if self.model.n > MOST or self.gate is not None else min(self.model.width, self.tracker.width)
+        return 1 if self.model.n > WIDEST_LANES or self.gate is not None else min(self.model.width, self.tracker.width)
 
     def lanes(self, count: int) -> Array:
         """A tile with this program in every lane, at its start. It is made once and must not be changed."""
@@ -316,16 +316,16 @@ class Program:
         """Run a tile over a record, a lane for each output; returns what is kept, (T,) of `output_type`."""
         T = len(record)
         out = self.written(tile, T, keep, dtype)
-        if FEW >= T:
+        if FIRST_PART >= T:
             self.fill(tile, *lanes_of(record), out)
             return out
-        a, count = 0, FEW
-        with progress("tracking", T, T > CHUNK) as advance:
+        a, count = 0, FIRST_PART
+        with progress("tracking", T, T > PROGRESS_SAMPLES) as advance:
             while a < T:
                 begun, part = perf_counter(), slice(a, min(a + count, T))
                 self.fill(tile, *lanes_of(record.part(part)), out[part])
                 advance(part.stop - a)
-                a, count = part.stop, 2 * count if perf_counter() - begun < PART else max(1, count // 2)
+                a, count = part.stop, 2 * count if perf_counter() - begun < PART_SECONDS else max(1, count // 2)
         return out
 
     def fill(self, tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
@@ -339,9 +339,9 @@ class Program:
         if out.dtype == rows.base:
             run(tile, y, u, known, *last, out)
             return
-        block = np.empty(min(BLOCK, len(out)), rows)
-        for a in range(0, len(out), BLOCK):
-            part = slice(a, min(a + BLOCK, len(out)))
+        block = np.empty(min(SINGLE_BLOCK, len(out)), rows)
+        for a in range(0, len(out), SINGLE_BLOCK):
+            part = slice(a, min(a + SINGLE_BLOCK, len(out)))
             results = block[: part.stop - a]
             run(tile, y[part], u[part], known if len(known) == 1 else known[part], *last, results)
             _copy(results, out[part])

@@ -10,12 +10,13 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from driftfit.data.record import Known, Labels, Record, Records, time_text
+from driftfit.data.record import Known, Record, Records, time_text
 from driftfit.engine.kernel import Array
+from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.readings.gate import AT_START
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, left_out_of
-from driftfit.run.columns import Columns
+from driftfit.run.columns import OfRecord
 from driftfit.run.gating import AtStart, without_codes
 from driftfit.run.lanes import Lane, Lanes, Results, names_of, read_results, write_results
 from driftfit.run.live.conformal import quantile, widened
@@ -26,7 +27,12 @@ from driftfit.trackers.student import log_student, residuals_before, wider
 
 
 class Plain:
-    """A result or a stream as data: ``Kind(...)`` makes an instance of its public class."""
+    """A result or a stream as data: ``Kind(...)`` makes an instance of its public class.
+
+    A verb such as `smooth` takes a result and is in a higher layer, so a result cannot have it as a method without a
+    circular import. The facade (`driftfit.results`, `driftfit.streams`) declares a class of each kind that also has the
+    verbs as methods, with ``public=True``; from then on the plain class makes instances of that class.
+    """
 
     _public: ClassVar[dict[type, type]] = {}
 
@@ -49,7 +55,7 @@ KIND = "track"
 """The kind of a file that holds one run."""
 
 
-class Track(Plain, Columns):
+class Track(Plain, OfRecord):
     """Parameters of a record, sample by sample.
 
     Outputs that share one theta, ``Regression(n, ny=2, shared=True)``, are one Track whose samples are instants: theta
@@ -70,6 +76,8 @@ class Track(Plain, Columns):
     names : tuple of str
         Names of the parameters.
     """
+
+    record: Record
 
     def __init__(
         self,
@@ -114,27 +122,9 @@ class Track(Plain, Columns):
         return self.program.tracker
 
     @property
-    def y(self) -> Array:
-        return self.by_row(self.record.y)
-
-    @property
-    def u(self) -> Array:
-        return self.by_row(self.record.u)
-
-    @property
-    def labels(self) -> Labels:
-        """Names and units of the signals, and what was left out."""
-        return self.record.labels
-
-    @property
     def known(self) -> Known:
         """The known factors of every row."""
         return self.record.known
-
-    @property
-    def timed(self) -> bool:
-        """Whether samples have times; otherwise `time` numbers them."""
-        return self.record.time is not None
 
     @property
     def keeps_cov(self) -> bool:
@@ -202,11 +192,6 @@ class Track(Plain, Columns):
         if dimensions is None or self.names != model.names:
             return ("",) * len(self.names)
         return tuple(self.labels.unit(*dimension) for dimension in dimensions)
-
-    @property
-    def time(self) -> Array:
-        """The given times, or sample numbers."""
-        return np.arange(len(self)) if self.record.time is None else self.after_rows(self.record.time)
 
     def time_text(self, t: int) -> str:
         """The time of sample t, in the time zone of the table that it came from."""
@@ -378,6 +363,8 @@ class Track(Plain, Columns):
 
     def polynomials(self) -> tuple[Array, list[Array]]:
         """A(z) and B(z) of an ARX model in powers of z^-1, (T, .) each; see `ARX.polynomials`."""
+        if not isinstance(self.model, ARX):
+            raise ValueError(f"polynomials: {type(self.model).__name__} has no polynomials; use ARX.")
         return self.model.polynomials(self.theta)
 
     def save(self, path: str | PathLike[str]) -> None:

@@ -1,7 +1,6 @@
 """Record mode: whole series in one call, causal at every sample. The public function is `driftfit.track`.
 
-One decision for many candidates: which readings are left out is decided by one run, and holds for all of them.
-
+`decide` makes one decision for many candidates: which readings are left out is decided by one run, and holds for all.
 The reference is `AdaptiveKalman` on the largest of the models, so the decision depends neither on the settings that are
 tried nor on their number. Refused readings are missing for every candidate, and samples with a refused input have no
 weight, so that likelihoods are of the same readings.
@@ -45,14 +44,11 @@ KEPT = ("std", "cov", "theta")
 Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
 """One tracker for all, or one per setting of a grid or per series."""
 
-PART = 16_000_000
+BYTES_AT_ONCE = 16_000_000
 """Bytes of results that `parts` holds at a time; a table of them and the writer of Parquet take some six times as much.
 With four times as many a series costs a quarter more, in memory that the process touches for the first time.
 """
-ASTRAY = 1.0
-"""Median prediction error, in deviations of the output, above which estimates went astray."""
-
-BEGUN = 100
+START_SAMPLES = 100
 """Samples among which codes may be the first that a run has."""
 
 Result = Track | Fleet | Outputs
@@ -103,7 +99,7 @@ def parts(
         yield run_fleet(programs, records, keep, failed, dtype=dtype)
         return
     row = programs[0].written(programs[0].tile(), 0, keep, dtype).dtype.itemsize * ny
-    upto = np.cumsum(records.length) * row // PART
+    upto = np.cumsum(records.length) * row // BYTES_AT_ONCE
     bounds = [0, *(np.flatnonzero(np.diff(upto)) + 1).tolist(), len(records.keys)]
     for k, (a, b) in enumerate(pairwise(bounds)):
         yield run_fleet(programs[a * ny : b * ny], records.some(a, b), keep, {} if k else failed, dtype=dtype)
@@ -263,7 +259,7 @@ def warn_astray(run: Track | KeyedResults) -> None:
     late = slice(len(run) // 2, None)
     e, y = run.innovation[late], run.record.y[late]
     error, varies = float(np.nanmedian(np.abs(e))), float(np.nanstd(y)) if np.isfinite(y).any() else 0.0
-    if varies > 0.0 and error > ASTRAY * varies:
+    if varies > 0.0 and error > varies:
         warn(
             f"{type(run.model).__name__} with {type(run.tracker).__name__}: half the prediction errors in the second "
             f"half of the record are above {error:.3g}, but y varies by {varies:.3g}: the estimates went astray. "
@@ -331,7 +327,7 @@ def _begins_change(y: Array, reason: Array) -> Array:
 
 def _codes_at_start(run: Track, strange: Array) -> Array:
     """Which readings (T,) a gate would have found to be codes among the first, some of which are ``strange``."""
-    first, found = slice(0, min(BEGUN, len(run))), np.zeros(len(run), bool)
+    first, found = slice(0, min(START_SAMPLES, len(run))), np.zeros(len(run), bool)
     if run.start is None and strange[first].any():
         left = track_record(replace(run.program, gate=Gate()), run.record.part(first)).left_out
         found[left.sample[left.code == AT_START]] = True

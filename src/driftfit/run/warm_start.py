@@ -2,7 +2,7 @@
 
 Everything carries over: the parameters, their covariance, the lags of the model, and the time of the last sample, so
 a record cut in two gives the same bits as the whole. A setting that differs between the two trackers takes its new
-value, for example a larger q.
+value, for example a larger q. `JointLayout` holds the states of all outputs of a series as one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import warn
 from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
-from driftfit.run.layout import fields_of, packed, unpacked
+from driftfit.run.layout import fields_of, own_words, packed, unpacked
 from driftfit.run.program import Program, State, programs_of, state_of, tile_of
 from driftfit.trackers.base import Tracker
 
@@ -261,15 +261,7 @@ class JointLayout:
 
     def unpack(self, data: bytes) -> Array:
         """The inverse of `pack`; ValueError for anything else."""
-        if len(self.programs) == 1:
-            return self.programs[0].layout.unpack(data)
-        tag, words = unpacked(data)
-        if tag != self.tag or len(words) != self.size:
-            raise ValueError(
-                f"the bytes hold a state of another model, tracker, gate, setting or version: their fingerprint is "
-                f"{tag.hex()}, that of {self.programs} is {self.tag.hex()}."
-            )
-        return words
+        return own_words(data, self.tag, self.size, self.programs)
 
     def made_by(self, tag: bytes, text: str) -> bool:
         """Whether a state with this fingerprint belongs to these programs in a version with other fields

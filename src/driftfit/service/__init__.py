@@ -3,7 +3,6 @@ own need.
 """
 
 from driftfit.service.sinks.contract import Event, Outcome, Result, Sink, Writer
-from driftfit.service.sources.contract import Reader, Source
-from driftfit.service.sources.samples import Batch, Samples
+from driftfit.service.sources.contract import Batch, Reader, Samples, Source
 
 __all__ = ["Batch", "Event", "Outcome", "Reader", "Result", "Samples", "Sink", "Source", "Writer"]

@@ -1,25 +1,31 @@
-"""The local socket by which the page asks the engine: status, units, operator's actions, samples over HTTP.
+"""The local socket by which the page asks the engine (status, units, actions, samples), and the health check.
 
 A message is a length, a header in JSON, a length and a body. The socket belongs to the user who runs the service, in a
-folder that nobody else can enter. Each connection has a thread; at most MOST are open.
+folder that nobody else can enter. Each connection has a thread; at most `CONNECTIONS` are open.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import json
+import logging
 import queue
 import socket
 import struct
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 from driftfit.service.core.engine import Engine
-from driftfit.service.sources.incoming import INCOMING, WAIT
+from driftfit.service.sources.http import ANSWER_SECONDS, INCOMING
 
-MOST = 64
-LONGEST = 16 << 20
+log = logging.getLogger("driftfit.service")
+CONNECTIONS, MESSAGE_BYTES = 64, 16 << 20
+"""At a time, and of a message."""
+HEALTH_CLIENTS, HEALTH_SECONDS = 100, 2.0
+"""Clients of the health check at a time, and the time that each may take."""
 
 
 class Control(threading.Thread):
@@ -32,8 +38,8 @@ class Control(threading.Thread):
         path.unlink(missing_ok=True)
         self.listener.bind(str(path))
         path.chmod(0o600)
-        self.listener.listen(MOST)
-        self._slots = threading.Semaphore(MOST)
+        self.listener.listen(CONNECTIONS)
+        self._slots = threading.Semaphore(CONNECTIONS)
 
     def run(self) -> None:
         while True:
@@ -45,7 +51,6 @@ class Control(threading.Thread):
             threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
 
     def close(self) -> None:
-        """Stop listening."""
         self.listener.close()
         self.path.unlink(missing_ok=True)
 
@@ -86,7 +91,7 @@ class Control(threading.Thread):
             problems: queue.Queue[str] = queue.Queue()
             self.engine.act(name, header["action"], problems.put)
             try:
-                problem = problems.get(timeout=WAIT)
+                problem = problems.get(timeout=ANSWER_SECONDS)
             except queue.Empty:
                 return {"error": "the journal does not answer", "status": 503}
             return {"error": problem, "status": 400} if problem else {"done": True}
@@ -106,13 +111,58 @@ def receive(file: Any) -> tuple[dict[str, Any], bytes] | None:
         if len(length) < 4:
             return None
         (count,) = struct.unpack(">I", length)
-        if count > LONGEST:
+        if count > MESSAGE_BYTES:
             raise ValueError("too long")
         parts.append(file.read(count))
     return json.loads(parts[0]), parts[1]
 
 
 def packed(header: dict[str, Any], body: bytes = b"") -> bytes:
-    """A message."""
     text = json.dumps(header).encode()
     return struct.pack(">I", len(text)) + text + struct.pack(">I", len(body)) + body
+
+
+def health(status: Mapping[str, Any], alive: bool, named: bool) -> tuple[dict[str, Any], int]:
+    """(the answer, its status of HTTP) by the status of a service; 503 if it takes no samples.
+
+    It is degraded where units have failed, alarms are not armed, or sources and sinks are away. Not everyone may know
+    their names: without ``named`` they are only counted.
+    """
+    problem = status.get("problem", "") if alive else "the engine does not answer"
+    reasons = status.get("reasons", [])
+    state = "failing" if problem else "degraded" if reasons else "healthy"
+    told = reasons if named or not reasons else [f"{len(reasons)} units, sources or sinks; log in for their names"]
+    return {"healthy": not problem, "state": state, "problem": problem, "reasons": told}, 503 if problem else 200
+
+
+class Health(threading.Thread):
+    """Answers every request on a port of 127.0.0.1, whatever the page does."""
+
+    def __init__(self, port: int, ask: Callable[[], tuple[dict[str, Any], int]]) -> None:
+        super().__init__(name="driftfit-health", daemon=True)
+        self.port, self.ask = port, ask
+        self._slots = asyncio.Semaphore(HEALTH_CLIENTS)
+
+    def run(self) -> None:
+        try:
+            asyncio.run(self._serve())
+        except OSError as error:
+            log.error("health", extra={"detail": str(error)})
+
+    async def _serve(self) -> None:
+        server = await asyncio.start_server(self._answer, "127.0.0.1", self.port, limit=1 << 14)
+        async with server:
+            await server.serve_forever()
+
+    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        broken = (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError)
+        with contextlib.closing(writer), contextlib.suppress(*broken):
+            if self._slots.locked():
+                return
+            async with self._slots, asyncio.timeout(HEALTH_SECONDS):
+                await reader.readuntil(b"\r\n\r\n")
+                said, code = self.ask()
+                body = json.dumps(said).encode()
+                head = f"HTTP/1.1 {code} -\r\ncontent-type: application/json\r\ncontent-length: {len(body)}\r\n"
+                writer.write(f"{head}connection: close\r\n\r\n".encode() + body)
+                await writer.drain()

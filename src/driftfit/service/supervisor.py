@@ -15,26 +15,25 @@ import sys
 import tempfile
 import threading
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from driftfit.engine import __version__
-from driftfit.service.control import Control
+from driftfit.service.config import Config, read
+from driftfit.service.control import Control, Health, health
 from driftfit.service.core.engine import Engine
-from driftfit.service.health import Health, health
-from driftfit.service.settings.config import Config
+from driftfit.service.core.journal import Journal
 from driftfit.service.threads import SinkThread, SourceThread, WorkerThread
 
 log = logging.getLogger("driftfit.service")
 PRIVATE = "driftfit-"
 """How the names of folders in the temporary directory begin."""
-LOOK = 1.0
-"""Seconds between two looks at the page's process."""
-SWITCH = 0.0005
-"""Seconds for which a thread may keep the interpreter while others wait."""
-STOP = 10.0
-"""Seconds that sinks have to write stored results when the service stops."""
+DEMO = Path(__file__).parent / "demo.toml"
+LOOK_SECONDS = 1.0
+"""Time between two looks at the page's process."""
+STOP_SECONDS = 10.0
+"""For this time sinks may write stored results when the service stops."""
 
 
 class JsonLines(logging.Formatter):
@@ -49,7 +48,6 @@ class JsonLines(logging.Formatter):
 
 
 def log_to_stderr(level: str) -> None:
-    """Structured logs."""
     handler = logging.StreamHandler()
     handler.setFormatter(JsonLines())
     log.handlers[:] = [handler]
@@ -64,7 +62,7 @@ def cut_the_tail() -> None:
     would wait so long each time while a source decodes. The garbage collector passes over modules and routines, which
     stay; to look through them takes 0.1 s.
     """
-    sys.setswitchinterval(SWITCH)
+    sys.setswitchinterval(0.0005)
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
@@ -117,7 +115,6 @@ class Service:
         }  # fmt: skip
 
     def run(self, signals: bool = True) -> None:
-        """Work until `stop`."""
         if signals:
             for one in (signal.SIGTERM, signal.SIGINT):
                 signal.signal(one, lambda *_: self.stop())
@@ -136,11 +133,10 @@ class Service:
             self.engine.run()
         finally:
             self._close(runners)
-            keeper.join(STOP)
+            keeper.join(STOP_SECONDS)
             self._end_page()
 
     def stop(self) -> None:
-        """Let `run` return."""
         self._stopping.set()
         for one in self.sources:
             one.stop()
@@ -152,7 +148,7 @@ class Service:
             self.engine.news.notify_all()
         for runner in runners:
             runner.stop()
-        until = time.monotonic() + STOP
+        until = time.monotonic() + STOP_SECONDS
         for runner in runners:
             runner.join(max(0.1, until - time.monotonic()))
         self.control.close()
@@ -163,7 +159,7 @@ class Service:
 
     def _keep(self) -> None:
         """Start the page, and start it again when it dies; tell systemd that the service lives."""
-        pause, at = LOOK, 0.0
+        pause, at = LOOK_SECONDS, 0.0
         while not self._stopping.is_set():
             if self.config.page.enabled and (self.page is None or self.page.poll() is not None):
                 if self.page is not None and time.monotonic() - at < 60.0:
@@ -174,7 +170,7 @@ class Service:
                 at = time.monotonic()
                 self._start_page()
             notify("WATCHDOG=1")
-            self._stopping.wait(LOOK)
+            self._stopping.wait(LOOK_SECONDS)
 
     def _start_page(self) -> None:
         given = {
@@ -209,3 +205,40 @@ def notify(text: str) -> None:
     if address:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as one:
             one.sendto(text.encode(), address.replace("@", "\0", 1))
+
+
+def configured(file: Path, port: int | None, folder: Path | None) -> tuple[Config, Path]:
+    """(the configuration, the folder of the data), as changed by the command line."""
+    config = read(file)
+    if port is not None:
+        config = replace(config, page=replace(config.page, port=port))
+    return config, folder or Path(config.service.folder)
+
+
+def described(config: Config) -> str:
+    lines = [f"The configuration is valid: {len(config.sources)} sources, {len(config.units)} sections of units, "
+             f"{len(config.sinks)} sinks."]  # fmt: skip
+    for unit in config.units:
+        inputs = ", ".join(unit.u) or "its own past"
+        lines.append(
+            f"  {unit.match.text}: {unit.y} from {inputs}, {unit.model!r}, {unit.tracker!r}"
+            + ("" if unit.gate else ", without a gate")
+        )
+    return "\n".join(lines)
+
+
+def greeting(config: Config, folder: Path) -> str:
+    page = config.page
+    scheme = "https" if page.certificate else "http"
+    where = f"{scheme}://{page.host}:{page.port}/" if page.enabled else "no page"
+    return f"driftfit serve: {where}  (data in {folder}; Ctrl-C stops)"
+
+
+def rebuild(folder: Path) -> None:
+    """Let the service compute all states again from its journal."""
+    Journal(folder, rebuild=True).close()
+
+
+def run(config: Config, folder: Path) -> None:
+    log_to_stderr(config.service.log)
+    Service(config, folder).run()

@@ -17,9 +17,9 @@ from driftfit.service.sources.contract import END, Reader, Source
 
 log = logging.getLogger("driftfit.service")
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
-TRIES = 10
+EVENT_TRIES = 10
 """How often an event is written that the receiver refuses, which takes five minutes."""
-READ = 0.5
+READ_SECONDS = 0.5
 """Seconds for which a source may block."""
 
 
@@ -54,15 +54,12 @@ class WorkerThread(threading.Thread):
         raise NotImplementedError
 
     def status(self) -> dict[str, Any]:
-        """Numbers for the page."""
         return {"state": self.state, "count": self.count, "failures": self.failures}
 
     def reasons(self) -> list[str]:
-        """Why the service is degraded."""
         return [f"{self.what} {self.label} is {self.state}"] if self.state.startswith("away") else []
 
     def stop(self) -> None:
-        """Let the thread end."""
         self.stopping.set()
 
 
@@ -82,7 +79,7 @@ class SourceThread(WorkerThread):
         self.state = "running"
         try:
             while not self.stopping.is_set():
-                batch = reader.read(READ)
+                batch = reader.read(READ_SECONDS)
                 if batch is END:
                     return
                 if batch is not None:
@@ -112,7 +109,6 @@ class SinkThread(WorkerThread):
         self._tries = self.set_aside = 0
 
     def work(self) -> None:
-        """Write until the thread is stopped."""
         journal = Journal(self.engine.journal.path.parent, read_only=True)
         writer: Writer | None = None
         try:
@@ -144,7 +140,7 @@ class SinkThread(WorkerThread):
                 writer.write(replace(batch, parts=[], events=[event]))
             except RefusedError as error:
                 self._tries += 1
-                if self._tries < TRIES:
+                if self._tries < EVENT_TRIES:
                     raise
                 self.set_aside += 1
                 detail = {"sink": self.label, "why": str(error), "tries": self._tries, **event._asdict()}
@@ -183,5 +179,4 @@ class SinkThread(WorkerThread):
         return super().reasons() + [aside] * bool(self.set_aside)
 
     def status(self) -> dict[str, Any]:
-        """Numbers for the page."""
         return super().status() | {"at": self.at, "set_aside": self.set_aside, **quantiles(self.latencies)}

@@ -5,7 +5,7 @@ signals under their own names, ``prediction``, ``innovation``, ``innovation_std`
 ``theta_<name>`` and ``std_<name>``, or all in the array columns ``theta`` and ``std``. Units are stored where each
 format has room for them: ``attrs`` in pandas, the metadata of fields in pyarrow, the metadata of the file in Parquet.
 
-Results as xarray datasets, with labelled dimensions.
+xarray datasets have labelled dimensions:
 
     run.to_xarray()      dimensions time (or sample), parameter, input
     fleet.to_xarray()    the same and one dimension more, `unit`, over the union of all times (absent samples are NaN)

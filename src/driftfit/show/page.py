@@ -1,12 +1,11 @@
-"""Parts of an HTML page: sections, tables, and pictures as SVG in the colours of the page.
-
-The parts common to all reports: the style sheet (light, dark and print), and the section "How to read this".
+"""Parts of an HTML page: sections, tables, and pictures as SVG in the colours of the page. The
+style sheet (light, dark and print) and the section "How to read this" are those of all reports.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from io import StringIO
 from typing import TYPE_CHECKING
@@ -19,10 +18,10 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 
-LONG = 3000
+IMAGE_SAMPLES = 3000
 """In longer records the points of pictures are an image inside the SVG."""
 
-SHORT = 12
+UNSPLIT_ROWS = 12
 """A table with at most this many rows is not split between two printed pages."""
 
 INK = "#1b1b1b"
@@ -53,15 +52,36 @@ def table(caption: str, heads: tuple[str, ...], rows: Sequence[tuple[str, ...]],
         return "".join(f"<{tag}{kind}>{cell}</{tag}>" for kind, cell in zip(kinds, cells, strict=True))
 
     top, body = line("th", heads), "".join(f"<tr>{line('td', row)}</tr>" for row in rows)
-    short = " short" if len(rows) <= SHORT else ""
+    short = " short" if len(rows) <= UNSPLIT_ROWS else ""
     return (
         f'<div class="wide{short}"><table><caption>{escape(caption)}</caption>'
         f"<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>"
     )
 
 
+def opening(sentences: Iterable[str]) -> str:
+    """The sentences with which a page begins."""
+    return f'<div class="verdict">{"".join(f"<p>{escape(one)}</p>" for one in sentences)}</div>'
+
+
+def points(items: Sequence[str]) -> str:
+    """A list, of HTML; nothing for no items."""
+    return f"<ul>{''.join(f'<li>{one}</li>' for one in items)}</ul>" if items else ""
+
+
+def facts(pairs: Iterable[tuple[str, str]]) -> str:
+    """Names with what is known of them; what is empty is left out."""
+    each = (f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in pairs if value)
+    return f"<dl>{''.join(each)}</dl>"
+
+
+def of_all(count: int, listed: int) -> str:
+    """What a caption says of a table that lists only the first of its rows."""
+    return f" The first {listed} of {count}." if count > listed else ""
+
+
 def picture(figure: Figure, run: Track, caption: str) -> str:
-    return f"<figure>{svg(figure, len(run) > LONG)}<figcaption>{escape(caption)}</figcaption></figure>\n"
+    return f"<figure>{svg(figure, len(run) > IMAGE_SAMPLES)}<figcaption>{escape(caption)}</figcaption></figure>\n"
 
 
 def svg(figure: Figure, thin: bool = False) -> str:

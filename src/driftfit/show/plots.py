@@ -1,4 +1,4 @@
-"""Pictures of results. matplotlib is imported only here."""
+"""Pictures of runs, of many runs and of pages; `driftfit.show.axes` draws their parts."""
 
 from __future__ import annotations
 
@@ -31,6 +31,29 @@ def plot_track(run: Track, level: float = 0.95, ax: Any = None) -> Figure:
     axes[-1].set_xlabel(time_label(run))
     date_axis(axes[-1], run)
     figure.align_ylabels(axes)
+    return figure
+
+
+def plot_parameters(run: Track) -> Figure:
+    """The parameters with their bands, for a page."""
+    n = len(run.names)
+    columns = 1 if n <= 3 else 2
+    figure, axes = panels(None, (9.5, 1.55 * -(-n // columns) + 0.5), n, columns, sharex=True)
+    for i, axis in enumerate(axes):
+        draw_parameter(axis, run, i)
+        date_axis(axis, run)
+    for axis in axes[-columns:]:
+        axis.set_xlabel(time_label(run))
+    return figure
+
+
+def plot_signals(run: Track) -> Figure:
+    """The output with its prediction, and the innovations, for a page."""
+    figure, (signal, error) = panels(None, (9.5, 4.6), 2, sharex=True, heights=[2.0, 1.3])
+    draw_prediction(signal, run)
+    draw_innovation(error, run)
+    error.set_xlabel(time_label(run))
+    date_axis(error, run)
     return figure
 
 

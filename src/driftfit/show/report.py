@@ -1,22 +1,16 @@
-"""Report: one self-contained page about a run, for a reader who does not know this library.
+"""Report: one self-contained page about a run, or about many, for a reader who does not know this library.
 
 The page gives the verdict first, then the parameters, the comparison, the diagnostics, pictures, settings and counts of
-skipped samples. Pictures are inline SVG in the colours of the page, which follow the reader's light or dark setting and
-turn light for print; nothing is loaded from elsewhere. The points of a long record are an image inside the SVG, which
-keeps the page small.
-
-Report on many runs: one self-contained page about a fleet, or about the outputs of one record.
-
-The page gives the verdict on all runs first, then a table with one row per run, pictures of those that change most
-clearly, and how often each diagnostic is out of bounds. It has the style of `driftfit.show.report`.
-
-The section about faults: the dates of labels, the alarms with dates and causes, and their picture.
+skipped samples; with alarms or labels also their dates and causes. A page about many runs has a row for each, and
+pictures of those that move most clearly. Pictures are inline SVG in the colours of the page, which follow the reader's
+light or dark setting and turn light for print; nothing is loaded from elsewhere. The points of a long record are an
+image inside the SVG, which keeps the page small.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from html import escape
 from os import PathLike
 from pathlib import Path
@@ -34,15 +28,13 @@ from driftfit.judge.fleet_verdict import Judgement, ManyDiagnoses, ManyVerdicts,
 from driftfit.judge.verdict import LEVEL, Verdict, change, judged, p_text
 from driftfit.models.arx import ARX
 from driftfit.run.result import Track, burn_in
-from driftfit.show.axes import date_axis, draw_innovation, draw_parameter, draw_prediction, new_figure, time_label
-from driftfit.show.page import READING, document, picture, section, table
+from driftfit.show.page import READING, document, facts, of_all, opening, picture, points, section, table
+from driftfit.show.plots import plot_parameters, plot_signals
 from driftfit.show.summary import Summary, summarise
 from driftfit.show.text import counts, digits, key_text
 from driftfit.use.system import dc_gain, largest_pole
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from driftfit.engine.kernel import Array
     from driftfit.judge.alarms.detect import Alarms
     from driftfit.judge.alarms.fleet_alarms import ManyAlarms
@@ -90,19 +82,19 @@ def check_path(path: str | PathLike[str]) -> Path:
 
 def page(run: Track, title: str | None = None, alarms: Alarms | None = None, labels: Array | None = None) -> str:
     """The page as HTML text."""
-    facts, known = summarise(run), Evidence(run)
+    summary, known = summarise(run), Evidence(run)
     truth, health = judged(known), diagnosis(known)
     heading = title or _heading(run)
     sections = [
         f"<h1>{escape(heading)}</h1>",
-        f'<p class="soft">{escape(_subtitle(run, facts))}</p>',
+        f'<p class="soft">{escape(_subtitle(run, summary))}</p>',
         _verdict(truth, health),
         *([section("Faults and alarms", faults(run, alarms, labels))] if alarms or labels is not None else []),
-        section("Parameters over time", picture(parameter_figure(run), run, PARAMETERS)),
-        section("Parameters", _parameter_table(facts, truth) + _system_table(run)),
-        section("Predictions", _comparison(truth) + picture(_signals(run), run, SIGNALS)),
+        section("Parameters over time", picture(plot_parameters(run), run, PARAMETERS)),
+        section("Parameters", _parameter_table(summary, truth) + _system_table(run)),
+        section("Predictions", _comparison(truth) + picture(plot_signals(run), run, SIGNALS)),
         section("Diagnostics", _checks(health) + picture(health.plot(), run, DIAGNOSTICS)),
-        section("Settings and omitted data", _settings(run, facts)),
+        section("Settings and omitted data", _settings(run, summary)),
         section("How to read this", READING),
     ]
     return document(heading, sections)
@@ -120,8 +112,13 @@ def _heading(run: Track) -> str:
     return f"{labels.y} from {', '.join(labels.u)}" if labels.u else f"Parameters of {labels.y}"
 
 
-def _subtitle(run: Track, facts: Summary) -> str:
-    parts = [f"{facts.samples} samples", facts.span, f"{facts.used} used", f"{facts.samples - facts.used} skipped"]
+def _subtitle(run: Track, summary: Summary) -> str:
+    parts = [
+        f"{summary.samples} samples",
+        summary.span,
+        f"{summary.used} used",
+        f"{summary.samples - summary.used} skipped",
+    ]
     return ", ".join(part for part in parts if part)
 
 
@@ -132,15 +129,14 @@ def _verdict(truth: Verdict, health: Diagnosis) -> str:
         if health.ok
         else (f"{count} of {len(health.checks)} diagnostics {'is' if count == 1 else 'are'} out of bounds, see below.")
     )
-    lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*truth.sentences, state))
-    return f'<div class="verdict">{lines}</div>'
+    return opening((*truth.sentences, state))
 
 
-def _parameter_table(facts: Summary, truth: Verdict) -> str:
+def _parameter_table(summary: Summary, truth: Verdict) -> str:
     heads = ("parameter", "now", "95 % band", "range of the path", "p, constant", "moves")
     tests = {moved.name: moved for moved in truth.parameters}
     rows = []
-    for row in facts.rows:
+    for row in summary.rows:
         test = tests.get(row.name)
         moved = "no" if test is not None and np.isfinite(test.p_own) else ""
         if test is not None and test.moves:
@@ -150,7 +146,7 @@ def _parameter_table(facts: Summary, truth: Verdict) -> str:
         cells = (theta, f"{low} to {high}", f"{least} to {most}")
         p = "" if test is None else escape(p_text(test.p_own))
         rows.append((escape(f"{row.name} {row.unit}".strip()), *cells, p, moved))
-    caption = f"After the last sample; the range is that of the path after the first {facts.burn} samples."
+    caption = f"After the last sample; the range is that of the path after the first {summary.burn} samples."
     return table(caption, heads, rows)
 
 
@@ -187,57 +183,29 @@ def _checks(health: Diagnosis) -> str:
         low, high = ("" if np.isinf(limit) else f"{limit:.4g}" for limit in (check.low, check.high))
         state = '<span class="good">ok</span>' if check.ok else '<span class="bad">out of bounds</span>'
         rows.append((check.name, escape(check.text), low, high, "not known" if np.isnan(check.value) else state))
-    text = "".join(f"<li>{escape(sentence)}</li>" for sentence in health.sentences)
     listed = table("Numbers with their limits.", ("check", "value", "from", "to", ""), rows)
-    return listed + (f"<ul>{text}</ul>" if text else "")
+    return listed + points([escape(sentence) for sentence in health.sentences])
 
 
-def _settings(run: Track, facts: Summary) -> str:
+def _settings(run: Track, summary: Summary) -> str:
     missing_y, missing_u = int(np.sum(~np.isfinite(run.y))), int(np.sum(~np.isfinite(run.u).all(axis=1)))
+    skipped = summary.samples - summary.used
     pairs = [
-        ("Model", facts.model), ("Tracker", facts.tracker), ("Signals", facts.signals), ("Time", facts.span),
-        ("Samples", f"{facts.samples}, of which {facts.used} were used and {facts.samples - facts.used} skipped"),
+        ("Model", summary.model), ("Tracker", summary.tracker), ("Signals", summary.signals), ("Time", summary.span),
+        ("Samples", f"{summary.samples}, of which {summary.used} were used and {skipped} skipped"),
         ("Missing", f"{missing_y} outputs, {missing_u} samples with a missing input"),
-        ("Rows left out", facts.dropped), *facts.remarks, ("Log-likelihood", f"{facts.loglik:.6g}"),
+        ("Rows left out", summary.dropped), *summary.remarks, ("Log-likelihood", f"{summary.loglik:.6g}"),
         ("Made by", f"driftfit {__version__}"),
     ]  # fmt: skip
-    return f"<dl>{''.join(f'<dt>{escape(name)}</dt><dd>{escape(value)}</dd>' for name, value in pairs if value)}</dl>"
-
-
-def parameter_figure(run: Track) -> Figure:
-    n = len(run.names)
-    columns = 1 if n <= 3 else 2
-    rows = -(-n // columns)
-    figure = new_figure(9.5, 1.55 * rows + 0.5)
-    axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
-    for i, axis in enumerate(axes):
-        axis.set_visible(i < n)
-        if i < n:
-            draw_parameter(axis, run, i)
-            date_axis(axis, run)
-    for axis in axes[-columns:]:
-        axis.set_xlabel(time_label(run))
-    return figure
-
-
-def _signals(run: Track) -> Figure:
-    figure = new_figure(9.5, 4.6)
-    signal, error = figure.subplots(2, 1, sharex=True, height_ratios=[2.0, 1.3])
-    draw_prediction(signal, run)
-    draw_innovation(error, run)
-    error.set_xlabel(time_label(run))
-    date_axis(error, run)
-    return figure
+    return facts(pairs)
 
 
 SERIES_LISTED = 200
 """Most rows in the table."""
-SERIES_PICTURED = 4
+PICTURES = 4
 """Most runs with pictures."""
-NAMED = 4
+LISTED_BY_NAME = 4
 """Fewer runs, or models, than this are listed by name instead of counted."""
-
-HEADS = ("check", "series", "of")
 
 MANY = """<p>Each row was tested separately. Among many tests some reject by chance: q is the share of false rejections
 among all series with a q this small or smaller (false discovery rate).</p>"""
@@ -258,10 +226,10 @@ def page_of_many(
     if not runs:
         raise ValueError("report: no series has a result to report.")
     verdicts, health = verdicts_and_diagnoses(runs, by, LEVEL)
-    heading = title or (", ".join(map(key_text, runs)) if len(runs) < NAMED else f"{len(runs)} series")
+    heading = title or (", ".join(map(key_text, runs)) if len(runs) < LISTED_BY_NAME else f"{len(runs)} series")
     samples, used = sum(map(len, runs.values())), sum(int(run.ok.sum()) for run in runs.values())
     counted = f"{len(runs)} series, {samples} samples, {used} used, {samples - used} skipped"
-    shown = [row for row in verdicts.rows[:SERIES_PICTURED] if row.drifts] or list(verdicts.rows[:1])
+    shown = [row for row in verdicts.rows[:PICTURES] if row.drifts] or list(verdicts.rows[:1])
     return document(
         heading,
         [
@@ -287,8 +255,7 @@ def _verdict_of_many(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
     state = f"{out} of {known} have diagnostics out of bounds." if out else "All diagnostics are within limits."
     if known == 0:
         state = "No diagnostic can be computed."
-    lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*verdicts.sentences, state))
-    return f'<div class="verdict">{lines}</div>'
+    return opening((*verdicts.sentences, state))
 
 
 def _rows(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
@@ -298,25 +265,25 @@ def _rows(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
         marked = f'<span class="bad">{out}</span>' if out else "0" if row.key in known else ""
         rows.append((escape(key_text(row.key)), *map(escape, row.cells), marked))
     heads = ("", "what moves", "p", "q", "error", "of constants", "pays", "out of bounds")
-    more = f" The first {SERIES_LISTED} of {len(verdicts)}." if len(verdicts) > SERIES_LISTED else ""
-    return table(f"The clearest first.{more}", heads, rows, (1,))
+    return table(f"The clearest first.{of_all(len(verdicts), SERIES_LISTED)}", heads, rows, (1,))
 
 
 def _pictured(row: Judgement, run: Track) -> str:
     text = escape(" ".join(row.verdict.sentences))
-    shown = picture(parameter_figure(run), run, PARAMETERS)
+    shown = picture(plot_parameters(run), run, PARAMETERS)
     return f'<div class="one"><h3>{escape(key_text(row.key))}</h3><p>{text}</p>{shown}</div>'
 
 
 def _health(health: ManyDiagnoses) -> str:
     computed = health.computed
     out = [(name, str(k), str(computed[name])) for name, k in health.counts.items()]
-    counted = table("How many are out of bounds, of those for which the check can be computed.", HEADS, out)
-    worst = [key for key in health.worst[:SERIES_PICTURED] if not health[key].ok]
-    text = "".join(
-        f"<li><b>{escape(key_text(key))}</b>: {escape(' '.join(health[key].sentences))}</li>" for key in worst
+    counted = table(
+        "How many are out of bounds, of those for which the check can be computed.", ("check", "series", "of"), out
     )
-    return counted + (f"<ul>{text}</ul>" if text else "")
+    worst = [key for key in health.worst[:PICTURES] if not health[key].ok]
+    return counted + points(
+        [f"<b>{escape(key_text(key))}</b>: {escape(' '.join(health[key].sentences))}" for key in worst]
+    )
 
 
 def _settings_of_many(
@@ -325,7 +292,7 @@ def _settings_of_many(
     trackers = list(dict.fromkeys(repr(run.tracker) for run in runs.values()))
     models = list(dict.fromkeys(repr(run.model) for run in runs.values()))
     pairs = [
-        ("Model", "; ".join(models) if len(models) < NAMED else f"{len(models)} different ones"),
+        ("Model", "; ".join(models) if len(models) < LISTED_BY_NAME else f"{len(models)} different ones"),
         ("Tracker", trackers[0] if len(trackers) == 1 else f"{len(trackers)} different settings"),
         (
             "Without a result",
@@ -335,14 +302,11 @@ def _settings_of_many(
         ("Taken as missing", counts(sum((Counter(run.labels.missing) for run in runs.values()), Counter())) or "none"),
         ("Made by", f"driftfit {__version__}"),
     ]
-    return f"<dl>{''.join(f'<dt>{escape(name)}</dt><dd>{escape(value)}</dd>' for name, value in pairs)}</dl>"
+    return facts(pairs)
 
 
 FAULTS_LISTED = 100
 """Most rows in a table."""
-
-ALARMS_PICTURED = 4
-"""Most pictures of alarms on a page about many series."""
 
 PICTURE = "The output, and each statistic over its limit (dashed). Red: an alarm is on. Grey: labelled as wrong."
 
@@ -375,14 +339,17 @@ def many_faults(runs: Mapping[Hashable, Track], alarms: ManyAlarms | None, label
         if len(cells) > 3 or len(begun):
             rows.append((*cells, *[""] * (8 - len(cells))))
     heads = ("", "labelled", "the first", "alarms", "the first", "q", "found", "false")
-    shown = [row for row in watched.values() if row.onsets][:ALARMS_PICTURED]
+    shown = [row for row in watched.values() if row.onsets][:PICTURES]
     pictures = (
         f'<div class="one"><h3>{escape(key_text(row.key))}</h3>'
         f"{picture(row.alarms.plot(_given(runs, labels, row.key)), runs[row.key], PICTURE)}</div>"
         for row in shown
     )
     return table(
-        f"Intervals labelled as wrong, and alarms.{_more(rows)}", heads, rows[:FAULTS_LISTED], (2, 4)
+        f"Intervals labelled as wrong, and alarms.{of_all(len(rows), FAULTS_LISTED)}",
+        heads,
+        rows[:FAULTS_LISTED],
+        (2, 4),
     ) + "".join(pictures)
 
 
@@ -403,7 +370,7 @@ def _labels(run: Track, alarms: Alarms | None, wrong: Array) -> str:
             )
         rows.append(tuple(row))
     heads = ("from", "to", "samples", "first alarm")[: 3 if alarms is None else 4]
-    return table(f"Labelled as wrong.{_more(rows)}", heads, rows[:FAULTS_LISTED], (1, 3))
+    return table(f"Labelled as wrong.{of_all(len(rows), FAULTS_LISTED)}", heads, rows[:FAULTS_LISTED], (1, 3))
 
 
 def _score(alarms: Alarms, wrong: Array | None) -> str:
@@ -419,8 +386,4 @@ def _score(alarms: Alarms, wrong: Array | None) -> str:
 
 def _alarms(alarms: Alarms) -> str:
     rows = [tuple(map(escape, alarms.cells(int(t)))) for t in alarms.onsets]
-    return table(f"Alarms.{_more(rows)}", alarms.heads, rows[:FAULTS_LISTED], (1, 2))
-
-
-def _more(rows: Sequence[tuple[str, ...]]) -> str:
-    return f" The first {FAULTS_LISTED} of {len(rows)}." if len(rows) > FAULTS_LISTED else ""
+    return table(f"Alarms.{of_all(len(rows), FAULTS_LISTED)}", alarms.heads, rows[:FAULTS_LISTED], (1, 2))

@@ -1,13 +1,9 @@
-"""The summary of a run: the present parameters, and a comparison with simpler methods.
+"""Summaries: of a run, of a fleet, and what a notebook shows when a result is the value of a cell.
 
-What a notebook shows when a result is the value of a cell: what it is, and its parameters after the last sample.
-
-Nothing is run for it, unlike for a summary, whose comparisons cost three further runs.
-
-The summary of a fleet: which series moved most, and by how much.
-
-The path of a parameter counts after the start, that is after max(50, 5 n) samples (a third of a short record) and as
-soon as the parameter is determined. With theta_0 its value there, a parameter has moved by
+The summary of a run has its present parameters and a comparison with simpler methods, which costs three further runs.
+The cell of a notebook has the parameters alone, so nothing is run for it. The summary of a fleet ranks series by how
+much they moved. The path of a parameter counts after the start, that is after max(50, 5 n) samples (a third of a short
+record) and as soon as the parameter is determined. With theta_0 its value there, a parameter has moved by
 
     max_t |theta_t - theta_0| / sqrt(var_t + var_0)
 
@@ -54,7 +50,7 @@ from driftfit.show.text import (
 )
 from driftfit.trackers.student import wider
 
-HIGH = 3.0
+LEVEL_SPREADS = 3.0
 """Deviations from 0 from which on the level of an output calls for a constant."""
 _RIVALS = ("tracked", "persistence", "constant LS", "constant ARX")
 
@@ -94,10 +90,10 @@ class Summary(Printed):
         yield facts(
             ("Model", self.model),
             ("Tracker", self.tracker),
-            *([("Signals", self.signals)] if self.signals else []),
-            *([("Time", self.span)] if self.span else []),
+            ("Signals", self.signals),
+            ("Time", self.span),
             ("Samples", f"{self.samples}, {self.used} used, {self.samples - self.used} skipped"),
-            *([("Rows left out", self.dropped)] if self.dropped else []),
+            ("Rows left out", self.dropped),
             ("Log-likelihood", f"{self.loglik:.6g}"),
             *self.remarks,
         )
@@ -207,7 +203,7 @@ def _level(run: Track) -> tuple[tuple[str, str], ...]:
         return ()
     (level, *others), (spread, *others_spread) = zip(*(_middle(x) for x in (run.y, *run.u.T)), strict=True)
     explained = any(not abs(x) <= wide for x, wide in zip(others, others_spread, strict=True))
-    if explained or not abs(level) > HIGH * spread > 0.0:
+    if explained or not abs(level) > LEVEL_SPREADS * spread > 0.0:
         return ()
     inputs = ", the inputs about 0" if others else ""
     return ((f"No {setting}", f"y varies by {spread:.3g} about {level:.4g}{inputs}: {setting}=True is missing"),)
@@ -231,8 +227,8 @@ def _span(run: Track) -> str:
     return f"{first} to {last}"
 
 
-CELL_ROWS = 20
-"""Rows of the table."""
+ROWS_SHOWN = 20
+"""Rows of the table in a notebook, and series in the summary of a fleet."""
 LEVEL = 0.95
 
 _Line = tuple[str, str, float, float, float]
@@ -242,10 +238,10 @@ def cell_of(result: Track | KeyedResults) -> str:
     """One line about the result and a table, as HTML."""
     rows, count = _rows(result)
     table = table_of("Parameters after the last sample", "", "", "theta", "std", "[0.025", "0.975]", names=2)
-    for key, name, theta, std, half in islice(rows, CELL_ROWS):
+    for key, name, theta, std, half in islice(rows, ROWS_SHOWN):
         band = (digits(value, std) for value in (theta - half, theta + half))
         table.add_row(Text(key), Text(name), digits(theta, std), f"{std:.4g}", *band)
-    more = [Text(f" and {count - CELL_ROWS} more rows")] if count > CELL_ROWS else []
+    more = [Text(f" and {count - ROWS_SHOWN} more rows")] if count > ROWS_SHOWN else []
     return html_of(Text(repr(result)), table, *more)
 
 
@@ -263,9 +259,6 @@ def _own(key: str, run: Track) -> Iterator[_Line]:
     half = quantile(LEVEL) * std * (wider(run.state["count"], LEVEL) if run.tracker.learns_noise else 1.0)
     for i, name in enumerate(run.names):
         yield key if i == 0 else "", name, float(theta[i]), float(std[i]), float(half[i])
-
-
-SERIES_SHOWN = 20
 
 
 @dataclass(frozen=True)
@@ -306,34 +299,31 @@ class FleetSummary(Printed):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         samples, used = sum(unit.samples for unit in self.units), sum(unit.used for unit in self.units)
         settings = self.trackers[0] if len(self.trackers) == 1 else f"{len(self.trackers)} different settings"
-        pairs = [
+        yield facts(
             ("Model", self.model),
             ("Tracker", settings),
             ("Series", f"{len(self.units)}, {len(self.failed)} without a result"),
             ("Samples", f"{samples}, {used} used, {samples - used} skipped"),
-        ]
-        if self.dropped:
-            pairs.append(("Rows left out", counts(self.dropped)))
-        if self.missing:
-            pairs.append(("Taken as missing", counts(self.missing)))
-        pairs += self.left_out
-        yield facts(*pairs)
+            ("Rows left out", counts(self.dropped)),
+            ("Taken as missing", counts(self.missing)),
+            *self.left_out,
+        )
         yield from self._ranking()
-        for key, reason in list(self.failed.items())[:SERIES_SHOWN]:
+        for key, reason in list(self.failed.items())[:ROWS_SHOWN]:
             yield Text(f" no result for {key_text(key)}: {reason}")
 
     def _ranking(self) -> RenderResult:
         what = "std" if self.scaled else "x median"
         heads = ("", "parameter", what, "start", "farthest", "last", "rms e", "persist.")
         table = table_of("Series by how much they moved", *heads, names=2)
-        for unit in self.units[:SERIES_SHOWN]:
+        for unit in self.units[:ROWS_SHOWN]:
             path = together(unit.start, unit.farthest, unit.last, std=unit.std)
             moved = f"{unit.moved:.1f}" if np.isfinite(unit.moved) else "-"
             errors = (f"{error:.4g}" for error in (unit.error, unit.persistence))
             table.add_row(Text(key_text(unit.key)), Text(unit.parameter), moved, *path, *errors)
         yield table
-        if len(self.units) > SERIES_SHOWN:
-            yield Text(f" and {len(self.units) - SERIES_SHOWN} that moved less", "dim")
+        if len(self.units) > ROWS_SHOWN:
+            yield Text(f" and {len(self.units) - ROWS_SHOWN} that moved less", "dim")
 
 
 def summarise_fleet(fleet: KeyedResults) -> FleetSummary:

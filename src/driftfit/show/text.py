@@ -1,7 +1,4 @@
-"""Text of results: tables no wider than `WIDTH`, the same on a terminal, in a file and in a notebook.
-
-Results of several outputs, by the name of the output.
-"""
+"""Text of results: tables no wider than `WIDTH`, the same on a terminal, in a file and in a notebook."""
 
 from __future__ import annotations
 
@@ -120,14 +117,15 @@ def together(*values: float, std: float = float("nan"), least: int = 4) -> tuple
 
 
 def facts(*pairs: tuple[str, str]) -> Table:
-    """Names and values side by side, as plain text, since b1[flow] is not markup."""
+    """Names and values side by side, as plain text, since b1[flow] is not markup; what is empty is left out."""
     table = Table.grid(padding=(0, 2), pad_edge=True)
     for name, value in pairs:
-        table.add_row(Text(name, "bold"), Text(value))
+        if value:
+            table.add_row(Text(name, "bold"), Text(value))
     return table
 
 
-SHORT = 10
+UNWRAPPED = 10
 """A cell of at most this many characters stays on one line: numbers, and p-values such as < 0.0001."""
 
 
@@ -175,7 +173,7 @@ class Numbers(Table):
 
 
 def _widen(column: Column, text: str) -> None:
-    words = [text] if len(text) <= SHORT else text.split()
+    words = [text] if len(text) <= UNWRAPPED else text.split()
     column.min_width = max(column.min_width or 0, *map(cell_len, words), 0)
 
 

@@ -21,8 +21,8 @@ from driftfit.run.result import Track
 from driftfit.smooth.parts.rank import column_sizes
 from driftfit.smooth.plots import plot_segments
 from driftfit.smooth.problem import replay
-from driftfit.trackers.bank.results.decided_path import faults
 from driftfit.trackers.bank.results.results import Hypotheses
+from driftfit.trackers.bank.results.smoothed import faulty
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,7 +46,7 @@ class Segments:
         replayed = replay(run)
         known = replayed["ok"][:, 0] > 0.0
         if run.tracker.weighs:  # samples with a sensor fault carry no information about the segment
-            known &= faults(run.tracker, run, Hypotheses(run).events()) == 1.0  # type: ignore[arg-type]
+            known &= ~faulty(run, Hypotheses(run).found())
         self._ok, self._phi, self._y = known, replayed["phi"][..., 0], replayed["y"][:, 0]
         self._weight = 1.0 / replayed["used_noise"][:, 0]
         self._solve(r)

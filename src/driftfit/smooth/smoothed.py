@@ -12,13 +12,13 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
-from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
-from driftfit.models.hammerstein_wiener.separation.paths import Blocks
+from driftfit.models.hammerstein_wiener.blocks import Blocks
 from driftfit.run.result import Track
 from driftfit.smooth import exact
 from driftfit.smooth.parts.walk import NONE, Path, Walk, ordered
 from driftfit.smooth.plots import plot_smoothed
 from driftfit.smooth.problem import walk_of
+from driftfit.use.hammerstein_wiener.run_blocks import blocks_of
 
 ALONE = 1e-12
 """Below this sqrt(1 - leverage) a sample alone determines a direction, and its leave-one-out residual is undefined."""
@@ -173,18 +173,8 @@ class Smoothed:
 
     def _std(self, var: Array) -> Array:
         """Standard deviations from variances relative to the noise, in their place."""
-        var *= self.r * self._fold
+        var *= self.r
         return np.sqrt(var, out=var)
-
-    @property
-    def _fold(self) -> float:
-        """The factor by which variances grow because readings share errors of rounding
-        (`driftfit.trackers.parts.coarse.shared_rounding`), from the mean r phi' V phi of the used samples.
-        """
-        found = self.run.ended_with("common")
-        common = 0.0 if found is None else float(found)
-        undecided = self.r * self._path.spread / max(self._data.used, 1) if common > 0.0 else 0.0
-        return 1.0 + len(self.run.names) * common / undecided if undecided > 0.0 else 1.0
 
     @property
     def slope(self) -> Array:

@@ -21,8 +21,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, Thresholds
+from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.thresholds import Thresholds
 from driftfit.systems.drift import Jump, Law, Ramp, RandomWalk, SineIncrement, SineOffset, paths
 from driftfit.systems.inversion import LIMIT, NotMonotoneError, invert
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial
+from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial
 
 LIMIT = 1e3
 """Outputs beyond which the inversion gives up."""

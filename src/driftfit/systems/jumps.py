@@ -37,8 +37,8 @@ class Jumping(NamedTuple):
 
 
 def poles(a1: float, a2: float) -> float:
-    """The largest modulus of the poles."""
-    return float(np.abs(np.roots([1.0, -a1, -a2])).max())
+    """The largest modulus of the poles, the roots of z^2 - a1 z - a2."""
+    return abs(0.5 * abs(a1) + complex((0.5 * a1) ** 2 + a2) ** 0.5)
 
 
 def draw(rng: np.random.Generator) -> Array:

@@ -1,41 +1,36 @@
-"""A Kalman filter that estimates its own settings: drift ratio, noise variance and jumps, from the data as they arrive.
+"""A Kalman filter that estimates its own settings: drift, noise variance and jumps, from the data as they arrive.
 
-K random-walk filters run side by side. Filter k lets parameter i drift by ``q_ki = ratio_k w_ki r / c_i`` per nominal
-sample, where r is the present noise variance and c_i the mean square of regressor i, so ratio_k w_ki is the share of r
-that the drift of one parameter adds to the output per sample, whatever the units. The first ratio is 0. In the common
-ladder of ratios all weights w are 1; in a second one they are learned from the record
-(`driftfit.trackers.parts.modes.weights`); the filters of a third follow a trend
-(`driftfit.trackers.parts.modes.drifts.trend`); those of a fourth drift in one direction, which is learned too
-(`driftfit.trackers.parts.modes.drifts.one_direction`), those of a fifth about the mean regressors, beside an intercept
-(`driftfit.trackers.parts.modes.drifts.about_means`); with up to eight parameters, each has a ladder on which it alone
-drifts; one filter takes the last outlier for a jump (`driftfit.trackers.parts.modes.drifts.after_outlier`); and the
-last comes to rest after a change (`driftfit.trackers.parts.modes.drifts.at_rest`). The filters are the modes of a
-Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
+    y[t]  = phi[t]' theta[t] + v[t],              v[t] = e[t] + c e[t-1],  e of variance V
+    theta[t] = theta[t-1] (+ slope) + w[t],       w ~ N(0, rho r Q)        one pair (Q, rho) is one mode
 
-The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each
-filter the levels are merged at once, by a rank-one update (`driftfit.trackers.parts.modes.filters`). The variance r is
-never below that due to coarse readings (`driftfit.trackers.parts.coarse.resolution`). If innovations are correlated,
-the previous one is an additional regressor (`driftfit.trackers.parts.modes.coloured`).
+| ladder | Q, in units of noise variance over input power | rho |
+|---|---|---|
+| common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-5 .. .01, .04, .2, 1, J |
+| trend | as common; theta moves on along its slope | .001, .01, .1 |
+| learned | the drift covariance found by a backward pass of scores over the last 100 samples | .001, .01, .1, 1 |
+| single i | 1 / c_i for parameter i alone (two to eight parameters) | .003, .05, J |
+| group g | 1 / c_i for the parameters of a group, instead of single | .001, .01, .1, 1, J |
 
-Readings are judged by a gate (`driftfit.readings.gate`), which is on for this tracker, and not here. Outliers that keep
-coming are a change of level: a leap of the parameters (`driftfit.trackers.parts.modes.ladder`), or more noise.
+J, the largest jump, is the variance of the output or the square of an outlier before, in units of r, and at least 30.
+Every mode is a Kalman filter. They are merged after every sample (`driftfit.trackers.parts.mixture.filters`).
+Noise is quiet, restless, or an outlier of any size, and coarse readings that repeat share their rounding
+(`driftfit.trackers.parts.mixture.noise`). Scales, means, colour of the noise and covariance of the drift are learned
+(`driftfit.trackers.parts.mixture.learned`). Readings are judged by a gate (`driftfit.readings.gate`), which is on for
+this tracker, and not here.
 
 The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
-estimates themselves (`driftfit.trackers.parts.modes.filters`). The one-step variance excludes the outlier level, so its
-band is for samples that are not outliers.
+estimates themselves. The variance before a sample is for samples that are no outliers, and at which no jump begins.
 
-The start is exact diffuse least squares without drift, in which regressors out of proportion count less too, until
-there are enough residuals to estimate r; its bands are Student's (`driftfit.trackers.parts.few_residuals`). Every
-filter starts from generalised least squares with its own drift over the same samples
-(`driftfit.trackers.parts.modes.start`), in the directions that the regressors span. Scaling inputs or outputs changes
-only the units.
+The start is exact diffuse least squares without drift, until there are enough residuals to estimate r; its bands are
+Student's (`driftfit.trackers.parts.few_residuals`). Every filter starts from generalised least squares with its own
+drift over the same samples (`driftfit.trackers.parts.mixture.start`), in the directions that the regressors span.
+Scaling inputs or outputs changes only the units.
 
 Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Which parameters drift is learned
 in a few hundred samples; ``groups`` specifies it from the start.
 
-Source: interacting multiple models are Blom and Bar-Shalom (1988); the ladder of ratios, its transitions, the noise
-levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels; without groups K = 27 + 3 n
-for two to eight parameters, and 27 for more.
+Source: interacting multiple models are Blom and Bar-Shalom (1988); the modes and what is learned are ours. Cost per
+sample: O(K n^2) for K modes; without groups K = 16 + 3 n for two to eight parameters, and 16 for more.
 """
 
 from __future__ import annotations
@@ -52,8 +47,6 @@ from driftfit.engine.kernel import Array, State, kernel, nothing
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.coarse.resolution import resolution, resolve, unresolved
-from driftfit.trackers.parts.coarse.shared_rounding import nothing_shared_among_filters, share_among_filters
 from driftfit.trackers.parts.coordinates import (
     FRAME,
     frame,
@@ -66,6 +59,7 @@ from driftfit.trackers.parts.coordinates import (
 from driftfit.trackers.parts.covariance import prediction
 from driftfit.trackers.parts.diffuse import knowing_nothing, spanned_variance
 from driftfit.trackers.parts.excitation import (
+    FIRST,
     learn_information,
     learn_scales,
     learned,
@@ -74,30 +68,36 @@ from driftfit.trackers.parts.excitation import (
     window,
 )
 from driftfit.trackers.parts.few_residuals import RESIDUALS, widen_estimates, wider
-from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
-from driftfit.trackers.parts.modes.drifts.about_means import learn_means
-from driftfit.trackers.parts.modes.drifts.after_outlier import no_jump, suppose_jump
-from driftfit.trackers.parts.modes.drifts.at_rest import come_to_rest
-from driftfit.trackers.parts.modes.filters import (
+from driftfit.trackers.parts.mixture.filters import (
     enter_filters,
     innovate,
+    mix,
     mixture,
     outgrown,
     predict,
     update_filters,
     weigh,
 )
-from driftfit.trackers.parts.modes.ladder import filters, mix
-from driftfit.trackers.parts.modes.noise_levels import any_level, finest, learn_noise, noise_prior
-from driftfit.trackers.parts.modes.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
-from driftfit.trackers.parts.modes.start import begin_with_drift, forecast_start, start_density, take_start
-from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
-from driftfit.trackers.parts.proportion import (
-    FIRST,
-    bound_leverage,
-    learn_proportion,
-    no_proportion,
+from driftfit.trackers.parts.mixture.learned import (
+    colour,
+    learn_colour,
+    learn_drift,
+    learn_means,
+    machine_drift,
+    nothing_learned,
+    whiten_noise,
 )
+from driftfit.trackers.parts.mixture.modes import bank
+from driftfit.trackers.parts.mixture.noise import (
+    any_noise,
+    learn_noise,
+    least_noise,
+    noise_prior,
+    note_reading,
+    repeated_rounding,
+)
+from driftfit.trackers.parts.mixture.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
+from driftfit.trackers.parts.mixture.start import begin_with_drift, forecast_start, start_density, take_start
 
 
 @kernel
@@ -119,7 +119,7 @@ def go_on(s: State, l: int) -> None:
 @partial(kernel, short=True)
 def settle(s: State, l: int) -> None:
     """Start the filters from least squares once there are residuals to estimate r: z = M theta ~ N(d, r I)."""
-    s.r[l] = max(s.scale[l], finest(s, l))
+    s.r[l] = max(s.scale[l], least_noise(s, l))
     s.scale[l] = 1.0
     s.settled[l] = 1
     for i in range(s.theta.shape[0]):
@@ -127,7 +127,7 @@ def settle(s: State, l: int) -> None:
             s.m[i, k, l] = s.d[i, l]
             s.C[i, i, k, l] = 1.0 if s.S[i, i, l] > 0.0 else 0.0
     frame(s, l)
-    begin_with_drift(s, finest(s, l), l)
+    begin_with_drift(s, least_noise(s, l), l)
     mixture(s, l)
     go_on(s, l)
 
@@ -136,9 +136,7 @@ def settle(s: State, l: int) -> None:
 def look_ahead(s: State, entering: int, l: int) -> None:
     """Prediction of the running filters, and its variance; ``entering`` is the column in a new direction, or -1."""
     s.column[l] = entering
-    resolve(s, l)
     noise_prior(s, l)
-    bound_leverage(s, l)
     innovate(s, l)
     if entering >= 0:
         s.y_hat[l] = prediction(s, l)
@@ -148,23 +146,24 @@ def look_ahead(s: State, entering: int, l: int) -> None:
 @partial(kernel, inline=False)
 def follow(s: State, l: int) -> None:
     """One sample of the running filters."""
-    s.outlier[l], s.weighed[l] = 0.0, 0
+    s.outlier[l], s.certainty[l], weighed = 0.0, 0.0, 0.0
+    note_reading(s, l)
     column = s.column[l] if s.column[l] >= 0 else outgrown(s, l)
     if s.ok[l] > 0.0 and column >= 0:
         enter_filters(s, column, l)
     elif s.ok[l] > 0.0:
-        s.weighed[l] = 1
-        weigh(s, l)
-        suppose_jump(s, l)
+        weighed = 1.0
+        weigh(s, repeated_rounding(s, l), l)
         update_filters(s, l)
-        come_to_rest(s, l)
-        learn_weights(s, l)
+        learn_drift(s, l)
         learn_noise(s, l)
-    learn_colour(s, l)
+    else:
+        for k in range(s.modes[l]):
+            s.mu[k, l] = s.prior[k, l]
+    learn_colour(s, weighed, l)
     learn_scales(s, l)
     learn_means(s, l)
-    learn_information(s, s.leverage[l] * s.noise[l], l)
-    learn_proportion(s, l, s.outlier[l])
+    learn_information(s, s.noise[l], l)
 
 
 @kernel
@@ -182,7 +181,6 @@ def correct(s: State, l: int) -> None:
 @kernel
 def report(s: State, l: int) -> None:
     mixture(s, l)
-    share_among_filters(s, l)
     if s.ok[l] > 0.0:
         located(s, l)
     interact(s, l)
@@ -197,7 +195,6 @@ def forecast_first(s: State, l: int) -> None:
         whiten_noise(s, l)
         look_ahead(s, whiten_within(s, s.white.ctypes.data, l), l)
     else:
-        resolve(s, l)
         forecast_start(s, l)
         s.s[l] *= wider(s.count[l])
 
@@ -207,7 +204,6 @@ def correct_first(s: State, l: int) -> None:
     if s.settled[l] > 0:
         follow(s, l)
         mixture(s, l)
-        share_among_filters(s, l)
         go_on(s, l)
     else:
         residuals = s.count[l]
@@ -255,8 +251,8 @@ class AdaptiveKalman(Tracker):
     adapts: ClassVar[bool] = True
     gated: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
-        "pivot", "at_start", "gain", "e_k", "step", "h_k", "inverse", "joint", "mu_next", "share", "row", "m_next",
-        "weighted", "Z", "away", "about_drift",
+        "pivot", "at_start", "gain", "e_k", "step", "h_k", "curve", "inverse", "joint", "share", "row", "walk", "Z",
+        "away", "certainty",
     )  # fmt: skip
     """Not H and work, which `driftfit.trackers.parts.coordinates.frame` fills only where the coordinates change."""
 
@@ -274,8 +270,6 @@ class AdaptiveKalman(Tracker):
         beyond = [i for group in self.groups or () for i in group if i >= n]
         if beyond:
             raise ValueError(f"AdaptiveKalman: groups name parameter {beyond[0]}, but there are {n} (0 .. {n - 1}).")
-        modes, levels = filters(n, self.groups), any_level()
-        K, J = len(modes["mu"]), len(levels["nu"])
         return {
             "theta": np.zeros(n),
             "P": np.zeros((n, n)),
@@ -286,28 +280,16 @@ class AdaptiveKalman(Tracker):
             "scale": np.nan,
             "squares": 0.0,
             "count": 0.0,
+            "waited": 0.0,
             "settled": 0,
-            "weighed": 0,
             "column": -1,
+            "shift": 0.0,
             "vague": 0.0,
-            "gain": np.zeros((n, K)),
-            "e_k": np.zeros(K),
-            "step": np.zeros(K),
-            "h_k": np.zeros(K),
-            "weighted": np.zeros(K),
-            "mean_prior": np.zeros(K),
-            "inverse": np.zeros((J, K)),
-            "joint": np.zeros((J, K)),
             **knowing_nothing(n),
             **no_excitation(n),
-            **no_proportion(),
-            **unresolved(),
-            **nothing_shared_among_filters(),
-            **no_weights(n),
-            **white(n),
-            **no_jump(n),
-            **modes,
-            **levels,
+            **nothing_learned(n),
+            **bank(n, self.groups),
+            **any_noise(),
         }
 
     @property
@@ -325,7 +307,7 @@ class AdaptiveKalman(Tracker):
             TrackerSteps(predict, forecast_first, correct_first, nothing, nothing),
             store=keep_density,
             store_for_smoother=store_for_smoother,
-            machines=(*FRAME, machine_weights),
+            machines=(*FRAME, machine_drift),
             doubts=True,
             outlined=True,
         )
@@ -337,7 +319,7 @@ class AdaptiveKalman(Tracker):
     def estimated_variances(
         self, model: Model, fields: Mapping[str, Array], phi: Array, e: Array, time: Array
     ) -> tuple[Array, Array, Array, Array]:
-        return estimated_variances(fields, phi, e, time, self.state(model.n))
+        return estimated_variances(fields, phi, time, self.state(model.n))
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:
@@ -367,7 +349,6 @@ class AdaptiveKalman(Tracker):
             facts.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
         return (
             *facts,
-            *resolution(lane),
             *colour(lane),
         )
 

@@ -165,22 +165,21 @@ def _weight(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
     if groups is not None and not tracker.covariance:
         raise ValueError(f"tune: {type(tracker).__name__} has one mu for all parameters; leave groups=None.")
     power, _ = still(task, constant(task, tracker))
-    group = members(names, groups)
-    share = np.full(len(names), power.sum()) if groups is None else np.where(power > 0.0, power, power.max())
-    units = share[:1] if groups is None else share
-    low, high = _range(bounds, _drift_ends(task, tracker), units, group[: len(units)])
+    ends = _drift_ends(task, tracker)
+    if groups is None:
+        total = np.array([power.sum()])
+        return _single(tracker, "mu", _range(bounds, ends, total, np.zeros(1, int)), lambda x: 10.0**x * total, True)
+    group, share = members(names, groups), np.where(power > 0.0, power, power.max())
+    low, high = _range(bounds, ends, share, group)
 
     def each(x: Array) -> Array:
         return np.asarray(10.0 ** x[group] * share)
 
     def build(x: Array, sigma2: float = 1.0) -> Tracker:
-        mu = each(x)
-        return replace(tracker, mu=float(mu[0]) if groups is None else tuple(mu))  # type: ignore[no-any-return]
+        return replace(tracker, mu=tuple(each(x)))  # type: ignore[no-any-return]
 
-    no = np.zeros(len(low), bool)
-    if groups is None:
-        return Knobs(low, high, no, True, build, build, ("mu",), np.zeros(1, int), lambda x: each(x)[:1])
-    return Knobs(low, high, no, True, build, build, tuple(f"mu[{name}]" for name in names), group, each)
+    labels = tuple(f"mu[{name}]" for name in names)
+    return Knobs(low, high, np.zeros(len(low), bool), True, build, build, labels, group, each)
 
 
 def _drift(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
@@ -222,19 +221,22 @@ def _drift(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
     )  # fmt: skip
 
 
+def _single(
+    tracker: Any, name: str, ends: tuple[Array, Array], values: Callable[[Array], Array], profiled: bool
+) -> Knobs:
+    """The knob of one setting, whose value at x is ``values(x)`` (1,)."""
+
+    def build(x: Array, sigma2: float = 1.0) -> Tracker:
+        return replace(tracker, **{name: float(values(x)[0])})  # type: ignore[no-any-return]
+
+    return Knobs(*ends, np.zeros(1, bool), profiled, build, build, (name,), np.zeros(1, int), values)
+
+
 def _noise(task: Task, tracker: Any, bounds: Bounds) -> Knobs:
     """r of Kalman for a given q."""
     _, variance = still(task, constant(task, tracker))
-    one = np.zeros(1, int)
-    low, high = _range(bounds, (-9.0, 3.0), np.array([variance]), one)
-
-    def values(x: Array) -> Array:
-        return np.asarray(variance * 10.0**x)
-
-    def build(x: Array, sigma2: float = 1.0) -> Tracker:
-        return replace(tracker, r=float(values(x)[0]))  # type: ignore[no-any-return]
-
-    return Knobs(low, high, np.zeros(1, bool), False, build, build, ("r",), one, values)
+    ends = _range(bounds, (-9.0, 3.0), np.array([variance]), np.zeros(1, int))
+    return _single(tracker, "r", ends, lambda x: np.asarray(variance * 10.0**x), False)
 
 
 MOST_PROBABLE = 0.5
@@ -280,13 +282,6 @@ def _memory(task: Task, tracker: Any, bounds: Bounds) -> Knobs:
             f"tune: bounds of forgetting must be (low, high) between 0 and 1, such as (0.9, 0.999); got {bounds!r}."
         )
     memory = None if bounds is None else (1.0 / (1.0 - bounds[0]), 1.0 / (1.0 - bounds[1]))
-    ends, one = (float(np.log10(2.0 * task.model.n)), float(np.log10(100.0 * task.longest))), np.zeros(1, int)
-    low, high = _range(memory, ends, np.ones(1), one)
-
-    def values(x: Array) -> Array:
-        return np.asarray(np.maximum(1.0 - 10.0**-x, 0.0))
-
-    def build(x: Array, sigma2: float = 1.0) -> Tracker:
-        return replace(tracker, forgetting=float(values(x)[0]))  # type: ignore[no-any-return]
-
-    return Knobs(low, high, np.zeros(1, bool), True, build, build, ("forgetting",), one, values)
+    usual = (float(np.log10(2.0 * task.model.n)), float(np.log10(100.0 * task.longest)))
+    ends = _range(memory, usual, np.ones(1), np.zeros(1, int))
+    return _single(tracker, "forgetting", ends, lambda x: np.asarray(np.maximum(1.0 - 10.0**-x, 0.0)), True)

@@ -33,13 +33,13 @@ from driftfit.trackers.rls import RLS
 
 R = TypeVar("R", bound=Track)
 
-CLOSE = 0.01
+SETTLED_SHARE = 0.01
 """The passes end when every parameter moves by less than this share of its standard deviation."""
 
-LEAST = 0.01
+SMALLEST_STEP = 0.01
 """Least share of a step that is tried."""
 
-NOTHING = 1e-20
+HELD_VARIANCE = 1e-20
 """Covariance of parameters that are held."""
 
 
@@ -71,7 +71,7 @@ def refine(run: R, passes: int = 20, drifting: bool = False) -> R:
                 "refine: the record does not determine all parameters; give a longer one, or lower orders."
             )
         moved = float(np.max(np.abs(goal - point) / found.std[-1]))
-        if moved < CLOSE:
+        if moved < SETTLED_SHARE:
             return found
         step = _downhill(run, point, goal)
         if step is None:
@@ -105,7 +105,7 @@ def _downhill(run: Track, point: Array, goal: Array) -> Array | None:
     if not isinstance(run.tracker, RLS | InstrumentalVariables):
         return goal
     before, share = _error(run, run.tracker, point), 1.0
-    while share > LEAST:
+    while share > SMALLEST_STEP:
         step: Array = point + share * (goal - point)
         if _error(run, run.tracker, step) < before:
             return step
@@ -115,6 +115,6 @@ def _downhill(run: Track, point: Array, goal: Array) -> Array | None:
 
 def _error(run: Track, tracker: RLS | InstrumentalVariables, point: Array) -> float:
     """The mean squared prediction error at a point; infinite where the model is unstable."""
-    known = replace(tracker, p0=NOTHING, theta0=tuple(point.tolist()))
+    known = replace(tracker, p0=HELD_VARIANCE, theta0=tuple(point.tolist()))
     held = _at(run, point, known)
     return float(np.nanmean(held.innovation**2)) if np.array_equal(held.state["point"], point) else np.inf

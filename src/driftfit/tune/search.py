@@ -7,8 +7,8 @@
                by chi2 / 2, on either side; with one knob this is the profile itself
 
 The objective is minimised; it maps points (S, p) to values (S,), +inf for impossible points.
-
-Intervals of settings: profiles of the likelihood, also of a noise variance that was estimated in closed form.
+It is minus the log-likelihood, or the logarithm of a mean square of errors (`Criterion`). Intervals of settings are
+profiles of the likelihood, also of a noise variance that was estimated in closed form.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from driftfit.tune.lanes import Task, score
 from driftfit.tune.parametrisation import Knobs, constant
 
 Objective = Callable[[Array], Array]
-DECADE = 4
+GRID_PER_DECADE = 4
 """Points of a grid per decade."""
-STEP = 1e-3
+SLOPE_STEP = 1e-3
 """Decades between the points of a central difference."""
-CURVE = 0.03
+CURVATURE_STEP = 0.03
 """The same for second differences, which lose twice as many digits."""
-CYCLES = 4
+GRID_CYCLES = 4
 """Largest number of rounds over the knobs."""
-EDGE = 0.01
+EDGE_DECADES = 0.01
 """Distance in decades from an end of the range that counts as being at the end."""
 
 
@@ -73,7 +73,7 @@ def minimise(f: Objective, knobs: Knobs) -> Array:
 
 
 def _axis(knobs: Knobs, i: int) -> Array:
-    count = int(np.ceil(DECADE * (knobs.high[i] - knobs.low[i]))) + 1
+    count = int(np.ceil(GRID_PER_DECADE * (knobs.high[i] - knobs.low[i]))) + 1
     points = np.linspace(knobs.low[i], knobs.high[i], max(count, 2))
     return np.asarray(np.append(points, -np.inf) if knobs.zero[i] else points)
 
@@ -86,7 +86,7 @@ def _grid(f: Objective, knobs: Knobs) -> Array:
     values = f(points)
     x: Array = points[np.argmin(values)].copy()
     best = values.min()
-    for _ in range(CYCLES if p > 1 else 0):
+    for _ in range(GRID_CYCLES if p > 1 else 0):
         before = best
         for i in range(p):
             points = np.repeat(x[None], len(_axis(knobs, i)), axis=0)
@@ -109,18 +109,18 @@ def _refine(f: Objective, knobs: Knobs, x: Array) -> Array:
     if not free.size:
         return x
     # one grid cell around the best grid point, so that the search cannot end in another minimum
-    reach = 1.0 / DECADE if len(x) == 1 else np.inf
+    reach = 1.0 / GRID_PER_DECADE if len(x) == 1 else np.inf
     low, high = np.maximum(knobs.low[free], x[free] - reach), np.minimum(knobs.high[free], x[free] + reach)
 
     def value_and_slope(part: Array) -> tuple[float, Array]:
         points = np.repeat(x[None], 2 * free.size + 1, axis=0)
         points[:, free] = part
         for j, i in enumerate(free):
-            points[2 * j + 1, i] += STEP
-            points[2 * j + 2, i] -= STEP
+            points[2 * j + 1, i] += SLOPE_STEP
+            points[2 * j + 2, i] -= SLOPE_STEP
         values = f(points)
         with np.errstate(invalid="ignore"):  # without an error anywhere the criterion is -inf
-            slopes = (values[1::2] - values[2::2]) / (2.0 * STEP)
+            slopes = (values[1::2] - values[2::2]) / (2.0 * SLOPE_STEP)
         return float(values[0]), np.where(np.isfinite(slopes), slopes, 0.0)
 
     from scipy import optimize  # this import takes half a second
@@ -155,15 +155,15 @@ def curvature(f: Objective, x: Array, free: Array) -> Array:
     for i, j in pairs:
         for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
             point = x.copy()
-            point[free[i]] += a * CURVE
-            point[free[j]] += b * CURVE
+            point[free[i]] += a * CURVATURE_STEP
+            point[free[j]] += b * CURVATURE_STEP
             points.append(point)
     values = f(np.array(points))
     H = np.empty((k, k))
     for at, (i, j) in enumerate(pairs):
         pp, pm, mp, mm = values[1 + 4 * at : 5 + 4 * at]
         # on the diagonal the two steps add up to one of twice the length, or cancel
-        H[i, j] = H[j, i] = (pp - pm - mp + mm) / (4.0 * CURVE**2)
+        H[i, j] = H[j, i] = (pp - pm - mp + mm) / (4.0 * CURVATURE_STEP**2)
     return H
 
 
@@ -184,7 +184,7 @@ class Search:
 
     def at_bound(self, i: int) -> bool:
         """Whether a knob is at an end of its range, or zero."""
-        return not self.knobs.low[i] + EDGE < self.x[i] < self.knobs.high[i] - EDGE
+        return not self.knobs.low[i] + EDGE_DECADES < self.x[i] < self.knobs.high[i] - EDGE_DECADES
 
     @cached_property
     def inverse(self) -> Array:
@@ -302,10 +302,10 @@ def _with_noise(search: Search, task: Task, level: float) -> dict[str, tuple[flo
         scores = score(task, [knobs.run(point) for point in points])
         return points, scores.sigma2(), rise - (-scores.loglik(scores.sigma2()) - search.best)
 
-    steps = STEP * np.eye(len(x))[free]
+    steps = SLOPE_STEP * np.eye(len(x))[free]
     found = [at(np.concatenate([x[None], x + steps, x - steps]))]
     noise = np.log(found[0][1][1:]).reshape(2, -1)
-    g = (noise[0] - noise[1]) / (2.0 * STEP)
+    g = (noise[0] - noise[1]) / (2.0 * SLOPE_STEP)
     ridges = np.zeros((1 + len(x), len(x)))
     ridges[0, free], ridges[1:] = C @ g, np.eye(len(x))
     ridges[1 + free[:, None], free] = C * np.log(10.0) + C @ g

@@ -14,8 +14,6 @@ A grid runs as lanes: 32 settings cost about as much as a few. A quasi-Newton se
 intervals of the likelihood follow (see `driftfit.tune`). Source: the likelihood of de Jong (1991), diffuse start;
 leave-one-out after Allen (1974), GCV after Craven and Wahba (1979).
 
-Tuning for several outputs: each output separately, or all rows of a shared theta together.
-
 Outputs with a separate theta have separate noise, so each gets its own settings: `TunedOutputs.tracker` maps the name
 of an output to its tracker, in the form that `track` and `Live` take. Regressors are those of constant parameters,
 whose predictions also fill missing lags.

@@ -2,22 +2,15 @@
 
     p(theta_t | data, constraints) ~ N(theta_t; theta, P) prod_k 1[low_k <= g_k' theta_t <= high_k]
 
-The filter runs free, and its Gaussian at each sample is cut to where theta is known to be
-(`driftfit.use.constrained`): mean, standard deviation and quantiles of what is left. For constant parameters
-this is Bayes' rule itself, because the constraint is the same at all samples. For parameters that drift it is the
-distribution given the constraint *at that sample*; that it held before as well could narrow it further. The cut is
-never fed back into the filter: a filter that learns from the same inequality again at every sample shrinks its
-covariance without data, and leaves the bound for no reason.
+The filter runs free, and its Gaussian at each sample is cut to where theta is known to be: mean, standard deviation and
+quantiles of what is left. For constant parameters this is Bayes' rule itself, because the constraint is the same at all
+samples. For parameters that drift it is the distribution given the constraint *at that sample*; that it held before as
+well could narrow it further. The cut is never fed back into the filter: a filter that learns from the same inequality
+again at every sample shrinks its covariance without data, and leaves the bound for no reason.
 
 ``prob`` is the probability that the free filter gives to each constraint. Where it is small, data and constraint
 contradict each other, and the constraint may be wrong. Cost per sample: O(k n^2) for each sweep, some ten sweeps for
 several constraints that matter together.
-
-Constraints as text: "b1 >= 0", "0 <= a1 + a2 <= 1", "b1 + b2 == 1"; each is low <= g' theta <= high.
-
-Moments of Gaussians that are cut to half-spaces, for all samples at once.
-
-    p(theta) ~ N(theta; mu, S) prod_k 1[low_k <= g_k' theta <= high_k]
 
 A plane, low = high, is exact conditioning. Half-spaces are taken by expectation propagation: each is replaced by a
 Gaussian factor exp(-tau z^2 / 2 + nu z) of z = g' theta, such that mean and variance of z are those of the cut Gaussian
@@ -219,11 +212,11 @@ def _linear(node: ast.expr, places: dict[str, int], names: Sequence[str], text: 
     )
 
 
-SWEEPS, SETTLED = 100, 1e-10
+SWEEPS, SETTLED_MOVE = 100, 1e-10
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(60)
 EXPONENT = 80.0
 """Twice the exponent at which a tail ends."""
-LEAST = 1e-14
+KNOWN_SHARE = 1e-14
 """Share of a variance below which a direction is known, and cannot be cut."""
 
 
@@ -261,7 +254,7 @@ def cut(mu: Array, S: Array, within: Sequence[HalfSpace]) -> tuple[Array, Array,
         for k, one in cuts:
             Sg = S @ one.g
             v, m = Sg @ one.g, mu @ one.g
-            open_ = v > LEAST * (scale @ one.g**2)
+            open_ = v > KNOWN_SHARE * (scale @ one.g**2)
             v = np.where(open_, v, 1.0)
             cavity = 1.0 / (1.0 / v - tau[:, k])
             left = cavity * (m / v - nu[:, k])
@@ -275,6 +268,6 @@ def cut(mu: Array, S: Array, within: Sequence[HalfSpace]) -> tuple[Array, Array,
             S = S - dt[:, None, None] * gain[:, :, None] * Sg[:, None, :]
             tau[:, k], nu[:, k], without[:, k], spread[:, k] = fresh, shift, left, np.where(open_, cavity, 0.0)
             moved = max(moved, float(np.max(np.abs(dt) * v + np.abs(dn) * np.sqrt(v), initial=0.0)))
-        if moved < SETTLED:
+        if moved < SETTLED_MOVE:
             break
     return mu, S, without, spread

@@ -261,7 +261,9 @@ def _spread_of_draws(update: Any, begin: Array, inputs: Array, y_hat: Array) -> 
             off[k], std[k] = mean - y_hat[k], np.sqrt(s)
             update(state, mean + std[k] * draw[k], u)
     spread: Array = np.where(np.maximum.accumulate(np.isinf(deviation).any(axis=0)), np.inf, np.nan)
-    known = np.isnan(spread) & np.isfinite(away).all(axis=0) & np.isfinite(deviation).all(axis=0)
+    left = ~(np.isfinite(away) & np.isfinite(deviation))  # a future that is beyond all numbers is outside of any band
+    away[left], deviation[left] = np.inf, 1.0
+    known = np.isnan(spread) & (left.mean(axis=0) < 0.1)
     spread[known] = _central(away[:, known], deviation[:, known])
     return spread
 

@@ -11,12 +11,8 @@ the inputs. `simulate` uses no output at all. q is the drift per sample that the
 none; r makes the variance of the first step equal to that of the run. First-order in the parameter errors.
 Cost: O(T k n^2) for `ahead`, O(h n^2) for `simulate`.
 
-This is for ARX and Regression. For other models that can be run forward (`Model.play`), such as Hammerstein-Wiener,
-systems are drawn (`driftfit.use.simulate`).
-
-Predictions over a record: their errors, and their parts.
-
-Forward runs of models that are nonlinear in their parameters: bands from draws of systems and noise.
+This is for ARX and Regression. Of other models that can be run forward (`Model.play`), such as Hammerstein-Wiener,
+which are nonlinear in their parameters, systems and noise are drawn:
 
     theta_d ~ N(theta, P),  v_d ~ N(0, r)      D systems are run forward side by side (`Model.play`)
     y_hat       with theta itself and without noise

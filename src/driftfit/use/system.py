@@ -8,21 +8,20 @@
 In an ARX model all A_j are A; in polynomial models A_j = A F_j (`Model.transfers`).
 
 At every sample the parameters of that sample are assumed to be constant: the frozen system. Standard deviations come
-from the covariance of the run by the delta method (`driftfit.use.system`); for a frequency response they are
+from the covariance of the run by the delta method; for a frequency response they are
 those of the logarithm of the magnitude and of the phase. Units: w in radians per sample, gains in units of y over u.
 
 In econometrics: in a model of logarithms the gain is the long-run elasticity, b / (1 - a), which `long_run` returns
 with its standard error and with the interval of Fieller (1954). Where A(1) is not clearly different from zero the delta
 method fails; Fieller's interval is then unbounded, as it should be.
 
-The delta method: standard deviations of functions of the parameters.
+The delta method gives standard deviations of functions of the parameters:
 
     Cov f(theta) = J Cov(theta) J',     J = df / dtheta by central differences
 
 Steps are a hundredth of a standard deviation, so the slope is that in the region of likely theta. If f is nonlinear
 within a standard deviation (a gain whose denominator is near zero), the result is only a first-order approximation.
-
-The system behind a stream, now: poles, gains and responses with bands, as `Track` has them.
+`LiveSystem` is the same for a stream, now.
 """
 
 from __future__ import annotations

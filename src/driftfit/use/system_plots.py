@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
     from driftfit.run.result import Track
 
-TIMES = 5
+RESPONSES_DRAWN = 5
 """Number of samples whose responses are drawn by default."""
 
-LONGEST = 200
+STEP_SAMPLES = 200
 """Largest number of samples of a step response."""
 
 
@@ -56,7 +56,9 @@ def plot_system(
     linear(run)
     j = input_of(run, input)
     first = settled(run).start
-    chosen = np.unique(np.linspace(first, len(run) - 1, TIMES).astype(int)) if at is None else np.atleast_1d(at)
+    chosen = (
+        np.unique(np.linspace(first, len(run) - 1, RESPONSES_DRAWN).astype(int)) if at is None else np.atleast_1d(at)
+    )
     length = _settling(run, chosen) if h is None else h
     figure, (step, magnitude, plane, gain) = panels(ax, (10.0, 7.4), 4, 2)
     colours = _shades(len(chosen))
@@ -73,7 +75,7 @@ def _settling(run: Track, at: Array) -> int:
     sizes = np.abs(found[:, 0]) if found.shape[1] else np.zeros(1)
     slowest = float(np.max(np.where(sizes < 1.0, sizes, 0.99)))
     lags = max(B.shape[-1] for B, _ in parts)
-    return int(np.clip(lags + (np.log(0.02) / np.log(slowest) if slowest > 0.02 else 1.0), 10, LONGEST))
+    return int(np.clip(lags + (np.log(0.02) / np.log(slowest) if slowest > 0.02 else 1.0), 10, STEP_SAMPLES))
 
 
 def _shades(count: int) -> list[Any]:

@@ -130,7 +130,6 @@ def schema_of(task: Task, kinds: Mapping[str, str], outputs: str) -> dict[str, s
 def _worker(
     task: Task, outputs: str, schema: Mapping[str, str]
 ) -> Callable[[Iterator[pa.RecordBatch]], Iterator[pa.RecordBatch]]:
-    """What a partition runs."""
 
     def work(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
         part = Partition(task, outputs, schema)

@@ -230,15 +230,12 @@ class Known(NamedTuple):
 
     @property
     def old(self) -> Array:
-        """Which units have a state."""
         return np.asarray(self.kind[self.first] == OLD)
 
     def reasons(self, which: Array) -> list[str]:
-        """Why units cannot run."""
         return [one if isinstance(one := self.joints[k], str) else "rows without a unit" for k in which.tolist()]
 
     def keys(self, which: Array) -> dict[str, Any]:
-        """The names of units."""
         return {name: self.table.column(name).take(pa.array(self.first[which])) for name in self.flow.task.by}
 
     def unpacked(self, keys: Array) -> dict[int, Array]:
@@ -251,7 +248,6 @@ class Known(NamedTuple):
         return self.words
 
     def packed(self, k: int) -> bytes:
-        """The state of a unit as bytes."""
         if k in self.arrived and k not in self.words:
             return self.arrived[k]
         joint = self.joints[k]

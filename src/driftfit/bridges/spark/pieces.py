@@ -42,7 +42,6 @@ class Sums(NamedTuple):
 
     @classmethod
     def of(cls, units: int, task: Task) -> Sums:
-        """Zeros."""
         return cls(np.zeros((units, len(COUNTS)), int), np.zeros((units, len(task.y), 3)))
 
 

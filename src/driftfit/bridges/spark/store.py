@@ -49,12 +49,10 @@ class Store:
         return path.getFileSystem(self.spark._jsc.hadoopConfiguration()), path
 
     def _names(self, *parts: str) -> list[str]:
-        """Names in a folder; none if it does not exist."""
         files, path = self._folder(*parts)
         return [one.getPath().getName() for one in files.listStatus(path)] if files.exists(path) else []
 
     def has(self, batch: int) -> bool:
-        """Whether a batch is complete."""
         return "_SUCCESS" in self._names(f"batch={batch}")
 
     def batches(self) -> list[int]:
@@ -123,7 +121,6 @@ class Store:
         return [json.loads(row[0]) for row in rows if row is not None]
 
     def schema(self) -> str:
-        """Columns and types of the table."""
         return str(self._about()["schema"])
 
     def schema_of(self, what: str) -> list[str]:

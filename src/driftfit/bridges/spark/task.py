@@ -50,7 +50,6 @@ class Task:
 
     @cached_property
     def clock(self) -> Clock:
-        """The nominal interval."""
         return Clock.of(self.dt, self.zone)
 
     @property

@@ -14,12 +14,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.models.hammerstein_wiener.curves.basis import INSIDE, Basis, Thresholds
-from driftfit.models.hammerstein_wiener.products import Structure
+from driftfit.models.hammerstein_wiener.basis import Basis
+from driftfit.models.hammerstein_wiener.output_curve import WIDER
+from driftfit.models.hammerstein_wiener.structure import GRID, Structure
+from driftfit.models.hammerstein_wiener.thresholds import INSIDE, Thresholds
 
-GRID = 64
-WIDER = 0.2
-NEWTON = 3
+NEWTON_STEPS = 3
 
 
 class Blocks(Protocol):
@@ -86,7 +86,7 @@ class Inverse:
     def __init__(self, model: Blocks, d: Array, span: tuple[Any, Any]) -> None:
         self.basis, self.d = model.out, d
         least, most = (np.atleast_1d(np.asarray(end, float)) for end in span)
-        margin = WIDER * np.maximum(most - least, 1e-9)
+        margin = WIDER * np.where(most > least, most - least, 1e-9)
         low, high = np.maximum(least - margin, self.basis.limits[0]), np.minimum(most + margin, self.basis.limits[1])
         self.y = np.linspace(low, high, GRID, axis=1)
         self.own = np.arange(len(d)) if len(low) > 1 else np.zeros(len(d), int)
@@ -107,7 +107,7 @@ class Inverse:
         left, right_end = self.y[self.own, cell], self.y[self.own, cell + 1]
         y = left + np.clip(share, 0.0, 1.0) * (right_end - left)
         inside = self.rising & (right > self.level[:, 0]) & (right < self.level[:, -1])
-        for _ in range(NEWTON):
+        for _ in range(NEWTON_STEPS):
             slope = np.sum(self.basis.derivative(y) * self.d, axis=1)
             short = right - np.sum(self.basis.value(y) * self.d, axis=1)
             with np.errstate(invalid="ignore", divide="ignore"):

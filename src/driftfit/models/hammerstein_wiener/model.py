@@ -7,16 +7,15 @@
 With several inputs each has its own curve v_i and coefficients b_i, and their sum drives the linear block. With several
 outputs each has its own linear block and output block: a regression on its own lags and on the inputs, in a separate
 lane. Without noise this is not a restriction, since the entries of every row of a transfer matrix have a common
-denominator, of at most the order of the whole. If the input blocks are the same for all outputs,
-`driftfit.models.hammerstein_wiener.results.shared_curves` separates them together.
+denominator, of at most the order of the whole.
 
 In the measured signals this is a regression on products of the parameters
-(`driftfit.models.hammerstein_wiener.products`):
+(`driftfit.models.hammerstein_wiener.structure`):
 
     z_t = -g_1(y_t) = phi_t' theta_t
     phi_t = [g_1(y_{t-i}) .., -f_1(u_{t-nk-j+1}) .., g_2(y_t) .. g_q(y_t), -f_k(u_{t-nk-j+1}) .., g_k(y_{t-i}) .., (1)]
 
-Any tracker estimates theta (stage one); `driftfit.models.hammerstein_wiener.results` separates a, b, c, d from it. The
+Any tracker estimates theta (stage one); `driftfit.models.hammerstein_wiener.separation` gives a, b, c, d. The
 regression is exact only if each product uses every factor at its own time; products at one time leave an error of
 second order in the drift.
 
@@ -28,7 +27,7 @@ The a_i are those of the field's polynomial A(z) = 1 + a_1 z^-1 + .., and are na
 signs, and the names a1, a2. Use this model if one or both curves matter; for a linear system use `ARX`. Least squares
 is consistent only for data without measurement noise, because phi contains y. ``output_noise`` weights samples by the
 effect of noise of that standard deviation on the equation, which lowers the variance but not the bias;
-`driftfit.models.hammerstein_wiener.trackers.output_error` has neither problem.
+`driftfit.models.hammerstein_wiener.output_error` has neither problem.
 
 Source: Feng and Hong (2021), Int. J. Systems Science 52(16); Bai (1998), Automatica 34(3). Departures: all columns of
 the input have a minus sign, without which the regression gives -b. Cost per sample: O(n + 64 n_out).
@@ -47,22 +46,20 @@ from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import numbers, output_names, warn, whole
 from driftfit.models.base import Model
-from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
-from driftfit.models.hammerstein_wiener.curves.settled_thresholds import settled
-from driftfit.models.hammerstein_wiener.evaluate_bases import DIGITS
-from driftfit.models.hammerstein_wiener.products import Structure
-from driftfit.models.hammerstein_wiener.run_time_orders import RunTimeOrders
-from driftfit.models.hammerstein_wiener.step_memory import memory, places_of
-from driftfit.models.hammerstein_wiener.steps import applying, build, refusing
-from driftfit.models.inputs import CountedInputs
+from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial, basis_of
+from driftfit.models.hammerstein_wiener.forward import play
+from driftfit.models.hammerstein_wiener.steps import DIGITS, applying, build, build_any, refusing
+from driftfit.models.hammerstein_wiener.structure import Structure, memory, places_of
+from driftfit.models.hammerstein_wiener.thresholds import settled
+from driftfit.models.inputs import CountedInputs, Wider
 from driftfit.readings.screen import suspect
 
 IDENTITY = Polynomial(1)
-FLATTEST = 1e-3
+SLOPE_SHARE = 1e-3
 """Smallest slope of the output block that the likelihood accepts, as a share of the slope of its functions."""
-FLOOR = 1e-4
+VARIANCE_SHARE = 1e-4
 """Smallest variance that measurement noise adds to the equation, as a share of the squared height of the functions."""
-UNIT = 10.0
+UNIT_SIZE = 10.0
 """Root mean square beyond which, or below whose inverse, data are far from unit size for raw powers."""
 
 
@@ -272,7 +269,7 @@ class HammersteinWiener(CountedInputs):
 
     def as_large_as(self, family: Sequence[Model]) -> Model:
         room = max(np.size(one.memory()["blocks"]) for one in family)
-        return RunTimeOrders(self, max(one.n for one in family), self.family, self.places, room)
+        return RunTimeOrders(self, max(one.n for one in family), room)
 
     @property
     def apply(self) -> Step | None:
@@ -283,8 +280,6 @@ class HammersteinWiener(CountedInputs):
         return max(self.na, *(nb + nk - 1 for nb, nk in zip(self.structure.nb, self.delays, strict=True)))
 
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
-        from driftfit.models.hammerstein_wiener.forward import play
-
         return play(self, theta, y, u, noise, span)
 
     def touched(self, t: int, signal: str) -> range:
@@ -379,7 +374,7 @@ class HammersteinWiener(CountedInputs):
                 continue
             values = values[~suspect(values)]  # which say nothing of the unit of the others
             size = float(np.sqrt(values @ values / values.size)) if values.size else 0.0
-            if size and not 1.0 / UNIT <= size <= UNIT:
+            if size and not 1.0 / UNIT_SIZE <= size <= UNIT_SIZE:
                 powers = np.abs(values[:, None] ** [1, basis.degree])
                 lost = int(np.sum(powers[:, 1] >= DIGITS * np.maximum(powers[:, 0], 1.0)))
                 unusable = f", and {lost} samples, whose powers span more than 13 digits, are missing" if lost else ""
@@ -393,28 +388,24 @@ class HammersteinWiener(CountedInputs):
 
 @lru_cache
 def _flattest(model: HammersteinWiener) -> float:
-    return FLATTEST * model.out.steepness
+    return SLOPE_SHARE * model.out.steepness
 
 
 @lru_cache
 def _least_noise(model: HammersteinWiener) -> float:
     """The slope of the identity is 1, so that it needs no floor."""
-    return 0.0 if model.linear else FLOOR * model.out.height**2
+    return 0.0 if model.linear else VARIANCE_SHARE * model.out.height**2
 
 
 @lru_cache
 def _places(model: HammersteinWiener) -> tuple[int, ...]:
-    into = tuple(basis.parameters for basis in model.bases)
-    adaptive = tuple(basis.adaptive for basis in model.bases)
-    return places_of(model.structure, model.delays, into, model.out.parameters, model.linear, adaptive)
+    return places_of(model.structure, model.delays, model.bases, model.out)
 
 
 @lru_cache
 def _memory(model: HammersteinWiener) -> Array:
-    into = tuple(basis.parameters for basis in model.bases)
     sigma = model.output_noise[0] if several(model.output_noise) else model.output_noise
-    out, least = model.out, _least_noise(model)
-    return memory(model.structure, model.delays, into, out.parameters, out.limits, sigma, least, out.scale)
+    return memory(model.structure, model.delays, model.bases, model.out, sigma or 0.0, _least_noise(model))
 
 
 @lru_cache
@@ -425,3 +416,24 @@ def _rise(model: HammersteinWiener) -> Array:
 @lru_cache
 def _steps(model: HammersteinWiener) -> ModelSteps:
     return build(tuple(basis.kind for basis in model.bases), model.out.kind, model.places)
+
+
+@dataclass(frozen=True)
+class RunTimeOrders(Wider):
+    """A bound `HammersteinWiener` in the record of a larger one, whose memory has ``size_of_blocks`` numbers.
+
+    A driver is compiled for one number of parameters and one set of orders. To compare many orders, each model gets the
+    size of the largest, with regressors of 0 after its own, and its orders are numbers in the record instead of
+    constants of the compiled routines. Bits are the same; a sample takes longer.
+    """
+
+    size_of_blocks: int
+
+    def memory(self) -> Mapping[str, Any]:
+        own = self.model.memory()
+        blocks = np.append(own["blocks"], np.zeros(self.size_of_blocks - own["blocks"].size))
+        return {**own, "blocks": blocks, "orders": np.array(_places(self.model))}
+
+    @property
+    def steps(self) -> ModelSteps:
+        return build_any(self.model.family[:-1], self.model.family[-1])

@@ -12,7 +12,7 @@ Let d' be coefficients for which all differences D_i of levels were positive; th
     sum_k |d_k - d'_k| max_i |D_ik / D_i| < 1,       D_ik the differences of g_k
 
 If the levels do not increase, the monotone envelope (running maximum from the middle outwards, running minimum inwards)
-is inverted instead and ``RISING`` is 0. Source of the cubic: Fritsch and Carlson (1980). Cost: O(log GRID n_out).
+is inverted instead and ``rising`` is 0. Source of the cubic: Fritsch and Carlson (1980). Cost: O(log GRID n_out).
 """
 
 from __future__ import annotations
@@ -25,34 +25,8 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, part, shared
 from driftfit.engine.simd import fill_four, load_four, plus, reached, times
-from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, level_of
-from driftfit.models.hammerstein_wiener.step_memory import (
-    BEND,
-    BOTTOM,
-    CELL,
-    COARSE,
-    CURVE,
-    D_CHECKED,
-    D_NOW,
-    EIGHT,
-    GRID,
-    HIGHEST,
-    LATE,
-    LEVEL,
-    LOW,
-    LOWEST,
-    MOVED,
-    N_OUT,
-    REACH,
-    RISING,
-    ROW,
-    SCALE,
-    STEP,
-    TOP,
-    TRIAL,
-    TRIAL_BEND,
-    Places,
-)
+from driftfit.models.hammerstein_wiener.curve_kernels import LEGENDRE, POWERS, legendre, powers
+from driftfit.models.hammerstein_wiener.structure import AT, EIGHT, GRID, NUMBER, ROW, Places
 
 WIDER = 0.2
 """Share of the range of the outputs by which the grid extends beyond it at both ends."""
@@ -60,24 +34,74 @@ SAFE = 0.99
 """The bound on the change of d, reduced for rounding."""
 FINE = 1e-8
 """Share of a cell; the Newton iteration stops when its error is below it."""
-STEPS = 8
-WIDE = 10.0
+NEWTON_STEPS = 8
+SPREAD = 10.0
 """A grid that is this many times wider than needed, because of an absurd first output, is computed again."""
+
+Kind = tuple[Any, int]
+"""The compiled routine of a basis, and its code."""
+
+
+@lru_cache
+def values_of(kind: Kind, numbers: int, following: int, count: int) -> Any:
+    """A part (m, p, x, at, slopes) that fills two arrays with the functions of a block at x, and their slopes.
+
+    Every basis is evaluated by its compiled routine, called by symbol. Raw powers and Legendre polynomials, the most
+    common ones, are computed inline.
+    """
+    evaluate, code = kind
+    inline: Any = {POWERS: powers, LEGENDRE: legendre}.get(code)
+
+    def called(m: Array, p: Places, x: float, at: int, slopes: int) -> None:
+        own, L = p[numbers], m.shape[1]
+        base, size = m.ctypes.data, 8 * L
+        evaluate(x, base + size * own, p[following] - own, base + size * at, base + size * slopes, p[count], L)
+
+    def inlined(m: Array, p: Places, x: float, at: int, slopes: int) -> None:
+        own = m[p[numbers] + 1 : p[following], 0]
+        inline(x, own, m[at : at + p[count], 0], m[slopes : slopes + p[count], 0])
+
+    return part(called if inline is None else inlined)
+
+
+@lru_cache
+def level_of(kind: Kind) -> Any:
+    """A part (m, p, y) that returns the level of the output block at y and its slope; it may fill trial, trial_bend."""
+    fill_trial = values_of(kind, AT.out, AT.curve, AT.n_out)
+
+    def at_output(m: Array, p: Places, y: float) -> tuple[float, float]:
+        d, g, h = p[AT.d_now], p[AT.trial], p[AT.trial_bend]
+        fill_trial(m, p, y, g, h)
+        value, slope = m[g, 0], m[h, 0]
+        for k in range(1, p[AT.n_out]):
+            value += m[d + k, 0] * m[g + k, 0]
+            slope += m[d + k, 0] * m[h + k, 0]
+        return value, slope
+
+    def horner(m: Array, p: Places, y: float) -> tuple[float, float]:
+        value, slope = 0.0, 0.0
+        for k in range(p[AT.n_out] - 1, -1, -1):
+            slope = slope * y + value
+            value = value * y + (m[p[AT.d_now] + k, 0] if k > 0 else 1.0)
+        return value * y, slope * y + value
+
+    return part(horner if kind[1] == POWERS else at_output)
 
 
 @part
 def believe(m: Array, y: float) -> None:
     """Include an output in the range of accepted outputs."""
-    if y < m[LOWEST, 0] or y > m[HIGHEST, 0]:
-        m[LOWEST, 0], m[HIGHEST, 0], m[MOVED, 0] = min(m[LOWEST, 0], y), max(m[HIGHEST, 0], y), 1.0
+    if y < m[NUMBER.lowest, 0] or y > m[NUMBER.highest, 0]:
+        m[NUMBER.lowest, 0], m[NUMBER.highest, 0] = min(m[NUMBER.lowest, 0], y), max(m[NUMBER.highest, 0], y)
+        m[NUMBER.moved, 0] = 1.0
 
 
 @part
 def level(m: Array, p: Places, at: int, i: int) -> Any:
-    """sum_k d_k times function k of the table at ``at``: the level (CURVE) or its slope (BEND) at a grid point."""
-    d, place = p[D_NOW], at + i
+    """sum_k d_k times function k of the table at ``at``: the level (curve) or its slope (bend) at a grid point."""
+    d, place = p[AT.d_now], at + i
     total = m[place, 0]
-    for k in range(1, p[N_OUT]):
+    for k in range(1, p[AT.n_out]):
         total += m[d + k, 0] * m[place + k * ROW, 0]
     return total
 
@@ -85,9 +109,9 @@ def level(m: Array, p: Places, at: int, i: int) -> Any:
 @part
 def beneath(m: Array, p: Places, at: int, row: int, right: float) -> int:
     """How many of the eight levels from ``at`` on are not above ``right``; ``row`` is the length of a row."""
-    d = p[D_NOW]
+    d = p[AT.d_now]
     one, other = load_four(m, at, 0), load_four(m, at + 4, 0)
-    for k in range(1, p[N_OUT]):
+    for k in range(1, p[AT.n_out]):
         weight = fill_four(m[d + k, 0])
         one = plus(one, times(weight, load_four(m, at + k * row, 0)))
         other = plus(other, times(weight, load_four(m, at + k * row + 4, 0)))
@@ -98,11 +122,11 @@ def beneath(m: Array, p: Places, at: int, row: int, right: float) -> int:
 @part
 def beneath_in_lane(m: Array, p: Places, at: int, row: int, right: float) -> int:
     """The same if the numbers of a lane are not contiguous."""
-    d, count = p[D_NOW], 0
+    d, count = p[AT.d_now], 0
     for i in range(EIGHT):
         place = at + i
         total = m[place, 0]
-        for k in range(1, p[N_OUT]):
+        for k in range(1, p[AT.n_out]):
             total += m[d + k, 0] * m[place + k * row, 0]
         count += int(total <= right)
     return count
@@ -111,14 +135,14 @@ def beneath_in_lane(m: Array, p: Places, at: int, row: int, right: float) -> int
 @shared
 def look(m: Array, p: Places) -> None:
     """Check whether the levels increase, and how far d may change until the next check; if not, make the envelope."""
-    n_out, d, checked, reach, at = p[N_OUT], p[D_NOW], p[D_CHECKED], p[REACH], p[CURVE]
-    levels = p[LEVEL]
+    n_out, d, checked, reach, at = p[AT.n_out], p[AT.d_now], p[AT.d_checked], p[AT.reach], p[AT.curve]
+    levels = p[AT.level]
     for i in range(GRID):
         m[levels + i, 0] = level(m, p, at, i)
     falls = 0
     for i in range(GRID - 1):
         falls += 0 if m[levels + i + 1, 0] > m[levels + i, 0] else 1
-    m[RISING, 0] = 1.0 if falls == 0 else 0.0
+    m[NUMBER.rising, 0] = 1.0 if falls == 0 else 0.0
     m[reach, 0] = 0.0 if falls == 0 else np.inf
     if falls == 0:
         for k in range(1, n_out):
@@ -137,11 +161,11 @@ def look(m: Array, p: Places) -> None:
 @shared
 def on_envelope(m: Array, p: Places, right: float) -> float:
     """The y at which the envelope has the level ``right``; the end of the grid for a level beyond it."""
-    levels = p[LEVEL]
+    levels, low, step = p[AT.level], m[NUMBER.low, 0], m[NUMBER.step, 0]
     if right < m[levels, 0]:
-        return float(m[LOW, 0])
+        return float(low)
     if right >= m[levels + GRID - 1, 0]:
-        return float(m[LOW, 0] + (GRID - 1) * m[STEP, 0])
+        return float(low + (GRID - 1) * step)
     below, above = 0, GRID - 1
     while above - below > 1:
         middle = (below + above) // 2
@@ -150,19 +174,19 @@ def on_envelope(m: Array, p: Places, right: float) -> float:
         else:
             above = middle
     before, after = m[levels + below, 0], m[levels + below + 1, 0]
-    return float(m[LOW, 0] + m[STEP, 0] * (below + (right - before) / (after - before)))
+    return float(low + step * (below + (right - before) / (after - before)))
 
 
 @part
 def rises(m: Array, p: Places) -> bool:
     """Whether the output block with the present d increases along the grid."""
-    d, checked, reach = p[D_NOW], p[D_CHECKED], p[REACH]
+    d, checked, reach = p[AT.d_now], p[AT.d_checked], p[AT.reach]
     moved = m[reach, 0]
-    for k in range(1, p[N_OUT]):
+    for k in range(1, p[AT.n_out]):
         moved += abs(m[d + k, 0] - m[checked + k, 0]) * m[reach + k, 0]
     if not moved < SAFE:
         look(m, p)
-    return bool(m[RISING, 0] > 0.0)
+    return bool(m[NUMBER.rising, 0] > 0.0)
 
 
 @part
@@ -180,26 +204,28 @@ def locating(lanes: bool = False) -> Any:
     count = beneath_in_lane if lanes else beneath
 
     def locate(m: Array, p: Places, right: float) -> Any:
-        m[LATE, 0] = 0.0
-        if not m[STEP, 0] > 0.0 or right != right:
+        m[NUMBER.late, 0] = 0.0
+        if not m[NUMBER.step, 0] > 0.0 or right != right:
             return np.nan
         right = min(max(right, -LARGEST), LARGEST)  # the level beyond all levels of the grid is infinite
         if not rises(m, p):
             return on_envelope(m, p, right)
-        below = EIGHT * count(m, p, p[COARSE], EIGHT, right)
-        below += count(m, p, p[CURVE] + below + 1, ROW, right)
-        m[CELL, 0], m[LATE, 0] = min(below, GRID - 2), 1.0
+        below = EIGHT * count(m, p, p[AT.coarse], EIGHT, right)
+        below += count(m, p, p[AT.curve] + below + 1, ROW, right)
+        m[NUMBER.cell, 0], m[NUMBER.late, 0] = min(below, GRID - 2), 1.0
         return right
 
     return part(locate)
 
 
 @lru_cache
-def refining(level_at: Any) -> Any:
-    """A part (m, p, right) that solves in the cell that was found; ``level_at`` returns level and slope at a y."""
+def refining(out: Kind) -> Any:
+    """A part (m, p, right) that solves in the cell that was found."""
+    level_at = level_of(out)
 
     def refine(m: Array, p: Places, right: float) -> Any:
-        step, start, at, bends, below = m[STEP, 0], m[LOW, 0], p[CURVE], p[BEND], int(m[CELL, 0])
+        step, start, below = m[NUMBER.step, 0], m[NUMBER.low, 0], int(m[NUMBER.cell, 0])
+        at, bends = p[AT.curve], p[AT.bend]
         before, after = level(m, p, at, below), level(m, p, at, below + 1)
         if right < before:
             return start
@@ -209,7 +235,7 @@ def refining(level_at: Any) -> Any:
         mean, left = rise / step, start + below * step
         y = left + step * cubic((right - before) / rise, mean, first, final)
         bend = abs(first - mean) + abs(final - mean)
-        for _ in range(STEPS):
+        for _ in range(NEWTON_STEPS):
             value, slope = level_at(m, p, y)
             if not slope > 0.0:
                 break
@@ -223,13 +249,13 @@ def refining(level_at: Any) -> Any:
 
 
 @lru_cache
-def inverse_of(level_at: Any, lanes: bool = False) -> Any:
-    """A part (m, p, right) that inverts the output block; ``level_at`` returns level and slope at a y."""
-    locate, refine = locating(lanes), refining(level_at)
+def inverse_of(out: Kind, lanes: bool = False) -> Any:
+    """A part (m, p, right) that inverts the output block."""
+    locate, refine = locating(lanes), refining(out)
 
     def invert(m: Array, p: Places, right: float) -> Any:
         found = locate(m, p, right)
-        return refine(m, p, found) if m[LATE, 0] > 0.0 else found
+        return refine(m, p, found) if m[NUMBER.late, 0] > 0.0 else found
 
     return part(invert)
 
@@ -237,39 +263,42 @@ def inverse_of(level_at: Any, lanes: bool = False) -> Any:
 @lru_cache
 def inverting(out: Kind) -> Any:
     """The same as a core, for any lane, where it is seldom needed."""
-    return shared(inverse_of(level_of(out), lanes=True).py_func)
+    return shared(inverse_of(out, lanes=True).py_func)
 
 
 @lru_cache
-def laying(values: Any) -> Any:
+def laying(out: Kind) -> Any:
     """A core (m, p) that computes the grid again if the accepted outputs need another."""
+    values = values_of(out, AT.out, AT.curve, AT.n_out)
 
     def lay(m: Array, p: Places) -> None:
-        m[MOVED, 0] = 0.0
-        low, high = m[LOWEST, 0], m[HIGHEST, 0]
-        start, end = m[LOW, 0], m[LOW, 0] + (GRID - 1) * m[STEP, 0]
+        m[NUMBER.moved, 0] = 0.0
+        low, high, scale = m[NUMBER.lowest, 0], m[NUMBER.highest, 0], m[NUMBER.scale, 0]
+        bottom, top = m[NUMBER.bottom, 0], m[NUMBER.top, 0]
+        start, end = m[NUMBER.low, 0], m[NUMBER.low, 0] + (GRID - 1) * m[NUMBER.step, 0]
         wide = high - low
-        alone = m[SCALE, 0] if m[SCALE, 0] > 0.0 else WIDER * (abs(high) if high != 0.0 else 1.0)
+        alone = scale if scale > 0.0 else WIDER * (abs(high) if high != 0.0 else 1.0)
         margin = WIDER * wide if wide > 0.0 else alone
-        short = (low < start and start > m[BOTTOM, 0]) or (high > end and end < m[TOP, 0])
-        if low <= high and (m[STEP, 0] == 0.0 or short or end - start > WIDE * (wide + 2.0 * margin)):
-            start, end = max(low - margin, m[BOTTOM, 0]), min(high + margin, m[TOP, 0])
-            m[LOW, 0], m[STEP, 0] = start, (end - start) / (GRID - 1)
+        short = (low < start and start > bottom) or (high > end and end < top)
+        if low <= high and (m[NUMBER.step, 0] == 0.0 or short or end - start > SPREAD * (wide + 2.0 * margin)):
+            start, end = max(low - margin, bottom), min(high + margin, top)
+            m[NUMBER.low, 0], m[NUMBER.step, 0] = start, (end - start) / (GRID - 1)
             table(m, p, end)
-            m[p[REACH], 0] = np.inf
+            m[p[AT.reach], 0] = np.inf
 
     def fill_table(m: Array, p: Places, end: float) -> None:
-        n_out, g, h, curve, bend, coarse = p[N_OUT], p[TRIAL], p[TRIAL_BEND], p[CURVE], p[BEND], p[COARSE]
+        n_out, g, h = p[AT.n_out], p[AT.trial], p[AT.trial_bend]
         for i in range(GRID):
-            values(m, p, min(m[LOW, 0] + i * m[STEP, 0], end), g, h)
+            values(m, p, min(m[NUMBER.low, 0] + i * m[NUMBER.step, 0], end), g, h)
             for k in range(n_out):
-                m[curve + k * ROW + i, 0] = m[g + k, 0]
-                m[bend + k * ROW + i, 0] = m[h + k, 0]
+                m[p[AT.curve] + k * ROW + i, 0] = m[g + k, 0]
+                m[p[AT.bend] + k * ROW + i, 0] = m[h + k, 0]
         for k in range(n_out):
             beyond = np.inf if k == 0 else 0.0
-            m[curve + k * ROW + GRID, 0] = beyond
+            m[p[AT.curve] + k * ROW + GRID, 0] = beyond
             for j in range(EIGHT):
-                m[coarse + k * EIGHT + j, 0] = m[curve + k * ROW + EIGHT * (j + 1), 0] if j < EIGHT - 1 else beyond
+                at = p[AT.curve] + k * ROW + EIGHT * (j + 1)
+                m[p[AT.coarse] + k * EIGHT + j, 0] = m[at, 0] if j < EIGHT - 1 else beyond
 
     table = part(fill_table)
     return shared(lay)

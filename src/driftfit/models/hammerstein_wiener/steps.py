@@ -8,7 +8,12 @@ theta before the sample, by solving
 
 with `driftfit.models.hammerstein_wiener.output_curve`. The steps in a driver only pass a lane to two compiled routines,
 which are compiled once for all trackers. A call of a routine that is compiled for its orders is as fast as code inside
-of the driver. One routine with orders at run time would serve all models, but took twice as long per sample.
+of the driver. One routine with orders at run time takes twice as long per sample; `build_any` makes it, for comparisons
+of many orders.
+
+There are two rows of regressors, one for this sample and one for the next. The next row is filled as soon as its lags
+are known, at the previous sample, and is copied when it is needed. If a row were written in single numbers and read in
+SIMD vectors directly afterwards, the processor would have to wait until all writes are finished.
 """
 
 from __future__ import annotations
@@ -19,94 +24,174 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
-from driftfit.engine.kernel import Array, State, Step, floats, kernel, machine, part, shared
+from driftfit.engine.kernel import Array, State, Step, floats, kernel, machine, part, shared, wholes
 from driftfit.models.base import GAP
-from driftfit.models.hammerstein_wiener.curves.basis import INSIDE
-from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, input_values, level_of, output_values, usable
-from driftfit.models.hammerstein_wiener.output_curve import believe, inverting, laying, locating, refining
-from driftfit.models.hammerstein_wiener.regressor_rows import (
-    complete,
-    fill,
-    forget,
-    lose_output,
-    minimal_past,
-    noise_factor,
-    past,
-    shift,
+from driftfit.models.hammerstein_wiener.output_curve import (
+    Kind,
+    believe,
+    inverting,
+    laying,
+    locating,
+    refining,
+    values_of,
 )
-from driftfit.models.hammerstein_wiener.step_memory import (
-    ADAPTIVE,
-    BELIEVED,
-    DT,
-    EACH,
-    FACTOR,
-    G_PAST,
-    GIVEN,
-    H_PAST,
-    IDENTITY,
-    INPUTS,
-    LATE,
-    MINIMAL,
-    MOVED,
-    N_OUT,
-    NA,
-    NB,
-    NEXT,
-    NK,
-    NOW,
-    OK,
-    OWN,
-    OWN_ADAPTIVE,
-    OWN_F,
-    OWN_INTO,
-    OWN_N_IN,
-    OWN_NB,
-    OWN_NK,
-    PREDICTED,
-    RAW,
-    SPARE,
-    STARTED,
-    US,
-    VARIANCE,
-    N,
-    Places,
-    Y,
-    room,
-)
+from driftfit.models.hammerstein_wiener.structure import AT, INPUT, NUMBER, Places, room
+from driftfit.models.hammerstein_wiener.thresholds import INSIDE
+
+DIGITS = 1e13
+"""Largest ratio of the functions of a reading to the first of them, or to 1. Beyond it an absurd reading would leave
+too few of sixteen digits for ordinary readings in the same columns."""
+CURVED = 1e19
+"""Largest function of a reading if there are several functions, which are nearly proportional for large readings. The
+product of two stays below LARGEST."""
+
+
+@part
+def usable(m: Array, at: int, count: int) -> bool:
+    """Whether the functions of a reading, stored from ``at`` on, are numbers of comparable size."""
+    top = min(DIGITS * max(abs(m[at, 0]), 1.0), CURVED) if count > 1 else LARGEST
+    beyond = 0
+    for k in range(count):
+        beyond += 0 if abs(m[at + k, 0]) < top else 1
+    return beyond == 0
+
+
+@part
+def shift(m: Array, at: int, width: int, rows: int) -> None:
+    """Move every row of an array to the place of the next one."""
+    for i in range(at + width * rows - 1, at + width - 1, -1):
+        m[i, 0] = m[i - width, 0]
+
+
+@part
+def past(m: Array, p: Places, theta: Array) -> float:
+    """Return -(phi' theta) without the columns of the present output; also fills d_now."""
+    at_d, n, others, now = p[AT.d], p[AT.n], p[AT.n_out] - 1, p[AT.now]
+    for k in range(others):
+        m[p[AT.d_now] + 1 + k, 0] = theta[at_d + k, 0]
+    one, other = 0.0, 0.0
+    for i in range(at_d):
+        one -= theta[i, 0] * m[now + i, 0]
+    i = at_d + others
+    while i + 1 < n:
+        one -= theta[i, 0] * m[now + i, 0]
+        other -= theta[i + 1, 0] * m[now + i + 1, 0]
+        i += 2
+    if i < n:
+        one -= theta[i, 0] * m[now + i, 0]
+    return one + other
+
+
+@shared
+def minimal_past(m: Array, p: Places, theta: Array) -> float:
+    """The same if theta is xi."""
+    na, more_out, now, d, ad = p[AT.na], p[AT.n_out] - 1, p[AT.now], p[AT.x_d], p[AT.now] + p[AT.ad]
+    total = 0.0
+    for i in range(p[AT.inputs]):
+        own = AT.count + INPUT.count * i
+        nb, b, c, bc = p[own + INPUT.nb], p[own + INPUT.b], p[own + INPUT.c], now + p[own + INPUT.bc]
+        for j in range(nb):
+            column = m[now + b + j, 0]
+            for k in range(p[own + INPUT.n_in] - 1):
+                column += theta[c + k, 0] * m[bc + k * nb + j, 0]
+            total -= theta[b + j, 0] * column
+    for k in range(more_out):
+        m[p[AT.d_now] + 1 + k, 0] = theta[d + k, 0]
+    for i in range(na):
+        column = m[now + i, 0]
+        for k in range(more_out):
+            column += theta[d + k, 0] * m[ad + k * na + i, 0]
+        total -= theta[i, 0] * column
+    for i in range(ad + na * more_out, now + p[AT.n]):
+        total -= theta[d + more_out, 0] * m[i, 0]
+    return total
+
+
+@shared
+def noise_factor(m: Array, p: Places, theta: Array) -> float:
+    """sigma^2 sum_i a_i^2 F'(y_(t-i))^2 + floor, a_0 = 1, from the estimates before the sample."""
+    n_out, total = p[AT.n_out], 0.0
+    for i in range(p[AT.na] + 1):
+        slope = 0.0
+        for k in range(n_out):
+            slope += m[p[AT.d_now] + k, 0] * m[p[AT.h_past] + i * n_out + k, 0]
+        weight = 1.0 if i == 0 else theta[i - 1, 0]
+        total += weight * weight * slope * slope
+    factor = m[NUMBER.variance, 0] * total + m[NUMBER.floor, 0]
+    return factor if factor < LARGEST else 1.0
+
+
+@part
+def fill(m: Array, p: Places, to: int, ago: int, observed: bool) -> None:
+    """Fill phi without the columns of the present output, from the lags ``ago`` samples before it."""
+    na, n_out, g, ad = p[AT.na], p[AT.n_out], p[AT.g_past] + (1 - ago) * p[AT.n_out], to + p[AT.ad]
+    for i in range(p[AT.inputs]):
+        own = AT.count + INPUT.count * i
+        nb, n_in, b, bc = p[own + INPUT.nb], p[own + INPUT.n_in], to + p[own + INPUT.b], to + p[own + INPUT.bc]
+        f = p[own + INPUT.f] + (p[own + INPUT.nk] - ago) * n_in
+        for j in range(nb):
+            m[b + j, 0] = -m[f + j * n_in, 0]
+        for k in range(1, n_in):
+            for j in range(nb):
+                m[bc + (k - 1) * nb + j, 0] = -m[f + j * n_in + k, 0]
+    for k in range(n_out):
+        start = to if k == 0 else ad + (k - 1) * na
+        for i in range(na):
+            m[start + i, 0] = m[g + i * n_out + k, 0] if observed or i > 0 else np.nan
+    for i in range(ad + (n_out - 1) * na, to + p[AT.n]):
+        m[i, 0] = 1.0
+
+
+@shared
+def refuse_output(m: Array, p: Places) -> None:
+    """The newest output, which the row of the next sample already contains, is missing: a gate refused it."""
+    for k in range(p[AT.n_out]):
+        m[p[AT.g_past] + k, 0] = np.nan
+        if p[AT.na] > 0:
+            m[p[AT.now] + (0 if k == 0 else p[AT.ad] + (k - 1) * p[AT.na]), 0] = np.nan
+
+
+@shared
+def complete(m: Array, p: Places) -> bool:
+    """Whether all lags are known."""
+    missing = 0
+    for i in range(p[AT.n]):
+        if i < p[AT.d] or i >= p[AT.d] + p[AT.n_out] - 1:
+            missing += 0 if abs(m[p[AT.now] + i, 0]) < LARGEST else 1
+    return missing == 0
 
 
 @shared
 def thresholds(m: Array, p: Places, theta: Array) -> None:
     """Feed back the coefficients of a dead zone: sum_j b_j (b_j c_k) / sum_j b_j^2, or the mean of (b_j c_k) / b_j."""
-    at_b, at_bc, x_c = p[NA], p[NA] + p[NB] + p[N_OUT] - 1, p[NA] + p[NB]
-    for i in range(p[INPUTS]):
-        own = OWN + EACH * i
-        nb, into = p[own + OWN_NB], p[own + OWN_INTO]
-        for k in range(2 if p[own + OWN_ADAPTIVE] > 0 else 0):
+    for i in range(p[AT.inputs]):
+        own = AT.count + INPUT.count * i
+        nb, into = p[own + INPUT.nb], p[own + INPUT.into]
+        for k in range(2 if p[own + INPUT.adaptive] > 0 else 0):
             total, size = 0.0, 0.0
-            for j in range(nb if m[MINIMAL, 0] == 0.0 else 0):
-                gain, product = theta[at_b + j, 0], theta[at_bc + k * nb + j, 0]
+            for j in range(nb if m[NUMBER.minimal, 0] == 0.0 else 0):
+                gain, product = theta[p[own + INPUT.b] + j, 0], theta[p[own + INPUT.bc] + k * nb + j, 0]
                 size += 1.0 if m[into + 4, 0] > 0.0 else gain * gain
                 total += product / gain if m[into + 4, 0] > 0.0 else product * gain
-            threshold = total / size if m[MINIMAL, 0] == 0.0 else theta[x_c + k, 0]
+            threshold = total / size if m[NUMBER.minimal, 0] == 0.0 else theta[p[own + INPUT.c] + k, 0]
             if abs(threshold) < LARGEST:
                 top, bottom = INSIDE * m[into + 3, 0] * (1 - k), -INSIDE * m[into + 3, 0] * k
                 m[into + 1 + k, 0] = min(max(threshold, bottom), top)
-        more = p[own + OWN_N_IN] - 1
-        at_b, at_bc, x_c = at_b + nb, at_bc + nb * more, x_c + more
 
 
 @lru_cache
 def _entering(into: tuple[Kind, ...], i: int = 0, moves: bool = True) -> Any:
     """A part (m, p) that adds the inputs of this sample, from input i on, to their lags, or replaces the newest."""
-    input_at, own = input_values(into[i], i), OWN + EACH * i
+    own = AT.count + INPUT.count * i
+    input_at = values_of(into[i], own + INPUT.into, own + INPUT.end, own + INPUT.n_in)
 
     def one(m: Array, p: Places) -> None:
+        f, n_in = p[own + INPUT.f], p[own + INPUT.n_in]
         if moves:
-            shift(m, p[own + OWN_F], p[own + OWN_N_IN], p[own + OWN_NB] + p[own + OWN_NK])
-        input_at(m, p, m[p[US] + i, 0], p[own + OWN_F], p[SPARE])
-        if not usable(m, p[own + OWN_F], p[own + OWN_N_IN]):
-            m[p[own + OWN_F], 0] = np.nan
+            shift(m, f, n_in, p[own + INPUT.nb] + p[own + INPUT.nk])
+        input_at(m, p, m[p[AT.us] + i, 0], f, p[AT.spare])
+        if not usable(m, f, n_in):
+            m[f, 0] = np.nan
 
     enter = part(one)
     if i + 1 == len(into):
@@ -121,54 +206,50 @@ def _entering(into: tuple[Kind, ...], i: int = 0, moves: bool = True) -> Any:
 
 
 @lru_cache
-def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
+def _regressing(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
     """The computation of ``regress``, for the functions of all bases."""
-    enter, output_at, bare_output_at = _entering(into), output_values(out), output_values(out, bends=False)
-    lay, locate, invert = laying(output_at), locating(lanes), inverting(out)
+    enter, output_at = _entering(into), values_of(out, AT.out, AT.curve, AT.n_out)
+    lay, locate, invert = laying(out), locating(lanes), inverting(out)
 
     def regress_sample(m: Array, p: Places, theta: Array) -> None:
-        n_out, rows, g, h = p[N_OUT], 1 + max(p[NA], 1), p[G_PAST], p[H_PAST]
-        if not m[BELIEVED, 0] > 0.0:  # the previous sample
-            for k in range(n_out):
-                m[g + k, 0] = np.nan
-            lose_output(m, p)
-        elif abs(m[RAW, 0]) < LARGEST:
-            believe(m, m[RAW, 0])  # not before a gate has judged it
+        n_out, rows, g, h = p[AT.n_out], 1 + max(p[AT.na], 1), p[AT.g_past], p[AT.h_past]
+        if not m[NUMBER.believed, 0] > 0.0:  # the previous sample
+            refuse_output(m, p)
+        elif abs(m[NUMBER.raw, 0]) < LARGEST:
+            believe(m, m[NUMBER.raw, 0])  # not before a gate has judged it
         shift(m, g, n_out, rows)
-        if m[VARIANCE, 0] > 0.0:
+        if m[NUMBER.variance, 0] > 0.0:
             shift(m, h, n_out, rows)
-        if p[IDENTITY] == 0 and m[MOVED, 0] > 0.0:
+        if p[AT.identity] == 0 and m[NUMBER.moved, 0] > 0.0:
             lay(m, p)
-        if m[DT, 0] > GAP:
-            forget(m, p)
-        if p[ADAPTIVE] > 0 and m[OK, 0] > 0.0:
+        if m[NUMBER.dt, 0] > GAP:  # all lags are missing
+            for i in range(p[AT.f_past], p[AT.spare]):
+                m[i, 0] = np.nan
+        if p[AT.adaptive] > 0 and m[NUMBER.ok, 0] > 0.0:
             thresholds(m, p, theta)
         enter(m, p)
-        if p[NK] == 0 or m[DT, 0] > GAP:
-            fill(m, p, p[NOW], 0, True)
-        if m[STARTED, 0] == 0.0 and complete(m, p):
-            m[STARTED, 0] = 1.0
-        right = minimal_past(m, p, theta) if m[MINIMAL, 0] > 0.0 else past(m, p, theta)
-        y = m[Y, 0]
+        if p[AT.nk] == 0 or m[NUMBER.dt, 0] > GAP:
+            fill(m, p, p[AT.now], 0, True)
+        if m[NUMBER.started, 0] == 0.0 and complete(m, p):
+            m[NUMBER.started, 0] = 1.0
+        right = minimal_past(m, p, theta) if m[NUMBER.minimal, 0] > 0.0 else past(m, p, theta)
+        y = m[NUMBER.y, 0]
         observed = abs(y) < LARGEST
         if observed:
-            if m[VARIANCE, 0] > 0.0:
-                output_at(m, p, y, g, h)
-            else:
-                bare_output_at(m, p, y, g, h)
+            output_at(m, p, y, g, h)
             observed = usable(m, g, n_out)
-        m[RAW, 0] = y if observed else np.nan
-        if p[IDENTITY] == 0:
+        m[NUMBER.raw, 0] = y if observed else np.nan
+        if p[AT.identity] == 0:
             right = locate(m, p, right) if observed else invert(m, p, right)
-            m[LATE, 0] = m[LATE, 0] if observed else 0.0
-        m[PREDICTED, 0] = right
+            m[NUMBER.late, 0] = m[NUMBER.late, 0] if observed else 0.0
+        m[NUMBER.predicted, 0] = right
         if not observed:
             output_at(m, p, right, g, h)
-        m[FACTOR, 0] = noise_factor(m, p, theta) if m[VARIANCE, 0] > 0.0 else 1.0
-        m[Y, 0] = -m[g, 0] if observed else np.nan
-        m[DT, 0] = m[DT, 0] if m[STARTED, 0] > 0.0 else 0.0
-        if p[NK] > 0:
-            fill(m, p, p[NEXT], 1, observed)
+        m[NUMBER.factor, 0] = noise_factor(m, p, theta) if m[NUMBER.variance, 0] > 0.0 else 1.0
+        m[NUMBER.y, 0] = -m[g, 0] if observed else np.nan
+        m[NUMBER.dt, 0] = m[NUMBER.dt, 0] if m[NUMBER.started, 0] > 0.0 else 0.0
+        if p[AT.nk] > 0:
+            fill(m, p, p[AT.next], 1, observed)
 
     return part(regress_sample)
 
@@ -176,7 +257,7 @@ def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
 @lru_cache
 def _regress(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
     """The compiled routine of ``regress``."""
-    work, orders, rows, n = regress_work(into, out, lanes), np.array(p), room(p), p[N]
+    work, orders, rows, n = _regressing(into, out, lanes), np.array(p), room(p), p[AT.n]
 
     def machine_regress(blocks: int, theta: int, L: int) -> None:
         stride = L if lanes else 1  # known to the compiler
@@ -188,12 +269,12 @@ def _regress(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...], lanes: bool)
 @lru_cache
 def _push(out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
     """The compiled routine of ``push``: it predicts if no other step needed the prediction before."""
-    refine, orders, rows = refining(level_of(out)), np.array(p), room(p)
+    refine, orders, rows = refining(out), np.array(p), room(p)
 
     def machine_push(blocks: int, L: int) -> None:
         m = floats(blocks, rows, L if lanes else 1)
-        if m[LATE, 0] > 0.0:
-            m[PREDICTED, 0] = refine(m, orders, m[PREDICTED, 0])
+        if m[NUMBER.late, 0] > 0.0:
+            m[NUMBER.predicted, 0] = refine(m, orders, m[NUMBER.predicted, 0])
 
     return machine(machine_push)
 
@@ -201,7 +282,7 @@ def _push(out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
 @kernel
 def settle_output(s: State, l: int) -> None:
     """Whether the output becomes a lag and part of the range of outputs: unless it is missing, or a gate refused it."""
-    s.blocks[BELIEVED, l], s.blocks[OK, l] = s.observed[l], s.ok[l]
+    s.blocks[NUMBER.believed, l], s.blocks[NUMBER.ok, l] = s.observed[l], s.ok[l]
 
 
 @lru_cache
@@ -209,14 +290,12 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
     """The steps for the compiled bases of the inputs and of the output."""
     regress_one, regress_lane = _regress(into, out, p, False), _regress(into, out, p, True)
     push_one, push_lane = _push(out, p, False), _push(out, p, True)
-    curved = not p[IDENTITY]
-
-    now, following, n, present, at_d, more = p[NOW], p[NEXT], p[N], p[G_PAST] + 1, p[NA] + p[NB], p[N_OUT] - 1
-    us, inputs = p[US], p[INPUTS]
+    curved, us, inputs, n, more = not p[AT.identity], p[AT.us], p[AT.inputs], p[AT.n], p[AT.n_out] - 1
+    now, following, present, at_d = p[AT.now], p[AT.next], p[AT.g_past] + 1, p[AT.d]
 
     @kernel
     def regress(s: State, l: int) -> None:
-        s.blocks[GIVEN, l], s.blocks[Y, l], s.blocks[DT, l] = s.noise[l], s.y[l], s.dt[l]
+        s.blocks[NUMBER.given, l], s.blocks[NUMBER.y, l], s.blocks[NUMBER.dt, l] = s.noise[l], s.y[l], s.dt[l]
         for i in range(inputs):
             s.blocks[us + i, l] = s.u[i, l]
         at, L = 8 * l, s.y.shape[0]
@@ -229,29 +308,74 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
             s.phi[i, l] = s.blocks[now + i, l]
         for k in range(more):
             s.phi[at_d + k, l] = s.blocks[present + k, l]
-        s.y[l], s.dt[l] = s.blocks[Y, l], s.blocks[DT, l]
-        s.noise[l] *= s.blocks[FACTOR, l]
+        s.y[l], s.dt[l] = s.blocks[NUMBER.y, l], s.blocks[NUMBER.dt, l]
+        s.noise[l] *= s.blocks[NUMBER.factor, l]
 
     @kernel
     def push(s: State, l: int) -> None:
-        s.noise[l] = s.blocks[GIVEN, l]
+        s.noise[l] = s.blocks[NUMBER.given, l]
         if curved:
             at, L = 8 * l, s.y.shape[0]
             if L == 1:
                 push_one(s.blocks.ctypes.data + at, L)
             else:
                 push_lane(s.blocks.ctypes.data + at, L)
-        s.y_hat[l] = s.blocks[PREDICTED, l]
+        s.y_hat[l] = s.blocks[NUMBER.predicted, l]
         settle_output(s, l)
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 
     def ready(L: int) -> None:
-        for routine in (
-            *(one[0] for one in into),
-            out[0],
-            *((regress_one, push_one) if L == 1 else (regress_lane, push_lane)),
-        ):
+        own = (regress_one, push_one) if L == 1 else (regress_lane, push_lane)
+        for routine in (*(one[0] for one in into), out[0], *own):
+            routine.load()
+
+    return ModelSteps(regress, push, ready)
+
+
+@lru_cache
+def build_any(into: tuple[Kind, ...], out: Kind) -> ModelSteps:
+    """The same with the places of a model in its record, field ``orders``, instead of constants: for one lane."""
+    work, refine, count = _regressing(into, out, False), refining(out), AT.count + INPUT.count * len(into)
+
+    def machine_regress_any(blocks: int, theta: int, orders: int) -> None:
+        p = wholes(orders, 1, count)[0]
+        work(floats(blocks, p[AT.us] + p[AT.inputs], 1), p, floats(theta, p[AT.n], 1))
+
+    def machine_push_any(blocks: int, orders: int) -> None:
+        p = wholes(orders, 1, count)[0]
+        m = floats(blocks, p[AT.us] + p[AT.inputs], 1)
+        if m[NUMBER.late, 0] > 0.0:
+            m[NUMBER.predicted, 0] = refine(m, p, m[NUMBER.predicted, 0])
+
+    regress_any, push_any = machine(machine_regress_any), machine(machine_push_any)
+
+    @kernel
+    def regress(s: State, l: int) -> None:
+        s.blocks[NUMBER.given, l], s.blocks[NUMBER.y, l], s.blocks[NUMBER.dt, l] = s.noise[l], s.y[l], s.dt[l]
+        for i in range(s.orders[AT.inputs, l]):
+            s.blocks[s.orders[AT.us, l] + i, l] = s.u[i, l]
+        regress_any(s.blocks.ctypes.data, s.theta.ctypes.data, s.orders.ctypes.data)
+        for i in range(s.orders[AT.n, l]):
+            s.phi[i, l] = s.blocks[s.orders[AT.now, l] + i, l]
+        for k in range(s.orders[AT.n_out, l] - 1):
+            s.phi[s.orders[AT.d, l] + k, l] = s.blocks[s.orders[AT.g_past, l] + 1 + k, l]
+        s.y[l], s.dt[l] = s.blocks[NUMBER.y, l], s.blocks[NUMBER.dt, l]
+        s.noise[l] *= s.blocks[NUMBER.factor, l]
+
+    @kernel
+    def push(s: State, l: int) -> None:
+        s.noise[l] = s.blocks[NUMBER.given, l]
+        if s.orders[AT.identity, l] == 0:
+            push_any(s.blocks.ctypes.data, s.orders.ctypes.data)
+        s.y_hat[l] = s.blocks[NUMBER.predicted, l]
+        settle_output(s, l)
+        for i in range(s.orders[AT.n, l]):
+            s.blocks[s.orders[AT.now, l] + i, l] = s.blocks[s.orders[AT.next, l] + i, l]
+
+    def ready(L: int) -> None:
+        assert L == 1
+        for routine in (*(one[0] for one in into), out[0], regress_any, push_any):
             routine.load()
 
     return ModelSteps(regress, push, ready)
@@ -260,15 +384,15 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
 @lru_cache
 def applying(into: tuple[Kind, ...], p: tuple[int, ...]) -> Step:
     """The step that takes inputs after their sample: it evaluates their functions and fills the next row again."""
-    place, orders = _entering(into, moves=False), np.array(p)
-    now, following, n, us, inputs, rows = p[NOW], p[NEXT], p[N], p[US], p[INPUTS], room(p)
+    place, orders, rows, us, inputs = _entering(into, moves=False), np.array(p), room(p), p[AT.us], p[AT.inputs]
+    now, following, n = p[AT.now], p[AT.next], p[AT.n]
 
     def apply(s: State, l: int) -> None:
         for i in range(inputs):
             s.blocks[us + i, l] = s.u[i, l]
         m = floats(s.blocks.ctypes.data + 8 * l, rows, s.y.shape[0])
         place(m, orders)
-        fill(m, orders, following, 1, m[BELIEVED, 0] > 0.0)
+        fill(m, orders, following, 1, m[NUMBER.believed, 0] > 0.0)
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 
@@ -279,12 +403,9 @@ def applying(into: tuple[Kind, ...], p: tuple[int, ...]) -> Step:
 @lru_cache
 def refusing(p: tuple[int, ...]) -> Any:
     """`Model.refuse`: the functions of an input are missing, also from the row of the next sample."""
-    inputs, column, firsts = p[INPUTS], p[NEXT] + p[NA], []
-    for i in range(inputs):
-        own = OWN + EACH * i
-        firsts.append((p[own + OWN_F], p[own + OWN_N_IN], p[own + OWN_NB], p[own + OWN_NK], column))
-        column += p[own + OWN_NB]
-    begin, width, count, delay, at = (tuple(each) for each in zip(*firsts, strict=True))
+    inputs, own = p[AT.inputs], np.array(p[AT.count :]).reshape(-1, INPUT.count)
+    begin, width, count, delay = (tuple(own[:, k].tolist()) for k in (INPUT.f, INPUT.n_in, INPUT.nb, INPUT.nk))
+    at = tuple((own[:, INPUT.b] + p[AT.next]).tolist())
 
     @kernel
     def refuse(s: State, signal: int, age: int, l: int) -> None:

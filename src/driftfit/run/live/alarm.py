@@ -2,8 +2,7 @@
 
 It needs the memory of the window, or of the sums of "glr". Cost: some ten microseconds per sample in addition to the
 update.
-
-A change that an alarm with a frozen reference model found: what changed, by how much and since when.
+A `Change` says what an alarm with a frozen reference model found: what changed, by how much and since when.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from driftfit.run.live.reference_model import (
 from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits
 from driftfit.trackers.base import Tracker
 
-KEPT = 256
+ONSETS_KEPT = 256
 """Number of onsets that are kept until `onsets` is called."""
 
 
@@ -84,7 +83,7 @@ class LiveAlarm:
         self._tracker, self._columns = tracker, rule.columns(names)
         self._wait, self._left, self._judged = wait, 0, 0
         self._scores: deque[float] = deque(maxlen=rule.window)
-        self._onsets: deque[Onset] = deque(maxlen=KEPT)
+        self._onsets: deque[Onset] = deque(maxlen=ONSETS_KEPT)
         if rule.kind in FROZEN:
             self._frozen = rule.reference
             self._memory = memory_of(self._frozen)
@@ -259,7 +258,7 @@ def check_rule(rule: Any) -> AlarmRule:
     return rule
 
 
-SURE = NormalDist().inv_cdf(0.975)
+TWO_SIDED_95 = NormalDist().inv_cdf(0.975)
 
 
 class Change(NamedTuple):
@@ -285,13 +284,13 @@ def change_of(rule: AlarmRule, findings: Array, t: int) -> Change:
     if cause == "noise" and np.isfinite(findings[RATIO]):
         L = findings[NOISE_WINDOW]
         error = 0.5 * np.sqrt(model.numbers[SPREAD] / L) / model.numbers[RAW]
-        size, half = findings[RATIO], SURE * findings[RATIO] * error
+        size, half = findings[RATIO], TWO_SIDED_95 * findings[RATIO] * error
     elif np.isfinite(findings[WHICH]) and (
         rule.kind == "glr" or cause in ("noise", rule.parameters[int(findings[WHICH])])
     ):
         which, L = int(findings[WHICH]), findings[WINDOW]
         unit = model.numbers[SCALE] / model.unit[which]
-        cause, size, half = rule.parameters[which], findings[SIZE] * unit, SURE * findings[STD] * unit
+        cause, size, half = rule.parameters[which], findings[SIZE] * unit, TWO_SIDED_95 * findings[STD] * unit
     else:
         return Change(cause, np.nan, np.nan, np.nan, t)
     return Change(cause, float(size), float(size - half), float(size + half), max(t + 1 - int(L), 0))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.arguments import times_of
-from driftfit.data.clock import LOOK
+from driftfit.data.clock import PACE_SAMPLES
 from driftfit.data.instants import instant
 from driftfit.data.record import Known, Reading, Records
 from driftfit.engine.drivers import DRIFT, INTERVAL, NOISE
@@ -157,7 +157,7 @@ class Batched(Stream):
             taken, gaps = clock.arrivals(self._last, axis)
             self._clock, axis = clock, axis[taken]
             self._ignored += T - len(axis)
-            for gap in gaps[: LOOK + 1]:
+            for gap in gaps[: PACE_SAMPLES + 1]:
                 self._pace.see(gap)
             known = records.known if records.known.constant else Known(records.known.columns[taken])
             if len(axis):
@@ -233,11 +233,22 @@ class Batched(Stream):
             window.push(self._state_tile(), (known[INTERVAL, lane], known[NOISE, lane], known[DRIFT, lane]), lane)
 
 
+def _of_output(name: str, text: str) -> Any:
+    """The part of a property of a stream that belongs to one output."""
+    return property(lambda self: getattr(self._stream, name)[self._lane], doc=text)
+
+
 class LiveOutput:
     """A view of a stream, ``live["level"]``: it always shows the state after the last update.
 
     ``output`` is the name of the output, ``names`` are those of its parameters.
     """
+
+    program: Program = _of_output("programs", "Its model and tracker.")
+    theta: Array = _of_output("theta", "Parameters now, (n,).")
+    std: Array = _of_output("std", "Their standard deviations (n,), as those of the stream.")
+    cov: Array = _of_output("cov", "Their covariance, (n, n).")
+    learning: Array = _of_output("learning", "Which of them are being learned now, (n,) bool.")
 
     def __init__(self, stream: Any, lane: int) -> None:
         self._stream, self._lane = stream, lane
@@ -245,12 +256,6 @@ class LiveOutput:
 
     def __repr__(self) -> str:
         return f"{self.output} of {self._stream!r}"
-
-    @property
-    def program(self) -> Program:
-        """Its model and tracker."""
-        found: Program = self._stream.programs[self._lane]
-        return found
 
     @property
     def tracker(self) -> Any:
@@ -261,30 +266,6 @@ class LiveOutput:
     def names(self) -> tuple[str, ...]:
         """Names of its parameters."""
         return self.program.names
-
-    @property
-    def theta(self) -> Array:
-        """Parameters now, (n,)."""
-        found: Array = self._stream.theta[self._lane]
-        return found
-
-    @property
-    def std(self) -> Array:
-        """Their standard deviations (n,): inf for parameters that are not determined yet, NaN without a covariance."""
-        found: Array = self._stream.std[self._lane]
-        return found
-
-    @property
-    def cov(self) -> Array:
-        """Their covariance, (n, n)."""
-        found: Array = self._stream.cov[self._lane]
-        return found
-
-    @property
-    def learning(self) -> Array:
-        """Which of them are being learned now, (n,) bool."""
-        found: Array = self._stream.learning[self._lane]
-        return found
 
     @property
     def alarm(self) -> Any:

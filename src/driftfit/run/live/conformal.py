@@ -4,9 +4,9 @@ Before sample t, y is expected within y_hat +- z f_t s_t^(1/2), with z the norma
 
     f_1 = 1,    log f_(t+1) = log f_t + STEP (1[|e_t| > z f_t s_t^(1/2)] - alpha)
 
-within 1 / MOST and MOST. The share of outputs outside is then alpha to within log(MOST) / (STEP T) in any record of T
-used samples, for every distribution of the noise: f corrects the width of bands that rest on a wrong noise or a wrong
-model. It only scales a band, and does not correct a lasting bias. Parameters are scaled by the same
+within 1 / F and F = LARGEST_FACTOR. The share of outputs outside is then alpha to within log F / (STEP T) in any record
+of T used samples, for every distribution of the noise: f corrects the width of bands that rest on a wrong noise or a
+wrong model. It only scales a band, and does not correct a lasting bias. Parameters are scaled by the same
 factor, which is a heuristic: their errors are not observed.
 
 f^2 changes by two constant factors, so a stream and a record have the same bits. Samples that are not used change
@@ -31,9 +31,9 @@ from driftfit.engine.kernel import Array
 
 STEP = 0.05
 """Change of log f for one output outside its band: the rest of the change is alpha times as large, down."""
-MOST = 100.0
+LARGEST_FACTOR = 100.0
 """Largest factor, and the inverse of the least."""
-MUCH = 2.0
+WARNED_FACTOR = 2.0
 """A warning is issued for a factor above this."""
 
 
@@ -82,7 +82,7 @@ class ConformalFactor:
         if isfinite(e) and isfinite(s):
             outside = e * e > self.z * self.z * self.square * s
             square = self.square * (self._up if outside else self._down)
-            self.square = min(max(square, 1.0 / MOST**2), MOST**2)
+            self.square = min(max(square, 1.0 / LARGEST_FACTOR**2), LARGEST_FACTOR**2)
         return self.value
 
 
@@ -94,14 +94,14 @@ def factors(e: Array, s: Array, level: float) -> Array:
 
 
 def widened(e: Array, s: Array, level: float, name: str) -> Array:
-    """`factors`, with a warning where one is above `MUCH`."""
+    """`factors`, with a warning where one is above `WARNED_FACTOR`."""
     found = factors(e, s, level)
-    if found.max() > MUCH:
-        t = int(np.argmax(found > MUCH))
+    if found.max() > WARNED_FACTOR:
+        t = int(np.argmax(found > WARNED_FACTOR))
         warnings.warn(
             f"{name}: outputs are outside their {level:.0%} bands so often that the bands are widened by a factor "
-            f"above {MUCH:g} after {t} samples, and up to {found.max():.1f}: the model or the noise is not what the "
-            "tracker assumes; run.diagnose() shows which.",
+            f"above {WARNED_FACTOR:g} after {t} samples, and up to {found.max():.1f}: the model or the noise is not "
+            "what the tracker assumes; run.diagnose() shows which.",
             stacklevel=3,
         )
     return found

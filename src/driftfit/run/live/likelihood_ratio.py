@@ -1,14 +1,4 @@
-"""The score CUSUM of a frozen reference model.
-
-    C <- max(0, C + log likelihood ratio of a shift by SHIFT standard deviations of the noise)
-
-for each parameter and both signs, and for the variance of the noise. Where a regressor is centred, its parameter also
-has sums for a step of the slope through zero, unless that is hardly more than one of the level. Reported is the larger
-of them as sqrt(2 C), a deviate. Above TOP the sum forgets exponentially: it would otherwise grow for as long as a fault
-lasts, and the alarm would stay on for up to nine times as long after it. The column with the largest drift still has
-the largest sum. Source: Page (1954). Cost per sample: O(n).
-
-Windowed likelihood ratios on a frozen reference model, recursive and in constant memory.
+"""Windowed likelihood ratios on a frozen reference model, recursive and in constant memory.
 
 For a window of L samples S = sum phi g, G = sum phi phi', Q = sum g^2, with the scores of
 `driftfit.run.live.reference_model`. theta was estimated, with covariance C, so that without a fault S ~ N(0, V),
@@ -34,6 +24,16 @@ the window that one step explains best. It is not the noise that changed if a st
 Source: Lai (1998); Dumbgen and Spokoiny (2001) for limits that depend on the length. Departures: the covariance of the
 reference within the statistic; windows of 8 and 12 blocks, of which the longer ones are compared less often.
 Cost per sample: O(n^3 + p n) on average, some 2 microseconds with four parameters.
+
+The score CUSUM of the same model accumulates
+
+    C <- max(0, C + log likelihood ratio of a shift by SHIFT standard deviations of the noise)
+
+for each parameter and both signs, and for the variance of the noise. Where a regressor is centred, its parameter also
+has sums for a step of the slope through zero, unless that is hardly more than one of the level. Reported is the larger
+of them as sqrt(2 C), a deviate. Above TOP the sum forgets exponentially: it would otherwise grow for as long as a fault
+lasts, and the alarm would stay on for up to nine times as long after it. The column with the largest drift still has
+the largest sum. Source: Page (1954). Cost per sample: O(n).
 """
 
 from __future__ import annotations

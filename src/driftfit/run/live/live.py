@@ -75,7 +75,6 @@ class Live(Batched):
     ) -> None:  # fmt: skip
         check_roles("Live", model, tracker, several=isinstance(model, Model) and len(model.outputs) > 1)
         self._begin(model, tracker, dt, lag, warm_start, limits, gate)
-        self._single = len(self.model.outputs) == 1
         if lag:
             regression = self._rows if self._single else Regression(self._rows.n)
             rows = (lag + 1) * len(self.model.outputs) - 1 if self.model.shared else lag
@@ -87,9 +86,7 @@ class Live(Batched):
         tile = self._state_tile()
         self._scratch = tile.copy()
         self._bytes, self._scratch_bytes = tile.view(np.uint8), self._scratch.view(np.uint8)
-        self._m = self._rows.m
-        self._shape = (len(self.model.outputs), self._m) if self.model.shared else (self._m,)
-        self._unknown, self._interval = np.full(self._shape, np.nan), tile["interval"][0]
+        self._interval = tile["interval"][0]
         self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
         gated = self._single and self.programs[0].gate is not None
         self._undecided = gated and not tile["gate_decided"][0, 0]
@@ -190,7 +187,7 @@ class Live(Batched):
         """The inputs as the compiled step takes them; it reads m floats from any address, so they must exist."""
         if type(u) is _ARRAY and u.dtype is _FLOAT and u.shape == self._shape and self._m != 1:
             return u
-        return one_or_all(self._inputs(u))
+        return one_or_all(self.inputs_of(u))
 
     def _update_at(self, y: float, u: Any, time: Any) -> Any:
         """A sample whose only known factor is its time: the interval is written for this step alone."""
@@ -282,7 +279,7 @@ class Live(Batched):
         receive, so that candidates can be compared.
         """
         self._scratch_bytes[:] = self._bytes  # copying a record field by field takes ten times as long
-        inputs = self._inputs(u) if self._limits is None else self._limits.inputs(self._inputs(u))
+        inputs = self.inputs_of(u) if self._limits is None else self._limits.inputs(self.inputs_of(u))
         self._put(self._scratch, inputs)
         if self._single:
             y_hat, _, s, _ = self._look(self._compiled_scratch, np.nan, one_or_all(inputs))
@@ -294,7 +291,7 @@ class Live(Batched):
     def pass_by(self, y: Array, u: Any) -> None:
         """Let one nominal sample of several outputs pass: y goes to the lags and is not used."""
         resting = self.resting
-        self._passed(self._state_tile(), y, self._inputs(u), (1.0, np.inf, 1.0))
+        self._passed(self._state_tile(), y, self.inputs_of(u), (1.0, np.inf, 1.0))
         self._rest(resting)
 
     def _passed(self, tile: Array, y: Array, u: Array, known: Factors) -> Steps:
@@ -389,10 +386,6 @@ class Live(Batched):
                 self._placing()(as_compiled(tile), inputs[0])
             inputs = np.vstack([inputs[1:], np.full((1, self._m), np.nan)])
         return copies, inputs
-
-    def inputs_of(self, u: Any) -> Array:
-        """u as floats, NaN where it is not known."""
-        return self._inputs(u)
 
     @property
     def theta(self) -> Array:

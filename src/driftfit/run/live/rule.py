@@ -10,7 +10,7 @@ streams.
 
 A record and a stream use the same operations in the same order, so their results agree bit for bit.
 
-Readings of a coarse sensor, drawn again within their step.
+Readings of a coarse sensor are drawn again within their step:
 
     z = m + S Phi^-1(Phi(a) + U (Phi(b) - Phi(a))),   a, b = (y -+ h - m) / S,   U uniform
 
@@ -47,7 +47,7 @@ KINDS = (*FROZEN, "band", "innovation", "probability")
 
 THETA, OF_NUMBERS, MEAN = (Frozen._fields.index(name) for name in ("theta", "numbers", "mean"))
 """Places in `AlarmRule.frozen`."""
-BEYOND = 1.3
+CUSUM_CAP = 1.3
 """From this multiple of the largest limit on, a CUSUM forgets."""
 CHANGE, REPORT = "window", "report"
 """Where the probability of a change is stored: in a field of the tracker, or in the report of a `Bank`."""
@@ -115,7 +115,7 @@ class AlarmRule(Settings):
         shapes, given = (-1, -1, -1, (n, n), -1, (-1, n), -1), (*self.frozen, *((), ())[len(self.frozen) - 5 :])
         found = Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(given, shapes, strict=True)))
         numbers = np.append(found.numbers, np.zeros(NUMBERS - len(found.numbers)))
-        numbers[TOP] = BEYOND * max(self.limits, default=0.0)
+        numbers[TOP] = CUSUM_CAP * max(self.limits, default=0.0)
         return found._replace(numbers=numbers)
 
     def drawn(self, phi: Array, y: Array, noise: Array, first: int) -> Array:

@@ -17,7 +17,7 @@ from driftfit.data import storage
 from driftfit.data.arguments import by_name, noise_of, order_of
 from driftfit.data.clock import Clock, Pace
 from driftfit.data.instants import instant
-from driftfit.data.limits import StreamLimits
+from driftfit.data.limits import Limits
 from driftfit.engine.drivers import INPUTS
 from driftfit.engine.kernel import Array, Driver, Step
 from driftfit.engine.settings import as_numbers, factor, near, numbers, vector, whole
@@ -30,7 +30,6 @@ from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import programs_of, state_of, tile_of
 from driftfit.run.result import Plain, burn_in
 from driftfit.run.warm_start import (
-    ABSENT,
     KINDS,
     End,
     Run,
@@ -128,9 +127,7 @@ class Stream(Plain, storage.Kept):
         self._clock = Clock.of(dt)
         self.dt = self._clock.plain
         self._pace = Pace(self._clock, self.model.reach)
-        self._limits = (
-            StreamLimits(limits, self.model.outputs, self._rows.input_names, self._rows.m) if limits else None
-        )
+        self._limits = Limits(limits, self.model.outputs, self._rows.input_names, self._rows.m) if limits else None
         self.lag = whole("Live", "lag", lag, 0)
         if lag and warm_start is not None:
             raise ValueError("Live: lag= and warm_start= cannot be combined; give one of them.")
@@ -144,6 +141,9 @@ class Stream(Plain, storage.Kept):
         self._windows: list[Window] = []
         self._watching: list[tuple[int, LiveAlarm]] = []
         self._tile = tile_of(self.programs, carried(before, self.programs))
+        self._single, self._m = len(self.model.outputs) == 1, self._rows.m
+        self._shape = (len(self.model.outputs), self._m) if self.model.shared else (self._m,)
+        self._unknown: Array = np.full(self._shape, np.nan)
 
     def _state_tile(self) -> Array:
         """The tile, with the present state in it."""
@@ -189,7 +189,7 @@ class Stream(Plain, storage.Kept):
         return interval, noise, 1.0 if drift == 1.0 else float(factor("drift", drift))
 
     def _checked(self, y: Any, u: Any) -> tuple[Array, Array]:
-        outputs, inputs = self._outputs(y), self._inputs(u)
+        outputs, inputs = self._outputs(y), self.inputs_of(u)
         return (outputs, inputs) if self._limits is None else self._limits.sample(outputs, inputs)
 
     def _outputs(self, y: Any) -> Array:
@@ -204,7 +204,7 @@ class Stream(Plain, storage.Kept):
             raise ValueError(f"Live.update: y must be {wanted}; got shape {given.shape}.")
         return given.reshape(-1)
 
-    def _inputs(self, u: Any) -> Array:
+    def inputs_of(self, u: Any) -> Array:
         """u as floats (m,), or (ny, m) where outputs share one theta."""
         if u is None or u is LATER:
             return self._unknown
@@ -275,7 +275,7 @@ class Stream(Plain, storage.Kept):
             If no sample is waiting for its input, or u does not have m numbers.
         """
         check_expected(self._awaits)
-        self._put(self._state_tile(), self._within(self._inputs(u)))
+        self._put(self._state_tile(), self._within(self.inputs_of(u)))
         self._expect(NOTHING)
 
     def _put(self, tile: Array, inputs: Array) -> None:
@@ -341,23 +341,12 @@ class Stream(Plain, storage.Kept):
         tile = self._state_tile()
         return written(self.programs, [one.pack(tile, lane) for lane, one in enumerate(self.programs)], extra)
 
+    def __reduce__(self) -> Any:
+        return type(self).from_bytes, (self.to_bytes(), tuple(storage.parts_of((self.model, *self.trackers))))
+
     @classmethod
     def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array], classes: Iterable[Any]) -> Self:
         model, trackers, extra = read(source, header, arrays, classes)
-        return cls._again(source, (model, trackers), {**header, "extra": extra}, arrays)
-
-    def __reduce__(self) -> Any:
-        header, arrays = self._written()
-        header["extra"] = {**ABSENT, **header["extra"]}
-        return type(self)._again, ("the copy", (self.model, self.trackers), header, arrays)
-
-    @classmethod
-    def _again(
-        cls, source: str, settings: tuple[Model, tuple[Tracker, ...]], header: Mapping[str, Any],
-        arrays: Mapping[str, Array],
-    ) -> Self:  # fmt: skip
-        """The stream that continues from a stored state."""
-        (model, trackers), extra = settings, header["extra"]
         limits, outside = extra["limits"] or ([], [])
         make: Any = cls
         clock = Clock.of(extra["dt"], extra["zone"])

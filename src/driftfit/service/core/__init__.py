@@ -1,0 +1,1 @@
+"""The engine: journal, units, their states, and results."""

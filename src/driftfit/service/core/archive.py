@@ -7,25 +7,29 @@ moment leaves every sample in at least one of the two, and a piece that is writt
 from __future__ import annotations
 
 import logging
-import os
 import time
+from collections.abc import Mapping
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
-from driftfit.service.core.journal import Act, Journal, Pending
-from driftfit.service.settings.options import ServiceOptions
+from driftfit.data.storage import replace_file
+from driftfit.service.core.journal import Act, Item, Journal, Pending
+from driftfit.service.options import ServiceOptions
 
 log = logging.getLogger("driftfit.service")
-EVERY = 60.0
+SEARCH_SECONDS = 60.0
 """Seconds between two searches."""
-PIECE = 2_000
+PIECE_GROUPS = 2_000
 """Groups of one piece."""
-DAY = 86_400.0
+DAY_SECONDS = 86_400.0
 OLD = "stop < ? and stop > 1e8"
 """Which blocks of the history are older than a time; those of units without times are kept."""
+TYPES: dict[str, Any] = {
+    "number": pl.Int64, "unit": pl.String, "time": pl.Float64, "values": pl.List(pl.Float64), "action": pl.String,
+}  # fmt: skip
 
 
 class Archive:
@@ -47,7 +51,7 @@ class Archive:
                 pending.forget.append(("delete from log where first < ?", (upto,)))
                 pending.forget.append(("delete from chain where number < ?", (upto,)))
             self._writing = None
-        if time.monotonic() - self._looked < EVERY or self._writing is not None:
+        if time.monotonic() - self._looked < SEARCH_SECONDS or self._writing is not None:
             return
         self._looked = time.monotonic()
         self.begin(pending, journal, sinks_at)
@@ -56,19 +60,19 @@ class Archive:
         """Look for old rows; results that no sink has written yet are not deleted without an event."""
         now, needed = time.time(), journal.first_needed()
         query = "select count(*) from result where at < ? and first > ?"
-        ((lost,),) = journal.db.execute(query, (now - DAY * self.options.results, sinks_at))
+        ((lost,),) = journal.db.execute(query, (now - DAY_SECONDS * self.options.results, sinks_at))
         if lost:
             why = f"{lost} groups of results are older than {self.options.results} days, and a sink was away"
             log.error("lost", extra={"detail": why})
             pending.add_event(sinks_at, 0, now, "lost", {"why": why})
-        old = now - DAY * self.options.history
+        old = now - DAY_SECONDS * self.options.history
         pending.forget += [
             ("delete from result where at < ? and first < ?", (now - 60.0, min(needed, sinks_at))),
-            ("delete from result where at < ?", (now - DAY * self.options.results,)),
+            ("delete from result where at < ?", (now - DAY_SECONDS * self.options.results,)),
             (f"delete from history where (unit, first) in (select unit, first from block where {OLD})", (old,)),
             (f"delete from block where {OLD}", (old,)),
         ]
-        self._writing = self._pool.submit(export, self.folder, needed, now - DAY * self.options.keep)
+        self._writing = self._pool.submit(export, self.folder, needed, now - DAY_SECONDS * self.options.keep)
 
 
 def export(folder: Path, needed: int, before: float) -> int:
@@ -79,44 +83,36 @@ def export(folder: Path, needed: int, before: float) -> int:
     journal = Journal(folder, read_only=True)
     try:
         query = "select first, count from log where at < ? and first + count <= ? order by first limit ?"
-        found = journal.db.execute(query, (before, needed, PIECE)).fetchall()
+        found = journal.db.execute(query, (before, needed, PIECE_GROUPS)).fetchall()
         if not found:
             return 0
         first, upto = found[0][0], found[-1][0] + found[-1][1]
         names = {number: name for number, name, *_ in journal.units()}
-        rows: dict[str, list[Any]] = {"number": [], "unit": [], "time": [], "values": [], "action": []}
-        for start, items in journal.groups(first):
-            if start >= upto:
+        tables = []
+        for number, items in journal.groups(first):
+            if number >= upto:
                 break
-            number = start
             for item in items:
-                count = item.length
-                rows["number"] += range(number, number + count)
-                number += count
-                if isinstance(item, Act):
-                    rows["unit"].append(names[item.unit])
-                    rows["time"].append(None)
-                    rows["values"].append([])
-                    rows["action"].append(str(item.action))
-                    continue
-                rows["unit"] += [names[unit] for unit in item.unit.tolist()]
-                rows["time"] += [None] * count if item.time is None else item.time.tolist()
-                rows["values"] += item.values.tolist()
-                rows["action"] += [None] * count
+                tables.append(table_of(number, item, names))
+                number += item.length
     finally:
         journal.close()
     target = folder / "journal" / f"{first:016d}-{upto - 1:016d}.parquet"
     target.parent.mkdir(exist_ok=True)
-    types: dict[str, Any] = {
-        "number": pl.Int64,
-        "unit": pl.String,
-        "time": pl.Float64,
-        "values": pl.List(pl.Float64),
-        "action": pl.String,
-    }
-    partial = target.with_suffix(".part")
-    pl.DataFrame(rows, schema=types).write_parquet(partial)
-    with open(partial, "rb") as handle:
-        os.fsync(handle.fileno())
-    partial.replace(target)
+    replace_file(target, pl.concat(tables).write_parquet)
     return int(upto)
+
+
+def table_of(number: int, item: Item, names: Mapping[int, str]) -> pl.DataFrame:
+    """An entry of the log, whose first sample has a number, as a table."""
+    count = item.length
+    columns: dict[str, Any] = {"number": range(number, number + count)}
+    if isinstance(item, Act):
+        columns |= {"unit": [names[item.unit]], "time": [None], "values": [[]], "action": [str(item.action)]}
+    else:
+        columns |= {
+            "unit": [names[unit] for unit in item.unit.tolist()],
+            "time": [None] * count if item.time is None else item.time,
+        }
+        columns |= {"values": item.values.tolist(), "action": [None] * count}
+    return pl.DataFrame(columns, schema=TYPES)

@@ -2,7 +2,7 @@
 
     gather -> admit -> commit (journal, positions, earlier results, states) -> acknowledge -> update -> results
 
-A transaction contains whatever has arrived since the one before, which is `PACE` seconds ago at least, so groups grow
+A transaction contains whatever has arrived since the one before, which is `PACE_SECONDS` ago at least, so groups grow
 with the load. It takes 1 to 10 ms; a sample costs a few microseconds more (`benchmarks/service.py`).
 """
 
@@ -18,42 +18,32 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from driftfit.service.config import Config
 from driftfit.service.core.archive import Archive
-from driftfit.service.core.calibration import rules_of
-from driftfit.service.core.intake import Action, Arrived, Intake
-from driftfit.service.core.journal import (
-    DAMAGED,
-    NEEDED_FROM,
-    Act,
-    Group,
-    Item,
-    Journal,
-    Pending,
-    check_storable,
-)
-from driftfit.service.core.unit import Out, Unit
+from driftfit.service.core.journal import DAMAGED, NEEDED_FROM, Act, Group, Item, Journal, Pending, check_storable
+from driftfit.service.core.unit import Out, Unit, rules_of
 from driftfit.service.core.units import Units
-from driftfit.service.settings.config import Config
+from driftfit.service.sources.contract import Batch
 
 log = logging.getLogger("driftfit.service")
-BUDGET = 0.02
+STORE_SECONDS = 0.02
 """Seconds of one transaction that may go into storing states."""
-IDLE = 0.25
+IDLE_SECONDS = 0.25
 """Seconds that the engine waits for samples before it does other work."""
-PACE, SLOWEST_PACE, SHARE = 0.01, 0.025, 5.0
+PACE_SECONDS, SLOWEST_PACE_SECONDS, PACE_FACTOR = 0.01, 0.025, 5.0
 """Seconds from one transaction to the next at least, and at least so many times what the last one took of the
 processor: the fixed cost of a group, about a millisecond, would otherwise be most of the work."""
-KEPT = 16
+KEPT_GROUPS = 16
 """Groups of which the results are kept in memory."""
-TROUBLED = 100
+NAMED_TROUBLES = 100
 """Units with trouble that are named."""
-STEP = 60.0
+GROUP_SECONDS = 60.0
 """Seconds that one group may take."""
-RETRY = 1.0
+RETRY_SECONDS = 1.0
 """Seconds between two attempts to write the journal."""
 
 
@@ -161,8 +151,8 @@ class Engine:
         """Work until `stop`."""
         while not self._stop.is_set():
             begun, used = time.monotonic(), time.thread_time()
-            self.step(IDLE)
-            pace = min(max(PACE, SHARE * (time.thread_time() - used)), SLOWEST_PACE)
+            self.step(IDLE_SECONDS)
+            pace = min(max(PACE_SECONDS, PACE_FACTOR * (time.thread_time() - used)), SLOWEST_PACE_SECONDS)
             self._stop.wait(begun + pace - time.monotonic())
         if not self.problem:  # otherwise nothing more may be written: sources send again what was not acknowledged
             self.step(0.0)
@@ -268,7 +258,7 @@ class Engine:
             return
         with self.news:
             self._fresh.append(group)
-            while len(self._fresh) > KEPT:
+            while len(self._fresh) > KEPT_GROUPS:
                 self._elsewhere = self._fresh.popleft().first
             self.news.notify_all()
 
@@ -313,7 +303,7 @@ class Engine:
         begin, now = time.perf_counter(), time.monotonic()
         if self._dirty:
             self.units.note_programs(self._pending)
-        while self._dirty and (everything or time.perf_counter() - begin < BUDGET):
+        while self._dirty and (everything or time.perf_counter() - begin < STORE_SECONDS):
             number, (_, since) = next(iter(self._dirty.items()))
             if not everything and now - since < self.config.service.snapshot:
                 break
@@ -345,7 +335,7 @@ class Engine:
                 if not self.problem:
                     log.error("journal", extra={"detail": str(error)})
                 self.problem = f"the journal cannot be written: {error}; sources are held back."
-                if self._stop.wait(RETRY):
+                if self._stop.wait(RETRY_SECONDS):
                     return False
                 continue
             break
@@ -362,19 +352,96 @@ class Engine:
 
     @property
     def alive(self) -> bool:
-        """Whether it works on samples, or says what the problem is."""
-        return bool(self.problem) or time.monotonic() - self._stepped < STEP
+        return bool(self.problem) or time.monotonic() - self._stepped < GROUP_SECONDS
 
     def status(self) -> dict[str, Any]:
-        """Numbers for the page and for Prometheus."""
         trouble = self.units.troubled()
-        shown = dict(islice(trouble.items(), TROUBLED))
+        shown = dict(islice(trouble.items(), NAMED_TROUBLES))
         return quantiles(self.latencies) | {
             "samples": self.samples, "next": self.next, "units": len(self.units), "waiting": self.intake.waiting,
             "held_back": self.intake.held_back, "refused": dict(self.units.refused), "problem": self.problem,
             "failed": sum("failed" in what for what in trouble.values()), "trouble": shown, "troubled": len(trouble),
             "reasons": [f"{unit}: {what} ({why})" for unit, found in shown.items() for what, why in found.items()]
-            + [f"{len(trouble) - TROUBLED} more units"] * (len(trouble) > TROUBLED),
+            + [f"{len(trouble) - NAMED_TROUBLES} more units"] * (len(trouble) > NAMED_TROUBLES),
             "dirty": len(self._dirty), "recovered": self.recovered, "positions": dict(self.positions),
             "left_out": self.units.left_out,
         }  # fmt: skip
+
+
+class Action(NamedTuple):
+    """An action on a unit, by an operator or by the service itself."""
+
+    unit: str
+    what: dict[str, Any]
+    done: Callable[[str], None] = lambda problem: None
+    """Called when it was carried out, with "" or the reason why that was not possible."""
+
+
+class Arrived(NamedTuple):
+    """Batches and actions that are journaled together."""
+
+    batches: list[tuple[str, Batch]]
+    actions: list[Action]
+
+
+class Intake:
+    """A bounded queue of samples, in which `put` holds back fast sources, and an unbounded one of the few actions."""
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self.waiting = 0
+        """Samples that wait."""
+        self.held_back = 0
+        """How often a source had to wait."""
+        self._batches: deque[tuple[str, Batch]] = deque()
+        self._actions: deque[Action] = deque()
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def put(self, source: str, batch: Batch) -> bool:
+        """Add a batch once there is room; False if the service stops first."""
+        count = _size(batch)
+        with self._changed:
+            if self.waiting and self.waiting + count > self.most:
+                self.held_back += 1
+            while self.waiting and self.waiting + count > self.most and not self._closed:
+                self._changed.wait()
+            if self._closed:
+                return False
+            self._batches.append((source, batch))
+            self.waiting += count
+            self._changed.notify_all()
+        return True
+
+    def act(self, action: Action) -> None:
+        with self._changed:
+            self._actions.append(action)
+            self._changed.notify_all()
+
+    def take(self, most: int, wait: float) -> Arrived:
+        """The batches that have arrived, up to about ``most`` samples; empty after ``wait`` seconds."""
+        until = time.monotonic() + wait
+        with self._changed:
+            while not (self._batches or self._actions or self._closed):
+                left = until - time.monotonic()
+                if left <= 0.0 or not self._changed.wait(left):
+                    break
+            batches, count = [], 0
+            while self._batches and count < most:
+                batches.append(self._batches.popleft())
+                count += _size(batches[-1][1])
+            self.waiting -= count
+            actions = list(self._actions)
+            self._actions.clear()
+            self._changed.notify_all()
+        return Arrived(batches, actions)
+
+    def close(self) -> None:
+        """Release everyone who waits."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+
+def _size(batch: Batch) -> int:
+    return max(1, sum(one.length for one in batch.samples))

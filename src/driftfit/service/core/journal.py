@@ -30,6 +30,7 @@ import sqlite3
 import zlib
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -94,18 +95,15 @@ class Rows(NamedTuple):
         return len(self.unit)
 
     def some(self, which: Array) -> Rows:
-        """Some of the samples."""
         time = None if self.time is None else self.time[which]
         return Rows(self.section, self.unit[which], time, self.values[which])
 
     def plain(self) -> list[Any]:
-        """The columns as bytes."""
         time = None if self.time is None else self.time.tobytes()
         return [self.section, self.unit.tobytes(), time, self.values.tobytes()]
 
     @classmethod
     def of(cls, section: int, unit: bytes, time: bytes | None, values: bytes) -> Rows:
-        """The inverse of `plain`."""
         units = np.frombuffer(unit, np.int32)
         times = None if time is None else np.frombuffer(time)
         return cls(section, units, times, np.frombuffer(values).reshape(len(units), -1))
@@ -119,7 +117,6 @@ class Act(NamedTuple):
     length: int = 1
 
     def plain(self) -> list[Any]:
-        """As numbers, texts and so on."""
         return [self.unit, self.action]
 
 
@@ -243,7 +240,6 @@ class Journal:
         return str(rows[0][1]) if rows else None
 
     def next_number(self) -> int:
-        """The number of the next sample."""
         return int(self.meta("next") or 1)
 
     def head(self) -> bytes:
@@ -259,7 +255,6 @@ class Journal:
         return int(self.meta(NEEDED_FROM) or 1)
 
     def positions(self) -> dict[str, Any]:
-        """The positions of sources and sinks."""
         return {name: msgspec.json.decode(value) for name, value in self.certain("position")}
 
     def groups(self, first: int) -> Iterator[tuple[int, list[Item]]]:
@@ -403,7 +398,6 @@ class Names:
         self.about: dict[str, dict[str, Any]] = {}
 
     def read(self) -> None:
-        """Add the units that are new."""
         for number, name, section, topic, _, about in self._journal.units(max(self.names, default=0)):
             self.names[number] = name
             self.about[name] = msgspec.json.decode(about) | {"topic": topic, "section": section, "number": number}
@@ -416,3 +410,47 @@ class Names:
             self.read()
         named = [Event(row[0], self.names.get(row[1], ""), *row[2:]) for row in events]
         return Outcome(group, parts, named, self.names, self.about)
+
+
+TABLES = ("meta", "unit", "log", "result", "program", "snapshot", "block", "history", "event", "position", "chain")
+
+
+def verify(folder: Path, digest: str = "") -> tuple[str, list[str]]:
+    """(what there is, in words; the faults). ``digest`` is one of the chain that was printed earlier."""
+    try:
+        with closing(Journal(folder, read_only=True)) as journal:
+            groups = journal.db.execute("select count(*) from log").fetchone()[0]
+            chain = [bytes(one) for (one,) in journal.db.execute("select digest from chain order by number")]
+            faults = [*_sums(journal), *_links(journal)]
+    except sqlite3.Error as error:
+        raise ValueError(f"{folder / NAME} cannot be read: {error}.") from None
+    if digest and bytes.fromhex(digest) not in chain:
+        faults.append(f"the chain does not have the digest {digest}")
+    return f"{groups} groups" + (f"; the chain ends with {chain[-1].hex()}" if chain else ", no chain"), faults
+
+
+def _sums(journal: Journal) -> Iterator[str]:
+    found = [one for (one,) in journal.db.execute("pragma integrity_check")]
+    yield from (f"SQLite: {one}" for one in found if one != "ok")
+    for table in TABLES:
+        for row in journal.db.execute(f"select * from {table}"):
+            if sum_of(*row[:-1]) != row[-1]:
+                yield f"{table}: the check sum of the row {row[:2]} does not fit"
+
+
+def _links(journal: Journal) -> Iterator[str]:
+    last = None
+    for number, before, digest, _ in journal.db.execute("select * from chain order by number"):
+        group = journal.db.execute("select first, count, at, items from log where first = ?", (number,)).fetchone()
+        if last not in (None, before):
+            yield f"chain: links before the group {number} are missing"
+        if group is None or linked(before, group) != digest:
+            yield f"log: the group {number} is {'missing' if group is None else 'another one'}"
+        last = digest
+    if last not in (None, journal.head()):
+        yield "chain: its last links are missing"
+    since = "(select min(number) from chain)"
+    for (first,) in journal.db.execute(
+        f"select first from log where first > {since} and first not in (select number from chain)"
+    ):
+        yield f"log: the group {first} is not in the chain"

@@ -24,13 +24,11 @@ from driftfit.readings import gate
 from driftfit.readings.remarks import SAID
 from driftfit.run.live.rule import FROZEN
 from driftfit.run.live.stream import HELD
-from driftfit.run.parallel_lanes import FEWEST, Advanced, advance
-from driftfit.service.core.blocks import Blocks
+from driftfit.run.parallel_lanes import FEWEST_LANES, Advanced, advance
+from driftfit.service.config import UnitSettings
 from driftfit.service.core.journal import Rows
-from driftfit.service.core.results import ALARM, OK, THETA, TIME, Y_HAT, Results, Y
-from driftfit.service.core.streams import SAMPLES, USED, Streams
-from driftfit.service.core.unit import Out, Unit
-from driftfit.service.settings.config import UnitSettings
+from driftfit.service.core.results import ALARM, OK, THETA, TIME, Y_HAT, Blocks, Results, Y
+from driftfit.service.core.unit import SAMPLES, USED, Out, Streams, Unit
 
 COLUMNS = ("y_hat", "e", "s", "theta", "var", "ok")
 """Fields of a tracker's output, in the order of the results; the last becomes a flag."""
@@ -61,7 +59,6 @@ class Section:
         self.blocks = Blocks(THETA + 2 * self.streams.program.model.n)
 
     def add(self, number: int, name: str) -> Unit:
-        """A new unit."""
         unit = Unit(number, name, self.streams, self.streams.add(number))
         if unit.place == self.blocks.capacity:
             self.blocks.grow(self.streams.capacity)
@@ -76,7 +73,7 @@ class Section:
 
     def prepare(self) -> None:
         """Compile what the first samples need, so that they do not wait; lanes only if there are units for them."""
-        for count in (1, FEWEST) if len(self.units) >= FEWEST else (1,):
+        for count in (1, FEWEST_LANES) if len(self.units) >= FEWEST_LANES else (1,):
             trial = Section(self.streams.index, self.streams.settings)
             for k in range(count):
                 trial.add(k, "")

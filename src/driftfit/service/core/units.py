@@ -12,24 +12,22 @@ import msgspec
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.service.config import UnitSettings
 from driftfit.service.core.journal import Journal, Pending, Rows
 from driftfit.service.core.section import CounterOf, Section, tally
-from driftfit.service.core.streams import SAMPLES
-from driftfit.service.core.unit import Unit
-from driftfit.service.settings.config import UnitSettings
-from driftfit.service.settings.matching import valid_name
-from driftfit.service.settings.options import ServiceOptions
-from driftfit.service.sources.samples import NO_SIGNAL, TOO_MANY_NEW, Receipt, Samples, numbers_of, seconds_of
+from driftfit.service.core.unit import SAMPLES, Unit
+from driftfit.service.options import ServiceOptions, valid_name
+from driftfit.service.sources.contract import NO_SIGNAL, TOO_MANY_NEW, Receipt, Samples, numbers_of, seconds_of
 
 log = logging.getLogger("driftfit.service")
 Message = tuple[str, Samples, Receipt | None]
 """(client, samples, receipt)"""
-FEW, QUIET = 10, 600.0
+FEW_SAMPLES, QUIET_SECONDS = 10, 600.0
 """A unit that has had fewer samples, and none in so many seconds, is evicted."""
-ROUTES = 200_000
+KNOWN_TOPICS = 200_000
 """Topics whose units are remembered, including those that have none."""
 UNREADABLE = "its state cannot be read"
-SAVED = 10.0
+RATE_SECONDS = 10.0
 """Seconds over which the rate of a unit is averaged."""
 
 
@@ -46,7 +44,6 @@ class Gathered:
         """Who counts what is left out of each message besides the unit."""
 
     def add(self, place: int, samples: Samples, receipt: Receipt | None) -> bool:
-        """Add a message; False if it has no signal of the section."""
         given, count = samples.columns, samples.length
         if self.columns.keys().isdisjoint(given):
             return False
@@ -134,7 +131,6 @@ class Units:
 
     @property
     def resident(self) -> list[Unit]:
-        """The units in memory."""
         return list(self._units.values())
 
     def get(self, unit: int) -> Unit:
@@ -195,7 +191,7 @@ class Units:
             route, why = self._route(topic, client, pending, born)
             if not why:
                 self._routes[topic] = route
-            if len(self._routes) > ROUTES:
+            if len(self._routes) > KNOWN_TOPICS:
                 self._routes.popitem(last=False)
         return route, why
 
@@ -247,12 +243,12 @@ class Units:
         """Forget units that have had few samples, and none since the last sweep; ``unstored`` have a state that the
         database does not. With their next sample they are there again, as they were.
         """
-        if time.monotonic() - self._swept < QUIET:
+        if time.monotonic() - self._swept < QUIET_SECONDS:
             return
         self._swept, few, gone = time.monotonic(), {}, set()
         for unit in self.resident:
             count = int(unit.streams.counted[unit.place, SAMPLES])
-            if count < FEW and unit.number not in unstored and not unit.trouble:
+            if count < FEW_SAMPLES and unit.number not in unstored and not unit.trouble:
                 few[unit.number] = count
                 if self._few.get(unit.number) == count:
                     gone.add(unit.number)
@@ -315,11 +311,11 @@ class Units:
         return [rows for rows in found if rows is not None]
 
     def _paid(self, section: Section, one: Gathered) -> Array:
-        """Which messages are within the rate of their units, on average over `SAVED` seconds."""
+        """Which messages are within the rate of their units, on average over `RATE_SECONDS` seconds."""
         rate, now = section.streams.settings.rate, time.monotonic()
         saved, then = self._saved[section.streams.index]
-        most = np.full(section.streams.capacity, SAVED * rate)
-        most[: len(saved)] = np.minimum(SAVED * rate, saved + (now - then) * rate)
+        most = np.full(section.streams.capacity, RATE_SECONDS * rate)
+        most[: len(saved)] = np.minimum(RATE_SECONDS * rate, saved + (now - then) * rate)
         places, lengths = np.array(one.places), np.array(one.lengths)
         left = most - np.bincount(places, lengths, len(most))
         paid = np.ones(len(places), bool)

@@ -9,18 +9,26 @@
 
 from __future__ import annotations
 
+import base64
+import contextlib
+import hashlib
+import hmac
+import secrets
 import time
 from collections import OrderedDict
+from collections.abc import Iterable
 from functools import partial
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import msgspec
 from starlette.requests import HTTPConnection
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from driftfit.service.page.passwords import Sessions, token_fits
-from driftfit.service.settings.options import PageOptions, UserOptions
+from driftfit.data.storage import replace_file
+from driftfit.service.options import PageOptions, UserOptions
 
 COOKIE = "driftfit"
 LOCAL = UserOptions("local", "operator", token="sha256$")
@@ -28,9 +36,9 @@ LOCAL = UserOptions("local", "operator", token="sha256$")
 OPEN = ("/healthz", "/api/login", "/login", "/static/", "/favicon.ico")
 """Paths that need no user."""
 SAMPLES = "/api/samples"
-BURST = 4.0
+BURST_SECONDS = 4.0
 """Seconds of a client's rate that it may use at once."""
-CLIENTS = 10_000
+KNOWN_CLIENTS = 10_000
 HEADERS = [
     (b"content-security-policy", b"default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
      b"frame-ancestors 'none'; base-uri 'none'; form-action 'self'"),
@@ -43,17 +51,16 @@ HEADERS = [
 class Rates:
     """Token buckets by client."""
 
-    def __init__(self, rate: float, burst: float = BURST) -> None:
+    def __init__(self, rate: float, burst: float = BURST_SECONDS) -> None:
         self.rate, self.most = rate, rate * burst
         self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def allows(self, client: str) -> bool:
-        """Whether the client may ask now."""
         now = time.monotonic()
         left, then = self._left.pop(client, (self.most, now))
         left = min(self.most, left + (now - then) * self.rate)
         self._left[client] = (left - (left >= 1.0), now)
-        if len(self._left) > CLIENTS:
+        if len(self._left) > KNOWN_CLIENTS:
             self._left.popitem(last=False)
         return left >= 1.0
 
@@ -167,3 +174,84 @@ class Access:
 def _without_port(host: str) -> str:
     name, colon, port = host.rpartition(":")
     return name.lower() if colon and port.isdigit() else host.lower()
+
+
+SCRYPT_N, SCRYPT_R, SCRYPT_P = 1 << 14, 8, 1
+"""Cost of scrypt: 16 MB and some fifty milliseconds."""
+SESSION_SECONDS = 12 * 3600.0
+"""Seconds for which a session is valid."""
+
+
+def hashed(password: str) -> str:
+    """The scrypt hash of a password, for the configuration."""
+    if len(password) < 10:
+        raise ValueError("a password needs at least 10 characters.")
+    salt = secrets.token_bytes(16)
+    parts = (base64.b64encode(one).decode() for one in (salt, _scrypt(password, salt, SCRYPT_N)))
+    return "$".join(["scrypt", str(SCRYPT_N), *parts])
+
+
+def _scrypt(password: str, salt: bytes, n: int) -> bytes:
+    return hashlib.scrypt(password.encode(), salt=salt, n=n, r=SCRYPT_R, p=SCRYPT_P, maxmem=64 << 20, dklen=32)
+
+
+def password_fits(password: str, stored: str) -> bool:
+    try:
+        _, n, salt, key = stored.split("$")
+        return hmac.compare_digest(_scrypt(password, base64.b64decode(salt), int(n)), base64.b64decode(key))
+    except ValueError:
+        return False
+
+
+def new_token() -> list[str]:
+    """A token for a program, and its hash for the configuration; it is random, so a fast hash is enough."""
+    token = secrets.token_urlsafe(32)
+    return [f"token (give it to the program): {token}", f"hash (for the configuration): {token_hash(token)}"]
+
+
+def token_hash(token: str) -> str:
+    return f"sha256${hashlib.sha256(token.encode()).hexdigest()}"
+
+
+def token_fits(token: str, stored: str) -> bool:
+    return hmac.compare_digest(token_hash(token), stored)
+
+
+class Sessions:
+    """Open sessions: random tokens, of which only hashes are stored.
+
+    They are in the service's folder, so they outlive a restart of the page. An absent, empty or damaged file holds no
+    session: everybody logs in again. A session ends at its logout, after `SESSION_SECONDS`, and when its user has
+    another password.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "sessions.json"
+        self._open: dict[str, tuple[str, float]] = {}
+        """By hash of the token: the hash of the user's name and password, and the end in seconds since 1970."""
+        with contextlib.suppress(OSError, msgspec.DecodeError):
+            self._open = msgspec.json.decode(self._path.read_bytes(), type=dict[str, tuple[str, float]])
+
+    def new(self, user: UserOptions) -> str:
+        """The token of a new session."""
+        token, now = secrets.token_urlsafe(32), time.time()
+        self._open = {one: about for one, about in self._open.items() if about[1] > now}
+        self._open[token_hash(token)] = (_login_of(user), now + SESSION_SECONDS)
+        self._store()
+        return token
+
+    def user(self, token: str, users: Iterable[UserOptions]) -> UserOptions | None:
+        """The one of the users whose session this is."""
+        login, until = self._open.get(token_hash(token), ("", 0.0))
+        return next((one for one in users if _login_of(one) == login and until > time.time()), None)
+
+    def end(self, token: str) -> None:
+        if self._open.pop(token_hash(token), None) is not None:
+            self._store()
+
+    def _store(self) -> None:
+        replace_file(self._path, lambda file: file.write(msgspec.json.encode(self._open)))
+
+
+def _login_of(user: UserOptions) -> str:
+    return token_hash(f"{user.name}\n{user.password}")

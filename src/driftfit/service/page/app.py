@@ -7,6 +7,7 @@ import contextlib
 import io
 import json
 import time
+from collections import Counter
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -21,20 +22,22 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from driftfit.data.csv_files import without_formulas
-from driftfit.service.health import health
-from driftfit.service.page import history, metrics, openapi
-from driftfit.service.page.access import COOKIE, Access, Rates
-from driftfit.service.page.feed import Feed, finite
-from driftfit.service.page.passwords import SESSION, Sessions, password_fits
-from driftfit.service.page.sockets import Sockets
-from driftfit.service.settings.options import PageOptions
+from driftfit.service.control import health
+from driftfit.service.options import PageOptions
+from driftfit.service.page.access import COOKIE, SESSION_SECONDS, Access, Rates, Sessions, password_fits
+from driftfit.service.page.feed import Feed, column_names, columns_of, newest_blocks, reduced, samples
+from driftfit.service.page.openapi import ACTIONS, OPERATIONS, description
 
 STATIC = Path(__file__).parent / "static"
-LOGINS = 0.1
+LOGIN_RATE = 0.1
 """Attempts a second to log in, of one client on average; ten at once."""
-ACTIONS = ("hold", "reset", "acknowledge", "limits", "restart")
+REFRESH_SECONDS = 0.4
+"""Time between two messages to an open page."""
+REQUEST_BYTES = 2000
+"""Size of a message from an open page, at most."""
 
 
 class Page:
@@ -43,33 +46,19 @@ class Page:
     def __init__(self, options: PageOptions, feed: Feed, sessions: Sessions) -> None:
         self.options, self.feed, self.sessions = options, feed, sessions
         self.sockets = Sockets(feed, options.viewers)
-        self.logins = Rates(LOGINS, 100.0)
+        self.logins = Rates(LOGIN_RATE, 100.0)
         self.scrypt = asyncio.Semaphore(1)
 
     def app(self) -> Starlette:
-        """The application."""
         api: list[BaseRoute] = [
-            Route("/api/units", self.units),
-            Route("/api/units/{unit:path}", self.unit),
-            Route("/api/history", self.history),
-            Route("/api/export", self.export),
-            Route("/api/events", self.events),
-            Route("/api/status", self.status),
-            Route("/api/me", self.me),
-            Route("/api/samples", self.samples, methods=["POST"]),
-            Route("/api/samples/{topic:path}", self.samples, methods=["POST"]),
-            Route("/api/actions", self.actions, methods=["POST"]),
-            Route("/api/login", self.login, methods=["POST"]),
-            Route("/api/logout", self.logout, methods=["POST"]),
-            Route("/api/openapi.json", lambda request: JSONResponse(openapi.DESCRIPTION)),
+            *(Route(one.path, getattr(self, one.name), methods=[one.method.upper()]) for one in OPERATIONS),
+            Route("/api/openapi.json", lambda request: JSONResponse(description())),
         ]
         pages: list[BaseRoute] = [
             Route(path, self.file(name))
             for path, name in (("/", "index.html"), ("/login", "login.html"), ("/api", "api.html"))
         ]
         others: list[BaseRoute] = [
-            Route("/metrics", self.metrics),
-            Route("/healthz", self.healthz),
             WebSocketRoute("/ws", self.sockets.endpoint),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
@@ -106,7 +95,6 @@ class Page:
         return found
 
     async def units(self, request: Request) -> Response:
-        """The units that drift most, or those whose name contains ``search``."""
         search = request.query_params.get("search", "").lower()[:200]
         if not search:
             return Answer({"units": self.feed.fleet, "count": len(self.feed.names.names)})
@@ -119,7 +107,6 @@ class Page:
         return Answer({"units": found, "count": len(found)})
 
     async def unit(self, request: Request) -> Response:
-        """Everything about a unit now."""
         name = request.path_params["unit"]
         number = self.number(name)
         row = self.feed.latest.get(number)
@@ -132,35 +119,32 @@ class Page:
         if row is not None:
             names = about["names"]
             now = {
-                "number": row[0], "time": row[2], "y": finite(row[3]), "y_hat": finite(row[4]), "e": finite(row[5]),
-                "s": finite(row[6]), "ok": row[7], "alarm": row[10],
-                "theta": dict(zip(names, map(finite, row[8]), strict=False)),
-                "std": dict(zip(names, map(finite, row[9]), strict=False)),
+                "number": row[0], "time": row[2], "y": row[3], "y_hat": row[4], "e": row[5], "s": row[6], "ok": row[7],
+                "alarm": row[10], "theta": dict(zip(names, row[8], strict=False)),
+                "std": dict(zip(names, row[9], strict=False)),
             }  # fmt: skip
         return Answer({"unit": name, "about": about, "now": now, "state": state})
 
     async def history(self, request: Request) -> Response:
-        """Least, largest and mean of each column of a range, in at most ``points`` parts."""
         start, stop = _range(request)
         points = min(max(int(_number(request, "points", 600.0)), 10), 5000)
         name = request.query_params.get("unit", "")
         number = self.number(name)
         recent = await self.feed.recent(number)
-        found = await run_in_threadpool(history.reduced, self.feed.journal, number, recent, start, stop, points)
-        return Answer({"unit": name, "columns": history.names_of(self.feed.names.about[name]), **found})
+        found = await run_in_threadpool(reduced, self.feed.journal, number, recent, start, stop, points)
+        return Answer({"unit": name, "columns": column_names(self.feed.names.about[name]), **found})
 
     async def export(self, request: Request) -> Response:
-        """All columns of a range, as CSV or an Arrow file."""
         start, stop = _range(request)
         name, kind = request.query_params.get("unit", ""), request.query_params.get("format", "csv")
         number = self.number(name)
         if kind not in ("csv", "arrow"):
             raise HTTPException(400, f"format must be csv or arrow; got {kind!r}")
         recent = await self.feed.recent(number)
-        names = history.names_of(self.feed.names.about[name])
+        names = column_names(self.feed.names.about[name])
 
         def made() -> bytes:
-            values = history.samples(self.feed.journal, number, recent, start, stop)
+            values = samples(self.feed.journal, number, recent, start, stop)
             table = pl.DataFrame(values, schema=dict.fromkeys(names[: values.shape[1]], pl.Float64))
             if kind == "csv":
                 return without_formulas(table).write_csv().encode()
@@ -174,7 +158,6 @@ class Page:
         return Response(await run_in_threadpool(made), media_type=types[kind], headers=headers)
 
     async def events(self, request: Request) -> Response:
-        """The last events, of one unit or of all."""
         limit = min(max(int(_number(request, "limit", 100.0)), 1), 1000)
         name = request.query_params.get("unit")
         where, values = ("where unit = ?", [self.number(name)]) if name else ("", [])
@@ -187,16 +170,13 @@ class Page:
         return Answer({"events": found})
 
     async def status(self, request: Request) -> Response:
-        """Numbers of the service."""
         return Answer(self.feed.status | {"viewers": self.sockets.count, "healthy": self.feed.healthy})
 
     async def me(self, request: Request) -> Response:
-        """Who asks."""
         user = request.scope["user"]
         return Answer({"name": user.name, "role": user.role, "login": bool(self.options.user)})
 
     async def samples(self, request: Request) -> Response:
-        """Take samples; the answer comes when they are in the journal."""
         user = request.scope["user"]
         if user.role == "viewer":
             raise HTTPException(403, f"{user.name} is a viewer; this needs a sender or an operator")
@@ -221,7 +201,6 @@ class Page:
         return await self.asked({"do": "act", "unit": name, "action": given})
 
     async def asked(self, header: dict[str, Any], body: bytes = b"") -> Response:
-        """The engine's answer."""
         try:
             answer = await self.feed.ask(header, body)
         except (OSError, asyncio.IncompleteReadError):
@@ -229,14 +208,12 @@ class Page:
         return Answer(answer, answer.pop("status", 200))
 
     def operator(self, request: Request) -> str:
-        """The name of the user, who must be an operator."""
         user = request.scope["user"]
         if user.role != "operator":
             raise HTTPException(403, f"{user.name} is a viewer; this needs an operator")
         return str(user.name)
 
     async def login(self, request: Request) -> Response:
-        """A session, for a name and a password."""
         client = request.client.host if request.client else "local"
         if not self.logins.allows(client):
             raise HTTPException(429, "too many attempts; wait a while")
@@ -254,23 +231,20 @@ class Page:
         response = Answer({"name": name, "role": found.role})
         secure = bool(self.options.certificate) or self.options.behind_proxy
         response.set_cookie(
-            COOKIE, self.sessions.new(found), max_age=int(SESSION), httponly=True, samesite="strict", secure=secure
+            COOKIE, self.sessions.new(found), int(SESSION_SECONDS), httponly=True, samesite="strict", secure=secure
         )
         return response
 
     async def logout(self, request: Request) -> Response:
-        """End the session."""
         self.sessions.end(request.cookies.get(COOKIE, ""))
         response = Answer({})
         response.delete_cookie(COOKIE)
         return response
 
     async def metrics(self, request: Request) -> Response:
-        """For Prometheus."""
-        return PlainTextResponse(metrics.text(self.feed, self.sockets.count), media_type=metrics.TYPE)
+        return PlainTextResponse(metrics_of(self.feed, self.sockets.count), media_type=METRICS_TYPE)
 
     async def healthz(self, request: Request) -> Response:
-        """200 if the engine answers and the journal can be written; with what does not work besides."""
         return JSONResponse(*health(self.feed.status, self.feed.alive, request.scope["user"] is not None))
 
 
@@ -296,3 +270,129 @@ def _number(request: Request, name: str, default: float) -> float:
 
 def _range(request: Request) -> tuple[float, float]:
     return _number(request, "from", float("-inf")), _number(request, "to", float("inf"))
+
+
+class Sockets:
+    """The open pages: two and a half times a second the overview, or the new results of one unit.
+
+    A page states what it shows: {"view": "fleet"} or {"view": "unit", "unit": "pump 7"}. Each viewer has a separate
+    task, which waits for that viewer only; one that is slow is sent less often.
+    """
+
+    def __init__(self, feed: Feed, most: int) -> None:
+        self.feed, self.most = feed, most
+        self.count = 0
+        self._of: Counter[str] = Counter()
+        """Open pages by client."""
+
+    async def endpoint(self, socket: WebSocket) -> None:
+        """Serve one page until it closes."""
+        await socket.accept()
+        client = socket.client.host if socket.client else "local"
+        if self.count >= self.most or self._of[client] >= max(1, self.most // 2):
+            await socket.close(4429, "too many open pages")
+            return
+        self.count += 1
+        self._of[client] += 1
+        view: dict[str, Any] = {"view": "fleet", "unit": "", "at": 0}
+        sender = asyncio.create_task(self._send(socket, view))
+        try:
+            while True:
+                text = await socket.receive_text()
+                if len(text) > REQUEST_BYTES:
+                    break
+                given = msgspec.json.decode(text, type=dict[str, str])
+                view |= {"view": given.get("view", "fleet"), "unit": given.get("unit", ""), "at": 0}
+        except (WebSocketDisconnect, msgspec.DecodeError, KeyError, RuntimeError):
+            pass
+        finally:
+            self.count -= 1
+            self._of -= Counter([client])
+            sender.cancel()
+            with contextlib.suppress(RuntimeError):  # it may be closed
+                await socket.close(4400)
+
+    async def _send(self, socket: WebSocket, view: dict[str, Any]) -> None:
+        """Messages until the page is gone."""
+        try:
+            while socket.scope["still"]() is not None:
+                message = await self._message(view)
+                await socket.send_text(msgspec.json.encode(message).decode())
+                await asyncio.sleep(REFRESH_SECONDS)
+            await socket.close(4401, "the session has ended")
+        except (WebSocketDisconnect, RuntimeError):
+            pass
+
+    async def _message(self, view: dict[str, Any]) -> dict[str, Any]:
+        feed = self.feed
+        status = {name: feed.status.get(name) for name in ("samples", "units", "problem", "reasons", "p99")}
+        status["alive"] = feed.healthy
+        if view["view"] != "unit":
+            return {"view": "fleet", "status": status, "units": feed.fleet}
+        number = feed.find(view["unit"])
+        if number is None:
+            return {"view": "unit", "unit": view["unit"], "status": status, "missing": True}
+        unit, after = view["unit"], view["at"]
+        recent = await feed.recent(number)
+        rows = [row for row in recent if row[0] > after]
+        columns = columns_of(rows).T.tolist() if rows else []
+        if after == 0:
+            columns = (await asyncio.to_thread(newest_blocks, feed.journal, number, recent)).T.tolist()
+        if unit == view["unit"] and rows:
+            view["at"] = max(row[0] for row in rows)
+        on = rows[-1][10] if rows else None
+        return {"view": "unit", "unit": unit, "status": status, "columns": columns, "alarm": on}
+
+
+METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+
+
+def metrics_of(feed: Feed, viewers: int) -> str:
+    """Numbers for Prometheus, in its text format."""
+    status, trouble = feed.status, feed.trouble.items()
+    latency = {'quantile="0.5"': status.get("p50"), 'quantile="0.99"': status.get("p99")}
+    unarmed = {f'unit="{_label(unit)}",what="{_label(what)}",why="{_label(why)}"': 1
+               for unit, found in trouble for what, why in found.items()}  # fmt: skip
+    found: list[tuple[str, str, str, Any]] = [
+        ("up", "gauge", "Whether the engine answers and can write its journal.", int(feed.healthy)),
+        ("samples_total", "counter", "Samples that were processed.", status.get("samples", 0)),
+        ("units", "gauge", "Units.", status.get("units", 0)),
+        ("units_failed", "gauge", "Units that have failed.", status.get("failed", 0)),
+        ("trouble", "gauge", "What does not work in units, at most 100 of them.", unarmed),
+        ("units_in_alarm", "gauge", "Units whose alarm is on.", sum(bool(row[10]) for row in feed.latest.values())),
+        ("waiting_samples", "gauge", "Samples that wait for the journal.", status.get("waiting", 0)),
+        ("held_back_total", "counter", "How often a source was held back.", status.get("held_back", 0)),
+        ("viewers", "gauge", "Open pages.", viewers),
+        ("latency_seconds", "gauge", "From arrival to result, of recent batches.", latency),
+        ("refused_total", "counter", "What was refused, by reason.", _labelled("reason", status.get("refused", {}))),
+        ("left_out_total", "counter", "Samples that gates left out, by reason.",
+         _labelled("reason", status.get("left_out", {}))),
+    ]  # fmt: skip
+    for what in ("source", "sink"):
+        runners: dict[str, Any] = status.get(f"{what}s", {})
+        up = {name: int(one["state"] == "running") for name, one in runners.items()}
+        count, failures = ({name: one[key] for name, one in runners.items()} for key in ("count", "failures"))
+        found += [
+            (f"{what}_up", "gauge", f"Whether the {what} is connected.", _labelled(what, up)),
+            (f"{what}_samples_total", "counter", f"Samples of the {what}.", _labelled(what, count)),
+            (f"{what}_failures_total", "counter", f"Failures of the {what}.", _labelled(what, failures)),
+        ]
+    aside = {name: one["set_aside"] for name, one in status.get("sinks", {}).items()}
+    about = "Events that were refused and set aside."
+    found.append(("sink_set_aside_total", "counter", about, _labelled("sink", aside)))
+    lines = []
+    for name, kind, about, values in found:
+        lines += [f"# HELP driftfit_{name} {about}", f"# TYPE driftfit_{name} {kind}"]
+        if isinstance(values, dict):
+            lines += [f"driftfit_{name}{{{key}}} {value}" for key, value in values.items() if value is not None]
+        else:
+            lines.append(f"driftfit_{name} {values}")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _labelled(label: str, values: dict[str, Any]) -> dict[str, Any]:
+    return {f'{label}="{_label(key)}"': value for key, value in values.items()}
+
+
+def _label(value: str) -> str:
+    return value.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")

@@ -18,23 +18,32 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.engine.kernel import Array
 from driftfit.service.control import packed
 from driftfit.service.core.journal import Journal, Names
+from driftfit.service.core.results import FIXED, extremes_of
 
-TICK = 0.25
+READ_SECONDS = 0.25
 """Seconds between two reads."""
-CHECK = 60.0
+DRIFT_SECONDS = 60.0
 """Seconds after which the parameters to which drift refers are renewed: drift is that of one to two minutes."""
-RECENT = 512
+RECENT_RESULTS = 512
 """Results of a watched unit that are kept."""
-FORGET = 120.0
+WATCHED_SECONDS = 120.0
 """Seconds without a request after which a unit is no longer watched."""
-SHOWN = 200
+OVERVIEW_UNITS = 200
 """Units of the overview."""
-SILENT = 60.0
+SILENT_SECONDS = 60.0
 """Seconds without a result after which a unit is shown as silent."""
-BACK = 400
+START_GROUPS = 400
 """Groups of results that are read when the page starts."""
+EXPORT_ROWS = 2_000_000
+"""Samples of one export at most."""
+UNHEARD: dict[str, Any] = {
+    "drift": 0.0, "alarm": False, "time": None, "age": None, "silent": True, "y": None, "y_hat": None, "ok": False,
+    "theta": [],
+}  # fmt: skip
+"""What the overview shows of a unit whose last results are no longer stored."""
 
 
 class Feed:
@@ -56,7 +65,7 @@ class Feed:
         self._swept = time.monotonic()
         self._base: dict[int, tuple[float, list[float], list[float]]] = {}
         query = "select coalesce(min(first), 1) - 1 from (select first from result order by first desc limit ?)"
-        self.at = int(self.journal.db.execute(query, (BACK,)).fetchone()[0])
+        self.at = int(self.journal.db.execute(query, (START_GROUPS,)).fetchone()[0])
         self.lock = asyncio.Lock()
 
     async def run(self) -> None:
@@ -70,7 +79,7 @@ class Feed:
                 self.answered = time.monotonic()
             except (OSError, asyncio.IncompleteReadError, ValueError):
                 pass
-            await asyncio.sleep(max(0.05, TICK - (time.monotonic() - begun)))
+            await asyncio.sleep(max(0.05, READ_SECONDS - (time.monotonic() - begun)))
 
     def look(self) -> None:
         """Read the results that are new."""
@@ -90,12 +99,14 @@ class Feed:
                 break
         if any(unit not in self.names.names for unit in self.latest):
             self.names.read()
-        if time.monotonic() - self._swept > CHECK:
+        if time.monotonic() - self._swept > DRIFT_SECONDS:
             self._swept = time.monotonic()
             for unit in self.journal.evicted() & self.latest.keys():
                 del self.latest[unit], self.updated[unit]
                 self._base.pop(unit, None)
-        for unit in [unit for unit, (_, asked) in self.watched.items() if time.monotonic() - asked[0] > FORGET]:
+        for unit in [
+            unit for unit, (_, asked) in self.watched.items() if time.monotonic() - asked[0] > WATCHED_SECONDS
+        ]:
             del self.watched[unit]
 
     def drift(self, unit: int, row: list[Any]) -> float:
@@ -104,7 +115,7 @@ class Feed:
         base = self._base.get(unit)
         if base is None or len(base[1]) != len(theta) or not all(map(math.isfinite, base[1])):
             base = (now, theta, theta)
-        elif now - base[0] > CHECK:
+        elif now - base[0] > DRIFT_SECONDS:
             base = (now, base[2], theta)
         self._base[unit] = base
         moved = [abs(a - b) / s for a, b, s in zip(theta, base[1], std, strict=False) if s > 0.0 and math.isfinite(s)]
@@ -113,20 +124,19 @@ class Feed:
     def rank(self) -> None:
         """The units that are shown first: trouble, alarms, drift, and last those whose results are no longer stored."""
         found = ((row[10], self.drift(unit, row), unit, row) for unit, row in self.latest.items())
-        first = heapq.nlargest(SHOWN, found, key=lambda one: (one[0], one[1]))
+        first = heapq.nlargest(OVERVIEW_UNITS, found, key=lambda one: (one[0], one[1]))
         now = time.time()
         names = self.names.names
         ranked = [self.line(unit, row, drift, now) for _, drift, unit, row in first if unit in names]
         bad = [self.shown(name, now) for name in self.trouble if name in self.names.about]
         known = {one["unit"] for one in bad}
-        self.fleet = (bad + [one for one in ranked if one["unit"] not in known])[:SHOWN]
-        if len(self.fleet) < SHOWN and len(self.latest) < len(names):
+        self.fleet = (bad + [one for one in ranked if one["unit"] not in known])[:OVERVIEW_UNITS]
+        if len(self.fleet) < OVERVIEW_UNITS and len(self.latest) < len(names):
             gone = (name for unit, name in names.items() if unit not in self.latest and name not in known)
-            self.fleet += [self.shown(name, now) for name in islice(gone, SHOWN - len(self.fleet))]
+            self.fleet += [self.shown(name, now) for name in islice(gone, OVERVIEW_UNITS - len(self.fleet))]
 
     @property
     def trouble(self) -> dict[str, dict[str, str]]:
-        """By unit: what does not work, and why."""
         return dict(self.status.get("trouble", {}))
 
     def shown(self, name: str, now: float) -> dict[str, Any]:
@@ -134,7 +144,7 @@ class Feed:
         unit = int(self.names.about[name]["number"])
         row = self.latest.get(unit)
         if row is None:
-            return unheard(name) | {"trouble": list(self.trouble.get(name, {}))}
+            return UNHEARD | {"unit": name, "trouble": list(self.trouble.get(name, {}))}
         return self.line(unit, row, self.drift(unit, row), now)
 
     def line(self, unit: int, row: list[Any], drift: float, now: float) -> dict[str, Any]:
@@ -142,12 +152,11 @@ class Feed:
         age, name = now - self.updated[unit], self.names.names[unit]
         return {
             "unit": name, "trouble": list(self.trouble.get(name, {})), "drift": round(drift, 2), "alarm": row[10],
-            "time": row[2], "age": round(age, 1), "silent": age > SILENT, "y": finite(row[3]), "y_hat": finite(row[4]),
-            "ok": row[7], "theta": [finite(one) for one in row[8]],
+            "time": row[2], "age": round(age, 1), "silent": age > SILENT_SECONDS, "y": row[3], "y_hat": row[4],
+            "ok": row[7], "theta": row[8],
         }  # fmt: skip
 
     def find(self, name: str) -> int | None:
-        """The number of a unit."""
         about = self.names.about.get(name)
         if about is None:
             self.names.read()
@@ -171,7 +180,7 @@ class Feed:
         after = max(0, (found[0] if found else 0) - 1)
         start = self.journal.db.execute("select coalesce(max(first), 0) - 1 from result where first <= ?", (after,))
         at = int(start.fetchone()[0])
-        rows: deque[list[Any]] = deque(maxlen=RECENT)
+        rows: deque[list[Any]] = deque(maxlen=RECENT_RESULTS)
         end = self.at
         while at < end and (groups := self.journal.outcomes(at)):
             for group, parts, *_ in groups:
@@ -194,7 +203,6 @@ class Feed:
 
     @property
     def alive(self) -> bool:
-        """Whether the engine answers."""
         return time.monotonic() - self.answered < 10.0
 
     @property
@@ -203,14 +211,87 @@ class Feed:
         return self.alive and not self.status.get("problem")
 
 
-def unheard(name: str) -> dict[str, Any]:
-    """A unit of the overview that was silent since before the page started, and for longer than results are stored."""
-    return {
-        "unit": name, "trouble": [], "drift": 0.0, "alarm": False, "time": None, "age": None, "silent": True, "y": None,
-        "y_hat": None, "ok": False, "theta": [],
-    }  # fmt: skip
+def column_names(about: Any) -> list[str]:
+    return [*FIXED, *about["names"], *(f"std {name}" for name in about["names"])]
 
 
-def finite(value: Any) -> Any:
-    """NaN and infinity as None, which JSON can represent."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def reduced(
+    journal: Journal, unit: int, recent: list[list[Any]], start: float, stop: float, points: int
+) -> dict[str, Any]:
+    """(low, high, mean) of every column between two times, each (k, c), and the number of samples.
+
+    A range with at most ``2 points`` samples is reduced sample by sample. Beyond that whole blocks are represented by
+    their extremes, so a million samples cost the reading of 16,000 short rows.
+    """
+    query = "select coalesce(sum(count), 0) from block where unit = ? and stop >= ? and start <= ?"
+    if journal.db.execute(query, (unit, start, stop)).fetchone()[0] <= 2 * points:
+        values = samples(journal, unit, recent, start, stop)
+        parts = np.array_split(values, min(points, len(values)) or 1)
+        return _as_lists([(extremes_of(part), len(part)) for part in parts if len(part)])
+    found, end = [], -1
+    where = "where unit = ? and stop >= ? and start <= ? order by first"
+    for _, _, last, _, _, count, extremes, _ in journal.rows("block", where, unit, start, stop):
+        found.append((np.frombuffer(extremes).reshape(3, -1), count))
+        end = max(end, last)
+    if tail := [row for row in recent if row[0] > end and start <= _time(row) <= stop]:
+        found.append((extremes_of(columns_of(tail)), len(tail)))
+    if len(found) > points:
+        places = np.array_split(np.arange(len(found)), points)
+        found = [_joined([found[k] for k in one]) for one in places]
+    return _as_lists(found)
+
+
+def samples(journal: Journal, unit: int, recent: list[list[Any]], start: float, stop: float) -> Array:
+    """All columns (T, c) between two times."""
+    parts, end = [], -1
+    where = "where unit = ? and first in (select first from block where unit = ? and stop >= ? and start <= ?)"
+    for _, _, last, count, rows, _ in journal.rows("history", f"{where} order by first", unit, unit, start, stop):
+        parts.append(np.frombuffer(rows).reshape(count, -1))
+        end = max(end, last)
+        if sum(map(len, parts)) > EXPORT_ROWS:
+            raise ValueError(f"more than {EXPORT_ROWS} samples; ask for a shorter range.")
+    if tail := [row for row in recent if row[0] > end]:
+        parts.append(columns_of(tail))
+    if not parts:
+        return np.zeros((0, len(FIXED)))
+    values = np.vstack(parts)
+    return values[(values[:, 0] >= start) & (values[:, 0] <= stop)]
+
+
+def newest_blocks(journal: Journal, unit: int, recent: list[list[Any]], blocks: int = 10) -> Array:
+    """All columns (T, c) of the last blocks, and of the samples after them."""
+    found = [*journal.rows("history", "where unit = ? order by first desc limit ?", unit, blocks)][::-1]
+    end = max((row[2] for row in found), default=-1)
+    parts = [np.frombuffer(row[4]).reshape(row[3], -1) for row in found]
+    if tail := [row for row in recent if row[0] > end]:
+        parts.append(columns_of(tail))
+    return np.vstack(parts) if parts else np.zeros((0, 0))
+
+
+def columns_of(rows: list[list[Any]]) -> Array:
+    """Results as an array (count, 5 + 2 n); where samples have no times their numbers are used."""
+    values = np.array([[_time(row), *row[3:7], *row[8], *row[9]] for row in rows])
+    with np.errstate(invalid="ignore"):
+        values[:, 4] = np.sqrt(values[:, 4])
+    return values
+
+
+def _time(row: list[Any]) -> float:
+    return float(row[0] if row[2] is None else row[2])
+
+
+def _joined(blocks: list[tuple[Array, int]]) -> tuple[Array, int]:
+    """Neighbouring blocks as one."""
+    stack, counts = np.stack([one for one, _ in blocks]), [count for _, count in blocks]
+    fine, weight = np.isfinite(stack[:, 2]), np.array(counts, float)[:, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(fine, stack[:, 2] * weight, 0.0).sum(axis=0) / np.where(fine, weight, 0.0).sum(axis=0)
+    low = np.where(fine, stack[:, 0], np.inf).min(axis=0)
+    high = np.where(fine, stack[:, 1], -np.inf).max(axis=0)
+    return np.where(fine.any(axis=0), np.stack([low, high, mean]), np.nan), sum(counts)
+
+
+def _as_lists(found: list[tuple[Array, int]]) -> dict[str, Any]:
+    kinds = ("low", "high", "mean")
+    columns = {kind: np.stack([one[k] for one, _ in found]).T.tolist() if found else [] for k, kind in enumerate(kinds)}
+    return {"count": sum(count for _, count in found), **columns}

@@ -1,16 +1,4 @@
-"""A sink consists of options and of ``write``. A new sink is one file in this folder, with a class of its name.
-
-    class Mine(Sink):                           # src/driftfit/service/sinks/mine.py, kind = "mine"
-        url: str                                # options are the fields of a frozen dataclass
-        def open(self): ...                     # connect, and return a Writer
-                                                # Writer.write(batch) returns once the batch is safe
-
-A sink reads the stored results from where it stopped, so one that is away or slow never delays the tracking and loses
-nothing. After a crash the last batches come again: every result has a ``number``, by which an idempotent sink skips
-results that it already has. An exception means that the sink is away; the batch is written again after a pause. A sink
-with ``one_by_one`` takes events in batches of one, and raises `RefusedError` for one that its receiver does not want:
-after some tries that event is set aside, so that it does not hold up those behind it.
-"""
+"""What a sink is, and what it is given: results and events in batches."""
 
 from __future__ import annotations
 
@@ -20,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
+from driftfit.service.connector import Connector
 from driftfit.service.core.results import Results
 
 
@@ -80,12 +69,10 @@ class Outcome:
     """By unit: names of parameters, y and u, topic and the parts that its pattern matched."""
 
     def __len__(self) -> int:
-        """How many results there are."""
         return sum(len(one.number) for one in self.parts)
 
     @cached_property
     def results(self) -> list[Result]:
-        """The results one by one."""
         return self._listed(self.parts)
 
     @cached_property
@@ -99,10 +86,9 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Sink(ABC):
+class Sink(Connector):
     """A sink of results and events."""
 
-    name: str
     most: ClassVar[int] = 5_000
     """Results of one batch at which it is not collected further."""
     one_by_one: ClassVar[bool] = False
@@ -112,10 +98,6 @@ class Sink(ABC):
     def gather(self) -> float:
         """Seconds for which results are collected into one batch."""
         return 0.0
-
-    def check(self) -> None:
-        """Raise ValueError or ImportError if the options cannot work."""
-        return None
 
     @abstractmethod
     def open(self) -> Writer:

@@ -12,7 +12,7 @@ from driftfit.service.sinks.contract import Outcome, Sink, Writer
 from driftfit.service.sinks.mqtt import messages
 from driftfit.service.sources.kafka import library
 
-TIMEOUT = 30.0
+FLUSH_SECONDS = 30.0
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,9 @@ class Kafka(Sink):
     settings: dict[str, str] = field(default_factory=dict)
 
     def check(self) -> None:
-        """The client library."""
         library()
 
     def open(self) -> Writer:
-        """Connect."""
         return _Kafka(self)
 
 
@@ -42,15 +40,11 @@ class _Kafka(Writer):
         self.failed: list[str] = []
 
     def write(self, batch: Outcome) -> None:
-        """Send, and wait until the cluster has it."""
-        units = [one.unit for one in (batch.results if self.options.every_result else batch.last)]
-        keys = [*units, *(one.unit for one in batch.events)]
-        for key, (topic, body) in zip(keys, messages(self.options, batch), strict=True):
-            event = topic.endswith("/event")
-            self.producer.produce(f"{self.options.topic}-events" if event else self.options.topic, body, key.encode(),
-                                  on_delivery=self._delivered)  # fmt: skip
+        for unit, is_event, body in messages(batch, self.options.every_result):
+            topic = self.options.topic + "-events" * is_event
+            self.producer.produce(topic, body, unit.encode(), on_delivery=self._delivered)
             self.producer.poll(0)
-        left = self.producer.flush(TIMEOUT)
+        left = self.producer.flush(FLUSH_SECONDS)
         failed, self.failed = self.failed, []
         if left or failed:
             raise ConnectionError(failed[0] if failed else f"{left} messages are not acknowledged")

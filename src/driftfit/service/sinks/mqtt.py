@@ -10,21 +10,16 @@ After a crash the last results come again, with the same ``number``.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import msgspec
 
-from driftfit.service.settings.matching import Pattern
+from driftfit.service.connector import ANSWER_SECONDS
+from driftfit.service.options import Pattern
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
-from driftfit.service.sinks.sqlite import by_name
 from driftfit.service.sources.mqtt import Broker, connected, paho, secure
-
-TIMEOUT = 20.0
-"""Seconds in which the broker must have acknowledged a batch."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,12 +33,10 @@ class Mqtt(Broker, Sink):
     """Whether every result is sent, or only the last result of each unit in a batch."""
 
     def check(self) -> None:
-        """The address, the topic and the client library."""
         super().check()
         Pattern(self.topic)
 
     def open(self) -> Writer:
-        """Connect."""
         return _Mqtt(self)
 
 
@@ -63,29 +56,30 @@ class _Mqtt(Writer):
         self.client.loop_start()
 
     def write(self, batch: Outcome) -> None:
-        """Send, and wait for the broker's acknowledgements."""
-        until = time.monotonic() + TIMEOUT
-        sent = [self.client.publish(topic, body, qos=self.options.qos) for topic, body in messages(self.options, batch)]
+        until = time.monotonic() + ANSWER_SECONDS
+        options, sent = self.options, []
+        for unit, is_event, body in messages(batch, options.every_result):
+            topic = topic_of(options.topic, batch, unit) + "/event" * is_event
+            sent.append(self.client.publish(topic, body, qos=options.qos))
         for one in sent:
             one.wait_for_publish(max(0.0, until - time.monotonic()))
             if not one.is_published():
-                raise ConnectionError(f"{self.options.url} does not acknowledge")
+                raise ConnectionError(f"{options.url} does not acknowledge")
 
     def close(self) -> None:
-        """Publish the status and disconnect."""
         self.client.publish(self.options.status, "offline", qos=1, retain=True)
         self.client.disconnect()
         self.client.loop_stop()
 
 
-def messages(options: Any, batch: Outcome) -> Iterator[tuple[str, bytes]]:
-    """(topic, payload) of a batch."""
-    for one in batch.results if options.every_result else batch.last:
-        plain = {key: _finite(value) for key, value in one._asdict().items()}
-        plain |= {"theta": by_name(batch, one.unit, one.theta), "std": by_name(batch, one.unit, one.std)}
-        yield topic_of(options.topic, batch, one.unit), msgspec.json.encode(plain)
+def messages(batch: Outcome, every_result: bool) -> Iterator[tuple[str, bool, bytes]]:
+    """(unit, whether it is an event, payload in JSON, with null for what is not finite) of a batch."""
+    for one in batch.results if every_result else batch.last:
+        names = batch.about[one.unit]["names"]
+        named = {what: dict(zip(names, getattr(one, what), strict=False)) for what in ("theta", "std")}
+        yield one.unit, False, msgspec.json.encode(one._asdict() | named)
     for event in batch.events:
-        yield f"{topic_of(options.topic, batch, event.unit)}/event", msgspec.json.encode(event._asdict())
+        yield event.unit, True, msgspec.json.encode(event._asdict())
 
 
 def topic_of(template: str, batch: Outcome, unit: str) -> str:
@@ -93,7 +87,3 @@ def topic_of(template: str, batch: Outcome, unit: str) -> str:
     about = batch.about.get(unit, {})
     parts = {name: "?" for name in Pattern(template).fields} | dict(about.get("parts") or {}) | {"unit": unit}
     return template.format_map(parts).replace("+", "_").replace("#", "_")
-
-
-def _finite(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -5,13 +5,12 @@ A client sees the last values: prediction, innovation, alarm, and each parameter
 
 from __future__ import annotations
 
-import asyncio
-import threading
 from dataclasses import dataclass
 from typing import Any
 
+from driftfit.service.connector import ANSWER_SECONDS, EventLoop
 from driftfit.service.sinks.contract import Outcome, Result, Sink, Writer
-from driftfit.service.sources.opcua import asyncua
+from driftfit.service.sources.opcua import library
 
 
 @dataclass(frozen=True)
@@ -21,16 +20,14 @@ class Opcua(Sink):
     url: str = "opc.tcp://127.0.0.1:4840/driftfit"
 
     def check(self) -> None:
-        """The options and the library."""
         if not self.url.startswith(("opc.tcp://127.0.0.1", "opc.tcp://localhost")):
             raise ValueError(
                 f"opcua: url {self.url!r} can be reached from other machines, without a password; use 127.0.0.1 and "
                 "a gateway."
             )
-        asyncua()
+        library()
 
     def open(self) -> Writer:
-        """Start the server."""
         return _Opcua(self.url)
 
 
@@ -38,28 +35,22 @@ class _Opcua(Writer):
     def __init__(self, url: str) -> None:
         self.variables: dict[tuple[str, str], Any] = {}
         self.folders: dict[str, Any] = {}
-        self.loop = asyncio.new_event_loop()
-        self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
-        self.thread.start()
+        self.loop = EventLoop()
         try:
-            self._call(self._start(url))
+            self.loop.call(self._start(url), 2 * ANSWER_SECONDS)
         except BaseException:
-            self._end()
+            self.loop.end()
             raise
 
-    def _call(self, work: Any) -> Any:
-        return asyncio.run_coroutine_threadsafe(work, self.loop).result(30.0)
-
     async def _start(self, url: str) -> None:
-        self.server = asyncua().Server()
+        self.server = library().Server()
         await self.server.init()
         self.server.set_endpoint(url)
         self.space = await self.server.register_namespace("https://driftfit/units")
         await self.server.start()
 
     def write(self, batch: Outcome) -> None:
-        """Set the variables to the last result of each unit."""
-        self._call(self._write(batch))
+        self.loop.call(self._write(batch))
 
     async def _write(self, batch: Outcome) -> None:
         for one in batch.last:
@@ -79,16 +70,10 @@ class _Opcua(Writer):
         return self.folders[unit]
 
     def close(self) -> None:
-        """Stop the server."""
         try:
-            self._call(self.server.stop())
+            self.loop.call(self.server.stop())
         finally:
-            self._end()
-
-    def _end(self) -> None:
-        self.loop.call_soon_threadsafe(self.loop.stop)
-        self.thread.join(5.0)
-        self.loop.close()
+            self.loop.end()
 
 
 def _values(one: Result, names: list[str]) -> list[tuple[str, Any]]:

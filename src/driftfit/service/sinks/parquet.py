@@ -6,13 +6,13 @@ replaces itself.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import polars as pl
 
+from driftfit.data.storage import replace_file
 from driftfit.service.core.results import ALARM, OK, Results
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
 
@@ -33,11 +33,9 @@ class Parquet(Sink):
 
     @property
     def gather(self) -> float:
-        """The time of one file."""
         return self.seconds
 
     def open(self) -> Writer:
-        """Make the folder."""
         Path(self.path).mkdir(parents=True, exist_ok=True)
         return _Parquet(Path(self.path))
 
@@ -50,16 +48,11 @@ class _Parquet(Writer):
         """One file, complete or not at all."""
         if not len(batch):
             return
-        target = self.folder / f"results-{batch.group:016d}.parquet"
-        partial = target.with_suffix(".part")
-        pl.concat([table_of(batch, part) for part in batch.parts]).write_parquet(partial)
-        with open(partial, "rb") as handle:
-            os.fsync(handle.fileno())
-        partial.replace(target)
+        table = pl.concat([table_of(batch, part) for part in batch.parts])
+        replace_file(self.folder / f"results-{batch.group:016d}.parquet", table.write_parquet)
 
 
 def table_of(batch: Outcome, part: Results) -> pl.DataFrame:
-    """Results as a table."""
     columns = {name: part.values[:, k] for k, name in enumerate(("time", "y", "y_hat", "e", "s"))}
     given = {"number": part.number, "unit": [batch.names[k] for k in part.unit.tolist()], **columns}
     given |= {"ok": (part.flags & OK) > 0, "alarm": (part.flags & ALARM) > 0}

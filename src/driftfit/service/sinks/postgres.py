@@ -9,9 +9,10 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from functools import partial
 
-from driftfit.service.settings.options import Secret
+from driftfit.service.connector import client_library
+from driftfit.service.options import Secret
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
 
 SCHEMA = """
@@ -25,6 +26,7 @@ create table if not exists {schema}.driftfit_event (
     primary key (unit, number, kind, detail));
 create temporary table if not exists driftfit_staging (like {schema}.driftfit_result);
 """
+library = partial(client_library, "postgres", "psycopg", "psycopg", "postgres")
 COLUMNS = "time, number, unit, seconds, y, y_hat, e, s, ok, alarm, theta, std, names"
 
 
@@ -38,7 +40,6 @@ class Postgres(Sink):
     schema: str = "public"
 
     def check(self) -> None:
-        """The options and the client library."""
         if not self.schema.isidentifier():
             raise ValueError(f"postgres: schema must be a plain name; got {self.schema!r}.")
         if "@" in self.url and ":" in self.url.partition("://")[2].partition("@")[0]:
@@ -46,7 +47,6 @@ class Postgres(Sink):
         library()
 
     def open(self) -> Writer:
-        """Connect, and make the tables."""
         return _Postgres(self)
 
 
@@ -59,11 +59,9 @@ class _Postgres(Writer):
         for statement in SCHEMA.format(schema=options.schema).split(";\n"):
             if statement.strip():
                 self.db.execute(statement)
-        timescale = self.db.execute("select 1 from pg_extension where extname = 'timescaledb'").fetchone()
-        if timescale:
-            name = f"{options.schema}.driftfit_result"
+        if self.db.execute("select 1 from pg_extension where extname = 'timescaledb'").fetchone():
             query = "select create_hypertable(%s, 'time', if_not_exists => true, migrate_data => true)"
-            self.db.execute(query, (name,))
+            self.db.execute(query, (f"{options.schema}.driftfit_result",))
 
     def write(self, batch: Outcome) -> None:
         """All of the batch, or nothing."""
@@ -87,7 +85,6 @@ class _Postgres(Writer):
             )
 
     def close(self) -> None:
-        """Disconnect."""
         self.db.close()
 
 
@@ -97,12 +94,3 @@ def _moment(time: float | None, number: int) -> datetime:
         return datetime.fromtimestamp(number if time is None else time, UTC)
     except (OverflowError, ValueError, OSError):
         return datetime.fromtimestamp(0, UTC)
-
-
-def library() -> Any:
-    """The client library; ImportError says how to install it."""
-    try:
-        import psycopg
-    except ImportError:
-        raise ImportError("postgres needs psycopg: pip install 'driftfit[postgres]'.") from None
-    return psycopg

@@ -31,7 +31,6 @@ class Sqlite(Sink):
     path: str
 
     def open(self) -> Writer:
-        """Open or make the file."""
         return _Sqlite(self.path)
 
 
@@ -55,7 +54,6 @@ class _Sqlite(Writer):
             raise
 
     def close(self) -> None:
-        """Close the file."""
         self.db.close()
 
 
@@ -74,9 +72,3 @@ def _texts(names: Iterable[Any], values: Array) -> list[str]:
     objects = list(map(dict, map(zip, names, values.tolist())))
     lines: str = msgspec.json.Encoder().encode_lines(objects).decode()
     return lines.split("\n")[:-1]
-
-
-def by_name(batch: Outcome, unit: str, values: list[float]) -> dict[str, Any]:
-    """Parameters by name; None where they are not finite."""
-    names = batch.about[unit]["names"]
-    return {name: value if abs(value) < float("inf") else None for name, value in zip(names, values, strict=False)}

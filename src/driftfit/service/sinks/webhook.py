@@ -15,13 +15,13 @@ import urllib.error
 import urllib.request
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 from urllib.parse import urlsplit
 
-from driftfit.service.settings.options import Secret
+from driftfit.service.options import Secret
 from driftfit.service.sinks.contract import Event, Outcome, RefusedError, Sink, Writer
 
-TIMEOUT = 10.0
+ANSWER_SECONDS = 10.0
 
 
 @dataclass(frozen=True)
@@ -30,22 +30,17 @@ class Webhook(Sink):
 
     url: str
     events: list[str] = field(default_factory=lambda: ["alarm", "failed"])
-    body: str = "json"
-    """json, or text."""
+    body: Literal["json", "text"] = "json"
     token: Secret | None = None
     """Sent as ``Authorization: Bearer``."""
     one_by_one: ClassVar[bool] = True
 
     def check(self) -> None:
-        """The address."""
         parts = urlsplit(self.url)
         if parts.scheme not in ("http", "https") or not parts.hostname or parts.password:
             raise ValueError(f"webhook: url must be https://... without a password; got {self.url!r}.")
-        if self.body not in ("json", "text"):
-            raise ValueError(f"webhook: body must be json or text; got {self.body!r}.")
 
     def open(self) -> Writer:
-        """Nothing is connected before an event."""
         return _Webhook(self)
 
 
@@ -55,7 +50,6 @@ class _Webhook(Writer):
         self.client = urllib.request.build_opener(_NoRedirect)
 
     def write(self, batch: Outcome) -> None:
-        """A request for each event."""
         for event in batch.events:
             if event.kind in self.options.events:
                 self._send(event)
@@ -67,12 +61,12 @@ class _Webhook(Writer):
         else:  # in a header only characters of ASCII arrive everywhere
             title = event.unit.encode("ascii", "replace").decode()
             headers, data = {"Content-Type": "text/plain; charset=utf-8", "Title": title}, str(content["text"])
-        headers |= {"User-Agent": "driftfit", "Idempotency-Key": "-".join(map(str, event.key))}
+        headers |= {"User-Agent": "driftfit", "Idempotency-Key": event.key}
         if self.options.token is not None:
             headers["Authorization"] = f"Bearer {self.options.token.value}"
         request = urllib.request.Request(self.options.url, data.encode(), headers, method="POST")
         try:
-            with self.client.open(request, timeout=TIMEOUT):
+            with self.client.open(request, timeout=ANSWER_SECONDS):
                 pass
         except urllib.error.HTTPError as error:
             with error:
@@ -85,7 +79,6 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
 
 
 def message(event: Event) -> dict[str, object]:
-    """An event as JSON."""
     detail = dict(event.detail)
     at = datetime.fromtimestamp(event.at, UTC).isoformat(timespec="seconds")
     text = f"{event.unit}: {event.kind}"

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
-from driftfit.service.sources.contract import Reader, Source
-from driftfit.service.sources.samples import Batch, Samples, decode
+from driftfit.service.connector import ANSWER_SECONDS, client_library
+from driftfit.service.sources.contract import BATCH_MESSAGES, Batch, Reader, Samples, Source, decode
 
-MOST = 2_000
-START = 20.0
-"""Seconds in which the brokers must answer."""
+library = partial(client_library, "kafka", "confluent_kafka", "confluent-kafka", "kafka")
 
 
 @dataclass(frozen=True)
@@ -23,19 +22,15 @@ class Kafka(Source):
 
     brokers: str
     topics: list[str]
-    begin: str = "latest"
-    """Where to begin without a position: latest or earliest."""
+    begin: Literal["latest", "earliest"] = "latest"
+    """Where to begin without a position."""
     settings: dict[str, str] = field(default_factory=dict)
     """Further settings of librdkafka, such as "security.protocol"."""
 
     def check(self) -> None:
-        """The options and the client library."""
-        if self.begin not in ("latest", "earliest"):
-            raise ValueError(f"kafka: begin must be latest or earliest; got {self.begin!r}.")
         library()
 
     def open(self, position: Any) -> Reader:
-        """Continue after the messages that were read."""
         return _Kafka(self, dict(position or {}))
 
 
@@ -48,12 +43,12 @@ class _Kafka(Reader):
         self.consumer = kafka.Consumer(given)
         places = []
         for topic in options.topics:
-            known = self.consumer.list_topics(topic, START).topics[topic]
+            known = self.consumer.list_topics(topic, ANSWER_SECONDS).topics[topic]
             if known.error is not None:
                 raise ConnectionError(str(known.error))
             for part in known.partitions:
                 at = position.get(f"{topic}/{part}")
-                ends = self.consumer.get_watermark_offsets(kafka.TopicPartition(topic, part), START)
+                ends = self.consumer.get_watermark_offsets(kafka.TopicPartition(topic, part), ANSWER_SECONDS)
                 if at is None:
                     at = ends[options.begin == "latest"]
                 elif not ends[0] <= at <= ends[1]:  # the library would go on at one of the ends, without a word
@@ -64,11 +59,10 @@ class _Kafka(Reader):
         self.consumer.assign(places)
 
     def read(self, wait: float) -> Batch | None:
-        """The messages that have arrived."""
         if self.noticed:
             noticed, self.noticed = self.noticed, ""
             return Batch([], noticed=noticed)
-        found = self.consumer.consume(MOST, wait)
+        found = self.consumer.consume(BATCH_MESSAGES, wait)
         if not found:
             return None
         arrived = time.monotonic()
@@ -87,14 +81,4 @@ class _Kafka(Reader):
         return Batch(samples, position=dict(self.position), refused=refused, arrived=arrived)
 
     def close(self) -> None:
-        """Disconnect."""
         self.consumer.close()
-
-
-def library() -> Any:
-    """The client library; ImportError says how to install it."""
-    try:
-        import confluent_kafka
-    except ImportError:
-        raise ImportError("kafka needs confluent-kafka: pip install 'driftfit[kafka]'.") from None
-    return confluent_kafka

@@ -17,23 +17,19 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 from urllib.parse import urlsplit
 
-from driftfit.service.settings.options import Secret
-from driftfit.service.sources.contract import Reader, Source
-from driftfit.service.sources.samples import LARGEST, Batch, Samples, decode
+from driftfit.service.connector import ANSWER_SECONDS, client_library
+from driftfit.service.options import Secret
+from driftfit.service.sources.contract import BATCH_MESSAGES, MESSAGE_BYTES, Batch, Reader, Samples, Source, decode
 from driftfit.service.sources.sparkplug import REBIRTH, Sparkplug, UnknownAliasError, rebirth_topic
 
-MOST = 2_000
-"""Messages of one batch."""
-AWAY = 20.0
-"""Seconds in which the broker must have accepted a connection."""
-LEAVE = 1.0
-"""Seconds for which a reader that is closed waits for acknowledgements."""
-
-PATIENCE = 30.0
-"""Seconds between two commands to a node to declare its metrics again."""
+CLOSE_SECONDS = 1.0
+"""For this time a reader that is closed waits for acknowledgements."""
+REBIRTH_SECONDS = 30.0
+"""Time between two commands to a node to declare its metrics again."""
+paho = partial(client_library, "mqtt", "paho.mqtt.client", "paho-mqtt", "serve")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +47,6 @@ class Broker:
     """File of the certificate authority, if it is not one of the system's."""
 
     def check(self) -> None:
-        """The address and the client library."""
         connected(self.url)
 
 
@@ -61,19 +56,15 @@ class Mqtt(Broker, Source):
 
     topic: str
     """Filter with the wildcards + and #; several are separated by spaces."""
-    payload: str = "json"
-    """json, or sparkplug for the messages of Sparkplug B (`driftfit.service.sources.sparkplug`)."""
+    payload: Literal["json", "sparkplug"] = "json"
+    """Of Sparkplug B: `driftfit.service.sources.sparkplug`."""
 
     def check(self) -> None:
-        """The address, the client library, the payload, and a level of acknowledgement that is read."""
         super().check()
         if self.qos not in (0, 1):
             raise ValueError(f"mqtt: qos must be 0 or 1; got {self.qos}.")
-        if self.payload not in ("json", "sparkplug"):
-            raise ValueError(f"mqtt: payload must be json or sparkplug; got {self.payload!r}.")
 
     def open(self, position: Any) -> Reader:
-        """Connect; the broker keeps the position."""
         return _Mqtt(self)
 
 
@@ -119,7 +110,7 @@ class _Mqtt(Reader):
         if message.qos:
             heard.identifiers.append(message.mid)
         try:
-            if len(message.payload) > LARGEST:
+            if len(message.payload) > MESSAGE_BYTES:
                 raise ValueError
             read = self._decode(message.topic, message.payload)
         except ValueError:  # it is acknowledged like any other: sent again it would not be better
@@ -128,7 +119,6 @@ class _Mqtt(Reader):
             heard.samples += [] if read is None else [read]
 
     def read(self, wait: float) -> Batch | None:
-        """The messages that have arrived."""
         until = time.monotonic() + wait
         while not self.batch.count:
             self._send()
@@ -157,7 +147,7 @@ class _Mqtt(Reader):
     def _wait(self, seconds: float) -> None:
         """Until messages arrive, or acknowledgements are to be sent."""
         socket = self.client.socket()
-        if socket is None or (not self.client.is_connected() and time.monotonic() - self.begun > AWAY):
+        if socket is None or (not self.client.is_connected() and time.monotonic() - self.begun > ANSWER_SECONDS):
             raise ConnectionError(f"no connection to {self.options.url}")
         if self.more or (isinstance(socket, ssl.SSLSocket) and socket.pending()):
             return
@@ -167,9 +157,8 @@ class _Mqtt(Reader):
             self.woken.recv(4096)
 
     def _receive(self) -> None:
-        """Read what is there."""
         self.more = True
-        while self.more and self.batch.count < MOST:  # a call reads one packet
+        while self.more and self.batch.count < BATCH_MESSAGES:  # a call reads one packet
             before = self.batch.count
             self._checked(self.client.loop_read())
             self.more = self.batch.count > before or self.line.holds
@@ -186,7 +175,7 @@ class _Mqtt(Reader):
             return self.sparkplug.decode(topic, payload)
         except UnknownAliasError:  # the birth was before this process
             command, now = rebirth_topic(topic), time.monotonic()
-            if now - self.asked.get(command, -PATIENCE) >= PATIENCE:
+            if now - self.asked.get(command, -REBIRTH_SECONDS) >= REBIRTH_SECONDS:
                 self.asked[command] = now
                 self.client.publish(command, REBIRTH)
             raise
@@ -199,7 +188,7 @@ class _Mqtt(Reader):
 
     def close(self) -> None:
         """Disconnect, once what was passed on is acknowledged; the session stays at the broker."""
-        until = time.monotonic() + LEAVE
+        until = time.monotonic() + CLOSE_SECONDS
         with contextlib.suppress(OSError):
             while self.unconfirmed and (left := until - time.monotonic()) > 0.0:
                 select.select([self.woken], [], [], left)
@@ -262,15 +251,6 @@ class Line:
         """Send the rest, and give the socket back to the client."""
         self.flush()
         vars(self._client).update(self.theirs)
-
-
-def paho() -> Any:
-    """The client library; ImportError says how to install it."""
-    try:
-        from paho.mqtt import client
-    except ImportError:
-        raise ImportError("mqtt needs paho-mqtt: pip install 'driftfit[serve]'.") from None
-    return client
 
 
 def connected(url: str) -> tuple[str, int]:

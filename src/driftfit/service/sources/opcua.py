@@ -7,20 +7,20 @@ sample whenever one of them, or the one named ``trigger``, changes. The time is 
 
 from __future__ import annotations
 
-import asyncio
+import contextlib
 import queue
-import threading
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from driftfit.service.settings.options import Secret
-from driftfit.service.sources.contract import Reader, Source
-from driftfit.service.sources.samples import Batch, Samples
+from driftfit.service.connector import EventLoop, client_library
+from driftfit.service.options import Secret
+from driftfit.service.sources.contract import BATCH_MESSAGES, Batch, Reader, Source, by_topic
 
-WAITING = 100_000
-"""Changes that wait to be read; beyond that the oldest are dropped, and counted as refused."""
-MOST = 2_000
+QUEUED_CHANGES = 100_000
+"""Changes that wait to be read; those beyond are dropped, and counted as refused."""
+library = partial(client_library, "opcua", "asyncua", "asyncua", "opcua")
 
 
 @dataclass(frozen=True)
@@ -39,39 +39,31 @@ class Opcua(Source):
     password: Secret | None = None
 
     def check(self) -> None:
-        """The address and the client library."""
         if not self.url.startswith("opc.tcp://"):
             raise ValueError(f"opcua: url must be opc.tcp://host:port; got {self.url!r}.")
-        asyncua()
+        library()
 
     def open(self, position: Any) -> Reader:
-        """Connect and subscribe."""
         return _Opcua(self)
 
 
 class _Opcua(Reader):
     def __init__(self, options: Opcua) -> None:
         self.options = options
-        self.changes: queue.Queue[tuple[str, dict[str, Any]]] = queue.Queue(WAITING)
+        self.changes: queue.Queue[tuple[str, dict[str, Any]]] = queue.Queue(QUEUED_CHANGES)
         self.values: dict[str, dict[str, Any]] = {topic: {} for topic in options.nodes}
         self.dropped = 0
         self.error: BaseException | None = None
         self.places: dict[str, tuple[str, str]] = {}
-        self.loop = asyncio.new_event_loop()
-        self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
-        self.thread.start()
+        self.loop = EventLoop()
         try:
-            self._call(self._connect())
+            self.loop.call(self._connect())
         except BaseException:
             self.close()
             raise
 
-    def _call(self, work: Any, timeout: float = 20.0) -> Any:
-        return asyncio.run_coroutine_threadsafe(work, self.loop).result(timeout)
-
     async def _connect(self) -> None:
-        library = asyncua()
-        self.client = library.Client(self.options.url, timeout=10)
+        self.client = library().Client(self.options.url, timeout=10)
         if self.options.user:
             self.client.set_user(self.options.user)
             self.client.set_password(self.options.password.value if self.options.password else "")
@@ -103,44 +95,22 @@ class _Opcua(Reader):
         self.error = ConnectionError(f"subscription: {status}")
 
     def read(self, wait: float) -> Batch | None:
-        """The changes that have arrived."""
         try:
             found = [self.changes.get(timeout=wait)]
         except queue.Empty:
             if self.error is not None:
                 raise self.error from None
-            self._call(self.client.check_connection())
+            self.loop.call(self.client.check_connection())
             return None
         arrived = time.monotonic()
-        while len(found) < MOST and not self.changes.empty():
+        while len(found) < BATCH_MESSAGES and not self.changes.empty():
             found.append(self.changes.get())
         refused, self.dropped = self.dropped, 0
-        rows: dict[str, list[dict[str, Any]]] = {}
-        for topic, values in found:
-            rows.setdefault(topic, []).append(values)
-        samples = [
-            Samples(topic, len(many), {name: [one.get(name) for one in many] for name in many[-1]})
-            for topic, many in rows.items()
-        ]
-        return Batch(samples, refused=refused, arrived=arrived)
+        return Batch(by_topic(found), refused=refused, arrived=arrived)
 
     def close(self) -> None:
-        """Disconnect."""
         try:
-            if hasattr(self, "client"):
-                self._call(self.client.disconnect(), 5.0)
-        except Exception:  # the server may be gone
-            pass
+            with contextlib.suppress(Exception):  # the server may be gone
+                self.loop.call(self.client.disconnect(), 5.0)
         finally:
-            self.loop.call_soon_threadsafe(self.loop.stop)
-            self.thread.join(5.0)
-            self.loop.close()
-
-
-def asyncua() -> Any:
-    """The library; ImportError says how to install it."""
-    try:
-        import asyncua as library
-    except ImportError:
-        raise ImportError("opcua needs asyncua: pip install 'driftfit[opcua]'.") from None
-    return library
+            self.loop.end()

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.service.sources.contract import Reader, Source
-from driftfit.service.sources.samples import Batch, Samples
+from driftfit.service.sources.contract import Batch, Reader, Samples, Source
 
 PUMPS = 6
 CLOSING = 3
@@ -36,7 +35,6 @@ class Plant(Source):
     seed: int = 1
 
     def open(self, position: Any) -> Reader:
-        """Begin."""
         return _Plant(self)
 
 
@@ -60,7 +58,6 @@ class _Plant(Reader):
         return GAIN + share * (CLOSED - GAIN)
 
     def read(self, wait: float) -> Batch | None:
-        """The samples measured since the last call."""
         step = self.options.interval
         due = int((time.time() - self.zero) / step) + self.options.before
         if due <= self.count:

@@ -17,11 +17,9 @@ from typing import Any
 import polars as pl
 
 from driftfit.data.files import read_parquet
-from driftfit.service.sources.contract import END, FileSource, Reader
-from driftfit.service.sources.samples import Batch, Samples, seconds
+from driftfit.service.sources.contract import END, Batch, FileSource, Reader, Samples, seconds
 
-PIECE = 1000
-"""Rows of one batch at most."""
+BATCH_ROWS = 1000
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,6 @@ class Replay(FileSource):
     speed: float = 0.0
 
     def check(self) -> None:
-        """The file must exist, and have the columns."""
         if not Path(self.path).exists():
             raise ValueError(f"replay: there is no file {self.path}.")
         if not self.speed >= 0.0:
@@ -44,7 +41,6 @@ class Replay(FileSource):
                 raise ValueError(f"replay: {self.path} has no column {name!r}; it has {', '.join(known)}.")
 
     def open(self, position: Any) -> Reader:
-        """Continue after the rows that were read."""
         table = read_parquet(self.path, self.path)[1] if self.path.endswith(".parquet") else pl.read_csv(self.path)
         with open(self.path, "rb") as file:
             digest = hashlib.file_digest(file, "blake2b").hexdigest()
@@ -72,11 +68,10 @@ class _Replay(Reader):
         return upto
 
     def read(self, wait: float) -> Batch | None:
-        """The rows that are due."""
         if self.at >= len(self.table):
             return END
         until = time.monotonic() + wait
-        while (due := min(self._due(), len(self.table), self.at + PIECE)) <= self.at:
+        while (due := min(self._due(), len(self.table), self.at + BATCH_ROWS)) <= self.at:
             if time.monotonic() >= until:
                 return None
             time.sleep(0.01)

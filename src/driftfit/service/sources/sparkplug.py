@@ -18,11 +18,11 @@ from collections.abc import Iterator
 from struct import unpack_from
 from typing import Any
 
-from driftfit.service.sources.samples import MOST_FIELDS, Samples, bounded
+from driftfit.service.sources.contract import MESSAGE_FIELDS, Samples, bounded, of_rows
 
 PREFIX = "spBv1.0"
 BIRTHS, DATA = ("NBIRTH", "DBIRTH"), ("NDATA", "DDATA")
-MOST_NODES = 100_000
+KNOWN_NODES = 100_000
 """Nodes and devices whose metrics are known."""
 METRICS, TIMESTAMP = 2, 1
 """Fields of a payload."""
@@ -69,8 +69,8 @@ class Sparkplug:
             rows.setdefault(one.get(WHEN, when), {})[name] = value_of(one)
             if not one.get(HISTORICAL):
                 last[name] = value_of(one)
-        if len(last) > MOST_FIELDS or (len(self._last) >= MOST_NODES and where not in self._last):
-            raise ValueError(f"more than {MOST_FIELDS} metrics, or {MOST_NODES} nodes and devices.")
+        if len(last) > MESSAGE_FIELDS or (len(self._last) >= KNOWN_NODES and where not in self._last):
+            raise ValueError(f"more than {MESSAGE_FIELDS} metrics, or {KNOWN_NODES} nodes and devices.")
         before = {} if born else self._last.get(where, {})
         if born:
             self._names[group, node] = names
@@ -98,8 +98,8 @@ def _samples(topic: str, rows: dict[int, dict[str, Any]], before: dict[str, Any]
     for time in sorted(rows):
         known |= rows[time]
         filled.append(known | {"timestamp": time})
-    names = filled[-1].keys()
-    return Samples(topic, bounded(len(filled)), {name: [row.get(name) for row in filled] for name in names})
+    bounded(len(filled))
+    return of_rows(topic, filled)
 
 
 def value_of(metric: dict[int, Any]) -> Any:

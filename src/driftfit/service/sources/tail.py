@@ -15,15 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from driftfit.service.sources.contract import FileSource, Reader
-from driftfit.service.sources.samples import Batch, Samples, decode
+from driftfit.service.sources.contract import Batch, FileSource, Reader, Samples, by_topic, decode
 
-PIECE = 1 << 20
+PIECE_BYTES = 1 << 20
 """Most bytes that are read at once, and of one line."""
-BEFORE = 1 << 16
+DIGEST_BYTES = 1 << 16
 """Bytes before the position by which a file is recognised."""
-LOOK = 0.05
-"""Seconds between two looks at a file that does not grow."""
+POLL_SECONDS = 0.05
+"""Time between two looks at a file that does not grow."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,6 @@ class Tail(FileSource):
     separator: str = ","
 
     def open(self, position: Any) -> Reader:
-        """Continue after the lines that were read."""
         return _Tail(self, position)
 
 
@@ -46,7 +44,7 @@ class _Tail(Reader):
     def _open(self, position: Any) -> None:
         self.file = open(self.path, "rb", buffering=0)  # noqa: SIM115  (closed by `close`)
         json_lines = self.path.suffix.lower() in (".jsonl", ".ndjson", ".json")
-        head = b"\n" if json_lines else self.file.readline(PIECE)
+        head = b"\n" if json_lines else self.file.readline(PIECE_BYTES)
         if not head.endswith(b"\n"):
             self.file.close()
             raise ValueError(f"{self.path} has no complete header line yet.")
@@ -62,7 +60,7 @@ class _Tail(Reader):
 
     def _read(self, at: int, count: int) -> bytes:
         """Some bytes before ``at``, and ``count`` bytes from there on, in one piece: another may write meanwhile."""
-        begin = max(0, at - BEFORE)
+        begin = max(0, at - DIGEST_BYTES)
         self.file.seek(begin)
         return self.file.read(at - begin + count)
 
@@ -71,14 +69,13 @@ class _Tail(Reader):
         return next(csv.reader([text], delimiter=self.options.separator), [])
 
     def read(self, wait: float) -> Batch | None:
-        """Complete lines that have been added."""
         until = time.monotonic() + wait
         while True:
             if self.noticed:
                 noticed, self.noticed = self.noticed, ""
                 return Batch([], noticed=noticed)
             renamed = self._renamed()  # what was written to the old file before is read below
-            found = self._read(self.at, PIECE)
+            found = self._read(self.at, PIECE_BYTES)
             if not found.startswith(self.before):
                 self.close()
                 self._open((self.at, ""))
@@ -86,12 +83,12 @@ class _Tail(Reader):
             piece = found[len(self.before) :]
             end = piece.rfind(b"\n") + 1
             lines = piece[:end]
-            if not end and len(piece) == PIECE:
-                end = PIECE  # no line is so long
+            if not end and len(piece) == PIECE_BYTES:
+                end = PIECE_BYTES  # no line is so long
             elif not end and renamed:
                 lines, end = piece, len(piece)
             if end:
-                self.at, self.before = self.at + end, found[: len(self.before) + end][-BEFORE:]
+                self.at, self.before = self.at + end, found[: len(self.before) + end][-DIGEST_BYTES:]
                 return self._batch(lines)
             if renamed:
                 self.close()
@@ -99,7 +96,7 @@ class _Tail(Reader):
             elif time.monotonic() >= until:
                 return None
             else:
-                time.sleep(LOOK)
+                time.sleep(POLL_SECONDS)
 
     def _renamed(self) -> bool:
         """Whether another file has the name now."""
@@ -109,41 +106,31 @@ class _Tail(Reader):
             return False
 
     def _batch(self, piece: bytes) -> Batch:
-        rows: dict[str, list[dict[str, Any]]] = {}
+        rows: list[tuple[str, dict[str, Any]]] = []
         samples: list[Samples] = []
         refused = 0 if piece else 1
-        for line in piece.splitlines():
-            if not line.strip():
+        for line in filter(bytes.strip, piece.splitlines()):
+            try:
+                found = self._samples(line)
+            except ValueError:
+                refused += 1
                 continue
-            if self.header is None:
-                try:
-                    found = decode("", line)
-                except ValueError:
-                    refused += 1
-                    continue
-                topic = self._topic(found.columns)
-                if found.length > 1:
-                    samples.append(found._replace(topic=topic))
-                    continue
-                row = dict(found.columns)
+            if found.length > 1:
+                samples.append(found)
             else:
-                cells = self._cells(line)
-                if len(cells) != len(self.header):
-                    refused += 1
-                    continue
-                row = dict(zip(self.header, cells, strict=True))
-                topic = self._topic(row)
-            rows.setdefault(topic, []).append(row)
-        for topic, many in rows.items():
-            names = {name for row in many for name in row}
-            samples.append(Samples(topic, len(many), {name: [row.get(name) for row in many] for name in names}))
-        return Batch(samples, position=[self.at, _digest(self.before)], refused=refused, arrived=time.monotonic())
+                rows.append((found.topic, dict(found.columns)))
+        position = [self.at, _digest(self.before)]
+        return Batch(samples + by_topic(rows), position=position, refused=refused, arrived=time.monotonic())
 
-    def _topic(self, row: Any) -> str:
-        return self.options.topic_of(row.get(self.options.by, ""))
+    def _samples(self, line: bytes) -> Samples:
+        """The samples of a line; ValueError if it cannot be read."""
+        if self.header is None:
+            found = decode("", line)
+        else:
+            found = Samples("", 1, dict(zip(self.header, self._cells(line), strict=True)))
+        return found._replace(topic=self.options.topic_of(found.columns.get(self.options.by, "")))
 
     def close(self) -> None:
-        """Close the file."""
         self.file.close()
 
 

@@ -165,7 +165,7 @@ class Bank(Tracker):
                 "Bank: Decide(1) with outliers always prefers the outlier and never adapts; use Decide(2) or deeper, "
                 "Hybrid(9), or Decide(1, force=True)."
             )
-        if "frozen" in kinds and self._alike:
+        if "frozen" in kinds and self.independent:
             import warnings
 
             warnings.warn(
@@ -206,7 +206,8 @@ class Bank(Tracker):
         return events("Bank", self.all_changes, self.all_sensors, self.transition, self.initial)
 
     @property
-    def _alike(self) -> bool:
+    def independent(self) -> bool:
+        """Whether every event is independent of earlier ones."""
         P = self.event_probabilities[0]
         return bool((P[0] == P).all())
 
@@ -218,7 +219,7 @@ class Bank(Tracker):
             return False
         P = self.event_probabilities[0].reshape(-1, Hd, Hm)
         product = P.sum(axis=2)[0, :, None] * P.sum(axis=1)[:, None, :]
-        return self._alike or bool(np.allclose(P, product, rtol=1e-12, atol=1e-15))
+        return self.independent or bool(np.allclose(P, product, rtol=1e-12, atol=1e-15))
 
     def _frames(self, na: int) -> bool:
         """Whether the bank may run in the coordinates of its start (`driftfit.trackers.bank.machine.framed`)."""
@@ -305,8 +306,8 @@ class Bank(Tracker):
             arrays["root"][:, 0], scale = arrays["leaves"][:, 0], 1.0
         q0, Q0 = arrays["walks"][0, : n * (n + 1) // 2], np.zeros((n, n))
         numbers = {
-            "n": n, "output_lags": na, "unknown": nominal.r is None, "independent": self._alike, "apart": self._apart,
-            "plain": na == 0 and self.form == "covariance",
+            "n": n, "output_lags": na, "unknown": nominal.r is None, "independent": self.independent,
+            "apart": self._apart, "plain": na == 0 and self.form == "covariance",
         }  # fmt: skip
         Q0[np.tril_indices(n)] = q0
         return {  # memory first, where a cache line begins

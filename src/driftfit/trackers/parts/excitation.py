@@ -27,7 +27,6 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.coarse.resolution import reading
-from driftfit.trackers.parts.proportion import FIRST
 
 MEMORY = 50.0
 """Memory of the mean square of a regressor, in samples."""
@@ -36,6 +35,9 @@ DULL = 1e-4
 
 LITTLE = 0.1
 """Share of the average information below which a parameter is not being learned."""
+
+FIRST = 10.0
+"""Number of first squares that are taken as they are, for comparison with later ones."""
 
 LARGE = 25.0
 """A square above this multiple of the mean square counts as this multiple."""

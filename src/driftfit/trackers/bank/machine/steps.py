@@ -57,7 +57,7 @@ from driftfit.trackers.parts.covariance import prediction
 from driftfit.trackers.parts.diffuse import correct_on_roots, forecast_on_roots, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.few_residuals import RESIDUALS, wider
-from driftfit.trackers.parts.modes.noise_levels import LEAST_SHARE
+from driftfit.trackers.parts.mixture.noise import LEAST_SHARE
 
 GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift"], ROW["own_likelihoods"]
 

@@ -10,22 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
-
-
-class Shifts(Protocol):
-    """Anything from which the change of parameters can be read: a smoothed path."""
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-
-    def increment(self, t: int) -> tuple[Array, Array]: ...
-
 
 FAINT = 0.02
 """Probability below which a sample does not belong to a cluster."""
@@ -60,16 +50,16 @@ class Event:
     span : Span
         The four as sample numbers.
     level : float
-        Level of the interval: 0.95 for changes in a record, whose dates are those of
-        `driftfit.trackers.bank.results.dates`, checked by simulation in `benchmarks/event_dates.py`. NaN for faults,
-        and in a stream, where the interval contains only the dates of the leaves that were kept.
+        Level of the interval: 0.95 for changes in a record, whose dates are those of the smoother
+        (`driftfit.trackers.bank.results.smoothed`), checked by simulation in `benchmarks/event_dates.py`. NaN for
+        faults, and in a stream, where the interval contains only the dates of the leaves that were kept.
     prob : float
         Probability that it happened.
     name : str
         The most likely change, or the sensor fault.
     names : mapping from names of changes to their share
     shift, std, z : mappings from parameters to their change, its standard error, and their ratio (changes only)
-        From the smoothed path given the events: conditional on them.
+        Over all dates of the interval, given that there was a change.
     """
 
     kind: str
@@ -105,14 +95,10 @@ class Event:
         """The same event with times from sample numbers."""
         return replace(self, times=tuple(time(sample) for sample in self.span))
 
-    def measured(self, smoothed: Shifts) -> Event:
-        """The same event with the change of each parameter."""
-        mean, cov = smoothed.increment(self.span.date)
-        std = np.sqrt(np.maximum(np.diag(cov), 0.0))
-        names = smoothed.names
-        return replace(
-            self, shift=dict(zip(names, mean.tolist(), strict=True)), std=dict(zip(names, std.tolist(), strict=True))
-        )
+    def measured(self, names: tuple[str, ...], shift: Array, std: Array) -> Event:
+        """The same event with the change of each parameter (n,), and its standard deviation."""
+        shifts, stds = shift.tolist(), std.tolist()
+        return replace(self, shift=dict(zip(names, shifts, strict=True)), std=dict(zip(names, stds, strict=True)))
 
     @property
     def z(self) -> dict[str, float]:

@@ -18,11 +18,10 @@ from driftfit.run.result import Track
 from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.bank.layout import IMPOSSIBLE
 from driftfit.trackers.bank.reduction import Decide
-from driftfit.trackers.bank.results import dates
-from driftfit.trackers.bank.results.decided_path import EventSmoothed, measurements, steps_of
-from driftfit.trackers.bank.results.events import Event, Probabilities, all_of
+from driftfit.trackers.bank.results.events import LEVEL, Event, Probabilities, all_of, changes_of
 from driftfit.trackers.bank.results.mixture import Mixture, mixture_of, undecided
 from driftfit.trackers.bank.results.pictures import plot_hypotheses
+from driftfit.trackers.bank.results.smoothed import SmoothedMixture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -180,30 +179,45 @@ class Hypotheses:
         found = undecided(self.tracker, self.run, lane, loss)
         return [Decision(sample, last, event, prob) for sample, event, prob in found]
 
-    def smooth(self, threshold: float = 0.5) -> EventSmoothed:
-        """The path of the whole record given the events."""
-        return EventSmoothed(self.run, self.dated(threshold))
+    @cached_property
+    def smoothed(self) -> SmoothedMixture:
+        """The record smoothed over all hypotheses, given the faults of sensors that say nothing about theta."""
+        return SmoothedMixture(self.run, self.found())
 
     def events(self, threshold: float = 0.5) -> list[Event]:
         """Changes and sensor faults whose probability exceeds the threshold, sorted by time.
 
-        The change of each parameter is estimated by `smooth` from the whole record. If a change forgets or resets,
-        there is nothing to smooth, and it is not given.
+        Changes, their dates and sizes come from the whole record (`smoothed`), faults from the filter. Changes of a
+        bank in which one forgets or resets are as `found`, since there is nothing to smooth.
         """
-        found = self.dated(threshold)
-        if not any(event.kind == "change" for event in found) or any(c.forgets for c in self.tracker.all_changes):
-            return found
-        smoothed = EventSmoothed(self.run, found)
-        return [event.measured(smoothed) if event.kind == "change" and event.span.date else event for event in found]
-
-    def dated(self, threshold: float = 0.5) -> list[Event]:
-        """`found`, with the dates of changes estimated from all samples around them (module ``dates``)."""
         found = self.found(threshold)
-        if not any(event.kind == "change" for event in found):
+        if any(change.forgets for change in self.tracker.all_changes):
             return found
-        measured = measurements(self.run, found)
-        jumps = dict(zip(self.tracker.change_names, steps_of(self.run, measured), strict=True))
-        return self._timed(dates.dated(found, measured, jumps))
+        faults = [event for event in found if event.kind == "sensor"]
+        return sorted(faults + self._smoothed_changes(found, threshold), key=lambda event: event.span.date)
+
+    def changes(self, threshold: float = 0.5) -> list[Event]:
+        """`events` without the faults."""
+        return [event for event in self.events(threshold) if event.kind == "change"]
+
+    def _smoothed_changes(self, found: list[Event], threshold: float) -> list[Event]:
+        """Changes with their credible sets of dates, and when the filter knew of them."""
+        smoothed, W, last = self.smoothed, self.lags[-1] + 1, len(self.run) - 1
+        p, prior = (gathered(one, self.run.ok) for one in (smoothed.change_prob, smoothed.prior))
+        # no more likely than before the record was seen: at the end of a record, say
+        p = np.where(p[:, :1] < prior[:, :1], p, np.eye(1, p.shape[1]))
+        total = np.r_[np.zeros(W), np.cumsum(1.0 - p[:, 0])]
+        given = Probabilities(p, total[W:] - total[:-W], self.run.ok, W, self.tracker.change_names, ("nominal",))
+        known = [event.span for event in found if event.kind == "change"]
+        changes = []
+        for event in changes_of(given, threshold):
+            first, final = event.span.first, event.span.last
+            when = [span.known for span in known if first - W < span.date < final + W and span.known >= first]
+            span = event.span._replace(known=min(when, default=last))
+            changes.append(
+                replace(event, span=span, level=LEVEL).measured(smoothed.names, *smoothed.increment(first, final))
+            )
+        return self._timed(changes)
 
     def found(self, threshold: float = 0.5) -> list[Event]:
         """`events` at the time of their detection: with the dates of the leaves, and without shifts."""
@@ -277,3 +291,14 @@ class Hypotheses:
 def onsets(on: Array) -> Array:
     """Samples at which a condition begins to hold."""
     return np.flatnonzero(on & ~np.r_[False, on[:-1]])
+
+
+def gathered(p: Array, used: Array) -> Array:
+    """Probabilities (T, H_d) of changes with those at unused samples moved to the next one that was used."""
+    next_used = np.flatnonzero(used)
+    at = np.searchsorted(next_used, np.arange(len(p)))
+    to = next_used[np.minimum(at, len(next_used) - 1)] if len(next_used) else np.arange(len(p))
+    result = np.zeros_like(p)
+    np.add.at(result[:, 1:], to, p[:, 1:])
+    result[:, 0] = 1.0 - result[:, 1:].sum(axis=1)
+    return result

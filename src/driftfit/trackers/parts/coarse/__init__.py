@@ -1,1 +1,1 @@
-"""Coarse meters: what the errors of rounding of several readings have in common."""
+"""Coarse meters."""

@@ -13,8 +13,8 @@ collapses, and bands and likelihood with it. Therefore
                one, as long as the quantum is unknown
 
 and no tracker takes its noise variance to be below ``coarse``. That of a sample is r / w with its weight w; the least r
-is therefore ``coarse`` times the mean weight of the readings. `AdaptiveKalman` also treats readings that repeat as
-one rounding error observed several times (`lasting`). Readings of a fine sensor never repeat, and nothing changes for
+is therefore ``coarse`` times the mean weight of the readings. A bank also treats readings that repeat as one rounding
+error observed several times (`lasting`). Readings of a fine sensor never repeat, and nothing changes for
 them. If they do repeat, at a limit, at 0 while a pump is off, or because a value is held, the other steps have all
 sizes, and no step is frequent. A fine sensor that follows an input of a few levels has large steps and small ones, too:
 a grid needs three levels, mostly steps from one to the next, more of them than small ones, and innovations that show

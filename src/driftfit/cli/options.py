@@ -1,0 +1,273 @@
+"""The options of every command that reads data: files and columns, which part of them to use, model and tracker."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+from typer import Argument, Option
+
+from driftfit.cli.program import progress, writable
+from driftfit.cli.reading import (
+    Part,
+    Rows,
+    decimal_from,
+    interval_from,
+    limits_from,
+    listed,
+    parse_interval,
+    parse_units,
+    rows_from,
+    rows_of,
+    separator_from,
+)
+from driftfit.engine.settings import missing_settings
+from driftfit.models.arx import ARX
+from driftfit.models.base import Model
+from driftfit.parsing.settings import own_tracker, parse_model, parse_tracker
+from driftfit.trackers.base import Tracker
+
+Names = list[str] | None
+WRITTEN = {"write_to": "--out", "plot": "--plot", "system": "--system", "report": "--report"}
+"""Arguments of commands that are files to be written."""
+
+
+Own = Annotated[str | None, Option("--with", metavar="MODULE:CLASS", help="Your own tracker.")]
+Setting = Annotated[Names, Option("-p", help="Setting of the tracker; repeat it.")]
+Out = Annotated[Path | None, Option("--out", help="Write the result to .csv, .parquet or .npz (complete).")]
+Table = Annotated[Path | None, Option("--out", help="Write the result to .csv or .parquet.")]
+Plot = Annotated[Path | None, Option(help="Save a picture (.png, .pdf, .svg).")]
+Report = Annotated[Path | None, Option(help="Write a page (.html) to send to someone; a fleet has one page.")]
+
+
+def check_table(path: Path | None, what: str) -> None:
+    """ValueError for a file whose ending is not that of a table."""
+    if path is not None and path.suffix.lower() not in (".csv", ".parquet"):
+        raise ValueError(f"--out {path}: {what} written to .csv or .parquet.")
+
+
+@dataclass(frozen=True)
+class Given:
+    """The options that commands share, as given on the command line."""
+
+    file: Annotated[
+        list[str],
+        Argument(help="CSV files with a header line, or Parquet files, or patterns such as 'runs/*.csv'; - is stdin."),
+    ]
+    y: Annotated[
+        list[str],
+        Option(help="Column of the output; repeat it, or separate names by commas, for several (ARX, Regression)."),
+    ]
+    u: Annotated[Names, Option(help="Column of an input; repeat it, or separate names by commas.")] = None
+    model: Annotated[
+        Names,
+        Option(
+            help="Model and settings by position or name: arx:2,2,nk=1,intercept; one value per input with a slash: "
+            "arx:2,2/1,nk=0/1; regression:intercept; or as in Python: 'ARX(2, [2, 1])'. Default: arx:2,2,intercept, "
+            "without inputs arx:2,0,intercept."
+        ),
+    ] = None
+    tracker: Annotated[
+        str, Option(help="Tracker, as `driftfit trackers` lists them, or as in Python: 'Kalman(q=1e-4, r=0.1)'.")
+    ] = "adaptive-kalman"
+    p: Annotated[Names, Option("-p", help="Setting of the tracker: q=1e-4, q=1e-4,0,0 or p0=none; repeat it.")] = None
+    time: Annotated[str | None, Option(help="Column of the time: numbers or dates.")] = None
+    by: Annotated[
+        Names, Option(help="Column that identifies the series of a fleet, or `file`; repeat it for several.")
+    ] = None
+    unit: Annotated[Names, Option(help="Unit of a column: flow=l/min; repeat it.")] = None
+    own: Annotated[
+        str | None, Option("--with", metavar="MODULE:CLASS", help="Your own tracker, from a module in this folder.")
+    ] = None
+    dt: Annotated[
+        str | None,
+        Option(
+            help="Nominal interval: a number; for dates 10ms, 1s, 15min, 1h, 1d, 1w, 'business day', month, quarter, "
+            "year, or label if samples are one step apart whatever their dates."
+        ),
+    ] = None
+    first: Annotated[str | None, Option("--from", help="First time to use, with --time.")] = None
+    last: Annotated[str | None, Option("--to", help="Last time to use, with --time.")] = None
+    rows: Annotated[
+        str | None, Option(help="Rows to use of each file, counted from 1 after the header: 100:500, 100: or :500.")
+    ] = None
+    separator: Annotated[
+        str | None,
+        Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
+    ] = None
+    decimal: Annotated[
+        str | None, Option(help="Decimal sign of the numbers: . or , (by default the file shows it).")
+    ] = None
+    missing: Annotated[
+        Names, Option(help="What the file holds where there is no reading: Offline or -999; repeat it.")
+    ] = None
+    limits: Annotated[
+        Names, Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
+    ] = None
+    exclude: Annotated[
+        Names, Option(help="Interval to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
+    ] = None
+    gate: Annotated[
+        bool | None,
+        Option(
+            "--gate/--no-gate",
+            help="Leave out readings that look like fault codes, or use all. Default: as the tracker asks.",
+            show_default=False,
+        ),
+    ] = None
+    start: Annotated[
+        Path | None, Option(help="Continue from a saved run (.npz) or live state, with its model and tracker.")
+    ] = None
+
+    @property
+    def outputs(self) -> list[str]:
+        names = listed(self.y)
+        if not names:
+            raise ValueError("--y names no column.")
+        if len(set(names)) < len(names):
+            raise ValueError(f"--y {','.join(names)}: name each output once.")
+        return names
+
+    @property
+    def inputs(self) -> list[str]:
+        names = listed(self.u)
+        if both := [name for name in names if name in listed(self.y)]:
+            raise ValueError(
+                f"--u {both[0]}: this is the output, which would explain itself; its past is in arx models."
+            )
+        return names
+
+    def models(self) -> list[Model]:
+        """The models, each bound to the inputs."""
+        default = [f"arx:2,{2 if self.inputs else 0},intercept"]
+        found = [parse_model(text) for text in self.model or default]
+        several = len(found) > 1  # then one of them may have no inputs
+        alone = [model.shared or (several and isinstance(model, ARX) and model.nb == 0) for model in found]
+        return [model if one else model.bind(self.inputs) for model, one in zip(found, alone, strict=True)]
+
+    def chosen_tracker(self) -> Tracker:
+        return parse_tracker(self.tracker, self.p or [], self.own)
+
+    def part(self) -> Part:
+        """Which part of the files is used, and how the files are read."""
+        names = [*self.outputs, *self.inputs]
+        return Part(
+            first=self.first, last=self.last, rows=rows_from(self.rows),
+            separator=separator_from(self.separator), decimal=decimal_from(self.decimal),
+            missing=tuple(self.missing or []),
+            limits=tuple(limits_from(entry, names) for entry in self.limits or []),
+            exclude=tuple(map(interval_from, self.exclude or [])),
+        )  # fmt: skip
+
+    def signals(self, rows: Rows | None = None) -> dict[str, Any]:
+        """The arguments of `track` other than model and tracker; ``rows`` are the data if they were read already."""
+        outputs = self.outputs
+        if rows is None and (not self.part().whole or "-" in self.file):
+            rows = self.read()
+        data: Any = self.file if rows is None else rows.table(self.time, self.by or [])
+        signals = {"y": outputs if len(outputs) > 1 else outputs[0], "u": self.inputs, "data": data, "time": self.time}
+        signals |= {**self.part().restrictions(self.time is not None), "gate": self.gate}
+        units = {**({} if rows is None else rows.units), **parse_units(self.unit)}
+        return signals | {"by": self.by or None, "dt": parse_interval(self.dt), "units": units or None}
+
+    def read(self, *more: str) -> Rows:
+        """Read the selected part of the columns, and of ``more`` columns."""
+        return rows_of(self.file, [*self.outputs, *self.inputs, *more], self.time, self.by or [], self.part())
+
+    def run(self, rows: Rows | None = None, tracker: Tracker | None = None) -> Any:
+        """Run the configuration that the options describe: a Track, an Outputs or a fleet."""
+        from driftfit.tracking import track
+
+        model, chosen, before = self._begun()
+        if tracker is None and (missing := missing_settings(chosen)):
+            typed = " ".join(f"-p {name}=..." for name in missing)
+            names = ", ".join(missing)
+            raise ValueError(
+                f"--tracker {self.tracker}: {names} must be given: {typed}; `driftfit tune` estimates them from data."
+            )
+        signals: Any = self.signals(rows)
+        more: Any = {} if before is None else {"warm_start": before}
+        if before is not None and self.gate is None:
+            signals["gate"] = before.end().programs[0].gate or False
+        with progress.status("tracking"):
+            return track(model, tracker or chosen, **signals, **more)
+
+    def _begun(self) -> tuple[Model, Tracker, Any]:
+        """(model, tracker, run to continue or None); all three come from the saved run if there is one."""
+        models = self.models()
+        if len(models) > 1:
+            raise ValueError("--model: give one model; `driftfit select` compares several.")
+        if self.start is None:
+            return models[0], self.chosen_tracker(), None
+        if self.model or self.p or self.tracker != "adaptive-kalman":
+            raise ValueError(f"--start {self.start}: model and tracker come from the file; leave out --model, -p ...")
+        if self.by or len(self.outputs) > 1:
+            raise ValueError(f"--start {self.start}: the file holds one run of one output; leave out --by.")
+        before = saved(self.start, [own_tracker(self.own)] if self.own else [])
+        return before.model, before.tracker, before
+
+    def check_single(self, verb: str) -> None:
+        """Raise ValueError for several series or outputs."""
+        if self.by or len(self.outputs) > 1:
+            raise ValueError(f"{verb}: one series of one output at a time; leave out --by and further --y.")
+
+    def arrays(self) -> dict[str, Any]:
+        """One series in the form that `tune` and `select` take."""
+        if self.by or len(self.outputs) > 1 or self.start is not None:
+            raise ValueError("this command takes one series of one output; leave out --by, --start and further --y.")
+        signals = self.signals()
+        return {name: signals[name] for name in signals if name not in ("by", "units")}
+
+
+def saved(path: Path, classes: list[Any]) -> Any:
+    """Load a run, or the state of a stream, from a file; ``classes`` are those of the user's own that it may need."""
+    from driftfit.results import Track
+    from driftfit.streams import Live
+
+    try:
+        return Track.load(path, classes)
+    except ValueError as error:
+        if "state" not in str(error):
+            raise
+    return Live.load(path, classes)
+
+
+def reads(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command, whose first argument is a `Given`, all its options on the command line.
+
+    An argument that is a dataclass of options is replaced by its fields.
+    """
+    groups: dict[str, Any] = {}
+    options: list[inspect.Parameter] = []
+    for one in inspect.signature(command, eval_str=True).parameters.values():
+        if is_dataclass(one.annotation):
+            groups[one.name] = one.annotation
+            options += _options_of(one.annotation)
+        else:
+            options.append(one.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+
+    def run(**typed: Any) -> None:
+        for name, option in WRITTEN.items():
+            writable(typed.get(name), option)
+        grouped = {name: kind(**{f.name: typed.pop(f.name) for f in fields(kind)}) for name, kind in groups.items()}
+        command(**grouped, **typed)
+
+    vars(run)["__signature__"] = inspect.Signature(options)
+    run.__annotations__ = {one.name: one.annotation for one in options}
+    run.__name__, run.__doc__ = command.__name__, command.__doc__
+    return run
+
+
+def _options_of(group: Any) -> list[inspect.Parameter]:
+    """The options that the fields of a dataclass are."""
+    hints = get_type_hints(group, include_extras=True)
+    return [
+        inspect.Parameter(
+            f.name, inspect.Parameter.KEYWORD_ONLY, annotation=hints[f.name],
+            default=inspect.Parameter.empty if f.default is MISSING else f.default,
+        )
+        for f in fields(group)
+    ]  # fmt: skip

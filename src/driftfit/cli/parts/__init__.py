@@ -1,1 +1,0 @@
-"""Parts that several commands share: parsing arguments, reading data, reporting errors."""

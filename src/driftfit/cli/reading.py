@@ -1,0 +1,256 @@
+"""Read parts of files: ranges of rows and times, decimal commas, separators, stdin; valid ranges and exclusions.
+
+Rows are counted from 1 after the header, as in messages about cells, and ranges include both ends. Valid ranges and
+intervals are passed on unchanged (`driftfit.data.limits`).
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import timedelta
+from typing import Any, NamedTuple
+
+import numpy as np
+import polars as pl
+
+from driftfit.data.clock import Clock
+from driftfit.data.columns import Columns, Wanted, convert
+from driftfit.data.files import paths_of, read_file
+from driftfit.data.instants import EXAMPLES, dates, span
+from driftfit.data.limits import marks
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import near
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Part:
+    """Which part of the files is used, and how they are read."""
+
+    first: str | None = None
+    last: str | None = None
+    rows: tuple[int, int | None] = (1, None)
+    separator: str | None = None
+    decimal: str | None = None
+    missing: tuple[str, ...] = ()
+    limits: tuple[tuple[str, Range], ...] = ()
+    exclude: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def whole(self) -> bool:
+        """Whether the files are read without any restriction."""
+        return self == Part(limits=self.limits, exclude=self.exclude, missing=self.missing)
+
+    def restrictions(self, timed: bool) -> dict[str, Any]:
+        """limits=, exclude= and missing= of `track`; without time, intervals are rows, which `track` numbers from 0."""
+        exclude: list[tuple[Any, Any]] = list(self.exclude)
+        if not timed:
+            exclude = [(self._sample(first), self._sample(last)) for first, last in self.exclude]
+        return {"limits": dict(self.limits) or None, "exclude": exclude or None, "missing": self.missing}
+
+    def _sample(self, row: str) -> int:
+        """The sample of a row."""
+        if not row.isdigit():
+            raise ValueError(f"--exclude: without --time give an interval of rows, such as 100..120; got {row!r}.")
+        return int(row) - self.rows[0]
+
+
+class Rows(NamedTuple):
+    """The selected rows of all files: numbers (N,), times (N,) or None, and the columns that identify the series."""
+
+    numbers: dict[str, Array]
+    time: Array | None
+    zone: str | None
+    by: list[list[Any]]
+    units: Mapping[str, str]
+
+    def table(self, time: str | None, by: Sequence[str]) -> pl.DataFrame:
+        """The rows as a table that `track` reads."""
+        columns: dict[str, Any] = dict(self.numbers)
+        if time is not None and self.time is not None:
+            columns[time] = self.time
+        table = pl.DataFrame({**columns, **dict(zip(by, self.by, strict=True))})
+        if self.zone is not None and time is not None:
+            table = table.with_columns(pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(self.zone))
+        return table
+
+    def order(self) -> Array:
+        """Indices of the rows of a single series, sorted by time, with the first of several rows at the same time."""
+        if self.time is None:
+            return np.arange(len(next(iter(self.numbers.values()))))
+        order = np.argsort(self.time, kind="stable")
+        timeless = np.isnat(self.time) if self.time.dtype.kind == "M" else ~np.isfinite(self.time)
+        order = order[~timeless[order]]
+        again = np.append(False, self.time[order][1:] == self.time[order][:-1])
+        return np.asarray(order[~again])
+
+
+def limits_from(entry: str, names: Sequence[str]) -> tuple[str, Range]:
+    """``flow=0:80`` as a name and its range."""
+    name, _, bounds = entry.rpartition("=")
+    low, colon, high = bounds.partition(":")
+    try:
+        found = float(low or "-inf"), float(high or "inf")
+    except ValueError:
+        colon = ""
+    if not colon or not found[0] <= found[1]:
+        raise ValueError(f"--limits {entry}: give a valid range as column=low:high, such as --limits flow=0:80.")
+    if name.strip() not in names:
+        raise ValueError(f"--limits {entry}: no signal has the name {name.strip()!r}; {near(name.strip(), names)}")
+    return name.strip(), found
+
+
+def interval_from(entry: str, option: str = "--exclude") -> tuple[str, str]:
+    """``2024-03-01..2024-03-04`` as a pair of ends."""
+    first, dots, last = entry.partition("..")
+    if not (dots and first.strip() and last.strip()):
+        raise ValueError(f"{option} {entry}: give an interval as FROM..TO, such as {option} 2024-03-01..2024-03-04.")
+    return first.strip(), last.strip()
+
+
+def decimal_from(text: str | None) -> str | None:
+    """The decimal sign; None: the file shows it."""
+    if text not in (None, ".", ","):
+        raise ValueError(f"--decimal {text}: the decimal sign must be a point or a comma.")
+    return text
+
+
+def separator_from(text: str | None) -> str | None:
+    """The separator of cells, one character; None: it is detected."""
+    sign = "\t" if text in ("tab", "\\t") else text
+    if sign is not None and len(sign) != 1:
+        raise ValueError(f"--separator {text}: the separator must be one character, such as ';', or tab.")
+    return sign
+
+
+def rows_from(text: str | None) -> tuple[int, int | None]:
+    """``100:500`` as the first and the last row, None: to the end."""
+    if text is None:
+        return 1, None
+    first, colon, last = text.partition(":")
+    if not colon or not all(part.strip().isdigit() or not part.strip() for part in (first, last)):
+        raise ValueError(f"--rows {text}: rows are counted from 1, as in --rows 100:500, 100: or :500.")
+    a, b = int(first or 1), int(last) if last.strip() else None
+    if a < 1 or (b is not None and b < a):
+        raise ValueError(
+            f"--rows {text}: there are no such rows; rows are counted from 1, and the first must not be after the last."
+        )
+    return a, b
+
+
+def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Sequence[str], part: Part) -> Rows:
+    """Read columns of several files in the order of the files."""
+    if (part.first or part.last) and time is None:
+        raise ValueError("--from and --to are times, so they need --time; rows are chosen with --rows.")
+    wanted = Wanted(tuple(dict.fromkeys(names)), time, tuple(by), marks(part.missing)[0], part.separator, part.decimal)
+    read = [_one(path, wanted, part) for path in (["-"] if "-" in files else paths_of(list(files)))]
+    if len({one.time.dtype.kind for one in read if one.time is not None}) > 1:
+        raise ValueError("the times of some files are numbers, those of others are dates.")
+    found = Rows(
+        {name: np.concatenate([one.numbers[name] for one in read]) for name in wanted.numbers},
+        None if time is None else np.concatenate([one.time for one in read if one.time is not None]),
+        read[0].zone,
+        [[value for one in read for value in one.by[k]] for k in range(len(by))],
+        read[0].units,
+    )
+    return _between(found, part)
+
+
+def _one(path: str, wanted: Wanted, part: Part) -> Columns:
+    """The selected rows of one file."""
+    where = "stdin" if path == "-" else path
+    frame, units = read_file(sys.stdin.buffer.read() if path == "-" else path, wanted, where)
+    first, last = part.rows
+    if len(frame) < first:
+        raise ValueError(f"{where} has no row {first}.")
+    return replace(convert(frame, wanted, where, 1, slice(first - 1, last)), units=units)
+
+
+def _between(rows: Rows, part: Part) -> Rows:
+    """The rows between the first and the last time."""
+    if rows.time is None or (part.first is None and part.last is None):
+        return rows
+    axis = rows.time
+    keep = np.ones(len(axis), bool)
+    if part.first is not None:
+        keep &= axis >= moment(part.first, axis, rows.zone)
+    if part.last is not None:
+        keep &= axis <= moment(part.last, axis, rows.zone, end=True)
+    if not keep.any():
+        raise ValueError(f"no row is between --from {part.first or '...'} and --to {part.last or '...'}.")
+    by = [[value for value, kept in zip(column, keep.tolist(), strict=True) if kept] for column in rows.by]
+    numbers = {name: column[keep] for name, column in rows.numbers.items()}
+    return Rows(numbers, axis[keep], rows.zone, by, rows.units)
+
+
+def moment(text: str, axis: Array, zone: str | None, end: bool = False) -> Any:
+    """A time from text, of the kind of ``axis``: a number, or a date in its zone; ``end``: its day's last instant."""
+    if axis.dtype.kind != "M":
+        try:
+            return float(text)
+        except ValueError:
+            raise ValueError(f"{text!r} is not a number, but the times of the record are.") from None
+    text = text.strip()
+    if re.fullmatch(r"\d{4}", text):
+        text += "-12-31" if end else "-01-01"
+    elif (days := span(text)) is not None:
+        text, end = (str(days[1] - timedelta(1)), True) if end else (str(days[0]), False)
+    else:
+        end = end and ":" not in text
+    found = dates(pl.Series("time", [text]), "the command line")
+    if found.has_nulls():
+        raise ValueError(
+            f"{text!r} is not a date; write 2024-01-31, '2024-01-31 12:00:00', or a period as in {EXAMPLES}."
+        )
+    if zone is not None:
+        found = (
+            found.dt.replace_time_zone(zone, ambiguous="earliest")
+            .dt.convert_time_zone("UTC")
+            .dt.replace_time_zone(None)
+        )
+    instant = found.to_numpy()[0]
+    return instant + np.timedelta64(1, "D") - np.timedelta64(1, "us") if end else instant
+
+
+def listed(given: Sequence[str] | None) -> list[str]:
+    """Names that were given in several options, or separated by commas; one with a comma is quoted, as in a CSV file.
+
+    In a shell that is ``--u '"flow, cold",temperature'``. Blanks, parentheses and other signs need no quotes here.
+    """
+    try:
+        rows = [next(csv.reader([entry], skipinitialspace=True, strict=True), []) for entry in given or []]
+    except csv.Error:
+        raise ValueError(
+            f"{', '.join(given or [])}: a name with a comma is quoted as in a CSV file, in a shell as "
+            "--u '\"flow, cold\",temperature'."
+        ) from None
+    return [name.strip() for row in rows for name in row if name.strip()]
+
+
+def parse_units(given: Sequence[str] | None) -> dict[str, str]:
+    """``flow=l/min`` as a name and its unit."""
+    pairs = {entry: entry.rpartition("=") for entry in given or []}
+    for entry, (name, _, unit) in pairs.items():
+        if not name.strip() or not unit.strip():
+            raise ValueError(f"--unit {entry}: give a unit as column=unit, such as --unit flow=l/min.")
+    return {name.strip(): unit.strip() for name, _, unit in pairs.values()}
+
+
+def parse_interval(text: str | None) -> float | str | None:
+    """``0.5`` as a number; a duration or a step of the calendar as text, in which ``m`` after a number is minutes."""
+    if text is None:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        given = re.sub(r"(\d\s*)m\s*$", r"\1min", text)
+    try:
+        Clock.of(given)
+    except ValueError as error:
+        raise ValueError(f"--dt {text}: {error}") from None
+    return given

@@ -1,1 +1,0 @@
-"""Formulas of models, from text or from plain Python functions."""

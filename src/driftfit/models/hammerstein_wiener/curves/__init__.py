@@ -1,1 +1,0 @@
-"""Static curves of Hammerstein-Wiener blocks: bases and their compiled functions."""

@@ -1,1 +1,0 @@
-"""Results of a Hammerstein-Wiener run: blocks, free runs, diagnostics, plots."""

@@ -1,1 +1,0 @@
-"""Separation: the parameters of the blocks from the products of stage one."""

@@ -1,1 +1,0 @@
-"""Trackers of the minimal parameters of a Hammerstein-Wiener model."""

@@ -1,1 +1,0 @@
-"""Lags in regressors: past outputs that are missing, and those that are doubted."""

@@ -1,0 +1,427 @@
+"""The smoother of mixtures: a random walk whose drift follows a Markov chain, with events and a mixture of noises.
+
+    theta_t = theta_{t-1} + w_t,   w_t ~ N(0, Q of the move),   P(move to mode s' with event e | mode s) = p
+    y_t = phi_t' theta_t + v_t,    v_t ~ N(offset_l, r_t factor_l) with the probability of noise l in mode s
+
+One filter goes forwards through p(theta_t, s_t | y_1 .. y_t), another backwards through p(y_t .. y_T | theta_t, s_t).
+Both are sums of Gaussians (`driftfit.smooth.parts.components`) and run the same routine. Between t and t + 1 they meet,
+
+    p(theta_t, i, m, j | y)  proportional to  F_i(theta_t) p_m integral N(w; 0, Q_m) B_j(theta_t + w) dw
+
+for all components i and j and moves m. This gives the moments of the mixture, the probabilities of the events, and how
+far theta moved. The sum over all of them is the evidence at every t. Where it is not constant the reductions have lost
+a hypothesis that counts, and the record is smoothed again with more components there.
+
+Source: Kitagawa (1994), "The two-filter formula for smoothing and an implementation of the Gaussian-sum smoother".
+Cost: O(K^2 M n^3) per sample for K components and M moves. Memory: that of the result, and the components of `BLOCK`
+samples; the filter runs again from checkpoints.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, Driver, shared
+from driftfit.smooth.parts.components import (
+    COST,
+    LOG,
+    MODE,
+    MOVE,
+    ROOMY,
+    SHARE,
+    UNLIKELY,
+    Filter,
+    Moves,
+    Noises,
+    Room,
+    absorb,
+    grow,
+    log_det,
+    lowered,
+    moments,
+    observe,
+    reduce,
+    room_for,
+)
+from driftfit.smooth.parts.rank import column_sizes
+
+BLOCK = 1000
+"""Samples between checkpoints."""
+MOST = 48
+"""Components that are kept at most, where the evidence is not constant; `ROOMY` elsewhere."""
+NEAR = 25
+"""Samples to either side of such a place that get more components."""
+CONSTANT = 0.2
+"""Change of the log evidence from one sample to the next that is accepted."""
+VAGUE = 1e-11
+"""Information on theta outside the record, as a share of the root of that in one sample."""
+
+
+class Alternatives(NamedTuple):
+    """What may happen between two samples: M moves between S modes."""
+
+    source: Array
+    target: Array
+    event: Array
+    """(M,): modes before and after, and the event, 0 for none."""
+    log_prob: Array
+    """(U, M): U tables of log probabilities; those out of a mode sum to 1. At the first sample all is in mode 0."""
+    roots: Array
+    """(k, n, n): upper triangles G with G G' the covariance."""
+    which: Array
+    """(M, 2): the roots of the drift and of the event; -1 for none."""
+    column: Array
+    """(M, 2): which column of ``Problem.sizes`` multiplies either."""
+
+    def first(self) -> Array:
+        """(U, E): the probabilities of the events out of mode 0."""
+        probs = np.zeros((len(self.log_prob), self.event.max() + 1))
+        for move in np.flatnonzero(self.source == 0):
+            probs[:, self.event[move]] += np.exp(self.log_prob[:, move])
+        return probs
+
+    def moves(self, scale: Array, back: bool = False) -> Moves:
+        """The same in one direction of time, for theta multiplied by ``scale``."""
+        source, target = (self.target, self.source) if back else (self.source, self.target)
+        order, modes = np.argsort(source, kind="stable"), max(source.max(), target.max()) + 1
+        begin = np.searchsorted(source[order], np.arange(modes + 1))
+        kind = np.column_stack([target, self.event, self.which, self.column])[order].astype(np.int64)
+        return Moves(begin, kind, np.ascontiguousarray(self.log_prob[:, order]), self.roots * scale[:, None])
+
+
+class Problem(NamedTuple):
+    """T samples of a regression of n parameters, and what may happen between them."""
+
+    phi: Array
+    """(T, n), finite."""
+    y: Array
+    r: Array
+    """(T,): noise variance; inf for samples that are not used."""
+    alternatives: Alternatives
+    table: Array
+    """(T,): which table of probabilities holds before each sample."""
+    sizes: Array
+    """(T, C): factors of the roots before each sample."""
+    start: Array
+    """(k, n + 1): information before the first sample, rows theta = value of variance 1."""
+    noises: Noises
+
+
+class Mixture(NamedTuple):
+    """The moments of the mixture given the whole record."""
+
+    theta: Array
+    cov: Array
+    """(T, n), and variances (T, n) or covariances (T, n, n)."""
+    events: Array
+    """(T, E): probabilities of the events between t - 1 and t, event 0 first."""
+    shift: Array
+    shift_var: Array
+    """(T, n): mean and variance of theta_t - theta_{t-1} if there was an event other than 0."""
+    evidence: Array
+    """(T,): log evidence as computed at each sample, without the constant of a start without information."""
+    kept: Array
+    """(T,): how many components were allowed."""
+
+    @property
+    def uneven(self) -> Array:
+        """(T,) bool: whether the evidence differs from that of the next sample, so that a hypothesis was lost."""
+        return np.append(np.abs(np.diff(self.evidence)) > CONSTANT, False)
+
+
+class Samples(NamedTuple):
+    """A block of samples for a pass, and the moves before them, or after them backwards."""
+
+    phi: Array
+    y: Array
+    r: Array
+    table: Array
+    sizes: Array
+    keep: Array
+
+
+class Stored(NamedTuple):
+    """The components of the filter after each sample of a block."""
+
+    A: Array
+    facts: Array
+    many: Array
+    """(b - a,): their number."""
+    level: Array
+    """(b - a + 1,): logs of the factors taken out of the components, before and after each sample."""
+
+
+@shared
+def join(mean: Array, cov: Array, share: float, m: Array, R: Array, d: Array) -> None:
+    """The moments of a mixture, with one more component N(m, R R') of this share."""
+    n = len(m)
+    for i in range(n):
+        d[i] = m[i] - mean[i]
+    for i in range(n):
+        mean[i] += share * d[i]
+        for j in range(i + 1):
+            t = 0.0
+            for k in range(i, n):
+                t += R[i, k] * R[j, k]
+            cov[i, j] += share * (t + (1.0 - share) * d[i] * d[j] - cov[i, j])
+            cov[j, i] = cov[i, j]
+
+
+@shared
+def step(
+    A: Array, move: Array, roots: Array, sizes: Array, work: Array, share: float, out: Array, row: Array
+) -> None:  # fmt: skip
+    """The same for the change w of a move, from the posterior N(m, R R') of theta before it and the likelihood A:
+
+    E w = Q S' (d - S m),   Var w = Q - Q S' S Q + (R' S' S Q)' (R' S' S Q)
+    """
+    n = len(A)
+    R, m, Q, V, shift, shift_var = work[1, :, :n], work[1, :, n], work[2], work[3], out[n + 1], out[n + 2]
+    for i in range(n):
+        for j in range(n):
+            Q[i, j] = 0.0
+    for which in range(2):
+        G, size = move[2 + which], sizes[move[4 + which]]
+        if G >= 0:
+            for i in range(n):
+                for j in range(n):
+                    for k in range(max(i, j), n):
+                        Q[i, j] += size * size * roots[G, i, k] * roots[G, j, k]
+    for i in range(n):
+        row[i] = A[i, n]
+        for j in range(i, n):
+            row[i] -= A[i, j] * m[j]
+        for j in range(n):
+            V[i, j] = 0.0
+            for k in range(i, n):
+                V[i, j] += A[i, k] * Q[k, j]
+    for j in range(n):
+        mean, var = 0.0, Q[j, j]
+        for i in range(n):
+            mean += V[i, j] * row[i]
+            var -= V[i, j] * V[i, j]
+        for k in range(n):
+            z = 0.0  # row k of R' S' V
+            for i in range(n):
+                t = 0.0
+                for q in range(i, k + 1):
+                    t += A[i, q] * R[q, k]
+                z += t * V[i, j]
+            var += z * z
+        d = mean - shift[j]
+        shift[j] += share * d
+        shift_var[j] += share * (max(var, 0.0) + (1.0 - share) * d * d - shift_var[j])
+
+
+@shared
+def meet(
+    X: Array, facts: Array, C: int, moves: Moves, sizes: Array, room: Room, out: Array, events: Array
+) -> float:  # fmt: skip
+    """All pairs of K components of the filter and C children of the components after them.
+
+    Adds the probabilities of events to ``events``; the rows of ``out`` become the mean, those of the covariance, and
+    mean and variance of the change at an event. Returns the log of the sum of all pairs.
+    """
+    K, Y, more, row, work = len(X), room.children.A, room.children.facts, room.row, room.squares
+    n, top, total, moved = X.shape[1], -np.inf, 0.0, 0.0
+    W, R, m, mean, cov = work[0], work[1, :, :n], work[1, :, n], out[0], out[1 : n + 1]
+    for i in range(n + 3):
+        for j in range(n):
+            out[i, j] = 0.0
+    for f in range(K):
+        for k in range(C):
+            ahead = max(facts[f, LOG] - facts[f, SHARE], more[k, LOG] - more[k, SHARE])
+            c = facts[f, LOG] + more[k, LOG]
+            if facts[f, MODE] != more[k, MODE] or c - ahead < top - UNLIKELY:
+                continue
+            for i in range(n):
+                for j in range(i, n + 1):
+                    W[i, j] = X[f, i, j]
+            for q in range(n):
+                for j in range(n + 1):
+                    row[j] = Y[k, q, j] if j >= q else 0.0
+                e = absorb(W, row)
+                c -= 0.5 * e * e
+                if c - ahead < top - UNLIKELY:
+                    break
+            c -= log_det(W)
+            if c < top - UNLIKELY:
+                continue
+            w = np.exp(c - top)
+            if c > top:
+                scale = np.exp(top - c)
+                total, moved, top, w = total * scale, moved * scale, c, 1.0
+                for e in range(len(events)):
+                    events[e] *= scale
+            moments(W, R, m)
+            total += w
+            join(mean, cov, w / total, m, R, row)
+            label, at = int(moves.kind[int(more[k, MOVE]), 1]), int(more[k, MOVE])
+            events[label] += w
+            if label > 0:
+                moved += w
+                step(Y[k], moves.kind[at], moves.roots, sizes, work, w / moved, out, row)
+    for e in range(len(events)):
+        events[e] /= total
+    return float(top + np.log(total))
+
+
+@Driver
+def forwards(
+    samples: Samples, moves: Moves, noises: Noises, now: Filter, stored: Stored, room: Room, store: bool
+) -> None:  # fmt: skip
+    """The filter through a block of samples, whose components are stored if ``store`` says so."""
+    phi, y, r, table, sizes, keep = samples
+    K = now.many[0]
+    stored.level[0] = now.level[0]
+    for t in range(len(y)):
+        C = grow(K, now, moves, moves.log_prob[table[t]], sizes[t], room)
+        if r[t] < np.inf:
+            C = observe(C, room, phi[t], y[t], r[t], noises)
+        K = reduce(C, room, keep[t], now)
+        now.level[0] += lowered(K, now.facts)
+        if store:
+            stored.many[t], stored.level[t + 1] = K, now.level[0]
+            stored.A[t, :K], stored.facts[t, :K] = now.A[:K], now.facts[:K]
+    now.many[0] = K
+
+
+@Driver
+def backwards(
+    samples: Samples, moves: Moves, noises: Noises, now: Filter, stored: Stored, room: Room, last: bool, found: Mixture
+) -> None:  # fmt: skip
+    """The likelihood through a block, and where it meets the filter; ``last``: the record ends with the block."""
+    phi, y, r, table, sizes, keep = samples
+    K, n, wide = now.many[0], phi.shape[1], found.cov.shape[2]
+    out = np.zeros((n + 3, n))
+    for t in range(len(y) - 1, -1, -1):
+        if last and t == len(y) - 1:
+            C = K
+            room.children.A[:K], room.children.facts[:K] = now.A[:K], now.facts[:K]
+        else:
+            C = grow(K, now, moves, moves.log_prob[table[t]], sizes[t], room)
+        X, facts = stored.A[t, : stored.many[t]], stored.facts[t]
+        total = meet(X, facts, C, moves, sizes[t], room, out, found.events[t])
+        found.evidence[t] = stored.level[t + 1] + now.level[0] + total
+        found.theta[t], found.shift[t], found.shift_var[t] = out[0], out[n + 1], out[n + 2]
+        for i in range(n):
+            for j in range(wide if wide > 1 else 0):
+                found.cov[t, i, j] = out[1 + i, j]
+            found.cov[t, i, min(i, wide - 1)] = out[1 + i, i]
+        if r[t] < np.inf:
+            C = observe(C, room, phi[t], y[t], r[t], noises)
+        K = reduce(C, room, keep[t], now)
+        now.level[0] += lowered(K, now.facts)
+    now.many[0] = K
+
+
+def smooth(problem: Problem, covariances: bool = False, kept: Array | None = None) -> Mixture:
+    """Smooth a record; with ``covariances`` of every sample, and otherwise variances.
+
+    ``kept`` (T,) says how many components another smoother of the record needed, with which this one begins.
+
+    Where the evidence is not constant, twice as many components are allowed, up to `MOST`; see `Mixture.uneven`.
+    """
+    keep = np.full(len(problem.y), ROOMY) if kept is None else kept
+    while True:
+        found = Passes(problem, keep).smoothed(covariances)
+        more = keep.copy()
+        for t in np.flatnonzero(found.uneven):
+            near = slice(max(t - NEAR, 0), t + NEAR)
+            more[near] = np.minimum(2 * keep[near], MOST)
+        if np.array_equal(more, keep):
+            return found
+        keep = more
+
+
+def filtered(problem: Problem, keep: int) -> tuple[float, float]:
+    """The log evidence, and the expected sum of e_t^2 / s_t, from a filter with this number of components."""
+    passes = Passes(problem, np.full(len(problem.y), keep))
+    passes.forward()
+    facts = passes.ahead.facts[: passes.ahead.many[0]]
+    weight = np.exp(facts[:, SHARE])
+    evidence = passes.ahead.level[0] + np.log(weight.sum()) + passes.constant
+    return float(evidence), float(weight @ facts[:, COST] / weight.sum())
+
+
+class Passes:
+    """The two filters over one record, in units in which columns of regressors have unit size."""
+
+    def __init__(self, problem: Problem, keep: Array) -> None:
+        phi, r, noises = problem.phi, problem.r, problem.noises
+        self.problem, self.keep, used = problem, keep, np.isfinite(r)
+        T, n = phi.shape
+        S, most = len(noises.log_prob), max(int(keep.max()), len(noises.log_prob))
+        self.constant = -0.5 * used.sum() * np.log(2.0 * np.pi)
+        self.scale = column_sizes(phi[used]) if used.any() else np.ones(n)
+        self.ways = [problem.alternatives.moves(self.scale, back) for back in (False, True)]
+        children = max(int(np.diff(way.begin).max()) for way in self.ways) * len(noises.kind)
+        self.room = room_for(n, most, children)
+        scaled, now, after = phi / self.scale, np.arange(T), np.append(np.arange(1, T), 0)
+        self.samples = [
+            Samples(scaled, problem.y, r, problem.table[at], problem.sizes[at], keep) for at in (now, after)
+        ]
+        unit = VAGUE / np.sqrt(np.median(r[used])) if used.any() else VAGUE
+        end, rows = unit * np.eye(n, n + 1), problem.start / np.append(self.scale, 1.0)
+        self.ahead, self.behind = (
+            Filter(np.zeros((most, n, n + 1)), np.zeros((most, 5)), np.full(1, many), np.zeros(1)) for many in (1, S)
+        )
+        self.ahead.A[0] = triangle(np.vstack([rows, end]))
+        size = np.sum(np.log(np.diag(self.ahead.A[0])))
+        self.ahead.facts[0, LOG], self.ahead.facts[0, SHARE] = (size, 0.0) if len(rows) >= n else (0.0, -size)
+        self.behind.A[:S] = end
+        self.behind.facts[:S, MODE], self.behind.facts[:S, SHARE] = np.arange(S), -n * np.log(unit)
+        size = min(T, BLOCK)
+        self.stored = Stored(
+            np.zeros((size, most, n, n + 1)), np.zeros((size, most, 5)), np.zeros(size, np.int64), np.zeros(size + 1)
+        )
+
+    def _block(self, a: int, which: int) -> Samples:
+        return Samples(*(values[a : a + BLOCK] for values in self.samples[which]))
+
+    def _forward(self, a: int, store: bool) -> None:
+        forwards(self._block(a, 0), self.ways[0], self.problem.noises, self.ahead, self.stored, self.room, store)
+
+    def forward(self) -> list[Filter]:
+        """The filter over the record; its components before every block. Those of the last block are stored."""
+        places = []
+        for a in range(0, len(self.keep), BLOCK):
+            places.append(Filter(*(values.copy() for values in self.ahead)))
+            self._forward(a, a + BLOCK >= len(self.keep))
+        return places
+
+    def smoothed(self, covariances: bool) -> Mixture:
+        """Both passes."""
+        T, n = self.problem.phi.shape
+        E = int(self.problem.alternatives.event.max()) + 1
+        found = Mixture(
+            np.empty((T, n)), np.empty((T, n, n if covariances else 1)), np.zeros((T + 1, E)), np.zeros((T + 1, n)),
+            np.zeros((T + 1, n)), np.empty(T), self.keep,
+        )  # fmt: skip
+        for a, place in reversed([*zip(range(0, T, BLOCK), self.forward(), strict=True)]):
+            here, after = slice(a, min(a + BLOCK, T)), slice(a + 1, min(a + BLOCK, T) + 1)
+            if here.stop < T:
+                for values, before in zip(self.ahead, place, strict=True):
+                    values[:] = before
+                self._forward(a, True)
+            part = Mixture(
+                found.theta[here], found.cov[here], found.events[after], found.shift[after], found.shift_var[after],
+                found.evidence[here], found.kept[here],
+            )  # fmt: skip
+            samples, last = self._block(a, 1), here.stop == T
+            backwards(samples, self.ways[1], self.problem.noises, self.behind, self.stored, self.room, last, part)
+        found.events[0] = np.eye(1, E)
+        scale = self.scale
+        return Mixture(
+            found.theta / scale, found.cov / np.outer(scale, scale) if covariances else found.cov[:, :, 0] / scale**2,
+            found.events[:T], found.shift[:T] / scale, found.shift_var[:T] / scale**2, found.evidence + self.constant,
+            self.keep,
+        )  # fmt: skip
+
+
+def triangle(rows: Array) -> Array:
+    """[S | d] of at least n rows [phi | y]."""
+    R = np.asarray(np.linalg.qr(rows, mode="r"))[: rows.shape[1] - 1]
+    return np.triu(R * np.where(np.diag(R) < 0.0, -1.0, 1.0)[:, None])

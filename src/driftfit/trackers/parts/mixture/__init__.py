@@ -1,0 +1,1 @@
+"""The mixture of random-walk filters of the default tracker."""

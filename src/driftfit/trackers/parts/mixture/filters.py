@@ -1,0 +1,442 @@
+"""A bank of Kalman filters that differ in how the parameters drift: forecast, correction and interaction.
+
+    e_k = y - x' m_k,     g_k = C_k x,     h_k = x' g_k,     s_kj = h_k + v_kj
+    p_kj  proportional to c_k nu_j t(e_k; s_kj)
+    a_k = sum_j p_(j|k) / s_kj,    d_k = sum_j p_(j|k) (1 / s_kj - a_k)^2
+    m_k   <- m_k + g_k a_k e_k,        C_k <- C_k - g_k g_k' (a_k - d_k e_k^2)
+
+with c_k and nu_j the probabilities of mode k and of state j of the noise (`driftfit.trackers.parts.mixture.noise`), and
+t the normal density, or Student's while the noise variance rests on few samples. Modes are merged by their moments
+after every sample, c_j = sum_i mu_i T_ij. T moves a mode up or down its ladder, from the foot of a ladder to rest, and
+leads from the whole bank to mode j with the same small probability a_j, so that it costs O(K) instead of O(K^2):
+
+    T_ij = kappa (a_j + up_i [j above i]) + down_i [j below i],   the rest stays
+
+kappa, the rate of changes relative to what is usual, is the share of the expected jumps that were left behind by a
+later sample:  kappa = (EVENTS + sum_t sum_j down_j mu_tj) / (EVENTS + sum_t sum_j a_j),  j over the modes of jumps.
+
+The filters use coordinates z = M theta of their start, in which the regressor is x (`driftfit.trackers.parts
+.coordinates`). A regressor in a direction that no earlier one has determined is used by all filters, and does not
+change their probabilities.
+
+Source: interacting multiple models are Blom and Bar-Shalom (1988); ladders and transitions are ours. Cost per sample:
+O(K n^2) for K modes.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from driftfit.engine.kernel import State, exp, kernel, log
+from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
+from driftfit.trackers.parts.covariance import LEFT
+from driftfit.trackers.parts.mixture.modes import COMMON, FIRST_ALONE, FIRST_LEARNED
+from driftfit.trackers.parts.mixture.noise import STATES, variance_in
+from driftfit.trackers.parts.mixture.rows import least_of_row, sum_of_row
+
+EVENTS, RAREST, OFTENEST, SPAN = 3.0, 0.05, 3.0, 2e4
+"""Jumps that the prior of their rate counts for, its bounds, and its memory in samples."""
+FADING, BEND = 0.05, 0.1
+"""Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""
+FLOOR = 0.002
+"""Share of the common drift in the learned one."""
+STUDENT = 60.0
+"""Samples from which on Student's density is taken for normal."""
+UNSURE = 4.5
+"""The covariance that is reported is that of the mixture times 1 + this over the square root of the number of samples,
+because the probabilities of the filters, and r, are estimates."""
+LEAST = 1e-100
+"""Probability that a mode is never below."""
+
+
+@partial(kernel, inline=False)
+def walks(s: State, l: int) -> None:
+    """The common drift and the learned one in the coordinates z, for a ratio of 1 and r = 1."""
+    n, k = s.parameters[l], s.constant[l]
+    for a in range(n):
+        s.away[1, a, l] = 0.0
+        for b in range(a + 1):
+            s.walk[0, a, b, l], s.walk[1, a, b, l] = 0.0, 0.0
+    for i in range(n):
+        root = 1.0 / np.sqrt(s.c[i, l]) if s.c[i, l] > 0.0 else 0.0
+        own = s.weight[i, l] * root * root
+        rows = i + 1 if s.offset[i, l] == 0.0 else max(i, k) + 1  # S is triangular
+        for a in range(rows):
+            s.away[0, a, l] = s.S[a, i, l] - (s.offset[i, l] * s.S[a, k, l] if s.offset[i, l] != 0.0 else 0.0)
+            s.away[1, a, l] += s.S[a, i, l] * s.direction[i, l] * root
+            for b in range(a + 1):
+                s.walk[0, a, b, l] += s.drift_unit[i, l] * s.away[0, a, l] * s.away[0, b, l]
+                s.walk[1, a, b, l] += own * s.S[a, i, l] * s.S[b, i, l]
+    for a in range(n):
+        for b in range(a + 1):
+            s.walk[1, a, b, l] += FLOOR * s.walk[0, a, b, l] + s.away[1, a, l] * s.away[1, b, l]
+
+
+@partial(kernel, inline=False)
+def wander(s: State, size: float, l: int) -> None:
+    """Drift of all filters by ``size`` times their ratios."""
+    n = s.parameters[l]
+    walks(s, l)
+    for a in range(n):
+        for b in range(a + 1):
+            moved = size * s.walk[0, a, b, l]
+            for k in range(FIRST_LEARNED):
+                s.C[a, b, k, l] += s.ratio[k, l] * moved
+            moved = size * s.walk[1, a, b, l]
+            for k in range(FIRST_LEARNED, FIRST_ALONE):
+                s.C[a, b, k, l] += s.ratio[k, l] * moved
+    for i in range(n):
+        first, own = s.alone[i, l], size / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        for a in range(i + 1 if first >= 0 else 0):
+            for b in range(a + 1):
+                moved = own * s.S[a, i, l] * s.S[b, i, l]
+                for k in range(first, first + s.rungs[l]):
+                    s.C[a, b, k, l] += s.ratio[k, l] * moved
+
+
+@kernel
+def widest_jumps(s: State, l: int) -> None:
+    """The largest jumps may move the output by as much as it varies, however small the noise, and by as much as an
+    outlier was off in the sample before: it may have been the first one after a jump."""
+    ratio = max(COMMON[-1], max(s.spread[l], s.outlier[l] * s.e[l] * s.e[l]) / s.r[l])
+    s.ratio[len(COMMON) - 1, l] = ratio
+    for k in range(FIRST_ALONE + s.rungs[l] - 1, s.modes[l], s.rungs[l]):
+        s.ratio[k, l] = ratio
+
+
+@kernel
+def predict(s: State, l: int) -> None:
+    """Drift and trends of the time since the last sample."""
+    if s.settled[l] > 0 and s.dt[l] > 0.0:
+        widest_jumps(s, l)
+        wander(s, s.r[l] * s.dt[l] * s.drift[l], l)
+        time = s.dt[l] * min(s.drift[l], 1.0)
+        for j in range(s.trend.shape[1]):
+            k = len(COMMON) + j
+            fading = 1.0 / (1.0 + FADING * np.sqrt(s.ratio[k, l]) * time)
+            for i in range(s.parameters[l]):
+                s.m[i, k, l] += time * s.trend[i, j, l]
+                s.trend[i, j, l] *= fading
+
+
+@partial(kernel, inline=False)
+def project(s: State, l: int) -> None:
+    """x' m, g and h of every filter."""
+    n, K = s.parameters[l], s.modes[l]
+    for k in range(K):
+        s.e_k[k, l] = 0.0
+        s.h_k[k, l] = 0.0
+    for i in range(n):
+        for k in range(K):
+            s.e_k[k, l] += s.x[i, l] * s.m[i, k, l]
+            s.gain[i, k, l] = 0.0
+        for j in range(i + 1):
+            for k in range(K):
+                s.gain[i, k, l] += s.C[i, j, k, l] * s.x[j, l]
+        for j in range(i + 1, n):
+            for k in range(K):
+                s.gain[i, k, l] += s.C[j, i, k, l] * s.x[j, l]
+        for k in range(K):
+            s.h_k[k, l] += s.x[i, l] * s.gain[i, k, l]
+    for i in range(n):
+        for k in range(K):  # below 0: an absurd sample left no digits of C, and no gain can be trusted
+            s.gain[i, k, l] = s.gain[i, k, l] if s.h_k[k, l] >= 0.0 else 0.0
+    for k in range(K):
+        s.h_k[k, l] = max(s.h_k[k, l], 0.0)
+
+
+@partial(kernel, inline=False)
+def innovate(s: State, l: int) -> None:
+    """Innovation of every filter, and prediction and variance of the mixture before the sample."""
+    K = s.modes[l]
+    project(s, l)
+    for k in range(K):
+        s.e_k[k, l] += s.explained[l]
+        s.row[k, l] = s.prior[k, l] * s.e_k[k, l]
+    mean = sum_of_row(s, l)
+    for k in range(K):  # the band is for samples at which no jump begins
+        p = s.prior[k, l] - (s.kappa[l] * s.arrive[k, l] if s.ratio[k, l] >= 1.0 else 0.0)
+        s.row[k, l] = max(p, 0.0) * (s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2)
+    v = sum_of_row(s, l) + s.vague[l]
+    quiet, restless = variance_in(s, 0, l), s.nu_prior[1, l] / (1.0 - s.outlying[l])
+    v += quiet * exp(restless * log(variance_in(s, 1, l) / quiet))  # their arithmetic mean is that of rare large noise
+    for k in range(K):
+        s.e_k[k, l] = s.y[l] - s.e_k[k, l]
+    s.y_hat[l] = mean
+    s.e[l] = s.y[l] - mean
+    s.s[l] = v
+
+
+@partial(kernel, inline=False)
+def likelihoods(s: State, more: float, l: int) -> float:
+    """joint[j, k] = c_k nu_j times the density, relative to that of the nearest, of which e^2 / s is returned.
+
+    ``more`` is added to the variance of the noise.
+    """
+    K, few = s.modes[l], s.count[l]
+    for k in range(K):
+        s.row[k, l] = np.inf
+    for j in range(STATES):
+        noise = variance_in(s, j, l) + more
+        widest = np.inf if j == STATES - 1 else 0.0
+        for k in range(K):
+            square = s.e_k[k, l] * s.e_k[k, l]
+            v = 1.0 / (s.h_k[k, l] + max(noise, min(square, widest)))
+            s.inverse[j, k, l] = v
+            s.joint[j, k, l] = square * v
+            s.row[k, l] = min(s.row[k, l], square * v)
+    nearest = least_of_row(s, l)
+    if few > STUDENT:
+        for j in range(STATES):
+            for k in range(K):
+                p = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(s.inverse[j, k, l])
+                s.joint[j, k, l] = p * exp(-0.5 * (s.joint[j, k, l] - nearest))
+    else:
+        base = 1.0 / (1.0 + nearest / few)
+        for j in range(STATES):
+            for k in range(K):
+                p = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(s.inverse[j, k, l])
+                s.joint[j, k, l] = p * exp(-0.5 * (few + 1.0) * log((1.0 + s.joint[j, k, l] / few) * base))
+    return nearest  # type: ignore[no-any-return]
+
+
+@partial(kernel, inline=False)
+def predictive_density(s: State, nearest: float, l: int) -> None:
+    """The log density of the sample under its prediction, with a Cauchy tail for outliers, which integrates to 1."""
+    K, few = s.modes[l], s.count[l]
+    noise = variance_in(s, STATES - 1, l) + s.vague[l]
+    for k in range(K):
+        v = s.h_k[k, l] + noise
+        s.row[k, l] = s.prior[k, l] * s.nu_prior[STATES - 1, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
+    tail = log(sum_of_row(s, l) / np.pi)
+    for k in range(K):
+        s.row[k, l] = s.joint[0, k, l] + s.joint[1, k, l]
+    body, height = sum_of_row(s, l), -0.5 * nearest
+    if few <= STUDENT:
+        x = 0.25 / few
+        height = log(1.0 - x + 0.5 * x * x) - 0.5 * (few + 1.0) * log(1.0 + nearest / few)
+    body = log(body / np.sqrt(2.0 * np.pi)) + height if body > 0.0 else -np.inf
+    s.density[l] = tail + log(1.0 + exp(body - tail)) if body < tail else body + log(1.0 + exp(tail - body))
+
+
+@partial(kernel, inline=False)
+def weigh(s: State, more: float, l: int) -> None:
+    """Joint probabilities of modes and states of the noise after the sample, and its density before it.
+
+    ``more`` is the variance of rounding that repeats; ``s.vague`` is that of lags that the model doubts.
+    """
+    K = s.modes[l]
+    nearest = likelihoods(s, s.vague[l], l)
+    predictive_density(s, nearest, l)
+    if more > 0.0:
+        likelihoods(s, s.vague[l] + more, l)
+    for k in range(K):
+        s.row[k, l] = s.joint[0, k, l] + s.joint[1, k, l] + s.joint[2, k, l]
+    share = 1.0 / sum_of_row(s, l)
+    for k in range(K):
+        # at 0 a mode that only such modes lead to would have no mixture at all
+        s.mu[k, l] = max(s.row[k, l] * share, LEAST)
+    for j in range(STATES):
+        for k in range(K):
+            s.joint[j, k, l] *= share
+            s.row[k, l] = s.joint[j, k, l]
+        s.nu[j, l] = sum_of_row(s, l)
+    s.outlier[l] = s.nu[STATES - 1, l]
+    # an outlier says nothing about the state of ordinary noise
+    for j in range(STATES - 1):
+        s.nu[j, l] += s.nu[STATES - 1, l] * s.nu_prior[j, l] / (1.0 - s.outlying[l])
+
+
+@partial(kernel, inline=False)
+def absorb(s: State, l: int) -> None:
+    """The rank-one update: m + g step, C - curve g g'."""
+    n, K = s.parameters[l], s.modes[l]
+    for i in range(n):
+        for k in range(K):
+            s.m[i, k, l] += s.gain[i, k, l] * s.step[k, l]
+        for j in range(i):
+            for k in range(K):
+                s.C[i, j, k, l] -= s.curve[k, l] * s.gain[i, k, l] * s.gain[j, k, l]
+        for k in range(K):
+            left = s.C[i, i, k, l] - s.curve[k, l] * s.gain[i, k, l] * s.gain[i, k, l]
+            s.C[i, i, k, l] = max(left, LEFT * s.C[i, i, k, l])
+
+
+@partial(kernel, inline=False)
+def update_filters(s: State, l: int) -> None:
+    """Each filter takes the sample with the states of its noise merged."""
+    for k in range(s.modes[l]):
+        p, q, o = s.joint[0, k, l], s.joint[1, k, l], s.joint[2, k, l]
+        u, v, w = s.inverse[0, k, l], s.inverse[1, k, l], s.inverse[2, k, l]
+        part = 1.0 / s.mu[k, l]
+        a = part * (p * u + q * v + o * w)
+        spread = max(part * (p * u * u + q * v * v + o * w * w) - a * a, 0.0)
+        s.step[k, l] = a * s.e_k[k, l]
+        s.curve[k, l] = a - spread * s.e_k[k, l] * s.e_k[k, l]
+        s.row[k, l] = s.mu[k, l] * a
+    s.precision[l] = sum_of_row(s, l)
+    absorb(s, l)
+    for j in range(s.trend.shape[1]):
+        k = len(COMMON) + j
+        share = BEND * np.sqrt(s.ratio[k, l]) * s.step[k, l]
+        for i in range(s.parameters[l]):
+            s.trend[i, j, l] += share * s.gain[i, k, l]
+
+
+@kernel
+def outgrown(s: State, l: int) -> int:
+    """The coordinate on which this sample carries `OUTGROWN` times as much information as all earlier ones, or -1."""
+    others = variance_in(s, 0, l)
+    for j in range(s.parameters[l]):
+        own = s.x[j, l] * s.x[j, l] * s.C[j, j, 0, l]
+        if own > OUTGROWN * others:
+            return j
+        others += own
+    return -1
+
+
+@partial(kernel, short=True)
+def enter_filters(s: State, j: int, l: int) -> None:
+    """Row j of M becomes the rest of phi. The other coordinates take the sample as always, unless nothing was known of
+    z_j; then z_j = y - sum_{i<j} x_i z_i - v, which is correlated with them also by v.
+    """
+    n, K, fresh = s.parameters[l], s.modes[l], s.S[j, j, l] == 0.0
+    noise = variance_in(s, 0, l) + s.vague[l]
+    for k in range(K):
+        s.curve[k, l] = 0.0 if fresh or s.h_k[k, l] == 0.0 else 1.0 / (s.h_k[k, l] + noise)
+        s.step[k, l] = s.curve[k, l] * s.e_k[k, l]
+        s.mu[k, l] = s.prior[k, l]
+    absorb(s, l)
+    sign = new_row(s, s.white, j, l)
+    for t in range(s.trend.shape[1]):
+        s.trend[j, t, l] = 0.0
+    for i in range(j, n):
+        s.x[i, l] = 0.0
+    for k in range(K):
+        left = noise * s.curve[k, l]  # r / s, the share of the innovation that is noise
+        mean, own = s.y[l] - s.explained[l] - left * s.e_k[k, l], noise * (1.0 - left)
+        for i in range(n):
+            mean -= s.x[i, l] * s.m[i, k, l]
+            if i != j:
+                row = left * s.gain[i, k, l]
+                for b in range(j):
+                    row -= s.x[b, l] * s.C[max(i, b), min(i, b), k, l]
+                own -= s.x[i, l] * (row + left * s.gain[i, k, l])
+                s.C[max(i, j), min(i, j), k, l] = sign * row
+        s.m[j, k, l] = sign * mean
+        s.C[j, j, k, l] = own
+    s.density[l] = -0.5 * (log(2.0 * np.pi * s.s[l]) + s.e[l] * s.e[l] / s.s[l])
+
+
+@partial(kernel, inline=False)
+def mixture(s: State, l: int) -> None:
+    """Mean d of the filters, and the covariance of theta that is reported; without a sample d keeps its bits."""
+    n, K = s.parameters[l], s.modes[l]
+    for i in range(n):
+        for k in range(K):
+            s.row[k, l] = s.mu[k, l] * s.m[i, k, l]
+        mean = sum_of_row(s, l)
+        s.d[i, l] = mean if s.ok[l] > 0.0 else s.d[i, l]
+        for j in range(i + 1):
+            for k in range(K):
+                away = (s.m[i, k, l] - s.d[i, l]) * (s.m[j, k, l] - s.d[j, l])
+                s.row[k, l] = s.mu[k, l] * (s.C[i, j, k, l] + away)
+            s.Z[0, i, j, l] = sum_of_row(s, l)
+            s.P[i, j, l] = s.Z[0, i, j, l]
+    in_units_of_theta(s, l)
+    wide = 1.0 + UNSURE / np.sqrt(max(s.count[l], 1.0))
+    for i in range(n):
+        for j in range(i + 1):
+            s.P[i, j, l] *= wide
+        s.var[i, l] = s.P[i, i, l]
+
+
+@kernel
+def find_shares(s: State, l: int) -> None:
+    """Prior probabilities of the next sample, and of what comes before it: the mode, all modes, and in ``curve`` and
+    ``step`` those below and above."""
+    K, kappa = s.modes[l], s.kappa[l]
+    leave = kappa * s.arrivals[l]
+    for k in range(K):
+        s.share[0, k, l] = s.mu[k, l] * (1.0 - leave - kappa * s.up[k, l] - s.down[k, l] - s.foot[k, l])
+        s.share[1, k, l] = kappa * s.arrive[k, l]
+        s.share[2, k, l] = s.mu[k, l] * s.foot[k, l]
+        s.curve[k, l] = 0.0
+        s.step[k, l] = 0.0
+        s.row[k, l] = s.share[2, k, l]
+    rests = sum_of_row(s, l)
+    for k in range(1, K):
+        s.curve[k, l] = s.mu[k - 1, l] * kappa * s.up[k - 1, l]
+    for k in range(K - 1):
+        s.step[k, l] = s.mu[k + 1, l] * s.down[k + 1, l]
+    for k in range(K):
+        s.prior[k, l] = (s.share[0, k, l] + s.curve[k, l]) + (s.step[k, l] + s.share[1, k, l])
+    s.prior[0, l] += rests
+    for k in range(K):
+        part = 1.0 / s.prior[k, l]
+        s.share[0, k, l] *= part
+        s.curve[k, l] *= part
+        s.step[k, l] *= part
+        s.share[1, k, l] *= part
+    part = 1.0 / s.prior[0, l]
+    for k in range(K):
+        s.share[2, k, l] *= part
+
+
+@kernel
+def learn_rate(s: State, l: int) -> None:
+    """kappa, from the jumps that later samples have left behind."""
+    for k in range(s.modes[l]):
+        s.row[k, l] = s.mu[k, l] * (s.down[k, l] + s.foot[k, l]) if s.ratio[k, l] >= 1.0 else 0.0
+    fade = 1.0 - 1.0 / SPAN
+    s.left_behind[l] = fade * s.left_behind[l] + sum_of_row(s, l)
+    s.jumps_expected[l] = fade * s.jumps_expected[l] + s.jumping[l]
+    s.kappa[l] = min(OFTENEST, max(RAREST, (EVENTS + s.left_behind[l]) / (EVENTS + s.jumps_expected[l])))
+
+
+@partial(kernel, inline=False)
+def mix(s: State, l: int) -> None:
+    """Interaction: every filter continues from the mixture of its predecessors.
+
+    Means are taken relative to that of the mixture, d, so that moments may be added before the mean is subtracted.
+    """
+    n, K = s.parameters[l], s.modes[l]
+    learn_rate(s, l)
+    find_shares(s, l)
+    for a in range(n):  # what comes to rest
+        for k in range(K):
+            s.m[a, k, l] -= s.d[a, l]
+            s.row[k, l] = s.share[2, k, l] * s.m[a, k, l]
+        s.away[0, a, l] = sum_of_row(s, l)
+        for b in range(a + 1):
+            for k in range(K):
+                s.row[k, l] = s.share[2, k, l] * (s.C[a, b, k, l] + s.m[a, k, l] * s.m[b, k, l])
+            s.Z[1, a, b, l] = sum_of_row(s, l)
+    s.row[0, l], s.row[K + 1, l] = 0.0, 0.0
+    for a in range(n):
+        for k in range(K):
+            s.row[k + 1, l] = s.m[a, k, l]
+        for k in range(K):
+            s.gain[a, k, l] = s.share[0, k, l] * s.row[k + 1, l] + (
+                s.curve[k, l] * s.row[k, l] + s.step[k, l] * s.row[k + 2, l]
+            )
+        s.gain[a, 0, l] += s.away[0, a, l]
+        for b in range(a + 1):
+            for k in range(K):
+                s.row[k + 1, l] = s.C[a, b, k, l] + s.m[a, k, l] * s.m[b, k, l]
+            for k in range(K):
+                near = s.curve[k, l] * s.row[k, l] + s.step[k, l] * s.row[k + 2, l]
+                far = s.share[1, k, l] * s.Z[0, a, b, l] - s.gain[a, k, l] * s.gain[b, k, l]
+                s.C[a, b, k, l] = s.share[0, k, l] * s.row[k + 1, l] + (near + far)
+            s.C[a, b, 0, l] += s.Z[1, a, b, l]
+    for a in range(n):
+        for k in range(K):
+            s.m[a, k, l] = s.d[a, l] + s.gain[a, k, l]
+        before = 0.0
+        for j in range(s.trend.shape[1]):
+            k, here = len(COMMON) + j, s.trend[a, j, l]
+            ahead = s.trend[a, min(j + 1, s.trend.shape[1] - 1), l]
+            s.trend[a, j, l] = s.share[0, k, l] * here + s.curve[k, l] * before + s.step[k, l] * ahead
+            before = here

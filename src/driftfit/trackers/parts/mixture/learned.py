@@ -1,0 +1,362 @@
+"""What the bank learns beside theta: scales and means of the regressors, colour of the noise, covariance of the drift.
+
+The drift covariance Q, in units of r / (c_i c_j)^(1/2), is estimated from the scores of the disturbance smoother. With
+P the drift that the bank assumes, and e, 1 / s and k the innovation, its inverse variance and the gain of the mixture,
+a backward pass over the last samples gives
+
+    u <- phi (e / s - k' u) + u,        N <- phi phi' / s + (I - phi k') N (I - k phi')
+    E(u u' - N + N P N) = N Q N
+
+Sums B of the left side, and M of N, that fade from pass to pass, determine the leading direction a of Q, from the
+largest l_1 of the l with B a = l M a; sums of the squares of N its diagonal q >= 0, by non-negative least squares. The
+bank drifts with (1 - w) diag(q) + w a a', w = l_1 / sum max(l, 0), both of largest entry 1.
+
+Beside an intercept, inputs whose mean is more than three deviations from 0 drift about their means:  U = sum_i d_i d_i'
+/ v_i,  d_i = e_i - (m_i / m_k) e_k,  with k the constant column. An input without mean and the same input with an
+offset of any size thus have the same drift.
+
+Coloured noise, y_t = phi_t' theta + v_t + c v_(t-1), is taken out by regressors phi* = phi - c phi*_(t-1) and outputs
+y - c y*_(t-1); c is estimated by weighted least squares on the derivative of the prediction, bounded and shrunk.
+
+Source: scores are Koopman and Shephard's (1992); recursive maximum likelihood for c is Soderstrom's (1973), see Ljung
+and Soderstrom (1983), section 3.7; the estimates from them are ours. Cost per sample: O(n^2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, State, cubes, kernel, machine, shared
+from driftfit.trackers.parts.excitation import DULL, LARGE, MEMORY
+from driftfit.trackers.parts.mixture.filters import FLOOR
+from driftfit.trackers.parts.mixture.modes import FIRST_ALONE, FIRST_LEARNED
+from driftfit.trackers.parts.mixture.rows import sum_of_row
+
+BLOCK, WINDOW = 50, 100
+"""Samples between two passes, and samples of a pass."""
+FADE = 0.97
+"""Factor of the sums at every pass."""
+SWEEPS, ROTATIONS = 30, 6
+"""Sweeps over the parameters for the diagonal, and over pairs of them for the eigenvectors."""
+ROUNDED = 1e-6
+"""Added to the diagonal of M, relative to it."""
+LONG = 1000.0
+"""Memory of the variance of a regressor that rests, in samples."""
+FAR = 9.0
+"""Square of the mean of a regressor, in units of its variance, from which on it drifts about the mean."""
+STILL = 1e-24
+"""Variance of a column, as a share of its mean square, below which it counts as constant: it may be rounding."""
+E, PRECISION, PHI = range(3)
+"""Entries of a stored sample before its regressor: the innovation over its variance, and the inverse variance, both in
+units of r."""
+ASSUMED, SLOPE, WEIGHT, DIRECTION, SCORE, SHIFT, A, B, M, N, T, V = range(12)
+"""Rows (n,) of the estimation: the diagonal of P, the right side, q, a, u, N k; then those of the sums of squares, of
+B, of M, of N and of two scratch matrices by turns."""
+COLOUR_FADE, SHRUNK, BOUND, MOST, GAP = 0.995, 5.0, 2.0, 0.95, 1.5
+"""Fading of the sums for c; the square of its t value up to which noise is white; the bound of innovations in standard
+deviations; the largest c; and the interval that separates a sample from its past."""
+
+
+def nothing_learned(n: int) -> dict[str, Any]:
+    """Fields before the first sample."""
+    return {
+        "mean": np.zeros(n), "variance": np.zeros(n), "long_variance": np.zeros(n), "moved": np.zeros(n),
+        "middle": 0.0, "spread": 0.0, "readings": 0.0, "constant": -1, "drift_unit": np.zeros(n), "offset": np.zeros(n),
+        "samples": np.zeros((WINDOW, PHI + n)), "gains": np.zeros((WINDOW, n)), "remembered": 0, "assumed": np.zeros(n),
+        "sums": np.zeros((A + 6 * n, n)), "weight": np.ones(n), "direction": np.zeros(n),
+        "white": np.zeros(n), "past": np.zeros(n), "past_y": 0.0, "explained": 0.0, "colour": 0.0, "psi": 0.0,
+        "colour_scores": np.zeros(3),
+    }  # fmt: skip
+
+
+@kernel
+def learn_means(s: State, l: int) -> None:
+    """Means and variances of the regressors, and the drift of each: 1 / v_i and m_i / m_k, or 1 / c_i and 0."""
+    s.readings[l] += s.ok[l]
+    share = s.ok[l] / min(max(s.readings[l], 1.0), LONG)
+    away = s.y[l] - s.middle[l]
+    s.middle[l] += share * away
+    s.spread[l] += share * ((1.0 - share) * away * away - s.spread[l])
+    constant = -1
+    for i in range(s.parameters[l]):
+        off = s.phi[i, l] - s.mean[i, l]
+        own = s.variance[i, l]
+        moves = (s.moved[i, l] < 1.0) | (off * off > DULL * own * s.noise[l])
+        s.moved[i, l] += s.ok[l] if moves else 0.0
+        share = s.ok[l] / min(max(s.moved[i, l], 1.0), MEMORY) if moves else 0.0
+        s.mean[i, l] += share * off
+        square = off * (s.phi[i, l] - s.mean[i, l]) / s.noise[l]
+        most = LARGE * own if s.moved[i, l] > 10.0 else np.inf
+        s.variance[i, l] += share * (min(square, most) - own)
+        slowly = s.ok[l] / min(max(s.moved[i, l], 1.0), LONG)
+        s.long_variance[i, l] += slowly * (s.variance[i, l] - s.long_variance[i, l])
+        constant = i if (s.variance[i, l] <= STILL * s.c[i, l]) & (s.mean[i, l] != 0.0) else constant
+    s.constant[l] = constant
+    for i in range(s.parameters[l]):
+        v = max(s.variance[i, l], s.long_variance[i, l])
+        far = (s.mean[i, l] ** 2 > FAR * s.variance[i, l]) & (v > STILL * s.c[i, l])
+        beside = (constant >= 0) & (i != constant) & far
+        s.drift_unit[i, l] = 1.0 / v if beside else 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        s.offset[i, l] = s.mean[i, l] / s.mean[constant, l] if beside else 0.0
+
+
+@kernel
+def whiten_noise(s: State, l: int) -> None:
+    """The regressor phi* and the known part of y."""
+    c = s.colour[l] if s.dt[l] <= GAP else 0.0
+    s.explained[l] = c * s.past_y[l]
+    for i in range(s.theta.shape[0]):
+        s.white[i, l] = s.phi[i, l] - c * s.past[i, l]
+
+
+@kernel
+def learn_colour(s: State, weighed: float, l: int) -> None:
+    """Update c, and store the past of the next sample; s.theta is still the prediction. An outlier is no past."""
+    c, v = s.colour[l] if s.dt[l] <= GAP else 0.0, s.past_y[l]
+    ordinary = weighed * (1.0 - s.outlier[l])
+    for i in range(s.theta.shape[0]):
+        v -= s.past[i, l] * s.theta[i, l]
+        s.past[i, l] = ordinary * s.white[i, l]
+    s.past_y[l] = ordinary * (s.y[l] - s.explained[l])
+    psi = (v - c * s.psi[l]) if s.dt[l] <= GAP else 0.0
+    share = ordinary * min(1.0, s.noise[l] * s.r[l] / s.s[l]) if weighed > 0.0 else 0.0
+    weight = share / s.s[l] if share > 0.0 else 0.0
+    bound = BOUND * np.sqrt(s.s[l]) if share > 0.0 else 0.0
+    slope, e = max(-bound, min(bound, psi)), max(-bound, min(bound, s.e[l])) if share > 0.0 else 0.0
+    a = COLOUR_FADE * s.colour_scores[0, l] + weight * slope * slope
+    b = COLOUR_FADE * s.colour_scores[1, l] + weight * slope * (e + c * slope)
+    v = COLOUR_FADE * s.colour_scores[2, l] + weight * share * slope * slope
+    s.colour_scores[0, l], s.colour_scores[1, l], s.colour_scores[2, l] = a, b, v
+    s.psi[l] = ordinary * psi
+    square = b * b / v if v > 0.0 else 0.0
+    known = b / a * (1.0 - SHRUNK / square) if square > SHRUNK else 0.0
+    s.colour[l] = max(-MOST, min(MOST, known))
+
+
+def colour(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
+    """The line of the summary about coloured noise; none where innovations are white."""
+    c = float(lane["colour"])
+    return (("Coloured noise", f"v + {c:.2g} v of the sample before; the previous innovation is used"),) if c else ()
+
+
+@shared
+def step_back(past: Array, gains: Array, at: int, t: Array) -> None:
+    """One backward step of u and N."""
+    n = t.shape[1]
+    move, more = past[at, E], past[at, PRECISION]
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += t[N + 6 * i, j] * gains[at, j]
+        t[SHIFT, i] = total
+    for i in range(n):
+        move -= gains[at, i] * t[SCORE, i]
+        more += gains[at, i] * t[SHIFT, i]
+    for i in range(n):
+        x = past[at, PHI + i]
+        t[SCORE, i] += x * move
+        for j in range(i + 1):
+            other = past[at, PHI + j]
+            t[N + 6 * i, j] += x * other * more - x * t[SHIFT, j] - t[SHIFT, i] * other
+            t[N + 6 * j, i] = t[N + 6 * i, j]
+
+
+@shared
+def look_back(past: Array, gains: Array, newest: int, t: Array) -> None:
+    """Add the sums of the older half of the window."""
+    n = t.shape[1]
+    for i in range(n):
+        t[SCORE, i] = 0.0
+        t[SLOPE, i] *= FADE
+        for j in range(n):
+            t[A + 6 * i, j] *= FADE
+            t[B + 6 * i, j] *= FADE
+            t[M + 6 * i, j] *= FADE
+            t[N + 6 * i, j], t[T + 6 * i, j] = 0.0, 0.0
+    for back in range(WINDOW):
+        step_back(past, gains, (newest + WINDOW - back) % WINDOW, t)
+        if back >= WINDOW - BLOCK:
+            for i in range(n):
+                t[SLOPE, i] += t[SCORE, i] * t[SCORE, i] - t[N + 6 * i, i]
+                for j in range(n):
+                    square = t[N + 6 * i, j] * t[N + 6 * i, j]
+                    t[A + 6 * i, j] += square
+                    t[SLOPE, i] += square * t[ASSUMED, j]
+                    t[B + 6 * i, j] += t[SCORE, i] * t[SCORE, j] - t[N + 6 * i, j]
+                    t[T + 6 * i, j] += t[N + 6 * i, j]
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(n):
+                total += t[T + 6 * i, k] * t[ASSUMED, k] * t[T + 6 * k, j]
+            t[B + 6 * i, j] += total / BLOCK
+            t[M + 6 * i, j] += t[T + 6 * i, j]
+
+
+@shared
+def diagonal(t: Array) -> None:
+    """q by non-negative least squares, largest entry 1."""
+    n, most = t.shape[1], 0.0
+    for i in range(n):
+        t[WEIGHT, i] = 0.0
+    for _ in range(SWEEPS):
+        for i in range(n):
+            rest = t[SLOPE, i]
+            for j in range(n):
+                rest -= t[A + 6 * i, j] * t[WEIGHT, j]
+            t[WEIGHT, i] = max(0.0, t[WEIGHT, i] + rest / (t[A + 6 * i, i] + 1e-300))
+    for i in range(n):
+        most = max(most, t[WEIGHT, i])
+    for i in range(n):
+        t[WEIGHT, i] = t[WEIGHT, i] / most if (most > 0.0) & (most < np.inf) else 1.0
+
+
+@shared
+def whitened(t: Array) -> None:
+    """N <- L^-1 B L^-T with L L' = M, in the unit of M's diagonal; T <- L."""
+    n = t.shape[1]
+    for j in range(n):
+        for i in range(j, n):
+            left = t[M + 6 * i, j] * (1.0 + ROUNDED if i == j else 1.0)
+            for k in range(j):
+                left -= t[T + 6 * i, k] * t[T + 6 * j, k]
+            if i == j:
+                t[T + 6 * j, j] = np.sqrt(left) if left > 0.0 else 0.0
+            else:
+                t[T + 6 * i, j] = left / t[T + 6 * j, j] if t[T + 6 * j, j] > 0.0 else 0.0
+    for i in range(n):
+        for j in range(n):
+            t[N + 6 * i, j] = t[B + 6 * i, j]
+    for side in range(2):
+        for c in range(n):
+            for i in range(n):
+                total = t[N + 6 * i, c] if side == 0 else t[N + 6 * c, i]
+                for k in range(i):
+                    total -= t[T + 6 * i, k] * (t[N + 6 * k, c] if side == 0 else t[N + 6 * c, k])
+                total = total / t[T + 6 * i, i] if t[T + 6 * i, i] > 0.0 else 0.0
+                if side == 0:
+                    t[N + 6 * i, c] = total
+                else:
+                    t[N + 6 * c, i] = total
+
+
+@shared
+def rotate(t: Array, p: int, q: int) -> None:
+    """One rotation of Jacobi's, after which N_pq is 0; V collects them."""
+    n, off = t.shape[1], t[N + 6 * p, q]
+    if off * off <= 1e-30 * abs(t[N + 6 * p, p] * t[N + 6 * q, q]):
+        return
+    ratio = 0.6 * (t[N + 6 * q, q] - t[N + 6 * p, p]) / off
+    tangent = (1.0 if ratio >= 0.0 else -1.0) / (abs(ratio) + np.sqrt(1.0 + ratio * ratio))
+    cosine = 1.0 / np.sqrt(1.0 + tangent * tangent)
+    sine = tangent * cosine
+    for k in range(n):
+        u, v = t[N + 6 * k, p], t[N + 6 * k, q]
+        t[N + 6 * k, p], t[N + 6 * k, q] = cosine * u - sine * v, sine * u + cosine * v
+    for k in range(n):
+        u, v = t[N + 6 * p, k], t[N + 6 * q, k]
+        t[N + 6 * p, k], t[N + 6 * q, k] = cosine * u - sine * v, sine * u + cosine * v
+        u, v = t[V + 6 * k, p], t[V + 6 * k, q]
+        t[V + 6 * k, p], t[V + 6 * k, q] = cosine * u - sine * v, sine * u + cosine * v
+
+
+@shared
+def turn(t: Array) -> None:
+    """The leading direction a, and its share of the positive eigenvalues."""
+    n, best, positive, largest = t.shape[1], 0, 0.0, 0.0
+    for i in range(n):
+        for j in range(n):
+            t[V + 6 * i, j] = 1.0 if i == j else 0.0
+    for _ in range(ROTATIONS):
+        for p in range(n):
+            for q in range(p + 1, n):
+                rotate(t, p, q)
+    for i in range(n):
+        positive += max(t[N + 6 * i, i], 0.0)
+        best = i if t[N + 6 * i, i] > t[N + 6 * best, best] else best
+    for back in range(n):
+        i = n - 1 - back
+        total = t[V + 6 * i, best]
+        for k in range(i + 1, n):
+            total -= t[T + 6 * k, i] * t[DIRECTION, k]
+        t[DIRECTION, i] = total / t[T + 6 * i, i] if t[T + 6 * i, i] > 0.0 else 0.0
+        largest = max(largest, abs(t[DIRECTION, i]))
+    sound = (t[N + 6 * best, best] > 0.0) & (positive < np.inf) & (largest > 0.0) & (largest < np.inf)
+    share = t[N + 6 * best, best] / positive if sound else 0.0
+    for i in range(n):
+        t[DIRECTION, i] = np.sqrt(share) * t[DIRECTION, i] / largest if sound else 0.0
+        t[WEIGHT, i] *= 1.0 - share
+
+
+@partial(machine, short=True)
+def machine_drift(past: int, gains: int, newest: int, sums: int, n: int, L: int, l: int) -> None:
+    """A pass for lane l of L, from the addresses of fields."""
+    t = cubes(sums, A + 6 * n, n, L)[:, :, l]
+    look_back(cubes(past, WINDOW, PHI + n, L)[:, :, l], cubes(gains, WINDOW, n, L)[:, :, l], newest, t)
+    diagonal(t)
+    whitened(t)
+    turn(t)
+
+
+@partial(kernel, inline=False)
+def remember(s: State, at: int, l: int) -> None:
+    """Store a sample that the filters used, in units of r and c."""
+    n, K = s.parameters[l], s.modes[l]
+    for k in range(K):
+        s.row[k, l] = s.mu[k, l] * s.step[k, l]
+    e = sum_of_row(s, l)
+    for i in range(n):
+        for k in range(K):
+            a = s.joint[0, k, l] * s.inverse[0, k, l] + s.joint[1, k, l] * s.inverse[1, k, l]
+            s.row[k, l] = s.gain[i, k, l] * (a + s.joint[2, k, l] * s.inverse[2, k, l])
+        s.away[0, i, l] = sum_of_row(s, l)
+    for i in range(n):
+        gain, unit = 0.0, np.sqrt(s.c[i, l])
+        for j in range(i, n):
+            gain += s.R[i, j, l] * s.away[0, j, l]
+        s.samples[at, PHI + i, l] = s.white[i, l] / unit if unit > 0.0 else 0.0
+        s.gains[at, i, l] = gain * unit
+    s.samples[at, E, l] = e * np.sqrt(s.r[l])
+    s.samples[at, PRECISION, l] = s.precision[l] * s.r[l]
+    together = 0.0
+    for k in range(FIRST_LEARNED):
+        together += s.mu[k, l] * s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0
+    scaled = 0.0
+    for k in range(FIRST_LEARNED, FIRST_ALONE):
+        scaled += s.mu[k, l] * s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0
+    for i in range(n):
+        own = together + scaled * (s.weight[i, l] + FLOOR + s.direction[i, l] * s.direction[i, l])
+        first = s.alone[i, l]
+        for k in range(first, first + s.rungs[l] if first >= 0 else first):
+            own += s.mu[k, l] * s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0
+        s.assumed[i, l] += own / BLOCK
+
+
+@partial(kernel, short=True)
+def end_block(s: State, newest: int, l: int) -> None:
+    """A pass over the last samples, and the drift that the filters take from it."""
+    n, L = s.d.shape
+    for i in range(n):
+        s.sums[ASSUMED, i, l] = s.assumed[i, l]
+        s.assumed[i, l] = 0.0
+    machine_drift(s.samples.ctypes.data, s.gains.ctypes.data, newest, s.sums.ctypes.data, n, L, l)
+    for i in range(n):
+        s.weight[i, l], s.direction[i, l] = s.sums[WEIGHT, i, l], s.sums[DIRECTION, i, l]
+
+
+@partial(kernel, inline=False)
+def learn_drift(s: State, l: int) -> None:
+    """Store a sample, and update the drift covariance at the end of a block."""
+    at = s.remembered[l] % WINDOW
+    remember(s, at, l)
+    s.remembered[l] += 1
+    if s.remembered[l] % BLOCK == 0:
+        if s.remembered[l] >= WINDOW:
+            end_block(s, at, l)
+        else:
+            for i in range(s.parameters[l]):
+                s.assumed[i, l] = 0.0

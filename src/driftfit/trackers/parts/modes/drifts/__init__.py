@@ -1,1 +1,0 @@
-"""Kinds of drift of the filters, besides the common and the single ladder."""

@@ -1,0 +1,141 @@
+"""The blocks of a run or of its smoothed path: theta separated by a method, or the tracker's minimal parameters."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import one_of
+from driftfit.models.hammerstein_wiener.blocks import Blocks, deviations
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.separation import METHODS, Groups, LeastSquares, split
+from driftfit.run.program import lanes_of
+
+if TYPE_CHECKING:
+    from driftfit.run.result import Track
+
+BLOCK = 512
+"""Number of samples whose covariances are in memory at a time."""
+WEAK = 1e-3
+"""If 1 / |(1, c)| is below this, the first coefficient is close to zero relative to the others, and a bad gauge."""
+
+
+def blocks_of(
+    run: Track,
+    method: str = "svd-joint",
+    input: str | None = None,
+    output: str = "d1",
+    at: float = 0.0,
+    smoothed: tuple[Array, Callable[[], Array]] | None = None,
+) -> Blocks:
+    """The blocks of a run, see `Track.blocks`; or of its ``smoothed`` theta (T, n), whose covariances (T, n, n) are
+    computed if the method needs them.
+    """
+    model = run.model
+    if not isinstance(model, HammersteinWiener):
+        raise ValueError(f"blocks: {type(model).__name__} has no blocks; use a HammersteinWiener model.")
+    one_of("blocks", "method", method, METHODS)
+    theta = run.theta if smoothed is None else smoothed[0]
+    if run.names == model.structure.minimal_names:
+        found = _of_minimal(run, model)
+    elif method == "gls":
+        found = _by_least_squares(run, model, theta, covariances(run) if smoothed is None else [(0, smoothed[1]())])
+    else:
+        a, b, c, d, quality = split(model, theta, method)
+        none = Groups(*(np.full(part.shape, np.nan) for part in (a, b, c, d)))
+        found = Blocks(model, method, a, b, c, d, quality, none, _intercept(model, theta))
+    _warn(found, run, theta, input)
+    return found.gauge(found.gauged[0] if input is None else input, output, at)
+
+
+def _intercept(model: HammersteinWiener, theta: Array) -> Array | None:
+    return theta[:, -1].copy() if model.intercept else None
+
+
+def _warn(found: Blocks, run: Track, theta: Array, input: str | None) -> None:
+    """Warn of separations that are not reliable."""
+    used, n = int(run.ok.sum()), run.model.n
+    if used < n:
+        warnings.warn(
+            f"blocks: {used} usable samples cannot determine {n} products; the blocks are mostly the initial values.",
+            UserWarning,
+            stacklevel=4,
+        )
+    late = slice(min(len(found) // 2, 5 * run.model.n), None)
+    minimal = found.gauged[0] == "c1"
+    curves = [found.of_input(i)[1] for i in range(found.model.m)] if input == "c1" or minimal else []
+    ways = ("follow the products, with Kalman" if minimal else 'use input="unit"', "use Legendre on the range of y")
+    for group, name, way in (*((c, "c_1", ways[0]) for c in curves), (found.d, "d_1", ways[1])):
+        size = np.linalg.norm(group[late], axis=1)
+        head = np.divide(np.abs(group[late, 0]), size, out=np.full(len(size), np.nan), where=size > 0.0)
+        usual = float(np.nanmedian(head)) if np.isfinite(head).any() else 1.0
+        if usual < WEAK:
+            warnings.warn(
+                f"blocks: {name} = 1 is a bad gauge here, the other coefficients are {1.0 / usual:.3g} times as large; "
+                f"order the functions so that the first matters, or {way}.",
+                UserWarning,
+                stacklevel=4,
+            )
+    if found.method == "average" and found.c.shape[1] > 1:
+        near = np.abs(theta[late, found.a.shape[1] : found.a.shape[1] + found.b.shape[1]])
+        small = near < 0.05 * near.max(axis=1, initial=0.0, keepdims=True)
+        if small.any():
+            warnings.warn(
+                f'blocks: a b_j is close to zero in {int(small.any(axis=1).sum())} samples, where "average" has '
+                'spikes; use "svd-joint".',
+                UserWarning,
+                stacklevel=4,
+            )
+
+
+def _of_minimal(run: Track, model: HammersteinWiener) -> Blocks:
+    """The blocks of a tracker of the minimal parameters."""
+    structure = model.structure
+    at = structure.na + sum(structure.nb)
+    leads = at + structure.leads - np.arange(model.m)
+    fixed = [*leads, at + sum(structure.n_in) - model.m]  # entries of xi before which c_1 and d_1 are inserted
+    var = np.insert(run.var, fixed, 0.0, axis=1)
+    cov = None
+    if run.keeps_cov:
+        cov = np.insert(np.insert(run.written("P"), fixed, 0.0, axis=1), fixed, 0.0, axis=2)
+    a, b, c, d = structure.groups(run.theta)
+    exact, std = np.zeros((len(run), 2)), deviations(model, var)
+    return Blocks(model, "minimal", a, b, c, d, exact, std, _intercept(model, run.theta), cov, gauged=("c1", "d1"))
+
+
+def _by_least_squares(run: Track, model: HammersteinWiener, path: Array, pieces: Iterable[tuple[int, Array]]) -> Blocks:
+    """Refine the separation of a path (T, n), whose covariances come in pieces: (first sample, P (k, n, n))."""
+    if not run.tracker.covariance:
+        raise ValueError(f'blocks: "gls" needs a covariance, but {type(run.tracker).__name__} carries none.')
+    a, b, c, d, quality = split(model, path, "svd-joint")
+    rest, at = _intercept(model, path), a.shape[1] + b.shape[1] + c.shape[1]
+    zeta = np.concatenate([a, b, c, d[:, 1:], *([] if rest is None else [rest[:, None]])], axis=1)
+    fit, found = LeastSquares(model.structure), []
+    for first, P in pieces:
+        part = slice(first, first + len(P))
+        found.append(fit.refine(path[part], P, zeta[part]))
+    zeta, cov, cost = (np.concatenate(part) for part in zip(*found, strict=True))
+    cov = np.insert(np.insert(cov, at, 0.0, axis=1), at, 0.0, axis=2)  # the row and column of d_1
+    x = np.insert(zeta, at, 1.0, axis=1)
+    a, b, c, d, more = np.split(x, np.cumsum([a.shape[1], b.shape[1], c.shape[1], d.shape[1]]), axis=1)
+    std, intercept = deviations(model, np.einsum("tii->ti", cov)), more[:, 0] if model.intercept else None
+    return Blocks(model, "gls", a, b, c, d, quality, std, intercept, cov, cost, ("free", "d1")).gauge()
+
+
+def covariances(run: Track) -> Iterator[tuple[int, Array]]:
+    """(first sample, P (k, n, n)) for the pieces of a run, replayed unless the run kept them."""
+    T = len(run)
+    if run.keeps_cov:
+        yield 0, np.ascontiguousarray(run.written("P"))
+        return
+    tile = run.fresh()
+    out = run.program.written(tile, min(BLOCK, T), "cov")
+    drive = run.program.drivers("cov").run
+    for first in range(0, T, BLOCK):
+        last = min(first + BLOCK, T)
+        drive(tile, *lanes_of(run.record.part(slice(first, last))), out[: last - first])
+        yield first, np.ascontiguousarray(out["P"][: last - first, ..., 0])
