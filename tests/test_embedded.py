@@ -192,9 +192,7 @@ def test_states_travel_both_ways(tmp_path, p0):
     live, ours = agree(tmp_path, ARX(2, 2), tracker, 500)
     there = Live.from_bytes(from_struct(ARX(2, 2), tracker, ours.state).to_bytes())
     assert bits(there.theta) == bits(live.theta)
-    held = [
-        name for name in live.lane() if name not in tracker.scratch
-    ]  # never saved
+    held = [name for name in live.lane() if name not in tracker.scratch]  # never saved
     assert all(np.array_equal(there.lane()[name], live.lane()[name], equal_nan=True) for name in held)
     assert bits(ours.predict([0.3])[::2]) == bits(live.predict(0.3))
     assert same_numbers(ours.state, to_struct(live))  # a prediction changes nothing

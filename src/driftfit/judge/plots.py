@@ -27,8 +27,10 @@ BRIDGE = 1.36
 
 
 class Health(NamedTuple):
-    """The quantities that a diagnosis examines; ``tested`` are the rows and ``names`` of the parameters that the test of constancy tells
-    apart, and ``fine`` maps the names of checks to whether they are within their limits.
+    """The quantities that a diagnosis examines.
+
+    ``tested`` are the rows and ``names`` of the parameters that the test of constancy tells apart, and ``fine`` maps
+    the names of checks to whether they are within their limits.
     """
 
     run: Track

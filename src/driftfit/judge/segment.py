@@ -237,12 +237,11 @@ def segmented(run: Track, level: float = 0.95, false: float = REJECTED, shortest
     at = rows.at[found.breaks]
     limits = [0, *(int(t) for t in at), len(run)]
     parts = tuple(
-        Segment(limit[0], limit[1], numbers[0], numbers[1])
-        for limit, *numbers in zip(pairwise(limits), found.theta, found.std, strict=True)
-    )  # fmt: skip
-    breaks = tuple(
-        Break(time[t], *time[rows.at[span]], int(t)) for t, span in zip(at, found.spans, strict=True)
-    )  # fmt: skip
+        Segment(start, stop, theta, std)
+        for (start, stop), theta, std in zip(pairwise(limits), found.theta, found.std, strict=True)
+    )
+    spans = rows.at[found.spans]
+    breaks = tuple(Break(time[t], time[first], time[last], int(t)) for t, (first, last) in zip(at, spans, strict=True))
     other = changes.rejected and changes.kind.name != "steps"
     better = "; ".join(clauses(events(changes, run.model.names, rows.at, run.time_text))) if other else ""
     noise = float(np.median(changes.model.noise.level))

@@ -16,8 +16,8 @@ The first sentence combines both answers. The next ones say what moved, when, an
 or as a random walk (`driftfit.judge.changes.words`).
 
 A model without enough lags has correlated noise, which is hard to tell from a drifting intercept. The autoregression of
-the noise is found from the record, ``lags=`` sets its order, and the verdict reports it. A parameter that wanders as fast
-as the noise itself is mistaken for such noise; where the noise is nearly a random walk, the verdict says so.
+the noise is found from the record, ``lags=`` sets its order, and the verdict reports it. A parameter that wanders as
+fast as the noise itself is mistaken for such noise; where the noise is nearly a random walk, the verdict says so.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ class Moved:
     """The verdict on one parameter.
 
     ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: that of the path of the estimate, which separates
-    parameters with correlated regressors. ``moves``: whether it is named as moving. ``at``, ``when``: the sample, and its
-    time as text, of its clearest change, the beginning of one that takes time. ``before``: its value before its first
-    change. ``after``: the value furthest from that, and ``std`` the standard error of their difference, NaN for a gradual
-    change. ``last``: its last value, which is ``before`` again after a temporary fault. ``earliest``, ``latest``: first
-    and last sample of an interval that contains the date with 95 % confidence. ``instead``: the parameters whose change at
-    that time would explain the record as well; the record does not tell which of them moved.
+    parameters with correlated regressors. ``moves``: whether it is named as moving. ``at``, ``when``: the sample, and
+    its time as text, of its clearest change, the beginning of one that takes time. ``before``: its value before its
+    first change. ``after``: the value furthest from that, and ``std`` the standard error of their difference, NaN for a
+    gradual change. ``last``: its last value, which is ``before`` again after a temporary fault. ``earliest``,
+    ``latest``: first and last sample of an interval that contains the date with 95 % confidence. ``instead``: the
+    parameters whose change at that time would explain the record as well; the record does not tell which of them moved.
     """
 
     name: str
@@ -268,14 +268,14 @@ class Verdict(Printed):
         text = f"Lower error than this run: {', '.join(better)}. " if better else ""
         if self.correlated:
             text += (
-                "The noise is correlated, even within segments of constant parameters. A model with too few lags causes "
-                f"this, and so does a fast drift. The test allows for an autoregression up to lag {self.lags}; try one more "
-                "lag in the model. "
+                "The noise is correlated, even within segments of constant parameters. A model with too few lags "
+                "causes this, and so does a fast drift. The test allows for an autoregression up to lag "
+                f"{self.lags}; try one more lag in the model. "
             )
         if self.nearly_walk:
             text += (
-                f"The noise is nearly a random walk (largest root {self.nearly_walk:.4g}): a level that wanders looks the "
-                "same, and this record does not tell them apart. "
+                f"The noise is nearly a random walk (largest root {self.nearly_walk:.4g}): a level that wanders looks "
+                "the same, and this record does not tell them apart. "
             )
         if self.spread_with:
             text += (

@@ -1,8 +1,8 @@
 """One object that says how the parameters of a regression changed: the test, the dates, the parameters, the kind.
 
 `Track.verdict`, `Track.segment`, the page, fleets and diagnoses are views of it. If the test rejects constants there is
-a date, or a gradual change; if it does not, there is none. The steps are `driftfit.judge.changes.fit` (noise and segments
-together), `null` (the test), `dates`, `which` and `kinds`.
+a date, or a gradual change; if it does not, there is none. The steps are `driftfit.judge.changes.fit` (noise and
+segments together), `null` (the test), `dates`, `which` and `kinds`.
 """
 
 from __future__ import annotations
@@ -71,6 +71,8 @@ def changes(
         breaks, ar, prices = counted(model, test, draws, level)
     found = dated(model, breaks, ar, prices, dates)
     changed = which(model, found)
+    if (changed.dates != found.breaks).any():
+        found = dated(model, changed.dates, ar, prices, dates, settled=True)
     moving = tuple(sorted({j for own in changed.at for j in own}))
     if test.p < level and not moving:
         moving = (int(np.argmin(test.p_path[n:])),)

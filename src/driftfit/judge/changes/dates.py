@@ -4,8 +4,9 @@
 
 The number grows from none while one further break, or a pair, gains more than draws of constants do. Each date is the
 most likely one given its neighbours, among all rows between them, and its interval the shortest that holds 95 % of the
-likelihood. Parameters are weighted least squares of all rows of a segment, by the rows of `driftfit.judge.changes.scan`.
-Their covariance is White's, plus what they vary by while a date moves within its likelihood.
+likelihood. Parameters are weighted least squares of all rows of a segment, by the rows of
+`driftfit.judge.changes.scan`. Their covariance is White's, of residuals over one less their leverage (MacKinnon and
+White, 1985), plus what they vary by while a date moves within its likelihood.
 
 Source: Bai and Perron (1998); Yao (1987) for the likelihood of a date; White (1980). Cost: O(N n^2 + N K^3 n^3).
 """
@@ -17,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.judge.changes.constants import SINGULAR, SMALL, Work
 from driftfit.judge.changes.fit import (
     MOST,
     estimated,
@@ -28,7 +30,7 @@ from driftfit.judge.changes.fit import (
     white_rows,
 )
 from driftfit.judge.changes.null import Draws, Model, Tested, gains, price, problem_of, radius
-from driftfit.judge.changes.scan import SINGULAR, SMALL, Work, prepared
+from driftfit.judge.changes.scan import prepared
 from driftfit.judge.statistics.robust import orthonormal
 
 LEVEL = 0.95
@@ -38,6 +40,8 @@ SHARE = 5.0
 SWEEPS = 4
 DATES = 20_000
 """Places, at most, at which the likelihood of a date is computed."""
+LEVERAGE = 0.1
+"""Smallest share of a residual that its own row is taken to leave."""
 MOVED = 40
 """Dates within an interval, at most, for which the parameters are computed again."""
 
@@ -129,8 +133,8 @@ class Dated(NamedTuple):
     """(K + 1, n), in units of the model."""
     std: Array
     """(K + 1, n): standard errors; inf where the rows of a segment do not determine a parameter."""
-    changed: Array
-    """(K, n): standard errors of the changes."""
+    moved: Array
+    """(K + 1, n): what theta varies by while a date moves, a variance."""
     ar: Array
     """(p,)"""
     rss: float
@@ -180,7 +184,7 @@ def numbered(found: list[Partition], prices: tuple[float, float], N: int, least:
 def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Array, Array, tuple[float, float]]:
     """(breaks, autoregression, prices), given that constants are rejected."""
     X, y, noise = model.X, model.y, model.noise
-    N, n = X.shape
+    N = len(y)
     found: list[Partition] = [
         (float(test.rss[k]), test.breaks[k], test.ar[k]) for k in range(3) if np.isfinite(test.rss[k])
     ]
@@ -217,8 +221,10 @@ def shortest_interval(weight: Array, level: float) -> tuple[int, int]:
     return int(best), int(min(last[best], len(weight)) - 1)
 
 
-def dated(model: Model, breaks: Array, ar: Array, prices: tuple[float, float], level: float = LEVEL) -> Dated:
-    """Dates at full resolution with their intervals, and the parameters of the segments."""
+def dated(
+    model: Model, breaks: Array, ar: Array, prices: tuple[float, float], level: float = LEVEL, settled: bool = False
+) -> Dated:
+    """Dates at full resolution, unless they are ``settled``, with their intervals, and the parameters of segments."""
     X, y, noise = model.X, model.y, model.noise
     N, n = X.shape
     K, first = len(breaks), order_of(noise.lags)
@@ -227,7 +233,7 @@ def dated(model: Model, breaks: Array, ar: Array, prices: tuple[float, float], l
     if K:
         places = np.union1d(places_of(N), breaks)
         at = np.searchsorted(places, breaks)
-        for _ in range(2 if len(ar) else 1):
+        for _ in range(0 if settled else 2 if len(ar) else 1):
             exact = Exact(model, places, ar)
             at = exact.settled(at, gap)
             if len(ar):
@@ -246,13 +252,13 @@ def dated(model: Model, breaks: Array, ar: Array, prices: tuple[float, float], l
     edges = [(0, N), *_certain(breaks, spans, N, n)]
     known = [_directions(model, a, b) for a, b in edges]
     rows = np.hstack([part @ one for part, one in zip(np.split(split(X, breaks), K + 1, axis=1), known, strict=True)])
-    theta, rss = estimated(X, y, parts, breaks, rows)
-    std, changed = _errors(model, rows, parts, theta, moved)
+    theta, left = estimated(X, y, parts, breaks, rows)
+    std = _errors(model, rows, parts, moved)
     unknown = [
         undetermined(model.phi[a:b]) for a, b in _certain(np.append(0, breaks), np.vstack([[[0, 0]], spans]), N, n)
     ]
     std[np.array(unknown)] = np.inf
-    return Dated(breaks, spans, theta @ model.basis.T, std, changed, ar, rss, prices)
+    return Dated(breaks, spans, theta @ model.basis.T, std, moved, ar, left, prices)
 
 
 def _moved(exact: Exact, at: Array, k: int, low: int, weight: Array) -> Array:
@@ -267,24 +273,22 @@ def _moved(exact: Exact, at: Array, k: int, low: int, weight: Array) -> Array:
     return np.asarray(np.einsum("m,mkj->kj", share, (theta - mean) ** 2))
 
 
-def _errors(
-    model: Model, rows: Array, parts: tuple[Array, Array, Array], theta: Array, moved: Array
-) -> tuple[Array, Array]:
-    """Standard errors of the parameters (K + 1, n) and of their changes (K, n), in units of the model."""
-    n = model.X.shape[1]
-    K = len(theta) - 1
-    Z, z = white_rows(rows, model.y, *parts)
-    steps = np.concatenate([theta[:1], np.diff(theta, axis=0)]).ravel()
-    e = z - Z @ steps
+def covariance(Z: Array, z: Array) -> tuple[Array, Array]:
+    """Least squares of z (N,) on Z (N, q), and its covariance from residuals over one less their leverage."""
     inverse = np.linalg.pinv(Z.T @ Z, rcond=SINGULAR, hermitian=True)
-    scores = Z * e[:, None]
-    V = inverse @ (scores.T @ scores) @ inverse * len(z) / max(len(z) - Z.shape[1], 1)
-    basis = np.kron(np.eye(K + 1), model.basis)
-    V = basis @ V @ basis.T
-    total = np.kron(np.tril(np.ones((K + 1, K + 1))), np.eye(n))
-    own = np.diag(total @ V @ total.T).reshape(K + 1, n)
-    change = np.diag(V).reshape(K + 1, n)[1:] + moved[:-1] + moved[1:]
-    return np.sqrt(np.maximum(own + moved, 0.0)), np.sqrt(np.maximum(change, 0.0))
+    beta = inverse @ (Z.T @ z)
+    leverage = np.einsum("ti,ij,tj->t", Z, inverse, Z)
+    scores = Z * ((z - Z @ beta) / np.maximum(1.0 - leverage, LEVERAGE))[:, None]
+    return beta, np.asarray(inverse @ (scores.T @ scores) @ inverse)
+
+
+def _errors(model: Model, rows: Array, parts: tuple[Array, Array, Array], moved: Array) -> Array:
+    """Standard errors of the parameters (K + 1, n), in units of the model."""
+    K, n = len(moved) - 1, model.X.shape[1]
+    _, V = covariance(*white_rows(rows, model.y, *parts))
+    total = np.kron(np.tril(np.ones((K + 1, K + 1))), model.basis)
+    own = np.einsum("ij,jk,ik->i", total, V, total).reshape(K + 1, n)
+    return np.asarray(np.sqrt(np.maximum(own + moved, 0.0)))
 
 
 def _certain(starts: Array, spans: Array, N: int, n: int) -> list[tuple[int, int]]:
@@ -298,7 +302,7 @@ def _certain(starts: Array, spans: Array, N: int, n: int) -> list[tuple[int, int
 
 
 def _directions(model: Model, first: int, last: int) -> Array:
-    """The projector (n, n), in the basis, on changes of what rows first .. last determine, in units of the regressors."""
+    """The projector (n, n), in the basis, on changes of what rows first .. last determine."""
     n = model.X.shape[1]
     basis = orthonormal(model.phi[first:last])
     size, directions = np.linalg.svd(basis.R)[1:]

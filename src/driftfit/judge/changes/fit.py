@@ -11,12 +11,14 @@ the sum of squares, at three levels from the fit of segments. Cost: O(N n^2) and
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.scan import CELLS, PLACES, SINGULAR, SMALL
+from driftfit.judge.changes.constants import SINGULAR, SMALL
+from driftfit.judge.changes.scan import CELLS, PLACES
 from driftfit.judge.statistics.robust import deviation, robust_fit
 
 NONE = np.zeros(0, np.int64)
@@ -111,7 +113,7 @@ def regressed(v: Array, g: Array, lags: Array) -> Array:
     first = order_of(lags)
     past = np.column_stack([v[first - lag : len(v) - lag] for lag in lags]) if len(lags) else np.zeros((len(v), 0))
     w = g[first:]
-    return np.linalg.lstsq(past * w[:, None], v[first:] * w, rcond=None)[0]
+    return np.asarray(np.linalg.lstsq(past * w[:, None], v[first:] * w, rcond=None)[0])
 
 
 def lags_of(v: Array, most: int) -> Array:
@@ -149,23 +151,23 @@ def level_of(e: Array, first: int) -> Array:
     s = max(deviation(used), 1e-3 * float(np.std(used)), SMALL)
     m = max(3, min(WINDOWS, N // 20))
     edges = np.linspace(first, N, m + 1).astype(int)
-    parts = [np.abs(e[a:b]) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    parts = [np.abs(e[a:b]) for a, b in pairwise(edges)]
     held = (np.minimum(part, HELD * max(deviation(part), 0.05 * s)) for part in parts)
     own = np.log([max(np.sqrt(np.mean(part**2)), 0.05 * s) for part in held])
     chance = 0.6 * m / N  # variance of the logarithm of a deviation of N / m Gaussians
     share = max(0.0, 1.0 - 1.5 * chance / max(float(own.var()), chance))
     middle = float(np.median(own))
-    return np.exp(middle + np.interp(np.arange(N), 0.5 * (edges[:-1] + edges[1:]), share * (own - middle)))
+    return np.asarray(np.exp(middle + np.interp(np.arange(N), 0.5 * (edges[:-1] + edges[1:]), share * (own - middle))))
 
 
 def partitions(X: Array, y: Array, noise: tuple[Array, Array, Array], most: int, least: int) -> list[Array]:
     """The best partitions on cells with 0 .. breaks; rows that belong to two segments are left out."""
     places, stride = grid(len(y))
     edges, N, n = np.append(places[::stride], len(y)), len(y), X.shape[1]
-    lags, m, first = noise[0], len(edges) - 1, order_of(noise[0])
+    m, first = len(edges) - 1, order_of(noise[0])
     Z = np.zeros((N, n + 1))
     Z[first:, :n], Z[first:, n] = white_rows(X, y, *noise)
-    own = np.array([Z[a:b].T @ Z[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    own = np.array([Z[a:b].T @ Z[a:b] for a, b in pairwise(edges)])
     lost = np.array([Z[a : a + first].T @ Z[a : a + first] for a in edges[:-1]])
     lost[0] = 0.0
     C = np.concatenate([np.zeros((1, n + 1, n + 1)), np.cumsum(own, axis=0)])

@@ -24,10 +24,10 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
+from driftfit.judge.changes.constants import SMALL
 from driftfit.judge.changes.dates import Dated
 from driftfit.judge.changes.fit import order_of, split, white_rows
 from driftfit.judge.changes.null import Model
-from driftfit.judge.changes.scan import SMALL
 from driftfit.judge.changes.which import Which
 
 KNOTS = (3, 4, 5, 6, 8, 10, 13, 17, 22, 28)
@@ -145,12 +145,12 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
 def _hats(N: int, knots: int) -> Array:
     """(N, knots): piecewise linear functions, each 1 at its own knot."""
     at = np.linspace(0.0, N - 1.0, knots)
-    return np.maximum(0.0, 1.0 - np.abs(np.arange(N)[:, None] - at) / (at[1] - at[0]))
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(np.arange(N)[:, None] - at) / (at[1] - at[0])))
 
 
 def _rise(N: int, ends: tuple[int, int]) -> Array:
     """(N,): 0 up to the first end, 1 from the last one on."""
-    return np.clip((np.arange(N) - ends[0]) / max(ends[1] - ends[0], 1), 0.0, 1.0)
+    return np.asarray(np.clip((np.arange(N) - ends[0]) / max(ends[1] - ends[0], 1), 0.0, 1.0))
 
 
 def _ramp(

@@ -2,13 +2,12 @@
 
     y*_t = x*_t' theta + v*_t,   v*_t = sum a_l v*_(t-l) + s_t e_t,   s_t = -1 or 1,   x* with the lags of y*
 
-e are the residuals of the segments, limited at three levels where they pass through dynamics: residuals of constants would count a change as noise. theta
-and a are those of constants, less the bias that the same draws show (Kilian, 1998), with no root beyond 1. For every
-draw everything is estimated again, and three statistics are computed: Nyblom's, which sees a slow drift, the gain of one
-break, a step, and the gain of two, a temporary change. p is that of the smallest of their p-values among those of
-the draws, beyond the largest draws by their exponential tail.
-
-Residuals are divided by one less their leverage (MacKinnon and White, 1985).
+e are the residuals of the segments, over one less their leverage (MacKinnon and White, 1985): residuals of constants
+would count a change as noise. Where they pass through dynamics they are limited at three levels. theta and a are those
+of constants, less the bias that the same draws show (Kilian, 1998), with no root beyond 1. For every draw everything is
+estimated again, and three statistics are computed: Nyblom's, which sees a slow drift, the gain of one break, a step,
+and the gain of two, a temporary change. p is that of the smallest of their p-values among those of the draws, beyond
+the largest draws by their exponential tail.
 
 Source: Wu (1986) and Liu (1988) for wild residuals; Hansen (2000) for fixed regressors, Goncalves and Kilian (2004) for
 the recursion. Cost: `DRAWS` searches; records that are clearly constant stop after the first `FEW`.
@@ -22,9 +21,10 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.judge.changes.constants import SMALL, Found, Problem, Work
 from driftfit.judge.changes.fit import HELD, Noise, grid, noise, order_of, split, white_rows
 from driftfit.judge.changes.recursion import Drawn, Recursion, Results, draw
-from driftfit.judge.changes.scan import SMALL, Found, Problem, Work, searched
+from driftfit.judge.changes.scan import searched
 from driftfit.judge.statistics.robust import orthonormal
 
 DRAWS, FEW = 199, 39
@@ -38,7 +38,7 @@ ROUNDS = 5
 """Rounds of constants and their autoregression."""
 ROUNDING = 1e-15
 """Standard deviation of rounding, as a share of the outputs."""
-LOST = 1e-9
+LOST = 1e-7
 """Share of the sum of squares of constants that differences of sums may lose."""
 
 
@@ -127,8 +127,7 @@ def modelled(
 
 def problem_of(model: Model, paths: Array) -> Problem:
     """What all draws share."""
-    N, n = model.X.shape
-    places, stride = grid(N)
+    places, stride = grid(len(model.y))
     lags = model.noise.lags
     sizes = np.array([stride, model.noise.fewest, ROUNDS, 2])
     return Problem(model.noise.g, lags, places, np.ascontiguousarray(paths), sizes, np.array([model.floor]))
@@ -157,11 +156,11 @@ class Draws:
     def of(self, theta: Array, ar: Array, count: int, whole: bool) -> Results:
         """Draws from constants theta (n,) in units of the model; only constants of them unless ``whole``."""
         model, problem = self.model, self.problem
-        N, n = model.X.shape
+        n = model.X.shape[1]
         way = Recursion(
             model.phi, model.X, model.basis, *model.lags, theta, ar, model.y - model.phi @ theta, self.e
         )  # fmt: skip
-        signs = self.rng.integers(0, 2, (count, N)) * 2.0 - 1.0
+        signs = self.rng.integers(0, 2, (count, len(model.y))) * 2.0 - 1.0
         results = Results(
             np.full((count, 3), np.inf), np.zeros((count, 1 + len(problem.paths))), np.zeros((count, n)),
             np.zeros((count, len(ar))),

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from driftfit.engine.kernel import Array, Driver, shared
-from driftfit.judge.changes.scan import Found, Problem, Work, search, settle
+from driftfit.judge.changes.constants import Found, Problem, Work, settle
+from driftfit.judge.changes.scan import search
 
 
 class Recursion(NamedTuple):

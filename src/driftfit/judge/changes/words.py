@@ -76,22 +76,22 @@ def events(changes: Changes, names: Sequence[str], at: Array, text: Callable[[in
             when=text(one.at),
             ended="" if one.until is None else text(one.until),
             span=f"{text(one.earliest)} to {text(one.latest)}" if one.kind in DATED else "",
-        )  # fmt: skip
+        )
         for one in found
     )
 
 
 def _steps(changes: Changes, names: Sequence[str], at: Array, kind: str) -> list[Event]:
     """An event for every date."""
-    dated, found = changes.found, []
+    dated, own, found = changes.found, changes.which, []
     for k, row in enumerate(dated.breaks):
-        instead = tuple(names[j] for j in changes.which.instead[k])
+        instead = tuple(names[j] for j in own.instead[k])
         moves = tuple(
-            Move(names[j], float(dated.theta[k, j]), float(dated.theta[k + 1, j]), float(dated.changed[k, j]), instead)
-            for j in changes.which.at[k]
+            Move(names[j], float(own.theta[k, j]), float(own.theta[k + 1, j]), float(own.std[k, j]), instead)
+            for j in own.at[k]
         )
-        span = (int(at[one]) for one in dated.spans[k])
-        found.append(Event(kind, int(at[row]), *span, None, None, None, moves))
+        earliest, latest = (int(at[one]) for one in dated.spans[k])
+        found.append(Event(kind, int(at[row]), earliest, latest, None, None, None, moves))
     return found
 
 

@@ -6,8 +6,8 @@ Q is chi-square with K degrees of freedom for martingale differences, whatever t
 at three robust standard deviations, so that a pair of outliers does not decide. Source: Lo and MacKinlay (1989).
 
 Whether residuals are larger where a regressor is: squares, clipped, against the ranks of its size, with the Bartlett
-variance of the sum over 4 (N / 100)^(2/9) lags (White 1980, Newey and West 1987, 1994). A gain that is drawn again at every sample does that, and so does
-noise that grows with the input: the two are the same distribution of y.
+variance of the sum over 4 (N / 100)^(2/9) lags (White 1980, Newey and West 1987, 1994). A gain that is drawn again at
+every sample does that, and so does noise that grows with the input: the two are the same distribution of y.
 """
 
 from __future__ import annotations
