@@ -30,6 +30,8 @@ ORDER = 6
 """Largest order of the autoregression; a season may add one further lag."""
 SEASON = 24
 ROUNDS = 4
+KNOTS = (3, 5, 9, 17, 33)
+"""Knots of lines that parameters may move on."""
 MOST = 12
 """Largest number of breaks."""
 WINDOWS = 12
@@ -48,8 +50,9 @@ class Noise(NamedTuple):
     g: Array
     """(N,): roots of the weights."""
     e: Array
-    """(N,): white residuals of the segments, 0 in the first rows."""
-    breaks: Array
+    """(N,): white residuals of the segments or lines, 0 in the first rows."""
+    rows: Array
+    """(N, q): the regressors of these."""
     fewest: int
     """Rows in the shortest segment that is searched."""
 
@@ -160,6 +163,17 @@ def level_of(e: Array, first: int) -> Array:
     return np.asarray(np.exp(middle + np.interp(np.arange(N), 0.5 * (edges[:-1] + edges[1:]), share * (own - middle))))
 
 
+def hats(N: int, knots: int) -> Array:
+    """(N, knots): piecewise linear functions, each 1 at its own knot."""
+    at = np.linspace(0.0, N - 1.0, knots)
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(np.arange(N)[:, None] - at) / (at[1] - at[0])))
+
+
+def lined(X: Array, knots: int) -> Array:
+    """(N, n knots): regressors of parameters on continuous lines between evenly spaced knots."""
+    return np.hstack([X, *(X * hat[:, None] for hat in hats(len(X), knots).T[1:])])
+
+
 def partitions(X: Array, y: Array, noise: tuple[Array, Array, Array], most: int, least: int) -> list[Array]:
     """The best partitions on cells with 0 .. breaks; rows that belong to two segments are left out."""
     places, stride = grid(len(y))
@@ -240,10 +254,10 @@ def divided(
 def together(
     X: Array, y: Array, g: Array, orders: int, most: int, given: int | None = None
 ) -> tuple[Array, Array, Array]:
-    """(lags, ar, breaks), chosen together."""
-    N = len(y)
+    """(lags, ar, regressors of the path), chosen together: segments, or lines between knots."""
+    N, n = X.shape
     theta, _ = estimated(X, y, (NONE, np.zeros(0), g), NONE)
-    best: tuple[float, Array, Array, Array] | None = None
+    best: tuple[float, Array, Array, Array] | None = None  # criterion, lags, ar, rows
     tried: list[list[int]] = []
     for lags in (lags_of((y - X @ theta[0]) * g, orders), NONE):
         for _ in range(ROUNDS):
@@ -253,10 +267,24 @@ def together(
             breaks, ar, criterion = divided(X, y, lags, g, most, given)
             criterion += len(lags) * np.log(N)
             if best is None or criterion < best[0]:
-                best = criterion, lags, ar, breaks
+                best = criterion, lags, ar, split(X, breaks)
             theta, _ = estimated(X, y, (lags, ar, g), breaks)
             lags = lags_of(noise_of(X, y, theta, breaks) * g, orders)
     assert best is not None
+    for knots in KNOTS:
+        if n * knots > N // 8:
+            break
+        rows, lags, ar = lined(X, knots), NONE, np.zeros(0)
+        for _ in range(2):
+            Z, z = white_rows(rows, y, lags, ar, g)
+            v = y - rows @ np.linalg.lstsq(Z, z, rcond=None)[0]
+            lags = lags_of(v * g, orders)
+            ar = regressed(v, g, lags)
+        Z, z = white_rows(rows, y, lags, ar, g)
+        r = z - Z @ np.linalg.lstsq(Z, z, rcond=None)[0]
+        criterion = N * np.log(max(float(r @ r), SMALL)) + (n * (knots - 1) + len(lags)) * np.log(N)
+        if criterion < best[0]:
+            best = criterion, lags, ar, rows
     return best[1:]
 
 
@@ -276,13 +304,14 @@ def noise(X: Array, y: Array, order: int | None = None, fewest: int | None = Non
     g = weights(e, level)
     for _ in range(2):
         if order is None:
-            lags, ar, breaks = together(X, y, g, min(ORDER, N // 20), most, fewest)
+            lags, ar, rows = together(X, y, g, min(ORDER, N // 20), most, fewest)
         else:
             breaks, ar, _ = divided(X, y, lags, g, most, fewest)
-        theta, _ = estimated(X, y, (lags, ar, g), breaks)
+            rows = split(X, breaks)
+        Z, z = white_rows(rows, y, lags, ar, g)
         first = order_of(lags)
-        v = noise_of(X, y, theta, breaks)
+        v = y - rows @ np.linalg.lstsq(Z, z, rcond=None)[0]
         e = np.append(np.zeros(first), white_rows(v[:, None], v, lags, ar, np.ones(N))[1])
         level = level_of(e, first)
         g = weights(e, level)
-    return Noise(lags, ar, level, g, e, breaks, shortest(n, lags, fewest))
+    return Noise(lags, ar, level, g, e, rows, shortest(n, lags, fewest))

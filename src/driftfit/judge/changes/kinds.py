@@ -26,7 +26,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.constants import SMALL
 from driftfit.judge.changes.dates import Dated
-from driftfit.judge.changes.fit import order_of, split, white_rows
+from driftfit.judge.changes.fit import hats, order_of, split, white_rows
 from driftfit.judge.changes.null import Model
 from driftfit.judge.changes.which import Which
 
@@ -118,8 +118,8 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
     for knots in KNOTS:
         if len(moves) * knots > N // 8:
             break
-        hats = _hats(N, knots)
-        more = np.hstack([phi[:, j : j + 1] * hats[:, 1:] for j in moves])
+        lines = hats(N, knots)
+        more = np.hstack([phi[:, j : j + 1] * lines[:, 1:] for j in moves])
         both = np.hstack([Z, white_rows(more, model.y, lags, found.ar, g)[0]])
         score = M * np.log(left(both, z)) + (n + len(moves) * (knots - 1)) * price
         if score < scores["gradual"]:
@@ -127,7 +127,7 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
             beta = np.linalg.lstsq(both, z, rcond=None)[0]
             path = np.tile(beta[:n], (N, 1))
             for i, j in enumerate(moves):
-                path[:, j] += hats[:, 1:] @ beta[n + i * (knots - 1) : n + (i + 1) * (knots - 1)]
+                path[:, j] += lines[:, 1:] @ beta[n + i * (knots - 1) : n + (i + 1) * (knots - 1)]
     if not path.size:
         beta = np.linalg.lstsq(np.hstack([Z, slope[first:]]), z, rcond=None)[0]
         path = np.tile(beta[:n], (N, 1))
@@ -140,12 +140,6 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
     names = {"rest": "", "steps": "steps", "gradual": "gradual", "walk": "wandering", "jumps": "drift with jumps"}
     likely = max((name for name in weights if name != "rest"), key=lambda name: weights[name])
     return Kind(names[likely], weights, ends, path / np.where(size > 0.0, size, 1.0), dates)
-
-
-def _hats(N: int, knots: int) -> Array:
-    """(N, knots): piecewise linear functions, each 1 at its own knot."""
-    at = np.linspace(0.0, N - 1.0, knots)
-    return np.asarray(np.maximum(0.0, 1.0 - np.abs(np.arange(N)[:, None] - at) / (at[1] - at[0])))
 
 
 def _rise(N: int, ends: tuple[int, int]) -> Array:

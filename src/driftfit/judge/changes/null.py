@@ -22,7 +22,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.changes.constants import SMALL, Found, Problem, Work
-from driftfit.judge.changes.fit import HELD, Noise, grid, noise, order_of, split, white_rows
+from driftfit.judge.changes.fit import HELD, Noise, grid, noise, order_of, white_rows
 from driftfit.judge.changes.recursion import Drawn, Recursion, Results, draw
 from driftfit.judge.changes.scan import searched
 from driftfit.judge.statistics.robust import orthonormal
@@ -239,7 +239,7 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     work, found = Work.of(N, n, problem), Found.of(n, problem)
     searched(model.X, model.y, problem, work, found)
     held = noise.e.copy()
-    rows, _ = white_rows(split(model.X, noise.breaks), model.y, noise.lags, noise.ar, noise.g)
+    rows, _ = white_rows(noise.rows, model.y, noise.lags, noise.ar, noise.g)
     Q = np.linalg.qr(rows)[0]
     held[first:] /= np.maximum(1.0 - np.sum(Q * Q, axis=1), 0.1)
     if first or len(model.lags.columns):  # an outlier of the output would be one of the dynamics
