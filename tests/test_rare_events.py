@@ -23,8 +23,8 @@ def rare(kind, seed, T=400):
 @pytest.mark.parametrize("kind", ["counts", "counts missed, of twenty", "bursts", "sales in proportion"])
 def test_error_rate_of_rare_events(kind):
     """Of 40 constant records at most 15 % are rejected, three standard errors above 5 %."""
-    p = np.array([p_of(*rare(kind, seed)) for seed in range(40)])
-    assert np.mean(p < 0.05) <= 0.15
+    found = [judged(*rare(kind, seed)) for seed in range(40)]
+    assert np.mean([one is not None and one.test.p < 0.05 for one in found]) <= 0.15
 
 
 def test_rare_events_that_become_frequent_for_a_time_are_found():

@@ -54,7 +54,7 @@ def test_noise_far_below_an_offset_is_noise_unless_it_is_rounding():
     phi, y = record(300, 12)
     X = np.column_stack([phi, np.ones(300)])
     p = p_of(X, y)
-    assert p_of(X, 1.7e9 + 0.01 * y) == pytest.approx(p, rel=0.01)
+    assert p_of(X, 1.7e9 + 0.01 * y) == pytest.approx(p, rel=0.02)
     assert judged(X, 1.7e9 + X @ np.arange(4.0)) is None
 
 

@@ -38,15 +38,13 @@ from driftfit.judge.compare import left_at_start
 from driftfit.judge.evidence import REJECTED, Evidence, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
-from driftfit.judge.statistics.whiteness import grows_with
+from driftfit.judge.statistics.whiteness import LOUDER, grows_with
 from driftfit.readings.gate import FROZEN
 from driftfit.run.result import Track, root_mean_square
 from driftfit.show.text import Printed, digits, facts, table_of
 
 LEVEL = REJECTED
 RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
-LOUDER = 1e-3
-"""If the p-value of residuals of one size is below this, they are reported to grow with a regressor."""
 
 
 @dataclass(frozen=True)
@@ -431,7 +429,7 @@ def _moved(found: Changes, happened: Sequence[Event], name: str, i: int) -> Move
     if not own:
         return replace(unjudged(name), statistic=L, p=p, p_own=p_own)
     before = own[0][1].before
-    event, move = max(own, key=lambda one: abs(one[1].after - one[1].before) / (one[1].std or np.inf))
+    event, move = max(own, key=lambda one: abs(one[1].after - one[1].before) / one[1].std if one[1].std > 0.0 else 0.0)
     far = max(own, key=lambda one: abs(one[1].after - before))[1]
     last = own[-1][1].before if own[-1][0].kind == "temporary" else own[-1][1].after
     where = (event.at, event.when, before, far.after, far.std, last, event.earliest, event.latest)

@@ -41,7 +41,7 @@ class Changes(NamedTuple):
         """(N, n): sums of the scores of constants over the root of their sum of squares."""
         lags, g = self.model.noise.lags, self.model.noise.g
         Z, z = white_rows(self.model.phi, self.model.y, lags, self.test.ar[0], g)
-        own = Z * (z - Z @ self.test.theta)[:, None]
+        own = Z * (z - Z @ (self.test.theta - self.model.offset))[:, None]
         size = np.sqrt(np.sum(own**2, axis=0))
         return np.vstack([np.zeros((order_of(lags), Z.shape[1])), np.cumsum(own, axis=0) / np.where(size > 0, size, 1)])
 
@@ -77,4 +77,13 @@ def changes(
     if test.p < level and not moving:
         moving = (int(np.argmin(test.p_path[n:])),)
     own = kind(model, found, changed, moving) if moving else Kind("", {}, (0, N - 1), np.zeros((N, 0)), ())
-    return Changes(model, test, level, found, changed, own, moving)
+    moved = model.offset + np.zeros((len(found.breaks) + 1, 1))
+    return Changes(
+        model,
+        test._replace(theta=test.theta + model.offset),
+        level,
+        found._replace(theta=found.theta + moved),
+        changed._replace(theta=changed.theta + moved),
+        own._replace(path=own.path + model.offset) if own.path.size else own,
+        moving,
+    )

@@ -6,7 +6,8 @@ Breaks and correlation explain the same residuals. For each start, the white noi
 of constants, the best partition on cells (Jackson et al., 2005) and the lags of the noise follow each other until they
 stay; the pair with the smaller criterion counts. A break costs (n + 2) log N there (Zhang and Siegmund, 2007), a lag
 log N, and a lag of a season 2 log of their number more (Chen and Chen, 2008). Weights limit what a row adds to
-the sum of squares, at three levels from the fit of segments. Cost: O(N n^2) and O(c^2 n^3) for c cells.
+the sum of squares, at three levels from the fit of segments. Where residuals clearly grow with a regressor x, the level
+is in proportion to sqrt(a + b x^2). Cost: O(N n^2) and O(c^2 n^3) for c cells.
 """
 
 from __future__ import annotations
@@ -15,15 +16,19 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.changes.constants import SINGULAR, SMALL
 from driftfit.judge.changes.scan import CELLS, PLACES
 from driftfit.judge.statistics.robust import deviation, robust_fit
+from driftfit.judge.statistics.whiteness import LOUDER, grows_with
 
 NONE = np.zeros(0, np.int64)
 HELD = 3.0
 """Levels of the noise from the fit at which a residual is limited."""
+MEDIAN = 1.4826
+"""The deviation of a Gaussian over the median of its size."""
 FLOOR = 0.01
 """Smallest level of constants, as a share of the deviation of their residuals: half of them may be exact."""
 ORDER = 6
@@ -155,7 +160,7 @@ def level_of(e: Array, first: int) -> Array:
     m = max(3, min(WINDOWS, N // 20))
     edges = np.linspace(first, N, m + 1).astype(int)
     parts = [np.abs(e[a:b]) for a, b in pairwise(edges)]
-    held = (np.minimum(part, HELD * max(deviation(part), 0.05 * s)) for part in parts)
+    held = (np.minimum(part, HELD * max(MEDIAN * float(np.median(part)), 0.05 * s)) for part in parts)
     own = np.log([max(np.sqrt(np.mean(part**2)), 0.05 * s) for part in held])
     chance = 0.6 * m / N  # variance of the logarithm of a deviation of N / m Gaussians
     share = max(0.0, 1.0 - 1.5 * chance / max(float(own.var()), chance))
@@ -290,17 +295,36 @@ def together(
 
 def weights(e: Array, level: Array) -> Array:
     """Roots of the weights of residuals e (N,): a row counts as a residual of three levels if its own is larger."""
-    return np.asarray(np.minimum(1.0, HELD * level / np.maximum(np.abs(e), SMALL)) / level)
+    return np.asarray(HELD / np.maximum(np.abs(e) / level, HELD) / level)
 
 
-def noise(X: Array, y: Array, order: int | None = None, fewest: int | None = None) -> Noise:
-    """The noise of y (N,) on X (N, n), X' X = N I; of an autoregression of some ``order`` if that is given."""
+def spread(e: Array, phi: Array) -> Array:
+    """(N,): sqrt(a + b x^2) of the regressor x of phi (N, n) with which residuals e (N,) grow, if they clearly do.
+
+    The likelihood of Gaussian noise, by weighted least squares of squares that are limited at three deviations.
+    """
+    p = grows_with(e, phi)
+    most = int(np.argmin(p))
+    if not p[most] * len(p) < LOUDER:
+        return np.ones(len(e))
+    A = np.column_stack([np.ones(len(e)), phi[:, most] ** 2 / np.mean(phi[:, most] ** 2)])
+    square, size = e**2, np.full(len(e), np.mean(e**2))
+    for _ in range(ROUNDS):
+        limited = np.minimum(square, HELD**2 * np.maximum(size, square.mean()))
+        a, b = scipy.optimize.nnls(A / size[:, None], limited / size)[0]
+        size = np.maximum(A @ [a, b], SMALL + FLOOR**2 * square.mean())
+    return np.asarray(np.sqrt(size / np.median(size)))
+
+
+def noise(X: Array, y: Array, phi: Array, order: int | None = None, fewest: int | None = None) -> Noise:
+    """The noise of y (N,) on X (N, n), X' X = N I, which are phi in a basis; of some ``order`` if that is given."""
     N, n = X.shape
     most = max(0, min(MOST, N // shortest(n, NONE, fewest) - 1))
     lags = NONE if order is None else np.arange(1, order + 1)
     constants = robust_fit(X, y)
     e = constants.residual
     level = np.full(N, max(constants.scale, FLOOR * float(np.std(e)), SMALL))
+    level *= spread(e / level, phi)
     g = weights(e, level)
     for _ in range(2):
         if order is None:
@@ -312,6 +336,7 @@ def noise(X: Array, y: Array, order: int | None = None, fewest: int | None = Non
         first = order_of(lags)
         v = y - rows @ np.linalg.lstsq(Z, z, rcond=None)[0]
         e = np.append(np.zeros(first), white_rows(v[:, None], v, lags, ar, np.ones(N))[1])
-        level = level_of(e, first)
+        size = spread(e, phi)
+        level = size * level_of(e / size, first)
         g = weights(e, level)
     return Noise(lags, ar, level, g, e, rows, shortest(n, lags, fewest))

@@ -24,7 +24,6 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
-from driftfit.judge.changes.constants import SMALL
 from driftfit.judge.changes.dates import Dated
 from driftfit.judge.changes.fit import hats, order_of, split, white_rows
 from driftfit.judge.changes.null import Model
@@ -93,10 +92,10 @@ def innovations(H: Array, q: Array, W: Array) -> tuple[Array, float]:
     return W, float(total[0])
 
 
-def left(Z: Array, z: Array) -> float:
-    """Sum of squares of z (N,) that columns Z (N, q) do not explain."""
+def left(Z: Array, z: Array, floor: float) -> float:
+    """Sum of squares of z (N,) that columns Z (N, q) do not explain, beyond rounding."""
     r = z - Z @ np.linalg.lstsq(Z, z, rcond=None)[0]
-    return float(r @ r) + SMALL
+    return max(float(r @ r), floor)
 
 
 def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) -> Kind:
@@ -109,9 +108,9 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
     Z, z = white_rows(phi, model.y, lags, found.ar, g)
     M = len(z)
     moves = list(moving)
-    scores = {"rest": M * np.log(left(Z, z)) + n * price}
+    scores = {"rest": M * np.log(left(Z, z, model.floor)) + n * price}
     if K:
-        scores["steps"] = M * np.log(changes.rss) + (changes.used + DATE * K) * price
+        scores["steps"] = M * np.log(max(changes.rss, model.floor)) + (changes.used + DATE * K) * price
     ramp, ends, slope = _ramp(Z, z, phi[:, moves], model, found, first)
     scores["gradual"] = M * np.log(ramp) + (n + len(moves) + DATE * 2) * price
     path = np.zeros((N, 0))
@@ -121,7 +120,7 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
         lines = hats(N, knots)
         more = np.hstack([phi[:, j : j + 1] * lines[:, 1:] for j in moves])
         both = np.hstack([Z, white_rows(more, model.y, lags, found.ar, g)[0]])
-        score = M * np.log(left(both, z)) + (n + len(moves) * (knots - 1)) * price
+        score = M * np.log(left(both, z, model.floor)) + (n + len(moves) * (knots - 1)) * price
         if score < scores["gradual"]:
             scores["gradual"], ends = score, (0, N - 1)
             beta = np.linalg.lstsq(both, z, rcond=None)[0]
@@ -161,7 +160,7 @@ def _ramp(
             made = columns * _rise(N, (int(a), int(b)))[:, None]
             white = white_rows(made, model.y, model.noise.lags, found.ar, model.noise.g)[0]
             rest = white - Q @ (Q.T @ white)
-            value = left(rest, r)
+            value = left(rest, r, model.floor)
             if value < best[0]:
                 whole = np.zeros((N, columns.shape[1]))
                 whole[first:] = white
@@ -186,18 +185,18 @@ def _walks(
         used = int(np.count_nonzero(ar))
         for step in STEPS:
             W, total = innovations(Z[:, moves] / np.sqrt(unit), np.full(len(moves), step), np.column_stack([Z, z]))
-            score = len(z) * np.log(left(W[:, :n], W[:, -1])) + total + (n + 1 - len(lags) + used) * price
+            score = len(z) * np.log(left(W[:, :n], W[:, -1], model.floor)) + total + (n + 1 - len(lags) + used) * price
             walk = min(walk, score)
             kept = list(range(K))
             while kept:
                 some = [i for i, (k, _) in enumerate(steps) if k in kept]
-                score = (len(z) * np.log(left(W[:, [*range(n), *(n + i for i in some)]], W[:, -1])) + total
+                score = (len(z) * np.log(left(W[:, [*range(n), *(n + i for i in some)]], W[:, -1], model.floor)) + total
                          + (n + 1 + len(some) + DATE * len(kept) - len(lags) + used) * price)  # fmt: skip
                 if score < both:
                     both, dates = score, tuple(kept)
                 without = []
                 for k in kept:
                     rest = [n + i for i, (date, _) in enumerate(steps) if date in kept and date != k]
-                    without.append(left(W[:, [*range(n), *rest]], W[:, -1]))
+                    without.append(left(W[:, [*range(n), *rest]], W[:, -1], model.floor))
                 kept.remove(kept[int(np.argmin(without))])
     return float(walk), float(both), dates

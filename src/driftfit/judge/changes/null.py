@@ -96,6 +96,9 @@ class Model(NamedTuple):
 
     phi: Array
     y: Array
+    """(N,), less phi offset."""
+    offset: Array
+    """(n,): constants, so that sums of squares are those of the noise."""
     X: Array
     basis: Array
     """(n, n): X = phi basis."""
@@ -118,11 +121,13 @@ def modelled(
 ) -> Model:
     """The regression with its noise."""
     X, basis = in_basis(phi)
-    phi, y, basis = (np.ascontiguousarray(one) for one in (phi, y, basis))
-    found = noise(X, y, order, fewest)
+    offset = basis @ np.linalg.lstsq(X, y, rcond=None)[0]
+    rounding = ROUNDING * np.abs(y)
+    phi, y, basis = (np.ascontiguousarray(one) for one in (phi, y - phi @ offset, basis))
+    found = noise(X, y, phi, order, fewest)
     r = (y - X @ np.linalg.lstsq(X * found.g[:, None], y * found.g, rcond=None)[0]) * found.g
-    floor = float(np.sum((ROUNDING * y * found.g) ** 2) + LOST * (r @ r)) + SMALL
-    return Model(phi, y, X, basis, lags, root, found, floor)
+    floor = float(np.sum((rounding * found.g) ** 2) + LOST * (r @ r)) + SMALL
+    return Model(phi, y, offset, X, basis, lags, root, found, floor)
 
 
 def problem_of(model: Model, paths: Array) -> Problem:
@@ -158,7 +163,7 @@ class Draws:
         model, problem = self.model, self.problem
         n = model.X.shape[1]
         way = Recursion(
-            model.phi, model.X, model.basis, *model.lags, theta, ar, model.y - model.phi @ theta, self.e
+            model.phi, model.X, model.basis, *model.lags, theta + model.offset, ar, model.y - model.phi @ theta, self.e
         )  # fmt: skip
         signs = self.rng.integers(0, 2, (count, len(model.y))) * 2.0 - 1.0
         results = Results(
@@ -174,7 +179,7 @@ class Draws:
         if not len(columns) and not len(lags):
             return theta, ar
         drawn = self.of(theta, ar, BIASED, False)
-        shift = np.median(drawn.theta @ self.model.basis.T, axis=0) - theta
+        shift = np.median(drawn.theta @ self.model.basis.T, axis=0)
         turn = np.median(drawn.ar, axis=0) - ar
         if not (np.isfinite(shift).all() and np.isfinite(turn).all()):
             return theta, ar
@@ -193,6 +198,7 @@ class Draws:
         lags = np.array([row - source[row] for row, source in zip(known, back.source.T, strict=True)])
         order = np.argsort(lags)
         ratio = np.array([back.ratio[row, i] for i, row in enumerate(known)])
+        theta = theta + self.model.offset
         return radius((theta[back.columns] * ratio)[order], lags[order])
 
 

@@ -63,7 +63,7 @@ class Results(NamedTuple):
     L: Array
     """(R, 1 + m)"""
     theta: Array
-    """(R, n), in the basis."""
+    """(R, n), in the basis, less those that were drawn from."""
     ar: Array
     """(R, p)"""
 
@@ -87,6 +87,7 @@ def _draw(
     for d in range(signs.shape[0]):
         simulate(way, problem.lags, signs[d], work.v, drawn.phi, drawn.y)
         for t in range(N):
+            drawn.y[t] = work.v[t]  # without what constants explain, which may be far larger
             for j in range(n):
                 drawn.X[t, j] = way.X[t, j]
                 if way.columns.shape[0] > 0:

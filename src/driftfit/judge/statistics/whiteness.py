@@ -20,6 +20,9 @@ import scipy
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.robust import deviation
 
+LOUDER = 1e-3
+"""p-value of residuals of one size below which they grow with a regressor."""
+
 
 class Whiteness(NamedTuple):
     """Correlations at K lags with their standard errors under whiteness, Q and its p-value."""
