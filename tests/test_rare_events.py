@@ -29,7 +29,7 @@ def test_error_rate_of_rare_events(kind):
 
 def test_rare_events_that_become_frequent_for_a_time_are_found():
     """Also if nearly all of y is rare events: the change of the rate is not taken for correlated noise."""
-    for seed in range(10):
+    for seed in range(5):
         phi, y = rare("counts", seed)
         y[220:330] += np.random.default_rng(seed).poisson(1.2, 110)
         found = judged(phi, y)
@@ -48,7 +48,7 @@ def pulses(seed, change=0.0, louder=1.0, T=600):
 @pytest.mark.parametrize("change", [1.0, 4.0, 40.0])
 def test_the_response_to_rare_pulses_changes(change):
     """All residuals of pulses are clipped if the change is large: they still have information."""
-    assert max(p_of(*pulses(seed, change)) for seed in range(10)) < 0.05
+    assert max(p_of(*pulses(seed, change)) for seed in range(5)) < 0.05
 
 
 @pytest.mark.filterwarnings("ignore:.*fault code")
@@ -56,7 +56,7 @@ def test_noise_that_is_louder_in_rare_pulses():
     """Segments that hold one pulse fit it exactly, and rows of equal weight let pulses decide: of 100 constant records,
     57 were rejected."""
     runs = (track(Regression(1, intercept=True), RLS(1.0), y, phi[:, 0]) for phi, y in
-            (pulses(seed, louder=10.0) for seed in range(60)))  # fmt: skip
+            (pulses(seed, louder=10.0) for seed in range(20)))  # fmt: skip
     assert np.mean([bool(run.verdict().drifts) for run in runs]) < 0.2
 
 

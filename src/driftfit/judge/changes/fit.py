@@ -37,6 +37,10 @@ SEASON = 24
 ROUNDS = 4
 KNOTS = (3, 5, 9, 17, 33)
 """Knots of lines that parameters may move on."""
+FURTHER = 3
+"""Breaks, beyond the best number, that are tried."""
+ROUNDED = 1e-14
+"""Information below this share of that of the whole record is rounding."""
 MOST = 12
 """Largest number of breaks."""
 WINDOWS = 12
@@ -104,8 +108,8 @@ def estimated(
     Z, z = white_rows(split(X, breaks) if rows is None else rows, y, *noise)
     n, K = X.shape[1], len(breaks)
     G = Z.T @ Z
-    ridge = SINGULAR * np.trace(G[:n, :n]) / n * np.append(np.zeros(n), np.ones(K * n)) + SMALL
-    beta = np.linalg.lstsq(np.vstack([Z, np.diag(np.sqrt(ridge))]), np.append(z, np.zeros(len(ridge))), rcond=None)[0]
+    ridge = np.trace(G[:n, :n]) / n * np.append(np.full(n, ROUNDED), np.full(K * n, SINGULAR)) + SMALL
+    beta = np.linalg.solve(G + np.diag(ridge), Z.T @ z)
     r = z - Z @ beta
     return np.cumsum(beta.reshape(K + 1, n), axis=0), float(r @ r)
 
@@ -133,24 +137,20 @@ def lags_of(v: Array, most: int) -> Array:
     if most < 1 or longest >= N // 3:
         return NONE
     rows = np.column_stack([v[longest - lag : N - lag] for lag in range(longest + 1)])
-    G = rows.T @ rows + SMALL * np.eye(longest + 1)
+    G = rows.T @ rows
+    G += np.diag(SINGULAR * np.diag(G) + SMALL)
     count, price = N - longest, np.log(N)
-
-    def criterion(lags: list[int]) -> float:
-        if not lags:
-            return float(count * np.log(G[0, 0]))
-        A = G[np.ix_(lags, lags)]
-        A = A + SINGULAR * np.diag(np.diag(A))
-        left = G[0, 0] - G[0, lags] @ np.linalg.solve(A, G[lags, 0])
-        return float(count * np.log(max(left, SINGULAR * G[0, 0])) + price * len(lags))
-
-    best = min((list(range(1, p + 1)) for p in range(most + 1)), key=criterion)
-    seasons = [[*best, lag] for lag in range(most + 1, longest + 1)]
-    if seasons:
-        one = min(seasons, key=criterion)
-        if criterion(one) + 2.0 * np.log(len(seasons)) < criterion(best):
-            best = one
-    return np.array(best, np.int64)
+    own = np.linalg.solve(np.linalg.cholesky(G[1 : most + 1, 1 : most + 1]), G[1 : most + 1, 0])
+    left = np.maximum(G[0, 0] - np.append(0.0, np.cumsum(own**2)), SINGULAR * G[0, 0])
+    p = int(np.argmin(count * np.log(left) + price * np.arange(most + 1)))
+    lags, seasons = np.arange(1, p + 1), np.append(0, np.arange(most + 1, longest + 1))
+    if len(seasons) > 1:
+        ties = G[np.ix_(lags, seasons)]
+        rest = G[np.ix_(seasons, seasons)] - ties.T @ np.linalg.solve(G[np.ix_(lags, lags)], ties)
+        gain = rest[0, 1:] ** 2 / np.maximum(np.diag(rest)[1:], SMALL)
+        if -count * np.log1p(-min(gain.max() / left[p], 1.0 - SINGULAR)) > price + 2.0 * np.log(len(gain)):
+            lags = np.append(lags, seasons[1 + int(np.argmax(gain))])
+    return lags
 
 
 def level_of(e: Array, first: int) -> Array:
@@ -239,6 +239,8 @@ def divided(
         ar = regressed(noise_of(X, y, theta, found[0]), g, lags)
     for _ in range(ROUNDS if len(lags) else 1):
         for breaks in partitions(X, y, (lags, ar, g), most, shortest(n, lags, given)):
+            if len(breaks) > len(found[0]) + FURTHER:
+                break
             own = ar
             for _ in range(2 if len(breaks) else 0):
                 breaks = moved(X, y, (lags, own, g), breaks, shortest(n, lags, given))
@@ -279,12 +281,10 @@ def together(
     for knots in KNOTS:
         if n * knots > N // 8:
             break
-        rows, lags, ar = lined(X, knots), NONE, np.zeros(0)
-        for _ in range(2):
-            Z, z = white_rows(rows, y, lags, ar, g)
-            v = y - rows @ np.linalg.lstsq(Z, z, rcond=None)[0]
-            lags = lags_of(v * g, orders)
-            ar = regressed(v, g, lags)
+        rows = lined(X, knots)
+        v = y - rows @ np.linalg.lstsq(rows * g[:, None], y * g, rcond=None)[0]
+        lags = lags_of(v * g, orders)
+        ar = regressed(v, g, lags)
         Z, z = white_rows(rows, y, lags, ar, g)
         r = z - Z @ np.linalg.lstsq(Z, z, rcond=None)[0]
         criterion = N * np.log(max(float(r @ r), SMALL)) + (n * (knots - 1) + len(lags)) * np.log(N)

@@ -1,6 +1,6 @@
 """What kind of change: steps, a gradual one, a walk, or a walk with jumps, by one criterion.
 
-    BIC = N log(rss) + sum log f_t + (number of coefficients + 2 (number of dates)) log N
+    BIC = N log(rss) + sum log f_t + (number of coefficients + number of dates) log N
 
     rest      constants
     steps     the segments, with the changes that are needed
@@ -10,7 +10,7 @@
               constants are estimated on the innovations of all columns
     jumps     the walk, with those steps that it still needs
 
-A date costs as much as two coefficients (Zhang and Siegmund, 2007). The walk is tried beside the noise of the segments
+A date costs as much as a coefficient. The walk is tried beside the noise of the segments
 and beside white noise, since an autoregression takes a walk for noise. The weights of the kinds are exp(-BIC / 2).
 
 Source: Schwarz (1978); Ansley and Kohn (1985) for constants beside a filter. Cost: O(N) for each of some hundred
