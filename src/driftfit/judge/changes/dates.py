@@ -41,7 +41,7 @@ SWEEPS = 4
 DATES = 20_000
 """Places, at most, at which the likelihood of a date is computed."""
 RANK = 1e-12
-"""Smallest singular value of columns of unit length that counts."""
+"""Smallest singular value that counts, as a share of the largest."""
 LEVERAGE = 0.1
 """Smallest share of a residual that its own row is taken to leave."""
 MOVED = 40
@@ -276,9 +276,8 @@ def _moved(exact: Exact, at: Array, k: int, low: int, weight: Array) -> Array:
 
 
 def covariance(Z: Array, z: Array) -> tuple[Array, Array]:
-    """Least squares of z (N,) on Z (N, q), and its covariance from residuals over one less their leverage."""
-    size = np.sqrt(np.sum(Z * Z, axis=0)) + SMALL
-    inverse = np.linalg.pinv(Z / size, rcond=RANK) / size[:, None]
+    """Shortest least squares of z (N,) on Z (N, q); its covariance, from residuals over one less their leverage."""
+    inverse = np.linalg.pinv(Z, rcond=RANK)
     beta = inverse @ z
     e = (z - Z @ beta) / np.maximum(1.0 - np.einsum("tj,jt->t", Z, inverse), LEVERAGE)
     return beta, np.asarray((inverse * e**2) @ inverse.T)

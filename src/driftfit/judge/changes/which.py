@@ -25,6 +25,8 @@ ALIKE = 6.0
 """Twice the logarithm of the likelihood ratio from which on the evidence is strong (Kass and Raftery, 1995)."""
 RANK = 1e-10
 """Smallest singular value that counts, as a share of the largest."""
+EXACT = 1e-14
+"""Share of the sum of squares of constants below which a sum of squares is rounding."""
 NEAR = 4
 """Rows by which the date of another explanation may differ."""
 
@@ -78,14 +80,16 @@ class _Search:
         self.size = np.where(size > 0.0, size, 1.0)
         self.phi = model.phi / self.size
         self.flat = [j for j in range(self.n) if np.ptp(model.phi[:, j] / model.root) == 0.0]
+        self.whole = float(np.sum((model.y * model.noise.g) ** 2)) + SMALL
         self.need = np.log(self.N) + 2.0 * np.log(self.n)
         self.sets = self._needed()
         self.instead: list[tuple[int, ...]] = [()] * len(self.dates)
         self.temporary: list[int] = []
 
     def loss(self, rss: float, other: float | Array) -> Array:
-        """What an explanation with a larger sum of squares costs."""
-        return np.asarray(self.N * np.log(np.maximum(other, rss) / rss))
+        """What an explanation with a larger sum of squares costs; those of rounding are equal."""
+        least = max(rss, EXACT * self.whole)
+        return np.asarray(self.N * np.log(np.maximum(other, least) / least))
 
     def white(self, columns: Array) -> tuple[Array, Array]:
         """Columns and outputs after whitening."""
