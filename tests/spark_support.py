@@ -8,10 +8,9 @@ import polars as pl
 import pyarrow as pa
 
 from driftfit import ARX, Kalman, track
-from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow, Known
-from driftfit.bridges.spark.follow import STATE, _schema
-from driftfit.bridges.spark.pieces import ARROW
+from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow
 from driftfit.bridges.spark.task import SETTING, Task
+from driftfit.bridges.spark.units import ARROW
 from driftfit.run import layout
 
 MODEL, K = ARX(2, 2), Kalman(q=1e-4, r=0.1)
@@ -57,21 +56,23 @@ def task_of(model=MODEL, tracker=K):
 KINDS = {"unit": "string", "t": "double", "u": "double"}
 
 
+def flow_of(task, hold=HOLD, rules=None, origins=(), time="double"):
+    kinds = KINDS | dict.fromkeys(task.y, "double") | {"t": time}
+    return Flow(task, kinds, hold, (None,) * len(task.y) if rules is None else rules, origins)
+
+
 class ByHand:
     """A stream whose batches are given one by one: what Spark does for `driftfit.bridges.spark.follow`."""
 
     def __init__(self, model=MODEL, tracker=K, rules=None, hold=HOLD, origins=(), settings=()):
-        task = replace(task_of(model, tracker), settings=tuple(settings))
-        rules = (None,) * len(task.y) if rules is None else rules
-        kinds = KINDS | dict.fromkeys(task.y, "double")
-        self.flow = Flow(task, _schema(task, kinds, rules), hold, rules, origins)
+        self.flow = flow_of(replace(task_of(model, tracker), settings=tuple(settings)), hold, rules, origins)
         self.kept = []
         self.found = {}
 
     def batch(self, rows, expired=None):
         """Process new rows; units without a row since ``expired`` end."""
         task, schema = self.flow.task, self.flow.schema
-        columns = [*task.columns, *STATE, "last", "newest"]
+        columns = [*task.columns, *self.flow.state]
         own = dict.fromkeys((SETTING + name for name in task.settings), pa.float64())
         types = pa.schema({name: ARROW[schema[name]] for name in columns} | own | {"_kind": pa.int32()})
         parts = [rows.with_columns(_kind=pl.lit(NEW)), *self.kept]
@@ -79,7 +80,7 @@ class ByHand:
         table = pa.Table.from_pydict({name: every[name].to_list() if name in every.columns else [None] * len(every)
                                       for name in types.names}, types)  # fmt: skip
         self.kept = []
-        for one in replace(self.flow, expired=expired).tables(Known.of(replace(self.flow, expired=expired), table)):
+        for one in replace(self.flow, expired=expired).tables(table):
             frame = pl.from_arrow(one)
             kind = frame["kind"][0]
             self.found.setdefault(kind, []).append(frame)

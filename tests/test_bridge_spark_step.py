@@ -10,17 +10,15 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 import pytest
-from spark_support import HOLD, KINDS, MODEL, PAIR, ByHand, K, arriving, fleet_of, packed, rows_of, task_of
+from spark_support import HOLD, KINDS, MODEL, PAIR, ByHand, K, arriving, fleet_of, flow_of, packed, rows_of, task_of
 from support import same
 
 from driftfit import AdaptiveKalman, Kalman, Live, track
 from driftfit.bridges import spark
 from driftfit.bridges.spark import task as tasks
 from driftfit.bridges.spark.batch import Partition, schema_of
-from driftfit.bridges.spark.flow import Flow, Origin
 from driftfit.bridges.spark.frames import java, missing
-from driftfit.bridges.spark.unit import Unit
-from driftfit.run.layout import packed as pack
+from driftfit.bridges.spark.keyed import Unit
 
 TYPES = {"unit": pa.string(), **dict.fromkeys(("t", "y", "flow", "pressure", "u"), pa.float64())}
 
@@ -115,40 +113,18 @@ def test_outputs_have_alarms_each():
 
 
 @pytest.mark.parametrize("model", [MODEL, PAIR])
-def test_states_survive_other_settings_and_another_version(model):
-    """States of an earlier version have another order of fields, one that is gone, and lack one."""
+def test_states_survive_other_settings(model):
     rows = rows_of(5, 7, 40, y=model.outputs)
     first, rest = rows.filter(pl.col("t") < 20.0), rows.filter(pl.col("t") >= 20.0)
     other = replace(K, r=0.3)
     before = fleet_of(first, model=model)
     warm = {key: run for key, run in before.series().items() if key in rest["unit"]}
     expected = fleet_of(rest, other, model, warm).to_table().sort("unit", "t")
-    old = ByHand(model, hold=0.0)
+    old, stream = ByHand(model, hold=0.0), ByHand(model, other, hold=0.0, origins=(other, K))
     old.batch(first)
-    layout = old.flow.task.joint_for(None).programs[0].layout
-    names = [name for name in reversed(layout.text.split()) if not name.startswith("floor:")]
-    text = " ".join([*names, "gone:f2"])
-    assert len(names) == len(layout.text.split()) - 1
-
-    def earlier(state):
-        joint = old.flow.task.joint_for(None)
-        words = joint.unpack(state).reshape(len(joint.programs), -1)
-        places, at = {}, 0
-        for one in layout.text.split():
-            shape = layout.shapes[one.partition(":")[0]][1]
-            places[one] = slice(at, at + int(np.prod(shape)))
-            at = places[one].stop
-        lanes = [np.concatenate([*(lane[places[name]] for name in names), [0, 0]]) for lane in words]
-        return pack(joint._tag([one.layout.tag_with(text) for one in joint.programs]), np.concatenate(lanes))
-
-    for version in (False, True):
-        stream = ByHand(model, other, hold=0.0, origins=(Origin(other, "theta:f1"), Origin(K, text)))
-        stream.kept = list(old.kept)
-        if version:
-            states = [earlier(state) for state in old.kept[0]["state"]]
-            stream.kept = [old.kept[0].with_columns(state=pl.Series(states, dtype=pl.Binary))]
-        stream.batch(rest)
-        assert stream.rows().select(expected.columns).equals(expected)
+    stream.kept = list(old.kept)
+    stream.batch(rest)
+    assert stream.rows().select(expected.columns).equals(expected)
     foreign = ByHand(model, AdaptiveKalman(), hold=0.0, origins=())
     foreign.kept = list(old.kept)
     with pytest.raises(ValueError, match="a state of another model, tracker, gate, setting or version"):
@@ -160,7 +136,7 @@ def test_outputs_have_trackers_each():
     rows = rows_of(2, 7, 60, y=PAIR.outputs)
     own = {"flow": K, "pressure": replace(K, r=0.4)}
     _, table = pieces_of(rows.sort("unit", "t"), task_of(PAIR, own), "samples")
-    stream, unit = ByHand(PAIR, own, hold=0.0), Unit(task_of(PAIR, own), 0.0, False, (None, None))
+    stream, unit = ByHand(PAIR, own, hold=0.0), Unit(flow_of(task_of(PAIR, own), 0.0))
     for part in (rows.filter(pl.col("t") < 20.0), rows.filter(pl.col("t") >= 20.0)):
         stream.batch(part)
     assert stream.rows().select(table.columns).equals(table)
@@ -232,24 +208,24 @@ def test_a_unit_with_keyed_state_gives_what_the_sorted_table_gives():
         hold = np.timedelta64(4, "s") if dated else HOLD
         task = replace(task_of(), dt="1s" if dated else None)
         time = (t * 1e6).astype("M8[us]") if dated else t
-        unit, state, found = Unit(task, hold, dated, (rule,)), None, []
+        unit, state, found = Unit(flow_of(task, hold, (rule,), time="timestamp" if dated else "double")), None, []
         order = np.argsort(t + np.random.default_rng(1).uniform(0.0, 3.5, len(t)), kind="stable")
         for part in np.array_split(order, 12):
             stamps = time[part].astype(int) if dated else time[part]
             given = list(zip(stamps.tolist(), y[part].tolist(), u[part].tolist(), strict=True))
             state, some = unit.step(state, [*given, given[0], (None, 1.0, 1.0)])
             found += some
-        assert unit.newest(state) == t[-1] * (1e6 if dated else 1.0)
+        assert state["newest"] == t[-1] * (1e6 if dated else 1.0)
         *rest, end = unit.ended(state, "silent")
         assert 0 < len(rest) < 6
         found += rest
         fleet = fleet_of(rows)
         run = fleet["0"]
         assert end["state"][24:] == packed(fleet)["0"]
-        good = [one for one in found if "failed" not in one]
+        good = [one for one in found if one["failed"] is None]
         for name, path in (("prediction", run.prediction), ("theta_b1[u]", run.theta[:, 2]), ("std_a1", run.std[:, 0])):
             assert same([one[name] for one in good], path)
-        assert sorted({one["failed"] for one in found if "failed" in one}) == ["at a repeated time", "without a time"]
+        assert sorted({one["failed"] for one in found} - {None}) == ["at a repeated time", "without a time"]
         live, watch = Live(MODEL, K, dt="1s" if dated else None), []
         alarm = live.detect(rule)
         stamps = np.array([one["t"] for one in good]).astype("M8[us]") if dated else t
@@ -265,7 +241,9 @@ def test_a_unit_with_keyed_state_continues_with_other_settings():
     other = replace(K, r=0.3)
     before = fleet_of(first, model=PAIR)
     run = fleet_of(rest, other, PAIR, dict(before.series()))["0"]
-    old, new = Unit(task_of(PAIR), 0.0, False, (None, None)), Unit(task_of(PAIR, other), 0.0, False, (None, None), K)
+    old, new, foreign = (
+        Unit(flow_of(task_of(PAIR, one), 0.0, origins=made)) for one, made in ((K, ()), (other, (K,)), (other, ()))
+    )
     given = [part.select("t", "flow", "pressure", "u").rows() for part in (first, rest)]
     state, _ = old.step(None, given[0])
     _, found = new.step(state, given[1])
@@ -276,13 +254,13 @@ def test_a_unit_with_keyed_state_continues_with_other_settings():
     again = new.step(begun, given[1])[1]
     assert same([one["std_b1[pressure<-u]"] for one in again], run.std[:, 1, 2])
     with pytest.raises(ValueError, match="a state of another model, tracker, gate, setting or version"):
-        replace(new, before=None).step(state, given[1])
+        foreign.step(state, given[1])
 
 
 def test_a_flow_is_pickled_without_what_it_has_made():
     task = task_of()
     assert task.joint_for(None).programs[0].names == task.names[0]
-    again = pickle.loads(pickle.dumps(Flow(task, {}, 0.0, (None,))))
+    again = pickle.loads(pickle.dumps(flow_of(task)))
     assert again.task == task
     assert not again.task._made
 

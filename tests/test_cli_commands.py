@@ -63,8 +63,8 @@ def test_parts_of_a_record(table):
     assert np.array_equal(theta(*DATED, "--to", "2024-03-01"), expected().theta[:, 1])  # a day to its end
     assert "need --time" in fails("track", *SIGNALS, "--from", "3")
     assert "no row is between" in fails("track", *DATED, "--from", "2025-01-01")
-    assert "not a date" in fails("track", *DATED, "--from", "soon")
-    assert "not a number" in fails("track", *SIGNALS, "--time", "n", "--from", "2024-01-01")
+    assert "must be a date" in fails("track", *DATED, "--from", "soon")
+    assert "must be a number" in fails("track", *SIGNALS, "--time", "n", "--from", "2024-01-01")
     for wrong in ("5", "0:3", "7:3", "a:b"):
         assert f"--rows {wrong}" in fails("track", *SIGNALS, "--rows", wrong)
     assert "pump.csv has no row 1000" in fails("track", *SIGNALS, "--rows", "1000:")

@@ -134,8 +134,8 @@ ENGINE = HOME / "src/driftfit/engine"
 INTERNALS = {ENGINE / "numba_internals.py", *(ENGINE / "compile_time").glob("*.py")}
 """They lean on the private side of Numba; a test fails first for each place."""
 SOURCES = sorted({*(HOME / "src").rglob("*.py")} - INTERNALS)
-FOREIGN = {"_jsc", "_jvm", "_getframe", "_exit", "_sock_recv", "_sock_send", "_left_title"}
-"""Private names of Spark, Python, paho and matplotlib for which there is no public way."""
+FOREIGN = {"_jsc", "_jvm", "_getframe", "_exit", "_left_title"}
+"""Private names of Spark, Python and matplotlib for which there is no public way."""
 OWN = ("self", "cls", "super()", "type(self)")
 TUPLES = {"_replace", "_asdict", "_fields", "_make"}
 

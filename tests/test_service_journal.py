@@ -14,7 +14,6 @@ pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
 from service_support import (
     HTTP,
     UNIT,
-    coded,
     configured,
     events,
     feed,
@@ -32,7 +31,6 @@ from driftfit.cli import app
 from driftfit.service.core.archive import export
 from driftfit.service.core.journal import DAMAGED, NAME, Journal, sum_of, verify
 from driftfit.service.page import feed as history
-from driftfit.service.supervisor import rebuild
 
 Y, U = record(400)
 AUDIT = "[service]\naudit = true\n"
@@ -254,29 +252,13 @@ def test_old_journals_become_parquet(tmp_path, monkeypatch):
     assert engine.units.get(1).counts["samples"] == 101
 
 
-OLDER = {
-    "block": "unit, first, last, start, stop, count, x'90' as rows, extremes",
-    "event": "rowid as id, number, unit, at, kind, detail",
-}
-"""Columns of the older format, where they are not those of today without the sum."""
-
-
-def test_a_journal_of_an_older_format_is_refused_and_rebuilt(tmp_path):
-    y, u = coded()
-    engine = opened(configured(), tmp_path)
-    feed(engine, message("plant/a", range(100), y, u))
-    engine.close()
-    with sqlite3.connect(tmp_path / "driftfit.db") as db:
-        for table in ("meta", "unit", "log", "result", "program", "snapshot", "block", "event", "position"):
-            today = [name for _, name, *_ in db.execute(f"pragma table_info({table})") if name != "sum"]
-            db.execute(f"create table older as select {OLDER.get(table, ', '.join(today))} from {table}")
-            db.execute(f"drop table {table}")
-            db.execute(f"alter table older rename to {table}")
-        db.execute("drop table chain")
-        db.execute("update meta set value = '2' where key = 'format'")
-    db.close()
-    with pytest.raises(ValueError, match=r"older driftfit.*--rebuild"):
-        opened(configured(), tmp_path)
-    rebuild(tmp_path)
-    engine = opened(configured(), tmp_path)
-    assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])
+def test_a_journal_of_another_format_is_refused_and_stays_as_it_is(folder):
+    for older in ("2", "4"):
+        change(folder, ("update meta set value = ? where key = 'format'", older))
+        before = (folder / NAME).read_bytes()
+        for again in (False, True):
+            with pytest.raises(
+                ValueError, match=f"has the format {older}, and this version reads 3: use another folder"
+            ):
+                Journal(folder, rebuild=again)
+        assert (folder / NAME).read_bytes() == before

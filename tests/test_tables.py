@@ -115,7 +115,7 @@ def test_rows_are_sorted_and_of_several_at_one_time_the_first_is_used(kind):
     flow = y[rows]
     flow[T:] = 99.0  # what comes again at a time that was there
     table = KINDS[kind]({"y": flow, "u": u[rows], "t": time[rows]})
-    with pytest.warns(DataWarning, match=r"time: 3 of 63 rows repeat the time of another row .* by= the column"):
+    with pytest.warns(DataWarning, match=r"time: 3 of 63 rows repeat the time .* by= the column.* summer time"):
         run = track(MODEL, TRACKER, "y", "u", data=table, time="t", dt=2)
     assert_same(run, alone(y, u, time=time, dt=2))
     assert np.array_equal(run.time, time)
@@ -383,28 +383,6 @@ def test_a_fleet_continues_from_its_states_as_bytes():
     assert np.array_equal(Live.from_bytes(rest.states()[2]).cov, whole[2].cov(59))
     with pytest.raises(ValueError, match="a mapping from key to its end or bytes"):
         track(ARX(1, 1), K, y, u, by="row", warm_start=b"one")
-
-
-@pytest.mark.parametrize(
-    ("first", "hour", "every"), [("2024-10-27", 2, 10), ("2024-04-07", 2, 30), ("2024-11-03", 1, 60)]
-)
-def test_the_hour_that_is_repeated_at_the_end_of_summer_time_is_not_left_out_silently(first, hour, every):
-    """In Europe, Australia and America; of other repeated times the warning is a general one."""
-    count = 60 // every
-    wall = np.datetime64(first) + np.arange(6 * count) * np.timedelta64(every, "m")
-    again = np.concatenate([wall[: (hour + 1) * count], wall[hour * count :]])
-    frame = pl.DataFrame({"at": [str(t) for t in again], "y": rng_values(len(again)), "u": rng_values(len(again))})
-    options = {"model": ARX(1, 1), "tracker": Kalman(q=1e-3, r=0.1), "time": "at", "dt": f"{every}min"}
-    with pytest.warns(UserWarning, match=f"rows? repeats? times of the hour from {first} 0{hour}:00"):
-        run = track(y="y", u="u", data=frame, **options)
-    assert run.labels.dropped == {"at a repeated time": count}
-    in_june = frame.with_columns(pl.col("at").str.replace(first, "2024-06-11"))
-    with pytest.warns(DataWarning, match="rows repeat the time of another row"):
-        assert track(y="y", u="u", data=in_june, **options).labels.dropped == {"at a repeated time": count}
-
-
-def rng_values(count):
-    return np.random.default_rng(0).normal(size=count)
 
 
 def test_names_of_columns_with_blanks_around_them_or_quotes_are_found(tmp_path):

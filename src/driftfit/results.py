@@ -24,15 +24,14 @@ from driftfit.trackers.bank.results.results import Hypotheses
 from driftfit.trackers.bank.results.smoothed import SmoothedMixture
 from driftfit.tune.refine import refine
 from driftfit.use import simulate, system
+from driftfit.use.blocks import blocks_of
 from driftfit.use.constrained import Constrained, constrain
 from driftfit.use.conversion import Transfer, transfer
 from driftfit.use.crossing import Crossing, crossing
 from driftfit.use.forecast import Forecast, forecast
-from driftfit.use.hammerstein_wiener.block_plots import plot_blocks
-from driftfit.use.hammerstein_wiener.run_blocks import blocks_of
+from driftfit.use.plots import plot_blocks, plot_system, plot_validation
 from driftfit.use.simulate import Prediction
 from driftfit.use.system import FrequencyResponse, LongRun, Response
-from driftfit.use.system_plots import plot_system, plot_validation
 
 if TYPE_CHECKING:
     import xarray
@@ -241,7 +240,7 @@ class Track(result.Track, Exported, public=True):
 
     def plot_system(self, input: int | str = 0, at: Any = None, ax: Any = None, **settings: Any) -> Figure:
         """Step and frequency response over time with bands, poles in the plane, gain; see
-        `driftfit.use.system_plots`. ``ax`` as for `plot`.
+        `driftfit.use.plots`. ``ax`` as for `plot`.
         """
         return plot_system(self, input, at, ax=ax, **settings)
 

@@ -11,7 +11,8 @@ from typer import Option
 
 from driftfit.cli.options import Given, Plot, Report, Table, check_table, reads
 from driftfit.cli.program import app, say
-from driftfit.cli.reading import interval_from, moment
+from driftfit.cli.reading import interval_from
+from driftfit.data.limits import end_of
 from driftfit.engine.settings import marks
 from driftfit.results import Track
 from driftfit.show.export import write_table
@@ -89,7 +90,7 @@ def parse_reference(given: list[str] | None, run: Any) -> Any:
         return int(given[0])
     first, last = interval_from(given[0], "--reference")
     axis, zone = (run.time, run.labels.zone) if isinstance(run, Track) else (np.arange(1), None)
-    return moment(first, axis, zone), moment(last, axis, zone, end=True)
+    return end_of("--reference", first, axis, zone, 0), end_of("--reference", last, axis, zone, 1)
 
 
 def _band(entry: str) -> tuple[str, tuple[float, float]]:

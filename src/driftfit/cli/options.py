@@ -98,8 +98,9 @@ class Given:
         str | None,
         Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
     ] = None
-    decimal: Annotated[
-        str | None, Option(help="Decimal sign of the numbers: . or , (by default the file shows it).")
+    decimal: Annotated[str, Option(help="Decimal sign of the numbers: . or , (points then group thousands).")] = "."
+    dates: Annotated[
+        str | None, Option(help="Form of dates that do not begin with the year: '%d.%m.%Y %H:%M', as in Python.")
     ] = None
     missing: Annotated[
         Names, Option(help="What the file holds where there is no reading: Offline or -999; repeat it.")
@@ -156,7 +157,7 @@ class Given:
         names = [*self.outputs, *self.inputs]
         return Part(
             first=self.first, last=self.last, rows=rows_from(self.rows),
-            separator=separator_from(self.separator), decimal=decimal_from(self.decimal),
+            separator=separator_from(self.separator), decimal=decimal_from(self.decimal), dates=self.dates,
             missing=tuple(self.missing or []),
             limits=tuple(limits_from(entry, names) for entry in self.limits or []),
             exclude=tuple(map(interval_from, self.exclude or [])),

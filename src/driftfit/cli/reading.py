@@ -1,4 +1,4 @@
-"""Read parts of files: ranges of rows and times, decimal commas, separators, stdin; valid ranges and exclusions.
+"""Read parts of files: ranges of rows and times, separators, stdin; valid ranges and exclusions.
 
 Rows are counted from 1 after the header, as in messages about cells, and ranges include both ends. Valid ranges and
 intervals are passed on unchanged (`driftfit.data.limits`).
@@ -11,7 +11,6 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import timedelta
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,8 +19,7 @@ import polars as pl
 from driftfit.data.clock import Clock
 from driftfit.data.columns import Columns, Wanted, convert
 from driftfit.data.files import paths_of, read_file
-from driftfit.data.instants import EXAMPLES, dates, span
-from driftfit.data.limits import marks
+from driftfit.data.limits import end_of, marks
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
@@ -36,7 +34,8 @@ class Part:
     last: str | None = None
     rows: tuple[int, int | None] = (1, None)
     separator: str | None = None
-    decimal: str | None = None
+    decimal: str = "."
+    dates: str | None = None
     missing: tuple[str, ...] = ()
     limits: tuple[tuple[str, Range], ...] = ()
     exclude: tuple[tuple[str, str], ...] = ()
@@ -113,9 +112,9 @@ def interval_from(entry: str, option: str = "--exclude") -> tuple[str, str]:
     return first.strip(), last.strip()
 
 
-def decimal_from(text: str | None) -> str | None:
-    """The decimal sign; None: the file shows it."""
-    if text not in (None, ".", ","):
+def decimal_from(text: str) -> str:
+    """The decimal sign."""
+    if text not in (".", ","):
         raise ValueError(f"--decimal {text}: the decimal sign must be a point or a comma.")
     return text
 
@@ -147,7 +146,8 @@ def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Se
     """Read columns of several files in the order of the files."""
     if (part.first or part.last) and time is None:
         raise ValueError("--from and --to are times, so they need --time; rows are chosen with --rows.")
-    wanted = Wanted(tuple(dict.fromkeys(names)), time, tuple(by), marks(part.missing)[0], part.separator, part.decimal)
+    how = marks(part.missing)[0], part.separator, part.decimal, part.dates
+    wanted = Wanted(tuple(dict.fromkeys(names)), time, tuple(by), *how)
     read = [_one(path, wanted, part) for path in (["-"] if "-" in files else paths_of(list(files)))]
     if len({one.time.dtype.kind for one in read if one.time is not None}) > 1:
         raise ValueError("the times of some files are numbers, those of others are dates.")
@@ -178,43 +178,14 @@ def _between(rows: Rows, part: Part) -> Rows:
     axis = rows.time
     keep = np.ones(len(axis), bool)
     if part.first is not None:
-        keep &= axis >= moment(part.first, axis, rows.zone)
+        keep &= axis >= end_of("--from", part.first, axis, rows.zone, 0)
     if part.last is not None:
-        keep &= axis <= moment(part.last, axis, rows.zone, end=True)
+        keep &= axis <= end_of("--to", part.last, axis, rows.zone, 1)
     if not keep.any():
         raise ValueError(f"no row is between --from {part.first or '...'} and --to {part.last or '...'}.")
     by = [[value for value, kept in zip(column, keep.tolist(), strict=True) if kept] for column in rows.by]
     numbers = {name: column[keep] for name, column in rows.numbers.items()}
     return Rows(numbers, axis[keep], rows.zone, by, rows.units)
-
-
-def moment(text: str, axis: Array, zone: str | None, end: bool = False) -> Any:
-    """A time from text, of the kind of ``axis``: a number, or a date in its zone; ``end``: its day's last instant."""
-    if axis.dtype.kind != "M":
-        try:
-            return float(text)
-        except ValueError:
-            raise ValueError(f"{text!r} is not a number, but the times of the record are.") from None
-    text = text.strip()
-    if re.fullmatch(r"\d{4}", text):
-        text += "-12-31" if end else "-01-01"
-    elif (days := span(text)) is not None:
-        text, end = (str(days[1] - timedelta(1)), True) if end else (str(days[0]), False)
-    else:
-        end = end and ":" not in text
-    found = dates(pl.Series("time", [text]), "the command line")
-    if found.has_nulls():
-        raise ValueError(
-            f"{text!r} is not a date; write 2024-01-31, '2024-01-31 12:00:00', or a period as in {EXAMPLES}."
-        )
-    if zone is not None:
-        found = (
-            found.dt.replace_time_zone(zone, ambiguous="earliest")
-            .dt.convert_time_zone("UTC")
-            .dt.replace_time_zone(None)
-        )
-    instant = found.to_numpy()[0]
-    return instant + np.timedelta64(1, "D") - np.timedelta64(1, "us") if end else instant
 
 
 def listed(given: Sequence[str] | None) -> list[str]:

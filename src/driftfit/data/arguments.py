@@ -212,7 +212,8 @@ def warn_of_repeats(count: int, rows: int) -> None:
     """Warn that ``count`` rows were left out."""
     warn(
         f"time: {count} of {rows} rows repeat the time of another row and are left out. Give times of a finer clock, "
-        "by= the column that tells series apart, or the mean of the rows at each time."
+        "by= the column that tells series apart, or the mean of the rows at each time; local times that repeat the "
+        "hour at the end of summer time need their zone, such as 2024-10-27 02:30+01:00, or UTC."
     )
 
 

@@ -17,7 +17,7 @@ import narwhals as nw
 import numpy as np
 import polars as pl
 
-from driftfit.data.instants import DAY, EXAMPLES, dates, day_first, periods, zone_name
+from driftfit.data.instants import DAY, EXAMPLES, dates, periods, zone_name
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import ABSENT, as_numbers, near
 
@@ -43,7 +43,8 @@ class Wanted:
     """The columns to read: numbers, perhaps a time, and the columns that identify the series; and how they are read.
 
     ``missing`` are further texts that mean "no value". In CSV files ``separator`` divides lines into cells, and
-    ``decimal`` is the decimal sign, "." or ","; None: the file shows it.
+    ``decimal`` is the decimal sign, "." or ",". ``dates`` is the form of dates as in Python, "%d.%m.%Y %H:%M"; None:
+    the year is first.
     """
 
     numbers: tuple[str, ...]
@@ -51,7 +52,8 @@ class Wanted:
     by: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
     separator: str | None = None
-    decimal: str | None = None
+    decimal: str = "."
+    dates: str | None = None
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -77,23 +79,18 @@ class Columns:
 
 
 def convert(frame: nw.DataFrame[Any], wanted: Wanted, where: str, base: int, rows: slice | None = None) -> Columns:
-    """The wanted columns of one table as arrays; ``base`` is the number of its first row.
-
-    Of ``rows`` alone every cell is read; but the dates of all rows show whether their day or month comes first.
-    """
+    """The wanted columns of a table, or of some of its ``rows``, as arrays; ``base`` is the number of its first row."""
     names = plain_names(frame.columns, wanted.names)
     if names != frame.columns:
         frame = frame.rename(dict(zip(frame.columns, names, strict=True)))
     for name in wanted.names:
         if name not in frame.columns:
             raise ValueError(f"{where} has no column {name!r}: {near(name, frame.columns)}")
-    axis = None if wanted.time is None else frame[wanted.time]
-    first = day_first(_as_text(axis, wanted.missing)) if axis is not None and _is_text(axis) else None
     if rows is not None:
         frame, base = frame[rows], base + (rows.start or 0)
     time, zone = (None, None)
     if wanted.time is not None:
-        time, zone = times_of_column(frame[wanted.time], where, base, first, wanted.missing)
+        time, zone = times_of_column(frame[wanted.time], where, base, wanted.dates, wanted.missing)
     numbers = {name: numbers_of(frame[name], where, base, wanted.missing) for name in wanted.numbers}
     return Columns(numbers, time, zone, [_keys(frame[name], wanted.missing) for name in wanted.by], len(frame))
 
@@ -162,26 +159,26 @@ def _advice(cell: str, second_line: bool) -> str:
     """What to do about a cell that is not a number."""
     if re.search(r"\d[ ,'\u00a0\u2019\u202f]\d{3}", cell):
         return "write numbers without signs between thousands"
-    if re.fullmatch(r"[+-]?\d*,\d+", cell):
-        return "write numbers with a decimal point, or, on the command line, give --decimal ,"
+    if re.fullmatch(r"[+-]?[\d.]*,\d+", cell):
+        return (
+            "for decimal commas give --decimal , on the command line, or pass the table that "
+            "polars.read_csv(.., decimal_comma=True) reads"
+        )
     if second_line and not re.search(r"\d", cell):
         return "if this line holds units, put # before it"
     return "leave a cell empty where there is no value"
 
 
 def times_of_column(
-    series: nw.Series[Any], where: str, base: int, first: bool | None = None, missing: Sequence[str] = ()
+    series: nw.Series[Any], where: str, base: int, form: str | None = None, missing: Sequence[str] = ()
 ) -> tuple[Array, str | None]:
-    """(numbers or datetime64 in UTC, zone); NaN or NaT for rows without a time.
-
-    ``first``: whether dates such as 1/2/2024 begin with the day; None: the column shows it.
-    """
+    """(numbers or datetime64 in UTC, zone); NaN or NaT for rows without a time. ``form`` is that of dates as text."""
     if _is_text(series):
         text = _as_text(series, (*HISTORIANS, *missing))
         compact = bool(text.drop_nulls().str.contains(f"^{DAY}$").all()) and text.null_count() < len(text)
-        if not compact and text.cast(pl.Float64, strict=False).is_null().eq(text.is_null()).all():
+        if form is None and not compact and text.cast(pl.Float64, strict=False).is_null().eq(text.is_null()).all():
             return _numbers_of_text(text, where, base), None
-        series = nw.from_native(_dates_of_text(text, where, base, first), series_only=True)
+        series = nw.from_native(_dates_of_text(text, where, base, form), series_only=True)
     native: Any = series.to_native()
     if str(getattr(native, "dtype", "")).startswith("period["):  # pandas: periods, which narwhals does not know
         return np.asarray(native.dt.to_timestamp().to_numpy()), None
@@ -218,15 +215,16 @@ def _dates_of_objects(cells: list[Any], where: str, base: int) -> tuple[Array, s
     return np.array(days, dtype="datetime64[us]"), names.pop() if len(names) == 1 else "UTC" if names else None
 
 
-def _dates_of_text(text: pl.Series, where: str, base: int, first: bool | None) -> pl.Series:
-    begin = periods(text.to_list())
-    found = dates(text, where, first) if begin is None else pl.Series(text.name, begin)
+def _dates_of_text(text: pl.Series, where: str, base: int, form: str | None) -> pl.Series:
+    begin = None if form else periods(text.to_list())
+    found = dates(text, form) if begin is None else pl.Series(text.name, begin)
     wrong = (found.is_null() & text.is_not_null()).arg_true()
     if len(wrong):
+        form = form or f"2024-01-31, 2024-01-31 12:00:00, or a period as in {EXAMPLES}"
         raise ValueError(
             f"{where}, row {wrong[0] + base} of column {text.name!r} holds {text[wrong[0]]!r}, which is neither a "
-            "number nor a date in the form of the column's first cells (2024-01-31, 2024-01-31 12:00:00, or a period "
-            f"as in {EXAMPLES})."
+            f"number nor a date in the form {form}; for another give --dates '%d.%m.%Y %H:%M' on the command line, "
+            f"or pass the table with polars.col({text.name!r}).str.to_datetime('%d.%m.%Y %H:%M')."
         )
     return found
 

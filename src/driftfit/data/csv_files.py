@@ -6,27 +6,25 @@ which spreadsheets write. A row of units may follow it. Blank lines are left out
 missing readings, unless every line is followed by one. Separators at the end of a line are left out; a line with more
 cells than the header is an error. Text that is neither UTF-8 nor UTF-16 is taken as Windows-1252.
 
-Numbers may have a decimal comma, and dots between thousands: 1.234,5. Columns are cells without blanks around them,
-null for those without a value (`driftfit.data.columns.present`).
+With ``decimal=","`` numbers have a decimal comma, and dots between thousands: 1.234,5; nothing of it is guessed.
+Columns are cells without blanks around them, null for those without a value (`driftfit.data.columns.present`).
 """
 
 from __future__ import annotations
 
 import csv
 import io
-import itertools
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
 from driftfit.data.columns import ERROR, FILE, HISTORIANS, Wanted, plain_names, present
-from driftfit.data.instants import is_date
 
 PROBE_BYTES = 1 << 16
-"""The bytes from which the separator, the decimal sign and units are judged."""
+"""The bytes from which the separator and units are judged."""
 
 RUN = r"^[=+\-@\t\r]"
 """How a text begins that spreadsheets run as a formula."""
@@ -71,8 +69,7 @@ def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFra
     """The names of all columns of a CSV file, the wanted columns as text, and the units of a row of units.
 
     A name that several columns have is listed as often as it occurs. Without ``wanted.separator`` the header shows what
-    separates cells. With ``wanted.decimal`` of "," every number may have a decimal comma, with "." none; without it
-    those of a file whose cells are not separated by commas.
+    separates cells.
     """
     content = source if isinstance(source, bytes) else Path(source).read_bytes()
     if encoding := _encoding(content[:PROBE_BYTES]):
@@ -100,17 +97,13 @@ def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFra
             return read_csv(content.decode("windows-1252", errors="replace").encode(), wanted)
         _check_widths(content, sign, len(raw))
         every = pl.read_csv(content, columns=read, truncate_ragged_lines=True, **options)
-    rows = list(csv.reader(lines, delimiter=sign))[1:]
-    units = _units(rows, names, wanted)
-    every, rows = every.slice(bool(units)), rows[bool(units) :]
-    frame = every.select(list(chosen)).rename(chosen)
-    words = (*HISTORIANS, *wanted.missing)
-    numbers = [present(frame[name], words) for name in wanted.signals if name in frame.columns]
+    units = _units(list(csv.reader(lines, delimiter=sign))[1:], names, wanted)
+    frame = every.slice(bool(units)).select(list(chosen)).rename(chosen)
     if wanted.decimal == ",":
-        frame = frame.with_columns(map(points, numbers))
-    elif wanted.decimal is None and sign != ",":
-        others = every.get_columns() if read is None else _columns(rows)
-        frame = frame.with_columns(with_points(numbers, (present(other, words) for other in others)))
+        words = (*HISTORIANS, *wanted.missing)
+        frame = frame.with_columns(
+            points(present(frame[name], words)) for name in wanted.signals if name in frame.columns
+        )
     keys = frame.select(pl.col(name).str.strip_chars() for name in wanted.by if name in frame.columns)
     return [*names, *again], frame.with_columns(_whole(column) for column in keys), units
 
@@ -133,20 +126,15 @@ def _lines(start: bytes) -> list[str]:
     return [line for line in whole if line.strip() and not COMMENT.match(line)]
 
 
-def _columns(rows: Sequence[Sequence[str]]) -> list[pl.Series]:
-    """Columns of cells, of lines that may differ in length."""
-    return [pl.Series(str(k), cells) for k, cells in enumerate(itertools.zip_longest(*rows, fillvalue=""))]
-
-
 def _units(rows: Sequence[Sequence[str]], names: Sequence[str], wanted: Wanted) -> dict[str, str]:
     """The units of the wanted numbers, if the first line below the header holds them.
 
-    It is such a line if it has no number, no date, and no cell that its column holds again.
+    It is such a line if it has no number and no cell that its column holds again.
     """
     first = [cell.strip() for cell in rows[0]] if len(rows) > 1 else []
     for k, cell in enumerate(first):
         again = (row[k].strip() == cell for row in rows[1:] if k < len(row))
-        if cell and (VALUE.match(cell) or is_date(cell) or any(again)):
+        if cell and (VALUE.match(cell) or any(again)):
             return {}
     found = dict(zip(names, present(pl.Series(first, dtype=pl.String), (*HISTORIANS, *wanted.missing)), strict=False))
     return {name: unit.strip("[]() ") for name in wanted.numbers if (unit := found.get(name))}
@@ -199,60 +187,8 @@ def _whole(text: pl.Series) -> pl.Series:
 COMMA = r"^[+-]?(\d+|\d{1,3}(\.\d{3})+)?(,\d*)?([eE][+-]?\d+)?$"
 """A number with a decimal comma, perhaps with dots between thousands."""
 
-GROUPED = r"^[+-]?([1-9]\d{0,2}(\.\d{3})+|\d+)$"
-"""A whole number, perhaps with dots between thousands."""
-
-POINT = r"^[+-]?\d*\.(\d{0,2}|\d{4,})([eE][+-]?\d+)?$"
-"""A number with a decimal point, which cannot be between thousands."""
-
-
-def with_points(columns: Sequence[pl.Series], others: Iterable[pl.Series]) -> list[pl.Series]:
-    """Columns of a file with decimal points instead of decimal commas, and without dots between thousands.
-
-    ``others`` are all columns of the file, or the beginning of each: decimal commas in one of them say that the dots in
-    columns of whole numbers are between thousands, and a decimal point that commas may be between thousands. If there
-    are both, or text among the decimal commas, such dots raise a ValueError.
-    """
-    if not any(map(_doubtful, columns)):
-        return [_with_points(column, False, False) for column in columns]
-    every = [column.drop_nulls() for column in [*columns, *others]]
-    pointed = any(column.str.contains(POINT).any() for column in every)
-    commas = [column for column in every if (column.str.contains(COMMA) & column.str.contains(",", literal=True)).any()]
-    pure = bool(commas) and not pointed and all(column.str.contains(COMMA).all() for column in commas)
-    for column in columns if commas and not pure else ():
-        if _doubtful(column) and not column.str.contains(",", literal=True).any():
-            dot = column.filter(column.str.contains(".", literal=True).fill_null(False))[0]
-            raise ValueError(
-                f"the dot in {dot} of column {column.name!r} may be a decimal point or stand between thousands: "
-                f"the file has decimal commas and {'decimal points' if pointed else 'text among them'}. Give "
-                "--decimal , or --decimal . on the command line, or pass the table that "
-                "polars.read_csv(.., decimal_comma=True) reads."
-            )
-    return [_with_points(column, pure, pointed) for column in columns]
-
-
-def _doubtful(text: pl.Series) -> bool:
-    """Whether only other columns can show if all signs of a column are decimal ones or between thousands."""
-    known = text.drop_nulls()
-    commas = known.filter(known.str.contains(",", literal=True))
-    if len(commas):
-        return bool(commas.str.contains(r",\d{3}$").all())
-    return bool(known.str.contains(".", literal=True).any() and known.str.contains(GROUPED).all())
-
 
 def points(text: pl.Series) -> pl.Series:
     """A column with a decimal point instead of a comma; points that group thousands are removed."""
     plain = text.str.replace_all(".", "", literal=True).str.replace(",", ".", literal=True)
     return plain.zip_with(text.str.contains(COMMA).fill_null(False), text)
-
-
-def _with_points(text: pl.Series, commas: bool, pointed: bool) -> pl.Series:
-    """One column of a file in which others have decimal ``commas``, or some cells are ``pointed``."""
-    known = text.drop_nulls()
-    comma = known.filter(known.str.contains(",", literal=True))
-    if not len(comma):
-        return points(text) if commas and known.str.contains(GROUPED).all() else text
-    mixed = not comma.str.contains(COMMA).all() or known.str.contains(POINT).any()
-    if mixed or (pointed and comma.str.contains(r",\d{3}$").all()):
-        return text  # the error message names the cell
-    return points(text)

@@ -107,7 +107,7 @@ def within(intervals: Any, time: Array | None, number: Array, zone: str | None =
     for interval in intervals:
         if isinstance(interval, str) or not isinstance(interval, Sequence | np.ndarray) or len(interval) != 2:
             raise ValueError(f"exclude: each interval must be (from, to), in a list; got {interval!r}.")
-        low, high = (_end(one, axis, zone, upper) for upper, one in enumerate(interval))
+        low, high = (end_of("exclude", one, axis, zone, upper) for upper, one in enumerate(interval))
         if low is not None and high is not None and not low <= high:
             raise ValueError(f"exclude: an interval must not end before it begins; got {interval!r}.")
         inside |= (True if low is None else axis >= low) & (True if high is None else axis <= high)
@@ -131,7 +131,7 @@ def within_each(
     return inside
 
 
-def _end(given: Any, axis: Array, zone: str | None, upper: int) -> Any:
+def end_of(what: str, given: Any, axis: Array, zone: str | None, upper: int) -> Any:
     """One end of an interval in the kind of the axis; a day or longer, as the upper end, includes its last moment."""
     if given is None:
         return None
@@ -147,7 +147,7 @@ def _end(given: Any, axis: Array, zone: str | None, upper: int) -> Any:
     except (TypeError, ValueError):
         kind = "a date or a datetime" if axis.dtype.kind == "M" else "a number"
         raise ValueError(
-            f"exclude: for this record an end of an interval must be {kind}, or None; got {given!r}."
+            f"{what}: for this record an end of an interval must be {kind}, or None; got {given!r}."
         ) from None
 
 

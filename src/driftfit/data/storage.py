@@ -116,12 +116,12 @@ def parts_of(value: Any) -> Iterator[Any]:
 
 
 def check_size(source: str | PathLike[str], model: Any, tracker: Any, size: int) -> None:
-    """ValueError unless model and tracker have as many parameters as a file; what they need is made after that."""
+    """ValueError if model and tracker have more parameters than a file has room for: what they need is made later."""
     n = len(tracker.names_for(model))
-    if n != size:
+    if n > size:
         raise ValueError(
-            f"{os.fspath(source)} does not fit {type(tracker).__name__} in this version: field 'theta' has {size} "
-            f"numbers, the model {n} parameters."
+            f"{os.fspath(source)} does not fit {type(tracker).__name__} in this version: it has room for {size} "
+            f"parameters, the model has {n}."
         )
 
 

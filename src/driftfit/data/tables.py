@@ -23,7 +23,7 @@ from driftfit.data.arrays import named_outputs, noise_of_outputs
 from driftfit.data.clock import LABEL, Clock
 from driftfit.data.columns import Columns, Wanted
 from driftfit.data.files import read
-from driftfit.data.instants import warn_of_counted_years, warn_of_summer_time, warn_of_written_numbers
+from driftfit.data.instants import warn_of_counted_years, warn_of_written_numbers
 from driftfit.data.limits import marks
 from driftfit.data.record import Known, Labels, Reading, Records
 from driftfit.engine.kernel import Array
@@ -63,7 +63,7 @@ def read_records(
         if not _in_order(columns.time, code, axis, indexed):
             axis, columns = None, replace(columns, time=None)
     dropped: dict[Hashable, dict[str, int]] = {}
-    order, times = _order(columns.time, columns.zone, code, keys, dropped)
+    order, times = _order(columns.time, code, keys, dropped)
     length = np.bincount(code[order], minlength=len(keys))
     failed |= {keys[k]: "no row has a time" for k in np.flatnonzero(length == 0)}
     there = np.flatnonzero(length)
@@ -159,11 +159,7 @@ def _tuples(by: Sequence[Sequence[Any]]) -> Iterator[Hashable]:
 
 
 def _order(
-    time: Array | None,
-    zone: str | None,
-    code: Array,
-    keys: Sequence[Hashable],
-    dropped: dict[Hashable, dict[str, int]],
+    time: Array | None, code: Array, keys: Sequence[Hashable], dropped: dict[Hashable, dict[str, int]]
 ) -> tuple[Array, Array | None]:
     """(the rows that become samples, unit by unit and sorted by time; their times); the other rows are counted."""
     _count(dropped, [None], np.zeros(int((code < 0).sum()), dtype=np.int64), "without a unit")
@@ -177,7 +173,7 @@ def _order(
     repeated = np.zeros(len(order), dtype=bool)
     repeated[1:] = (np.diff(code[order]) == 0) & (time[order][1:] == time[order][:-1])
     _count(dropped, keys, code[order[repeated]], "at a repeated time")
-    if repeated.any() and not warn_of_summer_time(time[order[repeated]], zone):
+    if repeated.any():
         warn_of_repeats(int(repeated.sum()), len(order))
     order = order[~repeated]
     return order, time[order]

@@ -8,10 +8,12 @@ import hashlib
 import math
 from types import CodeType, FunctionType
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 LOAD_GLOBAL = dis.opmap["LOAD_GLOBAL"]
+_NAMES: WeakKeyDictionary[FunctionType, frozenset[str]] = WeakKeyDictionary()
 
 
 def identity(function: FunctionType) -> str:
@@ -22,12 +24,25 @@ def identity(function: FunctionType) -> str:
     be found on disk by a second process, and recompiles them when a step was edited. The identity is that of the
     compiled code, not of its text: the file may have been edited since it was imported, and at a prompt there is none.
     """
-    used = used_globals(function)
-    used |= dict(zip(function.__code__.co_freevars, (c.cell_contents for c in function.__closure__ or ()), strict=True))
+    used = used_values(function)
     used |= {"defaults": (*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).items())}
     parts = [function.__module__, function.__qualname__, _code(function.__code__)]
     parts += [f"{name}={_identity_of(value, function, name)}" for name, value in sorted(used.items())]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def used_values(function: FunctionType) -> dict[str, Any]:
+    """The globals and the variables of enclosing functions that a function reads."""
+    closed = zip(function.__code__.co_freevars, (c.cell_contents for c in function.__closure__ or ()), strict=True)
+    return used_globals(function) | dict(closed)
+
+
+def names_in(function: FunctionType) -> frozenset[str]:
+    """Names of all attributes, fields of records among them, in a function and the compiled functions that it uses."""
+    if function not in _NAMES:
+        inner = (getattr(value, "py_func", None) for value in used_values(function).values())
+        _NAMES[function] = frozenset(function.__code__.co_names).union(*(names_in(f) for f in inner if f is not None))
+    return _NAMES[function]
 
 
 def used_globals(function: FunctionType) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from numba import types
 from driftfit.engine import disk_cache
 from driftfit.engine import numba_internals as internals
 from driftfit.engine.compile_notice import compiling
+from driftfit.engine.identity import names_in
 
 PREFIX = "outlined-"
 """Beginning of the symbols of outlined steps, which are the names of their files too."""
@@ -30,20 +31,23 @@ LINKED: WeakValueDictionary[Any, internals.Linked] = WeakValueDictionary()
 """Outlined steps that drivers of this process use, by symbol and by the routines that are called instead of others."""
 
 
-def outlined(step: Any, short: bool = False) -> Any:
+def outlined(step: Any, short: bool = False, whole: bool = False) -> Any:
     """A step, which takes the record only, as drivers call it. For one lane it is compiled once for all sizes of the
     record (`driftfit.engine.compile_time.open_record`), and for size if it is ``short`` because it seldom runs; for
-    several lanes it is compiled once for each size.
+    several lanes it is compiled once for each size. One that takes the ``whole`` record, fields of the model and of the
+    tracker, is compiled once for all that have the fields it names.
     """
+    named = names_in(step.py_func) if whole else frozenset()
 
     def typed(context: Any, record: Any) -> Any:
         known = record.fields["theta"].type.shape[-1] > 1
-        taken = record if known else internals.OpenRecord(record)
+        fields = {name: record.fields[name] for name in sorted(named & record.fields.keys())} or record.fields
+        taken = record if known else internals.OpenRecord(fields)
         symbol = disk_cache.name_of(PREFIX.rstrip("-"), step.identity, taken)
         SOURCES[symbol] = step.py_func, taken, short and not known
 
         def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            argument = given if known else [internals.opened(context, builder, record, given[0])]
+            argument = given if known else [internals.opened(context, builder, fields, given[0])]
             return internals.call(context, builder, symbol, (taken,), argument)
 
         return types.none(record), build

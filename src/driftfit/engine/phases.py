@@ -224,7 +224,7 @@ def gated(look: Any, gate: Step, learn: Any, part: Any) -> Any:
             s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
             gate(s, l)
 
-    judged = outlined(judge)
+    judged = outlined(judge, whole=True)
 
     @kernel
     def between(s: State) -> None:

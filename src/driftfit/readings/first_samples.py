@@ -67,7 +67,7 @@ def reading_now(s: State, l: int) -> float:
     return s.raw_y[l] if s.observed[l] > 0.0 else np.nan
 
 
-@kernel
+@partial(kernel, short=True)
 def usual_value(s: State, column: int, center: float, apart: bool, l: int) -> float:
     """The lower median of a column; with ``apart``, of the distances from center that are not 0, or 0 if there are
     fewer than `FEW`."""
@@ -138,7 +138,7 @@ def rotate_in(s: State, k: int, l: int) -> float:
     return s.gate_fit[n, n, l] ** 2  # type: ignore[no-any-return]
 
 
-@kernel
+@partial(kernel, short=True)
 def fit(s: State, every: bool, l: int) -> float:
     """Sum of squares of least squares on all rows, or on those that are not doubtful."""
     N, n = s.gate_first.shape[0], s.phi.shape[0]
@@ -225,7 +225,7 @@ def comes_again(s: State, l: int) -> bool:
     return again
 
 
-@partial(kernel, inline=False)
+@partial(kernel, short=True)
 def decide(s: State, ages: int, implicit: bool, l: int) -> None:
     """Where samples made room for others they were judged one by one, unless they are the codes themselves."""
     N = s.gate_first.shape[0]
@@ -274,7 +274,7 @@ def keep(s: State, k: int, times: float, l: int) -> None:
         s.gate_first[k, PHI + i, l] = s.phi[i, l] if s.valid[l] > 0.0 else np.nan
 
 
-@partial(kernel, inline=False)
+@partial(kernel, short=True)
 def remember_one(s: State, ages: int, implicit: bool, l: int) -> None:
     N = s.gate_first.shape[0]
     last = s.gate_kept[l] - 1

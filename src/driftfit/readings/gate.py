@@ -33,6 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -200,6 +201,7 @@ def output_rule(gate: Gate) -> Step:
     return judge  # type: ignore[no-any-return]
 
 
+@lru_cache(maxsize=256)
 def gate_step(
     gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False
 ) -> Step:

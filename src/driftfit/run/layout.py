@@ -91,11 +91,7 @@ class Layout:
     @cached_property
     def tag(self) -> bytes:
         """Fingerprint of model, tracker and layout, 8 bytes."""
-        return self.tag_with(self.text)
-
-    def tag_with(self, text: str) -> bytes:
-        """The fingerprint of the same model and tracker in a version whose fields are ``text``."""
-        plain = json.dumps([self.owner, text], sort_keys=True, separators=(",", ":"))
+        plain = json.dumps([self.owner, self.text], sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(plain.encode()).digest()[:8]
 
     def taken(self, tile: Array) -> Array:
@@ -132,7 +128,7 @@ def own_words(data: bytes, tag: bytes, size: int, owner: Any) -> Array:
         raise ValueError(
             "the bytes hold a state of another model, tracker, gate, setting or version: their fingerprint is "
             f"{found.hex()}, that of {owner} is {tag.hex()}. Use the model, tracker and gate that made them, "
-            "or carry the state over field by field with warm_start=."
+            "carry the state over field by field with warm_start=, or run the record again."
         )
     return words
 
@@ -176,18 +172,3 @@ def tag_of(data: bytes) -> bytes:
 
 def _native(words: Array) -> Array:
     return words if sys.byteorder == "little" else words.astype(np.int64)
-
-
-def fields_of(text: str, words: Array) -> dict[str, Array]:
-    """The fields by name from the text of a layout (`Layout.text`) and words (W,); ValueError if they do not fit."""
-    found: dict[str, Array] = {}
-    at = 0
-    for one in text.split():
-        name, _, form = one.partition(":")
-        shape = tuple(int(size) for size in form[1:].split(",") if size)
-        part = words[at : at + prod(shape)]
-        found[name] = (part if form[:1] == "i" else part.view(np.float64)).reshape(shape)
-        at += prod(shape)
-    if at != len(words):
-        raise ValueError(f"the state has {len(words)} words, but its fields have {at}.")
-    return found

@@ -43,9 +43,7 @@ SINGLE_BLOCK = 4096
 """Samples of a block of results that are kept in single precision."""
 
 WIDEST_LANES = 10
-"""With more parameters than this loops over lanes are slower than single lanes (docs/design.md): the compiler does not
-unroll a loop over that many, and then does not vectorise the loop over lanes.
-"""
+"""Parameters above which loops over lanes are slower than single lanes (docs/decisions/vectorisation.md)."""
 
 _NOTHING: tuple[Array, ...] = ()
 

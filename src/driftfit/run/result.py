@@ -141,11 +141,6 @@ class Track(Plain, OfRecord):
         """The state after the last sample, field by field; these are views and must not be written to."""
         return state_of(self._lane.tile, self._lane.lane)
 
-    def ended_with(self, name: str) -> Array | None:
-        """One field of `state`, without the others; None if the state does not have it."""
-        tile = self._lane.tile
-        return tile[name][0, ..., self._lane.lane] if name in (tile.dtype.fields or ()) else None
-
     @property
     def undetermined(self) -> Array:
         """Which parameters the record does not determine, (n,) bool: their std after the last sample is inf."""

@@ -176,16 +176,6 @@ def _any_of(tracker: Any) -> list[Any]:
     return [next(iter(some))]
 
 
-def track_one(
-    model: Model, tracker: Tracker, y: Any, u: Any = None, reading: Reading | None = None, keep: str = "std",
-    warm_start: Run | None = None,
-) -> Track:  # fmt: skip
-    """`track` for one series of one output with one tracker."""
-    run = track(model, tracker, y, u, reading, keep=keep, warm_start=warm_start)
-    assert isinstance(run, Track)
-    return run
-
-
 def records_of(
     model: Model, y: Any, u: Any, reading: Reading, data: Any = None, by: Any = None
 ) -> tuple[Model, Records, Mapping[Hashable, str]]:

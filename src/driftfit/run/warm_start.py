@@ -19,10 +19,9 @@ from driftfit.data.clock import Clock
 from driftfit.data.instants import instant
 from driftfit.data.record import Labels
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import warn
 from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
-from driftfit.run.layout import fields_of, own_words, packed, unpacked
+from driftfit.run.layout import own_words, packed, unpacked
 from driftfit.run.program import Program, State, programs_of, state_of, tile_of
 from driftfit.trackers.base import Tracker
 
@@ -70,7 +69,7 @@ class End(NamedTuple):
             model, trackers, extra = read("what was given", header, arrays, classes)
             programs = programs_of(model, by_output(model, trackers), model.m, gate_from(header) or False)
             tile = tile_of(programs)
-            restore("what was given", programs, header, arrays, tile)
+            restore("what was given", programs, arrays, tile)
             states = tuple(state_of(tile, lane) for lane in range(len(programs)))
             return cls(programs, states, *(extra[name] for name in ("last", "awaits", "dt", "zone")))
 
@@ -89,7 +88,7 @@ def written(
     described = [storage.describe(one.tracker) for one in programs]
     model = programs[0].whole
     header: dict[str, Any] = {"kind": KINDS[len(model.outputs) > 1], "model": storage.describe(model)}
-    header |= {"tracker": described[0] if len(described) == 1 else described, "fields": programs[0].layout.text}
+    header |= {"tracker": described[0] if len(described) == 1 else described}
     header |= {"gate": None if programs[0].gate is None else programs[0].gate.settings()}
     header |= {"extra": {name: value for name, value in extra.items() if value != ABSENT[name]}}
     return header, {f"state{lane}": np.frombuffer(data, np.uint8) for lane, data in enumerate(lanes)}
@@ -103,9 +102,7 @@ def read(
     described, classes = given if isinstance(given, list) else [given], tuple(classes)
     trackers = tuple(storage.rebuild(one, Tracker, classes) for one in described)
     model = storage.rebuild(header["model"], Model, classes)
-    if "fields" in header:
-        theta = fields_of(header["fields"], unpacked(arrays["state0"].tobytes())[1]).get("theta", np.zeros(0))
-        storage.check_size(source, model, trackers[0], len(theta))
+    storage.check_size(source, model, trackers[0], len(unpacked(arrays["state0"].tobytes())[1]))
     return model, trackers, {**ABSENT, **header["extra"]}
 
 
@@ -120,31 +117,17 @@ def by_output(model: Model, trackers: Sequence[Tracker]) -> Any:
     return trackers[0] if len(trackers) == 1 else dict(zip(model.outputs, trackers, strict=True))
 
 
-def restore(
-    source: str, programs: Sequence[Program], header: Mapping[str, Any], arrays: Mapping[str, Array], tile: Array
-) -> None:
+def restore(source: str, programs: Sequence[Program], arrays: Mapping[str, Array], tile: Array) -> None:
     """Set the lanes of a tile to the states of a file; ``source`` is named in errors.
 
-    States of a version with other fields are matched by the names of their fields, with a warning. ValueError if a
-    field has another shape, or if there is no theta.
+    ValueError for states of other settings or versions.
     """
     for lane, program in enumerate(programs):
-        packed = arrays[f"state{lane}"].tobytes()
-        if header["fields"] == program.layout.text:
-            program.unpack(packed, tile, lane)
-            continue
-        stored, now = fields_of(header["fields"], unpacked(packed)[1]), state_of(tile, lane)
-        wrong = [name for name in now if name in stored and stored[name].shape != now[name].shape]
-        if wrong or "theta" not in stored:
-            raise ValueError(
-                f"{source} does not fit {type(program.tracker).__name__} in this version: field "
-                f"{(*wrong, 'theta')[0]!r}."
-            )
-        new = ", ".join(sorted(program.layout.shapes.keys() - stored.keys())) or "nothing"
-        gone = ", ".join(sorted(stored.keys() - now.keys())) or "nothing"
-        warn(f"{source} was written by another version: {new} begins as before the first sample, {gone} is left out.")
-        for name in now.keys() & stored.keys():
-            now[name][...] = stored[name]
+        try:
+            program.unpack(arrays[f"state{lane}"].tobytes(), tile, lane)
+        except ValueError as error:
+            name = type(program.tracker).__name__
+            raise ValueError(f"{source} does not fit {name} in this version: {error}") from None
 
 
 class Run(Protocol):
@@ -221,9 +204,7 @@ class JointLayout:
     @cached_property
     def tag(self) -> bytes:
         """Fingerprint of all programs, 8 bytes."""
-        return self._tag([one.layout.tag for one in self.programs])
-
-    def _tag(self, tags: Sequence[bytes]) -> bytes:
+        tags = [one.layout.tag for one in self.programs]
         return tags[0] if len(tags) == 1 else hashlib.sha256(b"".join(tags)).digest()[:8]
 
     @cached_property
@@ -262,25 +243,3 @@ class JointLayout:
     def unpack(self, data: bytes) -> Array:
         """The inverse of `pack`; ValueError for anything else."""
         return own_words(data, self.tag, self.size, self.programs)
-
-    def made_by(self, tag: bytes, text: str) -> bool:
-        """Whether a state with this fingerprint belongs to these programs in a version with other fields
-        (`Layout.text`).
-        """
-        return tag == self._tag([one.layout.tag_with(text) for one in self.programs])
-
-    def matched(self, words: Array, text: str) -> Array:
-        """The words (W,) of a state in a version with other fields; words that are absent have their values at the
-        start.
-
-        ValueError if a field has another shape.
-        """
-        tile = self.tile()
-        for lane, one in enumerate(words.reshape(len(self.programs), -1)):
-            for name, value in fields_of(text, one).items():
-                if name not in self.programs[0].layout.shapes:
-                    continue
-                if value.shape != tile[name][0, ..., lane].shape:
-                    raise ValueError(f"the state of that version does not fit this one: field {name!r}.")
-                tile[name][0, ..., lane] = value
-        return self.taken(tile)

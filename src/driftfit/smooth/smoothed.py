@@ -18,7 +18,7 @@ from driftfit.smooth import exact
 from driftfit.smooth.parts.walk import NONE, Path, Walk, ordered
 from driftfit.smooth.plots import plot_smoothed
 from driftfit.smooth.problem import walk_of
-from driftfit.use.hammerstein_wiener.run_blocks import blocks_of
+from driftfit.use.blocks import blocks_of
 
 ALONE = 1e-12
 """Below this sqrt(1 - leverage) a sample alone determines a direction, and its leave-one-out residual is undefined."""

@@ -1,1 +1,1 @@
-"""Uses of a run: simulation, forecasts, first passages, and the system behind an ARX model."""
+"""Uses of a run: simulation, forecasts, first passages, and the system behind it."""

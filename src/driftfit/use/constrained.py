@@ -133,23 +133,6 @@ class HalfSpace(NamedTuple):
     high: float
 
 
-class _Linear(NamedTuple):
-    """g' theta + c."""
-
-    g: Array
-    c: float
-
-    def scaled(self, factor: float) -> _Linear:
-        return _Linear(self.g * factor, self.c * factor)
-
-    def plus(self, other: _Linear) -> _Linear:
-        return _Linear(self.g + other.g, self.c + other.c)
-
-    @property
-    def constant(self) -> bool:
-        return not self.g.any()
-
-
 def half_space(text: str, names: Sequence[str]) -> HalfSpace:
     """The constraint that a text describes; ValueError for one that is not linear, or cannot be met."""
     places = {f"_p{i}_": i for i in range(len(names))}
@@ -162,54 +145,51 @@ def half_space(text: str, names: Sequence[str]) -> HalfSpace:
         tree = None
     if not isinstance(tree, ast.Compare):
         raise ValueError(f'constrain: {text!r} is no constraint such as "b1 >= 0" or "b1 + b2 == 1".')
-    sides = [_linear(side, places, names, text) for side in (tree.left, *tree.comparators)]
-    g, low, high = None, -np.inf, np.inf
+    try:
+        sides = [_linear(side, places) for side in (tree.left, *tree.comparators)]
+    except ValueError:
+        raise ValueError(
+            f"constrain: {text!r} is not linear in the parameters {', '.join(names)}; use sums, differences, and "
+            "products with numbers."
+        ) from None
+    g, low, high = np.zeros(0), -np.inf, np.inf
     for (a, b), sign in zip(pairwise(sides), tree.ops, strict=True):
-        if isinstance(sign, ast.Gt | ast.GtE):
-            a, b = b, a
-        elif not isinstance(sign, ast.Lt | ast.LtE | ast.Eq):
+        if not isinstance(sign, ast.Gt | ast.GtE | ast.Lt | ast.LtE | ast.Eq):
             raise ValueError(f"constrain: {text!r} must compare by <=, >= or ==.")
-        rest = b.plus(a.scaled(-1.0))  # rest >= 0
-        direction = rest.g if g is None or np.array_equal(rest.g, g) else -rest.g
-        if rest.constant or (g is not None and not np.array_equal(direction, g)):
+        *rest, c = a - b if isinstance(sign, ast.Gt | ast.GtE) else b - a  # rest' theta + c >= 0
+        g = g if len(g) else np.array(rest)
+        above = np.array_equal(rest, g)
+        if not np.any(rest) or not (above or np.array_equal(np.negative(rest), g)):
             raise ValueError(f"constrain: {text!r} must be limits of one sum of parameters ({', '.join(names)}).")
-        g = direction
-        limit, above = (-rest.c, True) if np.array_equal(rest.g, g) else (rest.c, False)
+        limit = -c if above else c
         if above or isinstance(sign, ast.Eq):
             low = max(low, limit)
         if not above or isinstance(sign, ast.Eq):
             high = min(high, limit)
-    if g is None or not low <= high:
+    if not low <= high:
         raise ValueError(f"constrain: no parameters satisfy {text!r}.")
-    return HalfSpace(text, g, low, high)
+    return HalfSpace(text, g, float(low), float(high))
 
 
-def _linear(node: ast.expr, places: dict[str, int], names: Sequence[str], text: str) -> _Linear:
-    n = len(names)
-
-    def at(one: ast.expr) -> _Linear:
-        return _linear(one, places, names, text)
-
+def _linear(node: ast.expr, places: dict[str, int]) -> Array:
+    """The coefficients of the parameters, and the constant, (n + 1,); ValueError for what is not linear."""
+    unit = np.eye(len(places) + 1)
     match node:
         case ast.Constant(value=(int() | float()) as value):
-            return _Linear(np.zeros(n), float(value))
+            return np.asarray(value * unit[-1])
         case ast.Name(id=name) if name in places:
-            return _Linear(np.eye(n)[places[name]], 0.0)
+            return np.asarray(unit[places[name]])
         case ast.UnaryOp(op=ast.USub()):
-            return at(node.operand).scaled(-1.0)
-        case ast.BinOp(op=ast.Add()):
-            return at(node.left).plus(at(node.right))
-        case ast.BinOp(op=ast.Sub()):
-            return at(node.left).plus(at(node.right).scaled(-1.0))
-        case ast.BinOp(op=ast.Mult()) if at(node.left).constant:
-            return at(node.right).scaled(at(node.left).c)
-        case ast.BinOp(op=ast.Mult() | ast.Div()) if at(node.right).constant:
-            factor = at(node.right).c
-            return at(node.left).scaled(factor if isinstance(node.op, ast.Mult) else 1.0 / factor)
-    raise ValueError(
-        f"constrain: {text!r} is not linear in the parameters {', '.join(names)}; use sums, differences, and products "
-        "with numbers."
-    )
+            return -_linear(node.operand, places)
+        case ast.BinOp(op=sign):
+            a, b = _linear(node.left, places), _linear(node.right, places)
+            if isinstance(sign, ast.Add | ast.Sub):
+                return a + b if isinstance(sign, ast.Add) else a - b
+            if isinstance(sign, ast.Mult) and not (a[:-1].any() and b[:-1].any()):
+                return np.asarray(a[-1] * b if b[:-1].any() else a * b[-1])
+            if isinstance(sign, ast.Div) and not b[:-1].any():
+                return np.asarray(a / b[-1])
+    raise ValueError
 
 
 SWEEPS, SETTLED_MOVE = 100, 1e-10

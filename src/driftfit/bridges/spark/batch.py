@@ -14,38 +14,25 @@ import numpy as np
 import pyarrow as pa
 
 from driftfit.bridges.spark.frames import rows_of, task_of
-from driftfit.bridges.spark.pieces import (
+from driftfit.bridges.spark.task import Task, chunks, parameters_schema, results_schema
+from driftfit.bridges.spark.units import (
     COUNTS,
-    REPEATED,
-    UNTIMED,
-    Piece,
-    Sums,
-    add,
-    ends,
-    filled,
-    instants,
-    named,
+    JUDGED,
+    SAMPLES,
+    SQUARES,
+    STANDARD,
+    Done,
+    Units,
+    by_output,
+    parameters,
     results,
-    why,
 )
-from driftfit.bridges.spark.task import (
-    Task,
-    chunks,
-    continued,
-    parameters_schema,
-    results_schema,
-    series_of,
-    times,
-    units_of,
-    words_after,
-)
-from driftfit.engine.kernel import Array
+from driftfit.data import late
 from driftfit.engine.settings import one_of
 from driftfit.judge.verdict import verdict
 from driftfit.models.base import Model
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
-from driftfit.run.warm_start import JointLayout
 from driftfit.trackers.base import Tracker
 
 OUTPUTS = ("samples", "summary", "verdict", "states")
@@ -145,76 +132,65 @@ class Partition:
 
     def __init__(self, task: Task, outputs: str, schema: Mapping[str, str]) -> None:
         self.task, self.outputs, self.schema = task, outputs, schema
-        self._going: Piece | None = None
+        self._going: Units | None = None
         """The part before of a unit that is cut into parts."""
 
     def run(self, table: pa.Table, more: bool) -> Iterator[pa.Table]:
         """Results of some rows; ``more`` if their only unit continues in the next call."""
-        piece = self._piece(table)
-        self._going = piece if more else None
-        if self.outputs == "samples" and piece.found is not None:
-            rows = pa.array(piece.some.rows)
-            own = {name: table.column(name).take(rows) for name in self.task.columns}
-            yield filled(own | results(self.task, piece.found), self.schema, table)
-        good = [k for k, reason in enumerate(piece.reasons) if reason is None]
-        bad = [k for k, reason in enumerate(piece.reasons) if reason is not None]
-        if self.outputs != "samples" and good and not more:
-            yield filled(self._of_units(piece, good), self.schema, table)
-        if bad and not more:
-            reasons = {"failed": [piece.reasons[k] for k in bad]}
-            yield filled(self._named(piece, bad) | self._counts(piece, bad) | reasons, self.schema, table)
+        units, before = Units(self.task, table), self._going
+        if before is not None:
+            units.last[0], units.counts[0], units.squares[0] = before.last[0], before.counts[0], before.squares[0]
+            units.words = before.words
+        self._going = units if more else None
+        order, fate, _ = late.sort_out(units.code, units.time, np.zeros(table.num_rows, bool), units.last, 0)
+        units.count(fate, order)
+        done = units.run(order[fate == late.RELEASED])
+        if self.outputs == "samples" and done is not None:
+            own = units.taken(self.task.columns, done.rows)
+            yield units.filled(own | results(self.task, done.found), self.schema)
+        if not more:
+            reasons = [self._reason(units, k) for k in range(len(units.first))]
+            good = [k for k, reason in enumerate(reasons) if reason is None]
+            bad = [k for k, reason in enumerate(reasons) if reason is not None]
+            if self.outputs != "samples" and good:
+                yield units.filled(self._of_units(units, good, done), self.schema)
+            if bad:
+                yield units.filled(self._named(units, bad) | {"failed": [reasons[k] for k in bad]}, self.schema)
 
-    def _piece(self, table: pa.Table) -> Piece:
-        task = self.task
-        first, code = units_of(table, task.by)
-        time, there = times(table.column(task.time)), named(table, task.by)[first]
-        settings = task.settings_of(table, first)
-        joints = [task.joint_for(one) for one in settings]
-        last = np.full(len(first), "NaT" if time.dtype.kind == "M" else np.nan, time.dtype)
-        states: dict[int, Array] = {}
-        sums = Sums.of(len(first), task)
-        if self._going is not None:
-            last[0], states = self._going.last[0], dict(self._going.words)
-            sums.counts[0], sums.squares[0] = (part[0] for part in self._going.sums)
-        rows = _usable(code, time, last, sums.counts)
-        good = there & np.array([isinstance(one, JointLayout) for one in joints])
-        some = series_of(task, table, code, rows, time, good)
-        found = continued(task, table, some, joints, states, last) if len(some.rows) else None
-        if found is not None:
-            add(sums, some, found)
-            last[some.keys] = some.time[some.first + some.length - 1]
-            states |= words_after(found, some)
-        return Piece(table, first, settings, joints, why(joints, there, sums), last, sums, some, found, states)
+    def _reason(self, units: Units, k: int) -> str | None:
+        """Why a unit has no result."""
+        return units.reason(k) or (None if units.counts[k, SAMPLES] else "no row has a time")
 
-    def _named(self, piece: Piece, which: list[int]) -> dict[str, Any]:
-        """The units, and their last times."""
-        rows = pa.array(piece.first[which])
-        columns: dict[str, Any] = {name: piece.table.column(name).take(rows) for name in self.task.by}
-        return columns | {self.task.time: instants(piece.last[which], piece.table.schema.field(self.task.time).type)}
+    def _named(self, units: Units, which: list[int]) -> dict[str, Any]:
+        """The units, their last times and their counts."""
+        own = units.taken(self.task.by, units.first[which]) | units.counted(which)
+        return own | {self.task.time: units.instants(units.last[which])}
 
-    def _counts(self, piece: Piece, which: list[int]) -> dict[str, Any]:
-        return {name: piece.sums.counts[which, j] for j, name in enumerate(COUNTS)}
-
-    def _of_units(self, piece: Piece, which: list[int]) -> dict[str, Any]:
+    def _of_units(self, units: Units, which: list[int], done: Done | None) -> dict[str, Any]:
         """A row for each unit that has a result."""
-        own = self._named(piece, which) | self._counts(piece, which)
+        own = self._named(units, which)
         if self.outputs == "states":
-            packed = [piece.joints[k].pack(piece.words[k]) for k in which]  # type: ignore[union-attr]
-            return own | {"state": packed, "settings": [piece.settings[k] for k in which]}
-        own |= ends(self.task, piece, which)
-        return own | (self._verdicts(piece, which) if self.outputs == "verdict" else {})
+            return own | {"state": [units.state(k) for k in which], "settings": [units.settings[k] for k in which]}
+        theta, var = (
+            np.array([units.joint(k).field(units.words[k], name) for k in which]) for name in ("theta", "var")
+        )
+        sums = units.squares[which]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            rms, standardised = (np.sqrt(sums[..., j] / sums[..., JUDGED]) for j in (SQUARES, STANDARD))
+            own |= parameters(self.task, theta, np.sqrt(var))
+        own |= by_output(self.task, {"rms": rms, "standardised": standardised})
+        return own if done is None or self.outputs == "summary" else own | self._verdicts(done, which)
 
-    def _verdicts(self, piece: Piece, which: list[int]) -> dict[str, Any]:
+    def _verdicts(self, done: Done, which: list[int]) -> dict[str, Any]:
         """What is judged of every output of each unit."""
-        found, place = piece.found, {int(k): j for j, k in enumerate(piece.some.keys)}
-        assert found is not None
-        ny = len(self.task.y)
-        columns: dict[str, list[Any]] = {f"{name}{of}": [] for of in self.task.suffixes for name in VERDICT}
-        for k in which:
-            j = place[k]
+        found, ny, columns = (
+            done.found,
+            len(self.task.y),
+            {f"{name}{of}": list[Any]() for of in self.task.suffixes for name in VERDICT},
+        )
+        for j in map(done.keys.index, which):
             each = range(j * ny, (j + 1) * ny)
-            own = found.lanes.part(each)
-            programs = [found.programs[i] for i in each]
+            own, programs = found.lanes.part(each), [found.programs[i] for i in each]
             runs = (
                 [Track(programs[0], found.records.part(j), own[0])]
                 if ny == 1
@@ -226,15 +202,3 @@ class Partition:
                 for name, value in zip(VERDICT, (truth.drifts, truth.p, truth.pays, most.name), strict=True):
                     columns[f"{name}{of}"].append(value)
         return columns
-
-
-def _usable(code: Array, time: Array, last: Array, counts: Array) -> Array:
-    """The rows that become samples, of rows in the order of unit and time; the others are counted."""
-    untimed = np.isnat(time) if time.dtype.kind == "M" else ~np.isfinite(time)
-    timed = np.flatnonzero(~untimed)
-    again = np.zeros(len(timed), bool)
-    again[1:] = (code[timed][1:] == code[timed][:-1]) & (time[timed][1:] == time[timed][:-1])
-    again |= time[timed] == last[code[timed]]
-    for place, rows in ((UNTIMED, np.flatnonzero(untimed)), (REPEATED, timed[again])):
-        counts[:, place] += np.bincount(code[rows], minlength=len(counts))
-    return timed[~again]

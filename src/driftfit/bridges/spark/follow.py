@@ -14,20 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow, Origin
+from driftfit.bridges.spark.alarms import rules_of
+from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, results_of
 from driftfit.bridges.spark.frames import rows_of, task_of
-from driftfit.bridges.spark.pieces import COUNTS, alarms_schema, rules_of
 from driftfit.bridges.spark.store import NEXT, Store
-from driftfit.bridges.spark.task import SETTING, Task, results_schema, trackers_of
+from driftfit.bridges.spark.task import SETTING, Task, trackers_of
 from driftfit.data.clock import Clock
 from driftfit.data.storage import describe, parts_of, rebuild
 from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
 from driftfit.run.live.rule import AlarmRule
 from driftfit.trackers.base import Tracker
-
-STATE = {"state": "binary", "settings": "string", **dict.fromkeys(COUNTS, "bigint"), "watch": "string"}
-"""Columns of states, after those of their unit and their times."""
 
 
 def follow(
@@ -61,8 +58,8 @@ def follow(
     initial : pyspark.sql.DataFrame or None
         States to begin with: ``track(..., outputs="states")``, or those of another stream, ``Store.states()``.
     migrate : bool
-        Go on from states that another tracker's settings, or another version of this library, made: what depends on
-        settings takes its new value, all else is carried over; fields are matched by their names.
+        Go on from states that another tracker's settings made: what depends on settings takes its new value, all else
+        is carried over.
     sink : callable or None
         ``sink(results, batch)`` is called after a batch is written, and may be called again for the same batch after a
         crash: it must be idempotent, as a MERGE by unit and time, or a write that replaces the batch.
@@ -84,9 +81,8 @@ def follow(
     kinds = dict(rows_of(stream, task, None).dtypes)
     dated = kinds[time].startswith("timestamp")
     rules = rules_of(task, rule)
-    schema = _schema(task, kinds, rules)
-    store = Store(stream.sparkSession, path)
-    flow = Flow(task, schema, duration("hold", hold, dated), rules, _origins(store, task, schema, migrate))
+    store, flow = Store(stream.sparkSession, path), Flow(task, kinds, duration("hold", hold, dated), rules)
+    flow = replace(flow, origins=_origins(store, flow, migrate))
     run = _Batches(store, flow, settings, initial, None if expire is None else duration("expire", expire, dated), sink)
     writer = stream.writeStream.foreachBatch(run).option("checkpointLocation", f"{store.path}/checkpoint")
     return writer.trigger(**(trigger or {"processingTime": "0 seconds"})).start()
@@ -106,60 +102,50 @@ def duration(name: str, value: Any, dated: bool) -> Any:
     return span
 
 
-def _schema(task: Task, kinds: Mapping[str, str], rules: Sequence[AlarmRule | None]) -> dict[str, str]:
-    """Columns and types of the table."""
-    own = {name: kinds[name] for name in task.columns} | results_schema(task) | alarms_schema(task, rules)
-    times = {"last": kinds[task.time], "newest": kinds[task.time]}
-    return {"kind": "string", **own, "failed": "string", **STATE, **times}
-
-
-def _origins(store: Store, task: Task, schema: Mapping[str, str], migrate: bool) -> tuple[Origin, ...]:
-    """The trackers and versions that made the states so far, the newest first; notes what is followed from now on.
+def _origins(store: Store, flow: Flow, migrate: bool) -> tuple[Any, ...]:
+    """The trackers that made the states so far, the newest first; notes what is followed from now on.
 
     Those before the newest count too: a batch that was cut off before it was complete has not carried states over.
     """
+    task = flow.task
     joint = task.joint_for(None)
-    text = "" if isinstance(joint, str) else joint.text
-    results = [name for name in schema if name not in ("kind", *STATE, "last", "newest", "failed")]
-    about: dict[str, Any] = {"model": describe(task.model), "fields": text, "results": results}
-    about["tracker"] = [describe(one) for one in trackers_of(task.tracker)]
-    about["gate"] = task.gate.settings() if isinstance(task.gate, Gate) else task.gate
-    about |= {"schema": ", ".join(f"`{name}` {kind}" for name, kind in {"batch": "int", **schema}.items())}
-    about |= {"rows": list(task.columns), "states": [*task.by, *STATE, "last", "newest"]}
+    about: dict[str, Any] = {"model": describe(task.model), "fields": "" if isinstance(joint, str) else joint.text}
+    about |= {"tracker": [describe(one) for one in trackers_of(task.tracker)]}
+    about |= {"gate": task.gate.settings() if isinstance(task.gate, Gate) else task.gate}
+    about |= {"schema": ", ".join(f"`{name}` {kind}" for name, kind in {"batch": "int", **flow.schema}.items())}
+    about |= {"results": [name for name in results_of(task, flow.kinds, flow.rules) if name != "failed"]}
+    about |= {"rows": list(task.columns), "states": [*task.by, *flow.state]}
     found = store.abouts()
     if not found:
         store.begin(about)
         return ()
-    last = found[-1]
+    last, made = found[-1], f"spark.follow: the states in {store.path} were made"
     if last["model"] != about["model"]:
         followed = rebuild(last["model"], Model, parts_of(task.model))
-        raise ValueError(
-            f"spark.follow: the states in {store.path} were made with {followed!r}, not with {task.model!r}; begin in "
-            "another folder."
-        )
+        raise ValueError(f"{made} with {followed!r}, not with {task.model!r}; begin in another folder.")
     if last.get("gate", "older") != about["gate"]:
         raise ValueError(
-            f"spark.follow: the states in {store.path} were made with another gate, and a gate must know all readings "
-            "from the first on; give gate= as it was, or begin in another folder with the whole stream."
+            f"{made} with another gate, and a gate must know all readings from the first on; give gate= as it was, or "
+            "begin in another folder with the whole stream."
         )
-    origins = tuple(_origin(task, one) for one in reversed(found))
-    if not migrate and (origins[0].tracker != task.tracker or last["fields"] != text):
-        other = f"not with {task.tracker!r}" if origins[0].tracker != task.tracker else "in another version"
+    if len({last["fields"], about["fields"]} - {""}) > 1:
+        raise ValueError(f"{made} by another version, whose states have other fields; begin in another folder.")
+    origins = tuple(_origin(task, one["tracker"]) for one in reversed(found))
+    if not migrate and origins[0] != task.tracker:
         raise ValueError(
-            f"spark.follow: the states in {store.path} were made with {origins[0].tracker!r}, {other}: give "
-            "migrate=True to carry them over, or begin in another folder."
+            f"{made} with {origins[0]!r}, not with {task.tracker!r}: give migrate=True to carry them over, or begin in "
+            "another folder."
         )
     if last != about:
         store.begin(about)
     return origins
 
 
-def _origin(task: Task, about: Mapping[str, Any]) -> Origin:
-    """What made states, from what was noted of it."""
+def _origin(task: Task, described: Sequence[Any]) -> Any:
+    """The tracker that made states, or that of each output, from what was noted of it."""
     own = tuple(parts_of(trackers_of(task.tracker)))
-    trackers: list[Tracker] = [rebuild(one, Tracker, own) for one in about["tracker"]]
-    several = len(trackers) > 1
-    return Origin(dict(zip(task.y, trackers, strict=True)) if several else trackers[0], about["fields"])
+    trackers: list[Tracker] = [rebuild(one, Tracker, own) for one in described]
+    return dict(zip(task.y, trackers, strict=True)) if len(trackers) > 1 else trackers[0]
 
 
 class _Batches:
@@ -190,22 +176,19 @@ class _Batches:
         if before is not None:
             kept = self.store.read(*NEXT, batches=[before])
             which = F.when(F.col("kind") == "state", F.lit(OLD)).otherwise(F.lit(WAITED))
-            names = [*task.columns, *STATE, "last", "newest"]
-            parts.append(kept.withColumn("_kind", which).select(*names, "_kind"))
+            parts.append(kept.withColumn("_kind", which).select(*task.columns, *flow.state, "_kind"))
             if self.expire is not None:
                 flow = replace(flow, expired=self._oldest(kept))
-        else:
-            if self.initial is not None:
-                parts.append(_begun(self.initial, task).withColumn("_kind", F.lit(OLD)))
+        elif self.initial is not None:
+            parts.append(begun(self.initial, task).withColumn("_kind", F.lit(OLD)))
         every = parts[0]
         for part in parts[1:]:
             every = every.unionByName(part, allowMissingColumns=True)
-        times = {"last": flow.schema["last"], "newest": flow.schema["newest"]}
-        for name, kind in {**STATE, **times}.items():
+        for name, kind in flow.state.items():
             if name not in every.columns:
                 every = every.withColumn(name, F.lit(None).cast(kind))
         own = [SETTING + name for name in task.settings]
-        every = every.select(*task.columns, *STATE, "last", "newest", *own, "_kind")
+        every = every.select(*task.columns, *flow.state, *own, "_kind")
         order = [*task.by, "_kind", task.time, *task.y, *task.u]
         made = ", ".join(f"`{name}` {kind}" for name, kind in flow.schema.items())
         return every.repartition(*task.by).sortWithinPartitions(*order).mapInArrow(flow.work, made)
@@ -218,7 +201,7 @@ class _Batches:
         return newest - self.expire if isinstance(newest, float) else np.datetime64(newest, "us") - self.expire
 
 
-def _begun(initial: Any, task: Task) -> Any:
+def begun(initial: Any, task: Task) -> Any:
     """States to begin with, from a batch run or from another stream."""
     from pyspark.sql import functions as F  # noqa: N812
 

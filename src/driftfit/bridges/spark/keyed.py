@@ -13,15 +13,17 @@ since, it is set again.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
-from driftfit.bridges.spark.follow import duration
+from driftfit.bridges.spark.alarms import rules_of
+from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, results_of
+from driftfit.bridges.spark.follow import begun, duration
 from driftfit.bridges.spark.frames import rows_of, task_of
-from driftfit.bridges.spark.pieces import COUNTS, alarms_schema, rules_of
-from driftfit.bridges.spark.task import Task, results_schema
-from driftfit.bridges.spark.unit import Unit
+from driftfit.bridges.spark.units import ARROW
 from driftfit.models.base import Model
 from driftfit.run.live.rule import AlarmRule
 from driftfit.trackers.base import Tracker
@@ -83,19 +85,24 @@ def follow_keyed(
     kinds = dict(rows.dtypes)
     dated = kinds[time].startswith("timestamp")
     span = None if expire is None else _ticks(duration("expire", expire, dated))
-    if dated:
-        rows = rows.withColumn(time, F.unix_micros(F.col(time).cast("timestamp")))
-    unit = Unit(task, duration("hold", hold, dated), dated, rules, before)
-    schema = _schema(task, kinds, unit, span is not None)
+    rows = _in_micros(rows, dated, time)
     if span is not None:
         ticks = F.floor(F.col(time) / F.lit(span)) + F.lit(2 * AHEAD)
         rows = rows.withColumn(EVENT, F.timestamp_millis(ticks)).withWatermark(EVENT, f"{AHEAD} milliseconds")
+    given = None if initial is None else _in_micros(begun(initial, task), dated, "last", "newest").groupBy(*task.by)
+    unit = Unit(Flow(task, kinds, duration("hold", hold, dated), rules, () if before is None else (before,)))
+    schema = results_of(task, kinds, rules) | {time: dict(rows.dtypes)[time]} | ({"state": "binary"} if span else {})
     made = ", ".join(f"`{name}` {kind}" for name, kind in schema.items())
-    begun = None if initial is None else _begun(initial, task, dated).groupBy(*task.by)
-    processor = _processor(unit, tuple(schema), span)
-    mode = "None" if span is None else "EventTime"
-    found = rows.groupBy(*task.by).transformWithState(processor, made, "Append", mode, begun)
+    processor, mode = _processor(unit, tuple(schema), span), "None" if span is None else "EventTime"
+    found = rows.groupBy(*task.by).transformWithState(processor, made, "Append", mode, given)
     return found.withColumn(time, F.timestamp_micros(time).cast(kinds[time])) if dated else found
+
+
+def _in_micros(frame: Any, dated: bool, *names: str) -> Any:
+    """A data frame whose dates of these names are microseconds, which Python and Java exchange without a time zone."""
+    from pyspark.sql import functions as F  # noqa: N812
+
+    return frame.withColumns({name: F.unix_micros(F.col(name).cast("timestamp")) for name in names * dated})
 
 
 def _ticks(span: Any) -> float:
@@ -106,24 +113,68 @@ def _ticks(span: Any) -> float:
     return whole / TICKS
 
 
-def _schema(task: Task, kinds: Mapping[str, str], unit: Unit, expires: bool) -> dict[str, str]:
-    """Columns and types of the results."""
-    schema = {name: kinds[name] for name in task.by} | {task.time: "bigint" if unit.dated else "double"}
-    schema |= dict.fromkeys((*task.y, *task.u), "double") | results_schema(task)
-    return schema | alarms_schema(task, unit.rules) | {"failed": "string"} | ({"state": "binary"} if expires else {})
+class Unit:
+    """One unit of a stream: its state and some rows go in, its state and results come out, by the flow of `follow`.
 
+    A state has the columns of a state of `follow`, and what waits: a list of (time, outputs, inputs) for each row.
+    Times are numbers, or microseconds.
+    """
 
-def _begun(initial: Any, task: Task, dated: bool) -> Any:
-    """States to begin with, from a batch run or from another stream."""
-    from pyspark.sql import functions as F  # noqa: N812
+    def __init__(self, flow: Flow) -> None:
+        self.flow, task = flow, flow.task
+        self.dated = flow.kinds[task.time].startswith("timestamp")
+        self.row = (task.time, *task.y, *task.u)
+        when = pa.timestamp("us") if self.dated else pa.float64()
+        self.when = {name: when for name in (task.time, "last", "newest")}
+        self.types = {name: ARROW[kind] for name, kind in flow.state.items() if name in STATE} | self.when
 
-    if "failed" in initial.columns:
-        initial = initial.where("failed is null")
-    last, newest = ("last", "newest") if "newest" in initial.columns else (task.time, task.time)
-    when = (F.unix_micros(F.col(name).cast("timestamp")) if dated else F.col(name) for name in (last, newest))
-    last, newest = (one.alias(name) for one, name in zip(when, ("last", "newest"), strict=True))
-    watch = F.col("watch") if "watch" in initial.columns else F.lit(None).cast("string")
-    return initial.select(*task.by, "state", watch.alias("watch"), *COUNTS, last, newest)
+    @property
+    def state(self) -> str:
+        """The type of a state for Spark."""
+        times = dict.fromkeys(("last", "newest"), "bigint" if self.dated else "double")
+        return ", ".join(
+            f"{name} {kind}" for name, kind in (STATE | times | {"waiting": "array<array<double>>"}).items()
+        )
+
+    def begun(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """A state to begin with, from a row of the states of a batch run or of another stream."""
+        return {name: given.get(name) for name in (*STATE, "last", "newest")} | {"waiting": []}
+
+    def step(
+        self, state: Mapping[str, Any] | None, rows: Sequence[Sequence[Any]], expired: Any = None
+    ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+        """(the state after some rows (time, outputs, inputs), the results)."""
+        before = [] if state is None else [state]
+        waiting = [] if state is None else state["waiting"]
+        every = [[None] * len(self.row) for _ in before] + [*waiting, *rows]
+        kind = [OLD] * len(before) + [WAITED] * len(waiting) + [NEW] * len(rows)
+        columns = dict.fromkeys(self.flow.task.by, pa.array([""] * len(every))) | {"_kind": pa.array(kind)}
+        for name, values in zip(self.row, zip(*every, strict=True), strict=True):
+            columns[name] = self._column(values, self.when.get(name, pa.float64()))
+        for name in (*STATE, "last", "newest"):
+            own = [one[name] for one in before]
+            columns[name] = self._column([*own, *[None] * (len(every) - len(own))], self.types[name])
+        found: dict[str, list[dict[str, Any]]] = {}
+        for table in replace(self.flow, expired=expired).tables(pa.table(columns)):
+            for name in self.when if self.dated else ():
+                table = table.set_column(table.column_names.index(name), name, table.column(name).cast(pa.int64()))
+            for row in table.drop_columns(list(self.flow.task.by)).to_pylist():
+                found.setdefault(row["kind"], []).append(row)
+        ((after,),) = (found[kind] for kind in ("expired", "state") if kind in found)
+        waiting = [[row[name] for name in self.row] for row in found.get("waiting", [])]
+        return self.begun(after) | {"waiting": waiting}, found.get("result", []) + found.get("late", [])
+
+    def ended(self, state: Mapping[str, Any], reason: str) -> list[dict[str, Any]]:
+        """The results of what waits, and a row with the reason and the last state of the unit."""
+        after, results = self.step(state, [], np.datetime64(2**63 - 1, "us") if self.dated else np.inf)
+        own = dict.fromkeys(self.row, np.nan) | {self.row[0]: after["last"]}
+        return [*results, own | {"failed": reason, "state": after["state"]}]
+
+    def _column(self, values: Sequence[Any], kind: pa.DataType) -> pa.Array:
+        """Values as a column; waiting times in microseconds are whole numbers, which floats hold exactly."""
+        if pa.types.is_timestamp(kind):
+            return pa.array([None if one is None else int(one) for one in values], pa.int64()).cast(kind)
+        return pa.array(values, kind)
 
 
 def _processor(unit: Unit, names: Sequence[str], span: float | None) -> Any:
@@ -131,55 +182,62 @@ def _processor(unit: Unit, names: Sequence[str], span: float | None) -> Any:
     from pyspark.sql import Row
     from pyspark.sql.streaming import StatefulProcessor
 
-    columns, keys = unit.task.columns, len(unit.task.by)
+    by, columns = unit.flow.task.by, (*STATE, "last", "newest", "waiting")
 
     def rows_for(key: Sequence[Any], found: Sequence[dict[str, Any]]) -> Iterator[Any]:
-        named = dict(zip(unit.task.by, key, strict=True))
+        named = dict(zip(by, key, strict=True))
         for one in found:
             yield Row(**{name: (named | one).get(name) for name in names})
 
     class Processor(StatefulProcessor):
         def init(self, handle: Any) -> None:
-            self.handle, self.state = handle, handle.getValueState("state", "state binary")
+            self.handle, self.value = handle, handle.getValueState("state", unit.state)
             self.came: set[Any] = set()
 
+        def state(self) -> dict[str, Any] | None:
+            return dict(zip(columns, self.value.get(), strict=True)) if self.value.exists() else None
+
+        def update(self, after: Mapping[str, Any]) -> None:
+            self.value.update(tuple(after[name] for name in columns))
+
         def handleInputRows(self, key: Any, rows: Any, timerValues: Any) -> Iterator[Any]:  # noqa: N802
-            before = bytes(self.state.get()[0]) if self.state.exists() else None
-            after, found = unit.step(before, [tuple(row[name] for name in columns)[keys:] for row in rows])
-            self.state.update((after,))
+            before = self.state()
+            after, found = unit.step(before, [tuple(row[name] for name in unit.row) for row in rows])
+            self.update(after)
             if span is not None:
                 self.came.add(tuple(key))
-                if before is None:
-                    self.set(after)
+            if before is None:
+                self.set(after)
             yield from rows_for(key, found)
 
         def handleExpiredTimer(self, key: Any, timerValues: Any, expiredTimerInfo: Any) -> Iterator[Any]:  # noqa: N802
-            if not self.state.exists():
+            before, now = self.state(), timerValues.getCurrentWatermarkInMs()
+            if before is None:
                 return
-            before, now = bytes(self.state.get()[0]), timerValues.getCurrentWatermarkInMs()
             if tuple(key) in self.came:
                 self.set(before, now)
-            elif due(before) > now:
+            elif _due(before, span or 1.0) > now:
                 self.set(before)
             else:
-                self.state.clear()
+                self.value.clear()
                 yield from rows_for(key, unit.ended(before, EXPIRED))
 
         def handleInitialState(self, key: Any, initialState: Any, timerValues: Any) -> None:  # noqa: N802
             after = unit.begun(initialState.asDict())
-            self.state.update((after,))
-            if span is not None:
-                self.set(after)
+            self.update(after)
+            self.set(after)
 
-        def set(self, state: bytes, now: int = 0) -> None:
-            self.handle.registerTimer(max(due(state), now + 1))
+        def set(self, state: Mapping[str, Any], now: int = 0) -> None:
+            if span is not None:
+                self.handle.registerTimer(max(_due(state, span), now + 1))
 
         def close(self) -> None:
             pass
 
-    def due(state: bytes) -> int:
-        """When a unit has been silent for too long, as Spark's watermark; that of a unit without a time is soon."""
-        newest = unit.newest(state)
-        return 0 if newest is None else int(np.floor(newest / (span or 1.0))) + AHEAD + TICKS
-
     return Processor()
+
+
+def _due(state: Mapping[str, Any], span: float) -> int:
+    """When a unit has been silent for too long, as Spark's watermark; that of a unit without a time is soon."""
+    newest = state["newest"]
+    return 0 if newest is None else int(np.floor(newest / span)) + AHEAD + TICKS

@@ -1,4 +1,4 @@
-"""The settings that a worker of Spark receives, and how rows that are sorted by unit become series of arrays."""
+"""The settings that a worker of Spark receives, and pieces of the rows that it is given."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,10 +14,8 @@ import pyarrow.compute as pc
 
 from driftfit.data.arguments import ordered
 from driftfit.data.clock import Clock
-from driftfit.data.record import Known, Labels, Records
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.run.parallel_lanes import Advanced, advance
 from driftfit.run.program import Program, programs_of
 from driftfit.run.warm_start import JointLayout
 from driftfit.trackers.base import Tracker
@@ -142,37 +140,15 @@ def parameters_schema(task: Task) -> dict[str, str]:
     return {f"{what}_{name}": "double" for names in task.names for name in names for what in ("theta", "std")}
 
 
-class Units(NamedTuple):
-    """Rows that are sorted by unit."""
-
-    first: Array
-    """(U,): the first row of each unit."""
-    code: Array
-    """(N,): the number of the unit of each row."""
-
-
-def units_of(table: pa.Table, by: Sequence[str]) -> Units:
-    """The units of a table with at least one row; missing names are equal."""
+def begins(table: pa.Table, by: Sequence[str]) -> Array:
+    """The first row of each unit of a table with at least one row, in the order of units; missing names are equal."""
     new = np.zeros(table.num_rows, bool)
     new[0] = True
     for name in by:
         column = table.column(name).combine_chunks()
         codes = pc.dictionary_encode(column, null_encoding="encode").indices.to_numpy(zero_copy_only=False)
         new[1:] |= codes[1:] != codes[:-1]
-    return Units(np.flatnonzero(new), np.cumsum(new) - 1)
-
-
-def numbers(column: pa.ChunkedArray) -> Array:
-    """Floats, NaN where there is none."""
-    return np.asarray(pc.fill_null(column.cast(pa.float64()), np.nan).to_numpy(), float)
-
-
-def times(column: pa.ChunkedArray) -> Array:
-    """Floats, or datetime64 in UTC; NaN or NaT where there is none."""
-    if not pa.types.is_timestamp(column.type):
-        return numbers(column)
-    instants: Array = column.cast(pa.timestamp("us")).to_numpy().astype("M8[us]")
-    return instants
+    return np.flatnonzero(new)
 
 
 def chunks(batches: Iterator[pa.RecordBatch], by: Sequence[str], parts: bool) -> Iterator[tuple[pa.Table, bool]]:
@@ -187,7 +163,7 @@ def chunks(batches: Iterator[pa.RecordBatch], by: Sequence[str], parts: bool) ->
         if count < ROWS:
             continue
         table = pa.Table.from_batches(waiting).combine_chunks()
-        cut = int(units_of(table, by).first[-1])
+        cut = int(begins(table, by)[-1])
         if cut:
             yield table.slice(0, cut), False
         elif parts:
@@ -196,77 +172,3 @@ def chunks(batches: Iterator[pa.RecordBatch], by: Sequence[str], parts: bool) ->
         waiting = table.slice(cut).to_batches()
     if sum(one.num_rows for one in waiting):
         yield pa.Table.from_batches(waiting).combine_chunks(), False
-
-
-class Series(NamedTuple):
-    """Some units in flat arrays, one after the other."""
-
-    keys: Array
-    """(K,): the number of each among the units of the table."""
-    rows: Array
-    """(N,): the row of each sample in the table."""
-    first: Array
-    length: Array
-    y: Array
-    """(N, ny)"""
-    time: Array
-
-
-def series_of(task: Task, table: pa.Table, code: Array, rows: Array, time: Array, good: Array) -> Series:
-    """The samples of the units that are ``good`` (U,), from rows in the order of unit and time."""
-    rows = rows[good[code[rows]]]
-    keys, first, length = np.unique(code[rows], return_index=True, return_counts=True)
-    y = np.stack([numbers(table.column(name))[rows] for name in task.y], axis=1)
-    return Series(keys, rows, first, length, y, time[rows])
-
-
-def continued(
-    task: Task, table: pa.Table, some: Series, joints: Sequence[Any], states: Mapping[int, Array], last: Array,
-    collected: bool = False,
-) -> Advanced:  # fmt: skip
-    """Run the series from their states, by the number of the unit; ``last`` (U,) are times of their last samples.
-
-    ``joints`` has an entry for each unit; those of the series are programs.
-    """
-    before = np.roll(some.time, 1)
-    before[some.first] = last[some.keys]
-    new = some.first[np.isnat(before[some.first]) if before.dtype.kind == "M" else np.isnan(before[some.first])]
-    before[new] = some.time[new]
-    gaps = task.clock.between(before, some.time)
-    gaps[new] = 1.0
-    keys, ny = some.keys.tolist(), len(task.y)
-    begun = np.array([k in states for k in keys])
-    words = np.zeros((len(keys) * ny, max((len(states[k]) // ny for k in keys if k in states), default=0)), np.int64)
-    for j in np.flatnonzero(begun).tolist():
-        own = states[keys[j]].reshape(ny, -1)
-        words[j * ny : (j + 1) * ny, : own.shape[1]] = own
-    programs = [one for k in keys for one in joints[k].programs]
-    records = _records(task, table, some, gaps)
-    return advance(programs, records, words, np.repeat(begun, ny), threads=1, collected=collected)
-
-
-def _records(task: Task, table: pa.Table, some: Series, gaps: Array) -> Records:
-    """The series as records."""
-    inputs = [numbers(table.column(name))[some.rows] for name in task.order]
-    u = np.stack(inputs, axis=1) if inputs else np.zeros((len(some.rows), 0))
-    keys, y, known, outputs = tuple(some.keys.tolist()), some.y[:, 0], Known.of(gaps), tuple[str, ...]()
-    if len(task.y) > 1:
-        y, known, outputs = some.y, known.for_outputs(np.ones(some.y.shape)), task.y
-    labels = Labels(task.y[0] if not outputs else "y", task.order, task.time, zone=task.zone, by=task.by)
-    return Records(keys, some.first, some.length, y, u, known, some.time, labels, outputs=outputs)
-
-
-def words_after(found: Advanced, some: Series) -> dict[int, Array]:
-    """The words of every unit after its last sample, by its number."""
-    rows, ny = found.states(), found.records.ny
-    sizes = [program.layout.size for program in found.programs[::ny]]
-    places = range(0, len(rows), ny)
-    return {
-        k: rows[j : j + ny, :size].reshape(-1) for k, j, size in zip(some.keys.tolist(), places, sizes, strict=True)
-    }
-
-
-def lists(values: Array) -> pa.Array:
-    """A row of numbers (N, n) for each sample."""
-    offsets = np.arange(len(values) + 1, dtype=np.int32) * values.shape[1]
-    return pa.ListArray.from_arrays(offsets, np.ascontiguousarray(values).ravel())

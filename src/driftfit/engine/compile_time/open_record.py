@@ -2,8 +2,9 @@
 
 A record of lanes has its shapes in its type, and what is compiled for n parameters is of no use for n + 1. For steps
 that run seldom the speed of that is not worth the time of compiling. They see an `OpenRecord`: the address of a record
-and of a table of its sizes, which the driver holds as a constant. For each field the table has the distance from the
-beginning of the record, and the lengths of its axes but for that of lanes, which is 1.
+and of a table of its sizes, which the driver holds as a constant. For each field that they name the table has the
+distance from the beginning of the record, and the lengths of its axes but for that of lanes, which is 1. Records that
+have these fields are of one type, whatever else they hold.
 
 The tables of banks (`driftfit.trackers.bank.table`) are not of this kind: their arrays lie in several memories, whose
 places are known when a bank runs, and their numbers in the table itself. An open record is made where code is compiled.
@@ -13,7 +14,7 @@ Private parts: `AttributeTemplate`, `infer_getattr`, `make_array` and `populate_
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from llvmlite import ir
@@ -28,11 +29,11 @@ WORD = ir.IntType(64)
 
 
 class OpenRecord(types.Type):
-    """A record of one lane, of which the fields, their types and numbers of axes are known."""
+    """A record of one lane, of which some fields, their types and numbers of axes are known."""
 
-    def __init__(self, record: Any) -> None:
+    def __init__(self, fields: Mapping[str, Any]) -> None:
         self.arrays, self.places, place = {}, {}, 0
-        for name, field in record.fields.items():
+        for name, field in fields.items():
             self.arrays[name] = types.Array(field.type.dtype, field.type.ndim, "C")
             self.places[name] = place
             place += field.type.ndim
@@ -67,11 +68,11 @@ class _Pair(models.StructModel):
         super().__init__(manager, kind, pointers)
 
 
-def opened(context: Any, builder: Any, record: Any, address: Any) -> Any:
-    """A record of lanes of this type at an address, as an `OpenRecord`, while code is built."""
-    numbers = [n for field in record.fields.values() for n in (field.offset, *field.type.shape[:-1])]
+def opened(context: Any, builder: Any, fields: Mapping[str, Any], address: Any) -> Any:
+    """The record of lanes at an address, as an `OpenRecord` of some of its fields, while code is built."""
+    numbers = [n for field in fields.values() for n in (field.offset, *field.type.shape[:-1])]
     table = ir.Constant(ir.ArrayType(WORD, len(numbers)), numbers)
-    made = cgutils.create_struct_proxy(OpenRecord(record))(context, builder)
+    made = cgutils.create_struct_proxy(OpenRecord(fields))(context, builder)
     made.record = builder.bitcast(address, made.record.type)
     made.table = builder.bitcast(cgutils.global_constant(builder, "sizes", table), made.table.type)
     return made._getvalue()

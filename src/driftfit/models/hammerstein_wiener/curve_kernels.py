@@ -60,8 +60,7 @@ def dead_zone(x: float, p: Array, out: Array, slopes: Array) -> None:
     out[0] = held if above or below or x != x else 0.0
     out[1] = -1.0 if above else 0.0
     out[2] = -1.0 if below else 0.0
-    for k in range(slopes.shape[0]):
-        slopes[k] = 0.0
+    slopes[1], slopes[2] = 0.0, 0.0
     slopes[0] = 1.0 if (above or below) and abs(x) <= p[4] else 0.0
 
 
@@ -71,8 +70,7 @@ def saturation(x: float, p: Array, out: Array, slopes: Array) -> None:
     out[0] = 0.0 if (above or below) and abs(x) < LARGEST else x
     out[1] = 1.0 if above else 0.0
     out[2] = 1.0 if below else 0.0
-    for k in range(slopes.shape[0]):
-        slopes[k] = 0.0
+    slopes[1], slopes[2] = 0.0, 0.0
     slopes[0] = 0.0 if above or below else 1.0
 
 
@@ -131,8 +129,7 @@ def splines(x: float, p: Array, out: Array, slopes: Array) -> None:
     work, anchor = 2 + count, 2 + count + order + 1
     inside = x >= p[2] and x <= p[1 + count]
     for k in range(out.shape[0]):
-        out[k] = -p[anchor + k] if inside else np.nan
-        slopes[k] = 0.0 if inside else np.nan
+        out[k], slopes[k] = -p[anchor + k] if inside else np.nan, 0.0 if inside else np.nan
     if inside:
         span = local_splines(x, p, order)
         for r in range(order + 1):

@@ -362,7 +362,7 @@ class Stream(Plain, storage.Kept):
         live._watching = [
             (lane, LiveAlarm.of(state, trackers[lane], live.programs[lane].names)) for lane, state in extra["alarms"]
         ]
-        restore(source, live.programs, header, arrays, live._state_tile())
+        restore(source, live.programs, arrays, live._state_tile())
         live._expect(extra["awaits"])
         return live
 

@@ -64,17 +64,10 @@ create table if not exists evicted (unit integer primary key);
 """
 log = logging.getLogger("driftfit.service")
 PRAGMAS = ("page_size=8192", "journal_mode=wal", "synchronous=full", "wal_autocheckpoint=2000", "temp_store=memory")
-FORMAT, OLDER = "3", "2"
+FORMAT = "3"
 REMEDY = "driftfit serve FILE --rebuild computes the states again from the journal"
 RESULTS_FROM, NEEDED_FROM, HEAD = "results from", "needed from", "head"
 """Keys of ``meta``: of `Journal.first_without_results`, `Journal.first_needed` and `Journal.head`."""
-CARRIED = {
-    "meta": ("meta", "*"), "unit": ("unit", "*"), "log": ("log", "*"), "result": ("result", "*"),
-    "block": ("block", "unit, first, last, start, stop, count, extremes"),
-    "history": ("block", "unit, first, last, count, rows"), "event": ("event", "number, unit, at, kind, detail"),
-    "position": ("position", "*"),
-}  # fmt: skip
-"""What `OLDER` journals hold of the present tables: (their table, its columns)."""
 NAME = "driftfit.db"
 
 
@@ -174,12 +167,11 @@ class Journal:
         for line in PRAGMAS:
             self.db.execute(f"pragma {line}")
         row = self.db.execute("select value from meta where key = 'format'").fetchone() if self._has("meta") else None
-        if row is not None and row[0] not in (FORMAT, OLDER):
-            raise ValueError(f"{self.path} has the format {row[0]}; this version reads {FORMAT}. Use another folder.")
-        if row == (OLDER,) and not rebuild:
-            raise ValueError(f"{self.path} was written by an older driftfit; {REMEDY}.")
-        if row == (OLDER,):
-            self._carry_over()
+        if row not in (None, (FORMAT,)):
+            raise ValueError(
+                f"{self.path} has the format {row[0]}, and this version reads {FORMAT}: use another folder, or the "
+                "version of driftfit that wrote it."
+            )
         self.db.executescript(SCHEMA)
         if row is None:
             self._put("meta", ("format", FORMAT))
@@ -191,23 +183,6 @@ class Journal:
 
     def _put(self, table: str, row: Sequence[Any]) -> None:
         self.db.execute(f"insert or replace into {table} values ({'?, ' * len(row)}?)", (*row, sum_of(*row)))
-
-    def _carry_over(self) -> None:
-        """Write the tables of the older format, whose rows have no sums, in the present one."""
-        self.db.execute("begin immediate")
-        old = sorted({source for source, _ in CARRIED.values()} | {"program", "snapshot"})
-        for table in old:
-            self.db.execute(f"alter table {table} rename to old_{table}")
-        self.db.execute("drop index if exists event_of_unit")
-        for statement in filter(str.strip, SCHEMA.split(";")):
-            self.db.execute(statement)
-        for table, (source, columns) in CARRIED.items():
-            for row in self.db.execute(f"select {columns} from old_{source}").fetchall():
-                self._put(table, row)
-        self._put("meta", ("format", FORMAT))
-        for table in old:
-            self.db.execute(f"drop table old_{table}")
-        self.db.execute("commit")
 
     def _forget_states(self) -> None:
         """Forget all states, so that they are computed again from the samples that the log still has."""

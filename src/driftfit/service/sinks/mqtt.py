@@ -19,7 +19,7 @@ import msgspec
 from driftfit.service.connector import ANSWER_SECONDS
 from driftfit.service.options import Pattern
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
-from driftfit.service.sources.mqtt import Broker, connected, paho, secure
+from driftfit.service.sources.mqtt import Broker, begin, client_of, end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,18 +42,12 @@ class Mqtt(Broker, Sink):
 
 class _Mqtt(Writer):
     def __init__(self, options: Mqtt) -> None:
-        from paho.mqtt.enums import CallbackAPIVersion
-
         self.options = options
-        name = options.client or f"driftfit-{options.name}-sink"
-        self.client = paho().Client(CallbackAPIVersion.VERSION2, name)
+        self.client = client_of(options, options.client or f"driftfit-{options.name}-sink")
         self.client.max_inflight_messages_set(1000)
         self.client.will_set(options.status, "offline", qos=1, retain=True)
         self.client.on_connect = lambda client, *_: client.publish(options.status, "online", qos=1, retain=True)
-        secure(self.client, options)
-        host, port = connected(options.url)
-        self.client.connect(host, port, keepalive=30)
-        self.client.loop_start()
+        begin(self.client, options.url)
 
     def write(self, batch: Outcome) -> None:
         until = time.monotonic() + ANSWER_SECONDS
@@ -68,8 +62,7 @@ class _Mqtt(Writer):
 
     def close(self) -> None:
         self.client.publish(self.options.status, "offline", qos=1, retain=True)
-        self.client.disconnect()
-        self.client.loop_stop()
+        end(self.client)
 
 
 def messages(batch: Outcome, every_result: bool) -> Iterator[tuple[str, bool, bytes]]:

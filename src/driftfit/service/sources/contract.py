@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+import queue
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -139,6 +140,36 @@ class Batch(NamedTuple):
 
 END = Batch([], position="end")
 """The result of `read` when the source has ended."""
+
+
+class QueueReader(Reader):
+    """A reader to whose bounded queue its client adds messages, from a thread of its own."""
+
+    def __init__(self, most: int = BATCH_MESSAGES) -> None:
+        self.arrived: queue.Queue[Any] = queue.Queue(most)
+        self.error: Exception | None = None
+        """Why nothing more will come."""
+
+    @abstractmethod
+    def batch(self, found: list[Any]) -> Batch:
+        """The samples of some messages."""
+
+    def read(self, wait: float) -> Batch | None:
+        """What waits in the queue; the error once that is read."""
+        try:
+            first = self.arrived.get(timeout=wait)
+        except queue.Empty:
+            if self.error is not None:
+                raise self.error from None
+            return None
+        return self.batch([first, *self.drain()])
+
+    def drain(self) -> list[Any]:
+        """What waits now."""
+        found: list[Any] = []
+        while len(found) < BATCH_MESSAGES and not self.arrived.empty():
+            found.append(self.arrived.get())
+        return found
 
 
 class ShapeError(ValueError):

@@ -3,26 +3,21 @@
 With ``qos = 1`` (the default) and ``time`` in the units, nothing is lost while the service or the broker is away, and
 samples that the broker sends again are recognised by their time. A retained message is a sample like any other.
 
-The thread of the source does the client's network work too (paho's methods for an event loop of one's own): a message
-passes through one thread less, and while the service is held back, messages wait at the broker and not in memory.
+While the service is held back, the queue of messages is full: the thread of the client waits, and messages stay at the
+broker.
 """
 
 from __future__ import annotations
 
-import contextlib
-import select
-import socket
-import ssl
 import time
-from collections import deque
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
-from driftfit.service.connector import ANSWER_SECONDS, client_library
+from driftfit.service.connector import client_library
 from driftfit.service.options import Secret
-from driftfit.service.sources.contract import BATCH_MESSAGES, MESSAGE_BYTES, Batch, Reader, Samples, Source, decode
+from driftfit.service.sources.contract import Batch, QueueReader, Reader, Samples, Source, decode
 from driftfit.service.sources.sparkplug import REBIRTH, Sparkplug, UnknownAliasError, rebirth_topic
 
 CLOSE_SECONDS = 1.0
@@ -68,104 +63,42 @@ class Mqtt(Broker, Source):
         return _Mqtt(self)
 
 
-class _Mqtt(Reader):
+class _Mqtt(QueueReader):
     def __init__(self, options: Mqtt) -> None:
-        from paho.mqtt.enums import CallbackAPIVersion
-
-        mqtt = paho()
+        super().__init__()
         self.options = options
         self.sparkplug = Sparkplug() if options.payload == "sparkplug" else None
         self.asked: dict[str, float] = {}
         """When nodes were last asked to declare their metrics again."""
-        self.batch = Heard()
         self.unconfirmed = 0
         """Messages passed on that are not yet acknowledged to the broker."""
-        self.confirmed: deque[list[int]] = deque()
-        """Those that are in the journal, from the thread of the journal."""
-        self.woken, self.waker = socket.socketpair()
-        self.woken.setblocking(False)
-        self.waker.setblocking(False)
-        self.more = False
-        """Whether the last read left messages behind."""
-        self.begun = time.monotonic()
-        name = options.client or f"driftfit-{options.name}"
-        self.client = mqtt.Client(CallbackAPIVersion.VERSION2, name, clean_session=False, manual_ack=True)
-        self.client.on_message = self._hear
+        more = {"clean_session": False, "manual_ack": True, "reconnect_on_failure": False}
+        self.client = client_of(options, options.client or f"driftfit-{options.name}", **more)
+        self.client.on_message = lambda client, user, message: self.arrived.put(message)
         self.client.on_connect = self._subscribe
-        self.client.on_socket_register_write = lambda *_: None  # packets are sent by `_send`, not one by one
-        self.line = Line(self.client)
-        secure(self.client, options)
-        host, port = connected(options.url)
-        self.client.connect(host, port, keepalive=30)
+        self.client.on_disconnect = self._lost
+        begin(self.client, options.url)
 
     def _subscribe(self, client: Any, user: Any, flags: Any, reason: Any, properties: Any) -> None:
-        if reason.is_failure:
-            raise ConnectionError(f"{self.options.url} refuses: {reason}")
-        client.subscribe([(topic, self.options.qos) for topic in self.options.topic.split()])
+        if not reason.is_failure:
+            client.subscribe([(topic, self.options.qos) for topic in self.options.topic.split()])
 
-    def _hear(self, client: Any, user: Any, message: Any) -> None:
-        """Decode a message; what cannot be read is counted."""
-        heard = self.batch
-        heard.count += 1
-        if message.qos:
-            heard.identifiers.append(message.mid)
-        try:
-            if len(message.payload) > MESSAGE_BYTES:
-                raise ValueError
-            read = self._decode(message.topic, message.payload)
-        except ValueError:  # it is acknowledged like any other: sent again it would not be better
-            heard.refused += 1
-        else:
-            heard.samples += [] if read is None else [read]
+    def _lost(self, client: Any, user: Any, flags: Any, reason: Any, properties: Any) -> None:
+        self.error = ConnectionError(f"{self.options.url}: {reason}")
 
-    def read(self, wait: float) -> Batch | None:
-        until = time.monotonic() + wait
-        while not self.batch.count:
-            self._send()
-            left = until - time.monotonic()
-            if left <= 0.0:
-                return None
-            self._wait(left)
-            self._receive()
-        heard, self.batch = self.batch, Heard()
-        self.unconfirmed += len(heard.identifiers)
-        confirm = partial(self._confirm, heard.identifiers)
-        return Batch(heard.samples, confirm, refused=heard.refused, arrived=time.monotonic())
-
-    def _send(self) -> None:
-        """Acknowledge what is in the journal, and send what waits."""
-        while self.confirmed:
-            identifiers = self.confirmed.popleft()
-            self.unconfirmed -= len(identifiers)
-            for one in identifiers:
-                self.client.ack(one, 1)
-        self._checked(self.client.loop_misc())
-        if self.client.want_write():
-            self._checked(self.client.loop_write())
-        self.line.flush()
-
-    def _wait(self, seconds: float) -> None:
-        """Until messages arrive, or acknowledgements are to be sent."""
-        socket = self.client.socket()
-        if socket is None or (not self.client.is_connected() and time.monotonic() - self.begun > ANSWER_SECONDS):
-            raise ConnectionError(f"no connection to {self.options.url}")
-        if self.more or (isinstance(socket, ssl.SSLSocket) and socket.pending()):
-            return
-        writing = [socket] if self.line.to_send or self.client.want_write() else []
-        ready, *_ = select.select([socket, self.woken], writing, [], seconds)
-        if self.woken in ready:
-            self.woken.recv(4096)
-
-    def _receive(self) -> None:
-        self.more = True
-        while self.more and self.batch.count < BATCH_MESSAGES:  # a call reads one packet
-            before = self.batch.count
-            self._checked(self.client.loop_read())
-            self.more = self.batch.count > before or self.line.holds
-
-    def _checked(self, code: int) -> None:
-        if code:
-            raise ConnectionError(f"{self.options.url}: {paho().error_string(code)}")
+    def batch(self, found: list[Any]) -> Batch:
+        """Decode messages; what cannot be read is acknowledged like any other: sent again it would not be better."""
+        samples, refused = [], 0
+        for message in found:
+            try:
+                read = self._decode(message.topic, message.payload)
+            except ValueError:
+                refused += 1
+            else:
+                samples += [] if read is None else [read]
+        identifiers = [one.mid for one in found if one.qos]
+        self.unconfirmed += len(identifiers)
+        return Batch(samples, partial(self._confirm, identifiers), refused=refused, arrived=time.monotonic())
 
     def _decode(self, topic: str, payload: bytes) -> Samples | None:
         """The samples of a message; None if it has none."""
@@ -181,76 +114,42 @@ class _Mqtt(Reader):
             raise
 
     def _confirm(self, identifiers: list[int]) -> None:
-        """Let the thread of the source acknowledge messages."""
-        self.confirmed.append(identifiers)
-        with contextlib.suppress(OSError):  # it is awake already, or closed: the broker sends them again
-            self.waker.send(b"1")
+        """Acknowledge messages that are in the journal, from its thread."""
+        for one in identifiers:
+            self.client.ack(one, 1)
+        self.unconfirmed -= len(identifiers)
 
     def close(self) -> None:
         """Disconnect, once what was passed on is acknowledged; the session stays at the broker."""
+        self.client.on_message = None
+        self.drain()  # the client's thread may wait for room
         until = time.monotonic() + CLOSE_SECONDS
-        with contextlib.suppress(OSError):
-            while self.unconfirmed and (left := until - time.monotonic()) > 0.0:
-                select.select([self.woken], [], [], left)
-                self._send()
-            self.line.release()
-            self.client.disconnect()
-            self._checked(self.client.loop_write())
-        self.woken.close()
-        self.waker.close()
+        while self.unconfirmed and self.client.is_connected() and time.monotonic() < until:
+            time.sleep(0.01)
+        end(self.client)
 
 
-class Heard:
-    """The messages of the next batch."""
+def client_of(options: Any, name: str, **more: Any) -> Any:
+    """A client of a broker, with name, password and TLS."""
+    from paho.mqtt.enums import CallbackAPIVersion
 
-    def __init__(self) -> None:
-        self.samples: list[Samples] = []
-        self.identifiers: list[int] = []
-        """Of those that are to be acknowledged."""
-        self.count = self.refused = 0
+    client = paho().Client(CallbackAPIVersion.VERSION2, name, **more)
+    if options.user:
+        client.username_pw_set(options.user, options.password.value if options.password else None)
+    if options.url.startswith("mqtts"):
+        client.tls_set(ca_certs=options.authority or None)
+    return client
 
 
-class Line:
-    """The socket of a client, read in large pieces, and written once for many packets.
+def begin(client: Any, url: str) -> None:
+    """Connect, and start the client's thread."""
+    client.connect(*connected(url), keepalive=30)
+    client.loop_start()
 
-    paho-mqtt takes three calls of the system to read a message and one to acknowledge it, which is more than half of
-    its cost. It has no public way to change that: should its methods be named otherwise one day, it is only slower.
-    """
 
-    def __init__(self, client: Any) -> None:
-        self.to_send = bytearray()
-        self._client, self._read, self._at = client, b"", 0
-        self.theirs = {name: getattr(client, name) for name in ("_sock_recv", "_sock_send") if hasattr(client, name)}
-        if len(self.theirs) == 2:
-            client._sock_recv, client._sock_send = self.receive, self.send
-
-    @property
-    def holds(self) -> bool:
-        """Whether something was read that the client has not yet taken."""
-        return self._at < len(self._read)
-
-    def receive(self, most: int) -> bytes:
-        """At most so many bytes; BlockingIOError if there are none, none at the end."""
-        if not self.holds:
-            self._read, self._at = self.theirs["_sock_recv"](max(most, 1 << 16)), 0
-        self._at += most
-        return self._read[self._at - most : self._at]
-
-    def send(self, data: bytes) -> int:
-        """Add to what `flush` sends."""
-        self.to_send += data
-        return len(data)
-
-    def flush(self) -> None:
-        """Send as much as the system takes."""
-        with contextlib.suppress(BlockingIOError):
-            while self.to_send:
-                del self.to_send[: self.theirs["_sock_send"](self.to_send)]
-
-    def release(self) -> None:
-        """Send the rest, and give the socket back to the client."""
-        self.flush()
-        vars(self._client).update(self.theirs)
+def end(client: Any) -> None:
+    client.disconnect()
+    client.loop_stop()
 
 
 def connected(url: str) -> tuple[str, int]:
@@ -260,11 +159,3 @@ def connected(url: str) -> tuple[str, int]:
         raise ValueError(f"url must be mqtt://host:port or mqtts://host:port, without a password; got {url!r}.")
     paho()
     return parts.hostname, parts.port or (8883 if parts.scheme == "mqtts" else 1883)
-
-
-def secure(client: Any, options: Any) -> None:
-    """Name, password and TLS of a client."""
-    if options.user:
-        client.username_pw_set(options.user, options.password.value if options.password else None)
-    if options.url.startswith("mqtts"):
-        client.tls_set(ca_certs=options.authority or None)

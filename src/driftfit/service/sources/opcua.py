@@ -16,7 +16,7 @@ from typing import Any
 
 from driftfit.service.connector import EventLoop, client_library
 from driftfit.service.options import Secret
-from driftfit.service.sources.contract import BATCH_MESSAGES, Batch, Reader, Source, by_topic
+from driftfit.service.sources.contract import Batch, QueueReader, Reader, Source, by_topic
 
 QUEUED_CHANGES = 100_000
 """Changes that wait to be read; those beyond are dropped, and counted as refused."""
@@ -47,13 +47,12 @@ class Opcua(Source):
         return _Opcua(self)
 
 
-class _Opcua(Reader):
+class _Opcua(QueueReader):
     def __init__(self, options: Opcua) -> None:
+        super().__init__(QUEUED_CHANGES)
         self.options = options
-        self.changes: queue.Queue[tuple[str, dict[str, Any]]] = queue.Queue(QUEUED_CHANGES)
         self.values: dict[str, dict[str, Any]] = {topic: {} for topic in options.nodes}
         self.dropped = 0
-        self.error: BaseException | None = None
         self.places: dict[str, tuple[str, str]] = {}
         self.loop = EventLoop()
         try:
@@ -86,7 +85,7 @@ class _Opcua(Reader):
         if len(values) <= len(self.options.nodes[topic]) or self.options.trigger not in ("", field):
             return
         try:
-            self.changes.put_nowait((topic, dict(values)))
+            self.arrived.put_nowait((topic, dict(values)))
         except queue.Full:
             self.dropped += 1
 
@@ -95,18 +94,14 @@ class _Opcua(Reader):
         self.error = ConnectionError(f"subscription: {status}")
 
     def read(self, wait: float) -> Batch | None:
-        try:
-            found = [self.changes.get(timeout=wait)]
-        except queue.Empty:
-            if self.error is not None:
-                raise self.error from None
+        found = super().read(wait)
+        if found is None:
             self.loop.call(self.client.check_connection())
-            return None
-        arrived = time.monotonic()
-        while len(found) < BATCH_MESSAGES and not self.changes.empty():
-            found.append(self.changes.get())
+        return found
+
+    def batch(self, found: list[Any]) -> Batch:
         refused, self.dropped = self.dropped, 0
-        return Batch(by_topic(found), refused=refused, arrived=arrived)
+        return Batch(by_topic(found), refused=refused, arrived=time.monotonic())
 
     def close(self) -> None:
         try:

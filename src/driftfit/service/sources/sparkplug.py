@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from struct import unpack_from
 from typing import Any
 
-from driftfit.service.sources.contract import MESSAGE_FIELDS, Samples, bounded, of_rows
+from driftfit.service.sources.contract import MESSAGE_BYTES, MESSAGE_FIELDS, Samples, bounded, of_rows
 
 PREFIX = "spBv1.0"
 BIRTHS, DATA = ("NBIRTH", "DBIRTH"), ("NDATA", "DDATA")
@@ -53,6 +53,8 @@ class Sparkplug:
         kind, group, node, device = parts_of(topic)
         if kind not in (*BIRTHS, *DATA):
             return None
+        if len(payload) > MESSAGE_BYTES:
+            raise ValueError(f"a message of {len(payload)} bytes; at most {MESSAGE_BYTES} are read.")
         where = "/".join(filter(None, (PREFIX, group, node, device)))
         names = self._names.get((group, node), {})
         born = kind in BIRTHS

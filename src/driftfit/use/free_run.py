@@ -23,7 +23,7 @@ from driftfit.models.hammerstein_wiener.blocks import Blocks
 from driftfit.models.hammerstein_wiener.forward import Inverse
 from driftfit.models.hammerstein_wiener.thresholds import Thresholds
 from driftfit.run.result import burn_in
-from driftfit.use.hammerstein_wiener.run_blocks import blocks_of
+from driftfit.use.blocks import blocks_of
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track

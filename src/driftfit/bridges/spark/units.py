@@ -1,0 +1,233 @@
+"""The units of a piece of a table: what is known of each, a run of some of their rows, and tables of what came out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from driftfit.bridges.spark.task import Task, begins
+from driftfit.data import late
+from driftfit.data.record import Known, Labels, Records
+from driftfit.engine.kernel import Array
+from driftfit.run.parallel_lanes import Advanced, advance
+from driftfit.run.warm_start import JointLayout
+
+ARROW = {
+    "double": pa.float64(), "boolean": pa.bool_(), "bigint": pa.int64(), "string": pa.string(), "binary": pa.binary(),
+    "array<double>": pa.list_(pa.float64()),
+}  # fmt: skip
+COUNTS = ("samples", "used", "without_time", "repeated", "late")
+"""Counts that a unit has."""
+SAMPLES, USED, *_REFUSED = range(len(COUNTS))
+PLACES = dict(zip((late.UNTIMED, late.REPEATED, late.LATE), _REFUSED, strict=True))
+"""Where rows that are left out are counted."""
+SQUARES, STANDARD, JUDGED = range(3)
+"""Sums of each output: of e^2, of e^2 / s, and how many terms the latter has."""
+
+
+class Done(NamedTuple):
+    """A run of units."""
+
+    rows: Array
+    """(N,): the rows of its samples in the table."""
+    keys: list[int]
+    """The numbers of its units."""
+    found: Advanced
+
+
+class Units:
+    """U units, whose N rows are sorted by unit.
+
+    Attributes
+    ----------
+    first, code : (U,), (N,)
+        The first row of each unit, and the number of the unit of each row.
+    time : (N,)
+        Floats, or datetime64 in UTC; NaN or NaT where there is none.
+    there : (U,) bool
+        Which units have a name.
+    settings, joints : list of U
+        Settings as JSON, None where they are the task's; the programs, or why there are none.
+    last, newest : (U,)
+        Times of the last sample, and of the newest row; NaN or NaT without one.
+    counts, squares : (U, COUNTS), (U, ny, 3)
+    packed : dict
+        States as they came, by the number of the unit; they are unpacked to ``words`` when a sample follows.
+    """
+
+    def __init__(self, task: Task, table: pa.Table) -> None:
+        self.task, self.table = task, table
+        self.first = begins(table, task.by)
+        self.code = np.repeat(np.arange(len(self.first)), np.diff(np.append(self.first, table.num_rows)))
+        self.time = times(table.column(task.time))
+        self.there = np.ones(len(self.first), bool)
+        for name in task.by:
+            self.there &= pc.is_valid(table.column(name)).to_numpy()[self.first]
+        self.last = np.full(len(self.first), "NaT" if self.time.dtype.kind == "M" else np.nan, self.time.dtype)
+        self.newest = self.last.copy()
+        self.counts: Array = np.zeros((len(self.first), len(COUNTS)), np.int64)
+        self.squares = np.zeros((len(self.first), len(task.y), 3))
+        self.packed: dict[int, bytes] = {}
+        self.words: dict[int, Array] = {}
+        self.set(task.settings_of(table, self.first))
+
+    def set(self, settings: list[str | None]) -> None:
+        """Give every unit its settings."""
+        self.settings, self.joints = settings, [self.task.joint_for(one) for one in settings]
+
+    @property
+    def good(self) -> Array:
+        """Which units can run."""
+        return np.asarray(self.there & np.array([isinstance(one, JointLayout) for one in self.joints]))
+
+    def joint(self, k: int) -> JointLayout:
+        """The programs of a unit that can run."""
+        found = self.joints[k]
+        assert isinstance(found, JointLayout)
+        return found
+
+    def reason(self, k: int) -> str | None:
+        """Why a unit cannot run."""
+        found = self.joints[k]
+        return "rows without a unit" if not self.there[k] else found if isinstance(found, str) else None
+
+    def state(self, k: int) -> bytes:
+        """The packed state of a unit."""
+        if k in self.packed:
+            return self.packed[k]
+        return self.joint(k).pack(self.words[k]) if k in self.words else self.joint(k).start
+
+    def count(self, fate: Array, rows: Array) -> None:
+        """Count rows that are left out."""
+        for code, place in PLACES.items():
+            self.counts[:, place] += np.bincount(self.code[rows[fate == code]], minlength=len(self.first))
+
+    def run(self, rows: Array, collected: bool = False) -> Done | None:
+        """Run the units that can on some rows, in the order of unit and time; None if there is no sample.
+
+        States, times, counts and sums go on.
+        """
+        rows = rows[self.good[self.code[rows]]]
+        if not len(rows):
+            return None
+        records = self._records(rows)
+        keys, ny = self.code[rows[records.first]].tolist(), len(self.task.y)
+        for k in self.packed.keys() & set(keys):
+            self.words[k] = self.joint(k).unpack(self.packed.pop(k))
+        begun = np.array([k in self.words for k in keys])
+        known = [self.words[k].reshape(ny, -1) if k in self.words else np.zeros((ny, 0), np.int64) for k in keys]
+        words = np.zeros((len(keys) * ny, max(one.shape[1] for one in known)), np.int64)
+        for j in np.flatnonzero(begun).tolist():
+            words[j * ny : (j + 1) * ny, : known[j].shape[1]] = known[j]
+        programs = [one for k in keys for one in self.joint(k).programs]
+        found = advance(programs, records, words, np.repeat(begun, ny), threads=1, collected=collected)
+        self._go_on(found, keys)
+        return Done(rows, keys, found)
+
+    def _records(self, rows: Array) -> Records:
+        """The samples of units in flat arrays, one unit after the other."""
+        task = self.task
+        keys, first, length = np.unique(self.code[rows], return_index=True, return_counts=True)
+        time, before = self.time[rows], np.roll(self.time[rows], 1)
+        before[first] = self.last[keys]
+        new = first[np.isnat(before[first]) if before.dtype.kind == "M" else np.isnan(before[first])]
+        before[new] = time[new]
+        gaps = task.clock.between(before, time)
+        gaps[new] = 1.0
+        signals = np.stack([numbers(self.table.column(name))[rows] for name in (*task.y, *task.order)], axis=1)
+        every, u = (np.ascontiguousarray(part) for part in np.split(signals, [len(task.y)], axis=1))
+        y, known, outputs = every[:, 0], Known.of(gaps), tuple[str, ...]()
+        if len(task.y) > 1:
+            y, known, outputs = every, known.for_outputs(np.ones(every.shape)), task.y
+        labels = Labels(task.y[0] if not outputs else "y", task.order, task.time, zone=task.zone, by=task.by)
+        return Records(tuple(keys.tolist()), first, length, y, u, known, time, labels, outputs=outputs)
+
+    def _go_on(self, found: Advanced, keys: Sequence[int]) -> None:
+        """Note states and times after the samples; a sample is used if one of its outputs is."""
+        records, ny, after = found.records, len(self.task.y), found.states()
+        assert records.time is not None
+        self.last[keys] = records.time[records.first + records.length - 1]
+        for j, k in enumerate(keys):
+            self.words[k] = after[j * ny : (j + 1) * ny, : found.programs[j * ny].layout.size].reshape(-1)
+        ok, e, s = (found.column(name).reshape(len(records.time), ny) for name in ("ok", "e", "s"))
+        used = ok > 0.0
+        judged = used & np.isfinite(s) & (s > 0.0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            terms = {SQUARES: np.where(judged, e * e, 0.0), STANDARD: np.where(judged, e * e / s, 0.0), JUDGED: judged}
+        for place, values in terms.items():
+            self.squares[keys, :, place] += np.add.reduceat(np.asarray(values, float), records.first)
+        self.counts[keys, USED] += np.add.reduceat(used.any(axis=1).astype(int), records.first)
+        self.counts[keys, SAMPLES] += records.length
+
+    def taken(self, names: Sequence[str], rows: Array) -> dict[str, Any]:
+        """Columns of some rows of the table."""
+        return {name: self.table.column(name).take(pa.array(rows)) for name in names}
+
+    def counted(self, which: Sequence[int]) -> dict[str, Any]:
+        """The counts of some units."""
+        return {name: self.counts[which, j] for j, name in enumerate(COUNTS)}
+
+    def instants(self, values: Array) -> pa.Array:
+        """Times as a column of the table's type; NaN and NaT are null."""
+        if values.dtype.kind != "M":
+            return pa.array(values, mask=np.isnan(values))
+        like = self.table.schema.field(self.task.time).type
+        return pa.array(values.astype("M8[us]").view(np.int64), mask=np.isnat(values)).cast(like)
+
+    def filled(self, columns: Mapping[str, Any], schema: Mapping[str, str]) -> pa.Table:
+        """A table with all columns of a schema, null where there are none; keys and times have this table's types."""
+        count, types, made = len(next(iter(columns.values()))), self.table.schema, {}
+        for name, kind in schema.items():
+            arrow, column = types.field(name).type if name in types.names else ARROW[kind], columns.get(name)
+            known = isinstance(column, pa.Array | pa.ChunkedArray)
+            made[name] = pa.nulls(count, arrow) if column is None else column if known else pa.array(column, arrow)
+        return pa.table(made)
+
+
+def numbers(column: pa.ChunkedArray) -> Array:
+    """Floats, NaN where there is none."""
+    return np.asarray(pc.fill_null(column.cast(pa.float64()), np.nan).to_numpy(), float)
+
+
+def times(column: pa.ChunkedArray) -> Array:
+    """Floats, or datetime64 in UTC; NaN or NaT where there is none."""
+    if not pa.types.is_timestamp(column.type):
+        return numbers(column)
+    instants: Array = column.cast(pa.timestamp("us")).to_numpy().astype("M8[us]")
+    return instants
+
+
+def results(task: Task, found: Advanced) -> dict[str, pa.Array]:
+    """The results at every sample, as `results_schema` names them."""
+    with np.errstate(invalid="ignore"):
+        std, deviation = np.sqrt(found.column("var")), np.sqrt(found.column("s"))
+    own = {"prediction": found.column("y_hat"), "innovation": found.column("e"), "innovation_std": deviation}
+    own["ok"] = found.column("ok") > 0.0
+    return by_output(task, own) | parameters(task, found.column("theta"), std)
+
+
+def by_output(task: Task, own: Mapping[str, Array]) -> dict[str, pa.Array]:
+    """A column for each output of values (N,) or (N, ny)."""
+    return {
+        f"{name}{of}": pa.array(np.ascontiguousarray(values.reshape(len(values), -1)[:, j]))
+        for j, of in enumerate(task.suffixes)
+        for name, values in own.items()
+    }
+
+
+def parameters(task: Task, theta: Array, std: Array) -> dict[str, pa.Array]:
+    """The columns of parameters (N, n) or (N, ny, n)."""
+    columns: dict[str, pa.Array] = {}
+    for j, (names, of) in enumerate(zip(task.names, task.suffixes, strict=True)):
+        for what, every in (("theta", theta), ("std", std)):
+            path = every.reshape(len(every), len(task.y), -1)[:, j]
+            if task.arrays:
+                offsets = np.arange(len(path) + 1, dtype=np.int32) * path.shape[1]
+                columns[f"{what}{of}"] = pa.ListArray.from_arrays(offsets, np.ascontiguousarray(path).ravel())
+            else:
+                columns |= {f"{what}_{name}": pa.array(path[:, i].copy()) for i, name in enumerate(names)}
+    return columns

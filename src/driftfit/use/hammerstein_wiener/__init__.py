@@ -1,1 +1,0 @@
-"""What is computed from runs of Hammerstein-Wiener models: blocks, diagnostics, free runs, fits of constant systems."""
