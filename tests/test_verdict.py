@@ -69,8 +69,8 @@ def test_the_headline_is_one_statement_of_both_answers():
     """A gain that swings fast leaves no trace in a cumulated score, but following it pays: nothing denies that."""
     rng = np.random.default_rng(3)
     u = rng.normal(size=600)
-    y = np.sin(2.0 * np.pi * np.arange(600) / 40.0) * u + 0.2 * rng.normal(size=600)
-    result = track(Regression(1, intercept=True), Kalman(q=0.02, r=0.04), y, u).verdict()
+    y = np.sin(2.0 * np.pi * np.arange(600) / 28.0) * u + 0.2 * rng.normal(size=600)
+    result = track(Regression(1, intercept=True), Kalman(q=0.1, r=0.04), y, u).verdict()
     assert result.drifts is False
     assert result.pays
     assert "No drift" not in str(result)
