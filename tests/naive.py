@@ -3,8 +3,9 @@
 import numpy as np
 from scipy import stats
 
-from driftfit.trackers.parts.mixture import filters, noise
-from driftfit.trackers.parts.mixture.modes import COMMON, FIRST_ALONE, FIRST_LEARNED
+from driftfit.trackers.mixture import filters
+from driftfit.trackers.mixture import states as of_noise
+from driftfit.trackers.mixture.states import COMMON, FIRST_ALONE, FIRST_LEARNED, FLOOR
 
 
 def full(lower):
@@ -13,24 +14,17 @@ def full(lower):
     return np.where(np.tri(len(lower), dtype=bool).reshape(lower.shape[:2] + (1,) * (lower.ndim - 2)), lower, other)
 
 
-def ratios(lane):
-    """Drift ratios (K,) in a sample: the last rung of jumps is the variance of the output, or the last outlier."""
-    rho, jump = lane["ratio"].copy(), max(COMMON[-1], max(lane["spread"], lane["outlier"] * lane["e"] ** 2) / lane["r"])
-    rho[len(COMMON) - 1] = jump
-    rho[FIRST_ALONE + lane["rungs"] - 1 :: lane["rungs"]] = jump
-    return rho
-
-
-def walks(lane):
-    """Drift covariances (K, n, n) of the modes in a nominal interval, in units of theta."""
-    rho, n, c = lane["r"] * ratios(lane), len(lane["c"]), lane["c"]
+def walks(lane, jump=COMMON[-1]):
+    """Drift covariances (K, n, n) of the modes in a nominal interval, in units of theta; ``jump`` is the last rung."""
+    n, c = len(lane["c"]), lane["c"]
+    rho = lane["r"] * np.where(lane["ratio"] == COMMON[-1], jump, lane["ratio"])
     away = np.eye(n)
     if lane["offset"].any():
         away[lane["constant"]] -= lane["offset"]
     common = (away * lane["drift_unit"]) @ away.T
     a = np.divide(lane["direction"], np.sqrt(c), out=np.zeros(n), where=c > 0.0)
     inverse = np.divide(1.0, c, out=np.zeros(n), where=c > 0.0)
-    learned = np.diag(lane["weight"] * inverse) + filters.FLOOR * common + np.outer(a, a)
+    learned = np.diag(lane["weight"] * inverse) + FLOOR * common + np.outer(a, a)
     Q = np.zeros((len(rho), n, n))
     Q[:FIRST_LEARNED], Q[FIRST_LEARNED:FIRST_ALONE] = common, learned
     for i, first in enumerate(lane["alone"]):
@@ -46,19 +40,35 @@ def moved_along(lane, time=1.0):
     return m
 
 
-def before(lane, phi):
+def before(lane, phi, jump=COMMON[-1]):
     """x, means (n, K), covariances (K, n, n) and variances (3,) of the noise before a sample."""
-    S = lane["S"]
-    C = np.moveaxis(full(lane["C"]), -1, 0) + S @ walks(lane) @ S.T
-    r = lane["r"]
-    v = lane["noise"] * np.array([r, max(lane["restless"], noise.LEAST_RESTLESS * r), noise.LARGE * r])
+    S, r = lane["S"], lane["r"]
+    C = np.moveaxis(full(lane["C"]), -1, 0) + S @ walks(lane, jump) @ S.T
+    v = lane["noise"] * np.array([r, max(lane["restless"], of_noise.LEAST_RESTLESS * r), of_noise.LARGE * r])
     return np.linalg.solve(S.T, phi), moved_along(lane), C, v
+
+
+def expected(lane, phi):
+    """Prediction, and its variance if nothing unusual happens."""
+    x, m, C, v = before(lane, phi)
+    jumps = lane["kappa"] * lane["arrive"] * (lane["ratio"] >= 1.0)
+    mean, restless = x @ m @ lane["prior"], states(lane)[1] / (1.0 - lane["outlying"])
+    spread = np.maximum(lane["prior"] - jumps, 0.0) @ (np.einsum("i,kij,j->k", x, C, x) + (x @ m - mean) ** 2)
+    return mean, spread + v[0] ** (1.0 - restless) * v[1] ** restless
+
+
+def after_jump(lane, phi, y):
+    """The same as `before`, with jumps as large as an unusual innovation."""
+    mean, variance = expected(lane, phi)
+    square, most = (y - mean) ** 2, max(lane["spread"], lane["astray"])
+    jump = min(most, square / lane["noise"]) / lane["r"] if square > COMMON[-1] * variance else 0.0
+    return before(lane, phi, max(COMMON[-1], jump))
 
 
 def states(lane):
     """Probabilities (3,) of the states of the noise before a sample."""
     (quiet, restless, _), o = lane["nu"], lane["outlying"]
-    usual = np.array([[noise.STAY, 1.0 - noise.STAY], [1.0 - noise.CALM, noise.CALM]])
+    usual = np.array([[of_noise.STAY, 1.0 - of_noise.STAY], [1.0 - of_noise.CALM, of_noise.CALM]])
     return np.append((1.0 - o) * np.array([quiet, restless]) @ usual, o)
 
 
@@ -77,7 +87,7 @@ def density(lane, phi, y):
 
 def sample(lane, phi, y):
     """Probabilities (K,), means (n, K) and covariances (K, n, n) after a sample, before and after the interaction."""
-    (x, m, C, v), K, count = before(lane, phi), len(lane["prior"]), float(lane["count"])
+    (x, m, C, v), K, count = after_jump(lane, phi, y), len(lane["prior"]), float(lane["count"])
     e, g = y - x @ m, C @ x
     h = g @ x
     s = h + np.stack([np.full(K, v[0]), np.full(K, v[1]), np.maximum(v[2], e**2)])

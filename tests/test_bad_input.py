@@ -6,8 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from driftfit import ARX, RLS, AugmentedFLS, DataWarning, Kalman, Live, Regression, Track, track
-from driftfit.data import storage
+from driftfit import ARX, RLS, AugmentedFLS, DataWarning, Kalman, Live, Regression, track
 from driftfit.trackers import found
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-3, r=0.1)
@@ -68,18 +67,6 @@ def test_names_and_tables_of_the_wrong_kind():
     assert "column 'u' is of type List" in message(ValueError, "flow", "u", data=data)
 
 
-@pytest.mark.parametrize("tracker", KINDS, ids=repr)
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, None, 1e200])
-def test_no_value_anywhere_poisons(tracker, bad):
-    data = table(60)
-    for name in ("flow", "u"):
-        column = pl.Series([bad if k in (0, 20, 59) else v for k, v in enumerate(data[name])])
-        run = track(MODEL, tracker, "flow", "u", data=data.with_columns(column.alias(name)))
-        assert np.isfinite(run.theta).all()
-        assert not run.ok[20 if name == "flow" else 21]
-        assert run.ok[25:59].all()
-
-
 @pytest.mark.parametrize("which", ["y", "u"])
 def test_complex_signals_are_refused(which):
     """Their imaginary parts were left out."""
@@ -117,17 +104,6 @@ def test_signals_of_impossible_size_are_named(size, counted, which):
 
 
 @pytest.mark.parametrize("tracker", KINDS, ids=repr)
-@pytest.mark.parametrize("level", [0.0, 5.0])
-def test_constant_inputs_for_a_hundred_thousand_steps(tracker, level):
-    T = 100_000
-    noise = np.random.default_rng(0).normal(size=T)
-    run = track(MODEL, tracker, 0.1 * noise, np.full(T, level))
-    assert np.isfinite(run.theta).all()
-    assert np.abs(run.theta).max() < 1e3
-    assert not np.isnan(run.std[100:]).any() or not tracker.covariance
-
-
-@pytest.mark.parametrize("tracker", KINDS, ids=repr)
 def test_one_sample_and_no_usable_sample(tracker):
     for y, u in (([1.0], [2.0]), ([np.nan] * 20, [1.0] * 20), ([1.0] * 20, [np.nan] * 20)):
         run = track(MODEL, tracker, y, u)
@@ -135,6 +111,8 @@ def test_one_sample_and_no_usable_sample(tracker):
         assert np.isfinite(run.theta).all()
         text = str(run.summary())
         assert f"{len(y)}, 0 used, {len(y)} skipped" in text
+        assert "nothing to compare" in text
+        assert np.isinf(run.std).all() or not tracker.covariance
         run.plot()
         assert len(run.to_table()) == len(y)
     with pytest.raises(ValueError, match="y is empty: there is nothing to track"):
@@ -160,17 +138,6 @@ def test_more_parameters_than_samples():
     assert np.isinf(run.std).all()
     assert np.isfinite(run.theta).all()
     run.summary()
-
-
-def test_times_that_do_not_increase():
-    y, u = np.ones(3), np.ones(3)
-    for time in ([0.0, 2.0, 1.0], [0.0, 1.0, 1.0], [0.0, np.nan, 1.0]):
-        with pytest.raises(ValueError, match="time must increase"):
-            track(MODEL, TRACKER, y, u, time=time)
-    live = Live(MODEL, TRACKER)
-    for time in (0.0, 1.0, 1.0, 0.5, 2.0):
-        live.update(1.0, 1.0, time=time)
-    assert live.ignored == 2
 
 
 def test_units_with_one_row_nothing_usable_or_no_time():
@@ -245,36 +212,6 @@ def test_a_cut_csv_line_is_missing_not_fatal(tmp_path):
     (tmp_path / "cut.csv").write_text("flow,u\n1.0,2.0\n1.5,3.0\n2.0")
     run = track(MODEL, TRACKER, "flow", "u", data=tmp_path / "cut.csv")
     assert np.isnan(run.u[2, 0])
-
-
-def test_state_files(tmp_path):
-    path = tmp_path / "state.npz"
-    live = Live(MODEL, TRACKER)
-    live.update(1.0, 1.0)
-    live.save(path)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match="is not a driftfit file, or it is damaged"):
-        Live.load(path)
-    path.write_bytes(b"something else")
-    with pytest.raises(ValueError, match="is not a driftfit file, or it is damaged"):
-        Live.load(path)
-    path.write_bytes(whole)
-    with pytest.raises(ValueError, match="holds a state, not a track"):
-        Track.load(path)
-
-    path.write_bytes(whole[:8] + b"\x63" + whole[9:])
-    with pytest.raises(ValueError, match="written by a newer driftfit"):
-        Live.load(path)
-    header, arrays = storage.expand(whole, ["state"])
-    settings = header["model"]["settings"]
-    path.write_bytes(storage.compact(header | {"model": header["model"] | {"settings": settings | {"na": 2}}}, arrays))
-    with pytest.raises(ValueError, match="does not fit"):
-        Live.load(path)
-    absent = header["model"] | {"class": "driftfit.models.arx:Absent"}
-    path.write_bytes(storage.compact(header | {"model": absent}, arrays))
-    with pytest.raises(ValueError, match=r"needs driftfit\.models\.arx:Absent, which is not a part"):
-        Live.load(path)
 
 
 def test_every_tracker_is_covered_by_some_kind():

@@ -7,8 +7,7 @@ import polars as pl
 import pytest
 from cli_support import fails, run
 
-import driftfit
-from driftfit import ARX, Kalman, Regression, Track, track, trackers
+from driftfit import ARX, Kalman, Regression, track, trackers
 from driftfit.cli import main
 from driftfit.cli.reading import parse_interval
 from driftfit.data.clock import Clock
@@ -77,22 +76,6 @@ def test_out_is_the_table_of_the_run(file, tmp_path, ending):
     assert np.array_equal(table["innovation"], of_run.innovation, equal_nan=True)
     assert np.array_equal(table["ok"], of_run.ok)
     assert np.array_equal(table["hour"], np.arange(200.0))
-
-
-def test_out_as_track(file, tmp_path):
-    out = tmp_path / "result.npz"
-    arguments = ["--y", "flow rate", "--u", "pressure", "--model", "arx:1,1", *SETTINGS]
-    run("track", file, *arguments, "--out", out)
-    loaded = Track.load(out)
-    assert np.array_equal(loaded.theta, expected().theta)
-    assert loaded.names == ("a1", "b1[pressure]")
-
-
-def test_plot(file, tmp_path):
-    picture = tmp_path / "run.png"
-    arguments = ["--y", "flow rate", "--u", "pressure", "--model", "arx:1,1", *SETTINGS]
-    run("track", file, *arguments, "--plot", picture)
-    assert picture.stat().st_size > 10_000
 
 
 def test_dates_need_dt_and_take_it(tmp_path):
@@ -184,11 +167,6 @@ def test_wrong_settings(file, settings, hint):
     )
 
 
-def test_unknown_tracker_gets_near_matches(file):
-    message = fails("track", file, "--y", "flow rate", "--u", "pressure", "--tracker", "kalmn")
-    assert "did you mean Kalman" in message
-
-
 def test_wrong_endings_are_refused_before_the_work(file, tmp_path):
     arguments = ["track", file, "--y", "flow rate", "--u", "pressure", *SETTINGS]
     assert ".parquet" in fails(*arguments, "--out", tmp_path / "result.xls")
@@ -262,10 +240,6 @@ def test_trackers_are_all_listed_with_their_settings():
         assert name in printed
         for field in settings.given_fields(kind):
             assert f"{field.name}=" in printed
-
-
-def test_version():
-    assert run("--version").strip() == f"driftfit {driftfit.__version__}"
 
 
 def test_missing_cells(tmp_path):

@@ -13,6 +13,7 @@ import pytest
 from cli_support import fails
 from cli_support import run as command
 
+import driftfit
 from driftfit import ARX, Kalman, track
 from driftfit.data.csv_files import without_formulas
 from driftfit.fleets import Fleet, Outputs
@@ -172,7 +173,7 @@ def test_the_package_is_the_command(monkeypatch, capsys):
     with pytest.raises(SystemExit) as ended:
         runpy.run_module("driftfit", run_name="__main__")
     assert ended.value.code == 0
-    assert capsys.readouterr().out.startswith("driftfit ")
+    assert capsys.readouterr().out == f"driftfit {driftfit.__version__}\n"
 
 
 @pytest.mark.parametrize("name", ["flow, cold", "flow (l/min)", "flow 'a'", 'the "old" flow', "flow=2", "a;b", "$x"])

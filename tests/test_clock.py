@@ -178,21 +178,6 @@ def test_a_stream_counts_as_its_record(dt):
         assert live.ignored == 1
 
 
-@pytest.mark.parametrize(
-    "dt", ["month", OFFSETS.CustomBusinessDay(holidays=["2024-01-08"]), timedelta(hours=36), "label"]
-)
-def test_a_stream_is_saved_with_its_clock(dt, tmp_path):
-    y, u = signals()
-    time = np.datetime64("2024-01-01", "us") + np.arange(T) * np.timedelta64(31, "h")
-    live = Live(MODEL, TRACKER, dt=dt)
-    for t in range(30):
-        live.update(y[t], u[t], time=time[t])
-    live.save(tmp_path / "live.npz")
-    again = Live.load(tmp_path / "live.npz")
-    for t in range(30, T):
-        assert np.array_equal(live.update(y[t], u[t], time=time[t]), again.update(y[t], u[t], time=time[t]), True)
-
-
 def test_a_warm_start_counts_from_the_end_of_the_run_before():
     y, u = signals()
     time = pd.date_range("2024-01-01", periods=T, freq="B")
@@ -209,9 +194,9 @@ def test_samples_lost_to_dt_are_reported():
     ):
         run = track(MODEL, TRACKER, y, u, time=10.0 * np.arange(T))
     assert not run.ok.any()
-    months = pd.date_range("2020-01-01", periods=T, freq="MS")
-    with pytest.warns(DataWarning, match="dt='month'"):
-        track(MODEL, TRACKER, y, u, time=months, dt="1d")
+    for freq, dt in (("MS", "month"), ("B", "business day")):  # of the latter only Mondays are lost
+        with pytest.warns(DataWarning, match=f"dt='{dt}'"):
+            track(MODEL, TRACKER, y, u, time=pd.date_range("2024-01-01", periods=T, freq=freq), dt="1d")
     table = pd.DataFrame(
         {"y": np.tile(y, 2), "u": np.tile(u, 2), "t": np.tile(10 * np.arange(T), 2), "k": [0] * T + [1] * T}
     )
@@ -223,13 +208,6 @@ def test_samples_lost_to_dt_are_reported():
     with pytest.warns(DataWarning, match="first 20 samples") as result:
         [live.update(y[t], u[t], time=10.0 * t) for t in range(T)]
     assert [one.filename for one in result] == [__file__]
-
-
-def test_weekends_that_cost_mondays_are_reported():
-    y, u = signals()
-    time = pd.date_range("2024-01-01", periods=T, freq="B")
-    with pytest.warns(DataWarning, match="dt='business day'"):
-        track(MODEL, TRACKER, y, u, time=time, dt="1d")
 
 
 def test_no_warning_where_no_sample_is_lost():

@@ -42,15 +42,6 @@ def assert_same(one: Track, other: Track) -> None:
     assert one.loglik == other.loglik or not one.tracker.covariance
 
 
-@pytest.mark.parametrize("tracker", [KALMAN, RLS(0.98), AugmentedFLS(mu=1.0)], ids=repr)
-def test_rows_are_bit_equal_to_each_alone(tracker):
-    y, u = rows(40, 300)
-    fleet = track(MODEL, tracker, y, u, by="row")
-    assert len(fleet) == 40
-    for key in (0, 31, 32, 39):
-        assert_same(fleet[key], track(MODEL, tracker, y[key], u[key]))
-
-
 def test_series_of_unequal_length_end_in_the_state_they_had_alone():
     y, u = rows(40, 600, seed=1)
     length = np.random.default_rng(2).integers(1, 600, 40)

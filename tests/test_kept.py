@@ -97,8 +97,6 @@ def test_what_is_refused():
     y, u = arx_record(20, 3)
     with pytest.raises(ValueError, match="dtype must be one of 'float64', 'float32'"):
         track(ARX(2, 2), K, y, u, dtype="float16")
-    with pytest.raises(ValueError, match="keep must be one of 'std', 'cov', 'theta'"):
-        track(ARX(2, 2), K, y, u, keep="all")
     with pytest.raises(ValueError, match="keep='theta' is for models of one output"):
         track(ARX(1, 1, ny=2), K, np.stack([y, y], axis=1), u, keep="theta")
 

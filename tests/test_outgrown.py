@@ -11,7 +11,7 @@ import pytest
 from naive import moved_along, walks
 
 from driftfit import AdaptiveKalman, Bank, Change, Live, Regression, Sensor, track
-from driftfit.trackers.parts.mixture.filters import UNSURE
+from driftfit.trackers.mixture.filters import UNSURE
 
 N, PARTED, T = 3, 40, 60
 EXACT = np.vectorize(Decimal, otypes=[object])

@@ -6,7 +6,6 @@ import pickle
 import re
 import subprocess
 import sys
-from multiprocessing import get_context
 
 import numpy as np
 import polars as pl
@@ -16,13 +15,9 @@ from support import arx_record, same
 
 from driftfit import (
     ARX,
-    FLS,
     RLS,
-    AdaptiveKalman,
-    HammersteinWiener,
     Kalman,
     Live,
-    Regression,
     grid,
     select,
     track,
@@ -116,57 +111,8 @@ def test_a_copied_stream_continues_independently(way):
             assert same(live.smooth().theta, other.smooth().theta)
 
 
-def test_bytes_are_what_a_file_holds(tmp_path):
-    live = Live(ARX(2, 2), K)
-    live.update(1.0, 2.0)
-    (tmp_path / "state").write_bytes(live.to_bytes())
-    assert Live.load(tmp_path / "state").to_bytes() == live.to_bytes()
-    for data in (b"", b"hello", live.to_bytes()[:-30]):
-        with pytest.raises(ValueError, match="what was given is not a driftfit file, or it is damaged"):
-            Live.from_bytes(data)
-    two = Live(ARX(1, 1, ny=2), K)
-    assert type(Live.from_bytes(two.to_bytes())) is type(two)
-
-
-@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-def test_results_can_be_copied_and_sent(run, fleet, way):
-    """Settings, records and what is said of them; the numbers stay, and what is asked of the copy is answered."""
-    for settings in (K, AdaptiveKalman(), FLS(), HammersteinWiener(1, 1), Regression(["a"], intercept=True)):
-        assert way(settings) == settings
-    for one in (run, fleet[3], track(Regression(1, ny=2), K, TWO, U)):
-        other = way(one)
-        assert same(other.theta, one.theta)
-        assert str(other.summary()) == str(one.summary())
-        assert same(other.forecast(2, U[:2]).y_std, one.forecast(2, U[:2]).y_std)
-    assert str(way(fleet).summary()) == str(fleet.summary())
-    for result in results(run, fleet):
-        assert str(way(result)) == str(result)
-    tuned = tune(ARX(2, 2), Kalman(), Y, U)
-    other = way(tuned)
-    assert repr(other) == repr(tuned)
-    assert other.table.equals(tuned.table)
-    for (_, x, value), (_, x2, value2) in zip(tuned.curves(), other.curves(), strict=True):
-        assert same(x, x2)
-        assert same(value, value2)
-
-
 def test_a_series_of_a_fleet_is_sent_alone(run, fleet):
     assert len(pickle.dumps(fleet[3])) < 2 * len(pickle.dumps(run))
-
-
-def advanced(live):
-    """What another process does with a stream."""
-    live.update(Y[50], U[50])
-    return live
-
-
-def test_a_stream_can_be_sent_to_a_process():
-    live = Live(ARX(2, 2), K)
-    for t in range(50):
-        live.update(Y[t], U[t])
-    with get_context("spawn").Pool(1) as pool:
-        other = pool.apply(advanced, (live,))
-    assert same(other.theta, advanced(live).theta)
 
 
 MODEL, TRACKER = "ARX(na=2, nb=2)", "Kalman(q=0.001, r=0.01)"

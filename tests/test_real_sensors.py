@@ -25,7 +25,7 @@ from driftfit import (
 from driftfit.smooth.parts.pooled_drift import pooled
 from driftfit.systems import scenarios
 from driftfit.systems.arc_furnace import switching
-from driftfit.trackers.parts.mixture.filters import UNSURE
+from driftfit.trackers.mixture.filters import UNSURE
 
 T = 1500
 MODEL, PLANT = Regression(3), ARX(2, 2)

@@ -39,7 +39,7 @@ from service_support import (
 from driftfit import track
 from driftfit.service.config import ProblemsError
 from driftfit.service.control import health
-from driftfit.service.core.section import Section
+from driftfit.service.core import section
 from driftfit.service.options import Pattern
 from driftfit.service.page.app import metrics_of
 from driftfit.service.page.feed import Feed
@@ -215,26 +215,39 @@ def theta_of(y, u):
     return track(MODEL, TRACKER, y, u, time=np.arange(len(y)) * 1.0, dt=1.0).theta[-1]
 
 
-@pytest.mark.parametrize("where", ["section.Section._within", "unit.Unit.watch"])
-def test_an_exception_in_a_unit_never_ends_the_service(tmp_path, monkeypatch, where):
-    config = configured(UNIT + UNIT.replace("plant", "other"))
-    engine = opened(config, tmp_path)
+def fails_in(where):
+    """A function of the service that fails for unit 1, at the first place of the first section."""
+    before, within = section.advance, section.Section._within
+
+    def fails(one, *given):
+        fine = where == "section.Section._within" and one.streams.index == 1
+        return within(one, *given) if fine else 1 / 0
+
+    return (lambda *a: 1 / 0 if 0 in a[1].keys else before(*a)) if where == "section.advance" else fails
+
+
+@pytest.mark.parametrize("where", ["section.advance", "section.Section._within", "unit.Unit.watch"])
+def test_an_exception_in_a_unit_ends_neither_the_service_nor_another_unit(tmp_path, monkeypatch, where):
+    """In the lanes that units of a section share, before them, and behind them; an operator starts the unit again."""
+    engine = opened(configured(UNIT + UNIT.replace("plant", "other")), tmp_path)
     y, u = record(20)
-    for topic in ("plant/a", "other/b"):
+    topics = ("plant/a", "plant/b") if where == "section.advance" else ("plant/a", "other/b")
+    for topic in topics:
         feed(engine, message(topic, range(10), y[:10], u[:10]))
-    engine.units.get(1).alarms = [SimpleNamespace(rule=SimpleNamespace(kind="band"))]
-    before = Section._within
-    monkeypatch.setattr(f"driftfit.service.core.{where}", lambda self, *a: before(self, *a) if odd(self) else 1 / 0)
-    for topic in ("plant/a", "other/b"):
-        engine.intake.put("web", message(topic, range(10, 20), y[10:], u[10:]))
-    engine.step(0.0)
+    if where == "unit.Unit.watch":
+        engine.units.get(1).alarms = [SimpleNamespace(rule=SimpleNamespace(kind="band"))]
+    with monkeypatch.context() as planted:
+        planted.setattr(f"driftfit.service.core.{where}", fails_in(where))
+        for topic in topics:
+            engine.intake.put("web", message(topic, range(10, 20), y[10:], u[10:]))
+        engine.step(0.0)
     assert "ZeroDivisionError" in engine.units.get(1).failure
     assert np.array_equal(engine.units.get(2).live.theta, theta_of(y, u))
     assert [one["error"][:4] for one in events(engine, "failed")] == ["Zero"]
-
-
-def odd(one):
-    return isinstance(one, Section) and one.streams.index == 1
+    engine.act(engine.units.get(1).name, {"do": "restart", "who": "me", "why": "a test"})
+    engine.step(0.0)
+    feed(engine, message("plant/a", range(20, 40), y, u))
+    assert np.array_equal(engine.units.get(1).live.theta, theta_of(y, u))
 
 
 def test_clients_that_do_not_send_their_requests_hold_up_no_others():

@@ -29,7 +29,6 @@ from service_support import (
 )  # fmt: skip
 
 from driftfit import ARX, DataWarning, track
-from driftfit.run.parallel_lanes import advance
 from driftfit.service.core.engine import KEPT_GROUPS, Intake
 from driftfit.service.core.section import Section
 from driftfit.service.sources.contract import Batch
@@ -76,24 +75,6 @@ def test_sinks_see_results_once_before_and_after_these_are_stored(engine):
     assert len(seen) == KEPT_GROUPS + 5
 
 
-def test_a_new_process_continues_with_the_same_bits(tmp_path):
-    y, u = record()
-    config = configured()
-    for k in range(0, 400, 40):
-        engine = opened(config, tmp_path)
-        feed(engine, message("plant/a", range(k, k + 40), y[k : k + 40], u[k : k + 40]))
-        if k % 80:  # sometimes the state is stored, sometimes only the journal has it; the results wait either way
-            engine._store_states(everything=True)
-            engine._commit()
-        engine.journal.close()
-    engine = opened(config, tmp_path)
-    assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])
-    assert [row[0] for row in results_of(engine)] == list(range(1, 401))
-    blocks = engine.journal.db.execute("select sum(count), count(*) from block").fetchone()
-    assert blocks[0] <= 400
-    assert engine.journal.rows_of(1)[0] == list(range(400))
-
-
 def test_late_rows_are_put_in_order(tmp_path):
     y, u = record(200)
     engine = opened(configured(UNIT + "hold_back = 5\n"), tmp_path)
@@ -118,42 +99,6 @@ def test_late_rows_are_put_in_order(tmp_path):
     for before, after in zip(streams.waiting.of(0), again.streams.waiting.of(0), strict=True):
         assert np.array_equal(before, after)
     assert np.array_equal(again.live.theta, run.theta[-1])
-
-
-def test_clocks_that_jump(engine):
-    y, u = record(100)
-    feed(engine, message("plant/a", range(50), y[:50], u[:50]))
-    feed(engine, message("plant/a", range(20, 60), y[20:60], u[20:60]))  # back by 30 s
-    unit = engine.units.get(1)
-    assert unit.counts["late"] + unit.counts["duplicate"] == 30
-    feed(engine, message("plant/a", [time.time() + 1e6], [0.0], [0.0]))  # ahead: it would make all others late
-    assert unit.counts["time in the future"] == 1
-    feed(engine, message("plant/a", range(60, 100), y[60:], u[60:]))
-    assert np.array_equal(unit.live.theta, run_of(y, u).theta[-1])
-
-
-def test_one_unit_fails_and_the_others_go_on(engine, monkeypatch):
-    y, u = record(100)
-    feed(engine, message("plant/a", range(50), y[:50], u[:50]))
-    feed(engine, message("plant/b", range(50), y[:50], u[:50]))
-
-    def fails(programs, records, *args):
-        if 0 in records.keys:  # the place of unit 1
-            raise ArithmeticError("a fault")
-        return advance(programs, records, *args)
-
-    with monkeypatch.context() as broken:
-        broken.setattr("driftfit.service.core.section.advance", fails)
-        for pump in "ab":
-            engine.intake.put("web", message(f"plant/{pump}", range(50, 100), y[50:], u[50:]))
-        engine.step(0.0)
-    assert "a fault" in engine.units.get(1).failure
-    assert events(engine, "failed")[0]["error"].startswith("ArithmeticError")
-    assert np.array_equal(engine.units.get(2).live.theta, run_of(y, u).theta[-1])
-    engine.act("a", {"do": "restart", "who": "me", "why": "a test"})
-    engine.step(0.0)
-    feed(engine, message("plant/a", range(100, 150), y[:50], u[:50]))
-    assert np.array_equal(engine.units.get(1).live.theta, run_of(y[:50], u[:50]).theta[-1])
 
 
 def test_actions_are_part_of_the_journal(tmp_path):

@@ -7,7 +7,7 @@ import pandas as pd
 import polars as pl
 import pyarrow as pa
 import pytest
-from support import arx_record, rows_of, same
+from support import arx_record, same
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Live, Regression, track
 
@@ -195,14 +195,3 @@ def test_live_refuses_weights_and_factors_that_are_none():
     with pytest.raises(ValueError, match="dt must be given"):
         live.update(1.0, 1.0, time=datetime(2024, 1, 1))
     assert live._tile.tobytes() == before
-
-
-def test_a_record_of_one_sample():
-    run = track(ARX(2, 2), K, [1.0], [1.0])
-    assert len(run) == 1
-    assert not run.ok.any()
-    assert np.isinf(run.std).all()
-    printed = rows_of(run.summary())
-    assert ["1,", "0", "used,", "1", "skipped"] in [line[1:] for line in printed]
-    assert ["a1", "0", "inf", "-inf", "inf", "0", "0"] in printed
-    assert "nothing to compare" in str(run.summary())

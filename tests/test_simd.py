@@ -13,7 +13,6 @@ from driftfit.engine.simd import (
     exp_of,
     fill,
     fill_four,
-    four_of,
     gathered,
     higher,
     load,
@@ -23,10 +22,10 @@ from driftfit.engine.simd import (
     only,
     pair,
     put_pair,
+    reached,
     reaches,
     row_sums,
     store,
-    store_four,
     sum_of,
     times,
     two,
@@ -105,15 +104,15 @@ def test_pairs_are_the_entries_of_the_last_axis():
 
 @njit
 def in_fours_of(x, out):
-    each = four_of((x[0, 0], x[1, 0], x[2, 0], x[3, 0]))
-    store_four(out, 0, 0, times(each, load_four(x, 1, 0)))
-    out[4, 0] = entry(times(each, fill_four(0.1)), 3)
+    each = times(load_four(x, 0, 0), load_four(x, 1, 0))
+    out[0, 0], out[1, 0] = entry(times(each, fill_four(0.1)), 3), reached(fill_four(0.0), each)
 
 
 def test_fours_are_four_rows_of_one_lane():
-    x, out = RNG.normal(size=(5, 1)), np.zeros((6, 1))
+    x, out = RNG.normal(size=(5, 1)), np.zeros((2, 1))
     in_fours_of(x, out)
-    np.testing.assert_array_equal(out[:, 0], [*(x[:4, 0] * x[1:, 0]), x[3, 0] * 0.1, 0.0])
+    both = x[:4, 0] * x[1:, 0]
+    np.testing.assert_array_equal(out[:, 0], [both[3] * 0.1, np.sum(both <= 0.0)])
 
 
 def test_a_part_of_a_compiled_routine_says_that_it_cannot_be_called():

@@ -33,7 +33,8 @@ def saved(request, tmp_path):
 
 def rewrite(path, change_header=None, change_arrays=None):
     """Write the file again with another header or other arrays."""
-    if path.read_bytes().startswith(storage.MAGIC):
+    packed = path.read_bytes().startswith(storage.MAGIC)
+    if packed:
         header, arrays = storage.read(path, "state")
     else:
         with np.load(path) as file:
@@ -43,7 +44,7 @@ def rewrite(path, change_header=None, change_arrays=None):
         change_header(header)
     if change_arrays:
         change_arrays(arrays)
-    if "fields" in header:
+    if packed:
         path.write_bytes(storage.compact(header, arrays))
     else:
         with open(path, "wb") as file:
@@ -63,6 +64,8 @@ def test_other_files_are_named(tmp_path, content):
     for load in (Live.load, Track.load):
         with pytest.raises(ValueError, match=r"other is not a driftfit file, or it is damaged"):
             load(path)
+    with pytest.raises(ValueError, match="what was given is not a driftfit file, or it is damaged"):
+        Live.from_bytes(content)
 
 
 def test_files_of_arrays_that_are_not_ours_are_named(tmp_path):

@@ -89,8 +89,10 @@ def test_a_stream_leaves_out_the_same_and_the_summary_names_it():
         assert "Inputs left out" in str(run.summary())
 
 
-@pytest.mark.xfail(reason="a code at the very first pulse leaves a gain of 4.74 for 5", strict=False)
-@pytest.mark.parametrize(("code", "learned"), [(None, 2), (0, 5), (1, 2)])
+FIRST = pytest.param(0, 5, marks=pytest.mark.xfail(reason="a code at the very first pulse is believed", strict=False))
+
+
+@pytest.mark.parametrize(("code", "learned"), [(None, 2), FIRST, (1, 2)])
 def test_the_first_pulses_of_an_input_at_rest_are_learned_from(code, learned):
     """Of two fault codes the first, at the first pulse of all, cannot be told from a response."""
     rng = np.random.default_rng(4)

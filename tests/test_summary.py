@@ -89,14 +89,6 @@ def test_a_short_record_is_compared_after_a_tenth_of_it():
         assert summary.comparison.tracked == pytest.approx(np.sqrt(np.nanmean(scored**2)))
 
 
-def test_a_record_of_as_many_samples_as_parameters_has_nothing_to_compare():
-    y, u = arx_record(4, 3)
-    summary = track(ARX(2, 2), K, y, u).summary()
-    assert summary.comparison.samples == 0
-    assert math.isnan(summary.comparison.tracked)
-    assert "nothing to compare" in str(summary)
-
-
 def test_comparison_without_inputs_and_with_times_and_weights():
     y, u = arx_record(200, 4)
     time = np.cumsum(np.where(np.arange(200) == 100, 5.0, 1.0))

@@ -26,9 +26,7 @@ from driftfit.engine.kernel import Array
 
 HOME = Path(driftfit.__file__).parent
 ROOT = Path(__file__).parent.parent.parent
-BANK, MODES, NOISE, LEARNED, START = (
-    f"trackers/parts/mixture/{name}.py" for name in ("filters", "modes", "noise", "learned", "start")
-)
+BANK, STATES, LEARNED = (f"trackers/mixture/{name}.py" for name in ("filters", "states", "learned"))
 TRACKER = "trackers/adaptive_kalman.py"
 State = Mapping[str, Any]
 NEXT_TO_NEVER = 1e-30
@@ -65,7 +63,7 @@ def never(state: dict[str, Any], ladder: Array, out: Array) -> None:
     leads = np.append(out[1:] & (ladder[1:] == ladder[:-1]), False)
     start = np.where(out, NEXT_TO_NEVER, state["mu"])
     state["up"] = np.where(leads | out, NEXT_TO_NEVER * (state["up"] > 0.0), state["up"])
-    state["arrive"], state["arrivals"], state["jumping"] = arrive, arrive.sum(), arrive[jump].sum()
+    state["arrive"] = arrive
     state["mu"] = state["prior"] = start / start.sum()
 
 
@@ -76,7 +74,7 @@ class Without(AdaptiveKalman):
     piece: str = ""
 
     def state(self, n: int) -> Mapping[str, Any]:
-        from driftfit.trackers.parts.mixture.modes import table
+        from driftfit.trackers.mixture.states import table
 
         state, piece, modes = dict(super().state(n)), PIECES[self.piece], table(n, self.groups)
         if piece.modes is not None:
@@ -113,11 +111,10 @@ PIECES: dict[str, Piece] = {
         ),
     ),
     "single ladders": Piece(lambda modes: modes["ladder"] >= 0),
-    "jumps": Piece(lambda modes: modes["ratio"] >= 1.0, functions=of(BANK, "widest_jumps", "learn_rate")),
+    "jumps": Piece(lambda modes: modes["ratio"] >= 1.0, functions=of(BANK, "leap", "learn_rate")),
     "common jumps": Piece(lambda modes: (modes["ladder"] == -3) & (modes["ratio"] >= 1.0)),
     "jumps of size 1": Piece(lambda modes: modes["ratio"] == 1.0),
     "largest jumps": Piece(lambda modes: modes["ratio"] > 1.0),
-    "slowest drift": Piece(lambda modes: modes["ratio"] == 1e-5),
     "learned rate of changes": Piece(
         state={"left_behind": 1e15, "jumps_expected": 1e15}, functions=of(BANK, "learn_rate")
     ),
@@ -125,48 +122,35 @@ PIECES: dict[str, Piece] = {
         edits=((LEARNED, "share = t[N + 6 * best, best] / positive if sound else 0.0", "share = 0.0"),),
         functions=of(LEARNED, "whitened", "rotate", "turn"),
     ),
-    "arrivals in all modes": Piece(edits=((MODES, "\nJUMP, ARRIVE = 3e-3, 1e-5\n", "\nJUMP, ARRIVE = 3e-3, 1e-9\n"),)),
-    "jumps as large as y": Piece(
-        edits=(
-            (
-                BANK,
-                "ratio = max(COMMON[-1], max(s.spread[l], s.outlier[l] * s.e[l] * s.e[l]) / s.r[l])",
-                "ratio = COMMON[-1]",
-            ),
-        ),
-        functions=of(BANK, "widest_jumps"),
-    ),
-    "jumps as large as outliers": Piece(
-        edits=((BANK, "max(s.spread[l], s.outlier[l] * s.e[l] * s.e[l]) / s.r[l])", "s.spread[l] / s.r[l])"),)
+    "arrivals in all modes": Piece(edits=((STATES, "\nJUMP, ARRIVE = 3e-3, 1e-5\n", "\nJUMP, ARRIVE = 3e-3, 1e-9\n"),)),
+    "jumps of any size": Piece(
+        edits=((BANK, "    s.leap[l] = far if", "    s.leap[l] = 0.0 * far if"),), functions=of(BANK, "leap")
     ),
     "Student's density": Piece(edits=((BANK, "\nSTUDENT = 60.0\n", "\nSTUDENT = 0.0\n"),)),
     "drift about means": Piece(
         edits=((LEARNED, "\nFAR = 9.0\n", "\nFAR = 1e300\n"),), functions=of(LEARNED, "learn_means")
     ),
-    "slow variance at rest": Piece(
-        edits=((LEARNED, "v = max(s.variance[i, l], s.long_variance[i, l])", "v = s.variance[i, l]"),)
-    ),
     "coloured noise": Piece(
         edits=((LEARNED, "s.colour[l] = max(-MOST, min(MOST, known))", "s.colour[l] = 0.0 * known"),),
         functions=of(LEARNED, "whiten_noise", "learn_colour", "colour"),
     ),
-    "restless noise": Piece(edits=((NOISE, "\nSTAY, CALM = 0.985, 0.95\n", "\nSTAY, CALM = 1.0 - 1e-9, 1e-9\n"),)),
-    "outliers": Piece(edits=((NOISE, "RARITY, FADE = 0.035, 50.0, 0.999", "RARITY, FADE = 1e-9, 1e12, 0.999"),)),
-    "learned rate of outliers": Piece(edits=((NOISE, "RARITY, FADE = 0.035, 50.0,", "RARITY, FADE = 0.035, 1e12,"),)),
+    "restless noise": Piece(edits=((STATES, "\nSTAY, CALM = 0.99, 0.95\n", "\nSTAY, CALM = 1.0 - 1e-9, 1e-9\n"),)),
+    "outliers": Piece(edits=((STATES, "RARITY, FADE = 0.035, 50.0, 0.999", "RARITY, FADE = 1e-9, 1e12, 0.999"),)),
+    "learned rate of outliers": Piece(edits=((STATES, "RARITY, FADE = 0.035, 50.0,", "RARITY, FADE = 0.035, 1e12,"),)),
     "repeated rounding": Piece(
         edits=(
             (
-                NOISE,
+                STATES,
                 "return s.repeats[l] * min(share, s.noise[l] * s.r[l]) if s.repeats[l] > 0.0 else 0.0",
                 "return 0.0",
             ),
-            (NOISE, "    if s.repeats[l] > 0.0:\n        return\n", ""),
+            (STATES, "    if s.repeats[l] > 0.0:\n        return\n", ""),
         ),
-        functions=of(NOISE, "note_reading", "repeated_rounding"),
+        functions=of(STATES, "note_reading", "repeated_rounding"),
     ),
     "start with drift": Piece(
         edits=((TRACKER, "    begin_with_drift(s, least_noise(s, l), l)\n", ""),),
-        functions=of(START, "keep", "whitened", "run_again", "begin_with_drift"),
+        functions=of(LEARNED, "keep", "start_regressor", "run_again", "begin_with_drift"),
     ),
     "late columns that dominate": Piece(
         edits=((TRACKER, "column = s.column[l] if s.column[l] >= 0 else outgrown(s, l)", "column = s.column[l]"),),

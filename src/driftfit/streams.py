@@ -10,7 +10,7 @@ from driftfit.models.hammerstein_wiener.blocks import Separator
 from driftfit.models.hammerstein_wiener.separation import Groups
 from driftfit.run.live import live
 from driftfit.trackers.bank.results.live_results import LiveHypotheses
-from driftfit.use.constrained import Constrained, constrain_stream
+from driftfit.use.constrained import Constrained, constrain
 from driftfit.use.forecast import Forecast, forecast_stream
 from driftfit.use.system import LiveSystem
 
@@ -42,7 +42,7 @@ class Live(live.Live, public=True):
 
     def constrain(self, *constraints: str) -> Constrained:
         """The present theta within constraints, as `Track.constrain`, with T = 1."""
-        return constrain_stream(self, *constraints)
+        return constrain(self, *constraints)
 
     @property
     def system(self) -> LiveSystem:

@@ -272,7 +272,7 @@ class Expressions:
             return arguments[0]  # C passes addresses one by one
         if function in (kernel.floats, kernel.wholes, kernel.cubes):
             return self._at_address(arguments)
-        if function in (simd.in_blocks, simd.in_fours):
+        if function is simd.in_blocks:
             return number(False)
         if function in FOUR or function is simd.reached:
             return self._of_four(function, arguments)

@@ -24,7 +24,6 @@ from driftfit.engine.compile_notice import compiling
 from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
 from driftfit.engine.phases import advancing, at_once, gated, learning, looking, raw_kept
-from driftfit.engine.simd import fill_four, four_of, in_fours, load_four, store_four, times
 from driftfit.engine.tiles import as_compiled, kind_of, tile_type
 from driftfit.engine.tracker_part import tracker_part, whole_record
 
@@ -108,11 +107,7 @@ def in_units_of_noise(variance: float, scale: float) -> float:
 def diagonal(s: State, l: int) -> None:
     """Report the diagonal of P, times the estimated noise variance where the tracker carries one."""
     n, scale = s.theta.shape[0], s.scale[l]
-    whole = n - n % 4 if in_fours(s) and scale >= 0.0 else 0
-    for i in range(0, whole, 4):
-        P = four_of((s.P[i, i, 0], s.P[i + 1, i + 1, 0], s.P[i + 2, i + 2, 0], s.P[i + 3, i + 3, 0]))
-        store_four(s.var, i, 0, times(P, fill_four(scale)))
-    for i in range(whole, n):
+    for i in range(n):
         s.var[i, l] = in_units_of_noise(s.P[i, i, l], scale)
 
 
@@ -305,15 +300,10 @@ def stored_too(first: Any, then: Any) -> Any:
 def write_common(o: State, s: State) -> None:
     """The results of every tracker."""
     n, L = s.theta.shape
-    whole = n - n % 4 if in_fours(s) else 0
-    for i in range(0, whole, 4):
-        theta, var = load_four(s.theta, i, 0), load_four(s.var, i, 0)
-        store_four(o.theta, i, 0, theta)
-        store_four(o.var, i, 0, var)
-    for i in range(whole, n):
+    for i in range(n):
         for l in range(L):
             o.theta[i, l] = s.theta[i, l]
-    for i in range(whole, n):
+    for i in range(n):
         for l in range(L):
             o.var[i, l] = s.var[i, l]
     for l in range(L):
@@ -327,10 +317,7 @@ def write_common(o: State, s: State) -> None:
 def store_theta(s: State, theta: Array, t: int) -> None:
     """theta alone, as row t of theta (T, n, L)."""
     n, L = s.theta.shape
-    whole = n - n % 4 if in_fours(s) else 0
-    for i in range(0, whole, 4):
-        store_four(theta, t, i, load_four(s.theta, i, 0))
-    for i in range(whole, n):
+    for i in range(n):
         for l in range(L):
             theta[t, i, l] = s.theta[i, l]
 

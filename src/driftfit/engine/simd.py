@@ -217,18 +217,14 @@ def _transposed(builder: Any, rows: Any) -> Any:
     return rows
 
 
-def _one_lane(least: int, most: int) -> Any:
-    """Whether a record has one lane and so many parameters, as its type says."""
+def _one_wide_lane(context: Any, record: Any) -> Any:
+    """Whether a record has one lane and more than `UNROLLED` parameters."""
+    n, L = record.fields["theta"].type.shape if isinstance(record, types.Record) else (0, 0)
 
-    def typed(context: Any, record: Any) -> Any:
-        n, L = record.fields["theta"].type.shape if isinstance(record, types.Record) else (0, 0)
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return ir.Constant(ir.IntType(1), n > UNROLLED and L == 1)
 
-        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            return ir.Constant(ir.IntType(1), least <= n <= most and L == 1)
-
-        return types.boolean(record), build
-
-    return typed
+    return types.boolean(record), build
 
 
 def _two_of(context: Any, first: Any, second: Any) -> Any:
@@ -418,10 +414,7 @@ gathered = _named("gathered", _gather)
 reached = _named("reached", _reached)
 """How many entries of the first are at least those of the second."""
 load_four, fill_four = _named("load_four", _load(vector4)), _named("fill_four", _fill(vector4))
-store_four, four_of = _named("store_four", _store(vector4)), _named("four_of", _made_of(vector4))
-"""The same for vectors of four; and one of the four numbers of a tuple. A vector that is loaded right after its entries
-were stored one by one waits until all of them are in the cache, so such entries are put together with `four_of`.
-"""
+"""The same for vectors of four."""
 pair, put_pair = _named("pair", _pair), _named("put_pair", _put_pair)
 """Pair ``at`` of an array whose last axis is 2, counted over its other axes; and write it there."""
 two, entry = _named("two", _two_of), _named("entry", _one_of)
@@ -436,12 +429,10 @@ add_products = _named("add_products", _add_products)
 """Eight sums plus the products of eight rows with x, which are added one after the other. Row k begins at entry
 at + k columns of an array.
 """
-in_fours = _named("in_fours", _one_lane(4, UNROLLED))
-"""Whether a record has one lane and four to `UNROLLED` parameters, as its type says: the compiler leaves these loops as
-single numbers. Steps that are compiled once for all sizes, and those that are exported to C, do without vectors.
+in_blocks = _named("in_blocks", _one_wide_lane)
+"""Whether a record has one lane and more than `UNROLLED` parameters, as its type says. Steps that are compiled once for
+all sizes, and those that are exported to C, do without vectors.
 """
-in_blocks = _named("in_blocks", _one_lane(UNROLLED + 1, 2**31))
-"""Whether it has one lane and more parameters."""
 sum_of = _named("sum_of", _sum)
 """The sum of the eight entries, added in pairs."""
 lower, higher = (_named(name, _pick(sign)) for name, sign in (("lower", "<"), ("higher", ">")))

@@ -208,11 +208,6 @@ class JointLayout:
         return tags[0] if len(tags) == 1 else hashlib.sha256(b"".join(tags)).digest()[:8]
 
     @cached_property
-    def text(self) -> str:
-        """The fields of one program (`Layout.text`); all have the same."""
-        return self.programs[0].layout.text
-
-    @cached_property
     def start(self) -> bytes:
         """The packed state before the first sample."""
         return self.pack(self.taken(self.tile()))

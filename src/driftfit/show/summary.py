@@ -332,7 +332,8 @@ def summarise_fleet(fleet: KeyedResults) -> FleetSummary:
     paths = [_path(run) for run in runs]
     excursion = np.array([path.excursion for path in paths])
     scaled = all(tracker.covariance for tracker in {run.tracker for run in runs})
-    moved = np.array([path.moved for path in paths]) if scaled else excursion / _median(excursion)
+    median = np.median(excursion, axis=0)
+    moved = np.array([path.moved for path in paths]) if scaled else excursion / np.where(median > 0.0, median, 1.0)
     units = [_unit(*each) for each in zip(fleet, runs, paths, moved, strict=True)]
     units.sort(key=lambda unit: -unit.moved if np.isfinite(unit.moved) else np.inf)
     trackers = tuple(dict.fromkeys(repr(run.tracker) for run in runs))
@@ -368,12 +369,6 @@ def _path(run: Track) -> _Path:
         spread = np.where(known, away / np.sqrt(var + var[first]), 0.0)
     moved = np.where(known.any(axis=0), np.nanmax(np.where(away > 0.0, spread, 0.0), axis=0), np.nan)
     return _Path(begin, theta[first], theta[most, np.arange(n)], away.max(axis=0), moved)
-
-
-def _median(excursion: Array) -> Array:
-    """Median over the fleet, 1 where nothing moved."""
-    median = np.median(excursion, axis=0)
-    return np.where(median > 0.0, median, 1.0)
 
 
 def _unit(key: Hashable, run: Track, path: _Path, moved: Array) -> Unit:

@@ -5,17 +5,17 @@
 
 | ladder | Q, in units of noise variance over input power | rho |
 |---|---|---|
-| common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-5 .. .01, .04, .2, 1, J |
+| common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-4 .. .01, .04, .2, 1, J |
 | trend | as common; theta moves on along its slope | .001, .01, .1 |
 | learned | the drift covariance found by a backward pass of scores over the last 100 samples | .001, .01, .1, 1 |
 | single i | 1 / c_i for parameter i alone (two to eight parameters) | .003, .05, J |
 | group g | 1 / c_i for the parameters of a group, instead of single | .001, .01, .1, 1, J |
 
-J, the largest jump, is the variance of the output or the square of an outlier before, in units of r, and at least 30.
-Every mode is a Kalman filter. They are merged after every sample (`driftfit.trackers.parts.mixture.filters`).
+J, the largest jump, is 30. Where e^2 > 30 s it is e^2 / r, but no more than the variance of y or the last outlier.
+Every mode is a Kalman filter. They are merged after every sample (`driftfit.trackers.mixture.filters`).
 Noise is quiet, restless, or an outlier of any size, and coarse readings that repeat share their rounding
-(`driftfit.trackers.parts.mixture.noise`). Scales, means, colour of the noise and covariance of the drift are learned
-(`driftfit.trackers.parts.mixture.learned`). Readings are judged by a gate (`driftfit.readings.gate`), which is on for
+(`driftfit.trackers.mixture.states`). Scales, means, colour of the noise and covariance of the drift are learned
+(`driftfit.trackers.mixture.learned`). Readings are judged by a gate (`driftfit.readings.gate`), which is on for
 this tracker, and not here.
 
 The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
@@ -23,14 +23,14 @@ estimates themselves. The variance before a sample is for samples that are no ou
 
 The start is exact diffuse least squares without drift, until there are enough residuals to estimate r; its bands are
 Student's (`driftfit.trackers.parts.few_residuals`). Every filter starts from generalised least squares with its own
-drift over the same samples (`driftfit.trackers.parts.mixture.start`), in the directions that the regressors span.
+drift over the same samples (`driftfit.trackers.mixture.learned`), in the directions that the regressors span.
 Scaling inputs or outputs changes only the units.
 
 Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Which parameters drift is learned
 in a few hundred samples; ``groups`` specifies it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the modes and what is learned are ours. Cost per
-sample: O(K n^2) for K modes; without groups K = 16 + 3 n for two to eight parameters, and 16 for more.
+sample: O(K n^2) for K modes; without groups K = 15 + 3 n for two to eight parameters, and 15 for more.
 """
 
 from __future__ import annotations
@@ -47,6 +47,41 @@ from driftfit.engine.kernel import Array, State, kernel, nothing
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.mixture.filters import (
+    enter_filters,
+    innovate,
+    mix,
+    mixture,
+    outgrown,
+    predict,
+    update_filters,
+    weigh,
+)
+from driftfit.trackers.mixture.learned import (
+    begin_with_drift,
+    colour,
+    forecast_start,
+    learn_colour,
+    learn_drift,
+    learn_means,
+    machine_drift,
+    nothing_learned,
+    start_density,
+    take_start,
+    whiten_noise,
+)
+from driftfit.trackers.mixture.states import (
+    SMOOTHER_FIELDS,
+    any_noise,
+    bank,
+    estimated_variances,
+    learn_noise,
+    least_noise,
+    noise_prior,
+    note_reading,
+    repeated_rounding,
+    store_for_smoother,
+)
 from driftfit.trackers.parts.coordinates import (
     FRAME,
     frame,
@@ -68,36 +103,6 @@ from driftfit.trackers.parts.excitation import (
     window,
 )
 from driftfit.trackers.parts.few_residuals import RESIDUALS, widen_estimates, wider
-from driftfit.trackers.parts.mixture.filters import (
-    enter_filters,
-    innovate,
-    mix,
-    mixture,
-    outgrown,
-    predict,
-    update_filters,
-    weigh,
-)
-from driftfit.trackers.parts.mixture.learned import (
-    colour,
-    learn_colour,
-    learn_drift,
-    learn_means,
-    machine_drift,
-    nothing_learned,
-    whiten_noise,
-)
-from driftfit.trackers.parts.mixture.modes import bank
-from driftfit.trackers.parts.mixture.noise import (
-    any_noise,
-    learn_noise,
-    least_noise,
-    noise_prior,
-    note_reading,
-    repeated_rounding,
-)
-from driftfit.trackers.parts.mixture.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
-from driftfit.trackers.parts.mixture.start import begin_with_drift, forecast_start, start_density, take_start
 
 
 @kernel
@@ -146,7 +151,7 @@ def look_ahead(s: State, entering: int, l: int) -> None:
 @partial(kernel, inline=False)
 def follow(s: State, l: int) -> None:
     """One sample of the running filters."""
-    s.outlier[l], s.certainty[l], weighed = 0.0, 0.0, 0.0
+    s.outlier[l], s.certainty[l], s.leap[l], weighed = 0.0, 0.0, 0.0, 0.0
     note_reading(s, l)
     column = s.column[l] if s.column[l] >= 0 else outgrown(s, l)
     if s.ok[l] > 0.0 and column >= 0:

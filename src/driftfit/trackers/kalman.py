@@ -34,7 +34,6 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
-from driftfit.engine.simd import entry, fill_four, in_fours, load_four, times
 from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.laws import filter as laws_filter
@@ -58,14 +57,8 @@ from driftfit.trackers.parts.varying_drift import read_drift
 @kernel
 def drift(s: State, l: int) -> None:
     """P <- P + diag(q) dt d."""
-    n, time = s.theta.shape[0], s.dt[l] * s.drift[l]
-    whole = n - n % 4 if in_fours(s) else 0
-    for i in range(0, whole, 4):
-        root = load_four(s.drift_root, i, 0)
-        more = times(times(load_four(s.q, i, 0), times(root, root)), fill_four(time))
-        for k in range(4):
-            s.P[i + k, i + k, 0] += entry(more, k)
-    for i in range(whole, n):
+    time = s.dt[l] * s.drift[l]
+    for i in range(s.theta.shape[0]):
         s.P[i, i, l] += s.q[i, l] * (s.drift_root[i, l] * s.drift_root[i, l]) * time
 
 

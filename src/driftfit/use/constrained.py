@@ -29,7 +29,7 @@ import re
 from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -103,25 +103,17 @@ class Constrained:
         return low, high
 
 
-def _constrained(names: tuple[str, ...], theta: Array, P: Array, constraints: tuple[str, ...]) -> Constrained:
-    if not constraints:
-        raise ValueError('constrain: give at least one constraint, such as "b1 >= 0".')
-    return Constrained(names, tuple(half_space(one, names) for one in constraints), theta, P)
-
-
-def constrain(run: Track, *constraints: str) -> Constrained:
-    """theta of a run within constraints; ValueError if it has no covariance, or a text is no constraint."""
+def constrain(run: Track | Live, *constraints: str) -> Constrained:
+    """theta of a run within constraints, or of a stream now with T = 1; ValueError if it has no covariance, or a text
+    is no constraint.
+    """
     if not run.tracker.covariance:
         raise ValueError(f"constrain: {type(run.tracker).__name__} has no covariance to be cut; use RLS or Kalman.")
-    return _constrained(run.names, run.theta, run.covariances(), constraints)
-
-
-def constrain_stream(live: Live, *constraints: str) -> Constrained:
-    """The same for the present theta of a stream, with T = 1."""
-    if not live.tracker.covariance:
-        raise ValueError(f"constrain: {type(live.tracker).__name__} has no covariance to be cut; use RLS or Kalman.")
-    theta: Any = live.theta
-    return _constrained(live.names, theta[None], live.cov[None], constraints)
+    if not constraints:
+        raise ValueError('constrain: give at least one constraint, such as "b1 >= 0".')
+    names: tuple[str, ...] = run.names
+    theta, P = (run.theta, run.covariances()) if isinstance(run, Track) else (run.theta[None], run.cov[None])
+    return Constrained(names, tuple(half_space(one, names) for one in constraints), theta, P)
 
 
 class HalfSpace(NamedTuple):

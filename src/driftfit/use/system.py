@@ -192,17 +192,17 @@ def _gain(model: Model, theta: Array) -> Array:
 
 def step_response(run: Followed, h: int, input: int | str = 0, at: Any = -1) -> Response:
     """Response (T, h) to a unit step of one input at sample 0; ``at`` selects samples, None all (T h n numbers)."""
-    model, j = linear(run), input_of(run, input)
-    whole("step_response", "h", h, 1)
-    drive = np.ones(h)
-    return Response(*spread(lambda theta: filtered(*model.transfers(theta)[1][j], drive), *taken(run, at)))
+    return _response(run, np.ones(whole("step_response", "h", h, 1)), input, at)
 
 
 def impulse_response(run: Followed, h: int, input: int | str = 0, at: Any = -1) -> Response:
     """Response (T, h) to a unit impulse of one input at sample 0."""
+    return _response(run, np.eye(1, whole("impulse_response", "h", h, 1))[0], input, at)
+
+
+def _response(run: Followed, drive: Array, input: int | str, at: Any) -> Response:
     model, j = linear(run), input_of(run, input)
-    whole("impulse_response", "h", h, 1)
-    return Response(*spread(lambda theta: filtered(*model.transfers(theta)[1][j], np.eye(1, h)[0]), *taken(run, at)))
+    return Response(*spread(lambda theta: filtered(*model.transfers(theta)[1][j], drive), *taken(run, at)))
 
 
 def filtered(B: Array, A: Array, drive: Array) -> Array:

@@ -109,7 +109,8 @@ def _origins(store: Store, flow: Flow, migrate: bool) -> tuple[Any, ...]:
     """
     task = flow.task
     joint = task.joint_for(None)
-    about: dict[str, Any] = {"model": describe(task.model), "fields": "" if isinstance(joint, str) else joint.text}
+    text = "" if isinstance(joint, str) else joint.programs[0].layout.text
+    about: dict[str, Any] = {"model": describe(task.model), "fields": text}
     about |= {"tracker": [describe(one) for one in trackers_of(task.tracker)]}
     about |= {"gate": task.gate.settings() if isinstance(task.gate, Gate) else task.gate}
     about |= {"schema": ", ".join(f"`{name}` {kind}" for name, kind in {"batch": "int", **flow.schema}.items())}

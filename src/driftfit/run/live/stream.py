@@ -101,15 +101,6 @@ def check_applied(expected: int) -> None:
         )
 
 
-def check_expected(expected: int) -> None:
-    """Raise an error if an input arrives although no sample is waiting for it."""
-    if expected == NOTHING:
-        raise ValueError(
-            "Live.apply: no sample is waiting for its input. The order is update(y) without u, then apply(u), once per "
-            "sample."
-        )
-
-
 class Stream(Plain, storage.Kept):
     """A stream: a tile with a lane for each program, which every sample changes.
 
@@ -274,7 +265,11 @@ class Stream(Plain, storage.Kept):
         ValueError
             If no sample is waiting for its input, or u does not have m numbers.
         """
-        check_expected(self._awaits)
+        if self._awaits == NOTHING:
+            raise ValueError(
+                "Live.apply: no sample is waiting for its input. The order is update(y) without u, then apply(u), once "
+                "per sample."
+            )
         self._put(self._state_tile(), self._within(self.inputs_of(u)))
         self._expect(NOTHING)
 

@@ -6,7 +6,7 @@ is another model of the same record, with tau_t the nominal intervals between th
 for parameter i, where r is the typical noise variance and c_i the mean square of the regressor. It is tried at every
 rho of `RATIOS`, and with two sets of shares: all parameters alike, and those of the random walk that the tracker has
 estimated, squared as its drift ratio alpha^2 belongs to a slope's alpha^4 / 4
-(`driftfit.trackers.parts.mixture.filters`). Each has the likelihood
+(`driftfit.trackers.mixture.filters`). Each has the likelihood
 
     log L = -1/2 sum (log f_t + min(e_t^2 / f_t, 16)),    e_t, f_t the innovations of a Kalman filter of level and slope
 

@@ -18,15 +18,10 @@ from driftfit.engine.simd import (
     eight_at,
     eight_of,
     fill,
-    fill_four,
-    four_of,
     in_blocks,
-    in_fours,
-    load_four,
     minus,
     plus,
     put_eight,
-    store_four,
     times,
 )
 
@@ -187,13 +182,7 @@ def reduce_covariance(s: State, gain: float, l: int) -> None:
 @kernel
 def move(s: State, gain: float, e: float, l: int) -> None:
     """theta <- theta + gain g e with s.g."""
-    n = s.theta.shape[0]
-    whole = n - n % 4 if in_fours(s) else 0
-    for i in range(0, whole, 4):
-        g = four_of((s.g[i, 0], s.g[i + 1, 0], s.g[i + 2, 0], s.g[i + 3, 0]))
-        change = times(times(fill_four(gain), g), fill_four(e))
-        store_four(s.theta, i, 0, plus(load_four(s.theta, i, 0), change))
-    for i in range(whole, n):
+    for i in range(s.theta.shape[0]):
         s.theta[i, l] += gain * s.g[i, l] * e
 
 

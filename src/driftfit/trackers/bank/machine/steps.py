@@ -49,6 +49,7 @@ from driftfit.trackers.bank.leaves.own_sensor import own_address
 from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, outgrown, read_framed, write_walks
 from driftfit.trackers.bank.machine.late_direction import begin_within, point_along
+from driftfit.trackers.mixture.states import LEAST_SHARE
 from driftfit.trackers.parts.coarse.resolution import lasting, learn_resolved_scale, least_noise, resolve
 from driftfit.trackers.parts.coordinates import FRAME, unseen_variance, whiten_within
 from driftfit.trackers.parts.covariance import correct as correct_one
@@ -57,7 +58,6 @@ from driftfit.trackers.parts.covariance import prediction
 from driftfit.trackers.parts.diffuse import correct_on_roots, forecast_on_roots, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.few_residuals import RESIDUALS, wider
-from driftfit.trackers.parts.mixture.noise import LEAST_SHARE
 
 GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift"], ROW["own_likelihoods"]
 

@@ -1,4 +1,4 @@
-"""What the bank learns beside theta: scales and means of the regressors, colour of the noise, covariance of the drift.
+"""What the bank learns beside theta, and its start: means of regressors, colour of noise, covariance of the drift.
 
 The drift covariance Q, in units of r / (c_i c_j)^(1/2), is estimated from the scores of the disturbance smoother. With
 P the drift that the bank assumes, and e, 1 / s and k the innovation, its inverse variance and the gain of the mixture,
@@ -18,23 +18,41 @@ offset of any size thus have the same drift.
 Coloured noise, y_t = phi_t' theta + v_t + c v_(t-1), is taken out by regressors phi* = phi - c phi*_(t-1) and outputs
 y - c y*_(t-1); c is estimated by weighted least squares on the derivative of the prediction, bounded and shrunk.
 
+Filters that began from least squares without drift would be certain of something wrong where the parameters moved
+while the samples were collected. So each of the samples so far runs through all of them, from m = d and C = `LOOSE` I
+in units of r, in which least squares have C = I, so that next to nothing of this prior is left:
+
+    m_k, C_k,    S_k = sum e_k^2 / s_k,    log p_k = -1/2 sum log s_k - (nu / 2) log S_k
+
+with nu the number of residuals, and p_k Student's density of the samples given the drift of mode k, whatever r. The
+modes start with probabilities proportional to p_k, and with r the mean of S_k / nu.
+
 Source: scores are Koopman and Shephard's (1992); recursive maximum likelihood for c is Soderstrom's (1973), see Ljung
-and Soderstrom (1983), section 3.7; the estimates from them are ours. Cost per sample: O(n^2).
+and Soderstrom (1983), section 3.7; the estimates from them are ours.
+Marginal likelihood under an inverse-gamma variance: West and Harrison, Bayesian Forecasting and Dynamic Models (1997),
+section 4.5. Cost per sample: O(n^2); O(K n^2) once more for each sample of the start.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, cubes, kernel, machine, shared
-from driftfit.trackers.parts.excitation import DULL, LARGE, MEMORY
-from driftfit.trackers.parts.mixture.filters import FLOOR
-from driftfit.trackers.parts.mixture.modes import FIRST_ALONE, FIRST_LEARNED
-from driftfit.trackers.parts.mixture.rows import sum_of_row
+from driftfit.engine.kernel import Array, State, cubes, exp, kernel, log, machine, shared
+from driftfit.trackers.mixture.filters import absorb, project, wander
+from driftfit.trackers.mixture.states import (
+    FIRST_ALONE,
+    FIRST_LEARNED,
+    FLOOR,
+    note_reading,
+    sum_of_row,
+)
+from driftfit.trackers.parts.diffuse import absorb_on_roots, forecast_on_roots
+from driftfit.trackers.parts.excitation import DULL, LARGE, MEMORY, learn_information, learn_scales
 
 BLOCK, WINDOW = 50, 100
 """Samples between two passes, and samples of a pass."""
@@ -45,7 +63,7 @@ SWEEPS, ROTATIONS = 30, 6
 ROUNDED = 1e-6
 """Added to the diagonal of M, relative to it."""
 LONG = 1000.0
-"""Memory of the variance of a regressor that rests, in samples."""
+"""Memory of the variance of y, in samples."""
 FAR = 9.0
 """Square of the mean of a regressor, in units of its variance, from which on it drifts about the mean."""
 STILL = 1e-24
@@ -59,13 +77,21 @@ B, of M, of N and of two scratch matrices by turns."""
 COLOUR_FADE, SHRUNK, BOUND, MOST, GAP = 0.995, 5.0, 2.0, 0.95, 1.5
 """Fading of the sums for c; the square of its t value up to which noise is white; the bound of innovations in standard
 deviations; the largest c; and the interval that separates a sample from its past."""
+Y, SINCE = range(2)
+"""Those of a sample of the start: the output over the root of the noise factor,
+and intervals of drift since the one before. The regressor is over that root too."""
+LOOSE = 1e4
+"""Variance of each coordinate before the first sample, in units of what least squares leave. A larger one would cost
+as many digits of the estimates."""
+LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi * math.sqrt(3.0))))
+"""log(gamma((nu + 1) / 2) / gamma(nu / 2) / sqrt(pi nu)) of Student's density, for nu = 1, 2, 3."""
 
 
 def nothing_learned(n: int) -> dict[str, Any]:
     """Fields before the first sample."""
     return {
-        "mean": np.zeros(n), "variance": np.zeros(n), "long_variance": np.zeros(n), "moved": np.zeros(n),
-        "middle": 0.0, "spread": 0.0, "readings": 0.0, "constant": -1, "drift_unit": np.zeros(n), "offset": np.zeros(n),
+        "mean": np.zeros(n), "variance": np.zeros(n), "moved": np.zeros(n),
+        "middle": 0.0, "spread": 0.0, "constant": -1, "drift_unit": np.zeros(n), "offset": np.zeros(n),
         "samples": np.zeros((WINDOW, PHI + n)), "gains": np.zeros((WINDOW, n)), "remembered": 0, "assumed": np.zeros(n),
         "sums": np.zeros((A + 6 * n, n)), "weight": np.ones(n), "direction": np.zeros(n),
         "white": np.zeros(n), "past": np.zeros(n), "past_y": 0.0, "explained": 0.0, "colour": 0.0, "psi": 0.0,
@@ -76,11 +102,10 @@ def nothing_learned(n: int) -> dict[str, Any]:
 @kernel
 def learn_means(s: State, l: int) -> None:
     """Means and variances of the regressors, and the drift of each: 1 / v_i and m_i / m_k, or 1 / c_i and 0."""
-    s.readings[l] += s.ok[l]
-    share = s.ok[l] / min(max(s.readings[l], 1.0), LONG)
+    share = s.ok[l] / min(max(s.power_samples[l], 1.0), LONG)
     away = s.y[l] - s.middle[l]
     s.middle[l] += share * away
-    s.spread[l] += share * ((1.0 - share) * away * away - s.spread[l])
+    s.spread[l] += share * ((1.0 - share) * away * away / s.noise[l] - s.spread[l])
     constant = -1
     for i in range(s.parameters[l]):
         off = s.phi[i, l] - s.mean[i, l]
@@ -92,13 +117,11 @@ def learn_means(s: State, l: int) -> None:
         square = off * (s.phi[i, l] - s.mean[i, l]) / s.noise[l]
         most = LARGE * own if s.moved[i, l] > 10.0 else np.inf
         s.variance[i, l] += share * (min(square, most) - own)
-        slowly = s.ok[l] / min(max(s.moved[i, l], 1.0), LONG)
-        s.long_variance[i, l] += slowly * (s.variance[i, l] - s.long_variance[i, l])
         constant = i if (s.variance[i, l] <= STILL * s.c[i, l]) & (s.mean[i, l] != 0.0) else constant
     s.constant[l] = constant
     for i in range(s.parameters[l]):
-        v = max(s.variance[i, l], s.long_variance[i, l])
-        far = (s.mean[i, l] ** 2 > FAR * s.variance[i, l]) & (v > STILL * s.c[i, l])
+        v = s.variance[i, l]
+        far = (s.c[i, l] > (1.0 + FAR) * s.variance[i, l]) & (v > STILL * s.c[i, l])
         beside = (constant >= 0) & (i != constant) & far
         s.drift_unit[i, l] = 1.0 / v if beside else 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
         s.offset[i, l] = s.mean[i, l] / s.mean[constant, l] if beside else 0.0
@@ -360,3 +383,106 @@ def learn_drift(s: State, l: int) -> None:
         else:
             for i in range(s.parameters[l]):
                 s.assumed[i, l] = 0.0
+
+
+@kernel
+def start_density(e: float, s: float, nu: float) -> float:
+    """Student's log density of an innovation of the start, which has fewer than `RESIDUALS` before it; NaN for none."""
+    ratio = LOG_RATIOS[0] if nu < 1.5 else LOG_RATIOS[1] if nu < 2.5 else LOG_RATIOS[2]
+    return ratio - 0.5 * (log(s) + (nu + 1.0) * log(1.0 + e * e / (nu * s)))  # type: ignore[no-any-return]
+
+
+@kernel
+def keep(s: State, l: int) -> None:
+    """Store a sample of the start, where those of the scores will be."""
+    if s.ok[l] > 0.0:
+        if s.remembered[l] < WINDOW:
+            at, root = s.remembered[l], 1.0 / math.sqrt(s.noise[l])
+            for i in range(s.theta.shape[0]):
+                s.samples[at, PHI + i, l] = root * s.phi[i, l]
+            s.samples[at, Y, l], s.samples[at, SINCE, l] = root * s.y[l], s.waited[l]
+        s.remembered[l] += 1
+        s.waited[l] = 0.0
+
+
+@kernel
+def forecast_start(s: State, l: int) -> None:
+    """Prediction of least squares, and its variance in units of the noise so far."""
+    forecast_on_roots(s, l)
+    s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l]) if s.h[l] < math.inf else math.inf
+
+
+@partial(kernel, short=True)
+def take_start(s: State, l: int) -> None:
+    """A sample of least squares, and its residual if the reading did not repeat the one before."""
+    s.waited[l] += s.dt[l] * s.drift[l]
+    note_reading(s, l)
+    learn_scales(s, l)
+    learn_means(s, l)
+    learn_information(s, s.noise[l], l)
+    absorb_on_roots(s, l)
+    if (s.h[l] < math.inf) & (s.repeats[l] < 1.0):
+        s.squares[l] += s.ok[l] * s.e[l] * s.e[l] / (s.h[l] + s.r[l] * s.noise[l])
+        s.count[l] += s.ok[l]
+        s.scale[l] = s.squares[l] / s.count[l]  # NaN until there is a residual
+    keep(s, l)
+
+
+@kernel
+def start_regressor(s: State, at: int, l: int) -> None:
+    """x of a stored sample, which is in the span of the columns that are not free."""
+    for j in range(s.theta.shape[0]):
+        u = s.samples[at, PHI + j, l]
+        for i in range(j):
+            u -= s.S[i, j, l] * s.x[i, l]
+        s.x[j, l] = u / s.S[j, j, l] if s.S[j, j, l] > 0.0 else 0.0
+
+
+@kernel
+def run_again(s: State, l: int) -> None:
+    """Every filter over the stored samples, in units of r; sums of squares in ``mu``, of logs in ``prior``."""
+    n, K = s.theta.shape[0], s.modes[l]
+    for k in range(K):
+        s.mu[k, l], s.prior[k, l] = 0.0, 0.0
+    for i in range(n):
+        for k in range(K):
+            s.C[i, i, k, l] *= LOOSE
+    for at in range(s.remembered[l]):
+        if at > 0:
+            wander(s, s.samples[at, SINCE, l], l)
+        start_regressor(s, at, l)
+        project(s, l)
+        for k in range(K):
+            e, v = s.samples[at, Y, l] - s.e_k[k, l], s.h_k[k, l] + 1.0
+            s.mu[k, l] += e * e / v
+            s.prior[k, l] += log(v)
+            s.step[k, l], s.curve[k, l] = e / v, 1.0 / v
+        absorb(s, l)
+
+
+@partial(kernel, short=True)
+def begin_with_drift(s: State, least: float, l: int) -> None:
+    """Estimates, r, which is at least ``least``, and probabilities of the filters, which have m = d and C = I."""
+    n, K, count, nearest = s.theta.shape[0], s.modes[l], s.count[l], np.inf
+    if s.remembered[l] <= WINDOW:
+        for k in range(K):
+            s.share[0, k, l] = s.mu[k, l]
+        run_again(s, l)
+        for k in range(K):
+            # residuals below the floor of r are rounding, and say nothing about the drift
+            s.step[k, l] = max(s.mu[k, l] / count, least)
+            s.curve[k, l] = s.prior[k, l] + count * log(s.step[k, l])
+            nearest = min(nearest, s.curve[k, l])
+        for k in range(K):
+            s.row[k, l] = s.share[0, k, l] * exp(-0.5 * (s.curve[k, l] - nearest))
+        share = 1.0 / sum_of_row(s, l)
+        for k in range(K):
+            s.mu[k, l] = s.row[k, l] * share
+            s.row[k, l] = s.mu[k, l] * s.step[k, l]
+        s.r[l] = sum_of_row(s, l)
+    for i in range(n):
+        for j in range(i + 1):
+            for k in range(K):
+                s.C[i, j, k, l] *= s.r[l]
+    s.restless[l] = s.r[l]
+    s.remembered[l] = 0

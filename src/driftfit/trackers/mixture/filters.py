@@ -5,7 +5,7 @@
     a_k = sum_j p_(j|k) / s_kj,    d_k = sum_j p_(j|k) (1 / s_kj - a_k)^2
     m_k   <- m_k + g_k a_k e_k,        C_k <- C_k - g_k g_k' (a_k - d_k e_k^2)
 
-with c_k and nu_j the probabilities of mode k and of state j of the noise (`driftfit.trackers.parts.mixture.noise`), and
+with c_k and nu_j the probabilities of mode k and of state j of the noise (`driftfit.trackers.mixture.states`), and
 t the normal density, or Student's while the noise variance rests on few samples. Modes are merged by their moments
 after every sample, c_j = sum_i mu_i T_ij. T moves a mode up or down its ladder, from the foot of a ladder to rest, and
 leads from the whole bank to mode j with the same small probability a_j, so that it costs O(K) instead of O(K^2):
@@ -30,18 +30,23 @@ from functools import partial
 import numpy as np
 
 from driftfit.engine.kernel import State, exp, kernel, log
+from driftfit.trackers.mixture.states import (
+    COMMON,
+    FIRST_ALONE,
+    FIRST_LEARNED,
+    FLOOR,
+    JUMP,
+    STATES,
+    sum_of_row,
+    variance_in,
+)
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.covariance import LEFT
-from driftfit.trackers.parts.mixture.modes import COMMON, FIRST_ALONE, FIRST_LEARNED
-from driftfit.trackers.parts.mixture.noise import STATES, variance_in
-from driftfit.trackers.parts.mixture.rows import least_of_row, sum_of_row
 
 EVENTS, RAREST, OFTENEST, SPAN = 3.0, 0.05, 3.0, 2e4
 """Jumps that the prior of their rate counts for, its bounds, and its memory in samples."""
 FADING, BEND = 0.05, 0.1
 """Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""
-FLOOR = 0.002
-"""Share of the common drift in the learned one."""
 STUDENT = 60.0
 """Samples from which on Student's density is taken for normal."""
 UNSURE = 4.5
@@ -96,21 +101,32 @@ def wander(s: State, size: float, l: int) -> None:
                     s.C[a, b, k, l] += s.ratio[k, l] * moved
 
 
-@kernel
-def widest_jumps(s: State, l: int) -> None:
-    """The largest jumps may move the output by as much as it varies, however small the noise, and by as much as an
-    outlier was off in the sample before: it may have been the first one after a jump."""
-    ratio = max(COMMON[-1], max(s.spread[l], s.outlier[l] * s.e[l] * s.e[l]) / s.r[l])
-    s.ratio[len(COMMON) - 1, l] = ratio
-    for k in range(FIRST_ALONE + s.rungs[l] - 1, s.modes[l], s.rungs[l]):
-        s.ratio[k, l] = ratio
+@partial(kernel, short=True)
+def leap(s: State, more: float, l: int) -> None:
+    """The last rungs of jumps get ``more`` variance, in units of the drift; so do gain and variance of the sample."""
+    n, k = s.parameters[l], len(COMMON) - 1
+    for a in range(n):
+        total = 0.0
+        for b in range(n):
+            moved = more * s.walk[0, max(a, b), min(a, b), l]
+            s.C[a, b, k, l] += moved if b <= a else 0.0
+            total += moved * s.x[b, l]
+        s.gain[a, k, l] += total
+        s.h_k[k, l] += total * s.x[a, l]
+    for i in range(n):
+        if s.alone[i, l] >= 0 and s.c[i, l] > 0.0:
+            k, own = s.alone[i, l] + s.rungs[l] - 1, more / s.c[i, l]
+            for a in range(i + 1):
+                for b in range(a + 1):
+                    s.C[a, b, k, l] += own * s.S[a, i, l] * s.S[b, i, l]
+                s.gain[a, k, l] += own * s.S[a, i, l] * s.white[i, l]
+            s.h_k[k, l] += own * s.white[i, l] * s.white[i, l]
 
 
 @kernel
 def predict(s: State, l: int) -> None:
     """Drift and trends of the time since the last sample."""
     if s.settled[l] > 0 and s.dt[l] > 0.0:
-        widest_jumps(s, l)
         wander(s, s.r[l] * s.dt[l] * s.drift[l], l)
         time = s.dt[l] * min(s.drift[l], 1.0)
         for j in range(s.trend.shape[1]):
@@ -170,40 +186,25 @@ def innovate(s: State, l: int) -> None:
 
 
 @partial(kernel, inline=False)
-def likelihoods(s: State, more: float, l: int) -> float:
-    """joint[j, k] = c_k nu_j times the density, relative to that of the nearest, of which e^2 / s is returned.
+def likelihoods(s: State, more: float, l: int) -> None:
+    """joint[j, k] = c_k nu_j times the density, up to a factor. That of an outlier is never small, and needs no unit.
 
     ``more`` is added to the variance of the noise.
     """
-    K, few = s.modes[l], s.count[l]
-    for k in range(K):
-        s.row[k, l] = np.inf
+    few = s.count[l]
     for j in range(STATES):
         noise = variance_in(s, j, l) + more
         widest = np.inf if j == STATES - 1 else 0.0
-        for k in range(K):
+        for k in range(s.modes[l]):
             square = s.e_k[k, l] * s.e_k[k, l]
             v = 1.0 / (s.h_k[k, l] + max(noise, min(square, widest)))
+            far = square * v if few > STUDENT else (few + 1.0) * log(1.0 + square * v / few)
             s.inverse[j, k, l] = v
-            s.joint[j, k, l] = square * v
-            s.row[k, l] = min(s.row[k, l], square * v)
-    nearest = least_of_row(s, l)
-    if few > STUDENT:
-        for j in range(STATES):
-            for k in range(K):
-                p = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(s.inverse[j, k, l])
-                s.joint[j, k, l] = p * exp(-0.5 * (s.joint[j, k, l] - nearest))
-    else:
-        base = 1.0 / (1.0 + nearest / few)
-        for j in range(STATES):
-            for k in range(K):
-                p = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(s.inverse[j, k, l])
-                s.joint[j, k, l] = p * exp(-0.5 * (few + 1.0) * log((1.0 + s.joint[j, k, l] / few) * base))
-    return nearest  # type: ignore[no-any-return]
+            s.joint[j, k, l] = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(v) * exp(-0.5 * far)
 
 
 @partial(kernel, inline=False)
-def predictive_density(s: State, nearest: float, l: int) -> None:
+def predictive_density(s: State, l: int) -> None:
     """The log density of the sample under its prediction, with a Cauchy tail for outliers, which integrates to 1."""
     K, few = s.modes[l], s.count[l]
     noise = variance_in(s, STATES - 1, l) + s.vague[l]
@@ -213,11 +214,9 @@ def predictive_density(s: State, nearest: float, l: int) -> None:
     tail = log(sum_of_row(s, l) / np.pi)
     for k in range(K):
         s.row[k, l] = s.joint[0, k, l] + s.joint[1, k, l]
-    body, height = sum_of_row(s, l), -0.5 * nearest
-    if few <= STUDENT:
-        x = 0.25 / few
-        height = log(1.0 - x + 0.5 * x * x) - 0.5 * (few + 1.0) * log(1.0 + nearest / few)
-    body = log(body / np.sqrt(2.0 * np.pi)) + height if body > 0.0 else -np.inf
+    x = 0.25 / few if few <= STUDENT else 0.0
+    body = sum_of_row(s, l) * (1.0 - x + 0.5 * x * x) / np.sqrt(2.0 * np.pi)
+    body = log(body) if body > 0.0 else -np.inf
     s.density[l] = tail + log(1.0 + exp(body - tail)) if body < tail else body + log(1.0 + exp(tail - body))
 
 
@@ -228,9 +227,15 @@ def weigh(s: State, more: float, l: int) -> None:
     ``more`` is the variance of rounding that repeats; ``s.vague`` is that of lags that the model doubts.
     """
     K = s.modes[l]
-    nearest = likelihoods(s, s.vague[l], l)
-    predictive_density(s, nearest, l)
-    if more > 0.0:
+    likelihoods(s, s.vague[l], l)
+    predictive_density(s, l)
+    square = s.e[l] * s.e[l] / s.noise[l]
+    far = min(max(s.spread[l], s.astray[l]), square) / s.r[l] - COMMON[-1]
+    unusual = s.e[l] * s.e[l] > COMMON[-1] * s.s[l]
+    s.leap[l] = far if unusual & (far > 0.0) & (s.drift[l] > 0.0) else 0.0
+    if s.leap[l] > 0.0:
+        leap(s, s.leap[l] * s.r[l] * s.dt[l] * s.drift[l], l)
+    if more > 0.0 or s.leap[l] > 0.0:
         likelihoods(s, s.vague[l] + more, l)
     for k in range(K):
         s.row[k, l] = s.joint[0, k, l] + s.joint[1, k, l] + s.joint[2, k, l]
@@ -244,6 +249,7 @@ def weigh(s: State, more: float, l: int) -> None:
             s.row[k, l] = s.joint[j, k, l]
         s.nu[j, l] = sum_of_row(s, l)
     s.outlier[l] = s.nu[STATES - 1, l]
+    s.astray[l] = s.outlier[l] * square
     # an outlier says nothing about the state of ordinary noise
     for j in range(STATES - 1):
         s.nu[j, l] += s.nu[STATES - 1, l] * s.nu_prior[j, l] / (1.0 - s.outlying[l])
@@ -358,7 +364,9 @@ def find_shares(s: State, l: int) -> None:
     """Prior probabilities of the next sample, and of what comes before it: the mode, all modes, and in ``curve`` and
     ``step`` those below and above."""
     K, kappa = s.modes[l], s.kappa[l]
-    leave = kappa * s.arrivals[l]
+    for k in range(K):
+        s.row[k, l] = s.arrive[k, l]
+    leave = kappa * sum_of_row(s, l)
     for k in range(K):
         s.share[0, k, l] = s.mu[k, l] * (1.0 - leave - kappa * s.up[k, l] - s.down[k, l] - s.foot[k, l])
         s.share[1, k, l] = kappa * s.arrive[k, l]
@@ -392,7 +400,7 @@ def learn_rate(s: State, l: int) -> None:
         s.row[k, l] = s.mu[k, l] * (s.down[k, l] + s.foot[k, l]) if s.ratio[k, l] >= 1.0 else 0.0
     fade = 1.0 - 1.0 / SPAN
     s.left_behind[l] = fade * s.left_behind[l] + sum_of_row(s, l)
-    s.jumps_expected[l] = fade * s.jumps_expected[l] + s.jumping[l]
+    s.jumps_expected[l] = fade * s.jumps_expected[l] + JUMP
     s.kappa[l] = min(OFTENEST, max(RAREST, (EVENTS + s.left_behind[l]) / (EVENTS + s.jumps_expected[l])))
 
 

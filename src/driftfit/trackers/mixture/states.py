@@ -1,0 +1,314 @@
+"""Modes of the drift and states of the noise: their tables, what is learned of the noise, and the smoother of both.
+
+Modes are rows of the table of `AdaptiveKalman`. Noise has one of three states, told apart by the samples:
+
+    quiet      variance r, the mean of E(v^2 | y) with a memory of `MEMORY` samples
+    restless   variance f, the same with a memory of `QUICK`
+    outlier    of any size: variance max(30 r, e^2), with a probability that is learned
+
+With p the joint probabilities of modes and states, E(v^2 | y) = sum p (r - r^2 / s + (r e / s)^2), exactly; a noise
+variance that is learned so needs no bounds. Equal readings in a row repeat one error of rounding: the j-th has
+(j - 1) min(step^2 / 12, r) more noise, step being the smallest change of the readings, and r is learned from readings
+that changed. A meter so fine that readings never repeat has no such noise, and neither has a plant without noise whose
+readings repeat because it rests.
+
+The smoother is given one random walk, with the drift that the modes have on average if all samples are known:
+
+    w_t(i) = f_t(i) sum_j T_ij w_{t+1}(j) / sum_h f_t(h) T_hj         probability of mode i at t, given all samples
+    q_t    = sum_k w_t(k) q_tk,    1 / r_t = sum_j nu_tj / v_tj
+
+with f_t the probabilities after sample t, T their transitions, and nu_tj those of the states of the noise after the
+sample. `driftfit.smooth.exact` estimates theta from it, on the regressors and outputs from which coloured noise was
+taken. Of learned drift in one direction the variances count, not the covariances. Before the filters start nothing
+drifts.
+
+Source: the moments of a noise given the data are those of an EM step, Shumway and Stoffer (1982); step^2 / 12 is
+Sheppard's (1898); the backward pass is Kim's (1994), eq. 2.20. The modes, the rule for repeats, and smoothing one
+random walk instead of one for each mode, are ours. Cost per sample: O(K).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.drivers import ROUNDING
+from driftfit.engine.kernel import Array, State, exp, kernel
+
+COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
+TREND = (1e-3, 1e-2, 0.1)
+LEARNED = (1e-3, 1e-2, 0.1, 1.0)
+ALONE, GROUP = (0.003, 0.05, 30.0), (1e-3, 1e-2, 0.1, 1.0, 30.0)
+"""Drift ratios of the ladders."""
+FLOOR = 0.002
+"""Share of the common drift in the learned one."""
+MOST_ALONE = 8
+"""Number of parameters up to which each has a ladder of its own."""
+UP, DOWN, BACK = 2e-4, 1e-3, 0.05
+"""Probabilities: to the next larger ratio, to the next smaller one, and the latter from ratios of 1 and more."""
+JUMP, ARRIVE = 3e-3, 1e-5
+"""Probabilities from the whole bank: into all modes with ratios of 1 and more, and into each other one."""
+AT_REST, ALL, SELDOM = 0.3, 0.45, 0.02
+"""Probabilities before the first sample: of no drift at least, of the other common ratios, and the share of jumps in
+these and those of the other ladders."""
+FIRST_LEARNED = len(COMMON) + len(TREND)
+FIRST_ALONE = FIRST_LEARNED + len(LEARNED)
+"""Where the ladders begin."""
+STATES = 3
+OUTLIER, RARITY, FADE = 0.035, 50.0, 0.999
+"""Probability of an outlier before the first sample, samples that this counts for, and fading of those since."""
+STAY, CALM = 0.99, 0.95
+"""Probabilities that quiet noise stays quiet, and that restless noise stays restless."""
+QUIET = 0.8
+"""Probability of quiet noise before the first sample."""
+MEMORY, QUICK = 70.0, 10.0
+"""Memories of r and f, in samples."""
+LEAST_RESTLESS, LARGE, WILDEST = 6.0, 30.0, 1e8
+"""Least f, the variance of outliers at least, and the largest f, in units of r."""
+LEAST_SHARE = 1e-26
+"""r is never below this share of the mean square of y, for rounding in the sums of a prediction."""
+
+
+def table(n: int, groups: Any) -> dict[str, Array]:
+    """The modes as arrays (K,): ``ratio``; the ``ladder``, -3 common, -2 trend, -1 learned, or the number of a group;
+    probabilities ``up``, ``down`` and ``arrive``; and ``start``, before the first sample. And ``first`` (n,), the first
+    mode of the ladder in which a parameter drifts without all others, or -1.
+    """
+    each = [[i] for i in range(n)] if groups is None and 1 < n <= MOST_ALONE else list(groups or ())
+    ladders = [(-3, COMMON), (-2, TREND), (-1, LEARNED)]
+    ladders += [(g, ALONE if groups is None else GROUP) for g in range(len(each))]
+    ratio = np.array([rho for _, ladder in ladders for rho in ladder])
+    of = np.array([which for which, ladder in ladders for _ in ladder])
+    top = np.array([j + 1 == len(ladder) for _, ladder in ladders for j in range(len(ladder))])
+    jump, alone = ratio >= 1.0, of >= 0
+    arrive = np.where(jump, JUMP, ARRIVE)
+    for kind, share in ((alone, 0.5), (~alone, 0.5 if each else 1.0)):
+        arrive[jump & kind] *= share / max(int(np.sum(jump & kind)), 1)
+    start = np.where(of == -3, ALL / (len(COMMON) - 1), (1.0 - AT_REST - ALL) / np.sum(of != -3))
+    start[ratio >= 1.0] *= SELDOM
+    start[0] = 1.0 - start[1:].sum()
+    first = np.full(n, -1)
+    for g, members in enumerate(each):
+        first[list(members)] = np.argmax(of == g)
+    down = np.where(ratio > 0.0, np.where(jump, BACK, DOWN), 0.0)
+    return {
+        "ratio": ratio, "ladder": of, "up": np.where(top, 0.0, UP), "down": down, "arrive": arrive, "start": start,
+        "first": first,
+    }  # fmt: skip
+
+
+def bank(n: int, groups: Any) -> dict[str, Any]:
+    """Fields of the K filters before the first sample: their modes, means m, covariances C (lower triangle)."""
+    modes = table(n, groups)
+    K = len(modes["ratio"])
+    foot = np.diff(modes["ladder"], prepend=-3) != 0
+    return {
+        "modes": K,
+        "parameters": n,
+        "ratio": modes["ratio"],
+        "up": modes["up"],
+        "down": np.where(foot, 0.0, modes["down"]),
+        "foot": np.where(foot, modes["down"], 0.0),
+        "arrive": modes["arrive"],
+        "alone": modes["first"],
+        "rungs": len(ALONE if groups is None else GROUP),
+        "left_behind": 0.0,
+        "jumps_expected": 0.0,
+        "kappa": 1.0,
+        "leap": 0.0,
+        "astray": 0.0,
+        "mu": modes["start"],
+        "prior": modes["start"],
+        "m": np.zeros((n, K)),
+        "C": np.zeros((n, n, K)),
+        "trend": np.zeros((n, len(TREND))),
+        "walk": np.zeros((2, n, n)),
+        "Z": np.zeros((2, n, n)),
+        "away": np.zeros((2, n)),
+        "e_k": np.zeros(K),
+        "h_k": np.zeros(K),
+        "gain": np.zeros((n, K)),
+        "step": np.zeros(K),
+        "curve": np.zeros(K),
+        "inverse": np.zeros((STATES, K)),
+        "joint": np.zeros((STATES, K)),
+        "share": np.zeros((3, K)),
+        "row": np.zeros(K + 8),
+    }
+
+
+def any_noise() -> dict[str, Any]:
+    """Fields before the first sample."""
+    return {
+        "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.zeros(STATES), "restless": 1.0, "outlier": 0.0,
+        "precision": 0.0, "certainty": 0.0, "outliers": 0.0, "watched": 0.0, "outlying": OUTLIER,
+        "finest": np.inf, "reading": np.nan, "repeats": 0.0,
+    }  # fmt: skip
+
+
+@partial(kernel, inline=False)
+def sum_of_row(s: State, l: int) -> float:
+    """Sum of the scratch row over the filters: in eight chains, none of which waits for the others."""
+    K = s.modes[l]
+    for k in range(K, K + 8):
+        s.row[k, l] = 0.0
+    a, b, c, d, e, f, g, h = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(0, K, 8):
+        a += s.row[k, l]
+        b += s.row[k + 1, l]
+        c += s.row[k + 2, l]
+        d += s.row[k + 3, l]
+        e += s.row[k + 4, l]
+        f += s.row[k + 5, l]
+        g += s.row[k + 6, l]
+        h += s.row[k + 7, l]
+    return ((a + b) + (c + d)) + ((e + f) + (g + h))
+
+
+@kernel
+def least_noise(s: State, l: int) -> float:
+    """The lower bound of r."""
+    return LEAST_SHARE * s.power[l]  # type: ignore[no-any-return]
+
+
+@kernel
+def variance_in(s: State, j: int, l: int) -> float:
+    """Variance of the noise of the sample in a state, for an outlier at least."""
+    r = s.r[l] if j == 0 else max(s.restless[l], LEAST_RESTLESS * s.r[l]) if j == 1 else LARGE * s.r[l]
+    return s.noise[l] * r  # type: ignore[no-any-return]
+
+
+@kernel
+def noise_prior(s: State, l: int) -> None:
+    """Probabilities of the states before the sample."""
+    usual = 1.0 - s.outlying[l]
+    s.nu_prior[0, l] = usual * (STAY * s.nu[0, l] + (1.0 - CALM) * s.nu[1, l])
+    s.nu_prior[1, l] = usual * ((1.0 - STAY) * s.nu[0, l] + CALM * s.nu[1, l])
+    s.nu_prior[2, l] = s.outlying[l]
+
+
+@kernel
+def note_reading(s: State, l: int) -> None:
+    """Count readings that repeat, and find the smallest step between two."""
+    if s.observed[l] > 0.0:
+        y = s.y[l] + s.shift[l]
+        step = abs(y - s.reading[l])  # NaN at the first reading
+        if step <= ROUNDING * (abs(y) + abs(s.shift[l])):
+            s.repeats[l] += 1.0
+        else:
+            s.finest[l] = step if step < s.finest[l] else s.finest[l]
+            s.repeats[l] = 0.0
+        s.reading[l] = y
+
+
+@kernel
+def repeated_rounding(s: State, l: int) -> float:
+    """Variance that a repeated reading adds to its noise."""
+    share = s.finest[l] * s.finest[l] / 12.0
+    return s.repeats[l] * min(share, s.noise[l] * s.r[l]) if s.repeats[l] > 0.0 else 0.0
+
+
+@partial(kernel, inline=False)
+def learn_noise(s: State, l: int) -> None:
+    """r and f from the moments of the noise of this sample."""
+    K, more = s.modes[l], s.vague[l] + repeated_rounding(s, l)
+    usual = s.nu[0, l] / (variance_in(s, 0, l) + more) + s.nu[1, l] / (variance_in(s, 1, l) + more)
+    far = max(variance_in(s, STATES - 1, l), s.e[l] * s.e[l]) + more
+    s.certainty[l] = s.noise[l] * ((1.0 - s.outlier[l]) * usual + s.outlier[l] / far)
+    if s.repeats[l] > 0.0:
+        return
+    ordinary, share, every = 0.0, 0.0, 0.0
+    for j in range(STATES):
+        least = variance_in(s, j, l)
+        widest = np.inf if j == STATES - 1 else 0.0
+        for k in range(K):
+            e2, v = s.e_k[k, l] * s.e_k[k, l], s.inverse[j, k, l]
+            own = max(least, min(e2, widest))
+            s.row[k, l] = s.joint[j, k, l] * (own * (1.0 - own * v) + own * v * own * v * e2)
+        moment = sum_of_row(s, l) / s.noise[l]
+        every += moment
+        if j < STATES - 1:
+            for k in range(K):
+                s.row[k, l] = s.joint[j, k, l]
+            share += sum_of_row(s, l)
+            ordinary += moment
+    s.count[l] += 1.0
+    s.outliers[l] = FADE * s.outliers[l] + s.outlier[l]
+    s.watched[l] = FADE * s.watched[l] + 1.0
+    s.outlying[l] = (OUTLIER * RARITY + s.outliers[l]) / (RARITY + s.watched[l])
+    move = (ordinary / s.r[l] - share) / min(s.count[l] + 1.0, MEMORY)
+    s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
+    s.restless[l] += (min(every, WILDEST * s.r[l]) - s.restless[l]) / QUICK
+
+
+SMOOTHER_FIELDS = (
+    "mu", "prior", "kappa", "r", "certainty", "leap", "c", "drift_unit", "offset", "weight", "direction", "white",
+    "explained", "settled", "constant",
+)  # fmt: skip
+"""Fields that are stored at every sample."""
+
+
+@kernel
+def store_for_smoother(o: State, s: State, l: int) -> None:
+    """Store the fields of the smoother."""
+    for k in range(s.mu.shape[0]):
+        o.mu[k, l], o.prior[k, l] = s.mu[k, l], s.prior[k, l]
+    for i in range(s.c.shape[0]):
+        o.c[i, l], o.drift_unit[i, l], o.offset[i, l] = s.c[i, l], s.drift_unit[i, l], s.offset[i, l]
+        o.weight[i, l], o.direction[i, l], o.white[i, l] = s.weight[i, l], s.direction[i, l], s.white[i, l]
+    o.kappa[l], o.r[l], o.certainty[l], o.explained[l] = s.kappa[l], s.r[l], s.certainty[l], s.explained[l]
+    o.settled[l], o.constant[l], o.leap[l] = s.settled[l], s.constant[l], s.leap[l]
+
+
+def transitions(state: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Transitions (K, K) of the modes as A + kappa B, from the fields of a bank."""
+    up, down, foot, arrive = state["up"], state["down"], state["foot"], state["arrive"]
+    A = np.diag(1.0 - down - foot) + np.diag(down[1:], -1)
+    A[:, 0] += foot
+    B = np.diag(-arrive.sum() - up) + np.diag(up[:-1], 1) + arrive
+    return A, B
+
+
+def modes_given_all(fields: Mapping[str, Array], used: Array, state: Mapping[str, Any]) -> Array:
+    """Probabilities (T, K) of the modes, given all samples; ``used`` (T,) are those that changed them."""
+    after, ahead = np.where(used[:, None], fields["mu"], fields["prior"]), fields["prior"]
+    (A, B), found = transitions(state), after.copy()
+    for t in range(len(found) - 2, -1, -1):
+        later = found[t + 1] / np.maximum(ahead[t], 1e-300)
+        found[t] = after[t] * (A @ later + fields["kappa"][t] * (B @ later)) if used[t] else found[t + 1]
+        found[t] /= max(found[t].sum(), 1e-300)
+    return found
+
+
+def estimated_variances(
+    fields: Mapping[str, Array], phi: Array, time: Array, state: Mapping[str, Any]
+) -> tuple[Array, Array, Array, Array]:
+    """q (T, n), that of the drift about the means, the matrix A (n, n) for which phi A are the regressors less their
+    means, and r (T,) of every sample, from the stored fields (T, ..), the regressors (N, n) of used samples and the
+    intervals of drift.
+    """
+    running = fields["settled"] > 0
+    used = running & (fields["certainty"] > 0.0)
+    r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
+    ratio = state["ratio"] + np.where(state["ratio"] == COMMON[-1], fields["leap"][:, None], 0.0)
+    size = modes_given_all(fields, used, state) * ratio * (r * time)[:, None]
+    centred = fields["offset"] != 0.0
+    learned = size[:, FIRST_LEARNED:FIRST_ALONE].sum(axis=1)
+    common = (size[:, :FIRST_LEARNED].sum(axis=1) + FLOOR * learned)[:, None] * fields["drift_unit"]
+    own = learned[:, None] * (fields["weight"] + fields["direction"] ** 2)
+    for i, first in enumerate(state["alone"]):
+        if first >= 0:
+            own[:, i] += size[:, first : first + state["rungs"]].sum(axis=1)
+    c = np.where(fields["c"] > 0.0, fields["c"], np.inf)
+    drifts = (running & (time > 0.0))[:, None]
+    q = np.where(drifts, own / c + np.where(centred, 0.0, common), 0.0)
+    about = np.where(drifts & centred, common, 0.0)
+    A, constant = np.eye(phi.shape[1]), int(fields["constant"][-1])
+    if constant >= 0 and centred.any():
+        mean = phi.mean(axis=0)
+        A[constant] = np.where(centred.any(axis=0), -mean / mean[constant], 0.0)
+        A[constant, constant] = 1.0
+    return q, about, A, 1.0 / np.where(used, fields["certainty"], 1.0 / r)
