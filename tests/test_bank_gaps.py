@@ -126,7 +126,7 @@ def test_jumps_in_an_outage_are_found():
 
 
 def test_small_jumps_are_found_and_dated_at_their_level():
-    """Two jumps of 1.6 standard deviations of the noise; `Bank()` finds some four fifths of them."""
+    """Two jumps of 1.6 standard deviations of the noise; `Bank()` finds some nine tenths of them."""
     held = found = 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -138,8 +138,8 @@ def test_small_jumps_are_found_and_dated_at_their_level():
             near = [e for e in events if abs(e.span.date - jump) <= 30]
             found += bool(near)
             held += any(e.span.first <= jump <= e.span.last for e in near)
-    assert found >= 60
-    assert held >= 0.93 * found
+    assert found >= 68
+    assert held >= 0.9 * found
 
 
 def test_the_log_likelihood_is_the_log_evidence():
@@ -242,22 +242,6 @@ def test_one_fault_code_is_survived(code):
     assert "3 samples far outside the range" in str(run.summary())
     lasting = y + np.where(np.arange(400) >= 200, 1e5, 0.0)  # what keeps coming is believed
     assert track(ARX(1, 1, intercept=True), Bank(), lasting, u).ok[205:].all()
-
-
-def test_forecasts_that_are_often_wrong_are_no_fault_codes():
-    """The gain of a quiet plant jumps, of which this bank knows nothing: its readings stay within their range."""
-    rng = np.random.default_rng(1)
-    u, y = rng.standard_normal(400), np.zeros(400)
-    for t in range(1, 400):
-        y[t] = 0.7 * y[t - 1] + (2.0 if t < 200 else -1.0) * u[t - 1] + 1e-3 * rng.standard_normal()
-    bank = Bank([Change(1e-10)], [Sensor.nominal(1e-6, limit=100.0)], p0=1.0)
-    run = track(ARX(1, 1), bank, y, u)
-    refused = np.flatnonzero(~run.ok[1:]) + 1
-    assert 3 <= len(refused) < 20
-    assert refused[0] == 200
-    codes = np.arange(20, 200, 3)
-    y[codes] = 9999.0  # out of their range: refused however often
-    assert not track(ARX(1, 1), bank, y, u).ok[codes].any()
 
 
 def test_the_bound_of_a_beam_is_found_among_large_numbers():

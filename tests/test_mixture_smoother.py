@@ -113,9 +113,10 @@ def test_it_is_the_sum_over_all_sequences(name):
 
 def test_the_filter_has_the_evidence_of_the_smoother():
     problem = short(9, BANKS["two changes"][1])
-    evidence, squares = mixture.filtered(problem, 12)
+    evidence, squares, spikes = mixture.filtered(problem, 12)
     assert evidence == pytest.approx(mixture.smooth(problem).evidence[0], abs=0.02)
     assert 0.3 < squares / 8 < 2.0
+    assert spikes == 0.0  # there is one noise
 
 
 @pytest.mark.parametrize("p0", [None, 2.0])

@@ -279,7 +279,7 @@ def forwards(
     for t in range(len(y)):
         C = grow(K, now, moves, moves.log_prob[table[t]], sizes[t], room)
         if r[t] < np.inf:
-            C = observe(C, room, phi[t], y[t], r[t], noises)
+            C = observe(C, room, phi[t], y[t], r[t], noises, now)
         K = reduce(C, room, keep[t], now)
         now.level[0] += lowered(K, now.facts)
         if store:
@@ -311,7 +311,7 @@ def backwards(
                 found.cov[t, i, j] = out[1 + i, j]
             found.cov[t, i, min(i, wide - 1)] = out[1 + i, i]
         if r[t] < np.inf:
-            C = observe(C, room, phi[t], y[t], r[t], noises)
+            C = observe(C, room, phi[t], y[t], r[t], noises, now)
         K = reduce(C, room, keep[t], now)
         now.level[0] += lowered(K, now.facts)
     now.many[0] = K
@@ -336,14 +336,16 @@ def smooth(problem: Problem, covariances: bool = False, kept: Array | None = Non
         keep = more
 
 
-def filtered(problem: Problem, keep: int) -> tuple[float, float]:
-    """The log evidence, and the expected sum of e_t^2 / s_t, from a filter with this number of components."""
+def filtered(problem: Problem, keep: int) -> tuple[float, float, float]:
+    """The log evidence, the expected sum of e_t^2 / s_t, and the expected number of samples with another noise than the
+    first, from a filter with this number of components.
+    """
     passes = Passes(problem, np.full(len(problem.y), keep))
     passes.forward()
-    facts = passes.ahead.facts[: passes.ahead.many[0]]
+    facts, now = passes.ahead.facts[: passes.ahead.many[0]], passes.ahead
     weight = np.exp(facts[:, SHARE])
-    evidence = passes.ahead.level[0] + np.log(weight.sum()) + passes.constant
-    return float(evidence), float(weight @ facts[:, COST] / weight.sum())
+    evidence = now.level[0] + np.log(weight.sum()) + passes.constant
+    return float(evidence), float(weight @ facts[:, COST] / weight.sum()), float(now.spikes[0])
 
 
 class Passes:
@@ -366,7 +368,8 @@ class Passes:
         unit = VAGUE / np.sqrt(np.median(r[used])) if used.any() else VAGUE
         end, rows = unit * np.eye(n, n + 1), problem.start / np.append(self.scale, 1.0)
         self.ahead, self.behind = (
-            Filter(np.zeros((most, n, n + 1)), np.zeros((most, 5)), np.full(1, many), np.zeros(1)) for many in (1, S)
+            Filter(np.zeros((most, n, n + 1)), np.zeros((most, 5)), np.full(1, many), np.zeros(1), np.zeros(1))
+            for many in (1, S)
         )
         self.ahead.A[0] = triangle(np.vstack([rows, end]))
         size = np.sum(np.log(np.diag(self.ahead.A[0])))

@@ -21,8 +21,12 @@ LOG, MODE, MOVE, COST, SHARE = range(5)
 """Of a component: c, its mode, its last move, the sum of e^2 / s on its path, and the log of its integral."""
 TOTAL, FIRST, MIXED = range(3)
 """Of one that others join: the log of the integral of all, of the first, and whether there are others."""
-UNLIKELY = 14.0
+UNLIKELY = 11.0
 """Log of the ratio to the most probable below which a component is dropped."""
+MINOR = 0.03
+"""Share of a noise below which it counts as the first."""
+FAR = 600.0
+"""Log of the ratio of two densities beyond which they are as far apart as can be."""
 ROOMY = 12
 """Components that are usually enough."""
 JOIN, SQUEEZE = 1e-3, 100.0
@@ -48,6 +52,8 @@ class Filter(NamedTuple):
     """(1,): the number of components."""
     level: Array
     """(1,): log of the factors that were taken out of them."""
+    spikes: Array
+    """(1,): the expected number of samples that had another noise than the first."""
 
 
 class Moves(NamedTuple):
@@ -74,7 +80,7 @@ class Noises(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Scratch space of a pass: children, their order, factors of kept components, facts of merging, squares, a row."""
+    """Scratch space: children, their order, factors of kept components, facts of merging, squares, a row, and odds."""
 
     children: Components
     order: Array
@@ -82,6 +88,7 @@ class Room(NamedTuple):
     merged: Array
     squares: Array
     row: Array
+    odds: Array
 
 
 def room_for(n: int, most: int, children: int) -> Room:
@@ -90,7 +97,7 @@ def room_for(n: int, most: int, children: int) -> Room:
     born = Components(np.empty((C, n, n + 1)), np.empty((C, 5)))
     return Room(
         born, np.empty(C, np.int64), np.empty((most + 1, n, n + 1)), np.empty((most, 3)), np.zeros((4, n, n + 1)),
-        np.empty(n + 1),
+        np.empty(n + 1), np.empty(children + 1),
     )  # fmt: skip
 
 
@@ -191,32 +198,60 @@ def grow(K: int, now: Filter, moves: Moves, logp: Array, sizes: Array, room: Roo
 
 
 @shared
-def observe(C: int, room: Room, phi: Array, y: float, r: float, noises: Noises) -> int:
-    """Update C children by a sample, each by every noise; returns the number of children that come of it."""
-    Y, more, row, n = room.children.A, room.children.facts, room.row, len(phi)
-    count = C
+def absorb_noise(A: Array, phi: Array, y: float, r: float, noise: Array, row: Array) -> float:
+    """Rotate a sample with this noise into A; returns what is left of y."""
+    root = 1.0 / np.sqrt(r * noise[0])
+    for i in range(len(phi)):
+        row[i] = phi[i] * root
+    row[len(phi)] = (y - noise[1]) * root
+    return float(absorb(A, row))
+
+
+@shared
+def observe(C: int, room: Room, phi: Array, y: float, r: float, noises: Noises, now: Filter) -> int:
+    """Update C children by a sample; returns the number of children that come of it.
+
+    Each is updated by every noise that has at least `MINOR` of its probability; the others count as the first. The
+    probability of others than the first is added to ``now.spikes``.
+    """
+    Y, more, kind, p, copy, n = room.children.A, room.children.facts, noises.kind, room.odds, room.squares[0], len(phi)
+    count, L, others, everything, best = C, len(kind), 0.0, 0.0, -np.inf
     for k in range(C):
-        mode = int(more[k, MODE])
-        for l in range(len(noises.kind) - 1, -1, -1):  # the first noise takes the place of the child
-            logp, v = noises.log_prob[mode, l], r * noises.kind[l, 0]
-            to = k if l == 0 else count
-            if l > 0:
-                if more[k, SHARE] + logp < -UNLIKELY:
-                    continue
-                count += 1
-                for i in range(n):
-                    for j in range(i, n + 1):
-                        Y[to, i, j] = Y[k, i, j]
-                for i in range(more.shape[1]):
-                    more[to, i] = more[k, i]
-            root = 1.0 / np.sqrt(v)
+        for i in range(n):
+            for j in range(i, n + 1 if L > 1 else 0):
+                copy[i, j] = Y[k, i, j]
+        earlier, share, total = more[k, LOG] - more[k, SHARE], more[k, SHARE], 0.0
+        e = absorb_noise(Y[k], phi, y, r, kind[0], room.row)
+        size = log_det(Y[k])
+        s = r * kind[0, 0] * np.exp(2.0 * (size - earlier))
+        f, first = e * np.sqrt(s) + kind[0, 1], noises.log_prob[int(more[k, MODE]), 0] - 0.5 * (e * e + np.log(s))
+        for l in range(L):
+            v = s + r * (kind[l, 0] - kind[0, 0])
+            p[l] = noises.log_prob[int(more[k, MODE]), l] - 0.5 * ((f - kind[l, 1]) ** 2 / v + np.log(v)) - first
+            p[l] = np.exp(min(p[l], FAR))
+            total += p[l]
+        w = share + first + np.log(total)
+        scale = np.exp(min(best - w, 0.0))
+        best = max(best, w)
+        others, everything = (
+            others * scale + np.exp(w - best) * (1.0 - p[0] / total),
+            everything * scale + np.exp(w - best),
+        )
+        for l in range(1, L):
+            if p[l] < MINOR * total:
+                p[0] += p[l]
+                continue
             for i in range(n):
-                row[i] = phi[i] * root
-            row[n] = (y - noises.kind[l, 1]) * root
-            e = absorb(Y[to], row)
-            more[to, LOG] += logp - 0.5 * (e * e + np.log(v))
-            more[to, COST] += e * e
-            more[to, SHARE] = more[to, LOG] - log_det(Y[to])
+                for j in range(i, n + 1):
+                    Y[count, i, j] = copy[i, j]
+            own = absorb_noise(Y[count], phi, y, r, kind[l], room.row)
+            more[count, MODE], more[count, MOVE] = more[k, MODE], more[k, MOVE]
+            more[count, COST], more[count, SHARE] = more[k, COST] + own * own, share + first + np.log(p[l])
+            more[count, LOG] = more[count, SHARE] + log_det(Y[count])
+            count += 1
+        more[k, SHARE], more[k, COST] = share + first + np.log(p[0]), more[k, COST] + e * e
+        more[k, LOG] = more[k, SHARE] + size
+    now.spikes[0] += others / everything
     return count
 
 

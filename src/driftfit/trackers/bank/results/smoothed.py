@@ -7,22 +7,23 @@ last moves theta. Outliers and offsets are a mixture of noises. Sensors whose re
 outliers, frozen, your own) depend on earlier readings, so they are no noise: samples at which the run found such a
 fault have no weight. Changes that forget or reset are no random walk, and are refused.
 
-An unknown noise variance is that at which the expected sum of e^2 / s is the number of samples. The drift of `Bank()`
-is a guess, so each parameter's is multiplied by a factor f >= 1. The path is the average over their values,
+The drift of `Bank()` is a guess. The covariance that it gives parameter i is multiplied by a factor f_i, one of
+`FACTORS`: none, or a power of ten. They are found by climbing from the best that is common to all parameters, one step
+for all or for one of them at a time. The path is the average over all that were tried, weighted by the evidence of all
+hypotheses. What is unknown of the noise is that of the record:
 
-    L(f) prod_i f_i^(1/4) d log f_i,    L the evidence of all hypotheses,
+    r       at which the expected sum of e^2 / s is the number of samples
+    spikes  their expected share, with a prior that counts for `RARITY` samples; without them they would be two jumps
 
-one factor at a time about the greatest. The prior is half-way between one that is flat in the standard deviation of the
-drift, after which paths at rest have 18 % more error, and one that is flat in its logarithm, after which bands of walks
-in 150 samples cover 85 per cent. Noises of `Bank()` are `NOISES`: spikes and bursts of noise would be jumps otherwise.
-
-Source: Kitagawa (1994) for the smoother; Gelman (2006, section 7.1) for priors of a standard deviation. Cost: 30 us per
-sample for two parameters and changes; for `Bank()` that for each likely drift, and some fifty filters.
+Source: Kitagawa (1994) for the smoother; Hoeting, Madigan, Raftery and Volinsky (1999) for averaging over models by
+their likelihood. Cost: 30 us per sample for two parameters and changes; for `Bank()` some fifteen filters of `FEW`
+components, and that for each likely drift.
 """
 
 from __future__ import annotations
 
 from functools import cached_property
+from itertools import product
 from statistics import NormalDist
 from typing import Any
 
@@ -40,16 +41,16 @@ from driftfit.trackers.bank.leaves.leaf_matrix import NU, WEIGHT, S
 from driftfit.trackers.bank.results.events import Event
 from driftfit.trackers.parts.information import triangular_root
 
-WIDER = 1e7
-"""Largest factor of a drift."""
-STEPS = np.arange(0.0, np.log(WIDER), 1.0)
-"""Logarithms of the factors that are tried."""
+FACTORS = np.append(0.0, 10.0 ** np.arange(8.0))
+"""Factors of the drift that are tried."""
+LIKELY = 0.1
+"""Drifts that are less likely than this share of the best are left out."""
+FEW = 8
+"""Components with which an evidence is computed."""
+RARITY = 20.0
+"""Samples that the prior share of spikes counts for."""
 NOISES = ((1.0, 0.95), (16.0, 0.04), (100.0, 0.01))
-"""Factors of the noise variance for `Bank()`, and their probabilities."""
-LIKELY = 0.01
-"""Values of a factor that are less likely than this share of the best are left out."""
-FEW = 4
-"""Components with which the evidence of a factor is computed."""
+"""Factors of the noise variance for `Bank()`, and their probabilities before the record is seen."""
 
 
 class SmoothedMixture:
@@ -67,8 +68,6 @@ class SmoothedMixture:
         Probability that each parameter was part of a change other than the normal course.
     shift, shift_std : (T, n)
         theta_t - theta_{t-1} if there was such a change.
-    widened : (n,)
-        Factors of the drift, averaged geometrically; 1 where the changes of the bank were given.
     r : float
         Noise variance.
     uneven : (T,) bool
@@ -80,26 +79,22 @@ class SmoothedMixture:
         self.run, self.names, self.time = run, run.names, run.time
         bank: Any = run.tracker
         problem = problem_of(run, faults)
-        free = bank.all_sensors[0].r is None and bank.all_sensors[0].guess is None
-        self._weighed = averaged(problem, free) if bank.changes is None else [(1.0, matched(problem, free), NO)]
+        self._weighed = hypotheses_of(bank, problem)
         found = self._smoothed(None)
-        self._mixtures, self._weights = found, np.array([weight for weight, _, _ in self._weighed])
+        self._mixtures, self._weights = found, np.array([weight for weight, _ in self._weighed])
         self.prior = problem.alternatives.first()[problem.table]
         self.theta = self._mean([one.theta for one in found])
         self.change_prob = self._mean([one.events for one in found])
         self.moved = self.change_prob[:, 1:] @ (moving(run) > 0.0)[1:]
-        self.widened = np.exp(
-            sum(weight * (logs if len(logs) else 0.0) for weight, _, logs in self._weighed)
-        ) * np.ones(run.model.n)
         used = int(np.argmax(np.isfinite(problem.r)))
-        scales = np.array([one.r[used] / problem.r[used] for _, one, _ in self._weighed])
+        scales = np.array([one.r[used] / problem.r[used] for _, one in self._weighed])
         self.r = float(noise_variance(bank, run) * np.sum(self._weights * np.where(scales > 0.0, scales, 1.0)))
         self.uneven = np.any([one.uneven for one in found], axis=0)
 
     def _smoothed(self, kept: Array | None, covariances: bool = False) -> list[mixture.Mixture]:
         """The record with each of the drifts; as many components are kept as the likeliest of them needed."""
         first = mixture.smooth(self._weighed[0][1], covariances, kept)
-        return [first, *(mixture.smooth(one, covariances, first.kept) for _, one, _ in self._weighed[1:])]
+        return [first, *(mixture.smooth(one, covariances, first.kept) for _, one in self._weighed[1:])]
 
     def _mean(self, values: list[Array]) -> Array:
         return np.asarray(np.einsum("k,k...->...", self._weights, np.array(values)))
@@ -157,8 +152,12 @@ class SmoothedMixture:
         return mean, np.sqrt(np.minimum(var, self.std[max(first - 1, 0)] ** 2 + self.std[last] ** 2))
 
 
-NO = np.zeros(0)
-"""No factors."""
+def hypotheses_of(bank: Bank, problem: Problem) -> list[tuple[float, Problem]]:
+    """Problems with weights that sum to 1: one if drift and noise are given."""
+    free = bank.all_sensors[0].r is None and bank.all_sensors[0].guess is None
+    if bank.changes is None:
+        return averaged(problem, problem.alternatives.roots[0], free, bank.gated)
+    return [(1.0, matched(problem, bank.gated) if free else problem)]
 
 
 def moving(run: Track) -> Array:
@@ -299,51 +298,64 @@ def scaled(problem: Problem, c: float) -> Problem:
     return problem._replace(r=problem.r * c, alternatives=alternatives, start=problem.start / np.sqrt(c))
 
 
-def matched(problem: Problem, free: bool) -> Problem:
-    """The problem with the noise variance of the record, if that is free."""
-    count = np.isfinite(problem.r).sum() - problem.phi.shape[1]
-    for _ in range(2 if free and count > 0 else 0):
-        problem = scaled(problem, mixture.filtered(problem, FEW)[1] / count)
+def matched(problem: Problem, spikes: bool) -> Problem:
+    """The problem with the noise variance of the record and, with ``spikes``, their share."""
+    used = np.isfinite(problem.r)
+    count = used.sum() - problem.phi.shape[1]
+    for _ in range(3 if count > 0 else 0):
+        _, squares, spiked = mixture.filtered(problem, FEW)
+        problem = scaled(problem, squares / count)
+        if spikes:
+            prior = np.array([p for _, p in NOISES])
+            share = (spiked + RARITY * (1.0 - prior[0])) / (used.sum() + RARITY)
+            p = np.where(prior < prior[0], prior * share / (1.0 - prior[0]), 1.0 - share)[None]
+            problem = problem._replace(noises=problem.noises._replace(log_prob=np.log(p)))
     return problem
 
 
-def averaged(problem: Problem, free: bool) -> list[tuple[float, Problem, Array]]:
-    """Problems with the drifts that are likely, with weights that sum to 1, and the logarithms of their factors."""
-    problem = matched(problem, free)
-    n, count = problem.phi.shape[1], np.isfinite(problem.r).sum() - problem.phi.shape[1]
-    known: dict[tuple[float, ...], tuple[float, float]] = {}
+def averaged(problem: Problem, drift: Array, free: bool, spikes: bool) -> list[tuple[float, Problem]]:
+    """Problems with the drifts that are likely, and their weights, which sum to 1.
 
-    def at(logs: tuple[float, ...]) -> Problem:
+    ``drift`` (n, n) has the columns g_i; the first root of the problem is that of the drift. ``free``: the noise
+    variance is the record's.
+    """
+    n, count = problem.phi.shape[1], np.isfinite(problem.r).sum() - problem.phi.shape[1]
+    free = free and count > 0
+    known: dict[tuple[int, ...], tuple[float, float]] = {}
+
+    def at(levels: tuple[int, ...]) -> Problem:
         roots = problem.alternatives.roots.copy()
-        roots[0] *= np.exp(0.5 * np.array(logs))[:, None]
+        roots[0] = triangular_root((drift * FACTORS[list(levels)]) @ drift.T)
         return problem._replace(alternatives=problem.alternatives._replace(roots=roots))
 
-    def value(logs: tuple[float, ...]) -> float:
-        """Log of evidence and prior, with the noise variance of greatest likelihood if it is free."""
-        if logs not in known:
-            evidence, squares = mixture.filtered(at(logs), FEW)
-            c = squares / count if free and count > 0 else 1.0
-            if free and count > 0:
+    def value(levels: tuple[int, ...]) -> float:
+        """Log of the evidence, with the noise variance of greatest likelihood if it is free."""
+        if levels not in known:
+            evidence, squares, _ = mixture.filtered(at(levels), FEW)
+            c = squares / count if free else 1.0
+            if free:
                 evidence += 0.5 * (squares - count) - 0.5 * count * np.log(c)
-            known[logs] = evidence + 0.25 * sum(logs), c
-        return known[logs][0]
+            known[levels] = evidence, c
+        return known[levels][0]
 
-    best = max(((step,) * n for step in STEPS[:: len(STEPS) // 3]), key=value)
+    if free:
+        first, before = np.argmax(np.isfinite(problem.r)), problem.r
+        problem = matched(at((2,) * n), spikes)
+        drift = drift * np.sqrt(problem.r[first] / before[first])
+    top = len(FACTORS) - 1
+    best = max(((level,) * n for level in range(0, top + 1, 2)), key=value)
     changed = True
     while changed:
         before = best
-        for i in range(n):
-            best = max(((*best[:i], step, *best[i + 1 :]) for step in STEPS), key=value)
+        near = [tuple(np.clip(np.add(best, step), 0, top)) for step in (-1, 1)]
+        near += [(*best[:i], level, *best[i + 1 :]) for i, step in product(range(n), (-1, 1))
+                 if 0 <= (level := best[i] + step) <= top]  # fmt: skip
+        best = max((best, *(tuple(map(int, one)) for one in near)), key=value)
         changed = best != before
-    shares = {best: 1.0}
-    for i in range(n):
-        for step in STEPS:
-            logs = (*best[:i], step, *best[i + 1 :])
-            share = np.exp(value(logs) - value(best))
-            if share > LIKELY:
-                shares[logs] = share
-    total = sum(shares.values())
-    return [(share / total, scaled(at(logs), known[logs][1]), np.array(logs)) for logs, share in shares.items()]
+    shares = {levels: np.exp(logs - known[best][0]) for levels, (logs, _) in known.items()}
+    likely = sorted((one for one in shares if shares[one] > LIKELY), key=lambda one: -shares[one])
+    total = sum(shares[one] for one in likely)
+    return [(shares[one] / total, scaled(at(one), known[one][1])) for one in likely]
 
 
 def noise_variance(bank: Bank, run: Track) -> float:
