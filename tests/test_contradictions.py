@@ -15,7 +15,6 @@ from driftfit import (
     InstrumentalVariables,
     JointKalman,
     Kalman,
-    Live,
     ParticleFilter,
     Regression,
     StateSpace,
@@ -158,17 +157,6 @@ def test_what_is_left_out_is_counted_and_the_smoother_leaves_it_out_too():
         assert "Left out" in str(run.summary())
         assert np.abs(run.smooth().theta - THETA).max() < 0.05
     assert not len(gated(PLANT, Kalman(q=1e-7, r=0.01), *plant()).left_out)
-
-
-def test_a_stream_leaves_out_the_same():
-    y, u = plant()
-    y[3], u[200] = 9999.0, -1e6
-    run, live = gated(PLANT, RLS(0.99), y, u), Live(PLANT, RLS(0.99), gate=True)
-    for one in zip(y, u, strict=True):
-        live.update(*one)
-    np.testing.assert_array_equal(live.theta, run.theta[-1])
-    assert 3 in run.left_out.sample
-    assert {201, 202} & set(run.left_out.sample.tolist())
 
 
 @pytest.mark.parametrize("tracker", [RLS(0.98), Kalman(q=1e-4, r=0.01)], ids=repr)
