@@ -99,9 +99,9 @@ def main(quick: bool = False) -> None:
     print(f"27 leaf updates, GPB(3), n = 3             {ours(3, Bank(THREE, KNOWN, reduce=GPB(3), p0=2.0)):8.3f}")
     print(f"27 leaf updates, Beam(9), n = 3            {ours(3, Bank(THREE, KNOWN, reduce=Beam(9), p0=2.0)):8.3f}")
     print(f"IMM, three changes, n = 4                  {ours(4, Bank(THREE, KNOWN, reduce=IMM(), p0=2.0)):8.3f}")
-    print('with factors, form="sqrt":')
+    print("in coordinates of the start, p0 = 1e14:")
     for n, reduce in ((4, Beam(8)), (3, GPB(3)), (4, IMM()), (8, Beam(8))):
-        both = [ours(n, Bank(THREE, KNOWN, reduce=reduce, p0=2.0, form=form)) for form in ("covariance", "sqrt")]
+        both = [ours(n, Bank(THREE, KNOWN, reduce=reduce, p0=p0)) for p0 in (2.0, 1e14)]
         print(f"{reduce!s:15}, n = {n}                     {both[1]:8.3f}   {both[1] / both[0]:.1f} times as long")
     for leaves in (16, 32, 64, 128, 256):
         print(f"Beam({leaves:3d}), three changes, n = 4           ", end="")

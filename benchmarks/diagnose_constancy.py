@@ -47,7 +47,7 @@ def record(model: str, seed: int, T: int) -> tuple[np.ndarray, np.ndarray]:
 def judged(run: Track) -> tuple[float, bool, bool, bool]:
     """(loss, ratio, worse, by 3 %); for a tracker with constant coefficients the first rule is its own."""
     known = Evidence(run)
-    error, p = known.errors, known.test.p_joint
+    error, p = known.errors, known.p
     own, steady = error.tracked[error.scored], error.constant_ls[error.scored]
     loss = root_mean_square(own) / root_mean_square(steady)
     if holds_constant(run):

@@ -262,18 +262,3 @@ def test_waiting_pays_if_some_number_of_samples_does(ahead, decided):
         near.append(abs(max(gains)) < 1e-5)
     assert [a == b or c for a, b, c in zip(ruled, rule, near, strict=True)] == [True] * 41
     assert sum(ruled) == decided
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_spikes_are_told_from_jumps(seed):
-    """Without a sensor for outliers each of them is two jumps, and nothing said so. A pulse of five samples is none."""
-    rng = np.random.default_rng(seed)
-    X, noise = rng.normal(size=(600, 2)), 0.3 * rng.normal(size=600)
-    jumps = np.cumsum((rng.random((600, 1)) < 0.01) * 3.0 * rng.normal(size=(600, 2)), axis=0)
-    for moves in (jumps, 3.0 * (np.arange(600) % 60 < 5)[:, np.newaxis]):
-        moved = track(Regression(2), Bank(), X @ [1.0, -0.5] + np.sum(X * moves, axis=1) + noise, X)
-        assert "Spikes" not in str(moved.summary())
-    y = X @ [1.0, -0.5] + noise + 3.0 * (rng.random(600) < 0.02)
-    with pytest.warns(UserWarning, match=r"look like spikes rather than jumps; give Bank\(sensors="):
-        run = track(Regression(2), Bank(), y, X)
-    assert "Spikes" in str(run.summary())

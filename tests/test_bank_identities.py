@@ -25,7 +25,7 @@ Table = namedtuple("Table", "leaves parents n output_lags unknown")
 
 @njit
 def match(t, members, share):
-    merge.match(t, members, share, 0, t.parents)
+    merge.match(t, members, share, 0)
 
 
 def matched(B, members, unknown, share, A):

@@ -79,13 +79,12 @@ def record(T=60):
     return np.minimum(y, LIMIT), u
 
 
-@pytest.mark.parametrize("form", ["covariance", "sqrt"])
 @pytest.mark.parametrize(
     ("reduce", "naive"), [(GPB(2), naive_bank.gpb(2)), (Beam(9), naive_bank.beam(9))], ids=["GPB", "Beam"]
 )
-def test_own_likelihoods_are_what_the_twin_says(reduce, naive, form):
+def test_own_likelihoods_are_what_the_twin_says(reduce, naive):
     y, u = record()
-    bank = Bank(changes(), SENSORS, None, reduce, p0=2.0, lag_variance=False, form=form)
+    bank = Bank(changes(), SENSORS, None, reduce, p0=2.0, lag_variance=False)
     P, initial = bank.event_probabilities
     twin = Twin(Q, TABLE, P, initial, np.zeros(N), 2.0 * np.eye(N), naive, na=1)
     run = track(ARX(1, 1, start="zero"), bank, y, u)

@@ -82,8 +82,8 @@ def test_bands_of_the_smoothed_path_hold_where_parameters_walk(walk, unit):
 
 @pytest.mark.parametrize("walk", [0.02, 0.05])
 def test_bands_of_a_short_record_hold_too(walk):
-    """150 samples hardly tell a small drift from none. With a prior that prefers large drifts .93 of the path was
-    covered, and constants had an eighth more error."""
+    """150 samples hardly tell a small drift from none. A prior that prefers large drifts covered .93 of the path, and
+    its error for constants was an eighth larger."""
     covered = []
     for seed in range(24):
         rng = np.random.default_rng([seed, 150])

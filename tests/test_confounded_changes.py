@@ -27,7 +27,7 @@ def test_a_change_that_ends_with_the_rest_of_an_input_may_be_of_either(slope):
     ]
     assert sum({"u", "intercept"} in names for names in found) >= 5
     verdict = resting(1, slope, True).verdict()
-    assert "(or intercept: their steps explain the record as well)" in verdict.sentences[1]
+    assert "(or u: a change of it explains the record as well)" in verdict.sentences[1]
 
 
 @pytest.mark.parametrize("slope", [False, True])

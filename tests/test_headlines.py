@@ -1,14 +1,10 @@
 """Sentences to act on: in constant systems tracking does not pay, and columns that say nothing are named."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy import signal
 
 from driftfit import RLS, BoxJenkins, ExtendedKalman, HammersteinWiener, Kalman, Polynomial, Regression, track
-from driftfit.judge.statistics.attribution import alike
-from driftfit.judge.statistics.constancy import constancy
 from driftfit.show.report import page
 
 T = 300
@@ -61,7 +57,7 @@ def test_a_few_fault_codes_are_no_drift_of_a_hammerstein_wiener_system(output):
 
 def columns(kind, moves):
     """A regression on two inputs, a column that says nothing new, and a constant; and the expected group."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(1)
     u, w, e = rng.normal(size=(3, 400))
     b = np.where(np.arange(400) < 200, 1.0, 1.0 + moves)
     third, group, held = {
@@ -124,7 +120,7 @@ def test_the_date_of_a_headline_is_that_of_its_interval_whatever_the_noise(growt
         (moved,) = verdict.parameters
         assert moved.earliest <= moved.at <= moved.latest
         assert abs(moved.at - T // 2) < 15
-        assert f"about {moved.at}" in verdict.sentences[1]
+        assert f"at {moved.at} " in verdict.sentences[1]
 
 
 def test_a_count_that_stops_growing_is_dated_where_it_does():
@@ -148,18 +144,6 @@ def test_steps_of_two_parameters_at_one_event_have_one_date():
         assert 199 <= slope.at <= 207
 
 
-def test_a_parameter_that_probably_moves_is_dated_by_the_noise_of_the_time():
-    rng = np.random.default_rng(1)
-    for growth in (-5.0, 5.0):
-        u, e = rng.normal(size=(2, T))
-        phi = np.column_stack([u, np.ones(T)])
-        level = 0.15 * np.exp(growth * np.linspace(-0.5, 0.5, T))
-        y = u + 0.2 * u * (np.arange(T) >= T // 2) + level * e
-        at, names = alike(phi, constancy(phi, y))
-        assert abs(at - T // 2) < 15
-        assert 0 in names
-
-
 @pytest.mark.parametrize("kind", ["exact", "rare"])
 def test_a_step_that_leaves_no_noise_to_test_is_named(kind):
     """Its own test had p < 0.0001, and the verdict said that this test did not confirm it."""
@@ -173,12 +157,3 @@ def test_a_step_that_leaves_no_noise_to_test_is_named(kind):
     assert moved.p_own < 1e-4
     assert 0.2 < moved.after - moved.before < 0.6
     assert abs(moved.at - len(y) // 2) <= (0 if kind == "exact" else 12)
-
-
-def test_a_sentence_about_a_test_says_what_the_table_says():
-    verdict = track(Regression(1), RLS(1.0), *regression_record(0, 0.5)).verdict()
-    (moved,) = verdict.parameters
-    for p, said in ((1e-6, "rejects constancy (p < 0.0001)"), (0.3, "does not confirm it (p = 0.30, level 0.05)")):
-        unnamed = replace(moved, moves=False, p_own=p)
-        sentence = replace(verdict, parameters=(unnamed,), alike=(moved.name,), since="150").sentences[1]
-        assert sentence.startswith(f"It probably is theta1, from about 150; its own test {said}")

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from driftfit import ARX, FLS, RLS, Bank, Change, Kalman, Regression, Sensor, track
-from driftfit.trackers.bank.reduction import FirstFloor
 
 T, N, ALIVE = 45, 2, 25
 LARGE = Decimal(10) ** 20
@@ -102,18 +101,16 @@ def test_a_bank_whose_jumps_forget_runs_while_a_column_is_idle(kind, forget, nea
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-6])
-@pytest.mark.parametrize("form", ["sqrt", "separate lags"])
-def test_a_bank_of_one_change_is_that_filter_when_a_column_is_late(form, unit):
-    """Leaves of theta itself: factors of covariances, and leaves that have separate output lags."""
+@pytest.mark.parametrize("lags", ["of the record", "separate"])
+def test_a_bank_of_one_change_is_that_filter_when_a_column_is_late(lags, unit):
     rng = np.random.default_rng(3)
     u, y = rng.standard_normal(90), np.zeros(90)
     u[:40] = 0.0
     for t in range(1, 90):
         y[t] = 0.7 * y[t - 1] + 2.0 * u[t - 1] + 0.5 * rng.standard_normal()
     changes = [Change(q=(0.01, 0.01 / unit**2))]
-    more = {"form": "sqrt"} if form == "sqrt" else {}
-    sensors = [Sensor.nominal(r=0.5), *([] if more else [Sensor.outlier(kind="additive", prob=0.0)])]
-    run = track(ARX(1, 1), Bank(changes=changes, sensors=sensors, **more), y, unit * u)
+    sensors = [Sensor.nominal(r=0.5), *([Sensor.outlier(kind="additive", prob=0.0)] if lags == "separate" else [])]
+    run = track(ARX(1, 1), Bank(changes=changes, sensors=sensors), y, unit * u)
     twin = track(ARX(1, 1), Kalman(q=(0.01, 0.01 / unit**2), r=0.5), y, unit * u)
     np.testing.assert_allclose(run.theta, twin.theta, rtol=1e-9)
     np.testing.assert_allclose(run.std, twin.std, rtol=1e-9)
@@ -122,10 +119,13 @@ def test_a_bank_of_one_change_is_that_filter_when_a_column_is_late(form, unit):
 
 RARE = [Change(size=0.003), Change(size=5.0, prob=0.01)]
 BANKS = {
-    "sqrt": Bank(changes=RARE, form="sqrt"),
-    "sqrt, exponential": Bank([Change(q=0.0), Change(forget=0.001, prob=0.02)], [Sensor.nominal()], form="sqrt"),
+    "relative": Bank(changes=RARE),
+    "exponential": Bank([Change(q=0.0), Change(forget=0.001, prob=0.02)], [Sensor.nominal()]),
     "reset": Bank([RARE[0], Change(q=4.0, prob=0.01, reset=True)], [Sensor.nominal(r=0.01)]),
-    "FirstFloor": Bank(RARE, [Sensor.nominal(r=0.01)], reduce=FirstFloor()),
+    "partial": Bank([RARE[0], Change(q=4.0, prob=0.01, reset=True, which=[0])], [Sensor.nominal(r=0.01)]),
+    "stabilised": Bank(
+        [RARE[0], Change(forget=0.01, kind="stabilised", anchor=4.0, prob=0.01)], [Sensor.nominal(r=0.01)]
+    ),
 }  # fmt: skip
 
 
@@ -145,10 +145,10 @@ def test_banks_find_jumps_while_a_column_is_idle_or_repeats_another(kind):
 
 
 def test_a_cap_of_forgetting_is_that_of_each_variance_in_its_own_unit():
-    """An exponential change with leaves of theta itself: units of a column that comes late decide nothing."""
+    """An exponential change: units of a column that comes late decide nothing."""
     y, u = alive_late(1.0)
     near, far = (
-        track(Regression(3), Bank([Change(forget=0.9)], [Sensor.nominal()], form="sqrt"), y, u * [1.0, 1.0, unit])
+        track(Regression(3), Bank([Change(forget=0.9)], [Sensor.nominal()]), y, u * [1.0, 1.0, unit])
         for unit in (1.0, 1e-9)
     )
     np.testing.assert_allclose(far.theta * [1.0, 1.0, 1e-9], near.theta, rtol=1e-7, atol=1e-12)

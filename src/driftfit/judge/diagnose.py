@@ -9,7 +9,7 @@ With z = e / s, innovations over their standard deviation, after the first max(5
     outliers          share of |z| > 4                                                          at most 0.2 %
     symmetry          skewness of z clipped at 4                                                -0.5 to 0.5
     excitation        largest condition index of a window (`driftfit.judge.excitation`)        at most 100
-    constancy         joint p-value of constant coefficients (`driftfit.judge.statistics.constancy`)      see below
+    constancy         joint p-value of constant coefficients (`driftfit.judge.changes`)                   see below
 
 Constancy is out of bounds if the record and the tracker disagree: the coefficients move but the tracker holds them
 constant (p below 0.01), or they do not move and the tracker lets them move at a cost: p above 0.05, and one-step errors
@@ -135,7 +135,7 @@ class Diagnosis(Printed):
         """
         z, white = standardised(self.run)
         known = Evidence(self.run)
-        parts = (self.run, z, white, excitation(known.rows.phi), known.test, known.rows, known.names)
+        parts = (self.run, z, white, excitation(known.rows.phi), known.changes, known.rows, known.tested, known.names)
         return draw_diagnosis(Health(*parts, lambda name: self[name].ok), ax)
 
 
@@ -271,12 +271,11 @@ def _excitation(run: Track, excited: Excitation) -> Check:
 
 
 def _constancy(known: Evidence) -> Check:
-    test = known.test
     if holds_constant(known.run):
         advice = (
             "The coefficients move, but this tracker holds them constant: use Kalman with a drift, or AdaptiveKalman."
         )
-        return Check("constancy (p)", test.p_joint, REJECTED, np.inf, advice)
+        return Check("constancy (p)", known.p, REJECTED, np.inf, advice)
     error = known.errors
     own, steady = (part[error.scored] for part in (error.tracked, error.constant_ls))
     least, most = root_mean_square(steady), root_mean_square(own)
@@ -285,7 +284,7 @@ def _constancy(known: Evidence) -> Check:
         "Lower q or increase the memory; tune() estimates it."
     )
     dear = paired("constant LS", own, MATERIAL * steady).p < REJECTED
-    return Check("constancy (p)", test.p_joint, -np.inf, NOT_REJECTED if dear else np.inf, advice)
+    return Check("constancy (p)", known.p, -np.inf, NOT_REJECTED if dear else np.inf, advice)
 
 
 def holds_constant(run: Track) -> bool:

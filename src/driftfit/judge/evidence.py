@@ -1,4 +1,4 @@
-"""What the verdict and the diagnosis of a run share: its regression, the test of constancy, the errors of rivals."""
+"""What the verdict and the diagnosis of a run share: its regression, its changes, the errors of rivals."""
 
 from __future__ import annotations
 
@@ -9,28 +9,44 @@ import numpy as np
 
 from driftfit.data.record import Record
 from driftfit.engine.kernel import Array
+from driftfit.judge.changes.changes import Changes, changes
+from driftfit.judge.changes.dates import LEVEL
 from driftfit.judge.compare import Errors, errors
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.judge.regressors import Distinct, Rows, judged_by_others, regressors
-from driftfit.judge.segments.noise_of_regressors import relative_size
-from driftfit.judge.statistics.constancy import Constancy, constancy
+from driftfit.judge.statistics.parts.coarse_readings import drawn_within
+from driftfit.judge.statistics.robust import fit_in, noisy, orthonormal, sole
 from driftfit.run.result import Track
 
+REJECTED = 0.05
+"""Level of the test where none is given."""
 
-def of_one_size(rows: Rows, test: Constancy, lags: int | None) -> tuple[Rows, Constancy]:
-    """Rows and their test of constancy, the rows divided by the size of their noise if that depends on the regressors
-    (`driftfit.judge.segments.noise_of_regressors`)."""
-    noise = test.noise
-    size = None if noise is None or noise.rare else relative_size(rows.phi, rows.y, noise)
-    if noise is None or size is None:
-        return rows, test
-    step = None if rows.step is None else rows.step / size
-    weighted = rows._replace(phi=rows.phi / size[:, None], y=rows.y / size, step=step)
-    again = constancy(weighted.phi, weighted.y, lags, rows.at, step)
-    # weights also change the correlation of the noise: there they must explain breaks, not add some
-    if again.noise is None or (len(again.noise.ar) and len(again.noise.breaks) >= len(noise.breaks)):
-        return rows, test
-    return weighted, again
+
+def least_rows(n: int) -> int:
+    """Rows that a test of n parameters needs."""
+    return 4 * n + 8
+
+
+def judged_rows(
+    rows: Rows, level: float, order: int | None = None, dates: float = LEVEL, fewest: int | None = None
+) -> Changes | None:
+    """The changes of rows; None if they are too few, do not determine every parameter, or have no noise."""
+    N, n = rows.phi.shape
+    if n == 0 or least_rows(n) > N:
+        return None
+    basis = orthonormal(rows.phi)
+    if not basis.distinct or sole(basis.Q).any():
+        return None
+    y = rows.y if rows.step is None else drawn_within(basis.Q, rows.y, rows.step)
+    if not noisy(fit_in(basis, y), rows.phi, y):
+        return None
+    found = changes(rows.phi, y, rows.lags, rows.root, level, order, dates, fewest)
+    if rows.step is None or y is not rows.y or not len(found.found.breaks):
+        return found
+    drawn = drawn_within(
+        basis.Q, y, rows.step, found.found.breaks
+    )  # readings of segments, where constants explain none
+    return found if drawn is y else changes(rows.phi, drawn, rows.lags, rows.root, level, order, dates, fewest)
 
 
 @dataclass(frozen=True)
@@ -40,6 +56,7 @@ class Evidence:
     run: Track
     lags: int | None = None
     burn: int | None = None
+    level: float = REJECTED
 
     @cached_property
     def _record(self) -> Record:
@@ -55,21 +72,17 @@ class Evidence:
         return regressors(self.run, self._steady)
 
     @cached_property
-    def _found(self) -> tuple[Distinct, Rows, Constancy]:
-        """The parameters that a test can tell apart, the samples with their regressors, and the test."""
+    def _found(self) -> tuple[Distinct, Rows, Changes | None]:
+        """The parameters that a test can tell apart, the samples with their regressors, and what changed."""
         rows, every = self.rows, Distinct(tuple(range(self.run.model.n)), ())
-        test = constancy(rows.phi, rows.y, self.lags, rows.at, rows.step)
-        if not np.isnan(test.p_joint):
-            return every, rows, test
-        rows, found = judged_by_others(rows)
-        if not found.kept or (len(found.kept) == self.run.model.n and len(rows.y) == len(self.rows.y)):
-            return every, self.rows, test
-        rows = rows._replace(phi=np.ascontiguousarray(rows.phi[:, found.kept]))
-        return found, rows, constancy(rows.phi, rows.y, self.lags, rows.at, rows.step)
-
-    @cached_property
-    def _weighted(self) -> tuple[Rows, Constancy]:
-        return of_one_size(*self._found[1:], self.lags)
+        found = judged_rows(rows, self.level, self.lags)
+        if found is not None:
+            return every, rows, found
+        others, apart = judged_by_others(rows)
+        if not apart.kept or (len(apart.kept) == self.run.model.n and len(others.y) == len(rows.y)):
+            return every, rows, None
+        others = others.only(np.arange(len(others.y)), apart.kept)
+        return apart, others, judged_rows(others, self.level, self.lags)
 
     @property
     def distinct(self) -> Distinct:
@@ -78,18 +91,18 @@ class Evidence:
 
     @property
     def tested(self) -> Rows:
-        """The samples with the regressors of these parameters, divided by the size of the noise."""
-        return self._weighted[0]
+        """The samples with the regressors of these parameters."""
+        return self._found[1]
 
     @property
-    def test(self) -> Constancy:
-        """Whether constants explain them."""
-        return self._weighted[1]
+    def changes(self) -> Changes | None:
+        """What changed in them; None if that cannot be tested."""
+        return self._found[2]
 
     @property
-    def unweighted(self) -> tuple[Rows, Constancy]:
-        """Samples and test before that division."""
-        return self._found[1:]
+    def p(self) -> float:
+        """p-value of constants; NaN if they cannot be tested."""
+        return float("nan") if self.changes is None else self.changes.test.p
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -72,7 +72,9 @@ class Judgement:
         If the value before is smaller than the standard error of the change, that standard error replaces it.
         """
         moved = [m for m in self.verdict.parameters if m.moves] if self.drifts else []
-        return max((abs(m.after - m.before) / max(abs(m.before), m.std) for m in moved), default=0.0)
+        return max(
+            (abs(m.after - m.before) / max(abs(m.before), np.nan_to_num(m.std), 1e-300) for m in moved), default=0.0
+        )
 
     @property
     def change(self) -> str:
@@ -287,8 +289,8 @@ def verdicts_and_diagnoses(
 
 
 def _both(run: Track, level: float) -> tuple[Verdict, Diagnosis]:
-    known = Evidence(run)
-    return judged(known, level), diagnosis(known)
+    known = Evidence(run, level=level)
+    return judged(known), diagnosis(known)
 
 
 def ranked(verdicts: Mapping[Hashable, Verdict], by: tuple[str, ...], level: float) -> ManyVerdicts:

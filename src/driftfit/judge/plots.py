@@ -9,9 +9,9 @@ import numpy as np
 import scipy
 
 from driftfit.engine.kernel import Array
+from driftfit.judge.changes.changes import Changes
 from driftfit.judge.excitation import Excitation
 from driftfit.judge.regressors import Rows
-from driftfit.judge.statistics.constancy import Constancy
 from driftfit.judge.statistics.whiteness import Whiteness
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.result import Track
@@ -22,19 +22,24 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = (BLUE, RED, "#3a8f4d", "#9a6fb0", "#c08a1e", "#4aa3a8", "#7a5c46", "#d17aa5")
+BRIDGE = 1.36
+"""What a Brownian bridge exceeds with probability 0.05 (Kolmogorov)."""
 
 
 class Health(NamedTuple):
-    """The quantities that a diagnosis examines; ``names`` are those of the parameters that the test of constancy tells
-    apart, and ``fine`` maps the names of checks to whether they are within their limits.
+    """The quantities that a diagnosis examines.
+
+    ``tested`` are the rows and ``names`` of the parameters that the test of constancy tells apart, and ``fine`` maps
+    the names of checks to whether they are within their limits.
     """
 
     run: Track
     z: Array
     white: Whiteness
     excited: Excitation
-    constant: Constancy
+    changes: Changes | None
     rows: Rows
+    tested: Rows
     names: tuple[str, ...]
     fine: Callable[[str], bool]
 
@@ -121,18 +126,18 @@ def _excitation(axis: Axes, diagnosis: Health) -> None:
 
 
 def _paths(axis: Axes, diagnosis: Health) -> None:
-    path: Array = diagnosis.constant.path
-    if len(path) and np.isfinite(path).all():
-        inner = slice(len(path) // 20, len(path) - len(path) // 20)
+    """Sums of scores of each parameter, a Brownian bridge if it is constant, and what 5 % of these leave."""
+    if diagnosis.changes is not None:
+        path = diagnosis.changes.scores
         for i, name in enumerate(diagnosis.names):
             colour = COLOURS[i % len(COLOURS)]
-            axis.plot(diagnosis.run.time[diagnosis.rows.at][inner], path[inner, i], lw=1.1, color=colour, label=name)
-        axis.axhspan(-3.0, 3.0, color=GREY, alpha=0.2, lw=0)
+            axis.plot(diagnosis.run.time[diagnosis.tested.at], path[:, i], lw=1.1, color=colour, label=name)
+        axis.axhspan(-BRIDGE, BRIDGE, color=GREY, alpha=0.2, lw=0)
         if path.shape[1] <= 8:
             axis.legend(fontsize=7, ncols=2, frameon=False)
     else:
         _unknown(axis)
-    _titled(axis, "constancy: paths of the estimates, standardised", diagnosis.fine("constancy (p)"))
+    _titled(axis, "constancy: sums of scores, standardised", diagnosis.fine("constancy (p)"))
 
 
 def _unknown(axis: Axes) -> None:

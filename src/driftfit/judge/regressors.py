@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.judge.changes.null import Lags
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.judge.statistics.parts.coarse_readings import step_of
 from driftfit.judge.statistics.robust import orthonormal, sole
@@ -25,6 +27,17 @@ class Rows(NamedTuple):
     """(N,)"""
     step: Array | None = None
     """(N,): the steps of a coarse sensor; None if it is fine."""
+    lags: Lags | None = None
+    """Which columns are earlier outputs; None if none is."""
+    root: Array | None = None
+    """(N,): what phi and y were multiplied by; None for 1."""
+
+    def only(self, rows: Array, columns: Sequence[int]) -> Rows:
+        """Some of the rows (a mask or indices), and some of the columns."""
+        lags = None if self.lags is None else self.lags.only(np.arange(len(self.y))[rows], columns)
+        phi = np.ascontiguousarray(self.phi[rows][:, columns])
+        step, root = (None if one is None else one[rows] for one in (self.step, self.root))
+        return Rows(self.at[rows], phi, self.y[rows], step, lags, root)
 
 
 class Distinct(NamedTuple):
@@ -75,8 +88,7 @@ def judged_by_others(rows: Rows) -> tuple[Rows, Distinct]:
     alone = sole(orthonormal(rows.phi[:, found.kept]).Q)
     if not alone.any():
         return rows, found
-    others = ~alone
-    rows = Rows(rows.at[others], rows.phi[others], rows.y[others], None if rows.step is None else rows.step[others])
+    rows = rows.only(~alone, range(rows.phi.shape[1]))
     return rows, distinct(rows.phi)
 
 
@@ -97,5 +109,31 @@ def regressors(run: Track, steady: Array | None = None) -> Rows:
     root = 1.0 / np.sqrt(noise)
     y = out["y"][at, 0]
     phi = run.model.settled(out["phi"][at, :, 0], y, run.u, at)
-    step = step_of(run.y)
-    return Rows(at, phi * np.reshape(root, (-1, 1)), y * root, step * np.broadcast_to(root, at.shape) if step else None)
+    step, lags = step_of(run.y), earlier_outputs(run, at, phi, out["y"][:, 0], root)
+    scaled = phi * np.reshape(root, (-1, 1)), y * root
+    return Rows(at, *scaled, step * np.broadcast_to(root, at.shape) if step else None, lags, root * np.ones(len(at)))
+
+
+def earlier_outputs(run: Track, at: Array, phi: Array, y: Array, root: Array) -> Lags | None:
+    """Which columns of phi (N, n) are outputs y (T,) of earlier samples than at (N,), in every row that has such."""
+    count = run.model.output_lags or 0
+    if not count or not len(at):
+        return None
+    place = np.full(len(y), -1)
+    place[at] = np.arange(len(at))
+    columns, source, ratio = [], [], []
+    root = np.broadcast_to(root, at.shape)
+    for j in range(count):
+        for lag in range(1, count + 1):
+            before = at - lag
+            past = np.where(before >= 0, y[before], np.nan)
+            known = np.isfinite(past)
+            if known.any() and (past[known] == phi[known, j]).all():
+                row = np.where(known, place[before], -1)
+                columns.append(j)
+                source.append(row)
+                ratio.append(root / np.where(row >= 0, root[row], 1.0))
+                break
+    if not columns:
+        return None
+    return Lags(np.array(columns), np.stack(source, axis=1), np.stack(ratio, axis=1))

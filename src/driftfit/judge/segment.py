@@ -1,23 +1,19 @@
 """Segments of a whole record: between which dates were the parameters constant, and how certain are the dates?
 
-    min over breaks of  sum over segments of min_theta sum (y_t - phi_t' theta)^2 / noise  +  penalty * number of breaks
+    y_t = x_t' theta_s + v_t,   v_t = sum a_l v_(t-l) + e_t        constant theta_s between two dates
 
-The minimum is found exactly by pruned dynamic programming (`driftfit.judge.statistics.partition`). Rows are first
-divided by the level of the noise, whitened if it is an autoregression, and limited to three levels from the fit, so
-that an outlier does not become a segment (`driftfit.judge.statistics.noise`). If the noise is louder where regressors
-are large, rows are weighted and the search is repeated (`driftfit.judge.segments.noise_of_regressors`). The penalty is
-chosen so that a record of constant parameters is divided with probability ``false``. Each date has an interval that
-contains the true one with probability at least ``level`` (`driftfit.judge.statistics.break_dates`), given that there
-is a break. What a segment does not determine has an infinite error (`driftfit.judge.segments.determined`).
+These are the dates of the verdict, with its error rate: where constants are not rejected at ``false`` there is no
+break (`driftfit.judge.changes`). A further break must gain what draws of constants gain in a fifth of that rate. Each
+date has an interval that holds 95 % of its likelihood, and the parameters of a segment are weighted least squares of
+all of its rows, with standard errors that count the uncertainty of the dates. What a segment does not determine has an
+infinite error.
 
 Use it on complete records in which parameters jump and are constant in between. A `Bank` does the same on-line, and
-`Track.smooth` estimates parameters that drift: a slow drift is cut into steps here. A record of more than 2000 samples
-is first divided on a grid with that many positions, and every date is then moved to the most likely position among all
-samples between its neighbours; two breaks closer than ``shortest`` are not distinguished.
+`Track.smooth` estimates parameters that drift: a slow drift is cut into steps here, and the text says where a gradual
+change or a random walk explains the record better. Breaks closer than ``shortest`` are not distinguished.
 
-Source: Bai and Perron (1998, 2003) for breaks in regressions; Killick, Fearnhead and Eckley (2012) for the pruning; Yao
-(1987), Bai (1997) for dates. Departures: whitening, outliers, weights, a penalty from a rate of false breaks, and
-dates from their likelihood. Cost: O(T n^2) and at most CELLS^2 / 2 factors of order n + 1.
+Source: Bai and Perron (1998, 2003) for breaks in regressions; Jackson et al. (2005) for the partition; Yao (1987) for
+dates. Cost: that of a verdict.
 """
 
 from __future__ import annotations
@@ -34,15 +30,13 @@ from driftfit.data.record import Reading
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
+from driftfit.judge.changes.dates import undetermined
+from driftfit.judge.changes.fit import NONE
+from driftfit.judge.changes.fit import shortest as shortest_of
+from driftfit.judge.changes.words import clauses, events
+from driftfit.judge.evidence import REJECTED, judged_rows
 from driftfit.judge.regressors import refuse_hidden, regressors
-from driftfit.judge.segments.determined import Determined, doubtful
-from driftfit.judge.segments.joint_autoregression import jointly
-from driftfit.judge.segments.noise_of_regressors import relative_size
-from driftfit.judge.statistics.break_dates import dated
-from driftfit.judge.statistics.constancy import shortest as shortest_of
-from driftfit.judge.statistics.noise import HELD, Noise, begun, whitened
-from driftfit.judge.statistics.parts.coarse_readings import drawn_within
-from driftfit.judge.statistics.robust import clipped, fit_in, least_squares, noisy, orthonormal, robust_fit
+from driftfit.judge.statistics.robust import inverted, least_squares, orthonormal
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
@@ -53,9 +47,6 @@ from driftfit.trackers.rls import RLS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-CELLS = 2000
-"""Largest number of positions for breaks that are compared at once."""
 
 
 class Break(NamedTuple):
@@ -113,6 +104,8 @@ class Segmentation(Printed):
     run: Track = field(repr=False, compare=False)
     undivided: str = ""
     """Why the record was not searched for breaks; empty if it was."""
+    better: str = ""
+    """What explains the record better than these steps, in words; empty if nothing does."""
 
     @property
     def theta(self) -> Array:
@@ -137,6 +130,8 @@ class Segmentation(Printed):
             numbers = (cell for value, std in pairs for cell in (digits(value, std), error_text(std)))
             table.add_row(str(part.start), str(part.stop - part.start), *numbers)
         yield table
+        if self.better:
+            yield Text(f" Steps are not the best description: {self.better}.")
         for part in self.segments:
             unknown = [name for name, std in zip(names, part.std, strict=True) if np.isinf(std)]
             if unknown:
@@ -183,7 +178,7 @@ def segment(
     model: Model | None = None,
     *,
     level: float = 0.95,
-    false: float = 0.01,
+    false: float = REJECTED,
     shortest: int | None = None,
     **record: Any,
 ) -> Segmentation:
@@ -198,8 +193,7 @@ def segment(
     level : number
         Level of the intervals for dates.
     false : number
-        Probability that a record of constant parameters is divided, which determines the penalty. If the noise is
-        correlated and its autoregression is estimated, the probability may be several times that.
+        Probability that a record of constant parameters is divided: the level of the test of constants.
     shortest : int or None
         Number of samples in the shortest segment; max(10, 4 n) by default.
     record
@@ -219,106 +213,39 @@ def segment(
     return segmented(run, level=level, false=false, shortest=shortest)
 
 
-def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: int | None = None) -> Segmentation:
+def segmented(run: Track, level: float = 0.95, false: float = REJECTED, shortest: int | None = None) -> Segmentation:
     """Divide the record of a run; see `segment`. The tracker is not used."""
     for name, given in (("level", level), ("false", false)):
         if not 0.0 < given < 1.0:
             raise ValueError(f"segment: {name} must be between 0 and 1, such as 0.95; got {given!r}.")
     refuse_hidden("segment", run.model, "run.theta, or a Regression")
     n = run.model.n
-    least = shortest_of(n) if shortest is None else max(whole("segment", "shortest", shortest, 1), n + 1)
-    rows = regressors(run)
+    fewest = None if shortest is None else whole("segment", "shortest", shortest, 1)
+    least, rows = shortest_of(n, NONE, fewest), regressors(run)
     N = len(rows.y)
     if max(2 * least, n + 2) > N:
         needed = f"{N} samples can be used, and at least {max(2 * least, n + 2)} are needed"
         return _undivided(run, rows.phi, rows.y, level, needed)
-    basis = orthonormal(rows.phi)
-    if not basis.distinct:
-        return _undivided(run, rows.phi, rows.y, level, "the regressors do not distinguish the parameters")
-    phi, y, fit = rows.phi, rows.y, fit_in(basis, rows.y)
-    step = rows.step
-    if step is not None:
-        y = drawn_within(basis.Q, y, step)
-        fit = fit_in(basis, y)
-    if not noisy(fit, phi, y):
-        return _undivided(run, phi, y, level, "constant parameters explain nine of ten outputs without error")
-    found = _searched(basis.Q, fit.residual, least, false)
-    if step is not None and y is rows.y and len(found.breaks):  # those of segments, where constants explain none
-        y = drawn_within(basis.Q, y, step, found.breaks)
-        fit = fit_in(basis, y)
-        found = _searched(basis.Q, fit.residual, least, false)
-    size = relative_size(phi, y, found)
-    if size is not None:
-        basis = orthonormal(phi / size[:, None])
-        weighted = fit_in(basis, y / size)
-        again = _searched(basis.Q, weighted.residual, least, false)
-        # weights also change the correlation of the noise: there they must explain breaks, not add some
-        if not len(again.ar) or len(again.breaks) < len(found.breaks):
-            phi, y, fit, found = phi / size[:, None], y / size, weighted, again
-        else:
-            basis, size = orthonormal(phi), None
-    # a value limited by the fit still supports one side; without its row it does not
-    used = np.abs(found.near) <= HELD * found.level
-    X, z = basis.Q * (used / found.level)[:, None], np.where(used, found.held, 0.0) / found.level
-    breaks, spans = dated(X / found.white, z / found.white, found.ar, found.breaks.tolist(), least, level)
-    at = [int(rows.at[b]) for b in breaks]
-    time = run.time
-    edges = [0, *breaks, N]
-    limits = [0, *at, len(run)]
-    sure = [0, *(limit for span in spans for limit in span), N]
-    parts, held = [], fit.theta
-    for k, limit in enumerate(pairwise(edges)):
-        theta, std = _fitted(phi, y, found, limit, (sure[2 * k], sure[2 * k + 1]), held)
-        held = np.where(np.isfinite(std), theta, held)
-        parts.append(Segment(limits[k], limits[k + 1], theta, std))
-    described = tuple(
-        Break(time[t], time[rows.at[a]], time[rows.at[b]], t) for t, (a, b) in zip(at, spans, strict=True)
+    changes = judged_rows(rows, false, None, level, fewest)
+    if changes is None:
+        distinct = orthonormal(rows.phi).distinct
+        why = "constant parameters explain nine of ten outputs without error"
+        return _undivided(
+            run, rows.phi, rows.y, level, why if distinct else "the regressors do not distinguish the parameters"
+        )
+    found, time = changes.found, run.time
+    at = rows.at[found.breaks]
+    limits = [0, *(int(t) for t in at), len(run)]
+    parts = tuple(
+        Segment(start, stop, theta, std)
+        for (start, stop), theta, std in zip(pairwise(limits), found.theta, found.std, strict=True)
     )
-    spread = float(np.median(found.level if size is None else found.level * size))
-    return Segmentation(described, tuple(parts), level, found.penalty, spread, tuple(map(float, found.ar)), run)
-
-
-def _searched(Q: Array, y: Array, least: int, false: float) -> Noise:
-    search, found, starts = begun(Q, y, CELLS, least, quiet=false)
-    return jointly(search, found, starts, false)
-
-
-def _fitted(
-    phi: Array, y: Array, found: Noise, rows: tuple[int, int], sure: tuple[int, int], held: Array
-) -> tuple[Array, Array]:
-    """theta of the rows a .. b and its standard errors, Huber's for noise that is white after whitening.
-
-    Where the rows next to a break alone tell about a direction, only the rows ``sure`` between the intervals of the
-    dates are used: one row of the neighbouring segment would decide. What they do not determine stays as in ``held``
-    (n,). A segment too short for errors has plain least squares, and errors
-    that are not known. Where more than nine of ten readings lie on one plane, as zeros of rare counts do, Huber's scale
-    vanishes, and least squares takes its place.
-    """
-    (a, b), p, n = rows, len(found.ar), len(held)
-    c = found.level[a:b]
-    X, z = phi[a:b] / c[:, None], y[a:b] / c
-    short = b - a - p <= n
-    first, last = (sure[0] - a, sure[1] - a) if sure[1] - sure[0] - p > n else (0, b - a)
-    if not short:
-        X, z = (part[p:] for part in whitened(X, z, found.ar))
-        first, last = max(first - p, 0), last - p
-    if doubtful(X, first, last):
-        X, z = X[first:last], z[first:last]
-    known = Determined.of(X)
-    start = np.where(known.unknown.any(), held, 0.0)
-    X_known, z = X @ known.M, z - X @ start
-    if short:
-        theta = start + known.M @ least_squares(X_known, z)
-        return theta, np.where(known.unknown, np.inf, np.nan)
-    if not X_known.shape[1]:
-        return start, np.full(n, np.inf)
-    fit = robust_fit(X_known, z)
-    if not noisy(fit, X_known, z):  # most of it lies on one plane: the rest would not count
-        beta = least_squares(X_known, z)
-        fit = clipped(beta, z - X_known @ beta, np.inf)
-    N, r = X_known.shape
-    variance = float(fit.psi @ fit.psi) / max(N - r, 1) / max(float(np.mean(fit.inside)), 0.1) ** 2
-    return start + known.M @ fit.theta, known.errors(X, variance)
+    spans = rows.at[found.spans]
+    breaks = tuple(Break(time[t], time[first], time[last], int(t)) for t, (first, last) in zip(at, spans, strict=True))
+    other = changes.rejected and changes.kind.name != "steps"
+    better = "; ".join(clauses(events(changes, run.model.names, rows.at, run.time_text))) if other else ""
+    noise = float(np.median(changes.model.noise.level))
+    return Segmentation(breaks, parts, level, found.prices[0], noise, tuple(map(float, found.ar)), run, "", better)
 
 
 def _undivided(run: Track, phi: Array, y: Array, level: float, why: str) -> Segmentation:
@@ -331,8 +258,9 @@ def _undivided(run: Track, phi: Array, y: Array, level: float, why: str) -> Segm
         e = np.where(np.abs(e) <= ROUNDING * (np.abs(y) + np.abs(phi) @ np.abs(theta)), 0.0, e)
         spread = float(np.std(e))
         if n < N:
-            known = Determined.of(phi)
-            std = known.errors(phi, e @ e / (N - known.M.shape[1]))
+            unknown = undetermined(phi)
+            std = np.sqrt(np.diag(inverted(phi)) * (e @ e) / max(N - np.linalg.matrix_rank(orthonormal(phi).R), 1))
+            std = np.where(unknown, np.inf, std)
     one = Segment(0, len(run), theta, std)
     return Segmentation((), (one,), level, float("nan"), spread, (), run, why)
 

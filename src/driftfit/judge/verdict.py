@@ -2,33 +2,28 @@
 
 The verdict answers two questions whose answers may differ:
 
-* *Do the parameters move?* Score tests of constant coefficients (`driftfit.judge.statistics.constancy`): the mean
-  square of Nyblom and Hansen, and the suprema over one break and over an interval, with one error rate for all. Their
-  null distribution follows the noise and the excitation of the record itself, so outliers, a changing noise variance,
-  changing inputs and correlated noise are not mistaken for drift. The tests use the record, not the tracker: q and r
-  do not enter. Only what the tracker left out, such as fault codes, is missing here, and for the rivals below, too.
-  If the parameters are constant, the verdict says that they move with probability ``level``, as
-  ``benchmarks/verdict_error_rate.py`` verifies.
+* *Do the parameters move?* One test of constants (`driftfit.judge.changes`), whose null distribution comes from records
+  that the model of constants draws itself, so that outliers, a changing noise variance, changing inputs and correlated
+  noise are not mistaken for drift. The test uses the record, not the tracker: q and r do not enter. Only what the
+  tracker left out, such as fault codes, is missing here, and for the rivals below, too. If the parameters are constant,
+  the verdict says that they move with probability ``level``, as ``benchmarks/judging.py`` verifies.
 * *Does following them pay?* The one-step errors of the run are compared with those of persistence, constant least
   squares on the past, the same with two lags of the outputs and regressors, and a constant ARX, on the same samples,
   with paired tests (`driftfit.judge.statistics.paired`). Correlated noise can be predicted, and so can the effect of a
   drifting parameter. Following therefore pays where the run beats the better of constants without lags and with them.
 
-The first sentence combines both answers. A parameter is named as one that moves if the joint test rejects
-constancy, the test of the parameter still rejects it when the parameters named before are taken into account
-(`driftfit.judge.statistics.attribution`), and its values before and after differ by more than chance explains.
+The first sentence combines both answers. The next ones say what moved, when, and how: in steps, for a time, gradually,
+or as a random walk (`driftfit.judge.changes.words`).
 
-A model without enough lags has correlated noise, which is hard to tell from a drifting intercept. The order of an
-autoregression of the noise is found from the record, ``lags=`` sets it, and the verdict reports it. A parameter that
-wanders as fast as the noise itself is mistaken for such noise. Do not use the verdict for fast smooth oscillations: a
-parameter that swings many times within the record leaves little trace in a cumulated score. Cost: three constant fits,
-O(T n^2).
+A model without enough lags has correlated noise, which is hard to tell from a drifting intercept. The autoregression of
+the noise is found from the record, ``lags=`` sets its order, and the verdict reports it. A parameter that wanders as
+fast as the noise itself is mistaken for such noise; where the noise is nearly a random walk, the verdict says so.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -37,38 +32,32 @@ from rich.text import Text
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
+from driftfit.judge.changes.changes import Changes
+from driftfit.judge.changes.words import Event, clauses, events, rows
 from driftfit.judge.compare import left_at_start
-from driftfit.judge.evidence import Evidence
-from driftfit.judge.regressors import Rows
-from driftfit.judge.statistics.attribution import Attribution, alike, attribute
-from driftfit.judge.statistics.constancy import Constancy, least_rows
+from driftfit.judge.evidence import REJECTED, Evidence, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
-from driftfit.judge.statistics.whiteness import grows_with, whiteness
+from driftfit.judge.statistics.whiteness import LOUDER, grows_with
 from driftfit.readings.gate import FROZEN
 from driftfit.run.result import Track, root_mean_square
 from driftfit.show.text import Printed, digits, facts, table_of
 
-LEVEL = 0.05
-"""Error rate of the statement that the parameters move, where none is given."""
+LEVEL = REJECTED
 RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
-CORRELATED = 1e-3
-"""If the p-value of whiteness of the residuals of segments is below this, they are reported as correlated; the same
-for residuals that grow with a regressor.
-"""
 
 
 @dataclass(frozen=True)
 class Moved:
     """The verdict on one parameter.
 
-    ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: p-value of the path of the estimate, which separates
-    parameters with correlated regressors, given the changes of those named before it. ``moves``: whether it is named as
-    moving. ``at``, ``when``: the sample, and its time as text, of its clearest step. ``before``: its value before its
-    first step. ``after``: the value furthest from that, and ``std`` the standard error of their difference. ``last``:
-    its value after the last step, which is ``before`` again after a temporary fault. ``earliest``, ``latest``: first
-    and last sample of an interval that contains the date of its clearest step with 95 % confidence. ``instead``: the
-    parameters whose step at that time would explain the record as well; the record does not tell which of them moved.
+    ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: that of the path of the estimate, which separates
+    parameters with correlated regressors. ``moves``: whether it is named as moving. ``at``, ``when``: the sample, and
+    its time as text, of its clearest change, the beginning of one that takes time. ``before``: its value before its
+    first change. ``after``: the value furthest from that, and ``std`` the standard error of their difference, NaN for a
+    gradual change. ``last``: its last value, which is ``before`` again after a temporary fault. ``earliest``,
+    ``latest``: first and last sample of an interval that contains the date with 95 % confidence. ``instead``: the
+    parameters whose change at that time would explain the record as well; the record does not tell which of them moved.
     """
 
     name: str
@@ -105,11 +94,11 @@ class Verdict(Printed):
     level : float
         Error rate: how often constant parameters are reported as moving.
     parameters : tuple of Moved
-    alike : tuple of str
-        If parameters move and none is named: those of which one moves; their regressors are too similar to tell which
-        one.
-    since : str
-        Time of the step that explains most of it.
+    events : tuple of Event
+        What happened: steps, temporary and gradual changes, walks.
+    weights : dict
+        Weights of constants (rest), steps, a gradual change, a walk, and a walk with jumps, of sum 1; empty where
+        constants are not rejected.
     rms : float
         Root mean square one-step error of the run on ``scored`` samples.
     rivals : tuple of Paired
@@ -117,9 +106,9 @@ class Verdict(Printed):
     samples, scored : int
         Samples in the test, and in the comparison.
     correlated : bool
-        Whether the residuals are correlated, even within segments of constant coefficients.
+        Whether the noise is correlated, even within segments of constant parameters.
     lags : int
-        Lags of correlation that were allowed for.
+        The last lag of the autoregression of the noise.
     burn : int
         Samples at the beginning that are not scored.
     hidden : bool
@@ -133,6 +122,8 @@ class Verdict(Printed):
         those whose regressors are 0 in every sample that can be used but one at most.
     stuck : int
         Readings of a frozen sensor, which the gate left out.
+    nearly_walk : float
+        Largest root of the noise, if a random walk is not excluded: a level that wanders looks the same. Otherwise 0.
     """
 
     drifts: bool | None
@@ -141,8 +132,8 @@ class Verdict(Printed):
     statistic: float
     level: float
     parameters: tuple[Moved, ...]
-    alike: tuple[str, ...]
-    since: str
+    events: tuple[Event, ...]
+    weights: dict[str, float]
     rms: float
     rivals: tuple[Paired, ...]
     samples: int
@@ -155,6 +146,7 @@ class Verdict(Printed):
     dependent: tuple[tuple[str, ...], ...] = ()
     held: tuple[str, ...] = ()
     stuck: int = 0
+    nearly_walk: float = 0.0
 
     @property
     def constants(self) -> Paired:
@@ -225,29 +217,7 @@ class Verdict(Printed):
         )
 
     def _which(self) -> str:
-        if not self.drifts:
-            return ""
-        if self.moving:
-            return f"These move: {'; '.join(sentence(moved) for moved in self.parameters if moved.moves)}."
-        limit = self.level / (len(self.parameters) - len(self.held))
-        own = {moved.name: moved.p_own for moved in self.parameters}
-        rejected = [name for name in own if own[name] < limit]
-        if len(self.alike) == 1:
-            name = self.alike[0]
-            test = (
-                f"rejects constancy ({p_equals(own[name])}), but its values before and after do not differ clearly"
-                if name in rejected
-                else f"does not confirm it ({p_equals(own[name])}, level {limit:g})"
-            )
-            return f"It probably is {name}, from about {self.since}; its own test {test}."
-        if len(self.alike) < len(self.parameters):
-            return (
-                f"It is one of {', '.join(self.alike)}, from about {self.since}; their regressors are too similar to "
-                "tell which one."
-            )
-        if rejected:
-            return f"The values of {listed(rejected)} vary, but those before and after do not differ clearly."
-        return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."
+        return f"What moves: {'; '.join(clauses(self.events))}." if self.events else ""
 
     def _indistinct(self) -> str:
         idle = [name for name in self.held if not any(name in group for group in self.dependent)]
@@ -296,9 +266,14 @@ class Verdict(Printed):
         text = f"Lower error than this run: {', '.join(better)}. " if better else ""
         if self.correlated:
             text += (
-                "The residuals are correlated, even within segments of constant parameters. A model with too few "
-                f"lags causes this, and so does a fast drift. The test allows for {self.lags} "
-                f"lag{'' if self.lags == 1 else 's'} of correlation; try one more lag in the model. "
+                "The noise is correlated, even within segments of constant parameters. A model with too few lags "
+                "causes this, and so does a fast drift. The test allows for an autoregression up to lag "
+                f"{self.lags}; try one more lag in the model. "
+            )
+        if self.nearly_walk:
+            text += (
+                f"The noise is nearly a random walk (largest root {self.nearly_walk:.4g}): a level that wanders looks "
+                "the same, and this record does not tell them apart. "
             )
         if self.spread_with:
             text += (
@@ -315,13 +290,17 @@ class Verdict(Printed):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for sentence in self.sentences:
             yield Text(f" {sentence}")
-        table = table_of("Parameters", "", "L", "p", "p own", "moves", "before", "after", "+-", "from")
+        table = table_of("Parameters", "", "L", "p", "p own", "moves")
         for m in self.parameters:
             L = f"{m.statistic:.2f}" if m.statistic < 1e6 else f"{m.statistic:.3g}"
-            shown = (L, p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
-            values = (digits(m.before, m.std, 3), digits(m.after, m.std, 3), f"{m.std:.2g}", m.when)
-            table.add_row(Text(m.name), *shown, *(values if m.moves else ("",) * 4))
+            table.add_row(Text(m.name), L, p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
         yield table
+        if self.events:
+            table = table_of("Changes", "", "at", "95 %", "until", "", "before", "after", "+-")
+            for row in rows(self.events):
+                table.add_row(*map(Text, row))
+            yield table
+            yield facts(("Weights", ", ".join(f"{name} {weight:.2f}" for name, weight in self.weights.items())))
         table = table_of("One-step prediction error, root mean square", "", "error", "t", "p")
         table.add_row("this run", f"{self.rms:.5g}", "", "")
         for rival in self.rivals:
@@ -354,17 +333,6 @@ def better_constants(rivals: tuple[Paired, ...]) -> Paired:
 def change(moved: Moved, least: int = 4) -> str:
     """Its values before and after, with at least so many digits."""
     return f"{digits(moved.before, moved.std, least)} to {digits(moved.after, moved.std, least)}"
-
-
-def sentence(moved: Moved) -> str:
-    """The change of one parameter in words."""
-    text = f"{moved.name} from {change(moved)} about {moved.when}"
-    if abs(moved.last - moved.after) > 2.0 * moved.std:
-        back = "back to" if abs(moved.last - moved.before) < 0.5 * abs(moved.after - moved.before) else "then"
-        text += f", {back} {digits(moved.last, moved.std)} at the end"
-    if moved.instead:
-        text += f" (or {' or '.join(moved.instead)}: their steps explain the record as well)"
-    return text
 
 
 def p_text(p: float) -> str:
@@ -402,52 +370,49 @@ def verdict(run: Track, level: float = LEVEL, lags: int | None = None, burn: int
     for name, given in (("lags", lags), ("burn", burn)):
         if given is not None:
             whole("verdict", name, given, 0)
-    return judged(Evidence(run, lags, burn), level)
+    return judged(Evidence(run, lags, burn, level))
 
 
-def judged(known: Evidence, level: float) -> Verdict:
+def judged(known: Evidence) -> Verdict:
     """The verdict where the test of constancy may be shared with the diagnosis."""
-    run, rows, test, lags, names = known.run, known.tested, known.test, known.lags, known.names
-    drifts = None if np.isnan(test.p_joint) else bool(test.p_joint < level)
-    steps = attribute(rows.phi, rows.y, test, level, lags, rows.step) if drifts else None
-    found = {name: _moved(known, steps, i) for i, name in enumerate(names)}
-    moved = tuple(found.get(name, unjudged(name)) for name in run.model.names)
-    groups = tuple(tuple(run.model.names[i] for i in group) for group in known.distinct.groups)
-    at, similar = alike(rows.phi, test) if drifts and not any(m.moves for m in moved) else (0, ())
+    run, found, names = known.run, known.changes, known.names
+    at, level = known.tested.at, known.level
+    happened = () if found is None or not found.rejected else events(found, names, at, run.time_text)
+    own = {name: _moved(found, happened, name, i) for i, name in enumerate(names)} if found is not None else {}
     scored = known.errors.scored
-    own, *others = (rounded(error[scored], run.y[scored]) for error in known.errors[:-1])
-    rivals = tuple(paired(name, error, own) for name, error in zip(RIVALS, others, strict=True))
+    error, *others = (rounded(each[scored], run.y[scored]) for each in known.errors[:-1])
+    rivals = tuple(paired(name, rival, error) for name, rival in zip(RIVALS, others, strict=True))
+    lags = () if found is None else found.model.noise.lags
     return Verdict(
-        drifts=drifts,
+        drifts=None if found is None else found.rejected,
         pays=None if np.isnan(rivals[1].p) else bool(better_constants(rivals).p < level),
-        p=test.p_joint,
-        statistic=test.joint,
+        p=known.p,
+        statistic=float("nan") if found is None else float(found.test.L[0]),
         level=level,
-        parameters=moved,
-        alike=tuple(names[i] for i in similar),
-        since=run.time_text(int(rows.at[at])) if similar else "",
-        rms=root_mean_square(own),
+        parameters=tuple(own.get(name, unjudged(name)) for name in run.model.names),
+        events=happened,
+        weights={} if found is None else found.kind.weights,
+        rms=root_mean_square(error),
         rivals=rivals,
-        samples=len(rows.y),
+        samples=len(at),
         scored=int(scored.sum()),
-        correlated=test.noise is not None and bool(whiteness(test.noise.residual).p < CORRELATED),
-        lags=test.lags,
+        correlated=len(lags) > 0,
+        lags=int(max(lags, default=0)),
         burn=left_at_start(run) if known.burn is None else known.burn,
         hidden=run.model.hidden is not None,
-        spread_with=_spread_with(names, *known.unweighted) if drifts is False else (),
-        dependent=groups,
+        spread_with=_spread_with(names, found) if found is not None and not found.rejected else (),
+        dependent=tuple(tuple(run.model.names[i] for i in group) for group in known.distinct.groups),
         held=tuple(name for name in run.model.names if name not in names),
         stuck=int(np.sum(run.left_out.code == FROZEN)),
+        nearly_walk=found.test.root if found is not None and found.wandering_noise else 0.0,
     )
 
 
-def _spread_with(names: Sequence[str], rows: Rows, test: Constancy) -> tuple[str, ...]:
+def _spread_with(names: Sequence[str], found: Changes) -> tuple[str, ...]:
     """The parameter with residuals that grow most clearly with its regressor, if they do."""
-    if test.noise is None:
-        return ()
-    p = grows_with(test.noise.residual, rows.phi)
+    p = grows_with(found.model.noise.e, found.model.phi)
     most = int(np.argmin(p))
-    return (names[most],) if p[most] * len(p) < CORRELATED else ()
+    return (names[most],) if p[most] * len(p) < LOUDER else ()
 
 
 def unjudged(name: str) -> Moved:
@@ -456,20 +421,16 @@ def unjudged(name: str) -> Moved:
     return Moved(name, nan, nan, nan, False, 0, "", nan, nan, nan, nan, 0, 0)
 
 
-def _moved(known: Evidence, steps: Attribution | None, i: int) -> Moved:
-    run, rows, test, names = known.run, known.tested, known.test, known.names
-    at, own = int(test.at[i]), float(test.p_own[i])
-    before = after = std = last = np.nan
-    named = steps is not None and bool(steps.moves[i])
-    span: Sequence[int] = (at, at)
-    if steps is not None:
-        own = float(steps.p[i])
-        if named:
-            at, span = steps.first(i) or 0, steps.span(i) or (at, at)
-            before, after, std, last = (float(one[i]) for one in (steps.before, steps.after, steps.std, steps.last))
-    places = (int(rows.at[min(place, len(rows.at) - 1)]) if len(rows.at) else 0 for place in (at, *span))
-    sample, earliest, latest = places
-    when = run.time_text(sample)
-    L, p = float(test.L[i]), float(test.p[i])
-    instead = tuple(names[k] for k in steps.instead(i)) if steps is not None and named else ()
-    return Moved(names[i], L, p, own, named, sample, when, before, after, std, last, earliest, latest, instead)
+def _moved(found: Changes, happened: Sequence[Event], name: str, i: int) -> Moved:
+    """What is said of parameter i."""
+    n = len(found.test.theta)
+    L, p, p_own = float(found.test.L[1 + i]), float(found.test.p_path[i]), float(found.test.p_path[n + i])
+    own = [(event, move) for event in happened for move in event.moves if move.name == name]
+    if not own:
+        return replace(unjudged(name), statistic=L, p=p, p_own=p_own)
+    before = own[0][1].before
+    event, move = max(own, key=lambda one: abs(one[1].after - one[1].before) / one[1].std if one[1].std > 0.0 else 0.0)
+    far = max(own, key=lambda one: abs(one[1].after - before))[1]
+    last = own[-1][1].before if own[-1][0].kind == "temporary" else own[-1][1].after
+    where = (event.at, event.when, before, far.after, far.std, last, event.earliest, event.latest)
+    return Moved(name, L, p, p_own, True, *where, move.instead)

@@ -111,11 +111,6 @@ class Program:
         return type(self.model).inspect is not Model.inspect
 
     @cached_property
-    def doubts(self) -> bool:
-        """Whether the tracker looks at a run after it."""
-        return type(self.tracker).doubts is not Tracker.doubts
-
-    @cached_property
     def alone(self) -> Program | None:
         """The program of its output alone; None if the model needs the other outputs, or has none."""
         model = None if self.output is None else self.model.alone(self.output)

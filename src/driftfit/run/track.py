@@ -74,8 +74,6 @@ def track(
         run = _one(programs, records, keep, warm_start, dtype)
     warn_unlearned(run)
     warn_astray(run)
-    if isinstance(run, Track) and run.program.doubts and (doubt := run.tracker.doubts(run)):
-        warn(f"{type(run.tracker).__name__}: {doubt}.", UserWarning)
     warn_ungated(run)
     return run  # type: ignore[no-any-return]
 

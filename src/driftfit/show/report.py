@@ -83,7 +83,7 @@ def check_path(path: str | PathLike[str]) -> Path:
 def page(run: Track, title: str | None = None, alarms: Alarms | None = None, labels: Array | None = None) -> str:
     """The page as HTML text."""
     summary, known = summarise(run), Evidence(run)
-    truth, health = judged(known, LEVEL), diagnosis(known)
+    truth, health = judged(known), diagnosis(known)
     heading = title or _heading(run)
     sections = [
         f"<h1>{escape(heading)}</h1>",

@@ -218,10 +218,6 @@ class Tracker(Settings, ABC):
         """Remarks for the summary of a run: a name and a sentence each."""
         return ()
 
-    def doubts(self, run: Any) -> str:
-        """Why these settings do not suit the record of a run, with the way out, of which `track` warns; or nothing."""
-        return ""
-
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         """Which entries of theta the data should have determined by now but have not, (n,) bool: `track` warns."""
         return np.zeros(len(lane["theta"]), bool)

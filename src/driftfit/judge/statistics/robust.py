@@ -27,7 +27,6 @@ from driftfit.engine.simd import (
     only,
     over,
     plus,
-    root,
     store,
     sum_of,
     times,
@@ -113,33 +112,6 @@ def cholesky(M: Array, n: int) -> float:
     for i in range(n):
         left -= M[k - 1, i] * M[k - 1, i]
     return left if left > 0.0 else 0.0
-
-
-@shared
-def cholesky_of_eight(M: Array, n: int) -> None:
-    """`cholesky` of eight matrices of n + 1 columns side by side: entry (i, j) of M in row (n + 1) i + j of (.., 8).
-
-    The last row becomes the remaining last entries.
-    """
-    k = n + 1
-    for j in range(n):
-        pivot = own = load(M, j * k + j, 0)
-        for i in range(j):
-            entry = load(M, j * k + i, 0)
-            pivot = minus(pivot, times(entry, entry))
-        above = minus(pivot, times(fill(FLAT), own))
-        diagonal = only(root(higher(pivot, fill(0.0))), above)
-        store(M, j * k + j, 0, diagonal)
-        for r in range(j + 1, k):
-            total = load(M, r * k + j, 0)
-            for i in range(j):
-                total = minus(total, times(load(M, r * k + i, 0), load(M, j * k + i, 0)))
-            store(M, r * k + j, 0, only(over(total, diagonal), diagonal))
-    left = load(M, n * k + n, 0)
-    for i in range(n):
-        entry = load(M, n * k + i, 0)
-        left = minus(left, times(entry, entry))
-    store(M, n * k + n, 0, higher(left, fill(0.0)))
 
 
 @shared

@@ -6,8 +6,8 @@ Q is chi-square with K degrees of freedom for martingale differences, whatever t
 at three robust standard deviations, so that a pair of outliers does not decide. Source: Lo and MacKinlay (1989).
 
 Whether residuals are larger where a regressor is: squares, clipped, against the ranks of its size, with the Bartlett
-variance of the sum (White 1980, Newey and West 1987). A gain that is drawn again at every sample does that, and so does
-noise that grows with the input: the two are the same distribution of y.
+variance of the sum over 4 (N / 100)^(2/9) lags (White 1980, Newey and West 1987, 1994). A gain that is drawn again at
+every sample does that, and so does noise that grows with the input: the two are the same distribution of y.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ import numpy as np
 import scipy
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.statistics.bandwidth import rule_of_thumb
 from driftfit.judge.statistics.robust import deviation
+
+LOUDER = 1e-3
+"""p-value of residuals of one size below which they grow with a regressor."""
 
 
 class Whiteness(NamedTuple):
@@ -73,7 +75,7 @@ def grows_with(z: Array, phi: Array) -> Array:
     below, up_to = ([np.searchsorted(np.sort(one), one, side) for one in size.T] for side in ("left", "right"))
     x = (np.array(below) + np.array(up_to)).T / (2.0 * N)
     d = (square - square.mean())[:, None] * (x - x.mean(axis=0))
-    lags = rule_of_thumb(N)
+    lags = int(4.0 * (N / 100.0) ** (2.0 / 9.0))
     total = np.sum(d * d, axis=0)
     for k in range(1, lags + 1):
         total += 2.0 * (1.0 - k / (lags + 1.0)) * np.sum(d[k:] * d[:-k], axis=0)

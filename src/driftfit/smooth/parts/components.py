@@ -202,7 +202,7 @@ def absorb_noise(A: Array, phi: Array, y: float, r: float, noise: Array, row: Ar
     for i in range(len(phi)):
         row[i] = phi[i] * root
     row[len(phi)] = (y - noise[1]) * root
-    return absorb(A, row)
+    return float(absorb(A, row))
 
 
 @shared

@@ -20,10 +20,6 @@ direction) only the first change acts. The tree then grows in the directions tha
 direction enters as the exact limit of a wide prior. Until then changes that reset or return to a prior act only on what
 has been determined.
 
-form="sqrt" keeps factors of the leaves' covariances (`driftfit.trackers.bank.leaves.square_root_form`): the same
-numbers for ordinary data, and no loss of digits or signs for collinear regressors with a wide prior; about twice the
-time.
-
 Source: fixed-lag decisions and trees of hypotheses after the paper on Bayesian tracking of parameters with alternative
 developments; Bar-Shalom, Li and Kirubarajan (2001), chapter 11; Andersson (1985) for the beam. Departures: leaves are
 merged at the present, not at the root; log weights; output lags per leaf. Cost per sample: O(n^2) per leaf update.
@@ -40,7 +36,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import as_numbers, covariance, factor, matrix, numbers, one_of, vector
+from driftfit.engine.settings import as_numbers, covariance, factor, matrix, numbers, vector
 from driftfit.models.base import Model
 from driftfit.trackers.bank import change as changes_
 from driftfit.trackers.bank import reduction as reductions
@@ -48,12 +44,8 @@ from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.layout import (
     COUNT,
     FADE,
-    FAULTS,
     HEAD,
-    HIGHEST,
     LEAVES,
-    LIMIT,
-    LOWEST,
     MOST_REPORTED,
     READING,
     ROW,
@@ -63,15 +55,13 @@ from driftfit.trackers.bank.layout import (
     R,
 )
 from driftfit.trackers.bank.leaves import forget
-from driftfit.trackers.bank.leaves.factored import factorise, widened
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
 from driftfit.trackers.bank.machine.start import begin, limit_forgetting
+from driftfit.trackers.bank.machine.steps import steps_of
 from driftfit.trackers.bank.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.prior import chains, events, per_sample
 from driftfit.trackers.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.trackers.bank.sensor import Sensor
-from driftfit.trackers.bank.spikes import LARGE, evident
-from driftfit.trackers.bank.variants import steps_of
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.coarse.resolution import resolution, unresolved
 from driftfit.trackers.parts.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing
@@ -104,9 +94,6 @@ class Bank(Tracker):
     lag_variance : bool
         Whether leaves with their own output lags (additive outliers, a frozen sensor) carry the uncertainty of these
         lags; see `driftfit.trackers.bank.leaves.lags`. False treats the lags as certain.
-    form : "covariance" or "sqrt"
-        "sqrt" for collinear or badly scaled regressors, a wide prior and little noise: leaves keep factors U D U' of
-        their covariances (`driftfit.trackers.bank.leaves.factored`), whose variances are positive by construction.
 
     Raises
     ------
@@ -122,7 +109,6 @@ class Bank(Tracker):
     p0: Any = None
     initial: Any = None
     lag_variance: bool = True
-    form: str = "covariance"
 
     width: ClassVar[int] = 1
     outputs: ClassVar[tuple[str, ...]] = ("report",)
@@ -142,7 +128,6 @@ class Bank(Tracker):
         if self.p0 is not None:
             self._set("p0", covariance("Bank", "p0", self.p0))
         self._set("theta0", numbers("Bank", "theta0", self.theta0))
-        one_of("Bank", "form", self.form, ("covariance", "sqrt"))
         for name in ("transition", "initial"):
             value = getattr(self, name)
             self._set(name, None if value is None else _tuples(value))
@@ -221,13 +206,6 @@ class Bank(Tracker):
         product = P.sum(axis=2)[0, :, None] * P.sum(axis=1)[:, None, :]
         return self.independent or bool(np.allclose(P, product, rtol=1e-12, atol=1e-15))
 
-    def _frames(self, na: int) -> bool:
-        """Whether the bank may run in the coordinates of its start (`driftfit.trackers.bank.machine.framed`)."""
-        anywhere = not any(one.reset or one.kind == "stabilised" for one in self.all_changes)
-        return (
-            anywhere and na == 0 and self.form == "covariance" and not isinstance(self.reduction, reductions.FirstFloor)
-        )
-
     @property
     def chained(self) -> bool:
         """Whether a gap is a chain of changes, all of them walks, of which leaves distinguish two courses."""
@@ -290,24 +268,22 @@ class Bank(Tracker):
         P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
         theta0 = vector("Bank", "theta0", self.theta0, n)
         sample, counters = np.zeros(SIZE), np.zeros(COUNT, int)
-        sample[READING], sample[R], sample[LIMIT] = np.nan, 1.0, nominal.limit or np.inf
-        sample[LOWEST], sample[HIGHEST] = np.inf, -np.inf
+        sample[READING], sample[R] = np.nan, 1.0
         sample[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
         count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
         squares *= nominal.guess or 0.0
         arrays = arrays_of(self, n, na, unit, theta0)
         scale = 1.0 if nominal.r is not None else np.nan
         if self.p0 is not None and (nominal.r is not None or guessed):
-            leaf = SimpleNamespace(**arrays, n=n, theta=theta0, cov=P0, counters=counters)
+            leaf = SimpleNamespace(**arrays, n=n, theta=theta0, cov=P0, counters=counters, sample=sample)
             limit_forgetting.py_func(leaf)
             begin.py_func(leaf, count, squares)
-            if self.form == "sqrt":
-                factorise.py_func(arrays["leaves"][FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 0.0)
             arrays["root"][:, 0], scale = arrays["leaves"][:, 0], 1.0
+        again = isinstance(self.reduction, reductions.FirstFloor)  # which keeps samples in theta
         q0, Q0 = arrays["walks"][0, : n * (n + 1) // 2], np.zeros((n, n))
         numbers = {
             "n": n, "output_lags": na, "unknown": nominal.r is None, "independent": self.independent,
-            "apart": self._apart, "plain": na == 0 and self.form == "covariance",
+            "apart": self._apart, "plain": na == 0,
         }  # fmt: skip
         Q0[np.tril_indices(n)] = q0
         return {  # memory first, where a cache line begins
@@ -316,8 +292,8 @@ class Bank(Tracker):
             "power_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
             "scale": scale, "count": count, "squares": squares, "sample": sample,
             "counters": counters, **unresolved(),
-            **(knowing_nothing(n, WORST if self._frames(na) else ALMOST_ANY) if self.p0 is None else knowing(n)),
-            "can_frame": int(self.p0 is None and self._frames(na)), "framed": 0, "within": 0.0, "x": np.zeros(n),
+            **(knowing_nothing(n, ALMOST_ANY if again else WORST) if self.p0 is None else knowing(n)),
+            "can_frame": int(not again), "framed": 0, "within": 0.0, "x": np.zeros(n),
             "column": -1,
             "W": np.zeros((n, n)), "Pz": np.zeros((n, n)), "no_power": np.zeros(n),
             "q0": q0, "G": triangular_root(Q0 + np.tril(Q0, -1).T), "size0": self.all_changes[0].increments(n)[1],
@@ -365,10 +341,7 @@ class Bank(Tracker):
         B = self._leaves(lane)
         factor = B[S] / (B[NU] - 2.0) if lane["unknown"] else np.ones(B.shape[1])
         each, C = 1.0 / np.where(factor > 0.0, factor, 1.0), B[FIRST + n : FIRST + n + n * (n + 1) // 2]
-        if self.form == "sqrt":
-            widened(C, p[:, None] * each)
-        else:
-            C += add[np.tril_indices(n)][:, None] * each
+        C += add[np.tril_indices(n)][:, None] * each
 
     def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
         """All leaves are moved by the same amount, so that the mixture is at the given value."""
@@ -416,11 +389,6 @@ class Bank(Tracker):
         if len(self.all_sensors) > 1:
             text += f", {wrong} fault{'' if wrong == 1 else 's'} of the sensor"
         facts = [("Events", f"{text}; see run.hypotheses.events()")]
-        if doubt := self.doubts(run):
-            facts.append(("Spikes", doubt))
-        faults = int(run.state["counters"][FAULTS])
-        if faults:
-            facts.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
         if hypotheses.impossible:
             facts.append(
                 ("Impossible", f"{hypotheses.impossible} samples that every hypothesis ruled out, left unused")
@@ -429,16 +397,6 @@ class Bank(Tracker):
         if (never := np.isinf(lane["var"])).any():
             facts.append(not_learned(run, np.array(run.names)[never]))
         return (*facts, *(resolution(lane) if self.all_sensors[0].r is None else ()))
-
-    def doubts(self, run: Any) -> str:
-        count = evident(run) if self.changes is None and self.sensors is None else 0
-        if not count:
-            return ""
-        return (
-            f"after {count} innovations of more than {LARGE:g} standard deviations the parameters returned to where "
-            "they were, so these look like spikes rather than jumps; give "
-            "Bank(sensors=[Sensor.nominal(), Sensor.outlier()])"
-        )
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
         """Which entries of theta the regressors have distinguished so far, (n,) bool."""
@@ -452,7 +410,7 @@ class Bank(Tracker):
     @property
     def steps(self) -> TrackerSteps:
         own = tuple(sensor.likelihood for sensor in self.all_sensors if sensor.kind == "own")
-        return steps_of(self.form == "sqrt", own)
+        return steps_of(own)
 
 
 def _tuples(value: Any) -> Any:

@@ -109,15 +109,20 @@ class Change(Settings):
         """Whether it is anything other than a random walk."""
         return self.reset or self.forget < 1.0
 
+    @property
+    def resets_some(self) -> bool:
+        """Whether it resets some parameters, and not all."""
+        return self.reset and self.which is not None
+
     def mapping(self) -> tuple[float, float, float, float]:
         """The row of `driftfit.trackers.bank.leaves.forget` for this change."""
         kinds = {
             "exponential": forget.EXPONENTIAL, "directional": forget.DIRECTIONAL, "stabilised": forget.STABILISED,
         }  # fmt: skip
         kind = kinds[self.kind] if self.forget < 1.0 else forget.WALK
-        if self.reset and self.which is not None:
+        if self.resets_some:
             kind = forget.PARTIAL
-        keep = 0.0 if self.reset and self.which is None else 1.0 / self.forget
+        keep = 0.0 if self.reset and not self.resets_some else 1.0 / self.forget
         return keep, float(keep == 0.0), float(kind), float(np.log(self.forget))
 
     def anchors(self, n: int, unit: float) -> Array:
@@ -125,8 +130,9 @@ class Change(Settings):
         rows = np.zeros((n, n))
         if self.anchor is not None:
             rows = forget.anchors_of(matrix("Change", "anchor", self.anchor, n) * unit)
-        elif self.reset and self.which is not None:
-            rows[0, list(self.which)] = 1.0
+        elif self.resets_some:
+            rows = np.eye(n)
+            rows[list(self.which), list(self.which)] = 0.0
         return rows
 
     def increments(self, n: int) -> tuple[Array, Array]:

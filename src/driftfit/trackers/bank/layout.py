@@ -13,6 +13,8 @@ With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m s
     prior                   p(next joint event | leaf), (H, leaves)
     walks, relative_walks   covariances that changes add in a nominal sample; in units of r / (mean square of phi_i)
     fixed_walks             `walks` for theta, where `machine.framed` writes `walks` in other coordinates
+    fixed_places            `places` likewise
+    lag_rows                for each output lag its coefficients as a function of z, and its value in the record
     drift                   factors of the drift of every change at this sample
     Q                       covariances that changes add in this interval, and a spare row
     maps, maps_nominal      changes that forget (`leaves.forget`), for this interval and for a nominal one
@@ -27,14 +29,16 @@ With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m s
     root, samples           the start and the samples from which the tree is grown again (`reducing.refilter`)
     ring                    recent samples, for the events of a stream
     new_events              the entries that an event adds to a history
-    gap, path               changes that may have happened since the last used sample (`machine.gaps`)
+    gap, path               changes that may have happened since the last used sample (`machine.gap`)
     lag_prob, newest        marginals of the events of all levels; of the levels that are reported
     C, m, z, g              for the columns that a sample updates: covariance, mean, regressor, C z
     expected                z'C z and z'm of these columns
     scores                  the unit of their covariance, or their log density; then two spare rows
-    scratch, from_g, spare  scratch rows: all of them, those from g on, and those that contain none of the above
+    scratch, spare          scratch rows: all of them, and those that contain none of the above
+    from_C, from_g          those from C on, which are all but z, and from g on
     answers                 results of a user's own likelihood for each leaf (`leaves.own_sensor`)
-    spare_lags, narrow      spare rows, as many as output lags; spare rows of eight columns
+    spare_lags              spare rows, as many as output lags; `spare_square` as many as entries of a matrix
+    lag_coefficients        the coefficients of the output lags
 """
 
 from __future__ import annotations
@@ -47,29 +51,26 @@ from driftfit.trackers.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
 
 (
     LEAVES, PARENTS, GROUPS, TREE_LEVELS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED,
-    OPEN, REFUSED, FAULTS, AGAIN, TAKEN, CHAINED, ALIKE, WIDE, PARTED, PHASE, LOOKED, COUNT,
-) = range(24)  # fmt: skip
+    OPEN, TAKEN, CHAINED, ALIKE, WIDE, PARTED, PHASE, LOOKED, COUNT,
+) = range(21)  # fmt: skip
 """Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY if
 it begins with the next sample. OPEN levels have passed since the last used sample
-(`driftfit.trackers.bank.machine.gaps`); REFUSED samples in a row were too far from what was expected, FAULTS in all;
-AGAIN is 1 if the present one was just refused; TAKEN steps of its interval are already in the table of a gap. Four
-counters are flags of the present sample: CHAINED if the user gave a chain of changes, ALIKE if all leaves have the same
-prior, WIDE if its level is not that of one nominal interval, PARTED if leaves are continued as two
-(`machine.gaps.chain_gap`). PHASE says what the routine is called for, LOOKED for which kind of sample its forecast was.
+(`driftfit.trackers.bank.machine.gap`); TAKEN steps of its interval are already in the table of a gap. Four counters
+are flags of the present sample: CHAINED if the user gave a chain of changes, ALIKE if all leaves have the same prior,
+WIDE if its level is not that of one nominal interval, PARTED if leaves are continued as two
+(`machine.markov_gap`). PHASE says what the routine is called for, LOOKED for which kind of sample its forecast was.
 """
 WAITING, READY = 0, -1
 LEARN, FORECAST = 0, 1
 (
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_OBSERVED, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
-    SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SHIFT, READING, LOWEST, HIGHEST, DOUBTS, ENTERS, SIZE,
-) = range(28)  # fmt: skip
+    SQUARES, TIMES, ELAPSED, MOST, FREEDOM, SHIFT, READING, UNIT, SIZE,
+) = range(24)  # fmt: skip
 """Numbers of the present sample: inputs and results. MOST is the largest mean square that a leaf's own prediction may
 have in its output lags (`driftfit.trackers.bank.leaves.lags`). FREEDOM is the degrees of freedom of an estimated noise
 variance before the tree grows, the number of residuals until then; inf for a variance that is given. The reading is y +
 SHIFT (`driftfit.trackers.parts.coarse.resolution`). READING is the last accepted reading, LAST the same minus the
-present shift; LOWEST and HIGHEST are the limits of all accepted readings. DOUBTS is the recent number of refused
-samples within them. ENTERS is the length of the regressor along a direction in which it is the first
-(`machine.late_direction`), else 0.
+present shift. UNIT is the mean of the units of the covariances of leaves: 1, or the noise variance where it is unknown.
 """
 NEVER = 1e9
 """The number of levels since the last change, for a leaf without a change."""
@@ -84,7 +85,8 @@ MOST_REPORTED = 8
 
 MATRICES = (
     "parents", "leaves", "history", "history_2", "prior", "walks", "fixed_walks", "relative_walks", "maps",
-    "maps_nominal", "places", "sensors", "transition", "loss", "components", "root", "samples", "Q", "ring",
+    "maps_nominal", "places", "fixed_places", "lag_rows", "spare_square",
+    "sensors", "transition", "loss", "components", "root", "samples", "Q", "ring",
     "new_events", "gap", "path", "chain", "lag_prob", "scratch",
 )  # fmt: skip
 VECTORS = ("drift", "initial", "row", "given", "given_chain", "reduction", "bases", "stamps")
@@ -92,18 +94,41 @@ WHOLE = ("parent", "event", "start", "order", "group", "slots")
 """Arrays of whole numbers."""
 REPORTED = ("newest", "decided")
 """Arrays that are part of the report."""
-WINDOWS = ("C", "m", "z", "g", "from_g", "expected", "scores", "spare", "spare_lags", "narrow", "answers")
+WINDOWS = (
+    "z",
+    "from_C",
+    "C",
+    "m",
+    "g",
+    "from_g",
+    "expected",
+    "scores",
+    "spare",
+    "spare_lags",
+    "lag_coefficients",
+    "answers",
+)
 """Rows of the scratch that have names."""
 OUTSIDE = {
     "report": VECTOR, "phi": VECTOR, "powers": VECTOR, "theta": VECTOR, "cov": MATRIX, "counters": COUNTS,
     "sample": VECTOR,
 }  # fmt: skip
 """Arrays that are fields of the state themselves."""
-NUMBERS = ("n", "output_lags", "unknown", "independent", "plain", "walks_only", "apart", "own_likelihoods")
+NUMBERS = (
+    "n",
+    "output_lags",
+    "unknown",
+    "independent",
+    "plain",
+    "walks_only",
+    "apart",
+    "in_coordinates",
+    "own_likelihoods",
+)
 """n; the number of separate output lags of leaves; whether the noise is unknown, and whether events are independent;
 whether all leaves have one regressor, all changes are walks and all sensors differ in their noise alone; whether all
-changes are walks; whether what may have happened since the last used sample is one level; and the address of the user's
-own likelihoods, while the compiled routine runs.
+changes are walks; whether what may have happened since the last used sample is one level; whether leaves are in
+coordinates of the start (`machine.framed`); and the address of the user's own likelihoods, during a sample.
 """
 BASES = ("memory", *(f"{name}_at" for name in OUTSIDE))
 """Rows with addresses: of the field `memory`, in which most arrays lie one after the other, so that banks of all

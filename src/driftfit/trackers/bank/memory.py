@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
-from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.layout import (
     COUNT,
     HEAD,
@@ -27,11 +26,10 @@ from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 from driftfit.trackers.bank.machine.ancestry import news_of
-from driftfit.trackers.bank.machine.gaps.gap import SINCE
+from driftfit.trackers.bank.machine.gap import SINCE
 from driftfit.trackers.bank.reducing import selection
 from driftfit.trackers.bank.reducing.lookahead import NODES
-from driftfit.trackers.bank.reduction import Reduction
-from driftfit.trackers.bank.sensor import Sensor, table_of
+from driftfit.trackers.bank.sensor import table_of
 
 SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
@@ -41,26 +39,7 @@ RING = 256
 """Samples of which a stream remembers probabilities, for events."""
 
 
-class Settings(Protocol):
-    """The settings of a `Bank`, as far as its memory depends on them."""
-
-    @property
-    def all_changes(self) -> tuple[Change, ...]: ...
-    @property
-    def all_sensors(self) -> tuple[Sensor, ...]: ...
-    @property
-    def reduction(self) -> Reduction: ...
-    @property
-    def event_probabilities(self) -> tuple[Array, Array]: ...
-    @property
-    def chained(self) -> bool: ...
-    @property
-    def lag_variance(self) -> bool: ...
-    @property
-    def form(self) -> str: ...
-
-
-def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
+def arrays_of(bank: Any, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
     """The arrays of `driftfit.trackers.bank.layout` before the first sample, but for fields of the state and
     windows of the scratch; covariances are multiplied by ``unit``.
     """
@@ -69,11 +48,10 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
     tri, K, W = n * (n + 1) // 2, shape.children * twice, shape.levels
     rows = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0)
     forgets = any(one.forgets for one in bank.all_changes)
-    more = na + (tri + 2 * n if forgets else 0)
+    more = 2 * na + (tri + 2 * n if forgets else 0)
+    square = n * n if any(one.resets_some for one in bank.all_changes) else 0
     parents, children = _room(max(shape.parents * twice, K // H), Hd, Hm)
     more += ANSWERS if any(sensor.kind == "own" for sensor in bank.all_sensors) else 0
-    if bank.form == "sqrt":
-        parents, more = parents + WIDTH, more + n + -(-(2 * tri + 4 * n) * WIDTH // children)
     remembered, links = _whole_vectors(W * (H + 1)), _whole_vectors(K + 1)
     refilters, waits = shape.knobs[selection.KIND] == selection.REFILTER, shape.knobs[selection.WAIT] > 0.0
     return _of_changes(bank, n, unit, theta0) | {
@@ -88,13 +66,14 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
         "components": np.zeros((4 + NODES, K * H if waits else 1)), "root": np.zeros((rows, WIDTH)),
         "samples": np.zeros((int(shape.knobs[selection.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
         "path": path_of(H, Hd, _whole_vectors(tri) if bank.chained else 0),
+        "spare_square": np.zeros((square, children)), "lag_rows": np.zeros((na, n + 1)),
         "ring": np.zeros((RING, SAMPLE_HEAD + H)), "new_events": news_of(H, Hm, remembered),
         "lag_prob": np.zeros((W, H)), "newest": np.zeros((min(W, MOST_REPORTED), H)),
         "decided": np.full((shape.held, 3), -1.0),
     }  # fmt: skip
 
 
-def _of_changes(bank: Settings, n: int, unit: float, theta0: Array) -> dict[str, Array]:
+def _of_changes(bank: Any, n: int, unit: float, theta0: Array) -> dict[str, Array]:
     """The arrays of the changes of theta."""
     changes, Hd, tri = bank.all_changes, len(bank.all_changes), n * (n + 1) // 2
     steps, lower, wide = [one.increments(n) for one in changes], np.tril_indices(n), _whole_vectors(tri)
@@ -109,9 +88,9 @@ def _of_changes(bank: Settings, n: int, unit: float, theta0: Array) -> dict[str,
     return {
         "walks": walks, "fixed_walks": walks,
         "relative_walks": np.array([sizes if scaled else sizes[:0] for _, sizes in steps]), "drift": np.ones(Hd),
-        "Q": np.zeros((Hd + 1, wide)), "maps": maps, "maps_nominal": maps, "places": places, "transition": transition,
-        "chain": transition.copy(),
-        "initial": initial, "given_chain": np.full(Hd * Hd, np.nan), "gap": _closed(Hd, wide),
+        "Q": np.zeros((Hd + 1, wide)), "maps": maps, "maps_nominal": maps, "places": places, "fixed_places": places,
+        "transition": transition, "chain": transition.copy(), "initial": initial,
+        "given_chain": np.full(Hd * Hd, np.nan), "gap": _closed(Hd, wide),
     }  # fmt: skip
 
 
@@ -125,9 +104,10 @@ def windows(n: int, na: int, rows: int) -> dict[str, tuple[int, int]]:
     tri = n * (n + 1) // 2
     g, scores = tri + 2 * n, _named_rows(n)
     return {
-        "C": (0, tri), "m": (tri, n), "z": (tri + n, n), "g": (g, n), "from_g": (g, rows - g), "expected": (g + n, 2),
-        "scores": (scores, 3), "spare": (scores + 1, rows - scores - 1), "spare_lags": (rows - na, na),
-        "narrow": (scores + 3, rows - scores - 3), "answers": (rows - na - ANSWERS, ANSWERS),
+        "z": (0, n), "from_C": (n, rows - n), "C": (n, tri), "m": (tri + n, n), "g": (g, n), "from_g": (g, rows - g),
+        "expected": (g + n, 2), "scores": (scores, 3), "spare": (scores + 1, rows - scores - 1),
+        "spare_lags": (rows - na, na), "lag_coefficients": (rows - 2 * na, na),
+        "answers": (rows - 2 * na - ANSWERS, ANSWERS),
     }  # fmt: skip
 
 
@@ -147,8 +127,6 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
     start, rows, columns = table[ROW["scratch"]]
     for name, (first, count) in windows(n, na, rows).items():
         table[ROW[name]] = start + 8 * first * columns, count, columns
-    first, count = windows(n, na, rows)["narrow"]
-    table[ROW["narrow"], 1:] = count * columns // WIDTH, WIDTH
     for name in ("phi", "powers", "theta"):
         table[ROW[name]] = 0, 1, n
     table[ROW["report"]], table[ROW["cov"]] = (0, 1, HEAD), (0, n, n)
@@ -163,12 +141,12 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
 
 
 def path_of(H: int, Hd: int, wide: int) -> Array:
-    """The table of `driftfit.trackers.bank.machine.gaps.chain_gap`; empty if there is none."""
+    """The table of `driftfit.trackers.bank.machine.markov_gap`; empty if there is none."""
     return np.zeros((3 * H + Hd + 1 if wide else 0, max(H, wide) + 1))
 
 
 def _closed(Hd: int, wide: int) -> Array:
-    """The table of a gap (`driftfit.trackers.bank.machine.gaps.gap`) while there is no gap."""
+    """The table of a gap (`driftfit.trackers.bank.machine.gap`) while there is no gap."""
     table = np.zeros((Hd, wide + WIDTH))
     table[0, wide + SINCE] = 1.0
     return table

@@ -43,13 +43,12 @@ class Sensor(Settings):
     guess: float | None = None
     nu: float = 4.0
     memory: float | None = 100.0
-    limit: float | None = None
     likelihood: Any = None
     own_lags: bool = False
 
     def __post_init__(self) -> None:
         one_of("Sensor", "kind", self.kind, KINDS)
-        for name in ("r", "guess", "factor", "resolution", "limit"):
+        for name in ("r", "guess", "factor", "resolution"):
             if getattr(self, name) is not None:
                 self._set(name, numbers("Sensor", name, getattr(self, name), ndim=0, low=0.0, strict=True))
         self._set("value", numbers("Sensor", "value", self.value, ndim=0))
@@ -78,19 +77,14 @@ class Sensor(Settings):
         guess: float | None = None,
         nu: float = 4.0,
         memory: float | None = 100.0,
-        limit: float | None = None,
     ) -> Sensor:
         """The sensor in its normal state, with noise variance r.
 
         r=None: the variance is unknown, and every leaf carries an inverse gamma distribution of it that forgets over
         ``memory`` samples (None: never). 1 / ``guess`` is the mean of 1 / r before the first sample, with the weight of
         ``nu`` samples; without a guess it comes from the first residuals, and q and p0 are in units of it.
-
-        A sample further than ``limit`` standard deviations from its forecast is treated as a fault code: it counts as
-        missing, also as a lag, and is counted. After three in a row the next one is accepted, and so are readings
-        within the range of earlier ones after three in some fifty samples: the forecasts are wrong then. None: never.
         """
-        return cls("nominal", r, prob, guess=guess, nu=nu, memory=memory, limit=limit)
+        return cls("nominal", r, prob, guess=guess, nu=nu, memory=memory)
 
     @classmethod
     def outlier(cls, scale: float = 10.0, kind: str = "innovation", prob: float = 0.05, plus: bool = False) -> Sensor:

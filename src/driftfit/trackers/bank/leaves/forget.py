@@ -28,10 +28,9 @@ KEEP, RESET, KIND, GAIN = range(4)
 interval 1/lam - 1 (directional), 1 - lam (stabilised), or whether time passes.
 """
 WALK, EXPONENTIAL, DIRECTIONAL, STABILISED, PARTIAL = range(5)
-MEAN, BEFORE, PER_CAP, RAY, ANCHORS = range(5)
+MEAN, BEFORE, PER_CAP, ANCHORS = range(4)
 """Rows of the table of places: theta0, the regressor of the last used sample, the reciprocals of the caps of variances
-(0: none), the direction that a sample determines first (`driftfit.trackers.bank.machine.late_direction`), and from
-ANCHORS on n rows for every change: W, or in the first of them which parameters are reset.
+(0: none), and from ANCHORS on n rows for every change: W, or D with zeros for the parameters that are reset.
 """
 GROWTH = 1e8
 """Exponential forgetting may let a variance grow to this multiple of its value when the tree begins, or when a sample
@@ -132,25 +131,45 @@ def measure(C: Array, m: Array, a: int, b: int, w: Array, mean: Array, r: float,
 
 
 @shared
-def renew(C: Array, m: Array, a: int, b: int, which: Array, mean: Array, q: Array) -> None:
-    """Reset some parameters."""
-    at = 0
-    for i in range(len(which)):
-        if which[i] > 0.0:
+def renew(C: Array, m: Array, a: int, b: int, D: Array, mean: Array, q: Array, X: Array) -> None:
+    """Reset some parameters: m <- mean + D (m - mean), C <- D (C - Q) D' + Q; X has n n spare rows."""
+    n, at = len(D), 0
+    for i in range(n):
+        for j in range(n):
+            to = X[i * n + j]  # (C - Q) D'
             for l in range(a, b):
-                m[i, l] = mean[i]
+                to[l] = 0.0
+            for k in range(n):
+                entry = i * (i + 1) // 2 + k if k <= i else k * (k + 1) // 2 + i
+                for l in range(a, b if D[j, k] != 0.0 else a):
+                    to[l] += D[j, k] * (C[entry, l] - q[entry])
+    for i in range(n):
         for j in range(i + 1):
-            if which[i] > 0.0 or which[j] > 0.0:
-                for l in range(a, b):
-                    C[at, l] = q[at]
+            for l in range(a, b):
+                C[at, l] = q[at]
+            for k in range(n):
+                for l in range(a, b if D[i, k] != 0.0 else a):
+                    C[at, l] += D[i, k] * X[k * n + j, l]
             at += 1
+    for i in range(n):
+        away = mean[i]
+        for k in range(n):
+            away -= D[i, k] * mean[k]
+        for l in range(a, b):
+            X[i, l] = away
+        for k in range(n):
+            for l in range(a, b if D[i, k] != 0.0 else a):
+                X[i, l] += D[i, k] * m[k, l]
+    for i in range(n):
+        for l in range(a, b):
+            m[i, l] = X[i, l]
 
 
 @shared
 def apply(t: Any, C: Array, m: Array, a: int, b: int, c: int, work: Array) -> None:
     """Complete change c in the columns a .. b of C and m, to which KEEP, RESET and Q have been applied.
 
-    ``work`` has n rows, for C z, and one more.
+    ``work`` has n rows, for C z, and one more; where some parameters are reset n n rows.
     """
     maps, places, n = t.maps, t.places, t.n
     kind = int(maps[c, KIND])
@@ -162,7 +181,7 @@ def apply(t: Any, C: Array, m: Array, a: int, b: int, c: int, work: Array) -> No
         for k in range(n):
             measure(C, m, a, b, places[ANCHORS + c * n + k], places[MEAN], 1.0 / maps[c, GAIN], work)
     elif kind == PARTIAL and maps[c, GAIN] > 0.0:
-        renew(C, m, a, b, places[ANCHORS + c * n], places[MEAN], t.Q[c])
+        renew(C, m, a, b, places[ANCHORS + c * n : ANCHORS + (c + 1) * n], places[MEAN], t.Q[c], t.spare_square)
 
 
 @shared

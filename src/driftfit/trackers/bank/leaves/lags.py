@@ -56,18 +56,31 @@ def push(t: Any, L: int, observed: bool, y_hat: Array, most: float) -> None:
 
 
 @shared
+def write_coefficients(t: Any, columns: int) -> None:
+    """The coefficients of the output lags, where leaves are in coordinates of the start."""
+    m, rows, a = t.m, t.lag_rows, t.lag_coefficients
+    for i in range(t.output_lags if t.in_coordinates > 0 else 0):
+        for l in range(columns):
+            a[i, l] = 0.0
+            for k in range(t.n):
+                a[i, l] += rows[i, k] * m[k, l]
+
+
+@shared
 def widen_by_lags(t: Any, B: Array, K: int, columns: int) -> None:
     """h <- h + a' V a for columns c K + l, whose lags are those of leaf l of B."""
-    na, m, h = t.output_lags, t.m, t.expected[0]
+    na, h = t.output_lags, t.expected[0]
     at = covariance_row(t.n, na)
     if at >= len(B):
         return
+    write_coefficients(t, columns)
+    a = t.lag_coefficients if t.in_coordinates > 0 else t.m
     for i in range(na):
         for j in range(i + 1):
             twice = 1.0 if i == j else 2.0
             for start in range(0, columns, K):
                 for l in range(K):
-                    h[start + l] += twice * m[i, start + l] * m[j, start + l] * B[at, l]
+                    h[start + l] += twice * a[i, start + l] * a[j, start + l] * B[at, l]
             at += 1
 
 
@@ -76,11 +89,13 @@ def shift_covariance(t: Any, A: Array, K: int, at: int, columns: int, own: bool)
     """V of the leaves from column ``at`` on, whose parents are K columns of A: moved by one lag, with the variance of
     the new entry, which is zero if it was measured or replaced. A may be the leaves themselves.
     """
-    B, na, m, expected, X = t.leaves, t.output_lags, t.m, t.expected, t.spare_lags
+    B, na, expected, X = t.leaves, t.output_lags, t.expected, t.spare_lags
     r, most, block = t.sample[R], t.sample[MOST], slice(at, at + columns)
     first = covariance_row(t.n, na)
     if first >= len(B):
         return
+    write_coefficients(t, columns)
+    a = t.lag_coefficients if t.in_coordinates > 0 else t.m
     for i in range(na - 1):  # V a, but for its last entry
         for l in range(columns):
             X[i, l] = 0.0
@@ -88,7 +103,7 @@ def shift_covariance(t: Any, A: Array, K: int, at: int, columns: int, own: bool)
             entry = A[first + (i * (i + 1) // 2 + j if j <= i else j * (j + 1) // 2 + i)]
             for start in range(0, columns, K):
                 for l in range(K):
-                    X[i, start + l] += entry[l] * m[j, start + l]
+                    X[i, start + l] += entry[l] * a[j, start + l]
     for i in range(na - 1, 0, -1):  # V moves down by a row and a column
         for j in range(i, 0, -1):
             to, was = B[first + i * (i + 1) // 2 + j, block], A[first + (i - 1) * i // 2 + j - 1]

@@ -110,7 +110,7 @@ def variance_factor(t: Any, X: Array, row: int, L: int) -> None:
 @part(sizes=(2, 3, 4))
 def mixture(n: int, t: Any, L: int) -> None:
     """Mean and covariance (lower triangle) of all leaves: sum w m, sum w (C + d d'), d = m - mean."""
-    B, X, theta, P = t.leaves, t.scratch, t.theta, t.cov
+    B, X, theta, P = t.leaves, t.from_C, t.theta, t.cov
     variance_factor(t, X, n, L)
     parts, tri = n + 1, n * (n + 1) // 2
     for i in range(n):  # the mean, and d in the first rows of the scratch
@@ -214,8 +214,16 @@ def increments(t: Any, time: float, each: float) -> None:
 
 
 @shared
-def ready(t: Any) -> None:
-    """Prepare covariances of changes for leaves: here they are used unchanged."""
+def regressors_from_lags(t: Any, B: Array, L: int, copies: int, phi: Array) -> None:
+    """x of every leaf in coordinates of the start: x + R' d, d the difference of its output lags from the record's."""
+    z, rows, lags = t.z, t.lag_rows, FIRST + t.n + t.n * (t.n + 1) // 2
+    for i in range(t.n):
+        for l in range(copies * L):
+            z[i, l] = phi[i]
+        for k in range(t.output_lags):
+            for at in range(0, copies * L, L):
+                for l in range(L):
+                    z[i, at + l] += rows[k, i] * (B[lags + k, l] - rows[k, t.n])
 
 
 @part
@@ -223,6 +231,9 @@ def regressors(n: int, t: Any, B: Array, L: int, copies: int, phi: Array) -> Non
     """The regressor of every leaf, with separate output lags if it has any; otherwise phi, for the first eight."""
     z, na = t.z, t.output_lags
     lags = FIRST + n + n * (n + 1) // 2
+    if na > 0 and t.in_coordinates > 0:
+        regressors_from_lags(t, B, L, copies, phi)
+        return
     for i in range(na):
         for at in range(0, copies * L, L):
             for l in range(L):

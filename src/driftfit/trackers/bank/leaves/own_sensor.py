@@ -14,7 +14,7 @@ so C remains a covariance whatever the function returns; with a = inf nothing is
 then `LARGEST` times h + r). ``clean`` goes into the leaf's output lags, if the sensor ``cleans``.
 
 The function is compiled by itself, in a second or two, and the compiled routine of a bank calls it by its address
-(`driftfit.trackers.bank.leaves.callback`); the routine is not recompiled.
+(`call`), which a step has looked up by its symbol; the routine is not recompiled.
 """
 
 from __future__ import annotations
@@ -24,19 +24,51 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from numba import types
 
 from driftfit.engine.kernel import Array, State, floats, kernel, machine, shared
+from driftfit.engine.numba_internals import ir, named_intrinsic
 from driftfit.engine.simd import WIDTH
-from driftfit.trackers.bank.layout import READING, SHIFT
-from driftfit.trackers.bank.leaves.callback import address_of, call
+from driftfit.trackers.bank.layout import READING, ROW, SHIFT
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
 
+OWN_AT = ROW["own_likelihoods"]
 LARGEST, LEAST = 1e12, 1e-12
 """Limits of noise variances: at most this multiple of the forecast's variance, which has no effect, and at least this
 share of the nominal one.
 """
 LOG_P, NOISE, CLEAN = range(3)
 """Entries of what a function returns."""
+NUMBERS = 6
+"""Numbers that a function called by its address takes, before the address of its results."""
+_KIND = ir.FunctionType(ir.VoidType(), [ir.DoubleType()] * NUMBERS + [ir.IntType(64)])
+
+
+def _address_of(context: Any, machine: Any) -> Any:
+    """The address of a compiled routine in this process."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        known = builder.module.globals.get(machine.symbol)
+        function = known or ir.Function(builder.module, _KIND, machine.symbol)
+        return builder.ptrtoint(function, ir.IntType(64))
+
+    return types.intp(machine), build
+
+
+def _call(context: Any, address: Any, numbers: Any, out: Any) -> Any:
+    """Call the function at an address with a tuple of six numbers and the address of its results."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        at, given, results = arguments
+        values = [builder.extract_value(given, k) for k in range(NUMBERS)]
+        builder.call(builder.inttoptr(at, _KIND.as_pointer()), [*values, results])
+        return context.get_dummy_value()
+
+    return types.void(types.intp, types.UniTuple(types.float64, NUMBERS), types.intp), build
+
+
+address_of = named_intrinsic("callback.address_of", _address_of)
+call = named_intrinsic("callback.call", _call)
 
 
 @shared
@@ -93,14 +125,14 @@ def clean_all(t: Any, at: int, columns: int) -> None:
 
 
 @kernel
-def own_address(s: State) -> int:
-    """The address of the functions of a bank; most banks have none."""
-    return 0
+def no_own_sensor(s: State, l: int) -> None:
+    """Most banks have no functions of the user's."""
+    s.table[OWN_AT, 0, l] = 0
 
 
 @cache
 def entry_of(functions: tuple[Callable[..., Any], ...]) -> tuple[Any, Any]:
-    """The functions, numbered from 1, as a compiled routine; and the kernel that replaces `own_address`."""
+    """The functions, numbered from 1, as a compiled routine; and the step that writes their address."""
     chosen = _chosen(functions)
 
     def likelihoods(which: float, y: float, y_hat: float, h: float, r: float, last: float, out: int) -> None:
@@ -111,10 +143,10 @@ def entry_of(functions: tuple[Callable[..., Any], ...]) -> tuple[Any, Any]:
     entry = machine(likelihoods)
 
     @kernel
-    def address(s: State) -> int:
-        return address_of(entry)  # type: ignore[no-any-return]
+    def point_out(s: State, l: int) -> None:
+        s.table[OWN_AT, 0, l] = address_of(entry)
 
-    return entry, address
+    return entry, point_out
 
 
 def _chosen(functions: Sequence[Callable[..., Any]]) -> Any:

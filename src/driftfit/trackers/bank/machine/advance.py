@@ -2,7 +2,7 @@
 
 A sample that is not used only lets time pass: every leaf makes its time update under the nominal change, no weight
 changes, and no leaf is dropped. Other changes that may have happened, and the reduction that was planned, wait for the
-next sample that can be used (`driftfit.trackers.bank.machine.gaps.gap`).
+next sample that can be used (`driftfit.trackers.bank.machine.gap`).
 """
 
 from __future__ import annotations
@@ -13,22 +13,17 @@ from typing import Any
 
 from driftfit.engine.kernel import Array, machine, shared
 from driftfit.trackers.bank.layout import (
-    AGAIN,
     ALIKE,
     CHAINED,
     CLOCK,
-    DOUBTS,
     ELAPSED,
-    ENTERS,
     EVIDENCE,
     EXPANDED,
-    FAULTS,
     FLIPPED,
     FORECAST,
     FREEDOM,
     GROUPS,
     HELD,
-    HIGHEST,
     IMPOSSIBLE,
     IN_DT,
     IN_NOISE,
@@ -39,16 +34,13 @@ from driftfit.trackers.bank.layout import (
     KEPT,
     LAST,
     LEAVES,
-    LIMIT,
     LOOKED,
-    LOWEST,
     MOST,
     OPEN,
     PARENTS,
     PARTED,
     PHASE,
     READING,
-    REFUSED,
     S2,
     SAMPLE_HEAD,
     SETTLED,
@@ -56,6 +48,7 @@ from driftfit.trackers.bank.layout import (
     STORED,
     TAKEN,
     TREE_LEVELS,
+    UNIT,
     WIDE,
     WINDOW,
     Y_HAT,
@@ -72,16 +65,14 @@ from driftfit.trackers.bank.leaves.leaf_matrix import (
     mixture,
     normalise,
     priors,
-    ready,
     regressors,
     standstill,
     variance_factor,
 )
 from driftfit.trackers.bank.machine.ancestry import chained, marginals, pick, shift, summary, write_out
-from driftfit.trackers.bank.machine.gaps.chain_gap import add_covariance, add_variance, further, go_on, origins, split
-from driftfit.trackers.bank.machine.gaps.gap import chances, close, covariances, extend, odds, take_back, widen
+from driftfit.trackers.bank.machine.gap import chances, close, covariances, extend, odds, take_back, widen
 from driftfit.trackers.bank.machine.grow import grow
-from driftfit.trackers.bank.machine.late_direction import determine
+from driftfit.trackers.bank.machine.markov_gap import add_covariance, add_variance, further, go_on, origins, split
 from driftfit.trackers.bank.machine.start import limit_forgetting, wait
 from driftfit.trackers.bank.reducing.merge import combine, mix, sort, take
 from driftfit.trackers.bank.reducing.refilter import NOISE, TIME, Y, histories, refilter
@@ -101,12 +92,6 @@ from driftfit.trackers.bank.reducing.selection import (
     merge,
     number,
 )
-
-FAULTS_IN_A_ROW = 3
-"""Largest number of successive samples that are taken for fault codes."""
-DOUBTED, FORGOTTEN = 3.0, 0.98
-"""Largest number of recently refused samples with an ordinary reading; and the share of that number that is left after
-a sample that is accepted."""
 
 
 @shared
@@ -149,7 +134,6 @@ def prepare(t: Any) -> None:
     if wide:
         odds(t.gap, t.row, Hm, dt, given)
         covariances(t.gap, dt, used, t.Q)
-    ready(t)
     if t.walks_only == 0:
         for_interval(t.maps_nominal, dt, t.maps)
 
@@ -300,7 +284,6 @@ def take_in(t: Any) -> None:
     K = reduce(t)
     if again:
         increments_now(t)
-        ready(t)
     if again or waits:
         keep_sample(t)
     counters[EXPANDED] = 0
@@ -332,7 +315,6 @@ def take_in(t: Any) -> None:
     counters[TREE_LEVELS] += 1
     if counters[WIDE] > 0 and waits:  # the next interval is nominal
         increments(t, 1.0, 1.0)
-        ready(t)
     choose(t, counters[LEAVES])
 
 
@@ -376,26 +358,6 @@ def let_pass(t: Any, L: int) -> None:
 
 
 @shared
-def refused(sample: Array, counters: Array) -> bool:
-    """Whether a sample is so far from the forecast that it is taken for a fault code, and counts as missing. A value
-    that persists is not a fault code; and where readings within the range of earlier ones are often far from their
-    forecasts, it is the forecasts that are wrong.
-    """
-    far, y = sample[IN_Y] - sample[Y_HAT], sample[IN_Y] + sample[SHIFT]
-    usual = sample[LOWEST] <= y <= sample[HIGHEST]
-    patient = counters[REFUSED] < FAULTS_IN_A_ROW and (sample[DOUBTS] < DOUBTED or not usual)
-    if patient and far * far > sample[LIMIT] * sample[LIMIT] * sample[S2]:
-        sample[IN_OK], sample[IN_OBSERVED] = 0.0, 0.0
-        sample[DOUBTS] += 1.0 if usual else 0.0
-        counters[REFUSED] += 1
-        counters[FAULTS] += 1
-        counters[AGAIN] = 1
-        return True
-    counters[REFUSED] = 0
-    return False
-
-
-@shared
 def look(t: Any) -> None:
     """The time update of a sample, and its forecast."""
     t.sample[EVIDENCE] = 0.0
@@ -413,21 +375,17 @@ def advance(t: Any) -> None:
     if (counters[LOOKED] > 0) != (sample[IN_OK] > 0.0):  # it was refused since
         look(t)
     if sample[IN_OK] > 0.0:
-        if refused(sample, counters):
-            return
         take_in(t)
     else:
         let_pass(t, counters[LEAVES])
-        if sample[ENTERS] != 0.0:
-            determine(t, counters[LEAVES])
     counters[CLOCK] += 1
     L = counters[LEAVES]
     mixture(t.n, t, L)
+    sample[UNIT] = weighted(t.leaves, L, t.from_C, t.n) if t.unknown > 0 else 1.0
     if counters[OPEN] > 0 and counters[PARTED] > 0:
         add_covariance(t, L)
     elif counters[OPEN] > 0:
-        variance_factor(t, t.scratch, 0, L)
-        widen(t.gap, weighted(t.leaves, L, t.scratch, 0), t.cov)
+        widen(t.gap, sample[UNIT], t.cov)
     sample[WINDOW] = marginals(t, L)
 
 
@@ -458,21 +416,9 @@ def note(t: Any, window: float) -> None:
         ring[row, SAMPLE_HEAD + e] = lag_prob[len(lag_prob) - 1, e]
 
 
-@shared
-def remember_reading(sample: Array) -> None:
-    """Update what is known of the readings, after a sample."""
-    if sample[IN_OBSERVED] > 0.0:
-        y = sample[IN_Y] + sample[SHIFT]
-        sample[READING], sample[DOUBTS] = y, FORGOTTEN * sample[DOUBTS]
-        sample[LOWEST], sample[HIGHEST] = min(sample[LOWEST], y), max(sample[HIGHEST], y)
-
-
 @partial(machine, short=True)  # rows of a dozen leaves: copies of loops for long rows made it a tenth slower
 def bank(address: int) -> None:
-    """The forecast of a sample, or its processing, by ``PHASE``, given the table of a bank.
-
-    A sample beyond the limit of its sensor is processed again as missing.
-    """
+    """The forecast of a sample, or its processing, by ``PHASE``, given the table of a bank."""
     t = table_at(address)
     counters, head = t.counters, t.report
     begun = counters[SETTLED] == 1
@@ -481,18 +427,17 @@ def bank(address: int) -> None:
         if begun:
             look(t)
         return
-    counters[AGAIN] = 1 if begun else 0
-    while counters[AGAIN] == 1:
-        counters[AGAIN] = 0
+    if begun:
         advance(t)
         head[0], head[1], head[2], head[3] = t.sample[EVIDENCE], t.sample[WINDOW], t.sample[KEPT], counters[LEAVES]
-    if not begun:
+    else:
         limit_forgetting(t)
         wait(t)
         for row in range(len(t.root)):
             t.root[row, 0] = t.leaves[row, 0]
         head[0], head[1], head[2], head[3] = lone_density(t.sample), 0.0, 1.0, 1.0
     t.sample[ELAPSED] += t.sample[IN_DT]
-    remember_reading(t.sample)
+    if t.sample[IN_OBSERVED] > 0.0:
+        t.sample[READING] = t.sample[IN_Y] + t.sample[SHIFT]
     summary(t.lag_prob, t.newest)
     note(t, head[1])

@@ -11,7 +11,8 @@ and so, with the covariance C of the former, z_j = x'z - sum_{i<j} x_i z_i has
     C_jb = cov(rho, b) - sum_{i<j} x_i C_ib,      C_jj = var(rho) - sum_{i<j} x_i (cov(rho, i) + C_ji)
 
 No difference of large numbers is left in them, however large x_j^2 C_jj is compared with r. If nothing was known of
-z_j, s is infinite: K is 0 for the other coordinates, and x'K is 1.
+z_j, s is infinite: K is 0 for the other coordinates, x'K is 1, and x_i z_i with i > j, which leaves with output lags
+of their own have, is no part of z_j.
 
 Source: ours; the limit is that of Durbin and Koopman, Time Series Analysis by State Space Methods (2012), section 5.2.
 Cost: O(n^2).
@@ -59,6 +60,7 @@ def enter_packed(M: Array, at: int, step: int, x: Array, now: Array, noise: floa
     without those of z_i, i < j.
     """
     n, j, sign = len(x), int(now[ENTERING]), now[OK]
+    others = j if left > 0.0 else n
     h = product(M, at, step, x, work, G)
     k = at
     for a in range(n):
@@ -71,9 +73,9 @@ def enter_packed(M: Array, at: int, step: int, x: Array, now: Array, noise: floa
         if b != j:
             shared_error = left * (work[G, b] - work[K, b] * h) + (1.0 - left) * noise * work[K, b]
             row = shared_error
-            for i in range(j):
+            for i in range(others):
                 row -= x[i] * M[at + (i * (i + 1) // 2 + b if b <= i else b * (b + 1) // 2 + i) * step]
-            if b < j:
+            if b < others:
                 own -= x[b] * (row + shared_error)
             M[at + (j * (j + 1) // 2 + b if b <= j else b * (b + 1) // 2 + j) * step] = sign * row
     M[at + (j * (j + 1) // 2 + j) * step] = own
@@ -88,6 +90,6 @@ def enter_mean(m: Array, at: int, step: int, x: Array, now: Array, left: float, 
     rest = now[Y] - left * e
     for i in range(len(x)):
         m[at + i * step] += work[K, i] * e
-    for i in range(j):
+    for i in range(j if left > 0.0 else len(x)):
         rest -= x[i] * m[at + i * step]
     m[at + j * step] = now[OK] * rest

@@ -1,18 +1,23 @@
 """A bank in the coordinates of its start: for offsets that a covariance cannot represent, and unknown directions.
 
 The compiled routine is given x and z in place of phi and theta (`driftfit.trackers.parts.coordinates`) and needs no
-other change: its updates of means and covariances hold in all coordinates, if no change names a value of theta (a
-reset, stabilised forgetting) and no leaf has separate output lags. Change i then adds
+other change: its updates of means and covariances hold in all coordinates. With R = M^-1 on what is determined, and its
+columns orthogonal to what is not, changes are
 
-    M (Q_i + diag(sizes_i r / c)) M'
+    random walk     C + M (Q_i + diag(sizes_i r / c)) M'
+    reset           to z0 = M theta0; of some parameters by the map M D R, D with zeros for these
+    stabilised      measurements by the rows of W R
 
-to a covariance; exponential and directional forgetting are the same in z as in theta, and leave a direction without
-information as it is. A regressor outside the span of the earlier ones, or with far more information on z_j than they
-had, determines z_j in every leaf (`driftfit.trackers.bank.machine.entering`); it changes no weight. The mixture and the
-covariances of the gap, which leaves share, are updated in the same way, with the gain of the mixture.
+while exponential and directional forgetting are the same in z as in theta; a direction without information stays as it
+is. A leaf with output lags of its own has x + R' d, d the difference of these lags from those of the record.
 
-A bank runs this way if its start is not determined well enough for a covariance when the first residuals are available;
-other banks use phi and theta, at lower cost. Cost per sample: O(n^3) for each change.
+A regressor outside the span of the earlier ones, or with far more information on z_j than they had, determines z_j in
+every leaf (`driftfit.trackers.bank.machine.entering`); it changes no weight. The mixture and the covariances of the
+gap, which leaves share, are updated in the same way, with the gain of the mixture.
+
+A bank begins this way if its start is not determined well enough for a covariance when the first residuals are
+available, and continues this way, M being the identity at first, from a sample with far more information than its
+prior; other banks use phi and theta, at lower cost. Cost per sample: O(n^3) for each change.
 """
 
 from __future__ import annotations
@@ -22,9 +27,9 @@ from functools import partial
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, packed, shared, wholes
-from driftfit.trackers.bank.layout import LEAVES, MEMORY_AT, ROW, ROWS, memory_at
-from driftfit.trackers.bank.leaves.forget import GROWTH, PER_CAP
-from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S
+from driftfit.trackers.bank.layout import LEAVES, MEMORY_AT, ROW, ROWS, UNIT, memory_at
+from driftfit.trackers.bank.leaves.forget import ANCHORS, GROWTH, KIND, MEAN, PARTIAL, PER_CAP
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 from driftfit.trackers.bank.machine.entering import enter_mean, enter_packed, gain_of
 from driftfit.trackers.parts.coordinates import (
     OUTGROWN,
@@ -36,12 +41,19 @@ from driftfit.trackers.parts.coordinates import (
 )
 from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, WORK, Y
 
-FIELDS = ("walks", "fixed_walks", "relative_walks", "leaves", "gap", "path", "prior", "places")
-WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR, PLACES = (ROW[name] for name in FIELDS)
+FIELDS = (
+    "walks", "fixed_walks", "relative_walks", "leaves", "gap", "path", "prior", "places", "fixed_places", "maps", "z",
+    "lag_rows", "output_lags", "in_coordinates",
+)  # fmt: skip
+(
+    WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR, PLACES, FIXED_PLACES, MAPS, REGRESSORS, LAG_ROWS, OUTPUT_LAGS,
+    IN_COORDINATES,
+) = (ROW[name] for name in FIELDS)  # fmt: skip
 """Rows of the table."""
 (
-    AT_MEMORY, AT_TABLE, AT_COUNTERS, AT_S, AT_W, AT_C, AT_X, AT_D, AT_P, AT_WORK, AT_NOW, ADDRESSES,
-) = range(12)  # fmt: skip
+    AT_MEMORY, AT_TABLE, AT_COUNTERS, AT_S, AT_W, AT_C, AT_X, AT_D, AT_P, AT_WORK, AT_NOW, AT_R, AT_H, AT_PHI,
+    ADDRESSES,
+) = range(15)  # fmt: skip
 """Addresses of fields that the routines here are given."""
 
 
@@ -70,25 +82,57 @@ def walk(M: Array, places: tuple[int, int, int], S: Array, c: Array, unit: float
 
 
 @shared
-def mean_noise(M: Array, table: Array, leaves: int, unknown: bool) -> float:
-    """Mean of the noise variance over the leaves; 1 if it is known."""
-    B, columns, mean = table[3 * COLUMNS] // 8, table[3 * COLUMNS + 2], 0.0
-    for leaf in range(B, B + leaves):
-        each = M[leaf + S * columns] / (M[leaf + NU * columns] - 2.0) if unknown else 1.0
-        mean += M[leaf + WEIGHT * columns] * each
-    return mean
+def seen_inverse(S: Array, R: Array, H: Array, W: Array) -> None:
+    """W = R without the directions H that no sample has determined: the theta nearest to theta0 for each z."""
+    n = len(S)
+    for k in range(n):
+        for i in range(n):
+            W[i, k] = R[i, k] if S[k, k] > 0.0 and i <= k else 0.0
+        for j in range(n):
+            dot = 0.0
+            for i in range(n if S[j, j] == 0.0 else 0):
+                dot += H[i, j] * W[i, k]
+            for i in range(n if dot != 0.0 else 0):
+                W[i, k] -= dot * H[i, j]
+
+
+@shared
+def pulled(M: Array, t: Array, S: Array, W: Array) -> None:
+    """theta0 and the matrices of resets and of stabilised forgetting in these coordinates; W is `seen_inverse`."""
+    n = len(S)
+    to, fixed, maps = t[3 * PLACES] // 8, t[3 * FIXED_PLACES] // 8, t[3 * MAPS] // 8
+    for i in range(n):
+        M[to + MEAN * n + i] = 0.0
+        for j in range(i, n):
+            M[to + MEAN * n + i] += S[i, j] * M[fixed + MEAN * n + j]
+    for c in range(t[3 * MAPS + 1] if t[3 * PLACES + 1] > ANCHORS else 0):
+        at, kind = (ANCHORS + c * n) * n, int(M[maps + c * t[3 * MAPS + 2] + KIND])
+        for i in range(n):
+            for k in range(n):
+                M[to + at + i * n + k] = 0.0
+                for j in range(n):
+                    M[to + at + i * n + k] += M[fixed + at + i * n + j] * W[j, k]
+        for i in range(n if kind == PARTIAL else 0):  # row i of M times the rows from i on, which are still there
+            for k in range(n):
+                total = 0.0
+                for j in range(i, n):
+                    total += S[i, j] * M[to + at + j * n + k]
+                M[to + at + i * n + k] = total
 
 
 @shared
 def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, known: int, work: Array) -> None:
-    """The sample in all leaves; each has its own gain."""
-    n, noise = len(x), now[NOISE]
-    B, columns = table[3 * COLUMNS] // 8, table[3 * COLUMNS + 2]
-    for leaf in range(B, B + many[LEAVES]):
+    """The sample in all leaves; each has its own gain, and its own regressor if it has output lags of its own."""
+    n, noise, lags = len(x), now[NOISE], table[3 * OUTPUT_LAGS]
+    B, columns, z = table[3 * COLUMNS] // 8, table[3 * COLUMNS + 2], table[3 * REGRESSORS] // 8
+    wide = table[3 * REGRESSORS + 2]
+    for l in range(many[LEAVES]):
+        leaf = B + l
+        own = M[z + l : z + l + n * wide : wide] if lags > 0 else x
         m, C = leaf + FIRST * columns, leaf + (FIRST + n) * columns
-        left = gain_of(M, C, columns, x, noise, known, work)
-        enter_mean(M, m, columns, x, now, left, work)
-        enter_packed(M, C, columns, x, now, noise, left, work)
+        left = gain_of(M, C, columns, own, noise, known, work)
+        enter_mean(M, m, columns, own, now, left, work)
+        enter_packed(M, C, columns, own, now, noise, left, work)
     M[table[3 * PLACES] // 8 + PER_CAP * n + int(now[ENTERING])] = 1.0 / (GROWTH * noise)
 
 
@@ -123,23 +167,34 @@ def enter_mixture(z: Array, P: Array, C: Array, x: Array, now: Array, noise: flo
 
 
 @partial(machine, short=True)
-def machine_walks(fields: int, unit: float, size: int, n: int, L: int, l: int) -> None:
-    """Q of every change for lane l of L, from the addresses of fields; the memory has ``size`` numbers."""
+def machine_changes(fields: int, unit: float, size: int, n: int, L: int, l: int) -> None:
+    """The changes in these coordinates, and the rows of R of the output lags with these lags, for lane l of L, from the
+    addresses of fields; the memory has ``size`` numbers.
+    """
     at = wholes(fields, 1, ADDRESSES)
     t, m = wholes(at[0, AT_TABLE], 3 * ROWS, L)[:, l], floats(at[0, AT_MEMORY], size, L)[:, l]
     M, W = cubes(at[0, AT_S], n, n, L)[:, :, l], cubes(at[0, AT_W], n, n, L)[:, :, l]
-    c = floats(at[0, AT_C], n, L)[:, l]
+    R, H = cubes(at[0, AT_R], n, n, L)[:, :, l], cubes(at[0, AT_H], n, n, L)[:, :, l]
+    c, phi = floats(at[0, AT_C], n, L)[:, l], floats(at[0, AT_PHI], n, L)[:, l]
     wide, sizes = t[3 * WALKS + 2], t[3 * RELATIVE + 2]
     for i in range(t[3 * WALKS + 1]):
         of = t[3 * RELATIVE] // 8 + i * sizes if sizes > 0 else -1
         places = t[3 * WALKS] // 8 + i * wide, t[3 * FIXED] // 8 + i * wide, of
         walk(m, places, M, c, unit, W)
+    if t[3 * OUTPUT_LAGS] > 0 or t[3 * PLACES + 1] > ANCHORS:
+        seen_inverse(M, R, H, W)
+    pulled(m, t, M, W)
+    for k in range(t[3 * OUTPUT_LAGS]):
+        row = t[3 * LAG_ROWS] // 8 + k * (n + 1)
+        for i in range(n):
+            m[row + i] = W[k, i]
+        m[row + n] = phi[k]
 
 
 @partial(machine, short=True)
-def machine_enter(fields: int, unknown: int, known: int, size: int, counters: int, n: int, L: int, l: int) -> None:
-    """A sample with which a coordinate enters, for lane l of L, from the addresses of fields; ``known`` is 0 if nothing
-    was known of that coordinate.
+def machine_enter(fields: int, unit: float, known: int, size: int, counters: int, n: int, L: int, l: int) -> None:
+    """A sample with which a coordinate enters, for lane l of L, from the addresses of fields; ``unit`` is that of the
+    covariances of leaves, and ``known`` is 0 if nothing was known of that coordinate.
     """
     at = wholes(fields, 1, ADDRESSES)
     t, m = wholes(at[0, AT_TABLE], 3 * ROWS, L)[:, l], floats(at[0, AT_MEMORY], size, L)[:, l]
@@ -148,89 +203,91 @@ def machine_enter(fields: int, unknown: int, known: int, size: int, counters: in
     z, P, C = (
         floats(at[0, AT_D], n, L)[:, l], cubes(at[0, AT_P], n, n, L)[:, :, l], floats(at[0, AT_W], n * n, L)[:, l]
     )  # fmt: skip
-    left = enter_mixture(z, P, C, x, now, now[NOISE] * mean_noise(m, t, many[LEAVES], unknown > 0), known, work)
+    left = enter_mixture(z, P, C, x, now, now[NOISE] * unit, known, work)
     enter_gap(m, t, x, now, left, work)
     enter_leaves(m, t, many, x, now, known, work)
 
 
-@partial(machine, short=True)
-def machine_outgrown(fields: int, unknown: int, size: int, counters: int, n: int, L: int, l: int) -> None:
-    """The first coordinate about which this sample has `OUTGROWN` times the information of all earlier ones, or -1, in
-    ``now[ENTERING]``; for lane l of L, from the addresses of fields.
-    """
-    at = wholes(fields, 1, ADDRESSES)
-    t, m = wholes(at[0, AT_TABLE], 3 * ROWS, L)[:, l], floats(at[0, AT_MEMORY], size, L)[:, l]
-    many, now = wholes(at[0, AT_COUNTERS], counters, L)[:, l], floats(at[0, AT_NOW], NOW, L)[:, l]
-    x, P = floats(at[0, AT_X], n, L)[:, l], cubes(at[0, AT_P], n, n, L)[:, :, l]
-    others, now[ENTERING] = now[NOISE] * mean_noise(m, t, many[LEAVES], unknown > 0), -1.0
-    for j in range(n):
-        own = x[j] * x[j] * P[j, j]
-        if own > OUTGROWN * others:
-            now[ENTERING] = j
-            break
-        others += own
-
-
-FRAMED = (machine_walks, machine_enter, machine_outgrown)
+FRAMED = (machine_changes, machine_enter)
 """What the steps here call, apart from the routines of the coordinates."""
+
+
+@kernel
+def spans_lags(s: State, l: int) -> bool:
+    """Whether what no sample has determined has no part in the output lags that leaves have of their own."""
+    n, spans = s.theta.shape[0], True
+    for j in range(n):
+        for i in range(s.table[OUTPUT_LAGS, 0, l] if s.S[j, j, l] == 0.0 else 0):
+            spans = spans and s.R[i, j, l] == 0.0
+    return spans
 
 
 @kernel
 def begin_framed(s: State, l: int) -> None:
     """The single leaf with which the bank begins: z ~ N(d, I), in units of the noise variance if that is unknown."""
     n = s.theta.shape[0]
-    s.framed[l] = 1
+    s.framed[l], s.table[IN_COORDINATES, 0, l] = 1, 1
     frame(s, l)
-    s.root[l] = 1
     for i in range(n):
         for j in range(i + 1):
             s.Pz[i, j, l] = 1.0 if i == j and s.S[i, i, l] > 0.0 else 0.0
 
 
 @kernel
-def write_walks(s: State, l: int) -> None:
-    """Write the covariances that changes add at the next sample, in these coordinates."""
+def frame_theta(s: State, l: int) -> None:
+    """Continue in coordinates that are theta itself, before a sample with far more information than all earlier."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        s.d[i, l], s.x[i, l] = s.theta[i, l], s.phi[i, l]
+        for j in range(n):
+            s.S[i, j, l], s.Pz[i, j, l] = 1.0 if i == j else 0.0, s.P[i, j, l]
+    s.framed[l], s.table[IN_COORDINATES, 0, l] = 1, 1
+    frame(s, l)
+
+
+@kernel
+def write_changes(s: State, l: int) -> None:
+    """Write the changes at the next sample in these coordinates."""
     n, L = s.d.shape
     unit = 1.0 if s.unknown[l] > 0 else s.r[l]
     # packed here: what a function packs is gone when it returns
     fields = packed((
         memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
         s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data,
+        s.R.ctypes.data, s.H.ctypes.data, s.phi.ctypes.data,
     ))  # fmt: skip
-    machine_walks(fields, unit, s.table[MEMORY_AT, 2, 0], n, L, l)
+    machine_changes(fields, unit, s.table[MEMORY_AT, 2, 0], n, L, l)
 
 
 @kernel
 def outgrown(s: State, l: int) -> int:
-    """The coordinate whose earlier information a covariance would lose next to that of this sample, or -1."""
-    n, L = s.d.shape
-    s.at_start[NOISE, l] = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
-    fields = packed((
-        memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
-        s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data,
-    ))  # fmt: skip
-    machine_outgrown(fields, s.unknown[l], s.table[MEMORY_AT, 2, 0], s.counters.shape[0], n, L, l)
-    return int(s.at_start[ENTERING, l])
+    """The coordinate whose earlier information a covariance would lose next to that of this sample, or -1: the first
+    about which it has `OUTGROWN` times the information of all earlier ones.
+    """
+    framed, others = s.framed[l] > 0, s.sample[UNIT, l] * s.r[l] * s.noise[l]
+    for j in range(s.theta.shape[0]):
+        x, var = (s.x[j, l], s.Pz[j, j, l]) if framed else (s.phi[j, l], s.P[j, j, l])
+        own = x * x * var
+        if own > OUTGROWN * others:
+            return j
+        others += own
+    return -1
 
 
 @kernel
 def enter_bank(s: State, column: int, l: int) -> None:
-    """Row ``column`` of M becomes the rest of this regressor. The compiled routine has made the time update, and
-    outside these coordinates (`driftfit.trackers.bank.machine.late_direction`) the rest.
-    """
+    """Row ``column`` of M becomes the rest of this regressor. The compiled routine has made the time update."""
     n, L = s.d.shape
     known = 1 if s.S[column, column, l] != 0.0 else 0
     sign = new_row(s, s.phi, column, l)
-    s.root[l] = 1
-    if s.framed[l] == 0:
-        return
     noise = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column
     fields = packed((
         memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
         s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data,
+        s.R.ctypes.data, s.H.ctypes.data, s.phi.ctypes.data,
     ))  # fmt: skip
-    machine_enter(fields, s.unknown[l], known, s.table[MEMORY_AT, 2, 0], s.counters.shape[0], n, L, l)
+    machine_enter(fields, s.sample[UNIT, l], known, s.table[MEMORY_AT, 2, 0], s.counters.shape[0], n, L, l)
     for i in range(column, n):
         s.x[i, l] = 0.0
 

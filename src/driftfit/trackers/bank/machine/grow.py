@@ -37,8 +37,8 @@ LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
 def develop_own(t: Any, K: int) -> int:
     """The same, where parent l takes only joint event l."""
     A, C, m, Q, maps, places, n, Hm = t.parents, t.C, t.m, t.Q, t.maps, t.places, t.n, len(t.sensors)
-    for l in range(K):
-        c = l // Hm
+    for l in range(-(-K // WIDTH) * WIDTH):  # numbers up to the end of a SIMD vector are finite
+        c = min(l // Hm, len(t.walks) - 1)
         for k in range(n * (n + 1) // 2):
             C[k, l] = maps[c, KEEP] * A[FIRST + n + k, l] + Q[c, k]
         for i in range(n):

@@ -19,6 +19,7 @@ from driftfit.trackers.bank.layout import (
     SETTLED,
     SQUARES,
     TIMES,
+    UNIT,
     Y_HAT,
 )  # fmt: skip
 from driftfit.trackers.bank.leaves.forget import GROWTH, PER_CAP
@@ -34,6 +35,7 @@ def begin(t: Any, nu: float, squares: float) -> None:
     B, theta, P, history, counters = t.leaves, t.theta, t.cov, t.history, t.counters
     n, H = len(theta), len(t.initial)
     at, unit = FIRST + n, squares / (nu - 2.0) if nu > 2.0 else 1.0
+    t.sample[UNIT] = unit
     for row in range(LOG, FIRST):
         B[row, 0] = 0.0
     B[WEIGHT, 0], B[NU, 0], B[S, 0], B[AGE, 0] = 1.0, nu, squares, NEVER

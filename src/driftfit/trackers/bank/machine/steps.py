@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
 import numpy as np
 
 from driftfit.engine.drivers import COMMON, TrackerSteps, diagonal
@@ -10,7 +14,6 @@ from driftfit.trackers.bank.layout import (
     COUNT,
     COUNTERS_AT,
     COV_AT,
-    ENTERS,
     FORECAST,
     FREEDOM,
     IN_DT,
@@ -45,13 +48,21 @@ from driftfit.trackers.bank.layout import (
     report_at,
 )
 from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
-from driftfit.trackers.bank.leaves.own_sensor import own_address
+from driftfit.trackers.bank.leaves.own_sensor import OWN_AT, entry_of, no_own_sensor
 from driftfit.trackers.bank.machine.advance import bank
-from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, outgrown, read_framed, write_walks
-from driftfit.trackers.bank.machine.late_direction import begin_within, point_along
+from driftfit.trackers.bank.machine.framed import (
+    FRAMED,
+    begin_framed,
+    enter_bank,
+    frame_theta,
+    outgrown,
+    read_framed,
+    spans_lags,
+    write_changes,
+)
 from driftfit.trackers.mixture.states import LEAST_SHARE
 from driftfit.trackers.parts.coarse.resolution import lasting, learn_resolved_scale, least_noise, resolve
-from driftfit.trackers.parts.coordinates import FRAME, unseen_variance, whiten_within
+from driftfit.trackers.parts.coordinates import FRAME, whiten_within
 from driftfit.trackers.parts.covariance import correct as correct_one
 from driftfit.trackers.parts.covariance import forecast as forecast_one
 from driftfit.trackers.parts.covariance import prediction
@@ -59,7 +70,7 @@ from driftfit.trackers.parts.diffuse import correct_on_roots, forecast_on_roots,
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.few_residuals import RESIDUALS, wider
 
-GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift"], ROW["own_likelihoods"]
+GIVEN, GIVEN_CHAIN, DRIFT = ROW["given"], ROW["given_chain"], ROW["drift"]
 
 
 @kernel
@@ -116,7 +127,6 @@ def point(s: State) -> None:
     s.table[COV_AT, 0, 0] = s.Pz.ctypes.data if framed else s.P.ctypes.data
     s.table[COUNTERS_AT, 0, 0] = s.counters.ctypes.data
     s.table[SAMPLE_AT, 0, 0] = s.sample.ctypes.data
-    s.table[OWN_AT, 0, 0] = own_address(s)
 
 
 @kernel
@@ -138,7 +148,7 @@ def among(s: State, l: int) -> None:
             table[k, i] = s.table[k, i, l]
     table[MEMORY_AT, 0], table[REPORT_AT, 0], table[PHI_AT, 0] = memory, report, vectors
     table[POWERS_AT, 0], table[THETA_AT, 0], table[COV_AT, 0] = vectors + 8 * n, vectors + 16 * n, P
-    table[COUNTERS_AT, 0], table[SAMPLE_AT, 0], table[OWN_AT, 0] = counters, sample, own_address(s)
+    table[COUNTERS_AT, 0], table[SAMPLE_AT, 0] = counters, sample
     for k in range(N):
         floats(memory, 1, N)[0, k] = own_memory[k, l]
     for i in range(n):
@@ -178,7 +188,8 @@ def run(s: State, l: int) -> None:
         bank(s.table.ctypes.data)
         for k in range(MEMORY_AT, SAMPLE_AT + 1):
             s.table[k, 0, 0] = 0
-        s.table[OWN_AT, 0, 0] = 0
+    if s.counters[PHASE, l] == LEARN:
+        s.table[OWN_AT, 0, l] = 0
 
 
 @kernel
@@ -195,7 +206,6 @@ def hand_over(s: State, l: int) -> None:
     s.sample[IN_TIME, l], s.sample[SHIFT, l] = s.dt[l] * s.drift[l], s.shift[l]
     s.sample[IN_OK, l], s.sample[IN_OBSERVED, l] = s.ok[l], s.observed[l]
     s.sample[R, l], s.sample[LEAST, l] = s.r[l], max(LEAST_SHARE * s.power[l] + 1e-300, least_noise(s, l))
-    s.sample[ENTERS, l] = 0.0
     s.sample[MOST, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
 
 
@@ -213,14 +223,10 @@ def alone(s: State, l: int, counts: bool) -> None:
     s.sample[Y_HAT, l], s.sample[S2, l] = s.y_hat[l], s.s[l] / wider(residuals)
     s.sample[SQUARES, l], s.sample[TIMES, l] = s.squares[l], s.count[l]
     ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
-    within = s.root[l] == 0
-    if ready and s.root[l] > 0 and s.within[l] >= RESIDUALS:
-        if s.can_frame[l] > 0:
+    if ready and s.root[l] > 0:
+        ready = s.can_frame[l] > 0 and s.within[l] >= RESIDUALS and spans_lags(s, l)
+        if ready:
             begin_framed(s, l)
-            within = True
-        else:
-            within = begin_within(s, l)
-    ready = ready and within
     s.counters[SETTLED, l] = READY if ready else WAITING
     run(s, l)
     if ready:
@@ -228,21 +234,52 @@ def alone(s: State, l: int, counts: bool) -> None:
 
 
 @kernel
-def look_ahead(s: State, l: int) -> None:
-    """The forecast of the tree."""
+def forecast_tree(s: State, l: int) -> None:
+    """The forecast of the tree, in theta or in coordinates of the start."""
+    column, y_hat, outside = -1, 0.0, False
+    if s.framed[l] > 0:
+        column, y_hat = whiten_within(s, s.phi.ctypes.data, l), prediction(s, l)
+        outside = column >= 0
+    if not outside and s.ok[l] > 0.0 and s.can_frame[l] > 0:
+        column = outgrown(s, l)
+        if column >= 0 and s.framed[l] == 0:
+            frame_theta(s, l)
+    if s.framed[l] > 0:
+        write_changes(s, l)
+    hand_over(s, l)
+    s.column[l] = column
+    if column >= 0:
+        s.sample[IN_OK, l] = 0.0
     s.counters[PHASE, l] = FORECAST
     run(s, l)
     s.counters[PHASE, l] = LEARN
     s.y_hat[l], s.s[l] = s.sample[Y_HAT, l], s.sample[S2, l]
+    if outside:
+        s.y_hat[l], s.s[l] = y_hat, np.inf
+    s.e[l] = s.y[l] - s.y_hat[l]
+
+
+@kernel
+def correct_tree(s: State, l: int) -> None:
+    """The tree takes the sample, unless a gate refused it; one that enters a coordinate changes no weight."""
+    column, outside = s.column[l], s.s[l] == np.inf
+    s.sample[IN_OK, l], s.sample[IN_OBSERVED, l] = s.ok[l] if column < 0 else 0.0, s.observed[l]
+    run(s, l)
+    if column >= 0 and s.ok[l] > 0.0:
+        enter_bank(s, column, l)
+        if not outside:
+            e, v = s.y[l] - s.y_hat[l], s.s[l]
+            floats(report_at(s), s.table[REPORT_AT, 2, 0], s.theta.shape[1])[0, l] = -0.5 * (
+                log(2.0 * np.pi * v) + e * e / v
+            )
+    learn_scales(s, l)
 
 
 @kernel
 def forecast(s: State, l: int) -> None:
     resolve(s, l)
     if s.counters[SETTLED, l] > 0:
-        hand_over(s, l)
-        look_ahead(s, l)
-        s.e[l] = s.y[l] - s.y_hat[l]
+        forecast_tree(s, l)
     else:
         only_drift(s, l)
         forecast_one(s, l)
@@ -250,19 +287,9 @@ def forecast(s: State, l: int) -> None:
 
 
 @kernel
-def learn(s: State, l: int) -> None:
-    """The tree takes the sample, unless a gate refused it."""
-    s.sample[IN_OK, l], s.sample[IN_OBSERVED, l] = s.ok[l], s.observed[l]
-    run(s, l)
-    # a sample beyond the limit of its sensor counts as missing, in lags too
-    s.ok[l], s.observed[l] = s.sample[IN_OK, l], s.sample[IN_OBSERVED, l]
-
-
-@kernel
 def correct(s: State, l: int) -> None:
     if s.counters[SETTLED, l] > 0:
-        learn(s, l)
-        learn_scales(s, l)
+        correct_tree(s, l)
     else:
         s.s[l] = s.h[l] + s.r[l] * s.noise[l]
         correct_one(s, l)
@@ -276,55 +303,13 @@ def read(s: State, l: int) -> None:
         read_framed(s, l)
     else:
         diagonal(s, l)
-        unseen_variance(s, l)
-
-
-@kernel
-def forecast_in_span(s: State, l: int) -> None:
-    """The forecast of a tree that began before the regressors spanned everything, or in coordinates of the start."""
-    column, y_hat, framed = whiten_within(s, s.phi.ctypes.data, l), prediction(s, l), s.framed[l] > 0
-    if framed:
-        write_walks(s, l)
-    hand_over(s, l)
-    outside = column >= 0
-    if framed and not outside and s.ok[l] > 0.0:
-        column = outgrown(s, l)
-    s.column[l] = column
-    if column >= 0:
-        s.sample[IN_OK, l] = 0.0
-    look_ahead(s, l)
-    if outside:
-        s.y_hat[l], s.s[l] = y_hat, np.inf
-    s.e[l] = s.y[l] - s.y_hat[l]
-
-
-@kernel
-def correct_in_span(s: State, l: int) -> None:
-    """Such a tree takes a sample; one that enters a column changes no weight."""
-    column, outside = s.column[l], s.s[l] == np.inf
-    if column >= 0:
-        enters = s.ok[l] > 0.0 and s.framed[l] == 0
-        s.sample[ENTERS, l] = point_along(s, column, l) if enters else 0.0
-        s.sample[IN_OBSERVED, l] = s.observed[l]
-        run(s, l)
-        if s.ok[l] > 0.0:
-            enter_bank(s, column, l)
-            if not outside:
-                e, v = s.y[l] - s.y_hat[l], s.s[l]
-                floats(report_at(s), s.table[REPORT_AT, 2, 0], s.theta.shape[1])[0, l] = -0.5 * (
-                    log(2.0 * np.pi * v) + e * e / v
-                )
-    else:
-        learn(s, l)
-    learn_scales(s, l)
-    read(s, l)
 
 
 @kernel
 def forecast_first(s: State, l: int) -> None:
     resolve(s, l)
     if s.counters[SETTLED, l] > 0:
-        forecast_in_span(s, l)
+        forecast_tree(s, l)
     else:
         only_drifted(s, l)
         forecast_on_roots(s, l)
@@ -334,15 +319,19 @@ def forecast_first(s: State, l: int) -> None:
 @kernel
 def correct_first(s: State, l: int) -> None:
     if s.counters[SETTLED, l] > 0:
-        correct_in_span(s, l)
+        correct_tree(s, l)
     else:
         s.s[l] = s.h[l] + s.r[l] * s.noise[l]
         correct_on_roots(s, l)
         alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
-        if s.counters[SETTLED, l] > 0:
-            read(s, l)
-        else:
-            spanned_variance(s, l)
+
+
+@kernel
+def read_first(s: State, l: int) -> None:
+    if s.counters[SETTLED, l] > 0:
+        read(s, l)
+    else:
+        spanned_variance(s, l)
 
 
 @kernel
@@ -358,7 +347,18 @@ def take_known(s: State, known: Array, t: int, l: int) -> None:
 
 
 STEPS = TrackerSteps(
-    nothing, forecast, correct, variance=nothing,
-    start=TrackerSteps(nothing, forecast_first, correct_first, nothing, nothing),
-    store=keep, read_extra=take_known, machines=(*FRAME, *FRAMED), outlined=True,
+    no_own_sensor, forecast, correct, read, nothing,
+    start=TrackerSteps(no_own_sensor, forecast_first, correct_first, read_first, nothing),
+    store=keep, read_extra=take_known, machines=(*FRAME, *FRAMED, bank), outlined=True,
 )  # fmt: skip
+
+
+@cache
+def steps_of(own: tuple[Callable[..., Any], ...]) -> TrackerSteps:
+    """The steps, which also know where the user's ``own`` likelihoods are."""
+    if not own:
+        return STEPS
+    entry, point_out = entry_of(own)
+    assert STEPS.start is not None
+    start = STEPS.start._replace(predict=point_out)
+    return STEPS._replace(predict=point_out, start=start, machines=(*STEPS.machines, entry))

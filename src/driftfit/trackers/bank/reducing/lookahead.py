@@ -34,14 +34,22 @@ SMALL = 1e-9
 
 
 @shared
-def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) -> float:
+def regressor(t: Any, l: int, phi: Array) -> None:
+    """The regressor of one leaf, in the first column of z."""
+    z, rows, lags = t.z, t.lag_rows, FIRST + t.n + t.n * (t.n + 1) // 2
+    for i in range(t.n):
+        z[i, 0] = t.leaves[lags + i, l] if i < t.output_lags and t.in_coordinates == 0 else phi[i]
+        for k in range(t.output_lags if t.in_coordinates > 0 else 0):
+            z[i, 0] += rows[k, i] * (t.leaves[lags + k, l] - rows[k, t.n])
+
+
+@shared
+def width(t: Any, l: int, keep: float, q: Array) -> float:
     """z' (keep C + Q) z of a leaf."""
-    lags, at, wide = FIRST + n + n * (n + 1) // 2, 0, 0.0
-    for i in range(n):
-        z = B[lags + i, l] if i < na else phi[i]
+    B, z, at, wide = t.leaves, t.z, 0, 0.0
+    for i in range(t.n):
         for j in range(i + 1):
-            other = B[lags + j, l] if j < na else phi[j]
-            wide += z * other * (keep * B[FIRST + n + at, l] + q[at]) * (1.0 if i == j else 2.0)
+            wide += z[i, 0] * z[j, 0] * (keep * B[FIRST + t.n + at, l] + q[at]) * (1.0 if i == j else 2.0)
             at += 1
     return wide
 
@@ -52,19 +60,18 @@ def density_parts(t: Any, L: int, top: float, mass: float, phi: Array, samples: 
     deviation.
     """
     B, Q, maps, theta0, sensors, out = t.leaves, t.Q, t.maps, t.places[MEAN], t.sensors, t.components
-    n, na, Hm, count, last, r = t.n, t.output_lags, len(t.sensors), 0, t.sample[LAST], t.sample[R]
+    n, z, Hm, count, last, r = t.n, t.z, len(t.sensors), 0, t.sample[LAST], t.sample[R]
     P, same = t.chain, t.independent > 0 and t.counters[CHAINED] == 0
-    lags = FIRST + n + n * (n + 1) // 2
     for l in range(L):
         if t.group[l] < 0:
             continue
         unit = B[S, l] / (B[NU, l] - 2.0) if t.unknown > 0 else 1.0
+        regressor(t, l, phi)
         # forecast of the output under every change c
         for c in range(len(t.walks)):
-            mean, wide = 0.0, width(B, l, n, na, phi, maps[c, KEEP], Q[c])
+            mean, wide = 0.0, width(t, l, maps[c, KEEP], Q[c])
             for i in range(n):
-                z = B[lags + i, l] if i < na else phi[i]
-                mean += z * (theta0[i] if maps[c, RESET] > 0.0 else B[FIRST + i, l])
+                mean += z[i, 0] * (theta0[i] if maps[c, RESET] > 0.0 else B[FIRST + i, l])
             # and every sensor j: weight, mean and standard deviation of one component
             for j in range(Hm):
                 e = c * Hm + j

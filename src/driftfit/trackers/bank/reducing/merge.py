@@ -67,8 +67,8 @@ def freedom(t: float, start: float) -> float:
 
 
 @shared
-def pool(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
-    """The covariance of parent ``to``, whose mean is already stored there: sum w (C_l + g_l d_l d_l'); X is spare."""
+def pool(t: Any, members: Array, share: Array, to: int) -> None:
+    """The covariance of parent ``to``, whose mean is already stored there: sum w (C_l + g_l d_l d_l')."""
     B, A, n, unknown = t.leaves, t.parents, t.n, t.unknown > 0
     for k in range(len(members)):
         l = members[k]
@@ -82,8 +82,8 @@ def pool(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
 
 
 @shared
-def match(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
-    """Fill parent ``to`` from the members, whose shares sum to 1; X is spare."""
+def match(t: Any, members: Array, share: Array, to: int) -> None:
+    """Fill parent ``to`` from the members, whose shares sum to 1."""
     B, A, n, na, unknown = t.leaves, t.parents, t.n, t.output_lags, t.unknown > 0
     lags = FIRST + n + n * (n + 1) // 2
     heaviest, g, s = 0, 0.0, 0.0
@@ -106,7 +106,7 @@ def match(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
             A[lags + i, to] += share[k] * B[lags + i, l]
         if unknown:
             s += share[k] * (digamma(0.5 * B[NU, l]) - math.log(0.5 * B[S, l]))
-    pool(t, members, share, to, X)
+    pool(t, members, share, to)
     merge_covariance(t, members, share, to)
     if unknown:
         A[NU, to] = max(freedom(s - math.log(g), B[NU, best]), LEAST_FREEDOM)
@@ -136,9 +136,9 @@ def sort(group: Array, L: int, G: int, start: Array, order: Array) -> int:
 @shared
 def combine(t: Any, L: int, G: int) -> float:
     """Make a parent and its history for every group that `sort` ordered; returns the remaining mass."""
-    A, B, start, order, X = t.parents, t.leaves, t.start, t.order, t.scratch
+    A, B, start, order = t.parents, t.leaves, t.start, t.order
     now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
-    kept, share = 0.0, X[0]
+    kept, share = 0.0, t.scratch[0]
     for k in range(G):
         members, part = order[start[k] : start[k + 1]], share[start[k] : start[k + 1]]
         mass = 0.0
@@ -151,7 +151,7 @@ def combine(t: Any, L: int, G: int) -> float:
             for row in range(len(A)):
                 A[row, k] = B[row, members[0]]
         else:
-            match(t, members, part, k, X[1:])
+            match(t, members, part, k)
             A[LOG, k] = math.log(mass)
         average(now, members, part, after, k)
     flip(t)
@@ -184,9 +184,9 @@ def mix(t: Any, L: int) -> int:
     """Interaction (IMM): parent e is mixed from all leaves that may lead to event e, with the weights
     W_le = w_l p(e | l) / sum_l w_l p(e | l). Returns the number of events.
     """
-    A, B, prior, order, X = t.parents, t.leaves, t.prior, t.order, t.scratch
+    A, B, prior, order = t.parents, t.leaves, t.prior, t.order
     now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
-    H, share = len(prior), X[0]
+    H, share = len(prior), t.scratch[0]
     for e in range(H):
         mass, count = 0.0, 0
         for l in range(L):
@@ -200,7 +200,7 @@ def mix(t: Any, L: int) -> int:
             order[0], share[0], mass, count = 0, 1.0, 1.0, 1
         for k in range(count):
             share[k] /= mass
-        match(t, order[:count], share[:count], e, X[1:])
+        match(t, order[:count], share[:count], e)
         average(now, order[:count], share[:count], after, e)
         A[LOG, e] = math.log(possible) if possible > 0.0 else -np.inf
     flip(t)

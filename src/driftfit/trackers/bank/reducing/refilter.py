@@ -13,21 +13,12 @@ from typing import Any
 
 from driftfit.engine.kernel import Array, shared
 from driftfit.trackers.bank.layout import FLIPPED
-from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, LOG, WEIGHT, increments, normalise, ready
+from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, LOG, WEIGHT, increments, normalise
 from driftfit.trackers.bank.machine.grow import grow
 from driftfit.trackers.bank.reducing.selection import DEPTH, PRIOR
 
 Y, NOISE, TIME = 0, 1, 2
 """Columns of a stored sample before its regressor."""
-
-
-@shared
-def widen(t: Any, weight: Array, X: Array) -> None:
-    """C + sum w_i Q_i of the root; X is spare."""
-    root, n, Q = t.root, t.n, t.Q
-    for k in range(n * (n + 1) // 2):
-        for e in range(len(t.walks)):
-            root[FIRST + n + k, 0] += weight[e] * Q[e, k]
 
 
 @shared
@@ -50,8 +41,9 @@ def refilter(t: Any, L: int) -> int:
         for l in range(L):
             weight[int(B[CODE, l] // top)] += B[WEIGHT, l]
     increments(t, samples[0, TIME], samples[0, TIME])
-    ready(t)
-    widen(t, weight, t.scratch[1:])
+    for k in range(t.n * (t.n + 1) // 2):
+        for e in range(H):
+            root[FIRST + t.n + k, 0] += weight[e] * Q[e, k]
     for e in range(H):  # the change is in the root: the oldest sample is one of no change and no increment
         prior[e, 0] = 0.0
         for k in range(Q.shape[1]):
@@ -70,7 +62,6 @@ def refilter(t: Any, L: int) -> int:
             for l in range(L):
                 prior[e, l] = row[e]
         increments(t, samples[at, TIME], samples[at, TIME])
-        ready(t)
         L = grow_level(t, L, samples[at])
         normalise(B, L)
         for k in range(len(root)):

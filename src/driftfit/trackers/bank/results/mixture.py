@@ -9,10 +9,9 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.layout import HELD, LEAVES, NEVER, OPEN, SETTLED
-from driftfit.trackers.bank.leaves.factored import product
 from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CODE, FIRST, NU, WEIGHT, S
 from driftfit.trackers.bank.machine.framed import in_theta
-from driftfit.trackers.bank.machine.gaps.gap import SINCE
+from driftfit.trackers.bank.machine.gap import SINCE
 
 if TYPE_CHECKING:
     from driftfit.trackers.bank.bank import Bank
@@ -50,11 +49,8 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
     B = tracker.array(place.model, lane, "leaves")[:, : lane["counters"][LEAVES]]
     i, j = np.tril_indices(n)
     C = B[FIRST + n : FIRST + n + len(i)]
-    if tracker.form == "sqrt":
-        covs = product(C, n)
-    else:
-        covs = np.zeros((B.shape[1], n, n))
-        covs[:, i, j] = covs[:, j, i] = C.T
+    covs = np.zeros((B.shape[1], n, n))
+    covs[:, i, j] = covs[:, j, i] = C.T
     gap = tracker.array(place.model, lane, "gap")
     since = gap[1:, gap.shape[1] - WIDTH + SINCE]
     if since.any():  # further events that are possible since the last used sample

@@ -124,7 +124,7 @@ def add_variance(t: Any, L: int) -> None:
 @shared
 def add_covariance(t: Any, L: int) -> None:
     """Add to the covariance of the mixture what the gap adds on average."""
-    P, B, X, path, H, Hd = t.cov, t.leaves, t.scratch, t.path, len(t.row), len(t.walks)
+    P, B, X, path, H, Hd = t.cov, t.leaves, t.from_C, t.path, len(t.row), len(t.walks)
     variance_factor(t, X, 0, L)
     for s in range(H):
         weight, at = 0.0, 0
@@ -139,7 +139,7 @@ def add_covariance(t: Any, L: int) -> None:
 
 @shared
 def widen_leaf(t: Any, k: int, q: Array) -> None:
-    """C + q of one parent; q is a lower triangle and may be overwritten."""
+    """C + q of one parent; q is a lower triangle."""
     for i in range(t.n * (t.n + 1) // 2):
         t.parents[FIRST + t.n + i, k] += q[i]
 

@@ -1,0 +1,1 @@
+"""One model of change: its test, its dates, what changed, and the sentences."""

@@ -1,0 +1,89 @@
+"""One object that says how the parameters of a regression changed: the test, the dates, the parameters, the kind.
+
+`Track.verdict`, `Track.segment`, the page, fleets and diagnoses are views of it. If the test rejects constants there is
+a date, or a gradual change; if it does not, there is none. The steps are `driftfit.judge.changes.fit` (noise and
+segments together), `null` (the test), `dates`, `which` and `kinds`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.changes.dates import LEVEL, Dated, counted, dated
+from driftfit.judge.changes.fit import NONE, order_of, white_rows
+from driftfit.judge.changes.kinds import UNIT_ROOT, Kind, kind
+from driftfit.judge.changes.null import Lags, Model, Tested, modelled, tested
+from driftfit.judge.changes.which import Which, which
+
+
+class Changes(NamedTuple):
+    """What a record of N rows says about n parameters."""
+
+    model: Model
+    test: Tested
+    level: float
+    found: Dated
+    which: Which
+    kind: Kind
+    moving: tuple[int, ...]
+    """Parameters that change."""
+
+    @property
+    def rejected(self) -> bool:
+        """Whether constants are rejected."""
+        return bool(self.test.p < self.level)
+
+    @property
+    def scores(self) -> Array:
+        """(N, n): sums of the scores of constants over the root of their sum of squares."""
+        lags, g = self.model.noise.lags, self.model.noise.g
+        Z, z = white_rows(self.model.phi, self.model.y, lags, self.test.ar[0], g)
+        own = Z * (z - Z @ (self.test.theta - self.model.offset))[:, None]
+        size = np.sqrt(np.sum(own**2, axis=0))
+        return np.vstack([np.zeros((order_of(lags), Z.shape[1])), np.cumsum(own, axis=0) / np.where(size > 0, size, 1)])
+
+    @property
+    def wandering_noise(self) -> bool:
+        """Whether the noise may be a random walk: then a level that wanders looks the same."""
+        return bool(len(self.model.noise.lags) and len(self.model.y) * (1.0 - self.test.root) < UNIT_ROOT)
+
+
+def changes(
+    phi: Array, y: Array, lags: Lags | None = None, root: Array | None = None, level: float = 0.05,
+    order: int | None = None, dates: float = LEVEL, fewest: int | None = None,
+) -> Changes:  # fmt: skip
+    """Judge y (N,) on phi (N, n): at which ``dates`` (the level of their intervals) its coefficients changed.
+
+    ``lags``: which columns are earlier outputs. ``root`` (N,): what rows were multiplied by. ``level``: error rate of
+    the test. ``order``: that of the autoregression of the noise; None estimates it. ``fewest``: rows
+    in a segment.
+    """
+    N, n = phi.shape
+    model = modelled(
+        phi, y, Lags.none(N) if lags is None else lags, np.ones(N) if root is None else root, order, fewest
+    )
+    test, draws = tested(model)
+    breaks, ar, prices = NONE, test.ar[0], (np.nan, np.nan)
+    if test.p < level:
+        breaks, ar, prices = counted(model, test, draws, level)
+    found = dated(model, breaks, ar, prices, dates)
+    changed = which(model, found)
+    if (changed.dates != found.breaks).any():
+        found = dated(model, changed.dates, ar, prices, dates, settled=True)
+    moving = tuple(sorted({j for own in changed.at for j in own}))
+    if test.p < level and not moving:
+        moving = (int(np.argmin(test.p_path[n:])),)
+    own = kind(model, found, changed, moving) if moving else Kind("", {}, (0, N - 1), np.zeros((N, 0)), ())
+    moved = model.offset + np.zeros((len(found.breaks) + 1, 1))
+    return Changes(
+        model,
+        test._replace(theta=test.theta + model.offset),
+        level,
+        found._replace(theta=found.theta + moved),
+        changed._replace(theta=changed.theta + moved),
+        own._replace(path=own.path + model.offset) if own.path.size else own,
+        moving,
+    )

@@ -1,0 +1,342 @@
+"""Segments and their noise, found together: an autoregression, a slowly changing level, and outliers.
+
+    y_t = x_t' theta_s + v_t,   v_t = sum a_l v_(t-l) + c_t e_t,   weight_t = min(1, 3 / |e_t|)^2 / c_t^2
+
+Breaks and correlation explain the same residuals. For each start, the white noise and the correlation of the residuals
+of constants, the best partition on cells (Jackson et al., 2005) and the lags of the noise follow each other until they
+stay; the pair with the smaller criterion counts. A break costs (n + 2) log N there (Zhang and Siegmund, 2007), a lag
+log N, and a lag of a season 2 log of their number more (Chen and Chen, 2008). Weights limit what a row adds to
+the sum of squares, at three levels from the fit of segments. Where residuals clearly grow with a regressor x, the level
+is in proportion to sqrt(a + b x^2). Cost: O(N n^2) and O(c^2 n^3) for c cells.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.changes.constants import SINGULAR, SMALL
+from driftfit.judge.changes.scan import CELLS, PLACES
+from driftfit.judge.statistics.robust import deviation, robust_fit
+from driftfit.judge.statistics.whiteness import LOUDER, grows_with
+
+NONE = np.zeros(0, np.int64)
+HELD = 3.0
+"""Levels of the noise from the fit at which a residual is limited."""
+MEDIAN = 1.4826
+"""The deviation of a Gaussian over the median of its size."""
+FLOOR = 0.01
+"""Smallest level of constants, as a share of the deviation of their residuals: half of them may be exact."""
+ORDER = 6
+"""Largest order of the autoregression; a season may add one further lag."""
+SEASON = 24
+ROUNDS = 4
+KNOTS = (3, 5, 9, 17, 33)
+"""Knots of lines that parameters may move on."""
+FURTHER = 3
+"""Breaks, beyond the best number, that are tried."""
+ROUNDED = 1e-14
+"""Information below this share of that of the whole record is rounding."""
+MOST = 12
+"""Largest number of breaks."""
+WINDOWS = 12
+"""Parts of a record, at most, whose noise may have a level of its own."""
+
+
+class Noise(NamedTuple):
+    """The noise of a record, and the segments that it was found with."""
+
+    lags: Array
+    """(p,): lags of the autoregression."""
+    ar: Array
+    """(p,)"""
+    level: Array
+    """(N,): standard deviation of white residuals."""
+    g: Array
+    """(N,): roots of the weights."""
+    e: Array
+    """(N,): white residuals of the segments or lines, 0 in the first rows."""
+    rows: Array
+    """(N, q): the regressors of these."""
+    fewest: int
+    """Rows in the shortest segment that is searched."""
+
+
+def shortest(n: int, lags: Array, given: int | None = None) -> int:
+    """Rows in the shortest segment that is searched, of n parameters: max(10, 4 n) unless they are given."""
+    return max(max(10, 4 * n) if given is None else given, order_of(lags) + n + 1)
+
+
+def order_of(lags: Array) -> int:
+    """The last lag; 0 if there is none."""
+    return int(lags[-1]) if len(lags) else 0
+
+
+def grid(N: int) -> tuple[Array, int]:
+    """Places where there may be a break, and how many of them are in a cell."""
+    m = int(np.clip(N // 8, 4, CELLS))
+    stride = max(1, min(PLACES, N) // m)
+    return np.linspace(0, N, m * stride + 1).astype(np.int64)[:-1], stride
+
+
+def white_rows(X: Array, y: Array, lags: Array, ar: Array, g: Array) -> tuple[Array, Array]:
+    """Rows X (N, ..) and outputs after whitening, times g (N,), without the first rows."""
+    Z, z, first = X.copy(), y.copy(), order_of(lags)
+    for lag, a in zip(lags, ar, strict=True):
+        Z[lag:] -= a * X[:-lag]
+        z[lag:] -= a * y[:-lag]
+    return Z[first:] * g[first:, None], z[first:] * g[first:]
+
+
+def split(X: Array, breaks: Array) -> Array:
+    """Rows (N, (K + 1) n) of theta of the first segment and of what each break adds."""
+    t = np.arange(len(X))[:, None]
+    return np.hstack([X, *(X * (t >= b) for b in breaks)])
+
+
+def estimated(
+    X: Array, y: Array, noise: tuple[Array, Array, Array], breaks: Array, rows: Array | None = None
+) -> tuple[Array, float]:
+    """theta of the segments (K + 1, n) and the sum of squares, for noise of (lags, ar, g).
+
+    What the rows of a segment do not determine stays as in the one before; ``rows`` instead of those of `split`.
+    """
+    Z, z = white_rows(split(X, breaks) if rows is None else rows, y, *noise)
+    n, K = X.shape[1], len(breaks)
+    G = Z.T @ Z
+    ridge = np.trace(G[:n, :n]) / n * np.append(np.full(n, ROUNDED), np.full(K * n, SINGULAR)) + SMALL
+    beta = np.linalg.solve(G + np.diag(ridge), Z.T @ z)
+    r = z - Z @ beta
+    return np.cumsum(beta.reshape(K + 1, n), axis=0), float(r @ r)
+
+
+def noise_of(X: Array, y: Array, theta: Array, breaks: Array) -> Array:
+    """v (N,): residuals of segments."""
+    part = np.searchsorted(breaks, np.arange(len(y)), side="right")
+    return np.asarray(y - np.einsum("tj,tj->t", X, theta[part]))
+
+
+def regressed(v: Array, g: Array, lags: Array) -> Array:
+    """Autoregression (p,) of v (N,)."""
+    first = order_of(lags)
+    past = np.column_stack([v[first - lag : len(v) - lag] for lag in lags]) if len(lags) else np.zeros((len(v), 0))
+    w = g[first:]
+    return np.asarray(np.linalg.lstsq(past * w[:, None], v[first:] * w, rcond=None)[0])
+
+
+def lags_of(v: Array, most: int) -> Array:
+    """Lags of the autoregression of v (N,): those up to an order of least BIC, and one of a season if it is clear."""
+    N = len(v)
+    limit = HELD * deviation(v)
+    v = np.clip(v, -limit, limit) if limit > 0.0 else v
+    longest = max(most, min(SEASON, N // 12))
+    if most < 1 or longest >= N // 3:
+        return NONE
+    rows = np.column_stack([v[longest - lag : N - lag] for lag in range(longest + 1)])
+    G = rows.T @ rows
+    G += np.diag(SINGULAR * np.diag(G) + SMALL)
+    count, price = N - longest, np.log(N)
+    own = np.linalg.solve(np.linalg.cholesky(G[1 : most + 1, 1 : most + 1]), G[1 : most + 1, 0])
+    left = np.maximum(G[0, 0] - np.append(0.0, np.cumsum(own**2)), SINGULAR * G[0, 0])
+    p = int(np.argmin(count * np.log(left) + price * np.arange(most + 1)))
+    lags, seasons = np.arange(1, p + 1), np.append(0, np.arange(most + 1, longest + 1))
+    if len(seasons) > 1:
+        ties = G[np.ix_(lags, seasons)]
+        rest = G[np.ix_(seasons, seasons)] - ties.T @ np.linalg.solve(G[np.ix_(lags, lags)], ties)
+        gain = rest[0, 1:] ** 2 / np.maximum(np.diag(rest)[1:], SMALL)
+        if -count * np.log1p(-min(gain.max() / left[p], 1.0 - SINGULAR)) > price + 2.0 * np.log(len(gain)):
+            lags = np.append(lags, seasons[1 + int(np.argmax(gain))])
+    return lags
+
+
+def level_of(e: Array, first: int) -> Array:
+    """c (N,): the slowly changing level of white residuals e, constant where windows differ by no more than chance."""
+    N, used = len(e), e[first:]
+    s = max(deviation(used), 1e-3 * float(np.std(used)), SMALL)
+    m = max(3, min(WINDOWS, N // 20))
+    edges = np.linspace(first, N, m + 1).astype(int)
+    parts = [np.abs(e[a:b]) for a, b in pairwise(edges)]
+    held = (np.minimum(part, HELD * max(MEDIAN * float(np.median(part)), 0.05 * s)) for part in parts)
+    own = np.log([max(np.sqrt(np.mean(part**2)), 0.05 * s) for part in held])
+    chance = 0.6 * m / N  # variance of the logarithm of a deviation of N / m Gaussians
+    share = max(0.0, 1.0 - 1.5 * chance / max(float(own.var()), chance))
+    middle = float(np.median(own))
+    return np.asarray(np.exp(middle + np.interp(np.arange(N), 0.5 * (edges[:-1] + edges[1:]), share * (own - middle))))
+
+
+def hats(N: int, knots: int) -> Array:
+    """(N, knots): piecewise linear functions, each 1 at its own knot."""
+    at = np.linspace(0.0, N - 1.0, knots)
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(np.arange(N)[:, None] - at) / (at[1] - at[0])))
+
+
+def lined(X: Array, knots: int) -> Array:
+    """(N, n knots): regressors of parameters on continuous lines between evenly spaced knots."""
+    return np.hstack([X, *(X * hat[:, None] for hat in hats(len(X), knots).T[1:])])
+
+
+def partitions(X: Array, y: Array, noise: tuple[Array, Array, Array], most: int, least: int) -> list[Array]:
+    """The best partitions on cells with 0 .. breaks; rows that belong to two segments are left out."""
+    places, stride = grid(len(y))
+    edges, N, n = np.append(places[::stride], len(y)), len(y), X.shape[1]
+    m, first = len(edges) - 1, order_of(noise[0])
+    Z = np.zeros((N, n + 1))
+    Z[first:, :n], Z[first:, n] = white_rows(X, y, *noise)
+    own = np.array([Z[a:b].T @ Z[a:b] for a, b in pairwise(edges)])
+    lost = np.array([Z[a : a + first].T @ Z[a : a + first] for a in edges[:-1]])
+    lost[0] = 0.0
+    C = np.concatenate([np.zeros((1, n + 1, n + 1)), np.cumsum(own, axis=0)])
+    i, j = np.triu_indices(m + 1, 1)
+    long = edges[j] - edges[i] >= least
+    i, j = i[long], j[long]
+    G = C[j] - C[i] - lost[i]
+    A = G[:, :n, :n] + (SINGULAR * np.trace(C[-1]) + SMALL) * np.eye(n)
+    cost = np.full((m + 1, m + 1), np.inf)
+    cost[i, j] = G[:, n, n] - np.einsum("ka,ka->k", G[:, :n, n], np.linalg.solve(A, G[:, :n, n, None])[:, :, 0])
+    best, back, found = cost[0], [np.zeros(m + 1, int)], [NONE]
+    for K in range(1, most + 1):
+        total = best[:, None] + cost
+        best, where = total.min(axis=0), total.argmin(axis=0)
+        back.append(where)
+        if not np.isfinite(best[m]):
+            break
+        path = [m]
+        for k in range(K, 0, -1):
+            path.append(int(back[k][path[-1]]))
+        found.append(edges[path[:0:-1]])
+    return found
+
+
+def moved(X: Array, y: Array, noise: tuple[Array, Array, Array], breaks: Array, gap: int) -> Array:
+    """Dates within cells: each where the residuals of the parameters before and after it are smallest together."""
+    breaks, N, first = breaks.copy(), len(y), order_of(noise[0])
+    theta, _ = estimated(X, y, noise, breaks)
+    Z, z = white_rows(X, y, *noise)
+    square = np.zeros((N, len(theta)))
+    square[first:] = (z[:, None] - Z @ theta.T) ** 2
+    for k in range(len(breaks)):
+        low = (breaks[k - 1] if k else 0) + gap
+        high = (breaks[k + 1] if k + 1 < len(breaks) else N) - gap
+        if high > low:
+            breaks[k] = low + np.argmin(np.append(0.0, np.cumsum((square[:, k] - square[:, k + 1])[low:high])))
+    return breaks
+
+
+def divided(
+    X: Array, y: Array, lags: Array, g: Array, most: int, given: int | None = None
+) -> tuple[Array, Array, float]:
+    """(breaks, ar, criterion) of the best partition whose noise has these lags."""
+    N, n = X.shape
+    found = (NONE, np.zeros(len(lags)), np.inf)
+    ar = np.zeros(len(lags))
+    seen: list[Array] = []
+    theta, _ = estimated(X, y, (lags, ar, g), found[0])
+    if len(lags):
+        ar = regressed(noise_of(X, y, theta, found[0]), g, lags)
+    for _ in range(ROUNDS if len(lags) else 1):
+        for breaks in partitions(X, y, (lags, ar, g), most, shortest(n, lags, given)):
+            if len(breaks) > len(found[0]) + FURTHER:
+                break
+            own = ar
+            for _ in range(2 if len(breaks) else 0):
+                breaks = moved(X, y, (lags, own, g), breaks, shortest(n, lags, given))
+            theta, rss = estimated(X, y, (lags, own, g), breaks)
+            if len(lags):
+                own = regressed(noise_of(X, y, theta, breaks), g, lags)
+                theta, rss = estimated(X, y, (lags, own, g), breaks)
+            criterion = N * np.log(max(rss, SMALL)) + (n + 2) * np.log(N) * len(breaks)
+            if criterion < found[2]:
+                found = breaks, own, float(criterion)
+        if any(np.array_equal(found[0], one) for one in seen):
+            break
+        seen.append(found[0])
+        ar = found[1]
+    return found
+
+
+def together(
+    X: Array, y: Array, g: Array, orders: int, most: int, given: int | None = None
+) -> tuple[Array, Array, Array]:
+    """(lags, ar, regressors of the path), chosen together: segments, or lines between knots."""
+    N, n = X.shape
+    theta, _ = estimated(X, y, (NONE, np.zeros(0), g), NONE)
+    best: tuple[float, Array, Array, Array] | None = None  # criterion, lags, ar, rows
+    tried: list[list[int]] = []
+    for lags in (lags_of((y - X @ theta[0]) * g, orders), NONE):
+        for _ in range(ROUNDS):
+            if lags.tolist() in tried:
+                break
+            tried.append(lags.tolist())
+            breaks, ar, criterion = divided(X, y, lags, g, most, given)
+            criterion += len(lags) * np.log(N)
+            if best is None or criterion < best[0]:
+                best = criterion, lags, ar, split(X, breaks)
+            theta, _ = estimated(X, y, (lags, ar, g), breaks)
+            lags = lags_of(noise_of(X, y, theta, breaks) * g, orders)
+    assert best is not None
+    for knots in KNOTS:
+        if n * knots > N // 8:
+            break
+        rows = lined(X, knots)
+        v = y - rows @ np.linalg.lstsq(rows * g[:, None], y * g, rcond=None)[0]
+        lags = lags_of(v * g, orders)
+        ar = regressed(v, g, lags)
+        Z, z = white_rows(rows, y, lags, ar, g)
+        r = z - Z @ np.linalg.lstsq(Z, z, rcond=None)[0]
+        criterion = N * np.log(max(float(r @ r), SMALL)) + (n * (knots - 1) + len(lags)) * np.log(N)
+        if criterion < best[0]:
+            best = criterion, lags, ar, rows
+    return best[1:]
+
+
+def weights(e: Array, level: Array) -> Array:
+    """Roots of the weights of residuals e (N,): a row counts as a residual of three levels if its own is larger."""
+    return np.asarray(HELD / np.maximum(np.abs(e) / level, HELD) / level)
+
+
+def spread(e: Array, phi: Array) -> Array:
+    """(N,): sqrt(a + b x^2) of the regressor x of phi (N, n) with which residuals e (N,) grow, if they clearly do.
+
+    The likelihood of Gaussian noise, by weighted least squares of squares that are limited at three deviations.
+    """
+    p = grows_with(e, phi)
+    most = int(np.argmin(p))
+    if not p[most] * len(p) < LOUDER:
+        return np.ones(len(e))
+    A = np.column_stack([np.ones(len(e)), phi[:, most] ** 2 / np.mean(phi[:, most] ** 2)])
+    square, size = e**2, np.full(len(e), np.mean(e**2))
+    for _ in range(ROUNDS):
+        limited = np.minimum(square, HELD**2 * np.maximum(size, square.mean()))
+        a, b = scipy.optimize.nnls(A / size[:, None], limited / size)[0]
+        size = np.maximum(A @ [a, b], SMALL + FLOOR**2 * square.mean())
+    return np.asarray(np.sqrt(size / np.median(size)))
+
+
+def noise(X: Array, y: Array, phi: Array, order: int | None = None, fewest: int | None = None) -> Noise:
+    """The noise of y (N,) on X (N, n), X' X = N I, which are phi in a basis; of some ``order`` if that is given."""
+    N, n = X.shape
+    most = max(0, min(MOST, N // shortest(n, NONE, fewest) - 1))
+    lags = NONE if order is None else np.arange(1, order + 1)
+    constants = robust_fit(X, y)
+    e = constants.residual
+    level = np.full(N, max(constants.scale, FLOOR * float(np.std(e)), SMALL))
+    level *= spread(e / level, phi)
+    g = weights(e, level)
+    for _ in range(2):
+        if order is None:
+            lags, ar, rows = together(X, y, g, min(ORDER, N // 20), most, fewest)
+        else:
+            breaks, ar, _ = divided(X, y, lags, g, most, fewest)
+            rows = split(X, breaks)
+        Z, z = white_rows(rows, y, lags, ar, g)
+        first = order_of(lags)
+        v = y - rows @ np.linalg.lstsq(Z, z, rcond=None)[0]
+        e = np.append(np.zeros(first), white_rows(v[:, None], v, lags, ar, np.ones(N))[1])
+        size = spread(e, phi)
+        level = size * level_of(e / size, first)
+        g = weights(e, level)
+    return Noise(lags, ar, level, g, e, rows, shortest(n, lags, fewest))

@@ -1,0 +1,274 @@
+"""One test of constancy, from records that the model of constants draws itself.
+
+    y*_t = x*_t' theta + v*_t,   v*_t = sum a_l v*_(t-l) + s_t e_t,   s_t = -1 or 1,   x* with the lags of y*
+
+e are the residuals of the segments, over one less their leverage (MacKinnon and White, 1985): residuals of constants
+would count a change as noise. Where they pass through dynamics they are limited at three levels. theta and a are those
+of constants, less the bias that the same draws show (Kilian, 1998), with no root beyond 1. For every draw everything is
+estimated again, and three statistics are computed: Nyblom's, which sees a slow drift, the gain of one break, a step,
+and the gain of two, a temporary change. p is that of the smallest of their p-values among those of the draws, beyond
+the largest draws by their exponential tail.
+
+Source: Wu (1986) and Liu (1988) for wild residuals; Hansen (2000) for fixed regressors, Goncalves and Kilian (2004) for
+the recursion. Cost: `DRAWS` searches; records that are clearly constant stop after the first `FEW`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.changes.constants import SMALL, Found, Problem, Work
+from driftfit.judge.changes.fit import HELD, Noise, grid, noise, order_of, white_rows
+from driftfit.judge.changes.recursion import Drawn, Recursion, Results, draw
+from driftfit.judge.changes.scan import searched
+from driftfit.judge.statistics.robust import orthonormal
+
+DRAWS, FEW = 199, 39
+CLEAR = 0.3
+"""p of the first draws above which no others are drawn."""
+BIASED = 40
+"""Draws of constants from which their bias comes."""
+UNIT = 0.9999
+"""Largest root of the noise."""
+ROUNDS = 5
+"""Rounds of constants and their autoregression."""
+ROUNDING = 1e-15
+"""Standard deviation of rounding, as a share of the outputs."""
+LOST = 1e-7
+"""Share of the sum of squares of constants that differences of sums may lose."""
+
+
+class Lags(NamedTuple):
+    """Which columns of a regression are earlier outputs of it."""
+
+    columns: Array
+    """(k,)"""
+    source: Array
+    """(N, k): the row whose output they are; negative where it is none of these rows."""
+    ratio: Array
+    """(N, k): what they are times that output."""
+
+    @classmethod
+    def none(cls, N: int) -> Lags:
+        """No column is."""
+        return cls(np.zeros(0, np.int64), np.zeros((N, 0), np.int64), np.zeros((N, 0)))
+
+    def only(self, rows: Array, columns: Sequence[int]) -> Lags:
+        """Those of some rows and columns, given by their indices."""
+        place = np.full(len(self.source) + 1, -1)
+        place[rows] = np.arange(len(rows))
+        kept = [i for i, j in enumerate(self.columns) if j in columns]
+        new = np.array([list(columns).index(self.columns[i]) for i in kept], np.int64)
+        source = place[self.source[rows][:, kept]]
+        return Lags(new, np.ascontiguousarray(source), np.ascontiguousarray(self.ratio[rows][:, kept]))
+
+
+class Tested(NamedTuple):
+    """A test of constancy."""
+
+    p: float
+    p_each: Array
+    """(3,): of Nyblom's statistic, of one break, of two."""
+    L: Array
+    """(1 + 2 n,): Nyblom's statistic of all scores, of that of each parameter, and of the path of each estimate."""
+    p_path: Array
+    """(2 n,): p-values of the last two."""
+    gains: Array
+    """(R, 2): gains of one and of two breaks of the draws."""
+    rss: Array
+    """(3,): sum of squares with no, one and two breaks."""
+    breaks: tuple[Array, Array, Array]
+    """Their dates."""
+    ar: Array
+    """(3, p): their autoregressions."""
+    theta: Array
+    """(n,): constants, in units of the model."""
+    root: float
+    """Largest root of the dynamics: of the lags of the output, and of the noise."""
+
+
+class Model(NamedTuple):
+    """A regression, its orthonormal basis, the outputs that are its regressors, and its noise."""
+
+    phi: Array
+    y: Array
+    """(N,), less phi offset."""
+    offset: Array
+    """(n,): constants, so that sums of squares are those of the noise."""
+    X: Array
+    basis: Array
+    """(n, n): X = phi basis."""
+    lags: Lags
+    root: Array
+    """(N,): what each row was multiplied by."""
+    noise: Noise
+    floor: float
+    """Smallest sum of squares that is more than rounding."""
+
+
+def in_basis(phi: Array) -> tuple[Array, Array]:
+    """X (N, n) with X' X = N I, and the matrix that makes it of phi."""
+    basis = orthonormal(phi)
+    return basis.Q, np.linalg.inv(basis.R) / basis.size[:, None]
+
+
+def modelled(
+    phi: Array, y: Array, lags: Lags, root: Array, order: int | None = None, fewest: int | None = None
+) -> Model:
+    """The regression with its noise."""
+    X, basis = in_basis(phi)
+    offset = basis @ np.linalg.lstsq(X, y, rcond=None)[0]
+    rounding = ROUNDING * np.abs(y)
+    phi, y, basis = (np.ascontiguousarray(one) for one in (phi, y - phi @ offset, basis))
+    found = noise(X, y, phi, order, fewest)
+    r = (y - X @ np.linalg.lstsq(X * found.g[:, None], y * found.g, rcond=None)[0]) * found.g
+    floor = float(np.sum((rounding * found.g) ** 2) + LOST * (r @ r)) + SMALL
+    return Model(phi, y, offset, X, basis, lags, root, found, floor)
+
+
+def problem_of(model: Model, paths: Array) -> Problem:
+    """What all draws share."""
+    places, stride = grid(len(model.y))
+    lags = model.noise.lags
+    sizes = np.array([stride, model.noise.fewest, ROUNDS, 2])
+    return Problem(model.noise.g, lags, places, np.ascontiguousarray(paths), sizes, np.array([model.floor]))
+
+
+def radius(a: Array, lags: Array) -> float:
+    """Largest root of an autoregression with these lags."""
+    p = order_of(lags)
+    if not p:
+        return 0.0
+    companion = np.eye(p, k=-1)
+    companion[0, lags - 1] = a
+    return float(np.abs(np.linalg.eigvals(companion)).max())
+
+
+class Draws:
+    """Records that a model of constants draws, and what is found in them."""
+
+    def __init__(self, model: Model, problem: Problem, held: Array, seed: int = 0) -> None:
+        N, n = model.X.shape
+        self.model, self.problem, self.e = model, problem, held
+        self.work, self.found = Work.of(N, n, problem), Found.of(n, problem)
+        self.rng = np.random.default_rng(seed)
+        self.drawn = Drawn(np.zeros((N, n)), np.zeros((N, n)), np.zeros(N))
+
+    def of(self, theta: Array, ar: Array, count: int, whole: bool) -> Results:
+        """Draws from constants theta (n,) in units of the model; only constants of them unless ``whole``."""
+        model, problem = self.model, self.problem
+        n = model.X.shape[1]
+        way = Recursion(
+            model.phi, model.X, model.basis, *model.lags, theta + model.offset, ar, model.y - model.phi @ theta, self.e
+        )  # fmt: skip
+        signs = self.rng.integers(0, 2, (count, len(model.y))) * 2.0 - 1.0
+        results = Results(
+            np.full((count, 3), np.inf), np.zeros((count, 1 + len(problem.paths))), np.zeros((count, n)),
+            np.zeros((count, len(ar))),
+        )  # fmt: skip
+        draw(way, signs, problem, int(whole), self.work, self.found, self.drawn, results)
+        return results
+
+    def unbiased(self, theta: Array, ar: Array) -> tuple[Array, Array]:
+        """Constants and their autoregression without the bias of the dynamics, as far as they remain stable."""
+        columns, lags = self.model.lags.columns, self.problem.lags
+        if not len(columns) and not len(lags):
+            return theta, ar
+        drawn = self.of(theta, ar, BIASED, False)
+        shift = np.median(drawn.theta @ self.model.basis.T, axis=0)
+        turn = np.median(drawn.ar, axis=0) - ar
+        if not (np.isfinite(shift).all() and np.isfinite(turn).all()):
+            return theta, ar
+        for share in np.linspace(1.0, 0.0, 21):
+            moved, less = theta - share * shift, ar - share * turn
+            if max(self.of_outputs(moved), radius(less, lags)) <= UNIT:
+                return moved, less
+        return theta, ar
+
+    def of_outputs(self, theta: Array) -> float:
+        """Largest root of the lags of the output."""
+        back = self.model.lags
+        if not len(back.columns):
+            return 0.0
+        known = [np.flatnonzero(one >= 0)[-1] for one in back.source.T]
+        lags = np.array([row - source[row] for row, source in zip(known, back.source.T, strict=True)])
+        order = np.argsort(lags)
+        ratio = np.array([back.ratio[row, i] for i, row in enumerate(known)])
+        theta = theta + self.model.offset
+        return radius((theta[back.columns] * ratio)[order], lags[order])
+
+
+def p_of(x: float, drawn: Array) -> float:
+    """p-value of x among draws (R,): its rank, beyond the largest ones by an exponential tail."""
+    R = len(drawn)
+    ordered = np.sort(drawn)
+    if x <= ordered[-6]:
+        return float((1 + np.sum(drawn >= x)) / (R + 1))
+    top = ordered[-max(10, R // 10) :]
+    mean = float(np.mean(top[1:] - top[0])) if len(top) > 1 else 0.0
+    return float(len(top) / (R + 1) * np.exp(-(x - top[0]) / max(mean, SMALL)))
+
+
+def price(drawn: Array, level: float) -> float:
+    """What draws (R,) exceed with probability ``level``, which may be below 1 / R."""
+    R = len(drawn)
+    top = np.sort(drawn)[-max(10, R // 10) :]
+    return float(top[0] + np.mean(top[1:] - top[0]) * np.log(len(top) / (R + 1) / level))
+
+
+def smallest(x: Array, drawn: Array) -> tuple[float, Array]:
+    """p-value of the smallest of the p-values of statistics x (k,) among those of draws (R, k), and each of them."""
+    R = len(drawn)
+    ranks = np.argsort(np.argsort(-drawn, axis=0), axis=0) + 1
+    least = (ranks / (R + 1.0)).min(axis=1)
+    each = np.array([p_of(float(one), column) for one, column in zip(x, drawn.T, strict=True)])
+    p = float(each.min())
+    few = 6.0 / (R + 1)
+    if p >= few:
+        return float((1 + np.sum(least <= p)) / (R + 1)), each
+    return float(p / few * (1 + np.sum(least <= few)) / (R + 1)), each
+
+
+def tested(model: Model) -> tuple[Tested, Draws]:
+    """The test of constancy, and the draws for further ones."""
+    N, n = model.X.shape
+    noise = model.noise
+    first = order_of(noise.lags)
+    Z = model.X * noise.g[:, None]
+    paths = np.vstack([np.linalg.inv(model.basis).T, model.basis @ np.linalg.inv(Z.T @ Z)])
+    size = np.sqrt(np.sum((paths @ (Z.T @ Z)) * paths, axis=1))
+    problem = problem_of(model, paths / np.maximum(size, SMALL)[:, None])
+    work, found = Work.of(N, n, problem), Found.of(n, problem)
+    searched(model.X, model.y, problem, work, found)
+    held = noise.e.copy()
+    rows, _ = white_rows(noise.rows, model.y, noise.lags, noise.ar, noise.g)
+    Q = np.linalg.qr(rows)[0]
+    held[first:] /= np.maximum(1.0 - np.sum(Q * Q, axis=1), 0.1)
+    if first or len(model.lags.columns):  # an outlier of the output would be one of the dynamics
+        held = np.clip(held, -HELD * noise.level, HELD * noise.level)
+    draws = Draws(model, problem, held)
+    theta, ar = draws.unbiased(model.basis @ found.theta, found.ar[0])
+    x = np.append(found.L[0], gains(found.rss[None], N)[0])
+    R, L = np.zeros((0, 2)), np.zeros((0, len(found.L)))
+    for count in (FEW, DRAWS - FEW):
+        drawn = draws.of(theta, ar, count, True)
+        fine = np.isfinite(drawn.L).all(axis=1) & np.isfinite(drawn.rss[:, 0])
+        R, L = np.vstack([R, gains(drawn.rss[fine], N)]), np.vstack([L, drawn.L[fine]])
+        p, each = smallest(x, np.column_stack([L[:, 0], R]))
+        if p > CLEAR:
+            break
+    p_path = np.array([p_of(float(one), drawn) for one, drawn in zip(found.L[1:], L.T[1:], strict=True)])
+    root = max(draws.of_outputs(theta), radius(ar, noise.lags))
+    dates = tuple(problem.places[found.at[k, :k]] for k in range(3))
+    constants = model.basis @ found.theta
+    return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, root), draws  # type: ignore[arg-type]
+
+
+def gains(rss: Array, N: int) -> Array:
+    """N log(rss_0 / rss_k), k = 1, 2, of sums of squares (R, 3); 0 where there is no room."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(np.isfinite(rss[:, 1:]), N * np.log(rss[:, :1] / rss[:, 1:]), 0.0)

@@ -1,0 +1,111 @@
+"""Records that a model of constants draws itself, and what is found in each, compiled."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from driftfit.engine.kernel import Array, Driver, shared
+from driftfit.judge.changes.constants import Found, Problem, Work, settle
+from driftfit.judge.changes.scan import search
+
+
+class Recursion(NamedTuple):
+    """How a record of a model makes the next one: its lags of the output are those of the drawn outputs."""
+
+    phi: Array
+    """(N, n): the regressors, in units of the model."""
+    X: Array
+    """(N, n): the same, orthonormal."""
+    basis: Array
+    """(n, n): X = phi basis."""
+    columns: Array
+    """(k,): columns of phi that are lags of the output."""
+    source: Array
+    """(N, k): the row whose output they are; negative where it is none of these rows."""
+    ratio: Array
+    """(N, k): what they are times that output."""
+    theta: Array
+    """(n,): constants, in units of the model."""
+    ar: Array
+    """(p,)"""
+    start: Array
+    """(N,): noise of the first rows, as many as the autoregression has lags."""
+    e: Array
+    """(N,): white residuals, whose signs are drawn."""
+
+
+@shared
+def simulate(way: Recursion, lags: Array, signs: Array, v: Array, phi: Array, y: Array) -> None:
+    """Outputs y (N,) and their regressors phi (N, n) of one draw of signs (N,)."""
+    N, n = phi.shape
+    p, k = lags.shape[0], way.columns.shape[0]
+    first = lags[p - 1] if p > 0 else 0
+    for t in range(N):
+        v[t] = way.start[t] if t < first else way.e[t] * signs[t]
+        if t >= first:
+            for i in range(p):
+                v[t] += way.ar[i] * v[t - lags[i]]
+        y[t] = v[t]
+        for j in range(n):
+            phi[t, j] = way.phi[t, j]
+        for i in range(k):
+            if way.source[t, i] >= 0:
+                phi[t, way.columns[i]] = way.ratio[t, i] * y[way.source[t, i]]
+        for j in range(n):
+            y[t] += phi[t, j] * way.theta[j]
+
+
+class Results(NamedTuple):
+    """What is found in R draws; sums of squares, Nyblom's statistics, or constants and their autoregressions."""
+
+    rss: Array
+    """(R, 3)"""
+    L: Array
+    """(R, 1 + m)"""
+    theta: Array
+    """(R, n), in the basis, less those that were drawn from."""
+    ar: Array
+    """(R, p)"""
+
+
+class Drawn(NamedTuple):
+    """Scratch space for one draw."""
+
+    phi: Array
+    """(N, n)"""
+    X: Array
+    """(N, n)"""
+    y: Array
+    """(N,)"""
+
+
+def _draw(
+    way: Recursion, signs: Array, problem: Problem, whole: int, work: Work, found: Found, drawn: Drawn, results: Results
+) -> None:
+    """Results of all draws of signs (R, N); only constants and their autoregression unless ``whole``."""
+    N, n = way.phi.shape
+    for d in range(signs.shape[0]):
+        simulate(way, problem.lags, signs[d], work.v, drawn.phi, drawn.y)
+        for t in range(N):
+            drawn.y[t] = work.v[t]  # without what constants explain, which may be far larger
+            for j in range(n):
+                drawn.X[t, j] = way.X[t, j]
+                if way.columns.shape[0] > 0:
+                    drawn.X[t, j] = 0.0
+                    for i in range(n):
+                        drawn.X[t, j] += drawn.phi[t, i] * way.basis[i, j]
+        if whole > 0:
+            search(drawn.X, drawn.y, problem, work, found)
+            for count in range(3):
+                results.rss[d, count] = found.rss[count]
+            for i in range(found.L.shape[0]):
+                results.L[d, i] = found.L[i]
+            continue
+        for i in range(results.ar.shape[1]):
+            results.ar[d, i] = 0.0
+        settle(drawn.X, drawn.y, problem, problem.sizes[2], results.ar[d], work)
+        for j in range(n):
+            results.theta[d, j] = work.theta[j]
+
+
+draw = Driver(_draw)

@@ -1,1 +1,0 @@
-"""Samples without an output: events in a gap, whose times the data cannot distinguish."""
