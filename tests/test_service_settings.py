@@ -127,7 +127,7 @@ def test_nothing_is_evaluated(text):
 @pytest.mark.parametrize(
     "text",
     ['Bank(sensors=[Sensor(kind="own", likelihood="trap:density")])',
-     'Bank(sensors=[Sensor("own", None, .1, 1.0, 0.0, None, None, 4.0, None, None, "trap:density")])',
+     'Bank(sensors=[Sensor("own", None, .1, 1.0, 0.0, None, None, 4.0, None, "trap:density")])',
      'HammersteinWiener(1, 1, input=Functions("trap:f", "trap:f"))'],
 )  # fmt: skip
 def test_no_configuration_imports_a_module(text, tmp_path, monkeypatch):

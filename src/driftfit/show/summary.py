@@ -332,7 +332,7 @@ def summarise_fleet(fleet: KeyedResults) -> FleetSummary:
     paths = [_path(run) for run in runs]
     excursion = np.array([path.excursion for path in paths])
     scaled = all(tracker.covariance for tracker in {run.tracker for run in runs})
-    median = np.median(excursion, axis=0)
+    median = np.median(excursion, axis=0) if runs else 1.0
     moved = np.array([path.moved for path in paths]) if scaled else excursion / np.where(median > 0.0, median, 1.0)
     units = [_unit(*each) for each in zip(fleet, runs, paths, moved, strict=True)]
     units.sort(key=lambda unit: -unit.moved if np.isfinite(unit.moved) else np.inf)

@@ -23,10 +23,8 @@ TOTAL, FIRST, MIXED = range(3)
 """Of one that others join: the log of the integral of all, of the first, and whether there are others."""
 UNLIKELY = 11.0
 """Log of the ratio to the most probable below which a component is dropped."""
-MINOR = 0.03
-"""Share of a noise below which it counts as the first."""
-FAR = 600.0
-"""Log of the ratio of two densities beyond which they are as far apart as can be."""
+MINOR, FAR = 0.03, 600.0
+"""Share of a noise below which it counts as the first, and log of the ratio of two densities at most."""
 ROOMY = 12
 """Components that are usually enough."""
 JOIN, SQUEEZE = 1e-3, 100.0
