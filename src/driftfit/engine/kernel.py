@@ -72,12 +72,6 @@ def _compiled(function: Callable[..., Any], cache: bool = False, short: bool = F
     return dispatcher
 
 
-def _again(dispatcher: Any, again: Callable[..., Any]) -> Any:
-    """Store how a function like this one is made from another source; see `driftfit.trackers.bank.substitute`."""
-    dispatcher.again = again
-    return dispatcher
-
-
 def kernel(function: Callable[..., Any], inline: bool = True, short: bool = False) -> Any:
     """Compile a step, or a function that steps call.
 
@@ -89,7 +83,7 @@ def kernel(function: Callable[..., Any], inline: bool = True, short: bool = Fals
     inline = inline and not short
     compiled = _compiled(function, short=short, forceinline=inline, **internals.LINKED)
     made = internals.as_part(compiled, internals.StepDispatcher, for_constants=inline, short=short)
-    return _again(made, lambda other: kernel(other, inline, short))
+    return made
 
 
 def shared(function: Callable[..., Any], arrays: bool = False) -> Any:
@@ -102,7 +96,7 @@ def shared(function: Callable[..., Any], arrays: bool = False) -> Any:
     """
     options = {**internals.LINKED, "_nrt": arrays}
     compiled = _compiled(function, cache=True, forceinline=False, **options)
-    return _again(internals.as_part(compiled), lambda other: shared(other, arrays))
+    return internals.as_part(compiled)
 
 
 def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] = ()) -> Any:
@@ -114,7 +108,7 @@ def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] =
     """
     if function is None:
         return lambda source: _for_sizes(part(source), sizes)
-    return _again(internals.as_part(_compiled(function, cache=True, forceinline=True, **internals.LINKED)), part)
+    return internals.as_part(_compiled(function, cache=True, forceinline=True, **internals.LINKED))
 
 
 def _for_sizes(work: Any, sizes: tuple[int, ...]) -> Any:
