@@ -148,17 +148,6 @@ def test_two_fault_codes_among_the_first_ten_samples_do_no_harm(tracker):
     assert fleet[1].left_out.sample.tolist() == [2, 7]
 
 
-def test_what_is_left_out_is_counted_and_the_smoother_leaves_it_out_too():
-    for at in (3, 300):
-        y, u = plant()
-        y[at] = 9999.0
-        run = gated(PLANT, Kalman(q=1e-7, r=0.01), y, u)
-        assert run.left_out.sample.tolist() == [at]
-        assert "Left out" in str(run.summary())
-        assert np.abs(run.smooth().theta - THETA).max() < 0.05
-    assert not len(gated(PLANT, Kalman(q=1e-7, r=0.01), *plant()).left_out)
-
-
 @pytest.mark.parametrize("tracker", [RLS(0.98), Kalman(q=1e-4, r=0.01)], ids=repr)
 def test_what_is_no_fault_is_learned_from(tracker):
     """A large test, a gain that changes, and a new level a hundred deviations away, which costs a few samples."""

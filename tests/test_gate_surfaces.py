@@ -67,6 +67,7 @@ def test_the_input_that_is_left_out_is_named(names, at):
     live.update_many(y, u)
     assert [(one.sample, one.signal) for one in run.left_out] == [(at, (names or ("u1", "u2"))[1])]
     assert live.left_out.last == tuple(run.left_out)
+    assert ("Inputs left out" if at == 100 else "Left out at the start") in str(run.summary())
 
 
 def test_decisions_of_a_stream_with_times_have_them():

@@ -12,7 +12,7 @@ from driftfit.cli.options import Given, Plot, reads
 from driftfit.cli.program import app, progress, say
 from driftfit.cli.reading import listed
 from driftfit.parsing.settings import given_fields
-from driftfit.readings.left_out import LeftOut, remarks_of
+from driftfit.readings.left_out import remarks_of
 from driftfit.show.text import facts, shortened, table_of
 
 
@@ -42,7 +42,7 @@ def tune(
         ("Model", repr(models[0])),
         ("Tracker", shortened(repr(tuned.tracker))),
         ("Log-likelihood", f"{tuned.loglik:.6g} of {tuned.used} samples"),
-        *remarks_of([tuned.left_out] if isinstance(tuned.left_out, LeftOut) else tuned.left_out.values()),
+        *remarks_of(tuned.left_out),
     ]
     say(facts(*rows))
     table = table_of(f"Settings by {method}", "", "chosen", f"{level:.0%} from", "to")

@@ -286,26 +286,29 @@ def first_samples(ages: int, implicit: bool = False) -> Step:
 
 
 class First(NamedTuple):
-    """Whole samples to replay, each as often as it came, up to the present one; what is a code is missing."""
+    """The first samples, each as often as it came, up to the present one."""
 
     y: Array
     """Readings (k,)."""
     u: Array
-    """Inputs (k, m)."""
+    """Inputs (k, m); of samples that made room for others NaN."""
     known: Array
     """Intervals since the sample before, factors of the noise variance and of the drift (k, 3)."""
     codes: Array
-    """Which signals (k, 1 + m), the output first, are left out as codes."""
-    readings: Array
-    """Readings (k,), of codes too."""
-    dropped: int
-    """How many samples with the reading of the first came before it, all of them codes."""
+    """Which signals (k, 1 + m), the output first, are codes."""
+    reason: Array
+    """What was decided (k,), as a gate stores it."""
+
+    def without_codes(self) -> tuple[Array, Array]:
+        """(readings (k,), inputs (k, m)), NaN where they are codes."""
+        return np.where(self.codes[:, 0], np.nan, self.y), np.where(self.codes[:, 1:], np.nan, self.u)
 
 
 def replayed(lane: Mapping[str, Array], m: int) -> First:
     """The first samples of a lane with ``gate_replay`` set, given the fields of its state."""
-    rows = np.array(lane["gate_first"][: int(lane["gate_kept"])])
+    rows, dropped = np.array(lane["gate_first"][: int(lane["gate_kept"])]), int(lane["gate_replay"]) - 1
+    rows[0, TIMES] += dropped
     rows = np.repeat(rows, rows[:, TIMES].astype(int), axis=0)
+    rows[:dropped, U : U + m] = np.nan
     codes = (rows[:, [CODES]].astype(int) >> np.arange(1 + m)) % 2 == 1
-    y, u = np.where(codes[:, 0], np.nan, rows[:, READING]), np.where(codes[:, 1:], np.nan, rows[:, U : U + m])
-    return First(y, u, rows[:, [DT, NOISE, DRIFT]], codes, rows[:, READING], int(lane["gate_replay"]) - 1)
+    return First(rows[:, READING], rows[:, U : U + m], rows[:, [DT, NOISE, DRIFT]], codes, np.zeros(len(rows)))

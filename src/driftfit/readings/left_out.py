@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -139,56 +138,38 @@ def left_out_of(decided: Array, y: Array, ok: Array, ages: int, names: Sequence[
     return LeftOut(sample, code, y[sample], np.array(names)[signal], refused, unused)
 
 
-def remarks_of(several: Iterable[LeftOut]) -> tuple[tuple[str, str], ...]:
-    """The lines on what was left out of several records together."""
-    codes = [one.code for one in several]
-    return remarks(counts(np.concatenate(codes))) if codes else ()
+def remarks_of(found: LeftOut | Mapping[Any, LeftOut]) -> tuple[tuple[str, str], ...]:
+    """The lines on what was left out of a record, or of several together."""
+    several = [found] if isinstance(found, LeftOut) else found.values()
+    return remarks(counts(np.concatenate([NONE, *(one.code for one in several)])))
 
 
 class Tally:
-    """What the gate of a stream left out: ``counts`` by reason, and the `last` decisions, the newest at the end."""
+    """What the gate of a stream left out: ``counts`` of samples by reason, as summaries call it, and the ``last`` 16
+    decisions, the newest at the end."""
 
-    def __init__(self) -> None:
-        self._counts: Counter[str] = Counter()
-        self._last: deque[Decision] = deque(maxlen=KEPT)
+    def __init__(self, counted: Mapping[str, int] | None = None, last: Iterable[Sequence[Any]] = ()) -> None:
+        """Nothing, or what `plain` wrote."""
+        self.counts: dict[str, int] = dict(counted or {})
+        self.last: tuple[Decision, ...] = tuple(Decision(*one) for one in last)
 
     def __len__(self) -> int:
-        return self._counts.total()
+        return sum(self.counts.values())
 
     def __iter__(self) -> Iterator[Decision]:
         return iter(self.last)
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """How many samples there are for each reason, by the name that summaries use."""
-        return dict(self._counts)
-
-    @property
-    def last(self) -> tuple[Decision, ...]:
-        """The last 16 decisions."""
-        return tuple(self._last)
-
-    def clear(self) -> None:
-        """Nothing was left out."""
-        self._counts.clear()
-        self._last.clear()
-
     def add(self, sample: Any, decided: int, value: float, names: Sequence[str]) -> None:
         """Count a sample that was not used, with the names of the output and the inputs."""
         signal, code = divmod(int(decided), SIGNAL)
-        self._counts[SAID[code][0]] += 1
-        self._last.append(Decision(sample, names[signal], value, SAID[code][1]))
+        name, reason = SAID[code]
+        self.counts[name] = self.counts.get(name, 0) + 1
+        self.last = (*self.last, Decision(sample, names[signal], value, reason))[-KEPT:]
 
     def __repr__(self) -> str:
-        said = ", ".join(f"{name}: {count}" for name, count in self._counts.items())
-        return f"{said}\n{table(self._last, len(self._last))}" if said else "nothing left out"
+        said = ", ".join(f"{name}: {count}" for name, count in self.counts.items())
+        return f"{said}\n{table(self.last, len(self.last))}" if said else "nothing left out"
 
     def plain(self) -> list[Any]:
-        """The state as plain data; `restore` takes it."""
-        return [dict(self._counts), [list(one) for one in self._last]] if self._counts else []
-
-    def restore(self, state: list[Mapping[str, int] | Any]) -> None:
-        """The inverse of `plain`."""
-        if state:
-            self._counts.update(state[0])
-            self._last.extend(Decision(*one) for one in state[1])
+        """The state as plain data."""
+        return [self.counts, [list(one) for one in self.last]] if self.counts else []

@@ -25,11 +25,11 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.readings.first_samples import replayed
-from driftfit.readings.gate import Gate, gate_step
+from driftfit.readings.first_samples import First, replayed
+from driftfit.readings.gate import AT_START, SIGNAL, Gate, gate_step
 from driftfit.readings.gate import start as gate_start
 from driftfit.run.columns import COLLECTED, collecting, put_columns
-from driftfit.run.gating import AtStart, at_start, gate_of, without_start
+from driftfit.run.gating import gate_of, without_start
 from driftfit.run.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
@@ -231,7 +231,7 @@ class Program:
 
     def _decided(
         self, run: Any, tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE,
-        found_too: list[tuple[int, AtStart]] | None = None,
+        found_too: list[tuple[int, First]] | None = None,
     ) -> int:  # fmt: skip
         """Run to the end, with the first samples once more without the codes that were found among them.
 
@@ -243,9 +243,8 @@ class Program:
             if found_too is not None:
                 found_too.append((done - 1, found))
             if "reason" in (out.dtype.names or ()) and theta is NOWHERE:
-                at = done - 1 - found.ago
-                out["reason"][:done] = 0.0
-                out["reason"][at[at >= 0], 0] = found.decided[at >= 0]
+                count = min(done, len(found.reason))
+                out["reason"][done - count : done, 0] = found.reason[-count:]
             rest = slice(done, None)
             known = known if len(known) == 1 else known[rest]
             if theta is NOWHERE:
@@ -254,15 +253,16 @@ class Program:
                 self._decided(run, tile, y[rest], u[rest], known, out, theta[rest])
         return len(y)
 
-    def replay(self, tile: Array) -> AtStart:
+    def replay(self, tile: Array) -> First:
         """Bring a tile, whose gate has found codes among the first samples, to where it is without them."""
         first = replayed(state_of(tile), self.model.m)
         fresh = self.tile({"gate_decided": np.array(1)})
-        out = self.written(fresh, len(first.y))
-        self.drivers().run(fresh, first.y[:, None], first.u[:, :, None], first.known[:, :, None], out)
-        fresh["gate_refused"][0, 0] = first.dropped + np.sum(first.codes.any(axis=1))
+        (y, u), coded, out = first.without_codes(), first.codes.any(axis=1), self.written(fresh, len(first.y))
+        self.drivers().run(fresh, y[:, None], u[:, :, None], first.known[:, :, None], out)
+        fresh["gate_refused"][0, 0] = np.sum(coded)
         tile.view(np.uint8)[:] = fresh.view(np.uint8)
-        return at_start(first, out["reason"][:, 0])
+        reason = np.where(coded, AT_START + SIGNAL * np.argmax(first.codes, axis=1), out["reason"][:, 0])
+        return first._replace(reason=reason)
 
     @property
     def width(self) -> int:

@@ -16,9 +16,10 @@ from driftfit.data.instants import instant
 from driftfit.data.record import Known, Reading, Records
 from driftfit.engine.drivers import DRIFT, INTERVAL, NOISE
 from driftfit.engine.kernel import Array
+from driftfit.readings.first_samples import First
 from driftfit.readings.gate import AT_START, SIGNAL
+from driftfit.readings.left_out import Tally
 from driftfit.run.columns import SCALARS, Columns
-from driftfit.run.gating import AtStart
 from driftfit.run.live.rule import FROZEN
 from driftfit.run.live.stream import HELD, Stream, check_applied
 from driftfit.run.program import Program, lanes_of
@@ -190,7 +191,7 @@ class Batched(Stream):
         if self.programs[0].gate is None:
             self._loop(self._state_tile(), y, u, known, out)
             return
-        found: list[tuple[int, AtStart]] = []
+        found: list[tuple[int, First]] = []
         self._loop(self._state_tile(), y, u, known, out, found_too=found)
         starts = dict(found)
         for t in sorted({*np.flatnonzero(out["reason"].any(axis=1)).tolist(), *starts}):
@@ -216,13 +217,12 @@ class Batched(Stream):
         """Count a sample that the gate refused."""
         self.left_out.add(sample if time is None else time, code, y, self.programs[lane].signals)
 
-    def _note_start(self, sample: int, time: Any, found: AtStart) -> None:
+    def _note_start(self, sample: int, time: Any, first: First) -> None:
         """Count what the gate decided of the first samples, at the present one, in place of what it said before."""
-        self.left_out.clear()
-        times = None if time is None else self._clock.moved(time, -found.intervals)
-        columns = (one.tolist() for one in (found.ago, found.value, found.decided))
-        for k, (ago, y, code) in enumerate(zip(*columns, strict=True)):
-            self._note(sample - ago, None if times is None else times[k], code, y)
+        self.left_out, dt, begun = Tally(), first.known[:, 0], sample + 1 - len(first.y)
+        times = None if time is None else self._clock.moved(time, dt - np.cumsum(dt[::-1])[::-1])
+        for k in np.flatnonzero(first.reason).tolist():
+            self._note(begun + k, None if times is None else times[k], first.reason.item(k), first.y.item(k))
 
     def _keep(self, y: Array, known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""
