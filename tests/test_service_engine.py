@@ -1,5 +1,6 @@
 """The engine of the service: the journal alone determines the states, whatever happens to the process."""
 
+import math
 import shutil
 import sqlite3
 import threading
@@ -99,6 +100,27 @@ def test_late_rows_are_put_in_order(tmp_path):
     for before, after in zip(streams.waiting.of(0), again.streams.waiting.of(0), strict=True):
         assert np.array_equal(before, after)
     assert np.array_equal(again.live.theta, run.theta[-1])
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_what_a_stored_state_contains_is_not_processed_again(tmp_path, timed):
+    """A group of two units is needed again for one of them; the state of the other has its samples already."""
+    y, u = record(100)
+    config = configured(UNIT if timed else UNIT.replace('time = "t"\ndt = 1.0\n', ""))
+    engine = opened(config, tmp_path)
+    for k in range(0, 100, 50):
+        for pump in "ab":
+            engine.intake.put("web", message(f"plant/{pump}", range(k, k + 50), y[k : k + 50], u[k : k + 50]))
+        engine.step(0.0)
+    engine._dirty[1] = (1, -math.inf)  # it has waited longest: only this state is stored
+    engine._store_states()
+    settled(engine)
+    engine.journal.close()
+    engine = opened(config, tmp_path)
+    assert engine.recovered == 100
+    for unit in (1, 2):
+        assert engine.units.get(unit).counts["samples"] == 100
+        assert np.array_equal(engine.units.get(unit).live.theta, run_of(y, u).theta[-1])
 
 
 def test_actions_are_part_of_the_journal(tmp_path):
