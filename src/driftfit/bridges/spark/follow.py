@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from driftfit.bridges.spark.alarms import rules_of
-from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, results_of
+from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, results_of, rules_of
 from driftfit.bridges.spark.frames import rows_of, task_of
 from driftfit.bridges.spark.store import NEXT, Store
 from driftfit.bridges.spark.task import SETTING, Task, trackers_of
@@ -171,7 +171,7 @@ class _Batches:
         """The table of a batch, which begins with the states after another one."""
         from pyspark.sql import functions as F  # noqa: N812
 
-        flow, task = self.flow, self.flow.task
+        flow, task, expired = self.flow, self.flow.task, None
         new = rows_of(rows, task, self.settings).withColumn("_kind", F.lit(NEW))
         parts = [new]
         if before is not None:
@@ -179,7 +179,7 @@ class _Batches:
             which = F.when(F.col("kind") == "state", F.lit(OLD)).otherwise(F.lit(WAITED))
             parts.append(kept.withColumn("_kind", which).select(*task.columns, *flow.state, "_kind"))
             if self.expire is not None:
-                flow = replace(flow, expired=self._oldest(kept))
+                expired = self._oldest(kept)
         elif self.initial is not None:
             parts.append(begun(self.initial, task).withColumn("_kind", F.lit(OLD)))
         every = parts[0]
@@ -192,7 +192,11 @@ class _Batches:
         every = every.select(*task.columns, *flow.state, *own, "_kind")
         order = [*task.by, "_kind", task.time, *task.y, *task.u]
         made = ", ".join(f"`{name}` {kind}" for name, kind in flow.schema.items())
-        return every.repartition(*task.by).sortWithinPartitions(*order).mapInArrow(flow.work, made)
+        return (
+            every.repartition(*task.by)
+            .sortWithinPartitions(*order)
+            .mapInArrow(partial(flow.work, expired=expired), made)
+        )
 
     def _oldest(self, kept: Any) -> Any:
         """The time before which a unit has been silent for too long."""

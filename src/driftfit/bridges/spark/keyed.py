@@ -13,14 +13,12 @@ since, it is set again.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from driftfit.bridges.spark.alarms import rules_of
-from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, results_of
+from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, Known, results_of, rules_of
 from driftfit.bridges.spark.follow import begun, duration
 from driftfit.bridges.spark.frames import rows_of, task_of
 from driftfit.bridges.spark.units import ARROW
@@ -155,11 +153,9 @@ class Unit:
             own = [one[name] for one in before]
             columns[name] = self._column([*own, *[None] * (len(every) - len(own))], self.types[name])
         found: dict[str, list[dict[str, Any]]] = {}
-        for table in replace(self.flow, expired=expired).tables(pa.table(columns)):
-            for name in self.when if self.dated else ():
-                table = table.set_column(table.column_names.index(name), name, table.column(name).cast(pa.int64()))
-            for row in table.drop_columns(list(self.flow.task.by)).to_pylist():
-                found.setdefault(row["kind"], []).append(row)
+        for name, own in self.flow.parts(Known(self.flow, pa.table(columns)), expired):
+            rows = zip(*map(_listed, own.values()), strict=True)
+            found.setdefault(name, []).extend({"failed": None, **dict(zip(own, row, strict=True))} for row in rows)
         ((after,),) = (found[kind] for kind in ("expired", "state") if kind in found)
         waiting = [[row[name] for name in self.row] for row in found.get("waiting", [])]
         return self.begun(after) | {"waiting": waiting}, found.get("result", []) + found.get("late", [])
@@ -175,6 +171,13 @@ class Unit:
         if pa.types.is_timestamp(kind):
             return pa.array([None if one is None else int(one) for one in values], pa.int64()).cast(kind)
         return pa.array(values, kind)
+
+
+def _listed(column: Any) -> list[Any]:
+    """A column as a list; dates are microseconds."""
+    if isinstance(column, pa.Array | pa.ChunkedArray):
+        return (column.cast(pa.int64()) if pa.types.is_timestamp(column.type) else column).to_pylist()
+    return np.asarray(column).tolist() if isinstance(column, np.ndarray) else list(column)
 
 
 def _processor(unit: Unit, names: Sequence[str], span: float | None) -> Any:
