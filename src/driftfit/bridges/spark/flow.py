@@ -51,6 +51,11 @@ class Flow:
     rules: tuple[AlarmRule | None, ...]
     origins: tuple[Any, ...] = ()
 
+    @property
+    def dated(self) -> bool:
+        """Whether times are dates."""
+        return self.kinds[self.task.time].startswith("timestamp")
+
     @cached_property
     def state(self) -> dict[str, str]:
         """Columns and types of a state, without those of its unit."""
@@ -106,7 +111,8 @@ class Flow:
         for j, k in enumerate(done.keys):
             lanes = done.found.lanes.part(range(j * ny, (j + 1) * ny))
             y = records.y[records.first[j] : records.first[j] + records.length[j]].reshape(-1, ny)
-            before, after, found = json.loads(known.watch[k] or "[]") or [None] * ny, [None] * ny, iter(schema)
+            before, found = json.loads(known.watch[k] or "[]") or [None] * ny, iter(schema)
+            after: list[Any] = [None] * ny
             for i, (rule, program, lane) in enumerate(zip(self.rules, known.joint(k).programs, lanes, strict=True)):
                 if rule is None:
                     continue
