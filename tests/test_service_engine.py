@@ -30,9 +30,9 @@ from service_support import (
 )  # fmt: skip
 
 from driftfit import ARX, DataWarning, track
+from driftfit.service.connect.base import Batch
 from driftfit.service.core.engine import KEPT_GROUPS, Intake
 from driftfit.service.core.section import Section
-from driftfit.service.sources.contract import Batch
 from driftfit.service.supervisor import Service, rebuild
 
 

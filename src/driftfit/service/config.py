@@ -21,9 +21,8 @@ from driftfit.models.base import Model
 from driftfit.parsing.settings import parse_model, tracker_of
 from driftfit.run.live.rule import KINDS
 from driftfit.run.program import Program
+from driftfit.service.connect.base import Connector, Sink, Source
 from driftfit.service.options import PageOptions, Pattern, ServiceOptions, build, converted, kinds
-from driftfit.service.sinks.contract import Sink
-from driftfit.service.sources.contract import Source
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
 
@@ -136,9 +135,9 @@ class _Reader:
                 self.fault((key,), f"there is no section {key!r}; {near(key, known)}")
         service = self.tried(("service",), lambda: build(ServiceOptions, self.table("service")))
         page = self.tried(("page",), lambda: build(PageOptions, self.table("page")))
-        sources = [self.one("source", key, given) for key, given in self.sources().items()]
+        sources = [self.one("source", Source, key, given) for key, given in self.sources().items()]
         units = [self.tried(("unit", k), partial(self.unit, k)) for k in range(len(self.tables("unit")))]
-        sinks = [self.one("sink", k, given) for k, given in enumerate(self.tables("sink"))]
+        sinks = [self.one("sink", Sink, k, given) for k, given in enumerate(self.tables("sink"))]
         if not self.problems and not self.data.get("source"):
             self.fault((), 'there is no source; add a table such as [source.plant] with kind = "mqtt".')
         if not self.problems and not units:
@@ -184,11 +183,11 @@ class _Reader:
         self.fault(("source",), "each source has a name: begin its table with [source.NAME].")
         return {}
 
-    def one(self, what: str, key: Any, given: dict[str, Any]) -> Any:
+    def one(self, what: str, base: type[Connector], key: Any, given: dict[str, Any]) -> Any:
         """A source or a sink."""
 
         def made() -> Any:
-            known = kinds(what)
+            known = kinds(base)
             kind = given.get("kind")
             if kind not in known:
                 raise KeyProblemError(("kind",), f"{what} kind {kind!r}; {near(str(kind), known)}")

@@ -1,6 +1,6 @@
 """Options of the service, its page, sources and sinks, built from tables of a TOML file; and patterns of topics.
 
-A source or sink is one file in ``sources/`` or ``sinks/``; existing in the folder is being registered.
+A source or sink is a class in a file of the folder ``connect``; being there is being registered.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ import os
 import pkgutil
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
 from importlib import import_module
+from inspect import isabstract
 from pathlib import Path
 from string import Formatter
 from typing import Any, TypeVar
 
 from driftfit.engine.settings import near
-from driftfit.service.sinks.contract import Sink
-from driftfit.service.sources.contract import Source
+from driftfit.service.connect.base import Connector
 
 Made = TypeVar("Made")
 
@@ -144,13 +144,18 @@ class PageOptions:
         return self.host in ("127.0.0.1", "::1", "localhost")
 
 
-def kinds(what: str) -> dict[str, Any]:
-    """The classes of the folder ``sources`` or ``sinks``, by kind, which is the name of the file."""
-    package = import_module(f"driftfit.service.{what}s")
-    names = [one.name for one in pkgutil.iter_modules(package.__path__)]
-    found = {name: import_module(f"{package.__name__}.{name}") for name in names}
-    classes = {name: getattr(module, name.capitalize(), None) for name, module in found.items()}
-    return {name: kind for name, kind in classes.items() if isinstance(kind, type) and issubclass(kind, Source | Sink)}
+def kinds(base: type[Connector]) -> dict[str, Any]:
+    """All sources or all sinks, by kind, once the files of the folder ``connect`` are imported."""
+    package = import_module("driftfit.service.connect")
+    for one in pkgutil.iter_modules(package.__path__):
+        import_module(f"{package.__name__}.{one.name}")
+    return {one.kind(): one for one in _below(base) if not isabstract(one)}
+
+
+def _below(base: type[Any]) -> Iterator[type[Any]]:
+    for one in base.__subclasses__():
+        yield one
+        yield from _below(one)
 
 
 def build(kind: type[Made], given: dict[str, Any]) -> Made:
