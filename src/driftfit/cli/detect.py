@@ -11,7 +11,7 @@ from typer import Option
 
 from driftfit.cli.options import Given, Plot, Report, Table, check_table, reads
 from driftfit.cli.program import app, say
-from driftfit.cli.reading import interval_from
+from driftfit.cli.reading import interval_from, order_of
 from driftfit.data.limits import end_of
 from driftfit.engine.settings import marks
 from driftfit.results import Track
@@ -63,7 +63,7 @@ def detect(
     say(alarms)
     faulty = None
     if rows is not None and labels is not None:
-        faulty = marks("--labels", rows.numbers[labels][rows.order()], len(alarms.active))
+        faulty = marks("--labels", rows.numbers[labels][order_of(rows)], len(alarms.active))
         score = alarms.score(faulty)
         late = "" if np.isnan(score.delay) else f", {score.delay:g} samples after they began (median)"
         found = f" Labels: {score.found} of {score.events} found{late};"
