@@ -210,7 +210,8 @@ class _Reader:
                 raise KeyProblemError(
                     (key,), f"unit needs {key} = a text" + ("; write a [[unit]] for each output." * (key == "y"))
                 )
-        u = at("u", lambda: converted("u", given.get("u", []), tuple[str, ...]))
+        named = given.get("u", [])
+        u = at("u", lambda: converted([named] if isinstance(named, str) else named, tuple[str, ...]))
         model = at("model", lambda: parse_model(str(given.get("model", f"ARX(2, {2 if u else 0}, intercept=True)"))))
         model = at("model", lambda: model.bind(list(u)))
         if len(model.outputs) > 1:
@@ -276,13 +277,13 @@ def _time_unit(given: Any) -> float:
 
 
 READ: dict[str, Callable[[Any], Any]] = {
-    "time": lambda given: converted("time", given, str),
+    "time": lambda given: converted(given, str),
     "time_unit": _time_unit,
     "dt": partial(_seconds, "dt", low=1e-12),
     "hold_back": partial(_seconds, "hold_back"),
     "ahead": partial(_seconds, "ahead"),
     "rate": partial(_positive, "rate"),
-    "gate": lambda given: converted("gate", given, bool),
+    "gate": lambda given: converted(given, bool),
 }
 """How a setting of [[unit]] is read that no other setting matters for."""
 

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import os
 import pkgutil
-import types
 import typing
 from collections.abc import Iterator, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field, is_dataclass
 from functools import cached_property
 from importlib import import_module
-from inspect import isabstract
+from inspect import isabstract, signature
 from pathlib import Path
 from string import Formatter
 from typing import Any, TypeVar
+
+import msgspec
 
 from driftfit.engine.settings import near
 from driftfit.service.connect.base import Connector
@@ -159,45 +160,23 @@ def _below(base: type[Any]) -> Iterator[type[Any]]:
 
 
 def build(kind: type[Made], given: dict[str, Any]) -> Made:
-    """A dataclass from a table; ValueError for an unknown, missing or wrong option."""
-    known = {one.name: one for one in fields(kind) if one.init}  # type: ignore[arg-type]
-    hints = typing.get_type_hints(kind)
-    for key in given:
-        if key not in known:
-            raise ValueError(f"there is no option {key!r}; {near(key, known)}")
-    for key, one in known.items():
-        if key not in given and one.default is MISSING and one.default_factory is MISSING:
-            raise ValueError(f"the option {key} is missing.")
-    return kind(**{key: converted(key, value, hints[key]) for key, value in given.items()})
+    """A dataclass from a table; ValueError for an unknown, missing or wrong option, also of a table in it."""
+    known = typing.get_type_hints(kind)
+    for key, value in given.items():
+        if key not in known or key not in signature(kind).parameters:
+            raise ValueError(f"there is no option {key!r}; {near(key, list(signature(kind).parameters))}")
+        for inner in typing.get_args(known[key]):
+            for one in value if is_dataclass(inner) and isinstance(value, list) else ():
+                build(inner, one)
+    return converted(given, kind)
 
 
-def converted(key: str, value: Any, hint: Any) -> Any:
+def converted(value: Any, hint: type[Made]) -> Made:
     """A value of a table in the type of an option."""
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (types.UnionType, typing.Union):
-        return converted(key, value, next(one for one in args if one is not type(None)))
-    if hint is Secret:
-        return Secret.of(value)
-    if origin is typing.Literal:
-        if value not in args:
-            raise ValueError(f"{key} must be {' or '.join(args)}; got {value!r}.")
-        return value
-    if origin in (list, tuple):
-        each = [value] if origin is tuple and isinstance(value, str) else value
-        if not isinstance(each, list):
-            raise ValueError(f"{key} must be a list; got {value!r}.")
-        return origin(converted(key, one, args[0]) for one in each)
-    if origin is dict:
-        if not isinstance(value, dict):
-            raise ValueError(f"{key} must be a table; got {value!r}.")
-        return {name: converted(f"{key}.{name}", one, args[1]) for name, one in value.items()}
-    if isinstance(value, dict):
-        return build(hint, value)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if type(value) is not hint:
-        raise ValueError(f"{key} must be of type {hint.__name__}; got {value!r}.")
-    return value
+    try:
+        return msgspec.convert(value, hint, dec_hook=lambda kind, given: kind.of(given))
+    except msgspec.ValidationError as error:
+        raise ValueError(str(error).replace(" - at `$.", " - in `").replace("Object", "the table")) from None
 
 
 NAME_CHARACTERS = 200
