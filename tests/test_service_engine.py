@@ -112,7 +112,7 @@ def test_what_a_stored_state_contains_is_not_processed_again(tmp_path, timed):
         for pump in "ab":
             engine.intake.put("web", message(f"plant/{pump}", range(k, k + 50), y[k : k + 50], u[k : k + 50]))
         engine.step(0.0)
-    engine._dirty[1] = (1, -math.inf)  # it has waited longest: only this state is stored
+    engine._dirty.update({1: (1, -math.inf)})  # it has waited longest: only this state is stored
     engine._store_states()
     settled(engine)
     engine.journal.close()
