@@ -1,6 +1,5 @@
 """The engine of the service: the journal alone determines the states, whatever happens to the process."""
 
-import math
 import shutil
 import sqlite3
 import threading
@@ -102,18 +101,30 @@ def test_late_rows_are_put_in_order(tmp_path):
     assert np.array_equal(again.live.theta, run.theta[-1])
 
 
+class Clock:
+    """The module `time`, ahead of itself."""
+
+    ahead = 0.0
+
+    def __getattr__(self, name):
+        return getattr(time, name)
+
+    def monotonic(self):
+        return time.monotonic() + self.ahead
+
+
 @pytest.mark.parametrize("timed", [True, False])
-def test_what_a_stored_state_contains_is_not_processed_again(tmp_path, timed):
+def test_what_a_stored_state_contains_is_not_processed_again(tmp_path, monkeypatch, timed):
     """A group of two units is needed again for one of them; the state of the other has its samples already."""
-    y, u = record(100)
+    clock, (y, u) = Clock(), record(100)
+    monkeypatch.setattr("driftfit.service.core.engine.time", clock)
     config = configured(UNIT if timed else UNIT.replace('time = "t"\ndt = 1.0\n', ""))
     engine = opened(config, tmp_path)
-    for k in range(0, 100, 50):
-        for pump in "ab":
-            engine.intake.put("web", message(f"plant/{pump}", range(k, k + 50), y[k : k + 50], u[k : k + 50]))
-        engine.step(0.0)
-    engine._dirty.update({1: (1, -math.inf)})  # it has waited longest: only this state is stored
-    engine._store_states()
+    feed(engine, message("plant/a", range(50), y[:50], u[:50]))
+    clock.ahead = 20.0
+    engine.intake.put("web", message("plant/a", range(50, 100), y[50:], u[50:]))
+    feed(engine, message("plant/b", range(100), y, u))
+    clock.ahead = 31.0  # only the state of a has waited for so long
     settled(engine)
     engine.journal.close()
     engine = opened(config, tmp_path)
