@@ -28,12 +28,12 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 68_743,
-    "statements": 44_480,
-    "modules": 368,
+    "lines of the library": 68_225,
+    "statements": 44_313,
+    "modules": 352,
     "levels of folders": 3,
     "constants of modules with numbers": 646,
-    "numbers in the source": 2_574,
+    "numbers in the source": 2_569,
     "private names of Numba and llvmlite": 45,
     "modules that the Kalman filter imports": 24,
     "lines of them": 5_677,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 33,
     "bytes of state of Kalman": 848,
     "bytes of state of AdaptiveKalman": 17_072,
-    "lines of tests": 33_394,
+    "lines of tests": 33_420,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 
