@@ -382,15 +382,14 @@ def emit(function: FunctionType, arguments: tuple[Any, ...], from_python: bool =
 class Linked:
     """Code in this process, at ``address``. Numba's loader never frees anything; this one does with the last reference.
 
-    ``outside`` maps symbols that the code calls to what they refer to: another symbol, or linked code.
+    ``outside`` is the linked code that it calls, by symbol.
     """
 
-    def __init__(self, code: Code, outside: Mapping[str, Any] = MappingProxyType({})) -> None:
+    def __init__(self, code: Code, outside: Mapping[str, Linked] = MappingProxyType({})) -> None:
         library = llvm.JITLibraryBuilder().add_object_img(code.data).add_current_process().export_symbol(code.entry)
         loader = _loader()
         for name in code.outside:
-            other = outside.get(name, name)
-            address = other.address if isinstance(other, Linked) else llvm.address_of_symbol(other)
+            address = outside[name].address if name in outside else llvm.address_of_symbol(name)
             if address is not None:
                 library.import_symbol(name, address)
         for name, _ in code.environments:
@@ -402,7 +401,7 @@ class Linked:
         self.address: int = tracker[code.entry]
 
 
-def load(code: Code, outside: Mapping[str, Any] = MappingProxyType({})) -> Any:
+def load(code: Code, outside: Mapping[str, Linked] = MappingProxyType({})) -> Any:
     """The entry point of code for Python."""
     made, module, own = Linked(code, outside), sys.modules.get(code.module), code.environments[0][1]
     return _dynfunc.make_function(module, code.name, code.name, made.address, own, (made,))
