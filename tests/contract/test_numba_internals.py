@@ -16,6 +16,7 @@ import numba
 import numpy as np
 import pytest
 from numba import types
+from numba.core import postproc
 from numba.core.compiler import Flags
 from numba.core.registry import cpu_target
 from numba.core.typing.templates import AbstractTemplate
@@ -143,6 +144,19 @@ def test_passes_for_what_is_not_used_are_left_out():
     every, ours = passes(numba.njit(first)), passes(internals.under_ieee(first))
     assert every - ours == UNUSED | {"native_lowering"}, "DefaultPassBuilder or the names of its passes changed."
     assert ours - every == {"direct_lowering"}
+
+
+def test_lifetimes_of_variables_are_not_searched(monkeypatch):
+    def larger(x, y):
+        return x if x > y else y
+
+    searched = []
+    search = postproc.analysis.compute_dead_maps
+    monkeypatch.setattr(postproc.analysis, "compute_dead_maps", lambda *given: searched.append(given) or search(*given))
+    internals.emit(larger, (types.float64, types.float64))
+    assert not searched, "PostProcessor.run is not what analyses a function: a tenth of compiling in Python is lost."
+    numba.njit(larger).compile((types.float64, types.float64))
+    assert searched, "Functions of users are analysed in our way."
 
 
 def test_declarations_are_looked_for_once_and_put_back():

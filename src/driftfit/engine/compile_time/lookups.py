@@ -21,6 +21,8 @@ from numba.core.compiler import Flags
 from numba.core.registry import cpu_target
 from numba.core.targetconfig import ConfigStack
 
+__all__ = ["cpu_target", "known_once", "replaced"]
+
 
 @contextmanager
 def replaced(owner: Any, **ours: Any) -> Iterator[None]:
