@@ -146,7 +146,7 @@ def test_passes_for_what_is_not_used_are_left_out():
     assert ours - every == {"direct_lowering"}
 
 
-def test_lifetimes_of_variables_are_not_searched(monkeypatch):
+def test_lifetimes_of_variables_are_searched_once(monkeypatch):
     def larger(x, y):
         return x if x > y else y
 
@@ -154,9 +154,12 @@ def test_lifetimes_of_variables_are_not_searched(monkeypatch):
     search = postproc.analysis.compute_dead_maps
     monkeypatch.setattr(postproc.analysis, "compute_dead_maps", lambda *given: searched.append(given) or search(*given))
     internals.emit(larger, (types.float64, types.float64))
-    assert not searched, "PostProcessor.run is not what analyses a function: a tenth of compiling in Python is lost."
+    assert len(searched) == 1, (
+        "PostProcessor.run is not what analyses a function: a tenth of compiling in Python is lost."
+    )
+    searched.clear()
     numba.njit(larger).compile((types.float64, types.float64))
-    assert searched, "Functions of users are analysed in our way."
+    assert len(searched) > 1, "Functions of users are analysed in our way."
 
 
 def test_declarations_are_looked_for_once_and_put_back():

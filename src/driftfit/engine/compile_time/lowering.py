@@ -357,7 +357,7 @@ def _is(value: Any, number: int) -> bool:
 def _analyse(self: PostProcessor, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
     """Numba's analysis of a function, repeated after four of its passes: where variables are needed for the last
     time, for generators and loops that are compiled apart, of which nothing here has any. It is left out here until
-    somebody asks, which was a tenth of the time in Python.
+    the last pass asks, which was a tenth of the time in Python.
     """
     function = self.func_ir
     if function.is_generator or not getattr(function.func_id, "direct", False):

@@ -83,11 +83,10 @@ def knowing(n: int) -> dict[str, Any]:
 
 
 def partly_known(small: Mapping[str, Any], large: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """The ``large`` state of a tracker with the ``small`` one as its beginning along each axis, so that the parameters
-    after those of the small one are known to be 0; None if it has no room for some field.
+    """The ``large`` state of a tracker that begins with the ``small`` one along each axis; None without room for it.
 
-    With a 1 on the diagonal of S they count as determined. Where their regressors are 0 in all samples, every sum over
-    parameters gains terms that are 0, and results are those of the small state, bit for bit.
+    The other parameters are known to be 0: with a 1 on the diagonal of S they count as determined. Where regressors are
+    0 in all samples, sums over parameters gain terms that are 0: results are those of the small state, bit for bit.
     """
     state = {name: np.array(value) for name, value in large.items()}
     if any(own > wide for name in state for own, wide in zip(np.shape(small[name]), state[name].shape, strict=True)):
