@@ -49,6 +49,7 @@ from driftfit.trackers.parts.diffuse import (
     forecast_on_roots,
     knowing,
     knowing_nothing,
+    partly_known,
     spanned_variance,
     started,
 )
@@ -166,9 +167,8 @@ class FLS(Tracker):
     def slopes(self) -> bool:
         return self.differences == 2
 
-    @property
-    def pads(self) -> bool:
-        return self.differences == 1
+    def partly_known(self, n: int, N: int) -> Mapping[str, Any] | None:
+        return None if self.slopes else partly_known(self.state(n), self.state(N))
 
     @property
     def steps(self) -> TrackerSteps:

@@ -26,6 +26,7 @@ Departures: the decision on rank; the change of form. Cost per sample: O(n^3) un
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -72,26 +73,31 @@ def knowing_nothing(n: int, worst: float = WORST) -> dict[str, Any]:
     square = np.zeros((n, n))
     return {
         "S": square, "d": np.zeros(n), "R": np.eye(n), "H": square, "pivot": np.zeros(n), "work": np.zeros((WORK, n)),
-        "at_start": np.zeros(NOW), "F": np.ones(n), "volume": 0.0, "rank": 0, "root": 1, "worst": worst, "absent": 0,
+        "at_start": np.zeros(NOW), "F": np.ones(n), "volume": 0.0, "rank": 0, "root": 1, "worst": worst,
     }  # fmt: skip
-
-
-@kernel
-def know_nothing(s: State, l: int) -> None:
-    """As before the first sample; the last ``absent`` parameters are known (`driftfit.trackers.parts.common_size`)."""
-    n = s.theta.shape[0]
-    for i in range(n):
-        s.d[i, l], s.F[i, l] = 0.0, 1.0
-        for j in range(n):
-            s.S[i, j, l], s.R[i, j, l] = 0.0, 1.0 if i == j else 0.0
-    for i in range(n - s.absent[l], n):
-        s.S[i, i, l] = 1.0
-    s.volume[l], s.rank[l] = 0.0, s.absent[l]
 
 
 def knowing(n: int) -> dict[str, Any]:
     """The same fields for a proper prior."""
     return knowing_nothing(n) | {"rank": n, "root": 0}
+
+
+def partly_known(small: Mapping[str, Any], large: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The ``large`` state of a tracker that begins with the ``small`` one along each axis; None without room for it.
+
+    The other parameters are known to be 0: with a 1 on the diagonal of S they count as determined. Where regressors are
+    0 in all samples, sums over parameters gain terms that are 0: results are those of the small state, bit for bit.
+    """
+    state = {name: np.array(value) for name, value in large.items()}
+    if any(own > wide for name in state for own, wide in zip(np.shape(small[name]), state[name].shape, strict=True)):
+        return None
+    for name, value in state.items():
+        value[tuple(slice(size) for size in np.shape(small[name]))] = small[name]
+    n, N = len(small["theta"]), len(large["theta"])
+    state["S"][range(n, N), range(n, N)] = 1.0
+    if state["root"] > 0:
+        state["rank"] += N - n
+    return state
 
 
 @shared
