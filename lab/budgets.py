@@ -28,12 +28,12 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 67_721,
-    "statements": 43_958,
-    "modules": 350,
+    "lines of the library": 67_965,
+    "statements": 44_099,
+    "modules": 351,
     "levels of folders": 3,
     "constants of modules with numbers": 643,
-    "numbers in the source": 2_563,
+    "numbers in the source": 2_564,
     "private names of Numba and llvmlite": 30,
     "modules that the Kalman filter imports": 24,
     "lines of them": 5_615,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 33,
     "bytes of state of Kalman": 840,
     "bytes of state of AdaptiveKalman": 17_064,
-    "lines of tests": 33_354,
+    "lines of tests": 33_443,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 
