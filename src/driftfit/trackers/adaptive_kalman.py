@@ -92,7 +92,7 @@ from driftfit.trackers.parts.coordinates import (
     whiten_within,
 )
 from driftfit.trackers.parts.covariance import prediction
-from driftfit.trackers.parts.diffuse import knowing_nothing, partly_known, spanned_variance
+from driftfit.trackers.parts.diffuse import knowing_nothing, spanned_variance
 from driftfit.trackers.parts.excitation import (
     FIRST,
     learn_information,
@@ -103,6 +103,7 @@ from driftfit.trackers.parts.excitation import (
     window,
 )
 from driftfit.trackers.parts.few_residuals import RESIDUALS, widen_estimates, wider
+from driftfit.trackers.parts.information import partly_known
 
 
 @kernel

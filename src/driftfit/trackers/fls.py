@@ -49,10 +49,10 @@ from driftfit.trackers.parts.diffuse import (
     forecast_on_roots,
     knowing,
     knowing_nothing,
-    partly_known,
     spanned_variance,
     started,
 )
+from driftfit.trackers.parts.information import partly_known
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.rls import learn_scale, no_scale
 

@@ -61,6 +61,7 @@ def tune(
     h: int = 1,
     bounds: tuple[float, float] | None = None,
     level: float = 0.95,
+    intervals: bool = True,
     order_by: Any = None,
     data: Any = None,
     by: Any = None,
@@ -98,6 +99,8 @@ def tune(
         samples, scales from 1e-3 to 1e3.
     level : number
         Level of the intervals.
+    intervals : bool
+        False leaves them out (NaN): they take most of the time of a short record.
     gate : bool, `Gate`, decisions of a run or None
         As for `track`. The gate decides once, by a run of `AdaptiveKalman`, and what it leaves out is left out for all
         settings: ``tuned.left_out``, which ``track(model, tuned.tracker, y, u, gate=tuned.left_out)`` takes.
@@ -134,18 +137,19 @@ def tune(
         raise ValueError(f"tune: {type(tracker).__name__} has no variance, so {method!r} is undefined; use 'h-step'.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing)
     if len(model.outputs) > 1:
-        options = (method, groups, h, bounds, level, order_by)
+        options = (method, groups, h, bounds, level if intervals else None, order_by)
         if gate:
             raise ValueError("tune: gate= is for one output; tune one output after the other, or leave gate= out.")
         return tune_outputs(model, tracker, y, u, reading, data, by, lambda task: _tuned(task, tracker, *options))
     reading = reading._replace(gate=gate)
-    return _tuned(_task(model, tracker, y, u, reading, data, by), tracker, method, groups, h, bounds, level, order_by)
+    task = _task(model, tracker, y, u, reading, data, by)
+    return _tuned(task, tracker, method, groups, h, bounds, level if intervals else None, order_by)
 
 
 def _tuned(
-    task: Task, tracker: Tracker, method: str, groups: Any, h: int, bounds: Any, level: float, order_by: Any
+    task: Task, tracker: Tracker, method: str, groups: Any, h: int, bounds: Any, level: float | None, order_by: Any
 ) -> Tuned:
-    """Tune on a checked record."""
+    """Tune on a checked record; without a level there are no intervals."""
     if order_by is not None:
         task = along(task, tracker, order_by)
     knobs = find_knobs(task, tracker, groups, bounds)
@@ -170,7 +174,7 @@ def _tuned(
         noise=sigma2 if knobs.profiled else float(getattr(knobs.run(search.x), "r", np.nan)),
         at_bound=tuple(name for name, i in zip(knobs.names, knobs.owner, strict=True) if search.at_bound(i)),
         interval=intervals_of(search, task, method, tracker, level),
-        level=level,
+        level=0.95 if level is None else level,
         left_out=_of_one(task.left_out or {}),
         _search=search,
     )

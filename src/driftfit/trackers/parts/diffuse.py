@@ -27,7 +27,8 @@ Departures: the decision on rank; the change of form. Cost per sample: O(n^3) un
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
+from functools import lru_cache, partial
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -68,36 +69,23 @@ SCRATCH = ("H", "pivot", "work", "at_start")
 """Fields of the start that carry nothing from one sample to the next."""
 
 
-def knowing_nothing(n: int, worst: float = WORST) -> dict[str, Any]:
+@lru_cache
+def knowing_nothing(n: int, worst: float = WORST) -> Mapping[str, Any]:
     """Fields for a diffuse start of n parameters; ``root`` is 1 while S and d, and not theta and P, are the state."""
     square = np.zeros((n, n))
-    return {
+    fields = {
         "S": square, "d": np.zeros(n), "R": np.eye(n), "H": square, "pivot": np.zeros(n), "work": np.zeros((WORK, n)),
         "at_start": np.zeros(NOW), "F": np.ones(n), "volume": 0.0, "rank": 0, "root": 1, "worst": worst,
     }  # fmt: skip
+    for value in fields.values():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)  # all trackers share them
+    return MappingProxyType(fields)
 
 
-def knowing(n: int) -> dict[str, Any]:
+def knowing(n: int) -> Mapping[str, Any]:
     """The same fields for a proper prior."""
-    return knowing_nothing(n) | {"rank": n, "root": 0}
-
-
-def partly_known(small: Mapping[str, Any], large: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """The ``large`` state of a tracker that begins with the ``small`` one along each axis; None without room for it.
-
-    The other parameters are known to be 0: with a 1 on the diagonal of S they count as determined. Where regressors are
-    0 in all samples, sums over parameters gain terms that are 0: results are those of the small state, bit for bit.
-    """
-    state = {name: np.array(value) for name, value in large.items()}
-    if any(own > wide for name in state for own, wide in zip(np.shape(small[name]), state[name].shape, strict=True)):
-        return None
-    for name, value in state.items():
-        value[tuple(slice(size) for size in np.shape(small[name]))] = small[name]
-    n, N = len(small["theta"]), len(large["theta"])
-    state["S"][range(n, N), range(n, N)] = 1.0
-    if state["root"] > 0:
-        state["rank"] += N - n
-    return state
+    return {**knowing_nothing(n), "rank": n, "root": 0}
 
 
 @shared
