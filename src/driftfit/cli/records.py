@@ -20,7 +20,7 @@ from driftfit.engine.settings import marks, missing_settings
 from driftfit.judge.structures.select import Selection
 from driftfit.judge.structures.select import select as compare
 from driftfit.parsing.settings import given_fields
-from driftfit.readings.left_out import LeftOut, remarks_of
+from driftfit.readings.left_out import remarks_of
 from driftfit.results import Track
 from driftfit.show.export import check_ending, write, write_table
 from driftfit.show.report import check_path
@@ -95,7 +95,7 @@ def tune(
         ("Model", repr(models[0])),
         ("Tracker", shortened(repr(tuned.tracker))),
         ("Log-likelihood", f"{tuned.loglik:.6g} of {tuned.used} samples"),
-        *remarks_of([tuned.left_out] if isinstance(tuned.left_out, LeftOut) else tuned.left_out.values()),
+        *remarks_of(tuned.left_out),
     ]
     say(facts(*rows))
     table = table_of(f"Settings by {method}", "", "chosen", f"{level:.0%} from", "to")
