@@ -243,7 +243,7 @@ def _beats_copies(y: Array, U: Array, shape: Shape, j: int, M: int, rng: np.rand
     x = np.where(np.isfinite(x), x, np.nanmean(x))
     both, copies = np.concatenate([x, x[::-1]]), []
     for k in range(COPIES):
-        moved = np.roll(both, int(rng.integers(T // 10, 2 * T - T // 10)))[:T][:: 1 if k % 2 else -1]
+        moved = np.roll(both, int(rng.integers(T // 10, T - T // 10)))[:T][:: 1 if k % 2 else -1]
         copies += [np.roll(moved, lag) for lag in range(0, 24, 3)]
     depth = max(nb + nk - 1 for _, nb, nk in shape[1])
     pool = Pool(y, U[:, used], max(depth, 1), na=max(shape[0], 1), more=np.column_stack(copies))
