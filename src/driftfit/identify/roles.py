@@ -110,7 +110,7 @@ class Roles:
         return y, U, place
 
 
-class NoAnswer(ValueError):
+class NoAnswerError(ValueError):
     """Raised for a record that cannot answer; the message says what it would need."""
 
 
@@ -152,7 +152,7 @@ def roles(
             raise ValueError(f"identify: name the output with --y; the columns of numbers are {', '.join(candidates)}.")
         y = candidates[0]
     if y not in numbers:
-        raise NoAnswer(f"The output {y} is text: {texts.get(y, '')!r} is not a number. Numbers are needed.")
+        raise NoAnswerError(f"The output {y} is text: {texts.get(y, '')!r} is not a number. Numbers are needed.")
     kept: list[str] = []
     for name in left if u is None else u:
         if name == y:
@@ -256,7 +256,12 @@ def _number(cell: Any) -> bool:
 
 
 def _clock(
-    frame: Any, names: Sequence[str], numbers: dict[str, Array], texts: dict[str, str], time: str | None, taken: set[Any]
+    frame: Any,
+    names: Sequence[str],
+    numbers: dict[str, Array],
+    texts: dict[str, str],
+    time: str | None,
+    taken: set[Any],
 ) -> tuple[str | None, Array | None, str | None, dict[str, str]]:
     """(name of the time, times, zone, other clocks with the reason)."""
     found: dict[str, tuple[Array, str | None]] = {}
@@ -316,7 +321,9 @@ def _reason(name: str, numbers: Mapping[str, Array], others: Sequence[str], axis
     return ""
 
 
-def _key(frame: Any, texts: Mapping[str, str], by: str | None, axis: Array | None) -> tuple[tuple[Any, ...], str | None]:
+def _key(
+    frame: Any, texts: Mapping[str, str], by: str | None, axis: Array | None
+) -> tuple[tuple[Any, ...], str | None]:
     """(key of every row, name of the column): given, of text with few values, or where the clock runs back."""
     T = len(frame)
     if by is not None:

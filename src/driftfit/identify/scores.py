@@ -14,6 +14,8 @@ columns added to k.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from driftfit.engine.kernel import Array
@@ -45,7 +47,7 @@ class Scores:
         B = int(np.clip(N // rows, 8, 80))
         edges = np.linspace(0, N, B + 1).astype(int)
         self.count = np.diff(edges).astype(float)
-        self.G = np.stack([Z[a:b].T @ Z[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)])
+        self.G = np.stack([Z[a:b].T @ Z[a:b] for a, b in itertools.pairwise(edges)])
         both, ridge = N < SHORT, RIDGE * np.eye(self.p + 1)
         kept = [f for f in memories if f * N >= FEWEST]
         self.memories, self.past = kept, np.empty((len(kept), *self.G.shape))

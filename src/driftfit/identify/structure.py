@@ -88,7 +88,7 @@ class Pool:
         X = np.column_stack([*columns, *([] if more is None else [more])])
         self.rows = np.flatnonzero(np.isfinite(X).all(axis=1) & np.isfinite(y))
         if len(self.rows) < FEWEST:
-            raise TooShort(len(self.rows))
+            raise TooShortError(len(self.rows))
         self.scores = Scores(X[self.rows], y[self.rows])
         self.shapes: dict[Shape, float] = {}
 
@@ -158,7 +158,7 @@ def with_input(inputs: tuple[tuple[int, int, int], ...], one: tuple[int, int, in
     return tuple(sorted((*inputs, one)))
 
 
-class TooShort(ValueError):
+class TooShortError(ValueError):
     """Raised for a record with too few complete rows; ``rows`` are those there are."""
 
     def __init__(self, rows: int) -> None:

@@ -1,0 +1,403 @@
+"""identify: from a table to an answer. What moves, since when, by how much, and is it time or the working point?
+
+The steps are `driftfit.identify.roles`, `structure`, `working_point` and `judgement`; each has its equations. The
+structure is chosen from the whole record, so p-values are those of a test after a selection; errors are always those of
+predictions made before the sample. Cost: for T rows and p columns of lags, O(T p^2) for the search, and that of
+`Track.verdict`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
+
+from driftfit.data.columns import Wanted
+from driftfit.fleets import Fleet
+from driftfit.identify import page, words
+from driftfit.identify.judgement import Effect, Errors, Move, effects, errors_of, feedback, least_squares, moves
+from driftfit.identify.roles import NoAnswerError, Roles, roles
+from driftfit.identify.scores import FEWEST
+from driftfit.identify.structure import Structure, TooShortError, search
+from driftfit.identify.working_point import Cause, cause, clear, regressors
+from driftfit.judge.alarms.detect import Alarms
+from driftfit.judge.fleet_verdict import ManyVerdicts
+from driftfit.judge.segment import Segmentation, segment
+from driftfit.judge.verdict import Verdict
+from driftfit.models.arx import ARX
+from driftfit.models.regression import Regression
+from driftfit.results import Track
+from driftfit.show.report import check_path
+from driftfit.show.text import Printed
+from driftfit.trackers.adaptive_kalman import AdaptiveKalman
+from driftfit.tracking import track
+
+LEFT_OUT = 0.01
+"""Share of the readings left out above which there is no answer without ``gate``."""
+FEEDBACK = 5.0
+"""F statistic above which the output is said to act on an input."""
+WORST = 3
+"""Records of a fleet that have a page."""
+
+
+@dataclass(frozen=True)
+class Identification(Printed):
+    """The result of `identify`; printing it shows the answer in some 25 lines.
+
+    Attributes
+    ----------
+    kind : str
+        "moves", "a static curve explains it", "both", "no drift found" or "cannot decide".
+    why : str
+        Why it cannot decide; empty otherwise.
+    model, track, verdict
+        The `ARX` model that was chosen, its run with the default tracker, and the verdict on its parameters.
+    roles, structure, cause
+        What each column is; what was chosen and what came second; what explains the record, in nats.
+    effects : tuple of Effect
+        Static gains of the inputs with constants, and the changes that would have been found.
+    moves : tuple of Move
+        What changed, in static gains.
+    errors : tuple of Errors
+        One step ahead and ``horizon`` steps ahead, beside constants and persistence.
+    memory : (float, float)
+        Sum of the lags of y and its standard error; near 1 is a unit root.
+    notes : tuple of str
+        Problems of the data; ``undecided``: what could not be decided.
+    """
+
+    kind: str
+    why: str
+    model: ARX
+    track: Track = field(repr=False)
+    verdict: Verdict = field(repr=False)
+    roles: Roles = field(repr=False)
+    structure: Structure
+    cause: Cause = field(repr=False)
+    effects: tuple[Effect, ...]
+    moves: tuple[Move, ...]
+    errors: tuple[Errors, ...]
+    memory: tuple[float, float]
+    notes: tuple[str, ...]
+    undecided: tuple[str, ...]
+    source: str = "data"
+    seconds: float = 0.0
+
+    @property
+    def code(self) -> int:
+        """Exit code of the command: 0 answered, 1 undecided."""
+        return int(self.kind == "cannot decide")
+
+    @property
+    def headline(self) -> str:
+        """The answer in one sentence or two."""
+        return words.headline(self)
+
+    @cached_property
+    def segments(self) -> Segmentation:
+        """Segments of constant parameters (`Track.segment`)."""
+        return self.track.segment()
+
+    @cached_property
+    def alarms(self) -> Alarms:
+        """Alarms whose reference is what followed the last change: armed from now on, with ``alarms.rule``."""
+        last = max((move.at for move in self.moves if move.kind != "temporary"), default=0)
+        T = len(self.track)
+        start = last if T - last > T // 4 else 3 * T // 4
+        return self.track.detect("glr", reference=(self.track.time[start], self.track.time[T - 1]))
+
+    def json(self) -> dict[str, Any]:
+        """The answer as plain data, in the form of `driftfit.identify.page.SCHEMA`."""
+        return page.as_json(self)
+
+    def page(self, path: Any = None) -> str:
+        """The answer as one self-contained HTML page; with a ``path`` it is written there."""
+        text = page.html(self)
+        if path is not None:
+            check_path(path).write_text(text, encoding="utf-8")
+        return text
+
+    def plot(self) -> Any:
+        """The picture of the page; a matplotlib figure."""
+        return page.figure(self)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for style, line in words.lines(self):
+            yield Text(line, style)
+
+
+@dataclass(frozen=True)
+class ManyIdentified(Printed):
+    """The result of `identify` for many records with one structure: the fleet, its verdicts, the clearest three."""
+
+    model: ARX
+    track: Fleet = field(repr=False)
+    verdict: ManyVerdicts = field(repr=False)
+    worst: Mapping[Any, Identification]
+
+    @property
+    def headline(self) -> str:
+        """The answer in a sentence."""
+        return self.verdict.sentences[0]
+
+    @property
+    def code(self) -> int:
+        """Exit code of the command."""
+        return int(all(row.drifts is None for row in self.verdict.rows))
+
+    def json(self) -> dict[str, Any]:
+        """The records by key: that of the worst three as for one record."""
+        rows = {str(row.key): {"moves": row.drifts, "p": row.verdict.p, "q": row.q} for row in self.verdict.rows}
+        return {"schema": page.NAME, "records": page.finite(rows), "worst": {str(k): one.json() for k, one in self.worst.items()}}  # fmt: skip
+
+    def page(self, path: Any = None) -> str:
+        """One page: the table of all records, then the three that move most clearly."""
+        text = page.many(self)
+        if path is not None:
+            check_path(path).write_text(text, encoding="utf-8")
+        return text
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield Text(f" {len(self.verdict)} records with one structure: {self.model!r}")
+        yield self.verdict
+        for key, one in self.worst.items():
+            yield Text(f"\n {key}: {one.headline}")
+
+
+def identify(
+    data: Any,
+    y: str | None = None,
+    *,
+    u: Sequence[str] | None = None,
+    not_u: Sequence[str] = (),
+    time: str | None = None,
+    dt: float | None = None,
+    by: str | None = None,
+    limits: Mapping[str, tuple[float | None, float | None]] | None = None,
+    max_lag: int = 30,
+    forecast: bool = False,
+    horizon: int = 10,
+    level: float = 0.05,
+    gate: bool | None = None,
+    budget: float = 45.0,
+    seed: int = 0,
+    reading: Wanted | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Identification | ManyIdentified:
+    """From a table to an answer: roles, structure, drift and its cause.
+
+    Parameters
+    ----------
+    data : table, mapping of columns, path, pattern or list of paths
+    y : name of the output
+        It may be left out if only one column of numbers is left.
+    u, not_u : names
+        The inputs to choose from, and columns that are none. By default every other column of numbers.
+    time, by : names
+        The column of the time, and the one that identifies records; found if not given.
+    dt : number
+        Nominal interval, of dates in seconds; the median by default.
+    limits : mapping from columns to (low, high)
+        Valid ranges; what is outside is missing.
+    max_lag : int
+        Longest lag of an input.
+    forecast : bool
+        Only inputs of earlier samples (nk of at least 1). By default an input of the same sample may explain y, and
+        the forecast is said beside it.
+    horizon : int
+        Steps ahead of the second comparison of errors.
+    level : number
+        Error rate of the statement that parameters move.
+    gate : bool or None
+        As for `track`. None: the gate of the default tracker, but there is no answer where it, or `roles`, leaves out
+        more than `LEFT_OUT` of the readings.
+    budget : number
+        Seconds after which the search stops with what it has.
+    seed : int
+        That of the displaced copies of inputs.
+    reading : Wanted or None
+        How a CSV file is read: decimal sign, separator, form of dates, words for missing values.
+    progress : callable
+        Told what is being done.
+
+    Returns
+    -------
+    Identification, or ManyIdentified for a table with several records.
+
+    Raises
+    ------
+    ValueError
+        For columns that do not exist, an output that is not named and not obvious, and everything that `track` does
+        not accept.
+    driftfit.identify.roles.NoAnswerError
+        For a record that cannot answer: fewer than `FEWEST` rows with all lags, a constant output, text.
+    """
+    began = monotonic()
+    for name, value, low in (("max_lag", max_lag, 1), ("horizon", horizon, 1), ("budget", budget, 0)):
+        if not value >= low:
+            raise ValueError(f"identify: {name} must be at least {low}; got {value!r}.")
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"identify: level must be between 0 and 1, such as 0.05; got {level!r}.")
+    progress("reading")
+    found = roles(data, y, u=u, not_u=not_u, time=time, dt=dt, by=by, limits=limits, wanted=reading)
+    check_record(found)
+    task = _Task(int(forecast), horizon, level, gate, began + budget, seed, progress, _source(data))
+    structure = task.structure(found, max_lag)
+    if found.by is None:
+        return replace(task.judged(found, structure), seconds=monotonic() - began)
+    progress("tracking")
+    model = model_of(found, structure)
+    fleet = track(model, AdaptiveKalman(), **signals(found, structure), by=found.by, gate=gate)
+    verdicts = fleet.verdict(level)
+    keys = [row.key for row in verdicts.rows[:WORST]]
+    worst = {}
+    for key in keys:
+        try:
+            worst[key] = task.judged(found.record(key[0] if isinstance(key, tuple) else key), structure)
+        except ValueError:  # a record that is too short for a page of its own is in the table
+            continue
+    return ManyIdentified(model, fleet, verdicts, worst)
+
+
+def check_record(found: Roles) -> None:
+    """NoAnswerError for a record that no structure can answer."""
+    known = found.y[np.isfinite(found.y)]
+    if len(known) < FEWEST:
+        raise NoAnswerError(f"{len(known)} of {len(found.y)} rows hold {found.output}; at least {FEWEST} are needed.")
+    if np.ptp(known) <= 1e-12 * np.max(np.abs(known)):
+        raise NoAnswerError(
+            f"{found.output} is {known[0]:g} in all {len(known)} rows: nothing moves, so nothing is learned."
+        )
+
+
+def model_of(found: Roles, structure: Structure) -> ARX:
+    """The ARX model of a structure."""
+    inputs = structure.shape[1]
+    if not inputs:
+        return ARX(structure.na, 0, intercept=True)
+    names = tuple(found.inputs[j] for j, _, _ in inputs)
+    nb, nk = tuple(nb for _, nb, _ in inputs), tuple(nk for *_, nk in inputs)
+    return ARX(structure.na, nb, nk, inputs=names, intercept=True)
+
+
+def signals(found: Roles, structure: Structure) -> dict[str, Any]:
+    """The arguments of `track` for a record."""
+    names = [found.inputs[j] for j in sorted(structure.lags)]
+    units = {name: unit for name, unit in found.units.items() if name in (*names, found.output)}
+    given = {"y": found.output, "u": names or None, "data": found.table(), "time": found.clock, "dt": found.dt}
+    return given | {"units": units or None}
+
+
+@dataclass(frozen=True)
+class _Task:
+    """The settings of a call."""
+
+    first: int
+    horizon: int
+    level: float
+    gate: bool | None
+    end: float
+    seed: int
+    progress: Callable[[str], None]
+    source: str
+
+    def structure(self, found: Roles, max_lag: int) -> Structure:
+        """The structure of all records, and beside it that of a forecast."""
+        self.progress("searching the structure")
+        y, U, _ = found.spread(max_lag + 1)
+        rng = np.random.default_rng(self.seed)
+        try:
+            best = search(y, U, max_lag, self.first, self.end, rng)
+            if any(nk == 0 for _, nk in best.lags.values()):
+                self.progress("searching a forecast")
+                best = replace(best, forecast=search(y, U, max_lag, 1, self.end, rng))
+        except TooShortError as error:
+            raise NoAnswerError(
+                f"{error.rows} rows of {len(found.y)} have all lags; at least {FEWEST} are needed."
+            ) from None
+        return best
+
+    def judged(self, found: Roles, structure: Structure) -> Identification:
+        """The answer for one record."""
+        y, U, place = found.spread(structure.na + 40)
+        self.progress("time or working point")
+        phi = regressors(y, U, structure)
+        why_not = cause(y, U, structure, found.inputs, found.output, self.first)
+        self.progress("tracking")
+        model = model_of(found, structure)
+        run: Track = track(model, AdaptiveKalman(), **signals(found, structure), gate=self.gate)
+        self.progress("judging")
+        verdict = run.verdict(self.level)
+        if verdict.drifts and clear(why_not.curve):
+            self.progress("judging the curve")
+            Z = np.column_stack([phi, why_not.columns])
+            rest = segment(y, Z[:, 1:], Regression(Z.shape[1] - 1, intercept=True), false=self.level)
+            why_not = replace(why_not, kind="both" if rest.breaks or rest.better else "working point")
+        theta, _ = least_squares(phi, y)
+        own, *memory = effects(phi, y, structure, found.inputs)
+        errors = errors_of(run, place, y, U, structure, self.horizon)
+        notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found, verdict)
+        kind, why = self._kind(found, run, verdict, why_not)
+        return Identification(
+            kind, why, model, run, verdict, found, structure, why_not, tuple(own), tuple(moves(verdict, run, theta)),
+            errors, (memory[0], memory[1]), notes, undecided, self.source,
+        )  # fmt: skip
+
+    def _kind(self, found: Roles, run: Track, verdict: Verdict, explained: Cause) -> tuple[str, str]:
+        share = max(found.share_refused, len(run.left_out) / len(run))
+        if share > LEFT_OUT and self.gate is None:
+            return "cannot decide", (
+                f"{100.0 * share:.1f} % of the readings look like fault codes or spikes and were left out; if they "
+                "are, say so with --gate, and if not, with --no-gate"
+            )
+        if verdict.drifts is None:
+            return "cannot decide", verdict.untested
+        if explained.kind == "working point":
+            return "a static curve explains it", ""
+        if verdict.drifts:
+            return ("both" if explained.kind == "both" else "moves"), ""
+        return "no drift found", ""
+
+
+def _notes(found: Roles, run: Track, y: Any, U: Any, structure: Structure) -> tuple[str, ...]:
+    """Problems of the data, each in a sentence."""
+    notes = [
+        f"{count} readings of {name} are codes or spikes and taken as missing" for name, count in found.refused.items()
+    ]
+    if len(run.left_out):
+        notes.append(f"the gate left out {', '.join(f'{n} {reason}' for reason, n in run.left_out.counts.items())}")
+    if found.missing:
+        notes.append(f"{found.missing} readings are missing")
+    if (gaps := len(y) - len(found.y)) > 0:
+        notes.append(f"gaps in time of {gaps} samples in all")
+    for j in structure.lags:
+        if feedback(y, U[:, j]) > FEEDBACK:
+            also = ": its effect at delay 0 is then no cause" if structure.lags[j][1] == 0 else ""
+            notes.append(f"{found.output} acts on {found.inputs[j]} (feedback){also}")
+    if structure.narrowed:
+        notes.append(structure.narrowed)
+    return tuple(notes)
+
+
+def _undecided(structure: Structure, found: Roles, verdict: Verdict) -> tuple[str, ...]:
+    """What the record does not decide."""
+    names, said = found.inputs, []
+    for j, (low, high) in structure.delays.items():
+        if high > low:
+            said.append(f"the delay of {names[j]}: {low} to {high} samples are as good")
+    said += [f"{names[j]} or {names[i]}: either explains the record" for j, i in structure.instead]
+    said += [f"{names[j]}: useful, but so are copies of it at other times" for j in structure.doubtful]
+    if verdict.nearly_walk:
+        said.append("a level that wanders, or noise that does")
+    return tuple(said)
+
+
+def _source(data: Any) -> str:
+    """What the commands to copy call the data."""
+    return str(data) if isinstance(data, str) or hasattr(data, "__fspath__") else "data.csv"
