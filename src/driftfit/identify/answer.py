@@ -21,7 +21,7 @@ from rich.text import Text
 from driftfit.data.columns import Wanted
 from driftfit.fleets import Fleet
 from driftfit.identify import page, words
-from driftfit.identify.judgement import Effect, Errors, Move, effects, errors_of, feedback, least_squares, moves
+from driftfit.identify.judgement import Effect, Errors, Memory, Move, effects, errors_of, feedback, moves
 from driftfit.identify.roles import NoAnswerError, Roles, roles
 from driftfit.identify.scores import FEWEST
 from driftfit.identify.structure import Structure, TooShortError, search
@@ -66,8 +66,8 @@ class Identification(Printed):
         What changed, in static gains.
     errors : tuple of Errors
         One step ahead and ``horizon`` steps ahead, beside constants and persistence.
-    memory : (float, float)
-        Sum of the lags of y and its standard error; near 1 is a unit root.
+    memory : Memory
+        Sum of the lags of y and its standard error; where 1 is within two of them, effects are those in a sample.
     notes : tuple of str
         Problems of the data; ``undecided``: what could not be decided.
     """
@@ -83,7 +83,7 @@ class Identification(Printed):
     effects: tuple[Effect, ...]
     moves: tuple[Move, ...]
     errors: tuple[Errors, ...]
-    memory: tuple[float, float]
+    memory: Memory
     notes: tuple[str, ...]
     undecided: tuple[str, ...]
     source: str = "data"
@@ -310,7 +310,7 @@ class _Task:
     def structure(self, found: Roles, max_lag: int) -> Structure:
         """The structure of all records, and beside it that of a forecast."""
         self.progress("searching the structure")
-        y, U, _ = found.spread(max_lag + 1)
+        y, U, _ = found.centred().spread(max_lag + 1)
         rng = np.random.default_rng(self.seed)
         try:
             best = search(y, U, max_lag, self.first, self.end, rng)
@@ -339,14 +339,13 @@ class _Task:
             Z = np.column_stack([phi, why_not.columns])
             rest = segment(y, Z[:, 1:], Regression(Z.shape[1] - 1, intercept=True), false=self.level)
             why_not = replace(why_not, kind="both" if rest.breaks or rest.better else "working point")
-        theta, _ = least_squares(phi, y)
-        own, *memory = effects(phi, y, structure, found.inputs)
+        theta, memory, own = effects(phi, y, structure, found.inputs)
         errors = errors_of(run, place, y, U, structure, self.horizon)
         notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found, verdict)
         kind, why = self._kind(found, run, verdict, why_not)
         return Identification(
-            kind, why, model, run, verdict, found, structure, why_not, tuple(own), tuple(moves(verdict, run, theta)),
-            errors, (memory[0], memory[1]), notes, undecided, self.source,
+            kind, why, model, run, verdict, found, structure, why_not, own, moves(verdict, run, theta, memory.root),
+            errors, memory, notes, undecided, self.source,
         )  # fmt: skip
 
     def _kind(self, found: Roles, run: Track, verdict: Verdict, explained: Cause) -> tuple[str, str]:

@@ -43,19 +43,24 @@ def recursive(phi: Array, y: Array, used: Array) -> Array:
     return theta
 
 
-def mixed(first: Array, std: Array, second: Array, y: Array) -> Array:
-    """The weight (T,) of the first of two predictions before each sample; ``std`` is that of the first."""
+def mixed(first: Array, second: Array, y: Array, std: Array | None, late: int) -> Array:
+    """The weight (T,) of the first of two predictions of y, from readings at least ``late`` samples before.
+
+    ``std``: standard deviation of the first; None, and for the second: that of its errors so far.
+    """
     e1, e2 = y - first, y - second
-    known = np.isfinite(e1) & np.isfinite(e2) & np.isfinite(std) & (std > 0.0)
-    square = np.where(known, e2, 0.0) ** 2
-    variance = (np.cumsum(square) - square + 1e-300) / np.maximum(np.cumsum(known) - known, 1)
-    gain = -0.5 * (e1 / std) ** 2 - np.log(std) + 0.5 * e2**2 / variance + 0.5 * np.log(variance)
+    known = np.isfinite(e1) & np.isfinite(e2)
+    spread = [np.where(known, e, 0.0) ** 2 for e in (e1, e2)]
+    v1, v2 = ((np.cumsum(one) - one + 1e-300) / np.maximum(np.cumsum(known) - known, 1) for one in spread)
+    v1 = v1 if std is None else np.where(np.isfinite(std) & (std > 0.0), std, np.nan) ** 2
+    with np.errstate(over="ignore"):
+        gain = 0.5 * (e2**2 / v2 + np.log(v2) - e1**2 / v1 - np.log(v1))
+    usable = known & np.isfinite(gain) & (np.cumsum(known) > 10)
     weight, w = np.full(len(y), 0.5), 0.5
-    odds = np.exp(np.clip(np.where(known & (np.cumsum(known) > 10), gain, 0.0), -50.0, 50.0))
-    for t, ratio in enumerate(odds.tolist()):
+    for t, ratio in enumerate(np.exp(np.clip(np.where(usable, gain, 0.0), -50.0, 50.0)).tolist()):
         weight[t] = w
         w = (1.0 - SHARED) * w * ratio / (w * ratio + 1.0 - w) + 0.5 * SHARED
-    return weight
+    return np.concatenate([np.full(late - 1, 0.5), weight[: len(y) - late + 1]])
 
 
 def ahead(theta: Array, y: Array, drive: Array, na: int, h: int) -> Array:
@@ -83,11 +88,11 @@ class Errors(NamedTuple):
 
 def errors_of(run: Track, place: Array, y: Array, U: Array, structure: Structure, horizon: int) -> tuple[Errors, ...]:
     """Errors one step and ``horizon`` steps ahead on the grid; ``place``: where the samples of the run are in it."""
-    T, n = len(y), run.model.n
+    T, n, y = len(y), run.model.n, np.where(np.isfinite(y), y, np.nan)
     phi, order = regressors(y, U, structure), [n - 1, *range(n - 1)]
     prediction, std, tracked = np.full(T, np.nan), np.full(T, np.nan), np.full((T, n), np.nan)
     prediction[place], std[place] = run.prediction, run.innovation_std
-    tracked[place] = np.where(run.theta == 0.0, 0.0, run.theta)[:, order]
+    tracked[place] = run.theta[:, order]
     last = np.maximum.accumulate(np.where(np.isfinite(tracked[:, 0]), np.arange(T), 0))
     before = np.concatenate([np.full((1, n), np.nan), tracked[last][:-1]])
     used = np.zeros(T, bool)
@@ -97,13 +102,11 @@ def errors_of(run: Track, place: Array, y: Array, U: Array, structure: Structure
     small = Structure(2, {j: (1, 1) for j in structure.lags})
     lags = regressors(y, U, small)
     arx = recursive(lags, y, used & np.isfinite(lags).all(axis=1))
-    constant = np.einsum("tn,tn->t", steady, phi)
-    weight = mixed(prediction, std, constant, np.where(used, y, np.nan))
     found = []
     for h in sorted({1, horizon}):
         own = prediction if h == 1 else ahead(before, y, phi[:, 1 + structure.na :], structure.na, h)
         rest = ahead(steady, y, phi[:, 1 + structure.na :], structure.na, h)
-        share = lagged(weight, h - 1)
+        share = mixed(own, rest, np.where(used, y, np.nan), std if h == 1 else None, h)
         each = [share * own + (1.0 - share) * rest, own, rest, ahead(arx, y, lags[:, 3:], 2, h)]
         errors = [y - one for one in (*each, lagged(persistence(y), h - 1))]
         scored = used & (np.cumsum(used) > min(burn_in(n), used.sum() // 4)) & np.isfinite(errors).all(axis=0)
@@ -112,18 +115,26 @@ def errors_of(run: Track, place: Array, y: Array, U: Array, structure: Structure
     return tuple(found)
 
 
-@dataclass(frozen=True)
-class Effect:
-    """The effect of one input in the long run, b / (1 - a), with constants, and the change that would have been found.
-
-    ``gain``, ``std``: static gain and its standard error. ``least``: the change of the gain half-way through the record
-    that would have been found in four of five records.
+class Effect(NamedTuple):
+    """The effect of an input with constants: in the long run, sum b / (1 - sum a), or in a sample, sum b, where the
+    output may have a unit root; its standard error; the change half-way that would be found in 4 of 5 records.
     """
 
     name: str
     gain: float
     std: float
     least: float
+
+
+class Memory(NamedTuple):
+    """Sum of the lags of y with its standard error; ``root``: whether 1 is within two of them."""
+
+    value: float
+    std: float
+
+    @property
+    def root(self) -> bool:
+        return self.value + 2.0 * self.std >= 1.0
 
 
 def least_squares(phi: Array, y: Array) -> tuple[Array, Array]:
@@ -136,23 +147,21 @@ def least_squares(phi: Array, y: Array) -> tuple[Array, Array]:
     return theta, variance * np.linalg.pinv(X.T @ X)
 
 
-def effects(phi: Array, y: Array, structure: Structure, names: tuple[str, ...]) -> tuple[list[Effect], float, float]:
-    """(effects of the inputs, sum of the lags of y, its standard error), all with constants."""
+def effects(
+    phi: Array, y: Array, structure: Structure, names: tuple[str, ...]
+) -> tuple[Array, Memory, tuple[Effect, ...]]:
+    """Constants theta (n,), the intercept first; the memory of y; the effects of the inputs."""
     theta, cov = least_squares(phi, y)
-    na, at = structure.na, 1 + structure.na
-    memory = float(theta[1:at].sum())
-    found = []
+    na, at, found = structure.na, 1 + structure.na, []
+    memory = Memory(float(theta[1:at].sum()), float(np.sqrt(cov[1:at, 1:at].sum())))
+    rest = 1.0 if memory.root else 1.0 - memory.value
     for j, nb, _ in structure.shape[1]:
         own = np.zeros(len(theta))
-        own[at : at + nb] = 1.0
-        at += nb
-        rest = 1.0 - memory if abs(1.0 - memory) > 1e-9 else 1e-9
-        b = float(own @ theta)
-        slope = own / rest
-        slope[1 : 1 + na] = b / rest**2
-        std_b = float(np.sqrt(own @ cov @ own))
-        found.append(Effect(names[j], b / rest, float(np.sqrt(slope @ cov @ slope)), FOUND * std_b / abs(rest)))
-    return found, memory, float(np.sqrt(cov[1 : 1 + na, 1 : 1 + na].sum())) if na else 0.0
+        own[at : at + nb], at = 1.0, at + nb
+        slope, b, least = own / rest, float(own @ theta), FOUND * float(np.sqrt(own @ cov @ own)) / abs(rest)
+        slope[1 : 1 + na] = 0.0 if memory.root else b / rest**2
+        found.append(Effect(names[j], b / rest, float(np.sqrt(slope @ cov @ slope)), least))
+    return theta, memory, tuple(found)
 
 
 class Move(NamedTuple):
@@ -168,38 +177,39 @@ class Move(NamedTuple):
     instead: tuple[str, ...]
 
 
-def moves(verdict: Verdict, run: Track, theta: Array) -> list[Move]:
-    """The events of a verdict as changes of effects; ``theta`` (n,) are constants, the intercept first."""
-    names = run.model.names
+def moves(verdict: Verdict, run: Track, theta: Array, root: bool) -> tuple[Move, ...]:
+    """The events of a verdict as changes of effects; ``theta`` (n,) are constants, the intercept first.
+
+    The level is that at mean inputs; with a ``root`` effects are those in a sample.
+    """
+    names, text, found = run.model.names, run.time_text, []
+    mean = dict(zip(run.model.input_names, np.nanmean(run.u, axis=0), strict=True)) if run.model.input_names else {}
+
+    def value(what: str, of: dict[str, float]) -> float:
+        memory = sum(of[name] for name in names if _what(name) == "memory")
+        if what == "memory":
+            return memory
+        inputs = sum(of[name] * mean[_what(name)] for name in names if _what(name) in mean)
+        own = of["intercept"] + inputs if what == "level" else sum(of[name] for name in names if _what(name) == what)
+        return float(own if root or memory >= 1.0 else own / (1.0 - memory))
+
     now = dict(zip(names, [*theta[1:], theta[0]], strict=True))
     for event in reversed(verdict.events):
         now |= {move.name: move.before for move in event.moves}
-    found = []
     for event in verdict.events:
         after = now | {move.name: move.after for move in event.moves}
-        touched = {_what(move.name) for move in event.moves}
         instead = tuple(dict.fromkeys(_what(name) for move in event.moves for name in move.instead))
-        text = run.time_text
         ends = (event.when, event.ended) if event.until is not None else (text(event.earliest), text(event.latest))
-        for what in sorted(touched):
-            values = (_value(what, values, names) for values in (now, after))
-            found.append(Move(what, event.kind, *values, *ends, event.at, instead))
-        if event.kind != "temporary":
-            now = after
-    return found
+        touched = {_what(move.name) for move in event.moves}
+        for what in sorted(touched, key=lambda what: (what in ("memory", "level"), what)):
+            found.append(Move(what, event.kind, value(what, now), value(what, after), *ends, event.at, instead))
+        now = now if event.kind == "temporary" else after
+    return tuple(found)
 
 
 def _what(name: str) -> str:
     """The effect that a parameter belongs to: the name of an input, "memory" or "level"."""
     return name.split("[", 1)[1][:-1] if "[" in name else "level" if name == "intercept" else "memory"
-
-
-def _value(what: str, theta: dict[str, float], names: tuple[str, ...]) -> float:
-    memory = sum(theta[name] for name in names if _what(name) == "memory")
-    if what == "memory":
-        return memory
-    rest = 1.0 - memory if abs(1.0 - memory) > 1e-9 else 1e-9
-    return sum(theta[name] for name in names if _what(name) == what) / rest
 
 
 def feedback(y: Array, u: Array) -> float:

@@ -78,7 +78,7 @@ def as_json(answer: Identification) -> dict[str, Any]:
                 "second": [{"structure": words.structure_text(answer, one), "behind": behind, "error": error}
                            for one, behind, error in structure.second],
             },
-            "effects": [vars(one) for one in answer.effects],
+            "effects": [one._asdict() for one in answer.effects],
             "moves": [one._asdict() for one in answer.moves],
             "errors": [one._asdict() for one in answer.errors],
             "cause": {"kind": cause.kind, "tracked": cause.tracked, "curve": cause.curve, "joint": cause.joint,
@@ -151,9 +151,7 @@ def body(answer: Identification) -> list[str]:
         section("What, since when, how large", _moves(answer) + _effects(answer)),
         section("The picture", picture(figure(answer), answer.track, CAPTION)),
         section("How good", _errors(answer)),
-        section(
-            "Time or working point", f"<p>Lead over constants: {escape(', '.join(said))}.</p>{_curve(answer)}"
-        ),
+        section("Time or working point", f"<p>Lead over constants: {escape(', '.join(said))}.</p>{_curve(answer)}"),
         section("What was chosen", points([escape(one) for one in (*words.chosen(answer), *words.columns(answer))])),
         section("Problems of the data", points([escape(one) for one in answer.notes]) or "<p>None.</p>"),
         section("What it could not decide", points([escape(one) for one in decided])),
@@ -167,7 +165,7 @@ def _nats(one: tuple[float, float]) -> str:
 
 
 def _moves(answer: Identification) -> str:
-    said = [escape(words.sentence(answer, move)) for move in answer.moves]
+    said = [escape(one) for one in words.sentences(answer)]
     return points(said) if said and answer.kind in ("moves", "both") else ""
 
 

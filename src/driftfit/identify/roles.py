@@ -16,7 +16,7 @@ Fault codes and spikes are missing, in inputs as in y: a reading so far from all
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import narwhals as nw
@@ -80,10 +80,16 @@ class Roles:
         return self.rows(np.flatnonzero(at))
 
     def rows(self, at: Array) -> Roles:
-        from dataclasses import replace
-
         time = None if self.time is None else self.time[at]
         return replace(self, y=self.y[at], U=self.U[at], time=time, key=tuple(self.key[t] for t in at), by=None)
+
+    def centred(self) -> Roles:
+        """The same with signals of mean 0 in every record, whose levels may differ."""
+        y, U, keys = self.y.copy(), self.U.copy(), np.array([str(one) for one in self.key])
+        for key in dict.fromkeys(keys):
+            at = keys == key
+            y[at], U[at] = y[at] - np.nanmean(y[at]), U[at] - np.nanmean(U[at], axis=0)
+        return replace(self, y=y, U=U)
 
     def table(self) -> pl.DataFrame:
         """The record as a table that `track` reads."""
@@ -97,7 +103,7 @@ class Roles:
         return table
 
     def spread(self, longest: int) -> tuple[Array, Array, Array]:
-        """y, U on a grid without gaps, and the place of every row in it; ``longest`` missing rows part two records."""
+        """y, U on a regular grid, inf where a gap in time is, and the place of every row; ``longest`` rows part records."""
         gap = np.ones(len(self.y), dtype=int)
         if self.time is not None:
             seconds = np.diff(self.time) / (np.timedelta64(1, "s") if self.time.dtype.kind == "M" else 1.0)
@@ -105,7 +111,7 @@ class Roles:
         if self.by is not None:
             gap[1:][[a != b for a, b in zip(self.key, self.key[1:], strict=False)]] = longest
         place = np.cumsum(gap) - 1
-        y, U = np.full(place[-1] + 1, np.nan), np.full((place[-1] + 1, self.U.shape[1]), np.nan)
+        y, U = np.full(place[-1] + 1, np.inf), np.full((place[-1] + 1, self.U.shape[1]), np.inf)
         y[place], U[place] = self.y, self.U
         return y, U, place
 
@@ -173,8 +179,6 @@ def roles(
 
 def _sorted(found: Roles, dt: float | None) -> Roles:
     """The record by key and time, without rows that repeat a time or have none, and its interval."""
-    from dataclasses import replace
-
     step = 1.0 if dt is None else dt
     if found.time is not None:
         place = {key: k for k, key in enumerate(dict.fromkeys(found.key))}

@@ -62,10 +62,11 @@ class Structure:
 
 
 def filled(x: Array) -> Array:
-    """A signal (T,) with at most `FILLED` missing readings in a row replaced by the last one."""
-    t, known = np.arange(len(x)), np.isfinite(x)
-    last = np.maximum.accumulate(np.where(known, t, -1))
-    return np.where((last >= 0) & (t - last <= FILLED), x[last], np.nan)
+    """A signal (T,) with at most `FILLED` missing readings in a row replaced by the last one, but not across gaps in
+    time, which are inf; NaN for what stays missing."""
+    t, known = np.arange(len(x)), ~np.isnan(x)
+    last = np.maximum.accumulate(np.where(known, t, 0))
+    return np.where((t - last <= FILLED) & np.isfinite(x[last]), x[last], np.nan)
 
 
 def lagged(x: Array, k: int) -> Array:
@@ -168,7 +169,7 @@ class TooShortError(ValueError):
 
 def search(y: Array, U: Array, M: int, first: int, end: float, rng: np.random.Generator) -> Structure:
     """The structure of a record on a regular grid; ``end``: the time (`time.monotonic`) at which the search stops."""
-    M, narrowed = _affordable(len(y), U.shape[1], M)
+    M, narrowed = _affordable(y, U, M)
     pool = Pool(y, U, M, first)
     out_of_time = False
 
@@ -229,10 +230,19 @@ COLUMNS = 420
 """Columns that the search holds in memory: 80 blocks and four memories of them take half a gigabyte."""
 
 
-def _affordable(T: int, m: int, M: int) -> tuple[int, str]:
-    """The longest lag that memory and record allow, and what is said of it."""
-    most = max(1, min(M, T // 10, COLUMNS // max(m, 1) - 1))
+def _affordable(y: Array, U: Array, M: int) -> tuple[int, str]:
+    """The longest lag that memory and record allow, and what is said of it: half of the rows must have all lags."""
+    most = max(1, min(M, len(y) // 10, COLUMNS // max(U.shape[1], 1) - 1))
+    known, reading = np.isfinite(np.column_stack([filled(x) for x in (y, *U.T)])).all(axis=1), np.isfinite(y)
+    while most > 1 and 2 * np.sum(_in_a_row(known, most) & reading) < np.sum(_in_a_row(known, 1) & reading):
+        most -= 1
     return most, f"lags of inputs up to {most} instead of {M}" if most < M else ""
+
+
+def _in_a_row(known: Array, k: int) -> Array:
+    """Where the last k and the present sample are known."""
+    total = np.cumsum(np.concatenate([np.zeros(k + 1), known]))
+    return np.asarray(total[k + 1 :] - total[: -k - 1] > k) & known if k else known
 
 
 def _beats_copies(y: Array, U: Array, shape: Shape, j: int, M: int, rng: np.random.Generator) -> bool:

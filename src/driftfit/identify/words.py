@@ -32,6 +32,11 @@ def duration(answer: Identification, samples: int) -> str:
     return f"{seconds / size:.3g} {unit}"
 
 
+def effect(answer: Identification) -> str:
+    """What the effects of inputs are: those in a sample where there may be no long run."""
+    return "effect in a sample" if answer.memory.root else "static gain"
+
+
 def delay(answer: Identification, name: str) -> str:
     j = answer.roles.inputs.index(name)
     low, high = answer.structure.delays.get(j, (answer.structure.lags[j][1],) * 2)
@@ -56,10 +61,10 @@ def headline(answer: Identification) -> str:
             else ""
         )
         return f"No drift found in {output} ({p_equals(answer.verdict.p)}).{seen}"
-    said = [sentence(answer, move) for move in answer.moves]
-    text = f"{'; '.join(said[:3])}{f'; and {len(said) - 3} more changes' if len(said) > 3 else ''}; {gain}."
+    said = sentences(answer)
+    text = f"{'; '.join(said[:2])}{f'; and {len(said) - 2} more changes' if len(said) > 2 else ''}; {gain}."
     text = text[0].upper() + text[1:]
-    return f"Both: {curve(answer)}, and besides this {text[0].lower()}{text[1:]}" if answer.kind == "both" else text
+    return f"Both: {curve(answer)}. Besides this: {text}" if answer.kind == "both" else text
 
 
 def curve(answer: Identification) -> str:
@@ -74,24 +79,29 @@ def _gain(answer: Identification) -> str:
     return f"tracking lowers the error {change:.0f} %" if change >= 0.5 else "tracking does not lower the error"
 
 
-def sentence(answer: Identification, move: Move) -> str:
-    """What an event did, in static gain."""
-    output = answer.roles.output
-    if move.what == "memory":
-        what = f"the memory of {output} (sum of its lags)"
-    elif move.what == "level":
-        what = f"the level of {output} (with inputs at 0)"
-    else:
-        what = f"the effect of {move.what} on {output} ({delay(answer, move.what)})"
-    before, after = number(move.before), number(move.after)
-    if move.kind == "wandering":
-        return f"{what} wandered between {number(min(move[2:4]))} and {number(max(move[2:4]))} over the whole record"
-    when = f"on {move.first}" if move.first == move.last else f"between {move.first} and {move.last}"
-    if move.kind == "gradual":
-        when = f"gradually from {move.first} to {move.last}"
-    back = "" if move.kind != "temporary" else ", and was then as before"
-    instead = f" (or {' or '.join(move.instead)} did)" if move.instead else ""
-    return f"{what} {verb(move)} from {before} to {after} {when}{back}{instead}"
+def sentences(answer: Identification) -> list[str]:
+    """What every event did, in static gains."""
+    events: dict[tuple[str, int], list[Move]] = {}
+    for move in answer.moves:
+        events.setdefault((move.kind, move.at), []).append(move)
+    return [_event(answer, own) for own in events.values()]
+
+
+def _event(answer: Identification, own: list[Move]) -> str:
+    one, output = own[0], answer.roles.output
+    whats = {"memory": f"the memory of {output} (sum of its lags)", "level": f"the level of {output} (at mean inputs)"}
+    parts = []
+    for move in own:
+        what = whats.get(move.what) or f"the effect of {move.what} on {output} ({delay(answer, move.what)})"
+        does = "wandered" if one.kind == "wandering" else verb(move)
+        parts.append(f"{what} {does} from {number(move.before)} to {number(move.after)}")
+    when = f"on {one.first}" if one.first == one.last else f"between {one.first} and {one.last}"
+    when = {"gradual": f"gradually from {one.first} to {one.last}", "wandering": "over the whole record"}.get(
+        one.kind, when
+    )
+    back = ", and was then as before" if one.kind == "temporary" else ""
+    instead = f" (or {' or '.join(one.instead)} did)" if one.instead else ""
+    return f"{', '.join(parts)} {when}{back}{instead}"
 
 
 def verb(move: Move) -> str:
@@ -186,7 +196,7 @@ def lines(answer: Identification) -> list[tuple[str, str]]:
         found.append(
             (
                 "",
-                f" {one.name:<20} static gain {number(one.gain):>9} +- {one.std:.2g}, {delay(answer, one.name)}{', moves' if moved else ''}",
+                f" {one.name:<20} {effect(answer)} {number(one.gain):>9} +- {one.std:.2g}, {delay(answer, one.name)}{', moves' if moved else ''}",
             )
         )
     found.append(("", ""))
