@@ -31,11 +31,14 @@ from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.segment import Segmentation, segment
 from driftfit.judge.verdict import Verdict
 from driftfit.models.arx import ARX
+from driftfit.models.hammerstein_wiener.basis import Polynomial
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.regression import Regression
 from driftfit.results import Track
 from driftfit.show.report import check_path
 from driftfit.show.text import Printed
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
+from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
 
 LEFT_OUT = 0.01
@@ -52,24 +55,16 @@ class Identification(Printed):
 
     Attributes
     ----------
-    kind : str
-        "moves", "a static curve explains it", "both", "no drift found" or "cannot decide".
-    why : str
-        Why it cannot decide; empty otherwise.
+    kind, why : str
+        "moves", "a static curve explains it", "both", "no drift found", or "cannot decide" and why.
     model, track, verdict
         The `ARX` model that was chosen, its run with the default tracker, and the verdict on its parameters.
     roles, structure, cause
         What each column is; what was chosen and what came second; what explains the record, in nats.
-    effects : tuple of Effect
-        Static gains of the inputs with constants, and the changes that would have been found.
-    moves : tuple of Move
-        What changed, in static gains.
-    errors : tuple of Errors
-        One step ahead and ``horizon`` steps ahead, beside constants and persistence.
-    memory : Memory
-        Sum of the lags of y and its standard error; where 1 is within two of them, effects are those in a sample.
-    notes : tuple of str
-        Problems of the data; ``undecided``: what could not be decided.
+    effects, moves, memory, errors
+        Effects of the inputs with constants; what changed; the lags of y; errors one step and ``horizon`` steps ahead.
+    notes, undecided : tuple of str
+        Problems of the data; what could not be decided.
     """
 
     kind: str
@@ -82,11 +77,11 @@ class Identification(Printed):
     cause: Cause = field(repr=False)
     effects: tuple[Effect, ...]
     moves: tuple[Move, ...]
-    errors: tuple[Errors, ...]
     memory: Memory
+    errors: tuple[Errors, ...]
     notes: tuple[str, ...]
     undecided: tuple[str, ...]
-    source: str = "data"
+    source: str
     seconds: float = 0.0
 
     @property
@@ -99,6 +94,11 @@ class Identification(Printed):
         """The answer in one sentence or two."""
         return words.headline(self)
 
+    @property
+    def effect(self) -> str:
+        """What the effects are: there may be no long run."""
+        return "effect in a sample" if self.memory.root else "static gain"
+
     @cached_property
     def segments(self) -> Segmentation:
         """Segments of constant parameters (`Track.segment`)."""
@@ -106,26 +106,43 @@ class Identification(Printed):
 
     @cached_property
     def alarms(self) -> Alarms:
-        """Alarms whose reference is what followed the last change: armed from now on, with ``alarms.rule``."""
-        last = max((move.at for move in self.moves if move.kind != "temporary"), default=0)
-        T = len(self.track)
+        """Alarms whose reference is what followed the last change; ``alarms.rule`` is armed from now on."""
+        last, T = max((move.at for move in self.moves), default=0), len(self.track)
         start = last if T - last > T // 4 else 3 * T // 4
         return self.track.detect("glr", reference=(self.track.time[start], self.track.time[T - 1]))
+
+    @property
+    def curve_model(self) -> HammersteinWiener:
+        """A Hammerstein-Wiener model with the curve of one input, or of all where it is of several."""
+        model, bent = self.model, self.cause.bent
+        curved = [bent < 0 or name == self.roles.inputs[bent] for name in model.input_names]
+        nb, nk = zip(*model.lags, strict=True)
+        bases = [Polynomial(3) if one else None for one in curved]
+        return HammersteinWiener(model.na, nb, nk, input=bases, inputs=model.input_names, intercept=True)
+
+    @cached_property
+    def curve(self) -> Track:
+        """The Hammerstein-Wiener model fitted to the record, with constants."""
+        return track(self.curve_model, RLS(1.0), **signals(self.roles, self.structure))
+
+    @property
+    def curve_call(self) -> str:
+        """The call that fits it."""
+        return (
+            f"track({self.curve_model!r}, RLS(1.0), y={self.roles.output!r}, u={list(self.model.input_names)}, data=..)"
+        )
 
     def json(self) -> dict[str, Any]:
         """The answer as plain data, in the form of `driftfit.identify.page.SCHEMA`."""
         return page.as_json(self)
 
-    def page(self, path: Any = None) -> str:
-        """The answer as one self-contained HTML page; with a ``path`` it is written there."""
-        text = page.html(self)
-        if path is not None:
-            check_path(path).write_text(text, encoding="utf-8")
-        return text
-
     def plot(self) -> Any:
         """The picture of the page; a matplotlib figure."""
         return page.figure(self)
+
+    def page(self, path: Any = None) -> str:
+        """The answer as one self-contained HTML page; with a ``path`` it is written there."""
+        return _written(page.html(self), path)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for style, line in words.lines(self):
@@ -134,7 +151,7 @@ class Identification(Printed):
 
 @dataclass(frozen=True)
 class ManyIdentified(Printed):
-    """The result of `identify` for many records with one structure: the fleet, its verdicts, the clearest three."""
+    """The result of `identify` for records with one structure: the fleet, its verdicts, the clearest three by key."""
 
     model: ARX
     track: Fleet = field(repr=False)
@@ -148,20 +165,18 @@ class ManyIdentified(Printed):
 
     @property
     def code(self) -> int:
-        """Exit code of the command."""
+        """Exit code of the command: 1 if no record could be judged."""
         return int(all(row.drifts is None for row in self.verdict.rows))
 
     def json(self) -> dict[str, Any]:
-        """The records by key: that of the worst three as for one record."""
+        """The records by key, and the clearest as for one record."""
         rows = {str(row.key): {"moves": row.drifts, "p": row.verdict.p, "q": row.q} for row in self.verdict.rows}
-        return {"schema": page.NAME, "records": page.finite(rows), "worst": {str(k): one.json() for k, one in self.worst.items()}}  # fmt: skip
+        worst = {str(key): one.json() for key, one in self.worst.items()}
+        return {"schema": page.NAME, "headline": self.headline, "records": page.finite(rows), "worst": worst}
 
     def page(self, path: Any = None) -> str:
         """One page: the table of all records, then the three that move most clearly."""
-        text = page.many(self)
-        if path is not None:
-            check_path(path).write_text(text, encoding="utf-8")
-        return text
+        return _written(page.many(self), path)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield Text(f" {len(self.verdict)} records with one structure: {self.model!r}")
@@ -170,26 +185,19 @@ class ManyIdentified(Printed):
             yield Text(f"\n {key}: {one.headline}")
 
 
+def _written(text: str, path: Any) -> str:
+    if path is not None:
+        check_path(path).write_text(text, encoding="utf-8")
+    return text
+
+
 def identify(
-    data: Any,
-    y: str | None = None,
-    *,
-    u: Sequence[str] | None = None,
-    not_u: Sequence[str] = (),
-    time: str | None = None,
-    dt: float | None = None,
-    by: str | None = None,
-    limits: Mapping[str, tuple[float | None, float | None]] | None = None,
-    max_lag: int = 30,
-    forecast: bool = False,
-    horizon: int = 10,
-    level: float = 0.05,
-    gate: bool | None = None,
-    budget: float = 45.0,
-    seed: int = 0,
-    reading: Wanted | None = None,
-    progress: Callable[[str], None] = lambda text: None,
-) -> Identification | ManyIdentified:
+    data: Any, y: str | None = None, *, u: Sequence[str] | None = None, not_u: Sequence[str] = (),
+    time: str | None = None, dt: float | None = None, by: str | None = None,
+    limits: Mapping[str, tuple[float | None, float | None]] | None = None, max_lag: int = 30, forecast: bool = False,
+    horizon: int = 10, level: float = 0.05, gate: bool | None = None, budget: float = 45.0, seed: int = 0,
+    reading: Wanted | None = None, progress: Callable[[str], None] = lambda text: None,
+) -> Identification | ManyIdentified:  # fmt: skip
     """From a table to an answer: roles, structure, drift and its cause.
 
     Parameters
@@ -252,17 +260,11 @@ def identify(
     if found.by is None:
         return replace(task.judged(found, structure), seconds=monotonic() - began)
     progress("tracking")
-    model = model_of(found, structure)
-    fleet = track(model, AdaptiveKalman(), **signals(found, structure), by=found.by, gate=gate)
-    verdicts = fleet.verdict(level)
-    keys = [row.key for row in verdicts.rows[:WORST]]
-    worst = {}
-    for key in keys:
-        try:
-            worst[key] = task.judged(found.record(key[0] if isinstance(key, tuple) else key), structure)
-        except ValueError:  # a record that is too short for a page of its own is in the table
-            continue
-    return ManyIdentified(model, fleet, verdicts, worst)
+    fleet = track(model_of(found, structure), AdaptiveKalman(), **signals(found, structure), by=found.by, gate=gate)
+    verdicts, worst = fleet.verdict(level), {}
+    for row in (one for one in verdicts.rows[:WORST] if one.drifts is not None):
+        worst[row.key] = task.judged(found.record(row.key), structure)
+    return ManyIdentified(model_of(found, structure), fleet, verdicts, worst)
 
 
 def check_record(found: Roles) -> None:
@@ -345,7 +347,7 @@ class _Task:
         kind, why = self._kind(found, run, verdict, why_not)
         return Identification(
             kind, why, model, run, verdict, found, structure, why_not, own, moves(verdict, run, theta, memory.root),
-            errors, memory, notes, undecided, self.source,
+            memory, errors, notes, undecided, self.source,
         )  # fmt: skip
 
     def _kind(self, found: Roles, run: Track, verdict: Verdict, explained: Cause) -> tuple[str, str]:

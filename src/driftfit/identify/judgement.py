@@ -10,7 +10,6 @@ predictions are made before the sample, one step or h steps ahead; those h ahead
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np

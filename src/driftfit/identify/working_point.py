@@ -1,15 +1,15 @@
 """Time or working point: do the parameters depend on when, or on where the plant is operated?
 
-Four regressions predict the record, each block from the others that are near in its memory (`driftfit.identify.scores`):
+Four regressions predict the record, each block from those that its memory holds (`driftfit.identify.scores`):
 
     constants            y = phi' theta
     tracked              y = phi' theta_t
     a curve, constant    y = phi' theta + sum c_i z_i
     both                 y = phi' theta_t + sum c_it z_i
 
-z_i are regressors times signals, x w, and hinges, (x - q)+ and x (w - q)+, at quartiles q. The signals w are the inputs,
-chosen or not, the last output, and the mean of the last twenty. They are added one by one while the score rises by more
-than the logarithm of their number. A curve that the plant passes through once cannot be told from time: then both
+z_i are regressors times signals, x w, and hinges, (x - q)+ and x (w - q)+, at quartiles q. The signals w are the
+inputs, chosen or not, the last output, and the mean of the last twenty. They are added one by one while the score rises
+by more than the logarithm of their number. A curve that the plant passes through once cannot be told from time: then both
 predict as well.
 """
 
