@@ -93,7 +93,7 @@ def plant(change: str, inputs: str, noise: str, snr: float, seed: int) -> Plant:
     y = np.zeros(n)
     for k in range(20, n):
         if noise == "closed loop":
-            U[k, first] -= 0.3 * y[k - 1]
+            U[k, first] -= 0.3 * np.sign(b[0]) * y[k - 1]
         x = U[k - delays[int(first)], first]
         x = 2.0 * np.tanh(1.2 * x + 0.6) if change == "static curve" else x
         past = poles[k] * y[k - 1] + (a[1] * y[k - 2] if len(a) > 1 else 0.0)

@@ -123,7 +123,8 @@ class Identification(Printed):
     @cached_property
     def curve(self) -> Track:
         """The Hammerstein-Wiener model fitted to the record, with constants."""
-        return track(self.curve_model, RLS(1.0), **signals(self.roles, self.structure))
+        fitted: Track = track(self.curve_model, RLS(1.0), **signals(self.roles, self.structure))
+        return fitted
 
     @property
     def curve_call(self) -> str:
@@ -351,7 +352,7 @@ class _Task:
         )  # fmt: skip
 
     def _kind(self, found: Roles, run: Track, verdict: Verdict, explained: Cause) -> tuple[str, str]:
-        share = max(found.share_refused, len(run.left_out) / len(run))
+        share = max(len(run.left_out), *found.refused.values(), 0) / len(run)
         if share > LEFT_OUT and self.gate is None:
             return "cannot decide", (
                 f"{100.0 * share:.1f} % of the readings look like fault codes or spikes and were left out; if they "

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftfit.identify import words
+from driftfit.judge.verdict import p_equals
 from driftfit.show.axes import BLUE, RED, date_axis, draw_prediction, frame, panels, settled, time_label
 from driftfit.show.page import document, facts, opening, picture, points, section, table
 
@@ -105,7 +106,7 @@ def body(answer: Identification) -> list[str]:
     if answer.kind in KINDS[1:3]:
         curve = f"<p>A model with that curve, fitted:</p><pre>{escape(answer.curve_call)}</pre>"
     copied = "".join(f"<pre>{escape(one)}</pre>" for one in (*words.commands(answer)[:2], words.unit(answer)))
-    open_ = [*answer.undecided, f"{words.p_equals(answer.verdict.p)} is that of a test after a selection"]
+    open_ = [*answer.undecided, f"{p_equals(answer.verdict.p)} is that of a test after a selection"]
     return [
         section("What, since when, how large", _listed(words.sentences(answer)) + _effects(answer)),
         section("The picture", picture(figure(answer), answer.track, CAPTION)),

@@ -113,7 +113,8 @@ class Pool:
 
     def best_delays(self, shape: Shape) -> dict[int, tuple[float, int]]:
         """(score, delay) of every input that the structure lacks, added at its best delay."""
-        added, used, best = self.scores.added(self.columns(shape)), {j for j, *_ in shape[1]}, {}
+        added, used = self.scores.added(self.columns(shape)), {j for j, *_ in shape[1]}
+        best: dict[int, tuple[float, int]] = {}
         for (j, k), column in self.place.items():
             if j >= 0 and j not in used:
                 best[j] = max(best.get(j, (-np.inf, 0)), (float(added[column]), k))
