@@ -179,7 +179,8 @@ class Move(NamedTuple):
 def moves(verdict: Verdict, run: Track, theta: Array, root: bool) -> tuple[Move, ...]:
     """The events of a verdict as changes of effects; ``theta`` (n,) are constants, the intercept first.
 
-    The level is that at mean inputs; with a ``root`` effects are those in a sample.
+    The level is that at mean inputs, and is left out where it moves with others by less than an error of predictions:
+    an effect that changes turns the plane about the origin. With a ``root`` effects are those in a sample.
     """
     names, text, found = run.model.names, run.time_text, []
     mean = dict(zip(run.model.input_names, np.nanmean(run.u, axis=0), strict=True)) if run.model.input_names else {}
@@ -201,7 +202,9 @@ def moves(verdict: Verdict, run: Track, theta: Array, root: bool) -> tuple[Move,
         ends = (event.when, event.ended) if event.until is not None else (text(event.earliest), text(event.latest))
         touched = {_what(move.name) for move in event.moves}
         for what in sorted(touched, key=lambda what: (what in ("memory", "level"), what)):
-            found.append(Move(what, event.kind, value(what, now), value(what, after), *ends, event.at, instead))
+            values = value(what, now), value(what, after)
+            if what != "level" or len(touched) == 1 or abs(values[1] - values[0]) > verdict.rms:
+                found.append(Move(what, event.kind, *values, *ends, event.at, instead))
         now = now if event.kind == "temporary" else after
     return tuple(found)
 
