@@ -18,7 +18,7 @@ PUMP = Path(str(files("driftfit.demo") / "pump.csv"))
 
 
 def make(path: Path, T: int = 800, seed: int = 48) -> None:
-    """Write the record: flow follows pressure after 70 s, and speed after 20 s; its filter clogs from 01:15 to 01:31."""
+    """Write the record: flow follows pressure after 70 s and speed after 20 s; a filter clogs from 01:15 to 01:31."""
     rng = np.random.default_rng(seed)
     pressure, speed = (rng.normal(size=T)[np.cumsum(rng.random(T) < 0.2)] for _ in range(2))
     temperature = 20.0 + np.cumsum(0.05 * rng.normal(size=T))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from time import monotonic
 from typing import Any
 
@@ -20,25 +19,22 @@ from rich.text import Text
 
 from driftfit.data.columns import Wanted
 from driftfit.fleets import Fleet
-from driftfit.identify import page, words
-from driftfit.identify.judgement import Effect, Errors, Memory, Move, effects, errors_of, feedback, moves
+from driftfit.identify import page
+from driftfit.identify.judgement import effects, errors_of, feedback, moves
+from driftfit.identify.result import Answer
 from driftfit.identify.roles import NoAnswerError, Roles, roles
 from driftfit.identify.scores import FEWEST
 from driftfit.identify.structure import Structure, TooShortError, search
 from driftfit.identify.working_point import Cause, cause, clear, regressors
-from driftfit.judge.alarms.detect import Alarms
 from driftfit.judge.fleet_verdict import ManyVerdicts
-from driftfit.judge.segment import Segmentation, segment
+from driftfit.judge.segment import segment
 from driftfit.judge.verdict import Verdict
 from driftfit.models.arx import ARX
-from driftfit.models.hammerstein_wiener.basis import Polynomial
-from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.regression import Regression
 from driftfit.results import Track
 from driftfit.show.report import check_path
 from driftfit.show.text import Printed
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
-from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
 
 LEFT_OUT = 0.01
@@ -50,88 +46,13 @@ WORST = 3
 
 
 @dataclass(frozen=True)
-class Identification(Printed):
-    """The result of `identify`; printing it shows the answer in some 25 lines.
-
-    Attributes
-    ----------
-    kind, why : str
-        "moves", "a static curve explains it", "both", "no drift found", or "cannot decide" and why.
-    model, track, verdict
-        The `ARX` model that was chosen, its run with the default tracker, and the verdict on its parameters.
-    roles, structure, cause
-        What each column is; what was chosen and what came second; what explains the record, in nats.
-    effects, moves, memory, errors
-        Effects of the inputs with constants; what changed; the lags of y; errors one step and ``horizon`` steps ahead.
-    notes, undecided : tuple of str
-        Problems of the data; what could not be decided.
-    """
-
-    kind: str
-    why: str
-    model: ARX
-    track: Track = field(repr=False)
-    verdict: Verdict = field(repr=False)
-    roles: Roles = field(repr=False)
-    structure: Structure
-    cause: Cause = field(repr=False)
-    effects: tuple[Effect, ...]
-    moves: tuple[Move, ...]
-    memory: Memory
-    errors: tuple[Errors, ...]
-    notes: tuple[str, ...]
-    undecided: tuple[str, ...]
-    source: str
-    seconds: float = 0.0
-
-    @property
-    def code(self) -> int:
-        """Exit code of the command: 0 answered, 1 undecided."""
-        return int(self.kind == "cannot decide")
+class Identification(Answer):
+    """The result of `identify`, an `Answer`; printing it shows some 25 lines."""
 
     @property
     def headline(self) -> str:
         """The answer in one sentence or two."""
-        return words.headline(self)
-
-    @property
-    def effect(self) -> str:
-        """What the effects are: there may be no long run."""
-        return "effect in a sample" if self.memory.root else "static gain"
-
-    @cached_property
-    def segments(self) -> Segmentation:
-        """Segments of constant parameters (`Track.segment`)."""
-        return self.track.segment()
-
-    @cached_property
-    def alarms(self) -> Alarms:
-        """Alarms whose reference is what followed the last change; ``alarms.rule`` is armed from now on."""
-        last, T = max((move.at for move in self.moves), default=0), len(self.track)
-        start = last if T - last > T // 4 else 3 * T // 4
-        return self.track.detect("glr", reference=(self.track.time[start], self.track.time[T - 1]))
-
-    @property
-    def curve_model(self) -> HammersteinWiener:
-        """A Hammerstein-Wiener model with the curve of one input, or of all where it is of several."""
-        model, bent = self.model, self.cause.bent
-        curved = [bent < 0 or name == self.roles.inputs[bent] for name in model.input_names]
-        nb, nk = zip(*model.lags, strict=True)
-        bases = [Polynomial(3) if one else None for one in curved]
-        return HammersteinWiener(model.na, nb, nk, input=bases, inputs=model.input_names, intercept=True)
-
-    @cached_property
-    def curve(self) -> Track:
-        """The Hammerstein-Wiener model fitted to the record, with constants."""
-        fitted: Track = track(self.curve_model, RLS(1.0), **signals(self.roles, self.structure))
-        return fitted
-
-    @property
-    def curve_call(self) -> str:
-        """The call that fits it."""
-        return (
-            f"track({self.curve_model!r}, RLS(1.0), y={self.roles.output!r}, u={list(self.model.input_names)}, data=..)"
-        )
+        return page.headline(self)
 
     def json(self) -> dict[str, Any]:
         """The answer as plain data, in the form of `driftfit.identify.page.SCHEMA`."""
@@ -146,7 +67,7 @@ class Identification(Printed):
         return _written(page.html(self), path)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        for style, line in words.lines(self):
+        for style, line in page.lines(self):
             yield Text(line, style)
 
 
@@ -177,7 +98,7 @@ class ManyIdentified(Printed):
 
     def page(self, path: Any = None) -> str:
         """One page: the table of all records, then the three that move most clearly."""
-        return _written(page.many(self), path)
+        return _written(page.many(self.verdict, self.worst), path)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield Text(f" {len(self.verdict)} records with one structure: {self.model!r}")
@@ -261,11 +182,12 @@ def identify(
     if found.by is None:
         return replace(task.judged(found, structure), seconds=monotonic() - began)
     progress("tracking")
-    fleet = track(model_of(found, structure), AdaptiveKalman(), **signals(found, structure), by=found.by, gate=gate)
+    model = model_of(found, structure)
+    fleet = track(model, AdaptiveKalman(), **found.signals(model.input_names), by=found.by, gate=gate)
     verdicts, worst = fleet.verdict(level), {}
     for row in (one for one in verdicts.rows[:WORST] if one.drifts is not None):
         worst[row.key] = task.judged(found.record(row.key), structure)
-    return ManyIdentified(model_of(found, structure), fleet, verdicts, worst)
+    return ManyIdentified(model, fleet, verdicts, worst)
 
 
 def check_record(found: Roles) -> None:
@@ -287,14 +209,6 @@ def model_of(found: Roles, structure: Structure) -> ARX:
     names = tuple(found.inputs[j] for j, _, _ in inputs)
     nb, nk = tuple(nb for _, nb, _ in inputs), tuple(nk for *_, nk in inputs)
     return ARX(structure.na, nb, nk, inputs=names, intercept=True)
-
-
-def signals(found: Roles, structure: Structure) -> dict[str, Any]:
-    """The arguments of `track` for a record."""
-    names = [found.inputs[j] for j in sorted(structure.lags)]
-    units = {name: unit for name, unit in found.units.items() if name in (*names, found.output)}
-    given = {"y": found.output, "u": names or None, "data": found.table(), "time": found.clock, "dt": found.dt}
-    return given | {"units": units or None}
 
 
 @dataclass(frozen=True)
@@ -334,7 +248,7 @@ class _Task:
         why_not = cause(y, U, structure, found.inputs, found.output, self.first)
         self.progress("tracking")
         model = model_of(found, structure)
-        run: Track = track(model, AdaptiveKalman(), **signals(found, structure), gate=self.gate)
+        run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
         self.progress("judging")
         verdict = run.verdict(self.level)
         if verdict.drifts and clear(why_not.curve):

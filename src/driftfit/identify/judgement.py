@@ -10,11 +10,10 @@ predictions are made before the sample, one step or h steps ahead; those h ahead
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.identify.result import Effect, Errors, Memory, Move
 from driftfit.identify.structure import Structure, filled, lagged
 from driftfit.identify.working_point import regressors
 from driftfit.judge.compare import persistence
@@ -77,14 +76,6 @@ def ahead(theta: Array, y: Array, drive: Array, na: int, h: int) -> Array:
     return lagged(made[-1], h - 1)
 
 
-class Errors(NamedTuple):
-    """Root mean square errors by the names of `NAMES`, on ``samples`` samples."""
-
-    steps: int
-    rms: dict[str, float]
-    samples: int
-
-
 def errors_of(run: Track, place: Array, y: Array, U: Array, structure: Structure, horizon: int) -> tuple[Errors, ...]:
     """Errors one step and ``horizon`` steps ahead on the grid; ``place``: where the samples of the run are in it."""
     T, n, y = len(y), run.model.n, np.where(np.isfinite(y), y, np.nan)
@@ -114,28 +105,6 @@ def errors_of(run: Track, place: Array, y: Array, U: Array, structure: Structure
     return tuple(found)
 
 
-class Effect(NamedTuple):
-    """The effect of an input with constants: in the long run, sum b / (1 - sum a), or in a sample, sum b, where the
-    output may have a unit root; its standard error; the change half-way that would be found in 4 of 5 records.
-    """
-
-    name: str
-    gain: float
-    std: float
-    least: float
-
-
-class Memory(NamedTuple):
-    """Sum of the lags of y with its standard error; ``root``: whether 1 is within two of them."""
-
-    value: float
-    std: float
-
-    @property
-    def root(self) -> bool:
-        return self.value + 2.0 * self.std >= 1.0
-
-
 def least_squares(phi: Array, y: Array) -> tuple[Array, Array]:
     """Coefficients (n,) and their covariance (n, n), from the complete rows."""
     rows = np.isfinite(phi).all(axis=1) & np.isfinite(y)
@@ -161,19 +130,6 @@ def effects(
         slope[1 : 1 + na] = 0.0 if memory.root else b / rest**2
         found.append(Effect(names[j], b / rest, float(np.sqrt(slope @ cov @ slope)), least))
     return theta, memory, tuple(found)
-
-
-class Move(NamedTuple):
-    """What an event did to one effect: the static gain of an input, the ``memory`` (sum of a) or the ``level``."""
-
-    what: str
-    kind: str
-    before: float
-    after: float
-    first: str
-    last: str
-    at: int
-    instead: tuple[str, ...]
 
 
 def moves(verdict: Verdict, run: Track, theta: Array, root: bool) -> tuple[Move, ...]:

@@ -106,6 +106,12 @@ class Roles:
             return table
         return table.with_columns(pl.col(self.clock).dt.replace_time_zone("UTC").dt.convert_time_zone(self.zone))
 
+    def signals(self, inputs: Sequence[str]) -> dict[str, Any]:
+        """The arguments of `track` for some inputs."""
+        units = {name: unit for name, unit in self.units.items() if name in (*inputs, self.output)} or None
+        given = {"y": self.output, "u": list(inputs) or None, "data": self.table(), "time": self.clock}
+        return given | {"dt": self.dt, "units": units}
+
     def spread(self, longest: int) -> tuple[Array, Array, Array]:
         """y, U on a regular grid, inf in gaps of time, and the place of every row; ``longest`` rows part records."""
         gap = np.ones(len(self.y), dtype=int)

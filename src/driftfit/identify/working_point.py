@@ -9,8 +9,8 @@ Four regressions predict the record, each block from those that its memory holds
 
 z_i are regressors times signals, x w, and hinges, (x - q)+ and x (w - q)+, at quartiles q. The signals w are the
 inputs, chosen or not, the last output, and the mean of the last twenty. They are added one by one while the score rises
-by more than the logarithm of their number. A curve that the plant passes through once cannot be told from time: then both
-predict as well.
+by more than the logarithm of their number. A curve that the plant passes through once cannot be told from time: both
+then predict as well.
 """
 
 from __future__ import annotations
