@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftfit.identify.result import Answer, Move
+from driftfit.identify.roles import CALENDAR
 from driftfit.identify.structure import Shape
 from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import p_equals
@@ -51,6 +52,8 @@ def duration(answer: Answer, samples: int) -> str:
     """A number of samples, where the record has dates as a time."""
     if not answer.roles.dated:
         return f"{samples} sample{'' if samples == 1 else 's'}"
+    if answer.roles.dt in CALENDAR:
+        return f"{samples} {answer.roles.dt}{'' if samples == 1 else 's'}"
     seconds = samples * answer.roles.step
     size, unit = next((one for one in UNITS if seconds >= 2.0 * one[0]), UNITS[-1])
     return f"{seconds / size:.3g} {unit}"
@@ -164,7 +167,7 @@ def commands(answer: Answer) -> list[str]:
     nb, nk = ("/".join(str(one[i]) for one in model.lags) for i in (0, 1))
     inputs = f" --u '{','.join(model.input_names)}'" if model.input_names else ""
     given = f"{answer.source} --y {roles.output}{inputs} --model arx:{model.na},{nb or 0}{nk and f',nk={nk}'},intercept"
-    given += f" --time {roles.clock} --dt {roles.step:g}{'s' if roles.dated else ''}" if roles.clock else ""
+    given += f" --time {roles.clock} --dt {roles.dt if roles.dated else f'{roles.step:g}'}" if roles.clock else ""
     served = f"driftfit serve {PurePath(answer.source).stem}.toml   # the unit is on the page"
     return [f"driftfit track {given}", f"driftfit detect {given}", served]
 
@@ -172,7 +175,7 @@ def commands(answer: Answer) -> list[str]:
 def unit(answer: Answer) -> str:
     """The unit of a service, as TOML."""
     names = ", ".join(f'"{name}"' for name in answer.model.input_names)
-    dt = f'dt = "{answer.roles.step:g}s"\n' if answer.roles.dated else ""
+    dt = f'dt = "{answer.roles.dt}"\n' if answer.roles.dated else ""
     return (f'[[unit]]\nname = "{PurePath(answer.source).stem}"\ny = "{answer.roles.output}"\nu = [{names}]\n{dt}'
             f'model = "{answer.model!r}"\ntracker = "AdaptiveKalman()"\nalarm = {{ every = "1 week" }}\n')  # fmt: skip
 

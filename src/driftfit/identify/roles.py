@@ -29,6 +29,8 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
 FAR = 3.0
+CALENDAR = {"month": (28.0, 31.0), "quarter": (90.0, 92.0), "year": (365.0, 366.0)}
+"""Days of the steps of the calendar."""
 FEW = 50
 """Values that a column of text may have to be a key."""
 SWITCHES = 0.02
@@ -68,9 +70,13 @@ class Roles:
         return self.time is not None and self.time.dtype.kind == "M"
 
     @property
-    def dt(self) -> Any:
-        """dt= of `track`."""
-        return np.timedelta64(round(self.step * 1e6), "us") if self.dated else None if self.time is None else self.step
+    def dt(self) -> float | str | None:
+        """dt= of `track`: a number, a step of the calendar, or seconds."""
+        if not self.dated:
+            return None if self.time is None else self.step
+        days = self.step / 86400.0
+        steps = (step for step, (low, high) in CALENDAR.items() if low <= days <= high)
+        return next(steps, f"{round(1e6 * self.step)}us" if self.step % 1.0 else f"{self.step:.0f}s")
 
     @property
     def groups(self) -> Array:
