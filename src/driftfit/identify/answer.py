@@ -18,14 +18,15 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.data.columns import Wanted
+from driftfit.engine.kernel import Array
 from driftfit.fleets import Fleet
 from driftfit.identify import page
 from driftfit.identify.judgement import effects, errors_of, feedback, moves
 from driftfit.identify.result import Answer
 from driftfit.identify.roles import NoAnswerError, Roles, roles
 from driftfit.identify.scores import FEWEST
-from driftfit.identify.structure import Structure, TooShortError, search
-from driftfit.identify.working_point import Cause, cause, clear, regressors
+from driftfit.identify.structure import Structure, search
+from driftfit.identify.working_point import cause, clear, regressors
 from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.segment import segment
 from driftfit.judge.verdict import Verdict
@@ -175,7 +176,8 @@ def identify(
     if not 0.0 < level < 1.0:
         raise ValueError(f"identify: level must be between 0 and 1, such as 0.05; got {level!r}.")
     progress("reading")
-    found = roles(data, y, u=u, not_u=not_u, time=time, dt=dt, by=by, limits=limits, wanted=reading)
+    found = roles(data, y, u=u, not_u=not_u, time=time, dt=dt, by=by, limits=limits, codes=gate is not False,
+                  wanted=reading)  # fmt: skip
     check_record(found)
     task = _Task(int(forecast), horizon, level, gate, began + budget, seed, progress, _source(data))
     structure = task.structure(found, max_lag)
@@ -196,19 +198,14 @@ def check_record(found: Roles) -> None:
     if len(known) < FEWEST:
         raise NoAnswerError(f"{len(known)} of {len(found.y)} rows hold {found.output}; at least {FEWEST} are needed.")
     if np.ptp(known) <= 1e-12 * np.max(np.abs(known)):
-        raise NoAnswerError(
-            f"{found.output} is {known[0]:g} in all {len(known)} rows: nothing moves, so nothing is learned."
-        )
+        raise NoAnswerError(f"{found.output} is {known[0]:g} in all {len(known)} rows; it must move to be explained.")
 
 
 def model_of(found: Roles, structure: Structure) -> ARX:
     """The ARX model of a structure."""
-    inputs = structure.shape[1]
-    if not inputs:
-        return ARX(structure.na, 0, intercept=True)
-    names = tuple(found.inputs[j] for j, _, _ in inputs)
-    nb, nk = tuple(nb for _, nb, _ in inputs), tuple(nk for *_, nk in inputs)
-    return ARX(structure.na, nb, nk, inputs=names, intercept=True)
+    names = tuple(found.inputs[j] for j, *_ in structure.shape[1])
+    nb, nk = (tuple(one[i] for one in structure.shape[1]) for i in (1, 2))
+    return ARX(structure.na, nb or 0, nk or 1, inputs=names or None, intercept=True)
 
 
 @dataclass(frozen=True)
@@ -229,15 +226,10 @@ class _Task:
         self.progress("searching the structure")
         y, U, _ = found.centred().spread(max_lag + 1)
         rng = np.random.default_rng(self.seed)
-        try:
-            best = search(y, U, max_lag, self.first, self.end, rng)
-            if any(nk == 0 for _, nk in best.lags.values()):
-                self.progress("searching a forecast")
-                best = replace(best, forecast=search(y, U, max_lag, 1, self.end, rng))
-        except TooShortError as error:
-            raise NoAnswerError(
-                f"{error.rows} rows of {len(found.y)} have all lags; at least {FEWEST} are needed."
-            ) from None
+        best = search(y, U, max_lag, self.first, self.end, rng)
+        if any(nk == 0 for _, nk in best.lags.values()):
+            self.progress("searching a forecast")
+            best = replace(best, forecast=search(y, U, max_lag, 1, self.end, rng))
         return best
 
     def judged(self, found: Roles, structure: Structure) -> Identification:
@@ -260,60 +252,46 @@ class _Task:
             why_not = replace(why_not, kind=("both" if moves_besides else "working point") if curved else "time")
         theta, memory, own = effects(phi, y, structure, found.inputs)
         errors = errors_of(run, place, y, U, structure, self.horizon)
-        notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found, verdict)
-        kind, why = self._kind(found, run, verdict, why_not)
+        notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict)
+        kind, why = self._kind(found, run, verdict, why_not.kind)
         return Identification(
             kind, why, model, run, verdict, found, structure, why_not, own, moves(verdict, run, theta, memory.root),
             memory, errors, notes, undecided, self.source,
         )  # fmt: skip
 
-    def _kind(self, found: Roles, run: Track, verdict: Verdict, explained: Cause) -> tuple[str, str]:
-        share = max(len(run.left_out), *found.refused.values(), 0) / len(run)
-        if share > LEFT_OUT and self.gate is None:
-            return "cannot decide", (
-                f"{100.0 * share:.1f} % of the readings look like fault codes or spikes and were left out; if they "
-                "are, say so with --gate, and if not, with --no-gate"
-            )
+    def _kind(self, found: Roles, run: Track, verdict: Verdict, kind: str) -> tuple[str, str]:
+        """The answer in a word, and why there is none."""
+        share = 100.0 * max(len(run.left_out), *found.refused.values(), 0) / len(run)
+        if share > 100.0 * LEFT_OUT and self.gate is None:
+            codes = f"{share:.1f} % of the readings look like fault codes or spikes and were left out"
+            return page.KINDS[4], f"{codes}; if they are, say so with --gate, and if not, with --no-gate"
         if verdict.drifts is None:
-            return "cannot decide", verdict.untested
-        if explained.kind == "working point":
-            return "a static curve explains it", ""
-        if verdict.drifts:
-            return ("both" if explained.kind == "both" else "moves"), ""
-        return "no drift found", ""
+            return page.KINDS[4], verdict.untested
+        if kind == "working point":
+            return page.KINDS[1], ""
+        return page.KINDS[2 if kind == "both" else 0] if verdict.drifts else page.KINDS[3], ""
 
 
-def _notes(found: Roles, run: Track, y: Any, U: Any, structure: Structure) -> tuple[str, ...]:
-    """Problems of the data, each in a sentence."""
-    notes = [
-        f"{count} readings of {name} are codes or spikes and taken as missing" for name, count in found.refused.items()
-    ]
-    if len(run.left_out):
-        notes.append(f"the gate left out {', '.join(f'{n} {reason}' for reason, n in run.left_out.counts.items())}")
-    if found.missing:
-        notes.append(f"{found.missing} readings are missing")
-    if (gaps := len(y) - len(found.y)) > 0:
-        notes.append(f"gaps in time of {gaps} samples in all")
-    for j in structure.lags:
-        if feedback(y, U[:, j]) > FEEDBACK:
-            also = ": its effect at delay 0 is then no cause" if structure.lags[j][1] == 0 else ""
-            notes.append(f"{found.output} acts on {found.inputs[j]} (feedback){also}")
-    if structure.narrowed:
-        notes.append(structure.narrowed)
-    return tuple(notes)
+def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -> tuple[str, ...]:
+    """Problems of the data, each in a few words."""
+    notes = [f"{count} readings of {name} taken as codes or spikes" for name, count in found.refused.items()]
+    notes += [f"{count} {reason}, left out by the gate" for reason, count in run.left_out.counts.items()]
+    notes += [f"{found.missing} readings missing"] if found.missing else []
+    notes += [f"gaps in time of {len(y) - len(found.y)} samples in all"] if len(y) > len(found.y) else []
+    fed = [j for j in structure.lags if feedback(y, U[:, j]) > FEEDBACK]
+    notes += [f"{found.output} acts on {found.inputs[j]} (feedback)" for j in fed]
+    at_once = [found.inputs[j] for j in fed if structure.lags[j][1] == 0]
+    notes += [f"what {' and '.join(at_once)} explain at once may then be no effect of theirs"] if at_once else []
+    return tuple([*notes, structure.narrowed] if structure.narrowed else notes)
 
 
-def _undecided(structure: Structure, found: Roles, verdict: Verdict) -> tuple[str, ...]:
-    """What the record does not decide."""
-    names, said = found.inputs, []
-    for j, (low, high) in structure.delays.items():
-        if high > low:
-            said.append(f"the delay of {names[j]}: {low} to {high} samples are as good")
+def _undecided(structure: Structure, names: Sequence[str], verdict: Verdict) -> tuple[str, ...]:
+    """What the record does not decide, each in a few words."""
+    ranges = [(names[j], *ends) for j, ends in structure.delays.items() if ends[0] < ends[1]]
+    said = [f"the delay of {name}: {low} to {high} samples are as good" for name, low, high in ranges]
     said += [f"{names[j]} or {names[i]}: either explains the record" for j, i in structure.instead]
     said += [f"{names[j]}: useful, but so are copies of it at other times" for j in structure.doubtful]
-    if verdict.nearly_walk:
-        said.append("a level that wanders, or noise that does")
-    return tuple(said)
+    return tuple([*said, "a level that wanders, or noise that does"] if verdict.nearly_walk else said)
 
 
 def _source(data: Any) -> str:

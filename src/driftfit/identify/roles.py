@@ -133,7 +133,8 @@ class Roles:
 def roles(
     data: Any, y: str | None = None, *, u: Sequence[str] | None = None, not_u: Sequence[str] = (),
     time: str | None = None, dt: float | None = None, by: str | None = None,
-    limits: Mapping[str, tuple[float | None, float | None]] | None = None, wanted: Wanted | None = None,
+    limits: Mapping[str, tuple[float | None, float | None]] | None = None, codes: bool = True,
+    wanted: Wanted | None = None,
 ) -> Roles:  # fmt: skip
     """The roles of the columns of a table or file; ValueError for names that it does not have, and without a y."""
     frame, units = _frame(data, wanted or Wanted(()))
@@ -158,7 +159,7 @@ def roles(
         low, high = (limits or {}).get(name, (None, None))
         x = numbers[name]
         bad = (x < (-np.inf if low is None else low)) | (x > (np.inf if high is None else high))
-        bad |= far_off(np.where(bad, np.nan, x))
+        bad |= far_off(np.where(bad, np.nan, x)) & codes
         numbers[name], refused[name] = np.where(bad, np.nan, x), int(bad.sum())
     kept: list[str] = []
     for name in (one for one in left if one != y and u is None):

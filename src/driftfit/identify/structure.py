@@ -20,6 +20,7 @@ from time import monotonic
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.identify.roles import NoAnswerError
 from driftfit.identify.scores import FEWEST, Scores, lead
 
 COLUMN = 1.5
@@ -37,13 +38,12 @@ Shape = tuple[int, tuple[tuple[int, int, int], ...]]
 
 @dataclass(frozen=True)
 class Structure:
-    """What was chosen, and what came second.
+    """What was chosen: ``na``, and (nb, nk) of each input by its place.
 
-    ``na``; ``lags``: (nb, nk) of each chosen input by its place; ``delays``: the least and the largest nk that are as
-    good. ``second``: descriptions of other structures, with how far they are behind in nats and the standard error of
-    that. ``doubtful``: inputs left out because displaced copies of them are as useful. ``instead``: pairs of an input
-    and one that could replace it. ``forecast``: the same with nk of at least 1, or None if it is this.
-    ``loss``: how much the forecast loses to it in nats. ``narrowed``: where the search was cut short.
+    ``delays``: the least and the largest nk that are as good. ``second``: other structures, by how many nats they are
+    behind, and the standard error of that. ``doubtful``: inputs that are no better than displaced copies. ``instead``:
+    pairs of an input and one that could replace it. ``forecast``: the same with nk of at least 1, if it is another.
+    ``narrowed``: where the search was cut short.
     """
 
     na: int
@@ -53,7 +53,6 @@ class Structure:
     doubtful: tuple[int, ...] = ()
     instead: tuple[tuple[int, int], ...] = ()
     forecast: Structure | None = None
-    loss: float = 0.0
     narrowed: str = ""
 
     @property
@@ -89,7 +88,7 @@ class Pool:
         X = np.column_stack([*columns, *([] if more is None else [more])])
         self.rows = np.flatnonzero(np.isfinite(X).all(axis=1) & np.isfinite(y))
         if len(self.rows) < FEWEST:
-            raise TooShortError(len(self.rows))
+            raise NoAnswerError(f"{len(self.rows)} rows of {len(y)} have all lags; at least {FEWEST} are needed.")
         self.scores = Scores(X[self.rows], y[self.rows])
         self.shapes: dict[Shape, float] = {}
 
@@ -124,22 +123,19 @@ class Pool:
         """The structures one step away."""
         na, inputs = shape
         found: list[Shape] = [(na - 1, inputs), (na + 1, inputs)]
-        found += [(na, with_input(inputs, (j, 1, k))) for j, (_, k) in self.best_delays(shape).items()]
+        found += [(na, (*inputs, (j, 1, k))) for j, (_, k) in self.best_delays(shape).items()]
         for one in inputs:
             j, nb, nk = one
             rest = tuple(other for other in inputs if other != one)
             moves = [(nb - 1, nk), (nb - 1, nk + 1), (nb + 1, nk), (nb + 1, nk - 1), (1, nk), (1, nk + nb - 1)]
             moves += [(nb, nk + d) for d in (-3, -2, -1, 1, 2, 3)]
-            found += [(na, rest), *((na, with_input(rest, (j, *move))) for move in moves)]
-            found += [(na, with_input(rest, (i, 1, k))) for i, (_, k) in self.best_delays((na, rest)).items()]
-        return [one for one in found if self.fits(one)]
+            found += [(na, rest), *((na, (*rest, (j, *move))) for move in moves)]
+            found += [(na, (*rest, (i, 1, k))) for i, (_, k) in self.best_delays((na, rest)).items()]
+        return [(na, tuple(sorted(inputs))) for na, inputs in found if self.fits((na, inputs))]
 
     def climb(self, shape: Shape, late: Callable[[], bool]) -> Shape:
         """The structure from which no step rises."""
-        while not late():
-            top = max(self.near(shape), key=self.value, default=shape)
-            if self.value(top) <= self.value(shape):
-                break
+        while not late() and self.value(top := max(self.near(shape), key=self.value)) > self.value(shape):
             shape = top
         return shape
 
@@ -154,18 +150,6 @@ class Pool:
             if top == shape or loss > min(error, TIED):
                 return shape
             shape = top
-
-
-def with_input(inputs: tuple[tuple[int, int, int], ...], one: tuple[int, int, int]) -> tuple[tuple[int, int, int], ...]:
-    return tuple(sorted((*inputs, one)))
-
-
-class TooShortError(ValueError):
-    """Raised for a record with too few complete rows; ``rows`` are those there are."""
-
-    def __init__(self, rows: int) -> None:
-        super().__init__(f"identify: {rows} rows have all lags, and at least {FEWEST} are needed.")
-        self.rows = rows
 
 
 def search(y: Array, U: Array, M: int, first: int, end: float, rng: np.random.Generator) -> Structure:
@@ -189,15 +173,12 @@ def search(y: Array, U: Array, M: int, first: int, end: float, rng: np.random.Ge
             break
     shape = pool.simplest(shape)
     doubtful = tuple(j for j, _, _ in shape[1] if not late() and not _beats_copies(y, U, shape, j, M, rng))
-    kept = shape[0], tuple(one for one in shape[1] if one[0] not in doubtful)
-    if kept != shape and not late():
-        kept = _without(pool.climb(kept, late), doubtful)
+    if doubtful:  # the others may need other lags without them
+        for climbed in (False, True):
+            shape = pool.climb(shape, late) if climbed else shape
+            shape = shape[0], tuple(one for one in shape[1] if one[0] not in doubtful)
     narrowed = "; ".join(filter(None, (narrowed, "the budget of time ended the search" if late() else "")))
-    return _told(pool, kept, doubtful, narrowed)
-
-
-def _without(shape: Shape, left_out: tuple[int, ...]) -> Shape:
-    return shape[0], tuple(one for one in shape[1] if one[0] not in left_out)
+    return _told(pool, shape, doubtful, narrowed)
 
 
 def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], narrowed: str) -> Structure:
@@ -214,7 +195,7 @@ def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], narrowed: str) ->
         tied = [nk]
         for step in (-1, 1):
             k = nk + step
-            while pool.fits(shifted := (shape[0], with_input(rest, (j, nb, k)))) and behind(shifted)[0] < TIED:
+            while pool.fits(shifted := (shape[0], (*rest, (j, nb, k)))) and behind(shifted)[0] < TIED:
                 tied.append(k)
                 k += step
         delays[j] = min(tied), max(tied)
