@@ -57,7 +57,7 @@ def identify_command(
     Exit codes: 0 answered, 1 undecided, 2 arguments or file, 3 the record cannot answer.
     """
     writable(page, "--page")
-    names = listed(u) + listed(not_u) + ([y] if y else [])
+    ranges = dict(limits_from(one, [one.rpartition("=")[0].strip()]) for one in limits or [])
     reading = Wanted((), None, (), tuple(missing or []), separator_from(separator), decimal_from(decimal), dates)
     began = monotonic()
     with progress.status("reading") as status:
@@ -71,7 +71,7 @@ def identify_command(
         try:
             found = identify(
                 file if len(file) > 1 else file[0], y, u=listed(u) or None, not_u=listed(not_u), time=time,
-                dt=seconds(dt), by=by, limits=dict(limits_from(one, names or [one.split("=")[0]]) for one in limits or []),
+                dt=seconds(dt), by=by, limits=ranges,
                 max_lag=max_lag, forecast=forecast, horizon=horizon, level=level, gate=gate,
                 budget=seconds(budget) or 0.0, seed=seed, reading=reading, progress=tell,
             )  # fmt: skip

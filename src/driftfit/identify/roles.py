@@ -138,7 +138,7 @@ def roles(
 ) -> Roles:  # fmt: skip
     """The roles of the columns of a table or file; ValueError for names that it does not have, and without a y."""
     frame, units = _frame(data, wanted or Wanted(()))
-    for name in filter(None, (y, time, by, *(u or ()), *not_u)):
+    for name in filter(None, (y, time, by, *(u or ()), *not_u, *(limits or ()))):
         if name not in frame.columns:
             raise ValueError(f"identify: no column {name!r}; {near(name, frame.columns)}")
     numbers, texts = _numbers(frame)
