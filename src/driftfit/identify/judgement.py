@@ -51,7 +51,7 @@ def mixed(first: Array, second: Array, y: Array, std: Array | None, late: int) -
     spread = [np.where(known, e, 0.0) ** 2 for e in (e1, e2)]
     v1, v2 = ((np.cumsum(one) - one + 1e-300) / np.maximum(np.cumsum(known) - known, 1) for one in spread)
     v1 = v1 if std is None else np.where(np.isfinite(std) & (std > 0.0), std, np.nan) ** 2
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         gain = 0.5 * (e2**2 / v2 + np.log(v2) - e1**2 / v1 - np.log(v1))
     usable = known & np.isfinite(gain) & (np.cumsum(known) > 10)
     weight, w = np.full(len(y), 0.5), 0.5

@@ -208,8 +208,8 @@ def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], narrowed: str) ->
     return Structure(shape[0], lags, delays, second, doubtful, tuple(instead), narrowed=narrowed)
 
 
-COLUMNS = 420
-"""Columns that the search holds in memory: 80 blocks and four memories of them take half a gigabyte."""
+COLUMNS = 250
+"""Columns that the search holds in memory: 80 blocks and four memories of them take a fifth of a gigabyte."""
 
 
 def _affordable(y: Array, U: Array, M: int) -> tuple[int, str]:

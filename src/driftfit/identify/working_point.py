@@ -94,7 +94,7 @@ def cause(y: Array, U: Array, structure: Structure, names: tuple[str, ...], outp
     chosen = [one - len(base) for one in bent[len(base) :]]
     own = {made[one][1] for one in chosen}
     return Cause(
-        kind, *leads, besides, further, tuple(made[one][0] for one in chosen),
+        kind, *leads, besides, further, tuple(dict.fromkeys(made[one][0] for one in chosen)),
         own.pop() if len(own) == 1 else -1, Z[:, chosen],
     )  # fmt: skip
 
