@@ -281,7 +281,7 @@ def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -
     fed = [j for j in structure.lags if feedback(y, U[:, j]) > FEEDBACK]
     notes += [f"{found.output} acts on {found.inputs[j]} (feedback)" for j in fed]
     at_once = [found.inputs[j] for j in fed if structure.lags[j][1] == 0]
-    notes += [f"what {' and '.join(at_once)} explain at once may then be no effect of theirs"] if at_once else []
+    notes += [f"the effect at once of {' and '.join(at_once)} may then be its response"] if at_once else []
     return tuple([*notes, structure.narrowed] if structure.narrowed else notes)
 
 
