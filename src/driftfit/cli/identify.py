@@ -26,6 +26,7 @@ SILENT = 2.0
 @app.command("identify")
 def identify_command(
     file: Annotated[list[str], Argument(help="CSV or Parquet files, or patterns such as 'runs/*.csv'.")],
+    *,
     y: Annotated[str | None, Option(help="Column of the output.")] = None,
     u: Annotated[Names, Option(help="Inputs to choose from; repeat it, or separate names by commas.")] = None,
     not_u: Annotated[Names, Option(help="Columns that are no inputs.")] = None,
