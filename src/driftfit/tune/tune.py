@@ -43,6 +43,7 @@ from driftfit.run.result import track_record
 from driftfit.run.track import Decisions, decide, records_of, warn_of_codes
 from driftfit.show.text import ByOutput
 from driftfit.trackers.base import Tracker
+from driftfit.tune.inference import unknown_at_start
 from driftfit.tune.lanes import Task, score
 from driftfit.tune.parametrisation import find_knobs
 from driftfit.tune.search import Counted, Criterion, Search, along, intervals_of, minimise, run_task
@@ -168,6 +169,8 @@ def _tuned(
         method=method,
         loglik=sum(run.loglik for run in runs),
         used=sum(int(np.isfinite(run.log_density).sum()) for run in runs) if tracker.covariance else 0,
+        settings=len(search.x) + int(knobs.profiled),
+        unknown=sum(unknown_at_start(run) for run in runs),
         noise=sigma2 if knobs.profiled else float(getattr(knobs.run(search.x), "r", np.nan)),
         at_bound=tuple(name for name, i in zip(knobs.names, knobs.owner, strict=True) if search.at_bound(i)),
         interval=intervals_of(search, task, method, tracker, level),
