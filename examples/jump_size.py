@@ -17,7 +17,7 @@ def record(seed):
     """(y, u, theta): three parameters that jump together, and white inputs."""
     rng = np.random.default_rng([seed, *b"sparse_jumps"])
     jump = rng.random(T) < RATE
-    theta = [1.0, -0.5, 0.8] + np.cumsum(jump[:, None] * rng.normal(size=(T, 3)) * JUMP, axis=0)
+    theta = np.array([1.0, -0.5, 0.8]) + np.cumsum(jump[:, None] * rng.normal(size=(T, 3)) * JUMP, axis=0)
     noise = NOISE * rng.normal(size=T)
     rng.normal(size=T)  # that all inputs share in other records
     u = rng.normal(size=(T, 3))
