@@ -222,7 +222,8 @@ class Program:
             model, own = self.model, self.steps if steps is None else steps
             gate = None
             if self.gate is not None:
-                gate = gate_step(self.gate, model.n, model.m, model.input_memory, model.refuse, model.implicit)
+                ages, refuse, lends = model.input_memory, model.refuse, not self.tracker.covariance
+                gate = gate_step(self.gate, model.n, model.m, ages, refuse, model.implicit, lends)
             found = drivers(model.steps_for(self.steps), own, keep, gate)
             if gate is not None:
                 found = found._replace(run=partial(self._decided, found.run))
