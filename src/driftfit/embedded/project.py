@@ -34,7 +34,7 @@ def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
     made, m = translation(program, fixed_rate), program.model.m
     header = templates.HEADER.format(
         what=comment(what), version=__version__, n=made.start["theta"].shape[1], m=m,
-        names=comment(", ".join(program.names)), fields=_fields(made),
+        names=comment(", ".join(program.names)), fields=_fields(made, made.names),
         known=templates.FIXED_RATE if fixed_rate else templates.KNOWN,
     )  # fmt: skip
     source = templates.SOURCE.format(what=comment(what)) + _source(made, program)
@@ -50,12 +50,11 @@ def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
     }  # fmt: skip
 
 
-def _fields(made: Translation) -> str:
-    lines = []
-    for name in made.names:
-        size = made.start[name][0].size
-        lines.append(f"    {made.type_of(name)} {identifier(name)}{'' if size == 1 else f'[{size}]'};")
-    return "\n".join(lines)
+def _fields(made: Translation, names: tuple[str, ...]) -> str:
+    sized = [(name, made.start[name][0].size) for name in names]
+    return "\n".join(
+        f"    {made.type_of(name)} {identifier(name)}{'' if size == 1 else f'[{size}]'};" for name, size in sized
+    )
 
 
 def _source(made: Translation, program: Program) -> str:
@@ -65,6 +64,8 @@ def _source(made: Translation, program: Program) -> str:
     support = _support(steps)
     start = f"static const tracker_state START = {{\n{_initial(made)}\n}};"
     tables = [body % name for body, name in made.unit.tables.items()]
+    if made.scratch:
+        tables.append(templates.SCRATCH.format(fields=_fields(made, made.scratch)))
     again = [] if program.gate is None else [_again(made, program)]
     return "\n\n".join([*support, *tables, start, steps, *again, _face(made, memory, bool(again))]) + "\n"
 
@@ -82,7 +83,7 @@ def _again(made: Translation, program: Program) -> str:
     rows, width = made.start["gate_first"].shape[1:3]
     return templates.AGAIN.format(
         rows=rows, columns=width, m=max(program.model.m, 1), kept="\n".join(kept), restored="\n".join(restored),
-        codes=CODES, reading=READING, inputs=INPUTS, times=TIMES, factors="\n".join(factors), entry=made.entry.name,
+        codes=CODES, reading=READING, inputs=INPUTS, times=TIMES, factors="\n".join(factors), sample=_sample(made),
     ).rstrip()  # fmt: skip
 
 
@@ -111,13 +112,18 @@ def _face(made: Translation, memory: set[str], gated: bool) -> str:
     return "\n".join([
         "void tracker_init(tracker_state *s) {", "    *s = START;", "}", "",
         "NOT_INLINED tracker_step tracker_update(tracker_state *s, tracker_real y, const tracker_real *u) {",
-        "    tracker_step step;",
-        f"    {made.entry.name}(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);",
+        "    tracker_step step;", f"    {_sample(made)}",
         *(["    if (s->gate_replay > 0) { first_samples_again(s); }"] if gated else []), "    return step;", "}", "",
         "tracker_step tracker_predict(const tracker_state *s, tracker_state *scratch, const tracker_real *u) {",
         "    *scratch = *s;", "    return tracker_update(scratch, NAN, u);", "}", "",
         "void tracker_reset(tracker_state *s) {", *copies, "}",
     ])  # fmt: skip
+
+
+def _sample(made: Translation) -> str:
+    """The statements that take in a sample."""
+    declared, state = ("scratch_fields scratch; ", "s, &scratch") if made.scratch else ("", "s")
+    return f"{declared}{made.entry.name}({state}, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);"
 
 
 def _copied(to: str, source: str, size: int) -> str:

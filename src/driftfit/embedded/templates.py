@@ -81,6 +81,12 @@ typedef tracker_real real;
 
 """
 
+SCRATCH = """\
+/* What steps work in: it carries nothing from one sample to the next. */
+typedef struct {{
+{fields}
+}} scratch_fields;"""
+
 AGAIN = """\
 /* The first samples once more, without the fault codes that the gate has found among them. */
 static void first_samples_again(tracker_state *s) {{
@@ -102,7 +108,7 @@ static void first_samples_again(tracker_state *s) {{
                 u[j] = i < 0 || (codes >> (j + 1)) % 2 == 1 ? R(NAN) : rows[k][{inputs} + j];
             }}
 {factors}
-            {entry}(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);
+            {sample}
         }}
     }}
 }}

@@ -18,7 +18,7 @@ pulse, may be FAR times as large as predicted. A far reading is refused. A chang
                is not counted, and believed only with the `hold`-th; with `LONGER` times as many if the forecast moved
                meanwhile, so that a level would not have repeated, and readings do not repeat by nature
 
-s = inf or NaN (start) contradicts nothing, a tracker without s is lent the mean of e^2, and a reading without a forecast
+s = inf or NaN (start) contradicts nothing, a tracker without s is lent the mean of e^2, and a sample without a forecast
 is judged by v alone. v counts a reading that contradicts its forecast as `CLIPPED` variances at most, so that spikes do
 not become usual, but what is far in one of ten readings does.
 
@@ -151,9 +151,8 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
         if (apart == 0.0) | turns:
             s.gate_same[l] += 1
             s.gate_pulses[l] += 1 if unmoved & strikes else 0
-            told = (s.gate_stuck[l] > 0.5) & (
-                not natural(s, l)
-            )  # a level does not repeat where the forecast is elsewhere
+            # a level does not repeat where the forecast is elsewhere
+            told = (s.gate_stuck[l] > 0.5) & (not natural(s, l))
             longest = LONGER * hold if told else hold
             return (s.gate_same[l] < longest) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
         alike = unmoved | ((y - s.gate_last[l]) ** 2 < near2)
