@@ -54,6 +54,7 @@ from driftfit.trackers.particle_filter import ParticleFilter
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
 from driftfit.tune.frontier import frontier
+from driftfit.tune.inference import likelihood_ratio
 from driftfit.tune.pool import pool
 from driftfit.tune.tune import tune
 from driftfit.use import prepare
@@ -120,6 +121,7 @@ __all__ = [
     "frontier",
     "grid",
     "huber",
+    "likelihood_ratio",
     "piecewise",
     "plot_tree",
     "pool",

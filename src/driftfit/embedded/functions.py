@@ -76,8 +76,8 @@ class Body(Statements):
         for argument, one in zip(self.tree.args.args, arguments, strict=True):
             name = identifier(argument.arg)
             if one.kind in ("record", "tile"):
-                self.parameters += ["tracker_state *s", *(["scratch_fields *scratch"] if self.unit.scratch else [])]
-                named[argument.arg] = Value(one.kind, self.unit.state)
+                self.parameters += ["tracker_state *s", "scratch_fields *scratch"]
+                named[argument.arg] = one
             elif one.kind == "array":
                 constant = "const " if one.text == "u" else ""
                 self.parameters.append(f"{constant}{TYPES[one.element]} *{name}")
@@ -162,7 +162,7 @@ class Body(Statements):
 def _passed(value: Value) -> str:
     """The expression passed for an argument; nothing if its value is known."""
     if value.kind in ("record", "tile"):
-        return value.text
+        return "s, scratch"
     if value.kind in ("array", "address"):
         return begin_of(value)
     if value.kind == "items":
@@ -248,7 +248,7 @@ def translation(program: Program, fixed_rate: bool = False) -> Translation:
     scratch = frozenset(program.scratch) & {*fields(tile)}
     while True:
         unit = Unit(tile, constant, flags, scratch)
-        entry = translate(unit, update, [Value("tile", unit.state), Value("real", "y"), u])
+        entry = translate(unit, update, [Value("tile"), Value("real", "y"), u])
         if not (constant & unit.written or flags & unit.beyond):
             break
         constant, flags = constant - unit.written, flags - unit.beyond

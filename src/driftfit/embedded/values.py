@@ -240,11 +240,6 @@ class Unit:
         return Value("array", text, shape=array.shape, strides=_strides(array.shape), element=element,
                      scalar=array.size == 1)  # fmt: skip
 
-    @property
-    def state(self) -> str:
-        """What functions are given of the record: the state, and the fields that carry nothing to the next sample."""
-        return "s, scratch" if self.scratch else "s"
-
     def start_of(self, name: str) -> Any:
         """The value that every entry of a constant field has; None if there is no such value."""
         values = self.record[name][0].ravel()
