@@ -105,21 +105,14 @@ def test_no_sample_is_between_those_judged_together_and_those_judged_alone(model
     assert max(np.abs(fleet[k].theta[-1] - fleet[0].theta[-1]).max() for k in range(21)) < 0.05
 
 
-COMPUTED = pytest.mark.xfail(
-    reason="the first samples are judged by regressors that the estimate with the code has computed", strict=True
-)
-
-
 @pytest.mark.parametrize(
     ("model", "tracker"),
     [(one, RLS(0.99)) for one in (OE(1, 1), BoxJenkins(), ARMAX(1, 1, 1))] + [(OE(1, 1), AdaptiveKalman())],
     ids=repr,
 )
 @pytest.mark.parametrize("at", [1, 3, 6, 7, 8])
-def test_models_that_compute_signals_begin_without_the_fault(model, tracker, at, request):
+def test_models_that_compute_signals_begin_without_the_fault(model, tracker, at):
     """What they compute with a wrong estimate is in later regressors."""
-    if (model, tracker, at) == (OE(1, 1), RLS(0.99), 8):
-        request.applymarker(COMPUTED)
     y, u = plant()
     y, u = y[:200], u[:200]
     clean = gated(model, tracker, y, u).theta[-1]

@@ -154,7 +154,7 @@ def test_codes_of_a_run_without_a_gate_are_listed(s):
     case.u[400] = -999.0
     assert looked_at(case)
     y_hat = case.theta[:, 0] * np.where(case.u[:, 0] == -999.0, -999.0, case.u[:, 0]) + case.theta[:, 1]
-    reason = Review(Gate(), 1, 0)(case.y, case.u, y_hat, np.full(600, s), np.ones(600, bool))
+    reason = Review(Gate(), 1, 0, np.isnan(s))(case.y, case.u, y_hat, np.full(600, s), np.ones(600, bool))
     assert counts(reason)[REFUSED] + counts(reason).get(2, 0) == 8
     assert reason[400] == INPUT + SIGNAL
     assert "far outside" in remarks(counts(reason))[0][1]

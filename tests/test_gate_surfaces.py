@@ -75,7 +75,7 @@ def test_decisions_of_a_stream_with_times_have_them():
     live = Live(PLANT, TRACKER, gate=True)
     for t in range(200):
         live.update(y[t], u[t], 1000.0 + t)
-    assert [one.sample for one in live.left_out] == [1005.0, 1100.0]
+    assert [one.sample for one in live.left_out.last] == [1005.0, 1100.0]
 
 
 def test_smoothers_covariances_and_likelihood_take_the_decisions():
@@ -175,7 +175,7 @@ def test_candidates_on_line_take_the_decisions_of_one_reference():
     for t in range(200):
         one.update(y[t], u[t])
         two.update(np.nan if t == 100 else y[t], u[t])
-    assert [decision.sample for decision in one.reference.left_out] == [100]
+    assert [decision.sample for decision in one.reference.left_out.last] == [100]
     np.testing.assert_array_equal(one.weights, two.weights)
     again = LiveSelection.from_bytes(one.to_bytes())
     assert again.reference.left_out.counts == {"Left out": 1}

@@ -35,7 +35,8 @@ def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
     made, m = translation(program, fixed_rate), program.model.m
     header = filled(
         "tracker.h", what=comment(what), version=__version__, n=made.start["theta"].shape[1], m=m,
-        names=comment(", ".join(program.names)), fields=_fields(made), known=FIXED_RATE if fixed_rate else KNOWN,
+        names=comment(", ".join(program.names)), fields=_fields(made, made.names),
+        known=FIXED_RATE if fixed_rate else KNOWN,
     )  # fmt: skip
     readme = filled(
         "README.md", what=as_code(what), names=", ".join(map(as_code, program.names)), doubles=made.layout(8).itemsize,
@@ -66,12 +67,11 @@ GATED = """
   came."""
 
 
-def _fields(made: Translation) -> str:
-    lines = []
-    for name in made.names:
-        size = made.start[name][0].size
-        lines.append(f"    {made.type_of(name)} {identifier(name)}{'' if size == 1 else f'[{size}]'};")
-    return "\n".join(lines)
+def _fields(made: Translation, names: tuple[str, ...]) -> str:
+    sized = [(name, made.start[name][0].size) for name in names]
+    return "\n".join(
+        f"    {made.type_of(name)} {identifier(name)}{'' if size == 1 else f'[{size}]'};" for name, size in sized
+    )
 
 
 def _source(made: Translation, program: Program) -> str:
@@ -81,6 +81,7 @@ def _source(made: Translation, program: Program) -> str:
     support = _support(steps)
     start = f"static const tracker_state START = {{\n{_initial(made)}\n}};"
     tables = [body % name for body, name in made.unit.tables.items()]
+    scratch = filled("scratch.c", fields=_fields(made, made.scratch) or "    int none;").rstrip()
     again = [] if program.gate is None else [_again(made, program)]
     copies = ((identifier(one), made.start[one][0].size) for one in made.names if one not in memory)
     face = filled(
@@ -88,7 +89,7 @@ def _source(made: Translation, program: Program) -> str:
         again="    if (s->gate_replay > 0) { first_samples_again(s); }\n" * bool(again),
         copies="\n".join(f"    {_copied(f's->{name}', f'START.{name}', size)}" for name, size in copies),
     )  # fmt: skip
-    return "\n\n".join([*support, *tables, start, steps, *again, face])
+    return "\n\n".join([*support, *tables, start, scratch, steps, *again, face])
 
 
 def _again(made: Translation, program: Program) -> str:

@@ -44,9 +44,9 @@ FEW = 3
 """Values that differ from the median, from which on their distance is usual."""
 ROUNDED = 1e-20
 """Share of the sum of squares of y that may be an error of rounding."""
-Y, READING, OK, DT, NOISE, DRIFT, TIMES, DOUBT, U = range(9)
+Y, READING, DT, NOISE, DRIFT, TIMES, DOUBT, U = range(8)
 CODES = Y
-"""Columns of a kept sample: output and reading (NaN if missing), whether there is a row, intervals since the last
+"""Columns of a kept sample: output (NaN if it cannot be used) and reading (NaN if missing), intervals since the last
 sample, factors of noise and drift, how often it came, the judgement, and the first input. The regressor follows the
 inputs. When it is decided, which signals are codes takes the place of the output."""
 
@@ -99,11 +99,11 @@ def reach(s: State, column: int, center: float, l: int) -> float:
 
 
 @kernel
-def doubt(s: State, implicit: bool, l: int) -> int:
-    """Write into each sample 1 if its reading is outlying, 2 if a regressor is; count those with one of the two."""
+def doubt(s: State, implicit: bool, l: int) -> bool:
+    """Write into each sample 1 if its reading is outlying, 2 if a regressor is; whether one has one of the two."""
     N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
     center = usual_value(s, READING, 0.0, False, l)
-    most, count = reach(s, READING, center, l), 0
+    most, some = reach(s, READING, center, l), False
     for k in range(N):
         s.gate_first[k, DOUBT, l] = 1.0 if abs(s.gate_first[k, READING, l] - center) > most else 0.0
     for i in range(n):
@@ -116,8 +116,8 @@ def doubt(s: State, implicit: bool, l: int) -> int:
                 s.gate_first[k, DOUBT, l] = d + 2.0
     for k in range(N):
         d = s.gate_first[k, DOUBT, l]
-        count += 1 if (d == 1.0) | (d == 2.0) else 0
-    return count
+        some |= (d == 1.0) | (d == 2.0)
+    return some
 
 
 @kernel
@@ -148,8 +148,8 @@ def fit(s: State, every: bool, l: int) -> float:
             s.gate_fit[i, j, l] = 0.0
     left = 0.0
     for k in range(N):
-        d = s.gate_first[k, DOUBT, l]
-        if (s.gate_first[k, OK, l] > 0.0) & (every | (d == 0.0) | (d == 3.0)):
+        d, y = s.gate_first[k, DOUBT, l], s.gate_first[k, Y, l]
+        if (y == y) & (every | (d == 0.0) | (d == 3.0)):
             left += rotate_in(s, k, l)
     return left
 
@@ -159,11 +159,11 @@ def contradicted(s: State, l: int) -> bool:
     """Whether the samples that are not doubtful contradict those that are."""
     rows, some, total = 0, 0, 0.0
     for k in range(s.gate_first.shape[0]):
-        d = s.gate_first[k, DOUBT, l]
-        if s.gate_first[k, OK, l] > 0.0:
+        d, y = s.gate_first[k, DOUBT, l], s.gate_first[k, Y, l]
+        if y == y:
             sure = (d == 0.0) | (d == 3.0)
             rows, some = rows + (1 if sure else 0), some + (0 if sure else 1)
-            total += s.gate_first[k, Y, l] ** 2 if sure else 0.0
+            total += y**2 if sure else 0.0
     alone, spare = fit(s, False, l), rows - s.phi.shape[0]
     more = fit(s, True, l) - alone
     return (spare >= RESIDUALS) & (more * spare > WORSE * some * (alone + ROUNDED * total))  # type: ignore[no-any-return]
@@ -209,11 +209,10 @@ def comes_again(s: State, l: int) -> bool:
 @partial(kernel, short=True)
 def decide(s: State, ages: int, implicit: bool, l: int) -> None:
     """Where samples made room for others they were judged one by one, unless they are the codes themselves."""
-    N = s.gate_first.shape[0]
     dropped, s.gate_decided[l] = -s.gate_decided[l], 1
-    count = doubt(s, implicit, l)
+    some = doubt(s, implicit, l)
     whole = (dropped == 0) | (s.gate_first[0, DOUBT, l] == 1.0) & (not comes_again(s, l))
-    if (count > 0) & (2 * count < N) & whole and contradicted(s, l):
+    if some & whole and contradicted(s, l):
         mark(s, ages, l)
         s.gate_replay[l] = 1 + dropped
 
@@ -243,10 +242,8 @@ def drop_oldest(s: State, l: int) -> None:
 @kernel
 def keep(s: State, k: int, times: float, l: int) -> None:
     n, PHI = s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
-    observed = s.observed[l] > 0.0
-    s.gate_first[k, Y, l] = s.y[l] if observed else np.nan
-    s.gate_first[k, READING, l] = reading_now(s, l)
-    s.gate_first[k, OK, l], s.gate_first[k, DT, l] = s.ok[l], s.dt[l]
+    s.gate_first[k, Y, l] = s.y[l] if s.ok[l] > 0.0 else np.nan
+    s.gate_first[k, READING, l], s.gate_first[k, DT, l] = reading_now(s, l), s.dt[l]
     s.gate_first[k, NOISE, l], s.gate_first[k, DRIFT, l] = s.noise[l], s.drift[l]
     s.gate_first[k, TIMES, l] = times
     for j in range(PHI - U):

@@ -105,16 +105,14 @@ class LeftOut:
         return y, noise
 
     def __repr__(self) -> str:
-        return table(self, len(self))
-
-    __str__ = __repr__
+        return table(list(self))
 
 
-def table(decisions: Any, count: int) -> str:
+def table(decisions: Sequence[Decision]) -> str:
     """Decisions as text, at most `KEPT` of them."""
+    rows, count = decisions[:KEPT], len(decisions)
     if count == 0:
         return "nothing left out"
-    rows = [Decision(*row) for row, _ in zip(decisions, range(KEPT), strict=False)]
     wide = max(6, *(len(str(row.sample)) for row in rows))
     lines = [f"{'sample':>{wide}}  signal    reading of y  reason"]
     lines += [f"{row.sample!s:>{wide}}  {row.signal:<6}  {row.value:>14.6g}  {row.reason}" for row in rows]
@@ -153,12 +151,6 @@ class Tally:
         self.counts: dict[str, int] = dict(counted or {})
         self.last: tuple[Decision, ...] = tuple(Decision(*one) for one in last)
 
-    def __len__(self) -> int:
-        return sum(self.counts.values())
-
-    def __iter__(self) -> Iterator[Decision]:
-        return iter(self.last)
-
     def add(self, sample: Any, decided: int, value: float, names: Sequence[str]) -> None:
         """Count a sample that was not used, with the names of the output and the inputs."""
         signal, code = divmod(int(decided), SIGNAL)
@@ -168,7 +160,7 @@ class Tally:
 
     def __repr__(self) -> str:
         said = ", ".join(f"{name}: {count}" for name, count in self.counts.items())
-        return f"{said}\n{table(self.last, len(self.last))}" if said else "nothing left out"
+        return f"{said}\n{table(self.last)}" if said else "nothing left out"
 
     def plain(self) -> list[Any]:
         """The state as plain data."""

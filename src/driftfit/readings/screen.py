@@ -85,12 +85,13 @@ def nothing_refused(s: State, signal: int, age: int, l: int) -> None:
 
 
 class Review:
-    """The gate's step over finished records with m inputs, of which the model remembered ``ages`` samples."""
+    """The gate's step over finished records with m inputs, of which the model remembered ``ages`` samples; ``lends`` as
+    for `gate_step`."""
 
-    def __init__(self, gate: Gate, m: int, ages: int) -> None:
+    def __init__(self, gate: Gate, m: int, ages: int, lends: bool) -> None:
         gate = replace(gate, first=0)
         self._start = start(gate, 0, m)
-        step = gate_step(gate, 0, m, ages, nothing_refused)
+        step = gate_step(gate, 0, m, ages, nothing_refused, lends=lends)
 
         def review(tile: Any, y: Any, u: Any, y_hat: Any, s: Any, valid: Any, reason: Any) -> None:
             of, l = tile[0], 0

@@ -150,6 +150,11 @@ class Program:
         return {**own, **begun, "raw_e": np.array(np.nan), "gate_refused": np.array(0)}
 
     @property
+    def scratch(self) -> tuple[str, ...]:
+        """Fields that carry nothing from one sample to the next."""
+        return self.tracker.scratch if self.gate is None else (*self.tracker.scratch, "gate_fit")
+
+    @property
     def outputs(self) -> tuple[str, ...]:
         """Fields that are stored of every sample, besides those of all trackers."""
         return self.tracker.outputs if self.gate is None else (*self.tracker.outputs, *GATED)
@@ -197,7 +202,7 @@ class Program:
             "gate": None if self.gate is None else self.gate.settings(),
         }
         record = self.tile().dtype
-        return Layout(record, held_in(record, self.tracker_start), self.tracker.scratch, owner)
+        return Layout(record, held_in(record, self.tracker_start), self.scratch, owner)
 
     def pack(self, tile: Array, lane: int = 0) -> bytes:
         """The state of a lane as bytes (`driftfit.run.layout`)."""
@@ -222,7 +227,8 @@ class Program:
             model, own = self.model, self.steps if steps is None else steps
             gate = None
             if self.gate is not None:
-                gate = gate_step(self.gate, model.n, model.m, model.input_memory, model.refuse, model.implicit)
+                ages, refuse, lends = model.input_memory, model.refuse, not self.tracker.covariance
+                gate = gate_step(self.gate, model.n, model.m, ages, refuse, model.implicit, lends)
             found = drivers(model.steps_for(self.steps), own, keep, gate)
             if gate is not None:
                 found = found._replace(run=partial(self._decided, found.run))

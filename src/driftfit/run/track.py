@@ -294,7 +294,7 @@ def _codes(run: Track) -> dict[str, list[float]]:
     y_hat = np.where(np.isfinite(e), y - e, y_hat) if model.implicit else y_hat
     begun = _codes_at_start(run, suspect(y))
     y, early = np.where(begun, np.nan, y), y[begun]
-    reason = _review(model.m, model.input_memory)(y, u, y_hat, s, np.isfinite(y_hat))
+    reason = _review(model.m, model.input_memory, not run.tracker.covariance)(y, u, y_hat, s, np.isfinite(y_hat))
     blamed = np.flatnonzero(reason % SIGNAL == INPUT)[:, None] - np.arange(model.input_memory + 1)
     names = run.labels.u or run.program.signals[1:]
     entered = (reason == REFUSED) & ~_begins_change(y, reason) & (run.ok | np.isnan(y_hat))
@@ -320,9 +320,9 @@ def _codes_at_start(run: Track, strange: Array) -> Array:
 
 
 @lru_cache
-def _review(m: int, ages: int) -> Review:
+def _review(m: int, ages: int, lends: bool) -> Review:
     """The gate for finished records, which is compiled once."""
-    return Review(Gate(), m, ages)
+    return Review(Gate(), m, ages, lends)
 
 
 def warn_unlearned(run: Track | KeyedResults) -> None:

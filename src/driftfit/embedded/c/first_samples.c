@@ -1,6 +1,7 @@
 /* The first samples once more, without the fault codes that the gate has found among them. */
 static void first_samples_again(tracker_state *s) {
     tracker_step step;
+    scratch_fields scratch;
     real rows[@rows@][@columns@], u[@m@];
     const int64_t kept = s->gate_kept, dropped = s->gate_replay - 1;
 @kept@
@@ -18,7 +19,7 @@ static void first_samples_again(tracker_state *s) {
                 u[j] = i < 0 || (codes >> (j + 1)) % 2 == 1 ? R(NAN) : rows[k][@inputs@ + j];
             }
 @factors@
-            @entry@(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);
+            @entry@(s, &scratch, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);
         }
     }
 }

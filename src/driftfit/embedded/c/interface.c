@@ -4,7 +4,8 @@ void tracker_init(tracker_state *s) {
 
 NOT_INLINED tracker_step tracker_update(tracker_state *s, tracker_real y, const tracker_real *u) {
     tracker_step step;
-    @entry@(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);
+    scratch_fields scratch;
+    @entry@(s, &scratch, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);
 @again@    return step;
 }
 
