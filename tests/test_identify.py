@@ -157,6 +157,20 @@ def test_the_budget_narrows_the_search():
     )
 
 
+def test_the_budget_is_that_of_the_whole_call():
+    found = identify(PUMP, y="flow", budget=0.0)
+    assert len(found.track) == 500
+    assert "only the last 500 of 800 samples were judged" in str(found)
+
+
+def test_track_without_a_model_takes_that_of_identify():
+    result = CliRunner().invoke(app, ["track", PUMP, "--y", "flow"])
+    assert result.exit_code == 0, result.output
+    assert "Chosen: --model arx:1,1/1,nk=7/2,intercept --u pressure,speed;" in result.output.splitlines()[0]
+    assert "flow from pressure, speed" in result.output
+    assert "2026-03-03" in result.output
+
+
 def test_predictions_of_constants_and_their_mixture():
     y, U = plant("time")
     phi = regressors(y, U, Structure(1, {0: (1, 6)}))

@@ -14,9 +14,12 @@ from typer import Option
 from driftfit.cli.options import Given, Out, Plot, Report, Table, check_table, reads
 from driftfit.cli.program import app, draw, progress, say
 from driftfit.cli.reading import interval_from, listed, order_of, rows_of
+from driftfit.data.columns import Wanted
 from driftfit.data.limits import end_of
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks, missing_settings
+from driftfit.identify.answer import chosen
+from driftfit.identify.page import interval, short
 from driftfit.judge.structures.select import Selection
 from driftfit.judge.structures.select import select as compare
 from driftfit.parsing.settings import given_fields
@@ -45,6 +48,8 @@ def track(
         check_ending(write_to)
     if report is not None:
         check_path(report)
+    if given.free:
+        given = _with_structure(given)
     run = given.run()
     say(run.summary())
     if write_to is not None:
@@ -55,6 +60,18 @@ def track(
     draw(system, lambda: run.plot_system())
     if report is not None:
         run.report(report)
+
+
+def _with_structure(given: Given) -> Given:
+    """The options with the inputs, the structure and the time that `driftfit identify` finds."""
+    part = given.part()
+    reading = Wanted((), None, (), part.missing, part.separator, part.decimal, part.dates)
+    with progress.status("searching the structure"):
+        found, model = chosen(given.file[0], given.outputs[0], given.time, reading)
+    text, inputs = short(model), f" --u {','.join(model.input_names)}" if model.input_names else ""
+    say(Text(f" Chosen: --model {text}{inputs}; `driftfit identify` says why."), soft_wrap=True)
+    dt = given.dt or (interval(found) if found.clock else None)
+    return replace(given, model=[text], u=list(model.input_names), time=found.clock, dt=dt)
 
 
 @app.command()
