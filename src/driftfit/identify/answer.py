@@ -172,7 +172,7 @@ def identify(
     driftfit.identify.roles.NoAnswerError
         For a record that cannot answer: fewer than `FEWEST` rows with all lags, a constant output, text.
     """
-    began = monotonic()
+    end = monotonic() + budget
     for name, value, low in (("max_lag", max_lag, 1), ("horizon", horizon, 1), ("budget", budget, 0)):
         if not value >= low:
             raise ValueError(f"identify: {name} must be at least {low}; got {value!r}.")
@@ -183,10 +183,10 @@ def identify(
                   wanted=reading)  # fmt: skip
     check_record(found)
     source = str(data) if isinstance(data, str) or hasattr(data, "__fspath__") else "data.csv"
-    task = _Task(int(forecast), horizon, level, gate, began + budget, seed, progress, source)
+    task = _Task(int(forecast), horizon, level, gate, end, seed, progress, source)
     structure = task.structure(found, max_lag)
     if found.by is None:
-        return replace(task.judged(found, structure), seconds=monotonic() - began)
+        return task.judged(found, structure)
     progress("tracking")
     model = model_of(found, structure)
     fleet = track(model, AdaptiveKalman(), **found.signals(model.input_names), by=found.by, gate=gate)
