@@ -223,19 +223,20 @@ SAMPLE = {"t": 1e3, "y": 1.0, "u": 1.0}
     ("who", "method", "path", "body", "status", "text"),
     [
         (None, "GET", "/api/units", {}, 401, ""), (None, "GET", "/healthz", {}, (200, 503), ""),
-        ("wrong", "GET", "/api/units", {}, 401, ""), (WATCHER[0], "GET", "/api/units", {}, 200, ""),
-        (WATCHER[0], "POST", "/api/actions", ACT, 403, "needs an operator"),
-        (WATCHER[0], "POST", "/api/samples", {}, 403, "needs a sender"),
-        (TOKEN, "POST", "/api/actions", {"unit": "a"}, 400, "do must be one of"),
-        *((GATEWAY[0], method, path, ACT, 403, "may only post samples") for method, path in
+        ("wrong", "GET", "/api/units", {}, 401, ""), ("viewer", "GET", "/api/units", {}, 200, ""),
+        ("viewer", "POST", "/api/actions", ACT, 403, "needs an operator"),
+        ("viewer", "POST", "/api/samples", {}, 403, "needs a sender"),
+        ("robot", "POST", "/api/actions", {"unit": "a"}, 400, "do must be one of"),
+        *(("gateway", method, path, ACT, 403, "may only post samples") for method, path in
           (("GET", "/"), ("GET", "/api/units"), ("GET", "/api/status"), ("GET", "/metrics"),
            ("GET", "/api/export?unit=a"), ("POST", "/api/actions"), ("GET", "/api/samplesX"))),
-        (GATEWAY[0], "POST", "/api/samples", {"plant/a": SAMPLE, "plant/c": SAMPLE}, 403, "samples of c (plant/c)"),
-        (GATEWAY[0], "POST", "/api/samples/plant/c", SAMPLE, 403, "samples of c (plant/c)"),
+        ("gateway", "POST", "/api/samples", {"plant/a": SAMPLE, "plant/c": SAMPLE}, 403, "samples of c (plant/c)"),
+        ("gateway", "POST", "/api/samples/plant/c", SAMPLE, 403, "samples of c (plant/c)"),
     ],
 )  # fmt: skip
 def test_who_may_do_what(client, who, method, path, body, status, text):
-    headers = {} if who is None else {"authorization": f"Bearer {who}"}
+    tokens = {"viewer": WATCHER[0], "robot": TOKEN, "gateway": GATEWAY[0]}
+    headers = {} if who is None else {"authorization": f"Bearer {tokens.get(who, who)}"}
     found, answer = client(user=USERS)(method, path, body, **headers)
     assert found in np.ravel(status)
     assert text in answer.decode()
