@@ -57,11 +57,9 @@ class Feed:
         self.latest: dict[int, Result] = {}
         self.updated: dict[int, float] = {}
         self.fleet: list[dict[str, Any]] = []
-        self.events: deque[list[Any]] = deque(maxlen=200)
         self.watched: dict[int, tuple[deque[Result], list[float]]] = {}
         self.status: dict[str, Any] = {"problem": "the engine has not answered yet"}
         self.answered = 0.0
-        self.count = 0
         self._swept = time.monotonic()
         self._base: dict[int, tuple[float, list[float], list[float]]] = {}
         query = "select coalesce(min(first), 1) - 1 from (select first from result order by first desc limit ?)"
@@ -85,16 +83,14 @@ class Feed:
         """Read the results that are new."""
         for _ in range(20):
             groups = self.journal.outcomes(self.at)
-            for group, parts, events, at in groups:
+            for group, parts, _, at in groups:
                 self.at = group
-                self.count += sum(len(part.number) for part in parts)
                 for part in parts:
                     for row in part.last().rows():
                         self.latest[row.unit] = row
                         self.updated[row.unit] = at
                     for unit, (kept, _) in self.watched.items():
                         kept.extend(part.some(np.flatnonzero(part.unit == unit)).rows())
-                self.events.extend(events)
             if len(groups) < 64:
                 break
         if any(unit not in self.names.names for unit in self.latest):
