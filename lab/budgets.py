@@ -28,12 +28,12 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 69_551,
-    "statements": 45_200,
+    "lines of the library": 69_544,
+    "statements": 45_199,
     "modules": 359,
     "levels of folders": 3,
     "constants of modules with numbers": 666,
-    "numbers in the source": 2_630,
+    "numbers in the source": 2_607,
     "private names of Numba and llvmlite": 30,
     "modules that the Kalman filter imports": 24,
     "lines of them": 5_633,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 32,
     "bytes of state of Kalman": 840,
     "bytes of state of AdaptiveKalman": 17_064,
-    "lines of tests": 33_610,
+    "lines of tests": 33_569,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 
