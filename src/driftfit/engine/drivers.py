@@ -234,9 +234,8 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
         for machine in tracker.machines:
             machine.load()
     part = whole_record if tracker.reads_model else tracker_part
-    in_two = tracker.outlined or gate is not None
-    phases: tuple[Any, ...] = (looking(tracker), learning(tracker)) if in_two else (advancing(tracker),)
-    phases = tuple(map(outlined, phases)) if tracker.outlined else phases
+    phases: tuple[Any, ...] = looking(tracker), learning(tracker)
+    phases = tuple(map(outlined, phases)) if tracker.outlined else phases if gate else (advancing(tracker),)
     if gate is None:
         between = ungated(phases, part)
     else:
