@@ -4,13 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scipy import signal, stats
-from support import Doubtful, arx_record, rows_of
-
-from driftfit import ARX, AugmentedFLS, HammersteinWiener, Kalman, Regression, track
-from driftfit.engine.kernel import kernel
 from driftfit.judge.alarms.calibration import _least, begun_over, innovations, limits_of, null_records, residuals
-from driftfit.judge.alarms.detect import Alarms
 from driftfit.judge.alarms.onsets import (
     chance,
     held,
@@ -21,6 +15,12 @@ from driftfit.judge.alarms.onsets import (
     power_limit,
     power_rate,
 )
+from scipy import signal, stats
+from support import Doubtful, arx_record, rows_of
+
+from driftfit import ARX, AugmentedFLS, HammersteinWiener, Kalman, Regression, track
+from driftfit.engine.kernel import kernel
+from driftfit.judge.alarms.detect import Alarms
 from driftfit.judge.statistics.robust import core
 from driftfit.run.live.rule import AlarmRule, normal_scores
 from driftfit.trackers.kalman import INDEPENDENT

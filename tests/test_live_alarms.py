@@ -5,12 +5,12 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
+from driftfit.judge.alarms.calibration import null_records
 from support import Doubtful, arx_record, damaged, same
 from test_bank import N, R, changes
 from test_bank import record as jumping
 
 from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Bank, Beam, Kalman, Live, Regression, Sensor, track
-from driftfit.judge.alarms.calibration import null_records
 from driftfit.run.live.alarm import LiveAlarm
 from driftfit.run.live.rule import FROZEN, AlarmRule
 from driftfit.run.program import lanes_of

@@ -13,7 +13,7 @@ from driftfit.data.storage import describe
 from driftfit.engine.kernel import Array
 from driftfit.run.lanes import Lane
 from driftfit.run.live.alarm import LiveAlarm, check_rule
-from driftfit.run.live.rule import FROZEN, AlarmRule
+from driftfit.run.live.rule import AlarmRule
 from driftfit.run.result import burn_in
 from driftfit.run.warm_start import JointLayout
 
@@ -33,7 +33,7 @@ def rules_of(task: Task, rule: Any) -> tuple[AlarmRule | None, ...]:
 
 def collects(rules: Sequence[AlarmRule | None]) -> bool:
     """Whether a rule needs the samples as the tracker receives them."""
-    return any(one is not None and one.kind in FROZEN for one in rules)
+    return any(one is not None and one.kind == "glr" for one in rules)
 
 
 def alarms_schema(task: Task, rules: Sequence[AlarmRule | None]) -> dict[str, str]:
