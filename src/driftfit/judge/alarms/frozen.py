@@ -92,10 +92,9 @@ def frozen_model(
 ) -> tuple[Frozen, Known] | None:
     """Estimate the model from rows (N, n + 4), regressors and the columns of `ROW`; None if they have no noise.
 
-    Regressors that are far from zero are centred on column ``constant``, if it is not negative. ``lags``: columns of earlier outputs. ``order`` is that of
-    the autoregression; None estimates it. Fault codes, and rows
-    whose inputs are blamed, are residuals of the noise model as any other, but say nothing of theta or the
-    autoregression.
+    Regressors that are far from zero are centred on column ``constant``, if it is not negative. ``lags`` are columns of
+    earlier outputs. ``order`` is that of the autoregression; None estimates it. Fault codes, and rows whose inputs are
+    blamed, are residuals of the noise model as any other, but say nothing of theta or the autoregression.
     """
     phi, rest = rows[:, :-4], rows[:, -4:]
     judged, ok = rest[:, OK] > 0.0, rest[:, OK] > BLAMED

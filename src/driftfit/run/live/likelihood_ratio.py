@@ -20,13 +20,13 @@ Once a statistic is beyond its end, the residuals x of the last samples show wha
 up to 384, what a change L samples ago explains of their squares,
 
     a step of one parameter     (d'G V^-1 U)^2 / d'G V^-1 G d,   U = sum phi x,   its size d'G V^-1 U / d'G V^-1 G d
-    the noise                   (L - n) (r - 1 - log r) / c,     r = (sum x^2 - U' G^-1 U) / (L - n) over the reference's
+    the noise                   (L - n) (r - 1 - log r) / c,     r = (sum x^2 - U' G^-1 U) / (L - n), over that before
 
 twice the log likelihood ratio of a Gaussian noise; c corrects the second for tails, and the noise has changed only as
-far as no change of parameters explains its squares. The change is the largest of all;
-but the level, where another is larger by less than `ALIKE`: the record does not tell them apart. It is not known while
-it is less than `FEWEST` samples old. Its size is the mean over all L, each weighted by its likelihood, and its standard
-error allows for what the size varies by between them.
+far as no change of parameters explains its squares. The change is the largest of all; but the level, where another is
+larger by less than `ALIKE`: the record does not tell them apart. It is not known while it is less than `FEWEST` samples
+old. Its size is the mean over all L, each weighted by its likelihood, and its standard error allows for what the size
+varies by between them.
 
 Source: Lai (1998); Dumbgen and Spokoiny (2001) for limits that depend on the length. Departures: the covariance of the
 reference within the statistic; windows of 8 and 12 blocks, of which the longer ones are compared less often.
@@ -72,7 +72,7 @@ from driftfit.run.live.reference_model import (
 )
 
 OWN, BEST, AGE, SUM = 0, 3, 4, 5
-"""Rows of `Memory.best`: gain, size and std at one age; the largest gain; its age; sums of weights, w size, w size^2."""
+"""Rows of `Memory.best`: gain, size and std at one age; the largest gain; its age; sums of w, w size and w size^2."""
 ALIKE = 1.0
 """Twice the logarithm of the likelihood ratio up to which two changes explain a record alike."""
 FEWEST = 4

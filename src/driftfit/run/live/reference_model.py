@@ -10,16 +10,16 @@ regressor: a slope about the mean does not move the level, so that the two can b
 
 Where the reference knows little of a direction that a sample excites, as of an input that hardly moved, much of x may
 be the error of theta, with the variance phi' C phi in units of the noise. From `UNSURE` on (and from `USUAL` n / N on,
-which rows of the reference seldom exceed; lags of y do not count, since a fault moves them), a sample corrects theta as a Kalman filter without drift does, until that
+which rows of the reference seldom exceed), a sample corrects theta as a Kalman filter without drift does, until that
 variance is n / N, the mean of the N rows of the reference: its error is then divided by its standard deviation, and
-judges as any other, but not the noise while the variance is that large. Where nothing is known, as of an input that was
-0 or constant, a sample corrects theta as from a diffuse start and judges nothing. Where an error has more than
-`CREDIBLE` deviations, or the tracker blames the inputs, the sample corrects nothing: its error, over its standard
-deviation, judges with regressors shortened to leverage 1 / N, that of rows along one direction, so that no reading of
-an input, however large, counts more than a reading of y. One false reading of an input comes alone. Therefore a sample
-beyond the reference corrects theta only if there was another among the `AGAIN` before, and one with such an error, or
-blamed, judges only then, and not while the first may be one of its lags. Other samples that correct nothing are not
-judged above `UNKNOWN`.
+judges as any other, but not the noise while the variance is that large. Lags of y do not count in phi, since a fault
+moves them. Where nothing is known, as of an input that was 0 or constant, a sample corrects theta as from a diffuse
+start and judges nothing. Where an error has more than `CREDIBLE` deviations, or the tracker blames the inputs, the
+sample corrects nothing: its error, over its standard deviation, judges with regressors shortened to leverage 1 / N,
+that of rows along one direction, so that no reading of an input, however large, counts more than a reading of y. One
+false reading of an input comes alone. Therefore a sample beyond the reference corrects theta only if there was another
+among the `AGAIN` before, and one with such an error, or blamed, judges only then, and not while the first may be one of
+its lags. Other samples that correct nothing are not judged above `UNKNOWN`.
 
 A sample that cannot be used is passed over. Where lags of the autoregression are missing, a Kalman filter predicts
 them, [phi, e] together so that a change of theta shows in the same way, and w_t is divided by the standard deviation of
