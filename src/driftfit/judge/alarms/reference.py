@@ -236,7 +236,7 @@ def doubt(run: Track, first: int, end: int) -> str:
     if found is None or not found.rejected:
         return ""
     at, names = rows.at[inside], ", ".join(run.model.names[j] for j in found.moving)
-    dates = [int(at[row]) for row in found.found.breaks] if found.kind.name == "" else []
+    dates = [int(at[row]) for row in found.found.breaks] if found.kind.name == "steps" else []
     if not dates:
         return f"{names} of the reference moves gradually: choose another segment, reference=(from, to)"
     ends = [first, *dates, end]
