@@ -73,7 +73,7 @@ def constant(kind: str, T: int, rng: np.random.Generator) -> Track:
 
 
 def rates(records: int, lengths: tuple[int, ...], kinds: tuple[str, ...] = NOISES) -> Table:
-    """For references of some lengths; more of the short ones."""
+    """For references of some lengths."""
     title = f"Measured over set rate of false alarms, {LATER} samples after the reference, {records} records"
     table = Table(box=SIMPLE_HEAD, show_edge=False, title=title)
     for head in ("noise", *(f"reference of {N}" for N in lengths)):
@@ -270,9 +270,7 @@ def main(records: int = 24, quick: bool = False) -> None:
     console = Console(width=120)
     console.print(causes(records, ("ARX: level by 4", "noise x 2") if quick else tuple(CAUSES)))
     console.print(delays(records, FAULTS[1:2] if quick else FAULTS))
-    console.print(
-        rates(2 if quick else 4 * records, (300,) if quick else (300, 1000), NOISES[::6] if quick else NOISES)
-    )
+    console.print(rates(2 if quick else records, (300,) if quick else (300, 1000), NOISES[::6] if quick else NOISES))
 
 
 if __name__ == "__main__":
