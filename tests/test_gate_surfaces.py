@@ -3,7 +3,21 @@
 import numpy as np
 import pytest
 
-from driftfit import ARX, DataWarning, Gate, Kalman, Live, LiveSelection, Outputs, Track, grid, select, track, tune
+from driftfit import (
+    ARX,
+    DataWarning,
+    Gate,
+    Kalman,
+    Live,
+    LiveSelection,
+    Outputs,
+    Regression,
+    Track,
+    grid,
+    select,
+    track,
+    tune,
+)
 from driftfit.readings.left_out import KEPT
 
 PLANT, TRACKER = ARX(1, 1), Kalman(q=1e-6, r=1e-4)
@@ -39,6 +53,21 @@ def test_a_stream_counts_what_it_left_out_and_keeps_the_last(way):
     assert live.left_out.last == tuple(run.left_out)[-KEPT:]
     again = Live.from_bytes(live.to_bytes())
     assert (again.left_out.counts, again.left_out.last) == (live.left_out.counts, live.left_out.last)
+
+
+@pytest.mark.parametrize("names", [(), ("flow", "heat")])
+@pytest.mark.parametrize("at", [5, 100])
+def test_the_input_that_is_left_out_is_named(names, at):
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((200, 2))
+    y = u @ [1.0, 2.0] + 0.01 * rng.standard_normal(200)
+    u[at, 1] = 9999.0
+    model = Regression(names or 2)
+    run, live = track(model, TRACKER, y, u, gate=True), Live(model, TRACKER, gate=True)
+    live.update_many(y, u)
+    assert [(one.sample, one.signal) for one in run.left_out] == [(at, (names or ("u1", "u2"))[1])]
+    assert live.left_out.last == tuple(run.left_out)
+    assert ("Inputs left out" if at == 100 else "Left out at the start") in str(run.summary())
 
 
 def test_decisions_of_a_stream_with_times_have_them():

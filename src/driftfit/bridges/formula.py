@@ -284,7 +284,7 @@ class TimeVaryingResults:
         facts = {
             "Dep. Variable": str(self.endog.name), "Tracker": repr(self.run.tracker), "Model": repr(self.run.model),
             "No. Observations": str(self.nobs), "Df Residuals": f"{self.df_resid:g}",
-            "Log-Likelihood": f"{self.llf:.3f}", **dict(remarks_of([self.run.left_out])),
+            "Log-Likelihood": f"{self.llf:.3f}", **dict(remarks_of(self.run.left_out)),
         }  # fmt: skip
         apart = float(np.sqrt(np.mean((self.forecasts - self.fittedvalues)[self.run.ok] ** 2)))
         if apart > 1e-9 * float(np.sqrt(np.mean(self.run.y[self.run.ok] ** 2))):

@@ -76,7 +76,7 @@ def read(data: Any, wanted: Wanted) -> tuple[Columns, dict[Hashable, str]]:
         warnings.warn(
             f"{len(failed)} of {len(paths)} files cannot be read: {next(iter(failed.values()))}", stacklevel=4
         )
-    return _together(parts), failed
+    return together(parts), failed
 
 
 def of_file(path: str, wanted: Wanted) -> Columns:
@@ -139,7 +139,7 @@ def read_file(source: str | bytes, wanted: Wanted, where: str) -> tuple[nw.DataF
     return nw.from_native(frame, eager_only=True), units
 
 
-def _together(parts: Mapping[str, Columns]) -> Columns:
+def together(parts: Mapping[str, Columns]) -> Columns:
     """Concatenate files; their times must be of one kind."""
     times = {path: part.time for path, part in parts.items() if part.time is not None}
     kinds = {time.dtype.kind: path for path, time in times.items()}

@@ -56,6 +56,9 @@ GROWTH = 1.02
 """Growth in one sample of the error of a settled tracker, at most."""
 USED, REFUSED, FROZEN, INPUT, AT_START = range(5)
 """Reasons: what was decided of a sample."""
+SIGNAL = 8
+"""A decision is a reason plus this many times the signal that it is about: 0 for the output, 1 + j for input j. Of
+several inputs it is the first."""
 
 
 @dataclass(frozen=True)
@@ -226,8 +229,9 @@ def gate_step(
         notice(s, s.gate_count[l] >= FIRST, l)
         off = reading(s, l) - s.gate_mean[l]
         contradicts = (s.ok[l] > 0.0) & (s.e[l] * s.e[l] > sure * variance_of_error(s, l))
-        if s.ok[l] > 0.0 and blame(s, contradicts, off * off <= rare * s.gate_variance[l], l):
-            s.ok[l], s.reason[l] = 0.0, INPUT
+        signal = blame(s, contradicts, off * off <= rare * s.gate_variance[l], l) if s.ok[l] > 0.0 else 0
+        if signal > 0:
+            s.ok[l], s.reason[l] = 0.0, INPUT + SIGNAL * signal
         if (s.observed[l] > 0.0) & (s.reason[l] == USED):
             if hold_frozen(s, variance_of_error(s, l), l) & (s.gate_same[l] == 0):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, FROZEN

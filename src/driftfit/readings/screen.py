@@ -14,6 +14,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, Driver, State, kernel
+from driftfit.engine.tiles import make_tile
 from driftfit.readings.gate import Gate, gate_step, start
 
 SUSPECT = 30.0
@@ -109,12 +110,6 @@ class Review:
     def __call__(self, y: Array, u: Array, y_hat: Array, s: Array, valid: Array) -> Array:
         """Reasons (T,), given readings y (T,), inputs u (T, m), forecasts and their variances (T,), and whether there
         was a forecast (T,)."""
-        signals = {"y": 0.0, "u": np.zeros(max(u.shape[1], 1)), "y_hat": 0.0, "e": 0.0, "s": 0.0}
-        fields = {**signals, "phi": np.zeros(0), "valid": 0.0, "observed": 0.0, "ok": 0.0, "dt": 1.0, "noise": 1.0,
-                  "drift": 1.0, **self._start}  # fmt: skip
-        kinds = [(name, np.asarray(value).dtype, (*np.shape(value), 1)) for name, value in fields.items()]
-        tile, reason = np.zeros(1, np.dtype(kinds, align=True)), np.zeros(len(y), np.int64)
-        for name, value in fields.items():
-            tile[name][0] = np.asarray(value)[..., None]
+        tile, reason = make_tile(0, u.shape[1], {}, [self._start]), np.zeros(len(y), np.int64)
         self._review(tile, y, u, np.where(valid, y_hat, 0.0), s, valid, reason)
         return reason

@@ -22,8 +22,8 @@ cheaper and has no covariance. `run.smooth()` computes the whole path that minim
 
 Source: Kalaba and Tesfatsion, Time-varying linear regression via flexible least squares (1989), whose matrix recursion
 is used in covariance form. Departures: an exact diffuse start (`driftfit.trackers.parts.diffuse`), which needs no
-penalty on the first point and no large matrix; the minimum-norm solution about theta0 until the regressors span. Cost:
-O(n^2).
+penalty on the first point and no large matrix; the minimum-norm solution about theta0 until the regressors span. In
+Chen et al. this is the classical method, T-FLS: J is (8), the filter (9) to (12), `smooth` (13) to (15). Cost O(n^2).
 """
 
 from __future__ import annotations

@@ -252,7 +252,7 @@ class Tuned(Printed):
             ("Criterion", METHODS[self.method]),
             ("Log-likelihood", f"{self.loglik:.6g} of {self.used} samples" if np.isfinite(self.loglik) else ""),
             ("Noise variance", f"{self.noise:.4g}"),
-            *remarks_of([self.left_out] if isinstance(self.left_out, LeftOut) else self.left_out.values()),
+            *remarks_of(self.left_out),
         )
         ends = (f"[{0.5 - self.level / 2:.3g}", f"{0.5 + self.level / 2:.3g}]")
         table = table_of("Settings", "", "estimate", *ends)

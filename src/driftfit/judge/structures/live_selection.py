@@ -27,7 +27,7 @@ from driftfit.data.storage import Kept
 from driftfit.engine.kernel import Array
 from driftfit.judge.structures.shared_streams import SharedStream, share
 from driftfit.models.base import Model
-from driftfit.readings.gate import FROZEN, INPUT, REFUSED
+from driftfit.readings.gate import FROZEN, INPUT, REFUSED, SIGNAL
 from driftfit.run.gating import gate_of
 from driftfit.run.live.live import Live
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
@@ -113,7 +113,7 @@ class LiveSelection(Kept):
         assert self.reference is not None
         *_, ok = self.reference.update(y, u, **known)
         reason = int(self.reference.lane()["reason"])
-        if reason == INPUT:
+        if reason % SIGNAL == INPUT:
             self._blamed = self.reference.model.input_memory + 1
         unused = self._blamed > 0 and not ok
         self._blamed = max(self._blamed - 1, 0)

@@ -12,7 +12,7 @@ denominator, of at most the order of the whole.
 In the measured signals this is a regression on products of the parameters
 (`driftfit.models.hammerstein_wiener.structure`):
 
-    z_t = -g_1(y_t) = phi_t' theta_t
+    z_t = -g_1(y_t) = phi_t' theta_t                                  equation (11) of the source
     phi_t = [g_1(y_{t-i}) .., -f_1(u_{t-nk-j+1}) .., g_2(y_t) .. g_q(y_t), -f_k(u_{t-nk-j+1}) .., g_k(y_{t-i}) .., (1)]
 
 Any tracker estimates theta (stage one); `driftfit.models.hammerstein_wiener.separation` gives a, b, c, d. The

@@ -16,9 +16,10 @@ from driftfit.data.instants import instant
 from driftfit.data.record import Known, Reading, Records
 from driftfit.engine.drivers import DRIFT, INTERVAL, NOISE
 from driftfit.engine.kernel import Array
-from driftfit.readings.gate import AT_START
+from driftfit.readings.first_samples import First
+from driftfit.readings.gate import AT_START, SIGNAL
+from driftfit.readings.left_out import Tally
 from driftfit.run.columns import SCALARS, Columns
-from driftfit.run.gating import AtStart
 from driftfit.run.live.stream import HELD, Stream, check_applied
 from driftfit.run.program import Program, lanes_of
 from driftfit.run.track import records_of
@@ -189,13 +190,13 @@ class Batched(Stream):
         if self.programs[0].gate is None:
             self._loop(self._state_tile(), y, u, known, out)
             return
-        found: list[tuple[int, AtStart]] = []
+        found: list[tuple[int, First]] = []
         self._loop(self._state_tile(), y, u, known, out, found_too=found)
         starts = dict(found)
         for t in sorted({*np.flatnonzero(out["reason"].any(axis=1)).tolist(), *starts}):
             at = None if time is None else instant(time[t])
             for lane in np.flatnonzero(out["reason"][t]).tolist():
-                if out["reason"][t, lane] != AT_START:
+                if out["reason"][t, lane] % SIGNAL != AT_START:
                     self._note(before + t, at, out["reason"].item(t, lane), y.item(t, lane), lane)
             if t in starts:
                 self._note_start(before + t, at, starts[t])
@@ -213,14 +214,14 @@ class Batched(Stream):
 
     def _note(self, sample: int, time: Any, code: int, y: float, lane: int = 0) -> None:
         """Count a sample that the gate refused."""
-        name = self.programs[lane].output or "y"
-        self.left_out.add(sample if time is None else time, code, y, name)
+        self.left_out.add(sample if time is None else time, code, y, self.programs[lane].signals)
 
-    def _note_start(self, sample: int, time: Any, found: AtStart) -> None:
-        """Count the codes that the gate found among the first samples, at the present one."""
-        times = None if time is None else self._clock.moved(time, -found.intervals)
-        for k, (ago, y) in enumerate(zip(found.ago.tolist(), found.value.tolist(), strict=True)):
-            self._note(sample - ago, None if times is None else times[k], AT_START, y)
+    def _note_start(self, sample: int, time: Any, first: First) -> None:
+        """Count what the gate decided of the first samples, at the present one, in place of what it said before."""
+        self.left_out, dt, begun = Tally(), first.known[:, 0], sample + 1 - len(first.y)
+        times = None if time is None else self._clock.moved(time, dt - np.cumsum(dt[::-1])[::-1])
+        for k in np.flatnonzero(first.reason).tolist():
+            self._note(begun + k, None if times is None else times[k], first.reason.item(k), first.y.item(k))
 
     def _keep(self, y: Array, known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""

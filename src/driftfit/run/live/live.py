@@ -89,7 +89,7 @@ class Live(Batched):
         self._interval = tile["interval"][0]
         self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
         gated = self._single and self.programs[0].gate is not None
-        self._undecided = gated and not tile["gate_decided"][0, 0]
+        self._undecided = gated and bool(tile["gate_decided"][0, 0] < 1)
         if self._single:
             self._look = self._stepper()
             self._update = self._noting(self._look) if gated else self._look
@@ -245,7 +245,7 @@ class Live(Batched):
         tile = self._state_tile()
         if tile["gate_replay"][0, 0] > 0:
             self._note_start(self._samples - 1, self._last, self.program.replay(tile))
-        self._undecided = not bool(tile["gate_decided"][0, 0])
+        self._undecided = bool(tile["gate_decided"][0, 0] < 1)
         self._expect(self._awaits)
 
     def _row(self, y: Array, u: Array, known: Factors) -> tuple[Array, Array, Array]:

@@ -351,7 +351,7 @@ class Stream(Plain, storage.Kept):
             live._limits.restore(outside)
         live._last, live._cold = extra["last"], extra["cold"]
         live._samples, live._ignored = extra["samples"], extra["ignored"]
-        live.left_out.restore(extra["left_out"])
+        live.left_out = Tally(*extra["left_out"])
         for window, state in zip(live._windows, extra["windows"], strict=True):
             window.restore(state)
         live._watching = [

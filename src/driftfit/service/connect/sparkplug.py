@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from struct import unpack_from
 from typing import Any
 
-from driftfit.service.sources.contract import MESSAGE_BYTES, MESSAGE_FIELDS, Samples, bounded, of_rows
+from driftfit.service.connect.samples import MESSAGE_BYTES, MESSAGE_FIELDS, Samples, bounded, of_rows
 
 PREFIX = "spBv1.0"
 BIRTHS, DATA = ("NBIRTH", "DBIRTH"), ("NDATA", "DDATA")

@@ -18,14 +18,14 @@ from datetime import UTC, datetime
 from typing import Any, ClassVar, Literal
 from urllib.parse import urlsplit
 
+from driftfit.service.connect.base import Event, Outcome, RefusedError, Sink, Writer
 from driftfit.service.options import Secret
-from driftfit.service.sinks.contract import Event, Outcome, RefusedError, Sink, Writer
 
 ANSWER_SECONDS = 10.0
 
 
 @dataclass(frozen=True)
-class Webhook(Sink):
+class WebhookSink(Sink):
     """An address to which events are posted."""
 
     url: str
@@ -45,7 +45,7 @@ class Webhook(Sink):
 
 
 class _Webhook(Writer):
-    def __init__(self, options: Webhook) -> None:
+    def __init__(self, options: WebhookSink) -> None:
         self.options = options
         self.client = urllib.request.build_opener(_NoRedirect)
 

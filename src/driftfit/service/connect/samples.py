@@ -1,4 +1,4 @@
-"""What a source is, and what it gives: batches of samples by topic, decoded from JSON, with an acknowledgement.
+"""Samples by topic, decoded from JSON.
 
 A payload is an object of numbers (one sample), an object of lists of equal length (many samples; numbers beside them
 are repeated), or a list of objects:
@@ -12,61 +12,17 @@ from __future__ import annotations
 
 import json
 import math
-import queue
-from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.service.connector import Connector
 
-
-@dataclass(frozen=True)
-class Source(Connector):
-    """A source of samples."""
-
-    @abstractmethod
-    def open(self, position: Any) -> Reader:
-        """Connect, and continue at a position."""
-
-
-@dataclass(frozen=True)
-class FileSource(Source):
-    """A source that reads a file."""
-
-    path: str
-    topic: str = ""
-    """Topic of the samples; empty: the name of the file."""
-    by: str = ""
-    """Column that names the unit; it is added to the topic after a slash."""
-
-    def topic_of(self, unit: Any) -> str:
-        """The topic of the samples of a unit; without ``by`` that of all."""
-        topic = self.topic or Path(self.path).name
-        return f"{topic}/{unit}" if self.by else topic
-
-
-class Reader(ABC):
-    """An open source."""
-
-    @abstractmethod
-    def read(self, wait: float) -> Batch | None:
-        """The samples that have arrived, or None after ``wait`` seconds."""
-
-    def close(self) -> None:
-        """Disconnect."""
-        return None
-
-
-BATCH_MESSAGES = 2_000
-"""Messages that a source reads at once, at most."""
 MESSAGE_SAMPLES = 10_000
 """Samples of one message."""
 MESSAGE_FIELDS = 256
@@ -116,60 +72,6 @@ class Receipt:
             if places:
                 signals = self.missing.setdefault(samples.topic, {})
                 signals[name] = {"count": len(places), "first": places[:NAMED_SAMPLES]}
-
-
-class Batch(NamedTuple):
-    """The samples that a source read at once."""
-
-    samples: list[Samples]
-    acknowledge: Callable[[], None] = lambda: None
-    """To be called once the samples are in the journal."""
-    position: Any = None
-    """Where the source continues after these samples, as plain data; None if the sender keeps that."""
-    client: str = ""
-    """Who sent it, if the source has several clients."""
-    noticed: str = ""
-    """What the source noticed, which becomes an event."""
-    refused: int = 0
-    """Messages that could not be decoded."""
-    arrived: float = 0.0
-    """When the first of them arrived, in seconds of the monotonic clock."""
-    receipt: Receipt | None = None
-    """To be filled before the acknowledgement, if the sender waits for it."""
-
-
-END = Batch([], position="end")
-"""The result of `read` when the source has ended."""
-
-
-class QueueReader(Reader):
-    """A reader to whose bounded queue its client adds messages, from a thread of its own."""
-
-    def __init__(self, most: int = BATCH_MESSAGES) -> None:
-        self.arrived: queue.Queue[Any] = queue.Queue(most)
-        self.error: Exception | None = None
-        """Why nothing more will come."""
-
-    @abstractmethod
-    def batch(self, found: list[Any]) -> Batch:
-        """The samples of some messages."""
-
-    def read(self, wait: float) -> Batch | None:
-        """What waits in the queue; the error once that is read."""
-        try:
-            first = self.arrived.get(timeout=wait)
-        except queue.Empty:
-            if self.error is not None:
-                raise self.error from None
-            return None
-        return self.batch([first, *self.drain()])
-
-    def drain(self) -> list[Any]:
-        """What waits now."""
-        found: list[Any] = []
-        while len(found) < BATCH_MESSAGES and not self.arrived.empty():
-            found.append(self.arrived.get())
-        return found
 
 
 class ShapeError(ValueError):

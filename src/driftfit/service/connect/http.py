@@ -12,17 +12,8 @@ from typing import Any
 
 import msgspec
 
-from driftfit.service.sources.contract import (
-    NO_SIGNAL,
-    TOO_MANY_NEW,
-    Batch,
-    Reader,
-    Receipt,
-    Samples,
-    ShapeError,
-    Source,
-    decode,
-)
+from driftfit.service.connect.base import Batch, Reader, Source
+from driftfit.service.connect.samples import NO_SIGNAL, TOO_MANY_NEW, Receipt, Samples, ShapeError, decode
 
 ANSWER_SECONDS = 30.0
 """After this time a request that is not yet journaled is answered with an error."""
@@ -34,7 +25,7 @@ _BODY = msgspec.json.Decoder(dict[str, msgspec.Raw])
 
 
 @dataclass(frozen=True)
-class Http(Source):
+class HttpSource(Source):
     """Samples over HTTP; host, port and tokens are those of [page]. Clients keep what is not yet acknowledged."""
 
     def open(self, position: Any) -> Reader:

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.service.sources.contract import Batch, Reader, Samples, Source
+from driftfit.service.connect.base import Batch, Reader, Source
+from driftfit.service.connect.samples import Samples
 
 PUMPS = 6
 CLOSING = 3
@@ -21,7 +22,7 @@ NOISE = 0.05
 
 
 @dataclass(frozen=True)
-class Plant(Source):
+class PlantSource(Source):
     """The plant."""
 
     interval: float = 0.05
@@ -39,7 +40,7 @@ class Plant(Source):
 
 
 class _Plant(Reader):
-    def __init__(self, options: Plant) -> None:
+    def __init__(self, options: PlantSource) -> None:
         self.options = options
         self.rng = np.random.default_rng(options.seed)
         self.flow, self.pressure = np.zeros(PUMPS), np.zeros(PUMPS)

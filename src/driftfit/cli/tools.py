@@ -1,4 +1,4 @@
-"""``driftfit cache``: the compiled code that is stored on disk."""
+"""Commands that read no data: trackers, demo, cache, warm, export c."""
 
 from __future__ import annotations
 
@@ -10,16 +10,47 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
 from rich.text import Text
 from typer import Option
 
+from driftfit import trackers as known
 from driftfit.cli.options import Own, Setting
-from driftfit.cli.program import app, progress, say
+from driftfit.cli.program import app, out, progress, say
+from driftfit.embedded import export_c
 from driftfit.engine.disk_cache import Contents, contents, folder, prune
-from driftfit.parsing.settings import parse_model, parse_tracker
+from driftfit.parsing.settings import default, given_fields, parse_model, parse_tracker
 from driftfit.results import Track
 from driftfit.run.parallel_lanes import FEWEST_LANES
 from driftfit.show.text import facts
+from driftfit.streams import Live
+from driftfit.tracking import track
+
+
+@app.command()
+def trackers() -> None:
+    """List the trackers with their settings and defaults."""
+    table = Table(box=SIMPLE_HEAD, show_edge=False, width=out.width)
+    for head in ("tracker", "settings", "what it is"):
+        table.add_column(head)
+    for name, kind in known.found().items():
+        required = kind.required
+        settings = [f"{f.name}={'...' if f.name in required else default(f)}" for f in given_fields(kind)]
+        first = (kind.__doc__ or "").strip().splitlines()[0]
+        table.add_row(Text(name, "bold"), Text("\n".join(settings)), Text(first))
+        table.add_section()
+    say(table)
+    say(Text(" ... must be given. On the command line: --tracker augmented-fls -p mu=10", "dim"))
+
+
+@app.command()
+def demo(plot: Annotated[Path, Option(help="File of the picture.")] = Path("driftfit-demo.png")) -> None:
+    """Track the US demand for money from 1959 to 2009."""
+    from driftfit.demo.demo import show
+
+    show(out, progress, plot)
 
 
 @app.command()
@@ -67,9 +98,6 @@ def warm(
     fleet: Annotated[bool, Option("--fleet", help="Compile for fleets as well.")] = False,
 ) -> None:
     """Compile and store what models and a tracker need: record, stream, summary, verdict, alarms, smoother, report."""
-    from driftfit.streams import Live
-    from driftfit.tracking import track
-
     if inputs < 0:
         raise ValueError(f"--inputs {inputs}: the number of inputs must be at least 0.")
     start, before = time.perf_counter(), contents()
@@ -113,3 +141,29 @@ def _used(run: Any) -> dict[str, str]:
 def _reported(run: Any) -> None:
     with TemporaryDirectory() as folder:
         run.report(Path(folder) / "page.html")
+
+
+export = typer.Typer(no_args_is_help=True, help="Write a tracker in another language.")
+app.add_typer(export, name="export")
+
+
+@export.callback()
+def _languages() -> None:
+    """Write a tracker in another language."""
+
+
+@export.command(name="c")
+def to_c(
+    model: Annotated[str, Option(help="As in `driftfit track`: arx:2,2 or 'ARX(2, 2)'.")],
+    out: Annotated[Path, Option(help="The folder to write into.")],
+    tracker: Annotated[str, Option(help="Tracker, by its name or as in Python.")] = "adaptive-kalman",
+    p: Setting = None,
+    own: Own = None,
+    fixed_rate: Annotated[bool, Option("--fixed-rate", help="No uneven intervals, no known factors.")] = False,
+    gate: Annotated[bool | None, Option("--gate/--no-gate", help="Judge readings first.")] = None,
+) -> None:
+    """Write a tracker as C99 for a controller: tracker.h, tracker.c, a self-test and a README."""
+    export_c(parse_model(model), parse_tracker(tracker, p or [], own), out, fixed_rate=fixed_rate, gate=gate)
+    readme = (out / "README.md").read_text(encoding="utf-8")
+    state = readme.split("State: ")[1].split(".")[0]
+    say(facts(("Written", str(out)), ("State", state), ("Check it", f"see {out / 'README.md'}")))
