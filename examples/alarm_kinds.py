@@ -9,7 +9,7 @@ number of false alarms in the 10 records without one, where 2 are expected. Run:
 
 import numpy as np
 
-from driftfit import AdaptiveKalman, Kalman, Regression, track
+from driftfit import AdaptiveKalman, Kalman, Regression, Tracker, track
 from driftfit.judge.alarms.detect import Alarms
 
 T, KNOWN, START, RECORDS, EVERY = 2000, 1000, 1500, 10, 5000.0
@@ -31,7 +31,7 @@ def record(seed: int, fault: str) -> tuple[np.ndarray, np.ndarray]:
     return gain * u + offset + (1.0 + 0.5 * jump if "noise" in fault else 1.0) * v, u
 
 
-def watched(seed: int, tracker: object, kind: str, reference: object) -> dict[str, Alarms]:
+def watched(seed: int, tracker: Tracker, kind: str, reference: object) -> dict[str, Alarms]:
     """The rule of the reference, applied to each of the records that begin with it."""
     rule = None
     detected = {}
