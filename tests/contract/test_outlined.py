@@ -26,11 +26,6 @@ def one(at):
     kernel.floats(at, 1, 1)[0, 0] = 1.0
 
 
-@machine
-def two(at):
-    kernel.floats(at, 1, 1)[0, 0] = 2.0
-
-
 @kernel.kernel
 def called(s, l):
     one(s.theta.ctypes.data)
@@ -38,7 +33,7 @@ def called(s, l):
     s.e[l], s.s[l], s.var[0, l] = s.y[l] - s.y_hat[l], 1.0, 0.0
 
 
-STEPS = TrackerSteps(still, still, called, still, still, machines=(one, two), outlined=True)
+STEPS = TrackerSteps(still, still, called, still, still, machines=(one,), outlined=True)
 
 
 def predictions(model, steps=STEPS, T=5):
@@ -129,10 +124,3 @@ def test_both_are_found_on_disk_and_a_driver_whose_step_was_lost_is_compiled_aga
         monkeypatch.setattr(f"driftfit.engine.outlined.{known}", {})
     assert predictions(Regression(1)) == [1.0]
     assert [name.split("_")[0] for name in compiled[before:]] == ["run", "outlined"]
-
-
-def test_machines_that_are_called_instead_of_others_are_called_by_the_step_too(compiled):
-    other = STEPS._replace(instead=((one, two),))
-    assert (predictions(Regression(1)), predictions(Regression(1), other)) == ([1.0], [2.0])
-    assert predictions(Regression(1)) == [1.0]
-    assert outlined(compiled) == 1

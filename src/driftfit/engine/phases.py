@@ -78,7 +78,7 @@ def advancing(tracker: Any) -> Any:
     """One sample of all lanes of a tile; lanes whose ``s.root`` is 1 take the steps of the ``start``."""
     forecasts, correct, report = forecasting(tracker), tracker.correct, tracker.report
     both, check, late = _wide_samples(tracker)
-    called = outlined(late, short=True) if both else late
+    called = outlined(late, short=True) if both and not tracker.outlined else late
 
     @kernel
     def advance(s: State) -> None:

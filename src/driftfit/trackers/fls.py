@@ -52,6 +52,7 @@ from driftfit.trackers.parts.diffuse import (
     spanned_variance,
     started,
 )
+from driftfit.trackers.parts.information import partly_known
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.rls import learn_scale, no_scale
 
@@ -166,9 +167,8 @@ class FLS(Tracker):
     def slopes(self) -> bool:
         return self.differences == 2
 
-    @property
-    def pads(self) -> bool:
-        return self.differences == 1
+    def partly_known(self, n: int, N: int) -> Mapping[str, Any] | None:
+        return None if self.slopes else partly_known(self.state(n), self.state(N))
 
     @property
     def steps(self) -> TrackerSteps:

@@ -185,7 +185,7 @@ def _processor(unit: Unit, names: Sequence[str], span: float | None) -> Any:
     def rows_for(key: Sequence[Any], found: Sequence[dict[str, Any]]) -> Iterator[Any]:
         named = dict(zip(by, key, strict=True))
         for one in found:
-            yield Row(**{name: (named | one).get(name) for name in names})
+            yield Row(**{name: (one | named).get(name) for name in names})
 
     class Processor(StatefulProcessor):
         def init(self, handle: Any) -> None:

@@ -80,7 +80,7 @@ class Batched(Stream):
     @cached_property
     def _row_type(self) -> np.dtype[Any]:
         """What the loop writes for one row."""
-        return self.programs[0].written(self._state_tile(), 0).dtype
+        return self.programs[0].written(self._tile, 0).dtype
 
     def update_many(
         self, y: Any, u: Any = None, time: Any = None, weights: Any = 1.0, drift: Any = 1.0, prob: Any = None
@@ -118,7 +118,7 @@ class Batched(Stream):
             return Batch(np.empty(0, self._row_type), rows)
         records = self._records(y, u, Reading(weights=weights, drift=drift, indexed=False), prob)
         resting, extra = self.resting, records.known.columns.shape[1] > len(HELD)
-        before = None if time is None else row_of(self._state_tile(), self._row_type)
+        before = None if time is None else row_of(self._tile, self._row_type)
         records, taken = self._arrived(records, time)
         if resting == HELD:
             columns = np.broadcast_to(np.reshape(HELD, (3, 1)), (3, len(self.model.outputs)))
@@ -188,10 +188,10 @@ class Batched(Stream):
     def _judged(self, y: Array, u: Array, known: Array, out: Array, time: Any, before: int) -> None:
         """Drive the tile over rows, with so many samples ``before`` them, and note what a gate leaves out."""
         if self.programs[0].gate is None:
-            self._loop(self._state_tile(), y, u, known, out)
+            self._loop(self._tile, y, u, known, out)
             return
         found: list[tuple[int, First]] = []
-        self._loop(self._state_tile(), y, u, known, out, found_too=found)
+        self._loop(self._tile, y, u, known, out, found_too=found)
         starts = dict(found)
         for t in sorted({*np.flatnonzero(out["reason"].any(axis=1)).tolist(), *starts}):
             at = None if time is None else instant(time[t])
@@ -206,7 +206,7 @@ class Batched(Stream):
 
         def noting(tile: Any, y: float, u: Any) -> Any:
             found = step(tile, y, u)
-            if not found[3] and (code := self._state_tile()["reason"].item(0, 0)):
+            if not found[3] and (code := self._tile["reason"].item(0, 0)):
                 self._note(self._samples - 1, self._last, code, y)
             return found
 
@@ -225,12 +225,12 @@ class Batched(Stream):
 
     def _keep(self, y: Array, known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""
-        tile, at = self._state_tile(), None if time is None else np.array([time])
+        tile, at = self._tile, None if time is None else np.array([time])
         for lane, alarm in self._watching:
             own = slice(lane, lane + 1)
             alarm.take_many(tile, lane, y[own], tile["noise"][0, own], at)
         for lane, window in enumerate(self._windows):
-            window.push(self._state_tile(), (known[INTERVAL, lane], known[NOISE, lane], known[DRIFT, lane]), lane)
+            window.push(self._tile, (known[INTERVAL, lane], known[NOISE, lane], known[DRIFT, lane]), lane)
 
 
 def _of_output(name: str, text: str) -> Any:

@@ -5,7 +5,6 @@ import pytest
 
 from driftfit import FLS, RLS, AdaptiveKalman, AugmentedFLS, Bank, Kalman, Law, Regression, track
 from driftfit.run.program import Program
-from driftfit.trackers.parts.common_size import padded, size_of
 
 TRACKERS = [
     Kalman(q=1e-3, r=0.1),
@@ -29,13 +28,12 @@ def record(request):
 
 @pytest.mark.parametrize("tracker", TRACKERS, ids=repr)
 def test_a_parameter_that_is_known_and_never_excited_changes_no_bit(tracker, record):
-    assert tracker.pads
     y, phi = record
     alone = track(Regression(1), tracker, y, phi, gate=False)  # candidates take the decisions of one reference
     program = Program(Regression(2), tracker)
     wide = track(Regression(2), Kalman(q=0.0, r=1.0), y, np.column_stack([phi, 0.0 * phi])).record
     wide.u[:, 1] = 0.0
-    found = program.run(program.tile(padded(tracker, 1, 2)), wide)
+    found = program.run(program.tile(tracker.partly_known(1, 2)), wide)
     for name in ("y_hat", "e", "s", "ok", *tracker.outputs):
         np.testing.assert_array_equal(found[name][..., 0], alone._complete.out[name][..., 0], err_msg=name)
     for name in ("theta", "var"):
@@ -43,14 +41,17 @@ def test_a_parameter_that_is_known_and_never_excited_changes_no_bit(tracker, rec
     assert (found["theta"][:, 1] == 0.0).all() or tracker.theta0 != 0.0
 
 
-def test_trackers_whose_parameters_are_weighed_together_do_not_pad():
-    """A cap on the trace, or leaves of a tree, would see the parameter that is not there."""
-    assert not any(one.pads for one in (RLS(0.98), AugmentedFLS(1.0), Bank(), FLS(1.0, differences=2)))
-    assert not Kalman(q=0.1, r=1.0, laws={"b1": Law.trend(0.1)}).pads
-
-
-def test_sizes_are_few_and_as_large_as_the_largest_structure():
-    assert [size_of([1, n], 9, 500) for n in range(1, 10)] == [6] * 6 + [9] * 3
-    assert size_of([2, 4], 4, 500) == 4
-    assert size_of([30], 40, 500) == 40
-    assert size_of([2, 4], 4, 10_000_000) == 0
+def test_trackers_whose_parameters_are_weighed_together_and_sizes_without_room_have_no_such_state():
+    """A cap on the trace, or leaves of a tree, would see the parameter that is not there; of more than eight parameters
+    `AdaptiveKalman` follows none alone.
+    """
+    together = (
+        RLS(0.98),
+        AugmentedFLS(1.0),
+        Bank(),
+        FLS(1.0, differences=2),
+        Kalman(q=0.1, r=1.0, laws={"b1": Law.trend(0.1)}),
+    )
+    assert all(one.partly_known(1, 2) is None for one in together)
+    assert AdaptiveKalman().partly_known(8, 9) is None
+    assert AdaptiveKalman().partly_known(9, 10) is not None
