@@ -4,6 +4,7 @@ from driftfit.checks import check_tracker
 from driftfit.engine import __version__
 from driftfit.engine.settings import DataWarning
 from driftfit.fleets import Fleet, Outputs
+from driftfit.identify.answer import identify
 from driftfit.judge.segment import segment
 from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
@@ -121,6 +122,7 @@ __all__ = [
     "frontier",
     "grid",
     "huber",
+    "identify",
     "likelihood_ratio",
     "piecewise",
     "plot_tree",

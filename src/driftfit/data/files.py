@@ -109,7 +109,7 @@ def paths_of(data: Any) -> list[str]:
 
 
 def read_file(source: str | bytes, wanted: Wanted, where: str) -> tuple[nw.DataFrame[Any], dict[str, str]]:
-    """The wanted columns of one file, given by its path or its contents, and their units if they have a row.
+    """The wanted columns of one file, all of them if none is named, by its path or contents, with a row of units.
 
     `read_csv` says how CSV is read.
     """
@@ -127,6 +127,8 @@ def read_file(source: str | bytes, wanted: Wanted, where: str) -> tuple[nw.DataF
             names, frame, units = read_csv(source, wanted)
         except (pl.exceptions.PolarsError, csv.Error, ValueError) as error:
             raise ValueError(f"{where} cannot be read as CSV: {' '.join(str(error).split())}") from None
+    if not wanted.names:
+        return read_file(source, replace(wanted, numbers=tuple(names)), where)
     for name in (name for name in wanted.names if not (name == FILE and FILE in wanted.by)):
         if name not in names:
             raise ValueError(f"{where} has no column {name!r}: {near(name, names)}")

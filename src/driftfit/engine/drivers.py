@@ -23,7 +23,7 @@ from numba import types
 from driftfit.engine.compile_notice import compiling
 from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
-from driftfit.engine.phases import advancing, at_once, gated, learning, looking, raw_kept
+from driftfit.engine.phases import advancing, gated, learning, looking, raw_kept, ungated
 from driftfit.engine.tiles import as_compiled, kind_of, tile_type
 from driftfit.engine.tracker_part import tracker_part, whole_record
 
@@ -234,13 +234,13 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
         for machine in tracker.machines:
             machine.load()
     part = whole_record if tracker.reads_model else tracker_part
+    phases = looking(tracker), learning(tracker)
+    if tracker.outlined:
+        phases = outlined(phases[0]), outlined(phases[1])
     if gate is None:
-        advance = advancing(tracker)
-        between = at_once(outlined(advance) if tracker.outlined else advance, part)
+        between = ungated(phases if tracker.outlined else (advancing(tracker),), part)
     else:
-        phases = looking(tracker), learning(tracker)
-        look, learn = (outlined(phase) for phase in phases) if tracker.outlined else phases
-        between, model = gated(look, gate, learn, part), model._replace(regress=raw_kept(model.regress))
+        between, model = gated(phases[0], gate, phases[1], part), model._replace(regress=raw_kept(model.regress))
     sample = _sample(model, tracker.note, between, part)
     keep_more = covariance if keep == "cov" else nothing_more
     common = nothing_common if keep == "own" else write_common

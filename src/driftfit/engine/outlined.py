@@ -3,7 +3,7 @@
 A driver inlines the steps of a tracker, and the compiler optimises them again in each driver: for every model, for
 every set of stored results, for records and for streams. For a step that takes a microsecond a call costs nothing, so
 it is compiled once for each kind of record that it works on, and drivers refer to it by its symbol. Records of one lane
-are of one kind if they have the same fields, whatever the number of parameters.
+are of one kind if they have the fields that the step names, whatever the number of parameters, the model and the gate.
 """
 
 from __future__ import annotations
@@ -31,13 +31,12 @@ LINKED: WeakValueDictionary[str, internals.Linked] = WeakValueDictionary()
 """Outlined steps that drivers of this process use, by symbol."""
 
 
-def outlined(step: Any, short: bool = False, whole: bool = False) -> Any:
+def outlined(step: Any, short: bool = False) -> Any:
     """A step, which takes the record only, as drivers call it. For one lane it is compiled once for all sizes of the
     record (`driftfit.engine.compile_time.open_record`), and for size if it is ``short`` because it seldom runs; for
-    several lanes it is compiled once for each size. One that takes the ``whole`` record, fields of the model and of the
-    tracker, is compiled once for all that have the fields it names.
+    several lanes it is compiled once for each size.
     """
-    named = names_in(step.py_func) if whole else frozenset()
+    named = names_in(step.py_func)
 
     def typed(context: Any, record: Any) -> Any:
         known = record.fields["theta"].type.shape[-1] > 1
