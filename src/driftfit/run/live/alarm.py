@@ -10,7 +10,6 @@ from __future__ import annotations
 from base64 import b64decode, b64encode
 from collections import deque
 from collections.abc import Mapping, Sequence
-from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +17,7 @@ import numpy as np
 from driftfit.data.instants import instant
 from driftfit.data.storage import describe, rebuild
 from driftfit.engine.kernel import Array
+from driftfit.run.live.conformal import quantile
 from driftfit.run.live.likelihood_ratio import scan
 from driftfit.run.live.reference_model import (
     FINDINGS,
@@ -221,9 +221,6 @@ def check_rule(rule: Any) -> AlarmRule:
     return rule
 
 
-TWO_SIDED_95 = NormalDist().inv_cdf(0.975)
-
-
 class Change(NamedTuple):
     """The change that explains the last samples best, at most 384 of them, with a band of 95 %.
 
@@ -251,5 +248,5 @@ def change_of(rule: AlarmRule, findings: Array, t: int) -> Change | None:
         return Change(UNKNOWN, np.nan, np.nan, np.nan, since)
     name, model = names[int(which)], rule.reference
     unit = 1.0 if name == "noise" else model.numbers[SCALE] / model.unit[int(which)]
-    half, instead = TWO_SIDED_95 * std, "" if np.isnan(other) else names[int(other)]
+    half, instead = quantile(0.95) * std, "" if np.isnan(other) else names[int(other)]
     return Change(name, float(unit * size), float(unit * (size - half)), float(unit * (size + half)), since, instead)
