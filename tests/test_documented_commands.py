@@ -79,7 +79,7 @@ def _kind(command: str) -> str:
 
 def test_commands_are_found():
     kinds = {kind: of_kind(kind) for kind in ("elsewhere", "driftfit", "benchmark", "record")}
-    assert "python benchmarks/alarm_rates.py 30" in kinds["benchmark"]
+    assert "python benchmarks/alarms.py" in kinds["benchmark"]
     assert "driftfit trackers" in kinds["driftfit"]
     assert any("hammerstein-wiener:2,2,input=polynomial/3" in command for command in kinds["driftfit"])
     assert "driftfit track pump.csv --y flow --u pressure --report report.html" in kinds["driftfit"]

@@ -167,20 +167,16 @@ def select(
 class AlarmOptions:
     """The options that define an alarm."""
 
-    kind: Annotated[str, Option(help="glr, cusum, band, innovation or probability.")] = "glr"
+    kind: Annotated[str, Option(help="glr or band.")] = "glr"
     every: Annotated[float, Option(help="Samples in which one false alarm may begin.")] = 10_000.0
     reference: Annotated[
         list[str] | None,
         Option(help="What is normal: a number of first samples, FROM..TO in times, or name=low:high; repeat the last."),
     ] = None
-    window: Annotated[int, Option(help="Samples in the sums of the innovation alarm.")] = 50
-    hold: Annotated[int, Option(help="Samples for which an alarm stays on after its cause.")] = 0
-    calibrate: Annotated[bool, Option("--calibrate", help="Find the limits by simulation.")] = False
 
     def find(self, run: Any) -> Any:
         """The alarms of a run, an `Outputs` or a fleet."""
-        settings = {"every": self.every, "window": self.window, "hold": self.hold, "calibrate": self.calibrate}
-        return run.detect(self.kind, reference=parse_reference(self.reference, run), **settings)
+        return run.detect(self.kind, every=self.every, reference=parse_reference(self.reference, run))
 
 
 @app.command()
