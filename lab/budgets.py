@@ -28,12 +28,12 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 68_582,
-    "statements": 44_629,
+    "lines of the library": 68_615,
+    "statements": 44_657,
     "modules": 354,
     "levels of folders": 3,
-    "constants of modules with numbers": 657,
-    "numbers in the source": 2_567,
+    "constants of modules with numbers": 654,
+    "numbers in the source": 2_574,
     "private names of Numba and llvmlite": 30,
     "modules that the Kalman filter imports": 24,
     "lines of them": 5_625,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 32,
     "bytes of state of Kalman": 840,
     "bytes of state of AdaptiveKalman": 17_064,
-    "lines of tests": 33_323,
+    "lines of tests": 33_337,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 
