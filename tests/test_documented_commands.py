@@ -32,6 +32,8 @@ ELSEWHERE = {
     "driftfit warm": ("tests/test_cli_commands.py", 'run("warm", "--model", "arx:1,1", *KALMAN)'),
     "driftfit journal verify": ("tests/test_service_journal.py", '["journal", "verify", str(folder)'),
     "driftfit serve": ("tests/service_support.py", '"driftfit", "serve", *(what or ["--demo"])'),
+    "driftfit track pump.csv --y flow --u 'pressure,speed'": ("tests/test_identify.py", "commands(pump)[:2]"),
+    "driftfit detect pump.csv --y flow --u 'pressure,speed'": ("tests/test_identify.py", "commands(pump)[:2]"),
     "python examples/controller.py": ("tests/test_embedded.py", '["controller.py"]'),
     "python -m lab bench accuracy": ("lab/tests/test_bench.py", '["bench", "accuracy", "--quick"'),
     "python -m lab budgets": ("tests/test_budgets.py", '["budgets"]'),

@@ -434,5 +434,5 @@ def test_the_docs_lead_to_an_alarm_on_a_phone(tmp_path):
             exec(text, {"wait": wait, "print": sent.append})
             until(lambda: Receiver.got)
     assert any(
-        who == "pump 1" and text.startswith("pump 1: band alarm, b1[pressure] is ") for _, text, who in Receiver.got
+        who == "pump 1" and text.startswith("pump 1: band alarm, cause b1[pressure], ") for _, text, who in Receiver.got
     )

@@ -198,9 +198,15 @@ class LiveAlarm:
         alarm.active, alarm.begun, alarm.samples = state["active"], state["begun"], state["samples"]
         alarm.statistic, alarm._judged = np.array(state["statistic"], float), state["judged"]
         alarm._onsets.extend(Onset(*onset) for onset in state["onsets"])
-        for part, stored in zip(alarm._memory if state["memory"] else (), state["memory"], strict=True):
-            part[...] = np.frombuffer(b64decode(stored)).reshape(part.shape)
-        if state["memory"]:
+        if alarm.rule.kind == "glr":
+            stored = [np.frombuffer(b64decode(one)) for one in state["memory"]]
+            if [one.size for one in stored] != [part.size for part in alarm._memory]:
+                raise ValueError(
+                    "the state of the alarm was saved by another version of driftfit: make the rule again, "
+                    "run.detect(...).rule, and give it to a stream that was saved without alarms."
+                )
+            for part, values in zip(alarm._memory, stored, strict=True):
+                part[...] = values.reshape(part.shape)
             alarm._findings[0] = alarm._memory.findings
         return alarm
 
