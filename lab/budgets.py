@@ -28,8 +28,8 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 68_621,
-    "statements": 44_660,
+    "lines of the library": 68_625,
+    "statements": 44_664,
     "modules": 354,
     "levels of folders": 3,
     "constants of modules with numbers": 654,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 32,
     "bytes of state of Kalman": 840,
     "bytes of state of AdaptiveKalman": 17_064,
-    "lines of tests": 33_343,
+    "lines of tests": 33_347,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 
