@@ -42,18 +42,15 @@ from driftfit.trackers.bank import change as changes_
 from driftfit.trackers.bank import reduction as reductions
 from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.layout import (
-    COUNT,
-    FADE,
+    COUNTERS,
     HEAD,
     LEAVES,
     MOST_REPORTED,
-    READING,
     ROW,
+    SAMPLE,
     SETTLED,
-    SIZE,
     WHOLE,
-    R,
-)
+)  # fmt: skip
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
 from driftfit.trackers.bank.machine.start import begin, limit_forgetting
@@ -267,15 +264,13 @@ class Bank(Tracker):
         unit = 1.0 if nominal.r is not None or nominal.guess is None else 1.0 / nominal.guess
         P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
         theta0 = vector("Bank", "theta0", self.theta0, n)
-        sample, counters = np.zeros(SIZE), np.zeros(COUNT, int)
-        sample[READING], sample[R] = np.nan, 1.0
-        sample[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
-        count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
-        squares *= nominal.guess or 0.0
+        count, squares = (nominal.nu, nominal.nu * nominal.guess) if guessed else (0.0, 0.0)
         arrays = arrays_of(self, n, na, unit, theta0)
         scale = 1.0 if nominal.r is not None else np.nan
+        sample = dict.fromkeys(SAMPLE, 0.0) | {"reading": np.nan, "r": 1.0}
+        sample["fade"] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
+        leaf = SimpleNamespace(**arrays, n=n, theta=theta0, cov=P0, **sample, **dict.fromkeys(COUNTERS, 0))
         if self.p0 is not None and (nominal.r is not None or guessed):
-            leaf = SimpleNamespace(**arrays, n=n, theta=theta0, cov=P0, counters=counters, sample=sample)
             limit_forgetting.py_func(leaf)
             begin.py_func(leaf, count, squares)
             arrays["root"][:, 0], scale = arrays["leaves"][:, 0], 1.0
@@ -290,8 +285,9 @@ class Bank(Tracker):
             **packed(arrays, numbers),
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "power_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
-            "scale": scale, "count": count, "squares": squares, "sample": sample,
-            "counters": counters, **unresolved(),
+            "scale": scale, "count": count, "squares": squares,
+            "sample": np.array([getattr(leaf, name) for name in SAMPLE]),
+            "counters": np.array([getattr(leaf, name) for name in COUNTERS]), **unresolved(),
             **(knowing_nothing(n, ALMOST_ANY if again else WORST) if self.p0 is None else knowing(n)),
             "can_frame": int(not again), "framed": 0, "within": 0.0, "x": np.zeros(n),
             "column": -1,

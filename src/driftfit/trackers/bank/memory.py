@@ -10,7 +10,6 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.layout import (
-    COUNT,
     HEAD,
     MEMORY_AT,
     MOST_REPORTED,
@@ -20,7 +19,6 @@ from driftfit.trackers.bank.layout import (
     ROW,
     ROWS,
     SAMPLE_HEAD,
-    SIZE,
 )
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
@@ -130,7 +128,6 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
     for name in ("phi", "powers", "theta"):
         table[ROW[name]] = 0, 1, n
     table[ROW["report"]], table[ROW["cov"]] = (0, 1, HEAD), (0, n, n)
-    table[ROW["counters"]], table[ROW["sample"]] = (0, 1, COUNT), (0, 1, SIZE)
     walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
     noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
     memory, report = (_padded(np.concatenate(parts), least) for parts, least in zip(flat, (8192, 32), strict=True))

@@ -8,7 +8,6 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, store, sum_of, times
-from driftfit.trackers.bank.layout import ALIKE, IN_NOISE, LAST, R
 from driftfit.trackers.bank.leaves.leaf_matrix import WEIGHT, total
 
 FACTOR, VALUE, FROZEN, STUCK, CLEANS, OWN = range(6)
@@ -28,7 +27,7 @@ def expect(t: Any, L: int) -> tuple[float, float]:
         t.prior,
         t.sensors,
         len(t.sensors),
-        t.sample[LAST],
+        t.last,
     )
     mean, variance, mass = 0.0, 0.0, 0.0
     for j in range(Hm):
@@ -51,7 +50,7 @@ def expect(t: Any, L: int) -> tuple[float, float]:
         mass += total(shares[j], L)
     mean = mean / mass if mass != 1.0 else mean
     # second moment about the mean: the variance within each component, and the distance of its mean
-    r, noise = t.sample[R], t.sample[IN_NOISE]
+    r, noise = t.r, t.noise
     for j in range(Hm):
         if sensors[j, FROZEN] > 0.0 and abs(last) < np.inf:
             for l in range(L):
@@ -86,7 +85,7 @@ def expect_together(t: Any, L: int) -> tuple[float, float]:
     row, and the last of Q, are overwritten.
     """
     theta, P, phi, Q, prior, sensors, X = t.theta, t.cov, t.phi, t.Q, t.prior, t.sensors, t.scores
-    alike, Hm = t.counters[ALIKE] > 0, len(sensors)
+    alike, Hm = t.alike > 0, len(sensors)
     mixed, spare_row = Q[len(Q) - 1], len(Q) - 1
     rest, unit = 0.0, weighted(t.leaves, L, X, 0) if alike else 0.0
     for at in range(0, Q.shape[1], WIDTH):
@@ -112,4 +111,4 @@ def expect_together(t: Any, L: int) -> tuple[float, float]:
             g += (P[j, i] + mixed[j * (j + 1) // 2 + i]) * phi[j]
         mean += phi[i] * theta[i]
         wide += phi[i] * g
-    return mean, wide + rest * (t.sample[R] * t.sample[IN_NOISE])
+    return mean, wide + rest * (t.r * t.noise)

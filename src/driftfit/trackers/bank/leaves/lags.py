@@ -19,7 +19,6 @@ import math
 from typing import Any
 
 from driftfit.engine.kernel import Array, kernel, shared
-from driftfit.trackers.bank.layout import IN_Y, MOST, R
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
 
 PLAUSIBLE, VAGUE = 1e4, 1e12
@@ -45,7 +44,7 @@ def push(t: Any, L: int, observed: bool, y_hat: Array, most: float) -> None:
     """Store output lags of leaves without a measurement update: y if it was observed, otherwise each prediction, within
     limits.
     """
-    B, n, na, y, limit = t.leaves, t.n, t.output_lags, t.sample[IN_Y], math.sqrt(most)
+    B, n, na, y, limit = t.leaves, t.n, t.output_lags, t.y, math.sqrt(most)
     at = FIRST + n + n * (n + 1) // 2
     for i in range(na - 1, 0, -1):
         for l in range(L):
@@ -90,7 +89,7 @@ def shift_covariance(t: Any, A: Array, K: int, at: int, columns: int, own: bool)
     the new entry, which is zero if it was measured or replaced. A may be the leaves themselves.
     """
     B, na, expected, X = t.leaves, t.output_lags, t.expected, t.spare_lags
-    r, most, block = t.sample[R], t.sample[MOST], slice(at, at + columns)
+    r, most, block = t.r, t.most, slice(at, at + columns)
     first = covariance_row(t.n, na)
     if first >= len(B):
         return

@@ -35,7 +35,6 @@ from driftfit.engine.simd import (
     sum_of,
     times,
 )
-from driftfit.trackers.bank.layout import ALIKE, FLIPPED, R
 
 LOG, WEIGHT, NU, S, CODE, AGE, SENSORS, CHANGES, FIRST = range(9)
 """Rows of a leaf; the mean begins at FIRST."""
@@ -149,8 +148,8 @@ def priors(t: Any, L: int, expanded: bool) -> None:
     If histories are ``expanded``, the last event of a leaf is given by probabilities.
     """
     prior, row, P, event, H = t.prior, t.row, t.chain, t.event, len(t.row)
-    history = t.history_2 if t.counters[FLIPPED] > 0 else t.history
-    if t.counters[ALIKE] > 0:
+    history = t.history_2 if t.flipped > 0 else t.history
+    if t.alike > 0:
         for e in range(H):
             for l in range(L):
                 prior[e, l] = row[e]
@@ -203,7 +202,7 @@ def increments(t: Any, time: float, each: float) -> None:
     The first change takes ``time``, the others ``each``. Relative walks are in units of r / (mean square of phi_k).
     """
     walks, relative, powers, Q = t.walks, t.relative_walks, t.powers, t.Q
-    unit = 1.0 if t.unknown > 0 else t.sample[R]
+    unit = 1.0 if t.unknown > 0 else t.r
     for i in range(len(walks)):
         span = (time if i == 0 else each) * t.drift[i]
         for k in range(0, walks.shape[1], WIDTH):

@@ -29,7 +29,7 @@ from numba import types
 from driftfit.engine.kernel import Array, State, floats, kernel, machine, shared
 from driftfit.engine.numba_internals import ir, named_intrinsic
 from driftfit.engine.simd import WIDTH
-from driftfit.trackers.bank.layout import READING, ROW, SHIFT
+from driftfit.trackers.bank.layout import ROW
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
 
 OWN_AT = ROW["own_likelihoods"]
@@ -79,9 +79,9 @@ def judge(t: Any, which: float, at: int, l: int, y: float, r: float, answers: Ar
     B, expected = t.leaves, t.expected
     unit = B[S, at + l] / (B[NU, at + l] - 2.0) if t.unknown > 0 else 1.0
     h = expected[0, l]
-    shift = t.sample[SHIFT]
+    shift = t.shift
     readings = y + shift, expected[1, l] + shift
-    call(t.own_likelihoods, (which, *readings, h * unit, r * unit, t.sample[READING]), answers.ctypes.data)
+    call(t.own_likelihoods, (which, *readings, h * unit, r * unit, t.reading), answers.ctypes.data)
     most = LARGEST * (h + r)
     answers[NOISE] = max(answers[NOISE] / unit, LEAST * r) if answers[NOISE] < most * unit else most
     answers[LOG_P] = answers[LOG_P] if answers[LOG_P] < np.inf else -np.inf

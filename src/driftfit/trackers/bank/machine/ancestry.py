@@ -16,7 +16,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, below, equal, fill, load, plus, store, sum_of, times
-from driftfit.trackers.bank.layout import EXPANDED, FLIPPED, PARENTS, flip
+from driftfit.trackers.bank.layout import flip
 from driftfit.trackers.bank.leaves.leaf_matrix import WEIGHT
 
 
@@ -64,11 +64,11 @@ def hand_on(T: Array, of: int, e: int, H: int, Hm: int, news: Array, T2: Array, 
 def write_out(t: Any, L: int) -> None:
     """The histories of the children, from those of their parents."""
     H, Hm = len(t.initial), len(t.sensors)
-    now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
+    now, after = (t.history_2, t.history) if t.flipped > 0 else (t.history, t.history_2)
     for l in range(L):
         hand_on(now, t.parent[l], t.event[l], H, Hm, t.new_events, after, l)
     flip(t)
-    t.counters[EXPANDED] = 1
+    t.expanded = 1
 
 
 @shared
@@ -93,10 +93,10 @@ def shift(T: Array, L: int, prior: Array, Hm: int) -> None:
 def pick(t: Any, G: int) -> None:
     """Copy the histories of the leaves that were kept, in `order`."""
     H, Hm = len(t.initial), len(t.sensors)
-    now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
+    now, after = (t.history_2, t.history) if t.flipped > 0 else (t.history, t.history_2)
     for k in range(G):
         l = t.order[k]
-        if t.counters[EXPANDED] > 0:
+        if t.expanded > 0:
             for at in range(now.shape[1]):
                 after[k, at] = now[l, at]
         else:
@@ -132,8 +132,8 @@ def marginals(t: Any, L: int) -> float:
     Leaves are ordered in blocks of the children of K parents. Two spare rows are overwritten.
     """
     B, X, event, lags = t.leaves, t.spare, t.event, t.lag_prob
-    T = t.history_2 if t.counters[FLIPPED] > 0 else t.history
-    H, Hm, K, expanded = len(t.initial), len(t.sensors), t.counters[PARENTS], t.counters[EXPANDED] > 0
+    T = t.history_2 if t.flipped > 0 else t.history
+    H, Hm, K, expanded = len(t.initial), len(t.sensors), t.many_parents, t.expanded > 0
     block, W, sums, mass, steady = H + 1, len(lags), len(T) - 1, X[0], X[1]
     back, quiet, last = 1, 0.0, W * block - 1
     if expanded:

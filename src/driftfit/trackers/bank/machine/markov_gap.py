@@ -35,7 +35,6 @@ import math
 from typing import Any
 
 from driftfit.engine.kernel import Array, kernel, shared
-from driftfit.trackers.bank.layout import ALIKE, FLIPPED, IN_DT, OPEN, TAKEN
 from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, LOG, WEIGHT, variance_factor
 
 SURE = 1e-12
@@ -61,7 +60,7 @@ def open_gap(path: Array, H: int) -> None:
 @shared
 def step(t: Any, e: int, to: int) -> float:
     """p(next event is ``to`` | e); one row serves all events where the rows are equal."""
-    return t.row[to] if t.counters[ALIKE] > 0 else t.chain[e, to]  # type: ignore[no-any-return]
+    return t.row[to] if t.alike > 0 else t.chain[e, to]  # type: ignore[no-any-return]
 
 
 @shared
@@ -96,14 +95,14 @@ def go_on(t: Any, dt: float, used: bool) -> None:
 
     A sample that is refused later is processed here twice.
     """
-    counters, Q = t.counters, t.Q
-    if counters[OPEN] == 0 and counters[TAKEN] == 0:
+    Q = t.Q
+    if t.open == 0 and t.taken == 0:
         open_gap(t.path, len(t.row))
     steps = further(dt) + 1 if dt > 0.0 else 0
     share = 1.0 / max(steps, 1)
-    for _ in range(steps - counters[TAKEN] - (1 if used and steps > 0 else 0)):
+    for _ in range(steps - t.taken - (1 if used and steps > 0 else 0)):
         lengthen(t, share)
-    counters[TAKEN] = steps - 1 if used and steps > 0 else 0
+    t.taken = steps - 1 if used and steps > 0 else 0
     for c in range(len(t.walks)):
         for k in range(Q.shape[1]):
             Q[c, k] *= share if used else 0.0
@@ -260,7 +259,7 @@ def follow_mode(t: Any, k: int, best: int, kappa: float) -> None:
     path, stay, H, Hm, q = t.path, t.scratch[1], len(t.row), len(t.sensors), t.path[len(t.path) - 1]
     for e in range(H):
         stay[e] = stay[e] / kappa if e // Hm == best else 0.0
-    next_event(t, t.sample[IN_DT] == 0.0, stay, k)
+    next_event(t, t.dt == 0.0, stay, k)
     for i in range(t.n * (t.n + 1) // 2):
         q[i] = path[2 * H + best, i]
     widen_leaf(t, k, q)
@@ -279,7 +278,7 @@ def follow_others(t: Any, k: int, to: int, best: int, kappa: float) -> None:
     for e in range(H):
         own = stay[e] if e // Hm == best and kappa > 0.0 else 0.0
         reach[e] = max(reach[e] - own, 0.0) / (1.0 - kappa)
-    next_event(t, t.sample[IN_DT] == 0.0, reach, to)
+    next_event(t, t.dt == 0.0, reach, to)
     widen_leaf(t, to, q)
 
 
@@ -298,8 +297,8 @@ def split(t: Any, K: int) -> int:
 
     `prior` has for every leaf the shares of the events before the gap, and takes those of the level to come.
     """
-    A, T = t.parents, t.history_2 if t.counters[FLIPPED] > 0 else t.history
-    H, Hm, levels, count = len(t.row), len(t.sensors), t.counters[OPEN], K
+    A, T = t.parents, t.history_2 if t.flipped > 0 else t.history
+    H, Hm, levels, count = len(t.row), len(t.sensors), t.open, K
     count_codes(t, K)
     for k in range(K):
         best, kappa = courses(t, k)

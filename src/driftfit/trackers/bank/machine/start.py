@@ -8,19 +8,8 @@ import numpy as np
 
 from driftfit.engine.kernel import shared
 from driftfit.trackers.bank.layout import (
-    CLOCK,
-    EXPANDED,
-    GROUPS,
-    IN_OBSERVED,
-    LEAST,
-    LEAVES,
     NEVER,
     READY,
-    SETTLED,
-    SQUARES,
-    TIMES,
-    UNIT,
-    Y_HAT,
 )  # fmt: skip
 from driftfit.trackers.bank.leaves.forget import GROWTH, PER_CAP
 from driftfit.trackers.bank.leaves.lags import push
@@ -32,10 +21,10 @@ def begin(t: Any, nu: float, squares: float) -> None:
     """Set the single leaf from which a bank starts; P, in units of an unknown noise variance, is converted to units of
     theta.
     """
-    B, theta, P, history, counters = t.leaves, t.theta, t.cov, t.history, t.counters
+    B, theta, P, history = t.leaves, t.theta, t.cov, t.history
     n, H = len(theta), len(t.initial)
     at, unit = FIRST + n, squares / (nu - 2.0) if nu > 2.0 else 1.0
-    t.sample[UNIT] = unit
+    t.unit = unit
     for row in range(LOG, FIRST):
         B[row, 0] = 0.0
     B[WEIGHT, 0], B[NU, 0], B[S, 0], B[AGE, 0] = 1.0, nu, squares, NEVER
@@ -47,20 +36,19 @@ def begin(t: Any, nu: float, squares: float) -> None:
             at += 1
     for at in range(history.shape[1]):
         history[0, at] = 1.0 if at % (H + 1) == H else 0.0
-    counters[LEAVES], counters[GROUPS], counters[EXPANDED], counters[SETTLED] = 1, 1, 1, 1
+    t.many_leaves, t.groups, t.expanded, t.settled = 1, 1, 1, 1
 
 
 @shared
 def wait(t: Any) -> None:
     """Before the tree grows there is one leaf and no event; the tracker runs its filter."""
-    counters, sample = t.counters, t.sample
     t.lag_prob[0, 0] = 1.0
     y_hat = t.leaves[WEIGHT, :1]
-    y_hat[0] = sample[Y_HAT] if abs(sample[Y_HAT]) < np.inf else 0.0
-    push(t, 1, sample[IN_OBSERVED] > 0.0, y_hat, np.inf)
-    counters[CLOCK] += 1
-    if counters[SETTLED] == READY:
-        begin(t, sample[TIMES], max(sample[SQUARES], sample[LEAST] * sample[TIMES]))
+    y_hat[0] = t.y_hat if abs(t.y_hat) < np.inf else 0.0
+    push(t, 1, t.observed > 0.0, y_hat, np.inf)
+    t.clock += 1
+    if t.settled == READY:
+        begin(t, t.times, max(t.squares, t.least * t.times))
 
 
 @shared

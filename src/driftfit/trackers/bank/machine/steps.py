@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import COMMON, TrackerSteps, diagonal
-from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
+from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, packed, wholes
 from driftfit.trackers.bank.layout import (
-    COUNT,
-    COUNTERS_AT,
-    COV_AT,
+    BASES as BASE_NAMES,
+)  # fmt: skip
+from driftfit.trackers.bank.layout import (
     FORECAST,
     FREEDOM,
     IN_DT,
@@ -27,19 +27,14 @@ from driftfit.trackers.bank.layout import (
     MEMORY_AT,
     MOST,
     PHASE,
-    PHI_AT,
-    POWERS_AT,
     READY,
     REPORT_AT,
     ROW,
     ROWS,
     S2,
-    SAMPLE_AT,
     SETTLED,
     SHIFT,
-    SIZE,
     SQUARES,
-    THETA_AT,
     TIMES,
     WAITING,
     Y_HAT,
@@ -70,6 +65,7 @@ from driftfit.trackers.parts.diffuse import correct_on_roots, forecast_on_roots,
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.few_residuals import RESIDUALS, wider
 
+BASES = len(BASE_NAMES)
 GIVEN, GIVEN_CHAIN, DRIFT = ROW["given"], ROW["given_chain"], ROW["drift"]
 
 
@@ -116,78 +112,45 @@ def only_drifted(s: State, l: int) -> None:
 
 
 @kernel
-def point(s: State) -> None:
-    """Write the addresses of the arrays into the table."""
-    framed = s.framed[0] > 0
-    s.table[MEMORY_AT, 0, 0] = memory_at(s)
-    s.table[REPORT_AT, 0, 0] = report_at(s)
-    s.table[PHI_AT, 0, 0] = s.x.ctypes.data if framed else s.phi.ctypes.data
-    s.table[POWERS_AT, 0, 0] = s.no_power.ctypes.data if framed else s.c.ctypes.data
-    s.table[THETA_AT, 0, 0] = s.d.ctypes.data if framed else s.theta.ctypes.data
-    s.table[COV_AT, 0, 0] = s.Pz.ctypes.data if framed else s.P.ctypes.data
-    s.table[COUNTERS_AT, 0, 0] = s.counters.ctypes.data
-    s.table[SAMPLE_AT, 0, 0] = s.sample.ctypes.data
-
-
-@kernel
-def among(s: State, l: int) -> None:
-    """The same for one of several outputs: the numbers of one lane are not contiguous, so it works on copies."""
-    n, L, framed = s.theta.shape[0], s.theta.shape[1], s.framed[l] > 0
-    N, size = s.table[MEMORY_AT, 2, 0], s.table[REPORT_AT, 2, 0]
-    own_memory, own_report = floats(memory_at(s), N, L), floats(report_at(s), size, L)
-    memory = memory_at(s) + 8 * N * L  # the field flat, behind the memory
-    report = memory + 8 * N
-    vectors = report + 8 * size
-    P = vectors + 24 * n
-    sample = P + 8 * n * n
-    counters = sample + 8 * SIZE
-    at = counters + 8 * COUNT
-    table = wholes(at, ROWS, 3)
-    for k in range(ROWS):
-        for i in range(3):
-            table[k, i] = s.table[k, i, l]
-    table[MEMORY_AT, 0], table[REPORT_AT, 0], table[PHI_AT, 0] = memory, report, vectors
-    table[POWERS_AT, 0], table[THETA_AT, 0], table[COV_AT, 0] = vectors + 8 * n, vectors + 16 * n, P
-    table[COUNTERS_AT, 0], table[SAMPLE_AT, 0] = counters, sample
-    for k in range(N):
-        floats(memory, 1, N)[0, k] = own_memory[k, l]
-    for i in range(n):
-        floats(vectors, 3, n)[0, i] = s.x[i, l] if framed else s.phi[i, l]
-        floats(vectors, 3, n)[1, i] = 0.0 if framed else s.c[i, l]
-        floats(vectors, 3, n)[2, i] = s.d[i, l] if framed else s.theta[i, l]
-        for j in range(n):
-            floats(P, n, n)[i, j] = s.Pz[i, j, l] if framed else s.P[i, j, l]
-    for k in range(SIZE):
-        floats(sample, 1, SIZE)[0, k] = s.sample[k, l]
-    for k in range(COUNT):
-        wholes(counters, 1, COUNT)[0, k] = s.counters[k, l]
-    bank(at)
-    for k in range(N):
-        own_memory[k, l] = floats(memory, 1, N)[0, k]
+def moved(at: int, size: int, L: int, l: int, to: int, back: bool) -> int:
+    """Copy lane l of a field of ``size`` numbers to an address, or ``back``; returns the address behind the copy."""
+    lane, flat = floats(at, size, L), floats(to, 1, size)
     for k in range(size):
-        own_report[k, l] = floats(report, 1, size)[0, k]
-    for k in range(SIZE):
-        s.sample[k, l] = floats(sample, 1, SIZE)[0, k]
-    for k in range(COUNT):
-        s.counters[k, l] = wholes(counters, 1, COUNT)[0, k]
-    for i in range(n):
-        theta = floats(vectors, 3, n)[2, i]
-        s.d[i, l], s.theta[i, l] = theta if framed else s.d[i, l], s.theta[i, l] if framed else theta
-        for j in range(n):
-            entry = floats(P, n, n)[i, j]
-            s.Pz[i, j, l], s.P[i, j, l] = entry if framed else s.Pz[i, j, l], s.P[i, j, l] if framed else entry
+        if back:
+            lane[k, l] = flat[0, k]
+        else:
+            flat[0, k] = lane[k, l]
+    return to + 8 * size
 
 
 @kernel
 def run(s: State, l: int) -> None:
-    """Call the compiled routine; addresses are not part of the state."""
-    if s.theta.shape[1] > 1:
-        among(s, l)
-    else:
-        point(s)
-        bank(s.table.ctypes.data)
-        for k in range(MEMORY_AT, SAMPLE_AT + 1):
-            s.table[k, 0, 0] = 0
+    """Call the compiled routine, whose table receives the addresses of the fields for that time. The numbers of one of
+    several lanes are not contiguous, so the routine works on copies behind the memory.
+    """
+    n, L, framed = s.theta.shape[0], s.theta.shape[1], s.framed[l] > 0
+    sizes = (
+        s.table[MEMORY_AT, 2, l], s.table[REPORT_AT, 2, l], n, n, n, n * n, s.counters.shape[0], s.sample.shape[0],
+        3 * ROWS,
+    )  # fmt: skip
+    fields = wholes(packed((
+        memory_at(s), report_at(s), s.x.ctypes.data if framed else s.phi.ctypes.data,
+        s.no_power.ctypes.data if framed else s.c.ctypes.data, s.d.ctypes.data if framed else s.theta.ctypes.data,
+        s.Pz.ctypes.data if framed else s.P.ctypes.data, s.counters.ctypes.data, s.sample.ctypes.data,
+        s.table.ctypes.data,
+    )), 1, BASES + 1)[0]  # fmt: skip
+    copies = fields[0] + 8 * sizes[0] * L
+    to = copies
+    for k in range(BASES):
+        s.table[MEMORY_AT + k, 0, l] = to if L > 1 else fields[k]
+        to = moved(fields[k], sizes[k], L, l, to, False) if L > 1 else fields[BASES]
+    if L > 1:
+        moved(fields[BASES], sizes[BASES], L, l, to, False)
+    bank(to)
+    for k in range(BASES if L > 1 else 0):
+        copies = moved(fields[k], sizes[k], L, l, copies, True)
+    for k in range(BASES):  # addresses are not part of the state
+        s.table[MEMORY_AT + k, 0, l] = 0
     if s.counters[PHASE, l] == LEARN:
         s.table[OWN_AT, 0, l] = 0
 

@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, exp, shared
-from driftfit.trackers.bank.layout import CHAINED, LAST, R
 from driftfit.trackers.bank.leaves.forecast import FACTOR, FROZEN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KEEP, MEAN, RESET
 from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, NU, WEIGHT, S
@@ -60,8 +59,8 @@ def density_parts(t: Any, L: int, top: float, mass: float, phi: Array, samples: 
     deviation.
     """
     B, Q, maps, theta0, sensors, out = t.leaves, t.Q, t.maps, t.places[MEAN], t.sensors, t.components
-    n, z, Hm, count, last, r = t.n, t.z, len(t.sensors), 0, t.sample[LAST], t.sample[R]
-    P, same = t.chain, t.independent > 0 and t.counters[CHAINED] == 0
+    n, z, Hm, count, last, r = t.n, t.z, len(t.sensors), 0, t.last, t.r
+    P, same = t.chain, t.independent > 0 and t.chained == 0
     for l in range(L):
         if t.group[l] < 0:
             continue

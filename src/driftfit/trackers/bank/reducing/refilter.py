@@ -12,7 +12,6 @@ from __future__ import annotations
 from typing import Any
 
 from driftfit.engine.kernel import Array, shared
-from driftfit.trackers.bank.layout import FLIPPED
 from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, LOG, WEIGHT, increments, normalise
 from driftfit.trackers.bank.machine.grow import grow
 from driftfit.trackers.bank.reducing.selection import DEPTH, PRIOR
@@ -77,7 +76,7 @@ def refilter(t: Any, L: int) -> int:
 def histories(t: Any, L: int) -> None:
     """Write the histories of the new tree, which has D - 1 levels."""
     A, D, H, Hm = t.parents, int(t.reduction[DEPTH]), len(t.initial), len(t.sensors)
-    T = t.history_2 if t.counters[FLIPPED] > 0 else t.history
+    T = t.history_2 if t.flipped > 0 else t.history
     block, width = H + 1, T.shape[1]
     for l in range(L):
         for at in range(width):

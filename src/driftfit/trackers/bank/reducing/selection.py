@@ -12,7 +12,6 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, reaches, store, sum_of
-from driftfit.trackers.bank.layout import CLOCK, HELD
 from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, SENSORS, WEIGHT
 from driftfit.trackers.bank.reducing.lookahead import expected_risk
 
@@ -208,7 +207,7 @@ def decide(t: Any, L: int, phi: Array) -> None:
     A leaf that loses a decision leaves its group. ``decided[k]`` is the event, how many samples ago it was first
     visible, and its probability. ``phi`` is used as the next regressor.
     """
-    B, group, stamps, decided, held = t.leaves, t.group, t.stamps, t.decided, t.counters[HELD]
+    B, group, stamps, decided, held = t.leaves, t.group, t.stamps, t.decided, t.held
     p, risk, H, count = t.scratch[0], t.scratch[1], len(t.loss), 0
     for l in range(L):
         group[l] = 0 if B[WEIGHT, l] > 0.0 else -1
@@ -218,7 +217,7 @@ def decide(t: Any, L: int, phi: Array) -> None:
         best = least_risk(t.loss, p, mass, risk)
         if not settled(t, L, held, risk[best], top, mass, phi):
             break
-        decided[count, 0], decided[count, 1], decided[count, 2] = best, float(t.counters[CLOCK]) - stamps[0], p[best]
+        decided[count, 0], decided[count, 1], decided[count, 2] = best, float(t.clock) - stamps[0], p[best]
         count += 1
         for k in range(held - 1):
             stamps[k] = stamps[k + 1]
@@ -229,7 +228,7 @@ def decide(t: Any, L: int, phi: Array) -> None:
                 else:
                     group[l] = -1
         held -= 1
-    t.counters[HELD] = held
+    t.held = held
 
 
 @shared
