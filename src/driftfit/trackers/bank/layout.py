@@ -112,12 +112,12 @@ OUTSIDE = {"report": VECTOR, "phi": VECTOR, "powers": VECTOR, "theta": VECTOR, "
 VARIABLES = {"counters_at": (types.int64, COUNTERS), "sample_at": (types.float64, SAMPLE)}
 """Names of single numbers, by the base of the field in which they lie."""
 NUMBERS = (
-    "n", "output_lags", "unknown", "independent", "plain", "walks_only", "apart", "in_coordinates", "own_likelihoods",
+    "n", "output_lags", "unknown", "independent", "plain", "walks_only", "apart", "own_likelihoods",
 )  # fmt: skip
 """n; the number of separate output lags of leaves; whether the noise is unknown, and whether events are independent;
 whether all leaves have one regressor, all changes are walks and all sensors differ in their noise alone; whether all
-changes are walks; whether what may have happened since the last used sample is one level; whether leaves are in
-coordinates of the start (`machine.framed`); and the address of the user's own likelihoods, during a sample.
+changes are walks; whether what may have happened since the last used sample is one level; and the address of the user's
+own likelihoods, during a sample.
 """
 BASES = ("memory", *(f"{name}_at" for name in OUTSIDE), *VARIABLES)
 """Rows with addresses: of the field `memory`, in which most arrays lie one after the other, so that banks of all

@@ -129,7 +129,7 @@ def forecast(t: Any, L: int) -> None:
         t.y_hat, t.s = expect_together(t, L)
     if not plain or not used:
         regressors(t.n, t, t.leaves, L, min(L, 1), t.phi)
-        foresee(t, L, len(t.walks), len(t.sensors), used)
+        foresee(t, L, len(t.walks), len(t.sensors))
         widen_by_lags(t, t.leaves, L, L)
         if parted:
             add_variance(t, L)
@@ -170,7 +170,7 @@ def reject(t: Any, K: int) -> None:
     L = recover(t.parents, K, t.leaves, len(t.parents))
     t.many_leaves, t.expanded = L, 1
     shift_covariance(t, t.leaves, L, 0, L, False)
-    push(t, L, True, t.expected[1], t.most)
+    push(t, t.leaves, L, 0, L, t.y, False)
     outlook(t, L, True, False)
     shift(t.history_2 if t.flipped > 0 else t.history, L, t.prior, len(t.sensors))
 
@@ -290,7 +290,7 @@ def let_pass(t: Any, L: int) -> None:
     B, n, dt, apart = t.leaves, t.n, t.dt, t.apart > 0
     observed = t.observed > 0.0
     shift_covariance(t, B, L, 0, L, not observed)
-    push(t, L, observed, t.expected[1], t.most)
+    push(t, B, L, 0, L, t.y, False)
     if dt == 0.0:
         return
     if t.expanded == 0:
@@ -303,7 +303,7 @@ def let_pass(t: Any, L: int) -> None:
         t.taken = 0
     if apart:  # leaves make the update of the nominal change only
         certain(t.prior, L)
-        foresee(t, L, 1, 1, False)
+        foresee(t, L, 1, 1)
         extend(t.gap)
         t.open += 1
     for k in range(n):

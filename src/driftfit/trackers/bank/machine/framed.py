@@ -43,17 +43,16 @@ from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, WORK, Y
 
 FIELDS = (
     "walks", "fixed_walks", "relative_walks", "leaves", "gap", "path", "prior", "places", "fixed_places", "maps", "z",
-    "lag_rows", "output_lags", "in_coordinates",
+    "lag_rows", "output_lags",
 )  # fmt: skip
 (
     WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR, PLACES, FIXED_PLACES, MAPS, REGRESSORS, LAG_ROWS, OUTPUT_LAGS,
-    IN_COORDINATES,
 ) = (ROW[name] for name in FIELDS)  # fmt: skip
 """Rows of the table."""
 (
-    AT_MEMORY, AT_TABLE, AT_COUNTERS, AT_S, AT_W, AT_C, AT_X, AT_D, AT_P, AT_WORK, AT_NOW, AT_R, AT_H, AT_PHI,
+    AT_MEMORY, AT_TABLE, AT_COUNTERS, AT_S, AT_W, AT_C, AT_X, AT_D, AT_P, AT_WORK, AT_NOW, AT_R, AT_H,
     ADDRESSES,
-) = range(15)  # fmt: skip
+) = range(14)  # fmt: skip
 """Addresses of fields that the routines here are given."""
 
 
@@ -175,7 +174,7 @@ def machine_changes(fields: int, unit: float, size: int, n: int, L: int, l: int)
     t, m = wholes(at[0, AT_TABLE], 3 * ROWS, L)[:, l], floats(at[0, AT_MEMORY], size, L)[:, l]
     M, W = cubes(at[0, AT_S], n, n, L)[:, :, l], cubes(at[0, AT_W], n, n, L)[:, :, l]
     R, H = cubes(at[0, AT_R], n, n, L)[:, :, l], cubes(at[0, AT_H], n, n, L)[:, :, l]
-    c, phi = floats(at[0, AT_C], n, L)[:, l], floats(at[0, AT_PHI], n, L)[:, l]
+    c = floats(at[0, AT_C], n, L)[:, l]
     wide, sizes = t[3 * WALKS + 2], t[3 * RELATIVE + 2]
     for i in range(t[3 * WALKS + 1]):
         of = t[3 * RELATIVE] // 8 + i * sizes if sizes > 0 else -1
@@ -188,7 +187,6 @@ def machine_changes(fields: int, unit: float, size: int, n: int, L: int, l: int)
         row = t[3 * LAG_ROWS] // 8 + k * (n + 1)
         for i in range(n):
             m[row + i] = W[k, i]
-        m[row + n] = phi[k]
 
 
 @partial(machine, short=True)
@@ -226,7 +224,7 @@ def spans_lags(s: State, l: int) -> bool:
 def begin_framed(s: State, l: int) -> None:
     """The single leaf with which the bank begins: z ~ N(d, I), in units of the noise variance if that is unknown."""
     n = s.theta.shape[0]
-    s.framed[l], s.table[IN_COORDINATES, 0, l] = 1, 1
+    s.framed[l] = 1
     frame(s, l)
     for i in range(n):
         for j in range(i + 1):
@@ -241,7 +239,7 @@ def frame_theta(s: State, l: int) -> None:
         s.d[i, l], s.x[i, l] = s.theta[i, l], s.phi[i, l]
         for j in range(n):
             s.S[i, j, l], s.Pz[i, j, l] = 1.0 if i == j else 0.0, s.P[i, j, l]
-    s.framed[l], s.table[IN_COORDINATES, 0, l] = 1, 1
+    s.framed[l] = 1
     frame(s, l)
 
 
@@ -254,7 +252,7 @@ def write_changes(s: State, l: int) -> None:
     fields = packed((
         memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
         s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data,
-        s.R.ctypes.data, s.H.ctypes.data, s.phi.ctypes.data,
+        s.R.ctypes.data, s.H.ctypes.data,
     ))  # fmt: skip
     machine_changes(fields, unit, s.table[MEMORY_AT, 2, 0], n, L, l)
 
@@ -285,7 +283,7 @@ def enter_bank(s: State, column: int, l: int) -> None:
     fields = packed((
         memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
         s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data,
-        s.R.ctypes.data, s.H.ctypes.data, s.phi.ctypes.data,
+        s.R.ctypes.data, s.H.ctypes.data,
     ))  # fmt: skip
     machine_enter(fields, s.sample[UNIT, l], known, s.table[MEMORY_AT, 2, 0], s.counters.shape[0], n, L, l)
     for i in range(column, n):

@@ -24,9 +24,9 @@ from driftfit.engine.kernel import Array, log, part, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
 from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, OWN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KEEP, KIND, MEAN, RESET, apply
-from driftfit.trackers.bank.leaves.lags import plausible, shift_covariance, widen_by_lags
+from driftfit.trackers.bank.leaves.lags import push, shift_covariance, widen_by_lags
 from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
-from driftfit.trackers.bank.leaves.own_sensor import clean_all, judge_all, weigh_all
+from driftfit.trackers.bank.leaves.own_sensor import judge_all, restore
 from driftfit.trackers.parts.covariance import LEFT
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
@@ -171,20 +171,6 @@ def inherit(t: Any, K: int, row: int, at: int, columns: int) -> None:
 
 
 @shared
-def remember(t: Any, K: int, at: int, columns: int, y: float, own: bool) -> None:
-    """Output lags of the children: the parent's, moved by one, and y or the leaf's prediction."""
-    A, B, expected, n, na, r, most = t.parents, t.leaves, t.expected, t.n, t.output_lags, t.r, t.most
-    first = FIRST + n + n * (n + 1) // 2
-    for i in range(na - 1, 0, -1):
-        for c in range(at, at + columns, K):
-            for l in range(K):
-                B[first + i, np.uint64(c + l)] = A[first + i - 1, l]
-    for l in range(columns):
-        believed = own and plausible(expected, l, most, r)
-        B[first, np.uint64(at + l)] = expected[1, l] if believed else y
-
-
-@shared
 def weigh(t: Any, K: int, at: int, columns: int, j: int, own: bool) -> None:
     """log w+ = log w + log p(event | leaf) + log N of the children under sensor j; their ages, parents
     and events.
@@ -250,7 +236,6 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
         elif sensors[j, OWN] > 0.0:
             judge_all(t, sensors[j, OWN], at, columns, y, t.r * noise)
             correct(t.n, t, at, columns, y, 0.0)
-            weigh_all(t, columns)
         else:
             correct(t.n, t, at, columns, y - sensors[j, VALUE], sensors[j, FACTOR] * t.r * noise)
             if t.unknown > 0:
@@ -260,10 +245,10 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
         if t.output_lags > 0:
             # output lags of the children, and the covariance of lags that are predictions
             own_lags = sensors[j, CLEANS] > 0.0
-            remember(t, K, at, columns, y - sensors[j, VALUE], own_lags)
-            if own_lags and sensors[j, OWN] > 0.0:
-                clean_all(t, at, columns)
+            push(t, t.parents, K, at, columns, y - sensors[j, VALUE], own_lags)
             shift_covariance(t, t.parents, K, at, columns, own_lags)
+        if sensors[j, OWN] > 0.0:
+            restore(t, at, columns, sensors[j, CLEANS] > 0.0 and t.output_lags > 0)
         # prior probability of the event, ancestry, and codes for the reduction
         weigh(t, K, at, columns, j, own)
         encode(t, K, at, columns, j)

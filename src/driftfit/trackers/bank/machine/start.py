@@ -43,9 +43,8 @@ def begin(t: Any, nu: float, squares: float) -> None:
 def wait(t: Any) -> None:
     """Before the tree grows there is one leaf and no event; the tracker runs its filter."""
     t.lag_prob[0, 0] = 1.0
-    y_hat = t.leaves[WEIGHT, :1]
-    y_hat[0] = t.y_hat if abs(t.y_hat) < np.inf else 0.0
-    push(t, 1, t.observed > 0.0, y_hat, np.inf)
+    t.expected[1, 0] = t.y_hat if abs(t.y_hat) < np.inf else 0.0
+    push(t, t.leaves, 1, 0, 1, t.y, False)
     t.clock += 1
     if t.settled == READY:
         begin(t, t.times, max(t.squares, t.least * t.times))

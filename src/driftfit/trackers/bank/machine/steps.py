@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import COMMON, TrackerSteps, diagonal
-from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, packed, wholes
+from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing
 from driftfit.trackers.bank.layout import (
     BASES as BASE_NAMES,
 )  # fmt: skip
@@ -47,6 +47,8 @@ from driftfit.trackers.bank.leaves.own_sensor import OWN_AT, entry_of, no_own_se
 from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.framed import (
     FRAMED,
+    LAG_ROWS,
+    OUTPUT_LAGS,
     begin_framed,
     enter_bank,
     frame_theta,
@@ -133,12 +135,13 @@ def run(s: State, l: int) -> None:
         s.table[MEMORY_AT, 2, l], s.table[REPORT_AT, 2, l], n, n, n, n * n, s.counters.shape[0], s.sample.shape[0],
         3 * ROWS,
     )  # fmt: skip
-    fields = wholes(packed((
-        memory_at(s), report_at(s), s.x.ctypes.data if framed else s.phi.ctypes.data,
-        s.no_power.ctypes.data if framed else s.c.ctypes.data, s.d.ctypes.data if framed else s.theta.ctypes.data,
-        s.Pz.ctypes.data if framed else s.P.ctypes.data, s.counters.ctypes.data, s.sample.ctypes.data,
-        s.table.ctypes.data,
-    )), 1, BASES + 1)[0]  # fmt: skip
+    fields = (
+        memory_at(s), report_at(s), np.int64(s.x.ctypes.data if framed else s.phi.ctypes.data),
+        np.int64(s.no_power.ctypes.data if framed else s.c.ctypes.data),
+        np.int64(s.d.ctypes.data if framed else s.theta.ctypes.data),
+        np.int64(s.Pz.ctypes.data if framed else s.P.ctypes.data),
+        np.int64(s.counters.ctypes.data), np.int64(s.sample.ctypes.data), np.int64(s.table.ctypes.data),
+    )  # fmt: skip
     copies = fields[0] + 8 * sizes[0] * L
     to = copies
     for k in range(BASES):
@@ -164,7 +167,10 @@ def repeated(s: State, l: int) -> float:
 
 @kernel
 def hand_over(s: State, l: int) -> None:
-    """Write the numbers of this sample for the compiled routine."""
+    """Write the numbers of this sample for the compiled routine, and the output lags of the record."""
+    n, memory = s.theta.shape[0], floats(memory_at(s), s.table[MEMORY_AT, 2, l], s.theta.shape[1])
+    for k in range(s.table[OUTPUT_LAGS, 0, l]):
+        memory[s.table[LAG_ROWS, 0, l] // 8 + k * (n + 1) + n, l] = s.phi[k, l]
     s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l] * repeated(s, l), s.dt[l]
     s.sample[IN_TIME, l], s.sample[SHIFT, l] = s.dt[l] * s.drift[l], s.shift[l]
     s.sample[IN_OK, l], s.sample[IN_OBSERVED, l] = s.ok[l], s.observed[l]

@@ -24,7 +24,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, exp, shared
 from driftfit.trackers.bank.leaves.forecast import FACTOR, FROZEN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KEEP, MEAN, RESET
-from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, NU, WEIGHT, S
+from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, NU, WEIGHT, S, lag_row
 
 NODES = 33
 """Nodes for every distinct component."""
@@ -35,10 +35,10 @@ SMALL = 1e-9
 @shared
 def regressor(t: Any, l: int, phi: Array) -> None:
     """The regressor of one leaf, in the first column of z."""
-    z, rows, lags = t.z, t.lag_rows, FIRST + t.n + t.n * (t.n + 1) // 2
+    z, rows, lags = t.z, t.lag_rows, lag_row(t)
     for i in range(t.n):
-        z[i, 0] = t.leaves[lags + i, l] if i < t.output_lags and t.in_coordinates == 0 else phi[i]
-        for k in range(t.output_lags if t.in_coordinates > 0 else 0):
+        z[i, 0] = phi[i]
+        for k in range(t.output_lags):
             z[i, 0] += rows[k, i] * (t.leaves[lags + k, l] - rows[k, t.n])
 
 
