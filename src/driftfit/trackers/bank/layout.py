@@ -47,7 +47,7 @@ from typing import Any
 
 from numba import types
 
-from driftfit.engine.kernel import kernel
+from driftfit.engine.kernel import Array, kernel
 from driftfit.engine.tracker_part import open_at
 from driftfit.trackers.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
 
@@ -150,6 +150,12 @@ def report_at(s: Any) -> int:
 def memory_at(s: Any) -> int:
     """Where the field `memory` begins, behind the report."""
     return open_at(s) + 8 * s.theta.shape[1] * s.table[REPORT_AT, 2, 0]  # type: ignore[no-any-return]
+
+
+@kernel
+def tables(t: Any) -> tuple[Array, Array]:
+    """The table of histories that is valid, and the other one."""
+    return (t.history_2, t.history) if t.flipped > 0 else (t.history, t.history_2)
 
 
 @kernel

@@ -31,6 +31,7 @@ from driftfit.engine.simd import (
     sum_of,
     times,
 )
+from driftfit.trackers.bank.layout import tables
 
 LOG, WEIGHT, NU, S, CODE, AGE, SENSORS, CHANGES, FIRST = range(9)
 """Rows of a leaf; the mean begins at FIRST."""
@@ -114,7 +115,7 @@ def priors(t: Any, L: int, expanded: bool) -> None:
     If histories are ``expanded``, the last event of a leaf is given by probabilities.
     """
     prior, row, P, event, H = t.prior, t.row, t.chain, t.event, len(t.row)
-    history = t.history_2 if t.flipped > 0 else t.history
+    history = tables(t)[0]
     if t.alike > 0:
         for e in range(H):
             for l in range(L):
@@ -150,9 +151,9 @@ def later(prior: Array, L: int, P: Array, steps: int, X: Array) -> None:
 
 
 @shared
-def standstill(prior: Array, L: int, Hm: int) -> None:
+def standstill(prior: Array, a: int, b: int, Hm: int) -> None:
     """The prior when no time passes: sensors keep their shares; all changes except the first have probability 0."""
-    for l in range(L):
+    for l in range(a, b):
         for j in range(Hm):
             share = 0.0
             for e in range(j, len(prior), Hm):

@@ -11,7 +11,8 @@ import math
 from functools import partial
 from typing import Any
 
-from driftfit.engine.kernel import Array, machine, shared
+from driftfit.engine.kernel import machine, shared
+from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.layout import (
     FORECAST,
     SAMPLE_HEAD,
@@ -31,8 +32,8 @@ from driftfit.trackers.bank.leaves.leaf_matrix import (
     standstill,
     variance_factor,
 )
-from driftfit.trackers.bank.machine.ancestry import chained, marginals, pick, shift, summary, write_out
-from driftfit.trackers.bank.machine.gap import chances, close, covariances, extend, odds, take_back, widen
+from driftfit.trackers.bank.machine.ancestry import chained, descend, marginals, shift
+from driftfit.trackers.bank.machine.gap import SINCE, chances, close, covariances, extend, odds, widen
 from driftfit.trackers.bank.machine.grow import grow
 from driftfit.trackers.bank.machine.markov_gap import add_covariance, add_variance, further, go_on, origins, split
 from driftfit.trackers.bank.machine.start import limit_forgetting, wait
@@ -57,14 +58,6 @@ from driftfit.trackers.bank.reducing.selection import (
 
 
 @shared
-def copy(P: Array, to: Array) -> None:
-    """All entries of a matrix."""
-    for i in range(P.shape[0]):
-        for j in range(P.shape[1]):
-            to[i, j] = P[i, j]
-
-
-@shared
 def increments_now(t: Any) -> None:
     """Covariances of the changes in this interval; where it is one level, a change happens in one nominal sample."""
     time, dt = t.time, t.dt
@@ -80,8 +73,10 @@ def prepare(t: Any) -> None:
         chained(t.given_chain, t.transition, Hm, t.chain)
         t.chained = 1
     elif t.chained > 0:
-        copy(t.transition, t.chain)
         t.chained = 0
+        for e in range(len(t.chain)):
+            for to in range(len(t.chain)):
+                t.chain[e, to] = t.transition[e, to]
     source = t.given if given else t.initial if t.levels == 0 else t.chain[0]
     for e in range(len(source)):
         t.row[e] = source[e]
@@ -106,7 +101,7 @@ def outlook(t: Any, L: int, expanded: bool, whole: bool) -> None:
     dt, Hm, wide = t.dt, len(t.sensors), t.wide > 0
     priors(t, L, expanded)
     if dt == 0.0:
-        standstill(t.prior, L, Hm)
+        standstill(t.prior, 0, L, Hm)
     elif dt > 1.0 and t.apart == 0 and t.alike == 0:
         later(t.prior, L, t.chain, further(dt), t.spare)
     if wide:
@@ -148,18 +143,9 @@ def accept(t: Any, gone: float) -> None:
     t.held += 1
     if t.open > 0:
         t.open = 0
-        close(t.gap)
+        for i in range(len(t.gap)):
+            t.gap[i, t.gap.shape[1] - WIDTH + SINCE] = 1.0 if i == 0 else 0.0
     t.taken = 0
-
-
-@shared
-def recover(A: Array, K: int, B: Array, rows: int) -> int:
-    """Restore the parents, as if the sample had been missing."""
-    for row in range(rows):
-        for l in range(K):
-            B[row, l] = A[row, l]
-    normalise(B, K)
-    return K
 
 
 @shared
@@ -167,12 +153,15 @@ def reject(t: Any, K: int) -> None:
     """No leaf can explain the sample: continue as if it had been missing."""
     t.impossible += 1
     t.open, t.taken = t.open if t.apart > 0 else 0, 0
-    L = recover(t.parents, K, t.leaves, len(t.parents))
-    t.many_leaves, t.expanded = L, 1
-    shift_covariance(t, t.leaves, L, 0, L, False)
-    push(t, t.leaves, L, 0, L, t.y, False)
-    outlook(t, L, True, False)
-    shift(t.history_2 if t.flipped > 0 else t.history, L, t.prior, len(t.sensors))
+    t.many_leaves, t.expanded = K, 1
+    for row in range(len(t.parents)):
+        for l in range(K):
+            t.leaves[row, l] = t.parents[row, l]
+    normalise(t.leaves, K)
+    shift_covariance(t, t.leaves, K, 0, K, False)
+    push(t, t.leaves, K, 0, K, t.y, False)
+    outlook(t, K, True, False)
+    shift(t, K)
 
 
 @shared
@@ -207,7 +196,7 @@ def reduce(t: Any) -> int:
     elif kind in (MERGE, HYBRID):
         alone = sort(t.group, L, t.groups, t.start, order) == t.groups
     if not alone and t.expanded == 0:
-        write_out(t, L)
+        descend(t, L, False)
     if full:
         t.stored -= 1
         L = refilter(t, L)
@@ -217,7 +206,7 @@ def reduce(t: Any) -> int:
         return int(mix(t, L))
     G = t.groups
     if alone:
-        pick(t, G)
+        descend(t, G, True)
         kept = take(t, G)
     else:
         kept = combine(t, L, G)
@@ -256,14 +245,7 @@ def take_in(t: Any) -> None:
     elif t.alike == 0 or again:
         outlook(t, K, True, True)
     if t.open > 0 and t.apart > 0:
-        take_back(
-            t.history_2 if t.flipped > 0 else t.history,
-            K,
-            t.open,
-            t.gap,
-            len(t.initial),
-            len(t.sensors),
-        )
+        close(t, K)
     L = grow(t, K, own, t.phi, t.y, t.last, t.noise)
     gone = normalise(t.leaves, L)
     t.many_parents, t.many_leaves = K, L
@@ -278,13 +260,6 @@ def take_in(t: Any) -> None:
 
 
 @shared
-def certain(prior: Array, L: int) -> None:
-    """The prior that is certain of the first event."""
-    for l in range(L):
-        prior[0, l] = 1.0
-
-
-@shared
 def let_pass(t: Any, L: int) -> None:
     """Process a sample that is not used: the time update of the leaves."""
     B, n, dt, apart = t.leaves, t.n, t.dt, t.apart > 0
@@ -294,15 +269,16 @@ def let_pass(t: Any, L: int) -> None:
     if dt == 0.0:
         return
     if t.expanded == 0:
-        write_out(t, L)
+        descend(t, L, False)
     if apart:
         outlook(t, L, True, False)
-    shift(t.history_2 if t.flipped > 0 else t.history, L, t.prior, len(t.sensors))
+    shift(t, L)
     if t.parted > 0:
         t.open += 1
         t.taken = 0
     if apart:  # leaves make the update of the nominal change only
-        certain(t.prior, L)
+        for l in range(L):
+            t.prior[0, l] = 1.0
         foresee(t, L, 1, 1)
         extend(t.gap)
         t.open += 1
@@ -363,17 +339,6 @@ def lone_density(t: Any) -> float:
     return -0.5 * (math.log(2.0 * math.pi * s) + far * far / s)  # type: ignore[no-any-return]
 
 
-@shared
-def note(t: Any, window: float) -> None:
-    """Store the probability of a change in the window, whether the sample was used, its interval, and the final
-    probabilities of the event W - 1 levels back.
-    """
-    row, ring, lag_prob = (t.clock - 1) % len(t.ring), t.ring, t.lag_prob
-    ring[row, 0], ring[row, 1], ring[row, 2] = window, t.ok, t.elapsed
-    for e in range(lag_prob.shape[1]):
-        ring[row, SAMPLE_HEAD + e] = lag_prob[len(lag_prob) - 1, e]
-
-
 @partial(machine, short=True)  # rows of a dozen leaves: copies of loops for long rows made it a tenth slower
 def bank(address: int) -> None:
     """The forecast of a sample, or its processing, by ``PHASE``, given the table of a bank."""
@@ -397,5 +362,10 @@ def bank(address: int) -> None:
     t.elapsed += t.dt
     if t.observed > 0.0:
         t.reading = t.y + t.shift
-    summary(t.lag_prob, t.newest)
-    note(t, head[1])
+    # for events of a stream: also the final probabilities of the event W - 1 levels back
+    row, oldest, last = t.ring[(t.clock - 1) % len(t.ring)], len(t.lag_prob) - 1, len(t.newest) - 1
+    row[0], row[1], row[2] = head[1], t.ok, t.elapsed
+    for e in range(t.lag_prob.shape[1]):
+        row[SAMPLE_HEAD + e] = t.lag_prob[oldest, e]
+        for k in range(len(t.newest)):
+            t.newest[k, e] = t.lag_prob[k if k < last else oldest, e]

@@ -20,7 +20,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, shared
 from driftfit.engine.simd import WIDTH, gathered, store
-from driftfit.trackers.bank.layout import flip
+from driftfit.trackers.bank.layout import flip, tables
 from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S, lag_row
 from driftfit.trackers.bank.machine.ancestry import average
 
@@ -137,7 +137,7 @@ def sort(group: Array, L: int, G: int, start: Array, order: Array) -> int:
 def combine(t: Any, L: int, G: int) -> float:
     """Make a parent and its history for every group that `sort` ordered; returns the remaining mass."""
     A, B, start, order = t.parents, t.leaves, t.start, t.order
-    now, after = (t.history_2, t.history) if t.flipped > 0 else (t.history, t.history_2)
+    now, after = tables(t)
     kept, share = 0.0, t.scratch[0]
     for k in range(G):
         members, part = order[start[k] : start[k + 1]], share[start[k] : start[k + 1]]
@@ -185,7 +185,7 @@ def mix(t: Any, L: int) -> int:
     W_le = w_l p(e | l) / sum_l w_l p(e | l). Returns the number of events.
     """
     A, B, prior, order = t.parents, t.leaves, t.prior, t.order
-    now, after = (t.history_2, t.history) if t.flipped > 0 else (t.history, t.history_2)
+    now, after = tables(t)
     H, share = len(prior), t.scratch[0]
     for e in range(H):
         mass, count = 0.0, 0
