@@ -53,7 +53,7 @@ from driftfit.trackers.bank.layout import (
 )  # fmt: skip
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
-from driftfit.trackers.bank.machine.start import begin, limit_forgetting
+from driftfit.trackers.bank.machine.advance import begin, limit_forgetting
 from driftfit.trackers.bank.machine.steps import steps_of
 from driftfit.trackers.bank.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.prior import chains, events, per_sample

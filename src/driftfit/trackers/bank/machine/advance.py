@@ -11,18 +11,27 @@ import math
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from driftfit.engine.kernel import machine, shared
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.layout import (
     FORECAST,
+    NEVER,
+    READY,
     SAMPLE_HEAD,
     table_at,
 )
 from driftfit.trackers.bank.leaves.forecast import expect, expect_together, weighted
-from driftfit.trackers.bank.leaves.forget import BEFORE, for_interval, foresee
+from driftfit.trackers.bank.leaves.forget import BEFORE, GROWTH, PER_CAP, for_interval, foresee
 from driftfit.trackers.bank.leaves.lags import push, shift_covariance, widen_by_lags
 from driftfit.trackers.bank.leaves.leaf_matrix import (
+    AGE,
     FIRST,
+    LOG,
+    NU,
+    WEIGHT,
+    S,
     increments,
     later,
     mixture,
@@ -36,7 +45,6 @@ from driftfit.trackers.bank.machine.ancestry import chained, descend, marginals,
 from driftfit.trackers.bank.machine.gap import SINCE, chances, close, covariances, extend, odds, widen
 from driftfit.trackers.bank.machine.grow import grow
 from driftfit.trackers.bank.machine.markov_gap import add_covariance, add_variance, further, go_on, origins, split
-from driftfit.trackers.bank.machine.start import limit_forgetting, wait
 from driftfit.trackers.bank.reducing.merge import combine, mix, sort, take
 from driftfit.trackers.bank.reducing.refilter import NOISE, TIME, Y, histories, refilter
 from driftfit.trackers.bank.reducing.selection import (
@@ -337,6 +345,47 @@ def lone_density(t: Any) -> float:
         wide = math.log(math.pi * nu * s) + (nu + 1.0) * math.log(1.0 + far * far / (nu * s))
         return ratio - 0.5 * wide  # type: ignore[no-any-return]
     return -0.5 * (math.log(2.0 * math.pi * s) + far * far / s)  # type: ignore[no-any-return]
+
+
+@shared
+def begin(t: Any, nu: float, squares: float) -> None:
+    """Set the single leaf from which a bank starts; P, in units of an unknown noise variance, is converted to units of
+    theta.
+    """
+    B, theta, P, history = t.leaves, t.theta, t.cov, t.history
+    n, H = len(theta), len(t.initial)
+    at, unit = FIRST + n, squares / (nu - 2.0) if nu > 2.0 else 1.0
+    t.unit = unit
+    for row in range(LOG, FIRST):
+        B[row, 0] = 0.0
+    B[WEIGHT, 0], B[NU, 0], B[S, 0], B[AGE, 0] = 1.0, nu, squares, NEVER
+    for i in range(n):
+        B[FIRST + i, 0] = theta[i]
+        for j in range(i + 1):
+            B[at, 0] = P[i, j]
+            P[i, j] *= unit
+            at += 1
+    for at in range(history.shape[1]):
+        history[0, at] = 1.0 if at % (H + 1) == H else 0.0
+    t.many_leaves, t.groups, t.expanded, t.settled = 1, 1, 1, 1
+
+
+@shared
+def wait(t: Any) -> None:
+    """Before the tree grows there is one leaf and no event; the tracker runs its filter."""
+    t.lag_prob[0, 0] = 1.0
+    t.expected[1, 0] = t.y_hat if abs(t.y_hat) < np.inf else 0.0
+    push(t, t.leaves, 1, 0, 1, t.y, False)
+    t.clock += 1
+    if t.settled == READY:
+        begin(t, t.times, max(t.squares, t.least * t.times))
+
+
+@shared
+def limit_forgetting(t: Any) -> None:
+    """The caps of variances, from those of the single filter."""
+    for i in range(t.n):
+        t.places[PER_CAP, i] = 1.0 / (GROWTH * t.cov[i, i]) if t.cov[i, i] > 0.0 else 0.0
 
 
 @partial(machine, short=True)  # rows of a dozen leaves: copies of loops for long rows made it a tenth slower

@@ -1,10 +1,10 @@
 """The histories of leaves, from which probabilities of past events are computed.
 
 Row l of the table is the history of leaf l: entry k (H + 1) + e is p(joint event e, k levels back | leaf), entry
-k (H + 1) + H is p(no change in the newest k + 1 levels | leaf). A history is contiguous, so inheriting it is one copy and
-a marginal one sum of rows; the last row of the table is for such sums. Row e of `new_events` is what event e adds; two
-rows of factors for the older entries follow: for no change, and for a change. After growth the table still holds the
-parents; a sample that is not used writes it out for every leaf.
+k (H + 1) + H is p(no change in the newest k + 1 levels | leaf). A history is contiguous, so inheriting it is one copy
+and a marginal one sum of rows; the last row of the table is for such sums. Row e of `new_events` is what event e adds;
+two rows of factors for the older entries follow: for no change, and for a change. After growth the table still holds
+the parents; a sample that is not used writes it out for every leaf.
 """
 
 from __future__ import annotations

@@ -163,7 +163,7 @@ def next_event(t: Any, p: Array, k: int) -> None:
 
 @shared
 def exclude(T: Array, k: int, levels: int, H: int, Hm: int, best: int, kappa: float) -> None:
-    """Row k: the mean over all courses of the newest ``levels`` without that of one mode, which has probability kappa."""
+    """Row k: the mean over all courses of the newest ``levels`` without that of one mode, of probability kappa."""
     block = H + 1
     for at in range(0, T.shape[1] - block + 1, block):
         if at < levels * block:

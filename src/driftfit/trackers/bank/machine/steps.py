@@ -50,12 +50,12 @@ from driftfit.trackers.bank.machine.framed import (
     LAG_ROWS,
     OUTPUT_LAGS,
     begin_framed,
+    call_framed,
     enter_bank,
     frame_theta,
     outgrown,
     read_framed,
     spans_lags,
-    write_changes,
 )
 from driftfit.trackers.mixture.states import LEAST_SHARE
 from driftfit.trackers.parts.coarse.resolution import lasting, learn_resolved_scale, least_noise, resolve
@@ -214,7 +214,7 @@ def forecast_tree(s: State, l: int) -> None:
         if column >= 0 and s.framed[l] == 0:
             frame_theta(s, l)
     if s.framed[l] > 0:
-        write_changes(s, l)
+        call_framed(s, -1, 1.0 if s.unknown[l] > 0 else s.r[l], l)
     hand_over(s, l)
     s.column[l] = column
     if column >= 0:
