@@ -51,7 +51,6 @@ P = [[0.99, 0.01], [0.2, 0.8]]
         (lambda: Change(reset=True), ["q="]),
         (lambda: Sensor.nominal(0.0), ["r must be", "above 0"]),
         (lambda: Sensor.frozen(0.0), ["resolution must be positive"]),
-        (lambda: Sensor.offset(), ["value= or std="]),
         (lambda: Sensor.outlier(kind="spike"), ["'innovation', 'additive'"]),
         (lambda: Live(Regression(2), Bank([Change(0.1, which=[2])])), ["parameter 2", "0 .. 1"]),
         (lambda: Live(Regression(2), Bank([Change([0.1, 0.2, 0.3])])), ["(3,)", "2 parameters"]),

@@ -26,7 +26,6 @@ from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 from driftfit.trackers.bank.machine.ancestry import news_of
 from driftfit.trackers.bank.machine.gap import SINCE
 from driftfit.trackers.bank.reducing import selection
-from driftfit.trackers.bank.reducing.lookahead import NODES
 from driftfit.trackers.bank.sensor import table_of
 
 SINGLE = ("evidence", "window", "kept", "leaves")
@@ -61,7 +60,7 @@ def arrays_of(bank: Any, n: int, na: int, unit: float, theta0: Array) -> dict[st
         "sensors": table_of(bank.all_sensors), "given": np.full(H, np.nan),
         "row": np.zeros(H), "loss": bank.reduction.losses(H), "reduction": shape.knobs,
         "bases": shape.bases, "stamps": np.zeros(shape.held),
-        "components": np.zeros((4 + NODES, K * H if waits else 1)), "root": np.zeros((rows, WIDTH)),
+        "components": np.zeros((4, K * H if waits else 1)), "root": np.zeros((rows, WIDTH)),
         "samples": np.zeros((int(shape.knobs[selection.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
         "path": path_of(H, Hd, _whole_vectors(tri) if bank.chained else 0),
         "spare_square": np.zeros((square, children)), "lag_rows": np.eye(na, n + 1),
