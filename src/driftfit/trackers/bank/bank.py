@@ -262,7 +262,8 @@ class Bank(Tracker):
         unit = 1.0 if nominal.r is not None or nominal.guess is None else 1.0 / nominal.guess
         P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
         theta0 = vector("Bank", "theta0", self.theta0, n)
-        count, squares = (nominal.nu, nominal.nu * nominal.guess) if guessed else (0.0, 0.0)
+        count = nominal.nu if guessed else 0.0
+        squares = count * (nominal.guess or 0.0)
         arrays = arrays_of(self, n, na, unit, theta0)
         scale = 1.0 if nominal.r is not None else np.nan
         sample = dict.fromkeys(SAMPLE, 0.0) | {"reading": np.nan, "r": 1.0}
