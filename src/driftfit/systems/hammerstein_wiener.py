@@ -22,6 +22,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial
+from driftfit.models.hammerstein_wiener.blocks import radius_of
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.thresholds import Thresholds
 from driftfit.systems.drift import Jump, Law, Ramp, RandomWalk, SineIncrement, SineOffset, paths
@@ -183,14 +184,8 @@ def _inverted(model: HammersteinWiener, d: Array, w: Array, limit: float, unstab
 
 
 def first_unstable(a: Array) -> int | None:
-    """The first sample at which z^na + a_1 z^(na-1) + .. has a root of size 1 or more; a (T, na)."""
-    T, na = a.shape
-    if not na:
-        return None
-    companion = np.zeros((T, na, na))
-    companion[:, 0] = -a
-    companion[:, range(1, na), range(na - 1)] = 1.0
-    beyond = np.abs(np.linalg.eigvals(companion)).max(axis=1) >= 1.0
+    """The first sample at which the linear block has a pole of size 1 or more; a (T, na)."""
+    beyond = radius_of(a) >= 1.0
     return int(np.argmax(beyond)) if beyond.any() else None
 
 

@@ -32,7 +32,7 @@ in variances of the noise. Without them the lags of an unstable leaf would diver
 @kernel
 def plausible(h: float, y_hat: float, most: float, r: float) -> bool:
     """Whether a prediction is a possible output."""
-    return y_hat * y_hat <= most and h <= VAGUE * r  # type: ignore[no-any-return]
+    return y_hat * y_hat <= most and h <= VAGUE * r
 
 
 @kernel
