@@ -102,7 +102,7 @@ def _rank_one(M: Array) -> tuple[Array, Array, Array]:
     """M (T, m, p) nearly left (T, m) times right (T, p) with |right| = 1, and sigma_2 / sigma_1. For numbers that are
     not finite the product is 0.
     """
-    known = np.isfinite(M).all(axis=(1, 2))
+    known = np.asarray(np.isfinite(M).all(axis=(1, 2)))
     M = np.where(known[:, None, None], M, 0.0)
     _, sizes, rights = np.linalg.svd(M, full_matrices=False)
     top = sizes[:, :1]
