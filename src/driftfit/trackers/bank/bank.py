@@ -42,13 +42,11 @@ from driftfit.trackers.bank import change as changes_
 from driftfit.trackers.bank import reduction as reductions
 from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.layout import (
-    COUNTERS,
+    COUNTER,
     HEAD,
-    LEAVES,
     MOST_REPORTED,
     ROW,
     SAMPLE,
-    SETTLED,
     WHOLE,
 )  # fmt: skip
 from driftfit.trackers.bank.leaves import forget
@@ -266,9 +264,9 @@ class Bank(Tracker):
         squares = count * (nominal.guess or 0.0)
         arrays = arrays_of(self, n, na, unit, theta0)
         scale = 1.0 if nominal.r is not None else np.nan
-        sample = dict.fromkeys(SAMPLE, 0.0) | {"reading": np.nan, "r": 1.0}
+        sample = dict.fromkeys(SAMPLE._fields, 0.0) | {"reading": np.nan, "r": 1.0}
         sample["fade"] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
-        leaf = SimpleNamespace(**arrays, n=n, theta=theta0, cov=P0, **sample, **dict.fromkeys(COUNTERS, 0))
+        leaf = SimpleNamespace(**arrays, n=n, theta=theta0, cov=P0, **sample, **dict.fromkeys(COUNTER._fields, 0))
         if self.p0 is not None and (nominal.r is not None or guessed):
             limit_forgetting.py_func(leaf)
             begin.py_func(leaf, count, squares)
@@ -285,8 +283,8 @@ class Bank(Tracker):
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "power_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
             "scale": scale, "count": count, "squares": squares,
-            "sample": np.array([getattr(leaf, name) for name in SAMPLE]),
-            "counters": np.array([getattr(leaf, name) for name in COUNTERS]), **unresolved(),
+            "sample": np.array([getattr(leaf, name) for name in SAMPLE._fields]),
+            "counters": np.array([getattr(leaf, name) for name in COUNTER._fields]), **unresolved(),
             **(knowing_nothing(n, ALMOST_ANY if again else WORST) if self.p0 is None else knowing(n)),
             "can_frame": int(not again), "framed": 0, "within": 0.0, "x": np.zeros(n),
             "column": -1,
@@ -348,7 +346,7 @@ class Bank(Tracker):
 
     def _leaves(self, lane: Mapping[str, Array]) -> Array:
         """The leaves of a lane, as a view; before the tree starts, the single filter."""
-        return self.array(None, lane, "leaves")[:, : max(int(lane["counters"][LEAVES]), 1)]
+        return self.array(None, lane, "leaves")[:, : max(int(lane["counters"][COUNTER.many_leaves]), 1)]
 
     def reported(self, report: Array, name: str) -> Array:
         """A quantity of reports (.., size): lag_prob (.., levels, H), decided (.., held, 3), or a number."""
@@ -392,7 +390,7 @@ class Bank(Tracker):
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])
-        begun = lane["counters"][SETTLED] > 0
+        begun = lane["counters"][COUNTER.settled] > 0
         return never & bool(begun and lane["power_samples"] >= window(len(never)))
 
     @property

@@ -43,6 +43,7 @@ With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m s
 
 from __future__ import annotations
 
+from collections import namedtuple
 from typing import Any
 
 from numba import types
@@ -51,11 +52,12 @@ from driftfit.engine.kernel import Array, kernel
 from driftfit.engine.tracker_part import open_at
 from driftfit.trackers.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
 
-COUNTERS = (
-    "many_leaves", "settled", "open", "phase", "held", "clock", "impossible", "reported_to",
-    "many_parents", "groups", "levels", "expanded", "stored", "flipped", "taken",
-    "chained", "alike", "wide", "parted", "looked",
-)  # fmt: skip
+_Counters = namedtuple(
+    "_Counters",
+    "many_leaves settled open phase held clock impossible reported_to many_parents groups levels expanded stored "
+    "flipped taken chained alike wide parted looked",
+)
+COUNTER = _Counters(*range(20))
 """Whole numbers of a bank. ``settled`` is 1 once the tree grows, `WAITING` before, `READY` if it begins with the next
 sample; ``levels`` counts those of the tree. ``open`` levels have passed since the last used sample (`machine.gap`),
 ``taken`` steps of its interval are already in the table of a gap. Flags of the present sample: ``chained`` if the user
@@ -64,23 +66,20 @@ interval, ``parted`` if leaves are continued as two (`machine.markov_gap`), ``ex
 leaves and not of their parents. ``phase`` says what the routine is called for, ``looked`` for which kind of sample its
 forecast was.
 """
-LEAVES, SETTLED, OPEN, PHASE, HELD, CLOCK, IMPOSSIBLE, REPORTED_TO = range(8)
 WAITING, READY = 0, -1
 LEARN, FORECAST = 0, 1
-SAMPLE = (
-    "y", "noise", "dt", "time", "ok", "observed", "r", "fade", "least", "most", "y_hat", "s", "squares", "times",
-    "elapsed", "freedom", "shift", "reading", "unit", "last", "evidence", "window", "kept",
-)  # fmt: skip
+_Sample = namedtuple(
+    "_Sample",
+    "y noise dt time ok observed r fade least most y_hat s squares times elapsed freedom shift reading unit last "
+    "evidence window kept",
+)
+SAMPLE = _Sample(*range(23))
 """Numbers of the present sample: inputs and results. ``most`` is the largest mean square that a leaf's own prediction
 may have in its output lags (`leaves.lags`), ``least`` the smallest noise variance. Before the tree grows ``freedom`` is
 that of an estimated noise variance, inf for one that is given. ``reading`` is y + ``shift`` of the last accepted sample
 (`driftfit.trackers.parts.coarse.resolution`), ``last`` the same minus the present shift. ``unit`` is the mean unit of
 the covariances of leaves: 1, or the noise variance where it is unknown.
 """
-(
-    IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_OBSERVED, R, FADE, LEAST, MOST, Y_HAT, S2, SQUARES, TIMES,
-    ELAPSED, FREEDOM, SHIFT, READING, UNIT,
-) = range(19)  # fmt: skip
 NEVER = 1e9
 """The number of levels since the last change, for a leaf without a change."""
 HEAD = 4
@@ -109,7 +108,7 @@ WINDOWS = (
 """Rows of the scratch that have names."""
 OUTSIDE = {"report": VECTOR, "phi": VECTOR, "powers": VECTOR, "theta": VECTOR, "cov": MATRIX}
 """Arrays that are fields of the state themselves."""
-VARIABLES = {"counters_at": (types.int64, COUNTERS), "sample_at": (types.float64, SAMPLE)}
+VARIABLES = {"counters_at": (types.int64, COUNTER._fields), "sample_at": (types.float64, SAMPLE._fields)}
 """Names of single numbers, by the base of the field in which they lie."""
 NUMBERS = (
     "n", "output_lags", "unknown", "independent", "plain", "walks_only", "apart", "own_likelihoods",

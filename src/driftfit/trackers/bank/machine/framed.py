@@ -37,12 +37,13 @@ Source: ours; the limit is that of Durbin and Koopman, Time Series Analysis by S
 
 from __future__ import annotations
 
+from collections import namedtuple
 from functools import partial
 
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, packed, shared, wholes
-from driftfit.trackers.bank.layout import LEAVES, MEMORY_AT, ROW, ROWS, UNIT, memory_at
+from driftfit.trackers.bank.layout import COUNTER, MEMORY_AT, ROW, ROWS, SAMPLE, memory_at
 from driftfit.trackers.bank.leaves.forget import ANCHORS, GROWTH, KIND, MEAN, PARTIAL, PER_CAP
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 from driftfit.trackers.parts.coordinates import (
@@ -58,18 +59,14 @@ from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, SIZE, STD,
 
 K, G = SIZE, STD
 """Rows of ``work`` here: the gain, and a covariance times the regressor."""
-FIELDS = (
-    "walks", "fixed_walks", "relative_walks", "leaves", "gap", "path", "prior", "places", "fixed_places", "maps", "z",
-    "lag_rows", "output_lags",
-)  # fmt: skip
-(
-    WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR, PLACES, FIXED_PLACES, MAPS, REGRESSORS, LAG_ROWS, OUTPUT_LAGS,
-) = (ROW[name] for name in FIELDS)  # fmt: skip
+_Rows = namedtuple(
+    "_Rows",
+    "walks fixed_walks relative_walks leaves gap path prior places fixed_places maps z lag_rows output_lags",
+)
+AT = _Rows(*(ROW[name] for name in _Rows._fields))
 """Rows of the table."""
-(
-    AT_MEMORY, AT_TABLE, AT_COUNTERS, AT_S, AT_W, AT_C, AT_X, AT_D, AT_P, AT_WORK, AT_NOW, AT_R, AT_H,
-    ADDRESSES,
-) = range(14)  # fmt: skip
+_Addresses = namedtuple("_Addresses", "memory table counters S W c x d P work now R H")
+ADDRESS = _Addresses(*range(13))
 """Addresses of fields that the routines here are given."""
 
 
@@ -188,13 +185,13 @@ def seen_inverse(S: Array, R: Array, H: Array, W: Array) -> None:
 def pulled(M: Array, t: Array, S: Array, W: Array) -> None:
     """theta0 and the matrices of resets and of stabilised forgetting in these coordinates; W is `seen_inverse`."""
     n = len(S)
-    to, fixed, maps = t[3 * PLACES] // 8, t[3 * FIXED_PLACES] // 8, t[3 * MAPS] // 8
+    to, fixed, maps = t[3 * AT.places] // 8, t[3 * AT.fixed_places] // 8, t[3 * AT.maps] // 8
     for i in range(n):
         M[to + MEAN * n + i] = 0.0
         for j in range(i, n):
             M[to + MEAN * n + i] += S[i, j] * M[fixed + MEAN * n + j]
-    for c in range(t[3 * MAPS + 1] if t[3 * PLACES + 1] > ANCHORS else 0):
-        at, kind = (ANCHORS + c * n) * n, int(M[maps + c * t[3 * MAPS + 2] + KIND])
+    for c in range(t[3 * AT.maps + 1] if t[3 * AT.places + 1] > ANCHORS else 0):
+        at, kind = (ANCHORS + c * n) * n, int(M[maps + c * t[3 * AT.maps + 2] + KIND])
         for i in range(n):
             for k in range(n):
                 M[to + at + i * n + k] = 0.0
@@ -211,27 +208,27 @@ def pulled(M: Array, t: Array, S: Array, W: Array) -> None:
 @shared
 def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, known: int, work: Array) -> None:
     """The sample in all leaves; each has its own gain, and its own regressor if it has output lags of its own."""
-    n, noise, lags = len(x), now[NOISE], table[3 * OUTPUT_LAGS]
-    B, columns, z = table[3 * COLUMNS] // 8, table[3 * COLUMNS + 2], table[3 * REGRESSORS] // 8
-    wide = table[3 * REGRESSORS + 2]
-    for l in range(many[LEAVES]):
+    n, noise, lags = len(x), now[NOISE], table[3 * AT.output_lags]
+    B, columns, z = table[3 * AT.leaves] // 8, table[3 * AT.leaves + 2], table[3 * AT.z] // 8
+    wide = table[3 * AT.z + 2]
+    for l in range(many[COUNTER.many_leaves]):
         leaf = B + l
         own = M[z + l : z + l + n * wide : wide] if lags > 0 else x
         m, C = leaf + FIRST * columns, leaf + (FIRST + n) * columns
         left = gain_of(M, C, columns, own, noise, known, work)
         enter_mean(M, m, columns, own, now, left, work)
         enter_packed(M, C, columns, own, now, noise, left, work)
-    M[table[3 * PLACES] // 8 + PER_CAP * n + int(now[ENTERING])] = 1.0 / (GROWTH * noise)
+    M[table[3 * AT.places] // 8 + PER_CAP * n + int(now[ENTERING])] = 1.0 / (GROWTH * noise)
 
 
 @shared
 def enter_gap(M: Array, table: Array, x: Array, now: Array, left: float, work: Array) -> None:
     """The covariances of the gap, with the gain that is in ``work``: leaves share them."""
-    gap, columns = table[3 * GAP] // 8, table[3 * GAP + 2]
-    for i in range(1, table[3 * GAP + 1]):
+    gap, columns = table[3 * AT.gap] // 8, table[3 * AT.gap + 2]
+    for i in range(1, table[3 * AT.gap + 1]):
         enter_packed(M, gap + i * columns, 1, x, now, 0.0, left, work)
-    path, columns, H = table[3 * PATH] // 8, table[3 * PATH + 2], table[3 * PRIOR + 1]
-    for i in range(2 * H, table[3 * PATH + 1] - 1):
+    path, columns, H = table[3 * AT.path] // 8, table[3 * AT.path + 2], table[3 * AT.prior + 1]
+    for i in range(2 * H, table[3 * AT.path + 1] - 1):
         enter_packed(M, path + i * columns, 1, x, now, 0.0, left, work)
 
 
@@ -257,16 +254,16 @@ def enter_mixture(z: Array, P: Array, C: Array, x: Array, now: Array, noise: flo
 @shared
 def write_changes(m: Array, t: Array, S: Array, R: Array, H: Array, W: Array, c: Array, unit: float) -> None:
     """The changes in these coordinates, and the rows of R of the output lags."""
-    n, wide, sizes = len(S), t[3 * WALKS + 2], t[3 * RELATIVE + 2]
-    for i in range(t[3 * WALKS + 1]):
-        of = t[3 * RELATIVE] // 8 + i * sizes if sizes > 0 else -1
-        walk(m, (t[3 * WALKS] // 8 + i * wide, t[3 * FIXED] // 8 + i * wide, of), S, c, unit, W)
-    if t[3 * OUTPUT_LAGS] > 0 or t[3 * PLACES + 1] > ANCHORS:
+    n, wide, sizes = len(S), t[3 * AT.walks + 2], t[3 * AT.relative_walks + 2]
+    for i in range(t[3 * AT.walks + 1]):
+        of = t[3 * AT.relative_walks] // 8 + i * sizes if sizes > 0 else -1
+        walk(m, (t[3 * AT.walks] // 8 + i * wide, t[3 * AT.fixed_walks] // 8 + i * wide, of), S, c, unit, W)
+    if t[3 * AT.output_lags] > 0 or t[3 * AT.places + 1] > ANCHORS:
         seen_inverse(S, R, H, W)
     pulled(m, t, S, W)
-    for k in range(t[3 * OUTPUT_LAGS]):
+    for k in range(t[3 * AT.output_lags]):
         for i in range(n):
-            m[t[3 * LAG_ROWS] // 8 + k * (n + 1) + i] = W[k, i]
+            m[t[3 * AT.lag_rows] // 8 + k * (n + 1) + i] = W[k, i]
 
 
 @partial(machine, short=True)
@@ -275,19 +272,18 @@ def machine_framed(fields: int, known: int, unit: float, size: int, counters: in
     ``known`` is negative; otherwise a sample with which a coordinate enters, of which nothing was known if it is 0. The
     memory has ``size`` numbers.
     """
-    at = wholes(fields, 1, ADDRESSES)[0]
-    t, m = wholes(at[AT_TABLE], 3 * ROWS, L)[:, l], floats(at[AT_MEMORY], size, L)[:, l]
-    W = cubes(at[AT_W], n, n, L)[:, :, l]
+    at = wholes(fields, 1, len(ADDRESS))[0]
+    t, m = wholes(at[ADDRESS.table], 3 * ROWS, L)[:, l], floats(at[ADDRESS.memory], size, L)[:, l]
+    W = cubes(at[ADDRESS.W], n, n, L)[:, :, l]
     if known < 0:
-        S, R, H = (
-            cubes(at[AT_S], n, n, L)[:, :, l], cubes(at[AT_R], n, n, L)[:, :, l], cubes(at[AT_H], n, n, L)[:, :, l]
-        )  # fmt: skip
-        write_changes(m, t, S, R, H, W, floats(at[AT_C], n, L)[:, l], unit)
+        S, R = cubes(at[ADDRESS.S], n, n, L)[:, :, l], cubes(at[ADDRESS.R], n, n, L)[:, :, l]
+        H = cubes(at[ADDRESS.H], n, n, L)[:, :, l]
+        write_changes(m, t, S, R, H, W, floats(at[ADDRESS.c], n, L)[:, l], unit)
         return
-    many, now = wholes(at[AT_COUNTERS], counters, L)[:, l], floats(at[AT_NOW], NOW, L)[:, l]
-    x, work = floats(at[AT_X], n, L)[:, l], cubes(at[AT_WORK], WORK, n, L)[:, :, l]
+    many, now = wholes(at[ADDRESS.counters], counters, L)[:, l], floats(at[ADDRESS.now], NOW, L)[:, l]
+    x, work = floats(at[ADDRESS.x], n, L)[:, l], cubes(at[ADDRESS.work], WORK, n, L)[:, :, l]
     z, P, C = (
-        floats(at[AT_D], n, L)[:, l], cubes(at[AT_P], n, n, L)[:, :, l], floats(at[AT_W], n * n, L)[:, l]
+        floats(at[ADDRESS.d], n, L)[:, l], cubes(at[ADDRESS.P], n, n, L)[:, :, l], floats(at[ADDRESS.W], n * n, L)[:, l]
     )  # fmt: skip
     left = enter_mixture(z, P, C, x, now, now[NOISE] * unit, known, work)
     enter_gap(m, t, x, now, left, work)
@@ -316,7 +312,7 @@ def spans_lags(s: State, l: int) -> bool:
     """Whether what no sample has determined has no part in the output lags that leaves have of their own."""
     n, spans = s.theta.shape[0], True
     for j in range(n):
-        for i in range(s.table[OUTPUT_LAGS, 0, l] if s.S[j, j, l] == 0.0 else 0):
+        for i in range(s.table[AT.output_lags, 0, l] if s.S[j, j, l] == 0.0 else 0):
             spans = spans and s.R[i, j, l] == 0.0
     return spans
 
@@ -349,7 +345,7 @@ def outgrown(s: State, l: int) -> int:
     """The coordinate whose earlier information a covariance would lose next to that of this sample, or -1: the first
     about which it has `OUTGROWN` times the information of all earlier ones.
     """
-    framed, others = s.framed[l] > 0, s.sample[UNIT, l] * s.r[l] * s.noise[l]
+    framed, others = s.framed[l] > 0, s.sample[SAMPLE.unit, l] * s.r[l] * s.noise[l]
     for j in range(s.theta.shape[0]):
         x, var = (s.x[j, l], s.Pz[j, j, l]) if framed else (s.phi[j, l], s.P[j, j, l])
         own = x * x * var
@@ -367,7 +363,7 @@ def enter_bank(s: State, column: int, l: int) -> None:
     sign = new_row(s, s.phi, column, l)
     noise = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column
-    call_framed(s, known, s.sample[UNIT, l], l)
+    call_framed(s, known, s.sample[SAMPLE.unit, l], l)
     for i in range(column, n):
         s.x[i, l] = 0.0
 

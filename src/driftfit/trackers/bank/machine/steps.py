@@ -14,31 +14,16 @@ from driftfit.trackers.bank.layout import (
     BASES as BASE_NAMES,
 )  # fmt: skip
 from driftfit.trackers.bank.layout import (
+    COUNTER,
     FORECAST,
-    FREEDOM,
-    IN_DT,
-    IN_NOISE,
-    IN_OBSERVED,
-    IN_OK,
-    IN_TIME,
-    IN_Y,
     LEARN,
-    LEAST,
     MEMORY_AT,
-    MOST,
-    PHASE,
     READY,
     REPORT_AT,
     ROW,
     ROWS,
-    S2,
-    SETTLED,
-    SHIFT,
-    SQUARES,
-    TIMES,
+    SAMPLE,
     WAITING,
-    Y_HAT,
-    R,
     memory_at,
     report_at,
 )
@@ -46,9 +31,8 @@ from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
 from driftfit.trackers.bank.leaves.own_sensor import OWN_AT, entry_of, no_own_sensor
 from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.framed import (
+    AT,
     FRAMED,
-    LAG_ROWS,
-    OUTPUT_LAGS,
     begin_framed,
     call_framed,
     enter_bank,
@@ -154,7 +138,7 @@ def run(s: State, l: int) -> None:
         copies = moved(fields[k], sizes[k], L, l, copies, True)
     for k in range(BASES):  # addresses are not part of the state
         s.table[MEMORY_AT + k, 0, l] = 0
-    if s.counters[PHASE, l] == LEARN:
+    if s.counters[COUNTER.phase, l] == LEARN:
         s.table[OWN_AT, 0, l] = 0
 
 
@@ -169,13 +153,17 @@ def repeated(s: State, l: int) -> float:
 def hand_over(s: State, l: int) -> None:
     """Write the numbers of this sample for the compiled routine, and the output lags of the record."""
     n, memory = s.theta.shape[0], floats(memory_at(s), s.table[MEMORY_AT, 2, l], s.theta.shape[1])
-    for k in range(s.table[OUTPUT_LAGS, 0, l]):
-        memory[s.table[LAG_ROWS, 0, l] // 8 + k * (n + 1) + n, l] = s.phi[k, l]
-    s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l] * repeated(s, l), s.dt[l]
-    s.sample[IN_TIME, l], s.sample[SHIFT, l] = s.dt[l] * s.drift[l], s.shift[l]
-    s.sample[IN_OK, l], s.sample[IN_OBSERVED, l] = s.ok[l], s.observed[l]
-    s.sample[R, l], s.sample[LEAST, l] = s.r[l], max(LEAST_SHARE * s.power[l] + 1e-300, least_noise(s, l))
-    s.sample[MOST, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
+    for k in range(s.table[AT.output_lags, 0, l]):
+        memory[s.table[AT.lag_rows, 0, l] // 8 + k * (n + 1) + n, l] = s.phi[k, l]
+    s.sample[SAMPLE.y, l], s.sample[SAMPLE.noise, l], s.sample[SAMPLE.dt, l] = (
+        s.y[l],
+        s.noise[l] * repeated(s, l),
+        s.dt[l],
+    )
+    s.sample[SAMPLE.time, l], s.sample[SAMPLE.shift, l] = s.dt[l] * s.drift[l], s.shift[l]
+    s.sample[SAMPLE.ok, l], s.sample[SAMPLE.observed, l] = s.ok[l], s.observed[l]
+    s.sample[SAMPLE.r, l], s.sample[SAMPLE.least, l] = s.r[l], max(LEAST_SHARE * s.power[l] + 1e-300, least_noise(s, l))
+    s.sample[SAMPLE.most, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
 
 
 @kernel
@@ -183,20 +171,20 @@ def alone(s: State, l: int, counts: bool) -> None:
     """After a sample of the single filter: update scales, noise and lags, and begin the bank as soon as possible."""
     learn_scales(s, l)
     residuals = s.count[l]
-    s.sample[FREEDOM, l] = residuals if s.unknown[l] > 0 else np.inf
+    s.sample[SAMPLE.freedom, l] = residuals if s.unknown[l] > 0 else np.inf
     if counts:
         learn_resolved_scale(s, l)
         s.scale[l] *= wider(s.count[l])
     s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
     hand_over(s, l)
-    s.sample[Y_HAT, l], s.sample[S2, l] = s.y_hat[l], s.s[l] / wider(residuals)
-    s.sample[SQUARES, l], s.sample[TIMES, l] = s.squares[l], s.count[l]
+    s.sample[SAMPLE.y_hat, l], s.sample[SAMPLE.s, l] = s.y_hat[l], s.s[l] / wider(residuals)
+    s.sample[SAMPLE.squares, l], s.sample[SAMPLE.times, l] = s.squares[l], s.count[l]
     ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
     if ready and s.root[l] > 0:
         ready = s.can_frame[l] > 0 and s.within[l] >= RESIDUALS and spans_lags(s, l)
         if ready:
             begin_framed(s, l)
-    s.counters[SETTLED, l] = READY if ready else WAITING
+    s.counters[COUNTER.settled, l] = READY if ready else WAITING
     run(s, l)
     if ready:
         s.scale[l] = 1.0
@@ -218,11 +206,11 @@ def forecast_tree(s: State, l: int) -> None:
     hand_over(s, l)
     s.column[l] = column
     if column >= 0:
-        s.sample[IN_OK, l] = 0.0
-    s.counters[PHASE, l] = FORECAST
+        s.sample[SAMPLE.ok, l] = 0.0
+    s.counters[COUNTER.phase, l] = FORECAST
     run(s, l)
-    s.counters[PHASE, l] = LEARN
-    s.y_hat[l], s.s[l] = s.sample[Y_HAT, l], s.sample[S2, l]
+    s.counters[COUNTER.phase, l] = LEARN
+    s.y_hat[l], s.s[l] = s.sample[SAMPLE.y_hat, l], s.sample[SAMPLE.s, l]
     if outside:
         s.y_hat[l], s.s[l] = y_hat, np.inf
     s.e[l] = s.y[l] - s.y_hat[l]
@@ -232,7 +220,7 @@ def forecast_tree(s: State, l: int) -> None:
 def correct_tree(s: State, l: int) -> None:
     """The tree takes the sample, unless a gate refused it; one that enters a coordinate changes no weight."""
     column, outside = s.column[l], s.s[l] == np.inf
-    s.sample[IN_OK, l], s.sample[IN_OBSERVED, l] = s.ok[l] if column < 0 else 0.0, s.observed[l]
+    s.sample[SAMPLE.ok, l], s.sample[SAMPLE.observed, l] = s.ok[l] if column < 0 else 0.0, s.observed[l]
     run(s, l)
     if column >= 0 and s.ok[l] > 0.0:
         enter_bank(s, column, l)
@@ -247,7 +235,7 @@ def correct_tree(s: State, l: int) -> None:
 @kernel
 def forecast(s: State, l: int) -> None:
     resolve(s, l)
-    if s.counters[SETTLED, l] > 0:
+    if s.counters[COUNTER.settled, l] > 0:
         forecast_tree(s, l)
     else:
         only_drift(s, l)
@@ -257,7 +245,7 @@ def forecast(s: State, l: int) -> None:
 
 @kernel
 def correct(s: State, l: int) -> None:
-    if s.counters[SETTLED, l] > 0:
+    if s.counters[COUNTER.settled, l] > 0:
         correct_tree(s, l)
     else:
         s.s[l] = s.h[l] + s.r[l] * s.noise[l]
@@ -277,7 +265,7 @@ def read(s: State, l: int) -> None:
 @kernel
 def forecast_first(s: State, l: int) -> None:
     resolve(s, l)
-    if s.counters[SETTLED, l] > 0:
+    if s.counters[COUNTER.settled, l] > 0:
         forecast_tree(s, l)
     else:
         only_drifted(s, l)
@@ -287,7 +275,7 @@ def forecast_first(s: State, l: int) -> None:
 
 @kernel
 def correct_first(s: State, l: int) -> None:
-    if s.counters[SETTLED, l] > 0:
+    if s.counters[COUNTER.settled, l] > 0:
         correct_tree(s, l)
     else:
         s.s[l] = s.h[l] + s.r[l] * s.noise[l]
@@ -297,7 +285,7 @@ def correct_first(s: State, l: int) -> None:
 
 @kernel
 def read_first(s: State, l: int) -> None:
-    if s.counters[SETTLED, l] > 0:
+    if s.counters[COUNTER.settled, l] > 0:
         read(s, l)
     else:
         spanned_variance(s, l)

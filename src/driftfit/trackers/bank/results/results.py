@@ -16,7 +16,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
 from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.layout import IMPOSSIBLE
+from driftfit.trackers.bank.layout import COUNTER
 from driftfit.trackers.bank.reduction import Decide
 from driftfit.trackers.bank.results.events import LEVEL, Event, Probabilities, all_of, changes_of
 from driftfit.trackers.bank.results.mixture import Mixture, mixture_of, undecided
@@ -155,7 +155,7 @@ class Hypotheses:
     @property
     def impossible(self) -> int:
         """Number of samples that no leaf allowed; they were not used."""
-        return int(self.run.state["counters"][IMPOSSIBLE])
+        return int(self.run.state["counters"][COUNTER.impossible])
 
     @cached_property
     def decisions(self) -> list[Decision]:
