@@ -114,13 +114,16 @@ def _rank_one(M: Array) -> tuple[Array, Array, Array]:
 
 def _joint(M: Array, d0: Array) -> tuple[Array, Array]:
     """a and d by alternating least squares on [[1, d], [a, AD]]; M = [a, AD], d0 and d have their leading 1."""
-    a, d = M[:, :, 0], d0
+    a, d, going = M[:, :, 0].copy(), d0.copy(), np.arange(len(M))
     for _ in range(ALTERNATIONS):
-        before = a, d
-        a = _times(M, d) / np.sum(d * d, axis=1, keepdims=True)
-        d = (d0 + np.einsum("tik,ti->tk", M, a)) / (1.0 + np.sum(a * a, axis=1, keepdims=True))
-        d[:, 0] = 1.0
-        if not max(np.abs(new - old).max(initial=0.0) for new, old in zip((a, d), before, strict=True)) >= STILL:
+        A, was = M[going], d[going]
+        one = _times(A, was) / np.sum(was * was, axis=1, keepdims=True)
+        other = (d0[going] + _times(A.transpose(0, 2, 1), one)) / (1.0 + np.sum(one * one, axis=1, keepdims=True))
+        other[:, 0] = 1.0
+        moved = np.maximum(np.abs(one - a[going]).max(axis=1), np.abs(other - was).max(axis=1))
+        a[going], d[going] = one, other
+        going = going[moved >= STILL]
+        if not going.size:
             break
     return a, d
 
