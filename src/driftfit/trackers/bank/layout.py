@@ -82,11 +82,9 @@ the covariances of leaves: 1, or the noise variance where it is unknown.
 """
 NEVER = 1e9
 """The number of levels since the last change, for a leaf without a change."""
-HEAD = 4
-"""Entries of the report before its arrays: evidence, probability of a change in the window, mass kept, leaves."""
-SAMPLE_HEAD = 3
-"""Entries of a remembered sample before its probabilities: that of a change in the window, whether it was used, and how
-many nominal intervals had passed.
+HEAD, SAMPLE_HEAD = 4, 3
+"""Entries before the arrays of a report: evidence, probability of a change in the window, mass kept, leaves; and before
+the probabilities of a remembered sample: that of such a change, whether it was used, how many intervals had passed.
 """
 MOST_REPORTED = 8
 """Largest number of levels in a report; if more are remembered, it holds the newest and the oldest."""
@@ -98,10 +96,8 @@ MATRICES = (
     "new_events", "gap", "path", "chain", "lag_prob", "scratch",
 )  # fmt: skip
 VECTORS = ("drift", "initial", "row", "given", "given_chain", "reduction", "bases", "stamps")
-WHOLE = ("parent", "event", "start", "order", "group", "slots")
-"""Arrays of whole numbers."""
-REPORTED = ("newest", "decided")
-"""Arrays that are part of the report."""
+WHOLE, REPORTED = ("parent", "event", "start", "order", "group", "slots"), ("newest", "decided")
+"""Arrays of whole numbers, and those that are part of the report."""
 WINDOWS = (
     "z", "from_C", "C", "m", "g", "from_g", "expected", "scores", "spare", "spare_lags", "lag_coefficients", "answers",
 )  # fmt: skip

@@ -62,7 +62,7 @@ def arrays_of(bank: Any, n: int, na: int, unit: float, theta0: Array) -> dict[st
         "bases": shape.bases, "stamps": np.zeros(shape.held),
         "components": np.zeros((4, K * H if waits else 1)), "root": np.zeros((rows, WIDTH)),
         "samples": np.zeros((int(shape.knobs[selection.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
-        "path": path_of(H, Hd, _whole_vectors(tri) if bank.chained else 0),
+        "path": np.zeros((3 * H + Hd + 1 if bank.chained else 0, max(H, _whole_vectors(tri)) + 1)),
         "spare_square": np.zeros((square, children)), "lag_rows": np.eye(na, n + 1),
         "ring": np.zeros((RING, SAMPLE_HEAD + H)), "new_events": news_of(H, Hm, remembered),
         "lag_prob": np.zeros((W, H)), "newest": np.zeros((min(W, MOST_REPORTED), H)),
@@ -80,14 +80,15 @@ def _of_changes(bank: Any, n: int, unit: float, theta0: Array) -> dict[str, Arra
     if forgets:
         places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in changes])
     transition, initial = bank.event_probabilities
-    maps = np.array([change.mapping() for change in changes])
+    maps, gap = np.array([change.mapping() for change in changes]), np.zeros((Hd, wide + WIDTH))
+    gap[0, wide + SINCE] = 1.0
     walks = np.array([np.pad(Q[lower] * unit, (0, wide - tri)) for Q, _ in steps])
     return {
         "walks": walks, "fixed_walks": walks,
         "relative_walks": np.array([sizes if scaled else sizes[:0] for _, sizes in steps]), "drift": np.ones(Hd),
         "Q": np.zeros((Hd + 1, wide)), "maps": maps, "maps_nominal": maps, "places": places, "fixed_places": places,
         "transition": transition, "chain": transition.copy(), "initial": initial,
-        "given_chain": np.full(Hd * Hd, np.nan), "gap": _closed(Hd, wide),
+        "given_chain": np.full(Hd * Hd, np.nan), "gap": gap,
     }  # fmt: skip
 
 
@@ -134,18 +135,6 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
     for name, value in {**numbers, "walks_only": walks, "plain": numbers["plain"] and walks and noises}.items():
         table[ROW[name], 0] = value
     return {"memory": memory, "report": report, "table": table, "flat": np.zeros(1)}
-
-
-def path_of(H: int, Hd: int, wide: int) -> Array:
-    """The table of `driftfit.trackers.bank.machine.markov_gap`; empty if there is none."""
-    return np.zeros((3 * H + Hd + 1 if wide else 0, max(H, wide) + 1))
-
-
-def _closed(Hd: int, wide: int) -> Array:
-    """The table of a gap (`driftfit.trackers.bank.machine.gap`) while there is no gap."""
-    table = np.zeros((Hd, wide + WIDTH))
-    table[0, wide + SINCE] = 1.0
-    return table
 
 
 def _room(parents: int, Hd: int, Hm: int) -> tuple[int, int]:

@@ -1,20 +1,13 @@
-"""Sensors with a likelihood that the user writes: `driftfit.Sensor.own`.
+"""Sensors with a likelihood that the user writes: `driftfit.trackers.bank.sensor.Sensor.own`.
 
-A plain function of numbers evaluates a reading y for one leaf,
-
-    log p(y),  a,  clean = likelihood(y, y_hat, h, r, last)
-
-where y_hat = z'm and h = z'C z are the leaf's forecast without noise, r is the noise variance of the nominal sensor (of
-this leaf, if it is unknown) and last is the last output observed. The leaf is updated by a measurement with noise
-variance a,
+A leaf, whose forecast without noise has mean y_hat = z'm and variance h = z'C z, is updated by a measurement with the
+noise variance a that the function returns,
 
     K = C z / (h + a),     m+ = m + K (y - y_hat),     C+ = C - K (C z)'
 
-so C remains a covariance whatever the function returns; with a = inf nothing is learned about theta (the variance is
-then `LARGEST` times h + r). ``clean`` goes into the leaf's output lags, if the sensor ``cleans``.
-
-The function is compiled by itself, in a second or two, and the compiled routine of a bank calls it by its address
-(`call`), which a step has looked up by its symbol; the routine is not recompiled.
+so C remains a covariance whatever the function returns; a = inf is `LARGEST` times h + r. The function is compiled by
+itself, in a second or two, and the compiled routine of a bank calls it by its address (`call`), which a step has looked
+up by its symbol; the routine is not recompiled.
 """
 
 from __future__ import annotations
