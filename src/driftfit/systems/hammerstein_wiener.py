@@ -24,7 +24,6 @@ from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial
 from driftfit.models.hammerstein_wiener.blocks import radius_of
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.thresholds import Thresholds
 from driftfit.systems.drift import Jump, Law, Ramp, RandomWalk, SineIncrement, SineOffset, paths
 from driftfit.systems.inversion import LIMIT, NotMonotoneError, invert
 
@@ -142,8 +141,7 @@ def simulate(
 
 def input_block(basis: Basis, u: Array, c: Array) -> Array:
     """v (T,) for coefficients c (T, n)."""
-    f = basis.split(u, u >= c[:, 1], u <= c[:, 2]) if isinstance(basis, Thresholds) else basis.value(u)
-    return np.asarray(np.sum(f * c, axis=1))
+    return np.asarray(np.sum(basis.for_coefficients(u, c) * c, axis=1))
 
 
 def _linear(model: HammersteinWiener, a: Array, b: Array, v: Array, error: Array) -> Array:

@@ -159,6 +159,10 @@ class Basis(Settings, ABC):
         """Their derivatives at x (...), as (..., n)."""
         return self._at(x)[1]
 
+    def for_coefficients(self, x: Any, c: Array) -> Array:
+        """The functions at x (...) under coefficients c (..., n), on which those of some bases depend, (..., n)."""
+        return self.value(x)
+
     def _at(self, x: Any) -> tuple[Array, Array]:
         points = np.asarray(x, dtype=float)
         out, slopes = values_and_slopes(self.evaluate, points.ravel(), self.parameters.copy(), self.n)

@@ -27,7 +27,6 @@ from driftfit.engine.settings import one_of
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.separation import METHODS, Groups, split
-from driftfit.models.hammerstein_wiener.thresholds import Thresholds
 
 INPUTS, OUTPUTS = ("unit", "c1", "b1"), ("d1", "unit", "slope")
 
@@ -107,11 +106,8 @@ class Blocks:
 
     def input_curve(self, u: Any, t: int = -1, i: int = 0) -> Array:
         """v of input i at inputs u (...), with the coefficients of sample t."""
-        basis, c = self.model.bases[i], self.of_input(i)[1][t]
-        if isinstance(basis, Thresholds):
-            x = np.asarray(u, dtype=float)
-            return np.asarray(basis.split(x, x >= c[1] / c[0], x <= c[2] / c[0]) @ c)
-        return np.asarray(basis.value(u) @ c)
+        c = self.of_input(i)[1][t]
+        return np.asarray(self.model.bases[i].for_coefficients(u, c) @ c)
 
     def output_curve(self, y: Any, t: int = -1) -> Array:
         """w = F(y) at outputs y (...), with the coefficients of sample t: the inverse of the output block."""
