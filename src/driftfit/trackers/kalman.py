@@ -98,7 +98,7 @@ class Kalman(Tracker):
         Mean of theta before the first sample.
     form : "covariance" or "sqrt"
         "sqrt" for collinear or badly scaled regressors: variances are positive by construction.
-    laws : mapping from the name of a parameter to `Law`, or None
+    laws : mapping from the name of a parameter to a `Law` or several, or None
         How single parameters move, instead of a random walk. With laws q is a number or (n,), form is "covariance";
         theta0 and p0 are those of the levels, and slopes and seasons start from no knowledge.
 
@@ -158,8 +158,8 @@ class Kalman(Tracker):
         names, n = model.names, model.n
         table = table_of("Kalman", self.laws, names, vector("Kalman", "q", self.q, n))
         p0 = None if self.p0 is None else matrix("Kalman", "p0", self.p0, n)
-        laws = {names.index(name): law for name, law in self.laws}
-        start = laws_filter.state(table, vector("Kalman", "theta0", self.theta0, n), p0, laws)
+        means = {names.index(name): law.mean for name, law in self.laws if law.mean is not None}
+        start = laws_filter.state(table, vector("Kalman", "theta0", self.theta0, n), p0, means)
         return {**start, "r": self.r}
 
     def state(self, n: int) -> Mapping[str, Any]:
