@@ -45,7 +45,7 @@ def test_filter_density_and_smoother_are_those_of_a_slow_twin(seed, volatility, 
     y, u, _ = record(seed)
     y[list(gaps)] = np.nan
     rng = np.random.default_rng(seed)
-    dt, weights = (rng.uniform(0.2, 3.0, size=(2, len(y))) if uneven else np.ones((2, len(y))))
+    dt, weights = rng.uniform(0.2, 3.0, size=(2, len(y))) if uneven else np.ones((2, len(y)))
     dt[0] = 1.0
     tracker = Kalman(q=q, r=0.7, p0=4.0, volatility=volatility)
     run = track(Regression(N), tracker, y, u, time=np.cumsum(dt), dt=1.0, weights=weights)
@@ -59,9 +59,7 @@ def test_filter_density_and_smoother_are_those_of_a_slow_twin(seed, volatility, 
     np.testing.assert_allclose(run.smooth().theta, given_r.smooth().theta, rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(run.smooth().std, given_r.smooth().std, rtol=1e-7)
     half = run.innovation_std / np.sqrt(v)
-    np.testing.assert_allclose(
-        half[nu > 4.0], (stats.t.ppf(0.975, nu) / stats.norm.ppf(0.975))[nu > 4.0], rtol=0.005
-    )
+    np.testing.assert_allclose(half[nu > 4.0], (stats.t.ppf(0.975, nu) / stats.norm.ppf(0.975))[nu > 4.0], rtol=0.005)
 
 
 def test_a_variance_that_hardly_moves_is_constant_and_every_form_is_one_filter():

@@ -11,8 +11,8 @@ with w the weight of the sample and d known factors of the drift, 1 unless given
 Use it if the size of the drift is known or can be tuned; `RLS` needs only a memory length, `AugmentedFLS` has no
 covariance. Without excitation P grows by exactly q per sample: it is finite, and describes the growing uncertainty.
 
-``volatility`` lets the noise variance move, as a random walk of log r (`driftfit.trackers.parts.volatility`): for returns,
-inflation and whatever else is restless for a while. Weights of samples follow it, and so do the bands.
+``volatility`` lets the noise variance move, as a random walk of log r (`driftfit.trackers.parts.volatility`): for
+returns, inflation and whatever else is restless for a while. The weights of samples and the bands follow it.
 
 ``laws`` say more of single parameters: that they return to a mean, follow a trend or a season, or drift at their own
 rate (`driftfit.trackers.laws.law`); all others remain random walks.
@@ -112,8 +112,8 @@ class Kalman(Tracker):
     Raises
     ------
     ValueError
-        If q or p0 is not a covariance (with form="sqrt" p0 must be positive definite), r or volatility is not positive, or
-        laws do not fit.
+        If q or p0 is not a covariance (with form="sqrt" p0 must be positive definite), r or volatility is not
+            positive, or laws do not fit.
     """
 
     q: Any = None

@@ -9,8 +9,8 @@
     smooth    1 / r_t|T = 1 / r_t + (nu_t+1|t / nu_t) (1 / r_t+1|T - 1 / r_t)
 
 with h the variance of the prediction, w the weight of the sample and k the share of the noise in v: a sample whose
-prediction is uncertain says little of r. theta is corrected, and smoothed, as if r were known. Before the first sample r is the
-setting, and nu infinite. t / z is the ratio of Student's quantile to the normal one
+prediction is uncertain says little of r. theta is corrected, and smoothed, as if r were known. Before the first sample
+r is the setting, and nu infinite. t / z is the ratio of Student's quantile to the normal one
 (`driftfit.trackers.parts.few_residuals`): y_hat +- 1.96 sqrt(s) holds 95 %.
 
 For h = 0 the correction is Bayes' rule. In the long run r has a memory of sqrt(2 / volatility) samples, 14 for 0.01,
