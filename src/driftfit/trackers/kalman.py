@@ -55,7 +55,7 @@ from driftfit.trackers.parts.diffuse import (
 )
 from driftfit.trackers.parts.information import partly_known, triangular_root
 from driftfit.trackers.parts.varying_drift import read_drift
-from driftfit.trackers.parts.volatility import FIELDS, OUTPUTS, known_noise, log_density, smoothed_noise, volatile
+from driftfit.trackers.parts.volatility import FIELDS, known_noise, log_density, smoothed_noise, volatile
 
 
 @kernel
@@ -146,6 +146,8 @@ class Kalman(Tracker):
 
         if self.volatility is not None:
             self._set("volatility", numbers("Kalman", "volatility", self.volatility, ndim=0, low=0.0, strict=True))
+            for name, value in FIELDS.items():
+                self._set(name, value)
         self._set("laws", laws_of("Kalman", self.laws))
         if self.laws is not None and (self.form == "sqrt" or np.ndim(self.q) == 2):
             raise ValueError('Kalman: with laws every q is a number or (n,), and form must be "covariance".')
@@ -208,21 +210,8 @@ class Kalman(Tracker):
         steps = laws_filter.STEPS if self.laws is not None else square_root.STEPS if self.form == "sqrt" else together
         return steps if self.volatility is None else volatile(steps)
 
-    @property
-    def outputs(self) -> tuple[str, ...]:  # type: ignore[override]
-        """What the densities are computed from, if they are not Gaussian."""
-        return () if self.volatility is None else OUTPUTS
-
-    @property
-    def density(self) -> str:  # type: ignore[override]
-        return "" if self.volatility is None else OUTPUTS[0]
-
     def log_density(self, out: Array) -> Array | None:
         return None if self.volatility is None else log_density(out)
-
-    @property
-    def smoother_fields(self) -> tuple[str, ...]:  # type: ignore[override]
-        return () if self.volatility is None else FIELDS
 
     def estimated_variances(
         self, model: Model, fields: Mapping[str, Array], phi: Array, e: Array, time: Array

@@ -136,13 +136,11 @@ def pool(fleet: Mapping[Hashable, Track], noise: str = "given") -> Pooled:
     theta = mean + np.einsum("iab,ib->ia", K, t - mean)
     left = np.eye(n) - K
     var = np.einsum("iaa->ia", cov - K @ cov + left @ V @ left.transpose(0, 2, 1))
-    typical = float(np.exp(np.mean(np.log(c))))
-    started = replace(
-        tracker, q=plain(typical * np.asarray(tracker.q)), r=typical * tracker.r, theta0=plain(mean),
-        p0=plain(0.5 * (cov + V + (cov + V).T)),
-    )  # fmt: skip
+    typical = np.exp(np.mean(np.log(c)))
+    q, r = (plain(typical * np.asarray(one)) for one in (tracker.q, tracker.r))
+    started = replace(tracker, q=q, r=r, theta0=plain(mean), p0=plain(0.5 * (cov + V + (cov + V).T)))
     std = np.sqrt(np.maximum(var, 0.0))
-    return Pooled(first.names, tuple(found), mean, cov, theta, std, t, c * tracker.r, started, loglik)
+    return Pooled(first.names, tuple(found), mean, cov, theta, std, t, c * np.asarray(tracker.r), started, loglik)
 
 
 def maximised(t: Array, P: Array, nu: Array, rss: Array) -> tuple[Array, Array, Array, Array, float]:

@@ -34,10 +34,10 @@ from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.few_residuals import wider
 from driftfit.trackers.student import log_student
 
-OUTPUTS = ("degrees", "unwidened")
-"""nu and v of every sample before it."""
-FIELDS = ("r", "spread", "degrees")
-"""What is kept of every sample for the smoother."""
+FIELDS = {
+    "outputs": ("degrees", "unwidened"), "density": "degrees", "smoother_fields": ("r", "spread", "degrees"),
+}  # fmt: skip
+"""What a tracker with these steps stores of every sample: nu and v before it, and r and 1 / nu after it."""
 
 
 def known_noise(volatility: float) -> Mapping[str, Any]:
