@@ -314,6 +314,37 @@ def test_a_prior_of_a_fleet_is_the_maximum_and_each_unit_its_posterior():
     assert pooled.spread == pytest.approx([0.2, 0.1], abs=0.06)
 
 
+def test_a_noise_variance_for_each_unit_is_the_restricted_maximum():
+    """Against the likelihood of all records as one mixed model, with constant parameters."""
+    rng = np.random.default_rng(3)
+    units, y, u, _ = fleet_of(12, 8, 3)
+    true = 0.25 * np.exp(rng.normal(size=12))
+    y = np.einsum("itk,ik->it", u, units) + np.sqrt(true)[:, None] * rng.normal(size=y.shape)
+    y[4, 2] = np.nan
+    pooled = pool(track(Regression(2), Kalman(q=0.0, r=0.25), y, u, by="row"), noise="each")
+
+    def restricted(x):
+        root, noise = np.array([[x[0], 0.0], [x[1], x[2]]]), np.exp(x[3:])
+        total, A, b = 0.0, np.zeros((2, 2)), np.zeros(2)
+        for i, (one, X) in enumerate(zip(y, u, strict=True)):
+            X, one = X[np.isfinite(one)], one[np.isfinite(one)]
+            S = X @ root @ root.T @ X.T + noise[i] * np.eye(len(one))
+            W = np.linalg.inv(S)
+            A, b, total = A + X.T @ W @ X, b + X.T @ W @ one, total - np.linalg.slogdet(S)[1] - one @ W @ one
+        return -0.5 * (total + b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1])
+
+    best = np.append(np.linalg.cholesky(pooled.cov)[np.tril_indices(2)], np.log(pooled.noise))
+    for i in range(len(best)):
+        away = np.zeros(len(best))
+        away[i] = 1e-4
+        slope = (restricted(best + away) - restricted(best - away)) / 2e-4
+        assert abs(slope) < 1e-3, i
+    assert np.corrcoef(np.log(pooled.noise), np.log(true))[0, 1] > 0.8
+    assert pooled.tracker.r == pytest.approx(np.exp(np.mean(np.log(pooled.noise))))
+    with pytest.raises(ValueError, match="noise"):
+        pool({}, noise="own")
+
+
 def test_pooling_with_drift_in_other_units_and_what_is_refused():
     _, y, u, fleet = fleet_of(30, 40, 1, Kalman(q=1e-4, r=0.25))
     pooled = pool(fleet)

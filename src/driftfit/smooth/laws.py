@@ -21,6 +21,7 @@ from driftfit.run.result import Track
 from driftfit.smooth.parts.walk import Path
 from driftfit.smooth.problem import replay
 from driftfit.trackers.laws.law import OWNER, VISIBLE, transition
+from driftfit.trackers.parts.volatility import smoothed_noise
 
 SPANNED = 1e-10
 """Share of the largest eigenvalue of M, in the units of its diagonal, below which a direction of delta is free."""
@@ -34,6 +35,8 @@ def smooth(run: Track) -> tuple[Path, Array]:
     H = (law[OWNER] == np.arange(n)[:, None]) * law[VISIBLE]
     h, owner = rows["phi"] @ H, law[OWNER].astype(int)
     w = np.where(rows["ok"] > 0.0, 1.0 / rows["used_noise"], 0.0)
+    if "spread" in rows:
+        w *= r / smoothed_noise(rows)
     drift = np.broadcast_to(run.known.drift, T)
     roots = run.known.extra[:, owner] if run.known.extra.size else np.ones((T, len(owner)))
     moves = {dt: transition(law, dt) for dt in np.unique(rows["dt"])}

@@ -120,17 +120,22 @@ def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -
     own, tracker = prior is None, run.tracker
     drift_root = run.known.extra if own and run.known.extra.size else NONE
     if prior is None:
-        prior = free(run.model.n) if tracker.smoother_fields else tracker.random_walk(run.model)
+        prior = free(run.model.n) if tracker.adapts else tracker.random_walk(run.model)
     phi, signals, fields = collected(run)
+    estimated = own and bool(fields)
     weight, drift = signals[:, WEIGHT], signals[:, DRIFT]
     dt = drift.copy() if prior.slopes or fields else NONE
     first = int(np.argmax(drift > 0.0)) + 1
     drift *= run.known.drift
     basis = NONE
-    if own and fields:
+    if estimated:
         q, q_turned, B, r_of = tracker.estimated_variances(
             run.model, fields, phi[weight > 0.0], np.sqrt(weight) * fields["e"], drift
         )
+        if prior.r is not None:  # of the noise alone
+            weight *= prior.r / r_of
+            estimated = False
+    if estimated:
         phi, signals[:, Y] = tracker.regression(fields, phi, signals[:, Y])
         basis = B if turned and np.any(np.eye(len(B)) != B) else NONE
         # B and its inverse have entries of the same size
@@ -145,6 +150,6 @@ def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -
     r = 1.0 if prior.r is None else prior.r
     p0 = None if prior.p0 is None else prior.p0 / r
     walk = Walk(phi, signals, prior.q / r, prior.theta0, p0, prior.r, drift_root, trend, basis=basis)
-    if not (own and fields):
+    if not estimated:
         return walk
     return average_drift(walk.independent, time, moving)._replace(phi=phi, basis=basis)

@@ -184,7 +184,7 @@ def _weight(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
 
 
 def _drift(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
-    """q of Kalman; a missing r in closed form after a diffuse start, or as a further knob with a given prior."""
+    """q of Kalman; a missing r in closed form, or as a further knob with a given prior or Student's density."""
     names = tracker.names_for(task.model)
     power, variance = still(task, constant(task, tracker))
     if len(names) != len(power):  # the tracker's parameters are not the regression's
@@ -193,7 +193,7 @@ def _drift(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
     share = np.where(power > 0.0, 1.0 / np.where(power > 0.0, power, 1.0), 0.0)
     least, most = _drift_ends(task, tracker)
     low, high = _range(bounds, (-most, -least), share if tracker.r is None else share * tracker.r, group)
-    own_r = tracker.r is None and tracker.p0 is not None
+    own_r = tracker.r is None and (tracker.p0 is not None or bool(tracker.density))
     profiled = tracker.r is None and not own_r
     if own_r:
         low, high = np.append(low, -9.0), np.append(high, 3.0)
