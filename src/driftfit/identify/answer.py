@@ -26,12 +26,11 @@ from driftfit.identify.result import Answer
 from driftfit.identify.roles import NoAnswerError, Roles, roles
 from driftfit.identify.scores import FEWEST
 from driftfit.identify.structure import Structure, search
-from driftfit.identify.working_point import cause, clear, regressors
+from driftfit.identify.working_point import cause
+from driftfit.judge.evidence import Evidence, judged_rows
 from driftfit.judge.fleet_verdict import ManyVerdicts
-from driftfit.judge.segment import segment
-from driftfit.judge.verdict import Verdict
+from driftfit.judge.verdict import Verdict, judged
 from driftfit.models.arx import ARX
-from driftfit.models.regression import Regression
 from driftfit.results import Track
 from driftfit.show.report import check_path
 from driftfit.show.text import Printed
@@ -256,26 +255,25 @@ class _Task:
             check_record(found)
         y, U, place = found.spread(structure.na + 40)
         self.progress("time or working point")
-        phi = regressors(y, U, structure)
         why_not = cause(y, U, structure, found.inputs, found.output, self.first)
         self.progress("tracking")
         run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
         self.progress("judging")
-        verdict = run.verdict(self.level)
-        if verdict.drifts and clear(why_not.curve):
+        known = Evidence(run, level=self.level)
+        verdict = judged(known)
+        moves_besides = bool(verdict.drifts)
+        if moves_besides and why_not.products:
             self.progress("judging the curve")
-            Z = np.column_stack([phi, why_not.columns])
-            rest = segment(y, Z[:, 1:], Regression(Z.shape[1] - 1, intercept=True), false=self.level)
-            moves_besides = bool(rest.breaks or rest.better)
-            curved = clear(why_not.further) if moves_besides else not clear(why_not.besides)
-            why_not = replace(why_not, kind=("both" if moves_besides else "working point") if curved else "time")
-        theta, memory, own = effects(phi, y, structure, found.inputs)
-        errors = errors_of(run, place, y, U, structure, self.horizon)
+            Z = why_not.columns[place][known.rows.at] * np.reshape(known.rows.root, (-1, 1))
+            more = known.rows._replace(phi=np.hstack([known.rows.phi, Z]))
+            again = judged_rows(more.only(np.isfinite(Z).all(axis=1), range(more.phi.shape[1])), self.level)
+            moves_besides = again is None or again.rejected
+        theta, memory, own = effects(known)
         notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict)
-        kind, why = self._kind(found, run, verdict, why_not.kind)
+        kind, why = self._kind(found, run, verdict, why_not.kind(moves_besides))
         return Identification(
             kind, why, model, run, verdict, found, structure, why_not, own, moves(verdict, run, theta, memory.root),
-            memory, errors, notes, undecided, self.source,
+            memory, errors_of(known, self.horizon), notes, undecided, self.source,
         )  # fmt: skip
 
     def _kind(self, found: Roles, run: Track, verdict: Verdict, kind: str) -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from html import escape
 from pathlib import PurePath
@@ -10,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from driftfit.data.clock import Clock, duration_text
 from driftfit.identify.result import Answer, Move
-from driftfit.identify.roles import CALENDAR, Roles
+from driftfit.identify.roles import Roles
 from driftfit.identify.structure import Shape
 from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import p_equals
@@ -41,9 +43,6 @@ CAPTION = (
 )
 
 
-UNITS = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
-
-
 def number(value: float) -> str:
     """Three digits, without an exponent below a million."""
     return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
@@ -51,25 +50,18 @@ def number(value: float) -> str:
 
 def duration(answer: Answer, samples: int) -> str:
     """A number of samples, where the record has dates as a time."""
-    if not answer.roles.dated:
-        return f"{samples} sample{'' if samples == 1 else 's'}"
-    if answer.roles.dt in CALENDAR:
-        return f"{samples} {answer.roles.dt}{'' if samples == 1 else 's'}"
-    seconds = samples * answer.roles.step
-    size, unit = next((one for one in UNITS if seconds >= 2.0 * one[0]), UNITS[-1])
-    return f"{seconds / size:.3g} {unit}"
+    clock = Clock.of(answer.roles.dt) if isinstance(answer.roles.dt, str) else Clock("number")
+    if clock.duration is not None:
+        return re.sub(r"(?<=\d)(?=\D)", " ", duration_text(samples * clock.duration))
+    count = int(samples * clock.count)
+    return f"{count} {'sample' if clock.kind == 'number' else clock.kind}{'' if count == 1 else 's'}"
 
 
 def delay(answer: Answer, name: str) -> str:
     """The delay of an input, a range where several are as good."""
     low, high = answer.structure.delays[answer.roles.inputs.index(name)]
-    if high == 0:
-        return "at once"
-    return (
-        f"delay {duration(answer, high)}"
-        if low == high
-        else f"delay {duration(answer, low)} to {duration(answer, high)}"
-    )
+    first = f"{duration(answer, low)} to " if low < high else ""
+    return f"delay {first}{duration(answer, high)}" if high else "at once"
 
 
 def headline(answer: Answer) -> str:
@@ -155,8 +147,7 @@ def chosen(answer: Answer) -> list[str]:
 def columns(answer: Answer) -> list[str]:
     """The roles, with the options that change them."""
     roles = answer.roles
-    step = duration(answer, 1) if roles.dated else f"{roles.step:g}"
-    clock = f"{roles.clock}, every {step} (--time, --dt)" if roles.clock else "none, rows are even (--time)"
+    clock = f"{roles.clock}, every {interval(roles)} (--time, --dt)" if roles.clock else "none, rows are even (--time)"
     said = [f"Output {roles.output} (--y); inputs {', '.join(roles.inputs) or 'none'} (--u, --not-u); time {clock}."]
     left = ", ".join(f"{name} ({why})" for name, why in roles.why.items())
     return [*said, f"Not inputs: {left}."] if left else said
@@ -180,13 +171,13 @@ def short(model: ARX) -> str:
 
 def interval(roles: Roles) -> str:
     """The interval as the option --dt."""
-    return str(roles.dt) if roles.dated else f"{roles.step:g}"
+    return roles.dt if isinstance(roles.dt, str) else f"{roles.dt:g}"
 
 
 def unit(answer: Answer) -> str:
     """The unit of a service, as TOML."""
     names = ", ".join(f'"{name}"' for name in answer.model.input_names)
-    dt = f'dt = "{answer.roles.dt}"\n' if answer.roles.dated else ""
+    dt = f'dt = "{answer.roles.dt}"\n' if isinstance(answer.roles.dt, str) else ""
     return (f'[[unit]]\nname = "{PurePath(answer.source).stem}"\ny = "{answer.roles.output}"\nu = [{names}]\n{dt}'
             f'model = "{answer.model!r}"\ntracker = "AdaptiveKalman()"\nalarm = {{ every = "1 week" }}\n')  # fmt: skip
 
@@ -227,7 +218,7 @@ def as_json(answer: Answer) -> dict[str, Any]:
     roles, structure = answer.roles, answer.structure
     second = [(structure_text(answer, shape), *behind) for shape, *behind in structure.second]
     inputs = {roles.inputs[j]: {"nb": nb, "nk": nk, "delays": structure.delays[j]} for j, nb, nk in structure.shape[1]}
-    shown = ("output", "inputs", "clock", "by", "step", "why", "refused", "missing")
+    shown = ("output", "inputs", "clock", "by", "dt", "why", "refused", "missing")
     found: dict[str, Any] = finite({
         "schema": NAME, "answer": answer.kind, "headline": headline(answer), "why": answer.why,
         "model": repr(answer.model), "p": answer.verdict.p, "roles": {name: getattr(roles, name) for name in shown},
@@ -309,15 +300,13 @@ def _effects(answer: Answer) -> str:
 
 
 def _errors(answer: Answer) -> str:
-    rows = []
+    heads, rows = tuple(answer.errors[0].rms), []
     for steps, rms, samples in answer.errors:
-        better = (
-            (f'<span class="bad">{value:.4g}</span>' if value < rms["driftfit"] else f"{value:.4g}")
-            for value in rms.values()
-        )
-        rows.append((f"{steps} ahead", *better, str(samples)))
+        style = {name: ' class="bad"' if value < rms["driftfit"] else "" for name, value in rms.items()}
+        cells = (f"<span{style[name]}>{rms[name]:.4g}</span>" if name in rms else "" for name in heads)
+        rows.append((f"{steps} ahead", *cells, str(samples)))
     caption = "Root mean square errors of predictions made before the sample, tracked and constants mixed. Red: lower."
-    return table(caption, ("", *answer.errors[0].rms, "samples"), rows)
+    return table(caption, ("", *heads, "samples"), rows)
 
 
 def many(verdict: ManyVerdicts, worst: Mapping[Any, Answer]) -> str:

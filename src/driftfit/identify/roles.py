@@ -9,8 +9,7 @@
 | output | named, or the only column of numbers that is left |
 | inputs | the other columns of numbers |
 
-Fault codes and spikes are missing, in inputs as in y: a reading, single or repeated in all digits, between which and
-all others there is a gap of `FAR` times their range.
+Fault codes and spikes are missing, in inputs as in y (`driftfit.readings.screen.apart`).
 """
 
 from __future__ import annotations
@@ -23,16 +22,13 @@ import narwhals as nw
 import numpy as np
 import polars as pl
 
+from driftfit.data.clock import Clock, median_interval
 from driftfit.data.columns import FILE, Wanted, numbers_of, times_of_column
 from driftfit.data.files import paths_of, read_file
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
+from driftfit.readings.screen import apart
 
-FAR = 3.0
-CALENDAR = {"month": (28.0, 31.0), "quarter": (90.0, 92.0), "year": (365.0, 366.0)}
-"""Days of the steps of the calendar."""
-FEW = 50
-"""Values that a column of text may have to be a key."""
 SWITCHES = 0.02
 ALIKE = 1e-6
 """How far below 1 the correlation of two copies may be."""
@@ -46,7 +42,7 @@ class NoAnswerError(ValueError):
 class Roles:
     """The columns, and the record: y (T,), U (T, m), time (T,) or None, key of every row.
 
-    ``step``: nominal interval, in seconds for dates. ``why``: why a column is no input. ``refused``: readings taken as
+    ``dt``: nominal interval, as for `track`. ``why``: why a column is no input. ``refused``: readings taken as
     missing, by column. ``missing``: readings that were missing already.
     """
 
@@ -58,25 +54,12 @@ class Roles:
     U: Array
     time: Array | None
     key: tuple[Any, ...]
-    step: float = 1.0
+    dt: float | str | None = None
     why: Mapping[str, str] = field(default_factory=dict)
     refused: Mapping[str, int] = field(default_factory=dict)
     missing: int = 0
     units: Mapping[str, str] = field(default_factory=dict)
     zone: str | None = None
-
-    @property
-    def dated(self) -> bool:
-        return self.time is not None and self.time.dtype.kind == "M"
-
-    @property
-    def dt(self) -> float | str | None:
-        """dt= of `track`: a number, a step of the calendar, or seconds."""
-        if not self.dated:
-            return None if self.time is None else self.step
-        days = self.step / 86400.0
-        steps = (step for step, (low, high) in CALENDAR.items() if low <= days <= high)
-        return next(steps, f"{round(1e6 * self.step)}us" if self.step % 1.0 else f"{self.step:.0f}s")
 
     @property
     def groups(self) -> Array:
@@ -101,30 +84,24 @@ class Roles:
             U[groups == k] -= np.nanmean(U[groups == k], axis=0)
         return replace(self, y=y, U=U)
 
-    def table(self) -> pl.DataFrame:
-        """The record as a table that `track` reads."""
-        columns: dict[str, Any] = {self.output: self.y, **dict(zip(self.inputs, self.U.T, strict=True))}
-        columns |= ({} if self.clock is None else {self.clock: self.time}) | (
-            {} if self.by is None else {self.by: self.key}
-        )
-        table = pl.DataFrame(columns)
-        if self.zone is None or self.clock is None:
-            return table
-        return table.with_columns(pl.col(self.clock).dt.replace_time_zone("UTC").dt.convert_time_zone(self.zone))
-
     def signals(self, inputs: Sequence[str]) -> dict[str, Any]:
         """The arguments of `track` for some inputs."""
+        columns: dict[str, Any] = {self.output: self.y, **dict(zip(self.inputs, self.U.T, strict=True))}
+        table = pl.DataFrame(columns | ({} if self.by is None else {self.by: self.key}))
+        if self.clock is not None:
+            time = pl.Series(self.clock, self.time)
+            time = time.dt.replace_time_zone("UTC").dt.convert_time_zone(self.zone) if self.zone else time
+            table = table.with_columns(time)
         units = {name: unit for name, unit in self.units.items() if name in (*inputs, self.output)} or None
-        given = {"y": self.output, "u": list(inputs) or None, "data": self.table(), "time": self.clock}
+        given = {"y": self.output, "u": list(inputs) or None, "data": table, "time": self.clock}
         return given | {"dt": self.dt, "units": units}
 
     def spread(self, longest: int) -> tuple[Array, Array, Array]:
         """y, U on a regular grid, inf in gaps of time, and the place of every row; ``longest`` rows part records."""
-        gap = np.ones(len(self.y), dtype=int)
-        if self.time is not None:
-            gap[1:] = np.clip(np.round(_steps(self.time) / self.step), 1, longest)
+        steps = np.ones(len(self.y)) if self.time is None else Clock.of(self.dt, self.zone).steps(self.time)
+        gap = np.clip(np.round(steps), 1, longest).astype(int)
         gap[1:][np.diff(self.groups) != 0] = longest
-        place = np.cumsum(gap) - 1
+        place = np.cumsum(gap) - gap[0]
         y, U = np.full(place[-1] + 1, np.inf), np.full((place[-1] + 1, self.U.shape[1]), np.inf)
         y[place], U[place] = self.y, self.U
         return y, U, place
@@ -132,7 +109,7 @@ class Roles:
 
 def roles(
     data: Any, y: str | None = None, *, u: Sequence[str] | None = None, not_u: Sequence[str] = (),
-    time: str | None = None, dt: float | None = None, by: str | None = None,
+    time: str | None = None, dt: float | str | None = None, by: str | None = None,
     limits: Mapping[str, tuple[float | None, float | None]] | None = None, codes: bool = True,
     wanted: Wanted | None = None,
 ) -> Roles:  # fmt: skip
@@ -159,7 +136,7 @@ def roles(
         low, high = (limits or {}).get(name, (None, None))
         x = numbers[name]
         bad = (x < (-np.inf if low is None else low)) | (x > (np.inf if high is None else high))
-        bad |= far_off(np.where(bad, np.nan, x)) & codes
+        bad |= apart(np.where(bad, np.nan, x)) & codes
         numbers[name], refused[name] = np.where(bad, np.nan, x), int(bad.sum())
     kept: list[str] = []
     for name in (one for one in left if one != y and u is None):
@@ -172,41 +149,20 @@ def roles(
     U = np.column_stack([numbers[name] for name in kept]) if kept else np.zeros((len(frame), 0))
     refused = {name: refused[name] for name in (y, *kept) if refused[name]}
     missing = int(np.sum(~np.isfinite(numbers[y])) + np.sum(~np.isfinite(U))) - sum(refused.values())
-    found = Roles(y, tuple(kept), clock, by, numbers[y], U, axis, key, dt or 1.0, why, refused, missing, units, zone)
-    return _in_order(found, dt)
+    found = Roles(y, tuple(kept), clock, by, numbers[y], U, axis, key, dt, why, refused, missing, units, zone)
+    return _in_order(found)
 
 
-def _in_order(found: Roles, dt: float | None) -> Roles:
+def _in_order(found: Roles) -> Roles:
     """The record by key and time, without rows that repeat a time or have none, and with its interval."""
     if found.time is None:
         return found
-    time, groups = found.time, found.groups
-    order = np.lexsort((time, groups))
-    order = order[~(np.isnat(time) if found.dated else ~np.isfinite(time))[order]]
-    new = (_steps(time[order]) != 0.0) | (np.diff(groups[order]) != 0)
-    found = found.rows(order[np.append(True, new)])
-    within = np.diff(found.groups) == 0
-    step = float(np.median(_steps(found.time)[within])) if within.any() else 1.0  # type: ignore[arg-type]
-    return replace(found, step=step if dt is None else dt)
-
-
-def _steps(time: Array) -> Array:
-    """Intervals (T - 1,), in seconds for dates."""
-    return np.diff(time) / np.timedelta64(1, "s") if time.dtype.kind == "M" else np.diff(time)
-
-
-def far_off(x: Array) -> Array:
-    """Which readings are fault codes or spikes."""
-    bad = np.zeros(len(x), bool)
-    for sign in (1.0, -1.0) * 5:
-        known = np.sort(sign * x[np.isfinite(x) & ~bad])
-        others = known[known < known[-1]] if len(known) else known
-        if len(others) < 20 or len(others) < 0.8 * len(known) or len(np.unique(others)) < 3:
-            continue
-        span = np.ptp(others[len(others) // 200 : len(others) - len(others) // 200])
-        if known[-1] - others[-1] > FAR * span > 0.0:
-            bad |= sign * x == known[-1]
-    return bad
+    order = np.lexsort((found.time, found.groups))
+    order = order[np.isfinite(found.time[order])]
+    time, groups = found.time[order], found.groups[order]
+    found = found.rows(order[np.append(True, (time[1:] != time[:-1]) | (groups[1:] != groups[:-1]))])
+    usual = 1.0 if len(order) < 2 or found.time is None else median_interval(found.time, found.zone)[1]
+    return replace(found, dt=usual if found.dt is None else found.dt)
 
 
 def _frame(data: Any, wanted: Wanted) -> tuple[Any, dict[str, str]]:
@@ -292,11 +248,11 @@ def _reason(numbers: Mapping[str, Array], name: str, others: Iterable[str]) -> s
 def _key(frame: Any, texts: Sequence[str], by: str | None, axis: Array | None) -> tuple[tuple[Any, ...], str | None]:
     """(key of every row, name of the column): given, of text with few values, or where the clock runs back."""
     count = {name: len(set(frame[name].to_list())) for name in texts}
-    few = [name for name in texts if 2 <= count[name] <= min(FEW, len(frame) // 30)]
+    few = [name for name in texts if 2 <= count[name] <= len(frame) // 30]
     by = by or max(few, key=lambda name: count[name], default=None)
     if by is not None:
         return tuple(frame[by].to_list()), by
-    back = np.append(False, _steps(axis) < 0.0) if axis is not None else np.zeros(len(frame), bool)
+    back = np.append(False, axis[1:] < axis[:-1]) if axis is not None else np.zeros(len(frame), bool)
     if 0 < back.sum() <= len(frame) // 100:
         return tuple(f"record {k + 1}" for k in np.cumsum(back)), "record"
     return (0,) * len(frame), None

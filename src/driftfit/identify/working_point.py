@@ -9,8 +9,8 @@ Four regressions predict the record, each block from those that its memory holds
 
 z_i are regressors times signals, x w, and hinges, (x - q)+ and x (w - q)+, at quartiles q. The signals w are the
 inputs, chosen or not, the last output, and the mean of the last twenty. They are added one by one while the score rises
-by more than the logarithm of their number. A curve that the plant passes through once cannot be told from time: both
-then predict as well.
+by more than one nat and the logarithm of their number. A curve that the plant passes through once cannot be told from
+time: both then predict as well.
 """
 
 from __future__ import annotations
@@ -23,41 +23,37 @@ from driftfit.engine.kernel import Array
 from driftfit.identify.scores import MEMORIES, Scores, lead
 from driftfit.identify.structure import Structure, filled, lagged
 
-PRODUCTS = 5
-"""Products that a curve may have."""
 SLOW = 20
 """Samples in the mean of the last outputs."""
 CLEAR = 3.0
-"""Nats, and `ERRORS` standard errors, by which one description must lead another."""
-ERRORS = 2.0
+"""Nats by which one description must lead another: -log of a level of 5 %."""
 
 Lead = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Cause:
-    """What explains the record: ``kind`` is "", "time", "working point" or "both".
+    """What explains the record: leads over constants in nats with their standard errors.
 
-    Leads over constants in nats with their standard errors: ``tracked``, ``curve``, ``joint``; ``besides``: the lead of
-    both over the curve alone; ``further``: over time alone. ``products``: what the curve is made of, in words.
-    ``bent``: the input of which the curve is a static one, or -1.
+    ``products``: what the curve is made of, in words; none where no curve leads. ``bent``: the input of which it is a
+    static curve, or -1.
     """
 
-    kind: str
     tracked: Lead
     curve: Lead
     joint: Lead
-    besides: Lead
-    further: Lead
     products: tuple[str, ...]
     bent: int
     columns: Array
     """(T, k): the products on the grid."""
 
-
-def clear(one: Lead) -> bool:
-    """Whether a lead is more than chance."""
-    return one[0] > max(CLEAR, ERRORS * one[1])
+    def kind(self, moves: bool) -> str:
+        """ "time", "working point", "both" or "": ``moves`` is whether constants, with the curve, are rejected."""
+        if not self.products:
+            return "time" if moves else ""
+        if not moves:
+            return "working point" if self.joint[0] - self.curve[0] <= CLEAR else "time"
+        return "both" if self.joint[0] - self.tracked[0] > CLEAR else "time"
 
 
 def regressors(y: Array, U: Array, structure: Structure) -> Array:
@@ -75,41 +71,16 @@ def cause(y: Array, U: Array, structure: Structure, names: tuple[str, ...], outp
     rows = np.isfinite(X).all(axis=1) & np.isfinite(y)
     base = list(range(phi.shape[1]))
     steady, moving = (Scores(X[rows], y[rows], memories) for memories in (MEMORIES[:1], MEMORIES))
-    steady.floor = moving.floor = moving.refer(base) and moving.floor
-    bent, jointly = _chosen(steady, base), _chosen(moving, base)
-    constants, tracked = steady.terms(base), moving.terms(base)
-    curve = steady.terms(bent)
-    joint = max((moving.terms(one) for one in (bent, jointly)), key=np.sum)
-    leads = lead(tracked, constants), lead(curve, constants), lead(joint, constants)
-    besides, further = lead(joint, curve), lead(joint, tracked)
-    bends = clear(leads[1])
-    kind = ""
-    if bends and not clear(besides):
-        kind = "working point"
-    elif bends and clear(further) and clear(leads[0]):
-        kind = "both"
-    elif clear(leads[0]):
-        kind = "time"
-    chosen = [one - len(base) for one in bent[len(base) :]]
+    moving.refer(base)
+    steady.floor = moving.floor
+    price, bent = np.log(max(len(made), 1)) + 1.0, list(base)
+    while len(bent) < X.shape[1] and (added := steady.added(bent)).max() > steady.score(bent) + price:
+        bent.append(int(np.argmax(added)))
+    constants, chosen = steady.terms(base), [one - len(base) for one in bent[len(base) :]]
+    leads = (lead(terms, constants) for terms in (moving.terms(base), steady.terms(bent), moving.terms(bent)))
     own = {made[one][1] for one in chosen}
-    return Cause(
-        kind, *leads, besides, further, tuple(dict.fromkeys(made[one][0] for one in chosen)),
-        own.pop() if len(own) == 1 else -1, Z[:, chosen],
-    )  # fmt: skip
-
-
-def _chosen(scores: Scores, base: list[int]) -> list[int]:
-    """The columns and the products that a curve needs."""
-    chosen, score = list(base), scores.score(base)
-    price = np.log(max(scores.p - len(base), 1)) + 1.0
-    for _ in range(PRODUCTS):
-        added = scores.added(chosen)
-        best = int(np.argmax(added))
-        if not added[best] > score + price:
-            break
-        chosen.append(best)
-        score = float(added[best])
-    return chosen
+    words = tuple(dict.fromkeys(made[one][0] for one in chosen))
+    return Cause(*leads, words, own.pop() if len(own) == 1 else -1, Z[:, chosen])
 
 
 def _products(
