@@ -26,7 +26,7 @@ from driftfit.identify.result import Answer
 from driftfit.identify.roles import NoAnswerError, Roles, roles
 from driftfit.identify.scores import FEWEST
 from driftfit.identify.structure import Structure, search
-from driftfit.identify.working_point import cause
+from driftfit.identify.working_point import cause, products
 from driftfit.judge.evidence import Evidence, judged_rows
 from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import Verdict, judged
@@ -117,7 +117,7 @@ def _written(text: str, path: Any) -> str:
 
 def identify(
     data: Any, y: str | None = None, *, u: Sequence[str] | None = None, not_u: Sequence[str] = (),
-    time: str | None = None, dt: float | None = None, by: str | None = None,
+    time: str | None = None, dt: float | str | None = None, by: str | None = None,
     limits: Mapping[str, tuple[float | None, float | None]] | None = None, max_lag: int = 30, forecast: bool = False,
     horizon: int = 10, level: float = 0.05, gate: bool | None = None, budget: float = 45.0, seed: int = 0,
     reading: Wanted | None = None, progress: Callable[[str], None] = lambda text: None,
@@ -133,8 +133,8 @@ def identify(
         The inputs to choose from, and columns that are none. By default every other column of numbers.
     time, by : names
         The column of the time, and the one that identifies records; found if not given.
-    dt : number
-        Nominal interval, of dates in seconds; the median by default.
+    dt : number or text
+        Nominal interval, as for `track`; the median by default.
     limits : mapping from columns to (low, high)
         Valid ranges; what is outside is missing.
     max_lag : int
@@ -214,9 +214,8 @@ def chosen(data: Any, y: str, time: str | None, reading: Wanted) -> tuple[Roles,
 
 def model_of(found: Roles, structure: Structure) -> ARX:
     """The ARX model of a structure."""
-    names = tuple(found.inputs[j] for j, *_ in structure.shape[1])
-    nb, nk = (tuple(one[i] for one in structure.shape[1]) for i in (1, 2))
-    return ARX(structure.na, nb or 0, nk or 1, inputs=names or None, intercept=True)
+    inputs, nb, nk = (tuple(one[i] for one in structure.shape[1]) for i in range(3))
+    return ARX(structure.na, nb or 0, nk or 1, inputs=tuple(found.inputs[j] for j in inputs) or None, intercept=True)
 
 
 @dataclass(frozen=True)
@@ -254,19 +253,20 @@ class _Task:
             found = found.rows(np.arange(T - most, T))
             check_record(found)
         y, U, place = found.spread(structure.na + 40)
-        self.progress("time or working point")
-        why_not = cause(y, U, structure, found.inputs, found.output, self.first)
         self.progress("tracking")
         run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
-        self.progress("judging")
         known = Evidence(run, level=self.level)
+        self.progress("time or working point")
+        rows, (Z, made) = known.rows, products(y, U, structure, found.inputs, found.output, self.first)
+        why_not = cause(rows.phi, rows.y, Z[place][rows.at] * np.reshape(np.asarray(rows.root), (-1, 1)), made)
+        self.progress("judging")
         verdict = judged(known)
         moves_besides = bool(verdict.drifts)
         if moves_besides and why_not.products:
-            self.progress("judging the curve")
-            Z = why_not.columns[place][known.rows.at] * np.reshape(known.rows.root, (-1, 1))
-            more = known.rows._replace(phi=np.hstack([known.rows.phi, Z]))
-            again = judged_rows(more.only(np.isfinite(Z).all(axis=1), range(more.phi.shape[1])), self.level)
+            more = rows._replace(phi=np.hstack([rows.phi, why_not.columns]))
+            again = judged_rows(
+                more.only(np.asarray(np.isfinite(more.phi).all(axis=1)), range(more.phi.shape[1])), self.level
+            )
             moves_besides = again is None or again.rejected
         theta, memory, own = effects(known)
         notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict)
@@ -284,9 +284,8 @@ class _Task:
             return page.KINDS[4], f"{codes}; if they are, say so with --gate, and if not, with --no-gate"
         if verdict.drifts is None:
             return page.KINDS[4], verdict.untested
-        if kind == "working point":
-            return page.KINDS[1], ""
-        return page.KINDS[2 if kind == "both" else 0] if verdict.drifts else page.KINDS[3], ""
+        moving = {"working point": 1, "both": 2}.get(kind, 0)
+        return page.KINDS[moving if verdict.drifts or moving == 1 else 3], ""
 
 
 def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -> tuple[str, ...]:

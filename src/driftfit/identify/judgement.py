@@ -2,7 +2,7 @@
 
 With p_1 and p_2 the densities of a reading under the tracker and under recursive least squares on the same regressors,
 
-    w_t  proportional to  (1 - s) w_(t-1) p_k(y_(t-1)) + s / 2,      theta = sum w_k theta_k,   y_hat = phi' theta
+    w_t  =  s + (1 - 2 s) w_(t-1) p_k(y_(t-1)) / sum,      theta = sum w_k theta_k,   y_hat = phi' theta
 
 so that a record of constants costs no more than a few nats, and a change is followed (Herbster and Warmuth, 1998). All
 predictions are made before the sample, one step or h steps ahead; those h ahead are given the inputs.
@@ -14,11 +14,12 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.identify.result import Effect, Errors, Memory, Move
-from driftfit.identify.scores import FEWEST, SHARED
+from driftfit.identify.scores import FEWEST
 from driftfit.identify.structure import filled, lagged
 from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.statistics.robust import inverted, least_squares
+from driftfit.judge.structures.candidates import SHARE
 from driftfit.judge.verdict import Verdict
 from driftfit.run.result import Track, root_mean_square
 
@@ -31,13 +32,14 @@ def weights(first: Array, second: Array) -> Array:
     """The weight (T,) of the first of two predictions before each sample, from its log-likelihoods and the errors of
     the second, whose variance is the mean of their squares so far."""
     known = np.isfinite(first) & np.isfinite(second)
-    square, count = np.where(known, second, 0.0) ** 2, np.cumsum(known) - known
+    square = np.where(known, second, 0.0) ** 2
+    count: Array = np.cumsum(known) - known
     v = np.maximum(np.cumsum(square) - square, 1e-300) / np.maximum(count, 1)
     gain = np.where(known & (count > 10), np.nan_to_num(first) + 0.5 * (np.log(2.0 * np.pi * v) + square / v), 0.0)
     weight, w = np.empty(len(first)), 0.5
     for t, ratio in enumerate(np.exp(np.clip(gain, -50.0, 50.0)).tolist()):
         weight[t] = w
-        w = (1.0 - SHARED) * w * ratio / (w * ratio + 1.0 - w) + 0.5 * SHARED
+        w = SHARE + (1.0 - 2.0 * SHARE) * w * ratio / (w * ratio + 1.0 - w)
     return weight
 
 

@@ -24,7 +24,7 @@ import polars as pl
 
 from driftfit.data.clock import Clock, median_interval
 from driftfit.data.columns import FILE, Wanted, numbers_of, times_of_column
-from driftfit.data.files import paths_of, read_file
+from driftfit.data.files import paths_of, read_file, table_frame
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 from driftfit.readings.screen import apart
@@ -78,11 +78,9 @@ class Roles:
 
     def centred(self) -> Roles:
         """The same with signals of mean 0 in every record, because their levels may differ."""
-        y, U, groups = self.y.copy(), self.U.copy(), self.groups
-        for k in range(groups.max() + 1):
-            y[groups == k] -= np.nanmean(y[groups == k])
-            U[groups == k] -= np.nanmean(U[groups == k], axis=0)
-        return replace(self, y=y, U=U)
+        parts = [np.flatnonzero(self.groups == k) for k in range(self.groups.max() + 1)]
+        means = np.array([np.nanmean(np.column_stack([self.y, self.U])[at], axis=0) for at in parts])[self.groups]
+        return replace(self, y=self.y - means[:, 0], U=self.U - means[:, 1:])
 
     def signals(self, inputs: Sequence[str]) -> dict[str, Any]:
         """The arguments of `track` for some inputs."""
@@ -133,17 +131,18 @@ def roles(
         raise NoAnswerError(f"the output {y} holds text, such as {frame[y][0]!r}; numbers are needed.")
     refused = {}
     for name in {*left, y, *(u or ())} & numbers.keys():
-        low, high = (limits or {}).get(name, (None, None))
+        low, high = (limits or {}).get(name) or (None, None)
         x = numbers[name]
         bad = (x < (-np.inf if low is None else low)) | (x > (np.inf if high is None else high))
         bad |= apart(np.where(bad, np.nan, x)) & codes
         numbers[name], refused[name] = np.where(bad, np.nan, x), int(bad.sum())
-    kept: list[str] = []
+    kept = list(u or ())
+    why |= {name: "not in --u" for name in left if kept and name not in (y, *kept)}
     for name in (one for one in left if one != y and u is None):
-        why |= {name: reason} if (reason := _reason(numbers, name, [y, *kept])) else {}
-        kept += [] if name in why else [name]
-    kept = list(u) if u is not None else kept
-    why |= {name: "not in --u" for name in left if u is not None and name not in (y, *u)}
+        if reason := _reason(numbers, name, [y, *kept]):
+            why[name] = reason
+        else:
+            kept.append(name)
     key, by = _key(frame, texts, by, axis)
     why |= {name: "text" for name in texts if name != by}
     U = np.column_stack([numbers[name] for name in kept]) if kept else np.zeros((len(frame), 0))
@@ -160,9 +159,9 @@ def _in_order(found: Roles) -> Roles:
     order = np.lexsort((found.time, found.groups))
     order = order[np.isfinite(found.time[order])]
     time, groups = found.time[order], found.groups[order]
-    found = found.rows(order[np.append(True, (time[1:] != time[:-1]) | (groups[1:] != groups[:-1]))])
-    usual = 1.0 if len(order) < 2 or found.time is None else median_interval(found.time, found.zone)[1]
-    return replace(found, dt=usual if found.dt is None else found.dt)
+    new = np.append(True, (time[1:] != time[:-1]) | (groups[1:] != groups[:-1]))
+    dt = median_interval(time[new], found.zone)[1] if found.dt is None and new.sum() > 1 else found.dt
+    return replace(found.rows(order[new]), dt=dt)
 
 
 def _frame(data: Any, wanted: Wanted) -> tuple[Any, dict[str, str]]:
@@ -170,14 +169,12 @@ def _frame(data: Any, wanted: Wanted) -> tuple[Any, dict[str, str]]:
     if isinstance(data, Mapping):
         data = pl.DataFrame({name: np.asarray(column) for name, column in data.items()})
     if not isinstance(data, str | list | tuple) and not hasattr(data, "__fspath__"):
-        frame = nw.from_native(data)
-        return (frame.collect() if isinstance(frame, nw.LazyFrame) else frame), {}
+        return table_frame(data), {}
     paths = paths_of(data)
     read = [read_file(path, wanted, path) for path in paths]
-    if len(read) == 1:
-        return read[0]
     parts = [one.to_native().with_columns(pl.lit(path).alias(FILE)) for path, (one, _) in zip(paths, read, strict=True)]
-    return nw.from_native(pl.concat(parts, how="diagonal_relaxed"), eager_only=True), read[0][1]
+    whole = nw.from_native(pl.concat(parts, how="diagonal_relaxed"), eager_only=True) if parts[1:] else read[0][0]
+    return whole, read[0][1]
 
 
 def _numbers(frame: Any) -> tuple[dict[str, Array], list[str]]:
@@ -196,7 +193,7 @@ def _clock(
     frame: Any, numbers: dict[str, Array], texts: list[str], time: str | None, given: set[Any]
 ) -> tuple[str | None, Array | None, str | None, dict[str, str]]:
     """(name of the time, times, zone, other clocks with the reason)."""
-    found: dict[str, tuple[Array, str | None]] = {} if time not in numbers else {time: (numbers[time], None)}
+    found: dict[str, tuple[Array, str | None]] = {}
     for name in [*texts] if time is None else {time} & {*texts}:
         try:
             found[name] = times_of_column(frame[name], "identify", 1)
@@ -204,20 +201,21 @@ def _clock(
         except (ValueError, TypeError) as error:
             if time is not None:
                 raise ValueError(f"identify: --time {time}: {error}") from None
-    counting = [name for name, x in numbers.items() if time is None and name not in given and _counts(x)]
-    found = found or {name: (numbers[name], None) for name in counting}
-    if not found:
-        return None, None, None, {}
-    clock = next(iter(found))
-    return clock, *found[clock], {name: "a second clock" for name in (*found, *counting) if name != clock}
+    counting = [
+        name for name, x in numbers.items() if name == time or (time is None and name not in given and _counts(x))
+    ]
+    found |= {name: (numbers[name], None) for name in counting}
+    clock = next(iter(found), None)
+    return clock, *found.get(clock or "", (None, None)), {name: "a second clock" for name in found if name != clock}
 
 
 def _counts(x: Array) -> bool:
     """Whether a column of numbers is complete and increases by even steps nearly everywhere."""
-    if len(x) < 3 or not np.isfinite(x).all():
-        return False
-    step, usual = np.diff(x), float(np.median(np.diff(x)))
-    return bool(np.mean(step > 0.0) > 0.99 and np.mean(np.abs(step - usual) < 0.5 * usual) > 0.8)
+    step = np.diff(x)
+    even = (
+        np.abs(step - np.median(step)) < 0.5 * np.median(step) if len(x) > 2 and np.isfinite(x).all() else np.zeros(1)
+    )
+    return bool(np.mean(step > 0.0) > 0.99 and np.mean(even) > 0.8)
 
 
 def _is_label(x: Array) -> bool:

@@ -33,7 +33,8 @@ Lead = tuple[float, float]
 
 @dataclass(frozen=True)
 class Cause:
-    """What explains the record: leads over constants in nats with their standard errors.
+    """What explains the record: leads over constants in nats, less the logarithm of the number of products for each
+    that is used, with their standard errors.
 
     ``products``: what the curve is made of, in words; none where no curve leads. ``bent``: the input of which it is a
     static curve, or -1.
@@ -45,7 +46,7 @@ class Cause:
     products: tuple[str, ...]
     bent: int
     columns: Array
-    """(T, k): the products on the grid."""
+    """(N, k): the products."""
 
     def kind(self, moves: bool) -> str:
         """ "time", "working point", "both" or "": ``moves`` is whether constants, with the curve, are rejected."""
@@ -56,55 +57,46 @@ class Cause:
         return "both" if self.joint[0] - self.tracked[0] > CLEAR else "time"
 
 
-def regressors(y: Array, U: Array, structure: Structure) -> Array:
-    """phi (T, n) of a structure on the grid, the constant first."""
-    past = [lagged(filled(y), k) for k in range(1, structure.na + 1)]
-    drive = [lagged(filled(U[:, j]), k) for j, nb, nk in structure.shape[1] for k in range(nk, nk + nb)]
-    return np.column_stack([np.ones(len(y)), *past, *drive])
-
-
-def cause(y: Array, U: Array, structure: Structure, names: tuple[str, ...], output: str, first: int) -> Cause:
-    """Compare the four descriptions of a record on a regular grid."""
-    phi = regressors(y, U, structure)
-    Z, made = _products(y, U, structure, names, output, first)
-    X = np.column_stack([phi, Z])
-    rows = np.isfinite(X).all(axis=1) & np.isfinite(y)
-    base = list(range(phi.shape[1]))
+def cause(phi: Array, y: Array, Z: Array, made: list[tuple[str, int]]) -> Cause:
+    """Compare the four descriptions of y (N,) on phi (N, n), the constant last, and `products` Z (N, q)."""
+    X = np.column_stack([phi[:, -1], phi[:, :-1], Z])
+    rows, base = np.isfinite(X).all(axis=1), list(range(phi.shape[1]))
     steady, moving = (Scores(X[rows], y[rows], memories) for memories in (MEMORIES[:1], MEMORIES))
     moving.refer(base)
     steady.floor = moving.floor
-    price, bent = np.log(max(len(made), 1)) + 1.0, list(base)
-    while len(bent) < X.shape[1] and (added := steady.added(bent)).max() > steady.score(bent) + price:
+    price, bent = float(np.log(max(len(made), 1))), list(base)
+    while len(bent) < X.shape[1] and (added := steady.added(bent)).max() > steady.score(bent) + price + 1.0:
         bent.append(int(np.argmax(added)))
     constants, chosen = steady.terms(base), [one - len(base) for one in bent[len(base) :]]
-    leads = (lead(terms, constants) for terms in (moving.terms(base), steady.terms(bent), moving.terms(bent)))
+    (curve, one), (joint, other) = (lead(scores.terms(bent), constants) for scores in (steady, moving))
+    price *= len(chosen)
+    leads = lead(moving.terms(base), constants), (curve - price, one), (joint - price, other)
     own = {made[one][1] for one in chosen}
     words = tuple(dict.fromkeys(made[one][0] for one in chosen))
     return Cause(*leads, words, own.pop() if len(own) == 1 else -1, Z[:, chosen])
 
 
-def _products(
+def products(
     y: Array, U: Array, structure: Structure, names: tuple[str, ...], output: str, first: int
 ) -> tuple[Array, list[tuple[str, int]]]:
-    """(T, q) products, and for each of them words and the input that is bent, -1 if a product is of two signals."""
+    """(T, q) products of signals on a grid; for each words and the input that is bent, -1 for one of two signals."""
     past, inputs = filled(y), [filled(u) for u in U.T]
-    total = np.cumsum(np.concatenate([[0.0], np.where(np.isfinite(past), past, np.nanmean(past))]))
-    slow = np.full(len(y), np.nan)
-    slow[SLOW:] = (total[SLOW:-1] - total[: -SLOW - 1]) / SLOW
-    signals = [(f"{output}, the last", lagged(past, 1)), (f"the level of {output}", slow)]
+    slow = np.convolve(np.where(np.isfinite(past), past, np.nanmean(past)), np.full(SLOW, 1.0 / SLOW))[: len(y)]
+    slow[: SLOW - 1] = np.nan
+    signals = [(f"{output}, the last", lagged(past, 1)), (f"the level of {output}", lagged(slow, 1))]
     signals += [(names[i], lagged(x, first)) for i, x in enumerate(inputs)]
     xs = [(names[j], j, lagged(inputs[j], k)) for j, nb, nk in structure.shape[1] for k in range(nk, nk + nb)]
-    if structure.na:
-        xs.append((output, -1, lagged(past, 1)))
-    columns, made = [], []
-    for name, j, x in xs:
-        for q in np.nanquantile(x, (0.25, 0.5, 0.75)):
-            columns.append(np.maximum(x - q, 0.0))
-            made.append((f"a bend of {name} at {q:.3g}", j))
-        for other, w in signals:
-            if np.array_equal(w, x, equal_nan=True):
-                continue
-            middle = np.nanmedian(w)
-            columns += [x * (w - middle), x * np.maximum(w - middle, 0.0)]
-            made += [(f"{name} times {other}", -1)] * 2
-    return (np.column_stack(columns) if columns else np.zeros((len(y), 0))), made
+    xs += [(output, -1, lagged(past, 1))] if structure.na else []
+    made = [
+        (f"a bend of {name} at {q:.3g}", j, np.maximum(x - q, 0.0))
+        for name, j, x in xs
+        for q in np.nanquantile(x, (0.25, 0.5, 0.75))
+    ]
+    made += [
+        (f"{name} times {other}", -1, x * bend)
+        for name, _, x in xs
+        for other, w in signals
+        for bend in (w - np.nanmedian(w), np.maximum(w - np.nanmedian(w), 0.0))
+        if not np.array_equal(w, x, equal_nan=True)
+    ]
+    return np.stack([np.zeros(len(y)), *(z for *_, z in made)], axis=1)[:, 1:], [(text, j) for text, j, _ in made]
