@@ -87,13 +87,11 @@ def identify_command(
 
 def write(found: Identification | ManyIdentified, page: Path | None, json_to: Path | None, quiet: bool) -> None:
     """Print the answer, and write what the options ask for."""
+    to_stdout = str(json_to) == "-"
     if json_to is not None:
         text = json.dumps(found.json(), indent=1)
-        if str(json_to) == "-":
-            typer.echo(text)
-        else:
-            json_to.write_text(text, encoding="utf-8")
-    if str(json_to) != "-":
+        typer.echo(text) if to_stdout else json_to.write_text(text, encoding="utf-8")
+    if not to_stdout:
         say(" ".join(found.headline.split()) if quiet else found)
     if page is not None:
         found.page(page)

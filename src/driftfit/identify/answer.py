@@ -19,6 +19,7 @@ from rich.text import Text
 
 from driftfit.data.columns import Wanted
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import whole
 from driftfit.fleets import Fleet
 from driftfit.identify import page
 from driftfit.identify.judgement import effects, errors_of, feedback, moves
@@ -172,9 +173,8 @@ def identify(
         For a record that cannot answer: fewer than `FEWEST` rows with all lags, a constant output, text.
     """
     end = monotonic() + budget
-    for name, value, low in (("max_lag", max_lag, 1), ("horizon", horizon, 1), ("budget", budget, 0)):
-        if not value >= low:
-            raise ValueError(f"identify: {name} must be at least {low}; got {value!r}.")
+    for name, value in (("max_lag", max_lag), ("horizon", horizon)):
+        whole("identify", name, value, 1)
     if not 0.0 < level < 1.0:
         raise ValueError(f"identify: level must be between 0 and 1, such as 0.05; got {level!r}.")
     progress("reading")
@@ -290,20 +290,25 @@ class _Task:
 
 def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -> tuple[str, ...]:
     """Problems of the data, each in a few words."""
-    notes = [f"{count} readings of {name} taken as codes or spikes" for name, count in found.refused.items()]
-    notes += [f"{count} {reason}, left out by the gate" for reason, count in run.left_out.counts.items()]
-    notes += [f"{found.missing} readings missing"] if found.missing else []
-    notes += [f"gaps in time of {len(y) - len(found.y)} samples in all"] if len(y) > len(found.y) else []
     fed = [j for j in structure.lags if feedback(y, U[:, j]) > FEEDBACK]
     at_once = {j: ", so what it explains at once may be its response" for j in fed if structure.lags[j][1] == 0}
-    notes += [f"{found.output} acts on {found.inputs[j]} (feedback){at_once.get(j, '')}" for j in fed]
-    return tuple([*notes, structure.narrowed] if structure.narrowed else notes)
+    notes = (
+        *(f"{count} readings of {name} taken as codes or spikes" for name, count in found.refused.items()),
+        *(f"{count} {reason}, left out by the gate" for reason, count in run.left_out.counts.items()),
+        f"{found.missing} readings missing" if found.missing else "",
+        f"gaps in time of {len(y) - len(found.y)} samples in all" if len(y) > len(found.y) else "",
+        *(f"{found.output} acts on {found.inputs[j]} (feedback){at_once.get(j, '')}" for j in fed),
+        structure.narrowed,
+    )
+    return tuple(filter(None, notes))
 
 
 def _undecided(structure: Structure, names: Sequence[str], verdict: Verdict) -> tuple[str, ...]:
     """What the record does not decide, each in a few words."""
     ranges = [(names[j], *ends) for j, ends in structure.delays.items() if ends[0] < ends[1]]
-    said = [f"the delay of {name}: {low} to {high} samples are as good" for name, low, high in ranges]
-    said += [f"{names[j]} or {names[i]}: either explains the record" for j, i in structure.instead]
-    said += [f"{names[j]}: useful, but so are copies of it at other times" for j in structure.doubtful]
-    return tuple([*said, "a level that wanders, or noise that does"] if verdict.nearly_walk else said)
+    return (
+        *(f"the delay of {name}: {low} to {high} samples are as good" for name, low, high in ranges),
+        *(f"{names[j]} or {names[i]}: either explains the record" for j, i in structure.instead),
+        *(f"{names[j]}: useful, but so are copies of it at other times" for j in structure.doubtful),
+        *(["a level that wanders, or noise that does"] if verdict.nearly_walk else []),
+    )

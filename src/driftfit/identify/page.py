@@ -64,7 +64,7 @@ def delay(answer: Answer, name: str) -> str:
 
 def headline(answer: Answer) -> str:
     """The answer in one sentence or two."""
-    output, rms = answer.roles.output, answer.errors[0].rms
+    output, rms, said = answer.roles.output, answer.errors[0].rms, sentences(answer)
     if answer.kind == "cannot decide":
         return f"Cannot decide: {answer.why}."
     if answer.kind == "a static curve explains it":
@@ -73,7 +73,6 @@ def headline(answer: Answer) -> str:
         least = "; ".join(f"{one.name} by {number(one.least)} from {number(one.gain)}" for one in answer.effects)
         seen = f" In 4 of 5 records a change half-way of the {answer.effect} would have been found: {least}."
         return f"No drift found in {output} ({p_equals(answer.verdict.p)}).{seen if least else ''}"
-    said = sentences(answer)
     change = 100.0 * (1.0 - rms["driftfit"] / rms["constants"]) if rms["constants"] > 0.0 else 0.0
     gain = f"lowers the error {change:.0f} %" if change >= 0.5 else "does not lower the error"
     more = f"; and {len(said) - 2} more change{'' if len(said) == 3 else 's'}" if len(said) > 2 else ""
@@ -119,20 +118,21 @@ def structure_text(answer: Answer, shape: Shape) -> str:
 
 def chosen(answer: Answer) -> list[str]:
     """What was chosen, and what came second."""
-    found, names, memory = answer.structure, answer.roles.inputs, answer.memory
-    root = ": perhaps a unit root" if memory.root else ""
-    said = [f"Chosen: {structure_text(answer, found.shape)} (lags in samples); sum of the lags of "
-            f"{answer.roles.output} {memory.value:.3f} +- {memory.std:.2g}{root}."]  # fmt: skip
-    for shape, behind, error in found.second[:1]:
-        said.append(f"Second: {structure_text(answer, shape)}, {behind:.1f} +- {error:.1f} nats behind.")
-    moving = {move.what for move in answer.moves}
+    found, names, memory, output = answer.structure, answer.roles.inputs, answer.memory, answer.roles.output
+    moving, root = {move.what for move in answer.moves}, ": perhaps a unit root" if memory.root else ""
     idle = [name for j, name in enumerate(names) if j not in found.lags]
     steady = [names[j] for j in sorted(found.lags) if moving and names[j] not in moving]
-    said += [f"{what}: {', '.join(which)}." for what, which in (("Constant", steady), ("Not needed", idle)) if which]
-    if found.forecast is not None:
-        other = structure_text(answer, found.forecast.shape)
-        said.append(f"An input at once explains {answer.roles.output} and does not forecast it. A forecast: {other}.")
-    return said
+    other = found.forecast and structure_text(answer, found.forecast.shape)
+    return [
+        f"Chosen: {structure_text(answer, found.shape)} (lags in samples); sum of the lags of {output} "
+        f"{memory.value:.3f} +- {memory.std:.2g}{root}.",
+        *(
+            f"Second: {structure_text(answer, shape)}, {b:.1f} +- {e:.1f} nats behind."
+            for shape, b, e in found.second[:1]
+        ),
+        *(f"{what}: {', '.join(which)}." for what, which in (("Constant", steady), ("Not needed", idle)) if which),
+        *([f"An input at once explains {output} and does not forecast it. A forecast: {other}."] if other else []),
+    ]
 
 
 def columns(answer: Answer) -> list[str]:

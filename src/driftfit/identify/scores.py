@@ -6,9 +6,9 @@ block b with coefficients from the other blocks, discounted by their distance, f
     C_b = sum_(i != b) lam^|b - i| G_i + ridge,   lam = exp(-1 / (f B)),   theta_b = C_b[S, S]^-1 C_b[S, y]
     log p_b = -(n_b / 2) log(e_b / n_b + floor),   e_b the sum of squares of block b under theta_b
 
-The memories are mixed with weights that are shared again at every block (Herbster and Warmuth, 1998), so that a
-coefficient that drifts does not hide its column. A quiet block cannot be predicted much better than the record: that is
-the floor. Cost: O(B p^2) memory, O(B k^2 p) for the scores of all p columns added to k.
+The memories are mixed with weights of which 1 / B is shared again at every block (Herbster and Warmuth, 1998), so that
+a coefficient that drifts does not hide its column. A quiet block cannot be predicted much better than the record: that
+is the floor. Cost: O(B p^2) memory, O(B k^2 p) for the scores of all p columns added to k.
 """
 
 from __future__ import annotations
@@ -21,8 +21,6 @@ from driftfit.engine.kernel import Array
 
 MEMORIES = (np.inf, 0.3, 0.1, 0.03)
 """Memories, as shares of the record."""
-SHARED = 0.05
-"""Share of the weights that is spread over all memories before each block."""
 RIDGE = 1e-3
 FLOOR = 0.3
 """The floor, as a share of the variance of the best regression known."""
@@ -74,7 +72,7 @@ class Scores:
             joint = weight * np.exp(each[:, b] - top)
             total = joint.sum(axis=0)
             terms.append(top + np.log(total))
-            weight = (1.0 - SHARED) * joint / total + SHARED / len(e)
+            weight = (1.0 - 1.0 / len(count)) * joint / total + 1.0 / len(count) / len(e)
         return np.stack(terms)
 
     def terms(self, S: list[int]) -> Array:

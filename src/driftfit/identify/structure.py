@@ -13,7 +13,7 @@ What is predicted is the present output: with nk = 0 an input explains it, but d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from time import monotonic
 
@@ -135,9 +135,9 @@ class Pool:
             found += [(na, (*rest, (i, 1, k))) for i, (_, k) in self.best_delays((na, rest)).items()]
         return [(na, tuple(sorted(inputs))) for na, inputs in found if self.fits((na, inputs))]
 
-    def climb(self, shape: Shape, late: Callable[[], bool]) -> Shape:
-        """The structure from which no step rises."""
-        while not late() and self.value(top := max(self.near(shape), key=self.value)) > self.value(shape):
+    def climb(self, shape: Shape, end: float) -> Shape:
+        """The structure from which no step rises; ``end``: the time (`time.monotonic`) at which it stops."""
+        while monotonic() < end and self.value(top := max(self.near(shape), key=self.value)) > self.value(shape):
             shape = top
         return shape
 
@@ -163,20 +163,16 @@ def search(y: Array, U: Array, M: int, first: int, end: float, rng: np.random.Ge
     """The structure of a record on a regular grid; ``end``: the time (`time.monotonic`) at which the search stops."""
     M, narrowed = _affordable(y, U, M)
     pool = Pool(y, U, M, first)
-
-    def late() -> bool:
-        return monotonic() > end
-
     starts: list[Shape] = [(2, ()), (0, ())]
     for _ in range(3):  # the floor is that of the best structure
         pool.scores.refer(pool.columns(starts[0]))
         pool.shapes.clear()
-        starts = [max((pool.climb(one, late) for one in starts), key=pool.value)]
+        starts = [max((pool.climb(one, end) for one in starts), key=pool.value)]
     shape = pool.simplest(starts[0])
-    doubtful = tuple(j for j, _, _ in shape[1] if not late() and not _beats_copies(y, U, shape, j, rng))
+    doubtful = tuple(j for j, _, _ in shape[1] if monotonic() < end and not _beats_copies(y, U, shape, j, rng))
     if doubtful:  # the others may need other lags without them
-        shape = without(pool.climb(without(shape, doubtful), late), doubtful)
-    narrowed = "; ".join(filter(None, (narrowed, "the budget of time ended the search" if late() else "")))
+        shape = without(pool.climb(without(shape, doubtful), end), doubtful)
+    narrowed = "; ".join(filter(None, (narrowed, "the budget of time ended the search" if monotonic() > end else "")))
     return _told(pool, shape, doubtful, narrowed)
 
 
