@@ -11,14 +11,16 @@ changes: nothing; the gain g jumps by a factor of 1.8; it rises by as much durin
 walk whose deviation at the end is 0.8 of it; the pole jumps by 0.35; f is a static curve that saturates; or g depends
 on the level of a third input, which returns to where it was.
 
-Seeds below 1000 are for tuning, those from 1000 on for judging. "named" and "date" are shares of the plants in which a
-drift was found, "cause" that of the plants of which a cause was named, "silent" that of those without one.
+Seeds below 1000 are for tuning, those from 1000 on for judging. "named", "date" and "interval" are shares of the plants
+in which a drift was found, "cause" that of the plants of which a cause was named, "silent" that of those without one.
+The row "true structure" is the verdict with the structure of the plant: how well a date can be known.
 
-Run: python benchmarks/identify.py [first seed, 1000 by default] [seed to stop before] [--quick]
+Run: python benchmarks/identify.py [first seed, 1000 by default] [seed to stop before] [--of CHANGE] [--by METHOD]
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import warnings
 from collections.abc import Callable
@@ -30,6 +32,7 @@ from scipy import signal
 
 from driftfit import ARX, AdaptiveKalman, identify, track
 from driftfit.engine.kernel import Array
+from driftfit.judge.verdict import Verdict
 
 T = 1500
 BEFORE = 200
@@ -125,9 +128,11 @@ class Found(NamedTuple):
 
     inputs: dict[str, tuple[int, int]]
     moves: bool | None
-    which: tuple[str, ...]
-    date: int
-    cause: str
+    which: tuple[str, ...] = ()
+    date: int = -1
+    cause: str = ""
+    spans: tuple[tuple[int, int], ...] = ()
+    """Intervals of its dates."""
 
 
 KINDS = {"moves": "time", "both": "both", "a static curve explains it": "working point"}
@@ -142,7 +147,7 @@ def ours(plant: Plant) -> Found:
     which = tuple("y" if move.what == "memory" else move.what for move in moved)
     moves = found.kind in ("moves", "both") if found.kind != "cannot decide" else None
     middle = np.median([move.at for move in moved]) if moved else -1
-    return Found(inputs, moves, which, int(middle), KINDS.get(found.kind, ""))
+    return Found(inputs, moves, which, int(middle), KINDS.get(found.kind, ""), spans(found.verdict))
 
 
 def by_criterion(price: float) -> Callable[[Plant], Found]:
@@ -168,25 +173,41 @@ def by_criterion(price: float) -> Callable[[Plant], Found]:
         for name, k in (places[one - 1] for one in chosen[1:]):
             if name != "y":
                 lags.setdefault(name, []).append(k)
-        return Found({name: (min(k), min(k)) for name, k in lags.items()}, None, (), -1, "")
+        return Found({name: (min(k), min(k)) for name, k in lags.items()}, None)
 
     return method
 
 
-def default_arx(plant: Plant) -> Found:
-    """ARX(2, 2) on all inputs, as `driftfit track` without a model did before, and its verdict."""
-    table = pl.DataFrame(plant.table)
-    names = [name for name in table.columns if name != "flow"]
-    model = ARX(2, 2, inputs=tuple(names), intercept=True)
-    judged = track(model, AdaptiveKalman(), y="flow", u=names, data=table).verdict()
+def spans(judged: Verdict) -> tuple[tuple[int, int], ...]:
+    """The intervals of the dates of a verdict."""
+    return tuple((event.earliest, event.latest) for event in judged.events)
+
+
+def with_model(plant: Plant, model: ARX) -> Found:
+    """A given model and its verdict."""
+    names = list(model.input_names)
+    judged = track(model, AdaptiveKalman(), y="flow", u=names, data=pl.DataFrame(plant.table)).verdict()
     which = tuple(name.split("[")[1][:-1] if "[" in name else "y" for name in judged.moving if name != "intercept")
-    at = judged.events[0].at if judged.events else -1
-    return Found({name: (1, 2) for name in names}, judged.drifts, which, at, "time" if judged.drifts else "")
+    at = int(np.median([event.at for event in judged.events])) if judged.events else -1
+    ends = (zip(names, *model.lags, strict=True)) if names else ()
+    inputs = {name: (nk, nk + nb - 1) for name, nb, nk in ends}
+    return Found(inputs, judged.drifts, which, at, "time" if judged.drifts else "", spans(judged))
+
+
+def default_arx(plant: Plant) -> Found:
+    """ARX(2, 2) on all inputs."""
+    return with_model(plant, ARX(2, 2, inputs=tuple(f"u{j}" for j in range(1, 6)), intercept=True))
+
+
+def true_structure(plant: Plant) -> Found:
+    """The inputs and delays of the plant, and two lags of the output."""
+    names = tuple(sorted(plant.inputs))
+    return with_model(plant, ARX(2, 1, tuple(plant.inputs[name] for name in names), inputs=names, intercept=True))
 
 
 METHODS: dict[str, Callable[[Plant], Found]] = {
-    "identify": ours, "constants, extended BIC": by_criterion(0.0), "ARIMAX, AIC": by_criterion(2.0),
-    "ARX(2, 2)": default_arx,
+    "identify": ours, "true structure": true_structure, "constants, extended BIC": by_criterion(0.0),
+    "ARIMAX, AIC": by_criterion(2.0), "ARX(2, 2)": default_arx,
 }  # fmt: skip
 NEAR = 30
 """Samples within which a date is right; of a ramp, within it."""
@@ -206,6 +227,9 @@ def scored(plant: Plant, found: Found) -> dict[str, float]:
         "drift found": float(found.moves) if timely and decided else nan,
         "named": float(plant.moving in found.which) if timely and found.moves else nan,
         "date": float(abs(found.date - plant.date) <= near) if timely and found.moves else nan,
+        "interval": float(any(first <= plant.date <= last for first, last in found.spans))
+        if plant.change in ("jump", "moving pole") and found.moves
+        else nan,
         "claims": float(found.moves) if plant.change == "constant" and decided else nan,
         "cause": float(found.cause == plant.cause) if plant.cause and found.cause else nan,
         "silent": float(not found.cause) if plant.cause and decided else nan,
@@ -214,20 +238,22 @@ def scored(plant: Plant, found: Found) -> dict[str, float]:
 
 def main() -> None:
     """Print the tables for some seeds and methods."""
-    quick = "--quick" in sys.argv
-    given = [arg for arg in sys.argv[1:] if not arg.startswith("--")]
-    seeds = range(int(given[0]), int(given[1])) if given else range(1000, 1001)
-    methods = {name: m for name, m in METHODS.items() if not quick or not name.startswith("ARX(")}
-    for name, method in methods.items():
+    options = argparse.ArgumentParser()
+    options.add_argument("seeds", type=int, nargs="*", default=[1000, 1001])
+    options.add_argument("--of", choices=CHANGES)
+    options.add_argument("--by", choices=METHODS)
+    given = options.parse_args()
+    for name in [given.by] if given.by else METHODS:
         rows: dict[str, list[dict[str, float]]] = {}
-        for one in [one for seed in seeds for one in plants(seed)][:: 6 if quick else 1]:
+        for one in (one for seed in range(*given.seeds) for one in plants(seed) if given.of in (None, one.change)):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                row = scored(one, method(one))
+                row = scored(one, METHODS[name](one))
             rows.setdefault(one.change, []).append(row)
             rows.setdefault("all", []).append(row)
+            print(".", end="", file=sys.stderr, flush=True)
         heads = list(rows["all"][0])
-        print(f"\n{name}, seeds {seeds.start} to {seeds.stop - 1}\n{'':14}{''.join(f'{h:>13}' for h in heads)}  plants")
+        print(f"\n{name}, seeds {given.seeds}\n{'':14}{''.join(f'{h:>13}' for h in heads)}  plants")
         for change, each in rows.items():
             known = [np.array([row[h] for row in each]) for h in heads]
             cells = (f"{np.nanmean(x):13.2f}" if np.isfinite(x).any() else f"{'':13}" for x in known)

@@ -2,7 +2,8 @@
 
 `screen` is one vectorised look at a signal of all series. Where it and `suspect` find something, `Review` runs the
 gate's step over the finished record, with the forecasts and variances of that run, and lists what a gate would have
-refused. A run that was spoilt by one code may say little of later ones.
+refused. A run that was spoilt by one code may say little of later ones. Before there is a run, `apart` finds codes in a
+complete record.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ SUSPECT = 30.0
 """Usual distances from the median beyond which a value may be a code."""
 FEWEST = 20
 """Values that a usual distance needs."""
+GAP = 3.0
 SAMPLED = 64
 """Values of a series that a first look takes for its usual ones."""
 
@@ -35,6 +37,16 @@ def suspect(signal: Array) -> Array:
     moving = away[away > 0.0]
     limit = SUSPECT * float(np.median(moving)) if len(moving) >= FEWEST else 0.0
     return np.asarray(away > limit)
+
+
+def apart(signal: Array) -> Array:
+    """Which values (T,) of a record are `suspect` and farther from all others than `GAP` times the range of these."""
+    far = suspect(signal)
+    usual = signal[np.isfinite(signal) & ~far]
+    if not far.any() or not np.ptp(usual) > 0.0:
+        return np.zeros(len(signal), bool)
+    beyond = np.maximum(signal - usual.max(), usual.min() - signal)
+    return np.asarray(far & (beyond > GAP * np.ptp(usual)))
 
 
 def screen(signal: Array, first: Array, length: Array) -> Array:
