@@ -16,7 +16,7 @@ from driftfit.judge.alarms.bootstrap import Normal
 from driftfit.judge.alarms.frozen import frozen_model
 from driftfit.judge.evidence import judged_rows
 from driftfit.judge.regressors import earlier_outputs, regressors
-from driftfit.judge.statistics.parts.coarse_readings import explained, step_of
+from driftfit.judge.statistics.coarse_readings import explained, step_of
 from driftfit.judge.statistics.robust import orthonormal
 from driftfit.readings import gate
 from driftfit.run.columns import COLLECTED, collect
