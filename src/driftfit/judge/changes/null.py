@@ -21,10 +21,9 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.constants import SMALL, Found, Problem, Work
-from driftfit.judge.changes.fit import HELD, Noise, grid, noise, order_of, white_rows
+from driftfit.judge.changes.fit import HELD, MOST, Noise, noise, order_of, white_rows
 from driftfit.judge.changes.recursion import Drawn, Recursion, Results, draw
-from driftfit.judge.changes.scan import searched
+from driftfit.judge.changes.scan import SMALL, Found, Problem, Work, problem_of, searched
 from driftfit.judge.statistics.robust import orthonormal
 
 DRAWS, FEW = 199, 39
@@ -34,8 +33,6 @@ BIASED = 40
 """Draws of constants from which their bias comes."""
 UNIT = 0.9999
 """Largest root of the noise."""
-ROUNDS = 5
-"""Rounds of constants and their autoregression."""
 ROUNDING = 1e-15
 """Standard deviation of rounding, as a share of the outputs."""
 LOST = 1e-7
@@ -80,11 +77,11 @@ class Tested(NamedTuple):
     gains: Array
     """(R, 2): gains of one and of two breaks of the draws."""
     rss: Array
-    """(3,): sum of squares with no, one and two breaks."""
-    breaks: tuple[Array, Array, Array]
+    """(K + 1,): sums of squares with 0 .. K breaks; inf where there is no room."""
+    breaks: tuple[Array, ...]
     """Their dates."""
     ar: Array
-    """(3, p): their autoregressions."""
+    """(K + 1, p): their autoregressions."""
     theta: Array
     """(n,): constants, in units of the model."""
     root: float
@@ -128,14 +125,6 @@ def modelled(
     r = (y - X @ np.linalg.lstsq(X * found.g[:, None], y * found.g, rcond=None)[0]) * found.g
     floor = float(np.sum((rounding * found.g) ** 2) + LOST * (r @ r)) + SMALL
     return Model(phi, y, offset, X, basis, lags, root, found, floor)
-
-
-def problem_of(model: Model, paths: Array) -> Problem:
-    """What all draws share."""
-    places, stride = grid(len(model.y))
-    lags = model.noise.lags
-    sizes = np.array([stride, model.noise.fewest, ROUNDS, 2])
-    return Problem(model.noise.g, lags, places, np.ascontiguousarray(paths), sizes, np.array([model.floor]))
 
 
 def radius(a: Array, lags: Array) -> float:
@@ -235,24 +224,25 @@ def smallest(x: Array, drawn: Array) -> tuple[float, Array]:
 
 def tested(model: Model) -> tuple[Tested, Draws]:
     """The test of constancy, and the draws for further ones."""
-    N, n = model.X.shape
-    noise = model.noise
+    N, noise = len(model.y), model.noise
     first = order_of(noise.lags)
     Z = model.X * noise.g[:, None]
     paths = np.vstack([np.linalg.inv(model.basis).T, model.basis @ np.linalg.inv(Z.T @ Z)])
     size = np.sqrt(np.sum((paths @ (Z.T @ Z)) * paths, axis=1))
-    problem = problem_of(model, paths / np.maximum(size, SMALL)[:, None])
-    work, found = Work.of(N, n, problem), Found.of(n, problem)
-    searched(model.X, model.y, problem, work, found)
+    paths /= np.maximum(size, SMALL)[:, None]
+    most = max(2, min(MOST, N // noise.fewest - 1))
+    problem = problem_of(noise.g, noise.lags, noise.fewest, most, paths, model.floor)
+    found, _ = searched(model.X, model.y, problem)
+    few = problem_of(noise.g, noise.lags, noise.fewest, 2, paths, model.floor)
     held = noise.e.copy()
     rows, _ = white_rows(noise.rows, model.y, noise.lags, noise.ar, noise.g)
     Q = np.linalg.qr(rows)[0]
     held[first:] /= np.maximum(1.0 - np.sum(Q * Q, axis=1), 0.1)
     if first or len(model.lags.columns):  # an outlier of the output would be one of the dynamics
         held = np.clip(held, -HELD * noise.level, HELD * noise.level)
-    draws = Draws(model, problem, held)
+    draws = Draws(model, few, held)
     theta, ar = draws.unbiased(model.basis @ found.theta, found.ar[0])
-    x = np.append(found.L[0], gains(found.rss[None], N)[0])
+    x = np.append(found.L[0], gains(found.rss[None, :3], N)[0])
     R, L = np.zeros((0, 2)), np.zeros((0, len(found.L)))
     for count in (FEW, DRAWS - FEW):
         drawn = draws.of(theta, ar, count, True)
@@ -263,9 +253,9 @@ def tested(model: Model) -> tuple[Tested, Draws]:
             break
     p_path = np.array([p_of(float(one), drawn) for one, drawn in zip(found.L[1:], L.T[1:], strict=True)])
     root = max(draws.of_outputs(theta), radius(ar, noise.lags))
-    dates = tuple(problem.places[found.at[k, :k]] for k in range(3))
+    dates = tuple(problem.places[found.at[k, :k]] for k in range(most + 1))
     constants = model.basis @ found.theta
-    return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, root), draws  # type: ignore[arg-type]
+    return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, root), draws
 
 
 def gains(rss: Array, N: int) -> Array:

@@ -58,8 +58,9 @@ class Fit(NamedTuple):
 
 
 @shared
-def cholesky(M: Array, n: int) -> float:
+def cholesky(M: Array, n: int, least: float) -> float:
     """Lower factor of the leading n columns of M (k, k), in place; returns the remaining last entry, M[k-1, k-1].
+    Directions of no more information than ``least`` are left out.
 
     With n = k - 1 and M = [phi, y]' [phi, y] that entry is the sum of squared residuals.
     """
@@ -69,7 +70,7 @@ def cholesky(M: Array, n: int) -> float:
         size = pivot
         for i in range(j):
             pivot -= M[j, i] * M[j, i]
-        root = np.sqrt(pivot) if pivot > FLAT * size else 0.0
+        root = np.sqrt(pivot) if pivot > max(FLAT * size, least) else 0.0
         M[j, j] = root
         for r in range(j + 1, k):
             total = M[r, j]
@@ -136,8 +137,10 @@ def fit_in(basis: Basis, y: Array) -> Fit:
     round, and with it the influence of all other readings: it is 0 then, and theta is not an estimate for them.
     """
     Q, R, size = basis
-    theta, weight, scale = np.zeros(Q.shape[1]), np.ones(len(y)), 0.0
-    residual, level = y, ROUNDING * float(np.sqrt(np.mean(y * y)))
+    theta: Array = np.zeros(Q.shape[1])
+    weight, scale = np.ones(len(y)), 0.0
+    residual: Array = y
+    level = ROUNDING * float(np.sqrt(np.mean(y * y)))
     for round in range(ROUNDS):
         W = Q.T * weight
         step = np.linalg.lstsq(W @ Q, W @ y, rcond=FLAT)[0]
