@@ -10,7 +10,8 @@ and the gain of two, a temporary change. p is that of the smallest of their p-va
 the largest draws by their exponential tail.
 
 Source: Wu (1986) and Liu (1988) for wild residuals; Hansen (2000) for fixed regressors, Goncalves and Kilian (2004) for
-the recursion. Cost: `DRAWS` searches; records that are clearly constant stop after the first `FEW`.
+the recursion. Besag and Clifford (1991) for the end. Cost: `DRAWS`
+searches, fewer the larger p.
 """
 
 from __future__ import annotations
@@ -26,9 +27,10 @@ from driftfit.judge.changes.recursion import Drawn, Recursion, Results, draw
 from driftfit.judge.changes.scan import SMALL, Found, Problem, Work, problem_of, searched
 from driftfit.judge.statistics.robust import orthonormal
 
-DRAWS, FEW = 199, 39
-CLEAR = 0.3
-"""p of the first draws above which no others are drawn."""
+DRAWS = (19, 39, 79, 199)
+"""Draws after which it is decided whether there are more."""
+CLEAR = 10.0
+"""Draws beyond the statistic from which on p is known well enough (Besag and Clifford, 1991)."""
 BIASED = 40
 """Draws of constants from which their bias comes."""
 UNIT = 0.9999
@@ -244,12 +246,12 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     theta, ar = draws.unbiased(model.basis @ found.theta, found.ar[0])
     x = np.append(found.L[0], gains(found.rss[None, :3], N)[0])
     R, L = np.zeros((0, 2)), np.zeros((0, len(found.L)))
-    for count in (FEW, DRAWS - FEW):
-        drawn = draws.of(theta, ar, count, True)
+    for count in np.diff(DRAWS, prepend=0):
+        drawn = draws.of(theta, ar, int(count), True)
         fine = np.isfinite(drawn.L).all(axis=1) & np.isfinite(drawn.rss[:, 0])
         R, L = np.vstack([R, gains(drawn.rss[fine], N)]), np.vstack([L, drawn.L[fine]])
         p, each = smallest(x, np.column_stack([L[:, 0], R]))
-        if p > CLEAR:
+        if p * len(R) > CLEAR:
             break
     p_path = np.array([p_of(float(one), drawn) for one, drawn in zip(found.L[1:], L.T[1:], strict=True)])
     root = max(draws.of_outputs(theta), radius(ar, noise.lags))
