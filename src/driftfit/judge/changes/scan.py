@@ -29,8 +29,10 @@ SMALL = 1e-300
 """Added to a diagonal, so that it can be inverted."""
 CELLS = 32
 """Cells at whose ends breaks are compared."""
-PLACES = 400
+PLACES = 20_000
 """Places at which a break may be, at most."""
+FINER = 8
+"""Steps of a cell in which a break is moved, before it moves in single places."""
 ROUNDS = 5
 """Rounds of constants and their autoregression."""
 
@@ -43,22 +45,23 @@ class Problem(NamedTuple):
     lags: Array
     """(p,) of whole numbers, ascending: lags of the autoregression."""
     places: Array
-    """(F + 1,): where there may be a break, from 0 to N; every ``stride`` of them bounds a cell."""
+    """(F + 1,): where there may be a break, from 0 to N."""
+    edges: Array
+    """(m + 1,): which of them bound cells."""
     paths: Array
     """(m, n): combinations of scores for which Nyblom's statistic is returned beside that of all."""
     sizes: Array
-    """(3,): stride; fewest rows of a segment; largest number of breaks."""
+    """(2,): fewest rows of a segment; largest number of breaks."""
     floor: Array
     """(1,): smallest sum of squares, that of rounding."""
 
 
 def problem_of(g: Array, lags: Array, fewest: int, most: int, paths: Array, floor: float = SMALL) -> Problem:
-    """The problem of a record with up to ``most`` breaks at about `PLACES` places."""
+    """The problem of a record with up to ``most`` breaks."""
     N = len(g)
-    m = int(np.clip(N // 8, 4, CELLS))
-    stride = max(1, min(PLACES, N) // m)
-    places = np.linspace(0, N, m * stride + 1).astype(np.int64)
-    return Problem(g, lags, places, np.ascontiguousarray(paths), np.array([stride, fewest, most]), np.array([floor]))
+    places = np.arange(N + 1) if N <= PLACES else np.linspace(0, N, PLACES + 1).astype(np.int64)
+    edges = np.linspace(0, len(places) - 1, int(np.clip(N // 8, 4, CELLS)) + 1).astype(np.int64)
+    return Problem(g, lags, places, edges, np.ascontiguousarray(paths), np.array([fewest, most]), np.array([floor]))
 
 
 class Work(NamedTuple):
@@ -84,8 +87,8 @@ class Work(NamedTuple):
     @classmethod
     def of(cls, N: int, n: int, problem: Problem) -> Work:
         """Empty space for one record."""
-        F, p, K = len(problem.places), len(problem.lags), int(problem.sizes[2])
-        m = (F - 1) // int(problem.sizes[0]) + 1
+        F, p, K = len(problem.places), len(problem.lags), int(problem.sizes[1])
+        m = len(problem.edges)
         shapes = (
             (N, n + 1), (N,), (F, n + 1, n + 1), (n + 1, n + 1), (p + 1, p + 1), (n, n), (m, m), (K + 1, m), (n,), (n,),
             (n,), (n,), (p,), (K + 1, p),
@@ -110,7 +113,7 @@ class Found(NamedTuple):
     @classmethod
     def of(cls, n: int, problem: Problem) -> Found:
         """Nothing found yet."""
-        p, K = len(problem.lags), int(problem.sizes[2])
+        p, K = len(problem.lags), int(problem.sizes[1])
         at, L = np.zeros((K + 1, K), np.int64), np.zeros(1 + len(problem.paths))
         return cls(np.full(K + 1, np.inf), at, np.zeros((K + 1, p)), np.zeros(n), L)
 
@@ -174,10 +177,11 @@ def cumulate(problem: Problem, work: Work) -> None:
     for f in range(1, problem.places.shape[0]):
         for i in range(k):
             for j in range(i + 1):
-                total = C[f - 1, i, j]
-                for t in range(problem.places[f - 1], problem.places[f]):
-                    total += Z[t, i] * Z[t, j]
-                C[f, i, j] = total
+                C[f, i, j] = C[f - 1, i, j]
+        for t in range(problem.places[f - 1], problem.places[f]):
+            for i in range(k):
+                for j in range(i + 1):
+                    C[f, i, j] += Z[t, i] * Z[t, j]
 
 
 @shared
@@ -212,13 +216,13 @@ def prepare(X: Array, y: Array, problem: Problem, a: Array, most: int, work: Wor
     """The best partitions on cells with up to ``most`` breaks, in noise a; returns the information that is none."""
     whiten(X, y, problem.g, problem.lags, a, work.Z)
     cumulate(problem, work)
-    stride, fewest, m, least = problem.sizes[0], problem.sizes[1], work.cost.shape[0], 0.0
+    edges, m, least = problem.edges, work.cost.shape[0], 0.0
     for i in range(X.shape[1]):
         least = max(least, SINGULAR * work.C[problem.places.shape[0] - 1, i, i])
     for j in range(1, m):
         for i in range(j):
-            long = problem.places[j * stride] - problem.places[i * stride] >= fewest
-            work.cost[i, j] = cost(work, i * stride, j * stride, least) if long else np.inf
+            long = problem.places[edges[j]] - problem.places[edges[i]] >= problem.sizes[0]
+            work.cost[i, j] = cost(work, edges[i], edges[j], least) if long else np.inf
         work.best[0, j] = work.cost[0, j]
     for count in range(1, most + 1):
         for j in range(1, m):
@@ -234,23 +238,28 @@ def prepare(X: Array, y: Array, problem: Problem, a: Array, most: int, work: Wor
 @shared
 def place(problem: Problem, count: int, work: Work, least: float) -> float:
     """The places ``at`` of so many breaks, moved within cells; returns the sum of squares, inf without room."""
-    stride, fewest, places, at = problem.sizes[0], problem.sizes[1], problem.places, work.at
+    fewest, places, at = problem.sizes[0], problem.places, work.at
     m, last, total = work.cost.shape[0] - 1, places.shape[0] - 1, 0.0
     if not work.best[count, m] < np.inf:
         return np.inf
     for k in range(count, 0, -1):
         m = work.back[k, m]
-        at[k - 1] = m * stride
+        at[k - 1] = problem.edges[m]
+    wide = problem.edges[1] - problem.edges[0] + 1
+    step = max(1, wide // FINER)
     for move in range(2 * count):
         k = move if move < count else 2 * count - 1 - move
-        low, high, old = at[k - 1] if k > 0 else 0, at[k + 1] if k + 1 < count else last, at[k]
-        most = np.inf
-        for f in range(max(old - stride, low), min(old + stride, high) + 1):
-            if places[f] - places[low] >= fewest and places[high] - places[f] >= fewest:
-                value = cost(work, low, f, least) + cost(work, f, high, least)
-                if value < most:
-                    most = value
-                    at[k] = f
+        low, high = at[k - 1] if k > 0 else 0, at[k + 1] if k + 1 < count else last
+        reach, by, most = wide, step, np.inf
+        while by > 0:
+            middle = at[k]
+            for f in range(max(middle - reach, low), min(middle + reach, high) + 1, by):
+                if places[f] - places[low] >= fewest and places[high] - places[f] >= fewest:
+                    value = cost(work, low, f, least) + cost(work, f, high, least)
+                    if value < most:
+                        most = value
+                        at[k] = f
+            reach, by = by, 1 if by > 1 else 0
     for k in range(count + 1):
         total += cost(work, at[k - 1] if k > 0 else 0, at[k] if k < count else last, least)
     return total
@@ -332,7 +341,7 @@ def nyblom(problem: Problem, work: Work, L: Array) -> None:
 @shared
 def search(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> None:
     """Everything of one record: constants, Nyblom's statistics, the best partition with every number of breaks."""
-    p, K, a = found.ar.shape[1], problem.sizes[2], work.a
+    p, K, a = found.ar.shape[1], problem.sizes[1], work.a
     for count in range(K + 1):
         found.rss[count] = np.inf
     for i in range(p):
