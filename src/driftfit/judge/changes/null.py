@@ -56,6 +56,12 @@ class Lags(NamedTuple):
         """No column is."""
         return cls(np.zeros(0, np.int64), np.zeros((N, 0), np.int64), np.zeros((N, 0)))
 
+    @property
+    def delays(self) -> Array:
+        """(k,): by how many rows each is earlier."""
+        known = [np.flatnonzero(one >= 0)[-1] for one in self.source.T]
+        return np.array([row - source[row] for row, source in zip(known, self.source.T, strict=True)], np.int64)
+
     def only(self, rows: Array, columns: Sequence[int]) -> Lags:
         """Those of some rows and columns, given by their indices."""
         place = np.full(len(self.source) + 1, -1)
@@ -185,10 +191,9 @@ class Draws:
         back = self.model.lags
         if not len(back.columns):
             return 0.0
-        known = [np.flatnonzero(one >= 0)[-1] for one in back.source.T]
-        lags = np.array([row - source[row] for row, source in zip(known, back.source.T, strict=True)])
-        order = np.argsort(lags)
-        ratio = np.array([back.ratio[row, i] for i, row in enumerate(known)])
+        lags = back.delays
+        order, last = np.argsort(lags), [np.flatnonzero(one >= 0)[-1] for one in back.source.T]
+        ratio = back.ratio[last, np.arange(len(last))]
         theta = theta + self.model.offset
         return radius((theta[back.columns] * ratio)[order], lags[order])
 

@@ -161,22 +161,6 @@ def noisy(fit: Fit, phi: Array, y: Array) -> bool:
     return bool(fit.scale > ROUNDING * (np.sqrt(np.mean(y * y)) + terms))
 
 
-def inverted(X: Array) -> Array:
-    """Pseudo-inverse of the moments X' X of regressors X (N, n), whose units and offsets may be far apart.
-
-    It is computed from X itself: the moments have half of its digits.
-    """
-    size = column_sizes(X, np.sum)
-    root = np.linalg.pinv(X / size, rcond=np.finfo(float).eps * max(X.shape)) / size[:, None]
-    return np.asarray(root @ root.T)
-
-
-def least_squares(X: Array, y: Array) -> Array:
-    """theta (n,) of least norm in units of the regressors X (N, n), which may be far apart."""
-    size = column_sizes(X)
-    return np.asarray(np.linalg.lstsq(X / size, y, rcond=None)[0] / size)
-
-
 def core(z: Array) -> float:
     """Mean square of z (N,) within three of its robust deviations, 1 for a Gaussian of variance 1; NaN below ten."""
     z = z[np.isfinite(z)]
