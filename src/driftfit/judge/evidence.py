@@ -14,7 +14,7 @@ from driftfit.judge.changes.dates import LEVEL
 from driftfit.judge.compare import Errors, errors
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.judge.regressors import Distinct, Rows, judged_by_others, regressors
-from driftfit.judge.statistics.parts.coarse_readings import drawn_within
+from driftfit.judge.statistics.coarse_readings import drawn_within
 from driftfit.judge.statistics.robust import fit_in, noisy, orthonormal, sole
 from driftfit.run.result import Track
 
