@@ -190,10 +190,10 @@ def filters(p: Places) -> tuple[Any, Any]:
     nc, nd, at_c, at_d = p.nc, p.nd, p.at_c, p.at_d
 
     @kernel
-    def colour(s: State, raw: int, into: int, l: int) -> float:
-        x = s.signals[raw, 0, l]
+    def colour(s: State, raw: int, into: int, about: float, l: int) -> float:
+        x = s.signals[raw, 0, l] - about
         for i in range(nd):
-            x -= s.point[at_d + i, l] * s.signals[raw, i + 1, l]
+            x -= s.point[at_d + i, l] * (s.signals[raw, i + 1, l] - about)
         for i in range(nc):
             x -= s.damped[at_c + i, l] * s.signals[into, i + 1, l]
         return x  # type: ignore[no-any-return]
@@ -256,7 +256,7 @@ def taking_inputs(p: Places) -> Step:
             enlarge(s, u, 1 + j, l)
             held = s.last_input[j, l]
             s.signals[own + HELD, 0, l] = held
-            s.signals[own + G, 0, l] = filtered(s, colour(s, own + HELD, own + G, l), held, 1 + j, l)
+            s.signals[own + G, 0, l] = filtered(s, colour(s, own + HELD, own + G, 0.0, l), held, 1 + j, l)
             x = s.signals[own + G, 0, l]
             for i in range(nf[j]):
                 x += s.damped[at_f[j] + i, l] * s.signals[own + UF, i + 1, l]
@@ -330,8 +330,18 @@ def gradient_of(p: Places) -> Any:
     @kernel
     def gradient(s: State, l: int) -> None:
         settled = s.usable[l] >= SETTLING * n
+        if at_offset >= 0:
+            one = 1.0
+            for i in range(nd):
+                one -= s.point[at_d + i, l]
+            for i in range(nc):
+                one -= s.damped[at_c + i, l] * s.signals[ONE, i + 1, l]
+            one = one if abs(one) < BEYOND else 1.0
+            s.signals[ONE, 0, l] = one
+            s.phi[at_offset, l] = one if settled else 1.0
         for i in range(na):
-            lag = s.signals[YF, i + 1, l] if settled else s.signals[Y, i + 1, l]
+            own = s.signals[YF, i + 1, l] + s.reference[l] * s.signals[ONE, 0, l]
+            lag = own if settled else s.signals[Y, i + 1, l]
             s.phi[i, l] = lag if abs(s.signals[Y, i + 1, l]) < LARGEST else np.nan
         for j in range(m):
             own = OWN + EACH * j
@@ -345,15 +355,6 @@ def gradient_of(p: Places) -> Any:
             s.phi[at_c + i, l] = s.signals[EF, i + 1, l] if settled else s.signals[E, i + 1, l]
         for i in range(nd):
             s.phi[at_d + i, l] = s.signals[VF, i + 1, l] if settled else s.signals[V, i + 1, l]
-        if at_offset >= 0:
-            one = 1.0
-            for i in range(nd):
-                one -= s.point[at_d + i, l]
-            for i in range(nc):
-                one -= s.damped[at_c + i, l] * s.signals[ONE, i + 1, l]
-            one = one if abs(one) < BEYOND else 1.0
-            s.signals[ONE, 0, l] = one
-            s.phi[at_offset, l] = one if settled else 1.0
 
     step: Step = gradient
     return step
@@ -420,7 +421,7 @@ def pushing(p: Places, place: Step, waiting: float = ENTRY) -> Step:
     def remember(s: State, y: float, known: bool, v: float, e: float, l: int) -> None:
         s.signals[Y, 0, l], s.signals[V, 0, l], s.signals[E, 0, l] = y, v, e
         s.signals[EF, 0, l], s.signals[VF, 0, l] = whitened(s, E, EF, l), whitened(s, V, VF, l)
-        s.signals[YF, 0, l] = filtered(s, colour(s, Y, YF, l), y, 0, l)
+        s.signals[YF, 0, l] = filtered(s, colour(s, Y, YF, s.reference[l], l), y - s.reference[l], 0, l)
         s.signals[Y, 0, l] = y if known else np.nan
 
     @kernel
@@ -447,6 +448,8 @@ def pushing(p: Places, place: Step, waiting: float = ENTRY) -> Step:
     def push(s: State, l: int) -> None:
         observed = s.observed[l] > 0.0
         predicted = informed(s, l)
+        if at_offset >= 0:
+            s.reference[l] = s.measured[l] if observed & (s.usable[l] < 1.0) else s.reference[l]
         # w and e of this sample are those of the theta that has learned from it
         enlarge(s, s.measured[l] if observed else np.nan, 0, l)
         linearise(s, l)
