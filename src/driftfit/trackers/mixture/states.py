@@ -60,11 +60,11 @@ FIRST_ALONE = FIRST_LEARNED + len(LEARNED)
 STATES = 3
 OUTLIER, RARITY, FADE = 0.035, 50.0, 0.999
 """Probability of an outlier before the first sample, samples that this counts for, and fading of those since."""
-STAY, CALM = 0.99, 0.95
+STAY, CALM = 0.99, 0.98
 """Probabilities that quiet noise stays quiet, and that restless noise stays restless."""
 QUIET = 0.8
 """Probability of quiet noise before the first sample."""
-MEMORY, QUICK = 70.0, 3.0
+MEMORY, QUICK = 70.0, 2.0
 """Memories of r and f, in samples."""
 LEAST_RESTLESS, LARGE = 6.0, 30.0
 """Least f and the variance of outliers at least, in units of r."""
