@@ -60,7 +60,7 @@ FIRST_ALONE = FIRST_LEARNED + len(LEARNED)
 STATES = 3
 OUTLIER, RARITY, FADE = 0.035, 50.0, 0.999
 """Probability of an outlier before the first sample, samples that this counts for, and fading of those since."""
-STAY, CALM = 0.99, 0.98
+STAY, CALM = 0.995, 0.98
 """Probabilities that quiet noise stays quiet, and that restless noise stays restless."""
 QUIET = 0.8
 """Probability of quiet noise before the first sample."""
