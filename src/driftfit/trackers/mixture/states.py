@@ -2,8 +2,8 @@
 
 Modes are rows of the table of `AdaptiveKalman`. Noise has one of three states, told apart by the samples:
 
-    quiet      variance r, the mean of E(v^2 | y) with a memory of `MEMORY` samples
-    restless   variance f, the same with a memory of `QUICK`
+    quiet      variance r, the mean of E(v^2 | y) with a memory of `MEMORY` samples that are no outliers
+    restless   variance f: log f follows log E(v^2 | y, not quiet) with a memory of `QUICK` samples that are not quiet
     outlier    of any size: variance max(30 r, e^2), with a probability that is learned
 
 With p the joint probabilities of modes and states, E(v^2 | y) = sum p (r - r^2 / s + (r e / s)^2), exactly; a noise
@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import ROUNDING
-from driftfit.engine.kernel import Array, State, exp, kernel
+from driftfit.engine.kernel import Array, State, exp, kernel, log
 
 COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
 TREND = (1e-3, 1e-2, 0.1)
@@ -60,14 +60,14 @@ FIRST_ALONE = FIRST_LEARNED + len(LEARNED)
 STATES = 3
 OUTLIER, RARITY, FADE = 0.035, 50.0, 0.999
 """Probability of an outlier before the first sample, samples that this counts for, and fading of those since."""
-STAY, CALM = 0.99, 0.95
+STAY, CALM = 0.995, 0.98
 """Probabilities that quiet noise stays quiet, and that restless noise stays restless."""
 QUIET = 0.8
 """Probability of quiet noise before the first sample."""
-MEMORY, QUICK = 70.0, 10.0
+MEMORY, QUICK = 70.0, 2.0
 """Memories of r and f, in samples."""
-LEAST_RESTLESS, LARGE, WILDEST = 6.0, 30.0, 1e8
-"""Least f, the variance of outliers at least, and the largest f, in units of r."""
+LEAST_RESTLESS, LARGE = 6.0, 30.0
+"""Least f and the variance of outliers at least, in units of r."""
 LEAST_SHARE = 1e-26
 """r is never below this share of the mean square of y, for rounding in the sums of a prediction."""
 
@@ -220,7 +220,7 @@ def learn_noise(s: State, l: int) -> None:
     s.certainty[l] = s.noise[l] * ((1.0 - s.outlier[l]) * usual + s.outlier[l] / far)
     if s.repeats[l] > 0.0:
         return
-    ordinary, share, every = 0.0, 0.0, 0.0
+    ordinary, wild = 0.0, 0.0
     for j in range(STATES):
         least = variance_in(s, j, l)
         widest = np.inf if j == STATES - 1 else 0.0
@@ -229,19 +229,18 @@ def learn_noise(s: State, l: int) -> None:
             own = max(least, min(e2, widest))
             s.row[k, l] = s.joint[j, k, l] * (own * (1.0 - own * v) + own * v * own * v * e2)
         moment = sum_of_row(s, l) / s.noise[l]
-        every += moment
-        if j < STATES - 1:
-            for k in range(K):
-                s.row[k, l] = s.joint[j, k, l]
-            share += sum_of_row(s, l)
-            ordinary += moment
+        ordinary += moment if j < STATES - 1 else 0.0
+        wild += moment if j > 0 else 0.0
     s.count[l] += 1.0
     s.outliers[l] = FADE * s.outliers[l] + s.outlier[l]
     s.watched[l] = FADE * s.watched[l] + 1.0
+    # s.nu counts an outlier for the states that were expected
+    away = 1.0 - s.nu[0, l] + s.outlier[l] * s.nu_prior[0, l] / (1.0 - s.outlying[l])
+    f = variance_in(s, 1, l) / s.noise[l]
+    s.restless[l] = f * exp(away / QUICK * log(wild / (away * f))) if (away > 0.0) & (wild > 0.0) else f
     s.outlying[l] = (OUTLIER * RARITY + s.outliers[l]) / (RARITY + s.watched[l])
-    move = (ordinary / s.r[l] - share) / min(s.count[l] + 1.0, MEMORY)
+    move = (ordinary / s.r[l] - (1.0 - s.outlier[l])) / min(s.count[l] + 1.0, MEMORY)
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
-    s.restless[l] += (min(every, WILDEST * s.r[l]) - s.restless[l]) / QUICK
 
 
 SMOOTHER_FIELDS = (
