@@ -33,6 +33,9 @@ from driftfit.smooth.parts.walk import Path, Walk
 from driftfit.trackers.parts.information import triangular_root
 
 
+TINY = 1e-150
+
+
 def smooth(walk: Walk, keep: str = "fit", rebuild: Callable[[], Walk] | None = None) -> Path:
     """Solve the problem.
 
@@ -53,7 +56,7 @@ def smooth(walk: Walk, keep: str = "fit", rebuild: Callable[[], Walk] | None = N
     if found is None:
         walk = rebuild() if simple and rebuild is not None else walk
         found = safely(walk, scale, unseen, keep)
-    return spread(walk, found)._replace(rank=rank)
+    return spread(walk, found._replace(rank=rank))
 
 
 def safely(walk: Walk, scale: Array, unseen: Array, keep: str) -> Path:
@@ -64,6 +67,13 @@ def safely(walk: Walk, scale: Array, unseen: Array, keep: str) -> Path:
 
 def spread(walk: Walk, path: Path) -> Path:
     """The path with the variance between the paths under all drifts that are possible."""
+    if walk.mixture is not None:
+        theta, cov = walk.mixture.theta, walk.mixture.cov
+        var, size = np.einsum("tii->ti", cov), np.sqrt(np.where(walk.weight > 0.0, walk.weight, np.nan))
+        path = path._replace(
+            theta=theta.copy(), var=np.where(np.isinf(path.var), np.inf, var), cov=cov if len(path.cov) else path.cov,
+            rho=size * walk.residual(theta) / np.maximum(path.c, TINY) if len(path.c) else path.rho,
+        )  # fmt: skip
     if not len(walk.paths):
         return path
     away = np.sqrt(walk.belief)[:, None, None] * (walk.paths - path.theta)

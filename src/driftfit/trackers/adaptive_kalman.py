@@ -71,12 +71,14 @@ from driftfit.trackers.mixture.learned import (
     whiten_noise,
 )
 from driftfit.trackers.mixture.states import (
+    MOST_ALONE,
     SMOOTHER_FIELDS,
     any_noise,
     bank,
-    estimated_variances,
+    centring,
     learn_noise,
     least_noise,
+    noise_given_all,
     noise_prior,
     note_reading,
     repeated_rounding,
@@ -321,10 +323,11 @@ class AdaptiveKalman(Tracker):
         running = np.append(False, fields["settled"][:-1] > 0)  # not yet at the sample with which the filters start
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
 
-    def estimated_variances(
-        self, model: Model, fields: Mapping[str, Array], phi: Array, e: Array, time: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        return estimated_variances(fields, phi, time, self.state(model.n))
+    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array]:
+        return centring(fields, phi), noise_given_all(fields)
+
+    def apart(self, n: int) -> Sequence[Sequence[int]]:
+        return [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:

@@ -150,16 +150,16 @@ class Tracker(Settings, ABC):
         """phi (T, n) and y (T,) as the tracker used them; ``fields`` as in `estimated_variances`."""
         return phi, y
 
-    def estimated_variances(
-        self, model: Model, fields: Mapping[str, Array], phi: Array, e: Array, time: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """Variances of the drift before each sample (T, n), those of an independent drift of B^-1 theta (T, n), B
-        (n, n), and variances of the noise (T,), if the tracker estimates them.
+    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array]:
+        """B (n, n), and the variances of the noise (T,), if the tracker estimates them: what drifts is B^-1 theta.
 
-        ``fields`` (T, ..) are those that ``smoother_fields`` names, phi (N, n) the regressors of the used samples, e
-        (T,) the innovations of samples of weight 1, time (T,) the intervals of drift.
+        ``fields`` (T, ..) are those that ``smoother_fields`` names, phi (N, n) the regressors of the used samples.
         """
         raise NotImplementedError
+
+    def apart(self, n: int) -> Sequence[Sequence[int]]:
+        """Groups of parameters that may move while the others rest."""
+        return ()
 
     def extra_columns(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
         """Known factors of every sample after interval, noise and drift, (T, k), which ``steps.read_extra`` reads."""

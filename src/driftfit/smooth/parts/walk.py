@@ -52,6 +52,8 @@ class Walk(NamedTuple):
     """(K, T, n): paths under other drifts that are possible too; empty if the drift is known."""
     belief: Array = NONE
     """(K,): their probabilities."""
+    mixture: Any = None
+    """The moments of a mixture, whose path and variances take the place of those of the walk; None if there is none."""
     basis: Array = NONE
     """(n, n): drifts, ``drift_root`` and ``paths`` are those of z, theta = basis z; empty if they are those of theta.
     """
