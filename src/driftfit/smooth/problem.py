@@ -128,11 +128,11 @@ def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -
     drift *= run.known.drift
     basis = NONE
     if own and fields:
-        B, r_of = tracker.problem(fields, phi[weight > 0.0])
-        groups, running = tracker.apart(run.model.n), fields["settled"] > 0
+        B, r_of, rate = tracker.problem(fields, phi[weight > 0.0])
+        groups = tracker.apart(run.model.n)
         phi, signals[:, Y] = tracker.regression(fields, phi, signals[:, Y])
         basis = B if turned and np.any(np.eye(len(B)) != B) else NONE
-        time = np.where(running, drift, 0.0)
+        time = np.where(rate > 0.0, drift, 0.0)
         weight /= r_of
         drift[:] = 1.0
     trend = dt if prior.slopes else NONE
@@ -144,4 +144,4 @@ def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -
     walk = Walk(phi, signals, prior.q / r, prior.theta0, p0, prior.r, drift_root, trend, basis=basis)
     if not (own and fields):
         return walk
-    return average_drift(walk.independent, time, moving, groups)._replace(phi=phi, basis=basis)
+    return average_drift(walk.independent, (time, rate * time), moving, groups)._replace(phi=phi, basis=basis)

@@ -1,17 +1,18 @@
-"""The smoother of records whose drift nobody has given: jumps and drifts of any size are hypotheses.
+"""The smoother of records whose drift nobody has given: jumps, drifts and slopes of any size are hypotheses.
 
-Between two samples nothing happens but the drift, with probability 1 - `PER_SAMPLE`, or all parameters, or those of one
-group, jump too:
+Between two samples the parameters drift, and with probability `PER_SAMPLE` all of them, or those of one group, jump:
 
     theta_t = theta_{t-1} + w_t,    Var w_t(i) = (rho_i tau_t + v) r / c_i,    v = 0 or one of `SIZES`
 
-with r the typical noise variance, c_i the mean square of regressor i, and tau_t the nominal intervals of drift. All
-sequences are summed by `driftfit.smooth.mixture`. The drift ratios rho_i are constant, and found in three steps:
+with r the typical noise variance, c_i the mean square of regressor i, and tau_t the time: the nominal intervals of drift,
+or these weighted by the drift that the tracker found, which must be T / `SHARE` better in log evidence because it was
+found in the same noise. `driftfit.smooth.mixture` sums over all sequences of jumps. The ratios rho_i are found in three
+steps:
 
-    1. one ratio of all parameters, of greatest evidence among `LEVELS`;
+    1. tau, and one ratio of all parameters, of greatest evidence among `LEVELS`;
     2. with the expected squares of its jumps as known drift the problem has one Gaussian, whose likelihood costs a
-       hundredth (`driftfit.smooth.parts.elimination`): climb in steps of `RATIOS`, for all parameters or one of them,
-       and average over the ratios that were tried;
+       hundredth (`driftfit.smooth.parts.elimination`): climb by half powers of ten, for all parameters or one group,
+       and average over the ratios that were tried, of which the smallest moves the path by less than its error;
     3. the path is the average over `SCALES` of these ratios, weighted by the evidence.
 
 Variances grow by the spread of the paths of step 2: a slow walk can look as if nothing moved. Slopes that walk are
@@ -19,14 +20,14 @@ another model of the same record (`driftfit.smooth.parts.slope_drift`) and are a
 probable than not, they are taken.
 
 Source: Hoeting, Madigan, Raftery and Volinsky (1999) for averaging over models by their likelihood; the three steps are
-ours. Cost per sample: eight filters of `FEW` components, about three smoothers of mixtures, and O(n^3) for each try.
+ours. Cost per sample: eleven filters of `FEW` components, two to five smoothers of mixtures, and O(n^3) for each try.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,44 +41,47 @@ from driftfit.smooth.parts.rank import column_scale
 from driftfit.smooth.parts.slope_drift import compared
 from driftfit.smooth.parts.walk import Walk
 
+Groups = Sequence[Sequence[int]]
 SIZES = ((9.0, 0.7), (900.0, 0.3))
 """Variances of jumps, in units of r / c, and their shares."""
-PER_SAMPLE = 5e-3
+PER_SAMPLE = 2e-3
 """Probability of a jump before a sample."""
 LEVELS = (0.0, 1e-4, 1e-2, 1.0)
-RATIOS = np.append(0.0, 10.0 ** np.arange(-6.0, 1.5, 0.5))
+SMALLEST, LARGEST = 10.0, 10.0
+"""The smallest ratio times T^2, and the largest."""
 SCALES = np.array([1.0 / 3.0, 1.0, 3.0, 9.0])
+SHARE = 200.0
 FEW = 8
 """Components with which evidences are computed, and the path where they suffice."""
-LIKELY = 0.1
-"""Scales that are less likely than this share of the best are left out."""
-LEAST = 1e-3
-"""Ratios with a smaller probability do not count in the variances."""
+LIKELY, LEAST = 0.1, 0.01
+"""Shares of the best below which scales, and ratios or slopes, are left out."""
 TRENDS = 3.0
 """Penalty of slopes that walk, in units of the log-likelihood."""
 
 
-class Weighed(NamedTuple):
-    """Models of a record with their probabilities."""
+class Tried(NamedTuple):
+    """Ratios that are likely, with a Gaussian each."""
 
     p: Array
     """(K,)"""
     theta: Array
     """(K, T, n)"""
+    q: Array
+    """(n,): the average drift."""
 
 
-def average_drift(walk: Walk, time: Array, trend: Array, groups: Sequence[Sequence[int]]) -> Walk:
-    """The walk with the average of the drifts, with the mixture of all hypotheses, and paths of other drifts.
+def average_drift(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Groups) -> Walk:
+    """The walk with the average of the drifts, with the moments of all hypotheses, and with paths of other drifts.
 
-    ``time`` (T,) are the intervals of drift before each sample, and ``trend`` (T,) those of motion along a slope.
-    Regressors that are always 0 take no part, and their parameters stay at 0.
+    ``times`` are the two tau (T,), of which the second need not have a unit, ``trend`` (T,) the intervals of motion
+    along a slope. Regressors that are always 0 take no part, and their parameters stay at 0.
     """
     moved = np.flatnonzero(np.any(walk.phi[walk.weight > 0.0] != 0.0, axis=0))
     if len(moved) == walk.phi.shape[1] or not len(moved):
-        return averaged(walk, time, trend, groups)
+        return averaged(walk, times, trend, groups)
     place = {int(i): k for k, i in enumerate(moved)}
     inner = [own for group in groups if (own := [place[i] for i in group if i in place])]
-    some = averaged(walk.of(moved), time, trend, inner)
+    some = averaged(walk.of(moved), times, trend, inner)
     drift_root, paths = np.zeros_like(walk.phi), np.zeros((len(some.paths), *walk.phi.shape))
     drift_root[:, moved], paths[:, :, moved] = some.drift_root, some.paths
     known = some.mixture
@@ -88,43 +92,42 @@ def average_drift(walk: Walk, time: Array, trend: Array, groups: Sequence[Sequen
     return walk._replace(drift_root=drift_root, trend=some.trend, paths=paths, belief=some.belief, mixture=known)
 
 
-def averaged(walk: Walk, time: Array, trend: Array, groups: Sequence[Sequence[int]]) -> Walk:
+def averaged(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Groups) -> Walk:
     """The same where every regressor moves."""
-    used, n = walk.weight > 0.0, walk.phi.shape[1]
-    if used.sum() <= n:
+    used, (T, n) = walk.weight > 0.0, walk.phi.shape
+    if used.sum() <= n or not times[1].any():
         return walk._replace(drift_root=np.zeros_like(walk.phi))
     r = float(np.median(1.0 / walk.weight[used]))
     power = r * np.mean(walk.weight[used, None] * walk.phi[used] ** 2, axis=0)
     unit = r / np.where(power > 0.0, power, 1.0)
-    problem = hypotheses(walk, time, unit, groups)
-    keep, levels = np.full(len(time), FEW), [one * unit for one in LEVELS]
-    best = max(levels, key=lambda q: mixture.filtered(drifting(problem, q), FEW)[0])
-    first = mixture.Passes(drifting(problem, best), keep).smoothed(False)
+    found = times[1] * (times[0].sum() / times[1].sum())
+    plain, weighed = (hypotheses(walk, time, unit, groups) for time in (times[0], found))
+    tried = [(drifting(plain, level * unit), 0.0) for level in LEVELS]
+    tried += [(drifting(weighed, level * unit), T / SHARE) for level in LEVELS[1:]]
+    problem, _ = max(tried, key=lambda one: mixture.filtered(one[0], FEW)[0] - one[1])
+    first = mixture.Passes(problem, np.full(T, FEW)).smoothed(False)
     jumps = (1.0 - first.events[:, :1]) * (first.shift**2 + first.shift_var)
-    one = Weighed(np.ones(1), first.theta[None])
-    found = climbed(walk, time, jumps, unit, groups if len(groups) > 1 else [])
-    q, weighed = (best, one) if found is None else found
-    gaussian = walk._replace(drift_root=np.sqrt(q * time[:, None] + jumps))
-    if found is None:
-        return gaussian
-    total = mean_of(problem, q, keep)
-    return with_slopes(gaussian._replace(mixture=total), weighed, trend)
+    time = problem.sizes[:, :1] ** 2
+    likely = climbed(walk, time, jumps, unit, groups if len(groups) > 1 else [])
+    if likely is None:
+        root = np.diag(problem.alternatives.roots[0])
+        return walk._replace(drift_root=np.sqrt(root**2 * time + jumps))
+    gaussian = walk._replace(drift_root=np.sqrt(likely.q * time + jumps), mixture=mean_of(problem, likely.q))
+    fitted = float(np.sum(1.0 - first.events[:, 0]))
+    return with_slopes(gaussian, likely, trend, TRENDS + fitted * np.log(PER_SAMPLE))
 
 
-def with_slopes(walk: Walk, weighed: Weighed, trend: Array) -> Walk:
+def with_slopes(walk: Walk, likely: Tried, trend: Array, price: float) -> Walk:
     """The problem with slopes if they are more probable, and with the paths of all that are probable at all."""
-    most = int(np.argmax(weighed.p))
-    rates, better = compared(walk, trend, weighed.theta[most, 0])
-    p = np.append(0.0, better - TRENDS)
+    rates, better = compared(walk, trend, likely.theta[np.argmax(likely.p), 0])
+    p = np.append(0.0, better - price)
     p = np.exp(p - p.max())
     p /= p.sum()
     which = np.flatnonzero(p[1:] >= LEAST)
     others = [slopes.smooth(sloped(walk, trend, rates[k])).theta for k in which]
-    belief = np.append(p[0] * weighed.p, p[1 + which])
     if p[0] < 0.5:
-        rate = p[1:] @ rates / p[1:].sum()
-        walk = sloped(walk, trend, rate)._replace(mixture=None)
-    return walk._replace(paths=np.array([*weighed.theta, *others]), belief=belief)
+        walk = sloped(walk, trend, p[1:] @ rates / p[1:].sum())._replace(mixture=None)
+    return walk._replace(paths=np.array([*likely.theta, *others]), belief=np.append(p[0] * likely.p, p[1 + which]))
 
 
 def sloped(walk: Walk, trend: Array, rate: Array) -> Walk:
@@ -132,12 +135,13 @@ def sloped(walk: Walk, trend: Array, rate: Array) -> Walk:
     return walk._replace(trend=trend, drift_root=np.sqrt(trend[:, None] * rate))
 
 
-def hypotheses(walk: Walk, time: Array, unit: Array, groups: Sequence[Sequence[int]]) -> Problem:
+def hypotheses(walk: Walk, time: Array, unit: Array, groups: Groups) -> Problem:
     """The problem without drift; ``unit`` (n,) is r / c."""
     T, n = walk.phi.shape
-    each = [np.ones(n), *(np.isin(np.arange(n), group) for group in groups)] if len(groups) > 1 else [np.ones(n)]
-    shares = [1.0] if len(each) == 1 else [0.5] + [0.5 / len(groups)] * len(groups)
-    jumps = [(size * unit * own, share * p) for (own, share), (size, p) in product(zip(each, shares), SIZES)]
+    each = [(np.ones(n), 1.0)]
+    if len(groups) > 1:
+        each = [(np.ones(n), 0.5), *((np.isin(np.arange(n), group), 0.5 / len(groups)) for group in groups)]
+    jumps = [(size * unit * own, share * p) for (own, share), (size, p) in product(each, SIZES)]
     roots = np.array([np.diag(np.sqrt(q)) for q in (np.zeros(n), *(q for q, _ in jumps))])
     label, zero = np.arange(len(roots)), np.zeros(len(roots), int)
     with np.errstate(divide="ignore"):
@@ -145,60 +149,63 @@ def hypotheses(walk: Walk, time: Array, unit: Array, groups: Sequence[Sequence[i
     which = np.column_stack([zero, np.where(label > 0, label, -1)])
     moves = Alternatives(zero, zero, label, log_prob, roots, which, np.tile([0, 1], (len(roots), 1)))
     r = np.divide(1.0, walk.weight, out=np.full(T, np.inf), where=walk.weight > 0.0)
-    sizes = np.column_stack([np.sqrt(time), np.ones(T)])
     noise = Noises(np.array([[1.0, 0.0]]), np.zeros((1, 1)))
-    table = (time > 0.0).astype(int)
+    table, sizes = (time > 0.0).astype(int), np.column_stack([np.sqrt(time), np.ones(T)])
     return Problem(walk.phi, walk.y.copy(), r, moves, table, sizes, np.zeros((0, n + 1)), noise)
 
 
 def drifting(problem: Problem, q: Array) -> Problem:
-    """The problem with this drift (n,) per nominal interval."""
+    """The problem with this drift (n,) per unit of time."""
     roots = problem.alternatives.roots.copy()
     roots[0] = np.diag(np.sqrt(q))
     return problem._replace(alternatives=problem.alternatives._replace(roots=roots))
 
 
-def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Any) -> tuple[Array, Weighed] | None:
-    """The average drift (n,) with known squares of jumps (T, n), and the paths; None if no likelihood is accurate."""
-    n, top = len(unit), len(RATIOS) - 1
-    size = column_scale(walk.phi, walk.signals)
-    known: dict[tuple[int, ...], tuple[float, Array]] = {}
+def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) -> Tried | None:
+    """Ratios with known squares of jumps (T, n); None if no likelihood is accurate."""
+    n, T = len(unit), len(time)
+    least = np.ceil(2.0 * np.log10(SMALLEST / T**2)) / 2.0
+    ratios = np.append(0.0, 10.0 ** np.arange(least, np.log10(LARGEST) + 0.25, 0.5))
+    size, top = column_scale(walk.phi, walk.signals), len(ratios) - 1
+    known: dict[tuple[int, ...], float] = {}
+
+    def solved(at: tuple[int, ...]) -> tuple[Array, float]:
+        found = smooth_and_weigh(walk._replace(drift_root=np.sqrt(ratios[list(at)] * unit * time + jumps)), size)
+        return (jumps, -np.inf) if found is None else (found[0].theta, found[1])
 
     def value(at: tuple[int, ...]) -> float:
         if at not in known:
-            q = RATIOS[list(at)] * unit
-            solved = smooth_and_weigh(walk._replace(drift_root=np.sqrt(q * time[:, None] + jumps)), size)
-            known[at] = (-np.inf, jumps) if solved is None else (solved[1], solved[0].theta)
-        return known[at][0]
+            known[at] = solved(at)[1]
+        return known[at]
 
-    best = max(((level,) * n for level in range(top + 1)), key=value)
-    before = None
+    best, before = max(((level,) * n for level in range(top + 1)), key=value), None
     while best != before:
         before = best
         near = [tuple(np.clip(np.add(best, step), 0, top).tolist()) for step in (-1, 1)]
-        for group in groups:
-            level = best[group[0]]
-            for other in (0, max(level - 1, 0), min(level + 1, top)):
-                near.append(tuple(other if i in group else own for i, own in enumerate(best)))
+        for group, step in product(groups, (-top, -1, 1)):
+            level = min(max(best[group[0]] + step, 0), top)
+            near.append(tuple(level if i in group else own for i, own in enumerate(best)))
         best = max((best, *near), key=value)
-    if known[best][0] == -np.inf:
+    if known[best] == -np.inf:
         return None
-    likely = [at for at, (logs, _) in known.items() if logs > known[best][0] + np.log(LEAST)]
-    p = np.exp([known[at][0] - known[best][0] for at in likely])
+    likely = [at for at, logs in known.items() if logs > known[best] + np.log(LEAST)]
+    p = np.exp([known[at] - known[best] for at in likely])
     p /= p.sum()
-    return p @ RATIOS[np.array(likely)] * unit, Weighed(p, np.array([known[at][1] for at in likely]))
+    return Tried(p, np.array([solved(at)[0] for at in likely]), p @ ratios[np.array(likely)] * unit)
 
 
-def mean_of(problem: Problem, q: Array, keep: Array) -> Mixture:
-    """The average of the mixtures with all likely scales of the drift q."""
+def mean_of(problem: Problem, q: Array) -> Mixture:
+    """The average of the mixtures with all likely scales of the drift q (n,)."""
     scales = [drifting(problem, scale * q) for scale in SCALES]
     logs = np.array([mixture.filtered(one, FEW)[0] for one in scales])
     order = [k for k in np.argsort(-logs) if logs[k] > logs.max() + np.log(LIKELY)]
     w = np.exp(logs[order] - logs.max())
     w /= w.sum()
-    first = mixture.smooth(scales[order[0]], True, keep)
+    first = mixture.smooth(scales[order[0]], True, np.full(len(problem.y), FEW))
     found = [first, *(mixture.smooth(scales[k], True, first.kept) for k in order[1:])]
     theta = np.asarray(np.einsum("k,kti->ti", w, np.array([one.theta for one in found])))
-    away = [one.theta - theta for one in found]
-    cov = sum(share * (one.cov + d[:, :, None] * d[:, None, :]) for share, one, d in zip(w, found, away, strict=True))
-    return first._replace(theta=theta, cov=np.asarray(cov))
+    cov = np.zeros_like(first.cov)
+    for share, one in zip(w, found, strict=True):
+        away = one.theta - theta
+        cov += share * (one.cov + away[:, :, None] * away[:, None, :])
+    return first._replace(theta=theta, cov=cov)

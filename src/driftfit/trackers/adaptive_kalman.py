@@ -45,7 +45,6 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel, nothing
 from driftfit.engine.settings import whole
-from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.mixture.filters import (
     enter_filters,
@@ -78,11 +77,11 @@ from driftfit.trackers.mixture.states import (
     centring,
     learn_noise,
     least_noise,
-    noise_given_all,
     noise_prior,
     note_reading,
     repeated_rounding,
     store_for_smoother,
+    variances_given_all,
 )
 from driftfit.trackers.parts.coordinates import (
     FRAME,
@@ -323,8 +322,8 @@ class AdaptiveKalman(Tracker):
         running = np.append(False, fields["settled"][:-1] > 0)  # not yet at the sample with which the filters start
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
 
-    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array]:
-        return centring(fields, phi), noise_given_all(fields)
+    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array]:
+        return centring(fields, phi), *variances_given_all(fields, self.state(phi.shape[1]))
 
     def apart(self, n: int) -> Sequence[Sequence[int]]:
         return [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()

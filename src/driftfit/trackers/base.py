@@ -150,8 +150,8 @@ class Tracker(Settings, ABC):
         """phi (T, n) and y (T,) as the tracker used them; ``fields`` as in `estimated_variances`."""
         return phi, y
 
-    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array]:
-        """B (n, n), and the variances of the noise (T,), if the tracker estimates them: what drifts is B^-1 theta.
+    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array]:
+        """B (n, n), what drifts being B^-1 theta, and the variances of noise and drift (T,), if they are estimated.
 
         ``fields`` (T, ..) are those that ``smoother_fields`` names, phi (N, n) the regressors of the used samples.
         """

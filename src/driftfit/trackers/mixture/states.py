@@ -244,17 +244,39 @@ def learn_noise(s: State, l: int) -> None:
     s.restless[l] += (min(every, WILDEST * s.r[l]) - s.restless[l]) / QUICK
 
 
-SMOOTHER_FIELDS = ("r", "certainty", "offset", "white", "explained", "settled", "constant")
+SMOOTHER_FIELDS = ("mu", "prior", "kappa", "r", "certainty", "offset", "white", "explained", "settled", "constant")
 """Fields that are stored at every sample."""
 
 
 @kernel
 def store_for_smoother(o: State, s: State, l: int) -> None:
     """Store the fields of the smoother."""
+    for k in range(s.mu.shape[0]):
+        o.mu[k, l], o.prior[k, l] = s.mu[k, l], s.prior[k, l]
     for i in range(s.c.shape[0]):
         o.offset[i, l], o.white[i, l] = s.offset[i, l], s.white[i, l]
-    o.r[l], o.certainty[l], o.explained[l] = s.r[l], s.certainty[l], s.explained[l]
+    o.kappa[l], o.r[l], o.certainty[l], o.explained[l] = s.kappa[l], s.r[l], s.certainty[l], s.explained[l]
     o.settled[l], o.constant[l] = s.settled[l], s.constant[l]
+
+
+def transitions(state: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Transitions (K, K) of the modes as A + kappa B, from the fields of a bank."""
+    up, down, foot, arrive = state["up"], state["down"], state["foot"], state["arrive"]
+    A = np.diag(1.0 - down - foot) + np.diag(down[1:], -1)
+    A[:, 0] += foot
+    B = np.diag(-arrive.sum() - up) + np.diag(up[:-1], 1) + arrive
+    return A, B
+
+
+def modes_given_all(fields: Mapping[str, Array], used: Array, state: Mapping[str, Any]) -> Array:
+    """Probabilities (T, K) of the modes, given all samples; ``used`` (T,) are those that changed them."""
+    after, ahead = np.where(used[:, None], fields["mu"], fields["prior"]), fields["prior"]
+    (A, B), found = transitions(state), after.copy()
+    for t in range(len(found) - 2, -1, -1):
+        later = found[t + 1] / np.maximum(ahead[t], 1e-300)
+        found[t] = after[t] * (A @ later + fields["kappa"][t] * (B @ later)) if used[t] else found[t + 1]
+        found[t] /= max(found[t].sum(), 1e-300)
+    return found
 
 
 def centring(fields: Mapping[str, Array], phi: Array) -> Array:
@@ -267,9 +289,10 @@ def centring(fields: Mapping[str, Array], phi: Array) -> Array:
     return A
 
 
-def noise_given_all(fields: Mapping[str, Array]) -> Array:
-    """The variance of the noise of every sample (T,)."""
+def variances_given_all(fields: Mapping[str, Array], state: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Variance of the noise of every sample (T,), and that of the drift but for jumps, in units of 1 / c (T,)."""
     running = fields["settled"] > 0
     r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
     used = running & (fields["certainty"] > 0.0)
-    return np.asarray(1.0 / np.where(used, fields["certainty"], 1.0 / r))
+    drift = modes_given_all(fields, used, state) @ np.where(state["ratio"] < 1.0, state["ratio"], 0.0)
+    return 1.0 / np.where(used, fields["certainty"], 1.0 / r), np.where(running, r * drift, 0.0)
