@@ -4,10 +4,9 @@ Between two samples the parameters drift, and with probability `PER_SAMPLE` all 
 
     theta_t = theta_{t-1} + w_t,    Var w_t(i) = (rho_i tau_t + v) r / c_i,    v = 0 or one of `SIZES`
 
-with r the typical noise variance, c_i the mean square of regressor i, and tau_t the time: the nominal intervals of drift,
-or these weighted by the drift that the tracker found, which must be T / `SHARE` better in log evidence because it was
-found in the same noise. `driftfit.smooth.mixture` sums over all sequences of jumps. The ratios rho_i are found in three
-steps:
+with r the typical noise variance, c_i the mean square of regressor i, and tau_t the nominal intervals of drift, or
+these weighted by the drift that the tracker found, which must be T / `SHARE` better in log evidence: it was found in
+the same noise. `driftfit.smooth.mixture` sums over all sequences of jumps. The ratios are found in three steps:
 
     1. tau, and one ratio of all parameters, of greatest evidence among `LEVELS`;
     2. with the expected squares of its jumps as known drift the problem has one Gaussian, whose likelihood costs a
@@ -42,10 +41,10 @@ from driftfit.smooth.parts.slope_drift import compared
 from driftfit.smooth.parts.walk import Walk
 
 Groups = Sequence[Sequence[int]]
-SIZES = ((9.0, 0.7), (900.0, 0.3))
-"""Variances of jumps, in units of r / c, and their shares."""
-PER_SAMPLE = 2e-3
-"""Probability of a jump before a sample."""
+SIZES = (9.0, 900.0)
+"""Variances of jumps, in units of r / c, equally likely."""
+PER_SAMPLE = 3e-3
+"""Probability of a jump before a sample, as in `driftfit.trackers.mixture.states`."""
 LEVELS = (0.0, 1e-4, 1e-2, 1.0)
 SMALLEST, LARGEST = 10.0, 10.0
 """The smallest ratio times T^2, and the largest."""
@@ -82,9 +81,11 @@ def average_drift(walk: Walk, times: tuple[Array, Array], trend: Array, groups: 
     place = {int(i): k for k, i in enumerate(moved)}
     inner = [own for group in groups if (own := [place[i] for i in group if i in place])]
     some = averaged(walk.of(moved), times, trend, inner)
-    drift_root, paths = np.zeros_like(walk.phi), np.zeros((len(some.paths), *walk.phi.shape))
-    drift_root[:, moved], paths[:, :, moved] = some.drift_root, some.paths
-    known = some.mixture
+    drift_root = np.zeros_like(walk.phi)
+    drift_root[:, moved], paths, known = some.drift_root, some.paths, some.mixture
+    if len(paths):
+        paths = np.zeros((len(paths), *walk.phi.shape))
+        paths[:, :, moved] = some.paths
     if known is not None:
         theta, cov = np.zeros_like(walk.phi), np.zeros((len(walk.phi), *walk.q.shape))
         theta[:, moved], cov[:, moved[:, None], moved] = known.theta, known.cov
@@ -138,10 +139,10 @@ def sloped(walk: Walk, trend: Array, rate: Array) -> Walk:
 def hypotheses(walk: Walk, time: Array, unit: Array, groups: Groups) -> Problem:
     """The problem without drift; ``unit`` (n,) is r / c."""
     T, n = walk.phi.shape
-    each = [(np.ones(n), 1.0)]
-    if len(groups) > 1:
-        each = [(np.ones(n), 0.5), *((np.isin(np.arange(n), group), 0.5 / len(groups)) for group in groups)]
-    jumps = [(size * unit * own, share * p) for (own, share), (size, p) in product(each, SIZES)]
+    apart = groups if len(groups) > 1 else []
+    each = [(np.ones(n), 0.5 if apart else 1.0)]
+    each += [(np.isin(np.arange(n), group).astype(float), 0.5 / len(groups)) for group in apart]
+    jumps = [(size * unit * own, share / len(SIZES)) for (own, share), size in product(each, SIZES)]
     roots = np.array([np.diag(np.sqrt(q)) for q in (np.zeros(n), *(q for q, _ in jumps))])
     label, zero = np.arange(len(roots)), np.zeros(len(roots), int)
     with np.errstate(divide="ignore"):

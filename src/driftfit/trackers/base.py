@@ -62,7 +62,7 @@ class Tracker(Settings, ABC):
     weighs: ClassVar[bool] = False
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
     smoother_fields: ClassVar[tuple[str, ...]] = ()
-    """Fields that `estimated_variances` needs from every sample; ``steps.store_for_smoother`` stores them."""
+    """Fields that `problem` needs from every sample; ``steps.store_for_smoother`` stores them."""
     drift_per_parameter: ClassVar[bool] = False
     """Whether every parameter may have its own drift at every sample (`driftfit.trackers.parts.varying_drift`)."""
     adapts: ClassVar[bool] = False
@@ -147,7 +147,7 @@ class Tracker(Settings, ABC):
         )
 
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
-        """phi (T, n) and y (T,) as the tracker used them; ``fields`` as in `estimated_variances`."""
+        """phi (T, n) and y (T,) as the tracker used them; ``fields`` as in `problem`."""
         return phi, y
 
     def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array]:

@@ -81,8 +81,7 @@ class Walk(NamedTuple):
 
     def of(self, which: Array) -> Walk:
         """The problem of some parameters with a diffuse start, if the regressors of the others are 0."""
-        phi, drift_root, q = self.phi[:, which], self.drift_root[:, which], self.q[np.ix_(which, which)]
-        return self._replace(phi=phi, drift_root=drift_root, q=q, theta0=self.theta0[which])
+        return self._replace(phi=self.phi[:, which], q=self.q[np.ix_(which, which)], theta0=self.theta0[which])
 
     @property
     def independent(self) -> Walk:

@@ -12,19 +12,17 @@ variance that is learned so needs no bounds. Equal readings in a row repeat one 
 that changed. A meter so fine that readings never repeat has no such noise, and neither has a plant without noise whose
 readings repeat because it rests.
 
-The smoother is given one random walk, with the drift that the modes have on average if all samples are known:
+The smoother (`driftfit.smooth.unknown_drift`) is given the noise and the course of the drift over time,
 
     w_t(i) = f_t(i) sum_j T_ij w_{t+1}(j) / sum_h f_t(h) T_hj         probability of mode i at t, given all samples
-    q_t    = sum_k w_t(k) q_tk,    1 / r_t = sum_j nu_tj / v_tj
+    q_t    = r_t sum_k w_t(k) rho_k for rho_k < 1,    1 / r_t = sum_j nu_tj / v_tj
 
 with f_t the probabilities after sample t, T their transitions, and nu_tj those of the states of the noise after the
-sample. `driftfit.smooth.exact` estimates theta from it, on the regressors and outputs from which coloured noise was
-taken. Of learned drift in one direction the variances count, not the covariances. Before the filters start nothing
-drifts.
+sample, on the regressors and outputs from which coloured noise was taken. Before the filters start nothing drifts.
 
 Source: the moments of a noise given the data are those of an EM step, Shumway and Stoffer (1982); step^2 / 12 is
-Sheppard's (1898); the backward pass is Kim's (1994), eq. 2.20. The modes, the rule for repeats, and smoothing one
-random walk instead of one for each mode, are ours. Cost per sample: O(K).
+Sheppard's (1898); the backward pass is Kim's (1994), eq. 2.20. The modes and the rule for repeats are ours. Cost per
+sample: O(K).
 """
 
 from __future__ import annotations
