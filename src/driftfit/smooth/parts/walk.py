@@ -81,7 +81,8 @@ class Walk(NamedTuple):
 
     def of(self, which: Array) -> Walk:
         """The problem of some parameters with a diffuse start, if the regressors of the others are 0."""
-        return self._replace(phi=self.phi[:, which], q=self.q[np.ix_(which, which)], theta0=self.theta0[which])
+        phi = np.ascontiguousarray(self.phi[:, which])
+        return self._replace(phi=phi, q=self.q[np.ix_(which, which)], theta0=self.theta0[which])
 
     @property
     def independent(self) -> Walk:
