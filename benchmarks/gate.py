@@ -242,7 +242,7 @@ class Bench:
         if tile["gate_replay"][0, 0] > 0:
             first = replayed({name: tile[name][0, ..., 0] for name in tile.dtype.names}, self.m)
             result.tile, k = tile_of(own | {"gate_decided": 1}), len(first.y)
-            loop(result.tile, first.y, first.u, 0, *(np.zeros_like(one[:k]) for one in out))
+            loop(result.tile, *first.without_codes(), 0, *(np.zeros_like(one[:k]) for one in out))
             result.reason[done - k + np.flatnonzero(first.codes.any(1))] = AT_START
             loop(result.tile, y, u, done, *out)
         return result

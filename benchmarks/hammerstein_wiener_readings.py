@@ -144,6 +144,23 @@ def recovery() -> None:
     print(f"samples to recover from the jump of example 3: {told}")
 
 
+def laws_of_b() -> None:
+    """Example 3 at 20 dB, Q/R = 1e-3: the laws of b as increments, and as levels as printed; rms by record."""
+    slow = Kalman(q=1e-3, r=1.0, p0=1e8, theta0=0.01)
+    for name, literal in (("increments", False), ("levels", True)):
+        found: dict[str, list[tuple[float, float]]] = {"average": [], "svd": [], "svd-joint": []}
+        for seed in range(24):
+            s = example(3, seed, snr_db=20.0, literal=literal)
+            run = track(s.model, slow, s.y, s.u)
+            for method, errors in found.items():
+                late = runs.late(runs.off(runs.separated(run, method), s))
+                errors.append((late.median, late.rms))
+        for method, errors in found.items():
+            median, rms = np.median(errors, axis=0)
+            worst = max(rms for _, rms in errors)
+            print(f"b as {name}, {method}: median {median:.3f}, rms {rms:.3g} (worst record {worst:.3g})")
+
+
 def legendre() -> None:
     """Example 4 on Legendre polynomials of higher order: squared errors of a and p, and the local gain, at the end."""
     furnaces = [furnace(seed) for seed in range(20)]
@@ -154,5 +171,5 @@ def legendre() -> None:
 
 
 if __name__ == "__main__":
-    for part in (thresholds, one_step, bias, noise_aware, arrivals, likelihood, rises, recovery, legendre):
+    for part in (thresholds, one_step, bias, noise_aware, arrivals, likelihood, rises, recovery, laws_of_b, legendre):
         part()

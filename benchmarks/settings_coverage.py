@@ -4,6 +4,9 @@ y = u' theta + v with two white inputs, r = 1 and random walks theta with varian
 own drift, which is estimated. *error* is the root mean square error of the estimates over that of the filter, or
 smoother, that knows q and r. The first 20 samples are left out.
 
+The second table has the share of records of constant parameters in which `likelihood_ratio` rejects a null hypothesis
+that is true, at three levels.
+
 Run: python benchmarks/settings_coverage.py [--records 40] [--quick]
 """
 
@@ -12,7 +15,7 @@ import warnings
 
 import numpy as np
 
-from driftfit import AdaptiveKalman, Kalman, Regression, Track, track, tune
+from driftfit import AdaptiveKalman, Kalman, Regression, Track, likelihood_ratio, track, tune
 from driftfit.engine.kernel import Array
 
 BURN, HALF = 20, 1.96
@@ -60,6 +63,21 @@ def scores(T: int, q: tuple[float, float], seed: int) -> Array:
     return np.array(rows)
 
 
+LEVELS = (0.01, 0.05, 0.10)
+NULLS = ("no drift, one q", "no drift, each q", "one q, each q")
+
+
+def rejections(T: int, seed: int) -> list[float]:
+    """p-values in the order of `NULLS`, of a record of constant parameters."""
+    y, u, _ = record(T, (0.0, 0.0), seed)
+    model = Regression(2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # an optimum at a bound
+        still, one = tune(model, Kalman(q=0.0), y, u), tune(model, Kalman(), y, u)
+        each = tune(model, Kalman(), y, u, groups="each")
+    return [likelihood_ratio(*pair).p for pair in ((still, one), (still, each), (one, each))]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--records", type=int, default=40)
@@ -70,6 +88,11 @@ def main() -> None:
         means = np.mean([scores(T, q, seed) for seed in range(2 if given.quick else given.records)], axis=0)
         cells = "".join(f"{f'{inside:.2f} (error {error:.2f})':>20}" for inside, error in means)
         print(f"{T:4}  {f'{q[0]:g}, {q[1]:g}':14}{cells}", flush=True)
+    print("\nrejected at" + "".join(f"{f'{level:.0%}':>8}" for level in LEVELS))
+    for T in (60,) if given.quick else (60, 200):
+        found = np.array([rejections(T, seed) for seed in range(2 if given.quick else 10 * given.records)])
+        for name, p in zip(NULLS, found.T, strict=True):
+            print(f"{T:4}  {name:18}" + "".join(f"{np.mean(p < level):8.1%}" for level in LEVELS), flush=True)
 
 
 if __name__ == "__main__":

@@ -8,15 +8,25 @@ Usage: jump_size.py
 import numpy as np
 
 from driftfit import Bank, Change, Kalman, Regression, track
-from driftfit.systems import scenarios
 
-JUMP, RATE = 0.7, 1.0 / 200.0  # of the scenario: standard deviation, and how often
-RUNS = 20
+JUMP, RATE, NOISE = 0.7, 1.0 / 200.0, 0.3  # size and rate of the jumps, standard deviation of the noise
+RUNS, T = 20, 1000
+
+
+def record(seed):
+    """(y, u, theta): three parameters that jump together, and white inputs."""
+    rng = np.random.default_rng([seed, *b"sparse_jumps"])
+    jump = rng.random(T) < RATE
+    theta = np.array([1.0, -0.5, 0.8]) + np.cumsum(jump[:, None] * rng.normal(size=(T, 3)) * JUMP, axis=0)
+    noise = NOISE * rng.normal(size=T)
+    rng.normal(size=T)  # that all inputs share in other records
+    u = rng.normal(size=(T, 3))
+    return np.sum(u * theta, axis=1) + noise, u, theta
 
 
 def error(tracker, records):
     """Root mean square error of theta after 200 samples, over all records."""
-    squares = [np.mean((track(Regression(3), tracker, r.y, r.u).theta - r.theta)[200:] ** 2) for r in records]
+    squares = [np.mean((track(Regression(3), tracker, y, u).theta - theta)[200:] ** 2) for y, u, theta in records]
     return float(np.sqrt(np.mean(squares)))
 
 
@@ -26,8 +36,7 @@ def bank(factor):
 
 
 def main():
-    records = [scenarios.simulate("sparse_jumps", "regression", seed) for seed in range(RUNS)]
-    r = float(np.mean([np.mean(one.noise) for one in records]))
+    records, r = [record(seed) for seed in range(RUNS)], NOISE
     given = error(bank(1.0), records)
     print(f"size of the jumps given:  {given:.4f}")
     for factor in (0.1, 1.0 / 3.0, 3.0, 10.0):

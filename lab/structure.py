@@ -43,7 +43,7 @@ LAYERS = (
     ("smooth", "tune", "judge", "use", "trackers.bank.results"),
     ("show",),
     # the facade binds verbs to results
-    ("", "results", "fleets", "streams", "tracking", "checks", "extend", "parsing"),
+    ("", "results", "fleets", "streams", "tracking", "checks", "extend", "parsing", "identify"),
     ("demo", "embedded", "bridges", "service", "cli", "__main__"),
 )
 """Folders and modules by layer, the lowest first; the longest prefix of a module's name counts."""

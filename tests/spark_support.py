@@ -80,7 +80,7 @@ class ByHand:
         table = pa.Table.from_pydict({name: every[name].to_list() if name in every.columns else [None] * len(every)
                                       for name in types.names}, types)  # fmt: skip
         self.kept = []
-        for one in replace(self.flow, expired=expired).tables(table):
+        for one in self.flow.work(iter(table.to_batches()), expired):
             frame = pl.from_arrow(one)
             kind = frame["kind"][0]
             self.found.setdefault(kind, []).append(frame)

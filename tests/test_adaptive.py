@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from driftfit import ARX, AdaptiveKalman, Kalman, Live, Regression, track
-from driftfit.systems import scenarios
 from driftfit.trackers.mixture.states import COMMON
 from driftfit.trackers.parts.excitation import learned, window
+from lab import scenarios
 
 BURN = 200
 MODELS = {"regression": Regression(3), "arx": ARX(2, 2)}

@@ -176,5 +176,5 @@ def test_summary_as_text_html_and_latex():
     for text in (summary.as_text(), summary.as_html(), summary.as_latex()):
         assert f"{row['coef']:.4f}" in text
         assert f"{row['0.975]']:.4f}" in text
-    assert summary.as_latex().count(r"\\") == 6 + 1 + 3
+    assert summary.as_latex().count(r"\\") == 7 + 1 + 3
     assert str(summary) == summary.as_text()

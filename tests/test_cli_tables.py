@@ -86,17 +86,6 @@ def test_a_tracker_of_the_users_own(folder):
         assert message in fails("track", "a.csv", "--y", "flow", "--u", "valve", "--with", place)
 
 
-def test_an_error_is_reported_in_one_line(folder):
-    for arguments, message in (
-        (["a.csv", "--y", "flo"], "has no column 'flo': did you mean flow?"),
-        (["z*.csv", "--y", "flow"], "no file matches z*.csv"),
-        (["a.csv", "--y", "flow", "--unit", "flow"], "give a unit as column=unit"),
-    ):
-        assert message in fails(
-            "track", *arguments, "--model", "arx:1,0", "--tracker", "kalman", "-p", "q=0", "-p", "r=1"
-        )
-
-
 @pytest.fixture
 def tanks(tmp_path, monkeypatch):
     """Two records of two outputs that see each other's past, in one file."""
@@ -155,19 +144,6 @@ def test_a_fleet_of_several_outputs(tanks):
     assert Path("two.png").stat().st_size > 1000
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--model", "arx:1,1,ny=3", "--y", "level,flow"), "y must name 3 columns, one for each output"),
-        (("--y", ","), "names no column"),
-        (("--y", "level", "--y", "level"), "--y level,level: name each output once"),
-        (("--y", "level,flow", "--u", "valve"), "inputs must be different names"),
-    ],
-)
-def test_what_several_outputs_cannot_have(tanks, arguments, message):
-    assert message in fails("track", "all.csv", "--u", "valve", *KALMAN, *arguments)
-
-
 def test_the_package_is_the_command(monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["driftfit", "--version"])
     with pytest.raises(SystemExit) as ended:
@@ -187,19 +163,7 @@ def test_columns_of_any_name_can_be_given(folder, name):
     assert f"b1[{name}]" in text
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--u", "flow"], "--u flow: this is the output"),
-        (["--u", '"valve, cold'], "a name with a comma is quoted as in a CSV file"),
-        (
-            ["--u", "valve", "--tracker", "kalman", "-p", "q=0"],
-            "--tracker kalman: r must be given: -p r=...; `driftfit tune`",
-        ),
-    ],
-)
-def test_what_a_newcomer_types_is_explained(folder, arguments, message):
-    assert message in fails("track", "a.csv", "--y", "flow", *arguments)
+def test_an_output_among_the_inputs_of_a_table_is_named(folder):
     with pytest.raises(ValueError, match="u contains the output 'flow'"):
         track(ARX(1, 1), Kalman(q=0.0, r=1.0), "flow", ["valve", "flow"], data="a.csv")
 

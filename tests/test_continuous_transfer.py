@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy import linalg
+from scipy.signal import lfilter
 from support import same
 
 from driftfit import RLS, ContinuousTransfer, InstrumentalVariables, Live, track
@@ -118,3 +119,20 @@ def test_what_is_no_such_model_is_refused():
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             make()
+
+
+@pytest.mark.parametrize(
+    "model", [ContinuousTransfer(), ContinuousTransfer(delay=2), ContinuousTransfer(2, 1)], ids=repr
+)
+@pytest.mark.parametrize("codes", [1, 3, 10])
+def test_codes_in_the_input_are_a_gap_behind_a_gate(model, codes):
+    rng = np.random.default_rng(0)
+    u, place = rng.normal(size=600), slice(400, 400 + codes)
+    y = lfilter([0.0] * (model.delay + 1) + [0.36], [1.0, -0.82], u) + 0.05 * rng.normal(size=600)
+    runs = []
+    for value in (np.nan, 9999.0):
+        bad = u.copy()
+        bad[place] = value
+        runs.append(track(model, RLS(0.99), y, bad, gate=True))
+    np.testing.assert_allclose(runs[1].theta, runs[0].theta, atol=1e-9)
+    assert 400 + model.delay + 1 in runs[1].left_out.sample

@@ -199,14 +199,14 @@ def test_states_travel_both_ways(tmp_path, p0):
     assert bits(there.update(0.1, 0.2)) == bits(live.update(0.1, 0.2)) == bits(ours.update(0.1, [0.2]))
     ctypes.memmove(ours.buffer, to_struct(live), ours.size)
     assert bits(ours.update(0.4, [0.5])) == bits(live.update(0.4, 0.5))
-    with pytest.raises(ValueError, match="a state of 1280 bytes; got 3"):
+    with pytest.raises(ValueError, match="a state of 632 bytes; got 3"):
         from_struct(ARX(2, 2), tracker, b"abc")
 
 
 def test_what_no_step_writes_is_left_out_of_the_structure(tmp_path):
     given, nothing = (Live(ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=p0)) for p0 in (1.0, None))
     assert (
-        len(to_struct(given)) == len(to_struct(nothing)) == 1280
+        len(to_struct(given)) == len(to_struct(nothing)) == 632
     )  # a given prior may be wide, and start on square roots
     export_c(ARX(2, 2), given.program.tracker, tmp_path)
     source = (tmp_path / "tracker.c").read_text()
@@ -463,7 +463,7 @@ def test_readme_and_header_say_what_there_is(tmp_path):
     export_c(ARX(2, 2), Kalman(q=1e-3, r=0.1), tmp_path)
     readme, header = (tmp_path / "README.md").read_text(), (tmp_path / "tracker.h").read_text()
     page = " ".join((Path(__file__).parent.parent / "docs/embedded.md").read_text().split())
-    assert "1280 bytes in double precision" in readme
+    assert "632 bytes in double precision" in readme
     assert "state of `Kalman` has 1280 bytes" in page
     assert "at most 3675 multiplications" in readme
     assert "of the start at most 3675" in page

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from driftfit import ARX, RLS, AdaptiveKalman, Equation, Kalman, Regression, track
+from driftfit import ARX, RLS, AdaptiveKalman, Equation, Kalman, Live, Regression, track
+from driftfit.readings.left_out import KEPT
 from driftfit.smooth.problem import walk_of
 
 T, THETA = 600, (1.1, -0.5, 1.0, 0.5)
@@ -50,18 +51,16 @@ def test_a_record_may_begin_with_a_run_of_fault_codes(count, unit):
     assert np.abs(theta[count + 100] - THETA).max() < 0.08
 
 
-@pytest.mark.parametrize(
-    ("codes", "counted"),
-    [
-        ([], []), ([4], [4]), ([2, 9], [2, 9]), ([0, 1, 2], [0, 1, 2]),
-        pytest.param([*range(8)], [*range(8)], marks=pytest.mark.xfail(
-            reason="repeats that made room for later samples are not listed", strict=True)),
-    ],
-)  # fmt: skip
-def test_what_was_left_out_is_listed(codes, counted):
+@pytest.mark.parametrize("codes", [[], [4], [2, 9], [0, 1, 2], [*range(8)], [*range(40)]], ids=len)
+def test_what_was_left_out_is_listed_and_a_stream_lists_the_same(codes):
     y, u = plant()
     y[codes] = 9999.0
-    assert track(PLANT, AdaptiveKalman(), y, u).left_out.sample.tolist() == counted
+    run, live = track(PLANT, AdaptiveKalman(), y, u), Live(PLANT, AdaptiveKalman())
+    for one in zip(y[:100], u[:100], strict=True):
+        live.update(*one)
+    assert run.left_out.sample.tolist() == codes
+    assert live.left_out.last == tuple(run.left_out)[-KEPT:]
+    assert np.array_equal(live.theta, run.theta[99])
 
 
 def test_a_large_response_to_a_large_input_is_kept():

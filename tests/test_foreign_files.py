@@ -79,7 +79,9 @@ def test_dates_begin_with_the_year_or_are_refused(tmp_path):
 SPREADSHEET = ["#N/A", "#DIV/0!", "#VALUE!", "#REF!", "#NUM!", "#NAME?", "#NULL!", "#SPILL!", "#NV", "#WERT!", "#####"]
 
 
-@pytest.mark.parametrize("cell", [*SPREADSHEET, "Bad", "Bad Input", "No Data", "I/O Timeout", "-", "offline"])
+@pytest.mark.parametrize(
+    "cell", [*SPREADSHEET, "NA", "nan", "null", "None", "Bad", "Bad Input", "No Data", "I/O Timeout", "-", "offline"]
+)
 @pytest.mark.parametrize("text", ["y,u\n{},1\n2,{}\n", "u;y\r1;{}\r{};2\r", "y\tu\r\n {} \t1\r\n2\t{}\r\n"])
 def test_what_spreadsheets_historians_and_users_write_for_no_value(tmp_path, cell, text):
     table = written(tmp_path, text.format(cell, cell))

@@ -7,8 +7,8 @@ import pytest
 
 from benchmarks.gate import NAMES, Bench, measured
 from benchmarks.gate_cases import AT, CODES, LEVEL, MODELS, REAL, STARTS, honest, level_50, record
-from driftfit.readings.gate import INPUT, REFUSED, USED, Gate
-from driftfit.readings.remarks import counts, floor_remark, remarks, ungated
+from driftfit.readings.gate import INPUT, REFUSED, SIGNAL, USED, Gate
+from driftfit.readings.left_out import counts, floor_remark, remarks, ungated
 from driftfit.readings.screen import Review, screen
 
 SEEDS = range(10)
@@ -109,8 +109,8 @@ def test_rare_pulses_are_followed_at_the_third(name):
 @pytest.mark.parametrize("name", ["no response, moves", "no response, rests"])
 def test_an_input_that_stays_without_a_response_is_believed_after_six_samples(name):
     for _, run in runs(REAL[name]):
-        assert set(np.flatnonzero(run.reason == INPUT)) <= set(range(AT, AT + 10))
-        assert np.sum(run.reason == INPUT) == 6
+        assert set(np.flatnonzero(run.reason % SIGNAL == INPUT)) <= set(range(AT, AT + 10))
+        assert np.sum(run.reason % SIGNAL == INPUT) == 6
 
 
 @pytest.mark.parametrize("name", ["frozen for 40", "frozen for 40, ARX"])
@@ -154,9 +154,9 @@ def test_codes_of_a_run_without_a_gate_are_listed(s):
     case.u[400] = -999.0
     assert looked_at(case)
     y_hat = case.theta[:, 0] * np.where(case.u[:, 0] == -999.0, -999.0, case.u[:, 0]) + case.theta[:, 1]
-    reason = Review(Gate(), 1, 0)(case.y, case.u, y_hat, np.full(600, s), np.ones(600, bool))
+    reason = Review(Gate(), 1, 0, np.isnan(s))(case.y, case.u, y_hat, np.full(600, s), np.ones(600, bool))
     assert counts(reason)[REFUSED] + counts(reason).get(2, 0) == 8
-    assert reason[400] == INPUT
+    assert reason[400] == INPUT + SIGNAL
     assert "far outside" in remarks(counts(reason))[0][1]
     assert "8 values look like fault codes (9999)" in ungated({"y": case.y[case.bad].tolist()}, linear=True)
 

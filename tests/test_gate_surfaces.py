@@ -3,7 +3,21 @@
 import numpy as np
 import pytest
 
-from driftfit import ARX, DataWarning, Gate, Kalman, Live, LiveSelection, Outputs, Track, grid, select, track, tune
+from driftfit import (
+    ARX,
+    DataWarning,
+    Gate,
+    Kalman,
+    Live,
+    LiveSelection,
+    Outputs,
+    Regression,
+    Track,
+    grid,
+    select,
+    track,
+    tune,
+)
 from driftfit.readings.left_out import KEPT
 
 PLANT, TRACKER = ARX(1, 1), Kalman(q=1e-6, r=1e-4)
@@ -41,12 +55,27 @@ def test_a_stream_counts_what_it_left_out_and_keeps_the_last(way):
     assert (again.left_out.counts, again.left_out.last) == (live.left_out.counts, live.left_out.last)
 
 
+@pytest.mark.parametrize("names", [(), ("flow", "heat")])
+@pytest.mark.parametrize("at", [5, 100])
+def test_the_input_that_is_left_out_is_named(names, at):
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((200, 2))
+    y = u @ [1.0, 2.0] + 0.01 * rng.standard_normal(200)
+    u[at, 1] = 9999.0
+    model = Regression(names or 2)
+    run, live = track(model, TRACKER, y, u, gate=True), Live(model, TRACKER, gate=True)
+    live.update_many(y, u)
+    assert [(one.sample, one.signal) for one in run.left_out] == [(at, (names or ("u1", "u2"))[1])]
+    assert live.left_out.last == tuple(run.left_out)
+    assert ("Inputs left out" if at == 100 else "Left out at the start") in str(run.summary())
+
+
 def test_decisions_of_a_stream_with_times_have_them():
     y, u = plant(codes=[5, 100])
     live = Live(PLANT, TRACKER, gate=True)
     for t in range(200):
         live.update(y[t], u[t], 1000.0 + t)
-    assert [one.sample for one in live.left_out] == [1005.0, 1100.0]
+    assert [one.sample for one in live.left_out.last] == [1005.0, 1100.0]
 
 
 def test_smoothers_covariances_and_likelihood_take_the_decisions():
@@ -146,7 +175,7 @@ def test_candidates_on_line_take_the_decisions_of_one_reference():
     for t in range(200):
         one.update(y[t], u[t])
         two.update(np.nan if t == 100 else y[t], u[t])
-    assert [decision.sample for decision in one.reference.left_out] == [100]
+    assert [decision.sample for decision in one.reference.left_out.last] == [100]
     np.testing.assert_array_equal(one.weights, two.weights)
     again = LiveSelection.from_bytes(one.to_bytes())
     assert again.reference.left_out.counts == {"Left out": 1}

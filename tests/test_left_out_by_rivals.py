@@ -50,7 +50,7 @@ def test_codes_are_missing_readings(model, tracker, places, code):
 def test_a_code_in_an_input_soon_after_the_start_is_not_learned_by_rivals():
     y, u = record(LAGS)
     run, whole = (track(LAGS, AdaptiveKalman(), y, one) for one in (replaced(u, (15,), -1e6), u))
-    assert run.left_out.counts["Inputs left out"] == 1
+    assert run.left_out.counts == {"Left out at the start": 1}
     assert errors(run)[1:] == pytest.approx(errors(whole)[1:], rel=0.02)
 
 

@@ -1,26 +1,19 @@
 """Orders and bases chosen on line: the weights of the record, and a change of structure that is found."""
 
-import copy
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from driftfit import (
-    ARX,
-    FLS,
-    RLS,
     AdaptiveKalman,
     AugmentedFLS,
     Bank,
     HammersteinWiener,
     Kalman,
-    Live,
     LiveSelection,
     grid,
     select,
 )
-from driftfit.engine.drivers import drivers
 from driftfit.models.hammerstein_wiener.basis import PiecewiseLinear
 
 K = Kalman(q=1e-4, r=4e-4)
@@ -85,41 +78,3 @@ def test_candidates_that_cannot_be_weighed_are_refused():
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             LiveSelection(*arguments)
-
-
-ORDERS = [ARX(2, 2), ARX(1, 1), ARX(0, 1, nk=2, intercept=True)]
-
-
-@pytest.mark.parametrize(
-    "tracker",
-    [Kalman(q=1e-3, r=0.01), Kalman(q=1e-3, r=0.01, p0=2.0, form="sqrt"), FLS(100.0), RLS(0.99)],
-    ids=lambda one: type(one).__name__,
-)
-def test_candidates_give_the_bits_that_they_give_alone(tracker):
-    """Also with missing and wrong readings, gaps in time, known factors, what-if questions and resets in between."""
-    y, u = record(1, 200)
-    y[20:25], y[60], u[90], y[120] = np.nan, 40.0, np.nan, -9.0
-    before = drivers.cache_info().misses
-    live = LiveSelection(ORDERS, tracker, dt=1.0)
-    assert drivers.cache_info().misses - before <= (1 if tracker.pads else 3)
-    alone = [Live(model, tracker, dt=1.0) for model in ORDERS]
-    time = np.cumsum(np.where(np.arange(200) == 140, 3.0, 1.0))
-    for t in range(200):
-        if t in (1, 4, 30, 80):
-            live = [copy.deepcopy, lambda one: LiveSelection.from_bytes(one.to_bytes())][t % 4 % 2](live)
-            for one, own in zip(live.streams, alone, strict=True):
-                np.testing.assert_array_equal(one.predict(0.3), own.predict(0.3))
-                for stream in (one, own):
-                    stream.reset(0, theta=0.1)
-        known = {"time": time[t], "weight": 0.5 if t % 7 == 0 else 1.0}
-        live.update(y[t], u[t], **known)
-        for one, own in zip(live.streams, alone, strict=True):
-            own.update(y[t], u[t], **known)
-            np.testing.assert_array_equal(one.theta, own.theta)
-    for one, own in zip(live.streams, alone, strict=True):
-        assert one.to_bytes() == own.to_bytes()
-        np.testing.assert_array_equal(one.cov, own.cov)
-        assert repr(one) == repr(own).replace("Live", "SharedStream")
-        for stream in (one, own):
-            stream.update_many(y[:20], u[:20], time=time[-1] + 1.0 + np.arange(20.0))
-        assert one.update(0.1, 0.2) == own.update(0.1, 0.2)

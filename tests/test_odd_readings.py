@@ -126,12 +126,3 @@ def test_a_stream_refuses_the_same_readings(name, tracker):
         live.update(y[t], u[t])
     assert same(live.theta, run.theta[-1])
     assert run.left_out.sample.tolist() == [*range(AT, AT + 20)]
-
-
-def test_a_change_of_level_is_accepted():
-    """A hundred times the deviation of the readings: two samples are lost, and those of noise around it are not."""
-    rng = np.random.default_rng(1)
-    y = np.where(np.arange(600) < 300, 0.0, 100.0) + rng.normal(size=600)
-    run = track(Equation("y = theta.c"), Kalman(q=0.1, r=1.0, p0=10.0), y, gate=True)
-    assert 0 < len(run.left_out) <= 2
-    assert abs(run.theta[-1, 0] - 100.0) < 2.0

@@ -22,9 +22,9 @@ from driftfit import (
     select,
     track,
 )
-from driftfit.systems import scenarios
 from driftfit.systems.arc_furnace import switching
 from driftfit.trackers.mixture.filters import UNSURE
+from lab import scenarios
 
 T = 1500
 MODEL, PLANT = Regression(3), ARX(2, 2)

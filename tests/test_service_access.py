@@ -11,11 +11,11 @@ pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
 from service_support import UNIT, configured, opened
 from test_service_page import PASSWORD, client, service  # noqa: F401  (fixtures)
 
+from driftfit.service.connect.http import INCOMING
 from driftfit.service.control import Control
 from driftfit.service.options import UserOptions
 from driftfit.service.page.access import hashed, new_token
 from driftfit.service.page.app import Sockets
-from driftfit.service.sources.http import INCOMING
 
 GATEWAY = [line.split(": ")[1] for line in new_token()]
 ANN = UserOptions("Ann", "operator", PASSWORD)

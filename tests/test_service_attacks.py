@@ -38,15 +38,15 @@ from service_support import (
 
 from driftfit import track
 from driftfit.service.config import ProblemsError
+from driftfit.service.connect.base import Batch, Event, Outcome
+from driftfit.service.connect.samples import Receipt, Samples
+from driftfit.service.connect.tables import SqliteSink
+from driftfit.service.connect.webhook import WebhookSink
 from driftfit.service.control import health
 from driftfit.service.core import section
 from driftfit.service.options import Pattern
 from driftfit.service.page.app import metrics_of
 from driftfit.service.page.feed import Feed
-from driftfit.service.sinks.contract import Event, Outcome
-from driftfit.service.sinks.sqlite import Sqlite
-from driftfit.service.sinks.webhook import Webhook
-from driftfit.service.sources.contract import Batch, Receipt, Samples
 from driftfit.service.threads import EVENT_TRIES, SinkThread, SourceThread
 
 
@@ -67,7 +67,7 @@ def test_an_event_that_is_refused_is_tried_again_and_then_set_aside(tmp_path, mo
             until(lambda: len(Receiver.got) == EVENT_TRIES + 4 and engine.progress)
         engine.close()
     with pytest.raises(ValueError, match="without a password"):
-        Webhook("w", "https://me:secret@host/").check()
+        WebhookSink("w", "https://me:secret@host/").check()
     keys = [key for key, *_ in Receiver.got]
     assert [keys.count(key) for key in dict.fromkeys(keys)] == [EVENT_TRIES, 3, 1]  # each is sent once it is taken
     assert runner.status()["set_aside"] == 1
@@ -82,7 +82,7 @@ def test_an_event_that_is_refused_is_tried_again_and_then_set_aside(tmp_path, mo
 def test_two_alarms_that_begin_at_one_sample_are_two(tmp_path):
     """The second was taken for the first that comes again."""
     made = [Event(7, "a", 0.0, "alarm", {"kind": kind, "cause": "a1"}) for kind in ("band", "glr")]
-    writer = Sqlite("s", str(tmp_path / "out.db")).open()
+    writer = SqliteSink("s", str(tmp_path / "out.db")).open()
     for _ in range(2):
         writer.write(Outcome(1, [], made, {}, {}))
     found = writer.db.execute("select detail from event order by detail").fetchall()

@@ -29,9 +29,9 @@ from service_support import (
 )  # fmt: skip
 
 from driftfit import ARX, DataWarning, track
+from driftfit.service.connect.base import Batch
 from driftfit.service.core.engine import KEPT_GROUPS, Intake
 from driftfit.service.core.section import Section
-from driftfit.service.sources.contract import Batch
 from driftfit.service.supervisor import Service, rebuild
 
 
@@ -99,6 +99,39 @@ def test_late_rows_are_put_in_order(tmp_path):
     for before, after in zip(streams.waiting.of(0), again.streams.waiting.of(0), strict=True):
         assert np.array_equal(before, after)
     assert np.array_equal(again.live.theta, run.theta[-1])
+
+
+class Clock:
+    """The module `time`, ahead of itself."""
+
+    ahead = 0.0
+
+    def __getattr__(self, name):
+        return getattr(time, name)
+
+    def monotonic(self):
+        return time.monotonic() + self.ahead
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_what_a_stored_state_contains_is_not_processed_again(tmp_path, monkeypatch, timed):
+    """A group of two units is needed again for one of them; the state of the other has its samples already."""
+    clock, (y, u) = Clock(), record(100)
+    monkeypatch.setattr("driftfit.service.core.engine.time", clock)
+    config = configured(UNIT if timed else UNIT.replace('time = "t"\ndt = 1.0\n', ""))
+    engine = opened(config, tmp_path)
+    feed(engine, message("plant/a", range(50), y[:50], u[:50]))
+    clock.ahead = 20.0
+    engine.intake.put("web", message("plant/a", range(50, 100), y[50:], u[50:]))
+    feed(engine, message("plant/b", range(100), y, u))
+    clock.ahead = 31.0  # only the state of a has waited for so long
+    settled(engine)
+    engine.journal.close()
+    engine = opened(config, tmp_path)
+    assert engine.recovered == 100
+    for unit in (1, 2):
+        assert engine.units.get(unit).counts["samples"] == 100
+        assert np.array_equal(engine.units.get(unit).live.theta, run_of(y, u).theta[-1])
 
 
 def test_actions_are_part_of_the_journal(tmp_path):

@@ -33,13 +33,16 @@ from service_support import (
 )  # fmt: skip
 
 from driftfit import track
+from driftfit.service.connect.base import Event, Outcome
+from driftfit.service.connect.files import ReplaySource, TailSource
+from driftfit.service.connect.http import INCOMING
+from driftfit.service.connect.kafka import KafkaSink, KafkaSource
+from driftfit.service.connect.mqtt import MqttSource
+from driftfit.service.connect.opcua import OpcuaSink, OpcuaSource
+from driftfit.service.connect.sparkplug import REBIRTH
+from driftfit.service.connect.tables import PostgresSink
 from driftfit.service.core.journal import Names
 from driftfit.service.core.results import OK, Results
-from driftfit.service.sinks.contract import Event, Outcome
-from driftfit.service.sources.mqtt import Mqtt
-from driftfit.service.sources.replay import Replay
-from driftfit.service.sources.sparkplug import REBIRTH
-from driftfit.service.sources.tail import Tail
 from driftfit.service.threads import SinkThread, SourceThread
 
 
@@ -145,7 +148,7 @@ def test_a_node_of_sparkplug_is_asked_for_its_birth(tmp_path):
     node.connect("127.0.0.1", broker.port)
     node.loop_start()
     url = f"mqtt://127.0.0.1:{broker.port}"
-    reader = Mqtt("plant", url=url, topic="spBv1.0/plant/+/#", payload="sparkplug").open(None)
+    reader = MqttSource("plant", url=url, topic="spBv1.0/plant/+/#", payload="sparkplug").open(None)
     until(lambda: reader.read(0.01) or (reader.client.is_connected() and node.is_connected()))
     time.sleep(0.3)  # both have subscribed
     node.publish("spBv1.0/plant/DDATA/edge/7", field(1, 900) + metric(30.0, alias=1), qos=1)
@@ -201,11 +204,9 @@ def postgres(folder):
 def test_postgres(tmp_path):
     import psycopg
 
-    from driftfit.service.sinks.postgres import Postgres
-
     with postgres(tmp_path / "pg") as url:
         for _ in range(2):  # the same batch again, in a new session
-            writer = until(lambda: _opened(Postgres("db", url)))
+            writer = until(lambda: _opened(PostgresSink("db", url)))
             writer.write(outcome())
             writer.write(outcome(5))
             writer.close()
@@ -251,16 +252,13 @@ def _opened(sink):
 def test_kafka(tmp_path):
     from confluent_kafka import Consumer, Producer
 
-    from driftfit.service.sinks.kafka import Kafka as Sink
-    from driftfit.service.sources.kafka import Kafka
-
     cluster = Producer({"test.mock.num.brokers": 1, "bootstrap.servers": "x", "log_level": 0})
     broker = next(iter(cluster.list_topics(timeout=20).brokers.values()))
     brokers = f"{broker.host}:{broker.port}"
     for k in range(20):
         cluster.produce("plant", b'{"t": %d, "y": 1.0}' % k if k != 5 else b"{poison", key=b"7")
     assert cluster.flush(20) == 0
-    source = Kafka("k", brokers, ["plant"], "earliest")
+    source = KafkaSource("k", brokers=brokers, topics=["plant"], begin="earliest")
     reader, first = source.open(None), []
     batch = until(lambda: reader.read(0.5))
     first += [one.columns["t"] for one in batch.samples]
@@ -274,10 +272,10 @@ def test_kafka(tmp_path):
     assert batch.samples[0].topic == "plant/7"
     for beyond in (50, -7):  # the topic was made again, or its first messages are gone
         reader = source.open({"plant/0": beyond})
-        assert "read from its first" in reader.read(0.5).noticed
+        assert "read from its first" in reader.noticed
         assert until(partial(reader.read, 0.5)).samples[0].columns["t"] == 0
         reader.close()
-    writer = Sink("out", brokers, "received").open()
+    writer = KafkaSink("out", brokers=brokers, topic="received").open()
     writer.write(outcome())
     consumer = Consumer({"bootstrap.servers": brokers, "group.id": "t", "auto.offset.reset": "earliest"})
     consumer.subscribe(["received"])
@@ -295,14 +293,11 @@ def test_kafka(tmp_path):
 @needs("asyncua")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
 def test_opcua_from_our_own_server():
-    from driftfit.service.sinks.opcua import Opcua as Sink
-    from driftfit.service.sources.opcua import Opcua
-
     url = f"opc.tcp://127.0.0.1:{free_port()}/driftfit"
-    writer = Sink("out", url).open()
+    writer = OpcuaSink("out", url).open()
     writer.write(outcome(1))
     nodes = {"plant/1": {"flow": "ns=2;s=pump 1.y", "a1": "ns=2;s=pump 1.a1"}}
-    reader = Opcua("in", url, nodes, trigger="a1", period=0.02).open(None)
+    reader = OpcuaSource("in", url, nodes, trigger="a1", period=0.02).open(None)
     begun = until(lambda: reader.read(0.5))
     assert begun.samples[0].columns["a1"][-1] == 0.5
     writer.write(outcome(1, 2, theta=0.75))
@@ -320,7 +315,7 @@ def test_tail(tmp_path, kind):
     lines = [(",".join(map(str, row.values())) if kind == "csv" else json.dumps(row)) + "\n" for row in rows]
     head = "t,pump,y\n" if kind == "csv" else ""
     path.write_text(head + "".join(lines[:10]) + lines[10][:-3])
-    source = Tail("f", str(path), topic="plant", by="pump")
+    source = TailSource("f", str(path), topic="plant", by="pump")
     reader = source.open(None)
     batch = reader.read(1.0)
     assert [one.topic for one in batch.samples] == ["plant/p0", "plant/p1"]
@@ -345,23 +340,22 @@ def test_tail(tmp_path, kind):
 def test_replay(tmp_path):
     path = tmp_path / "plant.csv"
     path.write_text("t,y\n" + "".join(f"2026-01-01T00:00:{t:02d},{t}\n" for t in range(30)))
-    digest = Replay("r", str(path)).open(None).read(1.0).position[1]
-    fast = Replay("r", str(path)).open([5, digest]).read(1.0)
-    assert (fast.samples[0].length, fast.position, fast.noticed) == (25, [30, digest], "")
-    other = Replay("r", str(path)).open([5, "of another file"]).read(1.0)
-    assert (other.samples[0].length, "is another file" in other.noticed) == (30, True)
-    slow = Replay("r", str(path), time="t", speed=100.0).open(None)
+    digest = ReplaySource("r", str(path)).open(None).read(1.0).position[1]
+    reader = ReplaySource("r", str(path)).open([5, digest])
+    fast = reader.read(1.0)
+    assert (fast.samples[0].length, fast.position, reader.noticed) == (25, [30, digest], "")
+    other = ReplaySource("r", str(path)).open([5, "of another file"])
+    assert (other.read(1.0).samples[0].length, "is another file" in other.noticed) == (30, True)
+    slow = ReplaySource("r", str(path), time="t", speed=100.0).open(None)
     begun, count = time.monotonic(), 0
     while count < 30:
         count += sum(one.length for one in slow.read(0.5).samples)
     assert 0.25 < time.monotonic() - begun < 5.0
     with pytest.raises(ValueError, match="no column"):
-        Replay("r", str(path), time="when").check()
+        ReplaySource("r", str(path), time="when").check()
 
 
 def test_a_request_that_one_of_two_units_takes_is_not_refused(tmp_path):
-    from driftfit.service.sources.http import INCOMING
-
     config = configured(UNIT + UNIT.replace('"y"', '"p"').replace('["u"]', '["q"]'), source=HTTP)
     engine = opened(config, tmp_path)
     with running(engine, SourceThread(engine, config.sources[0])):
@@ -373,8 +367,6 @@ def test_a_request_that_one_of_two_units_takes_is_not_refused(tmp_path):
 
 
 def test_http_samples_are_answered_when_they_are_in_the_journal(tmp_path):
-    from driftfit.service.sources.http import INCOMING
-
     config = configured(source=HTTP)
     engine = opened(config, tmp_path)
     with running(engine, SourceThread(engine, config.sources[0])):

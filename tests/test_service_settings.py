@@ -19,10 +19,10 @@ from driftfit import ARX, AdaptiveKalman, Bank, Change, Kalman, Sensor
 from driftfit.cli import app
 from driftfit.parsing.settings import parse_model, tracker_of
 from driftfit.service.config import ProblemsError, parse, read
+from driftfit.service.connect.http import decoded
+from driftfit.service.connect.samples import decode, number, seconds
+from driftfit.service.connect.sparkplug import REBIRTH, Sparkplug, UnknownAliasError, rebirth_topic
 from driftfit.service.options import Pattern, Secret
-from driftfit.service.sources.contract import decode, number, seconds
-from driftfit.service.sources.http import decoded
-from driftfit.service.sources.sparkplug import REBIRTH, Sparkplug, UnknownAliasError, rebirth_topic
 
 
 def test_the_example_of_the_issue():
@@ -53,7 +53,7 @@ def test_the_example_of_the_issue():
     assert unit.tracker == AdaptiveKalman()
     assert unit.alarm.every == 7 * 86400.0
     assert unit.match.unit("plant/7/sensors") == "7"
-    assert [type(one).__name__ for one in (*config.sources, *config.sinks)] == ["Mqtt", "Mqtt"]
+    assert [type(one).__name__ for one in (*config.sources, *config.sinks)] == ["MqttSource", "MqttSink"]
 
 
 def test_every_problem_has_its_line_and_a_way_out():
@@ -247,8 +247,8 @@ def test_the_files_of_the_docs_fit_the_service(monkeypatch):
     folder = Path(__file__).parent.parent / "docs" / "service"
     monkeypatch.setenv("POSTGRES_PASSWORD", "x")
     config = read(folder / "plant.toml")
-    assert [type(one).__name__ for one in config.sinks] == ["Webhook", "Postgres"]
-    assert {type(one).__name__ for one in config.sources} == {"Mqtt", "Http"}
+    assert [type(one).__name__ for one in config.sinks] == ["WebhookSink", "PostgresSink"]
+    assert {type(one).__name__ for one in config.sources} == {"MqttSource", "HttpSource"}
     (start,) = re.findall(
         r"^ExecStart=/opt/driftfit/bin/driftfit (.*)$", (folder / "driftfit.service").read_text(), re.M
     )

@@ -101,8 +101,11 @@ def test_likelihood_is_that_of_the_run():
     for factor in (0.9, 1.1):
         other = Kalman(q=np.multiply(tuned.tracker.q, factor), r=tuned.tracker.r)
         assert track(Regression(2), other, y, u).loglik < tuned.loglik
-    smooth = track(Regression(2), tune(Regression(2), FLS(), y, u).tracker, y, u).smooth()
+    quick = tune(Regression(2), Kalman(), y, u, intervals=False)
+    assert quick.tracker == tuned.tracker
+    assert np.isnan([*quick.interval.values()]).all()
     fls = tune(Regression(2), FLS(), y, u)
+    smooth = track(Regression(2), fls.tracker, y, u).smooth()
     assert fls.noise == pytest.approx(smooth.cost / (len(y) - 2), rel=1e-9)
     one = tune(Regression(2), Kalman(q=tuned.tracker.q), y, u)
     assert one.tracker.r == pytest.approx(tuned.tracker.r, rel=0.02)

@@ -17,7 +17,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 from driftfit.run.result import root_mean_square
-from driftfit.systems import scenarios
+from lab import scenarios
 from lab.bench.contestants import KALMAN, PEERS, Contestant, own, present
 from lab.bench.oracle import oracle
 from lab.bench.records import Outcome, Record, simulated

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftfit.show.axes import BLUE, GREY, RED, new_figure
-from driftfit.systems import scenarios
+from lab import scenarios
 from lab.bench.accuracy import HINDSIGHT, ORACLE, TUNING_SEED, Cell, Size
 from lab.bench.causes import CAUSES, REAL_CAUSES
 from lab.bench.computer import computer, markdown, versions

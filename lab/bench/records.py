@@ -17,7 +17,7 @@ from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.results import Track
-from driftfit.systems.scenarios import Simulated, simulate
+from lab.scenarios import Simulated, simulate
 
 MODELS: dict[str, Model] = {"regression": Regression(3), "arx": ARX(2, 2)}
 """The models of the scenarios, by kind."""

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track, trackers
-from driftfit.systems import scenarios
+from lab import scenarios
 from lab.bench import (
     accuracy,
     accuracy_page,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftfit.systems.jumps import jumping, poles
+from lab.jumps import jumping, poles
 from lab.reproduce.hypotheses.contests import contests
 from lab.reproduce.hypotheses.scores import measure
 

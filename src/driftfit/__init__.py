@@ -4,6 +4,7 @@ from driftfit.checks import check_tracker
 from driftfit.engine import __version__
 from driftfit.engine.settings import DataWarning
 from driftfit.fleets import Fleet, Outputs
+from driftfit.identify.answer import identify
 from driftfit.judge.segment import segment
 from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
@@ -54,6 +55,7 @@ from driftfit.trackers.particle_filter import ParticleFilter
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
 from driftfit.tune.frontier import frontier
+from driftfit.tune.inference import likelihood_ratio
 from driftfit.tune.pool import pool
 from driftfit.tune.tune import tune
 from driftfit.use import prepare
@@ -120,6 +122,8 @@ __all__ = [
     "frontier",
     "grid",
     "huber",
+    "identify",
+    "likelihood_ratio",
     "piecewise",
     "plot_tree",
     "pool",

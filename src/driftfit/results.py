@@ -22,6 +22,7 @@ from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.bank.results.events import Event
 from driftfit.trackers.bank.results.results import Hypotheses
 from driftfit.trackers.bank.results.smoothed import SmoothedMixture
+from driftfit.tune import inference
 from driftfit.tune.refine import refine
 from driftfit.use import simulate, system
 from driftfit.use.blocks import blocks_of
@@ -153,6 +154,24 @@ class Track(result.Track, Exported, public=True):
     def segment(self, **settings: Any) -> Segmentation:
         """Segments of the record with constant parameters, with dates and their intervals; `driftfit.segment`."""
         return segmented(self.rows, **settings)
+
+    def wald(self, *equations: str, at: int = -1) -> inference.Tested:
+        """Test linear equations of theta after a sample, such as "income == 1", jointly; `driftfit.tune.inference`."""
+        return inference.wald(self.rows, *equations, at=at)
+
+    def constants(self, **settings: Any) -> Any:
+        """statsmodels' least squares of the same regression with constant parameters, for HAC errors and all its tests;
+        ``settings`` as cov_type="HAC", cov_kwds={"maxlags": 4}.
+        """
+        return inference.constants(self.rows, **settings)
+
+    def aic(self, settings: int = 0) -> float:
+        """-2 loglik + 2 p; p counts the parameters whose start is unknown, and the settings that were estimated."""
+        return inference.information(self.rows, settings, 2.0)
+
+    def bic(self, settings: int = 0) -> float:
+        """-2 loglik + p log N, with p as for `aic` and N the samples that were used."""
+        return inference.information(self.rows, settings)
 
     def diagnose(self) -> Diagnosis:
         """Whiteness, noise level, distribution, excitation, constancy, with limits; see `driftfit.judge.diagnose`."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
-from driftfit.judge.structures import shared_streams
 from driftfit.models.hammerstein_wiener.blocks import Separator
 from driftfit.models.hammerstein_wiener.separation import Groups
 from driftfit.run.live import live
@@ -48,7 +47,3 @@ class Live(live.Live, public=True):
     def system(self) -> LiveSystem:
         """The present `ARX` system: poles, gains, responses with bands; see `driftfit.use.system`."""
         return LiveSystem(self)
-
-
-class SharedStream(Live, shared_streams.SharedStream, public=True):
-    """A candidate of `LiveSelection`, with the verbs of a stream."""

@@ -18,7 +18,6 @@ import pytest
 from numba import types
 from numba.core import postproc
 from numba.core.compiler import Flags
-from numba.core.errors import TypingError
 from numba.core.registry import cpu_target
 from numba.core.typing.templates import AbstractTemplate
 
@@ -143,12 +142,11 @@ def test_passes_for_what_is_not_used_are_left_out():
         return {name.split("_", 1)[1] for name in times}
 
     every, ours = passes(numba.njit(first)), passes(internals.under_ieee(first))
-    replaced = {"native_lowering", "ir_legalization"}
-    assert every - ours == UNUSED | replaced, "DefaultPassBuilder or the names of its passes changed."
-    assert ours - every == {"direct_lowering", "legalization"}
+    assert every - ours == UNUSED | {"native_lowering"}, "DefaultPassBuilder or the names of its passes changed."
+    assert ours - every == {"direct_lowering"}
 
 
-def test_lifetimes_of_variables_are_not_searched(monkeypatch):
+def test_lifetimes_of_variables_are_searched_once(monkeypatch):
     def larger(x, y):
         return x if x > y else y
 
@@ -156,9 +154,12 @@ def test_lifetimes_of_variables_are_not_searched(monkeypatch):
     search = postproc.analysis.compute_dead_maps
     monkeypatch.setattr(postproc.analysis, "compute_dead_maps", lambda *given: searched.append(given) or search(*given))
     internals.emit(larger, (types.float64, types.float64))
-    assert not searched, "PostProcessor.run is not what analyses a function: a tenth of compiling in Python is lost."
+    assert len(searched) == 1, (
+        "PostProcessor.run is not what analyses a function: a tenth of compiling in Python is lost."
+    )
+    searched.clear()
     numba.njit(larger).compile((types.float64, types.float64))
-    assert searched, "Functions of users are analysed in our way."
+    assert len(searched) > 1, "Functions of users are analysed in our way."
 
 
 def test_declarations_are_looked_for_once_and_put_back():
@@ -170,16 +171,6 @@ def test_declarations_are_looked_for_once_and_put_back():
         assert context.get_abi_sizeof(context.get_data_type(types.float64)) == 8
         context.refresh()
     assert [vars(one).keys() for one in parts] == [one.keys() for one in before], "Methods are not put back."
-
-
-def test_timers_and_colours_are_left_out():
-    heard, timed = [], []
-    with known_once(), numba.core.event.install_listener("numba:compile", Count(heard)):
-        with numba.core.event.install_timer("numba:llvm_lock", timed.append):
-            internals.emit(first, (VECTOR,))
-        assert str(TypingError("plain")) == "plain", "termcolor() is no longer what colours the message of every error."
-    assert not timed, "event.install_timer is not what times a compilation: every call of LLVM is told to all timers."
-    assert len(heard) == 1, "Listeners to compilations, such as the tests that count them, hear nothing."
 
 
 def test_instructions_leave_nothing_for_the_garbage_collector():

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from rich.console import Console
 
-from driftfit.systems.jumps import MODEL, jumping
 from driftfit.trackers.bank.reduction import Decide
 from driftfit.tracking import track
+from lab.jumps import MODEL, jumping
 from lab.reproduce import Claim
 from lab.reproduce.hypotheses.contests import bank
 from lab.reproduce.hypotheses.scores import REACH, Measured

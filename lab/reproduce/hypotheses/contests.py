@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.systems.jumps import Jumping
 from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid, Reduction
@@ -18,6 +17,7 @@ from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS
+from lab.jumps import Jumping
 from lab.reproduce.hypotheses.references import Row, references
 from lab.reproduce.hypotheses.rivals import tuned
 

@@ -10,13 +10,13 @@ from driftfit.engine.kernel import Array
 from driftfit.results import Track
 from driftfit.smooth import mixture
 from driftfit.smooth.piecewise import piecewise
-from driftfit.systems.jumps import MODEL, START, Jumping, jumping
 from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.bank.reduction import Beam, Decide
 from driftfit.trackers.bank.results.smoothed import problem_of
 from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.kalman import Kalman
 from driftfit.tracking import track
+from lab.jumps import MODEL, START, Jumping, jumping
 from lab.reproduce.hypotheses.contests import CHANGES, P0, R, bank
 from lab.reproduce.hypotheses.scores import pooled
 

@@ -10,9 +10,9 @@ from functools import cache
 
 import numpy as np
 
-from driftfit.systems.jumps import MODEL, SIGMA, START, jumping
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
+from lab.jumps import MODEL, SIGMA, START, jumping
 
 RECORDS, P0 = 20, 2.0
 FORGETTING = (0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 0.93, 0.96, 0.98, 0.99)

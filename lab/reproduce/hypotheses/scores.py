@@ -10,9 +10,9 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.models.regression import Regression
 from driftfit.results import Track
-from driftfit.systems.jumps import MODEL, START, Jumping, jumping
 from driftfit.trackers.bank.bank import Bank
 from driftfit.tracking import track
+from lab.jumps import MODEL, START, Jumping, jumping
 from lab.reproduce.hypotheses.contests import Contest, Entry
 
 REACH, QUIET = 20, 50

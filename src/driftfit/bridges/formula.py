@@ -15,6 +15,7 @@ Needs formulaic and pandas (``pip install "driftfit[formula]"``).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -36,6 +37,7 @@ from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.tracking import track
+from driftfit.tune.inference import Tested, degrees_of_freedom, wald
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -72,9 +74,13 @@ class TimeVaryingRegression:
     exog: pd.DataFrame
     tracker: Tracker | None = None
     gate: Any = None
+    weights: Any = 1.0
+    spec: Any = None
 
     @classmethod
-    def from_formula(cls, formula: str, data: Any, tracker: Tracker | None = None, gate: Any = None) -> Self:
+    def from_formula(
+        cls, formula: str, data: Any, tracker: Tracker | None = None, gate: Any = None, weights: Any = 1.0
+    ) -> Self:
         """Read a formula such as ``"y ~ x1 + log(x2) + C(region)"``.
 
         A row in which a number or a category is missing is kept, and is not used. ValueError for a formula without a
@@ -87,7 +93,7 @@ class TimeVaryingRegression:
         left, right = (_numbers(side, materializer.factor_cache) for side in (matrices.lhs, matrices.rhs))
         if left.shape[1] != 1:
             raise ValueError(f"from_formula: {formula!r} has {left.shape[1]} outputs; a regression has one.")
-        return cls(left.iloc[:, 0], right, tracker, gate)
+        return cls(left.iloc[:, 0], right, tracker, gate, weights, matrices.rhs.model_spec)
 
     def fit(self) -> TimeVaryingResults:
         """Track the coefficients through all rows."""
@@ -97,9 +103,10 @@ class TimeVaryingRegression:
         rows = chronological(self.endog.index)
         endog, exog = self.endog.iloc[rows], self.exog.iloc[rows]
         X = exog.drop(columns=_INTERCEPT, errors="ignore") if names else None
-        run = track(model, tracker, endog, X, gate=self.gate)
+        weights = self.weights if np.ndim(self.weights) == 0 else np.asarray(self.weights)[rows]
+        run = track(model, tracker, endog, X, gate=self.gate, weights=weights)
         columns = [*names, *([_INTERCEPT] if model.intercept else [])]
-        return TimeVaryingResults(run, endog, pd.Index(columns))
+        return TimeVaryingResults(run, endog, pd.Index(columns), self.spec)
 
 
 @dataclass(frozen=True)
@@ -109,6 +116,7 @@ class TimeVaryingResults:
     run: Track
     endog: pd.Series
     names: pd.Index
+    spec: Any = None
 
     @property
     def params(self) -> pd.Series:
@@ -131,7 +139,7 @@ class TimeVaryingResults:
         distribution with as many degrees of freedom. inf if the variance is given, or has a distribution that the
         standard errors include: theirs is normal.
         """
-        return float(self.run.state["count"]) if self.run.tracker.learns_noise else np.inf
+        return degrees_of_freedom(self.run)
 
     @property
     def pvalues(self) -> pd.Series:
@@ -145,6 +153,40 @@ class TimeVaryingResults:
         the same distribution.
         """
         return pd.DataFrame({side: path[-1] for side, path in enumerate(self.run.band(1.0 - alpha))}, self.names)
+
+    def cov_params(self) -> pd.DataFrame:
+        """Covariance of the coefficients after the last row, (k, k)."""
+        return pd.DataFrame(self.run.cov(-1), self.names, self.names)
+
+    def f_test(self, equations: str) -> Tested:
+        """Test equations of the coefficients after the last row jointly, as in ``"income = 1, rate = 0"``: an F test if
+        the tracker estimates the noise variance, otherwise chi-square (`driftfit.tune.inference`).
+        """
+        each = (re.sub(r"(?<![<>=])=(?!=)", "==", one) for one in equations.split(","))
+        return wald(self.run, *each, names=tuple(map(str, self.names)))
+
+    def predict(self, data: Any) -> pd.Series:
+        """x' params for the rows of other data, (N,): the coefficients after the last row."""
+        X = self._columns(data)
+        return pd.Series(X.to_numpy() @ self.params.to_numpy(), X.index, name="predict")
+
+    def get_forecast(self, data: Any, alpha: float = 0.05) -> pd.DataFrame:
+        """Outputs of the rows that follow the record, with the regressors of ``data`` and its index: ``mean``,
+        ``mean_se`` and the limits of the 1 - alpha interval, which contain drift and noise.
+        """
+        X = self._columns(data)
+        ahead = self.run.forecast(len(X), X.drop(columns=_INTERCEPT, errors="ignore").to_numpy())
+        low, high = ahead.band(1.0 - alpha)
+        columns = {"mean": ahead.y_hat, "mean_se": ahead.y_std, "mean_ci_lower": low, "mean_ci_upper": high}
+        return pd.DataFrame(columns, X.index)
+
+    def _columns(self, data: Any) -> pd.DataFrame:
+        """The regressors of other data by the formula, in the order of ``names``."""
+        if self.spec is None:
+            raise ValueError(
+                "predict: the regression was made without a formula; use TimeVaryingRegression.from_formula."
+            )
+        return pd.DataFrame(self.spec.get_model_matrix(data, na_action="ignore")).astype(float)[list(self.names)]
 
     @property
     def params_path(self) -> pd.DataFrame:
@@ -187,6 +229,16 @@ class TimeVaryingResults:
     def llf(self) -> float:
         """Log-likelihood; with a diffuse start its diffuse form, see "Likelihood" in the chapter on tuning."""
         return self.run.loglik
+
+    @property
+    def aic(self) -> float:
+        """Akaike's criterion, the coefficients counted whose start is unknown (`Track.aic`)."""
+        return self.run.aic()
+
+    @property
+    def bic(self) -> float:
+        """Schwarz's criterion, see `Track.bic`."""
+        return self.run.bic()
 
     @property
     def nobs(self) -> int:
@@ -284,7 +336,9 @@ class TimeVaryingResults:
         facts = {
             "Dep. Variable": str(self.endog.name), "Tracker": repr(self.run.tracker), "Model": repr(self.run.model),
             "No. Observations": str(self.nobs), "Df Residuals": f"{self.df_resid:g}",
-            "Log-Likelihood": f"{self.llf:.3f}", **dict(remarks_of([self.run.left_out])),
+            "Log-Likelihood": f"{self.llf:.3f}",
+            "AIC, BIC": f"{self.aic:.2f}, {self.bic:.2f}",
+            **dict(remarks_of(self.run.left_out)),
         }  # fmt: skip
         apart = float(np.sqrt(np.mean((self.forecasts - self.fittedvalues)[self.run.ok] ** 2)))
         if apart > 1e-9 * float(np.sqrt(np.mean(self.run.y[self.run.ok] ** 2))):

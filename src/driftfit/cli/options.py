@@ -13,7 +13,6 @@ from typer import Argument, Option
 from driftfit.cli.program import progress, writable
 from driftfit.cli.reading import (
     Part,
-    Rows,
     decimal_from,
     interval_from,
     limits_from,
@@ -23,7 +22,9 @@ from driftfit.cli.reading import (
     rows_from,
     rows_of,
     separator_from,
+    table_of,
 )
+from driftfit.data.columns import Columns
 from driftfit.engine.settings import missing_settings
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
@@ -163,22 +164,22 @@ class Given:
             exclude=tuple(map(interval_from, self.exclude or [])),
         )  # fmt: skip
 
-    def signals(self, rows: Rows | None = None) -> dict[str, Any]:
+    def signals(self, rows: Columns | None = None) -> dict[str, Any]:
         """The arguments of `track` other than model and tracker; ``rows`` are the data if they were read already."""
         outputs = self.outputs
         if rows is None and (not self.part().whole or "-" in self.file):
             rows = self.read()
-        data: Any = self.file if rows is None else rows.table(self.time, self.by or [])
+        data: Any = self.file if rows is None else table_of(rows, self.time, self.by or [])
         signals = {"y": outputs if len(outputs) > 1 else outputs[0], "u": self.inputs, "data": data, "time": self.time}
         signals |= {**self.part().restrictions(self.time is not None), "gate": self.gate}
         units = {**({} if rows is None else rows.units), **parse_units(self.unit)}
         return signals | {"by": self.by or None, "dt": parse_interval(self.dt), "units": units or None}
 
-    def read(self, *more: str) -> Rows:
+    def read(self, *more: str) -> Columns:
         """Read the selected part of the columns, and of ``more`` columns."""
         return rows_of(self.file, [*self.outputs, *self.inputs, *more], self.time, self.by or [], self.part())
 
-    def run(self, rows: Rows | None = None, tracker: Tracker | None = None) -> Any:
+    def run(self, rows: Columns | None = None, tracker: Tracker | None = None) -> Any:
         """Run the configuration that the options describe: a Track, an Outputs or a fleet."""
         from driftfit.tracking import track
 

@@ -6,7 +6,7 @@ A user's error prints one line on stderr and ends with exit code 2; a traceback 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -58,6 +58,12 @@ out = _output()
 def say(what: Any, **options: Any) -> None:
     """Print text unchanged: names of parameters contain brackets, and nothing is cut off."""
     out.print(what, markup=False, crop=False, **options)
+
+
+def draw(path: Path | None, figure: Callable[[], Any]) -> None:
+    """Save a picture, if one is wanted."""
+    if path is not None:
+        figure().savefig(path, dpi=150)
 
 
 def main() -> None:

@@ -9,17 +9,17 @@ from __future__ import annotations
 import csv
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import polars as pl
 
 from driftfit.data.clock import Clock
 from driftfit.data.columns import Columns, Wanted, convert
-from driftfit.data.files import paths_of, read_file
-from driftfit.data.limits import end_of, marks
+from driftfit.data.files import paths_of, read_file, together
+from driftfit.data.limits import marks, within
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
@@ -59,34 +59,21 @@ class Part:
         return int(row) - self.rows[0]
 
 
-class Rows(NamedTuple):
-    """The selected rows of all files: numbers (N,), times (N,) or None, and the columns that identify the series."""
+def table_of(rows: Columns, time: str | None, by: Sequence[str]) -> pl.DataFrame:
+    """The rows of all files as a table that `track` reads."""
+    columns: dict[str, Any] = dict(rows.numbers) | ({} if time is None else {time: rows.time})
+    table = pl.DataFrame(columns | dict(zip(by, rows.by, strict=True)))
+    if rows.zone is not None and time is not None:
+        table = table.with_columns(pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(rows.zone))
+    return table
 
-    numbers: dict[str, Array]
-    time: Array | None
-    zone: str | None
-    by: list[list[Any]]
-    units: Mapping[str, str]
 
-    def table(self, time: str | None, by: Sequence[str]) -> pl.DataFrame:
-        """The rows as a table that `track` reads."""
-        columns: dict[str, Any] = dict(self.numbers)
-        if time is not None and self.time is not None:
-            columns[time] = self.time
-        table = pl.DataFrame({**columns, **dict(zip(by, self.by, strict=True))})
-        if self.zone is not None and time is not None:
-            table = table.with_columns(pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(self.zone))
-        return table
-
-    def order(self) -> Array:
-        """Indices of the rows of a single series, sorted by time, with the first of several rows at the same time."""
-        if self.time is None:
-            return np.arange(len(next(iter(self.numbers.values()))))
-        order = np.argsort(self.time, kind="stable")
-        timeless = np.isnat(self.time) if self.time.dtype.kind == "M" else ~np.isfinite(self.time)
-        order = order[~timeless[order]]
-        again = np.append(False, self.time[order][1:] == self.time[order][:-1])
-        return np.asarray(order[~again])
+def order_of(rows: Columns) -> Array:
+    """Indices of the rows of a single series, sorted by time, with the first of several rows at the same time."""
+    if rows.time is None:
+        return np.arange(rows.rows)
+    known = np.flatnonzero(np.isfinite(rows.time))
+    return known[np.unique(rows.time[known], return_index=True)[1]]
 
 
 def limits_from(entry: str, names: Sequence[str]) -> tuple[str, Range]:
@@ -142,23 +129,21 @@ def rows_from(text: str | None) -> tuple[int, int | None]:
     return a, b
 
 
-def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Sequence[str], part: Part) -> Rows:
+def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Sequence[str], part: Part) -> Columns:
     """Read columns of several files in the order of the files."""
     if (part.first or part.last) and time is None:
         raise ValueError("--from and --to are times, so they need --time; rows are chosen with --rows.")
     how = marks(part.missing)[0], part.separator, part.decimal, part.dates
     wanted = Wanted(tuple(dict.fromkeys(names)), time, tuple(by), *how)
-    read = [_one(path, wanted, part) for path in (["-"] if "-" in files else paths_of(list(files)))]
-    if len({one.time.dtype.kind for one in read if one.time is not None}) > 1:
-        raise ValueError("the times of some files are numbers, those of others are dates.")
-    found = Rows(
-        {name: np.concatenate([one.numbers[name] for one in read]) for name in wanted.numbers},
-        None if time is None else np.concatenate([one.time for one in read if one.time is not None]),
-        read[0].zone,
-        [[value for one in read for value in one.by[k]] for k in range(len(by))],
-        read[0].units,
-    )
-    return _between(found, part)
+    found = together({path: _one(path, wanted, part) for path in (["-"] if "-" in files else paths_of(list(files)))})
+    if found.time is None or (part.first is None and part.last is None):
+        return found
+    keep = np.flatnonzero(within([(part.first, part.last)], found.time, found.time, found.zone, "--from, --to"))
+    if not len(keep):
+        raise ValueError(f"no row is between --from {part.first or '...'} and --to {part.last or '...'}.")
+    numbers = {name: column[keep] for name, column in found.numbers.items()}
+    units = [[column[k] for k in keep.tolist()] for column in found.by]
+    return Columns(numbers, found.time[keep], found.zone, units, len(keep), found.units)
 
 
 def _one(path: str, wanted: Wanted, part: Part) -> Columns:
@@ -169,23 +154,6 @@ def _one(path: str, wanted: Wanted, part: Part) -> Columns:
     if len(frame) < first:
         raise ValueError(f"{where} has no row {first}.")
     return replace(convert(frame, wanted, where, 1, slice(first - 1, last)), units=units)
-
-
-def _between(rows: Rows, part: Part) -> Rows:
-    """The rows between the first and the last time."""
-    if rows.time is None or (part.first is None and part.last is None):
-        return rows
-    axis = rows.time
-    keep = np.ones(len(axis), bool)
-    if part.first is not None:
-        keep &= axis >= end_of("--from", part.first, axis, rows.zone, 0)
-    if part.last is not None:
-        keep &= axis <= end_of("--to", part.last, axis, rows.zone, 1)
-    if not keep.any():
-        raise ValueError(f"no row is between --from {part.first or '...'} and --to {part.last or '...'}.")
-    by = [[value for value, kept in zip(column, keep.tolist(), strict=True) if kept] for column in rows.by]
-    numbers = {name: column[keep] for name, column in rows.numbers.items()}
-    return Rows(numbers, axis[keep], rows.zone, by, rows.units)
 
 
 def listed(given: Sequence[str] | None) -> list[str]:

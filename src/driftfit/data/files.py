@@ -76,7 +76,7 @@ def read(data: Any, wanted: Wanted) -> tuple[Columns, dict[Hashable, str]]:
         warnings.warn(
             f"{len(failed)} of {len(paths)} files cannot be read: {next(iter(failed.values()))}", stacklevel=4
         )
-    return _together(parts), failed
+    return together(parts), failed
 
 
 def of_file(path: str, wanted: Wanted) -> Columns:
@@ -109,7 +109,7 @@ def paths_of(data: Any) -> list[str]:
 
 
 def read_file(source: str | bytes, wanted: Wanted, where: str) -> tuple[nw.DataFrame[Any], dict[str, str]]:
-    """The wanted columns of one file, given by its path or its contents, and their units if they have a row.
+    """The wanted columns of one file, all of them if none is named, by its path or contents, with a row of units.
 
     `read_csv` says how CSV is read.
     """
@@ -127,6 +127,8 @@ def read_file(source: str | bytes, wanted: Wanted, where: str) -> tuple[nw.DataF
             names, frame, units = read_csv(source, wanted)
         except (pl.exceptions.PolarsError, csv.Error, ValueError) as error:
             raise ValueError(f"{where} cannot be read as CSV: {' '.join(str(error).split())}") from None
+    if not wanted.names:
+        return read_file(source, replace(wanted, numbers=tuple(names)), where)
     for name in (name for name in wanted.names if not (name == FILE and FILE in wanted.by)):
         if name not in names:
             raise ValueError(f"{where} has no column {name!r}: {near(name, names)}")
@@ -139,7 +141,7 @@ def read_file(source: str | bytes, wanted: Wanted, where: str) -> tuple[nw.DataF
     return nw.from_native(frame, eager_only=True), units
 
 
-def _together(parts: Mapping[str, Columns]) -> Columns:
+def together(parts: Mapping[str, Columns]) -> Columns:
     """Concatenate files; their times must be of one kind."""
     times = {path: part.time for path, part in parts.items() if part.time is not None}
     kinds = {time.dtype.kind: path for path, time in times.items()}

@@ -100,16 +100,16 @@ def _bounds(key: Any, bounds: Any) -> tuple[float, float]:
     return found
 
 
-def within(intervals: Any, time: Array | None, number: Array, zone: str | None = None) -> Array:
+def within(intervals: Any, time: Array | None, number: Array, zone: str | None = None, what: str = "exclude") -> Array:
     """Which samples are in one of the intervals; ``number`` (N,) counts the samples of each series."""
     inside = np.zeros(len(number), dtype=bool)
     axis = number if time is None else time
     for interval in intervals:
         if isinstance(interval, str) or not isinstance(interval, Sequence | np.ndarray) or len(interval) != 2:
-            raise ValueError(f"exclude: each interval must be (from, to), in a list; got {interval!r}.")
-        low, high = (end_of("exclude", one, axis, zone, upper) for upper, one in enumerate(interval))
+            raise ValueError(f"{what}: each interval must be (from, to), in a list; got {interval!r}.")
+        low, high = (end_of(what, one, axis, zone, upper) for upper, one in enumerate(interval))
         if low is not None and high is not None and not low <= high:
-            raise ValueError(f"exclude: an interval must not end before it begins; got {interval!r}.")
+            raise ValueError(f"{what}: an interval must not end before it begins; got {interval!r}.")
         inside |= (True if low is None else axis >= low) & (True if high is None else axis <= high)
     return inside
 

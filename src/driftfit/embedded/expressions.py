@@ -118,7 +118,7 @@ class Expressions:
         owner, name = self.owner(node.value)
         parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         if owner.kind == "tile":
-            return Value("record", "s")
+            return Value("record")
         if owner.kind == "items":
             item: Value = owner.constant[int(self.value(parts[-1]).constant)]
             return item

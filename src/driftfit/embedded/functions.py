@@ -76,8 +76,8 @@ class Body(Statements):
         for argument, one in zip(self.tree.args.args, arguments, strict=True):
             name = identifier(argument.arg)
             if one.kind in ("record", "tile"):
-                self.parameters.append("tracker_state *s")
-                named[argument.arg] = Value("record", "s") if one.kind == "record" else one
+                self.parameters += ["tracker_state *s", "scratch_fields *scratch"]
+                named[argument.arg] = one
             elif one.kind == "array":
                 constant = "const " if one.text == "u" else ""
                 self.parameters.append(f"{constant}{TYPES[one.element]} *{name}")
@@ -162,7 +162,7 @@ class Body(Statements):
 def _passed(value: Value) -> str:
     """The expression passed for an argument; nothing if its value is known."""
     if value.kind in ("record", "tile"):
-        return "s"
+        return "s, scratch"
     if value.kind in ("array", "address"):
         return begin_of(value)
     if value.kind == "items":
@@ -183,6 +183,7 @@ class Translation:
     unit: Unit
     entry: Function
     names: tuple[str, ...]
+    scratch: tuple[str, ...]
 
     @property
     def start(self) -> Array:
@@ -244,8 +245,9 @@ def translation(program: Program, fixed_rate: bool = False) -> Translation:
     factors = () if fixed_rate else FACTORS
     constant = frozenset(fields(tile)) - {*factors, *RESULTS, *program.tracker.settings()}
     flags = frozenset(name for name in constant if _may_be_flag(tile[name][0]))
+    scratch = frozenset(program.scratch) & {*fields(tile)}
     while True:
-        unit = Unit(tile, constant, flags)
+        unit = Unit(tile, constant, flags, scratch)
         entry = translate(unit, update, [Value("tile"), Value("real", "y"), u])
         if not (constant & unit.written or flags & unit.beyond):
             break
@@ -253,7 +255,8 @@ def translation(program: Program, fixed_rate: bool = False) -> Translation:
     text = "\n".join(function.text for function in unit.functions.values())
     read = {*re.findall(r"\bs->(\w+)", text), *factors, *RESULTS}
     names = [name for name in fields(tile) if identifier(name) in read]
-    return Translation(unit, entry, tuple(sorted(names, key=lambda name: name in flags)))  # no gaps: integers last
+    names.sort(key=lambda name: name in flags)  # no gaps: integers last
+    return Translation(unit, entry, tuple(names), tuple(sorted(scratch)))
 
 
 def _may_be_flag(start: Array) -> bool:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.embedded import templates
 from driftfit.embedded.functions import Translation, translation
 from driftfit.embedded.values import Unit, as_code, assigned, comment, identifier, number
 from driftfit.engine.kernel import Array
@@ -21,6 +20,8 @@ from driftfit.run.program import Program
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
 
+PLACE = Path(__file__).parent / "c"
+"""Texts of the files, in which a name between two @ stands for what is written there."""
 SAMPLES = 200
 """Of the self-test."""
 BOUND = 0.001
@@ -32,30 +33,45 @@ def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
     from driftfit import __version__
 
     made, m = translation(program, fixed_rate), program.model.m
-    header = templates.HEADER.format(
-        what=comment(what), version=__version__, n=made.start["theta"].shape[1], m=m,
-        names=comment(", ".join(program.names)), fields=_fields(made),
-        known=templates.FIXED_RATE if fixed_rate else templates.KNOWN,
+    header = filled(
+        "tracker.h", what=comment(what), version=__version__, n=made.start["theta"].shape[1], m=m,
+        names=comment(", ".join(program.names)), fields=_fields(made, made.names),
+        known=FIXED_RATE if fixed_rate else KNOWN,
     )  # fmt: skip
-    source = templates.SOURCE.format(what=comment(what)) + _source(made, program)
-    readme = templates.README.format(
-        what=as_code(what), names=", ".join(map(as_code, program.names)), doubles=made.layout(8).itemsize,
+    readme = filled(
+        "README.md", what=as_code(what), names=", ".join(map(as_code, program.names)), doubles=made.layout(8).itemsize,
         singles=made.layout(4).itemsize, ops=_counted(made.entry.operations), ordinary=_after_the_start(made),
-        gate="" if program.gate is None else templates.GATED.format(rows=made.start["gate_first"].shape[1]),
+        gate="" if program.gate is None else GATED % made.start["gate_first"].shape[1],
     )  # fmt: skip
-    test = selftest(program.model, program.tracker, program.gate)
     return {
-        "tracker.h": header, "tracker.c": source, "selftest.c": test, "tracker_sfun.c": templates.SFUNCTION,
-        "README.md": readme,
+        "tracker.h": header, "tracker.c": filled("tracker.c", what=comment(what)) + _source(made, program),
+        "selftest.c": selftest(program.model, program.tracker, program.gate),
+        "tracker_sfun.c": filled("tracker_sfun.c"), "README.md": readme,
     }  # fmt: skip
 
 
-def _fields(made: Translation) -> str:
-    lines = []
-    for name in made.names:
-        size = made.start[name][0].size
-        lines.append(f"    {made.type_of(name)} {identifier(name)}{'' if size == 1 else f'[{size}]'};")
-    return "\n".join(lines)
+def filled(name: str, **values: Any) -> str:
+    """The text of a file with these values."""
+    text = (PLACE / name).read_text(encoding="utf-8")
+    return re.sub(r"@(\w+)@", lambda found: str(values[found[1]]), text)
+
+
+KNOWN = """Known of the next samples, and kept until changed: interval (nominal intervals since
+   the sample before), noise (factor of the noise variance; INFINITY: do not use the sample) and drift (factor of the
+   drift)."""
+FIXED_RATE = """Samples come at a fixed rate and are all alike: one is left out by passing NAN,
+   not by leaving out the call."""
+GATED = """
+* A gate stands before the tracker: it leaves out fault codes, spikes and frozen readings. Once, after the first
+  samples, it may take them in again without the codes among them: up to %d different samples, each as often as it
+  came."""
+
+
+def _fields(made: Translation, names: tuple[str, ...]) -> str:
+    sized = [(name, made.start[name][0].size) for name in names]
+    return "\n".join(
+        f"    {made.type_of(name)} {identifier(name)}{'' if size == 1 else f'[{size}]'};" for name, size in sized
+    )
 
 
 def _source(made: Translation, program: Program) -> str:
@@ -65,8 +81,15 @@ def _source(made: Translation, program: Program) -> str:
     support = _support(steps)
     start = f"static const tracker_state START = {{\n{_initial(made)}\n}};"
     tables = [body % name for body, name in made.unit.tables.items()]
+    scratch = filled("scratch.c", fields=_fields(made, made.scratch) or "    int none;").rstrip()
     again = [] if program.gate is None else [_again(made, program)]
-    return "\n\n".join([*support, *tables, start, steps, *again, _face(made, memory, bool(again))]) + "\n"
+    copies = ((identifier(one), made.start[one][0].size) for one in made.names if one not in memory)
+    face = filled(
+        "interface.c", entry=made.entry.name,
+        again="    if (s->gate_replay > 0) { first_samples_again(s); }\n" * bool(again),
+        copies="\n".join(f"    {_copied(f's->{name}', f'START.{name}', size)}" for name, size in copies),
+    )  # fmt: skip
+    return "\n\n".join([*support, *tables, start, scratch, steps, *again, face])
 
 
 def _again(made: Translation, program: Program) -> str:
@@ -80,8 +103,9 @@ def _again(made: Translation, program: Program) -> str:
     columns = {"interval": DT, "noise": NOISE, "drift": DRIFT}
     factors = [f"            s->{name} = rows[k][{column}];" for name, column in columns.items() if name in made.names]
     rows, width = made.start["gate_first"].shape[1:3]
-    return templates.AGAIN.format(
-        rows=rows, columns=width, m=max(program.model.m, 1), kept="\n".join(kept), restored="\n".join(restored),
+    return filled(
+        "first_samples.c", rows=rows, columns=width, m=max(program.model.m, 1), kept="\n".join(kept),
+        restored="\n".join(restored),
         codes=CODES, reading=READING, inputs=INPUTS, times=TIMES, factors="\n".join(factors), entry=made.entry.name,
     ).rstrip()  # fmt: skip
 
@@ -89,9 +113,13 @@ def _again(made: Translation, program: Program) -> str:
 def _support(steps: str) -> list[str]:
     """The functions that the steps call; those that only the double-precision build calls are not in the other."""
     in_single = re.sub(r"^#else\n.*?^#endif", "", steps, flags=re.S | re.M)
-    used = {name: text for name, text in templates.SUPPORT.items() if re.search(rf"\b{name}\b", steps)}
+    parts = {}
+    for text in (PLACE / "support.c").read_text(encoding="utf-8").strip().split("\n\n"):
+        (name,) = re.findall(r"^.*?(\w+)(?:\([^)]*\) \{|;$)", text.splitlines()[0])
+        parts[name] = text
+    used = [(name, text) for name, text in parts.items() if re.search(rf"\b{name}\b", steps)]
     return [text if re.search(rf"\b{name}\b", in_single) else f"#ifndef TRACKER_SINGLE\n{text}\n#endif"
-            for name, text in used.items()]  # fmt: skip
+            for name, text in used]  # fmt: skip
 
 
 def _initial(made: Translation) -> str:
@@ -101,23 +129,6 @@ def _initial(made: Translation) -> str:
         values = ", ".join(assigned(number(one), kind) for one in made.start[name][0].ravel().tolist())
         lines.append(f"    {values}," if made.start[name][0].size == 1 else f"    {{{values}}},")
     return "\n".join(lines)
-
-
-def _face(made: Translation, memory: set[str], gated: bool) -> str:
-    copies = []
-    for name in (one for one in made.names if one not in memory):
-        field = identifier(name)
-        copies.append(f"    {_copied(f's->{field}', f'START.{field}', made.start[name][0].size)}")
-    return "\n".join([
-        "void tracker_init(tracker_state *s) {", "    *s = START;", "}", "",
-        "NOT_INLINED tracker_step tracker_update(tracker_state *s, tracker_real y, const tracker_real *u) {",
-        "    tracker_step step;",
-        f"    {made.entry.name}(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);",
-        *(["    if (s->gate_replay > 0) { first_samples_again(s); }"] if gated else []), "    return step;", "}", "",
-        "tracker_step tracker_predict(const tracker_state *s, tracker_state *scratch, const tracker_real *u) {",
-        "    *scratch = *s;", "    return tracker_update(scratch, NAN, u);", "}", "",
-        "void tracker_reset(tracker_state *s) {", *copies, "}",
-    ])  # fmt: skip
 
 
 def _copied(to: str, source: str, size: int) -> str:
@@ -190,8 +201,9 @@ def selftest(model: Model, tracker: Tracker, gate: Gate | None) -> str:
         for part in (record(model)[0], steps[:, 2], live.theta)
     ]  # without codes; fmt: skip
     last = "state.theta[i]" if len(live.theta) > 1 else "state.theta"
-    return templates.SELFTEST.format(
-        T=SAMPLES, m=max(model.m, 1), bound=BOUND, y=_listed(y), u=_listed(u), steps=_listed(steps), last=last,
+    return filled(
+        "selftest.c", T=SAMPLES, m=max(model.m, 1), bound=BOUND, y=_listed(y), u=_listed(u),
+        steps=_listed(steps), last=last,
         theta=_listed(live.theta), y_scale=repr(scales[0]), s_scale=repr(scales[1]), theta_scale=repr(scales[2]),
     )  # fmt: skip
 

@@ -111,13 +111,6 @@ def lifted(value: Any) -> Value:
     return Value("python", constant=value)
 
 
-def field(name: str, array: Array, flag: bool = False) -> Value:
-    """A field of the record, whose last axis is the only lane."""
-    element = "long" if array.dtype.kind == "i" else "flag" if flag else "real"
-    return Value("array", f"s->{identifier(name)}", shape=array.shape, strides=_strides(array.shape), element=element,
-                 scalar=array.size == 1)  # fmt: skip
-
-
 def _strides(shape: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(int(np.prod(shape[axis + 1 :])) for axis in range(len(shape)))
 
@@ -167,7 +160,7 @@ def bare(text: str) -> str:
 
 RESERVED = frozenset(
     """auto break case char const continue default do double else enum extern float for goto if int long register return
-    short signed sizeof static struct switch typedef union unsigned void volatile while real inline restrict
+    scratch short signed sizeof static struct switch typedef union unsigned void volatile while real inline restrict
     """.split()  # noqa: SIM905
 )
 """Words that cannot be names of variables or functions in C.
@@ -218,8 +211,8 @@ class Function:
 class Unit:
     """The shared state of the functions of one file."""
 
-    def __init__(self, record: Array, constant: frozenset[str], flags: frozenset[str]) -> None:
-        self.record = record
+    def __init__(self, record: Array, constant: frozenset[str], flags: frozenset[str], scratch: frozenset[str]) -> None:
+        self.record, self.scratch = record, scratch
         self.constant = constant
         """Fields that are assumed to keep the values that they start with."""
         self.flags = flags
@@ -237,7 +230,15 @@ class Unit:
         """The largest extent in the record: the upper bound of loops about which nothing else is known."""
 
     def field(self, name: str) -> Value:
-        return field(name, self.record[name][0], name in self.flags)
+        """A field of the record, whose last axis is the only lane; a table if it keeps different numbers."""
+        array, owner = self.record[name][0], "scratch" if name in self.scratch else "s"
+        element = "long" if array.dtype.kind == "i" else "flag" if name in self.flags else "real"
+        text = f"{owner}->{identifier(name)}"
+        if name in self.constant and element == "real" and self.start_of(name) is None:
+            self.replaced.add(name)
+            text, _ = self.table(array)
+        return Value("array", text, shape=array.shape, strides=_strides(array.shape), element=element,
+                     scalar=array.size == 1)  # fmt: skip
 
     def start_of(self, name: str) -> Any:
         """The value that every entry of a constant field has; None if there is no such value."""

@@ -14,7 +14,7 @@ The fields of a record are described in `driftfit.engine.tiles`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from numba import types
 from driftfit.engine.compile_notice import compiling
 from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
-from driftfit.engine.phases import advancing, at_once, gated, learning, looking, raw_kept
+from driftfit.engine.phases import advancing, gated, learning, looking, raw_kept, ungated
 from driftfit.engine.tiles import as_compiled, kind_of, tile_type
 from driftfit.engine.tracker_part import tracker_part, whole_record
 
@@ -151,10 +151,9 @@ class TrackerSteps(NamedTuple):
 
     ``start`` are the steps of a lane while ``s.root`` is 1, for trackers that start from no knowledge at all
     (`driftfit.trackers.parts.diffuse`); those with ``take_over``, which makes their state from theta and P, also take a
-    sample whose ``h`` is above `WIDE` times its noise. ``machines`` are the routines that steps call by symbol;
-    ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms of a
-    tracker share the code of a driver. ``store(o, s, l)`` copies what the tracker's ``outputs`` name from the record
-    ``s`` to the stored record ``o``. ``read_extra(s, known, t, l)`` reads the extra columns of ``known``, those after
+    sample whose ``h`` is above `WIDE` times its noise. ``machines`` are the routines that steps call by symbol.
+    ``store(o, s, l)`` copies what the tracker's ``outputs`` name from the record ``s`` to the stored record ``o``.
+    ``read_extra(s, known, t, l)`` reads the extra columns of ``known``, those after
     interval, noise and drift, for trackers that take more factors. ``store_for_smoother(o, s, l)`` copies the tracker's
     ``smoother_fields`` when a run is replayed for a smoother. With ``doubts`` the model weighs lags that the tracker
     doubts; with ``instruments`` a model that has its own writes them to s.zeta (n,), a field of the tracker. Steps see
@@ -177,7 +176,6 @@ class TrackerSteps(NamedTuple):
     read_extra: Any = nothing_extra
     store_for_smoother: Any = nothing_more
     machines: tuple[Any, ...] = ()
-    instead: tuple[tuple[Any, Any], ...] = ()
     doubts: bool = False
     instruments: bool = False
     reads_model: bool = False
@@ -235,20 +233,19 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
     with compiling():
         for machine in tracker.machines:
             machine.load()
-    driver = partial(Driver, instead=tracker.instead)
     part = whole_record if tracker.reads_model else tracker_part
+    phases = looking(tracker), learning(tracker)
+    if tracker.outlined:
+        phases = outlined(phases[0]), outlined(phases[1])
     if gate is None:
-        advance = advancing(tracker)
-        between = at_once(outlined(advance) if tracker.outlined else advance, part)
+        between = ungated(phases if tracker.outlined else (advancing(tracker),), part)
     else:
-        phases = looking(tracker), learning(tracker)
-        look, learn = (outlined(phase) for phase in phases) if tracker.outlined else phases
-        between, model = gated(look, gate, learn, part), model._replace(regress=raw_kept(model.regress))
+        between, model = gated(phases[0], gate, phases[1], part), model._replace(regress=raw_kept(model.regress))
     sample = _sample(model, tracker.note, between, part)
     keep_more = covariance if keep == "cov" else nothing_more
     common = nothing_common if keep == "own" else write_common
     store = tracker.store if gate is None or keep == "own" else stored_too(tracker.store, store_decision)
-    run = _run(driver, sample, tracker.read_extra, _written(common, store, keep_more, part), part, gate is not None)
+    run = _run(sample, tracker.read_extra, _written(common, store, keep_more, part), part, gate is not None)
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE) -> int:
         # nothing looks at types and bounds after this
@@ -271,7 +268,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
         done: int = run.of_kind((tile.dtype, out.dtype), given) if plain else run(*given)
         return done
 
-    return Drivers(checked, *_updates(driver, sample))
+    return Drivers(checked, *_updates(sample))
 
 
 GATED = ("reason", "raw_e")
@@ -365,10 +362,10 @@ def _sample(model: ModelSteps, note: Step, between: Any, part: Any) -> Any:
     return sample
 
 
-def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: Any, part: Any, judged: bool) -> Driver:
+def _run(sample: Any, read_extra: Any, write: Any, part: Any, judged: bool) -> Driver:
     """The loop over the samples of a record, which a gate may end early."""
 
-    @driver
+    @Driver
     def run(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array) -> int:
         s = tile[0]
         L = s.theta.shape[1]
@@ -403,10 +400,10 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, write: A
     return run
 
 
-def _updates(driver: Callable[[Any], Driver], sample: Any) -> tuple[Driver, Driver]:
+def _updates(sample: Any) -> tuple[Driver, Driver]:
     """One sample of a stream, with an array of inputs and with a single one."""
 
-    @driver
+    @Driver
     def update(tile: Array, y: float, u: Array) -> tuple[float, float, float, bool]:
         s = tile[0]
         s.y[0] = y
@@ -416,7 +413,7 @@ def _updates(driver: Callable[[Any], Driver], sample: Any) -> tuple[Driver, Driv
         sample(s)
         return s.y_hat[0], s.e[0], s.s[0], s.ok[0] > 0.0
 
-    @driver
+    @Driver
     def update_one(tile: Array, y: float, u: float) -> tuple[float, float, float, bool]:
         s = tile[0]
         s.y[0] = y

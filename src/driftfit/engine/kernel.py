@@ -21,7 +21,7 @@ import hashlib
 import math
 import os
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from operator import attrgetter
 from threading import Lock
 from types import FunctionType
@@ -202,13 +202,9 @@ class Driver:
     (`MOST_ENTRIES`); one that is needed again comes back from disk in milliseconds.
     """
 
-    def __init__(self, function: Callable[..., Any], instead: Sequence[tuple[Machine, Machine]] = ()) -> None:
-        """``instead``: machines that the function calls, each with the one that is called in its place. The code on
-        disk is the same for all of them.
-        """
+    def __init__(self, function: Callable[..., Any]) -> None:
         assert isinstance(function, FunctionType)
         self.function = function
-        self._instead = {called.symbol: other.symbol for called, other in instead}
         self._identity = identity(function)
         self._entries: dict[Any, Any] = {}
 
@@ -248,10 +244,10 @@ class Driver:
         name = disk_cache.name_of(self.function.__name__, self._identity, arguments)
         stored = disk_cache.read(name)
         code = None if stored is None else internals.Code(*stored)
-        outside = code and called_by(code, self._instead)
+        outside = code and called_by(code)
         if code is None or outside is None:
             code = object_code(self.function, name, arguments)
-            outside = called_by(code, self._instead)
+            outside = called_by(code)
             internals.forget(KEPT)
         assert outside is not None
         return internals.load(code, outside)

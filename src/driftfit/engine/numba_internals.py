@@ -5,7 +5,7 @@ for each, which names in one sentence what broke. Tried with the versions in `TR
 
     lock           numba.core.compiler_lock         one lock for all that compiles, so that threads cannot mix
     identity       Dispatcher._set_uuid             other processes find closures over compiled functions
-    stored         numba.core.caching._Cache,       one file for each function and signature, without Numba's index
+    stored         Dispatcher._cache,               one file for each function and signature, without Numba's index
                    CompileResult._reduce, _rebuild
     code to link   JITCodeLibrary, CPUDispatcher,   a part is typed and turned into LLVM's language only, not emitted;
                    get_call_template, codegen's     one copy serves all constants
@@ -31,30 +31,35 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from functools import cache
+from importlib.metadata import version
 from types import FunctionType, MappingProxyType
 from typing import Any, NamedTuple
 from weakref import ref
 
-import llvmlite
 import llvmlite.binding as llvm
 import numba
-from llvmlite import ir
 from llvmlite.binding import newpassmanagers as passes
 from numba import _dynfunc, njit, types
-from numba.core.caching import _Cache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import lookup_environment
-from numba.core.registry import CPUDispatcher, cpu_target
+from numba.core.registry import CPUDispatcher
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
-from numba.core.typing.templates import AttributeTemplate
 from numba.extending import intrinsic
 
-from driftfit.engine.compile_time.lookups import known_once, replaced
+from driftfit.engine.compile_time.lookups import cpu_target, known_once, replaced
 from driftfit.engine.compile_time.lowering import Pipeline
-from driftfit.engine.compile_time.open_record import WORD, OpenRecord, array_from, entry_of, opened
+from driftfit.engine.compile_time.open_record import (
+    WORD,
+    AttributeTemplate,
+    OpenRecord,
+    array_from,
+    entry_of,
+    ir,
+    opened,
+)
 
 __all__ = ["WORD", "AttributeTemplate", "OpenRecord", "dumps", "entry_of", "ir", "opened"]
 
@@ -102,18 +107,16 @@ def under_ieee(function: Callable[..., Any], **options: bool) -> Any:
 def target() -> str:
     """The versions on which code depends, and the processor for which it is generated."""
     processor = cpu_target.target_context.codegen().magic_tuple()
-    return f"{numba.__version__, llvmlite.__version__}{sys.byteorder}{processor}"
+    return f"{numba.__version__, version('llvmlite')}{sys.byteorder}{processor}"
 
 
-class Stored(_Cache):
+class Stored:
     """The cache of a dispatcher: ``read(sig)`` returns stored code, ``write(sig, data)`` stores it."""
+
+    cache_path = ""
 
     def __init__(self, read: Callable[[Any], Any], write: Callable[[Any, Any], None]) -> None:
         self._read, self._write = read, write
-
-    @property
-    def cache_path(self) -> str:
-        return ""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         target_context.refresh()
@@ -382,15 +385,14 @@ def emit(function: FunctionType, arguments: tuple[Any, ...], from_python: bool =
 class Linked:
     """Code in this process, at ``address``. Numba's loader never frees anything; this one does with the last reference.
 
-    ``outside`` maps symbols that the code calls to what they refer to: another symbol, or linked code.
+    ``outside`` is the linked code that it calls, by symbol.
     """
 
-    def __init__(self, code: Code, outside: Mapping[str, Any] = MappingProxyType({})) -> None:
+    def __init__(self, code: Code, outside: Mapping[str, Linked] = MappingProxyType({})) -> None:
         library = llvm.JITLibraryBuilder().add_object_img(code.data).add_current_process().export_symbol(code.entry)
         loader = _loader()
         for name in code.outside:
-            other = outside.get(name, name)
-            address = other.address if isinstance(other, Linked) else llvm.address_of_symbol(other)
+            address = outside[name].address if name in outside else llvm.address_of_symbol(name)
             if address is not None:
                 library.import_symbol(name, address)
         for name, _ in code.environments:
@@ -402,7 +404,7 @@ class Linked:
         self.address: int = tracker[code.entry]
 
 
-def load(code: Code, outside: Mapping[str, Any] = MappingProxyType({})) -> Any:
+def load(code: Code, outside: Mapping[str, Linked] = MappingProxyType({})) -> Any:
     """The entry point of code for Python."""
     made, module, own = Linked(code, outside), sys.modules.get(code.module), code.environments[0][1]
     return _dynfunc.make_function(module, code.name, code.name, made.address, own, (made,))

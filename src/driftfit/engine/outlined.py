@@ -3,12 +3,12 @@
 A driver inlines the steps of a tracker, and the compiler optimises them again in each driver: for every model, for
 every set of stored results, for records and for streams. For a step that takes a microsecond a call costs nothing, so
 it is compiled once for each kind of record that it works on, and drivers refer to it by its symbol. Records of one lane
-are of one kind if they have the same fields, whatever the number of parameters.
+are of one kind if they have the fields that the step names, whatever the number of parameters, the model and the gate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from types import FunctionType
 from typing import Any
 from weakref import WeakValueDictionary
@@ -27,17 +27,16 @@ SOURCES: dict[str, tuple[FunctionType, types.Type, bool]] = {}
 """The function, the type of its record and whether its code is short, by symbol, of all steps that this process met
 while it compiled."""
 
-LINKED: WeakValueDictionary[Any, internals.Linked] = WeakValueDictionary()
-"""Outlined steps that drivers of this process use, by symbol and by the routines that are called instead of others."""
+LINKED: WeakValueDictionary[str, internals.Linked] = WeakValueDictionary()
+"""Outlined steps that drivers of this process use, by symbol."""
 
 
-def outlined(step: Any, short: bool = False, whole: bool = False) -> Any:
+def outlined(step: Any, short: bool = False) -> Any:
     """A step, which takes the record only, as drivers call it. For one lane it is compiled once for all sizes of the
     record (`driftfit.engine.compile_time.open_record`), and for size if it is ``short`` because it seldom runs; for
-    several lanes it is compiled once for each size. One that takes the ``whole`` record, fields of the model and of the
-    tracker, is compiled once for all that have the fields it names.
+    several lanes it is compiled once for each size.
     """
-    named = names_in(step.py_func) if whole else frozenset()
+    named = names_in(step.py_func)
 
     def typed(context: Any, record: Any) -> Any:
         known = record.fields["theta"].type.shape[-1] > 1
@@ -57,26 +56,17 @@ def outlined(step: Any, short: bool = False, whole: bool = False) -> Any:
     return made
 
 
-def called_by(code: internals.Code, instead: Mapping[str, str]) -> dict[str, Any] | None:
-    """What the symbols that code calls refer to; None if the code of an outlined step is neither in this process nor
-    on disk, and its source is not known here: the driver that calls it must be compiled again.
-
-    ``instead`` maps symbols of machines to those that are called in their place, by the outlined steps too.
+def called_by(code: internals.Code) -> dict[str, internals.Linked] | None:
+    """The outlined steps that code calls, by symbol; None if one of them is neither in this process nor on disk, and
+    its source is not known here: the driver that calls it must be compiled again.
     """
-    outside: dict[str, Any] = dict(instead)
-    for symbol in code.outside:
-        if symbol.startswith(PREFIX):
-            found = _found(symbol, instead)
-            if found is None:
-                return None
-            outside[symbol] = found
-    return outside
+    found = {symbol: _linked(symbol) for symbol in code.outside if symbol.startswith(PREFIX)}
+    return None if None in found.values() else found  # type: ignore[return-value]
 
 
-def _found(symbol: str, instead: Mapping[str, str]) -> internals.Linked | None:
+def _linked(symbol: str) -> internals.Linked | None:
     """An outlined step in this process, from disk, or from the compiler."""
-    key = symbol, tuple(sorted(instead.items()))
-    found = LINKED.get(key)
+    found = LINKED.get(symbol)
     if found is None:
         stored = disk_cache.read(symbol)
         if stored is None:
@@ -84,7 +74,7 @@ def _found(symbol: str, instead: Mapping[str, str]) -> internals.Linked | None:
                 return None
             source, record, short = SOURCES[symbol]
             stored = object_code(source, symbol, (record,), from_python=False, short=short)
-        found = LINKED[key] = internals.Linked(internals.Code(*stored), instead)
+        found = LINKED[symbol] = internals.Linked(internals.Code(*stored))
     return found
 
 

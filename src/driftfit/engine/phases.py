@@ -120,9 +120,7 @@ def advancing(tracker: Any) -> Any:
         if both and not alone:
             late(s)
 
-    started = kernel(start, inline=False)  # seldom run: the lane loop is better without it
-    if not tracker.outlined:  # else it is called together with the rest
-        started = outlined(started, short=True)
+    started = outlined(kernel(start, inline=False), short=True)  # seldom run: the lane loop is better without it
 
     @kernel
     def advance_or_start(s: State) -> None:
@@ -205,14 +203,24 @@ def learning(tracker: Any) -> Any:
     return learn
 
 
-def at_once(advance: Any, part: Any) -> Any:
-    """The steps of a tracker without a gate."""
+def ungated(phases: tuple[Any, ...], part: Any) -> Any:
+    """The steps of a tracker without a gate: all at once, or in those two phases between which a gate stands, which are
+    compiled once for both.
+    """
+    first, *rest = phases
+    last = rest[0] if rest else nothing_further
 
     @kernel
     def between(s: State) -> None:
-        advance(part(s))
+        first(part(s))
+        last(part(s))
 
     return between
+
+
+@kernel
+def nothing_further(s: State) -> None:
+    """All was done at once."""
 
 
 def gated(look: Any, gate: Step, learn: Any, part: Any) -> Any:
@@ -224,7 +232,7 @@ def gated(look: Any, gate: Step, learn: Any, part: Any) -> Any:
             s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
             gate(s, l)
 
-    judged = outlined(judge, whole=True)
+    judged = outlined(judge)
 
     @kernel
     def between(s: State) -> None:

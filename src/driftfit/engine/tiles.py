@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
-from itertools import groupby
 from typing import Any
 
 import numba
@@ -61,29 +60,32 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
     values are the shapes of the fields. All trackers must have the same fields; what both give is that of the tracker.
     """
     L, given = len(trackers), {**_common(n), **model, "u": np.zeros(max(m, 1))}
-    rest = {name: value for name, value in given.items() if name not in trackers[0]}
-    fields: list[Any] = []
-    for name, value in {**trackers[0], **rest}.items():
-        kind = np.int64 if np.asarray(value).dtype.kind in "iub" else np.float64
-        fields.append((name, kind, (*np.shape(value), L)))
-    opened = [field for name in OPEN for field in fields if field[0] == name]
-    fields = [field for field in fields if field not in opened]
-    own = trackers[0].keys() | _common(n).keys()
-    tracked = [field for field in fields if field[0] in own]
-    others = [field for field in fields if field[0] not in own]
-    fields = [*tracked, _padding(BOUNDARY, tracked, L), *others]
-    tile = _aligned(_one_of(_followed_by(np.dtype([*fields, _padding("padding", fields, L)], align=True), opened)), 1)
-    for name, value in rest.items():
-        tile[name][0] = np.asarray(value)[..., None]
-    first = 0
-    for _, alike in groupby(trackers, id):  # lanes that begin alike are written together
-        start, *others = alike
-        lanes, first = slice(first, first + 1 + len(others)), first + 1 + len(others)
-        for name, value in start.items():
-            tile[name][0, ..., lanes] = np.asarray(value)[..., None]
-    if opened:
-        tile[BOUNDARY][0, 0] = tile[opened[0][0]].ctypes.data - tile[BOUNDARY].ctypes.data
+    starts = {**trackers[0], **{name: value for name, value in given.items() if name not in trackers[0]}}
+    arrays = {name: np.asarray(value) for name, value in starts.items()}
+    fields = tuple(
+        (name, np.int64 if one.dtype.kind in "iub" else np.float64, one.shape) for name, one in arrays.items()
+    )
+    tile = _aligned(_record(fields, frozenset(trackers[0].keys() | _common(n).keys()), L), 1)
+    for name, one in arrays.items():
+        values = [start[name] for start in trackers] if name in trackers[0] else []
+        alike = len(set(map(id, values))) < 2
+        tile[name][0] = one[..., None] if alike else np.moveaxis(np.array(values), 0, -1)
+    if opened := [name for name in OPEN if name in arrays]:
+        tile[BOUNDARY][0, 0] = tile[opened[0]].ctypes.data - tile[BOUNDARY].ctypes.data
     return tile
+
+
+@lru_cache(maxsize=256)
+def _record(given: tuple[Any, ...], own: frozenset[str], L: int) -> np.dtype[Any]:
+    """The record of a tile of L lanes with these fields (name, kind, shape of one lane), of which trackers see their
+    ``own``.
+    """
+    fields = [(name, kind, (*shape, L)) for name, kind, shape in given]
+    opened = [field for name in OPEN for field in fields if field[0] == name]
+    tracked = [field for field in fields if field not in opened and field[0] in own]
+    others = [field for field in fields if field not in opened and field[0] not in own]
+    fields = [*tracked, _padding(BOUNDARY, tracked, L), *others]
+    return _one_of(_followed_by(np.dtype([*fields, _padding("padding", fields, L)], align=True), opened))
 
 
 def _padding(name: str, fields: Sequence[Any], L: int) -> tuple[str, type, tuple[int, int]]:

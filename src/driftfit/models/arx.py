@@ -36,12 +36,9 @@ import numpy as np
 from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import one_of, output_names, whole
-from driftfit.models.base import GAP, Model, Term, refuse_lag
-from driftfit.models.inputs import CountedInputs, Wider
+from driftfit.models.base import GAP, Term, refuse_lag
+from driftfit.models.inputs import CountedInputs
 from driftfit.models.lags import doubted, no_doubts, shift_doubts, shift_inputs, take_output, wait_for_lags
-
-PAST, ONE, ABSENT = -1, -2, -3
-"""Regressors that are no lags of inputs: a past output (these are the first), the constant, and 0."""
 
 
 @dataclass(frozen=True)
@@ -133,18 +130,6 @@ class ARX(CountedInputs):
 
     def steps_for(self, tracker: TrackerSteps) -> ModelSteps:
         return _steps(self.na, self.lags, self.intercept, True) if tracker.doubts and self.na > 0 else self.steps
-
-    @property
-    def family(self) -> Any:
-        """ARX models of one output with as many inputs differ only in their orders."""
-        return None if len(self.outputs) > 1 else ("ARX", self.m)
-
-    def as_large_as(self, family: Sequence[Model]) -> Model:
-        memories = [one.memory() for one in family]
-        length, depth = max(len(one["y_lag"]) for one in memories), max(one["u_lag"].shape[1] for one in memories)
-        lags = [j * depth + nk + i for j, (nb, nk) in enumerate(self.lags) for i in range(nb)]
-        picks = (*(PAST,) * self.na, *lags, *((ONE,) if self.intercept else ()))
-        return RunTimeARX(self, max(one.n for one in family), self.na, picks, (length, depth))
 
     @property
     def apply(self) -> Step | None:
@@ -349,76 +334,5 @@ def _joint_steps(
             s.filled[o, l] = 0.0 if s.observed[lane] > 0.0 else s.filled[o, l] + 1.0
             if na > 0:
                 s.y_lag[o, 0, l] = s.y[lane] if s.observed[lane] > 0.0 else fill
-
-    return ModelSteps(regress, push)
-
-
-@dataclass(frozen=True)
-class RunTimeARX(Wider):
-    """A bound `ARX` in the record of a larger one.
-
-        phi_t[i] = a past output, entry picks[i] of the lags of the inputs, the constant 1, or 0 after the own ones
-
-    A driver is compiled for one number of parameters and one set of orders. To run many orders side by side, each model
-    gets the size of the largest, with regressors of 0 after its own, and its orders are numbers in the record instead
-    of constants of the compiled routines. Bits are those of the `ARX`; a sample takes longer.
-
-    ``na`` and ``picks`` (n,) are its orders; ``room`` is (lags of the output, lags of each input).
-    """
-
-    na: int
-    picks: tuple[int, ...]
-    room: tuple[int, int]
-
-    def memory(self) -> Mapping[str, Any]:
-        own, (length, depth) = self.model.memory(), self.room
-        unknown = own["y_lag"][0]
-        lags = {"y_lag": np.full(length, unknown), "u_lag": np.full((len(own["u_lag"]), depth), unknown)}
-        picks = np.array((*self.picks, *(ABSENT,) * (self.size - len(self.picks))))
-        return {**own, **lags, "picks": picks, "na": np.array(self.na)}
-
-    @property
-    def steps(self) -> ModelSteps:
-        return _run_time_steps(self.m, False)
-
-    def memory_for(self, tracker: TrackerSteps) -> Mapping[str, Any]:
-        return {**self.memory(), **no_doubts(1, self.room[0])} if tracker.doubts else self.memory()
-
-    def steps_for(self, tracker: TrackerSteps) -> ModelSteps:
-        return _run_time_steps(self.m, tracker.doubts)
-
-
-@lru_cache
-def _run_time_steps(m: int, doubts: bool) -> ModelSteps:
-    """The steps for m inputs, with orders in the record."""
-
-    @kernel
-    def regress(s: State, l: int) -> None:
-        broken = s.dt[l] > GAP
-        length, depth = s.y_lag.shape[0], s.u_lag.shape[1]
-        for i in range(length):
-            if i < s.na[l]:
-                lag = s.y_lag[i, l]
-                lag = np.nan if broken else lag
-                s.y_lag[i, l] = lag
-                s.phi[i, l] = doubted(s, 0, i, l, lag) if doubts else lag
-        shift_inputs(s, m, l)
-        for i in range(s.phi.shape[0]):
-            pick = s.picks[i, l]
-            if pick >= 0:
-                s.phi[i, l] = s.u_lag[pick // depth, pick % depth, l]
-            elif pick != PAST:
-                s.phi[i, l] = 1.0 if pick == ONE else 0.0
-        wait_for_lags(s, l)
-
-    @kernel
-    def push(s: State, l: int) -> None:
-        na = s.na[l]
-        if doubts and na > 0:
-            shift_doubts(s, 0, l, l, l, 1, 1, na)
-        for i in range(s.y_lag.shape[0] - 1, 0, -1):
-            if i < na:
-                s.y_lag[i, l] = s.y_lag[i - 1, l]
-        take_output(s, na, l)
 
     return ModelSteps(regress, push)

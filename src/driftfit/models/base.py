@@ -208,18 +208,6 @@ class Model(Settings, ABC):
         )
 
     @property
-    def family(self) -> Any:
-        """Models with the same family, unless it is None, can share a compiled driver: see `as_large_as`."""
-        return None
-
-    def as_large_as(self, family: Sequence[Model]) -> Model:
-        """This model with as many parameters, and as much memory, as the largest of its family.
-
-        Its regressors after its own ones are 0. All models of the family then have the same steps and fields.
-        """
-        return self
-
-    @property
     def noise_varies(self) -> bool:
         """Whether `noise_factor` is anything but 1."""
         return False

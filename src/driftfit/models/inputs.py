@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, ClassVar, Self
 from warnings import warn
 
@@ -184,23 +184,3 @@ class NamedInputs(Model):
     @property
     def input_names(self) -> tuple[str, ...]:
         return self.inputs or ()
-
-
-@dataclass(frozen=True)
-class Wider(Model):
-    """A bound model in the record of a larger one of ``size`` parameters: regressors after its own are 0."""
-
-    model: Model
-    size: int
-
-    def bind(self, inputs: int | Sequence[str]) -> Self:
-        return self
-
-    @property
-    def m(self) -> int:
-        return self.model.m
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        own = self.model.names
-        return (*own, *(f"absent{i + 1}" for i in range(self.size - len(own))))

@@ -2,25 +2,26 @@
 
 The signals of the first samples are kept, and judged together when there are ``first`` + n of them. Samples that repeat
 the one before are kept once, with their number. While the record begins with so many equal readings that they and the
-samples of which they are lags are half of all, the oldest makes room for the newest: a plant at rest, and a run of
-codes at the start, are judged when something happens. A value is outlying if it is `OUTLYING` usual distances from the
-median, the usual distance being the median of those that are not 0. A sample is doubtful if
+samples of which they are lags are half of all, the oldest makes room for the newest, and ``gate_decided`` counts down:
+a plant at rest, and a run of codes at the start, are judged when something happens. A value is outlying if it is
+`OUTLYING` usual distances from the median, the usual distance being the median of those that are not 0. A sample is
+doubtful if
 
     its reading is outlying and no regressor is: probably a fault code;
     or a regressor is outlying and the reading is not: a code of an input, or of an earlier output, now a lag.
 
 A large output after a large input is neither; a lag with the same fault code as the reading does not explain it, and
 where the model is ``implicit``, its regressors contain functions of the reading, and none of them does.
-Doubtful samples are left out if the others contradict them: if least squares on all leaves the others a sum of squares
-Q, and least squares on themselves only q with nu residuals, and
+Doubtful samples are left out if the others contradict them: if least squares on all leaves a sum of squares Q, and
+least squares on the others only q with nu residuals, and with k doubtful samples
 
-    nu (Q - q) > WORSE q
+    nu (Q - q) > WORSE k q
 
 Then the signals that made samples doubtful are marked, ``gate_replay`` is set, and the driver restores
 the state before the first sample and replays whole samples without the codes, once.
 
-Source: the median deviation as a scale is Hampel's (1974), the recursive QR decomposition Gentleman's (1974); the rule
-is ours. Cost: a copy of the sample, and O(N^2 (n + m) + N n^2) once.
+Source: the test is Chow's (1960), the median deviation as a scale Hampel's (1974), the recursive QR decomposition
+Gentleman's (1974); what is doubtful is ours. Cost: a copy of the sample, and O(N^2 (n + m) + N n^2) once.
 """
 
 from __future__ import annotations
@@ -43,11 +44,9 @@ FEW = 3
 """Values that differ from the median, from which on their distance is usual."""
 ROUNDED = 1e-20
 """Share of the sum of squares of y that may be an error of rounding."""
-MADE_ROOM = -1
-"""Value of ``gate_decided`` when samples were dropped for others; 0 before that, 1 when it is decided."""
-Y, READING, OK, DT, NOISE, DRIFT, TIMES, DOUBT, U = range(9)
+Y, READING, DT, NOISE, DRIFT, TIMES, DOUBT, U = range(8)
 CODES = Y
-"""Columns of a kept sample: output and reading (NaN if missing), whether there is a row, intervals since the last
+"""Columns of a kept sample: output (NaN if it cannot be used) and reading (NaN if missing), intervals since the last
 sample, factors of noise and drift, how often it came, the judgement, and the first input. The regressor follows the
 inputs. When it is decided, which signals are codes takes the place of the output."""
 
@@ -67,28 +66,30 @@ def reading_now(s: State, l: int) -> float:
     return s.raw_y[l] if s.observed[l] > 0.0 else np.nan
 
 
+@kernel
+def entry(s: State, k: int, column: int, center: float, apart: bool, l: int) -> float:
+    """The entry of sample k in a column; with ``apart`` its distance from center, NaN if that is 0."""
+    x = s.gate_first[k, column, l]
+    away = abs(x - center)
+    return (away if away > 0.0 else np.nan) if apart else x
+
+
 @partial(kernel, short=True)
 def usual_value(s: State, column: int, center: float, apart: bool, l: int) -> float:
-    """The lower median of a column; with ``apart``, of the distances from center that are not 0, or 0 if there are
-    fewer than `FEW`."""
-    N = s.gate_first.shape[0]
-    count = 0
+    """The lower median of the entries of a column; of fewer than `FEW` distances 0."""
+    N, count = s.gate_first.shape[0], 0
     for k in range(N):
-        x = abs(s.gate_first[k, column, l] - center) if apart else s.gate_first[k, column, l]
-        count += 1 if (x == x) & ((not apart) | (x > 0.0)) else 0
-    if apart & (count < FEW):
-        return 0.0
-    for k in range(N):
-        value = abs(s.gate_first[k, column, l] - center) if apart else s.gate_first[k, column, l]
-        less, same = 0, 0
+        x = entry(s, k, column, center, apart, l)
+        count += 1 if x == x else 0
+    for k in range(0 if apart & (count < FEW) else N):
+        value, less, same = entry(s, k, column, center, apart, l), 0, 0
         for other in range(N):
-            x = abs(s.gate_first[other, column, l] - center) if apart else s.gate_first[other, column, l]
-            if (x == x) & ((not apart) | (x > 0.0)):
-                less += 1 if x < value else 0
-                same += 1 if x == value else 0
+            x = entry(s, other, column, center, apart, l)
+            less += 1 if x < value else 0
+            same += 1 if x == value else 0
         if (less <= (count - 1) // 2) & ((count - 1) // 2 < less + same):
             return value  # type: ignore[no-any-return]
-    return np.nan
+    return 0.0 if apart else np.nan
 
 
 @kernel
@@ -98,11 +99,11 @@ def reach(s: State, column: int, center: float, l: int) -> float:
 
 
 @kernel
-def doubt(s: State, implicit: bool, l: int) -> int:
-    """Write into each sample 1 if its reading is outlying, 2 if a regressor is; count those with one of the two."""
+def doubt(s: State, implicit: bool, l: int) -> bool:
+    """Write into each sample 1 if its reading is outlying, 2 if a regressor is; whether one has one of the two."""
     N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
     center = usual_value(s, READING, 0.0, False, l)
-    most, count = reach(s, READING, center, l), 0
+    most, some = reach(s, READING, center, l), False
     for k in range(N):
         s.gate_first[k, DOUBT, l] = 1.0 if abs(s.gate_first[k, READING, l] - center) > most else 0.0
     for i in range(n):
@@ -115,8 +116,8 @@ def doubt(s: State, implicit: bool, l: int) -> int:
                 s.gate_first[k, DOUBT, l] = d + 2.0
     for k in range(N):
         d = s.gate_first[k, DOUBT, l]
-        count += 1 if (d == 1.0) | (d == 2.0) else 0
-    return count
+        some |= (d == 1.0) | (d == 2.0)
+    return some
 
 
 @kernel
@@ -147,45 +148,25 @@ def fit(s: State, every: bool, l: int) -> float:
             s.gate_fit[i, j, l] = 0.0
     left = 0.0
     for k in range(N):
-        d = s.gate_first[k, DOUBT, l]
-        if (s.gate_first[k, OK, l] > 0.0) & (every | (d == 0.0) | (d == 3.0)):
+        d, y = s.gate_first[k, DOUBT, l], s.gate_first[k, Y, l]
+        if (y == y) & (every | (d == 0.0) | (d == 3.0)):
             left += rotate_in(s, k, l)
     return left
 
 
 @kernel
-def solve(s: State, l: int) -> None:
-    """theta in place of the last column; 0 in directions without information."""
-    n = s.phi.shape[0]
-    largest = 0.0
-    for i in range(n):
-        largest = max(largest, abs(s.gate_fit[i, i, l]))
-    for back in range(n):
-        i = n - 1 - back
-        for j in range(i + 1, n):
-            s.gate_fit[i, n, l] -= s.gate_fit[i, j, l] * s.gate_fit[j, n, l]
-        pivot = s.gate_fit[i, i, l]
-        s.gate_fit[i, n, l] = s.gate_fit[i, n, l] / pivot if abs(pivot) > 1e-12 * largest else 0.0
-
-
-@kernel
 def contradicted(s: State, l: int) -> bool:
     """Whether the samples that are not doubtful contradict those that are."""
-    N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
-    fit(s, True, l)
-    solve(s, l)
-    rows, squares, total = 0, 0.0, 0.0
-    for k in range(N):
-        d = s.gate_first[k, DOUBT, l]
-        if (s.gate_first[k, OK, l] > 0.0) & ((d == 0.0) | (d == 3.0)):
-            y = s.gate_first[k, Y, l]
-            e = y
-            for i in range(n):
-                e -= s.gate_first[k, PHI + i, l] * s.gate_fit[i, n, l]
-            rows, squares, total = rows + 1, squares + e * e, total + y * y
-    alone = fit(s, False, l)
-    spare = rows - n
-    return (spare >= RESIDUALS) & ((squares - alone) * spare > WORSE * (alone + ROUNDED * total))  # type: ignore[no-any-return]
+    rows, some, total = 0, 0, 0.0
+    for k in range(s.gate_first.shape[0]):
+        d, y = s.gate_first[k, DOUBT, l], s.gate_first[k, Y, l]
+        if y == y:
+            sure = (d == 0.0) | (d == 3.0)
+            rows, some = rows + (1 if sure else 0), some + (0 if sure else 1)
+            total += y**2 if sure else 0.0
+    alone, spare = fit(s, False, l), rows - s.phi.shape[0]
+    more = fit(s, True, l) - alone
+    return (spare >= RESIDUALS) & (more * spare > WORSE * some * (alone + ROUNDED * total))  # type: ignore[no-any-return]
 
 
 @kernel
@@ -228,13 +209,12 @@ def comes_again(s: State, l: int) -> bool:
 @partial(kernel, short=True)
 def decide(s: State, ages: int, implicit: bool, l: int) -> None:
     """Where samples made room for others they were judged one by one, unless they are the codes themselves."""
-    N = s.gate_first.shape[0]
-    whole, s.gate_decided[l] = s.gate_decided[l] == 0, 1
-    count = doubt(s, implicit, l)
-    whole |= (s.gate_first[0, DOUBT, l] == 1.0) & (not comes_again(s, l))
-    if (count > 0) & (2 * count < N) & whole and contradicted(s, l):
+    dropped, s.gate_decided[l] = -s.gate_decided[l], 1
+    some = doubt(s, implicit, l)
+    whole = (dropped == 0) | (s.gate_first[0, DOUBT, l] == 1.0) & (not comes_again(s, l))
+    if some & whole and contradicted(s, l):
         mark(s, ages, l)
-        s.gate_replay[l] = 1
+        s.gate_replay[l] = 1 + dropped
 
 
 @kernel
@@ -262,10 +242,8 @@ def drop_oldest(s: State, l: int) -> None:
 @kernel
 def keep(s: State, k: int, times: float, l: int) -> None:
     n, PHI = s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
-    observed = s.observed[l] > 0.0
-    s.gate_first[k, Y, l] = s.y[l] if observed else np.nan
-    s.gate_first[k, READING, l] = reading_now(s, l)
-    s.gate_first[k, OK, l], s.gate_first[k, DT, l] = s.ok[l], s.dt[l]
+    s.gate_first[k, Y, l] = s.y[l] if s.ok[l] > 0.0 else np.nan
+    s.gate_first[k, READING, l], s.gate_first[k, DT, l] = reading_now(s, l), s.dt[l]
     s.gate_first[k, NOISE, l], s.gate_first[k, DRIFT, l] = s.noise[l], s.drift[l]
     s.gate_first[k, TIMES, l] = times
     for j in range(PHI - U):
@@ -283,7 +261,7 @@ def remember_one(s: State, ages: int, implicit: bool, l: int) -> None:
         return
     if s.gate_kept[l] == N:
         known = s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
-        s.gate_decided[l] = MADE_ROOM if known else s.gate_decided[l]
+        s.gate_decided[l] -= int(s.gate_first[0, TIMES, l]) if known else 0
         drop_oldest(s, l)
     keep(s, s.gate_kept[l], 1.0, l)
     s.gate_kept[l] += 1
@@ -305,26 +283,29 @@ def first_samples(ages: int, implicit: bool = False) -> Step:
 
 
 class First(NamedTuple):
-    """Whole samples to replay, each as often as it came, up to the present one; what is a code is missing."""
+    """The first samples, each as often as it came, up to the present one."""
 
     y: Array
     """Readings (k,)."""
     u: Array
-    """Inputs (k, m)."""
-    dt: Array
-    """Intervals (k,) since the sample before."""
-    noise: Array
-    """Factors (k,) of the noise variance."""
-    drift: Array
-    """Factors (k,) of the drift."""
+    """Inputs (k, m); of samples that made room for others NaN."""
+    known: Array
+    """Intervals since the sample before, factors of the noise variance and of the drift (k, 3)."""
     codes: Array
-    """Which signals (k, 1 + m), the output first, are left out as codes."""
+    """Which signals (k, 1 + m), the output first, are codes."""
+    reason: Array
+    """What was decided (k,), as a gate stores it."""
+
+    def without_codes(self) -> tuple[Array, Array]:
+        """(readings (k,), inputs (k, m)), NaN where they are codes."""
+        return np.where(self.codes[:, 0], np.nan, self.y), np.where(self.codes[:, 1:], np.nan, self.u)
 
 
 def replayed(lane: Mapping[str, Array], m: int) -> First:
     """The first samples of a lane with ``gate_replay`` set, given the fields of its state."""
-    rows = np.array(lane["gate_first"][: int(lane["gate_kept"])])
+    rows, dropped = np.array(lane["gate_first"][: int(lane["gate_kept"])]), int(lane["gate_replay"]) - 1
+    rows[0, TIMES] += dropped
     rows = np.repeat(rows, rows[:, TIMES].astype(int), axis=0)
+    rows[:dropped, U : U + m] = np.nan
     codes = (rows[:, [CODES]].astype(int) >> np.arange(1 + m)) % 2 == 1
-    y, u = np.where(codes[:, 0], np.nan, rows[:, READING]), np.where(codes[:, 1:], np.nan, rows[:, U : U + m])
-    return First(y, u, rows[:, DT], rows[:, NOISE], rows[:, DRIFT], codes)
+    return First(rows[:, READING], rows[:, U : U + m], rows[:, [DT, NOISE, DRIFT]], codes, np.zeros(len(rows)))

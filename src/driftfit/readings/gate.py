@@ -18,7 +18,7 @@ pulse, may be FAR times as large as predicted. A far reading is refused. A chang
                is not counted, and believed only with the `hold`-th; with `LONGER` times as many if the forecast moved
                meanwhile, so that a level would not have repeated, and readings do not repeat by nature
 
-s = inf (start) contradicts nothing, a tracker without s (NaN) is lent the mean of e^2, and a reading without a forecast
+s = inf or NaN (start) contradicts nothing, a tracker without s is lent the mean of e^2, and a sample without a forecast
 is judged by v alone. v counts a reading that contradicts its forecast as `CLIPPED` variances at most, so that spikes do
 not become usual, but what is far in one of ten readings does.
 
@@ -56,6 +56,9 @@ GROWTH = 1.02
 """Growth in one sample of the error of a settled tracker, at most."""
 USED, REFUSED, FROZEN, INPUT, AT_START = range(5)
 """Reasons: what was decided of a sample."""
+SIGNAL = 8
+"""A decision is a reason plus this many times the signal that it is about: 0 for the output, 1 + j for input j. Of
+several inputs it is the first."""
 
 
 @dataclass(frozen=True)
@@ -102,51 +105,37 @@ def start(gate: Gate, n: int, m: int) -> Mapping[str, Any]:
     }  # fmt: skip
 
 
-@kernel
-def own_variance(s: State, l: int) -> float:
-    """The tracker's variance of e; 1 for a tracker without one, of which e^2 itself is averaged."""
-    return s.s[l] if s.s[l] == s.s[l] else 1.0
-
-
-@kernel
-def usual_ratio(s: State, l: int) -> float:
-    """g: how much larger than the tracker's variance errors were so far."""
-    return max(s.gate_ratio[l], 1.0) if s.s[l] == s.s[l] else s.gate_ratio[l]  # type: ignore[no-any-return]
-
-
-@kernel
-def variance_of_error(s: State, l: int) -> float:
-    """The variance with which e is compared: the tracker's, or larger if errors so far were."""
-    return own_variance(s, l) * usual_ratio(s, l)  # type: ignore[no-any-return]
-
-
-@kernel
-def learn_usual(s: State, seen: bool, contradicts: bool, clip: float, l: int) -> None:
-    """Mean and variance of the readings, the mean of e^2 / s of the samples used, and the error of a settled tracker.
+def usual_rule(clip: float, lends: bool) -> Callable[[State, bool, bool, float, float, int], None]:
+    """``learn(s, seen, contradicts, own, v, l)``: mean and variance of the readings, the mean of e^2 / own of the
+    samples used, and the error of a settled tracker, which is compared with v.
 
     A reading that contradicts its forecast counts as no farther than `CLIPPED` variances: one in ten may be far for
     ever, more of them are usual in the end.
     """
-    known = s.gate_count[l] >= FIRST
-    s.gate_count[l] += 1.0 if seen else 0.0
-    share, v = 1.0 / max(min(s.gate_count[l], MEMORY), 1.0), s.gate_variance[l]
-    if seen:
-        off = reading(s, l) - s.gate_mean[l]
-        if contradicts & known:
-            most = np.sqrt(CLIPPED * v)
-            off = min(max(off, -most), most)
-        s.gate_mean[l] += share * off
-        s.gate_variance[l] += share * ((1.0 - share) * off * off - v)
-    own = own_variance(s, l)
-    if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
-        ratio = s.e[l] * s.e[l] / own
-        # a start may claim any precision for a sample, but the first error of a tracker without s is all there is
-        ratio = min(ratio, clip * usual_ratio(s, l)) if known | (s.s[l] == s.s[l]) else ratio
-        s.gate_ratio[l] += share * (ratio - s.gate_ratio[l])
-        s.gate_settled[l] = min(variance_of_error(s, l), GROWTH * s.gate_settled[l]) if known else np.inf
+
+    @kernel
+    def learn(s: State, seen: bool, contradicts: bool, own: float, v: float, l: int) -> None:
+        known, spread = s.gate_count[l] >= FIRST, s.gate_variance[l]
+        s.gate_count[l] += 1.0 if seen else 0.0
+        share = 1.0 / max(min(s.gate_count[l], MEMORY), 1.0)
+        if seen:
+            off = reading(s, l) - s.gate_mean[l]
+            if contradicts & known:
+                most = np.sqrt(CLIPPED * spread)
+                off = min(max(off, -most), most)
+            s.gate_mean[l] += share * off
+            s.gate_variance[l] += share * ((1.0 - share) * off * off - spread)
+        if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
+            e2 = s.e[l] * s.e[l]
+            # a start may claim any precision for a sample, but the first errors are all there is where none is claimed
+            e2 = e2 if lends & (not known) else min(e2, clip * v)
+            s.gate_ratio[l] += share * (e2 / own - s.gate_ratio[l])
+            s.gate_settled[l] = min(v, GROWTH * s.gate_settled[l]) if known else np.inf
+
+    return learn  # type: ignore[no-any-return]
 
 
-def output_rule(gate: Gate) -> Step:
+def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
     """Refuse a far reading, unless it belongs to a change."""
     far, rare = float(gate.far) ** 2, float(gate.rare) ** 2
     sure, believed, hold = float(gate.sure) ** 2, gate.believed, gate.hold
@@ -162,9 +151,8 @@ def output_rule(gate: Gate) -> Step:
         if (apart == 0.0) | turns:
             s.gate_same[l] += 1
             s.gate_pulses[l] += 1 if unmoved & strikes else 0
-            told = (s.gate_stuck[l] > 0.5) & (
-                not natural(s, l)
-            )  # a level does not repeat where the forecast is elsewhere
+            # a level does not repeat where the forecast is elsewhere
+            told = (s.gate_stuck[l] > 0.5) & (not natural(s, l))
             longest = LONGER * hold if told else hold
             return (s.gate_same[l] < longest) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
         alike = unmoved | ((y - s.gate_last[l]) ** 2 < near2)
@@ -175,9 +163,9 @@ def output_rule(gate: Gate) -> Step:
         return (s.gate_run[l] < believed) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
 
     @kernel
-    def judge(s: State, l: int) -> bool:
+    def judge(s: State, v: float, l: int) -> bool:
         """Whether the sample contradicts its forecast."""
-        y, e2, v = reading(s, l), s.e[l] * s.e[l], variance_of_error(s, l)
+        y, e2 = reading(s, l), s.e[l] * s.e[l]
         off = y - s.gate_mean[l]
         predicted, step = s.valid[l] > 0.0, s.gate_finest[l] if s.gate_steps[l] > 0.0 else 0.0
         spread, response = max(s.gate_variance[l], step * step), s.y_hat[l] + s.shift[l] - s.gate_mean[l]
@@ -203,20 +191,23 @@ def output_rule(gate: Gate) -> Step:
 
 @lru_cache(maxsize=256)
 def gate_step(
-    gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False
-) -> Step:
+    gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False,
+    lends: bool = False,
+) -> Step:  # fmt: skip
     """The gate of a model with n parameters and m inputs, of which it remembers ``ages`` samples besides the present.
 
     ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
     memory. The regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be
-    as large as predicted. There y is compared with the usual readings alone.
+    as large as predicted. There y is compared with the usual readings alone. With ``lends`` the mean of e^2 takes the
+    place of s, which the tracker does not have.
     """
     remember = first_samples(ages, implicit)
     notice, blame = input_rules(gate, ages, refuse)
     hold_frozen = frozen_rule(gate.frozen)
     judge = output_rule(replace(gate, rare=np.inf) if implicit else gate)
     resolve = resolution(gate.coarse)
-    sure, rare = float(gate.sure) ** 2, float(gate.rare) ** 2
+    sure, rare, least = float(gate.sure) ** 2, float(gate.rare) ** 2, 0.0 if lends else 1.0
+    learn = usual_rule(sure, lends)
 
     @kernel
     def step(s: State, l: int) -> None:
@@ -224,17 +215,19 @@ def gate_step(
         seen = s.observed[l] > 0.0
         remember(s, l)
         notice(s, s.gate_count[l] >= FIRST, l)
-        off = reading(s, l) - s.gate_mean[l]
-        contradicts = (s.ok[l] > 0.0) & (s.e[l] * s.e[l] > sure * variance_of_error(s, l))
-        if s.ok[l] > 0.0 and blame(s, contradicts, off * off <= rare * s.gate_variance[l], l):
-            s.ok[l], s.reason[l] = 0.0, INPUT
+        off, own = reading(s, l) - s.gate_mean[l], 1.0 if lends else s.s[l]
+        v = own * max(s.gate_ratio[l], least)
+        contradicts = (s.ok[l] > 0.0) & (s.e[l] * s.e[l] > sure * v)
+        signal = blame(s, contradicts, off * off <= rare * s.gate_variance[l], l) if s.ok[l] > 0.0 else 0
+        if signal > 0:
+            s.ok[l], s.reason[l] = 0.0, INPUT + SIGNAL * signal
         if (s.observed[l] > 0.0) & (s.reason[l] == USED):
-            if hold_frozen(s, variance_of_error(s, l), l) & (s.gate_same[l] == 0):
+            if hold_frozen(s, v, l) & (s.gate_same[l] == 0):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, FROZEN
             else:
-                contradicts = judge(s, l)
+                contradicts = judge(s, v, l)
         resolve(s, l)
         s.gate_before[l] = reading(s, l) if seen else s.gate_before[l]
-        learn_usual(s, seen, contradicts, sure, l)
+        learn(s, seen, contradicts, own, v, l)
 
     return step  # type: ignore[no-any-return]

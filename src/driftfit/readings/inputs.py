@@ -63,9 +63,10 @@ def notice_one(s: State, j: int, away: float, l: int) -> None:
 
 def input_rules(
     gate: Any, ages: int, refuse: Callable[[State, int, int, int], None]
-) -> tuple[Callable[[State, bool, int], None], Callable[[State, bool, bool, int], bool]]:
-    """``notice(s, known, l)``, which takes in the inputs of a sample, and ``blame(s, contradicts, usual, l)``, whether
-    they are blamed for it, of a model that remembers the inputs of ``ages`` samples besides the present.
+) -> tuple[Callable[[State, bool, int], None], Callable[[State, bool, bool, int], int]]:
+    """``notice(s, known, l)``, which takes in the inputs of a sample, and ``blame(s, contradicts, usual, l)``, the
+    number of the first input that is blamed for it, from 1, or 0, of a model that remembers the inputs of ``ages``
+    samples besides the present.
     """
     away, trust, ages = float(gate.away), gate.trust, min(ages, LONGEST)
     all_ages = (1 << (ages + 1)) - 1
@@ -87,18 +88,18 @@ def input_rules(
         forget(s, j, l)
 
     @kernel
-    def blame(s: State, contradicts: bool, usual: bool, l: int) -> bool:
-        strange = 0
-        for j in range(s.gate_low.shape[0]):
-            strange |= s.gate_outside[j, l]
-        if strange == 0:
+    def blame(s: State, contradicts: bool, usual: bool, l: int) -> int:
+        first = 0
+        for j in range(s.gate_low.shape[0] - 1, -1, -1):
+            first = j + 1 if s.gate_outside[j, l] != 0 else first
+        if first == 0:
             s.gate_blamed[l] = s.gate_blamed[l] if contradicts else 0
-            return False
-        blamed = contradicts & usual & (s.gate_blamed[l] < trust)
-        if blamed:
-            s.gate_blamed[l] += 1
-            for j in range(s.gate_low.shape[0]):
-                take_out(s, j, l)
-        return blamed  # type: ignore[no-any-return]
+            return 0
+        if not (contradicts & usual & (s.gate_blamed[l] < trust)):
+            return 0
+        s.gate_blamed[l] += 1
+        for j in range(s.gate_low.shape[0]):
+            take_out(s, j, l)
+        return first
 
     return notice, blame

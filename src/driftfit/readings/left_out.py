@@ -1,22 +1,61 @@
-"""What a gate left out, as a table; of a stream, counts and the last of it."""
+"""What a gate left out: in words, as a table, and of a stream as counts and the last of it."""
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.readings.gate import INPUT
-from driftfit.readings.remarks import SAID, counts, remarks
+from driftfit.readings.gate import AT_START, FROZEN, INPUT, REFUSED, SIGNAL
 
+SAID: Mapping[int, tuple[str, str]] = {
+    REFUSED: ("Left out", "far outside the range of the others, which the model did not predict"),
+    FROZEN: ("Frozen", "repeating the one before although the forecast moved"),
+    INPUT: ("Inputs left out", "with an input far outside its range to which the output did not respond"),
+    AT_START: ("Left out at the start", "contradicted by the others among the first"),
+}
+"""For each reason its label in a summary, and what is said of the samples."""
+NAMED = 3
+"""Values that a warning names at most."""
 KEPT = 16
-"""Decisions of which a stream keeps everything."""
-SHOWN = 20
-"""Rows of a printed table at most."""
+"""Decisions that a stream keeps, and rows of a printed table at most."""
+
+
+def counts(reason: Array) -> dict[int, int]:
+    """How many samples (T,) there are for each reason but USED."""
+    return {one: count for one in SAID if (count := int(np.count_nonzero(reason == one)))}
+
+
+def remarks(count: Mapping[int, int]) -> tuple[tuple[str, str], ...]:
+    """The lines of a summary: nothing if nothing was left out."""
+    return tuple(
+        (SAID[one][0], f"{k} sample{'s' if k > 1 else ''} {SAID[one][1]}: not used") for one, k in count.items()
+    )
+
+
+def floor_remark(floor: float) -> tuple[tuple[str, str], ...]:
+    """The line on a coarse meter, given the floor of the noise variance: nothing if there is none."""
+    step = np.sqrt(12.0 * floor)
+    said = f"steps of {step:.4g}: the noise variance is taken to be at least {floor:.3g}"
+    return (("Resolution", said),) if floor > 0.0 else ()
+
+
+def ungated(found: Mapping[str, Sequence[float]], linear: bool) -> str:
+    """What is warned of after a run without a gate, given the values of each signal that look like codes, and whether
+    the model is linear in theta."""
+    said = "; ".join(_codes(name, values) for name, values in found.items())
+    lasting = "" if linear else " An estimate of a model that is not linear in theta may not come back from them."
+    return f"{said}. Such readings enter the estimate; gate=True leaves them out.{lasting}"
+
+
+def _codes(name: str, values: Sequence[float]) -> str:
+    different = list(dict.fromkeys(values))
+    named = ", ".join(f"{value:g}" for value in different[:NAMED]) + (", .." if len(different) > NAMED else "")
+    which = "value looks like a fault code" if len(values) == 1 else "values look like fault codes"
+    return f"{name}: {len(values)} {which} ({named})"
 
 
 class Decision(NamedTuple):
@@ -29,29 +68,28 @@ class Decision(NamedTuple):
     reason: str
 
 
-def decision(sample: Any, code: int, value: float, name: str = "y") -> Decision:
-    """The decision that a code stands for."""
-    return Decision(sample, "u" if code == INPUT else name, value, SAID[code][1])
-
-
 @dataclass(frozen=True, repr=False)
 class LeftOut:
     """The decisions of a gate in the order of the samples: ``sample`` (k,), ``code`` (k,) of the reason
-    (`driftfit.readings.gate`), and ``value`` (k,), the readings of y there. ``unused`` (j,) are the samples that could
-    not be used because a refused input is among their lags. Given as ``gate=``, these decisions are applied again.
+    (`driftfit.readings.gate`), ``value`` (k,), the readings of y there, and ``signal`` (k,), the name of the signal.
+    ``refused`` (i,) are the samples whose reading was refused, and ``unused`` (j,) those that could not be used because
+    a refused input is in their regressors. Given as ``gate=``, these decisions are applied again.
     """
 
     sample: Array
     code: Array
     value: Array
+    signal: Array
+    refused: Array
     unused: Array
 
     def __len__(self) -> int:
         return len(self.sample)
 
     def __iter__(self) -> Iterator[Decision]:
-        for t, code, value in zip(self.sample.tolist(), self.code.tolist(), self.value.tolist(), strict=True):
-            yield decision(t, code, value)
+        columns = (one.tolist() for one in (self.sample, self.signal, self.value, self.code))
+        for sample, signal, value, code in zip(*columns, strict=True):
+            yield Decision(sample, signal, value, SAID[code][1])
 
     @property
     def counts(self) -> dict[str, int]:
@@ -62,22 +100,19 @@ class LeftOut:
         """Readings y (T,) and factors of the noise variance (T,) with these decisions: refused readings are NaN, and
         samples with a refused input have an infinite variance."""
         y, noise = y.copy(), np.array(np.broadcast_to(noise, len(y)))
-        y[self.sample[self.code != INPUT]] = np.nan
-        noise[self.sample[self.code == INPUT]] = np.inf
+        y[self.refused] = np.nan
         noise[self.unused] = np.inf
         return y, noise
 
     def __repr__(self) -> str:
-        return table(self, len(self))
-
-    __str__ = __repr__
+        return table(list(self))
 
 
-def table(decisions: Any, count: int) -> str:
-    """Decisions as text, at most `SHOWN` of them."""
+def table(decisions: Sequence[Decision]) -> str:
+    """Decisions as text, at most `KEPT` of them."""
+    rows, count = decisions[:KEPT], len(decisions)
     if count == 0:
         return "nothing left out"
-    rows = [Decision(*row) for row, _ in zip(decisions, range(SHOWN), strict=False)]
     wide = max(6, *(len(str(row.sample)) for row in rows))
     lines = [f"{'sample':>{wide}}  signal    reading of y  reason"]
     lines += [f"{row.sample!s:>{wide}}  {row.signal:<6}  {row.value:>14.6g}  {row.reason}" for row in rows]
@@ -85,63 +120,48 @@ def table(decisions: Any, count: int) -> str:
     return "\n".join([*lines, *more])
 
 
-NOTHING_LEFT_OUT = LeftOut(np.empty(0, int), np.empty(0, int), np.empty(0), np.empty(0, int))
+NONE = np.empty(0, int)
+NOTHING_LEFT_OUT = LeftOut(NONE, NONE, np.empty(0), np.empty(0, "<U1"), NONE, NONE)
 
 
-def left_out_of(reason: Array, y: Array, ok: Array, ages: int) -> LeftOut:
+def left_out_of(decided: Array, y: Array, ok: Array, ages: int, names: Sequence[str]) -> LeftOut:
     """The decisions in a run, from what its gate stored for every sample (T,), its readings, which samples were used
-    once all was decided, and how many samples its model remembers inputs."""
-    sample = np.flatnonzero(reason)
-    after = (sample[:, None] + np.arange(1, ages + 1)).ravel()
-    after = np.unique(after[after < len(y)])
-    unused = after[~ok[after] & (reason[after] == 0) & np.isfinite(y[after])]
-    return LeftOut(sample, reason[sample].astype(int), y[sample], unused)
+    once all was decided, how many samples its model remembers inputs, and the names of the output and the inputs."""
+    sample = np.flatnonzero(decided)
+    signal, code = np.divmod(decided[sample].astype(int), SIGNAL)
+    refused = sample[signal == 0]
+    after = (sample[:, None] + np.arange(ages + 1)).ravel()
+    after = np.setdiff1d(after[after < len(y)], refused)
+    unused = after[~ok[after] & np.isfinite(y[after])]
+    return LeftOut(sample, code, y[sample], np.array(names)[signal], refused, unused)
 
 
-def remarks_of(several: Iterable[LeftOut]) -> tuple[tuple[str, str], ...]:
-    """The lines on what was left out of several records together."""
-    codes = [one.code for one in several]
-    return remarks(counts(np.concatenate(codes))) if codes else ()
+def remarks_of(found: LeftOut | Mapping[Any, LeftOut]) -> tuple[tuple[str, str], ...]:
+    """The lines on what was left out of a record, or of several together."""
+    several = [found] if isinstance(found, LeftOut) else found.values()
+    return remarks(counts(np.concatenate([NONE, *(one.code for one in several)])))
 
 
 class Tally:
-    """What the gate of a stream left out: ``counts`` by reason, and the `last` decisions, the newest at the end."""
+    """What the gate of a stream left out: ``counts`` of samples by reason, as summaries call it, and the ``last`` 16
+    decisions, the newest at the end."""
 
-    def __init__(self) -> None:
-        self._counts: Counter[str] = Counter()
-        self._last: deque[Decision] = deque(maxlen=KEPT)
+    def __init__(self, counted: Mapping[str, int] | None = None, last: Iterable[Sequence[Any]] = ()) -> None:
+        """Nothing, or what `plain` wrote."""
+        self.counts: dict[str, int] = dict(counted or {})
+        self.last: tuple[Decision, ...] = tuple(Decision(*one) for one in last)
 
-    def __len__(self) -> int:
-        return self._counts.total()
-
-    def __iter__(self) -> Iterator[Decision]:
-        return iter(self.last)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """How many samples there are for each reason, by the name that summaries use."""
-        return dict(self._counts)
-
-    @property
-    def last(self) -> tuple[Decision, ...]:
-        """The last 16 decisions."""
-        return tuple(self._last)
-
-    def add(self, sample: Any, code: int, value: float, name: str = "y") -> None:
-        """Count a sample that was not used."""
-        self._counts[SAID[code][0]] += 1
-        self._last.append(decision(sample, code, value, name))
+    def add(self, sample: Any, decided: int, value: float, names: Sequence[str]) -> None:
+        """Count a sample that was not used, with the names of the output and the inputs."""
+        signal, code = divmod(int(decided), SIGNAL)
+        name, reason = SAID[code]
+        self.counts[name] = self.counts.get(name, 0) + 1
+        self.last = (*self.last, Decision(sample, names[signal], value, reason))[-KEPT:]
 
     def __repr__(self) -> str:
-        said = ", ".join(f"{name}: {count}" for name, count in self._counts.items())
-        return f"{said}\n{table(self._last, len(self._last))}" if said else "nothing left out"
+        said = ", ".join(f"{name}: {count}" for name, count in self.counts.items())
+        return f"{said}\n{table(self.last)}" if said else "nothing left out"
 
     def plain(self) -> list[Any]:
-        """The state as plain data; `restore` takes it."""
-        return [dict(self._counts), [list(one) for one in self._last]] if self._counts else []
-
-    def restore(self, state: list[Mapping[str, int] | Any]) -> None:
-        """The inverse of `plain`."""
-        if state:
-            self._counts.update(state[0])
-            self._last.extend(Decision(*one) for one in state[1])
+        """The state as plain data."""
+        return [self.counts, [list(one) for one in self.last]] if self.counts else []

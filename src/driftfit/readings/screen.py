@@ -14,6 +14,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, Driver, State, kernel
+from driftfit.engine.tiles import make_tile
 from driftfit.readings.gate import Gate, gate_step, start
 
 SUSPECT = 30.0
@@ -84,12 +85,13 @@ def nothing_refused(s: State, signal: int, age: int, l: int) -> None:
 
 
 class Review:
-    """The gate's step over finished records with m inputs, of which the model remembered ``ages`` samples."""
+    """The gate's step over finished records with m inputs, of which the model remembered ``ages`` samples; ``lends`` as
+    for `gate_step`."""
 
-    def __init__(self, gate: Gate, m: int, ages: int) -> None:
+    def __init__(self, gate: Gate, m: int, ages: int, lends: bool) -> None:
         gate = replace(gate, first=0)
         self._start = start(gate, 0, m)
-        step = gate_step(gate, 0, m, ages, nothing_refused)
+        step = gate_step(gate, 0, m, ages, nothing_refused, lends=lends)
 
         def review(tile: Any, y: Any, u: Any, y_hat: Any, s: Any, valid: Any, reason: Any) -> None:
             of, l = tile[0], 0
@@ -109,12 +111,6 @@ class Review:
     def __call__(self, y: Array, u: Array, y_hat: Array, s: Array, valid: Array) -> Array:
         """Reasons (T,), given readings y (T,), inputs u (T, m), forecasts and their variances (T,), and whether there
         was a forecast (T,)."""
-        signals = {"y": 0.0, "u": np.zeros(max(u.shape[1], 1)), "y_hat": 0.0, "e": 0.0, "s": 0.0}
-        fields = {**signals, "phi": np.zeros(0), "valid": 0.0, "observed": 0.0, "ok": 0.0, "dt": 1.0, "noise": 1.0,
-                  "drift": 1.0, **self._start}  # fmt: skip
-        kinds = [(name, np.asarray(value).dtype, (*np.shape(value), 1)) for name, value in fields.items()]
-        tile, reason = np.zeros(1, np.dtype(kinds, align=True)), np.zeros(len(y), np.int64)
-        for name, value in fields.items():
-            tile[name][0] = np.asarray(value)[..., None]
+        tile, reason = make_tile(0, u.shape[1], {}, [self._start]), np.zeros(len(y), np.int64)
         self._review(tile, y, u, np.where(valid, y_hat, 0.0), s, valid, reason)
         return reason

@@ -145,7 +145,7 @@ class Outputs(KeyedResults, OfRecord):
             units |= {name: units[source] for name, source in held if source in units}
             u = np.where(found["valid"][:, j, None] > 0.0, found["phi"][..., j], np.nan)
             if self._programs[j].gate is not None:
-                left = left_out_of(lane.written("reason"), y, lane.written("ok") > 0.0, 0)
+                left = left_out_of(lane.written("reason"), y, lane.written("ok") > 0.0, 0, self._programs[j].signals)
                 y, noise = left.applied(y, known.noise)
                 known = known.changed(noise=noise)
         tile = alone.tile()

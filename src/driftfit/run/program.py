@@ -25,11 +25,11 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.readings.first_samples import replayed
-from driftfit.readings.gate import AT_START, Gate, gate_step
+from driftfit.readings.first_samples import First, replayed
+from driftfit.readings.gate import AT_START, SIGNAL, Gate, gate_step
 from driftfit.readings.gate import start as gate_start
 from driftfit.run.columns import COLLECTED, collecting, put_columns
-from driftfit.run.gating import AtStart, gate_of, readings_of, without_start
+from driftfit.run.gating import gate_of, without_start
 from driftfit.run.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
@@ -124,6 +124,13 @@ class Program:
         own = () if self.alone is None else self.alone.names
         return tuple(f"{name}[{self.output}]" for name in own) or _distinct(self.model.names_of(self.output))
 
+    @cached_property
+    def signals(self) -> tuple[str, ...]:
+        """Names of the output and of the inputs."""
+        m = self.model.m
+        inputs = self.model.input_names or (("u",) if m == 1 else tuple(f"u{j + 1}" for j in range(m)))
+        return (self.output or "y", *inputs)
+
     @property
     def start(self) -> State:
         """Fields of a lane before the first sample, other than those of the model."""
@@ -141,6 +148,11 @@ class Program:
             return own
         begun = gate_start(self.gate, self.model.n, self.model.m)
         return {**own, **begun, "raw_e": np.array(np.nan), "gate_refused": np.array(0)}
+
+    @property
+    def scratch(self) -> tuple[str, ...]:
+        """Fields that carry nothing from one sample to the next."""
+        return self.tracker.scratch if self.gate is None else (*self.tracker.scratch, "gate_fit")
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -190,7 +202,7 @@ class Program:
             "gate": None if self.gate is None else self.gate.settings(),
         }
         record = self.tile().dtype
-        return Layout(record, held_in(record, self.tracker_start), self.tracker.scratch, owner)
+        return Layout(record, held_in(record, self.tracker_start), self.scratch, owner)
 
     def pack(self, tile: Array, lane: int = 0) -> bytes:
         """The state of a lane as bytes (`driftfit.run.layout`)."""
@@ -215,7 +227,8 @@ class Program:
             model, own = self.model, self.steps if steps is None else steps
             gate = None
             if self.gate is not None:
-                gate = gate_step(self.gate, model.n, model.m, model.input_memory, model.refuse, model.implicit)
+                ages, refuse, lends = model.input_memory, model.refuse, not self.tracker.covariance
+                gate = gate_step(self.gate, model.n, model.m, ages, refuse, model.implicit, lends)
             found = drivers(model.steps_for(self.steps), own, keep, gate)
             if gate is not None:
                 found = found._replace(run=partial(self._decided, found.run))
@@ -224,7 +237,7 @@ class Program:
 
     def _decided(
         self, run: Any, tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE,
-        found_too: list[tuple[int, AtStart]] | None = None,
+        found_too: list[tuple[int, First]] | None = None,
     ) -> int:  # fmt: skip
         """Run to the end, with the first samples once more without the codes that were found among them.
 
@@ -236,8 +249,8 @@ class Program:
             if found_too is not None:
                 found_too.append((done - 1, found))
             if "reason" in (out.dtype.names or ()) and theta is NOWHERE:
-                at = done - 1 - found.ago
-                out["reason"][at[at >= 0], 0] = AT_START
+                count = min(done, len(found.reason))
+                out["reason"][done - count : done, 0] = found.reason[-count:]
             rest = slice(done, None)
             known = known if len(known) == 1 else known[rest]
             if theta is NOWHERE:
@@ -246,17 +259,16 @@ class Program:
                 self._decided(run, tile, y[rest], u[rest], known, out, theta[rest])
         return len(y)
 
-    def replay(self, tile: Array) -> AtStart:
+    def replay(self, tile: Array) -> First:
         """Bring a tile, whose gate has found codes among the first samples, to where it is without them."""
-        first, raw = replayed(state_of(tile), self.model.m), readings_of(state_of(tile))
+        first = replayed(state_of(tile), self.model.m)
         fresh = self.tile({"gate_decided": np.array(1)})
-        known = np.stack([first.dt, first.noise, first.drift], axis=1)[:, :, None]
-        self.drivers().run(fresh, first.y[:, None], first.u[:, :, None], known, self.written(fresh, len(first.y)))
-        fresh["gate_refused"][0, 0] = np.sum(first.codes.any(axis=1))
+        (y, u), coded, out = first.without_codes(), first.codes.any(axis=1), self.written(fresh, len(first.y))
+        self.drivers().run(fresh, y[:, None], u[:, :, None], first.known[:, :, None], out)
+        fresh["gate_refused"][0, 0] = np.sum(coded)
         tile.view(np.uint8)[:] = fresh.view(np.uint8)
-        at = np.flatnonzero(first.codes.any(axis=1))
-        after = np.cumsum(first.dt[::-1])[::-1] - first.dt
-        return AtStart(len(first.y) - 1 - at, after[at], raw[at], first.codes[at])
+        reason = np.where(coded, AT_START + SIGNAL * np.argmax(first.codes, axis=1), out["reason"][:, 0])
+        return first._replace(reason=reason)
 
     @property
     def width(self) -> int:

@@ -14,10 +14,11 @@ from driftfit.data.record import Known, Record, Records, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
-from driftfit.readings.gate import AT_START
+from driftfit.readings.first_samples import First
+from driftfit.readings.gate import AT_START, SIGNAL
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, left_out_of
 from driftfit.run.columns import OfRecord
-from driftfit.run.gating import AtStart, without_codes
+from driftfit.run.gating import without_codes
 from driftfit.run.lanes import Lane, Lanes, Results, names_of, read_results, write_results
 from driftfit.run.live.conformal import quantile, widened
 from driftfit.run.program import Program, State, kept, lanes_of, state_of
@@ -285,14 +286,14 @@ class Track(Plain, OfRecord):
         if self.program.gate is None:
             return self._left_out
         used, ages = self.decided.in_rows("ok") > 0.0, self.program.model.input_memory
-        return left_out_of(self.in_rows("reason"), self.record.y, used, ages)
+        return left_out_of(self.in_rows("reason"), self.record.y, used, ages, self.program.signals)
 
     @cached_property
     def decided(self) -> Track:
         """The run without the codes that its gate found among the first samples, for smoothers and judgements."""
-        if self.program.gate is None or AT_START not in self.in_rows("reason"):
+        if self.program.gate is None or AT_START not in self.in_rows("reason") % SIGNAL:
             return self
-        found: list[tuple[int, AtStart]] = []
+        found: list[tuple[int, First]] = []
         tile = self.fresh()
         out = self.program.written(tile, len(self))
         self.program.drivers().run(tile, *lanes_of(self.record), out, found_too=found)

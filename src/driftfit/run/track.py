@@ -24,9 +24,8 @@ from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
-from driftfit.readings.gate import AT_START, INPUT, REFUSED, USED, Gate
-from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
-from driftfit.readings.remarks import ungated
+from driftfit.readings.gate import AT_START, INPUT, REFUSED, SIGNAL, USED, Gate
+from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, ungated
 from driftfit.readings.screen import Review, screen, suspect
 from driftfit.run.fleet import Fleet, run_fleet
 from driftfit.run.gating import gate_of
@@ -295,11 +294,9 @@ def _codes(run: Track) -> dict[str, list[float]]:
     y_hat = np.where(np.isfinite(e), y - e, y_hat) if model.implicit else y_hat
     begun = _codes_at_start(run, suspect(y))
     y, early = np.where(begun, np.nan, y), y[begun]
-    reason = _review(model.m, model.input_memory)(y, u, y_hat, s, np.isfinite(y_hat))
-    blamed = np.flatnonzero(reason == INPUT)[:, None] - np.arange(model.input_memory + 1)
-    names = (
-        run.labels.u or model.input_names or (("u",) if model.m == 1 else tuple(f"u{j + 1}" for j in range(model.m)))
-    )
+    reason = _review(model.m, model.input_memory, not run.tracker.covariance)(y, u, y_hat, s, np.isfinite(y_hat))
+    blamed = np.flatnonzero(reason % SIGNAL == INPUT)[:, None] - np.arange(model.input_memory + 1)
+    names = run.labels.u or run.program.signals[1:]
     entered = (reason == REFUSED) & ~_begins_change(y, reason) & (run.ok | np.isnan(y_hat))
     found = {run.labels.y: np.append(early, y[entered])}
     for name, signal, mark in zip(names, u.T, strange, strict=True):
@@ -323,9 +320,9 @@ def _codes_at_start(run: Track, strange: Array) -> Array:
 
 
 @lru_cache
-def _review(m: int, ages: int) -> Review:
+def _review(m: int, ages: int, lends: bool) -> Review:
     """The gate for finished records, which is compiled once."""
-    return Review(Gate(), m, ages)
+    return Review(Gate(), m, ages, lends)
 
 
 def warn_unlearned(run: Track | KeyedResults) -> None:

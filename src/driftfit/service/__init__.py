@@ -2,7 +2,7 @@
 own need.
 """
 
-from driftfit.service.sinks.contract import Event, Outcome, Result, Sink, Writer
-from driftfit.service.sources.contract import Batch, Reader, Samples, Source
+from driftfit.service.connect.base import Batch, Event, Outcome, Reader, Result, Sink, Source, Writer
+from driftfit.service.connect.samples import Samples
 
 __all__ = ["Batch", "Event", "Outcome", "Reader", "Result", "Samples", "Sink", "Source", "Writer"]

@@ -21,9 +21,8 @@ from driftfit.models.base import Model
 from driftfit.parsing.settings import parse_model, tracker_of
 from driftfit.run.live.rule import KINDS
 from driftfit.run.program import Program
+from driftfit.service.connect.base import Connector, Sink, Source
 from driftfit.service.options import PageOptions, Pattern, ServiceOptions, build, converted, kinds
-from driftfit.service.sinks.contract import Sink
-from driftfit.service.sources.contract import Source
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
 
@@ -136,9 +135,9 @@ class _Reader:
                 self.fault((key,), f"there is no section {key!r}; {near(key, known)}")
         service = self.tried(("service",), lambda: build(ServiceOptions, self.table("service")))
         page = self.tried(("page",), lambda: build(PageOptions, self.table("page")))
-        sources = [self.one("source", key, given) for key, given in self.sources().items()]
+        sources = [self.one("source", Source, key, given) for key, given in self.sources().items()]
         units = [self.tried(("unit", k), partial(self.unit, k)) for k in range(len(self.tables("unit")))]
-        sinks = [self.one("sink", k, given) for k, given in enumerate(self.tables("sink"))]
+        sinks = [self.one("sink", Sink, k, given) for k, given in enumerate(self.tables("sink"))]
         if not self.problems and not self.data.get("source"):
             self.fault((), 'there is no source; add a table such as [source.plant] with kind = "mqtt".')
         if not self.problems and not units:
@@ -184,11 +183,11 @@ class _Reader:
         self.fault(("source",), "each source has a name: begin its table with [source.NAME].")
         return {}
 
-    def one(self, what: str, key: Any, given: dict[str, Any]) -> Any:
+    def one(self, what: str, base: type[Connector], key: Any, given: dict[str, Any]) -> Any:
         """A source or a sink."""
 
         def made() -> Any:
-            known = kinds(what)
+            known = kinds(base)
             kind = given.get("kind")
             if kind not in known:
                 raise KeyProblemError(("kind",), f"{what} kind {kind!r}; {near(str(kind), known)}")
@@ -211,7 +210,8 @@ class _Reader:
                 raise KeyProblemError(
                     (key,), f"unit needs {key} = a text" + ("; write a [[unit]] for each output." * (key == "y"))
                 )
-        u = at("u", lambda: converted("u", given.get("u", []), tuple[str, ...]))
+        named = given.get("u", [])
+        u = at("u", lambda: converted([named] if isinstance(named, str) else named, tuple[str, ...]))
         model = at("model", lambda: parse_model(str(given.get("model", f"ARX(2, {2 if u else 0}, intercept=True)"))))
         model = at("model", lambda: model.bind(list(u)))
         if len(model.outputs) > 1:
@@ -277,13 +277,13 @@ def _time_unit(given: Any) -> float:
 
 
 READ: dict[str, Callable[[Any], Any]] = {
-    "time": lambda given: converted("time", given, str),
+    "time": lambda given: converted(given, str),
     "time_unit": _time_unit,
     "dt": partial(_seconds, "dt", low=1e-12),
     "hold_back": partial(_seconds, "hold_back"),
     "ahead": partial(_seconds, "ahead"),
     "rate": partial(_positive, "rate"),
-    "gate": lambda given: converted("gate", given, bool),
+    "gate": lambda given: converted(given, bool),
 }
 """How a setting of [[unit]] is read that no other setting matters for."""
 

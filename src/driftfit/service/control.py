@@ -18,8 +18,8 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+from driftfit.service.connect.http import ANSWER_SECONDS, INCOMING, HttpSource
 from driftfit.service.core.engine import Engine
-from driftfit.service.sources.http import ANSWER_SECONDS, INCOMING
 
 log = logging.getLogger("driftfit.service")
 CONNECTIONS, MESSAGE_BYTES = 64, 16 << 20
@@ -74,7 +74,7 @@ class Control(threading.Thread):
         if do == "status":
             return dict(self.status())
         if do == "samples":
-            if not any(type(one).__name__ == "Http" for one in self.engine.config.sources):
+            if not any(isinstance(one, HttpSource) for one in self.engine.config.sources):
                 return {
                     "error": 'no source takes samples over HTTP; add [source.web] with kind = "http".',
                     "status": 404,

@@ -1,25 +1,26 @@
 """Options of the service, its page, sources and sinks, built from tables of a TOML file; and patterns of topics.
 
-A source or sink is one file in ``sources/`` or ``sinks/``; existing in the folder is being registered.
+A source or sink is a class in a file of the folder ``connect``; being there is being registered.
 """
 
 from __future__ import annotations
 
 import os
 import pkgutil
-import types
 import typing
-from collections.abc import Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, is_dataclass
 from functools import cached_property
 from importlib import import_module
+from inspect import isabstract, signature
 from pathlib import Path
 from string import Formatter
 from typing import Any, TypeVar
 
+import msgspec
+
 from driftfit.engine.settings import near
-from driftfit.service.sinks.contract import Sink
-from driftfit.service.sources.contract import Source
+from driftfit.service.connect.base import Connector
 
 Made = TypeVar("Made")
 
@@ -144,55 +145,38 @@ class PageOptions:
         return self.host in ("127.0.0.1", "::1", "localhost")
 
 
-def kinds(what: str) -> dict[str, Any]:
-    """The classes of the folder ``sources`` or ``sinks``, by kind, which is the name of the file."""
-    package = import_module(f"driftfit.service.{what}s")
-    names = [one.name for one in pkgutil.iter_modules(package.__path__)]
-    found = {name: import_module(f"{package.__name__}.{name}") for name in names}
-    classes = {name: getattr(module, name.capitalize(), None) for name, module in found.items()}
-    return {name: kind for name, kind in classes.items() if isinstance(kind, type) and issubclass(kind, Source | Sink)}
+def kinds(base: type[Connector]) -> dict[str, Any]:
+    """All sources or all sinks, by kind, once the files of the folder ``connect`` are imported."""
+    package = import_module("driftfit.service.connect")
+    for one in pkgutil.iter_modules(package.__path__):
+        import_module(f"{package.__name__}.{one.name}")
+    return {one.kind(): one for one in _below(base) if not isabstract(one)}
+
+
+def _below(base: type[Any]) -> Iterator[type[Any]]:
+    for one in base.__subclasses__():
+        yield one
+        yield from _below(one)
 
 
 def build(kind: type[Made], given: dict[str, Any]) -> Made:
-    """A dataclass from a table; ValueError for an unknown, missing or wrong option."""
-    known = {one.name: one for one in fields(kind) if one.init}  # type: ignore[arg-type]
-    hints = typing.get_type_hints(kind)
-    for key in given:
-        if key not in known:
-            raise ValueError(f"there is no option {key!r}; {near(key, known)}")
-    for key, one in known.items():
-        if key not in given and one.default is MISSING and one.default_factory is MISSING:
-            raise ValueError(f"the option {key} is missing.")
-    return kind(**{key: converted(key, value, hints[key]) for key, value in given.items()})
+    """A dataclass from a table; ValueError for an unknown, missing or wrong option, also of a table in it."""
+    known = typing.get_type_hints(kind)
+    for key, value in given.items():
+        if key not in known or key not in signature(kind).parameters:
+            raise ValueError(f"there is no option {key!r}; {near(key, list(signature(kind).parameters))}")
+        for inner in typing.get_args(known[key]):
+            for one in value if is_dataclass(inner) and isinstance(value, list) else ():
+                build(inner, one)
+    return converted(given, kind)
 
 
-def converted(key: str, value: Any, hint: Any) -> Any:
+def converted(value: Any, hint: type[Made]) -> Made:
     """A value of a table in the type of an option."""
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (types.UnionType, typing.Union):
-        return converted(key, value, next(one for one in args if one is not type(None)))
-    if hint is Secret:
-        return Secret.of(value)
-    if origin is typing.Literal:
-        if value not in args:
-            raise ValueError(f"{key} must be {' or '.join(args)}; got {value!r}.")
-        return value
-    if origin in (list, tuple):
-        each = [value] if origin is tuple and isinstance(value, str) else value
-        if not isinstance(each, list):
-            raise ValueError(f"{key} must be a list; got {value!r}.")
-        return origin(converted(key, one, args[0]) for one in each)
-    if origin is dict:
-        if not isinstance(value, dict):
-            raise ValueError(f"{key} must be a table; got {value!r}.")
-        return {name: converted(f"{key}.{name}", one, args[1]) for name, one in value.items()}
-    if isinstance(value, dict):
-        return build(hint, value)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if type(value) is not hint:
-        raise ValueError(f"{key} must be of type {hint.__name__}; got {value!r}.")
-    return value
+    try:
+        return msgspec.convert(value, hint, dec_hook=lambda kind, given: kind.of(given))
+    except msgspec.ValidationError as error:
+        raise ValueError(str(error).replace(" - at `$.", " - in `").replace("Object", "the table")) from None
 
 
 NAME_CHARACTERS = 200

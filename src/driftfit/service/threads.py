@@ -9,11 +9,10 @@ from collections import deque
 from dataclasses import replace
 from typing import Any
 
+from driftfit.service.connect.base import END, Batch, Outcome, Reader, RefusedError, Sink, Source, Writer
 from driftfit.service.core.engine import Engine, quantiles
 from driftfit.service.core.journal import Journal, Names
 from driftfit.service.core.results import Results
-from driftfit.service.sinks.contract import Outcome, RefusedError, Sink, Writer
-from driftfit.service.sources.contract import END, Reader, Source
 
 log = logging.getLogger("driftfit.service")
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
@@ -79,7 +78,8 @@ class SourceThread(WorkerThread):
         self.state = "running"
         try:
             while not self.stopping.is_set():
-                batch = reader.read(READ_SECONDS)
+                noticed, reader.noticed = reader.noticed, ""
+                batch = Batch([], noticed=noticed) if noticed else reader.read(READ_SECONDS)
                 if batch is END:
                     return
                 if batch is not None:

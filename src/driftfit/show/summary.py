@@ -28,10 +28,7 @@ from driftfit.judge.compare import Comparison, compare, left_at_start, persisten
 from driftfit.models.base import GAP
 from driftfit.models.equation import Equation
 from driftfit.models.state_space import StateSpace
-from driftfit.readings.left_out import remarks_of as remarks_of_many
-from driftfit.readings.remarks import counts as counts_of
-from driftfit.readings.remarks import floor_remark
-from driftfit.readings.remarks import remarks as remarks_of
+from driftfit.readings.left_out import floor_remark, remarks_of
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.live.conformal import quantile
 from driftfit.run.outputs import Outputs
@@ -171,7 +168,7 @@ def _signals(labels: Labels) -> str:
 
 def _gate(run: Track) -> tuple[tuple[str, str], ...]:
     """What the gate left out, a line for each reason; nothing without a gate."""
-    left = remarks_of(counts_of(run.left_out.code))
+    left = remarks_of(run.left_out)
     if run.program.gate is None:
         return left
     return (*left, *floor_remark(float(run.state["floor"]))) or (("Gate", "nothing left out"),)
@@ -342,7 +339,7 @@ def summarise_fleet(fleet: KeyedResults) -> FleetSummary:
         missing.update(run.labels.missing)
     return FleetSummary(
         repr(fleet.model), trackers, tuple(units), dict(fleet.failed), fleet.dropped, scaled, dict(missing),
-        remarks_of_many(run.left_out for run in runs),
+        remarks_of({k: run.left_out for k, run in enumerate(runs)}),
     )  # fmt: skip
 
 

@@ -104,6 +104,7 @@ from driftfit.trackers.parts.excitation import (
     window,
 )
 from driftfit.trackers.parts.few_residuals import RESIDUALS, widen_estimates, wider
+from driftfit.trackers.parts.information import partly_known
 
 
 @kernel
@@ -216,7 +217,8 @@ def correct_first(s: State, l: int) -> None:
         take_start(s, l)
         if s.h[l] < np.inf:
             s.density[l] = start_density(s.e[l], s.s[l] / wider(residuals), residuals)
-        rank, n = s.rank[l] - s.absent[l], s.parameters[l]
+        n = s.parameters[l]
+        rank = s.rank[l] - (s.theta.shape[0] - n)  # without the parameters that are known
         # a column that enters late, as of signals that a model has to compute first, has no residuals yet
         early = rank == n and s.remembered[l] <= n + RESIDUALS
         enough = s.count[l] >= RESIDUALS and (early or s.remembered[l] >= FIRST)
@@ -298,9 +300,8 @@ class AdaptiveKalman(Tracker):
             **any_noise(),
         }
 
-    @property
-    def pads(self) -> bool:
-        return True
+    def partly_known(self, n: int, N: int) -> Mapping[str, Any] | None:
+        return partly_known(self.state(n), self.state(N))
 
     @property
     def steps(self) -> TrackerSteps:

@@ -109,12 +109,11 @@ class Tracker(Settings, ABC):
     def steps(self) -> TrackerSteps:
         """The compiled steps."""
 
-    @property
-    def pads(self) -> bool:
-        """Whether a parameter that is known to be 0 and never excited leaves the others bit for bit as they are without
-        it, so that structures of several sizes may share a driver (`driftfit.trackers.parts.common_size`).
+    def partly_known(self, n: int, N: int) -> Mapping[str, Any] | None:
+        """The state for N parameters of which those after the first n are known to be 0, so that structures of several
+        sizes are lanes of one driver; None if the tracker weighs parameters together, or N has no room for the n.
         """
-        return False
+        return None
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         """The state for a bound model."""

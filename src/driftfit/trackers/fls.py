@@ -22,8 +22,8 @@ cheaper and has no covariance. `run.smooth()` computes the whole path that minim
 
 Source: Kalaba and Tesfatsion, Time-varying linear regression via flexible least squares (1989), whose matrix recursion
 is used in covariance form. Departures: an exact diffuse start (`driftfit.trackers.parts.diffuse`), which needs no
-penalty on the first point and no large matrix; the minimum-norm solution about theta0 until the regressors span. Cost:
-O(n^2).
+penalty on the first point and no large matrix; the minimum-norm solution about theta0 until the regressors span. In
+Chen et al. this is the classical method, T-FLS: J is (8), the filter (9) to (12), `smooth` (13) to (15). Cost O(n^2).
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ from driftfit.trackers.parts.diffuse import (
     spanned_variance,
     started,
 )
+from driftfit.trackers.parts.information import partly_known
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.rls import learn_scale, no_scale
 
@@ -166,9 +167,8 @@ class FLS(Tracker):
     def slopes(self) -> bool:
         return self.differences == 2
 
-    @property
-    def pads(self) -> bool:
-        return self.differences == 1
+    def partly_known(self, n: int, N: int) -> Mapping[str, Any] | None:
+        return None if self.slopes else partly_known(self.state(n), self.state(N))
 
     @property
     def steps(self) -> TrackerSteps:

@@ -50,7 +50,7 @@ from driftfit.trackers.parts.diffuse import (
     spanned_variance,
     started,
 )
-from driftfit.trackers.parts.information import triangular_root
+from driftfit.trackers.parts.information import partly_known, triangular_root
 from driftfit.trackers.parts.varying_drift import read_drift
 
 
@@ -180,9 +180,8 @@ class Kalman(Tracker):
         p0 = None if self.p0 is None else matrix("Kalman", "p0", self.p0, n)
         return square_root.state(vector("Kalman", "theta0", self.theta0, n), p0)
 
-    @property
-    def pads(self) -> bool:
-        return self.laws is None
+    def partly_known(self, n: int, N: int) -> Mapping[str, Any] | None:
+        return None if self.laws else partly_known(self.state(n), self.state(N))
 
     @property
     def width(self) -> int:  # type: ignore[override]

@@ -264,11 +264,11 @@ class Search:
 
 
 def intervals_of(
-    search: Search, task: Task, method: str, tracker: Tracker, level: float
+    search: Search, task: Task, method: str, tracker: Tracker, level: float | None
 ) -> dict[str, tuple[float, float]]:
-    """Intervals by name of setting; NaN if the criterion is not a likelihood."""
+    """Intervals by name of setting; NaN if there is no level, or the criterion is not a likelihood."""
     knobs = search.knobs
-    if method != "ml":
+    if method != "ml" or level is None:
         return dict.fromkeys(knobs.names, (float("nan"), float("nan")))
     found: dict[str, tuple[float, float]] = {}
     ends = [search.profile(i, level) for i in range(len(search.x))]

@@ -43,6 +43,7 @@ from driftfit.run.result import track_record
 from driftfit.run.track import Decisions, decide, records_of, warn_of_codes
 from driftfit.show.text import ByOutput
 from driftfit.trackers.base import Tracker
+from driftfit.tune.inference import unknown_at_start
 from driftfit.tune.lanes import Task, score
 from driftfit.tune.parametrisation import find_knobs
 from driftfit.tune.search import Counted, Criterion, Search, along, intervals_of, minimise, run_task
@@ -60,6 +61,7 @@ def tune(
     h: int = 1,
     bounds: tuple[float, float] | None = None,
     level: float = 0.95,
+    intervals: bool = True,
     order_by: Any = None,
     data: Any = None,
     by: Any = None,
@@ -97,6 +99,8 @@ def tune(
         samples, scales from 1e-3 to 1e3.
     level : number
         Level of the intervals.
+    intervals : bool
+        False leaves them out (NaN): they take most of the time of a short record.
     gate : bool, `Gate`, decisions of a run or None
         As for `track`. The gate decides once, by a run of `AdaptiveKalman`, and what it leaves out is left out for all
         settings: ``tuned.left_out``, which ``track(model, tuned.tracker, y, u, gate=tuned.left_out)`` takes.
@@ -133,18 +137,19 @@ def tune(
         raise ValueError(f"tune: {type(tracker).__name__} has no variance, so {method!r} is undefined; use 'h-step'.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing)
     if len(model.outputs) > 1:
-        options = (method, groups, h, bounds, level, order_by)
+        options = (method, groups, h, bounds, level if intervals else None, order_by)
         if gate:
             raise ValueError("tune: gate= is for one output; tune one output after the other, or leave gate= out.")
         return tune_outputs(model, tracker, y, u, reading, data, by, lambda task: _tuned(task, tracker, *options))
     reading = reading._replace(gate=gate)
-    return _tuned(_task(model, tracker, y, u, reading, data, by), tracker, method, groups, h, bounds, level, order_by)
+    task = _task(model, tracker, y, u, reading, data, by)
+    return _tuned(task, tracker, method, groups, h, bounds, level if intervals else None, order_by)
 
 
 def _tuned(
-    task: Task, tracker: Tracker, method: str, groups: Any, h: int, bounds: Any, level: float, order_by: Any
+    task: Task, tracker: Tracker, method: str, groups: Any, h: int, bounds: Any, level: float | None, order_by: Any
 ) -> Tuned:
-    """Tune on a checked record."""
+    """Tune on a checked record; without a level there are no intervals."""
     if order_by is not None:
         task = along(task, tracker, order_by)
     knobs = find_knobs(task, tracker, groups, bounds)
@@ -164,10 +169,12 @@ def _tuned(
         method=method,
         loglik=sum(run.loglik for run in runs),
         used=sum(int(np.isfinite(run.log_density).sum()) for run in runs) if tracker.covariance else 0,
+        settings=len(search.x) + int(knobs.profiled),
+        unknown=sum(unknown_at_start(run) for run in runs),
         noise=sigma2 if knobs.profiled else float(getattr(knobs.run(search.x), "r", np.nan)),
         at_bound=tuple(name for name, i in zip(knobs.names, knobs.owner, strict=True) if search.at_bound(i)),
         interval=intervals_of(search, task, method, tracker, level),
-        level=level,
+        level=0.95 if level is None else level,
         left_out=_of_one(task.left_out or {}),
         _search=search,
     )

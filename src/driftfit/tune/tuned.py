@@ -202,6 +202,8 @@ class Tuned(Printed):
         records their sum; NaN for trackers without a variance.
     used : int
         Samples in this likelihood: those with a density given earlier samples.
+    settings, unknown : int
+        Number of settings that were estimated, the noise variance included, and of parameters whose start is unknown.
     noise : float
         Estimated noise variance; unreliable if ``at_bound`` is not empty.
     at_bound : tuple of str
@@ -219,6 +221,8 @@ class Tuned(Printed):
     method: str
     loglik: float
     used: int
+    settings: int
+    unknown: int
     noise: float
     at_bound: tuple[str, ...]
     interval: dict[str, tuple[float, float]]
@@ -241,6 +245,16 @@ class Tuned(Printed):
         return polars.DataFrame({**columns, name: self._criterion(values)})
 
     @property
+    def aic(self) -> float:
+        """Akaike's criterion, -2 loglik + 2 (settings + unknown)."""
+        return -2.0 * self.loglik + 2.0 * (self.settings + self.unknown)
+
+    @property
+    def bic(self) -> float:
+        """Schwarz's criterion, -2 loglik + (settings + unknown) log N, N the used samples and the unknown starts."""
+        return -2.0 * self.loglik + float(np.log(self.used + self.unknown)) * (self.settings + self.unknown)
+
+    @property
     def chosen(self) -> dict[str, float]:
         """The estimates by name of setting as in ``interval``; drifts are relative to the noise variance."""
         names, values = self._search.knobs.names, self._search.knobs.values(self._search.x)
@@ -251,8 +265,9 @@ class Tuned(Printed):
             ("Tracker", shortened(repr(self.tracker))),
             ("Criterion", METHODS[self.method]),
             ("Log-likelihood", f"{self.loglik:.6g} of {self.used} samples" if np.isfinite(self.loglik) else ""),
+            ("AIC, BIC", f"{self.aic:.6g}, {self.bic:.6g}" if np.isfinite(self.loglik) else ""),
             ("Noise variance", f"{self.noise:.4g}"),
-            *remarks_of([self.left_out] if isinstance(self.left_out, LeftOut) else self.left_out.values()),
+            *remarks_of(self.left_out),
         )
         ends = (f"[{0.5 - self.level / 2:.3g}", f"{0.5 + self.level / 2:.3g}]")
         table = table_of("Settings", "", "estimate", *ends)

@@ -125,7 +125,7 @@ class HalfSpace(NamedTuple):
     high: float
 
 
-def half_space(text: str, names: Sequence[str]) -> HalfSpace:
+def half_space(text: str, names: Sequence[str], verb: str = "constrain") -> HalfSpace:
     """The constraint that a text describes; ValueError for one that is not linear, or cannot be met."""
     places = {f"_p{i}_": i for i in range(len(names))}
     code = text
@@ -136,30 +136,30 @@ def half_space(text: str, names: Sequence[str]) -> HalfSpace:
     except SyntaxError:
         tree = None
     if not isinstance(tree, ast.Compare):
-        raise ValueError(f'constrain: {text!r} is no constraint such as "b1 >= 0" or "b1 + b2 == 1".')
+        raise ValueError(f'{verb}: {text!r} is no constraint such as "b1 >= 0" or "b1 + b2 == 1".')
     try:
         sides = [_linear(side, places) for side in (tree.left, *tree.comparators)]
     except ValueError:
         raise ValueError(
-            f"constrain: {text!r} is not linear in the parameters {', '.join(names)}; use sums, differences, and "
+            f"{verb}: {text!r} is not linear in the parameters {', '.join(names)}; use sums, differences, and "
             "products with numbers."
         ) from None
     g, low, high = np.zeros(0), -np.inf, np.inf
     for (a, b), sign in zip(pairwise(sides), tree.ops, strict=True):
         if not isinstance(sign, ast.Gt | ast.GtE | ast.Lt | ast.LtE | ast.Eq):
-            raise ValueError(f"constrain: {text!r} must compare by <=, >= or ==.")
+            raise ValueError(f"{verb}: {text!r} must compare by <=, >= or ==.")
         *rest, c = a - b if isinstance(sign, ast.Gt | ast.GtE) else b - a  # rest' theta + c >= 0
         g = g if len(g) else np.array(rest)
         above = np.array_equal(rest, g)
         if not np.any(rest) or not (above or np.array_equal(np.negative(rest), g)):
-            raise ValueError(f"constrain: {text!r} must be limits of one sum of parameters ({', '.join(names)}).")
+            raise ValueError(f"{verb}: {text!r} must be limits of one sum of parameters ({', '.join(names)}).")
         limit = -c if above else c
         if above or isinstance(sign, ast.Eq):
             low = max(low, limit)
         if not above or isinstance(sign, ast.Eq):
             high = min(high, limit)
     if not low <= high:
-        raise ValueError(f"constrain: no parameters satisfy {text!r}.")
+        raise ValueError(f"{verb}: no parameters satisfy {text!r}.")
     return HalfSpace(text, g, float(low), float(high))
 
 

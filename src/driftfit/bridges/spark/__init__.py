@@ -5,9 +5,8 @@ Spark partitions, shuffles, retries and keeps checkpoints; this package adds the
 """
 
 from driftfit.bridges.spark.batch import track
-from driftfit.bridges.spark.follow import follow
+from driftfit.bridges.spark.follow import Store, follow
 from driftfit.bridges.spark.frames import session
 from driftfit.bridges.spark.keyed import follow_keyed
-from driftfit.bridges.spark.store import Store
 
 __all__ = ["Store", "follow", "follow_keyed", "session", "track"]

@@ -7,13 +7,14 @@ with more rows is run in parts, so memory does not depend on its length.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from driftfit.bridges.spark.frames import rows_of, task_of
+from driftfit.bridges.spark.frames import by_unit, rows_of, task_of
 from driftfit.bridges.spark.task import Task, chunks, parameters_schema, results_schema
 from driftfit.bridges.spark.units import (
     COUNTS,
@@ -94,10 +95,8 @@ def track(
     one_of("spark.track", "outputs", outputs, OUTPUTS)
     task = task_of(df, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, settings, arrays, gate)
     rows = rows_of(df, task, settings)
-    order = [*task.by, task.time, *task.y, *task.u]
-    sorted_rows = rows.repartition(*task.by).sortWithinPartitions(*order)
     made = schema_of(task, dict(rows.dtypes), outputs)
-    return sorted_rows.mapInArrow(_worker(task, outputs, made), ", ".join(f"`{n}` {kind}" for n, kind in made.items()))
+    return by_unit(rows, task, partial(_work, task, outputs, made), made)
 
 
 def schema_of(task: Task, kinds: Mapping[str, str], outputs: str) -> dict[str, str]:
@@ -114,17 +113,14 @@ def schema_of(task: Task, kinds: Mapping[str, str], outputs: str) -> dict[str, s
     return own | parameters_schema(task) | sums | counts | {"failed": "string"}
 
 
-def _worker(
-    task: Task, outputs: str, schema: Mapping[str, str]
-) -> Callable[[Iterator[pa.RecordBatch]], Iterator[pa.RecordBatch]]:
-
-    def work(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
-        part = Partition(task, outputs, schema)
-        for table, more in chunks(batches, task.by, parts=outputs != "verdict"):
-            for found in part.run(table, more):
-                yield from found.to_batches()
-
-    return work
+def _work(
+    task: Task, outputs: str, schema: Mapping[str, str], batches: Iterator[pa.RecordBatch]
+) -> Iterator[pa.RecordBatch]:
+    """What a partition runs."""
+    part = Partition(task, outputs, schema)
+    for table, more in chunks(batches, task.by, parts=outputs != "verdict"):
+        for found in part.run(table, more):
+            yield from found.to_batches()
 
 
 class Partition:
@@ -149,17 +145,13 @@ class Partition:
             own = units.taken(self.task.columns, done.rows)
             yield units.filled(own | results(self.task, done.found), self.schema)
         if not more:
-            reasons = [self._reason(units, k) for k in range(len(units.first))]
-            good = [k for k, reason in enumerate(reasons) if reason is None]
-            bad = [k for k, reason in enumerate(reasons) if reason is not None]
+            empty = dict.fromkeys(np.flatnonzero(units.counts[:, SAMPLES] == 0).tolist(), "no row has a time")
+            failed = empty | {k: why for k in range(len(units.first)) if (why := units.reason(k))}
+            good, bad = [k for k in range(len(units.first)) if k not in failed], sorted(failed)
             if self.outputs != "samples" and good:
                 yield units.filled(self._of_units(units, good, done), self.schema)
             if bad:
-                yield units.filled(self._named(units, bad) | {"failed": [reasons[k] for k in bad]}, self.schema)
-
-    def _reason(self, units: Units, k: int) -> str | None:
-        """Why a unit has no result."""
-        return units.reason(k) or (None if units.counts[k, SAMPLES] else "no row has a time")
+                yield units.filled(self._named(units, bad) | {"failed": [failed[k] for k in bad]}, self.schema)
 
     def _named(self, units: Units, which: list[int]) -> dict[str, Any]:
         """The units, their last times and their counts."""
@@ -183,19 +175,15 @@ class Partition:
 
     def _verdicts(self, done: Done, which: list[int]) -> dict[str, Any]:
         """What is judged of every output of each unit."""
-        found, ny, columns = (
-            done.found,
-            len(self.task.y),
-            {f"{name}{of}": list[Any]() for of in self.task.suffixes for name in VERDICT},
-        )
+        found, ny = done.found, len(self.task.y)
+        columns = {f"{name}{of}": list[Any]() for of in self.task.suffixes for name in VERDICT}
         for j in map(done.keys.index, which):
             each = range(j * ny, (j + 1) * ny)
             own, programs = found.lanes.part(each), [found.programs[i] for i in each]
-            runs = (
-                [Track(programs[0], found.records.part(j), own[0])]
-                if ny == 1
-                else Outputs(programs, found.records.some(j, j + 1), own, {}, {}).values()
-            )
+            if ny == 1:
+                runs: Any = [Track(programs[0], found.records.part(j), own[0])]
+            else:
+                runs = Outputs(programs, found.records.some(j, j + 1), own, {}, {}).values()
             for run, of in zip(runs, self.task.suffixes, strict=True):
                 truth = verdict(run)
                 most = min(truth.parameters, key=lambda one: (not one.moves, np.nan_to_num(one.p_own, nan=1.0)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,14 +11,16 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from driftfit.bridges.spark.alarms import alarms_schema, collects, watched
 from driftfit.bridges.spark.task import Task, chunks, results_schema
 from driftfit.bridges.spark.units import ARROW, COUNTS, PLACES, SAMPLES, Done, Units, numbers, results, times
 from driftfit.data import late
+from driftfit.data.storage import describe
 from driftfit.engine.kernel import Array
 from driftfit.run.layout import tag_of
-from driftfit.run.live.rule import AlarmRule
+from driftfit.run.live.alarm import LiveAlarm, check_rule
+from driftfit.run.live.rule import FROZEN, AlarmRule
 from driftfit.run.program import state_of
+from driftfit.run.result import burn_in
 from driftfit.run.warm_start import End, JointLayout, carried
 
 OLD, WAITED, NEW = range(3)
@@ -39,7 +42,7 @@ class Flow:
     """The settings of a stream that a worker receives in addition to its task.
 
     ``kinds`` are the types of the rows, ``rules`` has the rule of each output. ``origins`` are the trackers that made
-    states before; units whose newest time is before ``expired`` end.
+    states before.
     """
 
     task: Task
@@ -47,7 +50,11 @@ class Flow:
     hold: Any
     rules: tuple[AlarmRule | None, ...]
     origins: tuple[Any, ...] = ()
-    expired: Any = None
+
+    @property
+    def dated(self) -> bool:
+        """Whether times are dates."""
+        return self.kinds[self.task.time].startswith("timestamp")
 
     @cached_property
     def state(self) -> dict[str, str]:
@@ -59,43 +66,43 @@ class Flow:
         """Columns and types of all that comes out."""
         return {"kind": "string", **results_of(self.task, self.kinds, self.rules), **self.state}
 
-    def work(self, batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
-        """What a partition runs."""
+    def work(self, batches: Iterator[pa.RecordBatch], expired: Any = None) -> Iterator[pa.RecordBatch]:
+        """What a partition runs; units whose newest time is before ``expired`` end."""
         for table, _ in chunks(batches, self.task.by, parts=False):
-            for found in self.tables(table):
-                yield from found.to_batches()
+            known = Known(self, table)
+            for kind, columns in self.parts(known, expired):
+                kinds = pa.array([kind] * len(next(iter(columns.values()))))
+                yield from known.filled(columns | {"kind": kinds}, self.schema).to_batches()
 
-    def tables(self, table: pa.Table) -> Iterator[pa.Table]:
-        """All that comes out, by kind; the rows are in the order of unit and kind."""
-        known = Known(self, table)
+    def parts(self, known: Known, expired: Any = None) -> Iterator[tuple[str, dict[str, Any]]]:
+        """All that comes out: the kind of some rows, and their columns that are not null; the given rows are in the
+        order of unit and kind.
+        """
         rows = np.flatnonzero(known.kind != OLD)
         waited = known.kind[rows] == WAITED
         fates = late.sort_out(known.code[rows], known.time[rows], waited, known.newest, self.hold)
         order, good = rows[fates.order], known.good
         known.newest[good] = fates.newest[good]
-        silent = known.silent(self.expired)
+        silent = known.silent(expired)
         over, stays = silent[known.code[order]], known.kind[order] == WAITED
         # a unit that cannot run stays as it is: what waits continues to wait, and the rest is refused
         other = np.where(stays & ~over, late.WAITING, REFUSED)
         fate = np.where(good[known.code[order]], late.ended(fates.fate, over), other)
         earlier = known.counts[:, SAMPLES].copy()
-        done = known.run(order[fate == late.RELEASED], collects(self.rules))
+        frozen = any(
+            one is not None and one.kind in FROZEN for one in self.rules
+        )  # these need what the tracker receives
+        done = known.run(order[fate == late.RELEASED], frozen)
         if done is not None:
             alarms = self._watched(known, done, earlier) if any(self.rules) else {}
             own = known.taken(self.task.columns, done.rows)
-            yield self._table(known, "result", own, results(self.task, done.found), alarms)
+            yield "result", own | results(self.task, done.found) | alarms
         known.count(fate, order)
         yield from self._left_out(known, order, fate)
         yield from self._states(known, good | (known.kind[known.first] == OLD), silent)
         if (bad := np.flatnonzero(~good)).size:
             reasons = {"failed": [known.reason(k) for k in bad.tolist()]}
-            yield self._table(known, "failed", known.taken(self.task.by, known.first[bad]), reasons)
-
-    def _table(self, known: Known, kind: str, *parts: Mapping[str, Any]) -> pa.Table:
-        """Rows of a kind."""
-        merged = {name: values for part in parts for name, values in part.items()}
-        count = len(next(iter(merged.values())))
-        return known.filled(merged | {"kind": pa.array([kind] * count)}, self.schema)
+            yield "failed", known.taken(self.task.by, known.first[bad]) | reasons
 
     def _watched(self, known: Known, done: Done, earlier: Array) -> dict[str, Any]:
         """The alarms at every sample, as `LiveAlarm` gives them."""
@@ -104,34 +111,47 @@ class Flow:
         for j, k in enumerate(done.keys):
             lanes = done.found.lanes.part(range(j * ny, (j + 1) * ny))
             y = records.y[records.first[j] : records.first[j] + records.length[j]].reshape(-1, ny)
-            causes, known.watch[k] = watched(self.rules, known.joint(k), known.watch[k], int(earlier[k]), lanes, y)
-            each = [column for one in causes for column in ([cause is not None for cause in one], one)]
-            for name, values in zip(schema, each, strict=True):
-                columns[name] += values
+            before, found = json.loads(known.watch[k] or "[]") or [None] * ny, iter(schema)
+            after: list[Any] = [None] * ny
+            for i, (rule, program, lane) in enumerate(zip(self.rules, known.joint(k).programs, lanes, strict=True)):
+                if rule is None:
+                    continue
+                if before[i] is None:  # it begins to watch after as many samples as in `Live`
+                    first = max(burn_in(program.model.n) - int(earlier[k]), 0)
+                    alarm = LiveAlarm(rule, program.tracker, program.names, first)
+                else:
+                    alarm = LiveAlarm.of(before[i] | {"rule": describe(rule)}, program.tracker, program.names)
+                causes = alarm.take_many(lane.out, lane.lane, y[:, i], np.ones(len(y)))
+                alarm.onsets()
+                after[i] = {name: value for name, value in alarm.plain().items() if name != "rule"}
+                columns[next(found)] += [cause is not None for cause in causes]
+                columns[next(found)] += causes
+            known.watch[k] = json.dumps(after)
         return {name: pa.array(columns[name], ARROW[kind]) for name, kind in schema.items()}
 
-    def _left_out(self, known: Known, order: Array, fate: Array) -> Iterator[pa.Table]:
+    def _left_out(self, known: Known, order: Array, fate: Array) -> Iterator[tuple[str, dict[str, Any]]]:
         """Rows that wait, and rows that are left out."""
         for code in (late.WAITING, *PLACES, REFUSED):
             which = order[fate == code]
             if which.size:
                 own = known.taken(self.task.columns, which)
                 if code == late.WAITING:
-                    yield self._table(known, "waiting", own)
+                    yield "waiting", own
                     continue
                 refused = (known.reason(k) for k in known.code[which].tolist())
                 reasons = list(refused) if code == REFUSED else [late.REASONS[code]] * len(which)
-                yield self._table(known, "late", own, {"failed": reasons})
+                yield "late", own | {"failed": reasons}
 
-    def _states(self, known: Known, kept: Array, silent: Array) -> Iterator[pa.Table]:
+    def _states(self, known: Known, kept: Array, silent: Array) -> Iterator[tuple[str, dict[str, Any]]]:
         """The states of units, those that go on and those that have been silent for too long."""
         for kind, which in (("state", np.flatnonzero(kept & ~silent)), ("expired", np.flatnonzero(kept & silent))):
             if which.size:
                 units = which.tolist()
-                own: dict[str, Any] = {"state": [known.state(k) for k in units]}
+                own = known.taken(self.task.by, known.first[which]) | known.counted(units)
+                own["state"] = [known.state(k) for k in units]
                 own |= {"settings": [known.settings[k] for k in units], "watch": [known.watch[k] for k in units]}
                 own |= {"last": known.instants(known.last[which]), "newest": known.instants(known.newest[which])}
-                yield self._table(known, kind, known.taken(self.task.by, known.first[which]), own, known.counted(units))
+                yield kind, own
 
 
 class Known(Units):
@@ -178,3 +198,22 @@ def migrated(task: Task, now: JointLayout, state: bytes, settings: str | None, o
             states = tuple(state_of(tile, lane) for lane in range(len(old.programs)))
             return now.taken(now.tile(carried(End(old.programs, states, None), now.programs)))
     return now.unpack(state)  # which says that it is another's
+
+
+def rules_of(task: Task, rule: Any) -> tuple[AlarmRule | None, ...]:
+    """The rule of each output: one output has one, several have rules by their names; ValueError for anything else."""
+    if rule is None or len(task.y) == 1:
+        return (None if rule is None else check_rule(rule),)
+    given = dict(rule) if isinstance(rule, Mapping) else {None: rule}
+    if not given or any(name not in task.y for name in given):
+        raise ValueError(
+            f"spark.follow: give rules by the name of their output; got {rule!r}, and the outputs are "
+            f"{', '.join(task.y)}."
+        )
+    return tuple(check_rule(given[name]) if name in given else None for name in task.y)
+
+
+def alarms_schema(task: Task, rules: Sequence[AlarmRule | None]) -> dict[str, str]:
+    """Columns and types of alarms."""
+    own = [of for of, one in zip(task.suffixes, rules, strict=False) if one is not None]
+    return {f"{name}{of}": kind for of in own for name, kind in (("alarm", "boolean"), ("cause", "string"))}

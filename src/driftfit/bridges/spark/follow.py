@@ -1,23 +1,33 @@
 """Streams: every unit of a stream of Spark, exactly once, with the states in a table of our own.
 
 For every micro-batch (`foreachBatch`) the new rows meet the states after the batch before: both are brought together by
-unit, run in the lanes of tiles, and written with the new states as one folder (`driftfit.bridges.spark.store`). A batch
+unit, run in the lanes of tiles, and written with the new states as one folder. A batch
 that Spark runs again after a crash finds the same rows and the same states, and writes the same folder, or finds it
-complete and leaves it as it is.
+complete and leaves it as it is. The folder of a stream is
+
+    PATH/batch=17/kind=result/*.parquet     a row per sample
+                 /kind=late                 rows that came too late, twice, without a time or to a unit that cannot run,
+                                            with the reason
+                 /kind=failed               units that cannot run, with the reason
+                 /kind=expired              states of units that were silent for too long
+                 /kind=state, kind=waiting  what the next batch begins with
+                 /_SUCCESS                  written last: without it the batch does not exist
+    PATH/programs/0, 1, ..                  model and tracker of the states, each time that they changed
+    PATH/checkpoint                         Spark's own
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from driftfit.bridges.spark.alarms import rules_of
-from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, results_of
-from driftfit.bridges.spark.frames import rows_of, task_of
-from driftfit.bridges.spark.store import NEXT, Store
+from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, results_of, rules_of
+from driftfit.bridges.spark.frames import rows_of, sql_of, task_of
 from driftfit.bridges.spark.task import SETTING, Task, trackers_of
 from driftfit.data.clock import Clock
 from driftfit.data.storage import describe, parts_of, rebuild
@@ -25,6 +35,122 @@ from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
 from driftfit.run.live.rule import AlarmRule
 from driftfit.trackers.base import Tracker
+
+KINDS = ("result", "late", "failed", "expired", "state", "waiting")
+"""Kinds of rows."""
+NEXT = ("state", "waiting")
+"""Those that the next batch reads."""
+
+
+class Store:
+    """The table of a stream.
+
+    Parameters
+    ----------
+    spark : pyspark.sql.SparkSession
+    path : str
+        A folder in any file system that Spark reads and writes.
+    """
+
+    def __init__(self, spark: Any, path: str) -> None:
+        self.spark, self.path = spark, path.rstrip("/")
+        self._newest: dict[str, Any] | None = None
+        """What `begin` noted last; reading it is a job."""
+
+    def __repr__(self) -> str:
+        return f"Store({self.path!r}): {len(self.batches())} batches"
+
+    def _folder(self, *parts: str) -> tuple[Any, Any]:
+        """(the file system, a path in it)."""
+        path = self.spark._jvm.org.apache.hadoop.fs.Path("/".join([self.path, *parts]))
+        return path.getFileSystem(self.spark._jsc.hadoopConfiguration()), path
+
+    def _names(self, *parts: str) -> list[str]:
+        files, path = self._folder(*parts)
+        return [one.getPath().getName() for one in files.listStatus(path)] if files.exists(path) else []
+
+    def has(self, batch: int) -> bool:
+        return "_SUCCESS" in self._names(f"batch={batch}")
+
+    def batches(self) -> list[int]:
+        """The batches that are complete, in order."""
+        found = [int(name.removeprefix("batch=")) for name in self._names() if name.startswith("batch=")]
+        return sorted(batch for batch in found if self.has(batch))
+
+    def write(self, table: Any, batch: int) -> None:
+        """Write a batch, completely or not at all."""
+        table.write.partitionBy("kind").mode("overwrite").parquet(f"{self.path}/batch={batch}")
+
+    def read(self, *kinds: str, batches: Sequence[int] | None = None) -> Any:
+        """The rows of some kinds, of all complete batches or of some, with the columns that these kinds have.
+
+        Raises
+        ------
+        ValueError
+            If there is no such batch, or no such kind.
+        """
+        from pyspark.sql import functions as F  # noqa: N812
+
+        if wrong := [kind for kind in kinds if kind not in KINDS]:
+            raise ValueError(f"Store.read: {wrong[0]!r} is none of the kinds {', '.join(KINDS)}.")
+        found = self.batches() if batches is None else list(batches)
+        if not found:
+            raise ValueError(f"Store.read: {self.path} has no complete batch.")
+        reader = self.spark.read.schema(self.schema()).option("basePath", self.path)
+        rows = reader.parquet(*(f"{self.path}/batch={batch}" for batch in found))
+        return rows.where(F.col("kind").isin(*kinds))
+
+    def results(self) -> Any:
+        """The results of all complete batches: a row per sample."""
+        columns = self.schema_of("results")
+        return self.read("result").select("batch", *columns)
+
+    def states(self, batch: int | None = None) -> Any:
+        """The states after a batch, the last one by default: a row per unit."""
+        last = self.batches()[-1] if batch is None else batch
+        return self.read("state", batches=[last]).select(*self.schema_of("states"))
+
+    def late(self) -> Any:
+        """Rows that were left out, with the reason."""
+        return self.read("late").select("batch", *self.schema_of("rows"), "failed")
+
+    def forget(self, before: int) -> None:
+        """Delete the states of batches before this one; their results stay."""
+        for batch in self.batches():
+            if batch < before:
+                for kind in NEXT:
+                    files, path = self._folder(f"batch={batch}", f"kind={kind}")
+                    if files.exists(path):
+                        files.delete(path, True)
+
+    def begin(self, about: dict[str, Any]) -> None:
+        """Note model, tracker and columns of what follows."""
+        count = len([name for name in self._names("programs") if name.isdigit()])
+        text = json.dumps(about, sort_keys=True)
+        frame = self.spark.createDataFrame([(text,)], "value string").coalesce(1)
+        frame.write.mode("overwrite").text(f"{self.path}/programs/{count}")
+        self._newest = about
+
+    def abouts(self) -> list[dict[str, Any]]:
+        """What `begin` noted, the oldest first."""
+        names = sorted((name for name in self._names("programs") if name.isdigit()), key=int)
+        rows = [self.spark.read.text(f"{self.path}/programs/{name}", wholetext=True).first() for name in names]
+        return [json.loads(row[0]) for row in rows if row is not None]
+
+    def schema(self) -> str:
+        return str(self._about()["schema"])
+
+    def schema_of(self, what: str) -> list[str]:
+        """The columns that "results", "states" or "rows" have."""
+        return list(self._about()[what])
+
+    def _about(self) -> dict[str, Any]:
+        if self._newest is None:
+            found = self.abouts()
+            if not found:
+                raise ValueError(f"{self.path} is not the table of a stream: driftfit.bridges.spark.follow makes one.")
+            self._newest = found[-1]
+        return self._newest
 
 
 def follow(
@@ -77,19 +203,25 @@ def follow(
     ImportError
         If PySpark or Java is missing.
     """
-    task = task_of(stream, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, settings, arrays, gate)
-    kinds = dict(rows_of(stream, task, None).dtypes)
-    dated = kinds[time].startswith("timestamp")
-    rules = rules_of(task, rule)
-    store, flow = Store(stream.sparkSession, path), Flow(task, kinds, duration("hold", hold, dated), rules)
+    columns = {"y": y, "u": u, "by": by, "time": time}
+    flow = flow_of(stream, task_of(stream, model, tracker, columns, dt, settings, arrays, gate), hold, rule)
+    store = Store(stream.sparkSession, path)
     flow = replace(flow, origins=_origins(store, flow, migrate))
-    run = _Batches(store, flow, settings, initial, None if expire is None else duration("expire", expire, dated), sink)
+    run = _Batches(store, flow, settings, initial, duration("expire", expire, flow.dated), sink)
     writer = stream.writeStream.foreachBatch(run).option("checkpointLocation", f"{store.path}/checkpoint")
     return writer.trigger(**(trigger or {"processingTime": "0 seconds"})).start()
 
 
+def flow_of(stream: Any, task: Task, hold: Any, rule: Any, origins: tuple[Any, ...] = ()) -> Flow:
+    """The flow of a stream."""
+    flow = Flow(task, dict(rows_of(stream, task, None).dtypes), None, rules_of(task, rule), origins)
+    return replace(flow, hold=duration("hold", hold or 0, flow.dated))
+
+
 def duration(name: str, value: Any, dated: bool) -> Any:
-    """A span of time in the type of times."""
+    """A span of time in the type of times; None for None."""
+    if value is None:
+        return None
     span = value if isinstance(value, int | float) and not dated else Clock.of(value).duration if value else 0
     none = np.timedelta64(0, "us") if dated else 0
     if dated and not value:
@@ -113,7 +245,7 @@ def _origins(store: Store, flow: Flow, migrate: bool) -> tuple[Any, ...]:
     about: dict[str, Any] = {"model": describe(task.model), "fields": text}
     about |= {"tracker": [describe(one) for one in trackers_of(task.tracker)]}
     about |= {"gate": task.gate.settings() if isinstance(task.gate, Gate) else task.gate}
-    about |= {"schema": ", ".join(f"`{name}` {kind}" for name, kind in {"batch": "int", **flow.schema}.items())}
+    about |= {"schema": sql_of({"batch": "int", **flow.schema})}
     about |= {"results": [name for name in results_of(task, flow.kinds, flow.rules) if name != "failed"]}
     about |= {"rows": list(task.columns), "states": [*task.by, *flow.state]}
     found = store.abouts()
@@ -171,7 +303,7 @@ class _Batches:
         """The table of a batch, which begins with the states after another one."""
         from pyspark.sql import functions as F  # noqa: N812
 
-        flow, task = self.flow, self.flow.task
+        flow, task, expired = self.flow, self.flow.task, None
         new = rows_of(rows, task, self.settings).withColumn("_kind", F.lit(NEW))
         parts = [new]
         if before is not None:
@@ -179,7 +311,7 @@ class _Batches:
             which = F.when(F.col("kind") == "state", F.lit(OLD)).otherwise(F.lit(WAITED))
             parts.append(kept.withColumn("_kind", which).select(*task.columns, *flow.state, "_kind"))
             if self.expire is not None:
-                flow = replace(flow, expired=self._oldest(kept))
+                expired = self._oldest(kept)
         elif self.initial is not None:
             parts.append(begun(self.initial, task).withColumn("_kind", F.lit(OLD)))
         every = parts[0]
@@ -192,7 +324,11 @@ class _Batches:
         every = every.select(*task.columns, *flow.state, *own, "_kind")
         order = [*task.by, "_kind", task.time, *task.y, *task.u]
         made = ", ".join(f"`{name}` {kind}" for name, kind in flow.schema.items())
-        return every.repartition(*task.by).sortWithinPartitions(*order).mapInArrow(flow.work, made)
+        return (
+            every.repartition(*task.by)
+            .sortWithinPartitions(*order)
+            .mapInArrow(partial(flow.work, expired=expired), made)
+        )
 
     def _oldest(self, kept: Any) -> Any:
         """The time before which a unit has been silent for too long."""

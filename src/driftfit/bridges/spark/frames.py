@@ -191,3 +191,16 @@ def session(master: str = "local[2]", **settings: Any) -> Any:
     for name, value in {**usual, **given}.items():
         builder = builder.config(name, value)
     return builder.getOrCreate()
+
+
+def sql_of(schema: Mapping[str, str]) -> str:
+    """Names and types of columns, as Spark reads them."""
+    return ", ".join(f"`{name}` {kind}" for name, kind in schema.items())
+
+
+def by_unit(rows: Any, task: Task, work: Any, schema: Mapping[str, str], first: Sequence[str] = ()) -> Any:
+    """What ``work`` makes of the rows of each partition: those of a unit are together, in the order of the columns
+    ``first``, of time and of signals.
+    """
+    order = [*task.by, *first, task.time, *task.y, *task.u]
+    return rows.repartition(*task.by).sortWithinPartitions(*order).mapInArrow(work, sql_of(schema))

@@ -13,16 +13,14 @@ since, it is set again.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from driftfit.bridges.spark.alarms import rules_of
-from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, results_of
-from driftfit.bridges.spark.follow import begun, duration
-from driftfit.bridges.spark.frames import rows_of, task_of
+from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, Known, results_of
+from driftfit.bridges.spark.follow import begun, duration, flow_of
+from driftfit.bridges.spark.frames import rows_of, sql_of, task_of
 from driftfit.bridges.spark.units import ARROW
 from driftfit.models.base import Model
 from driftfit.run.live.rule import AlarmRule
@@ -42,8 +40,7 @@ def follow_keyed(
     stream: Any, model: Model, tracker: Tracker | Mapping[str, Tracker], *, y: str | Sequence[str],
     by: str | Sequence[str], time: str, u: str | Sequence[str] | None = None, dt: Any = None, arrays: bool = False,
     gate: Any = None, hold: Any = 0, rule: AlarmRule | Mapping[str, AlarmRule] | None = None, expire: Any = None,
-    initial: Any = None,
-    before: Any = None,
+    initial: Any = None, before: Any = None,
 ) -> Any:  # fmt: skip
     """Follow every unit of a stream with Spark's own keyed state; PySpark 4.1 or later.
 
@@ -78,23 +75,20 @@ def follow_keyed(
     from pyspark.sql.group import GroupedData
 
     task = task_of(stream, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, None, arrays, gate)
-    rules = rules_of(task, rule)
     if not hasattr(GroupedData, "transformWithState"):
         raise ImportError("spark.follow_keyed needs transformWithState on rows: pip install 'pyspark>=4.1'.")
-    rows = rows_of(stream, task, None)
-    kinds = dict(rows.dtypes)
-    dated = kinds[time].startswith("timestamp")
+    flow = flow_of(stream, task, hold, rule, () if before is None else (before,))
+    kinds, dated = flow.kinds, flow.dated
     span = None if expire is None else _ticks(duration("expire", expire, dated))
-    rows = _in_micros(rows, dated, time)
+    rows = _in_micros(rows_of(stream, task, None), dated, time)
     if span is not None:
         ticks = F.floor(F.col(time) / F.lit(span)) + F.lit(2 * AHEAD)
         rows = rows.withColumn(EVENT, F.timestamp_millis(ticks)).withWatermark(EVENT, f"{AHEAD} milliseconds")
     given = None if initial is None else _in_micros(begun(initial, task), dated, "last", "newest").groupBy(*task.by)
-    unit = Unit(Flow(task, kinds, duration("hold", hold, dated), rules, () if before is None else (before,)))
-    schema = results_of(task, kinds, rules) | {time: dict(rows.dtypes)[time]} | ({"state": "binary"} if span else {})
-    made = ", ".join(f"`{name}` {kind}" for name, kind in schema.items())
-    processor, mode = _processor(unit, tuple(schema), span), "None" if span is None else "EventTime"
-    found = rows.groupBy(*task.by).transformWithState(processor, made, "Append", mode, given)
+    schema = results_of(task, kinds, flow.rules) | {time: dict(rows.dtypes)[time]}
+    schema |= {} if span is None else {"state": "binary"}
+    processor, mode = _processor(Unit(flow), tuple(schema), span), "None" if span is None else "EventTime"
+    found = rows.groupBy(*task.by).transformWithState(processor, sql_of(schema), "Append", mode, given)
     return found.withColumn(time, F.timestamp_micros(time).cast(kinds[time])) if dated else found
 
 
@@ -122,7 +116,7 @@ class Unit:
 
     def __init__(self, flow: Flow) -> None:
         self.flow, task = flow, flow.task
-        self.dated = flow.kinds[task.time].startswith("timestamp")
+        self.dated = flow.dated
         self.row = (task.time, *task.y, *task.u)
         when = pa.timestamp("us") if self.dated else pa.float64()
         self.when = {name: when for name in (task.time, "last", "newest")}
@@ -132,9 +126,7 @@ class Unit:
     def state(self) -> str:
         """The type of a state for Spark."""
         times = dict.fromkeys(("last", "newest"), "bigint" if self.dated else "double")
-        return ", ".join(
-            f"{name} {kind}" for name, kind in (STATE | times | {"waiting": "array<array<double>>"}).items()
-        )
+        return sql_of(STATE | times | {"waiting": "array<array<double>>"})
 
     def begun(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """A state to begin with, from a row of the states of a batch run or of another stream."""
@@ -155,11 +147,9 @@ class Unit:
             own = [one[name] for one in before]
             columns[name] = self._column([*own, *[None] * (len(every) - len(own))], self.types[name])
         found: dict[str, list[dict[str, Any]]] = {}
-        for table in replace(self.flow, expired=expired).tables(pa.table(columns)):
-            for name in self.when if self.dated else ():
-                table = table.set_column(table.column_names.index(name), name, table.column(name).cast(pa.int64()))
-            for row in table.drop_columns(list(self.flow.task.by)).to_pylist():
-                found.setdefault(row["kind"], []).append(row)
+        for what, made in self.flow.parts(Known(self.flow, pa.table(columns)), expired):
+            cells = zip(*map(_listed, made.values()), strict=True)
+            found.setdefault(what, []).extend({"failed": None, **dict(zip(made, row, strict=True))} for row in cells)
         ((after,),) = (found[kind] for kind in ("expired", "state") if kind in found)
         waiting = [[row[name] for name in self.row] for row in found.get("waiting", [])]
         return self.begun(after) | {"waiting": waiting}, found.get("result", []) + found.get("late", [])
@@ -177,6 +167,14 @@ class Unit:
         return pa.array(values, kind)
 
 
+def _listed(column: Any) -> list[Any]:
+    """A column as a list; dates are microseconds."""
+    if isinstance(column, pa.Array | pa.ChunkedArray):
+        found = column.cast(pa.int64()) if pa.types.is_timestamp(column.type) else column
+        return list(found.to_pylist())
+    return list(column.tolist() if isinstance(column, np.ndarray) else column)
+
+
 def _processor(unit: Unit, names: Sequence[str], span: float | None) -> Any:
     """The class that Spark calls, made here so that this module can be imported without PySpark."""
     from pyspark.sql import Row
@@ -187,7 +185,7 @@ def _processor(unit: Unit, names: Sequence[str], span: float | None) -> Any:
     def rows_for(key: Sequence[Any], found: Sequence[dict[str, Any]]) -> Iterator[Any]:
         named = dict(zip(by, key, strict=True))
         for one in found:
-            yield Row(**{name: (named | one).get(name) for name in names})
+            yield Row(**{name: (one | named).get(name) for name in names})
 
     class Processor(StatefulProcessor):
         def init(self, handle: Any) -> None:

@@ -3,27 +3,25 @@
 Numba tries dozens of templates for every operation of every function, and compares compile options one by one for each:
 a fifth of the time of compiling. What it found for an operation, types and options is remembered, by replacing
 `Function.get_call_type` and the comparison of `Flags`. Before each function, and at every second call in it, it looks
-for declarations of new types and functions; `known_once` looks once. What it tries in vain ends in an error with a
-message in colours, two thousand times for a driver; and every call of LLVM notifies one timer for each function that
-is being compiled.
+for declarations of new types and functions; `known_once` looks once.
 
 Private parts: `Function.get_call_type` and `_impl_keys`, `Flags._values`, `Record.__repr__`, `refresh` of the target
-and typing contexts, `_registries`, `_check_llvm_bugs`, `termcolor`, `event._registered`.
+and typing contexts, `_registries`, `_check_llvm_bugs`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from functools import cache, partial
 from typing import Any
 
 from numba import types
-from numba.core import event
 from numba.core.compiler import Flags
-from numba.core.errors import termcolor
 from numba.core.registry import cpu_target
 from numba.core.targetconfig import ConfigStack
+
+__all__ = ["cpu_target", "known_once", "replaced"]
 
 
 @contextmanager
@@ -43,7 +41,6 @@ def replaced(owner: Any, **ours: Any) -> Iterator[None]:
 def known_once() -> Iterator[None]:
     """While it lasts, Numba looks for declarations and for a bug of LLVM once, instead of before each function, and at
     every second call in it; of known declarations only new ones are installed. Sizes of types are found once too.
-    Messages of errors have no colours, and what nobody listens to is not announced.
     """
     context = cpu_target.target_context
     if "refresh" in vars(context):
@@ -61,21 +58,8 @@ def known_once() -> Iterator[None]:
         replaced(context, refresh=partial(look_again, context), get_abi_sizeof=size),
         replaced(context.typing_context, refresh=partial(look_again, context.typing_context)),
         replaced(codegen, _check_llvm_bugs=lambda: None),
-        replaced(termcolor(), **dict.fromkeys(("code", "errmsg", "filename", "indicate", "highlight"), str)),
-        replaced(event, start_event=_if_heard(event.start_event), end_event=_if_heard(event.end_event)),
-        replaced(event, install_timer=lambda kind, callback: nullcontext()),
     ):
         yield
-
-
-def _if_heard(announce: Callable[..., None]) -> Callable[..., None]:
-    """Announce an event if somebody listens to its kind."""
-
-    def announced(kind: str, *details: Any, **named: Any) -> None:
-        if event._registered.get(kind):
-            announce(kind, *details, **named)
-
-    return announced
 
 
 def _remembered(find: Callable[..., Any]) -> Callable[..., Any]:

@@ -17,21 +17,18 @@ for arrays.
 from __future__ import annotations
 
 import math
-from functools import partial, reduce
+from functools import reduce
 from typing import Any, NamedTuple
 
 from llvmlite.ir import Constant
 from numba import types
 from numba.core import cgutils, ir
-from numba.core.cgutils import alloca_once
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
-from numba.core.errors import LoweringError
-from numba.core.ir_utils import enforce_no_dels, enforce_no_phis
-from numba.core.lowering import Lower, new_error_context
+from numba.core.lowering import Lower
 from numba.core.postproc import PostProcessor, VariableLifetime
 from numba.core.transforms import canonicalize_cfg
-from numba.core.typed_passes import IRLegalization, NativeLowering
+from numba.core.typed_passes import NativeLowering
 from numba.np.arrayobj import fix_integer_index, load_item, store_item
 
 from driftfit.engine.compile_time.open_record import OpenRecord, beginning, lengths, tell_fields_apart
@@ -116,25 +113,6 @@ class Direct(Lower):
         self._made: dict[Any, Any] = {}
         super().pre_block(block)
 
-    def lower_block(self, block: Any) -> None:
-        """Lower a block, without what only ends the life of a variable that owns nothing. Where an error arose is said
-        when one has arisen: Numba prepares it for every instruction.
-        """
-        if not self._direct:
-            super().lower_block(block)
-            return
-        self.pre_block(block)
-        try:
-            for one in block.body:
-                if not (isinstance(one, ir.Del) and self._is_plain(one.value)):
-                    self.loc = one.loc
-                    self.lower_inst(one)
-        except Exception:
-            where = {"inst": one, "loc": self.loc, "errcls_": partial(LoweringError, loc=self.loc)}
-            with new_error_context('lowering "{inst}" at {loc}', **where):
-                raise
-        self.post_block(block)
-
     def lower(self) -> None:
         """Lower a function. Instructions and their block refer to each other until the garbage collector finds them."""
         super().lower()
@@ -149,7 +127,7 @@ class Direct(Lower):
             if later is not None:
                 self._later[inst.target.name] = later
                 return None
-        elif isinstance(inst, ir.Del) and inst.value in self._later:
+        elif isinstance(inst, ir.Del) and self._direct and (inst.value in self._later or self._is_plain(inst.value)):
             return None
         return super().lower_inst(inst)
 
@@ -202,7 +180,7 @@ class Direct(Lower):
         if row is None or row.kind != types.range_state64_type:
             return None
         start, stop = row.entries
-        now, following, left = (alloca_once(self.builder, start.type) for _ in range(3))
+        now, following, left = (cgutils.alloca_once(self.builder, start.type) for _ in range(3))
         self.builder.store(start, following)
         self.builder.store(stop if _is(start, 0) else self.builder.sub(stop, start), left)
         return Loop(kind, stop, now, following, left)
@@ -379,7 +357,7 @@ def _is(value: Any, number: int) -> bool:
 def _analyse(self: PostProcessor, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
     """Numba's analysis of a function, repeated after four of its passes: where variables are needed for the last
     time, for generators and loops that are compiled apart, of which nothing here has any. It is left out here until
-    somebody asks, which was a tenth of the time in Python.
+    the last pass asks, which was a tenth of the time in Python.
     """
     function = self.func_ir
     if function.is_generator or not getattr(function.func_id, "direct", False):
@@ -394,22 +372,6 @@ def _analyse(self: PostProcessor, emit_dels: bool = False, extend_lifetimes: boo
 
 _analyse_all = PostProcessor.run
 PostProcessor.run = _analyse
-
-
-@register_pass(mutates_CFG=False, analysis_only=True)
-class Legalization(IRLegalization):
-    """Numba's last check, which also marks the end of the life of variables: not where none owns memory."""
-
-    _name = "legalization"
-
-    def run_pass(self, state: Any) -> bool:
-        """Check a function."""
-        if state.flags.nrt and not all(isinstance(kind, PLAIN) for kind in state.typemap.values()):
-            return bool(super().run_pass(state))
-        enforce_no_phis(state.func_ir)
-        enforce_no_dels(state.func_ir)
-        PostProcessor(state.func_ir).run()
-        return True
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
@@ -437,7 +399,7 @@ class Pipeline(CompilerBase):
     def define_pipelines(self) -> list[Any]:
         """The one way through the compiler."""
         made = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        ours = {NativeLowering: DirectLowering, IRLegalization: Legalization}
+        ours = {NativeLowering: DirectLowering}
         made.passes = [(ours.get(one, one), why) for one, why in made.passes if one.name() not in UNUSED]
         self.state.func_id.direct = True
         return [made]

@@ -20,9 +20,22 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.core.typing.templates import AttributeTemplate, infer_getattr
-from numba.extending import lower_getattr_generic, models, register_model
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import infer_getattr, lower_getattr_generic, models, register_model
 from numba.np.arrayobj import populate_array
+
+__all__ = [
+    "WORD",
+    "AttributeTemplate",
+    "OpenRecord",
+    "array_from",
+    "beginning",
+    "entry_of",
+    "ir",
+    "lengths",
+    "opened",
+    "tell_fields_apart",
+]
 
 WORD = ir.IntType(64)
 """An entry of the table."""

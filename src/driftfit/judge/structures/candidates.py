@@ -3,17 +3,17 @@
     phi_t of a structure = its columns of the union's phi_t
 
 The union is run once to collect its regressors (missing lags are filled by constant least squares on all of
-them), so all structures use the same rows. They run in parallel, in lanes of drivers for a few sizes: a structure
-has columns of zeros up to the next size (`driftfit.trackers.parts.common_size`), and most share one compiled driver.
-Trackers that do not allow that take a driver for each number of columns. Several records are run separately, each from
-the start, and written one after the other.
+them), so all structures use the same rows. They run in parallel, in lanes of the driver of the union: a structure has
+columns of zeros after its own, whose parameters are known to be 0 (`Tracker.partly_known`). Trackers that do not allow
+that take a driver for each number of columns. Several records are run separately, each from the start, and written one
+after the other.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,12 +23,10 @@ from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model, Term
 from driftfit.models.regression import Regression
-from driftfit.run.lanes import Lane
 from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program
 from driftfit.run.result import Track, burn_in, track_record
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.common_size import SIZES, fits, padded, size_of
 
 TOGETHER = 32
 
@@ -102,45 +100,22 @@ class Pool:
     def _run(self, tracker: Tracker, structures: Sequence[Candidate]) -> list[Predicted]:
         found: dict[int, Predicted] = {}
         columns = [k for k, s in enumerate(structures) if s.columns is not None]
-        shared = tracker.pads and columns
-        sizes = [structures[k].n for k in columns]
-        size = size_of(sizes, len(self.names), len(self.gaps)) if shared else 0
         together: dict[int, list[int]] = {}
         for k in columns:
-            n = structures[k].n
-            driver = next(one for one in (size, *SIZES, n) if fits(tracker, n, one)) if size else n
-            together.setdefault(driver, []).append(k)
+            n, most = structures[k].n, len(self.names)
+            size = next((N for N in range(most, n, -1) if tracker.partly_known(n, N) is not None), n)
+            together.setdefault(size, []).append(k)
         for size, same in together.items():
             for first in range(0, len(same), TOGETHER):
                 part = same[first : first + TOGETHER]
                 predictions = self._lanes(tracker, [structures[k] for k in part], size)
                 found |= dict(zip(part, predictions, strict=True))
-        for models in self._families(tracker, structures):
-            for k, model in models.items():
-                wide = model.as_large_as(list(models.values())) if len(models) > 1 else model
-                runs = [run_within(Program(wide, tracker), Program(model, tracker), one) for one in self.records]
-                found[k] = joined([predicted(run) for run in runs])
-        return [found[k] for k in range(len(structures))]
-
-    def _families(self, tracker: Tracker, structures: Sequence[Candidate]) -> list[dict[int, Model]]:
-        """The models that are no columns, by their place: those that share a driver, and each of the others."""
-        families: dict[Any, dict[int, Model]] = {}
         for k, structure in enumerate(structures):
             if structure.columns is None:
                 assert structure.model is not None
-                shared = tracker.pads and structure.model.family is not None
-                families.setdefault((structure.model.family if shared else k, shared), {})[k] = structure.model
-        found: list[dict[int, Model]] = []
-        for models in families.values():
-            while models:
-                some, alike = list(models.values()), dict[int, Model]()
-                sizes = [model.n for model in some]
-                if len(sizes) > 1 and size_of(sizes, max(sizes), len(self.gaps)) > 0:
-                    N = some[0].as_large_as(some).n
-                    alike = {k: model for k, model in models.items() if fits(tracker, model.n, N)}
-                found += [alike] if alike else [{k: model} for k, model in models.items()]
-                models = {k: model for k, model in models.items() if alike and k not in alike}
-        return found
+                program = Program(structure.model, tracker)
+                found[k] = joined([predicted(track_record(program, record)) for record in self.records])
+        return [found[k] for k in range(len(structures))]
 
     def _lanes(self, tracker: Tracker, structures: Sequence[Candidate], size: int) -> list[Predicted]:
         """Run structures of at most ``size`` columns in drivers of that size."""
@@ -158,31 +133,13 @@ class Pool:
             Known(np.tile(known.columns, (count, 1))),
         )  # fmt: skip
         program = Program(Regression(size), tracker)
-        starts = {n: padded(tracker, n, size) for n in {s.n for s in structures} if n < size}
+        starts = {n: state for n in {s.n for s in structures} if n < size and (state := tracker.partly_known(n, size))}
         begun = {k * R + r: starts[s.n] for k, s in enumerate(structures) if s.n in starts for r in range(R)}
         lanes = run_lanes([program] * len(first), records, "std", begun)
         if not lanes.done.all():
             raise KeyboardInterrupt
         runs = [Track(program, records.part(k), lane) for k, lane in enumerate(lanes)]
         return [joined([predicted(run) for run in runs[k * R : (k + 1) * R]]) for k in range(count)]
-
-
-def run_within(wide: Program, program: Program, record: Record) -> Track:
-    """The run of a program over a record in the driver of a wider one (`Model.as_large_as`), or in its own."""
-    if wide.model is program.model:
-        return track_record(program, record)
-    n = program.model.n
-    tile = wide.tile(padded(program.tracker, n, wide.model.n))
-    out = wide.run(tile, record)
-    return Track(program, record, Lane(out.view(_narrow(out.dtype, n)), tile))
-
-
-def _narrow(rows: Any, n: int) -> Any:
-    """The type of rows of results of which only the first n parameters are read."""
-    kinds = {name: rows[name] for name in rows.names}
-    own = [(one.base, (n, 1) if name in ("theta", "var") else one.shape) for name, one in kinds.items()]
-    offsets = [rows.fields[name][1] for name in kinds]
-    return np.dtype({"names": [*kinds], "formats": own, "offsets": offsets, "itemsize": rows.itemsize})
 
 
 def joined(parts: Sequence[Predicted]) -> Predicted:

@@ -10,8 +10,7 @@ useless, but take long to become correct once their candidate is the right one. 
 those of ``select(..).average(a)``.
 
 Source: Raftery, Karny and Ettler (2010), Technometrics 52(1); the choice of r, m, p, q and bases on line is left open
-by Feng and Hong (2021), section 6. Cost: that of the candidates; those of one kind share compiled steps, whose number
-of parameters is that of the largest (`driftfit.judge.structures.shared_streams`).
+by Feng and Hong (2021), section 6. Cost: that of the candidates.
 """
 
 from __future__ import annotations
@@ -25,9 +24,8 @@ import scipy
 from driftfit.data.arguments import check_roles
 from driftfit.data.storage import Kept
 from driftfit.engine.kernel import Array
-from driftfit.judge.structures.shared_streams import SharedStream, share
 from driftfit.models.base import Model
-from driftfit.readings.gate import FROZEN, INPUT, REFUSED
+from driftfit.readings.gate import FROZEN, INPUT, REFUSED, SIGNAL
 from driftfit.run.gating import gate_of
 from driftfit.run.live.live import Live
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
@@ -79,18 +77,12 @@ class LiveSelection(Kept):
         judge = gate_of(tracker, gate)
         largest = max(models, key=lambda model: model.bind(model.input_names or model.m).n)
         reference = None if judge is None else Live(largest, AdaptiveKalman(), dt=dt, gate=judge)
-        self._follow([SharedStream(model, tracker, dt=dt, gate=False) for model in models], forgetting, reference)
+        self._follow([Live(model, tracker, dt=dt, gate=False) for model in models], forgetting, reference)
 
-    def _follow(self, streams: Sequence[SharedStream], forgetting: float, reference: Live | None) -> None:
-        share(streams)
+    def _follow(self, streams: Sequence[Live], forgetting: float, reference: Live | None) -> None:
         self.reference, self._blamed = reference, 0
         self.streams, self.forgetting = tuple(streams), float(forgetting)
         self._logs, self._residuals = np.zeros((2, len(self.streams)))
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """A copy shares compiled steps too."""
-        self.__dict__.update(state)
-        share(self.streams)
 
     def update(self, y: float, u: Any = None, **known: Any) -> float:
         """Process one sample; returns the prediction of y made before it, averaged over the candidates by their
@@ -113,7 +105,7 @@ class LiveSelection(Kept):
         assert self.reference is not None
         *_, ok = self.reference.update(y, u, **known)
         reason = int(self.reference.lane()["reason"])
-        if reason == INPUT:
+        if reason % SIGNAL == INPUT:
             self._blamed = self.reference.model.input_memory + 1
         unused = self._blamed > 0 and not ok
         self._blamed = max(self._blamed - 1, 0)
@@ -159,7 +151,7 @@ class LiveSelection(Kept):
     def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array], classes: Iterable[Any]) -> Self:
         found = cls.__new__(cls)
         count = len(arrays["logs"])
-        streams = [SharedStream.from_bytes(arrays[f"stream{k}"].tobytes(), classes) for k in range(count)]
+        streams = [Live.from_bytes(arrays[f"stream{k}"].tobytes(), classes) for k in range(count)]
         judge = Live.from_bytes(arrays["reference"].tobytes(), classes) if "reference" in arrays else None
         found._follow(streams, header["forgetting"], judge)
         found._blamed = header["blamed"]

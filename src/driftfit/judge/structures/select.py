@@ -191,7 +191,7 @@ class Selection(Printed):
         yield Text(f" best: {self.best}")
         yield Text(f" simplest within one standard error: {self.simplest}")
         yield Text(f" on {self.scored} samples that all could predict", "dim")
-        for name, said in remarks_of(self.left_out.values()):
+        for name, said in remarks_of(self.left_out):
             yield Text(f" {name.lower()}: {said}", "dim")
 
     def plot(self, most: int = 20, ax: Any = None) -> Figure:

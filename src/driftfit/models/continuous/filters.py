@@ -2,7 +2,8 @@
 
 Time is in units of 1 / lambda, D = d / d(lambda t), and the point of the linearisation is F' = D^n + p_1 D^(n-1) + ...
 Row j of s.chain holds D^k z_j, k < 2 n, for input j, and row m those of the output, row m + 1 what one unit more at
-the end of the interval would add to them:
+the end of the interval would add to them; s.before holds the chains of the inputs before this sample, and what they
+were driven by:
 
     F'^2 z_j = u_j held since the last sample,        F' q = y - c', linear between samples
 
@@ -229,6 +230,9 @@ def _inputs(o: Orders) -> tuple[Any, Step]:
             if known & (s.driven[j, l] == 0.0):
                 s.chain[j, 0, l] = u / s.poly[0, 0, l] if offset else 0.0
                 s.driven[j, l] = 1.0
+            s.before[j, 2 * n, l] = s.last[j, l]
+            for i in range(2 * n):
+                s.before[j, i, l] = s.chain[j, i, l]
             s.last[j, l] = u if known else s.last[j, l]
             advance(s, j, 0, s.last[j, l], 0.0, l)
             for i in range(2 * n):
@@ -242,6 +246,24 @@ def _inputs(o: Orders) -> tuple[Any, Step]:
             s.u_lag[j, 0, l] = s.u[j, l]
 
     return drive, take_inputs
+
+
+@lru_cache
+def refusing(o: Orders) -> Any:
+    """`Model.refuse`: an input that the chain has taken in at this sample is replaced by the one held before it."""
+    n, delay, advance = o.n, o.delay, chain_of(2 * o.n)
+
+    @kernel
+    def refuse(s: State, signal: int, age: int, l: int) -> None:
+        if age <= delay:
+            s.u_lag[signal, age, l] = np.nan
+        else:
+            for i in range(2 * n):
+                s.chain[signal, i, l] = s.before[signal, i, l]
+            s.last[signal, l] = s.before[signal, 2 * n, l]
+            advance(s, signal, 0, s.last[signal, l], 0.0, l)
+
+    return refuse
 
 
 @lru_cache

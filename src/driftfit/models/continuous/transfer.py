@@ -43,7 +43,7 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import numbers, whole
-from driftfit.models.continuous.filters import STIFF, Orders, late_inputs, steps
+from driftfit.models.continuous.filters import STIFF, Orders, late_inputs, refusing, steps
 from driftfit.models.continuous.sampling import sampled
 from driftfit.models.inputs import LinearisedTransfer
 from driftfit.models.linearised import MEMORY
@@ -170,9 +170,17 @@ class ContinuousTransfer(LinearisedTransfer):
             "unit": self.rate ** -np.arange(n + 1.0), "per_sample": self.rate * self.dt,
             "fastest": np.max(2.0 * scaled[1:] ** (1.0 / np.arange(1, n + 1))), "span": 0.0, "cuts": 0.0,
             "u_lag": np.full((self.m, self.delay + 1), np.nan), "last": np.zeros(self.m), "driven": np.zeros(self.m),
-            "last_y": 0.0, "expected": 0.0, "begun": 0.0, "point": point, "target": point,
-            **MEMORY, "usable": passed, "elapsed": passed,
+            "before": np.zeros((self.m, 2 * n + 1)), "last_y": 0.0, "expected": 0.0, "begun": 0.0,
+            "point": point, "target": point, **MEMORY, "usable": passed, "elapsed": passed,
         }  # fmt: skip
+
+    @property
+    def input_memory(self) -> int:
+        return self.delay + 1
+
+    @property
+    def refuse(self) -> Any:
+        return refusing(self._orders(False))
 
     @property
     def steps(self) -> ModelSteps:

@@ -12,7 +12,7 @@ denominator, of at most the order of the whole.
 In the measured signals this is a regression on products of the parameters
 (`driftfit.models.hammerstein_wiener.structure`):
 
-    z_t = -g_1(y_t) = phi_t' theta_t
+    z_t = -g_1(y_t) = phi_t' theta_t                                  equation (11) of the source
     phi_t = [g_1(y_{t-i}) .., -f_1(u_{t-nk-j+1}) .., g_2(y_t) .. g_q(y_t), -f_k(u_{t-nk-j+1}) .., g_k(y_{t-i}) .., (1)]
 
 Any tracker estimates theta (stage one); `driftfit.models.hammerstein_wiener.separation` gives a, b, c, d. The
@@ -48,10 +48,10 @@ from driftfit.engine.settings import numbers, output_names, warn, whole
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.forward import play
-from driftfit.models.hammerstein_wiener.steps import DIGITS, applying, build, build_any, refusing
+from driftfit.models.hammerstein_wiener.steps import DIGITS, applying, build, refusing
 from driftfit.models.hammerstein_wiener.structure import Structure, memory, places_of
 from driftfit.models.hammerstein_wiener.thresholds import settled
-from driftfit.models.inputs import CountedInputs, Wider
+from driftfit.models.inputs import CountedInputs
 from driftfit.readings.screen import suspect
 
 IDENTITY = Polynomial(1)
@@ -263,15 +263,6 @@ class HammersteinWiener(CountedInputs):
         return _steps(self)
 
     @property
-    def family(self) -> Any:
-        """The compiled functions of its bases."""
-        return None if len(self.outputs) > 1 else (*(basis.kind for basis in self.bases), self.out.kind)
-
-    def as_large_as(self, family: Sequence[Model]) -> Model:
-        room = max(np.size(one.memory()["blocks"]) for one in family)
-        return RunTimeOrders(self, max(one.n for one in family), room)
-
-    @property
     def apply(self) -> Step | None:
         return applying(tuple(basis.kind for basis in self.bases), self.places) if min(self.delays) > 0 else None
 
@@ -416,24 +407,3 @@ def _rise(model: HammersteinWiener) -> Array:
 @lru_cache
 def _steps(model: HammersteinWiener) -> ModelSteps:
     return build(tuple(basis.kind for basis in model.bases), model.out.kind, model.places)
-
-
-@dataclass(frozen=True)
-class RunTimeOrders(Wider):
-    """A bound `HammersteinWiener` in the record of a larger one, whose memory has ``size_of_blocks`` numbers.
-
-    A driver is compiled for one number of parameters and one set of orders. To compare many orders, each model gets the
-    size of the largest, with regressors of 0 after its own, and its orders are numbers in the record instead of
-    constants of the compiled routines. Bits are the same; a sample takes longer.
-    """
-
-    size_of_blocks: int
-
-    def memory(self) -> Mapping[str, Any]:
-        own = self.model.memory()
-        blocks = np.append(own["blocks"], np.zeros(self.size_of_blocks - own["blocks"].size))
-        return {**own, "blocks": blocks, "orders": np.array(_places(self.model))}
-
-    @property
-    def steps(self) -> ModelSteps:
-        return build_any(self.model.family[:-1], self.model.family[-1])

@@ -8,8 +8,7 @@ theta before the sample, by solving
 
 with `driftfit.models.hammerstein_wiener.output_curve`. The steps in a driver only pass a lane to two compiled routines,
 which are compiled once for all trackers. A call of a routine that is compiled for its orders is as fast as code inside
-of the driver. One routine with orders at run time takes twice as long per sample; `build_any` makes it, for comparisons
-of many orders.
+of the driver; one routine with orders at run time takes twice as long per sample.
 
 There are two rows of regressors, one for this sample and one for the next. The next row is filled as soon as its lags
 are known, at the previous sample, and is copied when it is needed. If a row were written in single numbers and read in
@@ -24,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
-from driftfit.engine.kernel import Array, State, Step, floats, kernel, machine, part, shared, wholes
+from driftfit.engine.kernel import Array, State, Step, floats, kernel, machine, part, shared
 from driftfit.models.base import GAP
 from driftfit.models.hammerstein_wiener.output_curve import (
     Kind,
@@ -328,54 +327,6 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
     def ready(L: int) -> None:
         own = (regress_one, push_one) if L == 1 else (regress_lane, push_lane)
         for routine in (*(one[0] for one in into), out[0], *own):
-            routine.load()
-
-    return ModelSteps(regress, push, ready)
-
-
-@lru_cache
-def build_any(into: tuple[Kind, ...], out: Kind) -> ModelSteps:
-    """The same with the places of a model in its record, field ``orders``, instead of constants: for one lane."""
-    work, refine, count = _regressing(into, out, False), refining(out), AT.count + INPUT.count * len(into)
-
-    def machine_regress_any(blocks: int, theta: int, orders: int) -> None:
-        p = wholes(orders, 1, count)[0]
-        work(floats(blocks, p[AT.us] + p[AT.inputs], 1), p, floats(theta, p[AT.n], 1))
-
-    def machine_push_any(blocks: int, orders: int) -> None:
-        p = wholes(orders, 1, count)[0]
-        m = floats(blocks, p[AT.us] + p[AT.inputs], 1)
-        if m[NUMBER.late, 0] > 0.0:
-            m[NUMBER.predicted, 0] = refine(m, p, m[NUMBER.predicted, 0])
-
-    regress_any, push_any = machine(machine_regress_any), machine(machine_push_any)
-
-    @kernel
-    def regress(s: State, l: int) -> None:
-        s.blocks[NUMBER.given, l], s.blocks[NUMBER.y, l], s.blocks[NUMBER.dt, l] = s.noise[l], s.y[l], s.dt[l]
-        for i in range(s.orders[AT.inputs, l]):
-            s.blocks[s.orders[AT.us, l] + i, l] = s.u[i, l]
-        regress_any(s.blocks.ctypes.data, s.theta.ctypes.data, s.orders.ctypes.data)
-        for i in range(s.orders[AT.n, l]):
-            s.phi[i, l] = s.blocks[s.orders[AT.now, l] + i, l]
-        for k in range(s.orders[AT.n_out, l] - 1):
-            s.phi[s.orders[AT.d, l] + k, l] = s.blocks[s.orders[AT.g_past, l] + 1 + k, l]
-        s.y[l], s.dt[l] = s.blocks[NUMBER.y, l], s.blocks[NUMBER.dt, l]
-        s.noise[l] *= s.blocks[NUMBER.factor, l]
-
-    @kernel
-    def push(s: State, l: int) -> None:
-        s.noise[l] = s.blocks[NUMBER.given, l]
-        if s.orders[AT.identity, l] == 0:
-            push_any(s.blocks.ctypes.data, s.orders.ctypes.data)
-        s.y_hat[l] = s.blocks[NUMBER.predicted, l]
-        settle_output(s, l)
-        for i in range(s.orders[AT.n, l]):
-            s.blocks[s.orders[AT.now, l] + i, l] = s.blocks[s.orders[AT.next, l] + i, l]
-
-    def ready(L: int) -> None:
-        assert L == 1
-        for routine in (*(one[0] for one in into), out[0], regress_any, push_any):
             routine.load()
 
     return ModelSteps(regress, push, ready)

@@ -184,20 +184,6 @@ def staying(s: State, l: int) -> None:
     """The point of the linearisation is held."""
 
 
-@kernel
-def refuse_held(s: State, signal: int, age: int, l: int) -> None:
-    """`Model.refuse`: the input before is held, also in the filters since then, as if this one had been missing."""
-    own, oldest = OWN + EACH * signal, s.signals.shape[1] - 1
-    s.signals[own + U, age, l] = np.nan
-    for r in range(HELD, W):
-        before = s.signals[own + r, age + 1, l] if age < oldest else s.left[signal, r - HELD, l]
-        for i in range(age + 1):
-            taken = (r > HELD) | (not abs(s.signals[own + U, i, l]) < LARGEST)
-            s.signals[own + r, i, l] = before if taken else s.signals[own + r, i, l]
-    s.last_input[signal, l] = s.signals[own + HELD, 0, l]
-    s.signals[own + WF, 0, l] = s.signals[own + WF, 1, l]
-
-
 @lru_cache
 def filters(p: Places) -> tuple[Any, Any]:
     """``colour(s, raw, into, l)`` and ``whitened(..)``: D/C and 1/C of the present sample of a row."""

@@ -217,22 +217,15 @@ class LiveAlarm:
     @classmethod
     def of(cls, state: Mapping[str, Any], tracker: Tracker, names: Sequence[str]) -> LiveAlarm:
         """The inverse of `plain`."""
-        alarm = cls(rebuild(state["rule"], AlarmRule), tracker, names, state["wait"], state.get("first", 0))
+        alarm = cls(rebuild(state["rule"], AlarmRule), tracker, names, state["wait"], state["first"])
         alarm.active, alarm.begun, alarm.samples = state["active"], state["begun"], state["samples"]
-        alarm.statistic, alarm._left = np.array(state["statistic"], float), state["left"]
-        alarm._judged = state.get("judged", 0)
+        alarm.statistic = np.array(state["statistic"], float)
+        alarm._left, alarm._judged = state["left"], state["judged"]
         alarm._scores.extend(state["scores"])
         alarm._onsets.extend(Onset(*onset) for onset in state["onsets"])
-        # states of earlier versions end before what was learned since the reference
-        for part, stored in zip(alarm._memory if state.get("memory") else (), state.get("memory", ()), strict=False):
-            values = np.frombuffer(b64decode(stored))
-            if values.size != part.size:
-                raise ValueError(
-                    "the state of the alarm was saved by another version of driftfit, whose sums have other sizes: "
-                    "make the rule again, run.detect(...).rule, and give it to a stream that was saved without alarms."
-                )
-            part[...] = values.reshape(part.shape)
-        if state.get("memory"):
+        for part, stored in zip(alarm._memory if state["memory"] else (), state["memory"], strict=True):
+            part[...] = np.frombuffer(b64decode(stored)).reshape(part.shape)
+        if state["memory"]:
             alarm._findings[0] = alarm._memory.findings
         return alarm
 

@@ -16,9 +16,10 @@ from driftfit.data.instants import instant
 from driftfit.data.record import Known, Reading, Records
 from driftfit.engine.drivers import DRIFT, INTERVAL, NOISE
 from driftfit.engine.kernel import Array
-from driftfit.readings.gate import AT_START
+from driftfit.readings.first_samples import First
+from driftfit.readings.gate import AT_START, SIGNAL
+from driftfit.readings.left_out import Tally
 from driftfit.run.columns import SCALARS, Columns
-from driftfit.run.gating import AtStart
 from driftfit.run.live.rule import FROZEN
 from driftfit.run.live.stream import HELD, Stream, check_applied
 from driftfit.run.program import Program, lanes_of
@@ -80,7 +81,7 @@ class Batched(Stream):
     @cached_property
     def _row_type(self) -> np.dtype[Any]:
         """What the loop writes for one row."""
-        return self.programs[0].written(self._state_tile(), 0).dtype
+        return self.programs[0].written(self._tile, 0).dtype
 
     def update_many(
         self, y: Any, u: Any = None, time: Any = None, weights: Any = 1.0, drift: Any = 1.0, prob: Any = None
@@ -118,7 +119,7 @@ class Batched(Stream):
             return Batch(np.empty(0, self._row_type), rows)
         records = self._records(y, u, Reading(weights=weights, drift=drift, indexed=False), prob)
         resting, extra = self.resting, records.known.columns.shape[1] > len(HELD)
-        before = None if time is None else row_of(self._state_tile(), self._row_type)
+        before = None if time is None else row_of(self._tile, self._row_type)
         records, taken = self._arrived(records, time)
         if resting == HELD:
             columns = np.broadcast_to(np.reshape(HELD, (3, 1)), (3, len(self.model.outputs)))
@@ -188,15 +189,15 @@ class Batched(Stream):
     def _judged(self, y: Array, u: Array, known: Array, out: Array, time: Any, before: int) -> None:
         """Drive the tile over rows, with so many samples ``before`` them, and note what a gate leaves out."""
         if self.programs[0].gate is None:
-            self._loop(self._state_tile(), y, u, known, out)
+            self._loop(self._tile, y, u, known, out)
             return
-        found: list[tuple[int, AtStart]] = []
-        self._loop(self._state_tile(), y, u, known, out, found_too=found)
+        found: list[tuple[int, First]] = []
+        self._loop(self._tile, y, u, known, out, found_too=found)
         starts = dict(found)
         for t in sorted({*np.flatnonzero(out["reason"].any(axis=1)).tolist(), *starts}):
             at = None if time is None else instant(time[t])
             for lane in np.flatnonzero(out["reason"][t]).tolist():
-                if out["reason"][t, lane] != AT_START:
+                if out["reason"][t, lane] % SIGNAL != AT_START:
                     self._note(before + t, at, out["reason"].item(t, lane), y.item(t, lane), lane)
             if t in starts:
                 self._note_start(before + t, at, starts[t])
@@ -206,7 +207,7 @@ class Batched(Stream):
 
         def noting(tile: Any, y: float, u: Any) -> Any:
             found = step(tile, y, u)
-            if not found[3] and (code := self._state_tile()["reason"].item(0, 0)):
+            if not found[3] and (code := self._tile["reason"].item(0, 0)):
                 self._note(self._samples - 1, self._last, code, y)
             return found
 
@@ -214,23 +215,23 @@ class Batched(Stream):
 
     def _note(self, sample: int, time: Any, code: int, y: float, lane: int = 0) -> None:
         """Count a sample that the gate refused."""
-        name = self.programs[lane].output or "y"
-        self.left_out.add(sample if time is None else time, code, y, name)
+        self.left_out.add(sample if time is None else time, code, y, self.programs[lane].signals)
 
-    def _note_start(self, sample: int, time: Any, found: AtStart) -> None:
-        """Count the codes that the gate found among the first samples, at the present one."""
-        times = None if time is None else self._clock.moved(time, -found.intervals)
-        for k, (ago, y) in enumerate(zip(found.ago.tolist(), found.value.tolist(), strict=True)):
-            self._note(sample - ago, None if times is None else times[k], AT_START, y)
+    def _note_start(self, sample: int, time: Any, first: First) -> None:
+        """Count what the gate decided of the first samples, at the present one, in place of what it said before."""
+        self.left_out, dt, begun = Tally(), first.known[:, 0], sample + 1 - len(first.y)
+        times = None if time is None else self._clock.moved(time, dt - np.cumsum(dt[::-1])[::-1])
+        for k in np.flatnonzero(first.reason).tolist():
+            self._note(begun + k, None if times is None else times[k], first.reason.item(k), first.y.item(k))
 
     def _keep(self, y: Array, known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""
-        tile, at = self._state_tile(), None if time is None else np.array([time])
+        tile, at = self._tile, None if time is None else np.array([time])
         for lane, alarm in self._watching:
             own = slice(lane, lane + 1)
             alarm.take_many(tile, lane, y[own], tile["noise"][0, own], at)
         for lane, window in enumerate(self._windows):
-            window.push(self._state_tile(), (known[INTERVAL, lane], known[NOISE, lane], known[DRIFT, lane]), lane)
+            window.push(self._tile, (known[INTERVAL, lane], known[NOISE, lane], known[DRIFT, lane]), lane)
 
 
 def _of_output(name: str, text: str) -> Any:

@@ -83,22 +83,18 @@ class Live(Batched):
 
     def _open(self) -> None:
         """Compile the step."""
-        tile = self._state_tile()
+        tile = self._tile
         self._scratch = tile.copy()
         self._bytes, self._scratch_bytes = tile.view(np.uint8), self._scratch.view(np.uint8)
         self._interval = tile["interval"][0]
         self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
         gated = self._single and self.programs[0].gate is not None
-        self._undecided = gated and not tile["gate_decided"][0, 0]
+        self._undecided = gated and bool(tile["gate_decided"][0, 0] < 1)
         if self._single:
-            self._look = self._stepper()
+            self._look = self.program.drivers().updater(tile, self._m)
             self._update = self._noting(self._look) if gated else self._look
             self._compiled, self._compiled_scratch = as_compiled(tile), as_compiled(self._scratch)  # views
         self._expect(self._awaits)
-
-    def _stepper(self) -> Any:
-        """The compiled step of one output."""
-        return self.program.drivers().updater(self._state_tile(), self._m)
 
     def _expect(self, what: int) -> None:
         super()._expect(what)
@@ -242,10 +238,10 @@ class Live(Batched):
 
     def _decide(self) -> None:
         """See whether the gate has judged the first samples, and take the codes that it found out of the state."""
-        tile = self._state_tile()
+        tile = self._tile
         if tile["gate_replay"][0, 0] > 0:
             self._note_start(self._samples - 1, self._last, self.program.replay(tile))
-        self._undecided = not bool(tile["gate_decided"][0, 0])
+        self._undecided = bool(tile["gate_decided"][0, 0] < 1)
         self._expect(self._awaits)
 
     def _row(self, y: Array, u: Array, known: Factors) -> tuple[Array, Array, Array]:
@@ -291,7 +287,7 @@ class Live(Batched):
     def pass_by(self, y: Array, u: Any) -> None:
         """Let one nominal sample of several outputs pass: y goes to the lags and is not used."""
         resting = self.resting
-        self._passed(self._state_tile(), y, self.inputs_of(u), (1.0, np.inf, 1.0))
+        self._passed(self._tile, y, self.inputs_of(u), (1.0, np.inf, 1.0))
         self._rest(resting)
 
     def _passed(self, tile: Array, y: Array, u: Array, known: Factors) -> Steps:
@@ -307,7 +303,7 @@ class Live(Batched):
         They are (lag + 1, ny, n) for outputs that each have their own theta. Row 0 equals the result of `Track.smooth`
         at that sample for a record that ends now.
         """
-        found = [window.smooth(self._state_tile(), lane) for lane, window in self._windowed()]
+        found = [window.smooth(self._tile, lane) for lane, window in self._windowed()]
         if len(found) > 1:
             return FixedLag(*(np.stack(part, axis=1) for part in zip(*found, strict=True)))
         ny = self._rows_per_instant
@@ -413,12 +409,12 @@ class Live(Batched):
     @property
     def regressors(self) -> Array:
         """The regressors of the last sample, (n,)."""
-        phi: Array = self._state_tile()["phi"][0, :, 0].copy()
+        phi: Array = self._tile["phi"][0, :, 0].copy()
         return phi
 
     def _of_lanes(self, name: str) -> Array:
         """A field (n,) of the one theta, or (ny, n)."""
-        values: Array = self._state_tile()[name][0].T.copy()
+        values: Array = self._tile[name][0].T.copy()
         return values[0] if len(values) == 1 else values
 
     def _by_lane(self, found: Callable[[Tracker, dict[str, Array]], Array]) -> Array:

@@ -36,7 +36,7 @@ import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, near
-from driftfit.run.live.reference_model import CONSTANT, CUSUM, JOINT, NOISE, NUMBERS, ONE, TOP, Frozen
+from driftfit.run.live.reference_model import CONSTANT, CUSUM, JOINT, NOISE, ONE, TOP, Frozen
 from driftfit.trackers.base import Tracker
 
 FROZEN = ("glr", "cusum")
@@ -110,13 +110,12 @@ class AlarmRule(Settings):
 
     @property
     def reference(self) -> Frozen:
-        """The frozen model of "glr" and "cusum", as arrays; rules of earlier versions have fewer of them."""
+        """The frozen model of "glr" and "cusum", as arrays."""
         n = len(self.parameters)
-        shapes, given = (-1, -1, -1, (n, n), -1, (-1, n), -1), (*self.frozen, *((), ())[len(self.frozen) - 5 :])
-        found = Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(given, shapes, strict=True)))
-        numbers = np.append(found.numbers, np.zeros(NUMBERS - len(found.numbers)))
-        numbers[TOP] = CUSUM_CAP * max(self.limits, default=0.0)
-        return found._replace(numbers=numbers)
+        shapes = (-1, -1, -1, (n, n), -1, (-1, n), -1)
+        found = Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(self.frozen, shapes, strict=True)))
+        found.numbers[TOP] = CUSUM_CAP * max(self.limits, default=0.0)
+        return found
 
     def drawn(self, phi: Array, y: Array, noise: Array, first: int) -> Array:
         """Readings y (T,) on phi (T, n) of the frozen model, the first of them sample number ``first`` that is judged:

@@ -136,17 +136,13 @@ class Stream(Plain, storage.Kept):
         self._shape = (len(self.model.outputs), self._m) if self.model.shared else (self._m,)
         self._unknown: Array = np.full(self._shape, np.nan)
 
-    def _state_tile(self) -> Array:
-        """The tile, with the present state in it."""
-        return self._tile
-
     @property
     def _rows_per_instant(self) -> int:
         return len(self.model.outputs) if self.model.shared else 1
 
     def lane(self, lane: int = 0) -> dict[str, Array]:
         """The fields of the record, or of that of one of several outputs, as views."""
-        return state_of(self._state_tile(), lane)
+        return state_of(self._tile, lane)
 
     def _set_extra(self, prob: Any, drift: Any) -> None:
         """Set the known factors of the next sample that only some trackers have; None is the default."""
@@ -241,7 +237,7 @@ class Stream(Plain, storage.Kept):
     def _placing(self) -> Any:
         """The routine that stores an input; ValueError for a model that needs it at once."""
         if self._place is None:
-            self._place = applier(self._rows, self.trackers[0], self._state_tile())
+            self._place = applier(self._rows, self.trackers[0], self._tile)
         return self._place
 
     def _expect(self, what: int) -> None:
@@ -270,7 +266,7 @@ class Stream(Plain, storage.Kept):
                 "Live.apply: no sample is waiting for its input. The order is update(y) without u, then apply(u), once "
                 "per sample."
             )
-        self._put(self._state_tile(), self._within(self.inputs_of(u)))
+        self._put(self._tile, self._within(self.inputs_of(u)))
         self._expect(NOTHING)
 
     def _put(self, tile: Array, inputs: Array) -> None:
@@ -315,7 +311,7 @@ class Stream(Plain, storage.Kept):
 
     def end(self) -> End:
         """The present state of the stream, from which another run can continue (`warm_start`)."""
-        lanes = (state_of(self._state_tile(), lane) for lane in range(len(self.programs)))
+        lanes = (state_of(self._tile, lane) for lane in range(len(self.programs)))
         states = tuple({name: np.array(value) for name, value in lane.items()} for lane in lanes)
         return End(tuple(self.programs), states, self._last, self._awaits, self.dt, self._clock.zone)
 
@@ -333,7 +329,7 @@ class Stream(Plain, storage.Kept):
             "alarms": tuple([lane, alarm.plain()] for lane, alarm in self._watching),
             "left_out": self.left_out.plain(),
         }  # fmt: skip
-        tile = self._state_tile()
+        tile = self._tile
         return written(self.programs, [one.pack(tile, lane) for lane, one in enumerate(self.programs)], extra)
 
     def __reduce__(self) -> Any:
@@ -351,13 +347,13 @@ class Stream(Plain, storage.Kept):
             live._limits.restore(outside)
         live._last, live._cold = extra["last"], extra["cold"]
         live._samples, live._ignored = extra["samples"], extra["ignored"]
-        live.left_out.restore(extra["left_out"])
+        live.left_out = Tally(*extra["left_out"])
         for window, state in zip(live._windows, extra["windows"], strict=True):
             window.restore(state)
         live._watching = [
             (lane, LiveAlarm.of(state, trackers[lane], live.programs[lane].names)) for lane, state in extra["alarms"]
         ]
-        restore(source, live.programs, arrays, live._state_tile())
+        restore(source, live.programs, arrays, live._tile)
         live._expect(extra["awaits"])
         return live
 
@@ -372,7 +368,7 @@ class Stream(Plain, storage.Kept):
     @property
     def held(self) -> bool:
         """Whether `hold` is on."""
-        return bool(self._state_tile()["noise"][0, 0] == np.inf)
+        return bool(self._tile["noise"][0, 0] == np.inf)
 
     @property
     def resting(self) -> tuple[float, float, float]:
@@ -435,4 +431,4 @@ class Stream(Plain, storage.Kept):
     def _rest(self, known: tuple[float, float, float]) -> None:
         """Set the known factors of every sample that gives none."""
         for name, value in zip(KNOWN, known, strict=True):
-            self._state_tile()[name] = value
+            self._tile[name] = value

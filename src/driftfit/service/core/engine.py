@@ -23,11 +23,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.service.config import Config
+from driftfit.service.connect.base import Batch
 from driftfit.service.core.archive import Archive
 from driftfit.service.core.journal import DAMAGED, NEEDED_FROM, Act, Group, Item, Journal, Pending, check_storable
 from driftfit.service.core.unit import Out, Unit, rules_of
 from driftfit.service.core.units import Units
-from driftfit.service.sources.contract import Batch
 
 log = logging.getLogger("driftfit.service")
 STORE_SECONDS = 0.02

@@ -38,8 +38,8 @@ import msgspec
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.service.connect.base import Event, Outcome
 from driftfit.service.core.results import Results
-from driftfit.service.sinks.contract import Event, Outcome
 
 SCHEMA = """
 create table if not exists meta (key text primary key, value text, sum integer);

@@ -21,7 +21,7 @@ from driftfit.data.record import Known, Records
 from driftfit.engine.drivers import INTERVAL, NOISE
 from driftfit.engine.kernel import Array
 from driftfit.readings import gate
-from driftfit.readings.remarks import SAID
+from driftfit.readings.left_out import SAID
 from driftfit.run.live.rule import FROZEN
 from driftfit.run.live.stream import HELD
 from driftfit.run.parallel_lanes import FEWEST_LANES, Advanced, advance
@@ -182,13 +182,13 @@ class Section:
     def _count_refused(self, found: Advanced, places: Array, own: Array, first: Array) -> None:
         """Count what gates left out, by reason: samples at ``places`` (N,), and ``first`` samples of units (K,)."""
         reason = found.reasons()
-        for k in np.flatnonzero((reason != gate.USED) & (reason != gate.AT_START)).tolist():
+        for k in np.flatnonzero((reason != gate.USED) & (reason % gate.SIGNAL != gate.AT_START)).tolist():
             self._count(places[k], reason.item(k), 1)
         for k in np.flatnonzero(first > 0).tolist():
             self._count(own[k], gate.AT_START, first.item(k))
 
     def _count(self, place: int, code: int, count: int) -> None:
-        tally((self.units[place].rare, self.left_out), SAID[code][0].lower(), count)
+        tally((self.units[place].rare, self.left_out), SAID[code % gate.SIGNAL][0].lower(), count)
 
     def _known(self, places: Array, own: Array, first: Array, time: Array | None) -> Array:
         """What is known of the samples (N, 3), or of all of them (1, 3)."""

@@ -13,11 +13,11 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.service.config import UnitSettings
+from driftfit.service.connect.samples import NO_SIGNAL, TOO_MANY_NEW, Receipt, Samples, numbers_of, seconds_of
 from driftfit.service.core.journal import Journal, Pending, Rows
 from driftfit.service.core.section import CounterOf, Section, tally
 from driftfit.service.core.unit import SAMPLES, Unit
 from driftfit.service.options import ServiceOptions, valid_name
-from driftfit.service.sources.contract import NO_SIGNAL, TOO_MANY_NEW, Receipt, Samples, numbers_of, seconds_of
 
 log = logging.getLogger("driftfit.service")
 Message = tuple[str, Samples, Receipt | None]

@@ -26,7 +26,9 @@ Departures: the decision on rank; the change of form. Cost per sample: O(n^3) un
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Mapping
+from functools import lru_cache, partial
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -67,31 +69,23 @@ SCRATCH = ("H", "pivot", "work", "at_start")
 """Fields of the start that carry nothing from one sample to the next."""
 
 
-def knowing_nothing(n: int, worst: float = WORST) -> dict[str, Any]:
+@lru_cache
+def knowing_nothing(n: int, worst: float = WORST) -> Mapping[str, Any]:
     """Fields for a diffuse start of n parameters; ``root`` is 1 while S and d, and not theta and P, are the state."""
     square = np.zeros((n, n))
-    return {
+    fields = {
         "S": square, "d": np.zeros(n), "R": np.eye(n), "H": square, "pivot": np.zeros(n), "work": np.zeros((WORK, n)),
-        "at_start": np.zeros(NOW), "F": np.ones(n), "volume": 0.0, "rank": 0, "root": 1, "worst": worst, "absent": 0,
+        "at_start": np.zeros(NOW), "F": np.ones(n), "volume": 0.0, "rank": 0, "root": 1, "worst": worst,
     }  # fmt: skip
+    for value in fields.values():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)  # all trackers share them
+    return MappingProxyType(fields)
 
 
-@kernel
-def know_nothing(s: State, l: int) -> None:
-    """As before the first sample; the last ``absent`` parameters are known (`driftfit.trackers.parts.common_size`)."""
-    n = s.theta.shape[0]
-    for i in range(n):
-        s.d[i, l], s.F[i, l] = 0.0, 1.0
-        for j in range(n):
-            s.S[i, j, l], s.R[i, j, l] = 0.0, 1.0 if i == j else 0.0
-    for i in range(n - s.absent[l], n):
-        s.S[i, i, l] = 1.0
-    s.volume[l], s.rank[l] = 0.0, s.absent[l]
-
-
-def knowing(n: int) -> dict[str, Any]:
+def knowing(n: int) -> Mapping[str, Any]:
     """The same fields for a proper prior."""
-    return knowing_nothing(n) | {"rank": n, "root": 0}
+    return {**knowing_nothing(n), "rank": n, "root": 0}
 
 
 @shared

@@ -19,6 +19,9 @@ that preserves the triangle. Cost: n rotations per sample and n (n + 1) / 2 for 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from driftfit.engine.kernel import Array, kernel
@@ -128,3 +131,21 @@ def triangular_root(q: Array) -> Array:
     values, vectors = linalg.eigh(q / np.outer(unit, unit))
     G: Array = unit[:, None] * linalg.rq(vectors * np.sqrt(np.maximum(values, 0.0)), mode="r")
     return G
+
+
+def partly_known(small: Mapping[str, Any], large: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The ``large`` state of a tracker that begins with the ``small`` one along each axis; None without room for it.
+
+    The other parameters are known to be 0: with a 1 on the diagonal of S they count as determined. Where regressors are
+    0 in all samples, sums over parameters gain terms that are 0: results are those of the small state, bit for bit.
+    """
+    state = {name: np.array(value) for name, value in large.items()}
+    if any(own > wide for name in state for own, wide in zip(np.shape(small[name]), state[name].shape, strict=True)):
+        return None
+    for name, value in state.items():
+        value[tuple(slice(size) for size in np.shape(small[name]))] = small[name]
+    n, N = len(small["theta"]), len(large["theta"])
+    state["S"][range(n, N), range(n, N)] = 1.0
+    if state["root"] > 0:
+        state["rank"] += N - n
+    return state

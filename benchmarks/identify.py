@@ -1,0 +1,238 @@
+"""Plants for `driftfit.identify`: is the structure found, is drift named and dated, and is its cause named?
+
+Each plant has five inputs, of which two matter, with delays of 0 to 15 samples, and one or two lags of the output:
+
+    y_t = sum a_i y_(t-i) + g_t f(u1_(t-k1)) + b u2_(t-k2) + c + v_t
+
+Inputs are white, autoregressions with 0.9, or held for 25 samples on average. The standard deviation of the effect of
+the inputs is 0.3 or 1 times that of the noise. The noise is white or an autoregression with 0.6; the first input reacts
+to the output (closed loop); or the meter of y prints whole numbers, about one deviation of the noise apart. What
+changes: nothing; the gain g jumps by a factor of 1.8; it rises by as much during a third of the record; it is a random
+walk whose deviation at the end is 0.8 of it; the pole jumps by 0.35; f is a static curve that saturates; or g depends
+on the level of a third input, which returns to where it was.
+
+Seeds below 1000 are for tuning, those from 1000 on for judging. "named" and "date" are shares of the plants in which a
+drift was found, "cause" that of the plants of which a cause was named, "silent" that of those without one.
+
+Run: python benchmarks/identify.py [first seed, 1000 by default] [seed to stop before] [--quick]
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import polars as pl
+from scipy import signal
+
+from driftfit import ARX, AdaptiveKalman, identify, track
+from driftfit.engine.kernel import Array
+
+T = 1500
+BEFORE = 200
+CHANGES = ("constant", "jump", "ramp", "walk", "moving pole", "static curve", "gain by level")
+INPUTS = ("white", "AR(0.9)", "held")
+NOISES = ("white", "coloured", "closed loop", "whole numbers")
+SNRS = (0.3, 1.0)
+FACTOR = 1.8
+
+
+class Plant(NamedTuple):
+    """A record, and what is true of it."""
+
+    table: dict[str, Array]
+    change: str
+    inputs: dict[str, int]
+    """The inputs that matter, with their delays."""
+    moving: str
+    """The input whose effect changes; "y" for a pole, empty if nothing changes in time."""
+    date: int
+    cause: str
+    """"", "time" or "working point"."""
+
+
+def input_of(kind: str, rng: np.random.Generator, n: int) -> Array:
+    """An input (n,) of variance about 1."""
+    if kind == "white":
+        return rng.normal(size=n)
+    if kind == "AR(0.9)":
+        return signal.lfilter([np.sqrt(1.0 - 0.81)], [1.0, -0.9], rng.normal(size=n))
+    return rng.normal(size=n)[np.cumsum(rng.random(n) < 1.0 / 25.0)]
+
+
+def plant(change: str, inputs: str, noise: str, snr: float, seed: int) -> Plant:
+    """A plant drawn from a seed."""
+    rng = np.random.default_rng([seed, CHANGES.index(change), INPUTS.index(inputs), NOISES.index(noise), int(10 * snr)])
+    n = T + BEFORE
+    U = np.column_stack([input_of(inputs, rng, n) for _ in range(5)])
+    first, second, level = rng.permutation(5)[:3]
+    delays = {int(first): int(rng.integers(0, 16)), int(second): int(rng.integers(0, 16))}
+    if noise == "closed loop":
+        delays[int(first)] = max(delays[int(first)], 1)
+    pole = float(rng.uniform(0.3, 0.6)) if change == "moving pole" else float(rng.uniform(0.3, 0.85))
+    a = [pole] if rng.random() < 0.5 or change == "moving pole" else [pole + 0.2, -0.2 * pole]
+    date = int(rng.uniform(0.4, 0.65) * T) + BEFORE
+    e = rng.normal(size=n)
+    v = signal.lfilter([0.8], [1.0, -0.6], e) if noise == "coloured" else e
+    b = snr / np.sqrt(2.0) * rng.choice([-1.0, 1.0], 2)
+    g, t = np.ones(n), np.arange(n)
+    if change == "jump":
+        g = np.where(t >= date, FACTOR, 1.0)
+    elif change == "ramp":
+        g = 1.0 + (FACTOR - 1.0) * np.clip((t - date + T // 6) / (T // 3), 0.0, 1.0)
+    elif change == "walk":
+        walk = np.cumsum(np.where(t > BEFORE, rng.normal(size=n), 0.0))
+        g = 1.0 + 0.8 * walk / np.sqrt(T)
+    elif change == "gain by level":
+        U[:, level] = signal.lfilter([np.sqrt(1.0 - 0.98**2)], [1.0, -0.98], rng.normal(size=n))
+        g = 1.0 + 0.8 * np.tanh(U[:, level])
+    poles = np.where(t >= date, a[0] + 0.35, a[0]) if change == "moving pole" else np.full(n, a[0])
+    y = np.zeros(n)
+    for k in range(20, n):
+        if noise == "closed loop":
+            U[k, first] -= 0.3 * np.sign(b[0]) * y[k - 1]
+        x = U[k - delays[int(first)], first]
+        x = 2.0 * np.tanh(1.2 * x + 0.6) if change == "static curve" else x
+        past = poles[k] * y[k - 1] + (a[1] * y[k - 2] if len(a) > 1 else 0.0)
+        y[k] = past + b[0] * g[k] * x + b[1] * U[k - delays[int(second)], second] + 0.5 + v[k]
+    y = np.round(y) if noise == "whole numbers" else y
+    timely = change in ("jump", "ramp", "walk", "moving pole")
+    return Plant(
+        {"flow": y[BEFORE:], **{f"u{j + 1}": U[BEFORE:, j] for j in range(5)}},
+        change,
+        {f"u{j + 1}": k for j, k in delays.items()},
+        "y" if change == "moving pole" else f"u{first + 1}" if timely else "",
+        date - BEFORE if timely else -1,
+        "time" if timely else "working point" if change in ("static curve", "gain by level") else "",
+    )
+
+
+def plants(seed: int) -> list[Plant]:
+    """Every change with every kind of input and both sizes of noise; kinds of noise in turn."""
+    found = []
+    for i, change in enumerate(CHANGES):
+        for j, inputs in enumerate(INPUTS):
+            for k, snr in enumerate(SNRS):
+                found.append(plant(change, inputs, NOISES[(i + 2 * j + k + seed) % len(NOISES)], snr, seed))
+    return found
+
+
+class Found(NamedTuple):
+    """What a method says of a plant: chosen inputs with delays, whether parameters move and which, when, and why."""
+
+    inputs: dict[str, tuple[int, int]]
+    moves: bool | None
+    which: tuple[str, ...]
+    date: int
+    cause: str
+
+
+KINDS = {"moves": "time", "both": "both", "a static curve explains it": "working point"}
+
+
+def ours(plant: Plant) -> Found:
+    """`driftfit.identify` with its defaults."""
+    found = identify(plant.table, "flow")
+    names = found.roles.inputs
+    inputs = {names[j]: found.structure.delays[j] for j in found.structure.lags}
+    moved = [move for move in found.moves if move.what != "level"]
+    which = tuple("y" if move.what == "memory" else move.what for move in moved)
+    moves = found.kind in ("moves", "both") if found.kind != "cannot decide" else None
+    middle = np.median([move.at for move in moved]) if moved else -1
+    return Found(inputs, moves, which, int(middle), KINDS.get(found.kind, ""))
+
+
+def by_criterion(price: float) -> Callable[[Plant], Found]:
+    """Forward selection of lags of y and inputs with constants: an information criterion with a price per column."""
+
+    def method(plant: Plant) -> Found:
+        y, names = plant.table["flow"], [name for name in plant.table if name != "flow"]
+        columns = {("y", k): np.roll(y, k) for k in range(1, 9)}
+        columns |= {(name, k): np.roll(plant.table[name], k) for name in names for k in range(31)}
+        X, z = np.column_stack([np.ones(len(y)), *columns.values()])[40:], y[40:]
+        N, chosen, places = len(z), [0], list(columns)
+        cost = price if price else np.log(N) + 2.0 * np.log(X.shape[1])
+        while True:
+            Q = np.linalg.qr(X[:, chosen])[0]
+            e, rest = z - Q @ (Q.T @ z), X - Q @ (Q.T @ X)
+            size = np.maximum(np.einsum("np,np->p", rest, rest), 1e-9)
+            gain = -N * np.log1p(-np.minimum((rest.T @ e) ** 2 / size / (e @ e), 0.999))
+            best = int(np.argmax(gain))
+            if best in chosen or not gain[best] > cost or len(chosen) > 20:
+                break
+            chosen.append(best)
+        lags: dict[str, list[int]] = {}
+        for name, k in (places[one - 1] for one in chosen[1:]):
+            if name != "y":
+                lags.setdefault(name, []).append(k)
+        return Found({name: (min(k), min(k)) for name, k in lags.items()}, None, (), -1, "")
+
+    return method
+
+
+def default_arx(plant: Plant) -> Found:
+    """ARX(2, 2) on all inputs, as `driftfit track` without a model did before, and its verdict."""
+    table = pl.DataFrame(plant.table)
+    names = [name for name in table.columns if name != "flow"]
+    model = ARX(2, 2, inputs=tuple(names), intercept=True)
+    judged = track(model, AdaptiveKalman(), y="flow", u=names, data=table).verdict()
+    which = tuple(name.split("[")[1][:-1] if "[" in name else "y" for name in judged.moving if name != "intercept")
+    at = judged.events[0].at if judged.events else -1
+    return Found({name: (1, 2) for name in names}, judged.drifts, which, at, "time" if judged.drifts else "")
+
+
+METHODS: dict[str, Callable[[Plant], Found]] = {
+    "identify": ours, "constants, extended BIC": by_criterion(0.0), "ARIMAX, AIC": by_criterion(2.0),
+    "ARX(2, 2)": default_arx,
+}  # fmt: skip
+NEAR = 30
+"""Samples within which a date is right; of a ramp, within it."""
+
+
+def scored(plant: Plant, found: Found) -> dict[str, float]:
+    """Whether each part is right, NaN where there is no such part."""
+    nan, timely = float("nan"), plant.cause == "time"
+    near = T // 6 if plant.change in ("ramp", "walk") else NEAR
+    right = set(found.inputs) == set(plant.inputs)
+    decided = found.moves is not None
+    return {
+        "inputs": float(right),
+        "delays": float(right and all(low <= plant.inputs[u] <= high for u, (low, high) in found.inputs.items())),
+        "false inputs": float(len(set(found.inputs) - set(plant.inputs))),
+        "missed": float(len(set(plant.inputs) - set(found.inputs))),
+        "drift found": float(found.moves) if timely and decided else nan,
+        "named": float(plant.moving in found.which) if timely and found.moves else nan,
+        "date": float(abs(found.date - plant.date) <= near) if timely and found.moves else nan,
+        "claims": float(found.moves) if plant.change == "constant" and decided else nan,
+        "cause": float(found.cause == plant.cause) if plant.cause and found.cause else nan,
+        "silent": float(not found.cause) if plant.cause and decided else nan,
+    }
+
+
+def main() -> None:
+    """Print the tables for some seeds and methods."""
+    quick = "--quick" in sys.argv
+    given = [arg for arg in sys.argv[1:] if not arg.startswith("--")]
+    seeds = range(int(given[0]), int(given[1])) if given else range(1000, 1001)
+    methods = {name: m for name, m in METHODS.items() if not quick or not name.startswith("ARX(")}
+    for name, method in methods.items():
+        rows: dict[str, list[dict[str, float]]] = {}
+        for one in [one for seed in seeds for one in plants(seed)][:: 6 if quick else 1]:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                row = scored(one, method(one))
+            rows.setdefault(one.change, []).append(row)
+            rows.setdefault("all", []).append(row)
+        heads = list(rows["all"][0])
+        print(f"\n{name}, seeds {seeds.start} to {seeds.stop - 1}\n{'':14}{''.join(f'{h:>13}' for h in heads)}  plants")
+        for change, each in rows.items():
+            known = [np.array([row[h] for row in each]) for h in heads]
+            cells = (f"{np.nanmean(x):13.2f}" if np.isfinite(x).any() else f"{'':13}" for x in known)
+            print(f"{change:14}{''.join(cells)}  {len(each)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

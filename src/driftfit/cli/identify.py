@@ -1,0 +1,109 @@
+"""``driftfit identify``: from a file to an answer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from time import monotonic
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from typer import Argument, Option
+
+from driftfit.cli.options import Names
+from driftfit.cli.program import app, progress, say, writable
+from driftfit.cli.reading import decimal_from, limits_from, listed, parse_interval, separator_from
+from driftfit.data.clock import Clock
+from driftfit.data.columns import Wanted
+from driftfit.identify.answer import Identification, ManyIdentified, identify
+from driftfit.identify.roles import NoAnswerError
+
+SILENT = 2.0
+"""Seconds before progress is shown."""
+
+
+@app.command("identify")
+def identify_command(
+    file: Annotated[list[str], Argument(help="CSV or Parquet files, or patterns such as 'runs/*.csv'.")],
+    *,
+    y: Annotated[str | None, Option(help="Column of the output.")] = None,
+    u: Annotated[Names, Option(help="Inputs to choose from; repeat it, or separate names by commas.")] = None,
+    not_u: Annotated[Names, Option(help="Columns that are no inputs.")] = None,
+    time: Annotated[str | None, Option(help="Column of the time.")] = None,
+    dt: Annotated[str | None, Option(help="Nominal interval: a number, for dates 1s, 15min, 1h, 1d.")] = None,
+    by: Annotated[str | None, Option(help="Column that identifies records of one structure.")] = None,
+    limits: Annotated[Names, Option(help="Valid range of a column: flow=0:80; outside is missing.")] = None,
+    max_lag: Annotated[int, Option(help="Longest lag of an input, in samples.")] = 30,
+    forecast: Annotated[
+        bool, Option("--forecast/--explain", help="Only inputs of earlier samples, or also of the same.")
+    ] = False,
+    horizon: Annotated[int, Option(help="Steps ahead of the second comparison.")] = 10,
+    level: Annotated[float, Option(help="Error rate of the statement that parameters move.")] = 0.05,
+    gate: Annotated[
+        bool | None, Option("--gate/--no-gate", help="Leave out fault codes however many, or use all readings.")
+    ] = None,
+    budget: Annotated[str, Option(help="Time after which the search stops.")] = "45s",
+    seed: Annotated[int, Option(help="Seed of the displaced copies of inputs.")] = 0,
+    separator: Annotated[str | None, Option(help="Separator of cells; by default detected.")] = None,
+    decimal: Annotated[str, Option(help="Decimal sign: . or ,")] = ".",
+    dates: Annotated[str | None, Option(help="Form of dates, such as '%d.%m.%Y %H:%M'.")] = None,
+    missing: Annotated[Names, Option(help="What the file holds where there is no reading; repeat it.")] = None,
+    page: Annotated[Path | None, Option(help="Write the answer to a page (.html).")] = None,
+    json_to: Annotated[Path | None, Option("--json", help="Write the answer as JSON; - is stdout.")] = None,
+    quiet: Annotated[bool, Option("--quiet", help="Print the headline alone.")] = False,
+) -> None:
+    """From a file to an answer: which inputs matter, what changed, since when, and is it time or the working point?
+
+    Exit codes: 0 answered, 1 undecided, 2 arguments or file, 3 the record cannot answer.
+    """
+    writable(page, "--page")
+    ranges = dict(limits_from(one, [one.rpartition("=")[0].strip()]) for one in limits or [])
+    reading = Wanted((), None, (), tuple(missing or []), separator_from(separator), decimal_from(decimal), dates)
+    began = monotonic()
+    with progress.status("reading") as status:
+        if not (progress.is_terminal and not quiet):
+            status.stop()
+
+        def tell(text: str) -> None:
+            if monotonic() - began > SILENT:
+                status.update(text)
+
+        try:
+            found = identify(
+                file if len(file) > 1 else file[0], y, u=listed(u) or None, not_u=listed(not_u), time=time,
+                dt=seconds(dt), by=by, limits=ranges,
+                max_lag=max_lag, forecast=forecast, horizon=horizon, level=level, gate=gate,
+                budget=seconds(budget) or 0.0, seed=seed, reading=reading, progress=tell,
+            )  # fmt: skip
+        except NoAnswerError as error:
+            status.stop()
+            typer.echo(f"driftfit: this record cannot answer: {error}", err=True)
+            raise typer.Exit(3) from None
+    write(found, page, json_to, quiet)
+    raise typer.Exit(found.code)
+
+
+def write(found: Identification | ManyIdentified, page: Path | None, json_to: Path | None, quiet: bool) -> None:
+    """Print the answer, and write what the options ask for."""
+    if json_to is not None:
+        text = json.dumps(found.json(), indent=1)
+        if str(json_to) == "-":
+            typer.echo(text)
+        else:
+            json_to.write_text(text, encoding="utf-8")
+    if str(json_to) != "-":
+        say(" ".join(found.headline.split()) if quiet else found)
+    if page is not None:
+        found.page(page)
+
+
+def seconds(text: str | None) -> float | None:
+    """A duration in seconds, a plain number as it is."""
+    given: Any = parse_interval(text)
+    if isinstance(given, str):
+        length = Clock.of(given).duration
+        if length is None:
+            raise ValueError(f"{text}: give a duration such as 1s, 15min, 1h or 1d.")
+        return float(length / np.timedelta64(1, "s"))
+    return None if given is None else float(given)

@@ -1,0 +1,306 @@
+"""Commands that read a record: track, verdict, tune, select, detect, forecast, smooth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import polars as pl
+from rich.text import Text
+from typer import Option
+
+from driftfit.cli.options import Given, Out, Plot, Report, Table, check_table, reads
+from driftfit.cli.program import app, draw, progress, say
+from driftfit.cli.reading import interval_from, listed, order_of, rows_of
+from driftfit.data.limits import end_of
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import marks, missing_settings
+from driftfit.judge.structures.select import Selection
+from driftfit.judge.structures.select import select as compare
+from driftfit.parsing.settings import given_fields
+from driftfit.readings.left_out import remarks_of
+from driftfit.results import Track
+from driftfit.show.export import check_ending, write, write_table
+from driftfit.show.report import check_path
+from driftfit.show.text import digits, facts, shortened, table_of
+from driftfit.tune.tune import tune as estimate
+from driftfit.tune.tuned import Tuned
+
+
+@app.command()
+@reads
+def track(
+    given: Given,
+    write_to: Out = None,
+    plot: Plot = None,
+    system: Annotated[
+        Path | None, Option(help="Save a picture of responses, poles and gain over time (ARX, one output).")
+    ] = None,
+    report: Report = None,
+) -> None:
+    """Track the parameters of a model in a record, or in a fleet of records."""
+    if write_to is not None:
+        check_ending(write_to)
+    if report is not None:
+        check_path(report)
+    run = given.run()
+    say(run.summary())
+    if write_to is not None:
+        write(run, write_to)
+    draw(plot, run.plot)
+    if system is not None and not isinstance(run, Track):
+        raise ValueError("--system: this draws one series with one output; leave out --by and further --y.")
+    draw(system, lambda: run.plot_system())
+    if report is not None:
+        run.report(report)
+
+
+@app.command()
+@reads
+def verdict(
+    given: Given,
+    level: Annotated[float, Option(help="Error rate of the test; for a fleet, the false discovery rate.")] = 0.05,
+    lags: Annotated[int | None, Option(help="Lags of correlation of the noise to allow for.")] = None,
+    report: Report = None,
+) -> None:
+    """Report whether the parameters move, which ones and when, and whether tracking them pays."""
+    run = given.run()
+    say(run.verdict(level=level, lags=lags))
+    if report is not None:
+        run.report(report)
+
+
+@app.command()
+@reads
+def tune(
+    given: Given,
+    method: Annotated[str, Option(help="ml, h-step, loo or gcv.")] = "ml",
+    ahead: Annotated[int, Option("--ahead", help="Samples ahead, for h-step.")] = 1,
+    groups: Annotated[
+        str | None, Option(help="each: a separate drift for each parameter; or one label per parameter, a,a,b.")
+    ] = None,
+    level: Annotated[float, Option(help="Level of the intervals.")] = 0.95,
+    plot: Plot = None,
+) -> None:
+    """Estimate the settings that a tracker is missing: --tracker kalman estimates q and r."""
+    models, shared = given.models(), groups.split(",") if groups and groups != "each" else groups
+    with progress.status("tuning"):
+        tuned = estimate(
+            models[0], given.chosen_tracker(), method=method, h=ahead, groups=shared, level=level, **given.arrays()
+        )
+    assert isinstance(tuned, Tuned)  # `arrays` are of one output
+    rows = [
+        ("Model", repr(models[0])),
+        ("Tracker", shortened(repr(tuned.tracker))),
+        ("Log-likelihood", f"{tuned.loglik:.6g} of {tuned.used} samples"),
+        *remarks_of(tuned.left_out),
+    ]
+    say(facts(*rows))
+    table = table_of(f"Settings by {method}", "", "chosen", f"{level:.0%} from", "to")
+    for name, value in tuned.chosen.items():
+        low, high = tuned.interval.get(name, (np.nan, np.nan))
+        table.add_row(Text(name), *("" if np.isnan(x) else f"{x:.4g}" for x in (value, low, high)))
+    say(table)
+    if tuned.at_bound:
+        say(Text(f" at a bound of the search: {', '.join(tuned.at_bound)}", "dim"))
+    say(Text(f" To use them: {_flags(given, tuned.tracker)}", "dim"), soft_wrap=True)
+    draw(plot, tuned.plot)
+
+
+def _flags(given: Given, tracker: Any) -> str:
+    """The tracker as command line options."""
+    values = {f.name: (getattr(tracker, f.name), f.default) for f in given_fields(type(tracker))}
+    parts = [f"-p {name}={_typed(value)}" for name, (value, default) in values.items() if not _same(value, default)]
+    return " ".join([f"--tracker {given.tracker}", *parts])
+
+
+def _same(value: Any, default: Any) -> bool:
+    return np.shape(value) == np.shape(default) and bool(np.all(value == default))
+
+
+def _typed(value: Any) -> str:
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    return ",".join(f"{x:.6g}" for x in np.ravel(value)) if np.ndim(value) or isinstance(value, float) else str(value)
+
+
+@app.command()
+@reads
+def select(
+    given: Given,
+    keep: Annotated[list[str] | None, Option(help="Regressor that every subset contains; repeat it.")] = None,
+    most: Annotated[int | None, Option(help="Largest number of regressors in a subset.")] = None,
+    plot: Plot = None,
+) -> None:
+    """Compare models (repeat --model), or the regressors of one, by how well they predict."""
+    models = given.models()
+    with progress.status("comparing"):
+        selection = compare(
+            models if len(models) > 1 else models[0], tracker=given.chosen_tracker(), keep=tuple(listed(keep)),
+            most=most, **given.arrays(),
+        )  # fmt: skip
+    say(selection)
+    assert isinstance(selection, Selection)  # `arrays` are of one output
+    draw(plot, selection.plot)
+
+
+@dataclass(frozen=True)
+class AlarmOptions:
+    """The options that define an alarm."""
+
+    kind: Annotated[str, Option(help="glr, cusum, band, innovation or probability.")] = "glr"
+    every: Annotated[float, Option(help="Samples in which one false alarm may begin.")] = 10_000.0
+    reference: Annotated[
+        list[str] | None,
+        Option(help="What is normal: a number of first samples, FROM..TO in times, or name=low:high; repeat the last."),
+    ] = None
+    window: Annotated[int, Option(help="Samples in the sums of the innovation alarm.")] = 50
+    hold: Annotated[int, Option(help="Samples for which an alarm stays on after its cause.")] = 0
+    calibrate: Annotated[bool, Option("--calibrate", help="Find the limits by simulation.")] = False
+
+    def find(self, run: Any) -> Any:
+        """The alarms of a run, an `Outputs` or a fleet."""
+        settings = {"every": self.every, "window": self.window, "hold": self.hold, "calibrate": self.calibrate}
+        return run.detect(self.kind, reference=parse_reference(self.reference, run), **settings)
+
+
+@app.command()
+@reads
+def detect(
+    given: Given,
+    options: AlarmOptions,
+    labels: Annotated[
+        str | None, Option(help="Column of labels, 0 or 1, that mark faults; the alarms are scored.")
+    ] = None,
+    write_to: Table = None,
+    plot: Plot = None,
+    report: Report = None,
+) -> None:
+    """Find alarms at a set rate of false alarms; with labels, score them."""
+    if labels is not None and (given.by or len(given.outputs) > 1):
+        raise ValueError("--labels: labels are for one series of one output; leave out --by and further --y.")
+    check_table(write_to, "alarms are")
+    if report is not None:
+        check_path(report)
+    rows = given.read(labels) if labels is not None else None
+    run = given.run(rows)
+    alarms = options.find(run)
+    say(alarms)
+    faulty = None
+    if rows is not None and labels is not None:
+        faulty = marks("--labels", rows.numbers[labels][order_of(rows)], len(alarms.active))
+        score = alarms.score(faulty)
+        late = "" if np.isnan(score.delay) else f", {score.delay:g} samples after they began (median)"
+        found = f" Labels: {score.found} of {score.events} found{late};"
+        say(Text(f"{found} {score.false} false alarms in {score.normal} normal samples."), soft_wrap=True)
+    if write_to is not None:
+        write_table(alarms.table, write_to)
+    if plot is not None and not isinstance(run, Track):
+        raise ValueError("--plot: alarms are drawn for one series; use --report for a fleet.")
+    draw(plot, lambda: alarms.plot(faulty))
+    if report is not None:
+        run.report(report, alarms=alarms, **({} if faulty is None else {"labels": faulty}))
+
+
+def parse_reference(given: list[str] | None, run: Any) -> Any:
+    """``300``, ``2024-03-01..2024-03-04`` or ``gain=0.9:1.1`` in the form that `Track.detect` takes."""
+    if not given:
+        return None
+    if all("=" in entry for entry in given):
+        return dict(_band(entry) for entry in given)
+    if len(given) > 1:
+        raise ValueError("--reference: several references are only for bands, such as --reference gain=0.9:1.1.")
+    if given[0].strip().isdigit():
+        return int(given[0])
+    first, last = interval_from(given[0], "--reference")
+    axis, zone = (run.time, run.labels.zone) if isinstance(run, Track) else (np.arange(1), None)
+    return end_of("--reference", first, axis, zone, 0), end_of("--reference", last, axis, zone, 1)
+
+
+def _band(entry: str) -> tuple[str, tuple[float, float]]:
+    name, _, bounds = entry.partition("=")
+    low, _, high = bounds.partition(":")
+    try:
+        return name.strip(), (float(low or "-inf"), float(high or "inf"))
+    except ValueError:
+        raise ValueError(f"--reference {entry}: give a band as name=low:high.") from None
+
+
+FORECAST_ROWS, SMOOTHED_ROWS = 40, 5
+"""Rows that are printed, at most."""
+
+
+@app.command()
+@reads
+def forecast(
+    given: Given,
+    ahead: Annotated[int | None, Option("--ahead", help="Samples to forecast; as many as --future has rows.")] = None,
+    future: Annotated[str | None, Option(help="File of future inputs, with the columns of --u.")] = None,
+    level: Annotated[float, Option(help="Level of the bands.")] = 0.95,
+    write_to: Table = None,
+) -> None:
+    """Forecast the outputs, and the parameters, after the end of the record."""
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"--level must be between 0 and 1, such as 0.95; got {level!r}.")
+    check_table(write_to, "a forecast is")
+    given.check_single("forecast")
+    u = None if future is None else _inputs(given, future)
+    if ahead is None:
+        ahead = 10 if u is None else len(u)
+    if u is None and given.inputs:
+        raise ValueError(
+            f"forecast: future inputs are needed: --future FILE with the columns {', '.join(given.inputs)}."
+        )
+    run: Track = given.run()
+    made = run.forecast(ahead, None if u is None else u[:ahead])
+    low, high = made.band(level)
+    frame = made.table.with_columns(low=low, high=high)
+    table = table_of(
+        f"{run.labels.y} after {run.time_text(-1)}", "ahead" if made.time is None else made.axis, run.labels.y, "std",
+        f"{level:.0%} from", "to",
+    )  # fmt: skip
+    for k, row in enumerate(frame.head(FORECAST_ROWS).select("y_hat", "y_std", "low", "high").iter_rows()):
+        table.add_row(made.time_text(k), *(f"{value:.6g}" for value in row))
+    say(table)
+    if ahead > FORECAST_ROWS:
+        say(Text(f" the first {FORECAST_ROWS} of {ahead}; --out writes all", "dim"))
+    if write_to is not None:
+        write_table(frame, write_to)
+
+
+def _inputs(given: Given, future: str) -> Array:
+    if not given.inputs:
+        raise ValueError(f"--future {future}: the model has no inputs; leave it out.")
+    read = rows_of([future], given.inputs, None, [], replace(given.part(), first=None, last=None, rows=(1, None)))
+    return np.stack([read.numbers[name] for name in given.inputs], axis=1)
+
+
+@app.command()
+@reads
+def smooth(given: Given, write_to: Table = None, plot: Plot = None) -> None:
+    """Estimate the parameters at every sample from the whole record; settings that are left out are tuned first."""
+    check_table(write_to, "a path is")
+    given.check_single("smooth")
+    tracker = given.chosen_tracker()
+    if missing_settings(tracker):
+        with progress.status("tuning"):
+            tuned = estimate(given.models()[0], tracker, **given.arrays())
+        assert isinstance(tuned, Tuned)  # `arrays` are of one output
+        tracker = tuned.tracker
+    run = given.run(tracker=tracker)
+    smoothed = run.smooth()
+    say(facts(("Model", repr(run.model)), ("Tracker", repr(run.tracker)), ("Samples", str(len(run)))))
+    table = table_of("Parameters from the whole record", "at", *run.names)
+    for t in np.unique(np.linspace(0, len(run) - 1, SMOOTHED_ROWS).astype(int)):
+        cells = (f"{digits(v, s)} +- {s:.2g}" for v, s in zip(smoothed.theta[t], smoothed.std[t], strict=True))
+        table.add_row(Text(run.time_text(int(t))), *cells)
+    say(table)
+    say(Text(" +- one standard deviation", "dim"))
+    if write_to is not None:
+        columns: dict[str, Any] = {run.labels.time or "sample": run.time}
+        columns |= {f"theta_{name}": smoothed.theta[:, i] for i, name in enumerate(run.names)}
+        columns |= {f"std_{name}": smoothed.std[:, i] for i, name in enumerate(run.names)}
+        write_table(pl.DataFrame(columns), write_to)
+    draw(plot, smoothed.plot)

@@ -1,0 +1,1 @@
+"""From a table to an answer: roles of columns, structure, what changes and why; one page."""

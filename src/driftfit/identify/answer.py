@@ -1,0 +1,299 @@
+"""identify: from a table to an answer. What moves, since when, by how much, and is it time or the working point?
+
+The steps are `driftfit.identify.roles`, `structure`, `working_point` and `judgement`; each has its equations. The
+structure is chosen from the whole record, so p-values are those of a test after a selection; errors are always those of
+predictions made before the sample. Cost: for T rows and p columns of lags, O(T p^2) for the search, and that of
+`Track.verdict`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
+
+from driftfit.data.columns import Wanted
+from driftfit.engine.kernel import Array
+from driftfit.fleets import Fleet
+from driftfit.identify import page
+from driftfit.identify.judgement import effects, errors_of, feedback, moves
+from driftfit.identify.result import Answer
+from driftfit.identify.roles import NoAnswerError, Roles, roles
+from driftfit.identify.scores import FEWEST
+from driftfit.identify.structure import Structure, search
+from driftfit.identify.working_point import cause, clear, regressors
+from driftfit.judge.fleet_verdict import ManyVerdicts
+from driftfit.judge.segment import segment
+from driftfit.judge.verdict import Verdict
+from driftfit.models.arx import ARX
+from driftfit.models.regression import Regression
+from driftfit.results import Track
+from driftfit.show.report import check_path
+from driftfit.show.text import Printed
+from driftfit.trackers.adaptive_kalman import AdaptiveKalman
+from driftfit.tracking import track
+
+LEFT_OUT = 0.01
+"""Share of the readings left out above which there is no answer without ``gate``."""
+FEEDBACK = 5.0
+"""F statistic above which the output is said to act on an input."""
+WORST = 3
+"""Records of a fleet that have a page."""
+
+
+@dataclass(frozen=True)
+class Identification(Answer):
+    """The result of `identify`, an `Answer`; printing it shows some 25 lines."""
+
+    @property
+    def headline(self) -> str:
+        """The answer in one sentence or two."""
+        return page.headline(self)
+
+    def json(self) -> dict[str, Any]:
+        """The answer as plain data, in the form of `driftfit.identify.page.SCHEMA`."""
+        return page.as_json(self)
+
+    def plot(self) -> Any:
+        """The picture of the page; a matplotlib figure."""
+        return page.figure(self)
+
+    def page(self, path: Any = None) -> str:
+        """The answer as one self-contained HTML page; with a ``path`` it is written there."""
+        return _written(page.html(self), path)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for style, line in page.lines(self):
+            yield Text(line, style)
+
+
+@dataclass(frozen=True)
+class ManyIdentified(Printed):
+    """The result of `identify` for records with one structure: the fleet, its verdicts, the clearest three by key."""
+
+    model: ARX
+    track: Fleet = field(repr=False)
+    verdict: ManyVerdicts = field(repr=False)
+    worst: Mapping[Any, Identification]
+
+    @property
+    def headline(self) -> str:
+        """The answer in a sentence."""
+        return self.verdict.sentences[0]
+
+    @property
+    def code(self) -> int:
+        """Exit code of the command: 1 if no record could be judged."""
+        return int(all(row.drifts is None for row in self.verdict.rows))
+
+    def json(self) -> dict[str, Any]:
+        """The records by key, and the clearest as for one record."""
+        rows = {str(row.key): {"moves": row.drifts, "p": row.verdict.p, "q": row.q} for row in self.verdict.rows}
+        worst = {str(key): one.json() for key, one in self.worst.items()}
+        return {"schema": page.NAME, "headline": self.headline, "records": page.finite(rows), "worst": worst}
+
+    def page(self, path: Any = None) -> str:
+        """One page: the table of all records, then the three that move most clearly."""
+        return _written(page.many(self.verdict, self.worst), path)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield Text(f" {len(self.verdict)} records with one structure: {self.model!r}")
+        yield self.verdict
+        for key, one in self.worst.items():
+            yield Text(f"\n {key}: {one.headline}")
+
+
+def _written(text: str, path: Any) -> str:
+    if path is not None:
+        check_path(path).write_text(text, encoding="utf-8")
+    return text
+
+
+def identify(
+    data: Any, y: str | None = None, *, u: Sequence[str] | None = None, not_u: Sequence[str] = (),
+    time: str | None = None, dt: float | None = None, by: str | None = None,
+    limits: Mapping[str, tuple[float | None, float | None]] | None = None, max_lag: int = 30, forecast: bool = False,
+    horizon: int = 10, level: float = 0.05, gate: bool | None = None, budget: float = 45.0, seed: int = 0,
+    reading: Wanted | None = None, progress: Callable[[str], None] = lambda text: None,
+) -> Identification | ManyIdentified:  # fmt: skip
+    """From a table to an answer: roles, structure, drift and its cause.
+
+    Parameters
+    ----------
+    data : table, mapping of columns, path, pattern or list of paths
+    y : name of the output
+        It may be left out if only one column of numbers is left.
+    u, not_u : names
+        The inputs to choose from, and columns that are none. By default every other column of numbers.
+    time, by : names
+        The column of the time, and the one that identifies records; found if not given.
+    dt : number
+        Nominal interval, of dates in seconds; the median by default.
+    limits : mapping from columns to (low, high)
+        Valid ranges; what is outside is missing.
+    max_lag : int
+        Longest lag of an input.
+    forecast : bool
+        Only inputs of earlier samples (nk of at least 1). By default an input of the same sample may explain y, and
+        the forecast is said beside it.
+    horizon : int
+        Steps ahead of the second comparison of errors.
+    level : number
+        Error rate of the statement that parameters move.
+    gate : bool or None
+        As for `track`. None: the gate of the default tracker, but there is no answer where it, or `roles`, leaves out
+        more than `LEFT_OUT` of the readings.
+    budget : number
+        Seconds after which the search stops with what it has.
+    seed : int
+        That of the displaced copies of inputs.
+    reading : Wanted or None
+        How a CSV file is read: decimal sign, separator, form of dates, words for missing values.
+    progress : callable
+        Told what is being done.
+
+    Returns
+    -------
+    Identification, or ManyIdentified for a table with several records.
+
+    Raises
+    ------
+    ValueError
+        For columns that do not exist, an output that is not named and not obvious, and everything that `track` does
+        not accept.
+    driftfit.identify.roles.NoAnswerError
+        For a record that cannot answer: fewer than `FEWEST` rows with all lags, a constant output, text.
+    """
+    began = monotonic()
+    for name, value, low in (("max_lag", max_lag, 1), ("horizon", horizon, 1), ("budget", budget, 0)):
+        if not value >= low:
+            raise ValueError(f"identify: {name} must be at least {low}; got {value!r}.")
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"identify: level must be between 0 and 1, such as 0.05; got {level!r}.")
+    progress("reading")
+    found = roles(data, y, u=u, not_u=not_u, time=time, dt=dt, by=by, limits=limits, codes=gate is not False,
+                  wanted=reading)  # fmt: skip
+    check_record(found)
+    task = _Task(int(forecast), horizon, level, gate, began + budget, seed, progress, _source(data))
+    structure = task.structure(found, max_lag)
+    if found.by is None:
+        return replace(task.judged(found, structure), seconds=monotonic() - began)
+    progress("tracking")
+    model = model_of(found, structure)
+    fleet = track(model, AdaptiveKalman(), **found.signals(model.input_names), by=found.by, gate=gate)
+    verdicts, worst = fleet.verdict(level), {}
+    for row in (one for one in verdicts.rows[:WORST] if one.drifts is not None):
+        worst[row.key] = task.judged(found.record(row.key), structure)
+    return ManyIdentified(model, fleet, verdicts, worst)
+
+
+def check_record(found: Roles) -> None:
+    """NoAnswerError for a record that no structure can answer."""
+    known = found.y[np.isfinite(found.y)]
+    if len(known) < FEWEST:
+        raise NoAnswerError(f"{len(known)} of {len(found.y)} rows hold {found.output}; at least {FEWEST} are needed.")
+    if np.ptp(known) <= 1e-12 * np.max(np.abs(known)):
+        raise NoAnswerError(f"{found.output} is {known[0]:g} in all {len(known)} rows; it must move to be explained.")
+
+
+def model_of(found: Roles, structure: Structure) -> ARX:
+    """The ARX model of a structure."""
+    names = tuple(found.inputs[j] for j, *_ in structure.shape[1])
+    nb, nk = (tuple(one[i] for one in structure.shape[1]) for i in (1, 2))
+    return ARX(structure.na, nb or 0, nk or 1, inputs=names or None, intercept=True)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """The settings of a call."""
+
+    first: int
+    horizon: int
+    level: float
+    gate: bool | None
+    end: float
+    seed: int
+    progress: Callable[[str], None]
+    source: str
+
+    def structure(self, found: Roles, max_lag: int) -> Structure:
+        """The structure of all records, and beside it that of a forecast."""
+        self.progress("searching the structure")
+        y, U, _ = found.centred().spread(max_lag + 1)
+        rng = np.random.default_rng(self.seed)
+        best = search(y, U, max_lag, self.first, self.end, rng)
+        if any(nk == 0 for _, nk in best.lags.values()):
+            self.progress("searching a forecast")
+            best = replace(best, forecast=search(y, U, max_lag, 1, self.end, rng))
+        return best
+
+    def judged(self, found: Roles, structure: Structure) -> Identification:
+        """The answer for one record."""
+        y, U, place = found.spread(structure.na + 40)
+        self.progress("time or working point")
+        phi = regressors(y, U, structure)
+        why_not = cause(y, U, structure, found.inputs, found.output, self.first)
+        self.progress("tracking")
+        model = model_of(found, structure)
+        run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
+        self.progress("judging")
+        verdict = run.verdict(self.level)
+        if verdict.drifts and clear(why_not.curve):
+            self.progress("judging the curve")
+            Z = np.column_stack([phi, why_not.columns])
+            rest = segment(y, Z[:, 1:], Regression(Z.shape[1] - 1, intercept=True), false=self.level)
+            moves_besides = bool(rest.breaks or rest.better)
+            curved = clear(why_not.further) if moves_besides else not clear(why_not.besides)
+            why_not = replace(why_not, kind=("both" if moves_besides else "working point") if curved else "time")
+        theta, memory, own = effects(phi, y, structure, found.inputs)
+        errors = errors_of(run, place, y, U, structure, self.horizon)
+        notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict)
+        kind, why = self._kind(found, run, verdict, why_not.kind)
+        return Identification(
+            kind, why, model, run, verdict, found, structure, why_not, own, moves(verdict, run, theta, memory.root),
+            memory, errors, notes, undecided, self.source,
+        )  # fmt: skip
+
+    def _kind(self, found: Roles, run: Track, verdict: Verdict, kind: str) -> tuple[str, str]:
+        """The answer in a word, and why there is none."""
+        share = 100.0 * max(len(run.left_out), *found.refused.values(), 0) / len(run)
+        if share > 100.0 * LEFT_OUT and self.gate is None:
+            codes = f"{share:.1f} % of the readings look like fault codes or spikes and were left out"
+            return page.KINDS[4], f"{codes}; if they are, say so with --gate, and if not, with --no-gate"
+        if verdict.drifts is None:
+            return page.KINDS[4], verdict.untested
+        if kind == "working point":
+            return page.KINDS[1], ""
+        return page.KINDS[2 if kind == "both" else 0] if verdict.drifts else page.KINDS[3], ""
+
+
+def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -> tuple[str, ...]:
+    """Problems of the data, each in a few words."""
+    notes = [f"{count} readings of {name} taken as codes or spikes" for name, count in found.refused.items()]
+    notes += [f"{count} {reason}, left out by the gate" for reason, count in run.left_out.counts.items()]
+    notes += [f"{found.missing} readings missing"] if found.missing else []
+    notes += [f"gaps in time of {len(y) - len(found.y)} samples in all"] if len(y) > len(found.y) else []
+    fed = [j for j in structure.lags if feedback(y, U[:, j]) > FEEDBACK]
+    notes += [f"{found.output} acts on {found.inputs[j]} (feedback)" for j in fed]
+    at_once = [found.inputs[j] for j in fed if structure.lags[j][1] == 0]
+    notes += [f"the effect at once of {' and '.join(at_once)} may then be its response"] if at_once else []
+    return tuple([*notes, structure.narrowed] if structure.narrowed else notes)
+
+
+def _undecided(structure: Structure, names: Sequence[str], verdict: Verdict) -> tuple[str, ...]:
+    """What the record does not decide, each in a few words."""
+    ranges = [(names[j], *ends) for j, ends in structure.delays.items() if ends[0] < ends[1]]
+    said = [f"the delay of {name}: {low} to {high} samples are as good" for name, low, high in ranges]
+    said += [f"{names[j]} or {names[i]}: either explains the record" for j, i in structure.instead]
+    said += [f"{names[j]}: useful, but so are copies of it at other times" for j in structure.doubtful]
+    return tuple([*said, "a level that wanders, or noise that does"] if verdict.nearly_walk else said)
+
+
+def _source(data: Any) -> str:
+    """What the commands to copy call the data."""
+    return str(data) if isinstance(data, str) or hasattr(data, "__fspath__") else "data.csv"

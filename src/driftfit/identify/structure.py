@@ -1,0 +1,246 @@
+"""Structure: which inputs matter, with which delays and lags, and how many lags of the output.
+
+    y_t = sum_(i <= na) a_i y_(t-i) + sum_j sum_(k < nb_j) b_jk u_j,(t - nk_j - k) + c + v_t
+
+The search climbs from several starts: it adds an input at its best delay, exchanges one for another, leaves one out,
+and lengthens, shortens and shifts its lags, as long as the score less a price rises (`driftfit.identify.scores`). Each
+input costs log p nats, where p is the number of columns among which it was chosen, and each column `COLUMN`. Of the
+structures on the way the simplest within one standard error of the best is taken. An input must then beat copies of
+itself that are displaced in time or reversed, each at its best delay, because a slow input resembles any slow drift.
+
+What is predicted is the present output: with nk = 0 an input explains it, but does not forecast it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from time import monotonic
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.identify.roles import NoAnswerError
+from driftfit.identify.scores import FEWEST, Scores, lead
+
+COLUMN = 1.5
+"""Price of a column in nats, about half the logarithm of the rows that a coefficient needs."""
+TIED = 2.0
+"""Nats within which delays and inputs are said to be as good."""
+COPIES = 19
+OUTPUT_LAGS = 8
+FILLED = 3
+"""Missing readings in a row of a regressor that the search replaces by the last one."""
+
+Shape = tuple[int, tuple[tuple[int, int, int], ...]]
+"""na, and (input, nb, nk) of every input, sorted."""
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What was chosen: ``na``, and (nb, nk) of each input by its place.
+
+    ``delays``: the least and the largest nk that are as good. ``second``: other structures, by how many nats they are
+    behind, and the standard error of that. ``doubtful``: inputs that are no better than displaced copies. ``instead``:
+    pairs of an input and one that could replace it. ``forecast``: the same with nk of at least 1, if it is another.
+    ``narrowed``: where the search was cut short.
+    """
+
+    na: int
+    lags: Mapping[int, tuple[int, int]]
+    delays: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    second: tuple[tuple[Shape, float, float], ...] = ()
+    doubtful: tuple[int, ...] = ()
+    instead: tuple[tuple[int, int], ...] = ()
+    forecast: Structure | None = None
+    narrowed: str = ""
+
+    @property
+    def shape(self) -> Shape:
+        return self.na, tuple((j, nb, nk) for j, (nb, nk) in sorted(self.lags.items()))
+
+
+def filled(x: Array) -> Array:
+    """A signal (T,) with at most `FILLED` missing readings in a row replaced by the last one, but not across gaps in
+    time, which are inf; NaN for what stays missing."""
+    t, known = np.arange(len(x)), ~np.isnan(x)
+    last = np.maximum.accumulate(np.where(known, t, 0))
+    return np.where((t - last <= FILLED) & np.isfinite(x[last]), x[last], np.nan)
+
+
+def lagged(x: Array, k: int) -> Array:
+    """A signal k samples ago."""
+    return np.concatenate([np.full(k, np.nan), x[: len(x) - k]])
+
+
+class Pool:
+    """All columns of a record on a regular grid: 1, na lags of y (T,), lags first..M of every column of U (T, m)."""
+
+    def __init__(self, y: Array, U: Array, M: int, first: int = 0, na: int = OUTPUT_LAGS, more: Array | None = None):
+        past, U = filled(y), np.column_stack([filled(u) for u in U.T]) if U.shape[1] else U
+        self.m, self.M, self.na = U.shape[1], M, na
+        self.place: dict[tuple[int, int], int] = {}
+        columns = [np.ones(len(y))]
+        for j, x in [(-1, past), *enumerate(U.T)]:
+            for k in range(1, na + 1) if j < 0 else range(first, M + 1):
+                self.place[j, k] = len(columns)
+                columns.append(lagged(x, k))
+        X = np.column_stack([*columns, *([] if more is None else [more])])
+        self.rows = np.flatnonzero(np.isfinite(X).all(axis=1) & np.isfinite(y))
+        if len(self.rows) < FEWEST:
+            raise NoAnswerError(f"{len(self.rows)} rows of {len(y)} have all lags; at least {FEWEST} are needed.")
+        self.scores = Scores(X[self.rows], y[self.rows])
+        self.shapes: dict[Shape, float] = {}
+
+    def columns(self, shape: Shape) -> list[int]:
+        na, inputs = shape
+        each = [self.place[-1, k] for k in range(1, na + 1)]
+        return [0, *each, *(self.place[j, k] for j, nb, nk in inputs for k in range(nk, nk + nb))]
+
+    def fits(self, shape: Shape) -> bool:
+        na, inputs = shape
+        return 0 <= na <= self.na and all(nb >= 1 and (j, nk) in self.place and nk + nb - 1 <= self.M
+                                          for j, nb, nk in inputs)  # fmt: skip
+
+    def value(self, shape: Shape) -> float:
+        """The score less the price."""
+        if shape not in self.shapes:
+            columns = self.columns(shape)
+            price = COLUMN * len(columns) + np.log(self.scores.p) * len(shape[1])
+            self.shapes[shape] = self.scores.score(columns) - price
+        return self.shapes[shape]
+
+    def best_delays(self, shape: Shape) -> dict[int, tuple[float, int]]:
+        """(score, delay) of every input that the structure lacks, added at its best delay."""
+        added, used = self.scores.added(self.columns(shape)), {j for j, *_ in shape[1]}
+        best: dict[int, tuple[float, int]] = {}
+        for (j, k), column in self.place.items():
+            if j >= 0 and j not in used:
+                best[j] = max(best.get(j, (-np.inf, 0)), (float(added[column]), k))
+        return best
+
+    def near(self, shape: Shape) -> list[Shape]:
+        """The structures one step away."""
+        na, inputs = shape
+        found: list[Shape] = [(na - 1, inputs), (na + 1, inputs)]
+        found += [(na, (*inputs, (j, 1, k))) for j, (_, k) in self.best_delays(shape).items()]
+        for one in inputs:
+            j, nb, nk = one
+            rest = tuple(other for other in inputs if other != one)
+            moves = [(nb - 1, nk), (nb - 1, nk + 1), (nb + 1, nk), (nb + 1, nk - 1), (1, nk), (1, nk + nb - 1)]
+            moves += [(nb, nk + d) for d in (-3, -2, -1, 1, 2, 3)]
+            found += [(na, rest), *((na, (*rest, (j, *move))) for move in moves)]
+            found += [(na, (*rest, (i, 1, k))) for i, (_, k) in self.best_delays((na, rest)).items()]
+        return [(na, tuple(sorted(inputs))) for na, inputs in found if self.fits((na, inputs))]
+
+    def climb(self, shape: Shape, late: Callable[[], bool]) -> Shape:
+        """The structure from which no step rises."""
+        while not late() and self.value(top := max(self.near(shape), key=self.value)) > self.value(shape):
+            shape = top
+        return shape
+
+    def simplest(self, shape: Shape) -> Shape:
+        """The simplest within one standard error: lags are left out as long as the loss is no larger than that."""
+        best = self.scores.terms(self.columns(shape))
+        while True:
+            size = len(self.columns(shape))
+            simpler = [one for one in self.near(shape) if len(self.columns(one)) < size]
+            top = max(simpler, key=self.value, default=shape)
+            loss, error = lead(best, self.scores.terms(self.columns(top)))
+            if top == shape or loss > min(error, TIED):
+                return shape
+            shape = top
+
+
+def search(y: Array, U: Array, M: int, first: int, end: float, rng: np.random.Generator) -> Structure:
+    """The structure of a record on a regular grid; ``end``: the time (`time.monotonic`) at which the search stops."""
+    M, narrowed = _affordable(y, U, M)
+    pool = Pool(y, U, M, first)
+    out_of_time = False
+
+    def late() -> bool:
+        nonlocal out_of_time
+        out_of_time |= monotonic() > end
+        return out_of_time
+
+    shape: Shape = (2, ())
+    for _ in range(3):  # the floor is that of the best structure
+        before = pool.scores.refer(pool.columns(shape))
+        pool.shapes.clear()
+        starts = dict.fromkeys([shape, (2, ()), (0, ())])
+        shape = max((pool.climb(one, late) for one in starts), key=pool.value)
+        if late() or abs(np.log(pool.scores.refer(pool.columns(shape)) / before)) < 0.05:
+            break
+    shape = pool.simplest(shape)
+    doubtful = tuple(j for j, _, _ in shape[1] if not late() and not _beats_copies(y, U, shape, j, M, rng))
+    if doubtful:  # the others may need other lags without them
+        for climbed in (False, True):
+            shape = pool.climb(shape, late) if climbed else shape
+            shape = shape[0], tuple(one for one in shape[1] if one[0] not in doubtful)
+    narrowed = "; ".join(filter(None, (narrowed, "the budget of time ended the search" if late() else "")))
+    return _told(pool, shape, doubtful, narrowed)
+
+
+def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], narrowed: str) -> Structure:
+    """A structure with its rivals."""
+    own = pool.scores.terms(pool.columns(shape))
+
+    def behind(other: Shape) -> tuple[float, float]:
+        return lead(own, pool.scores.terms(pool.columns(other)))
+
+    delays, instead = {}, []
+    for one in shape[1]:
+        j, nb, nk = one
+        rest = tuple(other for other in shape[1] if other != one)
+        tied = [nk]
+        for step in (-1, 1):
+            k = nk + step
+            while pool.fits(shifted := (shape[0], (*rest, (j, nb, k)))) and behind(shifted)[0] < TIED:
+                tied.append(k)
+                k += step
+        delays[j] = min(tied), max(tied)
+        base = float(own.sum())
+        others = pool.best_delays((shape[0], rest)).items()
+        instead += [(j, i) for i, (score, _) in others if i != j and base - score < TIED]
+    rivals = sorted((one for one in pool.shapes if one != shape), key=pool.value, reverse=True)
+    second = tuple((one, *behind(one)) for one in rivals[:3])
+    lags = {j: (nb, nk) for j, nb, nk in shape[1]}
+    return Structure(shape[0], lags, delays, second, doubtful, tuple(instead), narrowed=narrowed)
+
+
+COLUMNS = 250
+"""Columns that the search holds in memory: 80 blocks and four memories of them take a fifth of a gigabyte."""
+
+
+def _affordable(y: Array, U: Array, M: int) -> tuple[int, str]:
+    """The longest lag that memory and record allow, and what is said of it: half of the rows must have all lags."""
+    most = max(1, min(M, len(y) // 10, COLUMNS // max(U.shape[1], 1) - 1))
+    known, reading = np.isfinite(np.column_stack([filled(x) for x in (y, *U.T)])).all(axis=1), np.isfinite(y)
+    while most > 1 and 2 * np.sum(_in_a_row(known, most) & reading) < np.sum(_in_a_row(known, 1) & reading):
+        most -= 1
+    return most, f"lags of inputs up to {most} instead of {M}" if most < M else ""
+
+
+def _in_a_row(known: Array, k: int) -> Array:
+    """Where the last k and the present sample are known."""
+    total = np.cumsum(np.concatenate([np.zeros(k + 1), known]))
+    return np.asarray(total[k + 1 :] - total[: -k - 1] > k) & known if k else known
+
+
+def _beats_copies(y: Array, U: Array, shape: Shape, j: int, M: int, rng: np.random.Generator) -> bool:
+    """Whether an input is more useful than copies of itself at other times, each at the best of several delays."""
+    others = tuple(one for one in shape[1] if one[0] != j)
+    used = [j, *(one[0] for one in others)]
+    x, T = filled(U[:, j]), len(y)
+    x = np.where(np.isfinite(x), x, np.nanmean(x))
+    both, copies = np.concatenate([x, x[::-1]]), []
+    for k in range(COPIES):
+        moved = np.roll(both, int(rng.integers(T // 10, T - T // 10)))[:T][:: 1 if k % 2 else -1]
+        copies += [np.roll(moved, lag) for lag in range(0, 24, 3)]
+    depth = max(nb + nk - 1 for _, nb, nk in shape[1])
+    pool = Pool(y, U[:, used], max(depth, 1), na=max(shape[0], 1), more=np.column_stack(copies))
+    base = pool.columns((shape[0], tuple((used.index(i), nb, nk) for i, nb, nk in others)))
+    pool.scores.refer(base)
+    own = next(one for one in shape[1] if one[0] == j)
+    with_it = pool.scores.score([*base, *(pool.place[0, k] for k in range(own[2], own[2] + own[1]))])
+    return bool(with_it > pool.scores.added(base)[-len(copies) :].max())

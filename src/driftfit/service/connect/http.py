@@ -1,0 +1,123 @@
+"""HTTP: samples that clients send to ``POST /api/samples`` of the page; answered once they are in the journal."""
+
+from __future__ import annotations
+
+import json
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from driftfit.service.connect.base import Batch, Reader, Source
+from driftfit.service.connect.samples import NO_SIGNAL, TOO_MANY_NEW, Receipt, Samples, ShapeError, decode
+
+ANSWER_SECONDS = 30.0
+"""After this time a request that is not yet journaled is answered with an error."""
+SENT_BEFORE = frozenset({"late", "duplicate"})
+"""Reasons for which a sender need not mend anything: it has sent the samples before, or others were faster."""
+TOO_FAST = frozenset({"flood", TOO_MANY_NEW})
+"""Reasons for which a sender has to wait."""
+_BODY = msgspec.json.Decoder(dict[str, msgspec.Raw])
+
+
+@dataclass(frozen=True)
+class HttpSource(Source):
+    """Samples over HTTP; host, port and tokens are those of [page]. Clients keep what is not yet acknowledged."""
+
+    def open(self, position: Any) -> Reader:
+        return _Http()
+
+
+class _Http(Reader):
+    def read(self, wait: float) -> Batch | None:
+        try:
+            return INCOMING.queue.get(timeout=wait)
+        except queue.Empty:
+            return None
+
+
+class Incoming:
+    """Samples that came over HTTP and wait for the source of kind http; bounded, so senders wait."""
+
+    def __init__(self, most: int = 256) -> None:
+        self.queue: queue.Queue[Batch] = queue.Queue(most)
+
+    def offer(
+        self, topic: str, body: bytes, client: str = "", foreign: Callable[[str], list[str]] = lambda topic: []
+    ) -> dict[str, Any]:
+        """Decode a request, wait until it is in the journal, and report what was received and what was left out.
+
+        Nothing is taken if ``foreign`` names units of a topic, which the sender may not touch: the status is then 403.
+        The status is 200 if anything was taken, or all of it was known already; 400 if nothing is JSON, 429 if it was
+        too much for the rate of its unit, and 422 if there are no samples in it, or no unit could use them.
+        """
+        samples, refused, shaped = decoded(topic, body)
+        for name, units in ((one.topic, foreign(one.topic)) for one in samples):
+            if units:
+                return {"error": f"this sender may not send samples of {', '.join(units)} ({name}).", "status": 403}
+        done, receipt = threading.Event(), Receipt()
+        batch = Batch(samples, done.set, client=client, refused=len(refused), arrived=time.monotonic(), receipt=receipt)
+        try:
+            self.queue.put(batch, timeout=ANSWER_SECONDS)
+        except queue.Full:
+            return {"error": "busy: samples are held back; try again later", "status": 503}
+        if not done.wait(ANSWER_SECONDS):
+            return {"error": "the journal does not take samples now; try again later", "status": 503}
+        received, left_out = sum(one.length for one in samples), receipt.left_out
+        answer: dict[str, Any] = {"received": received, "refused": refused[:20], "left_out": dict(left_out)}
+        if not samples:
+            error = "; ".join(refused[:20]) or "the body has no topic."
+            return answer | {"error": error, "status": 422 if shaped else 400}
+        if receipt.missing:
+            answer["missing"] = receipt.missing
+        reasons = left_out.keys() - {NO_SIGNAL} or left_out.keys()  # a unit that does not read a signal refuses nothing
+        if left_out.total() < receipt.offered or reasons <= SENT_BEFORE:
+            return answer
+        why = ", ".join(f"{reason} ({count})" for reason, count in left_out.items())
+        return answer | {"error": f"no sample was taken: {why}.", "status": 429 if TOO_FAST & left_out.keys() else 422}
+
+
+INCOMING = Incoming()
+"""The one queue of this process."""
+
+
+def decoded(topic: str, body: bytes) -> tuple[list[Samples], list[str], bool]:
+    """Samples of one topic, or of a mapping from topics to payloads; what could not be read; and whether all of that is
+    JSON in another shape.
+    """
+    if topic:
+        try:
+            return [decode(topic, body)], [], False
+        except ValueError as error:
+            return [], [str(error)], isinstance(error, ShapeError)
+    parts = _payloads(body)
+    if parts is None:
+        return [], ["the body is not an object with a payload for each topic, in JSON."], False
+    samples, refused, shaped = [], [], bool(parts)
+    for name, payload in parts.items():
+        try:
+            samples.append(decode(name, bytes(payload)))
+        except ValueError as error:
+            refused.append(f"{name[:100]}: {error}")
+            shaped = shaped and isinstance(error, ShapeError)
+    return samples, refused, shaped
+
+
+def _payloads(body: bytes) -> Mapping[str, Any] | None:
+    """The payload of each topic; also of JSON with NaN or Infinity, which Python's own encoder writes."""
+    try:
+        found: Mapping[str, Any] = _BODY.decode(body)
+        return found
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        pass
+    if b"NaN" not in body and b"Infinity" not in body:
+        return None
+    try:
+        parts = json.loads(body)
+        return {name: json.dumps(one).encode() for name, one in parts.items()} if isinstance(parts, dict) else None
+    except (ValueError, RecursionError):
+        return None

@@ -1,0 +1,255 @@
+"""identify: roles, scores against a slow twin, structure, cause, and the answer for a record that ships."""
+
+import json
+from importlib.resources import files
+from time import monotonic
+
+import numpy as np
+import polars as pl
+import pytest
+from typer.testing import CliRunner
+
+from driftfit import identify
+from driftfit.cli import app
+from driftfit.identify.judgement import ahead, mixed, recursive
+from driftfit.identify.page import SCHEMA, verb
+from driftfit.identify.result import Move
+from driftfit.identify.roles import NoAnswerError, roles
+from driftfit.identify.scores import RIDGE, Scores
+from driftfit.identify.structure import Structure, search
+from driftfit.identify.working_point import cause, regressors
+
+PUMP = str(files("driftfit.demo") / "pump.csv")
+T = 900
+
+
+@pytest.fixture(scope="module")
+def pump():
+    return identify(PUMP, y="flow")
+
+
+def plant(change, seed=0):
+    """y with one lag, an effect of u1 at delay 6 that is constant, jumps or is bent, one of u2 at once; u3 is idle."""
+    rng = np.random.default_rng(seed)
+    U, y = rng.normal(size=(T, 3)), np.zeros(T)
+    gain = np.where((np.arange(T) > 450) & (change == "time"), 2.0, 1.0)
+    for t in range(6, T):
+        x = np.abs(U[t - 6, 0]) if change == "working point" else U[t - 6, 0]
+        y[t] = 0.5 * y[t - 1] + gain[t] * x + 0.6 * U[t, 1] + rng.normal()
+    return y, U
+
+
+def searched(y, U, first=0, budget=60.0):
+    return search(y, U, 12, first, monotonic() + budget, np.random.default_rng(0))
+
+
+def table(**more):
+    """A table of 300 rows with an output, an input and further columns."""
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=300)
+    return {"flow": np.cumsum(u), "pressure": u, **{name: make(rng, u) for name, make in more.items()}}
+
+
+ROLES = {
+    "a constant": (lambda rng, u: np.full(300, 7.0), "constant"),
+    "a copy": (lambda rng, u: 3.0 - 2.0 * u, "a copy of pressure"),
+    "a label": (lambda rng, u: (np.arange(300) > 200) * 1.0, "labels of 0 and 1"),
+    "a second clock": (lambda rng, u: np.arange(300) * 2.0, "a second clock"),
+    "text": (lambda rng, u: [f"note {k}" for k in range(300)], "text"),
+    "mostly empty": (lambda rng, u: np.where(np.arange(300) < 200, np.nan, rng.normal(size=300)), "mostly empty"),
+    "a switch": (lambda rng, u: (np.arange(300) // 10 % 2) * 1.0, ""),
+}
+
+
+@pytest.mark.parametrize("what", ROLES)
+def test_columns_that_are_no_inputs_are_named_with_the_reason(what):
+    make, why = ROLES[what]
+    found = roles(table(clock=lambda rng, u: np.arange(300.0), extra=make), "flow")
+    assert found.clock == "clock"
+    assert found.why.get("extra", "") == why
+    assert found.inputs == (("pressure",) if why else ("pressure", "extra"))
+    forced = roles(table(extra=make), "flow", u=["pressure", "extra"]) if what != "text" else None
+    assert forced is None or forced.inputs == ("pressure", "extra")
+
+
+def test_codes_and_spikes_are_missing_in_inputs_too():
+    given = table()
+    given["pressure"][[20, 120, 121]] = -715.0, 999.0, 999.0
+    found = roles(given, "flow")
+    assert found.refused == {"pressure": 3}
+    assert np.isnan(found.U[[20, 120, 121], 0]).all()
+    pulses = np.where(np.random.default_rng(2).random(300) < 0.05, np.random.default_rng(3).exponential(size=300), 0.0)
+    assert roles({**given, "pressure": pulses}, "flow").refused == {}  # rain is no fault
+
+
+def test_keys_clocks_that_run_back_and_gaps():
+    time = np.concatenate([np.arange(150.0), np.arange(150.0)])
+    found = roles(table(clock=lambda rng, u: time, pump=lambda rng, u: ["b"] * 150 + ["a"] * 150), "flow", time="clock")
+    assert (found.by, found.groups.max()) == ("pump", 1)
+    assert roles(table(clock=lambda rng, u: time), "flow", time="clock").key[-1] == "record 2"
+    late = np.arange(300.0) + 3.0 * (np.arange(300) > 100)
+    y, U, place = roles(table(clock=lambda rng, u: late), "flow").spread(10)
+    assert len(y) == 303
+    assert np.isinf(y[101:104]).all()
+    assert np.isinf(U[101:104]).all()
+    assert place[101] == 104
+
+
+def test_an_output_that_is_not_obvious_is_asked_for():
+    with pytest.raises(ValueError, match="name the output with --y; the columns of numbers are flow, pressure"):
+        roles(table())
+    assert roles({"flow": table()["flow"], "name": ["x"] * 300}).output == "flow"
+
+
+def naive_score(X, y, S, rows):
+    """Log-likelihood of blocks under coefficients of the blocks before them, with full memory, by plain loops."""
+    Z = np.column_stack([(X - [0.0, *X[:, 1:].mean(0)]) / [1.0, *X[:, 1:].std(0)], (y - y.mean()) / y.std()])
+    B = int(np.clip(len(y) // rows, 8, 80))
+    edges, total = np.linspace(0, len(y), B + 1).astype(int), 0.0
+    for b in range(max(2, int(np.ceil(0.15 * B))), B):
+        before, own = Z[: edges[b]][:, [*S, -1]], Z[edges[b] : edges[b + 1]][:, [*S, -1]]
+        A = before[:, :-1].T @ before[:, :-1] + RIDGE * np.eye(len(S))
+        e = own[:, -1] - own[:, :-1] @ np.linalg.solve(A, before[:, :-1].T @ before[:, -1])
+        total -= 0.5 * len(e) * np.log(np.mean(e**2))
+    return total
+
+
+def test_scores_are_those_of_a_slow_twin_and_each_added_column_that_of_the_larger_set():
+    rng = np.random.default_rng(4)
+    X = np.column_stack([np.ones(T), rng.normal(size=(T, 5))])
+    y = X @ [1.0, 2.0, 0.0, -1.0, 0.0, 0.0] + rng.normal(size=T)
+    one = Scores(X, y, memories=(np.inf,))
+    assert one.score([0, 1, 3]) == pytest.approx(naive_score(X, y, [0, 1, 3], 30), abs=1e-8)
+    for both in (Scores(X, y), Scores(X[:300], y[:300])):  # the second predicts blocks from both sides
+        both.refer([0, 1])
+        added = both.added([0, 1])
+        assert added[2:] == pytest.approx([both.score([0, 1, c]) for c in range(2, 6)], abs=1e-6)
+        assert np.isneginf(added[:2]).all()
+
+
+@pytest.mark.parametrize("change", ["", "time", "working point"])
+def test_structure_and_cause(change):
+    y, U = plant(change)
+    found = searched(y, U)
+    assert (found.na, dict(found.lags)) == (1, {0: (1, 6), 1: (1, 0)}) if change != "working point" else True
+    late = searched(y, U, first=1)
+    assert 1 not in late.lags
+    assert all(nk >= 1 for _, nk in late.lags.values())
+    given = Structure(1, {0: (1, 6), 1: (1, 0)})
+    assert cause(y, U, given, ("u1", "u2", "u3"), "y", 0).kind == change
+
+
+def test_a_slow_input_that_is_no_better_than_its_copies_is_left_out():
+    rng = np.random.default_rng(11)
+    walk, other = np.cumsum(rng.normal(size=(2, T)), axis=1)
+    y = 0.2 * walk + rng.normal(size=T)  # nothing to do with the input
+    found = searched(y, other[:, None])
+    assert found.lags == {}
+    assert searched(y, walk[:, None]).lags.keys() == {0}
+
+
+def test_the_budget_narrows_the_search():
+    y, U = plant("")
+    assert "budget" in searched(y, U, budget=0.0).narrowed
+    assert (
+        "up to 12 instead of 30"
+        in search(y[:120], U[:120], 30, 0, monotonic() + 9.0, np.random.default_rng(0)).narrowed
+    )
+
+
+def test_predictions_of_constants_and_their_mixture():
+    y, U = plant("time")
+    phi = regressors(y, U, Structure(1, {0: (1, 6)}))
+    used = np.isfinite(phi).all(axis=1)
+    theta = recursive(phi, y, used)
+    t = 700
+    rows = np.flatnonzero(used[:t])
+    assert theta[t] == pytest.approx(np.linalg.lstsq(phi[rows], y[rows], rcond=None)[0], abs=1e-6)
+    one = np.einsum("tn,tn->t", theta, phi)
+    assert ahead(theta, y, phi[:, 2:], 1, 1)[t] == pytest.approx(one[t])
+    step = theta[t] @ [1.0, theta[t] @ phi[t], U[t + 1 - 6, 0]]
+    assert ahead(theta, y, phi[:, 2:], 1, 2)[t + 1] == pytest.approx(step)
+    good, bad = y + np.random.default_rng(5).normal(size=(2, T)) * [[0.5], [2.0]]
+    first = np.where(np.arange(T) < T // 2, good, bad)
+    second = np.where(np.arange(T) < T // 2, bad, good)
+    w = mixed(first, second, y, None, 1)
+    error = np.sqrt(np.mean((y - w * first - (1.0 - w) * second) ** 2))
+    assert error < 0.75
+    assert w[:11] == pytest.approx(0.5)
+
+
+def test_the_answer_for_a_pump(pump):
+    assert pump.kind == "moves"
+    assert pump.code == 0
+    assert pump.model.lags == ((1, 7), (1, 2))
+    assert pump.model.input_names == ("pressure", "speed")
+    (move,) = pump.moves
+    assert move.what == "pressure"
+    assert 430 <= move.at <= 570
+    assert move.after < 0.75 * move.before
+    assert pump.headline.startswith("The effect of pressure on flow (delay 70 s) fell from 1.3")
+    one, ten = pump.errors
+    assert one.rms["driftfit"] < 0.95 * one.rms["constants"]
+    assert ten.steps == 10
+    text = str(pump)
+    assert len(text.splitlines()) <= 25
+    assert "pump (constant)" in text
+    assert "driftfit detect" in text
+    assert "Not needed: temperature, humidity" in text
+
+
+def test_the_page_and_the_data_of_an_answer(pump, tmp_path):
+    data = pump.json()
+    assert data.keys() == SCHEMA["properties"].keys()
+    assert data["answer"] in SCHEMA["properties"]["answer"]["enum"]
+    json.dumps(data, allow_nan=False)
+    kinds = {"string": str, "object": dict, "array": list}
+    typed = {name: kinds[one["type"]] for name, one in SCHEMA["properties"].items() if str(one.get("type")) in kinds}
+    assert {name: type(data[name]) for name in typed} == typed
+    pump.page(tmp_path / "pump.html")
+    page = (tmp_path / "pump.html").read_text()
+    heads = [
+        "What, since when",
+        "The picture",
+        "How good",
+        "Time or working point",
+        "What was chosen",
+        "Problems",
+        "not decide",
+        "To go on",
+    ]
+    assert [page.index(head) for head in heads] == sorted(page.index(head) for head in heads)
+
+
+CODES = {
+    "no such column": (["--y", "flux"], 2, "no column 'flux'"),
+    "no output named": ([], 2, "name the output with --y"),
+    "too few rows": (["--y", "flow", "--limits", "flow=0:11"], 3, "24 rows of 800 have all lags; at least 60"),
+    "constant output": (["--y", "pump"], 3, "pump is 1 in all 800 rows"),
+    "text": (["--y", "time", "--time", "speed"], 3, "holds text"),
+}
+
+
+@pytest.mark.parametrize("what", CODES)
+def test_exit_codes_of_the_command(what):
+    options, code, message = CODES[what]
+    result = CliRunner().invoke(app, ["identify", PUMP, *options])
+    assert (result.exit_code, message in result.output) == (code, True), result.output
+
+
+def test_a_negative_effect_neither_rises_nor_falls():
+    def moved(before, after):
+        return verb(Move("u", "step", before, after, "", "", 0, ()))
+
+    assert [moved(-1.9, -1.4), moved(-1.4, -1.9), moved(1.0, 2.0), moved(1.0, -1.0)] == [
+        "weakened", "grew stronger", "rose", "fell",
+    ]  # fmt: skip
+
+
+def test_more_than_one_in_a_hundred_left_out_is_no_answer_unless_the_gate_is_asked_for(pump, tmp_path):
+    table = pl.read_csv(PUMP).with_columns(
+        pl.when(pl.int_range(800) % 40 == 0).then(-715.0).otherwise(pl.col("speed")).alias("speed")
+    )
+    assert identify(table, y="flow").headline.startswith("Cannot decide: 2.5 % of the readings look like fault codes")
+    with pytest.raises(NoAnswerError, match="at least 60"):
+        identify(table[:50], y="flow")
