@@ -97,7 +97,7 @@ def journal(options, folder):
 
 def engine(options, folder):
     """The engine alone: decoded batches of 20 samples of each of 1,000 units, to stored results; with alarms too."""
-    for kinds in ((), ("innovation", "band"), ("glr",)):
+    for kinds in ((), ("band",), ("glr",)):
         one = Engine(parse(HTTP + UNIT), folder / "-".join(("engine", *kinds)))
         watched(one, options.units, kinds)
         wall, cpu = fed(one, options.units, 10)

@@ -53,8 +53,8 @@ def main(path: str, figures: str | None = None) -> None:
         labels = part["anomaly"].to_numpy() > 0.5
         reference = int(np.argmax(labels)) * 3 // 4
         run = followed(part, reference)
-        for kind in ("band", "innovation"):
-            alarms = run.detect(kind, every=EVERY, reference=reference, window=20, hold=30)
+        for kind in ("glr", "band"):
+            alarms = run.detect(kind, every=EVERY, reference=reference)
             got = alarms.score(labels)
             numbers = (got.events, got.found, f"{got.delay:g}", got.false, f"{got.normal / EVERY:.2f}", got.normal)
             table.add_row(name, kind, *map(str, numbers))

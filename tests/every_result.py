@@ -49,7 +49,7 @@ def every_result():
     found |= {"Track.smooth": run.smooth(), "Bank.hypotheses": bank.hypotheses, "Bank.smooth": bank.smooth()}
     found |= {"Tuned": tune(ARX(2, 2), Kalman(), Y, U), "TunedOutputs": tune(ARX(1, 1, ny=2), Kalman(), TWO, U)}
     found |= {"Selection": select([ARX(2, 2), ARX(1, 1)], Y, U, tracker=RLS(1.0)), "Segmentation": run.segment()}
-    found |= {"Frontier": frontier(ARX(2, 2), Y, U), "detect": run.detect("innovation")}
+    found |= {"Frontier": frontier(ARX(2, 2), Y, U), "detect": run.detect(records=8)}
     found |= {"Forecast": run.forecast(2, U[:2]), "Prediction": run.ahead(2), "Response": run.step_response(5)}
     found["Constrained"] = run.constrain("a1 >= 0")
     found["Pooled"] = pool(track(Regression(1), Kalman(q=0.0, r=1.0), Y.reshape(10, 20), U.reshape(10, 20), by="row"))

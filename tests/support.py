@@ -4,16 +4,10 @@ Compiled combinations are what costs time, so the tests share them: ARX(2, 2) (n
 Regression(1) (n = 1), in tiles of one lane or of a fleet's width.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import numpy as np
 
-from driftfit import Kalman
 from driftfit.engine.drivers import drivers
-from driftfit.engine.kernel import exp, kernel
 from driftfit.engine.tiles import make_tile, output_type
-from driftfit.trackers.kalman import INDEPENDENT
 
 BAD = (np.nan, np.inf, -np.inf, 1e200, -1e200)
 THETA = np.array([1.2, -0.5, 1.0, 0.4])
@@ -59,29 +53,3 @@ def same(a, b):
 def rows_of(text):
     """The words of each line of a printed table."""
     return [line.split() for line in str(text).splitlines() if line.split()]
-
-
-@kernel
-def store(o, s, l):
-    o.window[l] = s.window[l]
-
-
-@kernel
-def doubt(s, l):
-    for i in range(s.theta.shape[0]):
-        s.var[i, l] = s.P[i, i, l]
-    s.window[l] = 1.0 - exp(-0.5 * s.ok[l] * s.e[l] * s.e[l] / s.s[l])
-
-
-@dataclass(frozen=True)
-class Doubtful(Kalman):
-    """A Kalman filter that calls the share of smaller innovations a probability."""
-
-    outputs: ClassVar[tuple[str, ...]] = ("window",)
-
-    def state(self, n):
-        return {**super().state(n), "window": 0.0}
-
-    @property
-    def steps(self):
-        return INDEPENDENT._replace(report=doubt, store=store)

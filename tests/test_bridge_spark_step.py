@@ -96,7 +96,7 @@ def test_outputs_have_alarms_each():
     rows = rows_of(2, 6, 600, y=PAIR.outputs)
     y, u = 0.1 * np.random.default_rng(1).normal(size=(400, 2)), np.random.default_rng(2).normal(size=400)
     reference = track(PAIR, K, y, u)
-    rule = reference["pressure"].detect("innovation", every=20.0, reference=300).rule
+    rule = reference["pressure"].detect(every=20.0, reference=300).rule
     stream = ByHand(PAIR, rules=(None, rule), hold=0.0)
     for part in np.array_split(np.arange(len(rows)), 3):
         stream.batch(rows[part])
@@ -204,7 +204,7 @@ def test_a_unit_with_keyed_state_gives_what_the_sorted_table_gives():
     y, u, t = (rows[name].to_numpy() for name in "yut")
     reference = track(MODEL, K, *np.random.default_rng(1).normal(size=(2, 400)))
     for dated in (False, True):
-        rule = reference.detect("glr" if dated else "innovation", every=20.0, reference=300).rule
+        rule = reference.detect(every=20.0, reference=300).rule
         hold = np.timedelta64(4, "s") if dated else HOLD
         task = replace(task_of(), dt="1s" if dated else None)
         time = (t * 1e6).astype("M8[us]") if dated else t

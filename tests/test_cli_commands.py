@@ -174,7 +174,7 @@ def test_detect_scores_labels_and_writes_alarms(table):
     assert "--labels: labels are 0 or 1" in fails("detect", *DATED, *options[:-1], "flow")
 
 
-@pytest.mark.parametrize(("kind", "name"), [("glr", "a.csv"), ("cusum", "a.parquet"), ("innovation", "a.csv")])
+@pytest.mark.parametrize(("kind", "name"), [("glr", "a.csv"), ("glr", "a.parquet")])
 def test_alarms_of_other_kinds_are_written_too(table, kind, name):
     run(
         "detect", *DATED, "--kind", kind, "--reference", "150", "--every", "100", "--out", name, "--report", "page.html"

@@ -40,7 +40,7 @@ GIVEN = {
 """By page, what its sketches take for granted besides `COMMON`."""
 
 NO_CODE = {
-    "choosing_a_tracker.md", "coloured_noise.md", "flexible_least_squares.md",
+    "choosing_a_tracker.md", "coloured_noise.md", "flexible_least_squares.md", "identify.md",
     "instrumental_variables.md", "spark.md", "structure.md",
 }  # fmt: skip
 """Pages whose indented lines are lists or formulas, or need Java or a file of their own."""

@@ -32,6 +32,8 @@ ELSEWHERE = {
     "driftfit warm": ("tests/test_cli_commands.py", 'run("warm", "--model", "arx:1,1", *KALMAN)'),
     "driftfit journal verify": ("tests/test_service_journal.py", '["journal", "verify", str(folder)'),
     "driftfit serve": ("tests/service_support.py", '"driftfit", "serve", *(what or ["--demo"])'),
+    "driftfit track pump.csv --y flow --u 'pressure,speed'": ("tests/test_identify.py", "commands(pump)[:2]"),
+    "driftfit detect pump.csv --y flow --u 'pressure,speed'": ("tests/test_identify.py", "commands(pump)[:2]"),
     "python examples/controller.py": ("tests/test_embedded.py", '["controller.py"]'),
     "python -m lab bench accuracy": ("lab/tests/test_bench.py", '["bench", "accuracy", "--quick"'),
     "python -m lab budgets": ("tests/test_budgets.py", '["budgets"]'),
@@ -79,7 +81,7 @@ def _kind(command: str) -> str:
 
 def test_commands_are_found():
     kinds = {kind: of_kind(kind) for kind in ("elsewhere", "driftfit", "benchmark", "record")}
-    assert "python benchmarks/alarm_rates.py 30" in kinds["benchmark"]
+    assert "python benchmarks/alarms.py" in kinds["benchmark"]
     assert "driftfit trackers" in kinds["driftfit"]
     assert any("hammerstein-wiener:2,2,input=polynomial/3" in command for command in kinds["driftfit"])
     assert "driftfit track pump.csv --y flow --u pressure --report report.html" in kinds["driftfit"]

@@ -464,7 +464,7 @@ def test_readme_and_header_say_what_there_is(tmp_path):
     readme, header = (tmp_path / "README.md").read_text(), (tmp_path / "tracker.h").read_text()
     page = " ".join((Path(__file__).parent.parent / "docs/embedded.md").read_text().split())
     assert "632 bytes in double precision" in readme
-    assert "state of `Kalman` has 1280 bytes" in page
+    assert "state of `Kalman` has 632 bytes" in page
     assert "at most 3675 multiplications" in readme
     assert "of the start at most 3675" in page
     counted = re.search(r"at\s+most (\d+) multiplications, (\d+) additions and 1 division\.", readme)

@@ -1,6 +1,7 @@
 """identify: roles, scores against a slow twin, structure, cause, and the answer for a record that ships."""
 
 import json
+import shlex
 from importlib.resources import files
 from time import monotonic
 
@@ -12,7 +13,7 @@ from typer.testing import CliRunner
 from driftfit import identify
 from driftfit.cli import app
 from driftfit.identify.judgement import ahead, mixed, recursive
-from driftfit.identify.page import SCHEMA, verb
+from driftfit.identify.page import SCHEMA, commands, verb
 from driftfit.identify.result import Move
 from driftfit.identify.roles import NoAnswerError, roles
 from driftfit.identify.scores import RIDGE, Scores
@@ -155,6 +156,26 @@ def test_the_budget_narrows_the_search():
         "up to 12 instead of 30"
         in search(y[:120], U[:120], 30, 0, monotonic() + 9.0, np.random.default_rng(0)).narrowed
     )
+
+
+def test_the_budget_is_that_of_the_whole_call():
+    found = identify(PUMP, y="flow", budget=0.0)
+    assert len(found.track) == 500
+    assert "only the last 500 of 800 samples were judged" in str(found)
+
+
+def test_track_without_a_model_takes_that_of_identify():
+    result = CliRunner().invoke(app, ["track", PUMP, "--y", "flow"])
+    assert result.exit_code == 0, result.output
+    assert "Chosen: --model arx:1,1/1,nk=7/2,intercept --u pressure,speed;" in result.output.splitlines()[0]
+    assert "flow from pressure, speed" in result.output
+    assert "2026-03-03" in result.output
+
+
+def test_lines_to_copy_run(pump):
+    for line in commands(pump)[:2]:
+        result = CliRunner().invoke(app, shlex.split(line)[1:])
+        assert result.exit_code == 0, result.output
 
 
 def test_predictions_of_constants_and_their_mixture():

@@ -25,6 +25,10 @@ def test_constants_have_the_f_tests_and_robust_errors_of_statsmodels():
     assert (ours.statistic, ours.p) == pytest.approx((expected.fvalue, expected.pvalue))
     assert ours.df == (2, 117)
     assert f"F(2, 117)        {ours.statistic:.6g}" in str(ours)
+    first = api.OLS(y[:80], api.add_constant(X)[:80]).fit().f_test("rate = 0")
+    assert run.wald("rate == 0", at=79).p == pytest.approx(float(first.pvalue))
+    units = track(MODEL, RLS(1.0), y, X * [1e-9, 1e9]).wald("income == 1e9", "rate == 0")
+    assert units.statistic == pytest.approx(ours.statistic)
     robust = {"cov_type": "HAC", "cov_kwds": {"maxlags": 4}}
     hac = theirs.model.fit(**robust)
     np.testing.assert_allclose(run.constants(**robust).bse, hac.bse[["income", "rate", "const"]])

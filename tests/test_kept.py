@@ -54,10 +54,7 @@ def test_single_precision_rounds_what_is_stored_and_nothing_else(tmp_path):
         assert same(run.state["P"], full.state["P"])
         assert run.loglik == pytest.approx(full.loglik, rel=1e-5)
         assert same(run.smooth().theta, full.smooth().theta)
-        assert (
-            run.detect("innovation", reference=500).onsets.tolist()
-            == full.detect("innovation", reference=500).onsets.tolist()
-        )
+        assert run.detect("band", reference=500).onsets.tolist() == full.detect("band", reference=500).onsets.tolist()
     cov = track(ARX(2, 2), K, y[:50], u[:50], keep="cov", dtype=np.float32)
     np.testing.assert_allclose(cov.cov(40), full.cov(40), rtol=1e-6)
 

@@ -5,14 +5,11 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
-from support import Doubtful, arx_record, damaged, same
-from test_bank import N, R, changes
-from test_bank import record as jumping
+from support import arx_record, damaged, same
 
-from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Bank, Beam, Kalman, Live, Regression, Sensor, track
-from driftfit.judge.alarms.calibration import null_records
+from driftfit import ARX, AugmentedFLS, Kalman, Live, Regression, track
 from driftfit.run.live.alarm import LiveAlarm
-from driftfit.run.live.rule import FROZEN, AlarmRule
+from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import lanes_of
 
 K = Kalman(q=1e-4, r=0.01)
@@ -28,26 +25,17 @@ def record():
 
 
 @pytest.mark.parametrize(
-    ("tracker", "kind", "settings"),
-    [
-        (K, "glr", {"reference": CUT}),
-        (K, "cusum", {"reference": CUT, "hold": 5}),
-        (K, "band", {"reference": CUT}),
-        (K, "band", {"reference": {"b1": (0.9, 1.1)}, "hold": 7}),
-        (K, "innovation", {"reference": CUT, "window": 20}),
-        (K, "innovation", {"window": 10, "hold": 5}),
-        (K, "innovation", {"window": 10, "calibrate": True}),
-        (Doubtful(q=1e-4, r=0.01), "probability", {"hold": 3}),
-    ],
-    ids=["glr", "cusum", "band", "band given", "innovation", "innovation, no reference", "calibrated", "probability"],
+    ("kind", "settings"),
+    [("glr", {"reference": CUT}), ("band", {"reference": CUT}), ("band", {"reference": {"b1": (0.9, 1.1)}})],
+    ids=["glr", "band", "band given"],
 )
-def test_a_stream_says_what_the_record_says(record, tracker, kind, settings):
-    y, u = record
+def test_a_stream_says_what_the_record_says(record, kind, settings):
+    (y, u), tracker = record, K
     before = track(ARX(2, 2), tracker, y[:CUT], u[:CUT])
     rule = before.detect(kind, every=50.0, **settings).rule
     whole = track(ARX(2, 2), tracker, y, u)
     record_alarms = whole.detect(rule, start=CUT)
-    if "calibrate" not in settings and kind != "probability" and settings.get("reference") == CUT:
+    if settings["reference"] == CUT:
         own = whole.detect(kind, every=50.0, **settings)
         assert own.rule == rule  # limits and reference are those of the first samples, whatever comes later
         assert same(own.active, record_alarms.active)
@@ -58,14 +46,14 @@ def test_a_stream_says_what_the_record_says(record, tracker, kind, settings):
     for t in range(CUT, T):
         live.update(y[t], u[t], time=float(t))
         if t % 60 == 0:
-            live = pickle.loads(pickle.dumps(live)) if t % 120 else Live.from_bytes(live.to_bytes(), classes=[Doubtful])
+            live = pickle.loads(pickle.dumps(live)) if t % 120 else Live.from_bytes(live.to_bytes())
             (alarm,) = live.alarms
         assert alarm.active == record_alarms.active[t], t
         if alarm.active:
             assert same(alarm.statistic, record_alarms.statistic[t]), t
             assert alarm.cause == record_alarms.cause(t)
             now, then = alarm.change, record_alarms.change(t)
-            assert now is None or now[1:4] == then[1:4]
+            assert same(now[1:4], then[1:4]) if kind == "glr" else now is then is None
         begun += [t] if alarm.begun else []
         onsets += alarm.onsets()
     assert begun == record_alarms.onsets.tolist()
@@ -108,7 +96,7 @@ def test_samples_of_an_alarm_count_from_the_start_of_the_stream(record, way):
     found = []
     for t in range(CUT, T):
         live.update(y[t], u[t], time=float(t) if way == "timed" else None)
-        assert not alarm.active or alarm.change == record_alarms.change(t)
+        assert repr(alarm.change) == repr(record_alarms.change(t))
         found += [onset.sample for onset in alarm.onsets()]
     assert live.samples == T
     assert found == record_alarms.onsets.tolist() != []
@@ -117,7 +105,7 @@ def test_samples_of_an_alarm_count_from_the_start_of_the_stream(record, way):
 def in_parts(before, whole, rule):
     """(an alarm that judges many samples at a time, what it says of them)."""
     program, tile = whole.program, whole.program.tile(before.end().states[0])
-    run, out = program.loop(tile, T - CUT, "std", float, rule.kind in FROZEN)
+    run, out = program.loop(tile, T - CUT, "std", float, rule.kind == "glr")
     run(tile, *lanes_of(whole.record.part(slice(CUT, T))), out)
     alarm = LiveAlarm(rule, program.tracker, program.names)
     cuts = np.sort(np.random.default_rng(2).integers(0, T - CUT, 12))
@@ -125,24 +113,9 @@ def in_parts(before, whole, rule):
     return alarm, [alarm.take_many(part, 0, y, np.ones(len(y))) for part, y in parts]
 
 
-def test_the_probability_of_a_bank():
-    y, u = jumping(150, 5, (40, 90))
-    bank = Bank(changes(), [Sensor.nominal(R)], reduce=Beam(9), p0=2.0)
-    rule = AlarmRule("probability", 100.0, ("probability",), (0.5,))
-    record_alarms = track(Regression(N), bank, y, u).detect(rule, start=5)
-    live = Live(Regression(N), bank)
-    alarm = live.detect(rule, wait=5)
-    for t in range(150):
-        live.update(y[t], u[t])
-        assert alarm.active == record_alarms.active[t]
-        assert t < 5 or same(alarm.statistic, record_alarms.statistic[t])
-    assert [onset.sample for onset in alarm.onsets()] == record_alarms.onsets.tolist()
-    assert all(min(abs(t - jump) for t in record_alarms.onsets) < 4 for jump in (40, 90))
-
-
 def test_the_start_of_an_estimate_is_no_alarm(record):
     y, u = record
-    rule = track(ARX(2, 2), K, y[:CUT], u[:CUT]).detect("innovation", every=20.0, window=4).rule
+    rule = track(ARX(2, 2), K, y[:CUT], u[:CUT]).detect("band", every=20.0, reference=CUT).rule
     record_alarms = track(ARX(2, 2), K, y, u).detect(rule)
     assert record_alarms.start == 50
     live = Live(ARX(2, 2), K)
@@ -152,7 +125,7 @@ def test_the_start_of_an_estimate_is_no_alarm(record):
         live.update(y[t], u[t])
         active.append(alarm.active)
     assert same(active, record_alarms.active)
-    assert 50 < np.flatnonzero(active)[0] < 300
+    assert FAULT < np.flatnonzero(active)[0] < FAULT + 50
     assert "on after" in repr(alarm) or "off after" in repr(alarm)
 
 
@@ -160,8 +133,8 @@ def test_alarms_of_several_outputs(record):
     y, u = record
     both = np.column_stack([y, 2.0 * y[::-1]])
     before = track(Regression(1, ny=("level", "flow")), K, both[:CUT], u[:CUT])
-    kinds = {"level": "innovation", "flow": "glr"}
-    rules = {name: before[name].detect(kind, every=30.0, window=8, reference=CUT).rule for name, kind in kinds.items()}
+    kinds = {"level": "band", "flow": "glr"}
+    rules = {name: before[name].detect(kind, every=30.0, reference=CUT).rule for name, kind in kinds.items()}
     whole = track(Regression(1, ny=("level", "flow")), K, both, u)
     live = Live(Regression(1, ny=("level", "flow")), K, warm_start=before)
     live.detect(rules)
@@ -225,10 +198,9 @@ def test_references_in_times():
         [hours[95] + timedelta(minutes=1), hours[239] + timedelta(minutes=1)],
     ):
         assert dated.detect("band", reference=given).rule == expected.rule, given
-        assert dated.detect("innovation", reference=given, window=10).start == 240
     seconds = track(ARX(2, 2), K, y, u, time=10.0 * np.arange(400), dt=10.0)
     assert seconds.detect("band", reference=(960.0, 2400.0)).rule == expected.rule
-    assert plain.detect("innovation", reference=400).start == 400  # a rule may be made of the whole record
+    assert plain.detect("band", reference=400).start == 400  # a rule may be made of the whole record
     for wrong, match in (
         (("2024-03-05", "2024-03-05 04:00"), "at least 20 are needed"),
         (("2025-03-05", "2025-04-05"), "0 remain, and at least 20 are needed"),
@@ -255,28 +227,16 @@ def test_a_reference_in_local_time():
     assert record_alarms.rule.low == tuple(run.theta[3 * 24 : 7 * 24].min(axis=0).tolist())
 
 
-def test_a_tracker_that_adapts_is_judged_by_the_frozen_model():
-    y, u = arx_record(400, 3)
-    run = track(ARX(2, 2), AdaptiveKalman(), y, u)
-    with pytest.warns(UserWarning, match=r"AdaptiveKalman .* follows a fault: .*\"glr\".*tune"):
-        record_alarms = run.detect("innovation", reference=200)
-    assert record_alarms.kind == "glr"
-    other = track(ARX(2, 2), K, y, u).detect(reference=200).rule  # the tracker gives the regressors only
-    assert record_alarms.rule.reference.theta == pytest.approx(other.reference.theta, rel=1e-2)
-    assert record_alarms.rule.limits == pytest.approx(other.limits, rel=0.1)
-    run.detect("band", reference={"b1": (0.0, 2.0)})  # warnings are errors
-
-
 def test_rules_are_plain_settings_and_fit_what_they_watch():
     y, u = arx_record(300, 3)
     run = track(ARX(2, 2), K, y, u)
-    rule = run.detect("innovation", reference=200, window=10).rule
+    rule = run.detect(reference=200, records=8).rule
     assert AlarmRule.from_settings(rule.settings()) == rule
     assert hash(AlarmRule.from_settings(rule.settings())) == hash(rule)
-    assert "one false alarm in 10000 samples, limits power" in repr(rule)
+    assert "one false alarm in 10000 samples, limits one parameter" in repr(rule)
     live = Live(ARX(2, 2), K)
-    for wrong in (run.detect("innovation"), "band", None):
-        with pytest.raises(TypeError, match=r"detect\('innovation', reference=500\).rule"):
+    for wrong in (run.detect("band", reference=200), "band", None):
+        with pytest.raises(TypeError, match=r"detect\(reference=500\).rule"):
             live.detect(wrong)
     with pytest.raises(ValueError, match="wait"):
         live.detect(rule, wait=-1)
@@ -284,12 +244,8 @@ def test_rules_are_plain_settings_and_fit_what_they_watch():
     with pytest.raises(ValueError, match="no parameter 'b2'"):
         Live(ARX(1, 1), K).detect(band)
     blind = track(ARX(2, 2), AugmentedFLS(mu=10.0), y, u)
-    for kind, one, reference in (("innovation", rule, None), ("band", band, {"b2": (0.0, 1.0)})):
-        with pytest.raises(ValueError, match="no covariance"):
-            LiveAlarm(one, AugmentedFLS(1.0), run.names)
-        with pytest.raises(ValueError, match="no covariance"):
-            blind.detect(kind, reference=reference)
-    with pytest.raises(ValueError, match="no probability of a change"):
-        live.detect(AlarmRule("probability", 100.0, ("probability",), (0.5,)))
+    with pytest.raises(ValueError, match="no covariance"):
+        LiveAlarm(band, AugmentedFLS(1.0), run.names)
+    with pytest.raises(ValueError, match="no covariance"):
+        blind.detect("band", reference={"b2": (0.0, 1.0)})
     assert live.alarms == ()
-    assert next(null_records(run, 10.0, -1, 0)).detect(rule).limits.tolist() == list(rule.limits)

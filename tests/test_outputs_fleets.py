@@ -49,7 +49,7 @@ def test_verbs_of_a_fleet_of_several_outputs():
     np.testing.assert_array_equal(drawn["1, flow"], fleet[1].theta[:, 1, 2])
     assert {unit.key for unit in fleet.summary().units} == set(fleet)
     assert {row.key for row in fleet.verdict().rows} == set(fleet)
-    assert {row.key for row in fleet.detect("innovation", reference=150).rows} == set(fleet)
+    assert {row.key for row in fleet.detect("band", reference=150).rows} == set(fleet)
     ahead = fleet.forecast(2, np.ones(2))
     assert ahead.columns[:2] == ["series", "output"]
     one = ahead.filter((pl.col("series") == 2) & (pl.col("output") == "flow"))

@@ -40,7 +40,7 @@ def pictures():
         "Segments.plot": (piecewise(run, [100]).plot, 4),
         "Segmentation.plot": (one["Segmentation"].plot, 5),
         "Diagnosis.plot": (one["Track.diagnose"].plot, 6),
-        "Alarms.plot": (one["detect"].plot, 3),
+        "Alarms.plot": (one["detect"].plot, 4),
         "Selection.plot": (one["Selection"].plot, 2),
         "Tuned.plot": (one["Tuned"].plot, 1),
         "Frontier.plot": (one["Frontier"].plot, 2),

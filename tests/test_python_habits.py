@@ -60,11 +60,11 @@ def results(run, fleet):
     yield run.summary()
     yield run.verdict()
     yield run.diagnose()
-    yield run.detect("innovation")
+    yield run.detect(records=8)
     yield fleet.summary()
     yield fleet.verdict()
     yield fleet.diagnose()
-    yield fleet.detect("innovation")
+    yield fleet.detect(records=8)
     yield select([ARX(2, 2), ARX(1, 1)], Y, U, tracker=RLS(1.0))
 
 

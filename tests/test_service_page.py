@@ -21,6 +21,7 @@ pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
 
 import browser
 from service_support import (
+    UNIT,
     Receiver,
     configured,
     feed,
@@ -36,21 +37,23 @@ from service_support import (
     until,
 )
 
+from driftfit.service.connect.http import INCOMING
 from driftfit.service.control import Control
 from driftfit.service.core.journal import sum_of
 from driftfit.service.core.results import extremes_of
 from driftfit.service.options import PageOptions, UserOptions
 from driftfit.service.page.access import Sessions, hashed, new_token, password_fits, token_fits
-from driftfit.service.page.app import Page
+from driftfit.service.page.app import Page, Sockets
 from driftfit.service.page.feed import Feed, reduced
 
 TOKEN, HASH = (line.split(": ")[1] for line in new_token())
-WATCHER = [line.split(": ")[1] for line in new_token()]
+WATCHER, GATEWAY = ([line.split(": ")[1] for line in new_token()] for _ in range(2))
 PASSWORD = hashed("a long password")
 USERS = [
     UserOptions("Ann", "operator", PASSWORD), UserOptions("robot", "operator", token=HASH),
-    UserOptions("screen", "viewer", token=WATCHER[1]),
+    UserOptions("screen", "viewer", token=WATCHER[1]), UserOptions("gateway", "sender", token=GATEWAY[1], units=["a"]),
 ]  # fmt: skip
+ANN, SENDER, HOME = USERS[0], USERS[3], "http://localhost:8765"
 
 
 class Client:
@@ -212,40 +215,47 @@ def test_a_program_on_this_machine_needs_no_password_and_a_foreign_page_cannot_a
     assert engine.intake.take(10, 0.0).actions == []
 
 
-def test_roles(client):
-    ask = client(user=USERS)
-    act = {"unit": "a", "do": "acknowledge", "why": "seen"}
-    assert ask("GET", "/api/units")[0] == 401
-    assert ask("GET", "/", accept="text/html")[0] == 303
-    assert ask("GET", "/healthz")[0] in (200, 503)
-    viewer, robot = {"authorization": f"Bearer {WATCHER[0]}"}, {"authorization": f"Bearer {TOKEN}"}
-    assert ask("GET", "/api/units", **viewer)[0] == 200
-    assert ask("POST", "/api/actions", act, **viewer)[0] == 403
-    assert ask("POST", "/api/samples", {}, **viewer)[0] == 403
-    assert ask("POST", "/api/actions", {"unit": "a"}, **robot)[0] == 400
-    assert ask("GET", "/api/units", authorization="Bearer wrong")[0] == 401
+ACT = {"unit": "a", "do": "acknowledge", "why": "seen"}
+SAMPLE = {"t": 1e3, "y": 1.0, "u": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("who", "method", "path", "body", "status", "text"),
+    [
+        (None, "GET", "/api/units", {}, 401, ""), (None, "GET", "/healthz", {}, (200, 503), ""),
+        ("wrong", "GET", "/api/units", {}, 401, ""), ("viewer", "GET", "/api/units", {}, 200, ""),
+        ("viewer", "POST", "/api/actions", ACT, 403, "needs an operator"),
+        ("viewer", "POST", "/api/samples", {}, 403, "needs a sender"),
+        ("robot", "POST", "/api/actions", {"unit": "a"}, 400, "do must be one of"),
+        *(("gateway", method, path, ACT, 403, "may only post samples") for method, path in
+          (("GET", "/"), ("GET", "/api/units"), ("GET", "/api/status"), ("GET", "/metrics"),
+           ("GET", "/api/export?unit=a"), ("POST", "/api/actions"), ("GET", "/api/samplesX"))),
+        ("gateway", "POST", "/api/samples", {"plant/a": SAMPLE, "plant/c": SAMPLE}, 403, "samples of c (plant/c)"),
+        ("gateway", "POST", "/api/samples/plant/c", SAMPLE, 403, "samples of c (plant/c)"),
+    ],
+)  # fmt: skip
+def test_who_may_do_what(client, who, method, path, body, status, text):
+    tokens = {"viewer": WATCHER[0], "robot": TOKEN, "gateway": GATEWAY[0]}
+    headers = {} if who is None else {"authorization": f"Bearer {tokens.get(who, who)}"}
+    found, answer = client(user=USERS)(method, path, body, **headers)
+    assert found in np.ravel(status)
+    assert text in answer.decode()
+    assert INCOMING.queue.empty()  # also what a sender might have sent
+    assert client(user=USERS)("GET", "/", accept="text/html")[0] == 303
 
 
 def test_sessions(client):
     ask = client(user=USERS)
     wrong = {"name": "Ann", "password": "not this one"}
-    assert ask("POST", "/api/login", wrong)[0] == 401
-    assert ask("POST", "/api/login", wrong | {"name": "nobody"})[0] == 401
-    status, body = ask("POST", "/api/login", {"name": "Ann", "password": "a long password"})
-    assert (status, json.loads(body)["role"]) == (200, "operator")
-    cookie = ask.headers["set-cookie"]
-    assert "HttpOnly" in cookie
-    assert "SameSite=strict" in cookie
-    session = {"cookie": cookie.partition(";")[0]}
-    assert ask("GET", "/api/me", **session)[0] == 200
+    assert [ask("POST", "/api/login", wrong | {"name": name})[0] for name in ("Ann", "nobody")] == [401, 401]
+    session = logged_in(ask)
+    assert {"HttpOnly", "SameSite=strict"} <= set(ask.headers["set-cookie"].split("; "))
+    assert json.loads(ask("GET", "/api/me", **session)[1])["role"] == "operator"
     act = {"unit": "a", "do": "no", "why": "seen"}
     assert ask("POST", "/api/actions", act, **session)[0] == 403  # no Origin
-    assert ask("POST", "/api/actions", act, origin="http://localhost:8765", **session)[0] == 400
-    forged = {"cookie": session["cookie"][:-2] + "00"}
-    assert ask("GET", "/api/me", **forged)[0] == 401
-    for _ in range(15):
-        status, _ = ask("POST", "/api/login", wrong | {"password": "short"})
-    assert status == 429
+    assert ask("POST", "/api/actions", act, origin=HOME, **session)[0] == 400
+    assert ask("GET", "/api/me", cookie=session["cookie"][:-2] + "00")[0] == 401
+    assert 429 in [ask("POST", "/api/login", wrong | {"password": "short"})[0] for _ in range(15)]
 
 
 def test_passwords():
@@ -258,6 +268,79 @@ def test_passwords():
         hashed("short")
     with pytest.raises(ValueError, match="TLS"):
         PageOptions(host="0.0.0.0", user=USERS)
+    with pytest.raises(ValueError, match="units are those of a sender"):
+        UserOptions("Ann", "operator", PASSWORD, units=["a"])
+    with pytest.raises(ValueError, match="viewer, operator or sender"):
+        UserOptions("Ann", "root", PASSWORD)
+
+
+def logged_in(ask):
+    """Headers with the cookie of a session of Ann."""
+    assert ask("POST", "/api/login", {"name": "Ann", "password": "a long password"})[0] == 200
+    return {"cookie": ask.headers["set-cookie"].partition(";")[0]}
+
+
+def test_units_of_a_sender_are_named_in_every_section(tmp_path):
+    engine = opened(configured(UNIT + UNIT.replace('y = "y"', 'y = "z"')), tmp_path)
+    control = Control(engine, tmp_path / "c", dict)
+    assert control._foreign(["p:y"])("plant/p") == ["p:z"]
+    assert control._foreign(["p:y", "p:z"])("plant/p") == []
+    assert control._foreign([])("plant/q") == []
+    control.close()
+
+
+def test_a_session_ends_at_its_logout(service, client):
+    ask = client(user=[ANN])
+    one, other = logged_in(ask), logged_in(ask)
+    assert ask("POST", "/api/logout", origin=HOME, **one)[0] == 200
+    assert ask("GET", "/api/me", **one)[0] == 401  # a copy of the cookie
+    assert ask("GET", "/api/me", **other)[0] == 200
+    again = client(user=[ANN])  # the page's process was restarted
+    assert [again("GET", "/api/me", **cookie)[0] for cookie in (one, other)] == [401, 200]
+
+
+@pytest.mark.parametrize(
+    "then", [UserOptions("Ann", "operator", hashed("another password")), SENDER], ids=["password", "user"]
+)
+def test_a_session_ends_when_the_password_is_changed(client, then):
+    cookie = logged_in(client(user=[ANN]))
+    assert client(user=[then])("GET", "/api/me", **cookie)[0] == 401
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"x": 1}', bytes(40)])
+def test_a_damaged_file_of_sessions_lets_nobody_in(service, client, content):
+    folder, cookie = service[2], logged_in(client(user=[ANN]))
+    assert cookie["cookie"].partition("=")[2] not in (folder / "sessions.json").read_text()
+    (folder / "sessions.json").write_bytes(content)
+    ask = client(user=[ANN])
+    assert ask("GET", "/api/me", **cookie)[0] == 401
+    cookie = logged_in(ask)
+    assert client(user=[ANN])("GET", "/api/me", **cookie)[0] == 200
+
+
+@pytest.mark.parametrize("beside", ["Basic QW5uOng=", "Bearer ", f"Bearer {GATEWAY[0]}"], ids=["Basic", "empty", "key"])
+def test_a_cookie_beside_any_authorization_needs_its_origin(client, beside):
+    ask, act = client(user=[ANN, SENDER]), {"unit": "a", "do": "no", "why": "an attack"}
+    status, body = ask("POST", "/api/actions", act, authorization=beside, **logged_in(ask))
+    assert (status, "Origin" in json.loads(body)["error"]) == (403, True)
+
+
+def test_an_open_page_is_closed_with_its_session(service):
+    sent, valid = [], [True, True, False]
+
+    class Socket:
+        scope = {"still": lambda: ANN if valid.pop(0) else None}  # noqa: RUF012
+
+        async def send_text(self, text):
+            sent.append(text)
+
+        async def close(self, code, reason):
+            sent.append(code)
+
+    view = {"view": "fleet", "unit": "", "at": 0}
+    asyncio.run(Sockets(service[1], 10)._send(Socket(), view))
+    assert [type(one) for one in sent] == [str, str, int]
+    assert sent[-1] == 4401
 
 
 def test_bounds(client):
@@ -351,5 +434,5 @@ def test_the_docs_lead_to_an_alarm_on_a_phone(tmp_path):
             exec(text, {"wait": wait, "print": sent.append})
             until(lambda: Receiver.got)
     assert any(
-        who == "pump 1" and text.startswith("pump 1: band alarm, b1[pressure] is ") for _, text, who in Receiver.got
+        who == "pump 1" and text.startswith("pump 1: band alarm, cause b1[pressure], ") for _, text, who in Receiver.got
     )

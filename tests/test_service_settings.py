@@ -40,7 +40,7 @@ def test_the_example_of_the_issue():
     model = "ARX(2, [2, 2], intercept=True)"
     tracker = "AdaptiveKalman()"
     limits = { flow = [0, 80] }
-    alarm = { every = "1 week", on = ["band", "innovation"] }
+    alarm = { every = "1 week", on = ["band", "glr"] }
     [[sink]]
     kind = "mqtt"
     url = "mqtts://broker:8883"

@@ -16,11 +16,9 @@ from driftfit.cli.program import app, progress, say, writable
 from driftfit.cli.reading import decimal_from, limits_from, listed, parse_interval, separator_from
 from driftfit.data.clock import Clock
 from driftfit.data.columns import Wanted
+from driftfit.engine.compile_notice import PATIENCE
 from driftfit.identify.answer import Identification, ManyIdentified, identify
 from driftfit.identify.roles import NoAnswerError
-
-SILENT = 2.0
-"""Seconds before progress is shown."""
 
 
 @app.command("identify")
@@ -66,7 +64,7 @@ def identify_command(
             status.stop()
 
         def tell(text: str) -> None:
-            if monotonic() - began > SILENT:
+            if monotonic() - began > PATIENCE:
                 status.update(text)
 
         try:

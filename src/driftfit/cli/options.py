@@ -68,7 +68,7 @@ class Given:
         Option(
             help="Model and settings by position or name: arx:2,2,nk=1,intercept; one value per input with a slash: "
             "arx:2,2/1,nk=0/1; regression:intercept; or as in Python: 'ARX(2, [2, 1])'. Default: arx:2,2,intercept, "
-            "without inputs arx:2,0,intercept."
+            "without inputs arx:2,0,intercept; `track` without inputs chooses model and inputs."
         ),
     ] = None
     tracker: Annotated[
@@ -141,6 +141,12 @@ class Given:
                 f"--u {both[0]}: this is the output, which would explain itself; its past is in arx models."
             )
         return names
+
+    @property
+    def free(self) -> bool:
+        """Whether a record is given, and neither inputs nor a model."""
+        more = self.u or self.model or self.by or self.start or self.own or self.first or self.last or self.rows
+        return not more and len(self.outputs) == len(self.file) == 1 and self.file != ["-"]
 
     def models(self) -> list[Model]:
         """The models, each bound to the inputs."""

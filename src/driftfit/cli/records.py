@@ -14,9 +14,12 @@ from typer import Option
 from driftfit.cli.options import Given, Out, Plot, Report, Table, check_table, reads
 from driftfit.cli.program import app, draw, progress, say
 from driftfit.cli.reading import interval_from, listed, order_of, rows_of
+from driftfit.data.columns import Wanted
 from driftfit.data.limits import end_of
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks, missing_settings
+from driftfit.identify.answer import chosen
+from driftfit.identify.page import interval, short
 from driftfit.judge.structures.select import Selection
 from driftfit.judge.structures.select import select as compare
 from driftfit.parsing.settings import given_fields
@@ -45,6 +48,8 @@ def track(
         check_ending(write_to)
     if report is not None:
         check_path(report)
+    if given.free:
+        given = _with_structure(given)
     run = given.run()
     say(run.summary())
     if write_to is not None:
@@ -55,6 +60,18 @@ def track(
     draw(system, lambda: run.plot_system())
     if report is not None:
         run.report(report)
+
+
+def _with_structure(given: Given) -> Given:
+    """The options with the inputs, the structure and the time that `driftfit identify` finds."""
+    part = given.part()
+    reading = Wanted((), None, (), part.missing, part.separator, part.decimal, part.dates)
+    with progress.status("searching the structure"):
+        found, model = chosen(given.file[0], given.outputs[0], given.time, reading)
+    text, inputs = short(model), f" --u {','.join(model.input_names)}" if model.input_names else ""
+    say(Text(f" Chosen: --model {text}{inputs}; `driftfit identify` says why."), soft_wrap=True)
+    dt = given.dt or (interval(found) if found.clock else None)
+    return replace(given, model=[text], u=list(model.input_names), time=found.clock, dt=dt)
 
 
 @app.command()
@@ -150,20 +167,16 @@ def select(
 class AlarmOptions:
     """The options that define an alarm."""
 
-    kind: Annotated[str, Option(help="glr, cusum, band, innovation or probability.")] = "glr"
+    kind: Annotated[str, Option(help="glr or band.")] = "glr"
     every: Annotated[float, Option(help="Samples in which one false alarm may begin.")] = 10_000.0
     reference: Annotated[
         list[str] | None,
         Option(help="What is normal: a number of first samples, FROM..TO in times, or name=low:high; repeat the last."),
     ] = None
-    window: Annotated[int, Option(help="Samples in the sums of the innovation alarm.")] = 50
-    hold: Annotated[int, Option(help="Samples for which an alarm stays on after its cause.")] = 0
-    calibrate: Annotated[bool, Option("--calibrate", help="Find the limits by simulation.")] = False
 
     def find(self, run: Any) -> Any:
         """The alarms of a run, an `Outputs` or a fleet."""
-        settings = {"every": self.every, "window": self.window, "hold": self.hold, "calibrate": self.calibrate}
-        return run.detect(self.kind, reference=parse_reference(self.reference, run), **settings)
+        return run.detect(self.kind, every=self.every, reference=parse_reference(self.reference, run))
 
 
 @app.command()

@@ -40,8 +40,6 @@ from driftfit.engine.settings import as_numbers, factor
 from driftfit.models.base import Model
 
 FLOAT, ARRAY = np.dtype(np.float64), np.ndarray
-FIRST = np.zeros(1, dtype=int)
-"""Where a single series begins."""
 BY_ROW = 'by="row": '
 
 
@@ -95,7 +93,9 @@ def _plain(y: Any, u: Any, reading: Reading) -> Records | None:
         u = np.zeros((T, 0))
     elif not (type(u) is ARRAY and u.dtype is FLOAT and 1 <= u.ndim <= 2 and len(u) == T):
         return None
-    return Records((0,), FIRST, np.array((T,)), y, u[:, None] if u.ndim == 1 else u, row_of(1.0, 1.0, 1.0))
+    return Records(
+        (0,), np.zeros(1, dtype=int), np.array((T,)), y, u[:, None] if u.ndim == 1 else u, row_of(1.0, 1.0, 1.0)
+    )
 
 
 def _outputs(y: Any, outputs: Sequence[str], by_row: bool) -> Array:

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 PATIENCE = 2.0
-"""Seconds of compiling after which the notice appears."""
+"""Seconds of silence: the notice, and what other work says of its progress, appear after them."""
 
 TEXT = "driftfit: compiling once for this computer ..."
 TEXT_IN_MEMORY = "driftfit: compiling; no folder can be written to keep the code ..."

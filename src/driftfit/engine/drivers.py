@@ -234,11 +234,10 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
         for machine in tracker.machines:
             machine.load()
     part = whole_record if tracker.reads_model else tracker_part
-    phases = looking(tracker), learning(tracker)
-    if tracker.outlined:
-        phases = outlined(phases[0]), outlined(phases[1])
+    phases: tuple[Any, ...] = looking(tracker), learning(tracker)
+    phases = tuple(map(outlined, phases)) if tracker.outlined else phases if gate else (advancing(tracker),)
     if gate is None:
-        between = ungated(phases if tracker.outlined else (advancing(tracker),), part)
+        between = ungated(phases, part)
     else:
         between, model = gated(phases[0], gate, phases[1], part), model._replace(regress=raw_kept(model.regress))
     sample = _sample(model, tracker.note, between, part)

@@ -204,23 +204,16 @@ def learning(tracker: Any) -> Any:
 
 
 def ungated(phases: tuple[Any, ...], part: Any) -> Any:
-    """The steps of a tracker without a gate: all at once, or in those two phases between which a gate stands, which are
-    compiled once for both.
-    """
-    first, *rest = phases
-    last = rest[0] if rest else nothing_further
+    """The steps of a tracker without a gate: all at once, or the two phases between which a gate would stand."""
+    first, last, two = phases[0], phases[-1], len(phases) > 1
 
     @kernel
     def between(s: State) -> None:
         first(part(s))
-        last(part(s))
+        if two:  # a constant
+            last(part(s))
 
     return between
-
-
-@kernel
-def nothing_further(s: State) -> None:
-    """All was done at once."""
 
 
 def gated(look: Any, gate: Step, learn: Any, part: Any) -> Any:

@@ -42,6 +42,8 @@ LEFT_OUT = 0.01
 """Share of the readings left out above which there is no answer without ``gate``."""
 FEEDBACK = 5.0
 """F statistic above which the output is said to act on an input."""
+RATE, LEAST = 1000.0, 500
+"""Samples times parameters that the tracker and the verdict judge in a second; samples that are judged in any case."""
 WORST = 3
 """Records of a fleet that have a page."""
 
@@ -149,7 +151,8 @@ def identify(
         As for `track`. None: the gate of the default tracker, but there is no answer where it, or `roles`, leaves out
         more than `LEFT_OUT` of the readings.
     budget : number
-        Seconds after which the search stops with what it has.
+        Seconds for one record. The search stops after a third of them, and then the last samples are judged of which
+        the verdict is expected to take no more than what is left. For several records it is that of the search.
     seed : int
         That of the displaced copies of inputs.
     reading : Wanted or None
@@ -169,7 +172,7 @@ def identify(
     driftfit.identify.roles.NoAnswerError
         For a record that cannot answer: fewer than `FEWEST` rows with all lags, a constant output, text.
     """
-    began = monotonic()
+    end = monotonic() + budget
     for name, value, low in (("max_lag", max_lag, 1), ("horizon", horizon, 1), ("budget", budget, 0)):
         if not value >= low:
             raise ValueError(f"identify: {name} must be at least {low}; got {value!r}.")
@@ -179,10 +182,11 @@ def identify(
     found = roles(data, y, u=u, not_u=not_u, time=time, dt=dt, by=by, limits=limits, codes=gate is not False,
                   wanted=reading)  # fmt: skip
     check_record(found)
-    task = _Task(int(forecast), horizon, level, gate, began + budget, seed, progress, _source(data))
+    source = str(data) if isinstance(data, str) or hasattr(data, "__fspath__") else "data.csv"
+    task = _Task(int(forecast), horizon, level, gate, end, seed, progress, source)
     structure = task.structure(found, max_lag)
     if found.by is None:
-        return replace(task.judged(found, structure), seconds=monotonic() - began)
+        return task.judged(found, structure)
     progress("tracking")
     model = model_of(found, structure)
     fleet = track(model, AdaptiveKalman(), **found.signals(model.input_names), by=found.by, gate=gate)
@@ -199,6 +203,14 @@ def check_record(found: Roles) -> None:
         raise NoAnswerError(f"{len(known)} of {len(found.y)} rows hold {found.output}; at least {FEWEST} are needed.")
     if np.ptp(known) <= 1e-12 * np.max(np.abs(known)):
         raise NoAnswerError(f"{found.output} is {known[0]:g} in all {len(known)} rows; it must move to be explained.")
+
+
+def chosen(data: Any, y: str, time: str | None, reading: Wanted) -> tuple[Roles, ARX]:
+    """Roles and structure alone, with the defaults of `identify`."""
+    found = roles(data, y, time=time, wanted=reading)
+    check_record(found)
+    task = _Task(0, 1, 0.05, None, monotonic() + 45.0, 0, lambda text: None, "")
+    return found, model_of(found, task.structure(found, 30, forecast=False))
 
 
 def model_of(found: Roles, structure: Structure) -> ARX:
@@ -221,25 +233,32 @@ class _Task:
     progress: Callable[[str], None]
     source: str
 
-    def structure(self, found: Roles, max_lag: int) -> Structure:
+    def structure(self, found: Roles, max_lag: int, forecast: bool = True) -> Structure:
         """The structure of all records, and beside it that of a forecast."""
         self.progress("searching the structure")
         y, U, _ = found.centred().spread(max_lag + 1)
-        rng = np.random.default_rng(self.seed)
-        best = search(y, U, max_lag, self.first, self.end, rng)
-        if any(nk == 0 for _, nk in best.lags.values()):
+        rng, now = np.random.default_rng(self.seed), monotonic()
+        end = now + (self.end - now) / 3.0
+        best = search(y, U, max_lag, self.first, end, rng)
+        if forecast and any(nk == 0 for _, nk in best.lags.values()):
             self.progress("searching a forecast")
-            best = replace(best, forecast=search(y, U, max_lag, 1, self.end, rng))
+            best = replace(best, forecast=search(y, U, max_lag, 1, end, rng))
         return best
 
     def judged(self, found: Roles, structure: Structure) -> Identification:
-        """The answer for one record."""
+        """The answer for one record, or its last part if time is short."""
+        model, T = model_of(found, structure), len(found.y)
+        most = max(LEAST, int(RATE * (self.end - monotonic()) / model.n))
+        if most < T:
+            short = f"only the last {most} of {T} samples were judged (--budget)"
+            structure = replace(structure, narrowed="; ".join(filter(None, (structure.narrowed, short))))
+            found = found.rows(np.arange(T - most, T))
+            check_record(found)
         y, U, place = found.spread(structure.na + 40)
         self.progress("time or working point")
         phi = regressors(y, U, structure)
         why_not = cause(y, U, structure, found.inputs, found.output, self.first)
         self.progress("tracking")
-        model = model_of(found, structure)
         run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
         self.progress("judging")
         verdict = run.verdict(self.level)
@@ -279,9 +298,8 @@ def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -
     notes += [f"{found.missing} readings missing"] if found.missing else []
     notes += [f"gaps in time of {len(y) - len(found.y)} samples in all"] if len(y) > len(found.y) else []
     fed = [j for j in structure.lags if feedback(y, U[:, j]) > FEEDBACK]
-    notes += [f"{found.output} acts on {found.inputs[j]} (feedback)" for j in fed]
-    at_once = [found.inputs[j] for j in fed if structure.lags[j][1] == 0]
-    notes += [f"the effect at once of {' and '.join(at_once)} may then be its response"] if at_once else []
+    at_once = {j: ", so what it explains at once may be its response" for j in fed if structure.lags[j][1] == 0}
+    notes += [f"{found.output} acts on {found.inputs[j]} (feedback){at_once.get(j, '')}" for j in fed]
     return tuple([*notes, structure.narrowed] if structure.narrowed else notes)
 
 
@@ -292,8 +310,3 @@ def _undecided(structure: Structure, names: Sequence[str], verdict: Verdict) -> 
     said += [f"{names[j]} or {names[i]}: either explains the record" for j, i in structure.instead]
     said += [f"{names[j]}: useful, but so are copies of it at other times" for j in structure.doubtful]
     return tuple([*said, "a level that wanders, or noise that does"] if verdict.nearly_walk else said)
-
-
-def _source(data: Any) -> str:
-    """What the commands to copy call the data."""
-    return str(data) if isinstance(data, str) or hasattr(data, "__fspath__") else "data.csv"

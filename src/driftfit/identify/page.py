@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftfit.identify.result import Answer, Move
-from driftfit.identify.roles import CALENDAR
+from driftfit.identify.roles import CALENDAR, Roles
 from driftfit.identify.structure import Shape
 from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import p_equals
+from driftfit.models.arx import ARX
 from driftfit.show.axes import BLUE, RED, date_axis, draw_prediction, frame, panels, settled, time_label
 from driftfit.show.page import document, facts, opening, picture, points, section, table
 from driftfit.show.text import WIDTH
@@ -85,7 +86,7 @@ def headline(answer: Answer) -> str:
     said = sentences(answer)
     change = 100.0 * (1.0 - rms["driftfit"] / rms["constants"]) if rms["constants"] > 0.0 else 0.0
     gain = f"lowers the error {change:.0f} %" if change >= 0.5 else "does not lower the error"
-    more = f"; and {len(said) - 2} more changes" if len(said) > 2 else ""
+    more = f"; and {len(said) - 2} more change{'' if len(said) == 3 else 's'}" if len(said) > 2 else ""
     text = f"{'; '.join(said[:2])}{more}; tracking {gain}."
     return (f"Both: {curve(answer)}. Besides this: " if answer.kind == "both" else "") + text[0].upper() + text[1:]
 
@@ -164,12 +165,22 @@ def columns(answer: Answer) -> list[str]:
 def commands(answer: Answer) -> list[str]:
     """Three lines to copy."""
     model, roles = answer.model, answer.roles
-    nb, nk = ("/".join(str(one[i]) for one in model.lags) for i in (0, 1))
     inputs = f" --u '{','.join(model.input_names)}'" if model.input_names else ""
-    given = f"{answer.source} --y {roles.output}{inputs} --model arx:{model.na},{nb or 0}{nk and f',nk={nk}'},intercept"
-    given += f" --time {roles.clock} --dt {roles.dt if roles.dated else f'{roles.step:g}'}" if roles.clock else ""
+    given = f"{answer.source} --y {roles.output}{inputs} --model {short(model)}"
+    given += f" --time {roles.clock} --dt {interval(roles)}" if roles.clock else ""
     served = f"driftfit serve {PurePath(answer.source).stem}.toml   # the unit is on the page"
     return [f"driftfit track {given}", f"driftfit detect {given}", served]
+
+
+def short(model: ARX) -> str:
+    """A model as the option --model."""
+    nb, nk = ("/".join(str(one[i]) for one in model.lags) for i in (0, 1))
+    return f"arx:{model.na},{nb or 0}{nk and f',nk={nk}'},intercept"
+
+
+def interval(roles: Roles) -> str:
+    """The interval as the option --dt."""
+    return str(roles.dt) if roles.dated else f"{roles.step:g}"
 
 
 def unit(answer: Answer) -> str:

@@ -10,7 +10,6 @@ from driftfit.identify.roles import Roles
 from driftfit.identify.structure import Structure
 from driftfit.identify.working_point import Cause
 from driftfit.judge.alarms.detect import Alarms
-from driftfit.judge.segment import Segmentation
 from driftfit.judge.verdict import Verdict
 from driftfit.models.arx import ARX
 from driftfit.models.hammerstein_wiener.basis import Polynomial
@@ -97,7 +96,6 @@ class Answer(Printed):
     notes: tuple[str, ...]
     undecided: tuple[str, ...]
     source: str
-    seconds: float = 0.0
 
     @property
     def code(self) -> int:
@@ -108,11 +106,6 @@ class Answer(Printed):
     def effect(self) -> str:
         """What the effects are: there may be no long run."""
         return "effect in a sample" if self.memory.root else "static gain"
-
-    @cached_property
-    def segments(self) -> Segmentation:
-        """Segments of constant parameters (`Track.segment`)."""
-        return self.track.segment()
 
     @cached_property
     def alarms(self) -> Alarms:

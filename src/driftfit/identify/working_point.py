@@ -40,8 +40,7 @@ class Cause:
 
     Leads over constants in nats with their standard errors: ``tracked``, ``curve``, ``joint``; ``besides``: the lead of
     both over the curve alone; ``further``: over time alone. ``products``: what the curve is made of, in words.
-    ``bent``: the input of which the curve is a static one, or -1, and the ``curve_at`` quantiles of it, where the
-    deviation of the curve from a line is ``bend``.
+    ``bent``: the input of which the curve is a static one, or -1.
     """
 
     kind: str

@@ -149,16 +149,15 @@ def plot_alarms(
     run: Track, rule: AlarmRule, statistic: Array, active: Array, start: int, labels: Array | None = None,
     ax: Any = None,
 ) -> Figure:  # fmt: skip
-    """The output, and each statistic over its limit (probabilities unscaled), with alarms and labels shaded."""
+    """The output, and each statistic over its limit, with alarms and labels shaded."""
     c = len(rule.names)
     figure, axes = panels(ax, (9.5, 1.5 * c + 2.0), c + 1, sharex=True)
     axes[0].plot(run.time, run.y, color=BLUE, lw=0.8)
     axes[0].set_ylabel(run.labels.y)
     for j, (axis, name) in enumerate(zip(axes[1:], rule.names, strict=True)):
-        unit = 1.0 if rule.kind == "probability" else rule.limits[j]
-        column, limit = statistic[:, j] / unit, rule.limits[j] / unit
+        column, limit = statistic[:, j] / rule.limits[j], 1.0
         axis.plot(run.time, column, color=BLUE, lw=0.9)
-        axis.axhline(limit, color=RED, lw=0.9, ls="--", label=f"limit {rule.limit_text(j)}")
+        axis.axhline(limit, color=RED, lw=0.9, ls="--", label=f"limit {rule.limits[j]:.4g}")
         axis.legend(loc="upper left", fontsize=7, frameon=False)
         axis.set_ylabel(name)
         shown = column[start:][np.isfinite(column[start:])]
@@ -173,11 +172,7 @@ def plot_alarms(
         axis.grid(alpha=0.25, lw=0.5)
         if start < len(run):
             axis.axvline(run.time[start], color=GREY, lw=0.8, ls=":")
-    axes[0].set_title(
-        f"alarms red, labels grey; {'probabilities' if rule.kind == 'probability' else 'statistics over their limits'}",
-        fontsize=9,
-        loc="left",
-    )
+    axes[0].set_title("alarms red, labels grey; statistics over their limits", fontsize=9, loc="left")
     axes[-1].set_xlabel(time_label(run))
     date_axis(axes[-1], run)
     return figure

@@ -44,20 +44,17 @@ class AlarmSettings:
 
     every: float = 10_000.0
     """Samples in which one false alarm may begin."""
-    on: tuple[str, ...] = ("innovation",)
+    on: tuple[str, ...] = ("glr",)
     reference: int = 500
     """Number of first samples that are normal."""
-    window: int = 50
-    hold: int = 0
 
     def __post_init__(self) -> None:
         _positive("every", self.every)
         for kind in self.on:
             if kind not in KINDS:
                 raise ValueError(f"on: there is no alarm {kind!r}; {near(kind, KINDS)}")
-        for key, low in (("reference", 1), ("window", 1), ("hold", 0)):
-            if getattr(self, key) < low:
-                raise ValueError(f"{key} must be a whole number of samples; got {getattr(self, key)!r}.")
+        if self.reference < 1:
+            raise ValueError(f"reference must be a whole number of samples; got {self.reference!r}.")
 
     @property
     def each(self) -> float:
@@ -320,7 +317,7 @@ def _alarm(given: Any, dt: float | None) -> AlarmSettings | None:
 def _check_alarms(program: Program, alarm: AlarmSettings) -> None:
     """Raise ValueError if an alarm cannot be set from its reference."""
     for kind in alarm.on:
-        check_alarm(program, asked_for(kind, alarm.each, alarm.window, alarm.hold), alarm.reference)
+        check_alarm(program, asked_for(kind, alarm.each), alarm.reference)
 
 
 HEADER = re.compile(r"\s*(\[\[?)\s*([^\]]+?)\s*\]")

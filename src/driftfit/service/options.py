@@ -174,9 +174,10 @@ def build(kind: type[Made], given: dict[str, Any]) -> Made:
 def converted(value: Any, hint: type[Made]) -> Made:
     """A value of a table in the type of an option."""
     try:
-        return msgspec.convert(value, hint, dec_hook=lambda kind, given: kind.of(given))
+        made: Made = msgspec.convert(value, hint, dec_hook=lambda kind, given: kind.of(given))
     except msgspec.ValidationError as error:
         raise ValueError(str(error).replace(" - at `$.", " - in `").replace("Object", "the table")) from None
+    return made
 
 
 NAME_CHARACTERS = 200

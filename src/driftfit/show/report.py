@@ -21,7 +21,7 @@ import numpy as np
 from driftfit.engine import __version__
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks
-from driftfit.judge.alarms.onsets import onsets
+from driftfit.judge.alarms.detect import onsets
 from driftfit.judge.diagnose import Diagnosis, diagnosis
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.fleet_verdict import Judgement, ManyDiagnoses, ManyVerdicts, verdicts_and_diagnoses

@@ -52,11 +52,13 @@ class Tested(Printed):
         )
 
 
-def degrees_of_freedom(run: Track) -> float:
-    """Residuals from which the tracker estimates the noise variance; inf if it is given, or has a distribution that
-    the standard errors include.
+def degrees_of_freedom(run: Track, at: int = -1) -> float:
+    """Residuals from which the tracker estimates the noise variance after sample ``at``; inf if it is given, or has a
+    distribution that the standard errors include.
     """
-    return float(run.state["count"]) if run.tracker.learns_noise else np.inf
+    if not run.tracker.learns_noise:
+        return np.inf
+    return float((run.state if at in (-1, len(run) - 1) else run.lane(at))["count"])
 
 
 def wald(run: Track, *equations: str, at: int = -1, names: tuple[str, ...] = ()) -> Tested:
@@ -82,10 +84,12 @@ def wald(run: Track, *equations: str, at: int = -1, names: tuple[str, ...] = ())
         raise ValueError(f"wald: the record does not determine {found} up to sample {at}; test a later sample.")
     P = np.where(np.outer(R.any(axis=0), R.any(axis=0)), P, 0.0)
     S, k = R @ P @ R.T, len(R)
+    unit = np.sqrt(np.diag(S))  # parameters may have units that are far apart
+    S /= np.where(np.outer(unit, unit) > 0.0, np.outer(unit, unit), 1.0)
     if np.linalg.matrix_rank(S, hermitian=True) < k:
         raise ValueError("wald: the equations depend on each other; leave out those that follow from others.")
-    off = R @ run.theta[at] - [one.low for one in planes]
-    W, left = float(off @ np.linalg.solve(S, off)), degrees_of_freedom(run)
+    off = (R @ run.theta[at] - [one.low for one in planes]) / unit
+    W, left = float(off @ np.linalg.solve(S, off)), degrees_of_freedom(run, at)
     null = ", ".join(equations)
     if np.isfinite(left):
         return Tested(null, W / k, "F", (k, left), float(f.sf(W / k, k, left)))

@@ -18,7 +18,7 @@ from driftfit.data.storage import describe
 from driftfit.engine.kernel import Array
 from driftfit.run.layout import tag_of
 from driftfit.run.live.alarm import LiveAlarm, check_rule
-from driftfit.run.live.rule import FROZEN, AlarmRule
+from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import state_of
 from driftfit.run.result import burn_in
 from driftfit.run.warm_start import End, JointLayout, carried
@@ -90,7 +90,7 @@ class Flow:
         fate = np.where(good[known.code[order]], late.ended(fates.fate, over), other)
         earlier = known.counts[:, SAMPLES].copy()
         frozen = any(
-            one is not None and one.kind in FROZEN for one in self.rules
+            one is not None and one.kind == "glr" for one in self.rules
         )  # these need what the tracker receives
         done = known.run(order[fate == late.RELEASED], frozen)
         if done is not None:

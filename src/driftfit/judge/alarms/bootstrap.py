@@ -1,58 +1,53 @@
-"""Limits of the "glr" and "cusum" alarms by a bootstrap of the reference.
+"""Limits of alarms by simulation: the model of the reference makes records, and each is watched as a stream is.
 
-Every simulated record has its own reference. Its residuals x are drawn from those of the observed reference, in blocks
-and with random signs (sums of fitted residuals in their order vary too little). They are given the variances h of the
-model, and scale and variances are estimated from them again; an error of theta is drawn from its covariance. In the
-record that follows, regressors and residuals are drawn together, and its scores are those of the model that was
-estimated from its own reference. The limits therefore allow for everything that is estimated: a stream keeps these
-errors for as long as it runs. Whether the variance changes at all is seldom certain, so alpha and beta of each record
-are drawn from those that the reference leaves plausible. So is the autoregression that colours the noise of a record,
-which is whitened by the one that was estimated. Fault codes keep their sign and their regressors.
+    y*_t = phi*_t' theta + v_t,    v_t = sum_k a_k v_(t-k) + scale sqrt(h_t) x_t
 
-A window of L samples is beyond a limit c of "glr" if its deviate z is, with
+phi* has the inputs of the reference in their own order, and the lags of y* itself. x are residuals of the reference,
+drawn with random signs; how their variance h changes is drawn from what the reference leaves plausible. The first N
+samples are the reference of the record, from which its model is estimated anew, with the order of its noise; the others
+are scanned by the routine that watches streams. The limits therefore allow for everything that is estimated: a stream
+keeps these errors for as long as it runs. Fault codes keep their place and size. Residuals whose size is correlated
+even after the GARCH part are drawn in blocks.
 
-    z^2 > c^2 + 2 EVEN log(384 / L)
+With a deviate c as statistic the logarithm of the rate of onsets falls nearly as a straight line in c^2. Of the three
+statistics `SHARES` are their parts in the false alarms; then the rate of all together, with their ends, is that which
+is set. A limit that is rarer than the simulated records can show is found along that line, which also gives the
+probability of an extreme.
 
-and the false alarms of its three statistics are in the relation `SHARES`.
-
-With a deviate c as statistic the logarithm of the rate of onsets falls nearly as a straight line in c^2. A limit that
-is rarer than the simulated records can show is found along that line, which also gives the probability of an extreme.
-
-Source: Kunsch (1989) for blocks; Wu (1986) for signs. Cost: half a second at n = 4.
+Source: Kunsch (1989) for blocks; Wu (1986) for signs. Cost: `RECORDS` reference models and as many streams.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.alarms.calibration import limits_of
-from driftfit.judge.alarms.frozen import FAULTY, GARCH, Rows, noise_models, plausible, slopes_of
-from driftfit.judge.alarms.side_by_side import SimulatedRecords, statistics_of
-from driftfit.judge.alarms.variances import residuals, variances
+from driftfit.judge.alarms.frozen import FAULTY, GARCH, Known, frozen_model, plausible, variances
+from driftfit.judge.changes.recursion import Recursion, play
 from driftfit.judge.statistics.whiteness import whiteness
+from driftfit.run.live.likelihood_ratio import scan
 from driftfit.run.live.reference_model import (
     ALPHA,
     BETA,
+    BLAMED,
     CLIP,
     CONSTANT,
-    LEVELS,
+    FINDINGS,
+    LENGTHS,
+    NOISE_FACTOR,
+    OK,
     SCALE,
-    SHORT,
     Frozen,
-    K,
+    Y,
+    memory_of,
     stable,
-    stationary,
 )
+from driftfit.run.live.rule import OFTENER
 
 RECORDS, SAMPLES = 64, 1000
-"""Simulated records, and the samples of each that count."""
-START = SHORT << (LEVELS - 1)
-"""Samples at the beginning of a record that are not counted: the longest window is not complete."""
+"""Simulated records, and the samples of each that count, after the longest window is complete."""
 ENOUGH = 100.0
 """Onsets in all records from which a limit is known; rarer ones are extrapolated."""
 OFTEN = 10.0
@@ -60,137 +55,161 @@ OFTEN = 10.0
 CORRELATED = 1e-3
 """p-value of whiteness of squared scores below which residuals are drawn in blocks."""
 SHARES = (4.0, 2.0, 1.0)
-"""Shares of one parameter, all parameters and the noise in the false alarms of "glr". Most changes are of one
-parameter, and the noise exceeds its share where its variance comes in bursts that a short reference hardly shows.
+"""Shares of one parameter, all parameters and the noise in the false alarms. Most changes are of one parameter, and
+the noise exceeds its share where its variance comes in bursts that a short reference hardly shows.
 """
-STRATA = 10
-"""Residuals are drawn from the rows with the same tenth of all leverages."""
 STEP = 8.0
 """Factor between the two rates that determine the line."""
+LEVELS = 41
+"""Levels that are tried between these two."""
 
 
-def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> SimulatedRecords:
-    """Records without a change; fewer records are the first of more."""
-    (N, n), T = rows.phi.shape, SAMPLES + START
-    draws = [np.random.default_rng([seed, k]) for k in (0, 1, 2, 5)]
-    root = np.linalg.cholesky(frozen.cov)
-    code = np.abs(rows.x) > FAULTY
-    if drawn_in_blocks(frozen, rows.x):
-        block = int(np.clip(N // 20, 20, 200))
-        known, own = (_blocks(rng, (records, length), N, block) for rng, length in zip(draws[:2], (N, T), strict=True))
-        later = own
-    else:
-        known = draws[0].integers(0, N, (records, N))
-        later = (draws[3].integers(0, N, (records, 1)) + np.arange(T)) % N
-        own = _of_like_rows(np.einsum("ti,ij,tj->t", rows.phi, frozen.cov, rows.phi), later, draws[1])
-        own = np.where(code[later] | code[own], later, own)
-    signs = draws[2].integers(0, 2, (records, N + T)) * 2.0 - 1.0
-    drawn = np.tile(frozen.numbers, (records, 1))
-    drawn[:, [ALPHA, BETA]] = _variances(frozen, rows.x, _evenly(records, seed))
-    drawn_rows = np.hstack([known, own])
-    x = rows.x[drawn_rows] * np.where(code[drawn_rows], 1.0, signs)
-    w = np.hstack([residuals(x[:, :N], drawn), residuals(x[:, N:], drawn)])
-    numbers, _ = noise_models(w[:, :N], n)
-    w *= np.sqrt(N / max(N - n, 1))  # what follows has not been fitted
-    if len(frozen.ar):
-        w[:, N:] = _whitened_again(w[:, N:], frozen.ar, N, np.random.default_rng([seed, 6]))
-    z = _normal(n, records, seed) * np.sqrt(N / max(N - n - 1, 1))  # nor are its regressors those of the reference
-    w = w[:, N:] / numbers[:, SCALE, None]
-    h = variances(w, numbers)
-    phi = rows.phi[later] / np.sqrt(h)[..., None]
-    clip, k = numbers[:, CLIP, None], numbers[:, K, None]
-    g = np.clip(w / np.sqrt(h), -clip, clip) - k * np.einsum("rti,ri->rt", phi, z @ root.T)
-    numbers[:, CONSTANT] = frozen.numbers[CONSTANT]
-    cov, slopes = (np.broadcast_to(one, (records, *one.shape)) for one in (frozen.cov, slopes_of(frozen)))
-    return SimulatedRecords(cov, numbers, phi, g, slopes)
+class Normal(NamedTuple):
+    """A reference, and what was estimated from it."""
+
+    rows: Array
+    """(N, n + 4): regressors and the columns of `ROW`."""
+    delays: tuple[tuple[int, int], ...]
+    """(column, lag) of each regressor that is an earlier output."""
+    frozen: Frozen
+    known: Known
 
 
-@lru_cache(64)
-def _normal(n: int, records: int, seed: int) -> Array:
-    """Normal numbers (records, n) that fill space evenly."""
-    sobol = scipy.stats.qmc.Sobol(n, rng=np.random.default_rng([seed, 3]))
-    drawn = sobol.random_base2(int(np.ceil(np.log2(records))))[:records]
-    return np.asarray(scipy.special.ndtri(drawn * (1.0 - 1e-9) + 5e-10))
-
-
-def _evenly(records: int, seed: int) -> Array:
-    """Numbers (records,) that fill the interval from 0 to 1 evenly: multiples of the golden ratio."""
-    return np.asarray(
-        (np.random.default_rng([seed, 4]).random() + np.arange(records) * 0.5 * (np.sqrt(5.0) - 1.0)) % 1.0
-    )
-
-
-def together(parts: Sequence[SimulatedRecords]) -> SimulatedRecords:
-    """The records of several references in one."""
-    return SimulatedRecords(*map(np.concatenate, zip(*parts, strict=True)))
-
-
-def drawn_in_blocks(frozen: Frozen, x: Array) -> bool:
-    """Whether the size of the residuals is correlated even after the GARCH part, so that they are drawn in blocks.
+def drawn_in_blocks(normal: Normal) -> bool:
+    """Whether the size of the residuals is correlated even after the GARCH part.
 
     With blocks, the sums of squares of a short window are those that occur in the reference, so that none exceeds its
     largest.
     """
-    g = np.clip(x, -frozen.numbers[CLIP], frozen.numbers[CLIP])
-    return whiteness(g * g - np.mean(g * g)).p <= CORRELATED
+    clip = normal.frozen.numbers[CLIP]
+    g = np.clip(normal.known.x, -clip, clip)
+    return bool(whiteness(g * g - np.mean(g * g)).p <= CORRELATED)
 
 
-def _blocks(rng: np.random.Generator, shape: tuple[int, int], N: int, block: int) -> Array:
-    """Indices (R, T) of blocks of a record of N samples."""
-    R, T = shape
-    first = rng.integers(0, N, (R, T // block + 1))
-    return np.asarray((first[..., None] + np.arange(block)).reshape(R, -1)[:, :T] % N)
+class Source:
+    """Records that the model of a reference makes."""
+
+    def __init__(self, normal: Normal, seed: int) -> None:
+        self.normal, self.rng = normal, np.random.default_rng(seed)
+        self.rows, (self.at, x) = normal.rows, normal.known
+        frozen, (N, width) = normal.frozen, normal.rows.shape
+        self.N, self.n, self.p = N, width - 4, len(frozen.ar)
+        self.code = np.abs(x) > FAULTY
+        self.pool = x[~self.code] * np.sqrt(len(x) / max(len(x) - self.n - self.p, 1))
+        self.block = int(np.clip(len(self.pool) // 20, 20, 200)) if drawn_in_blocks(normal) else 1
+        h = np.empty(len(x))
+        variances(x, frozen.numbers, True, h)
+        self.share = plausible(x * np.sqrt(h), frozen.numbers)
+        self.theta, constant = frozen.theta.copy(), int(frozen.numbers[CONSTANT])
+        if len(frozen.mean):
+            self.theta[constant] -= frozen.mean @ frozen.theta
+        self.columns = columns = [column for column, _ in normal.delays]
+        if [lag for _, lag in normal.delays] == list(range(1, len(columns) + 1)):
+            self.theta[columns] = stable(self.theta[columns])
+
+    def _noise(self, M: int) -> Array:
+        """White noise (M,), whose variance may change."""
+        first = self.rng.integers(0, len(self.pool), M // self.block + 1)
+        drawn = (first[:, None] + np.arange(self.block)).ravel()[:M] % len(self.pool)
+        x = self.pool[drawn] * self.rng.choice([-1.0, 1.0], M)
+        numbers, h = self.normal.frozen.numbers.copy(), np.empty(M)
+        numbers[[ALPHA, BETA]] = GARCH[:, self.rng.choice(len(self.share), p=self.share)]
+        variances(x, numbers, True, h)
+        return np.asarray(numbers[SCALE] * np.sqrt(h) * x)
+
+    def record(self, T: int) -> Array:
+        """Rows (N + T, n + 4) of a reference and of the stream that follows."""
+        N, n, frozen = self.N, self.n, self.normal.frozen
+        order = np.concatenate([np.arange(N), (self.rng.integers(0, N) + np.arange(T)) % N])
+        made = self.rows[order]
+        made[made[:, n + OK] <= BLAMED, n + OK] = 0.0
+        used = made[:, n + OK] > 0.0
+        root = np.sqrt(np.where(used, made[:, n + NOISE_FACTOR], 1.0))
+        phi = np.where(used[:, None], made[:, :n], 0.0) / root[:, None]
+        columns, lags = np.array(self.columns, np.int64), np.array([lag for _, lag in self.normal.delays], np.int64)
+        source = np.arange(N + T)[:, None] - lags
+        way = Recursion(
+            phi, phi, np.zeros((0, 0)), columns, source, root[source] / root[:, None], self.theta, frozen.ar,
+            np.zeros(N + T), self._noise(N + T),
+        )  # fmt: skip
+        drawn, y = np.empty((N + T, n)), np.empty(N + T)
+        play(way, np.arange(1, self.p + 1), np.ones(N + T), np.empty(N + T), drawn, y)
+        place = np.zeros(N)
+        place[self.at[self.code]] = frozen.numbers[SCALE] * self.normal.known.x[self.code]
+        made[:, :n], made[:, n + Y] = drawn * root[:, None], y * root + place[order]
+        return np.asarray(made)
 
 
-def _of_like_rows(leverage: Array, rows: Array, rng: np.random.Generator) -> Array:
-    """Indices (R, T), each drawn from the rows whose leverage (N,) is about as large as that of ``rows`` (R, T)."""
-    N = len(leverage)
-    order, place = np.argsort(leverage), np.empty(N, np.int64)
-    place[order] = np.arange(N)
-    size = -(-N // STRATA)
-    first = np.minimum(place // size * size, N - size)
-    return np.asarray(order[first[rows] + rng.integers(0, size, rows.shape)])
+def simulated(normal: Normal, seed: int, records: int = RECORDS) -> Array:
+    """Statistics (R, SAMPLES, 3) of streams without a change; fewer records are the first of more."""
+    source, made, before = Source(normal, seed), [], LENGTHS[-1]
+    for _ in range(records):
+        rows = source.record(before + SAMPLES)
+        found = frozen_model(rows[: source.N], int(normal.frozen.numbers[CONSTANT]), source.columns, source.p)
+        if found is None or not np.isfinite(rows).all():
+            continue
+        findings = np.empty((before + SAMPLES, FINDINGS))
+        scan(rows[source.N :], found[0], memory_of(found[0]), findings, np.zeros(before + SAMPLES, np.int8))
+        made.append(np.nan_to_num(findings[before:, :3]))
+    return np.array(made)
 
 
-def _whitened_again(w: Array, ar: Array, N: int, rng: np.random.Generator) -> Array:
-    """White noise w (R, T) coloured by an autoregression, and whitened by ``ar`` (p,), its estimate from N samples.
-
-    Errors of the estimate have the covariance (stationary covariance of p lags)^-1 / N.
-    """
-    root = np.linalg.cholesky(np.linalg.inv(stationary(ar)) / N)
-    made = np.empty_like(w)
-    for k, z in enumerate(rng.normal(size=(len(w), len(ar)))):
-        true = stable(ar + root @ z)
-        made[k] = scipy.signal.lfilter(np.append(1.0, -ar), np.append(1.0, -true), w[k])
-    return made
-
-
-def _variances(frozen: Frozen, x: Array, chance: Array) -> Array:
-    """alpha and beta (R, 2) of the records, drawn from those that the reference leaves plausible; ``chance`` (R,)."""
-    numbers = frozen.numbers[None]
-    which = np.searchsorted(np.cumsum(plausible(residuals(x[None], numbers), numbers)), chance)
-    return np.asarray(GARCH[:, np.minimum(which, GARCH.shape[1] - 1)].T)
-
-
-def limits(records: SimulatedRecords, cusum: bool, every: float) -> tuple[Array, Array, float]:
-    """Limits (c,) of "glr" or "cusum" for one onset in ``every`` samples; growth (c,) of their square with its log; and
-    the standard deviation of the log of the rate that a stream has with these limits, since it keeps the errors of its
-    reference.
+def limits(statistic: Array, every: float) -> tuple[Array, Array, float]:
+    """Limits (3,) for one onset in ``every`` samples; growth (3,) of their square with its log; and the standard
+    deviation of the log of the rate that a stream has with these limits, since it keeps the errors of its reference.
 
     Each record has such errors of its own, so that the numbers of onsets in its halves are correlated; that onsets come
     in groups makes no difference to this. The exponent of a rate, and so its error, grows with the square of the limit.
     """
-    statistic = statistics_of(records, cusum, START)
-    base = min(every, max(SAMPLES * len(statistic) / ENOUGH, STEP * OFTEN))
+    samples = statistic[..., 0].size
+    base = min(every, max(samples / ENOUGH, STEP * OFTEN))
     often = max(base / STEP, OFTEN)
-    near, nearer = limits_of([(one, 0) for one in statistic], base, often, shares=() if cusum else SHARES)
+    share = np.array(SHARES) / np.sum(SHARES)
+    near, nearer = (
+        np.array([exceeded(one, samples / rate * part) for one, part in zip(statistic.T, share, strict=True)])
+        for rate in (base, often)
+    )
     growth = np.maximum(near**2 - nearer**2, 0.1) / np.log(base / often)
-    found = np.sqrt(near**2 + growth * np.log(every / base))
     idle = ~statistic.any(axis=(0, 1))
-    found[idle], growth[idle] = found[~idle].max(), growth[~idle].max()
-    active = np.logical_or.reduce([statistic[..., j] > limit for j, limit in enumerate(near)])
+    near[idle], growth[idle] = near[~idle].max(), growth[~idle].max()
+    # in units of the logarithm of a rate, the largest of the three
+    joint = np.max((statistic**2 - near**2) / growth, axis=2)
+    level = held_level(joint, samples / base)
+    found = np.sqrt(np.maximum(near**2 + growth * (level + np.log(every / base)), 0.0))
+    active = joint > level
     begun, half = active & ~np.column_stack([np.zeros(len(active), bool), active[:, :-1]]), active.shape[1] // 2
     halves = np.column_stack([begun[:, :half].sum(axis=1), begun[:, half:].sum(axis=1)])
     mean = max(float(halves.mean()), 1e-9)
     beyond = np.log1p(max(float(np.cov(halves.T)[0, 1]), 0.0) / mean**2)
     return found, growth, float(np.sqrt(beyond) * np.mean(found**2) / np.mean(near**2))
+
+
+def exceeded(values: Array, allowed: float) -> float:
+    """The smallest level from which upwards none is passed by more than ``allowed`` onsets; values (T, R) of R records.
+
+    A step from a to b > a is an onset over the levels c with a <= c < b, so the number at c is that of the a up to c
+    minus that of the b up to c.
+    """
+    after = values.T.ravel()
+    before = np.column_stack([np.full(values.shape[1], -np.inf), values.T[:, :-1]]).ravel()
+    rising = after > before
+    below, above = np.sort(before[rising]), np.sort(after[rising])
+    begun = np.searchsorted(below, above, side="right") - np.searchsorted(above, above, side="right")
+    most = np.maximum.accumulate(begun[::-1])[::-1]
+    return float(above[min(int(np.searchsorted(-most, -allowed)), len(above) - 1)])
+
+
+def held_level(joint: Array, allowed: float) -> float:
+    """The smallest level of joint (R, T) down to which so many alarms begin at most, if each lasts until log(`OFTENER`)
+    below it; not below that at which most begin: at a lower one they hardly end.
+    """
+    width, place, most, found = np.log(OFTENER), np.arange(joint.shape[1]), 0, np.log(STEP)
+    for level in np.linspace(found, -found, LEVELS):
+        begins = joint > level
+        decided = np.maximum.accumulate(np.where(begins | (joint <= level - width), place, 0), axis=1)
+        active = np.take_along_axis(begins, decided, axis=1)
+        begun = int(np.sum(active[:, 1:] & ~active[:, :-1]) + np.sum(active[:, 0]))
+        if begun > allowed:
+            break
+        most, found = (begun, level) if begun >= most else (most, found)
+    return float(found)

@@ -11,19 +11,22 @@ probability that a record without a fault is as extreme as this one, and
 is below ``level`` for the series in ``faulty``. On average at most that share of them has no fault, if the series are
 independent or positively dependent. A series can have an alarm and not be among them, and vice versa.
 
-The limits of "glr" and "cusum" come from simulated records. A series is first judged by the limits of a group of like
-series (`driftfit.judge.alarms.groups`), and by limits of its own if an alarm or a fault is possible then. So every
-alarm and every fault that is reported is one by the limits that the series has as a single run.
+The limits of "glr" come from simulated records. A series is first judged by those of a group of like series, and by
+limits of its own if an alarm or a fault is possible then. Series are alike if their reference models have the same
+parameters and a similar length, and if their noise is similar: its tails (the share of small residuals, and where
+scores are clipped), and whether its variance changes. The deviates of like series have nearly the same distribution, so
+records that are simulated from many of them serve for each, at the cost of a single one. So every alarm and every fault
+that is reported is one by the limits that the series has as a single run.
 
 Source: Benjamini and Hochberg (1995); Besag and Clifford (1991) for a simulation that ends when the answer is clear.
-Cost: that of `detect` for each run; for "glr" and "cusum" that of the reference model and the statistics, and a
-bootstrap for each series in doubt. Limits by ``calibrate=True`` need records for N every samples, N times. Memory: two
-kilobytes for each series; its statistics are computed again when `Watch.alarms` is read.
+Cost: that of the reference model and the statistics of each run, of the bootstrap of each group, and of `detect` for
+each series in doubt. Memory: two kilobytes for each series; its statistics are computed again when `Watch.alarms` is
+read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -31,18 +34,28 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from driftfit.engine.settings import numbers
-from driftfit.judge.alarms.detect import Alarms, asked_for, detect, judged
-from driftfit.judge.alarms.groups import Look, chance, in_doubt, look, with_limits
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import numbers, plain
+from driftfit.judge.alarms.bootstrap import RECORDS, Normal, drawn_in_blocks, limits, simulated
+from driftfit.judge.alarms.detect import Alarms, asked_for, chance_of, detect, findings_of, highest, judged
+from driftfit.judge.alarms.frozen import CLIPS
+from driftfit.judge.alarms.reference import Reference, in_samples, modelled
 from driftfit.judge.cores.on_all_cores import on_all_cores
 from driftfit.judge.fleet_verdict import SHOWN, discoveries
 from driftfit.judge.verdict import p_text
 from driftfit.run.keyed_results import table_by_key
-from driftfit.run.live.rule import FROZEN, AlarmRule
+from driftfit.run.live.reference_model import ALPHA, CLIP, CONSTANT
+from driftfit.run.live.rule import AlarmRule
 from driftfit.show.text import Printed, facts, key_text, table_of
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track
+
+
+MARGIN = 4.0
+"""A series is in doubt if its p-value could be this many times smaller by the limits of the series itself."""
+TAILS = 100.0
+"""Groups differ by 1 / TAILS in the share of residuals below the smallest of `CLIPS`."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +182,7 @@ def alarms(
 
     each = {key: reference[key] if own else reference for key in runs}
     settings = {"every": every * len(runs)} | settings
-    settled = _by_groups(runs, kind, each, level, settings) if kind in FROZEN and "records" not in settings else {}
+    settled = _by_groups(runs, kind, each, level, settings) if kind == "glr" and "records" not in settings else {}
     rest = [key for key in runs if key not in settled]
     alarms = settled | on_all_cores(rest, lambda key: (runs[key], kind, each[key], settings), _judged, "alarms")
     good = {key: one for key in runs if isinstance(one := alarms[key], Judged)}
@@ -209,22 +222,68 @@ def _by_groups(
     runs: Mapping[Hashable, Track], kind: str, each: dict[Hashable, Any], level: float, settings: dict[str, Any]
 ) -> dict[Hashable, Judged | ValueError]:
     """The series that the limits of their groups show to be without a fault, and those that cannot be judged."""
-    asked = asked_for(kind, **{name: settings[name] for name in ("every", "window", "hold") if name in settings})
-
+    asked, seed = asked_for(kind, settings["every"]), int(settings.get("seed", 0))
     first = on_all_cores(runs, lambda key: (runs[key], asked, each[key]), _first_look, "reference models")
     looks = {key: one for key, one in first.items() if isinstance(one, Look)}
-    rules = with_limits(runs, looks, each, int(settings.get("seed", 0)))
-    p = {key: chance(runs[key], rules[key], one) for key, one in looks.items()}
-    q = dict(zip(p, discoveries(np.array(list(p.values()))), strict=True))
-    quiet = (key for key, one in looks.items() if not in_doubt(p[key], q[key], level, one, asked.every))
-    settled: dict[Hashable, Judged | ValueError] = {
-        key: Judged(rules[key], looks[key].start, p[key], (), "") for key in quiet
+    groups: dict[Hashable, list[Hashable]] = {}
+    for key, one in looks.items():
+        groups.setdefault(one.like, []).append(key)
+
+    def chosen(like: Hashable) -> tuple[list[tuple[Track, AlarmRule, Reference]], int]:
+        members, few = groups[like], min(len(groups[like]), RECORDS)  # evenly spaced
+        keys = [members[k * len(members) // few] for k in range(few)]
+        return [(runs[key], looks[key].rule, each[key]) for key in keys], seed
+
+    found, settled = on_all_cores(groups, chosen, _limits_of, "limits"), {}
+    rules = {
+        key: replace(looks[key].rule, limits=plain(found[like][0]), growth=plain(found[like][1]), unsure=found[like][2])
+        for like, members in groups.items()
+        for key in members
     }
+    nan = float("nan")
+    p = {key: chance_of(rules[key], one.extreme, one.samples) if one.samples else nan for key, one in looks.items()}
+    q = dict(zip(p, discoveries(np.array(list(p.values()))), strict=True))
+    for key, one in looks.items():
+        alarm = -np.expm1(-one.samples / asked.every)  # the p-value of a series whose largest statistic is at its limit
+        if not (q[key] <= MARGIN * level or p[key] <= MARGIN * alarm):
+            settled[key] = Judged(rules[key], one.start, p[key], (), "")
     return settled | {key: one for key, one in first.items() if isinstance(one, ValueError)}
 
 
-def _first_look(run: Track, asked: AlarmRule, reference: Any) -> Look | ValueError:
+class Look(NamedTuple):
+    """A series before its limits are known: its reference model and its largest statistics."""
+
+    rule: AlarmRule
+    start: int
+    extreme: Array
+    """(c,)"""
+    samples: int
+    """Number of samples with a statistic."""
+    like: Hashable
+    """A key that is equal for series that are alike."""
+
+
+def _first_look(run: Track, asked: AlarmRule, reference: Reference) -> Look | ValueError:
     try:
-        return look(run, asked, reference)
+        rule, normal, start, rows = modelled(run, asked, in_samples(run, reference))
     except ValueError as error:
         return error
+    statistic = findings_of(rule, rows, start)[0][:, : len(rule.names)]
+    count = int(np.isfinite(statistic[start:]).any(axis=1).sum())
+    return Look(rule, start, highest(statistic, start), count, like(rule, normal))
+
+
+def like(rule: AlarmRule, normal: Normal) -> Hashable:
+    """A key that is equal for references that are alike."""
+    frozen, x = normal.frozen, normal.known.x
+    length, tails = round(2.0 * np.log2(len(x))), round(TAILS * np.mean(np.abs(x) < CLIPS[0]))
+    noise = length, tails, frozen.numbers[CLIP], bool(frozen.numbers[ALPHA] > 0.0), drawn_in_blocks(normal)
+    return rule.parameters, *noise, frozen.numbers[CONSTANT] if len(frozen.mean) else None
+
+
+def _limits_of(chosen: Sequence[tuple[Track, AlarmRule, Reference]], seed: int) -> tuple[Array, Array, float]:
+    """`limits`, from RECORDS or a few more records simulated from the chosen runs."""
+    each, parts = -(-RECORDS // len(chosen)), []
+    for k, (run, asked, reference) in enumerate(chosen):
+        parts.append(simulated(modelled(run, asked, in_samples(run, reference)).normal, seed + k, each))
+    return limits(np.concatenate(parts), chosen[0][1].every)

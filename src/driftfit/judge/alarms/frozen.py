@@ -1,4 +1,4 @@
-"""The frozen reference model of the "glr" and "cusum" alarms, estimated from the normal samples of a run.
+"""The frozen reference model of alarms, estimated from the normal samples of a run.
 
     y_t = phi_t' theta + e_t,    e an autoregression whose variance may follow a GARCH(1, 1)
 
@@ -8,21 +8,20 @@ the quasi-likelihood of the clipped residuals leaves each: a short reference sel
 and the most likely model is then constant noise. Each is estimated again, given the others, ROUNDS times.
 
 Source: Huber (1964); Bollerslev (1986); averages instead of a choice are Leamer's (1978).
-Cost: O(N n^2) for N samples, ten times, and 36 passes for the GARCH part.
+Cost: O(N n^2) for N samples, ten times, and 31 passes for the GARCH part.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from driftfit.engine.drivers import ROUNDING, SMALLEST
-from driftfit.engine.kernel import Array
-from driftfit.engine.simd import WIDTH
-from driftfit.judge.alarms.variances import losses, variances
+from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.statistics.robust import CLIP as OF_FIT
-from driftfit.judge.statistics.robust import LEAST, deviation, medians, noisy, robust_fit
+from driftfit.judge.statistics.robust import deviation, noisy, robust_fit
 from driftfit.run.live.reference_model import (
     ALPHA,
     BETA,
@@ -34,17 +33,18 @@ from driftfit.run.live.reference_model import (
     INSIDE,
     KAPPA,
     LONGEST,
+    NOISE_FACTOR,
     NORMAL,
     NUMBERS,
+    OK,
     RAW,
-    SAME,
     SCALE,
     SPREAD,
     WIDE,
     Frozen,
     K,
     V,
-    through_zero,
+    Y,
 )
 from driftfit.smooth.parts.rank import column_sizes
 
@@ -58,11 +58,9 @@ FAULTY = 30.0
 """Deviations from which on a residual of the reference is a fault code."""
 PERSISTENCE, REACTION = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98), (0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
 GARCH = np.array([(0.0, 0.0), *((a, both - a) for both in PERSISTENCE for a in REACTION if a < both)])
-GARCH = np.ascontiguousarray(np.vstack([GARCH, np.repeat(GARCH[-1:], -len(GARCH) % WIDTH, axis=0)]).T)
-"""alpha and beta of the candidates (2, C), constant noise first, the last repeated to fill a vector."""
-TIME = np.where(np.arange(GARCH.shape[1]) <= len(PERSISTENCE) * len(REACTION), 1.0 / (1.0 - GARCH.sum(axis=0)), 0.0)
-"""Time constants of the candidates in samples, 0 of the repeated one (C,)."""
-PRIOR = TIME**2
+GARCH = np.ascontiguousarray(GARCH.T)
+"""alpha and beta of the candidates (2, C), constant noise first."""
+PRIOR = 1.0 / (1.0 - GARCH.sum(axis=0)) ** 2
 PRIOR[0] = 0.5 * PRIOR[1:].sum()
 """How probable each candidate is before the reference, in relation (C,): constant noise half as probable as all others
 together, and those in proportion to the square of their time constant, since short references show long bursts least
@@ -80,29 +78,34 @@ SHARE = 8
 """The noise is judged by windows of at most this part of the reference."""
 
 
-class Rows(NamedTuple):
-    """The N usable rows of a reference, whitened."""
+class Known(NamedTuple):
+    """What a reference says of its noise."""
 
-    phi: Array
-    """(N, n): regressors, in units."""
+    at: Array
+    """(k,): its usable rows."""
     x: Array
-    """(N,): residuals over their standard deviation at the time."""
+    """(k,): their residuals over their standard deviation at the time."""
 
 
-def frozen_model(phi: Array, y: Array, ok: Array, constant: int = -1) -> tuple[Frozen, Rows] | None:
-    """Estimate the model from rows phi (N, n), y (N,) with `OK` in ok (N,); None if they have no noise.
+def frozen_model(
+    rows: Array, constant: int = -1, lags: Sequence[int] = (), order: int | None = None
+) -> tuple[Frozen, Known] | None:
+    """Estimate the model from rows (N, n + 4), regressors and the columns of `ROW`; None if they have no noise.
 
-    Regressors that are far from zero are centred on column ``constant``, if it is not negative. Fault codes, and rows
-    whose inputs are blamed, are residuals of the noise model as any other, but say nothing of theta or the
-    autoregression.
+    Regressors that are far from zero are centred on column ``constant``, if it is not negative. ``lags`` are columns of
+    earlier outputs. ``order`` is that of the autoregression; None estimates it. Fault codes, and rows whose inputs are
+    blamed, are residuals of the noise model as any other, but say nothing of theta or the autoregression.
     """
-    judged, ok = ok > 0.0, ok > BLAMED
+    phi, rest = rows[:, :-4], rows[:, -4:]
+    judged, ok = rest[:, OK] > 0.0, rest[:, OK] > BLAMED
+    own = 1.0 / np.sqrt(np.where(judged, rest[:, NOISE_FACTOR], 1.0))
+    phi, y = np.where(judged[:, None], phi, 0.0) * own[:, None], np.where(judged, rest[:, Y], 0.0) * own
     mean = means(phi[ok], constant) if constant >= 0 else np.zeros(0)
     phi = centred(phi, mean, constant)
     unit = column_sizes(phi[ok])
-    rows = np.where(judged[:, None], np.column_stack([phi / unit, y]), 0.0)
+    rows = np.column_stack([phi / unit, y])
     ar, root = np.zeros(0), np.ones(len(y))
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if order is None else ROUNDS - 1):
         used, white = _whitened(rows, ok, ar)
         white /= root[used, None]
         fit = robust_fit(white[:, :-1], white[:, -1])
@@ -110,7 +113,7 @@ def frozen_model(phi: Array, y: Array, ok: Array, constant: int = -1) -> tuple[F
             return None
         e = rows[:, -1] - rows[:, :-1] @ fit.theta
         ok = ok & (np.abs(e) <= FAULTY * deviation(e[ok]))
-        ar = _autoregression(e, ok, len(unit))
+        ar = _autoregression(e, ok, len(unit), range(1, ORDER + 1) if order is None else range(order, order + 1))
         used, w = _whitened(e[:, None], ok, ar, judged)
         numbers, h = noise_model(w[:, 0], len(unit))
         root = np.ones(len(y))
@@ -119,14 +122,8 @@ def frozen_model(phi: Array, y: Array, ok: Array, constant: int = -1) -> tuple[F
     fitted = ok[used]
     cov, unseen = _covariance((white / np.sqrt(h)[:, None])[fitted], x[fitted])
     numbers[CONSTANT] = constant
-    white[~fitted] = _shortened(white[~fitted], cov, 1.0 / len(x))
-    return Frozen(fit.theta / unit, unit, np.ascontiguousarray(ar), cov, numbers, unseen, mean), Rows(white, x)
-
-
-def _shortened(phi: Array, cov: Array, most: float) -> Array:
-    """Rows phi (k, n) whose leverage phi' C phi is at most that."""
-    leverage = np.einsum("ti,ij,tj->t", phi, cov, phi)
-    return np.asarray(phi * np.sqrt(most / np.maximum(leverage, most))[:, None])
+    lag = np.isin(np.arange(len(unit)), lags).astype(float)
+    return Frozen(fit.theta / unit, unit, np.ascontiguousarray(ar), cov, numbers, unseen, mean, lag), Known(used, x)
 
 
 def means(phi: Array, constant: int) -> Array:
@@ -148,63 +145,81 @@ def centred(phi: Array, mean: Array, constant: int) -> Array:
     return np.where((mean != 0.0) & (np.abs(about) <= FLAT * np.abs(phi)), 0.0, about)
 
 
-def slopes_of(frozen: Frozen) -> Array:
-    """(n, 2): `through_zero` of the centred regressors that moved, 0 of the others; (0, 2) if none is centred."""
-    constant, centred = int(frozen.numbers[CONSTANT]), enumerate(frozen.mean)
-    moved = np.sum(frozen.unseen**2, axis=0) <= 1.0 - SAME
-    every = [through_zero(frozen, j, constant) if mean != 0.0 and moved[j] else (0.0, 0.0) for j, mean in centred]
-    return np.array(every).reshape(-1, 2)
-
-
 def noise_model(w: Array, n: int) -> tuple[Array, Array]:
     """(`Frozen.numbers`, variances h (N,)) of white residuals w (N,) of a fit of n parameters."""
-    numbers, h = noise_models(w[None], n)
-    return numbers[0], h[0]
-
-
-def noise_models(w: Array, n: int) -> tuple[Array, Array]:
-    """The same for R references of N residuals each, w (R, N): numbers (R, k) and h (R, N)."""
-    R, N = w.shape
-    numbers = np.zeros((R, NUMBERS))
-    numbers[:, EVEN] = EVENNESS
-    numbers[:, NORMAL], numbers[:, LONGEST] = N, max(N // SHARE, 8)
-    numbers[:, SCALE] = _scales(w, n)
-    x = w / numbers[:, SCALE, None]
-    numbers[:, CLIP] = _clips(x)
-    clip = numbers[:, CLIP, None]
+    N = len(w)
+    numbers, freedom = np.zeros(NUMBERS), np.sqrt(N / max(N - n, 1))
+    numbers[EVEN], numbers[NORMAL], numbers[LONGEST] = EVENNESS, N, max(N // SHARE, 8)
+    numbers[SCALE] = deviation(w) * freedom
+    x = w / numbers[SCALE]
+    clip = numbers[CLIP] = _clip(x)
+    numbers[V] = np.mean(np.clip(x, -clip, clip) ** 2)
+    numbers[INSIDE] = np.mean(np.where(np.abs(x) < clip, x * x, 0.0))
+    numbers[[ALPHA, BETA]] = averaged(plausible(x, numbers))
+    h = np.empty(N)
+    variances(x, numbers, False, h)
+    numbers[SCALE] *= deviation(x / np.sqrt(h)) * freedom
+    x = w / (numbers[SCALE] * np.sqrt(h))
     square = np.clip(x, -clip, clip) ** 2
-    numbers[:, V] = square.mean(axis=1)
-    numbers[:, INSIDE] = np.mean(np.where(np.abs(x) < clip, x * x, 0.0), axis=1)
-    numbers[:, [ALPHA, BETA]] = averaged(plausible(x, numbers))
-    h = variances(x, numbers)
-    numbers[:, SCALE] *= _scales(w / (numbers[:, SCALE, None] * np.sqrt(h)), n)
-    x = w / (numbers[:, SCALE, None] * np.sqrt(h))
-    square = np.clip(x, -clip, clip) ** 2
-    numbers[:, K], numbers[:, V] = np.mean(np.abs(x) < clip, axis=1), square.mean(axis=1)
-    numbers[:, KAPPA] = square.var(axis=1)
+    numbers[K], numbers[V], numbers[KAPPA] = np.mean(np.abs(x) < clip), square.mean(), square.var()
     raw = np.clip(x, -WIDE, WIDE) ** 2
-    numbers[:, RAW], numbers[:, SPREAD] = raw.mean(axis=1), raw.var(axis=1)
+    numbers[RAW], numbers[SPREAD] = raw.mean(), raw.var()
     return numbers, h
 
 
+@Driver
+def variances(x: Array, numbers: Array, scores: bool, h: Array) -> None:
+    """h (T,) of residuals x (T,) in units of their scale; with ``scores`` x are these over sqrt(h).
+
+    h_(t+1) = 1 - alpha - beta + (alpha g_t^2 / v + beta) h_t,   g_t = x_t / sqrt(h_t) clipped at +-clip
+    """
+    alpha, beta, most, level = numbers[ALPHA], numbers[BETA], numbers[CLIP] * numbers[CLIP], 1.0
+    for t in range(x.shape[0]):
+        h[t] = level
+        square = min(x[t] * x[t] / (1.0 if scores else level), most)
+        level = 1.0 - alpha - beta + (alpha * square / numbers[V] + beta) * level
+
+
+@Driver
+def losses(x: Array, numbers: Array, weights: Array, state: Array, total: Array) -> None:
+    """sum log h + g^2 / inside of residuals x (T,) for candidates of the GARCH part into total (C,).
+
+    ``weights`` (2, C) are their alpha and beta, ``state`` (2, C) is scratch. With this factor h = 1 is the best
+    constant for every distribution of x.
+    """
+    most, v, inside = numbers[CLIP] * numbers[CLIP], numbers[V], numbers[INSIDE]
+    for c in range(total.shape[0]):
+        state[0, c], state[1, c], total[c] = 1.0, 1.0, 0.0
+    for t in range(x.shape[0]):
+        own = x[t] * x[t]
+        for c in range(total.shape[0]):
+            h = state[0, c]
+            square = own / h
+            square = most if square > most else square
+            state[1, c] *= h  # the product of some h, whose logarithm is that of all of them
+            total[c] += square / inside
+            state[0, c] = 1.0 - weights[0, c] - weights[1, c] + (weights[0, c] * square / v + weights[1, c]) * h
+        if t % 16 == 15 or t == x.shape[0] - 1:
+            for c in range(total.shape[0]):
+                total[c] += np.log(state[1, c])
+                state[1, c] = 1.0
+
+
 def plausible(x: Array, numbers: Array) -> Array:
-    """Probabilities (R, C) of the candidates `GARCH` for residuals x (R, N) in units of their scale; the
-    quasi-likelihood counts by as much as the tails allow."""
-    total = np.zeros((len(x), GARCH.shape[1]))
-    losses(x, numbers, GARCH, np.empty((1, GARCH.shape[1])), total)
-    clip = numbers[:, CLIP, None]
-    total *= (numbers[:, INSIDE] ** 2 / np.var(np.clip(x, -clip, clip) ** 2, axis=1))[:, None]
-    share = PRIOR * np.exp(total.min(axis=1, keepdims=True) - total)
-    return np.asarray(share / share.sum(axis=1, keepdims=True))
+    """Probabilities (C,) of the candidates `GARCH` for residuals x (N,) in units of their scale; the quasi-likelihood
+    counts by as much as the tails allow."""
+    total, clip = np.zeros(GARCH.shape[1]), numbers[CLIP]
+    losses(x, numbers, GARCH, np.empty(GARCH.shape), total)
+    total *= numbers[INSIDE] ** 2 / np.var(np.clip(x, -clip, clip) ** 2)
+    share = PRIOR * np.exp(total.min() - total)
+    return np.asarray(share / share.sum())
 
 
-def averaged(share: Array) -> Array:
-    """alpha and beta (R, 2) from the probabilities (R, C) of the candidates: the mean of alpha, and the mean of
-    alpha + beta weighted by alpha too, as constant noise has no persistence."""
-    reaction = GARCH[0] * share
-    alpha, both = reaction.sum(axis=1), reaction @ GARCH.sum(axis=0)
-    some = alpha > 0.0
-    return np.column_stack([alpha, np.where(some, both / np.where(some, alpha, 1.0) - alpha, 0.0)])
+def averaged(share: Array) -> tuple[float, float]:
+    """alpha and beta from the probabilities (C,) of the candidates: the mean of alpha, and the mean of alpha + beta
+    weighted by alpha too, as constant noise has no persistence."""
+    alpha, both = float(GARCH[0] @ share), float(GARCH[0] * share @ GARCH.sum(axis=0))
+    return alpha, both / alpha - alpha if alpha > 0.0 else 0.0
 
 
 def _covariance(phi: Array, x: Array) -> tuple[Array, Array]:
@@ -230,16 +245,18 @@ def _whitened(rows: Array, ok: Array, ar: Array, judged: Array | None = None) ->
 
     With ``judged``, of these rows, of which only some can be lags.
     """
-    p = len(ar)
-    complete, white = (ok if judged is None else judged)[p:].copy(), rows[p:].copy()
+    p, usable = len(ar), ok if judged is None else judged
+    if not p:
+        return np.flatnonzero(usable), rows[usable]
+    complete, white = usable[p:].copy(), rows[p:].copy()
     for lag, a in enumerate(ar, 1):
         complete &= ok[p - lag : len(ok) - lag]
         white -= a * rows[p - lag : len(rows) - lag]
     return p + np.flatnonzero(complete), white[complete]
 
 
-def _autoregression(e: Array, ok: Array, n: int) -> Array:
-    """Coefficients of the order up to ORDER with the smallest BIC; outliers are limited to three scales.
+def _autoregression(e: Array, ok: Array, n: int, orders: range) -> Array:
+    """Coefficients of the order with the smallest BIC, or of the only one; outliers are limited to three scales.
 
     Each order is compared with the one below on all samples whose lags are complete, of which there must be `COMPLETE`,
     and five for each of n parameters.
@@ -247,7 +264,7 @@ def _autoregression(e: Array, ok: Array, n: int) -> Array:
     limit = 3.0 * deviation(e[ok])
     e = np.clip(e, -limit, limit)
     found, gain, best = np.zeros(0), 0.0, 0.0
-    for p in range(1, ORDER + 1):
+    for p in orders if orders.start else ():
         used, _ = _whitened(e[:, None], ok, np.zeros(p))
         N = len(used)
         if max(COMPLETE, 5 * n) > N:
@@ -255,22 +272,15 @@ def _autoregression(e: Array, ok: Array, n: int) -> Array:
         R = np.asarray(np.linalg.qr(np.column_stack([*(e[used - lag] for lag in range(1, p + 1)), e[used]]), mode="r"))
         # the last two rows: what each order leaves
         gain += N * np.log1p((R[p - 1, p] / max(abs(R[p, p]), SMALLEST)) ** 2) - np.log(N)
-        if gain > best:
+        if gain > best or len(orders) == 1:
             best, found = gain, np.linalg.lstsq(R[:p, :p], R[:p, -1], rcond=None)[0]
     return np.asarray(found)
 
 
-def _clips(x: Array) -> Array:
-    """Where to clip residuals x (R, N): where a noise `LOUDER` moves the mean of their squares by most deviations."""
+def _clip(x: Array) -> float:
+    """Where to clip residuals x (N,): where a noise `LOUDER` moves the mean of their squares by most deviations."""
     moved = []
     for clip in CLIPS:
         square, louder = (np.minimum(np.abs(factor * x), clip) ** 2 for factor in (1.0, LOUDER))
-        moved.append((louder.mean(axis=1) - square.mean(axis=1)) / square.std(axis=1))
-    return np.asarray(np.take(CLIPS, np.argmax(moved, axis=0)))
-
-
-def _scales(w: Array, n: int) -> Array:
-    """Standard deviations (R,) of w (R, N), each as `deviation`, with the degrees of freedom of n parameters."""
-    N, sizes = w.shape[1], np.abs(w)
-    high = np.partition(sizes, 9 * N // 10, axis=1)[:, 9 * N // 10]
-    return np.asarray(np.maximum(1.4826 * medians(sizes), LEAST * high) * np.sqrt(N / max(N - n, 1)))
+        moved.append((louder.mean() - square.mean()) / square.std())
+    return CLIPS[int(np.argmax(moved))]

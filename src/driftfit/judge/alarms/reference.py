@@ -2,22 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 from zoneinfo import ZoneInfo
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import whole
-from driftfit.run.live.rule import FROZEN
-from driftfit.run.result import burn_in
+from driftfit.engine.settings import plain, whole
+from driftfit.judge.alarms.bootstrap import Normal
+from driftfit.judge.alarms.frozen import frozen_model
+from driftfit.judge.evidence import judged_rows
+from driftfit.judge.regressors import earlier_outputs, regressors
+from driftfit.judge.statistics.parts.coarse_readings import explained, step_of
+from driftfit.judge.statistics.robust import orthonormal
+from driftfit.readings import gate
+from driftfit.run.columns import COLLECTED, collect
+from driftfit.run.live.alarm import innovations
+from driftfit.run.live.reference_model import BLAMED, INTERVAL, NOISE_FACTOR, OK, ROW, Y, judgeable
+from driftfit.run.live.rule import OFFSET, AlarmRule, chances, check_fits, drawn, seed_of
+from driftfit.run.program import lanes_of
+from driftfit.run.result import Track, burn_in
 
-if TYPE_CHECKING:
-    from driftfit.run.result import Track
+Reference = Mapping[str, tuple[float, float]] | tuple[Any, Any] | int | None
 
 LEAST = 20
 """Smallest number of samples of a reference after the start of the run."""
+DOUBT = 0.01
+"""Level of the test of whether the reference is constant."""
 
 
 def burn(run: Track) -> int:
@@ -27,7 +41,7 @@ def burn(run: Track) -> int:
 
 def least(kind: str, n: int) -> int:
     """Normal samples after the start of a run of n parameters that an alarm of a kind needs."""
-    return max(100, 10 * n) if kind in FROZEN else LEAST
+    return max(100, 10 * n) if kind == "glr" else LEAST
 
 
 def in_samples(run: Track, reference: Any) -> Any:
@@ -101,3 +115,131 @@ def as_date(given: Any, zone: str | None) -> np.datetime64:
     if date.tzinfo is None and zone is not None:
         date = date.replace(tzinfo=ZoneInfo(zone))
     return np.datetime64(date if date.tzinfo is None else date.astimezone(UTC).replace(tzinfo=None))
+
+
+class Modelled(NamedTuple):
+    """A rule with the model of its reference, without limits."""
+
+    rule: AlarmRule
+    normal: Normal
+    start: int
+    """Its first sample after the reference."""
+    rows: Array
+    """(T, n + 4): the samples of the run, as `rows_of` gives them."""
+
+
+def by_innovations(run: Track) -> bool:
+    """Whether the innovations of the tracker are judged: the model is no regression, or not of what it estimates."""
+    return run.model.hidden is not None or run.theta.shape[1] != run.model.n
+
+
+def rows_of(run: Track) -> Array:
+    """Regressors of a run and the columns of `ROW` (T, n + 4), as the tracker receives them; "ok" are the samples that
+    are `judgeable`."""
+    steps = run.program.steps._replace(store=collect)
+    tile = run.fresh()
+    out = run.program.inspected(tile, len(run), COLLECTED)
+    y, u, known = lanes_of(run.record)
+    run.program.drivers(steps=steps).run(tile, y, u, known, out)
+    noise = np.broadcast_to(run.known.noise, len(run))
+    found = {"y": out["y"][:, 0], "ok": judgeable(out, 0, y[:, 0], noise), "noise": noise, "dt": out["dt"][:, 0]}
+    phi = out["phi"][..., 0]
+    if by_innovations(run):
+        phi, found = phi[:, :0], found | innovations(run.innovation, run.innovation_std**2, found["ok"])
+    return np.column_stack([phi, *(found[name] for name in ROW)])
+
+
+def with_offset(rows: Array, rule: AlarmRule) -> Array:
+    """The same with the constant regressor of the model of the reference, if it has one of its own."""
+    return np.insert(rows, rows.shape[1] - len(ROW), 1.0, axis=1) if rule.parameters[-1:] == (OFFSET,) else rows
+
+
+def modelled(run: Track, rule: AlarmRule, reference: Reference) -> Modelled:
+    """The rule of "glr" with the model of the reference."""
+    if isinstance(reference, Mapping):
+        raise ValueError('detect: the reference of "glr" must be a number of samples, such as 500, or (from, to).')
+    if by_innovations(run):
+        check_fits(replace(rule, parameters=(OFFSET,)), run.tracker, run.names)
+    every = rows_of(run)
+    n = every.shape[1] - len(ROW)
+    usable = (every[:, n + OK] > 0.0) & (every[:, n + INTERVAL] > 0.0)
+    enough = least("glr", n)
+    first, start = first_third(run, usable, enough) if reference is None else normal_samples(run, reference)
+    rows, names = every[first:start].copy(), run.model.names if n else ()
+    rows[:, n + OK] *= (usable & ~_stuck(run))[first:start]
+    ok = rows[:, n + OK] > BLAMED
+    if ok.sum() < enough:
+        raise ValueError(
+            f'detect: "glr" compares with {enough} normal samples at least; samples {first} to {start} contain '
+            f"{ok.sum()} that can be used. Give a longer normal segment, reference=(from, to), or "
+            'reference={"b1": (0.9, 1.1)} with kind="band".'
+        )
+    constants = np.flatnonzero((np.ptp(rows[ok, :n], axis=0) == 0.0) & (rows[ok][0, :n] != 0.0))
+    if not len(constants):
+        names, constants = (*names, OFFSET), np.array([n])
+    rule = replace(rule, parameters=names, names=("one parameter", "parameters", "noise"))
+    rows = with_offset(rows, rule)
+    rounding = _drawn(rows, step_of(run.y[first:start]) if n else 0.0, ok)
+    delays = _delays(run, rows[:, :n], every[:, n + Y], first, start) if n else ()
+    found = frozen_model(rows, int(constants[-1]), [column for column, _ in delays])
+    if found is None:
+        raise ValueError(
+            'detect: "glr" measures changes in units of the noise, and the reference has none: constant parameters '
+            f"explain samples {first} to {start} without error. Choose another reference."
+        )
+    frozen, known = found
+    rule = replace(rule, frozen=tuple(plain(one) for one in frozen[:-1]), rounding=rounding)
+    return Modelled(rule, Normal(rows, delays, frozen, known), start, every)
+
+
+def _delays(run: Track, phi: Array, y: Array, first: int, start: int) -> tuple[tuple[int, int], ...]:
+    """(column, lag) of each regressor that is an earlier output."""
+    at = np.arange(first, start)
+    back = earlier_outputs(run, at, phi, y, np.ones(len(at)))
+    if back is None:
+        return ()
+    known = [np.flatnonzero(one >= 0)[-1] for one in back.source.T]
+    lags = [int(row - source[row]) for row, source in zip(known, back.source.T, strict=True)]
+    return tuple(zip(map(int, back.columns), lags, strict=True))
+
+
+def _drawn(rows: Array, step: float, ok: Array) -> tuple[float, ...]:
+    """Draw the readings of a reference again within the step of a coarse sensor: (step, noise, seed) of it; (), and the
+    readings remain as they are, if constants do not explain those that are ``ok`` as rounded ones.
+    """
+    n = rows.shape[1] - len(ROW)
+    root = np.sqrt(rows[ok, n + NOISE_FACTOR])
+    basis = orthonormal(rows[ok, :n] / root[:, None]) if step else None
+    y = rows[ok, n + Y] / root
+    found = explained(basis.Q, y, step / root) if basis is not None and basis.distinct else None
+    if found is None:
+        return ()
+    seed = seed_of(y, step / root)
+    rows[ok, n + Y] = root * drawn(y, *found, 0.5 * step / root, chances(0, int(ok.sum()), seed))
+    return step, found[1], float(seed + 1)  # later samples draw other numbers
+
+
+def _stuck(run: Track) -> Array:
+    """Samples (T,) of a frozen sensor; other readings that a gate refused are normal if they are in the reference."""
+    left, found = run.left_out, np.zeros(len(run), bool)
+    found[left.sample[left.code == gate.FROZEN]] = True
+    return found
+
+
+def doubt(run: Track, first: int, end: int) -> str:
+    """Why samples first .. end are no good reference, in words: when the parameters change there; empty if not."""
+    if by_innovations(run):
+        return ""
+    rows = regressors(run)
+    inside = (rows.at >= first) & (rows.at < end)
+    found = judged_rows(rows.only(inside, range(rows.phi.shape[1])), DOUBT) if inside.any() else None
+    if found is None or not found.rejected:
+        return ""
+    at, names = rows.at[inside], ", ".join(run.model.names[j] for j in found.moving)
+    dates = [int(at[row]) for row in found.found.breaks] if found.kind.name == "steps" else []
+    if not dates:
+        return f"{names} of the reference moves gradually: choose another segment, reference=(from, to)"
+    ends = [first, *dates, end]
+    longest = int(np.argmax(np.diff(ends)))
+    when, one, other = (run.time_text(t) for t in (dates[0], ends[longest], ends[longest + 1] - 1))
+    return f"{names} of the reference changes at {when}: choose a segment of it, such as {one} to {other}"

@@ -109,3 +109,10 @@ def _draw(
 
 
 draw = Driver(_draw)
+
+
+def _play(way: Recursion, lags: Array, signs: Array, v: Array, phi: Array, y: Array) -> None:
+    simulate(way, lags, signs, v, phi, y)
+
+
+play = Driver(_play)

@@ -13,13 +13,12 @@ from contextlib import ExitStack
 from time import monotonic
 from typing import Any, TypeVar
 
+from driftfit.engine.compile_notice import PATIENCE
 from driftfit.judge.cores.processes import Processes, available
 from driftfit.run.parallel_lanes import cores
 from driftfit.run.program import progress_bar
 
 Result = TypeVar("Result")
-PATIENCE = 2.0
-"""Seconds after which a progress bar appears."""
 FIRST = 5
 """Runs that are judged first, one by one: one compiles, and the others show how long a run takes."""
 WORTH = 5.0

@@ -20,7 +20,6 @@ from driftfit.readings.first_samples import First
 from driftfit.readings.gate import AT_START, SIGNAL
 from driftfit.readings.left_out import Tally
 from driftfit.run.columns import SCALARS, Columns
-from driftfit.run.live.rule import FROZEN
 from driftfit.run.live.stream import HELD, Stream, check_applied
 from driftfit.run.program import Program, lanes_of
 from driftfit.run.track import records_of
@@ -174,7 +173,7 @@ class Batched(Stream):
 
     def _drive(self, y: Array, u: Array, known: Array, out: Array, time: Any = None) -> None:
         """Drive the tile over rows, of which ``time`` has the times, and let alarms and windows see each of them."""
-        if not self._windows and not any(alarm.rule.kind in FROZEN for _, alarm in self._watching):
+        if not self._windows and not any(alarm.rule.kind == "glr" for _, alarm in self._watching):
             self._judged(y, u, known, out, time, self._samples - len(y))
             for lane, alarm in self._watching:
                 noise = np.broadcast_to(known[:, NOISE, min(lane, known.shape[2] - 1)], len(y))

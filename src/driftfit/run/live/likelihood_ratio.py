@@ -1,4 +1,4 @@
-"""Windowed likelihood ratios on a frozen reference model, recursive and in constant memory.
+"""Windowed likelihood ratios on a frozen reference model, recursive and in constant memory, and what changed.
 
 For a window of L samples S = sum phi g, G = sum phi phi', Q = sum g^2, with the scores of
 `driftfit.run.live.reference_model`. theta was estimated, with covariance C, so that without a fault S ~ N(0, V),
@@ -14,26 +14,23 @@ windows, of which a record has many that are independent, and long windows would
 has sums over blocks of 2^j samples, of which it keeps twelve; a block is the sum of two of the level below, so nothing
 is ever subtracted, and windows of 8 and 12 blocks are compared whenever a block is complete. d is a step of one
 parameter; where a regressor is centred that is a slope about its mean, and a slope through zero, which moves the level
-too, is compared as well. The size of the change is d'G V^-1 U / d'G V^-1 G d with U = sum phi x, and of the noise
-sqrt(mean x^2), with x not clipped.
+too, is compared as well.
 
-Which parameter moved is the one with the largest statistic; but the level, not a slope through zero, where these are
-within `ALIKE`. Where most scores are clipped they show only that there is a change: the residuals x then show which, in
-the window that one step explains best. It is not the noise that changed if a step explains most of the squares.
+Once a statistic is beyond its end, the residuals x of the last samples show what changed, and since when: for every L,
+up to 384, what a change L samples ago explains of their squares,
+
+    a step of one parameter     (d'G V^-1 U)^2 / d'G V^-1 G d,   U = sum phi x,   its size d'G V^-1 U / d'G V^-1 G d
+    the noise                   (L - n) (r - 1 - log r) / c,     r = (sum x^2 - U' G^-1 U) / (L - n), over that before
+
+twice the log likelihood ratio of a Gaussian noise; c corrects the second for tails, and the noise has changed only as
+far as no change of parameters explains its squares. The change is the largest of all; but the level, where another is
+larger by less than `ALIKE`: the record does not tell them apart. It is not known while it is less than `FEWEST` samples
+old. Its size is the mean over all L, each weighted by its likelihood, and its standard error allows for what the size
+varies by between them.
 
 Source: Lai (1998); Dumbgen and Spokoiny (2001) for limits that depend on the length. Departures: the covariance of the
 reference within the statistic; windows of 8 and 12 blocks, of which the longer ones are compared less often.
-Cost per sample: O(n^3 + p n) on average, some 2 microseconds with four parameters.
-
-The score CUSUM of the same model accumulates
-
-    C <- max(0, C + log likelihood ratio of a shift by SHIFT standard deviations of the noise)
-
-for each parameter and both signs, and for the variance of the noise. Where a regressor is centred, its parameter also
-has sums for a step of the slope through zero, unless that is hardly more than one of the level. Reported is the larger
-of them as sqrt(2 C), a deviate. Above TOP the sum forgets exponentially: it would otherwise grow for as long as a fault
-lasts, and the alarm would stay on for up to nine times as long after it. The column with the largest drift still has
-the largest sum. Source: Page (1954). Cost per sample: O(n).
+Cost per sample: O(n^3 + p n) on average, some 2 microseconds with four parameters; during an alarm some 100.
 """
 
 from __future__ import annotations
@@ -43,40 +40,29 @@ import numpy as np
 from driftfit.engine.drivers import SMALLEST
 from driftfit.engine.kernel import Array, Driver, exp, kernel, log, part
 from driftfit.run.live.reference_model import (
-    ALIKE,
     BLOCKS,
-    BOUND,
-    CLIP,
     CONSTANT,
     COUNT,
     COVARIANCE,
-    CUSUM,
     EVEN,
-    FIT,
     FLAT,
-    FULLY,
+    INSTEAD,
     JOINT,
+    JUDGED,
     KAPPA,
-    LITTLE,
+    KEPT,
+    LENGTH,
     LONGEST,
-    MOST,
     NOISE,
-    NOISE_WINDOW,
     NORMAL,
     ONE,
-    PARAMETERS,
-    RATIO,
     RAW,
-    SAME,
-    SHIFT,
     SHORT,
     SHORTER,
     SIZE,
+    SPREAD,
     STD,
-    TOP,
     WHICH,
-    WINDOW,
-    WINDOWS,
     Frozen,
     K,
     Memory,
@@ -85,56 +71,14 @@ from driftfit.run.live.reference_model import (
     through_zero,
 )
 
-LASTING = 0.98
-"""What is kept, per sample, of the excess of a sum over the largest that counts."""
-
-
-@part
-def climb(cusum: Array, z: float, mean: float, var: float, power: float, most: float) -> None:
-    """One step of a CUSUM up and of one down, which forget what they are above ``most``."""
-    for side in range(2):
-        step = (mean * z if side == 0 else -mean * z) - 0.5 * mean * mean * power
-        value = max(0.0, cusum[side] + step / var)
-        cusum[side] = most + LASTING * (value - most) if value > most else value
-
-
-@part
-def idle(j: int, frozen: Frozen) -> bool:
-    """Whether regressor j was always 0 in the reference, or constant and is centred, so that it has no unit there."""
-    share = 0.0
-    for m in range(frozen.unseen.shape[0]):
-        share += frozen.unseen[m, j] * frozen.unseen[m, j]
-    return share > 1.0 - SAME
-
-
-@part
-def accumulate(phi: Array, g: float, noise: bool, frozen: Frozen, cusum: Array) -> None:
-    """One step of the CUSUM of every parameter, of the noise, and of slopes through zero; columns are up and down."""
-    n = frozen.theta.shape[0]
-    k, v, kappa = frozen.numbers[K], frozen.numbers[V], frozen.numbers[KAPPA]
-    most = 0.5 * frozen.numbers[TOP] ** 2 if frozen.numbers[TOP] > 0.0 else np.inf
-    for j in range(n):
-        own = np.sign(phi[j]) if idle(j, frozen) else min(BOUND, max(-BOUND, phi[j]))
-        climb(cusum[j], own * g, SHIFT * k, v, own * own, most)
-    if noise:
-        climb(cusum[n], g * g - v, SHIFT * v, kappa, 1.0, most)
-    constant = int(frozen.numbers[CONSTANT]) if frozen.mean.shape[0] > 0 else 0
-    for j in range(frozen.mean.shape[0]):
-        a, b = through_zero(frozen, j, constant) if frozen.mean[j] != 0.0 else (0.0, 0.0)
-        if a > LITTLE and not idle(j, frozen):
-            own = min(BOUND, max(-BOUND, a * phi[j] + b * phi[constant]))
-            climb(cusum[n + 1 + j], own * g, SHIFT * k, v, own * own, most)
-
-
-@part
-def report(cusum: Array, frozen: Frozen, deviates: Array) -> None:
-    """sqrt(2 C) of the parameters and of the noise into deviates (n + 1,)."""
-    n = frozen.theta.shape[0]
-    for j in range(n + 1):
-        highest = max(cusum[j, 0], cusum[j, 1])
-        if j < frozen.mean.shape[0]:
-            highest = max(highest, cusum[n + 1 + j, 0], cusum[n + 1 + j, 1])
-        deviates[j] = np.sqrt(2.0 * highest)
+OWN, BEST, AGE, SUM = 0, 3, 4, 5
+"""Rows of `Memory.best`: gain, size and std at one age; the largest gain; its age; sums of w, w size and w size^2."""
+ALIKE = 1.0
+"""Twice the logarithm of the likelihood ratio up to which two changes explain a record alike."""
+FEWEST = 4
+"""Samples since a change from which on it is told what it is."""
+FINE = 32
+"""Ages of a change are tried one by one up to this, then in steps of this part of them."""
 
 
 @part
@@ -164,10 +108,10 @@ def cube_deviate(ratio: float, shape: float) -> float:
 
 
 @part
-def variance(total: Array, cov: Array, frozen: Frozen, work: Array) -> None:
-    """V of the sums of a window in work[:n], G in work[n:2n], symmetric."""
-    n = frozen.theta.shape[0]
-    v, k, at = frozen.numbers[V], frozen.numbers[K], 2 * n + 2
+def variance(total: Array, v: float, k: float, cov: Array, work: Array) -> None:
+    """v G + k^2 G C G of the sums of a window in work[:n], G in work[n:2n], symmetric."""
+    n = cov.shape[0]
+    at = n + 1
     for i in range(n):
         for j in range(i + 1):
             work[n + i, j] = work[n + j, i] = total[at]
@@ -217,92 +161,69 @@ def solve(work: Array, n: int, given: Array, into: Array) -> None:
 
 
 @part
-def explain(g: Array, z: Array, u: Array, j: int, share: float, clipped: bool, named: float, findings: Array) -> float:
-    """Consider a change along g (n,), of which parameter j has a share; returns the best square by which one is named.
+def explain(z: Array, g: Array, share: float, j: int, best: Array) -> None:
+    """What a change along g (n,), of which parameter j has a share, explains of z; kept if it is more than before.
 
-    By residuals if scores are clipped, which then show only that there is a change.
+    best (3, ..): the square, the size and its standard error.
     """
-    length, score, raw = 0.0, 0.0, 0.0
+    length, score = 0.0, 0.0
     for i in range(g.shape[0]):
         length += g[i] * g[i]
         score += g[i] * z[i]
-        raw += g[i] * u[i]
-    if not length > 0.0:
-        return named
-    square = score * score / length
-    if not findings[ONE] >= square:
-        findings[ONE] = square
-    by = (raw * raw / length if clipped else square) - (ALIKE if share < 1.0 else 0.0)
-    if by > named:
-        findings[WHICH], findings[SIZE], findings[STD] = j, share * raw / length, share / np.sqrt(length)
-    return max(by, named)
+    if length > 0.0 and score * score / length > best[0, j]:
+        best[0, j], best[1, j], best[2, j] = score * score / length, share * score / length, share / np.sqrt(length)
 
 
 @part
-def explained(total: Array, frozen: Frozen, work: Array, j: int, constant: int) -> float:
-    """The squares that a step of parameter j explains, about its mean or through zero."""
+def steps(frozen: Frozen, work: Array, best: Array) -> None:
+    """What a step of each parameter explains of the sums whose whitened z is in work[2n], with the factor in work[:n]
+    and G in work[n:2n]: about the mean of its regressor, and through zero.
+    """
     n = frozen.theta.shape[0]
-    own, level = total[n + j], total[n + constant]
-    most: float = own * own / work[n + j, j]
-    if frozen.mean.shape[0] > 0 and frozen.mean[j] != 0.0:
-        a, b = through_zero(frozen, j, constant)
-        length = a * a * work[n + j, j] + 2.0 * a * b * work[n + j, constant] + b * b * work[n + constant, constant]
-        most = max(most, (a * own + b * level) ** 2 / max(length, SMALLEST))
-    return most
+    z, g, level = work[2 * n, :n], work[2 * n + 1, :n], work[2 * n + 2, :n]
+    centred = frozen.mean.shape[0] > 0
+    if centred:
+        solve(work, n, work[n + int(frozen.numbers[CONSTANT]), :n], level)
+    for j in range(n):
+        solve(work, n, work[n + j, :n], g)
+        explain(z, g, 1.0, j, best)
+        if centred and frozen.mean[j] != 0.0:
+            a, b = through_zero(frozen, j, int(frozen.numbers[CONSTANT]))
+            for i in range(n):
+                g[i] = a * g[i] + b * level[i]
+            explain(z, g, a, j, best)
 
 
 @part
-def compare(total: Array, L: int, cov: Array, frozen: Frozen, work: Array, findings: Array) -> None:
-    """The statistics of one window into findings."""
-    n = frozen.theta.shape[0]
-    numbers = frozen.numbers
-    variance(total, cov, frozen, work)
+def compare(total: Array, L: int, frozen: Frozen, memory: Memory, into: Array) -> None:
+    """The statistics of one window."""
+    n, numbers, work, best = frozen.theta.shape[0], frozen.numbers, memory.work, memory.best
+    variance(total, numbers[V], numbers[K], memory.known[COVARIANCE : COVARIANCE + n], work)
     rank = factor(work, n)
-    z, u, g = work[2 * n], work[2 * n + 1], work[2 * n + 2]
-    # with V = F F': z = F^-1 S and u = F^-1 U, so that S' V^-1 S = z'z
+    # with V = F F': z = F^-1 S, so that S' V^-1 S = z'z
+    z = work[2 * n]
     solve(work, n, total[:n], z)
-    solve(work, n, total[n : 2 * n], u)
-    square = 0.0
+    square, one = 0.0, 0.0
     for i in range(n):
         square += z[i] * z[i]
-    findings[JOINT] = cube_deviate(square / rank, 0.5 * rank) if rank > 0 else np.nan
-    clipped = total[2 * n] > MOST * L * numbers[CLIP] * numbers[CLIP]
-    centred, named, findings[ONE] = frozen.mean.shape[0] > 0, -ALIKE, np.nan
-    constant = int(numbers[CONSTANT]) if centred else 0
-    if centred:
-        solve(work, n, work[n + constant, :n], work[2 * n + 3])
-    for j in range(n):
-        # a change of parameter j alone: (g'z)^2 / g'g, its size g'u / g'g
-        solve(work, n, work[n + j, :n], g)
-        named = explain(g[:n], z, u, j, 1.0, clipped, named, findings)
-        if centred and frozen.mean[j] != 0.0:
-            a, b = through_zero(frozen, j, constant)
-            for i in range(n):
-                g[i] = a * g[i] + b * work[2 * n + 3, i]
-            named = explain(g[:n], z, u, j, a, clipped, named, findings)
-    findings[ONE] = np.sqrt(findings[ONE])
-    # squares of the residuals in units of those of the reference, and what that change leaves of them
-    fit = explained(total, frozen, work, int(findings[WHICH]), constant) if findings[ONE] >= 0.0 else 0.0
-    squares = total[2 * n + 1] / (L * numbers[RAW])
-    left = max(total[2 * n + 1] - fit, 0.0) / ((L - 1.0) * numbers[RAW])
-    moved = squares > 1.0 and left * left < squares
-    findings[STD] *= np.sqrt(numbers[RAW] * (max(left, 1.0) if moved else 1.0) / numbers[V])
-    findings[FIT] = np.nan if not clipped else fit / max(left, SMALLEST) if moved else 0.0
+        best[0, i] = 0.0
+    steps(frozen, work, best)
+    for i in range(n):
+        one = max(one, best[0, i])
+    into[ONE] = np.sqrt(one) if rank > 0 else np.nan
+    into[JOINT] = cube_deviate(square / rank, 0.5 * rank) if rank > 0 else np.nan
     # the variance of the noise: sum g^2 against L v, as a deviate
-    findings[NOISE], findings[WINDOW] = np.nan, L
+    into[NOISE] = np.nan
     if numbers[LONGEST] >= L:
-        ratio = total[2 * n] / (L * numbers[V])
-        z_noise = cube_deviate(ratio, L * numbers[V] * numbers[V] / numbers[KAPPA])
-        findings[NOISE] = abs(z_noise) / np.sqrt(1.0 + L / numbers[NORMAL])
-        findings[RATIO] = np.nan if moved else np.sqrt(squares)  # a parameter explains more of them than the noise
+        deviate = cube_deviate(total[n] / (L * numbers[V]), L * numbers[V] * numbers[V] / numbers[KAPPA])
+        into[NOISE] = abs(deviate) / np.sqrt(1.0 + L / numbers[NORMAL])
 
 
 @part
 def windows(memory: Memory, frozen: Frozen, count: int) -> None:
     """Compare the windows that end with a block that the last sample completed."""
-    sums, work, size = memory.sums, memory.work, memory.sums.shape[2]
-    cov = memory.known[COVARIANCE : COVARIANCE + frozen.theta.shape[0]]
-    total = work[work.shape[0] - 1]
+    sums, total = memory.sums, memory.work[memory.work.shape[0] - 1]
+    size = sums.shape[2]
     for j in range(sums.shape[0]):
         b = count >> j
         if count % (1 << j) != 0 or b < SHORT:
@@ -316,52 +237,137 @@ def windows(memory: Memory, frozen: Frozen, count: int) -> None:
             for back in range(begin, blocks):
                 for i in range(size):
                     total[i] += sums[j, (b - back) % BLOCKS, i]
-            compare(total, blocks << j, cov, frozen, work, memory.last[j, kind])
+            compare(total, blocks << j, frozen, memory, memory.last[j, kind])
+
+
+@part
+def noise(left: float, freedom: int, numbers: Array, own: Array) -> None:
+    """What a change of the noise explains, of which ``left`` squares are left."""
+    n, raw, spread = own.shape[1] - 1, numbers[RAW], numbers[SPREAD]
+    ratio = left / (freedom * raw)
+    own[0, n] = freedom * (ratio - 1.0 - log(max(ratio, SMALLEST))) / max(1.0, 0.5 * spread / (raw * raw))
+    own[1, n], own[2, n] = np.sqrt(ratio), 0.5 * np.sqrt(ratio * spread / freedom) / raw
+
+
+@part
+def weigh(best: Array, L: int, ages: int) -> None:
+    """Add what changes of this age explain, which stands for so many ages, to the sums over all of them."""
+    for j in range(best.shape[1]):
+        gain, size = best[0, j], best[1, j]
+        if gain > best[BEST, j]:
+            less = exp(0.5 * (best[BEST, j] - gain))
+            for i in range(SUM, SUM + 3):
+                best[i, j] *= less
+            best[BEST, j], best[AGE, j] = gain, L
+        weight = ages * exp(0.5 * (gain - best[BEST, j]))
+        best[SUM, j] += weight
+        best[SUM + 1, j] += weight * size
+        best[SUM + 2, j] += weight * (size * size + best[2, j] * best[2, j])
+
+
+@part
+def search(memory: Memory, frozen: Frozen, around: int) -> None:
+    """What changes of each parameter and of the noise, up to `KEPT` samples ago, explain, into memory.best.
+
+    The older ages are tried coarsely, but all of those about ``around``.
+    """
+    n, numbers, work, best = frozen.theta.shape[0], frozen.numbers, memory.work, memory.best
+    count, total, age = int(memory.counts[COUNT]), work[work.shape[0] - 1], 1
+    cov, z = memory.known[COVARIANCE : COVARIANCE + n], work[2 * n]
+    for i in range(total.shape[0]):
+        total[i] = 0.0
+    for i in range(best.shape[0]):
+        for j in range(n + 1):
+            best[i, j] = 0.0
+    for L in range(1, min(count, KEPT) + 1):
+        row, at = memory.recent[(count - L) % KEPT], n + 1
+        for i in range(n):
+            total[i] += row[i] * row[n]
+            for j in range(i + 1):
+                total[at] += row[i] * row[j]
+                at += 1
+        total[n] += row[n] * row[n]
+        near = abs(L - around) <= around // FINE
+        if age > L and not near:
+            continue
+        ages = 1 if near else 1 + L // FINE
+        age = L + ages
+        for i in range(OWN, OWN + 3):
+            for j in range(n + 1):
+                best[i, j] = 0.0
+        variance(total, 0.0, 1.0, cov, work)
+        for i in range(n):
+            for j in range(n):
+                work[i, j] = work[n + i, j]
+        rank = factor(work, n)
+        solve(work, n, total[:n], z)
+        left = total[n]
+        for j in range(n):
+            left -= z[j] * z[j]
+        variance(total, numbers[RAW], 1.0, cov, work)
+        factor(work, n)
+        solve(work, n, total[:n], z)
+        steps(frozen, work, best)
+        if rank + 1 < L:
+            noise(max(left, 0.0), L - rank, numbers, best)
+        weigh(best, L, ages)
+
+
+@part
+def tell(memory: Memory, frozen: Frozen, findings: Array) -> None:
+    """What changed, by how much, how many samples ago, and what else would explain them as well."""
+    n, best, constant = frozen.theta.shape[0], memory.best, int(frozen.numbers[CONSTANT])
+    which, around = 0, 0
+    for _ in range(2):
+        search(memory, frozen, around)
+        which = 0
+        for j in range(n + 1):
+            which = j if best[BEST, j] > best[BEST, which] else which
+        around = int(best[AGE, which])
+    if constant >= 0 and best[BEST, constant] > best[BEST, which] - ALIKE:
+        which = constant
+    findings[INSTEAD], most = np.nan, best[BEST, which] - ALIKE
+    for j in range(n + 1):
+        if j != which and best[BEST, j] > most:
+            most, findings[INSTEAD] = best[BEST, j], j
+    L, size = best[AGE, which], best[SUM + 1, which] / best[SUM, which]
+    findings[WHICH], findings[LENGTH], findings[SIZE] = which if L >= FEWEST else np.nan, L, size
+    findings[STD] = np.sqrt(max(best[SUM + 2, which] / best[SUM, which] - size * size, 0.0))
 
 
 @part
 def judge(memory: Memory, frozen: Frozen, findings: Array) -> None:
-    """Add the sample whose sums are in memory.sample, and write its statistics."""
-    sums, last = memory.sums, memory.last
+    """Add the sample whose sums are in memory.sample, and write its findings."""
+    last, beyond = memory.last, False
     memory.counts[COUNT] += 1.0
     count = int(memory.counts[COUNT])
-    enter(sums, memory.sample, count)
+    enter(memory.sums, memory.sample, count)
     windows(memory, frozen, count)
-    for i in range(CUSUM):
+    for i in range(findings.shape[0]):
         findings[i] = np.nan
-    best, fit, most, loudest = 0, np.nan, np.nan, np.nan
     for w in range(2 * last.shape[0]):
-        one, less = last[w // 2, w % 2], 2.0 * frozen.numbers[EVEN] * SHORTER[w]
-        for i in (ONE, JOINT, NOISE):
-            z = np.sqrt(max(one[i] * abs(one[i]) - less, 0.0)) if not np.isnan(one[i]) else np.nan
+        less = 2.0 * frozen.numbers[EVEN] * SHORTER[w]
+        for i in range(3):
+            own = last[w // 2, w % 2, i]
+            z = np.sqrt(max(own * abs(own) - less, 0.0)) if not np.isnan(own) else np.nan
             if z > findings[i] or np.isnan(findings[i]):
                 findings[i] = z
-        if one[ONE] > most or np.isnan(most):
-            best, fit, most = w, one[FIT], one[ONE]
-        if one[NOISE] > loudest or np.isnan(loudest):
-            loudest, findings[RATIO], findings[NOISE_WINDOW] = one[NOISE], one[RATIO], one[WINDOW]
-    # where scores are clipped, the window that one change explains best shows which
-    for w in range(2 * last.shape[0]):
-        if last[w // 2, w % 2, FIT] > fit:
-            best, fit, findings[RATIO] = w, last[w // 2, w % 2, FIT], np.nan
-    for i in (WHICH, SIZE, STD, WINDOW):
-        findings[i] = last[best // 2, best % 2, i]
+    for i in range(3):
+        beyond = beyond or findings[i] > frozen.ends[i]
+    if beyond:
+        tell(memory, frozen, findings)
 
 
 @Driver
 def scan(rows: Array, frozen: Frozen, memory: Memory, findings: Array, use: Array) -> None:
-    """Judge rows (T, n + 4), regressors and the columns of `ROW`: findings (T, CUSUM + n + 1) are repeated at
-    rows without a result.
+    """Judge rows (T, n + 4), regressors and the columns of `ROW`: findings (T, FINDINGS) are repeated at rows without
+    a result.
 
-    use (T,) is what every row could judge, `NOTHING` to `FULLY`.
+    use (T,) is what every row was good for, `NOTHING` to `JUDGED`.
     """
-    n = frozen.theta.shape[0]
     for t in range(rows.shape[0]):
         use[t] = enter_row(rows[t], frozen, memory)
-        if use[t] >= PARAMETERS:
-            accumulate(memory.work[0, :n], memory.work[0, n], use[t] == FULLY, frozen, memory.cusum)
-        if use[t] >= WINDOWS:
+        if use[t] == JUDGED:
             judge(memory, frozen, memory.findings)
-            report(memory.cusum, frozen, memory.findings[CUSUM:])
         for i in range(findings.shape[1]):
             findings[t, i] = memory.findings[i]

@@ -12,14 +12,14 @@ Where the reference knows little of a direction that a sample excites, as of an 
 be the error of theta, with the variance phi' C phi in units of the noise. From `UNSURE` on (and from `USUAL` n / N on,
 which rows of the reference seldom exceed), a sample corrects theta as a Kalman filter without drift does, until that
 variance is n / N, the mean of the N rows of the reference: its error is then divided by its standard deviation, and
-judges as any other, but not the noise while the variance is that large. Where nothing is known, as of an input that was
-0 or constant, a sample corrects theta as from a diffuse start and judges nothing. Where an error has more than
-`CREDIBLE` deviations, or the tracker blames the inputs, the sample corrects nothing: its error, over its standard
-deviation, judges with regressors shortened to leverage 1 / N, that of rows along one direction, so that no reading of
-an input, however large, counts more than a reading of y. One false reading of an input comes alone. Therefore a sample
-beyond the reference corrects theta only if there was another among the `AGAIN` before, and one with such an error, or
-blamed, judges only then, and not while the first may be one of its lags. Other samples that correct nothing are judged
-by windows alone, whose V allows for the variance, and not at all above `UNKNOWN`.
+judges as any other, but not the noise while the variance is that large. Lags of y do not count in phi, since a fault
+moves them. Where nothing is known, as of an input that was 0 or constant, a sample corrects theta as from a diffuse
+start and judges nothing. Where an error has more than `CREDIBLE` deviations, or the tracker blames the inputs, the
+sample corrects nothing: its error, over its standard deviation, judges with regressors shortened to leverage 1 / N,
+that of rows along one direction, so that no reading of an input, however large, counts more than a reading of y. One
+false reading of an input comes alone. Therefore a sample beyond the reference corrects theta only if there was another
+among the `AGAIN` before, and one with such an error, or blamed, judges only then, and not while the first may be one of
+its lags. Other samples that correct nothing are not judged above `UNKNOWN`.
 
 A sample that cannot be used is passed over. Where lags of the autoregression are missing, a Kalman filter predicts
 them, [phi, e] together so that a change of theta shows in the same way, and w_t is divided by the standard deviation of
@@ -50,14 +50,7 @@ LONG_GAP = 100.0
 """At most so many are predicted: later ones hardly differ."""
 ROOT = 0.999
 """The largest root of an autoregression whose lags are predicted."""
-SHIFT = 0.5
-"""The shift for which the score CUSUM is designed, in standard deviations of the noise per root mean square regressor.
-"""
 FLAT = 1e-9
-BOUND = 2.0
-"""Regressors further from 0, in root mean squares of the reference, count as this in the CUSUM: the shift that it waits
-for, SHIFT of the noise at 1, would otherwise be far larger than any where an input moves more than in the reference.
-"""
 SAME = 1e-6
 """A regressor that differs by less than this share from what it was in the whole reference has not changed."""
 UNSURE, USUAL, UNKNOWN, HUGE = 0.05, 8.0, 1.0, 1e200
@@ -74,34 +67,26 @@ Y, OK, NOISE_FACTOR, INTERVAL = range(4)
 """Columns of a row after its regressors, by the names of the fields of a tile, and by their places."""
 BLAMED = 0.5
 """`OK` of a sample whose inputs the tracker blames: it is judged, but is no lag and corrects nothing."""
-NOTHING, UNLIKE, WINDOWS, PARAMETERS, FULLY = range(5)
-"""What a row judges: nothing, as it cannot be used; nothing, as it is unlike the reference; the windows, without the
-noise; the CUSUM of the parameters too; everything.
-"""
+NOTHING, UNLIKE, JUDGED = range(3)
+"""What a row is good for: nothing, as it cannot be used, or as it is unlike the reference; or it is judged."""
 WIDE = 30.0
-"""For the size of a change x is limited to this, so that one outlier does not count more, or to twice the last e."""
-SCALE, CLIP, K, V, KAPPA, ALPHA, BETA, INSIDE, RAW, SPREAD, LONGEST, NORMAL, CONSTANT, EVEN, TOP = range(15)
+"""Scales from which on a residual is a fault code, and no lag."""
+SCALE, CLIP, K, V, KAPPA, ALPHA, BETA, INSIDE, RAW, SPREAD, LONGEST, NORMAL, CONSTANT, EVEN = range(14)
 """Entries of `Frozen.numbers`. INSIDE is the mean of x^2 where x is not clipped and 0 elsewhere, RAW and SPREAD are the
 mean and variance of x^2, LONGEST is the longest window that judges the noise, NORMAL the size of the reference,
-CONSTANT the index of the regressor that the others are centred on (read only if some are), EVEN how evenly windows of
-all lengths share the false alarms, from 0 (all have the same limit) to 1, TOP the deviate of a CUSUM from which on it
-forgets (none if it is 0).
+CONSTANT the index of the regressor that the others are centred on, EVEN how evenly windows of all lengths share the
+false alarms, from 0 (all have the same limit) to 1.
 """
-NUMBERS = TOP + 1
-ALIKE = 1.0
-"""Twice the logarithm of the likelihood ratio up to which a step is of the level, not of a slope through zero."""
-LITTLE = 0.2
-"""Share of a slope in a step through zero below which it is that of the level, which has a CUSUM of its own."""
-MOST = 0.5
-"""Share of sum g^2, of what it is where every score is clipped, from which on scores no longer show what moved."""
+NUMBERS = EVEN + 1
 SINCE, LEVEL, COUNT = range(3)
 """Entries of `Memory.counts`: usable samples in a row, h, samples that were used."""
-ONE, JOINT, NOISE, WHICH, SIZE, STD, WINDOW, RATIO, NOISE_WINDOW, CUSUM = range(10)
-"""Entries of the findings of a sample; the CUSUM of n parameters and of the noise come last."""
+ONE, JOINT, NOISE, WHICH, SIZE, STD, LENGTH, INSTEAD = range(8)
+"""Entries of the findings of a sample: the statistics, and the change that explains the last samples best."""
+FINDINGS = INSTEAD + 1
+KEPT = LENGTHS[-1]
+"""Samples in which the beginning of a change is searched."""
 LEARNED, COVARIANCE = 0, 1
 """Rows of `Memory.known`."""
-FIT = NOISE_WINDOW
-"""Entry of a window in its place: where scores are clipped, how well one change explains it, or 0; otherwise NaN."""
 
 
 class Frozen(NamedTuple):
@@ -116,21 +101,28 @@ class Frozen(NamedTuple):
     """(k, n): directions of the regressors in which the reference has none, such as that of an input that was 0."""
     mean: Array = np.zeros(0)
     """(n,): regressors in the reference as multiples of the constant, 0 if they moved about zero; none if all did."""
+    lag: Array = np.zeros(0)
+    """(n,): 1 for regressors that are earlier outputs, which a fault moves, and 0 for inputs."""
+    ends: Array = np.full(3, np.inf)
+    """(3,): statistics above which it is told what changed."""
 
 
 class Memory(NamedTuple):
-    """The state: lags, block sums, the statistics of every window, CUSUM, counts, and the sums and statistics of the
-    last sample; ``work`` is scratch.
+    """The state: lags, block sums, the statistics of every window, counts, and the sums and findings of the last
+    sample; ``work`` is scratch.
     """
 
     past: Array
     sums: Array
     last: Array
-    cusum: Array
     counts: Array
     work: Array
     sample: Array
     findings: Array
+    recent: Array
+    """(KEPT, n + 1): regressors and residuals of the last samples."""
+    best: Array
+    """(8, n + 1): scratch, what a change of each parameter and of the noise explains."""
     known: Array
     """(n + 2, n): row LEARNED is how far theta is from that of the reference; n rows from COVARIANCE on are its
     covariance C, which has no part in ``unknown``; and the last row begins with the result of `noted`.
@@ -145,16 +137,15 @@ class Memory(NamedTuple):
 
 def memory_of(frozen: Frozen) -> Memory:
     """The state before the first sample."""
-    n, p, centred = len(frozen.theta), len(frozen.ar), len(frozen.mean)
-    last = np.full((LEVELS, 2, CUSUM), np.nan)
-    sums = np.zeros((LEVELS, BLOCKS, size_of(n)))
-    work = np.zeros((2 * n + 4 + (centred > 0), size_of(n)))
-    counts, findings = np.array([0.0, 1.0, 0.0]), np.full(CUSUM + n + 1, np.nan)
-    past, cusum = np.zeros((p + 1, n + 1)), np.zeros((n + 1 + centred, 2))
+    n, p = len(frozen.theta), len(frozen.ar)
+    last, sums = np.full((LEVELS, 2, 3), np.nan), np.zeros((LEVELS, BLOCKS, size_of(n)))
+    work = np.zeros((2 * n + 5, size_of(n)))
+    counts, findings = np.array([0.0, 1.0, 0.0]), np.full(FINDINGS, np.nan)
     excited = np.eye(n) - frozen.unseen.T @ frozen.unseen
     known = np.vstack([np.zeros((1, n)), excited @ frozen.cov @ excited, np.zeros((1, n))])
     unknown, lags = frozen.unseen.copy(), np.vstack([stationary(frozen.ar), np.zeros((1, p))])
-    return Memory(past, sums, last, cusum, counts, work, np.zeros(size_of(n)), findings, known, unknown, lags)
+    past, recent, best = np.zeros((p + 1, n + 1)), np.zeros((KEPT, n + 1)), np.zeros((8, n + 1))
+    return Memory(past, sums, last, counts, work, np.zeros(size_of(n)), findings, recent, best, known, unknown, lags)
 
 
 def stable(ar: Array) -> Array:
@@ -175,8 +166,8 @@ def stationary(ar: Array) -> Array:
 
 
 def size_of(n: int) -> int:
-    """Numbers in the sums of a block: S, U, Q, sum x^2 and the lower triangle of G."""
-    return 2 * n + 2 + n * (n + 1) // 2
+    """Numbers in the sums of a block: S, Q and the lower triangle of G."""
+    return n + 1 + n * (n + 1) // 2
 
 
 def judgeable(fields: Any, lane: int, y: Array, noise: Array) -> Array:
@@ -202,13 +193,13 @@ def through_zero(frozen: Frozen, j: int, constant: int) -> tuple[float, float]:
 
 
 @part
-def leverage(phi: Array, cov: Array) -> float:
-    """phi' C phi: the variance of the prediction by theta, as a share of that of the noise."""
+def leverage(phi: Array, cov: Array, lag: Array) -> float:
+    """phi' C phi without lags: the variance of the prediction by theta, as a share of that of the noise."""
     total = 0.0
-    for i in range(cov.shape[1]):
+    for i in range(lag.shape[0]):
         for j in range(i):
-            total += 2.0 * cov[i, j] * phi[i] * phi[j]
-        total += cov[i, i] * phi[i] * phi[i]
+            total += 2.0 * cov[i, j] * phi[i] * phi[j] * (1.0 - lag[i]) * (1.0 - lag[j])
+        total += cov[i, i] * phi[i] * phi[i] * (1.0 - lag[i])
     return total
 
 
@@ -274,15 +265,15 @@ def discover(phi: Array, x: float, frozen: Frozen, memory: Memory, gain: Array) 
 
 
 @part
-def enter_scores(phi: Array, g: float, x: float, sample: Array) -> None:
-    """The sums of a single sample: phi g, phi x, g^2, x^2, phi phi'."""
-    n, at = phi.shape[0], 2 * phi.shape[0] + 2
+def enter_scores(phi: Array, g: float, sample: Array) -> None:
+    """The sums of a single sample: phi g, g^2, phi phi'."""
+    n, at = phi.shape[0], phi.shape[0] + 1
     for i in range(n):
-        sample[i], sample[n + i] = phi[i] * g, phi[i] * x
+        sample[i] = phi[i] * g
         for j in range(i + 1):
             sample[at] = phi[i] * phi[j]
             at += 1
-    sample[2 * n], sample[2 * n + 1] = g * g, x * x
+    sample[n] = g * g
 
 
 @part
@@ -362,7 +353,10 @@ def observe_lags(ar: Array, memory: Memory, innovation: Array, n: int) -> float:
 
 @part
 def whiten(row: Array, frozen: Frozen, memory: Memory) -> float:
-    """[phi, x] of a row into memory.work[0]; returns the limit of x, 0 if it cannot be used."""
+    """[phi, x] of a row into memory.work[0]; returns the limit of x, 0 if it cannot be used.
+
+    x is limited to `WIDE`, or to twice the last e, so that one outlier does not count more.
+    """
     n, p = frozen.theta.shape[0], frozen.ar.shape[0]
     past, counts, numbers, phi = memory.past, memory.counts, frozen.numbers, memory.work[0]
     if not row[n + INTERVAL] > 0.0:
@@ -422,13 +416,13 @@ def noted(left: float, strange: bool, n: int) -> float:
 
 @part
 def enter_row(row: Array, frozen: Frozen, memory: Memory) -> int:
-    """Scores of a row into memory.sample, and [phi, g] for the CUSUM into memory.work[0]; what it can judge."""
+    """Scores of a row into memory.sample, and [phi, x] into memory.recent; what it is good for."""
     n, numbers, known = frozen.theta.shape[0], frozen.numbers, memory.known
     phi, scratch = memory.work[0], memory.work[1:3]
     wide = whiten(row, frozen, memory)
     if not wide > 0.0:
         return NOTHING
-    reference, x = leverage(phi, frozen.cov), phi[n]
+    reference, x = leverage(phi, frozen.cov, frozen.lag), phi[n]
     if not reference < HUGE:
         return UNLIKE
     if outside(phi, frozen.unseen):
@@ -437,7 +431,7 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> int:
         x -= phi[i] * known[LEARNED, i]
     clip, least, blamed = numbers[CLIP], max(UNSURE, USUAL * n / numbers[NORMAL]), row[n + OK] <= BLAMED
     # the variance can only have become smaller since the reference
-    h = reference if reference <= least else leverage(phi, known[COVARIANCE : COVARIANCE + n])
+    h = reference if reference <= least else leverage(phi, known[COVARIANCE : COVARIANCE + n], frozen.lag)
     sure, root = h <= least, np.sqrt(1.0 + h * numbers[K] * numbers[K] / numbers[V])
     far = abs(x) > CREDIBLE * root
     unlike, alone = reference > least and not blamed, blamed or (far and not sure)
@@ -459,11 +453,14 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> int:
         x /= root
         for i in range(n):
             phi[i] *= shorter
-    phi[n] = min(clip, max(-clip, x))
-    enter_scores(phi[:n], phi[n], min(wide, max(-wide, x)), memory.sample)
+    enter_scores(phi[:n], min(clip, max(-clip, x)), memory.sample)
     if not sure:
-        memory.sample[2 * n], memory.sample[2 * n + 1] = numbers[V], numbers[RAW]
+        memory.sample[n] = numbers[V]
+    newest = memory.recent[int(memory.counts[COUNT]) % KEPT]
+    for i in range(n):
+        newest[i] = phi[i]
+    newest[n] = min(wide, max(-wide, x))
     # the GARCH recursion for h at the next sample
-    fed = numbers[ALPHA] * memory.sample[2 * n] / numbers[V] + numbers[BETA]
+    fed = numbers[ALPHA] * memory.sample[n] / numbers[V] + numbers[BETA]
     memory.counts[LEVEL] = 1.0 - numbers[ALPHA] - numbers[BETA] + fed * memory.counts[LEVEL]
-    return FULLY if sure else PARAMETERS if learns or far else WINDOWS
+    return JUDGED

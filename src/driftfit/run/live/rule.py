@@ -1,12 +1,11 @@
 """The rule of an alarm: what is compared with which limits; estimated from a reference, and applied to later runs and
 streams.
 
-    band          z_ti = max(theta_ti - high_i, low_i - theta_ti) / std_ti
-    innovation    sums over the last W used samples of g_t^2 and of g_t (its absolute value), g = e / s, or its normal
-                  score among normal innovations
-    probability   the probability of a change in the tracker's window
-    glr, cusum    likelihood ratios or cumulated scores on a frozen reference model
-                  (`driftfit.run.live.likelihood_ratio`)
+    glr     likelihood ratios on a frozen reference model (`driftfit.run.live.likelihood_ratio`)
+    band    z_ti = max(theta_ti - high_i, low_i - theta_ti) / std_ti
+
+An alarm is on from where a statistic is beyond its limit until all are below their ends, the limits that false alarms
+would exceed `OFTENER` times as often: it does not flicker.
 
 A record and a stream use the same operations in the same order, so their results agree bit for bit.
 
@@ -36,21 +35,16 @@ import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, near
-from driftfit.run.live.reference_model import CONSTANT, CUSUM, JOINT, NOISE, ONE, TOP, Frozen
+from driftfit.run.live.reference_model import CONSTANT, Frozen
 from driftfit.trackers.base import Tracker
 
-FROZEN = ("glr", "cusum")
-"""Kinds that judge by a frozen reference model."""
 OFFSET = "offset"
 """The parameter of a constant regressor that the frozen model has even if the model of the run has none."""
-KINDS = (*FROZEN, "band", "innovation", "probability")
+KINDS = ("glr", "band")
+OFTENER = 2.0
 
 THETA, OF_NUMBERS, MEAN = (Frozen._fields.index(name) for name in ("theta", "numbers", "mean"))
 """Places in `AlarmRule.frozen`."""
-CUSUM_CAP = 1.3
-"""From this multiple of the largest limit on, a CUSUM forgets."""
-CHANGE, REPORT = "window", "report"
-"""Where the probability of a change is stored: in a field of the tracker, or in the report of a `Bank`."""
 
 
 @dataclass(frozen=True)
@@ -59,50 +53,40 @@ class AlarmRule(Settings):
 
     Attributes
     ----------
-    kind : "glr", "cusum", "band", "innovation" or "probability"
+    kind : "glr" or "band"
     every : number
         Samples in which one false alarm may begin.
     names, limits : (c,)
-        Names of the statistics and their limits: "one parameter", "parameters" and "noise" of "glr"; parameters;
-        "power" and "mean" of the innovations; "probability".
-    hold : int
-        Number of samples for which an alarm stays on after its cause.
-    window : int
-        Samples in the sums of "innovation".
-    low, high : (c,)
-        Bands of the parameters, for "band".
-    normal : (k,)
-        Normal absolute standardised innovations, ascending, for "innovation" with a reference; otherwise empty.
-    simulated : bool
-        Whether the limits were found by simulation.
-    parameters : (n,)
-        Names of the parameters of the frozen model, for "glr" and "cusum"; otherwise empty. The last is OFFSET if the
-        run has no constant regressor.
-    frozen : theta, unit, ar, cov, numbers, unseen, mean
-        That model, as `driftfit.run.live.reference_model.Frozen`.
+        Names of the statistics and their limits: "one parameter", "parameters" and "noise" of "glr"; parameters.
     growth : (c,)
         Growth of the squares of the limits with log(every).
-    rounding : () or (step, noise, seed)
-        Of a coarse sensor: its readings are drawn again within the step (`driftfit.run.live.rule`).
+    low, high : (c,)
+        Bands of the parameters, for "band".
+    parameters : (n,)
+        Names of the parameters of the frozen model, for "glr"; otherwise empty. The last is OFFSET if the run has no
+        constant regressor; it is the only one where the innovations of the tracker are judged.
+    frozen : theta, unit, ar, cov, numbers, unseen, mean, lag
+        That model, as `driftfit.run.live.reference_model.Frozen`.
     unsure : number
         Standard deviation of the log of the real rate of false alarms, which errors of the reference leave.
+    rounding : () or (step, noise, seed)
+        Of a coarse sensor: its readings are drawn again within the step (`driftfit.run.live.rule`).
+    doubt : str
+        What speaks against the reference: when it changes itself; empty if nothing does.
     """
 
     kind: str
     every: float
     names: tuple[str, ...]
     limits: tuple[float, ...]
-    hold: int = 0
-    window: int = 50
+    growth: tuple[float, ...] = ()
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
-    normal: tuple[float, ...] = ()
-    simulated: bool = False
     parameters: tuple[str, ...] = ()
     frozen: tuple[Any, ...] = ()
-    growth: tuple[float, ...] = ()
     unsure: float = 0.0
     rounding: tuple[float, ...] = ()
+    doubt: str = ""
 
     def __repr__(self) -> str:
         limits = ", ".join(f"{name} {limit:.4g}" for name, limit in zip(self.names, self.limits, strict=True))
@@ -110,12 +94,21 @@ class AlarmRule(Settings):
 
     @property
     def reference(self) -> Frozen:
-        """The frozen model of "glr" and "cusum", as arrays."""
+        """The frozen model of "glr", as arrays."""
         n = len(self.parameters)
-        shapes = (-1, -1, -1, (n, n), -1, (-1, n), -1)
+        shapes = (-1, -1, -1, (n, n), -1, (-1, n), -1, -1)
         found = Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(self.frozen, shapes, strict=True)))
-        found.numbers[TOP] = CUSUM_CAP * max(self.limits, default=0.0)
-        return found
+        return found._replace(ends=self.ends) if self.limits else found
+
+    @property
+    def of_innovations(self) -> bool:
+        """Whether "glr" judges the innovations of the tracker."""
+        return self.parameters == (OFFSET,)
+
+    @cached_property
+    def ends(self) -> Array:
+        """(c,): below these statistics an alarm ends."""
+        return np.asarray(np.sqrt(np.maximum(np.square(self.limits) - np.log(OFTENER) * np.array(self.growth), 0.0)))
 
     def drawn(self, phi: Array, y: Array, noise: Array, first: int) -> Array:
         """Readings y (T,) on phi (T, n) of the frozen model, the first of them sample number ``first`` that is judged:
@@ -140,66 +133,35 @@ class AlarmRule(Settings):
         middle = 0.5 * self.unsure**2
         return self.every * float(np.exp(middle - away)), self.every * float(np.exp(middle + away))
 
-    @property
-    def entries(self) -> list[int]:
-        """Indices of the statistics of "glr" or "cusum" among the findings."""
-        return [ONE, JOINT, NOISE] if self.kind == "glr" else [CUSUM + j for j in range(len(self.names))]
-
-    @property
-    def slack(self) -> float:
-        """How much wider the limits are because the reference is itself an estimate."""
-        return float(np.sqrt(1.0 + self.window / len(self.normal))) if self.normal else 1.0
-
-    @cached_property
-    def _arrays(self) -> tuple[Array, Array, Array, Array]:
-        """limits, low, high and normal."""
-        return np.array(self.limits), np.array(self.low), np.array(self.high), np.array(self.normal)
-
     def columns(self, names: Sequence[str]) -> list[int]:
         """Indices of the watched parameters among those of a run; ValueError if one does not exist."""
         return [names.index(name) for name in self.names] if self.kind == "band" else []
 
     def outside(self, theta: Array, std: Array) -> Array:
         """How many standard deviations parameters (.., c) are outside their bands; NaN if they are not determined."""
-        _, low, high, _ = self._arrays
         with np.errstate(invalid="ignore", divide="ignore"):
-            beyond = np.maximum(theta - high, low - theta) / std
+            beyond = np.maximum(theta - self.high, self.low - theta) / std
         return np.where(np.isfinite(std), beyond, np.nan)
 
-    def scores(self, innovation: Array, std: Array) -> Array:
-        """g, finite or NaN: innovations over their standard deviations, or their normal scores."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            g = innovation / std
-        g = np.where(np.isfinite(g), g, np.nan)
-        return normal_scores(g, self._arrays[3]) if self.normal else g
-
-    def exceeded(self, statistic: Array) -> Array:
-        """Whether any column (.., c) is beyond its limit."""
+    def active(self, statistic: Array, before: bool = False) -> Array:
+        """Whether an alarm is on at each of T samples with statistics (T, c), after it was on or off ``before``."""
         with np.errstate(invalid="ignore"):
-            return np.asarray((statistic > self._arrays[0]).any(axis=-1))
+            begins, stays = (np.any(statistic > one, axis=1) for one in (np.array(self.limits), self.ends))
+        decided = np.maximum.accumulate(np.where(begins | ~stays, np.arange(len(statistic)), -1))
+        return np.where(decided >= 0, begins[decided], before)
 
     def cause(self, statistic: Array) -> int:
         """The column (c,) that is furthest beyond its limit."""
         with np.errstate(invalid="ignore", divide="ignore"):  # a limit is 0 where z hardly moves between samples
-            ratio = statistic / self._arrays[0]
+            ratio = statistic / np.array(self.limits)
         ratio = np.where(np.isfinite(statistic) & ~np.isnan(ratio), ratio, -np.inf)
         return int(np.argmax(ratio))
-
-    def limit_text(self, column: int) -> str:
-        """The limit of a column as text; a probability near 1 as its distance from 1."""
-        return value_text(self.kind, self.limits[column])
-
-
-def value_text(kind: str, value: float) -> str:
-    """A statistic or a limit as text; a probability near 1 as its distance from 1."""
-    return f"1 - {1.0 - value:.2g}" if kind == "probability" and 0.999 < value < 1.0 else f"{value:.4g}"
 
 
 def check_fits(rule: AlarmRule, tracker: Tracker, names: Sequence[str]) -> None:
     """Raise an error if a tracker does not support the alarm."""
-    kind = type(tracker).__name__
     own = [name for name in rule.parameters if name != OFFSET]
-    if rule.kind in FROZEN and len(names) != len(own):
+    if rule.kind == "glr" and len(names) != len(own) and not rule.of_innovations:
         raise ValueError(
             f"detect: the reference model has {len(own)} parameters, {', '.join(own)}; this run has {len(names)}. "
             "Make the rule from a run of the same model."
@@ -207,45 +169,9 @@ def check_fits(rule: AlarmRule, tracker: Tracker, names: Sequence[str]) -> None:
     absent = [name for name in rule.names if name not in names] if rule.kind == "band" else []
     if absent:
         raise ValueError(f"detect: there is no parameter {absent[0]!r}; {near(str(absent[0]), names)}")
-    if rule.kind == "band" and not tracker.covariance:
-        raise ValueError(f"detect: {kind} carries no covariance, so no band can be judged.")
-    if rule.kind == "innovation" and not tracker.covariance:
-        raise ValueError(
-            f"detect: {kind} carries no covariance, so the size of an innovation cannot be judged; use FLS or Kalman."
-        )
-    if rule.kind == "probability" and not {CHANGE, REPORT} & set(tracker.outputs):
-        raise ValueError(
-            f"detect: {kind} carries no probability of a change; track with Bank, or use "
-            'kind="band" or kind="innovation".'
-        )
-
-
-def normal_scores(g: Array, known: Array) -> Array:
-    """g with the size that a normal variable of the same rank among ``known`` (N,) absolute values would have."""
-    share = (1.0 + len(known) - np.searchsorted(known, np.abs(g), side="left")) / (len(known) + 1.0)
-    return np.where(np.isfinite(g), -scipy.special.ndtri(np.clip(share / 2.0, 1e-12, 0.5)) * np.sign(g), np.nan)
-
-
-def moving_sums(values: Array, window: int) -> Array:
-    """Sums (.., T - window + 1) of neighbours on the last axis, added from the oldest on, as in a stream."""
-    count = max(values.shape[-1] - window + 1, 0)
-    total = np.zeros((*values.shape[:-1], count))
-    for k in range(window if count else 0):
-        total += values[..., k : k + count]
-    return total
-
-
-def power_and_mean(g: Array, window: int) -> Array:
-    """Moving sums of g^2 and absolute moving sums of g, (T - window + 1, 2)."""
-    power, mean = moving_sums(np.stack([g * g, g]), window)
-    return np.stack([power, np.abs(mean)], axis=1)
-
-
-def change_probability(tracker: Any, fields: Any) -> float:
-    """The probability of a change in the tracker's window, from the fields of one lane."""
-    if CHANGE in tracker.outputs:
-        return float(np.reshape(fields[CHANGE], -1)[0])
-    return float(tracker.reported(fields[REPORT], CHANGE))
+    if (rule.kind == "band" or rule.of_innovations) and not tracker.covariance:
+        what = "no band" if rule.kind == "band" else "the size of no innovation"
+        raise ValueError(f"detect: {type(tracker).__name__} carries no covariance, so {what} can be judged.")
 
 
 GOLDEN, FIRST, SECOND = (np.uint64(one) for one in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))

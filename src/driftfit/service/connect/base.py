@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 from driftfit.service.connect.samples import Receipt, Samples
-from driftfit.service.core.results import Results
+from driftfit.service.core.results import Result, Results
 
 ANSWER_SECONDS = 20.0
 """In this time a broker or a server must have answered."""
@@ -181,25 +181,6 @@ class QueueReader(Reader):
         return found
 
 
-class Result(NamedTuple):
-    """The tracker's result for one sample."""
-
-    number: int
-    """Number of the sample in the journal."""
-    unit: str
-    time: float | None
-    """Seconds, in UTC since 1970 for dates."""
-    y: float
-    y_hat: float
-    e: float
-    s: float
-    ok: bool
-    theta: list[float]
-    std: list[float]
-    alarm: bool
-    """Whether an alarm is on."""
-
-
 class Event(NamedTuple):
     """Something that happened to a unit."""
 
@@ -251,7 +232,7 @@ class Outcome:
         return list(found.values())
 
     def _listed(self, parts: Sequence[Results]) -> list[Result]:
-        return [Result(row[0], self.names[row[1]], *row[2:]) for one in parts for row in one.rows()]
+        return [row._replace(unit=self.names[row.unit]) for one in parts for row in one.rows()]
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,12 @@ from driftfit.service.connect.base import (
     Outcome,
     QueueReader,
     Reader,
-    Result,
     Sink,
     Source,
     Writer,
 )
 from driftfit.service.connect.samples import by_topic
+from driftfit.service.core.results import Result
 from driftfit.service.options import Secret
 
 QUEUED_CHANGES = 100_000

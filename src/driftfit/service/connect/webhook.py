@@ -83,7 +83,7 @@ def message(event: Event) -> dict[str, object]:
     at = datetime.fromtimestamp(event.at, UTC).isoformat(timespec="seconds")
     text = f"{event.unit}: {event.kind}"
     if event.kind == "alarm":
-        text = (f"{event.unit}: {detail['kind']} alarm, {detail['cause']} is {detail['statistic']:.3g}, "
+        text = (f"{event.unit}: {detail['kind']} alarm, cause {detail['cause']}, statistic {detail['statistic']:.3g}, "
                 f"limit {detail['limit']:.3g}")  # fmt: skip
     return {"unit": event.unit, "kind": event.kind, "at": at, "title": "driftfit", "text": text, "message": text,
             "number": event.number, "detail": detail}  # fmt: skip

@@ -19,6 +19,26 @@ OK, ALARM = 1, 2
 """Bits of the flags."""
 
 
+class Result(NamedTuple):
+    """The tracker's result for one sample."""
+
+    number: int
+    """Number of the sample in the journal."""
+    unit: Any
+    """Its name; in `Results` and on the page its number."""
+    time: float | None
+    """Seconds, in UTC since 1970 for dates."""
+    y: float
+    y_hat: float
+    e: float
+    s: float
+    ok: bool
+    theta: list[float]
+    std: list[float]
+    alarm: bool
+    """Whether an alarm is on."""
+
+
 class Results(NamedTuple):
     """Results of N samples, sorted by unit, and of a unit in the order in which they were processed."""
 
@@ -52,14 +72,15 @@ class Results(NamedTuple):
         """The last result of every unit."""
         return self.some(np.flatnonzero(np.append(self.unit[1:] != self.unit[:-1], True)))
 
-    def rows(self) -> list[list[Any]]:
-        """A list for each sample: number, unit, time or None, y, y_hat, e, s, ok, theta, std, alarm."""
+    def rows(self) -> list[Result]:
+        """The results one by one."""
         n, found = self.n, []
         columns = (self.number, self.unit, self.flags, self.values)
         for number, unit, flags, values in zip(*(column.tolist() for column in columns), strict=True):
-            time, theta, std = values[TIME], values[THETA : THETA + n], values[THETA + n :]
-            found.append([number, unit, time if time == time else None, *values[Y:THETA], bool(flags & OK), theta, std,
-                          bool(flags & ALARM)])  # fmt: skip
+            time, y, y_hat, e, s, *rest = values
+            ok, alarm = bool(flags & OK), bool(flags & ALARM)
+            time = time if time == time else None
+            found.append(Result(number, unit, time, y, y_hat, e, s, ok, rest[:n], rest[n:], alarm))
         return found
 
     def plain(self) -> tuple[bytes, bytes, bytes, bytes]:

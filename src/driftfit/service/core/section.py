@@ -22,7 +22,6 @@ from driftfit.engine.drivers import INTERVAL, NOISE
 from driftfit.engine.kernel import Array
 from driftfit.readings import gate
 from driftfit.readings.left_out import SAID
-from driftfit.run.live.rule import FROZEN
 from driftfit.run.live.stream import HELD
 from driftfit.run.parallel_lanes import FEWEST_LANES, Advanced, advance
 from driftfit.service.config import UnitSettings
@@ -145,7 +144,7 @@ class Section:
         length = np.diff(np.append(first, len(places)))
         own = places[first]
         known = self._known(places, own, first, time)
-        collected = any(alarm.rule.kind in FROZEN for k in own.tolist() for alarm in self.units[k].alarms)
+        collected = any(alarm.rule.kind == "glr" for k in own.tolist() for alarm in self.units[k].alarms)
         records = Records(tuple(own.tolist()), first, length, values[:, 0], values[:, 1:], Known(known), time)
         try:
             found = advance(

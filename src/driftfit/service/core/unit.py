@@ -367,9 +367,8 @@ def rules_of(settings: UnitSettings, rows: Array) -> dict[str, Any]:
     except Exception as error:
         return {"do": "calibrated", "rules": [], "refused": dict.fromkeys(alarm.on, str(error))}
     for kind in alarm.on:
-        reference = None if kind == "probability" else len(rows)
         try:
-            alarms = run.detect(kind, every=alarm.each, reference=reference, window=alarm.window, hold=alarm.hold)
+            alarms = run.detect(kind, every=alarm.each, reference=len(rows))
             rules.append(describe(alarms.rule))
         except Exception as error:
             refused[kind] = str(error)

@@ -75,7 +75,6 @@ class Access:
     def __init__(self, app: ASGIApp, page: PageOptions, sessions: Sessions) -> None:
         self.app, self.page, self.sessions = app, page, sessions
         self.rates = Rates(page.requests)
-        self.refused = 0
         names = {"localhost", "127.0.0.1", "[::1]", "::1", *page.names}
         self.hosts = names if page.host in ("0.0.0.0", "::") else names | {page.host}
         self.any_host = page.host in ("0.0.0.0", "::") and not page.names
@@ -87,7 +86,6 @@ class Access:
         connection = HTTPConnection(scope)
         problem = self.problem(connection)
         if problem is not None:
-            self.refused += 1
             await self._refuse(scope, receive, send, *problem)
             return
         if scope["type"] == "websocket":

@@ -117,12 +117,8 @@ class Page:
             state = {"error": "the engine does not answer"}
         now = {}
         if row is not None:
-            names = about["names"]
-            now = {
-                "number": row[0], "time": row[2], "y": row[3], "y_hat": row[4], "e": row[5], "s": row[6], "ok": row[7],
-                "alarm": row[10], "theta": dict(zip(names, row[8], strict=False)),
-                "std": dict(zip(names, row[9], strict=False)),
-            }  # fmt: skip
+            named = {what: dict(zip(about["names"], getattr(row, what), strict=False)) for what in ("theta", "std")}
+            now = row._asdict() | named | {"unit": name}
         return Answer({"unit": name, "about": about, "now": now, "state": state})
 
     async def history(self, request: Request) -> Response:
@@ -334,13 +330,13 @@ class Sockets:
             return {"view": "unit", "unit": view["unit"], "status": status, "missing": True}
         unit, after = view["unit"], view["at"]
         recent = await feed.recent(number)
-        rows = [row for row in recent if row[0] > after]
+        rows = [row for row in recent if row.number > after]
         columns = columns_of(rows).T.tolist() if rows else []
         if after == 0:
             columns = (await asyncio.to_thread(newest_blocks, feed.journal, number, recent)).T.tolist()
         if unit == view["unit"] and rows:
-            view["at"] = max(row[0] for row in rows)
-        on = rows[-1][10] if rows else None
+            view["at"] = max(row.number for row in rows)
+        on = rows[-1].alarm if rows else None
         return {"view": "unit", "unit": unit, "status": status, "columns": columns, "alarm": on}
 
 
@@ -359,7 +355,7 @@ def metrics_of(feed: Feed, viewers: int) -> str:
         ("units", "gauge", "Units.", status.get("units", 0)),
         ("units_failed", "gauge", "Units that have failed.", status.get("failed", 0)),
         ("trouble", "gauge", "What does not work in units, at most 100 of them.", unarmed),
-        ("units_in_alarm", "gauge", "Units whose alarm is on.", sum(bool(row[10]) for row in feed.latest.values())),
+        ("units_in_alarm", "gauge", "Units whose alarm is on.", sum(row.alarm for row in feed.latest.values())),
         ("waiting_samples", "gauge", "Samples that wait for the journal.", status.get("waiting", 0)),
         ("held_back_total", "counter", "How often a source was held back.", status.get("held_back", 0)),
         ("viewers", "gauge", "Open pages.", viewers),

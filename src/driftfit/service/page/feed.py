@@ -21,7 +21,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.service.control import packed
 from driftfit.service.core.journal import Journal, Names
-from driftfit.service.core.results import FIXED, extremes_of
+from driftfit.service.core.results import FIXED, Result, extremes_of
 
 READ_SECONDS = 0.25
 """Seconds between two reads."""
@@ -54,14 +54,12 @@ class Feed:
         self.journal = Journal(folder, read_only=True)
         self.names = Names(self.journal)
         self.names.read()
-        self.latest: dict[int, list[Any]] = {}
+        self.latest: dict[int, Result] = {}
         self.updated: dict[int, float] = {}
         self.fleet: list[dict[str, Any]] = []
-        self.events: deque[list[Any]] = deque(maxlen=200)
-        self.watched: dict[int, tuple[deque[list[Any]], list[float]]] = {}
+        self.watched: dict[int, tuple[deque[Result], list[float]]] = {}
         self.status: dict[str, Any] = {"problem": "the engine has not answered yet"}
         self.answered = 0.0
-        self.count = 0
         self._swept = time.monotonic()
         self._base: dict[int, tuple[float, list[float], list[float]]] = {}
         query = "select coalesce(min(first), 1) - 1 from (select first from result order by first desc limit ?)"
@@ -85,16 +83,14 @@ class Feed:
         """Read the results that are new."""
         for _ in range(20):
             groups = self.journal.outcomes(self.at)
-            for group, parts, events, at in groups:
+            for group, parts, _, at in groups:
                 self.at = group
-                self.count += sum(len(part.number) for part in parts)
                 for part in parts:
                     for row in part.last().rows():
-                        self.latest[row[1]] = row
-                        self.updated[row[1]] = at
+                        self.latest[row.unit] = row
+                        self.updated[row.unit] = at
                     for unit, (kept, _) in self.watched.items():
                         kept.extend(part.some(np.flatnonzero(part.unit == unit)).rows())
-                self.events.extend(events)
             if len(groups) < 64:
                 break
         if any(unit not in self.names.names for unit in self.latest):
@@ -109,9 +105,9 @@ class Feed:
         ]:
             del self.watched[unit]
 
-    def drift(self, unit: int, row: list[Any]) -> float:
+    def drift(self, unit: int, row: Result) -> float:
         """The largest change of a parameter in the last minutes, in standard deviations."""
-        theta, std, now = row[8], row[9], time.monotonic()
+        theta, std, now = row.theta, row.std, time.monotonic()
         base = self._base.get(unit)
         if base is None or len(base[1]) != len(theta) or not all(map(math.isfinite, base[1])):
             base = (now, theta, theta)
@@ -123,7 +119,7 @@ class Feed:
 
     def rank(self) -> None:
         """The units that are shown first: trouble, alarms, drift, and last those whose results are no longer stored."""
-        found = ((row[10], self.drift(unit, row), unit, row) for unit, row in self.latest.items())
+        found = ((row.alarm, self.drift(unit, row), unit, row) for unit, row in self.latest.items())
         first = heapq.nlargest(OVERVIEW_UNITS, found, key=lambda one: (one[0], one[1]))
         now = time.time()
         names = self.names.names
@@ -147,13 +143,13 @@ class Feed:
             return UNHEARD | {"unit": name, "trouble": list(self.trouble.get(name, {}))}
         return self.line(unit, row, self.drift(unit, row), now)
 
-    def line(self, unit: int, row: list[Any], drift: float, now: float) -> dict[str, Any]:
+    def line(self, unit: int, row: Result, drift: float, now: float) -> dict[str, Any]:
         """A unit of the overview."""
         age, name = now - self.updated[unit], self.names.names[unit]
         return {
-            "unit": name, "trouble": list(self.trouble.get(name, {})), "drift": round(drift, 2), "alarm": row[10],
-            "time": row[2], "age": round(age, 1), "silent": age > SILENT_SECONDS, "y": row[3], "y_hat": row[4],
-            "ok": row[7], "theta": row[8],
+            "unit": name, "trouble": list(self.trouble.get(name, {})), "drift": round(drift, 2), "alarm": row.alarm,
+            "time": row.time, "age": round(age, 1), "silent": age > SILENT_SECONDS, "y": row.y,
+            "y_hat": row.y_hat, "ok": row.ok, "theta": row.theta,
         }  # fmt: skip
 
     def find(self, name: str) -> int | None:
@@ -163,7 +159,7 @@ class Feed:
             about = self.names.about.get(name)
         return None if about is None else int(about["number"])
 
-    async def recent(self, unit: int) -> list[list[Any]]:
+    async def recent(self, unit: int) -> list[Result]:
         """The last results of a unit, which is watched from now on."""
         if unit not in self.watched:
             async with self.lock:
@@ -180,7 +176,7 @@ class Feed:
         after = max(0, (found[0] if found else 0) - 1)
         start = self.journal.db.execute("select coalesce(max(first), 0) - 1 from result where first <= ?", (after,))
         at = int(start.fetchone()[0])
-        rows: deque[list[Any]] = deque(maxlen=RECENT_RESULTS)
+        rows: deque[Result] = deque(maxlen=RECENT_RESULTS)
         end = self.at
         while at < end and (groups := self.journal.outcomes(at)):
             for group, parts, *_ in groups:
@@ -216,7 +212,7 @@ def column_names(about: Any) -> list[str]:
 
 
 def reduced(
-    journal: Journal, unit: int, recent: list[list[Any]], start: float, stop: float, points: int
+    journal: Journal, unit: int, recent: list[Result], start: float, stop: float, points: int
 ) -> dict[str, Any]:
     """(low, high, mean) of every column between two times, each (k, c), and the number of samples.
 
@@ -233,7 +229,7 @@ def reduced(
     for _, _, last, _, _, count, extremes, _ in journal.rows("block", where, unit, start, stop):
         found.append((np.frombuffer(extremes).reshape(3, -1), count))
         end = max(end, last)
-    if tail := [row for row in recent if row[0] > end and start <= _time(row) <= stop]:
+    if tail := [row for row in recent if row.number > end and start <= _time(row) <= stop]:
         found.append((extremes_of(columns_of(tail)), len(tail)))
     if len(found) > points:
         places = np.array_split(np.arange(len(found)), points)
@@ -241,7 +237,7 @@ def reduced(
     return _as_lists(found)
 
 
-def samples(journal: Journal, unit: int, recent: list[list[Any]], start: float, stop: float) -> Array:
+def samples(journal: Journal, unit: int, recent: list[Result], start: float, stop: float) -> Array:
     """All columns (T, c) between two times."""
     parts, end = [], -1
     where = "where unit = ? and first in (select first from block where unit = ? and stop >= ? and start <= ?)"
@@ -250,7 +246,7 @@ def samples(journal: Journal, unit: int, recent: list[list[Any]], start: float, 
         end = max(end, last)
         if sum(map(len, parts)) > EXPORT_ROWS:
             raise ValueError(f"more than {EXPORT_ROWS} samples; ask for a shorter range.")
-    if tail := [row for row in recent if row[0] > end]:
+    if tail := [row for row in recent if row.number > end]:
         parts.append(columns_of(tail))
     if not parts:
         return np.zeros((0, len(FIXED)))
@@ -258,26 +254,26 @@ def samples(journal: Journal, unit: int, recent: list[list[Any]], start: float, 
     return values[(values[:, 0] >= start) & (values[:, 0] <= stop)]
 
 
-def newest_blocks(journal: Journal, unit: int, recent: list[list[Any]], blocks: int = 10) -> Array:
+def newest_blocks(journal: Journal, unit: int, recent: list[Result], blocks: int = 10) -> Array:
     """All columns (T, c) of the last blocks, and of the samples after them."""
     found = [*journal.rows("history", "where unit = ? order by first desc limit ?", unit, blocks)][::-1]
     end = max((row[2] for row in found), default=-1)
     parts = [np.frombuffer(row[4]).reshape(row[3], -1) for row in found]
-    if tail := [row for row in recent if row[0] > end]:
+    if tail := [row for row in recent if row.number > end]:
         parts.append(columns_of(tail))
     return np.vstack(parts) if parts else np.zeros((0, 0))
 
 
-def columns_of(rows: list[list[Any]]) -> Array:
+def columns_of(rows: list[Result]) -> Array:
     """Results as an array (count, 5 + 2 n); where samples have no times their numbers are used."""
-    values = np.array([[_time(row), *row[3:7], *row[8], *row[9]] for row in rows])
+    values = np.array([[_time(row), row.y, row.y_hat, row.e, row.s, *row.theta, *row.std] for row in rows])
     with np.errstate(invalid="ignore"):
         values[:, 4] = np.sqrt(values[:, 4])
     return values
 
 
-def _time(row: list[Any]) -> float:
-    return float(row[0] if row[2] is None else row[2])
+def _time(row: Result) -> float:
+    return float(row.number if row.time is None else row.time)
 
 
 def _joined(blocks: list[tuple[Array, int]]) -> tuple[Array, int]:
