@@ -246,7 +246,7 @@ def meet(
                 c -= 0.5 * e * e
                 if c - ahead < top - UNLIKELY:
                     break
-            c -= log_det(W)
+            c -= max(log_det(W), ahead)  # of a pair that is given up, W lacks rows
             if c < top - UNLIKELY:
                 continue
             w = np.exp(c - top)
