@@ -32,7 +32,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.smooth import mixture
-from driftfit.smooth.mixture import Alternatives, Mixture, Problem
+from driftfit.smooth.mixture import Alternatives, Mixture, Passes, Problem
 from driftfit.smooth.parts import slopes
 from driftfit.smooth.parts.components import Noises
 from driftfit.smooth.parts.elimination import smooth_and_weigh
@@ -41,8 +41,8 @@ from driftfit.smooth.parts.slope_drift import compared
 from driftfit.smooth.parts.walk import Walk
 
 Groups = Sequence[Sequence[int]]
-SIZES = (9.0, 900.0)
-"""Variances of jumps, in units of r / c, equally likely."""
+SIZES = (15.0, 900.0)
+"""Variances of jumps, in units of r / c; a group alone has the first."""
 PER_SAMPLE = 3e-3
 """Probability of a jump before a sample, as in `driftfit.trackers.mixture.states`."""
 LEVELS = (0.0, 1e-4, 1e-2, 1.0)
@@ -103,17 +103,20 @@ def averaged(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Group
     unit = r / np.where(power > 0.0, power, 1.0)
     found = times[1] * (times[0].sum() / times[1].sum())
     plain, weighed = (hypotheses(walk, time, unit, groups) for time in (times[0], found))
-    tried = [(drifting(plain, level * unit), 0.0) for level in LEVELS]
-    tried += [(drifting(weighed, level * unit), T / SHARE) for level in LEVELS[1:]]
-    problem, _ = max(tried, key=lambda one: mixture.filtered(one[0], FEW)[0] - one[1])
-    first = mixture.Passes(problem, np.full(T, FEW)).smoothed(False)
+    few = np.full(T, FEW)
+    tried = [(Passes(drifting(plain, level * unit), few), 0.0) for level in LEVELS]
+    tried += [(Passes(drifting(weighed, level * unit), few), T / SHARE) for level in LEVELS[1:]]
+    passes, _ = max(tried, key=lambda one: one[0].forward() - one[1])
+    first, problem = passes.smoothed(False), passes.problem
     jumps = (1.0 - first.events[:, :1]) * (first.shift**2 + first.shift_var)
     time = problem.sizes[:, :1] ** 2
     likely = climbed(walk, time, jumps, unit, groups if len(groups) > 1 else [])
     if likely is None:
         root = np.diag(problem.alternatives.roots[0])
         return walk._replace(drift_root=np.sqrt(root**2 * time + jumps))
-    gaussian = walk._replace(drift_root=np.sqrt(likely.q * time + jumps), mixture=mean_of(problem, likely.q))
+    gaussian = walk._replace(
+        drift_root=np.sqrt(likely.q * time + jumps), mixture=mean_of(problem, likely.q, first.needed)
+    )
     fitted = float(np.sum(1.0 - first.events[:, 0]))
     return with_slopes(gaussian, likely, trend, TRENDS + fitted * np.log(PER_SAMPLE))
 
@@ -140,9 +143,8 @@ def hypotheses(walk: Walk, time: Array, unit: Array, groups: Groups) -> Problem:
     """The problem without drift; ``unit`` (n,) is r / c."""
     T, n = walk.phi.shape
     apart = groups if len(groups) > 1 else []
-    each = [(np.ones(n), 0.5 if apart else 1.0)]
-    each += [(np.isin(np.arange(n), group).astype(float), 0.5 / len(groups)) for group in apart]
-    jumps = [(size * unit * own, share / len(SIZES)) for (own, share), size in product(each, SIZES)]
+    jumps = [(size * unit, (0.5 if apart else 1.0) / len(SIZES)) for size in SIZES]
+    jumps += [(SIZES[0] * unit * np.isin(np.arange(n), group), 0.5 / len(groups)) for group in apart]
     roots = np.array([np.diag(np.sqrt(q)) for q in (np.zeros(n), *(q for q, _ in jumps))])
     label, zero = np.arange(len(roots)), np.zeros(len(roots), int)
     with np.errstate(divide="ignore"):
@@ -195,18 +197,17 @@ def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) 
     return Tried(p, np.array([solved(at)[0] for at in likely]), p @ ratios[np.array(likely)] * unit)
 
 
-def mean_of(problem: Problem, q: Array) -> Mixture:
+def mean_of(problem: Problem, q: Array, keep: Array) -> Mixture:
     """The average of the mixtures with all likely scales of the drift q (n,)."""
-    scales = [drifting(problem, scale * q) for scale in SCALES]
-    logs = np.array([mixture.filtered(one, FEW)[0] for one in scales])
+    scales = [Passes(drifting(problem, scale * q), keep) for scale in SCALES]
+    logs = np.array([one.forward() for one in scales])
     order = [k for k in np.argsort(-logs) if logs[k] > logs.max() + np.log(LIKELY)]
     w = np.exp(logs[order] - logs.max())
     w /= w.sum()
-    first = mixture.smooth(scales[order[0]], True, np.full(len(problem.y), FEW))
-    found = [first, *(mixture.smooth(scales[k], True, first.kept) for k in order[1:])]
+    found = [mixture.refined(scales[k], True) for k in order]
     theta = np.asarray(np.einsum("k,kti->ti", w, np.array([one.theta for one in found])))
-    cov = np.zeros_like(first.cov)
+    cov = np.zeros_like(found[0].cov)
     for share, one in zip(w, found, strict=True):
         away = one.theta - theta
         cov += share * (one.cov + away[:, :, None] * away[:, None, :])
-    return first._replace(theta=theta, cov=cov)
+    return found[0]._replace(theta=theta, cov=cov)
