@@ -22,7 +22,6 @@ from driftfit import (
     select,
     track,
 )
-from driftfit.smooth.parts.pooled_drift import pooled
 from driftfit.systems.arc_furnace import switching
 from driftfit.trackers.mixture.filters import MEMORY, UNSURE
 from lab import scenarios
@@ -216,14 +215,6 @@ def test_bands_hold_where_the_walk_is_too_slow_to_be_observed():
     np.testing.assert_allclose(whole.theta, path.theta, rtol=1e-6)
     spread = np.sqrt([np.diag(whole.cov(t)) for t in range(0, 500, 50)])
     np.testing.assert_allclose(spread, path.std[::50], rtol=1e-6)
-
-
-def test_drift_is_pooled_over_time_except_at_jumps():
-    rate = np.append(0.0, np.tile([1.0, 3.0], 20))[:, None]
-    rate[7] = 200.0
-    steady = (np.arange(41) > 0) & (np.arange(41) != 7)
-    np.testing.assert_allclose(pooled(rate)[:, 0], np.where(steady, rate[steady].mean(), rate[:, 0]))
-    np.testing.assert_array_equal(pooled(np.zeros((3, 2))), np.zeros((3, 2)))
 
 
 def test_a_fleet_warns_once_of_what_its_series_could_not_learn():

@@ -17,8 +17,8 @@ from driftfit.engine.kernel import Array, Driver, State, kernel
 from driftfit.run.columns import COLLECTED, collect, put_fields
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
-from driftfit.smooth.parts.pooled_drift import average_drift
 from driftfit.smooth.parts.walk import DRIFT, NONE, WEIGHT, Walk, Y, free, room_for_signals
+from driftfit.smooth.unknown_drift import average_drift
 from driftfit.trackers.base import RandomWalk
 
 
@@ -129,18 +129,14 @@ def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -
     drift *= run.known.drift
     basis = NONE
     if estimated:
-        q, q_turned, B, r_of = tracker.estimated_variances(
-            run.model, fields, phi[weight > 0.0], np.sqrt(weight) * fields["e"], drift
-        )
+        B, r_of, rate, groups = tracker.problem(fields, phi[weight > 0.0])
         if prior.r is not None:  # of the noise alone
             weight *= prior.r / r_of
             estimated = False
     if estimated:
         phi, signals[:, Y] = tracker.regression(fields, phi, signals[:, Y])
         basis = B if turned and np.any(np.eye(len(B)) != B) else NONE
-        # B and its inverse have entries of the same size
-        q = q @ (B**2).T + q_turned if len(basis) else q + q_turned @ (B**2).T
-        time, drift_root = drift.copy(), np.sqrt(q)
+        time = np.where(rate > 0.0, drift, 0.0)
         weight /= r_of
         drift[:] = 1.0
     trend = dt if prior.slopes else NONE
@@ -152,4 +148,4 @@ def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -
     walk = Walk(phi, signals, prior.q / r, prior.theta0, p0, prior.r, drift_root, trend, basis=basis)
     if not estimated:
         return walk
-    return average_drift(walk.independent, time, moving)._replace(phi=phi, basis=basis)
+    return average_drift(walk.independent, (time, rate * time), moving, groups)._replace(phi=phi, basis=basis)

@@ -213,12 +213,10 @@ class Kalman(Tracker):
     def log_density(self, out: Array) -> Array | None:
         return None if self.volatility is None else log_density(out)
 
-    def estimated_variances(
-        self, model: Model, fields: Mapping[str, Array], phi: Array, e: Array, time: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """Those of the noise alone; the others are settings."""
+    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array, Sequence[Sequence[int]]]:
+        """The variance of the noise alone is estimated."""
         given: Array = np.empty(0)
-        return given, given, given, smoothed_noise(fields)
+        return given, smoothed_noise(fields), given, ()
 
     @property
     def beyond(self) -> str:

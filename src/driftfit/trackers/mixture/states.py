@@ -12,19 +12,17 @@ variance that is learned so needs no bounds. Equal readings in a row repeat one 
 that changed. A meter so fine that readings never repeat has no such noise, and neither has a plant without noise whose
 readings repeat because it rests.
 
-The smoother is given one random walk, with the drift that the modes have on average if all samples are known:
+The smoother (`driftfit.smooth.unknown_drift`) is given the noise and the course of the drift over time,
 
     w_t(i) = f_t(i) sum_j T_ij w_{t+1}(j) / sum_h f_t(h) T_hj         probability of mode i at t, given all samples
-    q_t    = sum_k w_t(k) q_tk,    1 / r_t = sum_j nu_tj / v_tj
+    q_t    = r_t sum_k w_t(k) rho_k for rho_k < 1,    1 / r_t = sum_j nu_tj / v_tj
 
 with f_t the probabilities after sample t, T their transitions, and nu_tj those of the states of the noise after the
-sample. `driftfit.smooth.exact` estimates theta from it, on the regressors and outputs from which coloured noise was
-taken. Of learned drift in one direction the variances count, not the covariances. Before the filters start nothing
-drifts.
+sample, on the regressors and outputs from which coloured noise was taken. Before the filters start nothing drifts.
 
 Source: the moments of a noise given the data are those of an EM step, Shumway and Stoffer (1982); step^2 / 12 is
-Sheppard's (1898); the backward pass is Kim's (1994), eq. 2.20. The modes, the rule for repeats, and smoothing one
-random walk instead of one for each mode, are ours. Cost per sample: O(K).
+Sheppard's (1898); the backward pass is Kim's (1994), eq. 2.20. The modes and the rule for repeats are ours. Cost per
+sample: O(K).
 """
 
 from __future__ import annotations
@@ -243,10 +241,7 @@ def learn_noise(s: State, l: int) -> None:
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
 
 
-SMOOTHER_FIELDS = (
-    "mu", "prior", "kappa", "r", "certainty", "leap", "c", "drift_unit", "offset", "weight", "direction", "white",
-    "explained", "settled", "constant",
-)  # fmt: skip
+SMOOTHER_FIELDS = ("mu", "prior", "kappa", "r", "certainty", "offset", "white", "explained", "settled", "constant")
 """Fields that are stored at every sample."""
 
 
@@ -256,10 +251,9 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
     for k in range(s.mu.shape[0]):
         o.mu[k, l], o.prior[k, l] = s.mu[k, l], s.prior[k, l]
     for i in range(s.c.shape[0]):
-        o.c[i, l], o.drift_unit[i, l], o.offset[i, l] = s.c[i, l], s.drift_unit[i, l], s.offset[i, l]
-        o.weight[i, l], o.direction[i, l], o.white[i, l] = s.weight[i, l], s.direction[i, l], s.white[i, l]
+        o.offset[i, l], o.white[i, l] = s.offset[i, l], s.white[i, l]
     o.kappa[l], o.r[l], o.certainty[l], o.explained[l] = s.kappa[l], s.r[l], s.certainty[l], s.explained[l]
-    o.settled[l], o.constant[l], o.leap[l] = s.settled[l], s.constant[l], s.leap[l]
+    o.settled[l], o.constant[l] = s.settled[l], s.constant[l]
 
 
 def transitions(state: Mapping[str, Any]) -> tuple[Array, Array]:
@@ -282,32 +276,20 @@ def modes_given_all(fields: Mapping[str, Array], used: Array, state: Mapping[str
     return found
 
 
-def estimated_variances(
-    fields: Mapping[str, Array], phi: Array, time: Array, state: Mapping[str, Any]
-) -> tuple[Array, Array, Array, Array]:
-    """q (T, n), that of the drift about the means, the matrix A (n, n) for which phi A are the regressors less their
-    means, and r (T,) of every sample, from the stored fields (T, ..), the regressors (N, n) of used samples and the
-    intervals of drift.
-    """
-    running = fields["settled"] > 0
-    used = running & (fields["certainty"] > 0.0)
-    r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
-    ratio = state["ratio"] + np.where(state["ratio"] == COMMON[-1], fields["leap"][:, None], 0.0)
-    size = modes_given_all(fields, used, state) * ratio * (r * time)[:, None]
-    centred = fields["offset"] != 0.0
-    learned = size[:, FIRST_LEARNED:FIRST_ALONE].sum(axis=1)
-    common = (size[:, :FIRST_LEARNED].sum(axis=1) + FLOOR * learned)[:, None] * fields["drift_unit"]
-    own = learned[:, None] * (fields["weight"] + fields["direction"] ** 2)
-    for i, first in enumerate(state["alone"]):
-        if first >= 0:
-            own[:, i] += size[:, first : first + state["rungs"]].sum(axis=1)
-    c = np.where(fields["c"] > 0.0, fields["c"], np.inf)
-    drifts = (running & (time > 0.0))[:, None]
-    q = np.where(drifts, own / c + np.where(centred, 0.0, common), 0.0)
-    about = np.where(drifts & centred, common, 0.0)
-    A, constant = np.eye(phi.shape[1]), int(fields["constant"][-1])
+def centring(fields: Mapping[str, Array], phi: Array) -> Array:
+    """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
+    centred, A, constant = fields["offset"] != 0.0, np.eye(phi.shape[1]), int(fields["constant"][-1])
     if constant >= 0 and centred.any():
         mean = phi.mean(axis=0)
         A[constant] = np.where(centred.any(axis=0), -mean / mean[constant], 0.0)
         A[constant, constant] = 1.0
-    return q, about, A, 1.0 / np.where(used, fields["certainty"], 1.0 / r)
+    return A
+
+
+def variances_given_all(fields: Mapping[str, Array], state: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Variance of the noise of every sample (T,), and that of the drift but for jumps, in units of 1 / c (T,)."""
+    running = fields["settled"] > 0
+    r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
+    used = running & (fields["certainty"] > 0.0)
+    drift = modes_given_all(fields, used, state) @ np.where(state["ratio"] < 1.0, state["ratio"], 0.0)
+    return 1.0 / np.where(used, fields["certainty"], 1.0 / r), np.where(running, r * drift, 0.0)
