@@ -18,7 +18,6 @@ from driftfit.identify.scores import FEWEST
 from driftfit.identify.structure import filled, lagged
 from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
-from driftfit.judge.statistics.robust import inverted, least_squares
 from driftfit.judge.structures.candidates import SHARE
 from driftfit.judge.verdict import Verdict
 from driftfit.run.result import Track, root_mean_square
@@ -89,11 +88,20 @@ def parts(run: Track) -> dict[str, Array]:
     return found
 
 
+def pseudo_inverse(X: Array) -> Array:
+    """The pseudo-inverse (n, N) of regressors X (N, n), whose units may be far apart."""
+    size = np.sqrt(np.mean(X * X, axis=0))
+    size[size == 0.0] = 1.0
+    return np.asarray(np.linalg.pinv(X / size, rcond=np.finfo(float).eps * max(X.shape)) / size[:, None])
+
+
 def effects(known: Evidence) -> tuple[Array, Memory, tuple[Effect, ...]]:
     """Constants theta (n,), the memory of y, and the effects of the inputs."""
     phi, y, own = known.rows.phi, known.rows.y, parts(known.run)
-    theta = least_squares(phi, y)
-    cov, lags = inverted(phi) * np.sum((y - phi @ theta) ** 2) / max(len(y) - len(theta), 1), own["memory"]
+    inverse = pseudo_inverse(phi)
+    theta = inverse @ y
+    s2, lags = np.sum((y - phi @ theta) ** 2) / max(len(y) - len(theta), 1), own["memory"]
+    cov = inverse @ inverse.T * s2
     memory, found = Memory(float(lags @ theta), float(np.sqrt(lags @ cov @ lags))), []
     rest = 1.0 if memory.root else 1.0 - memory.value
     for name in known.run.model.input_names:
@@ -140,5 +148,5 @@ def feedback(y: Array, u: Array) -> float:
     X, z = X[rows], u[rows]
     if len(z) < FEWEST or np.ptp(z) == 0.0:
         return 0.0
-    full, less = (float(np.sum((z - A @ least_squares(A, z)) ** 2)) for A in (X, X[:, :4]))
+    full, less = (float(np.sum((z - A @ (pseudo_inverse(A) @ z)) ** 2)) for A in (X, X[:, :4]))
     return (less - full) / 3.0 / max(full / (len(z) - 7), 1e-300)
