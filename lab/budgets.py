@@ -28,8 +28,8 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 68_081,
-    "statements": 44_254,
+    "lines of the library": 68_078,
+    "statements": 44_251,
     "modules": 348,
     "levels of folders": 3,
     "constants of modules with numbers": 653,
