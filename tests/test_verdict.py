@@ -136,8 +136,7 @@ def test_robust_fit_is_the_minimum_of_hubers_loss():
     fit = robust_fit(phi, y)
     psi = np.clip(fit.residual, -1.5 * fit.scale, 1.5 * fit.scale)
     assert np.abs(phi.T @ psi).max() < 1e-6 * np.abs(phi * psi[:, None]).sum()
-    clean = np.linalg.lstsq(phi, y)[0]
-    truth = np.arange(1.0, 4.0)
+    clean, truth = np.linalg.lstsq(phi, y)[0], np.arange(1.0, 4.0)
     assert np.abs(fit.theta - truth).max() < np.abs(clean - truth).max()
 
 

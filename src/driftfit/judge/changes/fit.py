@@ -104,6 +104,12 @@ def estimated(
     return np.cumsum(beta.reshape(K + 1, n), axis=0), float(r @ r)
 
 
+def left(Z: Array, z: Array, floor: float = SMALL) -> float:
+    """Sum of squares of z (N,) that columns Z (N, q) do not explain, beyond rounding."""
+    r = z - Z @ np.linalg.lstsq(Z, z, rcond=None)[0]
+    return max(float(r @ r), floor)
+
+
 def noise_of(X: Array, y: Array, theta: Array, breaks: Array) -> Array:
     """v (N,): residuals of segments."""
     part = np.searchsorted(breaks, np.arange(len(y)), side="right")
@@ -149,8 +155,9 @@ def level_of(e: Array, first: int) -> Array:
     s = max(deviation(used), 1e-3 * float(np.std(used)), SMALL)
     m = max(3, min(WINDOWS, N // 20))
     edges = np.linspace(first, N, m + 1).astype(int)
-    parts = [np.abs(e[a:b]) for a, b in pairwise(edges)]
-    held = (np.minimum(part, HELD * max(MEDIAN * float(np.median(part)), 0.05 * s)) for part in parts)
+    parts = [np.sort(np.abs(e[a:b])) for a, b in pairwise(edges)]
+    middles = (0.5 * (part[(len(part) - 1) // 2] + part[len(part) // 2]) for part in parts)  # as `np.median`, faster
+    held = (np.minimum(part, HELD * max(MEDIAN * float(x), 0.05 * s)) for part, x in zip(parts, middles, strict=True))
     own = np.log([max(np.sqrt(np.mean(part**2)), 0.05 * s) for part in held])
     chance = 0.6 * m / N  # variance of the logarithm of a deviation of N / m Gaussians
     share = max(0.0, 1.0 - 1.5 * chance / max(float(own.var()), chance))
@@ -208,9 +215,7 @@ def together(
         v = y - rows @ np.linalg.lstsq(rows * g[:, None], y * g, rcond=None)[0]
         lags = lags_of(v * g, orders)
         ar = regressed(v, g, lags)
-        Z, z = white_rows(rows, y, lags, ar, g)
-        r = z - Z @ np.linalg.lstsq(Z, z, rcond=None)[0]
-        criterion = N * np.log(max(float(r @ r), SMALL)) + (n * (knots - 1) + len(lags)) * np.log(N)
+        criterion = N * np.log(left(*white_rows(rows, y, lags, ar, g))) + (n * (knots - 1) + len(lags)) * np.log(N)
         if criterion < best[0]:
             best = criterion, lags, ar, rows
     return best[1:]

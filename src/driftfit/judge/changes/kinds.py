@@ -25,7 +25,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.dates import Dated
-from driftfit.judge.changes.fit import hats, order_of, split, white_rows
+from driftfit.judge.changes.fit import hats, left, order_of, split, white_rows
 from driftfit.judge.changes.null import Model
 from driftfit.judge.changes.scan import SINGULAR, SMALL
 from driftfit.judge.changes.which import Which
@@ -91,12 +91,6 @@ def innovations(H: Array, q: Array, W: Array) -> tuple[Array, float]:
     J, W, total = H.shape[1], W.copy(), np.zeros(1)
     _filtered(np.ascontiguousarray(H), q, W, np.zeros((J, W.shape[1])), np.zeros((J, J)), np.zeros(J), total)
     return W, float(total[0])
-
-
-def left(Z: Array, z: Array, floor: float) -> float:
-    """Sum of squares of z (N,) that columns Z (N, q) do not explain, beyond rounding."""
-    r = z - Z @ np.linalg.lstsq(Z, z, rcond=None)[0]
-    return max(float(r @ r), floor)
 
 
 def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) -> Kind:
