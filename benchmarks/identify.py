@@ -27,12 +27,19 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import polars as pl
 from scipy import signal
 
-from driftfit import ARX, AdaptiveKalman, identify, track
 from driftfit.engine.kernel import Array
-from driftfit.judge.verdict import Verdict
+from driftfit.identify.roles import roles
+from driftfit.identify.structure import Structure, lagged, search
+from driftfit.identify.working_point import cause, products
+from driftfit.judge.changes.changes import Changes
+from driftfit.judge.changes.null import Lags
+from driftfit.judge.changes.words import Event, events
+from driftfit.judge.evidence import REJECTED as LEVEL
+from driftfit.judge.evidence import judged_rows
+from driftfit.judge.regressors import Rows
+from driftfit.judge.statistics.parts.coarse_readings import step_of
 
 T = 1500
 BEFORE = 200
@@ -135,19 +142,58 @@ class Found(NamedTuple):
     """Intervals of its dates."""
 
 
-KINDS = {"moves": "time", "both": "both", "a static curve explains it": "working point"}
+class Judged(NamedTuple):
+    """The verdict on constants of a structure, without its tracker, which only decides what readings are left out."""
+
+    rows: Rows
+    changes: Changes
+    events: tuple[Event, ...]
+
+    @classmethod
+    def of(cls, plant: Plant, structure: Structure) -> Judged:
+        """The verdict of a structure, whose inputs are numbered in the order of the table."""
+        y, names = plant.table["flow"], [name for name in plant.table if name != "flow"]
+        past = [lagged(y, k + 1) for k in range(structure.na)]
+        each = [(names[j], k) for j, nb, nk in structure.shape[1] for k in range(nk, nk + nb)]
+        phi = np.column_stack([*past, *(lagged(plant.table[name], k) for name, k in each), np.ones(T)])
+        at = np.flatnonzero(np.isfinite(phi).all(axis=1))
+        source = (
+            np.column_stack([at - at[0] - k - 1 for k in range(structure.na)]) if past else np.zeros((len(at), 0), int)
+        )
+        lags = Lags(np.arange(structure.na), source, np.ones(source.shape))
+        step = step_of(y)
+        rows = Rows(at, phi[at], y[at], np.full(len(at), step) if step else None, lags, np.ones(len(at)))
+        found = judged_rows(rows, LEVEL)
+        assert found is not None
+        own = ["y"] * len(past) + [name for name, _ in each] + ["level"]
+        return cls(rows, found, events(found, own, at, str) if found.rejected else ())
+
+    @property
+    def found(self) -> Found:
+        """What it says."""
+        moved = [event for event in self.events if any(move.name != "level" for move in event.moves)]
+        which = tuple(move.name for event in moved for move in event.moves)
+        middle = int(np.median([event.at for event in moved])) if moved else -1
+        spans = tuple((event.earliest, event.latest) for event in moved)
+        return Found({}, self.changes.rejected, which, middle, "time" if self.changes.rejected else "", spans)
 
 
 def ours(plant: Plant) -> Found:
-    """`driftfit.identify` with its defaults."""
-    found = identify(plant.table, "flow")
-    names = found.roles.inputs
-    inputs = {names[j]: found.structure.delays[j] for j in found.structure.lags}
-    moved = [move for move in found.moves if move.what != "level"]
-    which = tuple("y" if move.what == "memory" else move.what for move in moved)
-    moves = found.kind in ("moves", "both") if found.kind != "cannot decide" else None
-    middle = np.median([move.at for move in moved]) if moved else -1
-    return Found(inputs, moves, which, int(middle), KINDS.get(found.kind, ""), spans(found.verdict))
+    """The decisions of `driftfit.identify` with its defaults."""
+    record = roles(plant.table, "flow")
+    y, U, _ = record.centred().spread(31)
+    best = search(y, U, 30, 0, np.inf, np.random.default_rng(0))
+    one = Judged.of(plant, best)
+    Z, made = products(plant.table["flow"], record.U, best, record.inputs, "flow", 0)
+    why, moves = cause(one.rows.phi, one.rows.y, Z[one.rows.at], made), one.changes.rejected
+    if moves and why.products:
+        more = one.rows._replace(phi=np.hstack([one.rows.phi, why.columns]))
+        again = judged_rows(more.only(np.isfinite(more.phi).all(axis=1), range(more.phi.shape[1])), LEVEL)
+        moves = again is None or again.rejected
+    kind = why.kind(moves)
+    inputs = {record.inputs[j]: ends for j, ends in best.delays.items()}
+    moves = one.changes.rejected and kind != "working point"
+    return one.found._replace(inputs=inputs, moves=moves, cause=kind if moves or kind == "working point" else "")
 
 
 def by_criterion(price: float) -> Callable[[Plant], Found]:
@@ -178,31 +224,17 @@ def by_criterion(price: float) -> Callable[[Plant], Found]:
     return method
 
 
-def spans(judged: Verdict) -> tuple[tuple[int, int], ...]:
-    """The intervals of the dates of a verdict."""
-    return tuple((event.earliest, event.latest) for event in judged.events)
-
-
-def with_model(plant: Plant, model: ARX) -> Found:
-    """A given model and its verdict."""
-    names = list(model.input_names)
-    judged = track(model, AdaptiveKalman(), y="flow", u=names, data=pl.DataFrame(plant.table)).verdict()
-    which = tuple(name.split("[")[1][:-1] if "[" in name else "y" for name in judged.moving if name != "intercept")
-    at = int(np.median([event.at for event in judged.events])) if judged.events else -1
-    ends = (zip(names, *model.lags, strict=True)) if names else ()
-    inputs = {name: (nk, nk + nb - 1) for name, nb, nk in ends}
-    return Found(inputs, judged.drifts, which, at, "time" if judged.drifts else "", spans(judged))
-
-
 def default_arx(plant: Plant) -> Found:
     """ARX(2, 2) on all inputs."""
-    return with_model(plant, ARX(2, 2, inputs=tuple(f"u{j}" for j in range(1, 6)), intercept=True))
+    inputs = {name: (1, 2) for name in plant.table if name != "flow"}
+    return Judged.of(plant, Structure(2, dict.fromkeys(range(5), (2, 1)))).found._replace(inputs=inputs)
 
 
 def true_structure(plant: Plant) -> Found:
     """The inputs and delays of the plant, and two lags of the output."""
-    names = tuple(sorted(plant.inputs))
-    return with_model(plant, ARX(2, 1, tuple(plant.inputs[name] for name in names), inputs=names, intercept=True))
+    inputs = {name: (k, k) for name, k in plant.inputs.items()}
+    given = {int(name[1:]) - 1: (1, k) for name, k in plant.inputs.items()}
+    return Judged.of(plant, Structure(2, given)).found._replace(inputs=inputs)
 
 
 METHODS: dict[str, Callable[[Plant], Found]] = {

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from driftfit import identify
 from driftfit.cli import app
-from driftfit.identify.judgement import ahead, weights
+from driftfit.identify.judgement import ahead, density, weights
 from driftfit.identify.page import SCHEMA, commands, verb
 from driftfit.identify.result import Move
 from driftfit.identify.roles import NoAnswerError, roles
@@ -196,7 +196,7 @@ def test_predictions_some_steps_ahead_and_the_weights_of_a_mixture():
     early = np.arange(T) < T // 2
     first, second = np.where(early, good, bad), np.where(early, bad, good)
     variance = np.where(early, 0.5, 2.0) ** 2
-    w = weights(-0.5 * (np.log(2.0 * np.pi * variance) + first**2 / variance), second)
+    w = weights(-0.5 * (np.log(2.0 * np.pi * variance) + first**2 / variance), density(second))
     assert np.sqrt(np.mean((w * first + (1.0 - w) * second) ** 2)) < 0.75
     assert w[:11] == pytest.approx(0.5)
 

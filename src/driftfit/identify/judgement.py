@@ -2,10 +2,11 @@
 
 With p_1 and p_2 the densities of a reading under the tracker and under recursive least squares on the same regressors,
 
-    w_t  =  s + (1 - 2 s) w_(t-1) p_k(y_(t-1)) / sum,      theta = sum w_k theta_k,   y_hat = phi' theta
+    w_t = s + (1 - 2 s) w_(t-1) p_1(y_(t-1)) / (w_(t-1) p_1 + (1 - w_(t-1)) p_2),    y_hat = w y_hat_1 + (1 - w) y_hat_2
 
 so that a record of constants costs no more than a few nats, and a change is followed (Herbster and Warmuth, 1998). All
-predictions are made before the sample, one step or h steps ahead; those h ahead are given the inputs.
+predictions are made before the sample, one step or h steps ahead; those h ahead are given the inputs, and are weighed
+by what is known h steps before.
 """
 
 from __future__ import annotations
@@ -27,16 +28,18 @@ FOUND = 6.7
 the difference of both halves is twice as large, times 2.8 for a test at 5 %, times 1.2 since the date is not known."""
 
 
-def weights(first: Array, second: Array) -> Array:
-    """The weight (T,) of the first of two predictions before each sample, from its log-likelihoods and the errors of
-    the second, whose variance is the mean of their squares so far."""
-    known = np.isfinite(first) & np.isfinite(second)
-    square = np.where(known, second, 0.0) ** 2
-    count: Array = np.cumsum(known) - known
+def density(e: Array) -> Array:
+    """Log-likelihoods (T,) of errors, Gaussian with the mean of their squares so far; NaN for the first ten."""
+    known = np.isfinite(e)
+    square, count = np.where(known, e, 0.0) ** 2, np.cumsum(known) - known
     v = np.maximum(np.cumsum(square) - square, 1e-300) / np.maximum(count, 1)
-    gain = np.where(known & (count > 10), np.nan_to_num(first) + 0.5 * (np.log(2.0 * np.pi * v) + square / v), 0.0)
+    return np.where(known & (count > 10), -0.5 * (np.log(2.0 * np.pi * v) + square / v), np.nan)
+
+
+def weights(first: Array, second: Array) -> Array:
+    """The weight (T,) of the first of two predictions before each sample, from their log-likelihoods (T,)."""
     weight, w = np.empty(len(first)), 0.5
-    for t, ratio in enumerate(np.exp(np.clip(gain, -50.0, 50.0)).tolist()):
+    for t, ratio in enumerate(np.exp(np.clip(np.nan_to_num(first - second), -50.0, 50.0)).tolist()):
         weight[t] = w
         w = SHARE + (1.0 - 2.0 * SHARE) * w * ratio / (w * ratio + 1.0 - w)
     return weight
@@ -56,22 +59,20 @@ def ahead(theta: Array, phi: Array, na: int, h: int) -> Array:
 
 def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
     """Errors one step and ``horizon`` steps ahead of a run and of simpler predictions."""
-    run, own, steady = known.run, known.errors, known.steady
+    run, own, steady, found = known.run, known.errors, known.steady, []
     y, phi = run.used_record.y, np.where(steady["valid"] > 0.0, steady["phi"][..., 0], np.nan)
-    w = weights(run.log_density, own.constant_ls)
     none = np.full((1, run.model.n), np.nan)
-    theta, still = (np.vstack([none, path[:-1]]) for path in (run.theta, steady["theta"][..., 0]))
-    paths = {"driftfit": w[:, None] * theta + (1.0 - w)[:, None] * still, "tracked": theta, "constants": still}
-    mixture = w * own.tracked + (1.0 - w) * own.constant_ls
-    near = dict(zip(("driftfit", "tracked", "constants"), (mixture, own.tracked, own.constant_ls), strict=True))
-    far = {name: y - ahead(path, phi, run.model.output_lags or 0, horizon) for name, path in paths.items()}
-    found = [(1, near | {"constant ARX": own.constant_arx, "persistence": own.persistence})]
-    found += [(horizon, far | {"persistence": y - lagged(persistence(y), horizon - 1)})] if horizon > 1 else []
-    scored = [own.scored & np.isfinite([*errors.values()]).all(axis=0) for _, errors in found]
-    return tuple(
-        Errors(h, {name: root_mean_square(e[at]) for name, e in errors.items()}, int(at.sum()))
-        for at, (h, errors) in zip(scored, found, strict=True)
-    )
+    paths = (np.vstack([none, path[:-1]]) for path in (run.theta, steady["theta"][..., 0]))
+    far = [y - ahead(path, phi, run.model.output_lags or 0, horizon) for path in paths]
+    rivals = {"constant ARX": own.constant_arx, "persistence": own.persistence}
+    cases = [(1, own.tracked, own.constant_ls, run.log_density, rivals)]
+    cases += [(horizon, *far, density(far[0]), {"persistence": y - lagged(persistence(y), horizon - 1)})][: horizon - 1]
+    for h, tracked, constants, likely, others in cases:
+        w = np.append(np.full(h - 1, 0.5), weights(likely, density(constants)))[: len(y)]
+        errors = {"driftfit": w * tracked + (1.0 - w) * constants, "tracked": tracked, "constants": constants, **others}
+        at = own.scored & np.isfinite([*errors.values()]).all(axis=0)
+        found.append(Errors(h, {name: root_mean_square(e[at]) for name, e in errors.items()}, int(at.sum())))
+    return tuple(found)
 
 
 def _what(name: str) -> str:

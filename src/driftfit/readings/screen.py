@@ -23,6 +23,7 @@ SUSPECT = 30.0
 FEWEST = 20
 """Values that a usual distance needs."""
 GAP = 3.0
+"""Ranges of all other values by which a fault code of a complete record is apart from them."""
 SAMPLED = 64
 """Values of a series that a first look takes for its usual ones."""
 
@@ -40,13 +41,16 @@ def suspect(signal: Array) -> Array:
 
 
 def apart(signal: Array) -> Array:
-    """Which values (T,) of a record are `suspect` and farther from all others than `GAP` times the range of these."""
-    far = suspect(signal)
-    usual = signal[np.isfinite(signal) & ~far]
-    if not far.any() or not np.ptp(usual) > 0.0:
-        return np.zeros(len(signal), bool)
-    beyond = np.maximum(signal - usual.max(), usual.min() - signal)
-    return np.asarray(far & (beyond > GAP * np.ptp(usual)))
+    """Which values (T,) of a record are `suspect`, and each beyond a gap of `GAP` times the range of all before it."""
+    usual, found = np.isfinite(signal) & ~suspect(signal), np.zeros(len(signal), bool)
+    if not usual.any() or not np.ptp(signal[usual]) > 0.0:
+        return found
+    for side in (signal, -signal):
+        value = np.unique(side[side >= side[usual].max()])
+        wide = np.diff(value) > GAP * (value[:-1] - side[usual].min())
+        alone = int(np.logical_and.accumulate(wide[::-1]).sum())  # a cluster of values is no code
+        found |= side >= (value[-alone] if alone else np.inf)
+    return found
 
 
 def screen(signal: Array, first: Array, length: Array) -> Array:
