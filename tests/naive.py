@@ -51,7 +51,7 @@ def before(lane, phi, jump=COMMON[-1]):
 def expected(lane, phi):
     """Prediction, and its variance if nothing unusual happens."""
     x, m, C, v = before(lane, phi)
-    jumps = lane["arrive"] * (lane["ratio"] >= 1.0)
+    jumps = lane["kappa"] * lane["arrive"] * (lane["ratio"] >= 1.0)
     mean, restless = x @ m @ lane["prior"], states(lane)[1] / (1.0 - lane["outlying"])
     spread = np.maximum(lane["prior"] - jumps, 0.0) @ (np.einsum("i,kij,j->k", x, C, x) + (x @ m - mean) ** 2)
     return mean, spread + v[0] ** (1.0 - restless) * v[1] ** restless
@@ -73,12 +73,13 @@ def states(lane):
 
 
 def density(lane, phi, y):
-    """The predictive density of y, of any shape, with a Cauchy tail."""
-    (x, m, C, v), total = before(lane, phi), 0.0
+    """The predictive density of y, of any shape: Student's while r rests on few samples, and a Cauchy tail."""
+    (x, m, C, v), total, count = before(lane, phi), 0.0, float(lane["count"])
+    body = stats.norm if count > filters.STUDENT else stats.t(count)
     for k, weight in enumerate(lane["prior"]):
         e, h = y - x @ m[:, k], x @ C[k] @ x
         for j, p in enumerate(states(lane)):
-            law = stats.cauchy if j == 2 else stats.norm
+            law = stats.cauchy if j == 2 else body
             scale = np.sqrt(h + v[j])
             total = total + weight * p * law.pdf(e / scale) / scale
     return total
@@ -86,11 +87,12 @@ def density(lane, phi, y):
 
 def sample(lane, phi, y):
     """Probabilities (K,), means (n, K) and covariances (K, n, n) after a sample, before and after the interaction."""
-    (x, m, C, v), K = after_jump(lane, phi, y), len(lane["prior"])
+    (x, m, C, v), K, count = after_jump(lane, phi, y), len(lane["prior"]), float(lane["count"])
     e, g = y - x @ m, C @ x
     h = g @ x
     s = h + np.stack([np.full(K, v[0]), np.full(K, v[1]), np.maximum(v[2], e**2)])
-    joint = lane["prior"] * states(lane)[:, None] * np.exp(-0.5 * e**2 / s) / np.sqrt(s)
+    kernel = np.exp(-0.5 * e**2 / s) if count > filters.STUDENT else (1.0 + e**2 / s / count) ** (-0.5 * (count + 1.0))
+    joint = lane["prior"] * states(lane)[:, None] * kernel / np.sqrt(s)
     joint /= joint.sum()
     mu = np.maximum(joint.sum(axis=0), filters.LEAST)
     a, a2 = (joint / s).sum(axis=0) / mu, (joint / s**2).sum(axis=0) / mu
@@ -99,11 +101,12 @@ def sample(lane, phi, y):
     return mu, m, C, joint
 
 
-def interaction(lane, mu, m, C):
+def interaction(lane, mu, m, C, kappa):
     """The same after it, with the full matrix of transitions."""
     up, down, foot, arrive = (lane[name] for name in ("up", "down", "foot", "arrive"))
-    T = np.diag(1.0 - down - foot - up - arrive.sum()) + np.diag(down[1:], -1) + np.diag(up[:-1], 1) + arrive
+    T = np.diag(1.0 - down - foot - kappa * (up + arrive.sum())) + np.diag(down[1:], -1) + kappa * np.diag(up[:-1], 1)
     T[:, 0] += foot
+    T += kappa * arrive
     share = mu[:, None] * T
     prior = share.sum(axis=0)
     share /= prior

@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -35,12 +35,11 @@ NEXT_TO_NEVER = 1e-30
 
 @dataclass(frozen=True)
 class Piece:
-    """``modes`` (K,) tells which modes to leave out; or ``edits`` of a file, an old text and a new one.
-
-    ``functions`` are those that would go with the piece, "file:name".
-    """
+    """``modes`` (K,) tells which modes to leave out, and ``state`` what fields are instead; or ``edits`` of a file, an
+    old text and a new one. ``functions`` are those that would go with the piece, "file:name"."""
 
     modes: Callable[[State], Array] | None = None
+    state: Mapping[str, Any] = field(default_factory=dict)
     edits: tuple[tuple[str, str, str], ...] = ()
     functions: tuple[str, ...] = ()
 
@@ -80,7 +79,7 @@ class Without(AdaptiveKalman):
         state, piece, modes = dict(super().state(n)), PIECES[self.piece], table(n, self.groups)
         if piece.modes is not None:
             never(state, modes["ladder"], piece.modes(modes))
-        return state
+        return {**state, **piece.state}
 
 
 def largest(modes: State) -> Array:
@@ -112,18 +111,22 @@ PIECES: dict[str, Piece] = {
         ),
     ),
     "single ladders": Piece(lambda modes: modes["ladder"] >= 0),
-    "jumps": Piece(lambda modes: modes["ratio"] >= 1.0, functions=of(BANK, "leap")),
+    "jumps": Piece(lambda modes: modes["ratio"] >= 1.0, functions=of(BANK, "leap", "learn_rate")),
     "common jumps": Piece(lambda modes: (modes["ladder"] == -3) & (modes["ratio"] >= 1.0)),
     "jumps of size 1": Piece(lambda modes: modes["ratio"] == 1.0),
     "largest jumps": Piece(lambda modes: modes["ratio"] > 1.0),
+    "learned rate of changes": Piece(
+        state={"left_behind": 1e15, "jumps_expected": 1e15}, functions=of(BANK, "learn_rate")
+    ),
     "leading direction": Piece(
         edits=((LEARNED, "share = t[N + 6 * best, best] / positive if sound else 0.0", "share = 0.0"),),
         functions=of(LEARNED, "whitened", "rotate", "turn"),
     ),
-    "arrivals in all modes": Piece(edits=((STATES, "\nJUMP, ARRIVE = 2e-3, 1e-5\n", "\nJUMP, ARRIVE = 2e-3, 1e-9\n"),)),
+    "arrivals in all modes": Piece(edits=((STATES, "\nJUMP, ARRIVE = 3e-3, 1e-5\n", "\nJUMP, ARRIVE = 3e-3, 1e-9\n"),)),
     "jumps of any size": Piece(
         edits=((BANK, "    s.leap[l] = far if", "    s.leap[l] = 0.0 * far if"),), functions=of(BANK, "leap")
     ),
+    "Student's density": Piece(edits=((BANK, "\nSTUDENT = 60.0\n", "\nSTUDENT = 0.0\n"),)),
     "drift about means": Piece(
         edits=((LEARNED, "\nFAR = 9.0\n", "\nFAR = 1e300\n"),), functions=of(LEARNED, "learn_means")
     ),

@@ -1,16 +1,19 @@
 """A bank of Kalman filters that differ in how the parameters drift: forecast, correction and interaction.
 
     e_k = y - x' m_k,     g_k = C_k x,     h_k = x' g_k,     s_kj = h_k + v_kj
-    p_kj  proportional to c_k nu_j N(e_k; s_kj)
+    p_kj  proportional to c_k nu_j t(e_k; s_kj)
     a_k = sum_j p_(j|k) / s_kj,    d_k = sum_j p_(j|k) (1 / s_kj - a_k)^2
     m_k   <- m_k + g_k a_k e_k,        C_k <- C_k - g_k g_k' (a_k - d_k e_k^2)
 
-with c_k and nu_j the probabilities of mode k and of state j of the noise (`driftfit.trackers.mixture.states`). Modes
-are merged by their moments after every sample, c_j = sum_i mu_i T_ij. T moves a mode up or down its ladder, from the
-foot of a ladder to rest, and leads from the whole bank to mode j with the same small probability a_j, so that it costs
-O(K) instead of O(K^2):
+with c_k and nu_j the probabilities of mode k and of state j of the noise (`driftfit.trackers.mixture.states`), and
+t the normal density, or Student's while the noise variance rests on few samples. Modes are merged by their moments
+after every sample, c_j = sum_i mu_i T_ij. T moves a mode up or down its ladder, from the foot of a ladder to rest, and
+leads from the whole bank to mode j with the same small probability a_j, so that it costs O(K) instead of O(K^2):
 
-    T_ij = a_j + up_i [j above i] + down_i [j below i],   the rest stays
+    T_ij = kappa (a_j + up_i [j above i]) + down_i [j below i],   the rest stays
+
+kappa, the rate of changes relative to what is usual, is the share of the expected jumps that were left behind by a
+later sample:  kappa = (EVENTS + sum_t sum_j down_j mu_tj) / (EVENTS + sum_t sum_j a_j),  j over the modes of jumps.
 
 The filters use coordinates z = M theta of their start, in which the regressor is x (`driftfit.trackers.parts
 .coordinates`). A regressor in a direction that no earlier one has determined is used by all filters, and does not
@@ -32,6 +35,7 @@ from driftfit.trackers.mixture.states import (
     FIRST_ALONE,
     FIRST_LEARNED,
     FLOOR,
+    JUMP,
     MEMORY,
     STATES,
     sum_of_row,
@@ -40,8 +44,12 @@ from driftfit.trackers.mixture.states import (
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.covariance import LEFT
 
+EVENTS, RAREST, OFTENEST, SPAN = 3.0, 0.05, 3.0, 2e4
+"""Jumps that the prior of their rate counts for, its bounds, and its memory in samples."""
 FADING, BEND = 0.05, 0.1
 """Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""
+STUDENT = 60.0
+"""Samples from which on Student's density is taken for normal."""
 UNSURE = 4.0
 """The covariance that is reported is that of the mixture times 1 + this over the square root of the number of samples,
 because r and the probabilities of the filters are estimates. They have a memory: samples count up to `MEMORY`."""
@@ -166,7 +174,7 @@ def innovate(s: State, l: int) -> None:
         s.row[k, l] = s.prior[k, l] * s.e_k[k, l]
     mean = sum_of_row(s, l)
     for k in range(K):  # the band is for samples at which no jump begins
-        p = s.prior[k, l] - (s.arrive[k, l] if s.ratio[k, l] >= 1.0 else 0.0)
+        p = s.prior[k, l] - (s.kappa[l] * s.arrive[k, l] if s.ratio[k, l] >= 1.0 else 0.0)
         s.row[k, l] = max(p, 0.0) * (s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2)
     v = sum_of_row(s, l) + s.vague[l]
     quiet, restless = variance_in(s, 0, l), s.nu_prior[1, l] / (1.0 - s.outlying[l])
@@ -184,20 +192,22 @@ def likelihoods(s: State, more: float, l: int) -> None:
 
     ``more`` is added to the variance of the noise.
     """
+    few = s.count[l]
     for j in range(STATES):
         noise = variance_in(s, j, l) + more
         widest = np.inf if j == STATES - 1 else 0.0
         for k in range(s.modes[l]):
             square = s.e_k[k, l] * s.e_k[k, l]
             v = 1.0 / (s.h_k[k, l] + max(noise, min(square, widest)))
+            far = square * v if few > STUDENT else (few + 1.0) * log(1.0 + square * v / few)
             s.inverse[j, k, l] = v
-            s.joint[j, k, l] = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(v) * exp(-0.5 * square * v)
+            s.joint[j, k, l] = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(v) * exp(-0.5 * far)
 
 
 @partial(kernel, inline=False)
 def predictive_density(s: State, l: int) -> None:
     """The log density of the sample under its prediction, with a Cauchy tail for outliers, which integrates to 1."""
-    K = s.modes[l]
+    K, few = s.modes[l], s.count[l]
     noise = variance_in(s, STATES - 1, l) + s.vague[l]
     for k in range(K):
         v = s.h_k[k, l] + noise
@@ -205,7 +215,8 @@ def predictive_density(s: State, l: int) -> None:
     tail = log(sum_of_row(s, l) / np.pi)
     for k in range(K):
         s.row[k, l] = s.joint[0, k, l] + s.joint[1, k, l]
-    body = sum_of_row(s, l) / np.sqrt(2.0 * np.pi)
+    x = 0.25 / few if few <= STUDENT else 0.0
+    body = sum_of_row(s, l) * (1.0 - x + 0.5 * x * x) / np.sqrt(2.0 * np.pi)
     body = log(body) if body > 0.0 else -np.inf
     s.density[l] = tail + log(1.0 + exp(body - tail)) if body < tail else body + log(1.0 + exp(tail - body))
 
@@ -353,20 +364,20 @@ def mixture(s: State, l: int) -> None:
 def find_shares(s: State, l: int) -> None:
     """Prior probabilities of the next sample, and of what comes before it: the mode, all modes, and in ``curve`` and
     ``step`` those below and above."""
-    K = s.modes[l]
+    K, kappa = s.modes[l], s.kappa[l]
     for k in range(K):
         s.row[k, l] = s.arrive[k, l]
-    leave = sum_of_row(s, l)
+    leave = kappa * sum_of_row(s, l)
     for k in range(K):
-        s.share[0, k, l] = s.mu[k, l] * (1.0 - leave - s.up[k, l] - s.down[k, l] - s.foot[k, l])
-        s.share[1, k, l] = s.arrive[k, l]
+        s.share[0, k, l] = s.mu[k, l] * (1.0 - leave - kappa * s.up[k, l] - s.down[k, l] - s.foot[k, l])
+        s.share[1, k, l] = kappa * s.arrive[k, l]
         s.share[2, k, l] = s.mu[k, l] * s.foot[k, l]
         s.curve[k, l] = 0.0
         s.step[k, l] = 0.0
         s.row[k, l] = s.share[2, k, l]
     rests = sum_of_row(s, l)
     for k in range(1, K):
-        s.curve[k, l] = s.mu[k - 1, l] * s.up[k - 1, l]
+        s.curve[k, l] = s.mu[k - 1, l] * kappa * s.up[k - 1, l]
     for k in range(K - 1):
         s.step[k, l] = s.mu[k + 1, l] * s.down[k + 1, l]
     for k in range(K):
@@ -383,6 +394,17 @@ def find_shares(s: State, l: int) -> None:
         s.share[2, k, l] *= part
 
 
+@kernel
+def learn_rate(s: State, l: int) -> None:
+    """kappa, from the jumps that later samples have left behind."""
+    for k in range(s.modes[l]):
+        s.row[k, l] = s.mu[k, l] * (s.down[k, l] + s.foot[k, l]) if s.ratio[k, l] >= 1.0 else 0.0
+    fade = 1.0 - 1.0 / SPAN
+    s.left_behind[l] = fade * s.left_behind[l] + sum_of_row(s, l)
+    s.jumps_expected[l] = fade * s.jumps_expected[l] + JUMP
+    s.kappa[l] = min(OFTENEST, max(RAREST, (EVENTS + s.left_behind[l]) / (EVENTS + s.jumps_expected[l])))
+
+
 @partial(kernel, inline=False)
 def mix(s: State, l: int) -> None:
     """Interaction: every filter continues from the mixture of its predecessors.
@@ -390,6 +412,7 @@ def mix(s: State, l: int) -> None:
     Means are taken relative to that of the mixture, d, so that moments may be added before the mean is subtracted.
     """
     n, K = s.parameters[l], s.modes[l]
+    learn_rate(s, l)
     find_shares(s, l)
     for a in range(n):  # what comes to rest
         for k in range(K):

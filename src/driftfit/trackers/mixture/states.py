@@ -49,7 +49,7 @@ MOST_ALONE = 8
 """Number of parameters up to which each has a ladder of its own."""
 UP, DOWN, BACK = 2e-4, 1e-3, 0.05
 """Probabilities: to the next larger ratio, to the next smaller one, and the latter from ratios of 1 and more."""
-JUMP, ARRIVE = 2e-3, 1e-5
+JUMP, ARRIVE = 3e-3, 1e-5
 """Probabilities from the whole bank: into all modes with ratios of 1 and more, and into each other one."""
 AT_REST, ALL, SELDOM = 0.3, 0.45, 0.02
 """Probabilities before the first sample: of no drift at least, of the other common ratios, and the share of jumps in
@@ -115,6 +115,9 @@ def bank(n: int, groups: Any) -> dict[str, Any]:
         "arrive": modes["arrive"],
         "alone": modes["first"],
         "rungs": len(ALONE if groups is None else GROUP),
+        "left_behind": 0.0,
+        "jumps_expected": 0.0,
+        "kappa": 1.0,
         "leap": 0.0,
         "astray": 0.0,
         "mu": modes["start"],
@@ -241,7 +244,7 @@ def learn_noise(s: State, l: int) -> None:
 
 
 SMOOTHER_FIELDS = (
-    "mu", "prior", "r", "certainty", "leap", "c", "drift_unit", "offset", "weight", "direction", "white",
+    "mu", "prior", "kappa", "r", "certainty", "leap", "c", "drift_unit", "offset", "weight", "direction", "white",
     "explained", "settled", "constant",
 )  # fmt: skip
 """Fields that are stored at every sample."""
@@ -255,25 +258,26 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
     for i in range(s.c.shape[0]):
         o.c[i, l], o.drift_unit[i, l], o.offset[i, l] = s.c[i, l], s.drift_unit[i, l], s.offset[i, l]
         o.weight[i, l], o.direction[i, l], o.white[i, l] = s.weight[i, l], s.direction[i, l], s.white[i, l]
-    o.r[l], o.certainty[l], o.explained[l] = s.r[l], s.certainty[l], s.explained[l]
+    o.kappa[l], o.r[l], o.certainty[l], o.explained[l] = s.kappa[l], s.r[l], s.certainty[l], s.explained[l]
     o.settled[l], o.constant[l], o.leap[l] = s.settled[l], s.constant[l], s.leap[l]
 
 
-def transitions(state: Mapping[str, Any]) -> Array:
-    """Transitions (K, K) of the modes, from the fields of a bank."""
+def transitions(state: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Transitions (K, K) of the modes as A + kappa B, from the fields of a bank."""
     up, down, foot, arrive = state["up"], state["down"], state["foot"], state["arrive"]
-    T = np.diag(1.0 - down - foot - up - arrive.sum()) + np.diag(down[1:], -1) + np.diag(up[:-1], 1) + arrive
-    T[:, 0] += foot
-    return T
+    A = np.diag(1.0 - down - foot) + np.diag(down[1:], -1)
+    A[:, 0] += foot
+    B = np.diag(-arrive.sum() - up) + np.diag(up[:-1], 1) + arrive
+    return A, B
 
 
 def modes_given_all(fields: Mapping[str, Array], used: Array, state: Mapping[str, Any]) -> Array:
     """Probabilities (T, K) of the modes, given all samples; ``used`` (T,) are those that changed them."""
     after, ahead = np.where(used[:, None], fields["mu"], fields["prior"]), fields["prior"]
-    T, found = transitions(state), after.copy()
+    (A, B), found = transitions(state), after.copy()
     for t in range(len(found) - 2, -1, -1):
         later = found[t + 1] / np.maximum(ahead[t], 1e-300)
-        found[t] = after[t] * (T @ later) if used[t] else found[t + 1]
+        found[t] = after[t] * (A @ later + fields["kappa"][t] * (B @ later)) if used[t] else found[t + 1]
         found[t] /= max(found[t].sum(), 1e-300)
     return found
 
