@@ -117,6 +117,12 @@ def enlarge(s: State, x: float, signal: int, l: int) -> None:
 
 
 @kernel
+def refer(s: State, x: float, signal: int, l: int) -> None:
+    """The reading about which a signal is filtered: the last before the first usable sample."""
+    s.reference[signal, l] = x if (s.usable[l] < 1.0) & (abs(x) < LARGEST) else s.reference[signal, l]
+
+
+@kernel
 def stable(s: State, first: int, order: int, sign: float, l: int) -> bool:
     """Whether 1 + sum_i sign x_i z^-i is, x from s.point[first]: all reflection coefficients are inside (-1, 1)."""
     inside = True
@@ -188,8 +194,8 @@ def staying(s: State, l: int) -> None:
 def filters(p: Places) -> tuple[Any, Any]:
     """``colour(s, raw, into, about, l)`` and ``whitened(s, raw, into, l)``: D/C and 1/C of the present sample of a row.
 
-    Beside an offset, outputs and inputs are filtered about a reading of the start: the filters change while they learn,
-    and those of a large mean and of the ones, at different moments, would differ by more than the signal.
+    Beside an offset, signals are filtered about a reading of the start: filters change while they learn, and those of a
+    large mean and of the ones, at different moments, would differ by more than the signal.
     """
     nc, nd, at_c, at_d = p.nc, p.nd, p.at_c, p.at_d
 
@@ -247,7 +253,7 @@ def point(p: Places, place: Step, waiting: float = ENTRY) -> Any:
 @lru_cache
 def taking_inputs(p: Places) -> Step:
     """The step that takes the inputs of the present sample, and filters them."""
-    m, nf, at_f, at_offset = p.m, p.nf, p.at_f, p.at_offset
+    m, nf, at_f, offset = p.m, p.nf, p.at_f, p.at_offset >= 0
     colour, _ = filters(p)
 
     @kernel
@@ -260,8 +266,8 @@ def taking_inputs(p: Places) -> Step:
             enlarge(s, u, 1 + j, l)
             held = s.last_input[j, l]
             s.signals[own + HELD, 0, l] = held
-            if (at_offset >= 0) & (nf[j] == 0):
-                s.reference[1 + j, l] = held if s.usable[l] < 1.0 else s.reference[1 + j, l]
+            if offset & (nf[j] == 0):
+                refer(s, held, 1 + j, l)
             about = s.reference[1 + j, l]
             s.signals[own + G, 0, l] = filtered(s, colour(s, own + HELD, own + G, about, l), held - about, 1 + j, l)
             x = s.signals[own + G, 0, l]
@@ -397,12 +403,14 @@ def ageing(p: Places) -> Any:
 @lru_cache
 def regressing(p: Places, place: Step, regressors: Any, waiting: float = ENTRY) -> Step:
     """``regress``; ``regressors(s, y_hat, l)`` fills s.phi, and returns the prediction at the point."""
-    n, age, linearise, take_inputs = p.n, ageing(p), point(p, place, waiting), taking_inputs(p)
-    predict, _ = predictions(p)
+    n, offset, predict = p.n, p.at_offset >= 0, predictions(p)[0]
+    age, linearise, take_inputs = ageing(p), point(p, place, waiting), taking_inputs(p)
 
     @kernel
     def regress(s: State, l: int) -> None:
         age(s, l)
+        if offset:
+            refer(s, s.y[l], 0, l)
         linearise(s, l)
         take_inputs(s, l)
         y_hat = regressors(s, predict(s, True, l), l)
@@ -429,8 +437,7 @@ def pushing(p: Places, place: Step, waiting: float = ENTRY) -> Step:
     def remember(s: State, y: float, known: bool, v: float, e: float, l: int) -> None:
         s.signals[Y, 0, l], s.signals[V, 0, l], s.signals[E, 0, l] = y, v, e
         s.signals[EF, 0, l], s.signals[VF, 0, l] = whitened(s, E, EF, l), whitened(s, V, VF, l)
-        about = s.reference[0, l]
-        s.signals[YF, 0, l] = filtered(s, colour(s, Y, YF, about, l), y - about, 0, l)
+        s.signals[YF, 0, l] = filtered(s, colour(s, Y, YF, s.reference[0, l], l), y - s.reference[0, l], 0, l)
         s.signals[Y, 0, l] = y if known else np.nan
 
     @kernel
@@ -457,8 +464,6 @@ def pushing(p: Places, place: Step, waiting: float = ENTRY) -> Step:
     def push(s: State, l: int) -> None:
         observed = s.observed[l] > 0.0
         predicted = informed(s, l)
-        if at_offset >= 0:
-            s.reference[0, l] = s.measured[l] if observed & (s.usable[l] < 1.0) else s.reference[0, l]
         # w and e of this sample are those of the theta that has learned from it
         enlarge(s, s.measured[l] if observed else np.nan, 0, l)
         linearise(s, l)
