@@ -128,8 +128,7 @@ def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -
     drift *= run.known.drift
     basis = NONE
     if own and fields:
-        B, r_of, rate = tracker.problem(fields, phi[weight > 0.0])
-        groups = tracker.apart(run.model.n)
+        B, r_of, rate, groups = tracker.problem(fields, phi[weight > 0.0])
         phi, signals[:, Y] = tracker.regression(fields, phi, signals[:, Y])
         basis = B if turned and np.any(np.eye(len(B)) != B) else NONE
         time = np.where(rate > 0.0, drift, 0.0)

@@ -323,11 +323,10 @@ class AdaptiveKalman(Tracker):
         running = np.append(False, fields["settled"][:-1] > 0)  # not yet at the sample with which the filters start
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
 
-    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array]:
-        return centring(fields, phi), *variances_given_all(fields, self.state(phi.shape[1]))
-
-    def apart(self, n: int) -> Sequence[Sequence[int]]:
-        return [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
+    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array, Sequence[Sequence[int]]]:
+        n = phi.shape[1]
+        groups = [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
+        return centring(fields, phi), *variances_given_all(fields, self.state(n)), groups
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:

@@ -149,16 +149,12 @@ class Tracker(Settings, ABC):
         """phi (T, n) and y (T,) as the tracker used them; ``fields`` as in `problem`."""
         return phi, y
 
-    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array]:
-        """B (n, n), what drifts being B^-1 theta, and the variances of noise and drift (T,), if they are estimated.
+    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array, Sequence[Sequence[int]]]:
+        """B (n, n), what drifts being B^-1 theta, variances of noise and drift (T,), and groups that may move alone.
 
         ``fields`` (T, ..) are those that ``smoother_fields`` names, phi (N, n) the regressors of the used samples.
         """
         raise NotImplementedError
-
-    def apart(self, n: int) -> Sequence[Sequence[int]]:
-        """Groups of parameters that may move while the others rest."""
-        return ()
 
     def extra_columns(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
         """Known factors of every sample after interval, noise and drift, (T, k), which ``steps.read_extra`` reads."""
