@@ -2,11 +2,12 @@
 
 Between two samples the parameters drift, and with probability `PER_SAMPLE` all of them, or those of one group, jump:
 
-    theta_t = theta_{t-1} + w_t,    Var w_t(i) = (rho_i tau_t + v) r / c_i,    v = 0 or one of `SIZES`
+    theta_t = theta_{t-1} + w_t,    Var w_t(i) = (rho_i tau_t + v) r / c_i,    v = 0, or the size of a jump
 
-with r the typical noise variance, c_i the mean square of regressor i, and tau_t the nominal intervals of drift, or
-these weighted by the drift that the tracker found, which must be T / `SHARE` better in log evidence: it was found in
-the same noise. `driftfit.smooth.mixture` sums over all sequences of jumps. The ratios are found in three steps:
+with `SIZES` for jumps, r the typical noise variance, c_i the mean square of regressor i, and tau_t the nominal
+intervals of drift, or these weighted by the drift that the tracker found, which must be T / `SHARE` better in log
+evidence: it was found in the same noise. `driftfit.smooth.mixture` sums over all sequences of jumps. The ratios are
+found in three steps:
 
     1. tau, and one ratio of all parameters, of greatest evidence among `LEVELS`;
     2. with the expected squares of its jumps as known drift the problem has one Gaussian, whose likelihood costs a
@@ -78,8 +79,7 @@ def average_drift(walk: Walk, times: tuple[Array, Array], trend: Array, groups: 
     moved = np.flatnonzero(np.any(walk.phi[walk.weight > 0.0] != 0.0, axis=0))
     if len(moved) == walk.phi.shape[1] or not len(moved):
         return averaged(walk, times, trend, groups)
-    place = {int(i): k for k, i in enumerate(moved)}
-    inner = [own for group in groups if (own := [place[i] for i in group if i in place])]
+    inner = [own for group in groups if (own := np.flatnonzero(np.isin(moved, group)).tolist())]
     some = averaged(walk.of(moved), times, trend, inner)
     known, whole = some.mixture, np.eye(walk.phi.shape[1])[moved]
     if known is not None:
@@ -148,9 +148,10 @@ def hypotheses(walk: Walk, time: Array, unit: Array, groups: Groups) -> Problem:
     which = np.column_stack([zero, np.where(label > 0, label, -1)])
     moves = Alternatives(zero, zero, label, log_prob, roots, which, np.tile([0, 1], (len(roots), 1)))
     r = np.divide(1.0, walk.weight, out=np.full(T, np.inf), where=walk.weight > 0.0)
-    noise = Noises(np.array([[1.0, 0.0]]), np.zeros((1, 1)))
     table, sizes = (time > 0.0).astype(int), np.column_stack([np.sqrt(time), np.ones(T)])
-    return Problem(walk.phi, walk.y.copy(), r, moves, table, sizes, np.zeros((0, n + 1)), noise)
+    return Problem(
+        walk.phi, walk.y.copy(), r, moves, table, sizes, np.zeros((0, n + 1)), Noises(np.eye(1, 2), np.zeros((1, 1)))
+    )
 
 
 def drifting(problem: Problem, q: Array) -> Problem:
