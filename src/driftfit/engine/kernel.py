@@ -210,9 +210,8 @@ class Driver:
 
     def __call__(self, *given: Any) -> Any:
         """Run on arrays and numbers. Whether arrays are read-only is not part of the signature."""
-        kind: tuple[Any, ...]
         try:
-            kind = tuple(map(_KIND, given))
+            kind: Any = tuple(map(_KIND, given))
         except AttributeError:  # numbers, and tuples of arrays
             kind = tuple(map(_kind, given))
         return self.of_kind(kind, given)
@@ -263,9 +262,8 @@ Numbers of NumPy have them too; no driver takes arrays without axes, with which 
 
 
 def _kind(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return type(value), *map(_kind, value)
-    return _KIND(value) if isinstance(value, np.ndarray) else type(value)
+    inner = value if isinstance(value, tuple) else ()
+    return _KIND(value) if isinstance(value, np.ndarray) else (type(value), *map(_kind, inner))
 
 
 def _type(value: Any) -> types.Type:

@@ -76,13 +76,11 @@ def spread(walk: Walk, path: Path) -> Path:
 
 def mixed(walk: Walk, path: Path) -> Path:
     """The path with the moments of the mixture; leverages stay those of one Gaussian."""
-    theta, cov = walk.mixture.theta, walk.mixture.cov
+    cov = walk.mixture.cov
     var = np.where(np.isinf(path.var), np.inf, np.einsum("tii->ti", cov))
-    path = path._replace(theta=theta.copy(), var=var, cov=cov if len(path.cov) else path.cov)
-    if not len(path.c):
-        return path
-    error = np.sqrt(np.where(walk.weight > 0.0, walk.weight, np.nan)) * walk.residual(theta)
-    return path._replace(rho=error / np.where(path.c > 0.0, path.c, 1.0))
+    path = path._replace(theta=walk.mixture.theta.copy(), var=var, cov=cov if len(path.cov) else path.cov)
+    error = np.sqrt(np.where(walk.weight > 0.0, walk.weight, np.nan)) * walk.residual(path.theta)
+    return path._replace(rho=error / np.where(path.c > 0.0, path.c, 1.0) if len(path.c) else path.rho)
 
 
 def turned(walk: Walk, keep: str) -> Path:

@@ -2,11 +2,12 @@
 
 Between two samples the parameters drift, and with probability `PER_SAMPLE` all of them, or those of one group, jump:
 
-    theta_t = theta_{t-1} + w_t,    Var w_t(i) = (rho_i tau_t + v) r / c_i,    v = 0 or one of `SIZES`
+    theta_t = theta_{t-1} + w_t,    Var w_t(i) = (rho_i tau_t + v) r / c_i,    v = 0, or the size of a jump
 
-with r the typical noise variance, c_i the mean square of regressor i, and tau_t the nominal intervals of drift, or
-these weighted by the drift that the tracker found, which must be T / `SHARE` better in log evidence: it was found in
-the same noise. `driftfit.smooth.mixture` sums over all sequences of jumps. The ratios are found in three steps:
+with `SIZES` for jumps, r the typical noise variance, c_i the mean square of regressor i, and tau_t the nominal
+intervals of drift, or these weighted by the drift that the tracker found, which must be T / `SHARE` better in log
+evidence: it was found in the same noise. `driftfit.smooth.mixture` sums over all sequences of jumps. The ratios are
+found in three steps:
 
     1. tau, and one ratio of all parameters, of greatest evidence among `LEVELS`;
     2. with the expected squares of its jumps as known drift the problem has one Gaussian, whose likelihood costs a
@@ -42,13 +43,13 @@ from driftfit.smooth.parts.walk import Walk
 
 Groups = Sequence[Sequence[int]]
 SIZES = (15.0, 900.0)
-"""Variances of jumps, in units of r / c; a group alone has the first."""
+"""Variances of jumps, in units of r / c; a group alone has their geometric mean."""
 PER_SAMPLE = 3e-3
 """Probability of a jump before a sample, as in `driftfit.trackers.mixture.states`."""
 LEVELS = (0.0, 1e-4, 1e-2, 1.0)
-SMALLEST, LARGEST = 10.0, 10.0
+EDGE = 10.0
 """The smallest ratio times T^2, and the largest."""
-SCALES = np.array([1.0 / 3.0, 1.0, 3.0, 9.0])
+SCALES = 3.0 ** np.arange(-1, 3)
 SHARE = 200.0
 FEW = 8
 """Components with which evidences are computed, and the path where they suffice."""
@@ -78,18 +79,12 @@ def average_drift(walk: Walk, times: tuple[Array, Array], trend: Array, groups: 
     moved = np.flatnonzero(np.any(walk.phi[walk.weight > 0.0] != 0.0, axis=0))
     if len(moved) == walk.phi.shape[1] or not len(moved):
         return averaged(walk, times, trend, groups)
-    place = {int(i): k for k, i in enumerate(moved)}
-    inner = [own for group in groups if (own := [place[i] for i in group if i in place])]
+    inner = [own for group in groups if (own := np.flatnonzero(np.isin(moved, group)).tolist())]
     some = averaged(walk.of(moved), times, trend, inner)
-    drift_root = np.zeros_like(walk.phi)
-    drift_root[:, moved], paths, known = some.drift_root, some.paths, some.mixture
-    if len(paths):
-        paths = np.zeros((len(paths), *walk.phi.shape))
-        paths[:, :, moved] = some.paths
+    known, whole = some.mixture, np.eye(walk.phi.shape[1])[moved]
     if known is not None:
-        theta, cov = np.zeros_like(walk.phi), np.zeros((len(walk.phi), *walk.q.shape))
-        theta[:, moved], cov[:, moved[:, None], moved] = known.theta, known.cov
-        known = known._replace(theta=theta, cov=cov)
+        known = known._replace(theta=known.theta @ whole, cov=whole.T @ known.cov @ whole)
+    paths, drift_root = some.paths @ whole if len(some.paths) else some.paths, some.drift_root @ whole
     return walk._replace(drift_root=drift_root, trend=some.trend, paths=paths, belief=some.belief, mixture=known)
 
 
@@ -112,21 +107,16 @@ def averaged(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Group
     time = problem.sizes[:, :1] ** 2
     likely = climbed(walk, time, jumps, unit, groups if len(groups) > 1 else [])
     if likely is None:
-        root = np.diag(problem.alternatives.roots[0])
-        return walk._replace(drift_root=np.sqrt(root**2 * time + jumps))
-    gaussian = walk._replace(
-        drift_root=np.sqrt(likely.q * time + jumps), mixture=mean_of(problem, likely.q, first.needed)
-    )
-    fitted = float(np.sum(1.0 - first.events[:, 0]))
-    return with_slopes(gaussian, likely, trend, TRENDS + fitted * np.log(PER_SAMPLE))
+        return walk._replace(drift_root=np.sqrt(np.diag(problem.alternatives.roots[0]) ** 2 * time + jumps))
+    price = TRENDS + np.sum(1.0 - first.events[:, 0]) * np.log(PER_SAMPLE)
+    known = mean_of(problem, likely.q, first.needed)
+    return with_slopes(walk._replace(drift_root=np.sqrt(likely.q * time + jumps), mixture=known), likely, trend, price)
 
 
 def with_slopes(walk: Walk, likely: Tried, trend: Array, price: float) -> Walk:
     """The problem with slopes if they are more probable, and with the paths of all that are probable at all."""
     rates, better = compared(walk, trend, likely.theta[np.argmax(likely.p), 0])
-    p = np.append(0.0, better - price)
-    p = np.exp(p - p.max())
-    p /= p.sum()
+    p = shares(np.append(0.0, better - price))
     which = np.flatnonzero(p[1:] >= LEAST)
     others = [slopes.smooth(sloped(walk, trend, rates[k])).theta for k in which]
     if p[0] < 0.5:
@@ -139,12 +129,18 @@ def sloped(walk: Walk, trend: Array, rate: Array) -> Walk:
     return walk._replace(trend=trend, drift_root=np.sqrt(trend[:, None] * rate))
 
 
+def shares(logs: Array) -> Array:
+    """Probabilities (K,) of hypotheses of these log likelihoods, alike before."""
+    p = np.exp(logs - logs.max())
+    return np.asarray(p / p.sum())
+
+
 def hypotheses(walk: Walk, time: Array, unit: Array, groups: Groups) -> Problem:
     """The problem without drift; ``unit`` (n,) is r / c."""
     T, n = walk.phi.shape
     apart = groups if len(groups) > 1 else []
     jumps = [(size * unit, (0.5 if apart else 1.0) / len(SIZES)) for size in SIZES]
-    jumps += [(SIZES[0] * unit * np.isin(np.arange(n), group), 0.5 / len(groups)) for group in apart]
+    jumps += [(np.sqrt(np.prod(SIZES)) * unit * np.isin(np.arange(n), group), 0.5 / len(groups)) for group in apart]
     roots = np.array([np.diag(np.sqrt(q)) for q in (np.zeros(n), *(q for q, _ in jumps))])
     label, zero = np.arange(len(roots)), np.zeros(len(roots), int)
     with np.errstate(divide="ignore"):
@@ -152,9 +148,10 @@ def hypotheses(walk: Walk, time: Array, unit: Array, groups: Groups) -> Problem:
     which = np.column_stack([zero, np.where(label > 0, label, -1)])
     moves = Alternatives(zero, zero, label, log_prob, roots, which, np.tile([0, 1], (len(roots), 1)))
     r = np.divide(1.0, walk.weight, out=np.full(T, np.inf), where=walk.weight > 0.0)
-    noise = Noises(np.array([[1.0, 0.0]]), np.zeros((1, 1)))
     table, sizes = (time > 0.0).astype(int), np.column_stack([np.sqrt(time), np.ones(T)])
-    return Problem(walk.phi, walk.y.copy(), r, moves, table, sizes, np.zeros((0, n + 1)), noise)
+    return Problem(
+        walk.phi, walk.y.copy(), r, moves, table, sizes, np.zeros((0, n + 1)), Noises(np.eye(1, 2), np.zeros((1, 1)))
+    )
 
 
 def drifting(problem: Problem, q: Array) -> Problem:
@@ -167,8 +164,8 @@ def drifting(problem: Problem, q: Array) -> Problem:
 def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) -> Tried | None:
     """Ratios with known squares of jumps (T, n); None if no likelihood is accurate."""
     n, T = len(unit), len(time)
-    least = np.ceil(2.0 * np.log10(SMALLEST / T**2)) / 2.0
-    ratios = np.append(0.0, 10.0 ** np.arange(least, np.log10(LARGEST) + 0.25, 0.5))
+    least = np.ceil(2.0 * np.log10(EDGE / T**2)) / 2.0
+    ratios = np.append(0.0, 10.0 ** np.arange(least, np.log10(EDGE) + 0.25, 0.5))
     size, top = column_scale(walk.phi, walk.signals), len(ratios) - 1
     known: dict[tuple[int, ...], float] = {}
 
@@ -192,8 +189,7 @@ def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) 
     if known[best] == -np.inf:
         return None
     likely = [at for at, logs in known.items() if logs > known[best] + np.log(LEAST)]
-    p = np.exp([known[at] - known[best] for at in likely])
-    p /= p.sum()
+    p = shares(np.array([known[at] for at in likely]))
     return Tried(p, np.array([solved(at)[0] for at in likely]), p @ ratios[np.array(likely)] * unit)
 
 
@@ -202,8 +198,7 @@ def mean_of(problem: Problem, q: Array, keep: Array) -> Mixture:
     scales = [Passes(drifting(problem, scale * q), keep) for scale in SCALES]
     logs = np.array([one.forward() for one in scales])
     order = [k for k in np.argsort(-logs) if logs[k] > logs.max() + np.log(LIKELY)]
-    w = np.exp(logs[order] - logs.max())
-    w /= w.sum()
+    w = shares(logs[order])
     found = [mixture.refined(scales[k], True) for k in order]
     theta = np.asarray(np.einsum("k,kti->ti", w, np.array([one.theta for one in found])))
     cov = np.zeros_like(found[0].cov)
