@@ -27,6 +27,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from driftfit.judge.statistics.parts.coarse_readings import step_of
 from scipy import signal
 
 from driftfit.engine.kernel import Array
@@ -39,7 +40,6 @@ from driftfit.judge.changes.words import Event, events
 from driftfit.judge.evidence import REJECTED as LEVEL
 from driftfit.judge.evidence import judged_rows
 from driftfit.judge.regressors import Rows
-from driftfit.judge.statistics.parts.coarse_readings import step_of
 
 T = 1500
 BEFORE = 200
