@@ -236,6 +236,7 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
         elif sensors[j, OWN] > 0.0:
             judge_all(t, sensors[j, OWN], at, columns, y, t.r * noise)
             correct(t.n, t, at, columns, y, 0.0)
+            restore(t, at, columns, False)
         else:
             correct(t.n, t, at, columns, y - sensors[j, VALUE], sensors[j, FACTOR] * t.r * noise)
             if t.unknown > 0:
@@ -247,8 +248,8 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
             own_lags = sensors[j, CLEANS] > 0.0
             push(t, t.parents, K, at, columns, y - sensors[j, VALUE], own_lags)
             shift_covariance(t, t.parents, K, at, columns, own_lags)
-        if sensors[j, OWN] > 0.0:
-            restore(t, at, columns, sensors[j, CLEANS] > 0.0 and t.output_lags > 0)
+        if sensors[j, OWN] > 0.0 and sensors[j, CLEANS] > 0.0 and t.output_lags > 0:
+            restore(t, at, columns, True)
         # prior probability of the event, ancestry, and codes for the reduction
         weigh(t, K, at, columns, j, own)
         encode(t, K, at, columns, j)
