@@ -67,7 +67,9 @@ def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
     far = [y - ahead(path, phi, run.model.output_lags or 0, horizon) for path in paths]
     rivals = {"constant ARX": own.constant_arx, "persistence": own.persistence}
     cases = [(1, own.tracked, own.constant_ls, run.log_density, rivals)]
-    cases += [(horizon, *far, density(far[0]), {"persistence": y - lagged(persistence(y), horizon - 1)})][: horizon - 1]
+    if horizon > 1:
+        last = {"persistence": y - lagged(persistence(y), horizon - 1)}
+        cases.append((horizon, far[0], far[1], density(far[0]), last))
     for h, tracked, constants, likely, others in cases:
         w = np.append(np.full(h - 1, 0.5), weights(likely, density(constants)))[: len(y)]
         errors = {"driftfit": w * tracked + (1.0 - w) * constants, "tracked": tracked, "constants": constants, **others}
