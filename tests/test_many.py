@@ -116,6 +116,12 @@ def test_ranked_by_change_puts_the_largest_share_first(fleet):
     assert all(row.relative == 0.0 for row in rows[2:])
     assert {row.key for row in rows} == {f"<{k}>" for k in range(7)}
     assert result.ranked("change").ranked("clearest").rows == result.rows
+    cells = next(row for row in result.table.iter_rows(named=True) if row[fleet.by[0]] == "<4>")
+    assert cells["parameter"] == "b2"
+    assert abs(cells["sample"] - 150) < 10
+    assert [cells["before"], cells["after"]] == pytest.approx([0.4, 1.2], abs=0.1)
+    assert 0.85 < cells["coverage"] < 1.0
+    assert cells["left_out"] == 0
     with pytest.raises(ValueError, match="'change'"):
         result.ranked("size")
 

@@ -20,12 +20,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
+from scipy.special import ndtri
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.diagnose import Diagnosis, diagnose, diagnosis
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.on_all_cores import on_all_cores
-from driftfit.judge.verdict import Verdict, change, judged, p_text, verdict
+from driftfit.judge.verdict import Moved, Verdict, change, judged, p_text, verdict
 from driftfit.run.keyed_results import table_by_key
 from driftfit.show.text import Printed, key_text, table_of
 
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 SHOWN = 20
+NORMAL_95 = float(ndtri(0.975))
 
 
 def discoveries(p: Array) -> Array:
@@ -50,7 +52,8 @@ def discoveries(p: Array) -> Array:
 class Judgement:
     """One run among many: its verdict, and the q-values of "the parameters move" and of "tracking them pays".
 
-    ``drifts`` and ``pays`` are None where this was not tested.
+    ``drifts`` and ``pays`` are None where this was not tested. ``coverage`` is the share of readings within the 95 %
+    band of their prediction, and ``left_out`` the number of readings that a gate left out.
     """
 
     key: Hashable
@@ -59,6 +62,13 @@ class Judgement:
     q_pays: float
     drifts: bool | None
     pays: bool | None
+    coverage: float
+    left_out: int
+
+    @property
+    def moves(self) -> tuple[Moved, ...]:
+        """The parameters that move."""
+        return tuple(one for one in self.verdict.parameters if one.moves) if self.drifts else ()
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -71,15 +81,15 @@ class Judgement:
 
         If the value before is smaller than the standard error of the change, that standard error replaces it.
         """
-        moved = [m for m in self.verdict.parameters if m.moves] if self.drifts else []
         return max(
-            (abs(m.after - m.before) / max(abs(m.before), np.nan_to_num(m.std), 1e-300) for m in moved), default=0.0
+            (abs(m.after - m.before) / max(abs(m.before), np.nan_to_num(m.std), 1e-300) for m in self.moves),
+            default=0.0,
         )
 
     @property
     def change(self) -> str:
         """The change of the first parameter that moves, in words."""
-        moved = [m for m in self.verdict.parameters if m.moves] if self.drifts else []
+        moved = self.moves
         more = f" and {len(moved) - 1} more" if len(moved) > 1 else ""
         if not moved:
             return ""
@@ -167,8 +177,19 @@ class ManyVerdicts(Printed):
     def table(self) -> Any:
         """One row per run, as a polars table that joins to others by the columns of its keys.
 
-        ``drifts`` and ``pays`` are null where this was not tested; ``untested`` is the reason.
+        ``drifts`` and ``pays`` are null where this was not tested; ``untested`` is the reason. Of the first parameter
+        that moves there are its name, the sample and the time of the change, its values before and after, and the
+        standard error of the change.
         """
+        first = [row.moves[0] if row.moves else None for row in self.rows]
+        named = {
+            "parameter": "name",
+            "sample": "at",
+            "when": "when",
+            "before": "before",
+            "after": "after",
+            "std": "std",
+        }
         return table_by_key(
             self.by,
             [row.key for row in self.rows],
@@ -179,11 +200,14 @@ class ManyVerdicts(Printed):
                 "drifts": [row.drifts for row in self.rows],
                 "moving": [", ".join(row.moving) for row in self.rows],
                 "change": [row.change for row in self.rows],
+                **{column: [getattr(one, name, None) for one in first] for column, name in named.items()},
                 "relative": [row.relative for row in self.rows],
                 "rms": [row.verdict.rms for row in self.rows],
                 "constant_ls": [row.verdict.rivals[1].rms for row in self.rows],
                 "pays": [row.pays for row in self.rows],
                 "samples": [row.verdict.samples for row in self.rows],
+                "coverage": [row.coverage for row in self.rows],
+                "left_out": [row.left_out for row in self.rows],
                 "untested": [row.verdict.untested for row in self.rows],
             },
         )
@@ -276,7 +300,8 @@ def verdicts(
     runs: Mapping[Hashable, Track], by: tuple[str, ...], level: float, lags: int | None = None, burn: int | None = None
 ) -> ManyVerdicts:
     """Judge runs by key, whose parts ``by`` names; see `driftfit.judge.verdict.verdict` for the settings and errors."""
-    return ranked(on_all_cores(runs, lambda key: (runs[key], level, lags, burn), verdict, "verdict"), by, level)
+    found = on_all_cores(runs, lambda key: (runs[key], level, lags, burn), verdict, "verdict")
+    return ranked(found, runs, by, level)
 
 
 def verdicts_and_diagnoses(
@@ -284,7 +309,7 @@ def verdicts_and_diagnoses(
 ) -> tuple[ManyVerdicts, ManyDiagnoses]:
     """The verdicts and the diagnoses, which share the test of constancy of each run."""
     pairs = on_all_cores(runs, lambda key: (runs[key], level), _both, "report")
-    judgements = ranked({key: one for key, (one, _) in pairs.items()}, by, level)
+    judgements = ranked({key: one for key, (one, _) in pairs.items()}, runs, by, level)
     return judgements, ManyDiagnoses({key: health for key, (_, health) in pairs.items()}, by)
 
 
@@ -293,16 +318,28 @@ def _both(run: Track, level: float) -> tuple[Verdict, Diagnosis]:
     return judged(known), diagnosis(known)
 
 
-def ranked(verdicts: Mapping[Hashable, Verdict], by: tuple[str, ...], level: float) -> ManyVerdicts:
-    """Verdicts by key with their q-values, the clearest first."""
+def ranked(
+    verdicts: Mapping[Hashable, Verdict], runs: Mapping[Hashable, Track], by: tuple[str, ...], level: float
+) -> ManyVerdicts:
+    """Verdicts of runs by key with their q-values, the clearest first."""
     q, q_pays = (
         discoveries(np.array(p)) for p in ([v.p for v in verdicts.values()], [v.constants.p for v in verdicts.values()])
     )
     rows = [
-        Judgement(key, one, float(a), float(b), *(None if np.isnan(value) else bool(value < level) for value in (a, b)))
+        Judgement(
+            key, one, float(a), float(b), *(None if np.isnan(value) else bool(value < level) for value in (a, b)),
+            _coverage(runs[key]), len(runs[key].left_out),
+        )
         for (key, one), a, b in zip(verdicts.items(), q, q_pays, strict=True)
-    ]
+    ]  # fmt: skip
     return ManyVerdicts(tuple(rows), level, by).ranked("clearest")
+
+
+def _coverage(run: Track) -> float:
+    """The share of readings within the 95 % band of their prediction, where they have both; NaN without any."""
+    z = np.abs(run.innovation[run.ok]) / run.innovation_std[run.ok]
+    z = z[np.isfinite(z)]
+    return float(np.mean(z < NORMAL_95)) if z.size else float("nan")
 
 
 def diagnoses(runs: Mapping[Hashable, Track], by: tuple[str, ...]) -> ManyDiagnoses:
