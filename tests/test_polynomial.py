@@ -359,3 +359,12 @@ def test_inputs_far_from_zero_cause_a_warning():
     with pytest.warns(UserWarning, match="steam varies by .* Subtract an operating point"):
         track(OE(1, 1, offset=True, inputs=["steam"]), RLS(1.0), y + 62.5, u + 25.0)
     track(ARMAX(1, 1, 1, offset=True), RLS(1.0), y + 62.5, u + 25.0)  # has no response that is simulated
+
+
+@pytest.mark.parametrize(("level", "mean"), [(293.15, 0.0), (0.0, 300.0)])
+def test_beside_an_offset_other_parameters_do_not_depend_on_levels(level, mean):
+    """Filters of the gradient that change while they learn made a large level look like a signal."""
+    y, u = armax_record(400, 21, 0.5)
+    here, there = (track(ARMAX(1, 1, 1, offset=True), RLS(1.0), y + a, u + b) for a, b in ((0, 0), (level, mean)))
+    np.testing.assert_allclose(there.theta[20:, :3], here.theta[20:, :3], rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(there.std[20:, :3], here.std[20:, :3], rtol=1e-3)

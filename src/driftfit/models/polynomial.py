@@ -227,6 +227,7 @@ class PolynomialModel(LinearisedTransfer):
             "last_input": np.zeros(max(self.m, 1)),
             "left": np.zeros((max(self.m, 1), 3)),
             "extent": np.zeros(1 + self.m),
+            "reference": np.zeros(1 + self.m),
             **MEMORY,
             "usable": 0.0 if self.point is None else LARGEST,
         }

@@ -106,7 +106,7 @@ def instrumental_steps(p: Places, held: bool) -> ModelSteps:
             own = rows + MORE * j
             s.signals[own + XI, 0, l] = s.signals[OWN + EACH * j + W, 0, l] + s.signals[V, 0, l]
             raw = s.signals[own + XI, 0, l]
-            s.signals[own + XI_C, 0, l] = filtered(s, colour(s, own + XI, own + XI_C, l), raw, 0, l)
+            s.signals[own + XI_C, 0, l] = filtered(s, colour(s, own + XI, own + XI_C, 0.0, l), raw, 0, l)
             x = s.signals[own + XI_C, 0, l]
             for i in range(nf[j]):
                 x += s.damped[at_f[j] + i, l] * s.signals[own + XI_F, i + 1, l]

@@ -117,6 +117,12 @@ def enlarge(s: State, x: float, signal: int, l: int) -> None:
 
 
 @kernel
+def refer(s: State, x: float, signal: int, l: int) -> None:
+    """The reading about which a signal is filtered: the last before the first usable sample."""
+    s.reference[signal, l] = x if (s.usable[l] < 1.0) & (abs(x) < LARGEST) else s.reference[signal, l]
+
+
+@kernel
 def stable(s: State, first: int, order: int, sign: float, l: int) -> bool:
     """Whether 1 + sum_i sign x_i z^-i is, x from s.point[first]: all reflection coefficients are inside (-1, 1)."""
     inside = True
@@ -186,14 +192,18 @@ def staying(s: State, l: int) -> None:
 
 @lru_cache
 def filters(p: Places) -> tuple[Any, Any]:
-    """``colour(s, raw, into, l)`` and ``whitened(..)``: D/C and 1/C of the present sample of a row."""
+    """``colour(s, raw, into, about, l)`` and ``whitened(s, raw, into, l)``: D/C and 1/C of the present sample of a row.
+
+    Beside an offset, signals are filtered about a reading of the start: filters change while they learn, and those of a
+    large mean and of the ones, at different moments, would differ by more than the signal.
+    """
     nc, nd, at_c, at_d = p.nc, p.nd, p.at_c, p.at_d
 
     @kernel
-    def colour(s: State, raw: int, into: int, l: int) -> float:
-        x = s.signals[raw, 0, l]
+    def colour(s: State, raw: int, into: int, about: float, l: int) -> float:
+        x = s.signals[raw, 0, l] - about
         for i in range(nd):
-            x -= s.point[at_d + i, l] * s.signals[raw, i + 1, l]
+            x -= s.point[at_d + i, l] * (s.signals[raw, i + 1, l] - about)
         for i in range(nc):
             x -= s.damped[at_c + i, l] * s.signals[into, i + 1, l]
         return x  # type: ignore[no-any-return]
@@ -243,7 +253,7 @@ def point(p: Places, place: Step, waiting: float = ENTRY) -> Any:
 @lru_cache
 def taking_inputs(p: Places) -> Step:
     """The step that takes the inputs of the present sample, and filters them."""
-    m, nf, at_f = p.m, p.nf, p.at_f
+    m, nf, at_f, offset = p.m, p.nf, p.at_f, p.at_offset >= 0
     colour, _ = filters(p)
 
     @kernel
@@ -256,11 +266,14 @@ def taking_inputs(p: Places) -> Step:
             enlarge(s, u, 1 + j, l)
             held = s.last_input[j, l]
             s.signals[own + HELD, 0, l] = held
-            s.signals[own + G, 0, l] = filtered(s, colour(s, own + HELD, own + G, l), held, 1 + j, l)
+            if offset & (nf[j] == 0):
+                refer(s, held, 1 + j, l)
+            about = s.reference[1 + j, l]
+            s.signals[own + G, 0, l] = filtered(s, colour(s, own + HELD, own + G, about, l), held - about, 1 + j, l)
             x = s.signals[own + G, 0, l]
             for i in range(nf[j]):
                 x += s.damped[at_f[j] + i, l] * s.signals[own + UF, i + 1, l]
-            s.signals[own + UF, 0, l] = filtered(s, x, held, 1 + j, l)
+            s.signals[own + UF, 0, l] = filtered(s, x, held - about, 1 + j, l)
 
     step: Step = take_inputs
     return step
@@ -330,21 +343,6 @@ def gradient_of(p: Places) -> Any:
     @kernel
     def gradient(s: State, l: int) -> None:
         settled = s.usable[l] >= SETTLING * n
-        for i in range(na):
-            lag = s.signals[YF, i + 1, l] if settled else s.signals[Y, i + 1, l]
-            s.phi[i, l] = lag if abs(s.signals[Y, i + 1, l]) < LARGEST else np.nan
-        for j in range(m):
-            own = OWN + EACH * j
-            for i in range(nb[j]):
-                at = nk[j] + i
-                lag = s.signals[own + UF, at, l] if settled else s.signals[own + U, at, l]
-                s.phi[at_b[j] + i, l] = lag if abs(s.signals[own + U, at, l]) < LARGEST else np.nan
-            for i in range(nf[j]):
-                s.phi[at_f[j] + i, l] = s.signals[own + WF, i + 1, l] if settled else s.signals[own + W, i + 1, l]
-        for i in range(nc):
-            s.phi[at_c + i, l] = s.signals[EF, i + 1, l] if settled else s.signals[E, i + 1, l]
-        for i in range(nd):
-            s.phi[at_d + i, l] = s.signals[VF, i + 1, l] if settled else s.signals[V, i + 1, l]
         if at_offset >= 0:
             one = 1.0
             for i in range(nd):
@@ -354,6 +352,23 @@ def gradient_of(p: Places) -> Any:
             one = one if abs(one) < BEYOND else 1.0
             s.signals[ONE, 0, l] = one
             s.phi[at_offset, l] = one if settled else 1.0
+        for i in range(na):
+            whole = s.signals[YF, i + 1, l] + s.reference[0, l] * s.signals[ONE, 0, l]
+            lag = whole if settled else s.signals[Y, i + 1, l]
+            s.phi[i, l] = lag if abs(s.signals[Y, i + 1, l]) < LARGEST else np.nan
+        for j in range(m):
+            own = OWN + EACH * j
+            for i in range(nb[j]):
+                at = nk[j] + i
+                whole = s.signals[own + UF, at, l] + s.reference[1 + j, l] * s.signals[ONE, 0, l]
+                lag = whole if settled else s.signals[own + U, at, l]
+                s.phi[at_b[j] + i, l] = lag if abs(s.signals[own + U, at, l]) < LARGEST else np.nan
+            for i in range(nf[j]):
+                s.phi[at_f[j] + i, l] = s.signals[own + WF, i + 1, l] if settled else s.signals[own + W, i + 1, l]
+        for i in range(nc):
+            s.phi[at_c + i, l] = s.signals[EF, i + 1, l] if settled else s.signals[E, i + 1, l]
+        for i in range(nd):
+            s.phi[at_d + i, l] = s.signals[VF, i + 1, l] if settled else s.signals[V, i + 1, l]
 
     step: Step = gradient
     return step
@@ -388,12 +403,14 @@ def ageing(p: Places) -> Any:
 @lru_cache
 def regressing(p: Places, place: Step, regressors: Any, waiting: float = ENTRY) -> Step:
     """``regress``; ``regressors(s, y_hat, l)`` fills s.phi, and returns the prediction at the point."""
-    n, age, linearise, take_inputs = p.n, ageing(p), point(p, place, waiting), taking_inputs(p)
-    predict, _ = predictions(p)
+    n, offset, predict = p.n, p.at_offset >= 0, predictions(p)[0]
+    age, linearise, take_inputs = ageing(p), point(p, place, waiting), taking_inputs(p)
 
     @kernel
     def regress(s: State, l: int) -> None:
         age(s, l)
+        if offset:
+            refer(s, s.y[l], 0, l)
         linearise(s, l)
         take_inputs(s, l)
         y_hat = regressors(s, predict(s, True, l), l)
@@ -420,7 +437,7 @@ def pushing(p: Places, place: Step, waiting: float = ENTRY) -> Step:
     def remember(s: State, y: float, known: bool, v: float, e: float, l: int) -> None:
         s.signals[Y, 0, l], s.signals[V, 0, l], s.signals[E, 0, l] = y, v, e
         s.signals[EF, 0, l], s.signals[VF, 0, l] = whitened(s, E, EF, l), whitened(s, V, VF, l)
-        s.signals[YF, 0, l] = filtered(s, colour(s, Y, YF, l), y, 0, l)
+        s.signals[YF, 0, l] = filtered(s, colour(s, Y, YF, s.reference[0, l], l), y - s.reference[0, l], 0, l)
         s.signals[Y, 0, l] = y if known else np.nan
 
     @kernel
