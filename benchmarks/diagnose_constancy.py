@@ -44,10 +44,9 @@ def record(model: str, seed: int, T: int) -> tuple[np.ndarray, np.ndarray]:
     return signal.lfilter(B, A, u) + signal.lfilter([1.0], A, e), u
 
 
-def judged(run: Track) -> tuple[float, bool, bool, bool]:
+def judged(run: Track, p: float) -> tuple[float, bool, bool, bool]:
     """(loss, ratio, worse, by 3 %); for a tracker with constant coefficients the first rule is its own."""
-    known = Evidence(run)
-    error, p = known.errors, known.p
+    error = Evidence(run).errors
     own, steady = error.tracked[error.scored], error.constant_ls[error.scored]
     loss = root_mean_square(own) / root_mean_square(steady)
     if holds_constant(run):
@@ -66,10 +65,13 @@ def main(
     for head in ("model", "tracker", "T", "loss, %", "ratio", "worse", "by 3 %"):
         table.add_column(head, justify="left" if head in ("model", "tracker") else "right")
     for name, model in (("regression", Regression(3)), ("ARX(2, 2)", ARX(2, 2))):
+        still = {T: [track(model, TRACKERS["constant"], *record(name, k, T)) for k in range(records)] for T in lengths}
+        p = {T: [Evidence(run).p for run in runs] for T, runs in still.items()}  # not a matter of the tracker
         for tracker in trackers:
             given = TRACKERS[tracker]
             for T in lengths:
-                rows = np.array([judged(track(model, given, *record(name, seed, T))) for seed in range(records)])
+                runs = (track(model, given, *record(name, k, T)) for k in range(records))
+                rows = np.array([judged(*one) for one in zip(runs, p[T], strict=True)])
                 shares = (f"{100.0 * share:.1f}" for share in rows[:, 1:].mean(axis=0))
                 table.add_row(name, tracker, str(T), f"{100.0 * np.median(rows[:, 0]):.2f}", *shares)
         table.add_section()

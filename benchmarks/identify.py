@@ -11,25 +11,35 @@ changes: nothing; the gain g jumps by a factor of 1.8; it rises by as much durin
 walk whose deviation at the end is 0.8 of it; the pole jumps by 0.35; f is a static curve that saturates; or g depends
 on the level of a third input, which returns to where it was.
 
-Seeds below 1000 are for tuning, those from 1000 on for judging. "named" and "date" are shares of the plants in which a
-drift was found, "cause" that of the plants of which a cause was named, "silent" that of those without one.
+Seeds below 1000 are for tuning, those from 1000 on for judging. "named", "date" and "interval" are shares of the plants
+in which a drift was found, "cause" that of the plants of which a cause was named, "silent" that of those without one.
+The row "true structure" is the verdict with the structure of the plant: how well a date can be known.
 
-Run: python benchmarks/identify.py [first seed, 1000 by default] [seed to stop before] [--quick]
+Run: python benchmarks/identify.py [first seed, 1000 by default] [seed to stop before] [--of CHANGE] [--by METHOD]
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import polars as pl
+from driftfit.judge.statistics.parts.coarse_readings import step_of
 from scipy import signal
 
-from driftfit import ARX, AdaptiveKalman, identify, track
 from driftfit.engine.kernel import Array
+from driftfit.identify.roles import roles
+from driftfit.identify.structure import Structure, lagged, search
+from driftfit.identify.working_point import cause, products
+from driftfit.judge.changes.changes import Changes
+from driftfit.judge.changes.null import Lags
+from driftfit.judge.changes.words import Event, events
+from driftfit.judge.evidence import REJECTED as LEVEL
+from driftfit.judge.evidence import judged_rows
+from driftfit.judge.regressors import Rows
 
 T = 1500
 BEFORE = 200
@@ -125,24 +135,65 @@ class Found(NamedTuple):
 
     inputs: dict[str, tuple[int, int]]
     moves: bool | None
-    which: tuple[str, ...]
-    date: int
-    cause: str
+    which: tuple[str, ...] = ()
+    date: int = -1
+    cause: str = ""
+    spans: tuple[tuple[int, int], ...] = ()
+    """Intervals of its dates."""
 
 
-KINDS = {"moves": "time", "both": "both", "a static curve explains it": "working point"}
+class Judged(NamedTuple):
+    """The verdict on constants of a structure, without its tracker, which only decides what readings are left out."""
+
+    rows: Rows
+    changes: Changes
+    events: tuple[Event, ...]
+
+    @classmethod
+    def of(cls, plant: Plant, structure: Structure) -> Judged:
+        """The verdict of a structure, whose inputs are numbered in the order of the table."""
+        y, names = plant.table["flow"], [name for name in plant.table if name != "flow"]
+        past = [lagged(y, k + 1) for k in range(structure.na)]
+        each = [(names[j], k) for j, nb, nk in structure.shape[1] for k in range(nk, nk + nb)]
+        phi = np.column_stack([*past, *(lagged(plant.table[name], k) for name, k in each), np.ones(T)])
+        at = np.flatnonzero(np.isfinite(phi).all(axis=1))
+        source = (
+            np.column_stack([at - at[0] - k - 1 for k in range(structure.na)]) if past else np.zeros((len(at), 0), int)
+        )
+        lags = Lags(np.arange(structure.na), source, np.ones(source.shape))
+        step = step_of(y)
+        rows = Rows(at, phi[at], y[at], np.full(len(at), step) if step else None, lags, np.ones(len(at)))
+        found = judged_rows(rows, LEVEL)
+        assert found is not None
+        own = ["y"] * len(past) + [name for name, _ in each] + ["level"]
+        return cls(rows, found, events(found, own, at, str) if found.rejected else ())
+
+    @property
+    def found(self) -> Found:
+        """What it says."""
+        moved = [event for event in self.events if any(move.name != "level" for move in event.moves)]
+        which = tuple(move.name for event in moved for move in event.moves)
+        middle = int(np.median([event.at for event in moved])) if moved else -1
+        spans = tuple((event.earliest, event.latest) for event in moved)
+        return Found({}, self.changes.rejected, which, middle, "time" if self.changes.rejected else "", spans)
 
 
 def ours(plant: Plant) -> Found:
-    """`driftfit.identify` with its defaults."""
-    found = identify(plant.table, "flow")
-    names = found.roles.inputs
-    inputs = {names[j]: found.structure.delays[j] for j in found.structure.lags}
-    moved = [move for move in found.moves if move.what != "level"]
-    which = tuple("y" if move.what == "memory" else move.what for move in moved)
-    moves = found.kind in ("moves", "both") if found.kind != "cannot decide" else None
-    middle = np.median([move.at for move in moved]) if moved else -1
-    return Found(inputs, moves, which, int(middle), KINDS.get(found.kind, ""))
+    """The decisions of `driftfit.identify` with its defaults."""
+    record = roles(plant.table, "flow")
+    y, U, _ = record.centred().spread(31)
+    best = search(y, U, 30, 0, np.inf, np.random.default_rng(0))
+    one = Judged.of(plant, best)
+    Z, made = products(plant.table["flow"], record.U, best, record.inputs, "flow", 0)
+    why, moves = cause(one.rows.phi, one.rows.y, Z[one.rows.at], made), one.changes.rejected
+    if moves and why.products:
+        more = one.rows._replace(phi=np.hstack([one.rows.phi, why.columns]))
+        again = judged_rows(more.only(np.isfinite(more.phi).all(axis=1), range(more.phi.shape[1])), LEVEL)
+        moves = again is None or again.rejected
+    kind = why.kind(moves)
+    inputs = {record.inputs[j]: ends for j, ends in best.delays.items()}
+    moves = one.changes.rejected and kind != "working point"
+    return one.found._replace(inputs=inputs, moves=moves, cause=kind if moves or kind == "working point" else "")
 
 
 def by_criterion(price: float) -> Callable[[Plant], Found]:
@@ -168,25 +219,27 @@ def by_criterion(price: float) -> Callable[[Plant], Found]:
         for name, k in (places[one - 1] for one in chosen[1:]):
             if name != "y":
                 lags.setdefault(name, []).append(k)
-        return Found({name: (min(k), min(k)) for name, k in lags.items()}, None, (), -1, "")
+        return Found({name: (min(k), min(k)) for name, k in lags.items()}, None)
 
     return method
 
 
 def default_arx(plant: Plant) -> Found:
-    """ARX(2, 2) on all inputs, as `driftfit track` without a model did before, and its verdict."""
-    table = pl.DataFrame(plant.table)
-    names = [name for name in table.columns if name != "flow"]
-    model = ARX(2, 2, inputs=tuple(names), intercept=True)
-    judged = track(model, AdaptiveKalman(), y="flow", u=names, data=table).verdict()
-    which = tuple(name.split("[")[1][:-1] if "[" in name else "y" for name in judged.moving if name != "intercept")
-    at = judged.events[0].at if judged.events else -1
-    return Found({name: (1, 2) for name in names}, judged.drifts, which, at, "time" if judged.drifts else "")
+    """ARX(2, 2) on all inputs."""
+    inputs = {name: (1, 2) for name in plant.table if name != "flow"}
+    return Judged.of(plant, Structure(2, dict.fromkeys(range(5), (2, 1)))).found._replace(inputs=inputs)
+
+
+def true_structure(plant: Plant) -> Found:
+    """The inputs and delays of the plant, and two lags of the output."""
+    inputs = {name: (k, k) for name, k in plant.inputs.items()}
+    given = {int(name[1:]) - 1: (1, k) for name, k in plant.inputs.items()}
+    return Judged.of(plant, Structure(2, given)).found._replace(inputs=inputs)
 
 
 METHODS: dict[str, Callable[[Plant], Found]] = {
-    "identify": ours, "constants, extended BIC": by_criterion(0.0), "ARIMAX, AIC": by_criterion(2.0),
-    "ARX(2, 2)": default_arx,
+    "identify": ours, "true structure": true_structure, "constants, extended BIC": by_criterion(0.0),
+    "ARIMAX, AIC": by_criterion(2.0), "ARX(2, 2)": default_arx,
 }  # fmt: skip
 NEAR = 30
 """Samples within which a date is right; of a ramp, within it."""
@@ -206,6 +259,9 @@ def scored(plant: Plant, found: Found) -> dict[str, float]:
         "drift found": float(found.moves) if timely and decided else nan,
         "named": float(plant.moving in found.which) if timely and found.moves else nan,
         "date": float(abs(found.date - plant.date) <= near) if timely and found.moves else nan,
+        "interval": float(any(first <= plant.date <= last for first, last in found.spans))
+        if plant.change in ("jump", "moving pole") and found.moves
+        else nan,
         "claims": float(found.moves) if plant.change == "constant" and decided else nan,
         "cause": float(found.cause == plant.cause) if plant.cause and found.cause else nan,
         "silent": float(not found.cause) if plant.cause and decided else nan,
@@ -214,20 +270,22 @@ def scored(plant: Plant, found: Found) -> dict[str, float]:
 
 def main() -> None:
     """Print the tables for some seeds and methods."""
-    quick = "--quick" in sys.argv
-    given = [arg for arg in sys.argv[1:] if not arg.startswith("--")]
-    seeds = range(int(given[0]), int(given[1])) if given else range(1000, 1001)
-    methods = {name: m for name, m in METHODS.items() if not quick or not name.startswith("ARX(")}
-    for name, method in methods.items():
+    options = argparse.ArgumentParser()
+    options.add_argument("seeds", type=int, nargs="*", default=[1000, 1001])
+    options.add_argument("--of", choices=CHANGES)
+    options.add_argument("--by", choices=METHODS)
+    given = options.parse_args()
+    for name in [given.by] if given.by else METHODS:
         rows: dict[str, list[dict[str, float]]] = {}
-        for one in [one for seed in seeds for one in plants(seed)][:: 6 if quick else 1]:
+        for one in (one for seed in range(*given.seeds) for one in plants(seed) if given.of in (None, one.change)):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                row = scored(one, method(one))
+                row = scored(one, METHODS[name](one))
             rows.setdefault(one.change, []).append(row)
             rows.setdefault("all", []).append(row)
+            print(".", end="", file=sys.stderr, flush=True)
         heads = list(rows["all"][0])
-        print(f"\n{name}, seeds {seeds.start} to {seeds.stop - 1}\n{'':14}{''.join(f'{h:>13}' for h in heads)}  plants")
+        print(f"\n{name}, seeds {given.seeds}\n{'':14}{''.join(f'{h:>13}' for h in heads)}  plants")
         for change, each in rows.items():
             known = [np.array([row[h] for row in each]) for h in heads]
             cells = (f"{np.nanmean(x):13.2f}" if np.isfinite(x).any() else f"{'':13}" for x in known)

@@ -176,17 +176,6 @@ def test_first_floor_remembers_what_its_tree_says():
     assert p[47, 1, 1:].sum() > 0.5  # the second jump, one sample later
 
 
-def test_offset_of_unknown_size_is_an_outlier():
-    with pytest.warns(UserWarning, match="outlier of variance"):
-        offset = Sensor.offset(std=2.0, r=R, prob=0.05)
-    outlier = Sensor.outlier(np.sqrt((R + 4.0) / R), prob=0.05)
-    one, other = (
-        track(Regression(N), Bank(changes(), [Sensor.nominal(R), s], reduce=Beam(9), p0=2.0), Y, U)
-        for s in (offset, outlier)
-    )
-    np.testing.assert_allclose(one.theta, other.theta, atol=1e-12)
-
-
 def test_leaves_clean_their_own_lags():
     """Additive outliers: every leaf has its own regressor."""
     rng = np.random.default_rng(3)

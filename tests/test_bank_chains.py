@@ -174,5 +174,11 @@ def test_transitions_that_vary_in_time_are_summed_over():
     exact = every_course(Pt, bank.event_probabilities[1], q, z, y)
     assert reported(run, "evidence").sum() == pytest.approx(sum(one[0] for one in exact), abs=0.02)
     np.testing.assert_allclose(reported(run, "lag_prob")[-1, 0], exact[-1][1], atol=0.01)
+    live = Live(Regression(N), bank)
+    for t in range(9):
+        live.update(y[t], z[t], prob=Pt[t])
+        assert same(live.theta, run.theta[t]), t
+    with pytest.raises(ValueError, match="rows of a chain"):
+        track(Regression(N), bank, y, z, prob=Pt * 0.5)
     constant = track(Regression(N), bank, y, z)
     assert abs(reported(constant, "evidence").sum() - sum(one[0] for one in exact)) > 0.1

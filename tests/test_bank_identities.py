@@ -33,8 +33,8 @@ def matched(B, members, unknown, share, A):
 
 
 @njit
-def integrated(parts, count, loss, f, nodes):
-    return lookahead.integrate(parts, count, loss, f, nodes)
+def integrated(parts, count, loss, f):
+    return lookahead.integrate(parts, count, loss, f)
 
 
 def unknown(**more):
@@ -152,11 +152,11 @@ def test_merging_keeps_the_moments(known):
 def test_what_waiting_is_worth():
     """The expected risk is at most the present one, and it is the mean over draws of the next output."""
     rng = np.random.default_rng(4)
-    parts = np.zeros((4 + lookahead.NODES, 4))
+    parts = np.zeros((4, 4))
     parts[0, :4], parts[1, :4] = [0, 0, 1, 1], [0.5, 0.1, 0.25, 0.15]
     parts[2, :4], parts[3, :4] = [0.0, 0.5, 1.5, 0.0], [0.3, 2.0, 0.4, 3.0]
     loss = np.array([[0.0, 1.0], [3.0, 0.0]])
-    value = integrated(parts, 4, loss, np.zeros(2), np.zeros(4 * lookahead.NODES))
+    value = integrated(parts, 4, loss, np.zeros(2))
     risk = min(loss[:, k] @ [0.6, 0.4] for k in (0, 1))
     assert value <= risk + 1e-12
     of = rng.choice(4, 100_000, p=parts[1])

@@ -51,7 +51,6 @@ P = [[0.99, 0.01], [0.2, 0.8]]
         (lambda: Change(reset=True), ["q="]),
         (lambda: Sensor.nominal(0.0), ["r must be", "above 0"]),
         (lambda: Sensor.frozen(0.0), ["resolution must be positive"]),
-        (lambda: Sensor.offset(), ["value= or std="]),
         (lambda: Sensor.outlier(kind="spike"), ["'innovation', 'additive'"]),
         (lambda: Live(Regression(2), Bank([Change(0.1, which=[2])])), ["parameter 2", "0 .. 1"]),
         (lambda: Live(Regression(2), Bank([Change([0.1, 0.2, 0.3])])), ["(3,)", "2 parameters"]),
@@ -73,9 +72,9 @@ def test_priors_per_sample_are_checked():
     y, u = np.ones(3), np.ones((3, 1))
     bank = Bank(TWO, KNOWN, p0=1.0)
     for prob, message in (
-        ([[0.5, 0.6]] * 3, "row 0"),
+        ([[0.5, 0.6]] * 3, "at sample 0"),
         (np.ones((3, 5)) / 5.0, "2 columns"),
-        ([[0.9, 0.1], [1.2, -0.2], [1.0, 0.0]], "row 1"),
+        ([[0.9, 0.1], [1.2, -0.2], [1.0, 0.0]], "at sample 1"),
     ):
         with pytest.raises(ValueError, match=re.escape(message)):
             track(Regression(1), bank, y, u, prob=prob)

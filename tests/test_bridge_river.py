@@ -41,6 +41,17 @@ def test_passes_the_checks_of_river(check):
     check(TrackedRegressor(RLS(0.98)))
 
 
+def test_a_category_is_refused_by_name_and_leaves_the_model_as_it_was():
+    model = TrackedRegressor(RLS(0.98))
+    for x, y in samples(20):
+        model.learn_one(x, y)
+    before = model.coef
+    for call in (lambda x: model.learn_one(x, 1.0), model.predict_one):
+        with pytest.raises(ValueError, match="the feature 'colour' is 'red', which is not a number"):
+            call({"a": 1.0, "colour": "red"})
+    assert model.coef == before
+
+
 def test_works_in_a_pipeline():
     pipeline = preprocessing.StandardScaler() | TrackedRegressor(RLS(0.98))
     alone = linear_model.LinearRegression()

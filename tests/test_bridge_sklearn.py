@@ -71,6 +71,8 @@ def test_settings_of_the_tracker_are_searched_in_time(rows):
     )
     assert search.best_params_ == {"tracker__forgetting": 0.97}
     assert search.best_estimator_.tracker == RLS(0.97)
+    several = GridSearchCV(TrackedRegressor(), {"tracker": [RLS(0.97), RLS(1.0)]}, cv=TimeSeriesSplit(4))
+    assert several.fit(X, y, sample_weight=np.ones(400)).best_params_ == {"tracker": RLS(0.97)}
     with pytest.raises(ValueError, match="Invalid parameter 'memory'"):
         TrackedRegressor(RLS(0.5)).set_params(tracker__memory=3)
     with pytest.raises(ValueError, match="there is no tracker"):
@@ -89,6 +91,23 @@ def test_pipelines_clones_names_and_pickles(rows):
     np.testing.assert_array_equal(again.predict(frame), fitted.predict(frame))
     np.testing.assert_array_equal(again.partial_fit(frame, y).coef_, fitted.partial_fit(frame, y).coef_)
     assert clone(fitted).tracker == RLS(0.97)
+
+
+def test_a_weight_divides_the_variance_of_the_noise(rows):
+    X, y = rows
+    weights = np.repeat([1.0, 0.0, 4.0, 1.0], 100)
+    fitted = TrackedRegressor(RLS(1.0)).fit(X, y, sample_weight=weights)
+    ones, root = np.ones((400, 1)), np.sqrt(weights)
+    exact = np.linalg.lstsq(np.hstack([X, ones]) * root[:, None], root * y, rcond=None)[0]
+    np.testing.assert_allclose([*fitted.coef_, fitted.intercept_], exact, rtol=1e-9)
+    parts = TrackedRegressor(RLS(1.0)).partial_fit(X[:250], y[:250], weights[:250])
+    np.testing.assert_allclose(parts.partial_fit(X[250:], y[250:], weights[250:]).coef_, exact[:2], rtol=1e-9)
+
+
+def test_a_cell_that_is_no_number_is_named(rows):
+    frame = pd.DataFrame({"income": rows[0][:, 0], "region": ["north", "south"] * 200})
+    with pytest.raises(ValueError, match="row 0 of column 'region' holds 'north', which is not a number"):
+        TrackedRegressor(RLS(1.0)).fit(frame, rows[1])
 
 
 def test_lags_use_own_predictions(rows):

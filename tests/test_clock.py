@@ -223,7 +223,7 @@ def test_the_best_interval_is_found():
     rng = np.random.default_rng(0)
     for freq, best in (("B", "business day"), ("ME", "month"), ("QS", "quarter"), ("YE", "year"), ("15min", "15min"),
                        ("D", "1d"), ("W", "7d"), ("s", "1s")):  # fmt: skip
-        assert median_interval(pd.date_range("2020-01-01", periods=50, freq=freq).to_numpy())[1] == f"dt={best!r}"
+        assert median_interval(pd.date_range("2020-01-01", periods=50, freq=freq).to_numpy())[1] == best
     jitter = np.arange(50) * np.timedelta64(86400, "s") + rng.integers(0, 500, 50).astype("timedelta64[s]")
     assert "business" not in median_interval(np.datetime64("2024-01-01", "s") + jitter)[1]
 

@@ -6,7 +6,7 @@ import pytest
 from driftfit import RLS, Live, Regression, track
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.regressors import regressors
-from driftfit.judge.statistics.parts.coarse_readings import drawn_within, step_of
+from driftfit.judge.statistics.coarse_readings import drawn_within, step_of
 from driftfit.judge.statistics.robust import orthonormal
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from driftfit import RLS, AdaptiveKalman, Regression, track
-from driftfit.smooth.parts.rests import rests
 
 CONSTANT = RLS(1.0)
 
@@ -53,20 +52,6 @@ def test_inputs_that_move_together_during_a_change():
 def test_smoothed_bands_contain_a_change_of_either_parameter_during_a_rest(since, back):
     for seed in (0, 1, 2):
         smoothed = resting(seed, False, back, AdaptiveKalman(), since).smooth()
-        assert (np.abs(smoothed.theta[400] - [2.0, 5.0]) < 2.0 * smoothed.std[400]).all()
+        assert (np.abs(smoothed.theta[400] - [2.0, 5.0]) < 3.0 * smoothed.std[400]).all()
         assert (smoothed.std[400] < [0.1, 2.0]).all()
         assert (smoothed.std[200] < [0.01, 0.05]).all()
-
-
-def test_a_rest_is_far_longer_than_usual():
-    x = np.column_stack([np.repeat(np.arange(20.0), 30), np.ones(600)])
-    assert rests(x, np.ones(600)) == []  # as an input that is always held so long
-    x[:, 0] = np.arange(600)
-    x[100:300, 0] = 5.0
-    gaps = np.where(np.arange(600) % 7 == 0, 0.0, 1.0)
-    assert rests(x, np.ones(600)) == [(100, 300, (0, 1))]
-    assert rests(x, gaps) == [(100, 300, (0, 1))]
-    assert rests(x, np.zeros(600)) == []
-    moving = np.column_stack([x, np.cos(np.arange(600.0))])
-    assert rests(moving, gaps) == [(100, 300, (0, 1))]
-    assert rests(moving[:, [0, 2]], gaps) == []

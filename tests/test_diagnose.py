@@ -8,7 +8,7 @@ from support import arx_record
 from driftfit import ARX, RLS, AdaptiveKalman, AugmentedFLS, Kalman, Regression, track
 from driftfit.judge.diagnose import holds_constant, standardised
 from driftfit.judge.evidence import Evidence
-from driftfit.judge.excitation import excitation
+from driftfit.judge.regressors import excitation
 
 TRUE = Kalman(q=0.0, r=0.01)
 

@@ -430,11 +430,10 @@ def test_a_run_is_continued_only_with_its_own_model():
 
 
 @pytest.mark.filterwarnings("ignore:y has a root mean square")
-@pytest.mark.parametrize("tracker", [RLS(0.99), Kalman(q=1e-5, r=1e-2, p0=1e2)], ids=repr)
-@pytest.mark.parametrize("code", [-999.0, 9999.0, 20.0])
-def test_a_run_of_fault_codes_spoils_neither_theta_nor_the_grid(tracker, code):
+@pytest.mark.parametrize("code", [-999.0, 20.0])
+def test_a_run_of_fault_codes_spoils_neither_theta_nor_the_grid(code):
     """A refused code is no lag, and the grid on which the output block is inverted does not become as wide as it is."""
-    s = example(1, 2, T=500)
+    s, tracker = example(1, 2, T=500), RLS(0.99)
     whole = track(s.model, tracker, s.y, s.u, gate=True)
     for count in (1, 3, 15):
         y = s.y.copy()

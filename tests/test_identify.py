@@ -12,13 +12,13 @@ from typer.testing import CliRunner
 
 from driftfit import identify
 from driftfit.cli import app
-from driftfit.identify.judgement import ahead, mixed, recursive
+from driftfit.identify.judgement import ahead, density, weights
 from driftfit.identify.page import SCHEMA, commands, verb
 from driftfit.identify.result import Move
 from driftfit.identify.roles import NoAnswerError, roles
 from driftfit.identify.scores import RIDGE, Scores
-from driftfit.identify.structure import Structure, search
-from driftfit.identify.working_point import cause, regressors
+from driftfit.identify.structure import Structure, lagged, search
+from driftfit.identify.working_point import cause, products
 
 PUMP = str(files("driftfit.demo") / "pump.csv")
 T = 900
@@ -38,6 +38,11 @@ def plant(change, seed=0):
         x = np.abs(U[t - 6, 0]) if change == "working point" else U[t - 6, 0]
         y[t] = 0.5 * y[t - 1] + gain[t] * x + 0.6 * U[t, 1] + rng.normal()
     return y, U
+
+
+def regressors(y, U):
+    """phi (T, 4) of the plant."""
+    return np.column_stack([lagged(y, 1), lagged(U[:, 0], 6), U[:, 1], np.ones(T)])
 
 
 def searched(y, U, first=0, budget=60.0):
@@ -103,14 +108,15 @@ def test_an_output_that_is_not_obvious_is_asked_for():
 
 
 def naive_score(X, y, S, rows):
-    """Log-likelihood of blocks under coefficients of the blocks before them, with full memory, by plain loops."""
+    """Log-likelihood of blocks under coefficients of the other blocks, with full memory, by plain loops."""
     Z = np.column_stack([(X - [0.0, *X[:, 1:].mean(0)]) / [1.0, *X[:, 1:].std(0)], (y - y.mean()) / y.std()])
     B = int(np.clip(len(y) // rows, 8, 80))
     edges, total = np.linspace(0, len(y), B + 1).astype(int), 0.0
-    for b in range(max(2, int(np.ceil(0.15 * B))), B):
-        before, own = Z[: edges[b]][:, [*S, -1]], Z[edges[b] : edges[b + 1]][:, [*S, -1]]
-        A = before[:, :-1].T @ before[:, :-1] + RIDGE * np.eye(len(S))
-        e = own[:, -1] - own[:, :-1] @ np.linalg.solve(A, before[:, :-1].T @ before[:, -1])
+    for b in range(B):
+        own = Z[edges[b] : edges[b + 1]][:, [*S, -1]]
+        rest = np.delete(Z, slice(edges[b], edges[b + 1]), axis=0)[:, [*S, -1]]
+        A = rest[:, :-1].T @ rest[:, :-1] + RIDGE * np.eye(len(S))
+        e = own[:, -1] - own[:, :-1] @ np.linalg.solve(A, rest[:, :-1].T @ rest[:, -1])
         total -= 0.5 * len(e) * np.log(np.mean(e**2))
     return total
 
@@ -121,11 +127,11 @@ def test_scores_are_those_of_a_slow_twin_and_each_added_column_that_of_the_large
     y = X @ [1.0, 2.0, 0.0, -1.0, 0.0, 0.0] + rng.normal(size=T)
     one = Scores(X, y, memories=(np.inf,))
     assert one.score([0, 1, 3]) == pytest.approx(naive_score(X, y, [0, 1, 3], 30), abs=1e-8)
-    for both in (Scores(X, y), Scores(X[:300], y[:300])):  # the second predicts blocks from both sides
-        both.refer([0, 1])
-        added = both.added([0, 1])
-        assert added[2:] == pytest.approx([both.score([0, 1, c]) for c in range(2, 6)], abs=1e-6)
-        assert np.isneginf(added[:2]).all()
+    mixed = Scores(X, y)
+    mixed.refer([0, 1])
+    added = mixed.added([0, 1])
+    assert added[2:] == pytest.approx([mixed.score([0, 1, c]) for c in range(2, 6)], abs=1e-6)
+    assert np.isneginf(added[:2]).all()
 
 
 @pytest.mark.parametrize("change", ["", "time", "working point"])
@@ -137,7 +143,9 @@ def test_structure_and_cause(change):
     assert 1 not in late.lags
     assert all(nk >= 1 for _, nk in late.lags.values())
     given = Structure(1, {0: (1, 6), 1: (1, 0)})
-    assert cause(y, U, given, ("u1", "u2", "u3"), "y", 0).kind == change
+    phi, made = regressors(y, U), products(y, U, given, ("u1", "u2", "u3"), "y", 0)
+    rows = np.isfinite(phi).all(axis=1)
+    assert cause(phi[rows], y[rows], made[0][rows], made[1]).kind(change == "time") == change
 
 
 def test_a_slow_input_that_is_no_better_than_its_copies_is_left_out():
@@ -178,24 +186,18 @@ def test_lines_to_copy_run(pump):
         assert result.exit_code == 0, result.output
 
 
-def test_predictions_of_constants_and_their_mixture():
+def test_predictions_some_steps_ahead_and_the_weights_of_a_mixture():
     y, U = plant("time")
-    phi = regressors(y, U, Structure(1, {0: (1, 6)}))
-    used = np.isfinite(phi).all(axis=1)
-    theta = recursive(phi, y, used)
+    phi, theta = regressors(y, U), np.random.default_rng(3).normal(size=(T, 4))
     t = 700
-    rows = np.flatnonzero(used[:t])
-    assert theta[t] == pytest.approx(np.linalg.lstsq(phi[rows], y[rows], rcond=None)[0], abs=1e-6)
-    one = np.einsum("tn,tn->t", theta, phi)
-    assert ahead(theta, y, phi[:, 2:], 1, 1)[t] == pytest.approx(one[t])
-    step = theta[t] @ [1.0, theta[t] @ phi[t], U[t + 1 - 6, 0]]
-    assert ahead(theta, y, phi[:, 2:], 1, 2)[t + 1] == pytest.approx(step)
-    good, bad = y + np.random.default_rng(5).normal(size=(2, T)) * [[0.5], [2.0]]
-    first = np.where(np.arange(T) < T // 2, good, bad)
-    second = np.where(np.arange(T) < T // 2, bad, good)
-    w = mixed(first, second, y, None, 1)
-    error = np.sqrt(np.mean((y - w * first - (1.0 - w) * second) ** 2))
-    assert error < 0.75
+    assert ahead(theta, phi, 1, 1)[t] == pytest.approx(theta[t] @ phi[t])
+    assert ahead(theta, phi, 1, 2)[t + 1] == pytest.approx(theta[t] @ [theta[t] @ phi[t], *phi[t + 1, 1:]])
+    good, bad = np.random.default_rng(5).normal(size=(2, T)) * [[0.5], [2.0]]
+    early = np.arange(T) < T // 2
+    first, second = np.where(early, good, bad), np.where(early, bad, good)
+    variance = np.where(early, 0.5, 2.0) ** 2
+    w = weights(-0.5 * (np.log(2.0 * np.pi * variance) + first**2 / variance), density(second))
+    assert np.sqrt(np.mean((w * first + (1.0 - w) * second) ** 2)) < 0.75
     assert w[:11] == pytest.approx(0.5)
 
 

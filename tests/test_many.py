@@ -15,9 +15,9 @@ from scipy import stats
 from support import THETA, arx_record, rows_of
 
 from driftfit import ARX, DataWarning, Kalman, Regression, track
-from driftfit.judge.cores import on_all_cores
-from driftfit.judge.cores.processes import Processes, available
+from driftfit.judge import on_all_cores
 from driftfit.judge.fleet_verdict import discoveries, verdicts
+from driftfit.judge.on_all_cores import Processes, available
 
 K = Kalman(q=1e-4, r=0.01)
 MOVED = (1, 4)

@@ -9,6 +9,7 @@ from scipy.stats import norm
 from support import damaged, same
 
 from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Law, Live, Regression, check_tracker, pool, track, tune
+from driftfit.trackers.laws.law import transition
 from driftfit.use.constrained import Constrained, cut, half_space, moments
 
 LAWS = {"theta1": Law.returns(time=20, std=0.5), "theta2": Law.season(12, harmonics=2, q=1e-5)}
@@ -53,6 +54,74 @@ def test_laws_against_a_dense_twin_with_uneven_times_drift_and_missing_outputs()
     np.testing.assert_allclose(run.theta[15:], theta[15:], atol=1e-5)
     np.testing.assert_allclose(run.std[15:], std[15:], rtol=1e-5)
     assert np.isinf(run.std[3]).any()
+
+
+def test_smoothed_laws_are_the_least_squares_of_all_states():
+    """Against one dense system for the components of all samples."""
+    y, u = data(60)
+    rng = np.random.default_rng(2)
+    dt, drift, weights = rng.choice([1.0, 0.5, 3.0], 60), rng.choice([1.0, 20.0], 60), rng.choice([1.0, 4.0, 0.0], 60)
+    y[rng.random(60) < 0.1] = np.nan
+    dt[0] = 1.0
+    laws = {"theta1": (Law.trend(1e-4, level=1e-3), Law.cycle(9, time=15, std=0.3)), "theta2": LAWS["theta1"]}
+    run = track(
+        Regression(2), Kalman(q=1e-4, r=0.04, laws=laws), y, u, time=np.cumsum(dt), drift=drift, weights=weights
+    )
+    law = run.fresh()["law"][0, ..., 0]
+    N, H = 6, np.array([[1, 0, 1, 0, 0, 0], [0, 0, 0, 0, 1, 1]], dtype=float)
+    P, rows, unknown = np.zeros((60, N, 60, N)), np.zeros((60, 60, N)), np.eye(N)[:, [0, 1, 4]]
+    free = np.zeros((60, N, 3))
+    for t in range(60):
+        F, Q = transition(law, dt[t])
+        before = P[t - 1, :, t - 1] if t else np.diag([0.0, 0.0, 0.09, 0.09, 0.0, 0.25])
+        P[t, :, t], free[t] = F @ before @ F.T + drift[t] * Q, F @ (free[t - 1] if t else unknown)
+        for s in range(t):
+            P[t, :, s] = F @ P[t - 1, :, s]
+            P[s, :, t] = P[t, :, s].T
+        rows[t, t] = H.T @ u[t]
+    A, E, cov = rows.reshape(60, -1), free.reshape(-1, 3), P.reshape(60 * N, -1)
+
+    def dense_smoother(used):
+        """(mean, covariance) of all components: generalised least squares of what is unknown at the start."""
+        V = np.linalg.inv(A[used] @ cov @ A[used].T + np.diag(0.04 / weights[used]))
+        gain, X = cov @ A[used].T @ V, A[used] @ E
+        Mi = np.linalg.inv(X.T @ V @ X)
+        delta, D = Mi @ X.T @ V @ y[used], E - gain @ X
+        return gain @ y[used] + D @ delta, cov - gain @ A[used] @ cov + D @ Mi @ D.T
+
+    used, shown = np.isfinite(y) & (weights > 0.0), np.kron(np.eye(60), H)
+    mean, var = dense_smoother(used)
+    found, var = run.smooth(), (shown @ var @ shown.T).reshape(60, 2, 60, 2)
+    np.testing.assert_allclose(found.theta.ravel(), shown @ mean, atol=1e-8)
+    np.testing.assert_allclose(found.std**2, np.einsum("titi->ti", var), rtol=1e-7)
+    np.testing.assert_allclose(found.lag_cov(7), var[7, :, 8], atol=1e-9)
+    for t in np.flatnonzero(used)[[0, 20]]:  # leaving a sample out is leaving out its row
+        alone = y[t] - A[t] @ dense_smoother(used & (np.arange(60) != t))[0]
+        assert found.loo[t] == pytest.approx(alone, abs=1e-7)
+
+
+def test_structural_models_are_those_of_statsmodels():
+    sm = pytest.importorskip("statsmodels.api", reason="statsmodels is not installed")
+    y = sm.datasets.co2.load_pandas().data.co2.resample("MS").mean().interpolate().to_numpy()[:120]
+    laws = (Law.trend(level=None), Law.season(12, harmonics=2, q=None))
+    tuned = tune(Regression(intercept=True), Kalman(q=0, laws={"intercept": laws}), y, intervals=False)
+    other = sm.tsa.UnobservedComponents(
+        y, "lltrend", freq_seasonal=[{"period": 12, "harmonics": 2}], use_exact_diffuse=True
+    )
+    trend, season = (law for _, law in tuned.tracker.laws)
+    given = other.smooth([tuned.tracker.r, trend.level, trend.q, season.q])
+    assert tuned.loglik == pytest.approx(given.llf + 3 * np.log(2.0 * np.pi), abs=1e-6)  # 6 unknown components
+    best = other.fit(given.params, disp=0)
+    assert given.llf > best.llf - 1e-5
+    run = track(Regression(intercept=True), tuned.tracker, y)
+    shown = np.array([1, 0, 1, 0, 1, 0])
+    np.testing.assert_allclose(run.smooth().theta[:, 0], shown @ given.smoothed_state, rtol=1e-6)
+    ahead, there = run.forecast(24), given.get_forecast(24)
+    np.testing.assert_allclose(ahead.y_hat, there.predicted_mean, rtol=1e-6)
+    np.testing.assert_allclose(ahead.y_std, there.se_mean, rtol=1e-6)
+    limit = float(ahead.y_hat[12])
+    drawn = run.crossing("intercept", above=limit, horizon=24).by
+    assert drawn[-1] > 0.5 > drawn[1]
 
 
 def test_walks_are_the_kalman_filter_and_trends_are_second_differences():
@@ -126,11 +195,13 @@ def test_what_does_not_fit_a_law_is_refused():
         with pytest.raises(ValueError, match=message):
             track(Regression(2), Kalman(q=0.0, r=1.0, laws=laws), *data())
     for make, message in (
-        (lambda: Law.season(4, harmonics=2), "half a wave"), (lambda: Law("returns"), "needs time, std"),
+        (lambda: Law.season(4, harmonics=2), "half a wave"),
+        (lambda: track(Regression(2), Kalman(0, 1, laws={"theta1": Law.returns()}), *data()), "returns.theta1..time, "),
+        (lambda: track(Regression(2), Kalman(0, 1, laws={"theta1": [Law.walk(1), Law.trend(1)]}), *data()), "two laws"),
         (lambda: Law.trend(-1.0), "at least 0"), (lambda: Kalman(q=np.eye(2), r=1.0, laws=LAWS), "must be"),
-        (lambda: track(Regression(2), TRACKER, *data()).smooth(), "has laws"),
+        (lambda: track(Regression(2), TRACKER, *data()).smooth(order_by=np.arange(150)), "laws hold in time"),
         (lambda: track(Regression(2), TRACKER, *data()).ahead(2), "laws by which theta moves"),
-        (lambda: tune(Regression(2), Kalman(laws=LAWS), *data()), "laws"),
+        (lambda: tune(Regression(2), Kalman(laws=LAWS), *data(), bounds=(1e-3, 1.0)), "leave them out"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             make()
@@ -241,6 +312,37 @@ def test_a_prior_of_a_fleet_is_the_maximum_and_each_unit_its_posterior():
     error = [np.sqrt(np.mean((one - units) ** 2, axis=0)) for one in (pooled.theta, pooled.own)]
     assert (error[0] < [0.9, 0.6] * error[1]).all()
     assert pooled.spread == pytest.approx([0.2, 0.1], abs=0.06)
+
+
+def test_a_noise_variance_for_each_unit_is_the_restricted_maximum():
+    """Against the likelihood of all records as one mixed model, with constant parameters."""
+    rng = np.random.default_rng(3)
+    units, y, u, _ = fleet_of(12, 8, 3)
+    true = 0.25 * np.exp(rng.normal(size=12))
+    y = np.einsum("itk,ik->it", u, units) + np.sqrt(true)[:, None] * rng.normal(size=y.shape)
+    y[4, 2] = np.nan
+    pooled = pool(track(Regression(2), Kalman(q=0.0, r=0.25), y, u, by="row"), noise="each")
+
+    def restricted(x):
+        root, noise = np.array([[x[0], 0.0], [x[1], x[2]]]), np.exp(x[3:])
+        total, A, b = 0.0, np.zeros((2, 2)), np.zeros(2)
+        for i, (one, X) in enumerate(zip(y, u, strict=True)):
+            X, one = X[np.isfinite(one)], one[np.isfinite(one)]
+            S = X @ root @ root.T @ X.T + noise[i] * np.eye(len(one))
+            W = np.linalg.inv(S)
+            A, b, total = A + X.T @ W @ X, b + X.T @ W @ one, total - np.linalg.slogdet(S)[1] - one @ W @ one
+        return -0.5 * (total + b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1])
+
+    best = np.append(np.linalg.cholesky(pooled.cov)[np.tril_indices(2)], np.log(pooled.noise))
+    for i in range(len(best)):
+        away = np.zeros(len(best))
+        away[i] = 1e-4
+        slope = (restricted(best + away) - restricted(best - away)) / 2e-4
+        assert abs(slope) < 1e-3, i
+    assert np.corrcoef(np.log(pooled.noise), np.log(true))[0, 1] > 0.8
+    assert pooled.tracker.r == pytest.approx(np.exp(np.mean(np.log(pooled.noise))))
+    with pytest.raises(ValueError, match="noise"):
+        pool({}, noise="own")
 
 
 def test_pooling_with_drift_in_other_units_and_what_is_refused():

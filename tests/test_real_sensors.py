@@ -22,9 +22,8 @@ from driftfit import (
     select,
     track,
 )
-from driftfit.smooth.parts.pooled_drift import pooled
 from driftfit.systems.arc_furnace import switching
-from driftfit.trackers.mixture.filters import UNSURE
+from driftfit.trackers.mixture.filters import MEMORY, UNSURE
 from lab import scenarios
 
 T = 1500
@@ -218,14 +217,6 @@ def test_bands_hold_where_the_walk_is_too_slow_to_be_observed():
     np.testing.assert_allclose(spread, path.std[::50], rtol=1e-6)
 
 
-def test_drift_is_pooled_over_time_except_at_jumps():
-    rate = np.append(0.0, np.tile([1.0, 3.0], 20))[:, None]
-    rate[7] = 200.0
-    steady = (np.arange(41) > 0) & (np.arange(41) != 7)
-    np.testing.assert_allclose(pooled(rate)[:, 0], np.where(steady, rate[steady].mean(), rate[:, 0]))
-    np.testing.assert_array_equal(pooled(np.zeros((3, 2))), np.zeros((3, 2)))
-
-
 def test_a_fleet_warns_once_of_what_its_series_could_not_learn():
     y, u = jumping(noise, level(0.0))
     every = np.stack([u, u, u])
@@ -259,7 +250,7 @@ def test_a_direction_enters_as_the_limit_of_wide_priors_however_weakly(unit):
     exact = track(Regression(2, intercept=True), Kalman(q=0.0, r=float(live.lane()["r"]), form="sqrt"), y, columns)
     assert float(live.lane()["r"]) == pytest.approx(0.01, rel=0.15)
     wide = np.sqrt(
-        1.0 + UNSURE / np.sqrt(float(live.lane()["count"]))
+        1.0 + UNSURE / np.sqrt(min(float(live.lane()["count"]), MEMORY))
     )  # what is reported allows for estimated settings
     np.testing.assert_allclose(run.std[700, 1], wide * exact.std[700, 1], rtol=0.12)  # or a jump
 

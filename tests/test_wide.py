@@ -1,5 +1,7 @@
 """More parameters than loops are unrolled for: the same filter, the same bits in blocks, in rows and in every mode."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
@@ -91,3 +93,17 @@ def test_lanes_of_a_fleet_have_the_bits_of_single_runs(tracker, n, lanes):
 def test_series_of_a_model_that_takes_one_lane_at_a_time_run_one_by_one():
     model = HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2)).bind(1)
     assert width_of(Program(model, Kalman(q=1e-3, r=0.01)), 1000) == 1
+
+
+class Held(NamedTuple):
+    values: np.ndarray
+
+
+@Driver
+def corner(held, row):
+    return held.values[row, 1]
+
+
+def test_a_driver_reads_arrays_within_tuples_in_their_own_order():
+    rows = np.arange(6.0).reshape(2, 3)
+    assert [corner(Held(values), 1) for values in (rows, np.asfortranarray(rows), rows[::-1], rows.T)] == [4, 4, 1, 4]

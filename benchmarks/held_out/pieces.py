@@ -134,7 +134,7 @@ PIECES: dict[str, Piece] = {
         edits=((LEARNED, "s.colour[l] = max(-MOST, min(MOST, known))", "s.colour[l] = 0.0 * known"),),
         functions=of(LEARNED, "whiten_noise", "learn_colour", "colour"),
     ),
-    "restless noise": Piece(edits=((STATES, "\nSTAY, CALM = 0.99, 0.95\n", "\nSTAY, CALM = 1.0 - 1e-9, 1e-9\n"),)),
+    "restless noise": Piece(edits=((STATES, "\nSTAY, CALM = 0.995, 0.98\n", "\nSTAY, CALM = 1.0 - 1e-9, 1e-9\n"),)),
     "outliers": Piece(edits=((STATES, "RARITY, FADE = 0.035, 50.0, 0.999", "RARITY, FADE = 1e-9, 1e12, 0.999"),)),
     "learned rate of outliers": Piece(edits=((STATES, "RARITY, FADE = 0.035, 50.0,", "RARITY, FADE = 0.035, 1e12,"),)),
     "repeated rounding": Piece(

@@ -74,37 +74,28 @@ def watch() -> Violations:
         wide = builder.sext(index, i64) if index.type.width < 64 else index
         check(context, builder, builder.icmp_unsigned(">=", wide, size), wide, size)
 
-    def place(
-        context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any, vector: Any = simd._VECTOR8
-    ) -> Any:
+    def place(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any) -> Any:
         inside = context.make_array(kind)(context, builder, array)
         rows, columns = (builder.extract_value(inside.shape, k) for k in (0, 1))
         at = builder.add(builder.mul(row, columns), column)
         size = builder.mul(rows, columns)
-        last = builder.add(at, ir.Constant(i64, vector.count - 1))
+        last = builder.add(at, ir.Constant(i64, simd.WIDTH - 1))
         beyond = builder.or_(builder.icmp_signed("<", at, ir.Constant(i64, 0)), builder.icmp_signed(">=", last, size))
         check(context, builder, beyond, last, size)
-        return builder.bitcast(builder.gep(inside.data, [at]), vector.as_pointer())
+        return builder.bitcast(builder.gep(inside.data, [at]), simd._VECTOR8.as_pointer())
 
-    pairs, eights = simd._pair_place, simd._flat_place
+    pairs = simd._pair_place
 
     def pair_place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
         size = _length(context, builder, kind, array, kind.ndim - 1)
         check(context, builder, builder.icmp_unsigned(">=", at, size), at, size)
         return pairs(context, builder, kind, array, at)
 
-    def flat_place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
-        size = _length(context, builder, kind, array, kind.ndim)
-        last = builder.add(at, ir.Constant(i64, simd.WIDTH - 1))
-        beyond = builder.or_(builder.icmp_signed("<", at, ir.Constant(i64, 0)), builder.icmp_signed(">=", last, size))
-        check(context, builder, beyond, last, size)
-        return eights(context, builder, kind, array, at)
-
     for name in settings():  # processes that a test starts have no checks, and must not store their code in this folder
         del os.environ[name]
     config.reload_config = lambda: None  # it would see that the variables are gone
     cgutils.do_boundscheck = checked
-    simd._place, simd._pair_place, simd._flat_place = place, pair_place, flat_place
+    simd._place, simd._pair_place = place, pair_place
     return violations
 
 

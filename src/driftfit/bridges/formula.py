@@ -19,6 +19,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Self
 
 import formulaic
@@ -33,6 +34,7 @@ from driftfit.models.regression import Regression
 from driftfit.readings.left_out import remarks_of
 from driftfit.results import Track
 from driftfit.show.axes import BLUE, RED, panels
+from driftfit.show.text import WIDTH
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
@@ -355,9 +357,10 @@ class CoefficientTable:
 
     def as_text(self) -> str:
         """Plain text."""
-        width = max(map(len, self.facts))
-        lines = [f"{name + ':':<{width + 2}}{value}" for name, value in self.facts.items()]
-        body = self.table.to_string(float_format="{:.4f}".format)
+        body, width = self.table.to_string(float_format="{:.4f}".format), max(map(len, self.facts)) + 2
+        longest = max(WIDTH, *map(len, body.splitlines()))
+        facts = [f"{name + ':':<{width}}{value}" for name, value in self.facts.items()]
+        lines = [line for fact in facts for line in wrap(fact, longest, subsequent_indent=" " * width)]
         rule = "=" * max(map(len, [*lines, *body.splitlines()]))
         return "\n".join([rule, *lines, rule, body, rule])
 

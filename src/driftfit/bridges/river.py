@@ -72,7 +72,7 @@ class TrackedRegressor(base.Regressor):
         self.window = window
         self.gate = gate
         self._columns: dict[Any, int] = {}
-        self._past: deque[tuple[dict[Any, Any], float]] = deque(maxlen=window)
+        self._past: deque[tuple[dict[Any, float], float]] = deque(maxlen=window)
         self._count = 0
         self._range = (np.inf, -np.inf)
         self._hold(None)
@@ -101,8 +101,11 @@ class TrackedRegressor(base.Regressor):
         self._hold(None if state["_stream"] is None else Live.from_bytes(state["_stream"], parts_of(self.tracker)))
 
     def learn_one(self, x: dict[Any, Any], y: Any) -> None:
-        """Learn one sample: features by name, and the output; None and NaN are missing."""
-        output = _number(y)
+        """Learn one sample: features by name, and the output; None and NaN are missing.
+
+        ValueError for a feature that is a category.
+        """
+        output, x = _number(y, "the output"), _numbers(x)
         known, live = len(self._columns), self._live
         if live is None or not x.keys() <= self._columns.keys():
             for name in sorted(x.keys() - self._columns.keys(), key=str):
@@ -110,7 +113,7 @@ class TrackedRegressor(base.Regressor):
             if live is None or len(self._columns) > self._width:
                 live = self._widen(len(self._columns) if known == 0 else 2 * known)
         live.update(output, self._row(x, self._width))
-        self._past.append((dict(x), output))
+        self._past.append((x, output))
         if self._count < self._early and np.isfinite(output):
             self._count += 1
             self._range = (min(self._range[0], output), max(self._range[1], output))
@@ -120,7 +123,7 @@ class TrackedRegressor(base.Regressor):
         live = self._live
         if live is None:
             return 0.0
-        y_hat = live.predict(self._row(x, self._width))[0]
+        y_hat = live.predict(self._row(_numbers(x), self._width))[0]
         if not np.isfinite(y_hat):
             return 0.0
         return float(np.clip(y_hat, *self._range)) if 0 < self._count < self._early else y_hat
@@ -149,17 +152,28 @@ class TrackedRegressor(base.Regressor):
         self._hold(live)
         return live
 
-    def _row(self, x: dict[Any, Any], m: int) -> Array:
-        """The regressors (m,): an absent feature is 0, one that is None is NaN. Unknown features are left out."""
+    def _row(self, x: dict[Any, float], m: int) -> Array:
+        """The regressors (m,): an absent feature is 0. Unknown features are left out."""
         row, columns = [0.0] * m, self._columns
         for name, value in x.items():
             if name in columns:
-                row[columns[name]] = _number(value)
+                row[columns[name]] = value
         return np.array(row)
 
     def _by_name(self, values: Any) -> dict[Any, float]:
         return {name: float(values[column]) for name, column in self._columns.items() if column < len(values)}
 
 
-def _number(value: Any) -> float:
-    return np.nan if value is None else float(value)
+def _numbers(x: dict[Any, Any]) -> dict[Any, float]:
+    return {name: _number(value, f"the feature {name!r}") for name, value in x.items()}
+
+
+def _number(value: Any, name: str) -> float:
+    """A number, NaN for None; ValueError for a category."""
+    try:
+        return np.nan if value is None else float(value)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{name} is {value!r}, which is not a number; encode categories first, as river's "
+            "preprocessing.OneHotEncoder() does, or leave them out."
+        ) from None

@@ -12,6 +12,7 @@ estimator look ahead and scores predictions that could not have been made. Use `
 Settings of the tracker are parameters of the estimator:
 
     GridSearchCV(TrackedRegressor(RLS(0.98)), {"tracker__forgetting": [0.9, 0.99]}, cv=TimeSeriesSplit())
+    GridSearchCV(TrackedRegressor(), {"tracker": [AdaptiveKalman(), RLS(0.98)]}, cv=TimeSeriesSplit())
 
 Needs scikit-learn 1.6 or later (``pip install "driftfit[sklearn]"``).
 """
@@ -23,9 +24,9 @@ from typing import Any, Self
 
 import numpy as np
 from sklearn.base import BaseEstimator, RegressorMixin
-from sklearn.utils.validation import check_array, check_is_fitted, validate_data
+from sklearn.utils.validation import _check_sample_weight, check_array, check_is_fitted, validate_data
 
-from driftfit.data.arguments import chronological, dated
+from driftfit.data.arguments import chronological, dated, held
 from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
@@ -73,13 +74,17 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
         self.fit_intercept = fit_intercept
         self.gate = gate
 
-    def fit(self, X: Any, y: Any) -> Self:
-        """Track rows X (n_rows, n_features) with outputs y (n_rows,), in order of time. NaN is missing in both."""
-        return self._follow(X, y, first=True)
+    def fit(self, X: Any, y: Any, sample_weight: Any = None) -> Self:
+        """Track rows X (n_rows, n_features) with outputs y (n_rows,), in order of time. NaN is missing in both.
 
-    def partial_fit(self, X: Any, y: Any) -> Self:
+        The noise variance of a row is inversely proportional to its ``sample_weight`` (n_rows,); a row of weight 0 is
+        not used, and coefficients drift during it as during any other. ValueError for cells that are no numbers.
+        """
+        return self._follow(X, y, sample_weight, first=True)
+
+    def partial_fit(self, X: Any, y: Any, sample_weight: Any = None) -> Self:
         """Continue with rows that follow those fitted so far; the first call is a `fit`."""
-        return self._follow(X, y, first=not hasattr(self, "run_"))
+        return self._follow(X, y, sample_weight, first=not hasattr(self, "run_"))
 
     def predict(self, X: Any, return_std: bool = False) -> Any:
         """Outputs (n_rows,) of rows after the last fitted one; with ``return_std`` also their standard deviations.
@@ -97,11 +102,15 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
         mean = X @ self.coef_ + self.intercept_ if self.lags == 0 else ahead.y_hat[place]
         return (mean, ahead.y_std[place]) if return_std else mean
 
-    def _follow(self, X: Any, y: Any, first: bool) -> Self:
+    def _follow(self, X: Any, y: Any, sample_weight: Any, first: bool) -> Self:
         rows = chronological(getattr(X, "index", None))
         if not isinstance(rows, slice):
             X, y = X.iloc[rows], y.iloc[rows] if hasattr(y, "iloc") else np.asarray(y)[rows]
+        if hasattr(X, "columns") and len(X):
+            held("X", X)  # names the column of a cell that is no number
         X = validate_data(self, X, reset=first, dtype=float, ensure_all_finite="allow-nan")
+        weights = None if sample_weight is None else np.asarray(sample_weight)[rows]
+        weights = _check_sample_weight(weights, X, dtype=float, ensure_non_negative=True)
         if y is None:
             raise ValueError("this TrackedRegressor estimator requires y to be passed, but the target y is None.")
         y = check_array(y, ensure_2d=False, dtype=float, ensure_all_finite="allow-nan", input_name="y")
@@ -119,7 +128,9 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
             raise ValueError("y holds no number: every output is NaN, so there is nothing to fit.")
         before = None if first else self.run_
         tracker = AdaptiveKalman() if self.tracker is None else self.tracker
-        self.run_: Track = track(self._model(X.shape[1]), tracker, y, X, gate=self.gate, warm_start=before)
+        self.run_: Track = track(
+            self._model(X.shape[1]), tracker, y, X, weights=weights, gate=self.gate, warm_start=before
+        )
         lags, m = self.lags, X.shape[1]
         self.coef_path_: Array = self.run_.theta[:, lags : lags + m]
         self.coef_: Array = self.coef_path_[-1].copy()

@@ -5,16 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from time import monotonic
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 import typer
 from typer import Argument, Option
 
 from driftfit.cli.options import Names
 from driftfit.cli.program import app, progress, say, writable
 from driftfit.cli.reading import decimal_from, limits_from, listed, parse_interval, separator_from
-from driftfit.data.clock import Clock
 from driftfit.data.columns import Wanted
 from driftfit.engine.compile_notice import PATIENCE
 from driftfit.identify.answer import Identification, ManyIdentified, identify
@@ -41,7 +39,12 @@ def identify_command(
     gate: Annotated[
         bool | None, Option("--gate/--no-gate", help="Leave out fault codes however many, or use all readings.")
     ] = None,
-    budget: Annotated[str, Option(help="Time after which the search stops.")] = "45s",
+    budget: Annotated[
+        float,
+        Option(
+            help="Seconds for one record.", metavar="SECONDS", parser=lambda text: float(str(text).removesuffix("s"))
+        ),
+    ] = 45.0,
     seed: Annotated[int, Option(help="Seed of the displaced copies of inputs.")] = 0,
     separator: Annotated[str | None, Option(help="Separator of cells; by default detected.")] = None,
     decimal: Annotated[str, Option(help="Decimal sign: . or ,")] = ".",
@@ -70,9 +73,9 @@ def identify_command(
         try:
             found = identify(
                 file if len(file) > 1 else file[0], y, u=listed(u) or None, not_u=listed(not_u), time=time,
-                dt=seconds(dt), by=by, limits=ranges,
+                dt=parse_interval(dt), by=by, limits=ranges,
                 max_lag=max_lag, forecast=forecast, horizon=horizon, level=level, gate=gate,
-                budget=seconds(budget) or 0.0, seed=seed, reading=reading, progress=tell,
+                budget=budget, seed=seed, reading=reading, progress=tell,
             )  # fmt: skip
         except NoAnswerError as error:
             status.stop()
@@ -84,24 +87,11 @@ def identify_command(
 
 def write(found: Identification | ManyIdentified, page: Path | None, json_to: Path | None, quiet: bool) -> None:
     """Print the answer, and write what the options ask for."""
+    to_stdout = str(json_to) == "-"
     if json_to is not None:
         text = json.dumps(found.json(), indent=1)
-        if str(json_to) == "-":
-            typer.echo(text)
-        else:
-            json_to.write_text(text, encoding="utf-8")
-    if str(json_to) != "-":
+        typer.echo(text) if to_stdout else json_to.write_text(text, encoding="utf-8")
+    if not to_stdout:
         say(" ".join(found.headline.split()) if quiet else found)
     if page is not None:
         found.page(page)
-
-
-def seconds(text: str | None) -> float | None:
-    """A duration in seconds, a plain number as it is."""
-    given: Any = parse_interval(text)
-    if isinstance(given, str):
-        length = Clock.of(given).duration
-        if length is None:
-            raise ValueError(f"{text}: give a duration such as 1s, 15min, 1h or 1d.")
-        return float(length / np.timedelta64(1, "s"))
-    return None if given is None else float(given)

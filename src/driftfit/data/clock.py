@@ -335,16 +335,16 @@ PACE_SAMPLES = 20
 """Number of samples after which a stream warns if most of them cannot be used."""
 
 
-def median_interval(time: Array, zone: str | None = None) -> tuple[str, str]:
+def median_interval(time: Array, zone: str | None = None) -> tuple[str, float | str]:
     """(the median interval of a record in words, the dt that fits it best)."""
     middle = np.sort(np.diff(time))[(len(time) - 1) // 2]
     if time.dtype.kind != "M":
-        return f"{middle:g}", f"dt={middle:g}"
+        return f"{middle:g}", float(middle)
     best, name = max(0.9, float(np.mean(np.abs(np.diff(time) / middle - 1.0) < 1e-3))), duration_text(middle)
     for step in ("business day", "month", "quarter", "year"):
         fit = float(np.mean(Clock.of(step, zone).steps(time)[1:] == 1.0))
         best, name = (fit, step) if fit > best else (best, name)
-    return duration_text(middle), f"dt={name!r}"
+    return duration_text(middle), name
 
 
 def broken(gaps: Array, first: Array, reach: int) -> Array:
@@ -366,12 +366,13 @@ def warn_of_gaps(clock: Clock, time: Array, gaps: Array, first: Array, reach: in
     longest = int(np.argmax(np.diff(np.append(first, N))))
     axis = time[first[longest] : np.append(first, N)[longest + 1]]
     middle, better = median_interval(axis, zone)
-    weekdays = "business" in better and clock.kind == "duration"
+    text = repr(better) if isinstance(better, str) else f"{better:g}"
+    weekdays = better == "business day" and clock.kind == "duration"
     if lost > 0.5 * N or weekdays:
         warn(
             f"{lost} of {N} samples cannot be used: the median interval is {middle}, dt is "
             f"{1 if clock.plain is None else clock.plain}, and lags do not reach across gaps above {GAP} dt. "
-            f"Give {better}, or dt='label' if samples are one step apart regardless of their times."
+            f"Give dt={text}, or dt='label' if samples are one step apart regardless of their times."
         )
 
 

@@ -166,7 +166,7 @@ def _advice(cell: str, second_line: bool) -> str:
         )
     if second_line and not re.search(r"\d", cell):
         return "if this line holds units, put # before it"
-    return "leave a cell empty where there is no value"
+    return "leave a cell empty where there is no value; a category needs a column of 0 and 1 for each of its values"
 
 
 def times_of_column(

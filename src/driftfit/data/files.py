@@ -57,7 +57,7 @@ def read_columns(path: str | os.PathLike[str], names: Sequence[str], time: str |
 def read(data: Any, wanted: Wanted) -> tuple[Columns, dict[Hashable, str]]:
     """The wanted columns of a table, a file, or the concatenation of several files."""
     if not isinstance(data, str | os.PathLike | list | tuple):
-        return convert(_frame(data), wanted, "the table", 0), {}
+        return convert(table_frame(data), wanted, "the table", 0), {}
     paths = paths_of(data)
     if len(paths) == 1:
         return of_file(paths[0], wanted), {}
@@ -84,7 +84,8 @@ def of_file(path: str, wanted: Wanted) -> Columns:
     return replace(convert(frame, wanted, path, 1), units=units)
 
 
-def _frame(data: Any) -> nw.DataFrame[Any]:
+def table_frame(data: Any) -> nw.DataFrame[Any]:
+    """A table as narwhals sees it; ValueError for what is none."""
     try:
         frame = nw.from_native(data)
     except TypeError:

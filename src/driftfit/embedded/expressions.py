@@ -28,12 +28,11 @@ from driftfit.embedded.values import (
     plain,
     view,
 )
-from driftfit.engine import kernel, simd
+from driftfit.engine import kernel
 from driftfit.engine.tracker_part import tracker_part, whole_record
 
 ARITHMETIC = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "/", ast.Mod: "%"}
 BITS = {ast.BitAnd: "&", ast.BitOr: "|"}
-FOUR = {simd.fill_four: "four_of", simd.load_four: "four_at", simd.plus: "four_plus", simd.times: "four_times"}
 PYTHON = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
     ast.FloorDiv: operator.floordiv, ast.Mod: operator.mod, ast.Pow: operator.pow, ast.BitAnd: operator.and_,
@@ -272,10 +271,6 @@ class Expressions:
             return arguments[0]  # C passes addresses one by one
         if function in (kernel.floats, kernel.wholes, kernel.cubes):
             return self._at_address(arguments)
-        if function is simd.in_blocks:
-            return number(False)
-        if function in FOUR or function is simd.reached:
-            return self._of_four(function, arguments)
         if hasattr(function, "py_func"):
             return self.called(function.py_func, arguments, statement)
         return self._builtin(node, function, arguments)
@@ -335,17 +330,6 @@ class Expressions:
         return (
             Value("real", f"from_bits({inner.text})") if to is np.float64 else Value("long", f"bits_of({inner.text})")
         )
-
-    def _of_four(self, function: Any, arguments: list[Value]) -> Value:
-        """Four numbers at once are a structure of four."""
-        self.ops[-1]["multiply" if function is simd.times else "add"] += 4
-        if function is simd.reached:
-            one, other = arguments
-            return Value("long", f"four_reached({one.text}, {other.text})", most=4)
-        if function is simd.load_four:
-            array, row, _ = arguments
-            return Value("four", f"four_at({view(array, [row, range(4)]).text})")
-        return Value("four", f"{FOUR[function]}({', '.join(one.text for one in arguments)})")
 
 
 def _real(value: Value) -> str:

@@ -6,7 +6,6 @@ flag    a floating-point number that is 0 or 1, which C keeps as an int: compari
 record  the state; tile, an array of one state
 array   numbers in memory: their start, their shape, and the stride of every axis
 address the address of the first number of an array
-four    four numbers that are computed together
 items   several values, such as the addresses that a routine is given together
 table   a tuple or an array of constants; python, a function or module; nothing, no value
 """
@@ -23,7 +22,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 
-RANK = {"bool": 0, "flag": 1, "int": 2, "long": 3, "real": 4, "four": 5}
+RANK = {"bool": 0, "flag": 1, "int": 2, "long": 3, "real": 4}
 """Kinds of numbers, from narrow to wide."""
 
 BIGGEST_SINGLE, SMALLEST_SINGLE = 1e18, 1e-30
@@ -190,7 +189,7 @@ def as_code(text: str) -> str:
     return f"`{printed(text).replace('`', chr(39))}`"
 
 
-TYPES = {"real": "real", "int": "int", "long": "int64_t", "bool": "int", "flag": "int", "four": "four"}
+TYPES = {"real": "real", "int": "int", "long": "int64_t", "bool": "int", "flag": "int"}
 """C types of the kinds of numbers."""
 
 

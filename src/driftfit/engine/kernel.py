@@ -210,11 +210,10 @@ class Driver:
 
     def __call__(self, *given: Any) -> Any:
         """Run on arrays and numbers. Whether arrays are read-only is not part of the signature."""
-        kind: tuple[Any, ...]
         try:
-            kind = tuple(map(_KIND, given))
-        except AttributeError:  # numbers
-            kind = tuple([_KIND(one) if isinstance(one, np.ndarray) else type(one) for one in given])
+            kind: Any = tuple(map(_KIND, given))
+        except AttributeError:  # numbers, and tuples of arrays
+            kind = tuple(map(_kind, given))
         return self.of_kind(kind, given)
 
     def of_kind(self, kind: Any, given: tuple[Any, ...]) -> Any:
@@ -260,6 +259,11 @@ class Driver:
 _KIND = attrgetter("dtype", "ndim", "flags.num")
 """Properties of an array on which the compiler's type depends, and more: asked for together they take half the time.
 Numbers of NumPy have them too; no driver takes arrays without axes, with which they could be confused."""
+
+
+def _kind(value: Any) -> Any:
+    inner = value if isinstance(value, tuple) else ()
+    return _KIND(value) if isinstance(value, np.ndarray) else (type(value), *map(_kind, inner))
 
 
 def _type(value: Any) -> types.Type:

@@ -154,8 +154,10 @@ def one_of(owner: str, name: str, value: str, choices: Sequence[str]) -> str:
 
 
 def missing_settings(owner: Settings) -> list[str]:
-    """Names of settings that were left None although they have no default meaning."""
-    return [name for name in getattr(owner, "required", ()) if getattr(owner, name) is None]
+    """Names of settings that were left None although they have no default meaning, those of its ``laws`` too."""
+    missing = [name for name in getattr(owner, "required", ()) if getattr(owner, name) is None]
+    laws = getattr(owner, "laws", None) or ()
+    return missing + [f"{law.title}[{name}].{one}" for name, law in laws for one in missing_settings(law)]
 
 
 def classes_in(package: str, path: Iterable[str], kind: type) -> dict[str, Any]:

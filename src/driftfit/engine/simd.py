@@ -1,4 +1,4 @@
-"""SIMD vectors of eight numbers, or four, or two, for compiled routines that work on short rows.
+"""SIMD vectors of eight numbers, or two, for compiled routines that work on short rows.
 
 A compiler that vectorises a loop of unknown length puts checks before it and a remainder after it, which cost more than
 the loop where rows have a dozen entries. A loop over vectors has neither:
@@ -21,11 +21,9 @@ from driftfit.engine.kernel import ARTANH, EXP, LOG2, LOG2_HIGH, LOG2_LOW, ROUND
 from driftfit.engine.numba_internals import ir, named_intrinsic
 
 WIDTH = 8
-UNROLLED = 10
-"""Parameters up to which the compiler unrolls all loops."""
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _VECTOR8, _WHOLE = ir.VectorType(ir.DoubleType(), WIDTH), ir.VectorType(_I64, WIDTH)
-_VECTOR4, _VECTOR2 = (ir.VectorType(ir.DoubleType(), count) for count in (4, 2))
+_VECTOR2 = ir.VectorType(ir.DoubleType(), 2)
 
 
 class Vector8(types.Type):
@@ -33,13 +31,6 @@ class Vector8(types.Type):
 
     def __init__(self) -> None:
         super().__init__(name="driftfit.Vector8")
-
-
-class Vector4(types.Type):
-    """A vector of four floats: between scalar operations of a filter, vectors of eight cost more than they saved."""
-
-    def __init__(self) -> None:
-        super().__init__(name="driftfit.Vector4")
 
 
 class Vector2(types.Type):
@@ -55,20 +46,13 @@ class _Model8(models.PrimitiveModel):
         super().__init__(manager, kind, _VECTOR8)
 
 
-@register_model(Vector4)
-class _Model4(models.PrimitiveModel):
-    def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _VECTOR4)
-
-
 @register_model(Vector2)
 class _Model2(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _VECTOR2)
 
 
-vector8, vector4, vector2 = Vector8(), Vector4(), Vector2()
-_LLVM = {vector8: _VECTOR8, vector4: _VECTOR4, vector2: _VECTOR2}
+vector8, vector2 = Vector8(), Vector2()
 
 
 def _named(name: str, build: Any) -> Any:
@@ -76,56 +60,34 @@ def _named(name: str, build: Any) -> Any:
     return named_intrinsic(f"simd.{name}", build)
 
 
-def _place(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any, vector: Any = _VECTOR8) -> Any:
+def _place(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any) -> Any:
     """The address of entry [row, column]."""
     inside = context.make_array(kind)(context, builder, array)
     columns = builder.extract_value(inside.shape, 1)
     first = builder.gep(inside.data, [builder.add(builder.mul(row, columns), column)])
-    return builder.bitcast(first, vector.as_pointer())
+    return builder.bitcast(first, _VECTOR8.as_pointer())
 
 
-def _load(of: Any) -> Any:
-    def typed(context: Any, array: Any, row: Any, column: Any) -> Any:
-        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            return builder.load(
-                _place(context, builder, signature.args[0], given[0], given[1], given[2], _LLVM[of]), align=8
-            )
+def _load(context: Any, array: Any, row: Any, column: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return builder.load(_place(context, builder, signature.args[0], *given), align=8)
 
-        return of(array, types.intp, types.intp), build
-
-    return typed
+    return vector8(array, types.intp, types.intp), build
 
 
-def _store(of: Any) -> Any:
-    def typed(context: Any, array: Any, row: Any, column: Any, value: Any) -> Any:
-        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            place = _place(context, builder, signature.args[0], given[0], given[1], given[2], _LLVM[of])
-            builder.store(given[3], place, align=8)
-            return context.get_dummy_value()
+def _store(context: Any, array: Any, row: Any, column: Any, value: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        builder.store(given[3], _place(context, builder, signature.args[0], *given[:3]), align=8)
+        return context.get_dummy_value()
 
-        return types.void(array, types.intp, types.intp, of), build
-
-    return typed
+    return types.void(array, types.intp, types.intp, vector8), build
 
 
-def _fill(of: Any) -> Any:
-    def typed(context: Any, value: Any) -> Any:
-        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            return _spread(builder, given[0], _LLVM[of])
+def _fill(context: Any, value: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return _spread(builder, given[0], _VECTOR8)
 
-        return of(types.float64), build
-
-    return typed
-
-
-def _made_of(of: Any) -> Any:
-    def typed(context: Any, numbers: Any) -> Any:
-        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            return _assembled(builder, [builder.extract_value(given[0], k) for k in range(len(numbers))], _LLVM[of])
-
-        return of(numbers), build
-
-    return typed
+    return vector8(types.float64), build
 
 
 def _pair_place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
@@ -150,81 +112,11 @@ def _put_pair(context: Any, array: Any, at: Any, value: Any) -> Any:
     return types.void(array, types.intp, vector2), build
 
 
-def _flat_place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
-    """The address of entry ``at`` of an array, counted over all its axes."""
-    inside = context.make_array(kind)(context, builder, array)
-    return builder.bitcast(builder.gep(inside.data, [at]), _VECTOR8.as_pointer())
-
-
-def _eight_at(context: Any, array: Any, at: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return builder.load(_flat_place(context, builder, signature.args[0], *given), align=8)
-
-    return vector8(array, types.intp), build
-
-
-def _put_eight(context: Any, array: Any, at: Any, value: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        builder.store(given[2], _flat_place(context, builder, signature.args[0], *given[:2]), align=8)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, vector8), build
-
-
 def _assembled(builder: Any, entries: Any, kind: Any) -> Any:
     made = ir.Constant(kind, ir.Undefined)
     for k, entry in enumerate(entries):
         made = builder.insert_element(made, entry, ir.Constant(_I32, k))
     return made
-
-
-def _add_in_order(context: Any, total: Any, value: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        total, value = given
-        for k in range(WIDTH):
-            total = builder.fadd(total, builder.extract_element(value, ir.Constant(_I32, k)))
-        return total
-
-    return types.float64(types.float64, vector8), build
-
-
-def _add_products(context: Any, total: Any, array: Any, at: Any, columns: Any, x: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        total, array, at, columns, x = given
-        products = []
-        for k in range(WIDTH):
-            row = builder.add(at, builder.mul(columns, ir.Constant(_I64, k)))
-            place = _flat_place(context, builder, signature.args[1], array, row)
-            products.append(builder.fmul(builder.load(place, align=8), x))
-        for column in _transposed(builder, products):
-            total = builder.fadd(total, column)
-        return total
-
-    return vector8(vector8, array, types.intp, types.intp, vector8), build
-
-
-def _transposed(builder: Any, rows: Any) -> Any:
-    """The columns of eight vectors: off the diagonal entries, then squares of two, then of four are exchanged."""
-    rows = list(rows)
-    for step in (1, 2, 4):
-        for k in (k for k in range(WIDTH) if not k & step):
-            first = [m + WIDTH - step if m & step else m for m in range(WIDTH)]
-            second = [m + WIDTH if m & step else m + step for m in range(WIDTH)]
-            rows[k], rows[k + step] = (
-                builder.shuffle_vector(rows[k], rows[k + step], ir.Constant(ir.VectorType(_I32, WIDTH), order))
-                for order in (first, second)
-            )
-    return rows
-
-
-def _one_wide_lane(context: Any, record: Any) -> Any:
-    """Whether a record has one lane and more than `UNROLLED` parameters."""
-    n, L = record.fields["theta"].type.shape if isinstance(record, types.Record) else (0, 0)
-
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return ir.Constant(ir.IntType(1), n > UNROLLED and L == 1)
-
-    return types.boolean(record), build
 
 
 def _two_of(context: Any, first: Any, second: Any) -> Any:
@@ -351,14 +243,6 @@ def _reaches(context: Any, a: Any, b: Any) -> Any:
     return vector8(vector8, vector8), build
 
 
-def _reached(context: Any, a: Any, b: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        bits = builder.bitcast(builder.fcmp_ordered(">=", *given), ir.IntType(given[0].type.count))
-        return builder.ctpop(builder.zext(bits, _I64))
-
-    return types.int64(a, a), build
-
-
 def _sum(context: Any, value: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         parts = [builder.extract_element(given[0], ir.Constant(ir.IntType(32), k)) for k in range(WIDTH)]
@@ -393,11 +277,11 @@ def _sums(context: Any, array: Any, row: Any) -> Any:
     return vector8(array, types.intp), build
 
 
-load = _named("load", _load(vector8))
+load = _named("load", _load)
 """Entries [row, column] to [row, column + 7] of a matrix."""
-store = _named("store", _store(vector8))
+store = _named("store", _store)
 """Write a vector there."""
-fill = _named("fill", _fill(vector8))
+fill = _named("fill", _fill)
 """A vector of one number, eight times."""
 plus, minus, times, over = (
     _named(name, _two(operation))
@@ -411,28 +295,10 @@ equal, below = _named("equal", _compare("==")), _named("below", _compare("<"))
 """1 where entries [at] to [at + 7] of whole numbers are a value, or below it, 0 elsewhere."""
 gathered = _named("gathered", _gather)
 """Entries [row, order[k]] to [row, order[k + 7]] of a matrix."""
-reached = _named("reached", _reached)
-"""How many entries of the first are at least those of the second."""
-load_four, fill_four = _named("load_four", _load(vector4)), _named("fill_four", _fill(vector4))
-"""The same for vectors of four."""
 pair, put_pair = _named("pair", _pair), _named("put_pair", _put_pair)
 """Pair ``at`` of an array whose last axis is 2, counted over its other axes; and write it there."""
 two, entry = _named("two", _two_of), _named("entry", _one_of)
-"""A pair of two numbers; and entry k of a pair or of a vector of four."""
-eight_at, put_eight = _named("eight_at", _eight_at), _named("put_eight", _put_eight)
-"""Entries ``at`` to at + 7 of an array, counted over all its axes; and write them there."""
-eight_of = _named("eight_of", _made_of(vector8))
-"""A vector of the eight numbers of a tuple."""
-add_in_order = _named("add_in_order", _add_in_order)
-"""A number plus the eight entries of a vector, added one after the other."""
-add_products = _named("add_products", _add_products)
-"""Eight sums plus the products of eight rows with x, which are added one after the other. Row k begins at entry
-at + k columns of an array.
-"""
-in_blocks = _named("in_blocks", _one_wide_lane)
-"""Whether a record has one lane and more than `UNROLLED` parameters, as its type says. Steps that are compiled once for
-all sizes, and those that are exported to C, do without vectors.
-"""
+"""A pair of two numbers; and entry k of a pair."""
 sum_of = _named("sum_of", _sum)
 """The sum of the eight entries, added in pairs."""
 lower, higher = (_named(name, _pick(sign)) for name, sign in (("lower", "<"), ("higher", ">")))

@@ -19,6 +19,7 @@ from rich.text import Text
 
 from driftfit.data.columns import Wanted
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import whole
 from driftfit.fleets import Fleet
 from driftfit.identify import page
 from driftfit.identify.judgement import effects, errors_of, feedback, moves
@@ -26,12 +27,11 @@ from driftfit.identify.result import Answer
 from driftfit.identify.roles import NoAnswerError, Roles, roles
 from driftfit.identify.scores import FEWEST
 from driftfit.identify.structure import Structure, search
-from driftfit.identify.working_point import cause, clear, regressors
+from driftfit.identify.working_point import cause, products
+from driftfit.judge.evidence import Evidence, judged_rows
 from driftfit.judge.fleet_verdict import ManyVerdicts
-from driftfit.judge.segment import segment
-from driftfit.judge.verdict import Verdict
+from driftfit.judge.verdict import Verdict, judged
 from driftfit.models.arx import ARX
-from driftfit.models.regression import Regression
 from driftfit.results import Track
 from driftfit.show.report import check_path
 from driftfit.show.text import Printed
@@ -118,7 +118,7 @@ def _written(text: str, path: Any) -> str:
 
 def identify(
     data: Any, y: str | None = None, *, u: Sequence[str] | None = None, not_u: Sequence[str] = (),
-    time: str | None = None, dt: float | None = None, by: str | None = None,
+    time: str | None = None, dt: float | str | None = None, by: str | None = None,
     limits: Mapping[str, tuple[float | None, float | None]] | None = None, max_lag: int = 30, forecast: bool = False,
     horizon: int = 10, level: float = 0.05, gate: bool | None = None, budget: float = 45.0, seed: int = 0,
     reading: Wanted | None = None, progress: Callable[[str], None] = lambda text: None,
@@ -134,8 +134,8 @@ def identify(
         The inputs to choose from, and columns that are none. By default every other column of numbers.
     time, by : names
         The column of the time, and the one that identifies records; found if not given.
-    dt : number
-        Nominal interval, of dates in seconds; the median by default.
+    dt : number or text
+        Nominal interval, as for `track`; the median by default.
     limits : mapping from columns to (low, high)
         Valid ranges; what is outside is missing.
     max_lag : int
@@ -173,9 +173,8 @@ def identify(
         For a record that cannot answer: fewer than `FEWEST` rows with all lags, a constant output, text.
     """
     end = monotonic() + budget
-    for name, value, low in (("max_lag", max_lag, 1), ("horizon", horizon, 1), ("budget", budget, 0)):
-        if not value >= low:
-            raise ValueError(f"identify: {name} must be at least {low}; got {value!r}.")
+    for name, value in (("max_lag", max_lag), ("horizon", horizon)):
+        whole("identify", name, value, 1)
     if not 0.0 < level < 1.0:
         raise ValueError(f"identify: level must be between 0 and 1, such as 0.05; got {level!r}.")
     progress("reading")
@@ -215,9 +214,8 @@ def chosen(data: Any, y: str, time: str | None, reading: Wanted) -> tuple[Roles,
 
 def model_of(found: Roles, structure: Structure) -> ARX:
     """The ARX model of a structure."""
-    names = tuple(found.inputs[j] for j, *_ in structure.shape[1])
-    nb, nk = (tuple(one[i] for one in structure.shape[1]) for i in (1, 2))
-    return ARX(structure.na, nb or 0, nk or 1, inputs=names or None, intercept=True)
+    inputs, nb, nk = (tuple(one[i] for one in structure.shape[1]) for i in range(3))
+    return ARX(structure.na, nb or 0, nk or 1, inputs=tuple(found.inputs[j] for j in inputs) or None, intercept=True)
 
 
 @dataclass(frozen=True)
@@ -255,27 +253,27 @@ class _Task:
             found = found.rows(np.arange(T - most, T))
             check_record(found)
         y, U, place = found.spread(structure.na + 40)
-        self.progress("time or working point")
-        phi = regressors(y, U, structure)
-        why_not = cause(y, U, structure, found.inputs, found.output, self.first)
         self.progress("tracking")
         run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
+        known = Evidence(run, level=self.level)
+        self.progress("time or working point")
+        rows, (Z, made) = known.rows, products(y, U, structure, found.inputs, found.output, self.first)
+        why_not = cause(rows.phi, rows.y, Z[place][rows.at] * np.reshape(np.asarray(rows.root), (-1, 1)), made)
         self.progress("judging")
-        verdict = run.verdict(self.level)
-        if verdict.drifts and clear(why_not.curve):
-            self.progress("judging the curve")
-            Z = np.column_stack([phi, why_not.columns])
-            rest = segment(y, Z[:, 1:], Regression(Z.shape[1] - 1, intercept=True), false=self.level)
-            moves_besides = bool(rest.breaks or rest.better)
-            curved = clear(why_not.further) if moves_besides else not clear(why_not.besides)
-            why_not = replace(why_not, kind=("both" if moves_besides else "working point") if curved else "time")
-        theta, memory, own = effects(phi, y, structure, found.inputs)
-        errors = errors_of(run, place, y, U, structure, self.horizon)
+        verdict = judged(known)
+        moves_besides = bool(verdict.drifts)
+        if moves_besides and why_not.products:
+            more = rows._replace(phi=np.hstack([rows.phi, why_not.columns]))
+            again = judged_rows(
+                more.only(np.asarray(np.isfinite(more.phi).all(axis=1)), range(more.phi.shape[1])), self.level
+            )
+            moves_besides = again is None or again.rejected
+        theta, memory, own = effects(known)
         notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict)
-        kind, why = self._kind(found, run, verdict, why_not.kind)
+        kind, why = self._kind(found, run, verdict, why_not.kind(moves_besides))
         return Identification(
             kind, why, model, run, verdict, found, structure, why_not, own, moves(verdict, run, theta, memory.root),
-            memory, errors, notes, undecided, self.source,
+            memory, errors_of(known, self.horizon), notes, undecided, self.source,
         )  # fmt: skip
 
     def _kind(self, found: Roles, run: Track, verdict: Verdict, kind: str) -> tuple[str, str]:
@@ -286,27 +284,31 @@ class _Task:
             return page.KINDS[4], f"{codes}; if they are, say so with --gate, and if not, with --no-gate"
         if verdict.drifts is None:
             return page.KINDS[4], verdict.untested
-        if kind == "working point":
-            return page.KINDS[1], ""
-        return page.KINDS[2 if kind == "both" else 0] if verdict.drifts else page.KINDS[3], ""
+        moving = {"working point": 1, "both": 2}.get(kind, 0)
+        return page.KINDS[moving if verdict.drifts or moving == 1 else 3], ""
 
 
 def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -> tuple[str, ...]:
     """Problems of the data, each in a few words."""
-    notes = [f"{count} readings of {name} taken as codes or spikes" for name, count in found.refused.items()]
-    notes += [f"{count} {reason}, left out by the gate" for reason, count in run.left_out.counts.items()]
-    notes += [f"{found.missing} readings missing"] if found.missing else []
-    notes += [f"gaps in time of {len(y) - len(found.y)} samples in all"] if len(y) > len(found.y) else []
     fed = [j for j in structure.lags if feedback(y, U[:, j]) > FEEDBACK]
     at_once = {j: ", so what it explains at once may be its response" for j in fed if structure.lags[j][1] == 0}
-    notes += [f"{found.output} acts on {found.inputs[j]} (feedback){at_once.get(j, '')}" for j in fed]
-    return tuple([*notes, structure.narrowed] if structure.narrowed else notes)
+    notes = (
+        *(f"{count} readings of {name} taken as codes or spikes" for name, count in found.refused.items()),
+        *(f"{count} {reason}, left out by the gate" for reason, count in run.left_out.counts.items()),
+        f"{found.missing} readings missing" if found.missing else "",
+        f"gaps in time of {len(y) - len(found.y)} samples in all" if len(y) > len(found.y) else "",
+        *(f"{found.output} acts on {found.inputs[j]} (feedback){at_once.get(j, '')}" for j in fed),
+        structure.narrowed,
+    )
+    return tuple(filter(None, notes))
 
 
 def _undecided(structure: Structure, names: Sequence[str], verdict: Verdict) -> tuple[str, ...]:
     """What the record does not decide, each in a few words."""
     ranges = [(names[j], *ends) for j, ends in structure.delays.items() if ends[0] < ends[1]]
-    said = [f"the delay of {name}: {low} to {high} samples are as good" for name, low, high in ranges]
-    said += [f"{names[j]} or {names[i]}: either explains the record" for j, i in structure.instead]
-    said += [f"{names[j]}: useful, but so are copies of it at other times" for j in structure.doubtful]
-    return tuple([*said, "a level that wanders, or noise that does"] if verdict.nearly_walk else said)
+    return (
+        *(f"the delay of {name}: {low} to {high} samples are as good" for name, low, high in ranges),
+        *(f"{names[j]} or {names[i]}: either explains the record" for j, i in structure.instead),
+        *(f"{names[j]}: useful, but so are copies of it at other times" for j in structure.doubtful),
+        *(["a level that wanders, or noise that does"] if verdict.nearly_walk else []),
+    )

@@ -2,166 +2,78 @@
 
 With p_1 and p_2 the densities of a reading under the tracker and under recursive least squares on the same regressors,
 
-    w_t  proportional to  (1 - s) w_(t-1) p_k(y_(t-1)) + s / 2,        y_hat = sum_k w_k y_hat_k
+    w_t = s + (1 - 2 s) w_(t-1) p_1(y_(t-1)) / (w_(t-1) p_1 + (1 - w_(t-1)) p_2),    y_hat = w y_hat_1 + (1 - w) y_hat_2
 
 so that a record of constants costs no more than a few nats, and a change is followed (Herbster and Warmuth, 1998). All
-predictions are made before the sample, one step or h steps ahead; those h ahead are given the inputs.
+predictions are made before the sample, one step or h steps ahead; those h ahead are given the inputs, and are weighed
+by what is known h steps before.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.identify.result import Effect, Errors, Memory, Move
-from driftfit.identify.structure import Structure, filled, lagged
-from driftfit.identify.working_point import regressors
+from driftfit.identify.scores import FEWEST
+from driftfit.identify.structure import filled, lagged
 from driftfit.judge.compare import persistence
+from driftfit.judge.evidence import Evidence
+from driftfit.judge.structures.candidates import SHARE
 from driftfit.judge.verdict import Verdict
-from driftfit.run.result import Track, burn_in, root_mean_square
+from driftfit.run.result import Track, root_mean_square
 
-SHARED = 0.01
-"""Share of the weight that the other prediction gets before each sample."""
 FOUND = 6.7
 """Standard errors of a coefficient that a change half-way must have to be found in four of five records: the error of
 the difference of both halves is twice as large, times 2.8 for a test at 5 %, times 1.2 since the date is not known."""
-NAMES = ("driftfit", "tracked", "constants", "constant ARX", "persistence")
 
 
-def recursive(phi: Array, y: Array, used: Array) -> Array:
-    """(T, n): least squares of y (T,) on phi (T, n) from the ``used`` samples before each one."""
-    n, scale = phi.shape[1], np.sqrt(np.nanmean(phi**2, axis=0))
-    scale[~(scale > 0.0)] = 1.0
-    Z = np.where(used[:, None], phi / scale, 0.0)
-    A = np.cumsum(Z[:, :, None] * Z[:, None, :], axis=0)
-    b = np.cumsum(Z * np.where(used, y, 0.0)[:, None], axis=0)
-    theta = np.full(phi.shape, np.nan)
-    theta[1:] = np.linalg.solve(A[:-1] + 1e-8 * np.eye(n), b[:-1, :, None])[..., 0] / scale
-    theta[np.cumsum(used) - used < n] = np.nan
-    return theta
+def density(e: Array) -> Array:
+    """Log-likelihoods (T,) of errors, Gaussian with the mean of their squares so far; NaN for the first ten."""
+    known = np.isfinite(e)
+    square, count = np.where(known, e, 0.0) ** 2, np.cumsum(known) - known
+    v = np.maximum(np.cumsum(square) - square, 1e-300) / np.maximum(count, 1)
+    return np.where(known & (count > 10), -0.5 * (np.log(2.0 * np.pi * v) + square / v), np.nan)
 
 
-def mixed(first: Array, second: Array, y: Array, std: Array | None, late: int) -> Array:
-    """The weight (T,) of the first of two predictions of y, from readings at least ``late`` samples before.
-
-    ``std``: standard deviation of the first; None, and for the second: that of its errors so far.
-    """
-    e1, e2 = y - first, y - second
-    known = np.isfinite(e1) & np.isfinite(e2)
-    spread = [np.where(known, e, 0.0) ** 2 for e in (e1, e2)]
-    v1, v2 = ((np.cumsum(one) - one + 1e-300) / np.maximum(np.cumsum(known) - known, 1) for one in spread)
-    v1 = v1 if std is None else np.where(np.isfinite(std) & (std > 0.0), std, np.nan) ** 2
-    with np.errstate(over="ignore", invalid="ignore"):
-        gain = 0.5 * (e2**2 / v2 + np.log(v2) - e1**2 / v1 - np.log(v1))
-    usable = known & np.isfinite(gain) & (np.cumsum(known) > 10)
-    weight, w = np.full(len(y), 0.5), 0.5
-    for t, ratio in enumerate(np.exp(np.clip(np.where(usable, gain, 0.0), -50.0, 50.0)).tolist()):
+def weights(first: Array, second: Array) -> Array:
+    """The weight (T,) of the first of two predictions before each sample, from their log-likelihoods (T,)."""
+    weight, w = np.empty(len(first)), 0.5
+    for t, ratio in enumerate(np.exp(np.clip(np.nan_to_num(first - second), -50.0, 50.0)).tolist()):
         weight[t] = w
-        w = (1.0 - SHARED) * w * ratio / (w * ratio + 1.0 - w) + 0.5 * SHARED
-    return np.concatenate([np.full(late - 1, 0.5), weight[: len(y) - late + 1]])
+        w = SHARE + (1.0 - 2.0 * SHARE) * w * ratio / (w * ratio + 1.0 - w)
+    return weight
 
 
-def ahead(theta: Array, y: Array, drive: Array, na: int, h: int) -> Array:
-    """Predictions (T,) of every output from theta (T, n) known h samples before; ``drive`` (T, n - 1 - na) is given.
-
-    theta[t] is what is known before sample t, so sample t + h - 1 is predicted from it.
-    """
-    past, T = filled(y), len(y)
+def ahead(theta: Array, phi: Array, na: int, h: int) -> Array:
+    """Predictions (T,) h steps ahead, from theta (T, n) known before each sample and phi (T, n): na lags of the output,
+    and regressors that are given."""
     made: list[Array] = []
     for s in range(h):
-        lags = [made[s - i] if s >= i else lagged(past, i - s) for i in range(1, na + 1)]
-        ahead_drive = np.concatenate([drive[s:], np.full((s, drive.shape[1]), np.nan)])
-        columns = np.column_stack([np.ones(T), *lags, ahead_drive])
-        made.append(np.einsum("tn,tn->t", theta, columns))
+        now = np.vstack([phi[s:], np.full((min(s, len(phi)), phi.shape[1]), np.nan)])
+        for i in range(min(s, na)):
+            now[:, i] = made[s - 1 - i]
+        made.append(np.einsum("tn,tn->t", theta, now))
     return lagged(made[-1], h - 1)
 
 
-def errors_of(run: Track, place: Array, y: Array, U: Array, structure: Structure, horizon: int) -> tuple[Errors, ...]:
-    """Errors one step and ``horizon`` steps ahead on the grid; ``place``: where the samples of the run are in it."""
-    T, n, y = len(y), run.model.n, np.where(np.isfinite(y), y, np.nan)
-    phi, order = regressors(y, U, structure), [n - 1, *range(n - 1)]
-    prediction, std, tracked = np.full(T, np.nan), np.full(T, np.nan), np.full((T, n), np.nan)
-    prediction[place], std[place] = run.prediction, run.innovation_std
-    tracked[place] = run.theta[:, order]
-    last = np.maximum.accumulate(np.where(np.isfinite(tracked[:, 0]), np.arange(T), 0))
-    before = np.concatenate([np.full((1, n), np.nan), tracked[last][:-1]])
-    used = np.zeros(T, bool)
-    used[place] = run.ok
-    used &= np.isfinite(phi).all(axis=1) & np.isfinite(y)
-    steady = recursive(phi, y, used)
-    small = Structure(2, {j: (1, 1) for j in structure.lags})
-    lags = regressors(y, U, small)
-    arx = recursive(lags, y, used & np.isfinite(lags).all(axis=1))
-    found = []
-    for h in sorted({1, horizon}):
-        own = prediction if h == 1 else ahead(before, y, phi[:, 1 + structure.na :], structure.na, h)
-        rest = ahead(steady, y, phi[:, 1 + structure.na :], structure.na, h)
-        share = mixed(own, rest, np.where(used, y, np.nan), std if h == 1 else None, h)
-        each = [share * own + (1.0 - share) * rest, own, rest, ahead(arx, y, lags[:, 3:], 2, h)]
-        errors = [y - one for one in (*each, lagged(persistence(y), h - 1))]
-        scored = used & (np.cumsum(used) > min(burn_in(n), used.sum() // 4)) & np.isfinite(errors).all(axis=0)
-        rms = {name: root_mean_square(e[scored]) for name, e in zip(NAMES, errors, strict=True)}
-        found.append(Errors(h, rms, int(scored.sum())))
-    return tuple(found)
-
-
-def least_squares(phi: Array, y: Array) -> tuple[Array, Array]:
-    """Coefficients (n,) and their covariance (n, n), from the complete rows."""
-    rows = np.isfinite(phi).all(axis=1) & np.isfinite(y)
-    X, z = phi[rows], y[rows]
-    theta = np.linalg.lstsq(X, z, rcond=None)[0]
-    e = z - X @ theta
-    variance = float(e @ e) / max(len(z) - len(theta), 1)
-    return theta, variance * np.linalg.pinv(X.T @ X)
-
-
-def effects(
-    phi: Array, y: Array, structure: Structure, names: tuple[str, ...]
-) -> tuple[Array, Memory, tuple[Effect, ...]]:
-    """Constants theta (n,), the intercept first; the memory of y; the effects of the inputs."""
-    theta, cov = least_squares(phi, y)
-    na, at, found = structure.na, 1 + structure.na, []
-    memory = Memory(float(theta[1:at].sum()), float(np.sqrt(cov[1:at, 1:at].sum())))
-    rest = 1.0 if memory.root else 1.0 - memory.value
-    for j, nb, _ in structure.shape[1]:
-        own = np.zeros(len(theta))
-        own[at : at + nb], at = 1.0, at + nb
-        slope, b, least = own / rest, float(own @ theta), FOUND * float(np.sqrt(own @ cov @ own)) / abs(rest)
-        slope[1 : 1 + na] = 0.0 if memory.root else b / rest**2
-        found.append(Effect(names[j], b / rest, float(np.sqrt(slope @ cov @ slope)), least))
-    return theta, memory, tuple(found)
-
-
-def moves(verdict: Verdict, run: Track, theta: Array, root: bool) -> tuple[Move, ...]:
-    """The events of a verdict as changes of effects; ``theta`` (n,) are constants, the intercept first.
-
-    The level is that at mean inputs, and is left out where it moves with others by less than an error of predictions:
-    an effect that changes turns the plane about the origin. With a ``root`` effects are those in a sample.
-    """
-    names, text, found = run.model.names, run.time_text, []
-    mean = dict(zip(run.model.input_names, np.nanmean(run.u, axis=0), strict=True)) if run.model.input_names else {}
-
-    def value(what: str, of: dict[str, float]) -> float:
-        memory = sum(of[name] for name in names if _what(name) == "memory")
-        if what == "memory":
-            return memory
-        inputs = sum(of[name] * mean[_what(name)] for name in names if _what(name) in mean)
-        own = of["intercept"] + inputs if what == "level" else sum(of[name] for name in names if _what(name) == what)
-        return float(own if root or memory >= 1.0 else own / (1.0 - memory))
-
-    now = dict(zip(names, [*theta[1:], theta[0]], strict=True))
-    for event in reversed(verdict.events):
-        now |= {move.name: move.before for move in event.moves}
-    for event in verdict.events:
-        after = now | {move.name: move.after for move in event.moves}
-        instead = tuple(dict.fromkeys(_what(name) for move in event.moves for name in move.instead))
-        ends = (event.when, event.ended) if event.until is not None else (text(event.earliest), text(event.latest))
-        touched = {_what(move.name) for move in event.moves}
-        for what in sorted(touched, key=lambda what: (what in ("memory", "level"), what)):
-            values = value(what, now), value(what, after)
-            if what != "level" or len(touched) == 1 or abs(values[1] - values[0]) > verdict.rms:
-                found.append(Move(what, event.kind, *values, *ends, event.at, instead))
-        now = now if event.kind == "temporary" else after
+def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
+    """Errors one step and ``horizon`` steps ahead of a run and of simpler predictions."""
+    run, own, steady, found = known.run, known.errors, known.steady, []
+    y, phi = run.used_record.y, np.where(steady["valid"] > 0.0, steady["phi"][..., 0], np.nan)
+    none = np.full((1, run.model.n), np.nan)
+    paths = (np.vstack([none, path[:-1]]) for path in (run.theta, steady["theta"][..., 0]))
+    far = [y - ahead(path, phi, run.model.output_lags or 0, horizon) for path in paths]
+    rivals = {"constant ARX": own.constant_arx, "persistence": own.persistence}
+    cases: list[Any] = [(1, own.tracked, own.constant_ls, run.log_density, rivals)]
+    cases += [(horizon, *far, density(far[0]), {"persistence": y - lagged(persistence(y), horizon - 1)})][: horizon - 1]
+    for h, tracked, constants, likely, others in cases:
+        w = np.append(np.full(h - 1, 0.5), weights(likely, density(constants)))[: len(y)]
+        errors = {"driftfit": w * tracked + (1.0 - w) * constants, "tracked": tracked, "constants": constants, **others}
+        at = own.scored & np.isfinite([*errors.values()]).all(axis=0)
+        found.append(Errors(h, {name: root_mean_square(e[at]) for name, e in errors.items()}, int(at.sum())))
     return tuple(found)
 
 
@@ -170,14 +82,74 @@ def _what(name: str) -> str:
     return name.split("[", 1)[1][:-1] if "[" in name else "level" if name == "intercept" else "memory"
 
 
+def parts(run: Track) -> dict[str, Array]:
+    """The factors of the parameters (n,) of a run in every effect: an input is the sum of its lags, the memory that of
+    the lags of the output, and the level that at mean inputs."""
+    of = [_what(name) for name in run.model.names]
+    found = {what: np.array([own == what for own in of], float) for what in ("memory", "level", *run.model.input_names)}
+    found["level"] += sum(np.nanmean(run.u[:, j]) * found[name] for j, name in enumerate(run.model.input_names))
+    return found
+
+
+def pseudo_inverse(X: Array) -> Array:
+    """The pseudo-inverse (n, N) of regressors X (N, n), whose units may be far apart."""
+    size = np.sqrt(np.mean(X * X, axis=0))
+    size[size == 0.0] = 1.0
+    return np.asarray(np.linalg.pinv(X / size, rcond=np.finfo(float).eps * max(X.shape)) / size[:, None])
+
+
+def effects(known: Evidence) -> tuple[Array, Memory, tuple[Effect, ...]]:
+    """Constants theta (n,), the memory of y, and the effects of the inputs."""
+    phi, y, own = known.rows.phi, known.rows.y, parts(known.run)
+    inverse = pseudo_inverse(phi)
+    theta = inverse @ y
+    s2, lags = np.sum((y - phi @ theta) ** 2) / max(len(y) - len(theta), 1), own["memory"]
+    cov = inverse @ inverse.T * s2
+    memory, found = Memory(float(lags @ theta), float(np.sqrt(lags @ cov @ lags))), []
+    rest = 1.0 if memory.root else 1.0 - memory.value
+    for name in known.run.model.input_names:
+        gain, least = float(own[name] @ theta) / rest, FOUND * float(np.sqrt(own[name] @ cov @ own[name])) / abs(rest)
+        slope = own[name] / rest + (0.0 if memory.root else gain / rest * lags)
+        found.append(Effect(name, gain, float(np.sqrt(slope @ cov @ slope)), least))
+    return theta, memory, tuple(found)
+
+
+def moves(verdict: Verdict, run: Track, theta: Array, root: bool) -> tuple[Move, ...]:
+    """The events of a verdict as changes of effects; ``theta`` (n,) are constants.
+
+    The level is that at mean inputs, and is left out where it moves with others by less than an error of predictions:
+    an effect that changes turns the plane about the origin. With a ``root`` effects are those in a sample.
+    """
+    own, text, found = parts(run), run.time_text, []
+
+    def value(what: str, theta: Array) -> float:
+        memory = own["memory"] @ theta
+        return float(own[what] @ theta / (1.0 if what == "memory" or root or memory >= 1.0 else 1.0 - memory))
+
+    def changed(theta: Array, to: dict[str, float]) -> Array:
+        return np.array([to.get(name, theta[i]) for i, name in enumerate(run.model.names)])
+
+    for event in reversed(verdict.events):
+        theta = changed(theta, {move.name: move.before for move in event.moves})
+    for event in verdict.events:
+        after = changed(theta, {move.name: move.after for move in event.moves})
+        instead = tuple(dict.fromkeys(_what(name) for move in event.moves for name in move.instead))
+        ends = (event.when, event.ended) if event.until is not None else (text(event.earliest), text(event.latest))
+        touched = {_what(move.name) for move in event.moves}
+        for what in sorted(touched, key=lambda what: (what in ("memory", "level"), what)):
+            values = value(what, theta), value(what, after)
+            if what != "level" or len(touched) == 1 or abs(values[1] - values[0]) > verdict.rms:
+                found.append(Move(what, event.kind, *values, *ends, event.at, instead))
+        theta = theta if event.kind == "temporary" else after
+    return tuple(found)
+
+
 def feedback(y: Array, u: Array) -> float:
     """F statistic of three lags of y in a regression of u on three lags of itself and of y: over 5 is feedback."""
-    own = [lagged(filled(u), k) for k in (1, 2, 3)]
-    past = [lagged(filled(y), k) for k in (1, 2, 3)]
-    X = np.column_stack([np.ones(len(y)), *own, *past])
+    X = np.column_stack([np.ones(len(y)), *(lagged(filled(x), k) for x in (u, y) for k in (1, 2, 3))])
     rows = np.isfinite(X).all(axis=1) & np.isfinite(u)
     X, z = X[rows], u[rows]
-    if len(z) < 60 or np.ptp(z) == 0.0:
+    if len(z) < FEWEST or np.ptp(z) == 0.0:
         return 0.0
-    full, less = (z - A @ np.linalg.lstsq(A, z, rcond=None)[0] for A in (X, X[:, :4]))
-    return float((less @ less - full @ full) / 3.0 / max(full @ full / (len(z) - 7), 1e-300))
+    full, less = (float(np.sum((z - A @ (pseudo_inverse(A) @ z)) ** 2)) for A in (X, X[:, :4]))
+    return (less - full) / 3.0 / max(full / (len(z) - 7), 1e-300)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from html import escape
 from pathlib import PurePath
@@ -10,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from driftfit.data.clock import Clock, duration_text
 from driftfit.identify.result import Answer, Move
-from driftfit.identify.roles import CALENDAR, Roles
+from driftfit.identify.roles import Roles
 from driftfit.identify.structure import Shape
 from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import p_equals
@@ -25,23 +27,18 @@ if TYPE_CHECKING:
 
 NAME = "driftfit.identify/1"
 KINDS = ("moves", "a static curve explains it", "both", "no drift found", "cannot decide")
-OBJECT, TEXT, LIST = {"type": "object"}, {"type": "string"}, {"type": "array"}
 PROPERTIES: dict[str, Any] = {
-    "schema": {"const": NAME}, "answer": {"enum": KINDS}, "headline": TEXT, "why": TEXT, "model": TEXT,
-    "p": {"type": ["number", "null"]}, "roles": OBJECT, "structure": OBJECT, "effects": LIST, "moves": LIST,
-    "errors": LIST, "memory": OBJECT, "cause": OBJECT, "notes": LIST, "undecided": LIST, "commands": LIST, "unit": TEXT,
+    "schema": {"const": NAME}, "answer": {"enum": KINDS}, "p": {"type": ["number", "null"]},
+    **{key: {"type": "string"} for key in ("headline", "why", "model", "unit")},
+    **{key: {"type": "object"} for key in ("roles", "structure", "memory", "cause")},
+    **{key: {"type": "array"} for key in ("effects", "moves", "errors", "notes", "undecided", "commands")},
 }  # fmt: skip
 SCHEMA = {"title": NAME, "type": "object", "required": list(PROPERTIES), "properties": PROPERTIES}
 """JSON Schema of `Identification.json`."""
-DRAWN = 200
-"""Samples at which gains are drawn."""
 CAPTION = (
     "Above: the output (dots) and its prediction one sample before. Below: the static gain of each input with its 95 % "
     "band, from the past only. Red: when it changed."
 )
-
-
-UNITS = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 
 
 def number(value: float) -> str:
@@ -51,30 +48,23 @@ def number(value: float) -> str:
 
 def duration(answer: Answer, samples: int) -> str:
     """A number of samples, where the record has dates as a time."""
-    if not answer.roles.dated:
-        return f"{samples} sample{'' if samples == 1 else 's'}"
-    if answer.roles.dt in CALENDAR:
-        return f"{samples} {answer.roles.dt}{'' if samples == 1 else 's'}"
-    seconds = samples * answer.roles.step
-    size, unit = next((one for one in UNITS if seconds >= 2.0 * one[0]), UNITS[-1])
-    return f"{seconds / size:.3g} {unit}"
+    clock = Clock.of(answer.roles.dt) if isinstance(answer.roles.dt, str) else Clock("number")
+    if clock.duration is not None:
+        return re.sub(r"(?<=\d)(?=\D)", " ", duration_text(samples * clock.duration))
+    count = int(samples * clock.count)
+    return f"{count} {'sample' if clock.kind == 'number' else clock.kind}{'' if count == 1 else 's'}"
 
 
 def delay(answer: Answer, name: str) -> str:
     """The delay of an input, a range where several are as good."""
     low, high = answer.structure.delays[answer.roles.inputs.index(name)]
-    if high == 0:
-        return "at once"
-    return (
-        f"delay {duration(answer, high)}"
-        if low == high
-        else f"delay {duration(answer, low)} to {duration(answer, high)}"
-    )
+    first = f"{duration(answer, low)} to " if low < high else ""
+    return f"delay {first}{duration(answer, high)}" if high else "at once"
 
 
 def headline(answer: Answer) -> str:
     """The answer in one sentence or two."""
-    output, rms = answer.roles.output, answer.errors[0].rms
+    output, rms, said = answer.roles.output, answer.errors[0].rms, sentences(answer)
     if answer.kind == "cannot decide":
         return f"Cannot decide: {answer.why}."
     if answer.kind == "a static curve explains it":
@@ -83,7 +73,6 @@ def headline(answer: Answer) -> str:
         least = "; ".join(f"{one.name} by {number(one.least)} from {number(one.gain)}" for one in answer.effects)
         seen = f" In 4 of 5 records a change half-way of the {answer.effect} would have been found: {least}."
         return f"No drift found in {output} ({p_equals(answer.verdict.p)}).{seen if least else ''}"
-    said = sentences(answer)
     change = 100.0 * (1.0 - rms["driftfit"] / rms["constants"]) if rms["constants"] > 0.0 else 0.0
     gain = f"lowers the error {change:.0f} %" if change >= 0.5 else "does not lower the error"
     more = f"; and {len(said) - 2} more change{'' if len(said) == 3 else 's'}" if len(said) > 2 else ""
@@ -99,33 +88,26 @@ def curve(answer: Answer) -> str:
 
 def sentences(answer: Answer) -> list[str]:
     """What every event did."""
-    events: dict[tuple[str, int], list[Move]] = {}
-    for move in answer.moves:
-        events.setdefault((move.kind, move.at), []).append(move)
-    return [_event(answer, own) for own in events.values()]
+    events = dict.fromkeys((move.kind, move.at) for move in answer.moves)
+    return [_event(answer, [move for move in answer.moves if (move.kind, move.at) == one]) for one in events]
 
 
 def _event(answer: Answer, own: list[Move]) -> str:
-    one, output, parts = own[0], answer.roles.output, []
+    one, output = own[0], answer.roles.output
     whats = {"memory": f"the memory of {output} (sum of its lags)", "level": f"the level of {output} (at mean inputs)"}
-    for move in own:
-        what = whats.get(move.what) or f"the effect of {move.what} on {output} ({delay(answer, move.what)})"
-        does = "wandered" if one.kind == "wandering" else verb(move)
-        parts.append(f"{what} {does} from {number(move.before)} to {number(move.after)}")
-    when = f"on {one.first}" if one.first == one.last else f"between {one.first} and {one.last}"
-    when = "over the whole record" if one.kind == "wandering" else when
-    when = f"gradually from {one.first} to {one.last}" if one.kind == "gradual" else when
+    whats |= {name: f"the effect of {name} on {output} ({delay(answer, name)})" for name in answer.model.input_names}
+    parts = (f"{whats[move.what]} {verb(move)} from {number(move.before)} to {number(move.after)}" for move in own)
+    when = {"wandering": "over the whole record", "gradual": f"gradually from {one.first} to {one.last}"}
+    date = f"on {one.first}" if one.first == one.last else f"between {one.first} and {one.last}"
     back = ", and was then as before" if one.kind == "temporary" else ""
     instead = f" (or {' or '.join(one.instead)} changed)" if one.instead else ""
-    return f"{', '.join(parts)} {when}{back}{instead}"
+    return f"{', '.join(parts)} {when.get(one.kind, date)}{back}{instead}"
 
 
 def verb(move: Move) -> str:
     """fell or rose; a negative effect weakened or grew stronger, because it has no plain direction."""
-    up = move.after > move.before
-    if max(move.before, move.after) < 0.0:
-        return "weakened" if up else "grew stronger"
-    return "rose" if up else "fell"
+    up, down = ("weakened", "grew stronger") if max(move.before, move.after) < 0.0 else ("rose", "fell")
+    return "wandered" if move.kind == "wandering" else up if move.after > move.before else down
 
 
 def structure_text(answer: Answer, shape: Shape) -> str:
@@ -136,27 +118,27 @@ def structure_text(answer: Answer, shape: Shape) -> str:
 
 def chosen(answer: Answer) -> list[str]:
     """What was chosen, and what came second."""
-    found, names, memory = answer.structure, answer.roles.inputs, answer.memory
-    root = ": perhaps a unit root" if memory.root else ""
-    said = [f"Chosen: {structure_text(answer, found.shape)} (lags in samples); sum of the lags of "
-            f"{answer.roles.output} {memory.value:.3f} +- {memory.std:.2g}{root}."]  # fmt: skip
-    for shape, behind, error in found.second[:1]:
-        said.append(f"Second: {structure_text(answer, shape)}, {behind:.1f} +- {error:.1f} nats behind.")
-    moving = {move.what for move in answer.moves}
+    found, names, memory, output = answer.structure, answer.roles.inputs, answer.memory, answer.roles.output
+    moving, root = {move.what for move in answer.moves}, ": perhaps a unit root" if memory.root else ""
     idle = [name for j, name in enumerate(names) if j not in found.lags]
     steady = [names[j] for j in sorted(found.lags) if moving and names[j] not in moving]
-    said += [f"{what}: {', '.join(which)}." for what, which in (("Constant", steady), ("Not needed", idle)) if which]
-    if found.forecast is not None:
-        other = structure_text(answer, found.forecast.shape)
-        said.append(f"An input at once explains {answer.roles.output} and does not forecast it. A forecast: {other}.")
-    return said
+    other = found.forecast and structure_text(answer, found.forecast.shape)
+    return [
+        f"Chosen: {structure_text(answer, found.shape)} (lags in samples); sum of the lags of {output} "
+        f"{memory.value:.3f} +- {memory.std:.2g}{root}.",
+        *(
+            f"Second: {structure_text(answer, shape)}, {b:.1f} +- {e:.1f} nats behind."
+            for shape, b, e in found.second[:1]
+        ),
+        *(f"{what}: {', '.join(which)}." for what, which in (("Constant", steady), ("Not needed", idle)) if which),
+        *([f"An input at once explains {output} and does not forecast it. A forecast: {other}."] if other else []),
+    ]
 
 
 def columns(answer: Answer) -> list[str]:
     """The roles, with the options that change them."""
     roles = answer.roles
-    step = duration(answer, 1) if roles.dated else f"{roles.step:g}"
-    clock = f"{roles.clock}, every {step} (--time, --dt)" if roles.clock else "none, rows are even (--time)"
+    clock = f"{roles.clock}, every {interval(roles)} (--time, --dt)" if roles.clock else "none, rows are even (--time)"
     said = [f"Output {roles.output} (--y); inputs {', '.join(roles.inputs) or 'none'} (--u, --not-u); time {clock}."]
     left = ", ".join(f"{name} ({why})" for name, why in roles.why.items())
     return [*said, f"Not inputs: {left}."] if left else said
@@ -180,13 +162,13 @@ def short(model: ARX) -> str:
 
 def interval(roles: Roles) -> str:
     """The interval as the option --dt."""
-    return str(roles.dt) if roles.dated else f"{roles.step:g}"
+    return roles.dt if isinstance(roles.dt, str) else f"{roles.dt:g}"
 
 
 def unit(answer: Answer) -> str:
     """The unit of a service, as TOML."""
     names = ", ".join(f'"{name}"' for name in answer.model.input_names)
-    dt = f'dt = "{answer.roles.dt}"\n' if answer.roles.dated else ""
+    dt = f'dt = "{answer.roles.dt}"\n' if isinstance(answer.roles.dt, str) else ""
     return (f'[[unit]]\nname = "{PurePath(answer.source).stem}"\ny = "{answer.roles.output}"\nu = [{names}]\n{dt}'
             f'model = "{answer.model!r}"\ntracker = "AdaptiveKalman()"\nalarm = {{ every = "1 week" }}\n')  # fmt: skip
 
@@ -201,25 +183,20 @@ def lines(answer: Answer) -> list[tuple[str, str]]:
     for steps, rms, _ in answer.errors:
         each = ", ".join(f"{name} {number(value)}" for name, value in rms.items() if name != "tracked")
         found.append(("", f"Error {steps} step{'' if steps == 1 else 's'} ahead: {each}"))
-    rest = [*chosen(answer), *columns(answer)]
-    rest += [
-        f"{head}: {'; '.join(said)}."
-        for head, said in (("Data", answer.notes), ("Not decided", answer.undecided))
-        if said
-    ]
-    found += [("", line) for text in rest for line in wrap(text, WIDTH - 1)]
+    rest = {"Data": answer.notes, "Not decided": answer.undecided}
+    said = [*chosen(answer), *columns(answer), *(f"{head}: {'; '.join(each)}." for head, each in rest.items() if each)]
+    found += [("", line) for text in said for line in wrap(text, WIDTH - 1)]
     return [(style, f" {line}") for style, line in found + [("dim", one) for one in commands(answer)]]
 
 
 def finite(value: Any) -> Any:
     """Plain data: lists, strings, numbers, and None for numbers that are not finite."""
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {str(key): finite(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
         return [finite(one) for one in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    return int(value) if isinstance(value, np.integer) else value
+    value = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def as_json(answer: Answer) -> dict[str, Any]:
@@ -227,7 +204,7 @@ def as_json(answer: Answer) -> dict[str, Any]:
     roles, structure = answer.roles, answer.structure
     second = [(structure_text(answer, shape), *behind) for shape, *behind in structure.second]
     inputs = {roles.inputs[j]: {"nb": nb, "nk": nk, "delays": structure.delays[j]} for j, nb, nk in structure.shape[1]}
-    shown = ("output", "inputs", "clock", "by", "step", "why", "refused", "missing")
+    shown = ("output", "inputs", "clock", "by", "dt", "why", "refused", "missing")
     found: dict[str, Any] = finite({
         "schema": NAME, "answer": answer.kind, "headline": headline(answer), "why": answer.why,
         "model": repr(answer.model), "p": answer.verdict.p, "roles": {name: getattr(roles, name) for name in shown},
@@ -246,19 +223,16 @@ def figure(answer: Answer) -> Figure:
     run, shown = answer.track, answer.model.input_names[:4]
     drawn, axes = panels(None, (9.5, 2.4 + 1.6 * max(len(shown), 1)), 1 + len(shown), sharex=True)
     draw_prediction(axes[0], run)
-    at = np.unique(np.linspace(settled(run).start, len(run) - 1, min(DRAWN, len(run))).astype(int))
-    value, std = run.dc_gain(at) if shown else (np.zeros((len(at), 0)),) * 2
-    for i, (axis, name) in enumerate(zip(axes[1:], shown, strict=True)):
-        low, high = value[:, i] - 1.96 * std[:, i], value[:, i] + 1.96 * std[:, i]
-        axis.fill_between(run.time[at], low, high, color=BLUE, alpha=0.2, lw=0)
-        axis.plot(run.time[at], value[:, i], color=BLUE, lw=1.3)
+    at = np.arange(settled(run).start, len(run), -(-len(run) // 200))
+    gains = zip(axes[1:], shown, *(x.T for x in run.dc_gain(at).band()), strict=False) if shown else ()
+    for axis, name, *band in gains:
+        axis.fill_between(run.time[at], *band, color=BLUE, alpha=0.2, lw=0)
+        axis.plot(run.time[at], np.mean(band, axis=0), color=BLUE, lw=1.3)
         axis.set_ylabel(f"effect of\n{name}")
         axis.grid(alpha=0.25, lw=0.5)
-        both = np.concatenate([low, high])
-        frame(axis, np.nanpercentile(both[np.isfinite(both)], (2.0, 98.0)) if np.isfinite(both).any() else both)
-        for move in answer.moves:
-            if move.what == name and move.kind != "wandering":
-                axis.axvline(run.time[move.at], color=RED, lw=1.0)
+        frame(axis, np.clip(band, *np.nanpercentile(band, (2.0, 98.0))))
+        for move in (one for one in answer.moves if one.what == name and one.kind != "wandering"):
+            axis.axvline(run.time[move.at], color=RED, lw=1.0)
     axes[-1].set_xlabel(time_label(run))
     for axis in axes:
         date_axis(axis, run)
@@ -269,9 +243,9 @@ def figure(answer: Answer) -> Figure:
 def html(answer: Answer) -> str:
     """The page."""
     heading = f"{answer.roles.output} from {', '.join(answer.model.input_names) or 'its own past'}"
-    subtitle = f"{answer.source}, {len(answer.track)} samples, answer: {answer.kind}"
-    first = [f"<h1>{escape(heading)}</h1>", f'<p class="soft">{escape(subtitle)}</p>', opening([headline(answer)])]
-    return document(heading, [*first, *body(answer)])
+    subtitle = escape(f"{answer.source}, {len(answer.track)} samples, answer: {answer.kind}")
+    first = f'<h1>{escape(heading)}</h1><p class="soft">{subtitle}</p>{opening([headline(answer)])}'
+    return document(heading, [first, *body(answer)])
 
 
 def body(answer: Answer) -> list[str]:
@@ -279,8 +253,10 @@ def body(answer: Answer) -> list[str]:
     cause, curve = answer.cause, ""
     leads = (f"{name} {one[0]:.1f} +- {one[1]:.1f}" for name, one in
              (("tracked parameters", cause.tracked), ("a curve", cause.curve), ("both", cause.joint)))  # fmt: skip
-    if answer.kind in KINDS[1:3]:
-        curve = f"<p>A model with that curve, fitted:</p><pre>{escape(answer.curve_call)}</pre>"
+    if answer.kind in KINDS[1:3] and answer.model.input_names:
+        signals = f"y={answer.roles.output!r}, u={list(answer.model.input_names)}, data=.."
+        call = f"track({answer.curve.model!r}, RLS(1.0), {signals})"
+        curve = f"<p>A model with that curve, fitted:</p><pre>{escape(call)}</pre>"
     copied = "".join(f"<pre>{escape(one)}</pre>" for one in (*commands(answer)[:2], unit(answer)))
     open_ = [*answer.undecided, f"{p_equals(answer.verdict.p)} is that of a test after a selection"]
     return [
@@ -309,15 +285,13 @@ def _effects(answer: Answer) -> str:
 
 
 def _errors(answer: Answer) -> str:
-    rows = []
+    heads, rows = tuple(answer.errors[0].rms), []
     for steps, rms, samples in answer.errors:
-        better = (
-            (f'<span class="bad">{value:.4g}</span>' if value < rms["driftfit"] else f"{value:.4g}")
-            for value in rms.values()
-        )
-        rows.append((f"{steps} ahead", *better, str(samples)))
+        style = {name: ' class="bad"' if value < rms["driftfit"] else "" for name, value in rms.items()}
+        cells = (f"<span{style[name]}>{rms[name]:.4g}</span>" if name in rms else "" for name in heads)
+        rows.append((f"{steps} ahead", *cells, str(samples)))
     caption = "Root mean square errors of predictions made before the sample, tracked and constants mixed. Red: lower."
-    return table(caption, ("", *answer.errors[0].rms, "samples"), rows)
+    return table(caption, ("", *heads, "samples"), rows)
 
 
 def many(verdict: ManyVerdicts, worst: Mapping[Any, Answer]) -> str:

@@ -114,24 +114,12 @@ class Answer(Printed):
         start = last if T - last > T // 4 else 3 * T // 4
         return self.track.detect("glr", reference=(self.track.time[start], self.track.time[T - 1]))
 
-    @property
-    def curve_model(self) -> HammersteinWiener:
-        """A Hammerstein-Wiener model with the curve of one input, or of all where it is of several."""
-        model, bent = self.model, self.cause.bent
-        curved = [bent < 0 or name == self.roles.inputs[bent] for name in model.input_names]
-        nb, nk = zip(*model.lags, strict=True)
-        bases = [Polynomial(3) if one else None for one in curved]
-        return HammersteinWiener(model.na, nb, nk, input=bases, inputs=model.input_names, intercept=True)
-
     @cached_property
     def curve(self) -> Track:
-        """The Hammerstein-Wiener model fitted to the record, with constants."""
-        fitted: Track = track(self.curve_model, RLS(1.0), **self.roles.signals(self.model.input_names))
+        """A Hammerstein-Wiener model with the curve of one input, or of all where it is of several, with constants."""
+        model, bent = self.model, self.cause.bent
+        bases = [Polynomial(3) if bent < 0 or name == self.roles.inputs[bent] else None for name in model.input_names]
+        nb, nk = zip(*model.lags, strict=True)
+        curved = HammersteinWiener(model.na, nb, nk, input=bases, inputs=model.input_names, intercept=True)
+        fitted: Track = track(curved, RLS(1.0), **self.roles.signals(model.input_names))
         return fitted
-
-    @property
-    def curve_call(self) -> str:
-        """The call that fits it."""
-        return (
-            f"track({self.curve_model!r}, RLS(1.0), y={self.roles.output!r}, u={list(self.model.input_names)}, data=..)"
-        )

@@ -1,15 +1,14 @@
-"""Scores of regressions from block Gram matrices: how well does each predict what comes next, whatever its memory?
+"""Scores of regressions from block Gram matrices: how well does each predict what it has not seen, whatever its memory?
 
 The record is cut into B blocks of rows z_t = (x_t, y_t) with Gram matrices G_b. A regression on the columns S predicts
 block b with coefficients from the other blocks, discounted by their distance, for each of several memories f:
 
-    C_b = sum_(i < b) lam^(b - i) G_i + ridge,   lam = exp(-1 / (f B)),   theta_b = C_b[S, S]^-1 C_b[S, y]
+    C_b = sum_(i != b) lam^|b - i| G_i + ridge,   lam = exp(-1 / (f B)),   theta_b = C_b[S, S]^-1 C_b[S, y]
     log p_b = -(n_b / 2) log(e_b / n_b + floor),   e_b the sum of squares of block b under theta_b
 
-In short records the blocks after b count, too. The memories are mixed with weights that are shared again at every block
-(Herbster and Warmuth, 1998), so that a coefficient that drifts does not hide its column. A quiet block cannot be
-predicted much better than the record: that is the floor. Cost: O(B p^2) memory, O(B k^2 p) for the scores of all p
-columns added to k.
+The memories are mixed with weights of which 1 / B is shared again at every block (Herbster and Warmuth, 1998), so that
+a coefficient that drifts does not hide its column. A quiet block cannot be predicted much better than the record: that
+is the floor. Cost: O(B p^2) memory, O(B k^2 p) for the scores of all p columns added to k.
 """
 
 from __future__ import annotations
@@ -22,13 +21,9 @@ from driftfit.engine.kernel import Array
 
 MEMORIES = (np.inf, 0.3, 0.1, 0.03)
 """Memories, as shares of the record."""
-SHARED = 0.05
-"""Share of the weights that is spread over all memories before each block."""
 RIDGE = 1e-3
 FLOOR = 0.3
 """The floor, as a share of the variance of the best regression known."""
-SHORT = 600
-"""Rows below which both sides of a block predict it."""
 FEWEST = 60
 """Rows that a record needs."""
 
@@ -48,19 +43,9 @@ class Scores:
         edges = np.linspace(0, N, B + 1).astype(int)
         self.count = np.diff(edges).astype(float)
         self.G = np.stack([Z[a:b].T @ Z[a:b] for a, b in itertools.pairwise(edges)])
-        both, ridge = N < SHORT, RIDGE * np.eye(self.p + 1)
-        kept = [f for f in memories if f * N >= FEWEST]
-        self.memories, self.past = kept, np.empty((len(kept), *self.G.shape))
-        for f, past in zip(kept, self.past, strict=True):
-            lam, total = np.exp(-1.0 / (f * B)), ridge.copy()
-            for b in range(B):
-                past[b] = total
-                total = lam * total + self.G[b] + (1.0 - lam) * ridge
-            total = np.zeros_like(ridge)
-            for b in range(B - 1, -1, -1) if both else ():
-                past[b] += total
-                total = lam * total + self.G[b]
-        self.burn = 0 if both else max(2, int(np.ceil(0.15 * B)))
+        apart = np.abs(np.subtract.outer(np.arange(B), np.arange(B)))
+        shares = (np.exp(-apart / (f * B)) * (apart > 0) for f in memories if f * N >= FEWEST)
+        self.rest = np.stack([np.tensordot(one, self.G, 1) for one in shares]) + RIDGE * np.eye(self.p + 1)
         self.floor = 0.0
 
     def refer(self, S: list[int]) -> float:
@@ -71,14 +56,14 @@ class Scores:
 
     def _fit(self, S: list[int]) -> tuple[Array, Array]:
         """(sums of squares (L, B), coefficients (L, B, k))."""
-        A, g = self.past[:, :, S][..., S], self.past[:, :, S, -1]
+        A, g = self.rest[:, :, S][..., S], self.rest[:, :, S, -1]
         theta = np.linalg.solve(A, g[..., None])[..., 0]
         cross = np.einsum("lbk,bk->lb", theta, self.G[:, S, -1])
         e = self.G[:, -1, -1] - 2.0 * cross + np.einsum("lbk,bkj,lbj->lb", theta, self.G[:, S][..., S], theta)
         return np.maximum(e, 1e-12), theta
 
     def _mixed(self, e: Array) -> Array:
-        """Log-likelihoods (B - burn, ...) of sums of squares (L, B, ...), the memories mixed."""
+        """Log-likelihoods (B, ...) of sums of squares (L, B, ...), the memories mixed."""
         count = self.count.reshape(-1, *[1] * (e.ndim - 2))
         each = -0.5 * count * np.log(np.maximum(e, 1e-12) / count + self.floor)
         weight, terms = np.full((len(e), *e.shape[2:]), 1.0 / len(e)), []
@@ -87,8 +72,8 @@ class Scores:
             joint = weight * np.exp(each[:, b] - top)
             total = joint.sum(axis=0)
             terms.append(top + np.log(total))
-            weight = (1.0 - SHARED) * joint / total + SHARED / len(e)
-        return np.stack(terms[self.burn :])
+            weight = (1.0 - 1.0 / len(count)) * joint / total + 1.0 / len(count) / len(e)
+        return np.stack(terms)
 
     def terms(self, S: list[int]) -> Array:
         """Log-likelihoods of the blocks of a regression."""
@@ -100,12 +85,12 @@ class Scores:
 
     def added(self, S: list[int]) -> Array:
         """(p,): the score of S with each column added; -inf for columns of S, and flat ones."""
-        p, G, own = self.p, self.G, self.past[:, :, S]
+        p, G, own = self.p, self.G, self.rest[:, :, S]
         W = np.linalg.solve(own[..., S], own[..., :p])  # regressions of all columns on S
         e, theta = self._fit(S)
-        left = np.einsum("lbpp->lbp", self.past)[..., :p] - np.einsum("lbkp,lbkp->lbp", own[..., :p], W)
-        top = self.past[..., :p, -1] - np.einsum("lbkp,lbk->lbp", W, own[..., -1])
-        alone = left > 1e-7 * (1.0 + np.einsum("lbpp->lbp", self.past)[..., :p])
+        left = np.einsum("lbpp->lbp", self.rest)[..., :p] - np.einsum("lbkp,lbkp->lbp", own[..., :p], W)
+        top = self.rest[..., :p, -1] - np.einsum("lbkp,lbk->lbp", W, own[..., -1])
+        alone = left > 1e-7 * (1.0 + np.einsum("lbpp->lbp", self.rest)[..., :p])
         c = np.where(alone, top / np.where(alone, left, 1.0), 0.0)
         GS, GSS = G[:, S, :p], G[:, S][..., S]
         rest = G[:, S, -1] - np.einsum("bkj,lbj->lbk", GSS, theta)

@@ -13,7 +13,7 @@ What is predicted is the present output: with nk = 0 an input explains it, but d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from time import monotonic
 
@@ -29,6 +29,8 @@ TIED = 2.0
 """Nats within which delays and inputs are said to be as good."""
 COPIES = 19
 OUTPUT_LAGS = 8
+COLUMNS = 250
+"""Columns that the search holds in memory: 80 blocks and four memories of them take a fifth of a gigabyte."""
 FILLED = 3
 """Missing readings in a row of a regressor that the search replaces by the last one."""
 
@@ -133,9 +135,9 @@ class Pool:
             found += [(na, (*rest, (i, 1, k))) for i, (_, k) in self.best_delays((na, rest)).items()]
         return [(na, tuple(sorted(inputs))) for na, inputs in found if self.fits((na, inputs))]
 
-    def climb(self, shape: Shape, late: Callable[[], bool]) -> Shape:
-        """The structure from which no step rises."""
-        while not late() and self.value(top := max(self.near(shape), key=self.value)) > self.value(shape):
+    def climb(self, shape: Shape, end: float) -> Shape:
+        """The structure from which no step rises; ``end``: the time (`time.monotonic`) at which it stops."""
+        while monotonic() < end and self.value(top := max(self.near(shape), key=self.value)) > self.value(shape):
             shape = top
         return shape
 
@@ -152,95 +154,70 @@ class Pool:
             shape = top
 
 
+def without(shape: Shape, left: tuple[int, ...]) -> Shape:
+    """A structure without some inputs."""
+    return shape[0], tuple(one for one in shape[1] if one[0] not in left)
+
+
 def search(y: Array, U: Array, M: int, first: int, end: float, rng: np.random.Generator) -> Structure:
     """The structure of a record on a regular grid; ``end``: the time (`time.monotonic`) at which the search stops."""
     M, narrowed = _affordable(y, U, M)
     pool = Pool(y, U, M, first)
-    out_of_time = False
-
-    def late() -> bool:
-        nonlocal out_of_time
-        out_of_time |= monotonic() > end
-        return out_of_time
-
-    shape: Shape = (2, ())
+    starts: list[Shape] = [(2, ()), (0, ())]
     for _ in range(3):  # the floor is that of the best structure
-        before = pool.scores.refer(pool.columns(shape))
+        pool.scores.refer(pool.columns(starts[0]))
         pool.shapes.clear()
-        starts = dict.fromkeys([shape, (2, ()), (0, ())])
-        shape = max((pool.climb(one, late) for one in starts), key=pool.value)
-        if late() or abs(np.log(pool.scores.refer(pool.columns(shape)) / before)) < 0.05:
-            break
-    shape = pool.simplest(shape)
-    doubtful = tuple(j for j, _, _ in shape[1] if not late() and not _beats_copies(y, U, shape, j, M, rng))
+        starts = [max((pool.climb(one, end) for one in starts), key=pool.value)]
+    shape = pool.simplest(starts[0])
+    doubtful = tuple(j for j, _, _ in shape[1] if monotonic() < end and not _beats_copies(y, U, shape, j, rng))
     if doubtful:  # the others may need other lags without them
-        for climbed in (False, True):
-            shape = pool.climb(shape, late) if climbed else shape
-            shape = shape[0], tuple(one for one in shape[1] if one[0] not in doubtful)
-    narrowed = "; ".join(filter(None, (narrowed, "the budget of time ended the search" if late() else "")))
+        shape = without(pool.climb(without(shape, doubtful), end), doubtful)
+    narrowed = "; ".join(filter(None, (narrowed, "the budget of time ended the search" if monotonic() > end else "")))
     return _told(pool, shape, doubtful, narrowed)
 
 
 def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], narrowed: str) -> Structure:
     """A structure with its rivals."""
-    own = pool.scores.terms(pool.columns(shape))
-
-    def behind(other: Shape) -> tuple[float, float]:
-        return lead(own, pool.scores.terms(pool.columns(other)))
-
-    delays, instead = {}, []
-    for one in shape[1]:
-        j, nb, nk = one
-        rest = tuple(other for other in shape[1] if other != one)
-        tied = [nk]
+    own, (na, inputs) = pool.scores.terms(pool.columns(shape)), shape
+    base, delays, instead = float(own.sum()), {}, []
+    for j, nb, nk in inputs:
+        rest, ends = without(shape, (j,))[1], []
         for step in (-1, 1):
-            k = nk + step
-            while pool.fits(shifted := (shape[0], (*rest, (j, nb, k)))) and behind(shifted)[0] < TIED:
-                tied.append(k)
+            k = nk
+            while (
+                pool.fits(near := (na, (*rest, (j, nb, k + step))))
+                and base - pool.scores.score(pool.columns(near)) < TIED
+            ):
                 k += step
-        delays[j] = min(tied), max(tied)
-        base = float(own.sum())
-        others = pool.best_delays((shape[0], rest)).items()
-        instead += [(j, i) for i, (score, _) in others if i != j and base - score < TIED]
+            ends.append(k)
+        delays[j] = ends[0], ends[1]
+        instead += [(j, i) for i, (score, _) in pool.best_delays((na, rest)).items() if i != j and base - score < TIED]
     rivals = sorted((one for one in pool.shapes if one != shape), key=pool.value, reverse=True)
-    second = tuple((one, *behind(one)) for one in rivals[:3])
-    lags = {j: (nb, nk) for j, nb, nk in shape[1]}
-    return Structure(shape[0], lags, delays, second, doubtful, tuple(instead), narrowed=narrowed)
-
-
-COLUMNS = 250
-"""Columns that the search holds in memory: 80 blocks and four memories of them take a fifth of a gigabyte."""
+    second = tuple((one, *lead(own, pool.scores.terms(pool.columns(one)))) for one in rivals[:3])
+    lags = {j: (nb, nk) for j, nb, nk in inputs}
+    return Structure(na, lags, delays, second, doubtful, tuple(instead), narrowed=narrowed)
 
 
 def _affordable(y: Array, U: Array, M: int) -> tuple[int, str]:
     """The longest lag that memory and record allow, and what is said of it: half of the rows must have all lags."""
-    most = max(1, min(M, len(y) // 10, COLUMNS // max(U.shape[1], 1) - 1))
-    known, reading = np.isfinite(np.column_stack([filled(x) for x in (y, *U.T)])).all(axis=1), np.isfinite(y)
-    while most > 1 and 2 * np.sum(_in_a_row(known, most) & reading) < np.sum(_in_a_row(known, 1) & reading):
-        most -= 1
+    t, known = np.arange(len(y)), np.isfinite(np.column_stack([filled(x) for x in (y, *U.T)])).all(axis=1)
+    run = (t - np.maximum.accumulate(np.where(known, -1, t)))[np.isfinite(y)]  # known samples in a row
+    half = int(np.median(run[run > 1])) - 1 if (run > 1).any() else 1
+    most = max(1, min(M, len(y) // 10, COLUMNS // max(U.shape[1], 1) - 1, half))
     return most, f"lags of inputs up to {most} instead of {M}" if most < M else ""
 
 
-def _in_a_row(known: Array, k: int) -> Array:
-    """Where the last k and the present sample are known."""
-    total = np.cumsum(np.concatenate([np.zeros(k + 1), known]))
-    return np.asarray(total[k + 1 :] - total[: -k - 1] > k) & known if k else known
-
-
-def _beats_copies(y: Array, U: Array, shape: Shape, j: int, M: int, rng: np.random.Generator) -> bool:
+def _beats_copies(y: Array, U: Array, shape: Shape, j: int, rng: np.random.Generator) -> bool:
     """Whether an input is more useful than copies of itself at other times, each at the best of several delays."""
-    others = tuple(one for one in shape[1] if one[0] != j)
-    used = [j, *(one[0] for one in others)]
-    x, T = filled(U[:, j]), len(y)
-    x = np.where(np.isfinite(x), x, np.nanmean(x))
-    both, copies = np.concatenate([x, x[::-1]]), []
+    own, used, T = next(one for one in shape[1] if one[0] == j), [one[0] for one in shape[1]], len(y)
+    x = filled(U[:, j])
+    x, copies = np.where(np.isfinite(x), x, np.nanmean(x)), []
     for k in range(COPIES):
-        moved = np.roll(both, int(rng.integers(T // 10, T - T // 10)))[:T][:: 1 if k % 2 else -1]
+        moved = np.roll([x, x[::-1]], int(rng.integers(T // 10, T - T // 10)))[0][:: 1 if k % 2 else -1]
         copies += [np.roll(moved, lag) for lag in range(0, 24, 3)]
     depth = max(nb + nk - 1 for _, nb, nk in shape[1])
     pool = Pool(y, U[:, used], max(depth, 1), na=max(shape[0], 1), more=np.column_stack(copies))
-    base = pool.columns((shape[0], tuple((used.index(i), nb, nk) for i, nb, nk in others)))
+    base = pool.columns((shape[0], tuple((used.index(i), nb, nk) for i, nb, nk in without(shape, (j,))[1])))
     pool.scores.refer(base)
-    own = next(one for one in shape[1] if one[0] == j)
-    with_it = pool.scores.score([*base, *(pool.place[0, k] for k in range(own[2], own[2] + own[1]))])
-    return bool(with_it > pool.scores.added(base)[-len(copies) :].max())
+    with_it = [*base, *(pool.place[used.index(j), k] for k in range(own[2], own[2] + own[1]))]
+    return bool(pool.scores.score(with_it) > pool.scores.added(base)[-len(copies) :].max())

@@ -9,8 +9,8 @@ Four regressions predict the record, each block from those that its memory holds
 
 z_i are regressors times signals, x w, and hinges, (x - q)+ and x (w - q)+, at quartiles q. The signals w are the
 inputs, chosen or not, the last output, and the mean of the last twenty. They are added one by one while the score rises
-by more than the logarithm of their number. A curve that the plant passes through once cannot be told from time: both
-then predict as well.
+by more than one nat and the logarithm of their number. A curve that the plant passes through once cannot be told from
+time: both then predict as well.
 """
 
 from __future__ import annotations
@@ -23,117 +23,80 @@ from driftfit.engine.kernel import Array
 from driftfit.identify.scores import MEMORIES, Scores, lead
 from driftfit.identify.structure import Structure, filled, lagged
 
-PRODUCTS = 5
-"""Products that a curve may have."""
 SLOW = 20
 """Samples in the mean of the last outputs."""
 CLEAR = 3.0
-"""Nats, and `ERRORS` standard errors, by which one description must lead another."""
-ERRORS = 2.0
+"""Nats by which one description must lead another: -log of a level of 5 %."""
 
 Lead = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Cause:
-    """What explains the record: ``kind`` is "", "time", "working point" or "both".
+    """What explains the record: leads over constants in nats, less the logarithm of the number of products for each
+    that is used, with their standard errors.
 
-    Leads over constants in nats with their standard errors: ``tracked``, ``curve``, ``joint``; ``besides``: the lead of
-    both over the curve alone; ``further``: over time alone. ``products``: what the curve is made of, in words.
-    ``bent``: the input of which the curve is a static one, or -1.
+    ``products``: what the curve is made of, in words; none where no curve leads. ``bent``: the input of which it is a
+    static curve, or -1.
     """
 
-    kind: str
     tracked: Lead
     curve: Lead
     joint: Lead
-    besides: Lead
-    further: Lead
     products: tuple[str, ...]
     bent: int
     columns: Array
-    """(T, k): the products on the grid."""
+    """(N, k): the products."""
+
+    def kind(self, moves: bool) -> str:
+        """ "time", "working point", "both" or "": ``moves`` is whether constants, with the curve, are rejected."""
+        if not self.products:
+            return "time" if moves else ""
+        if not moves:
+            return "working point" if self.joint[0] - self.curve[0] <= CLEAR else "time"
+        return "both" if self.joint[0] - self.tracked[0] > CLEAR else "time"
 
 
-def clear(one: Lead) -> bool:
-    """Whether a lead is more than chance."""
-    return one[0] > max(CLEAR, ERRORS * one[1])
-
-
-def regressors(y: Array, U: Array, structure: Structure) -> Array:
-    """phi (T, n) of a structure on the grid, the constant first."""
-    past = [lagged(filled(y), k) for k in range(1, structure.na + 1)]
-    drive = [lagged(filled(U[:, j]), k) for j, nb, nk in structure.shape[1] for k in range(nk, nk + nb)]
-    return np.column_stack([np.ones(len(y)), *past, *drive])
-
-
-def cause(y: Array, U: Array, structure: Structure, names: tuple[str, ...], output: str, first: int) -> Cause:
-    """Compare the four descriptions of a record on a regular grid."""
-    phi = regressors(y, U, structure)
-    Z, made = _products(y, U, structure, names, output, first)
-    X = np.column_stack([phi, Z])
-    rows = np.isfinite(X).all(axis=1) & np.isfinite(y)
-    base = list(range(phi.shape[1]))
+def cause(phi: Array, y: Array, Z: Array, made: list[tuple[str, int]]) -> Cause:
+    """Compare the four descriptions of y (N,) on phi (N, n), the constant last, and `products` Z (N, q)."""
+    X = np.column_stack([phi[:, -1], phi[:, :-1], Z])
+    rows, base = np.isfinite(X).all(axis=1), list(range(phi.shape[1]))
     steady, moving = (Scores(X[rows], y[rows], memories) for memories in (MEMORIES[:1], MEMORIES))
-    steady.floor = moving.floor = moving.refer(base) and moving.floor
-    bent, jointly = _chosen(steady, base), _chosen(moving, base)
-    constants, tracked = steady.terms(base), moving.terms(base)
-    curve = steady.terms(bent)
-    joint = max((moving.terms(one) for one in (bent, jointly)), key=np.sum)
-    leads = lead(tracked, constants), lead(curve, constants), lead(joint, constants)
-    besides, further = lead(joint, curve), lead(joint, tracked)
-    bends = clear(leads[1])
-    kind = ""
-    if bends and not clear(besides):
-        kind = "working point"
-    elif bends and clear(further) and clear(leads[0]):
-        kind = "both"
-    elif clear(leads[0]):
-        kind = "time"
-    chosen = [one - len(base) for one in bent[len(base) :]]
+    moving.refer(base)
+    steady.floor = moving.floor
+    price, bent = float(np.log(max(len(made), 1))), list(base)
+    while len(bent) < X.shape[1] and (added := steady.added(bent)).max() > steady.score(bent) + price + 1.0:
+        bent.append(int(np.argmax(added)))
+    constants, chosen = steady.terms(base), [one - len(base) for one in bent[len(base) :]]
+    (curve, one), (joint, other) = (lead(scores.terms(bent), constants) for scores in (steady, moving))
+    price *= len(chosen)
+    leads = lead(moving.terms(base), constants), (curve - price, one), (joint - price, other)
     own = {made[one][1] for one in chosen}
-    return Cause(
-        kind, *leads, besides, further, tuple(dict.fromkeys(made[one][0] for one in chosen)),
-        own.pop() if len(own) == 1 else -1, Z[:, chosen],
-    )  # fmt: skip
+    words = tuple(dict.fromkeys(made[one][0] for one in chosen))
+    return Cause(*leads, words, own.pop() if len(own) == 1 else -1, Z[:, chosen])
 
 
-def _chosen(scores: Scores, base: list[int]) -> list[int]:
-    """The columns and the products that a curve needs."""
-    chosen, score = list(base), scores.score(base)
-    price = np.log(max(scores.p - len(base), 1)) + 1.0
-    for _ in range(PRODUCTS):
-        added = scores.added(chosen)
-        best = int(np.argmax(added))
-        if not added[best] > score + price:
-            break
-        chosen.append(best)
-        score = float(added[best])
-    return chosen
-
-
-def _products(
+def products(
     y: Array, U: Array, structure: Structure, names: tuple[str, ...], output: str, first: int
 ) -> tuple[Array, list[tuple[str, int]]]:
-    """(T, q) products, and for each of them words and the input that is bent, -1 if a product is of two signals."""
+    """(T, q) products of signals on a grid; for each words and the input that is bent, -1 for one of two signals."""
     past, inputs = filled(y), [filled(u) for u in U.T]
-    total = np.cumsum(np.concatenate([[0.0], np.where(np.isfinite(past), past, np.nanmean(past))]))
-    slow = np.full(len(y), np.nan)
-    slow[SLOW:] = (total[SLOW:-1] - total[: -SLOW - 1]) / SLOW
-    signals = [(f"{output}, the last", lagged(past, 1)), (f"the level of {output}", slow)]
+    slow = np.convolve(np.where(np.isfinite(past), past, np.nanmean(past)), np.full(SLOW, 1.0 / SLOW))[: len(y)]
+    slow[: SLOW - 1] = np.nan
+    signals = [(f"{output}, the last", lagged(past, 1)), (f"the level of {output}", lagged(slow, 1))]
     signals += [(names[i], lagged(x, first)) for i, x in enumerate(inputs)]
     xs = [(names[j], j, lagged(inputs[j], k)) for j, nb, nk in structure.shape[1] for k in range(nk, nk + nb)]
-    if structure.na:
-        xs.append((output, -1, lagged(past, 1)))
-    columns, made = [], []
-    for name, j, x in xs:
-        for q in np.nanquantile(x, (0.25, 0.5, 0.75)):
-            columns.append(np.maximum(x - q, 0.0))
-            made.append((f"a bend of {name} at {q:.3g}", j))
-        for other, w in signals:
-            if np.array_equal(w, x, equal_nan=True):
-                continue
-            middle = np.nanmedian(w)
-            columns += [x * (w - middle), x * np.maximum(w - middle, 0.0)]
-            made += [(f"{name} times {other}", -1)] * 2
-    return (np.column_stack(columns) if columns else np.zeros((len(y), 0))), made
+    xs += [(output, -1, lagged(past, 1))] if structure.na else []
+    made = [
+        (f"a bend of {name} at {q:.3g}", j, np.maximum(x - q, 0.0))
+        for name, j, x in xs
+        for q in np.nanquantile(x, (0.25, 0.5, 0.75))
+    ]
+    made += [
+        (f"{name} times {other}", -1, x * bend)
+        for name, _, x in xs
+        for other, w in signals
+        for bend in (w - np.nanmedian(w), np.maximum(w - np.nanmedian(w), 0.0))
+        if not np.array_equal(w, x, equal_nan=True)
+    ]
+    return np.stack([np.zeros(len(y)), *(z for *_, z in made)], axis=1)[:, 1:], [(text, j) for text, j, _ in made]

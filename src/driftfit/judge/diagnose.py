@@ -8,7 +8,7 @@ With z = e / s, innovations over their standard deviation, after the first max(5
     steady noise      the same, largest over smallest of ten parts of the record                at most 3
     outliers          share of |z| > 4                                                          at most 0.2 %
     symmetry          skewness of z clipped at 4                                                -0.5 to 0.5
-    excitation        largest condition index of a window (`driftfit.judge.excitation`)        at most 100
+    excitation        largest condition index of a window (`driftfit.judge.regressors.excitation`)        at most 100
     constancy         joint p-value of constant coefficients (`driftfit.judge.changes`)                   see below
 
 Constancy is out of bounds if the record and the tracker disagree: the coefficients move but the tracker holds them
@@ -33,8 +33,8 @@ from rich.text import Text
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.judge.evidence import Evidence
-from driftfit.judge.excitation import INDEX, Excitation, excitation
 from driftfit.judge.plots import Health, draw_diagnosis
+from driftfit.judge.regressors import INDEX, Excitation, excitation
 from driftfit.judge.statistics.paired import paired
 from driftfit.judge.statistics.robust import core
 from driftfit.judge.statistics.whiteness import Whiteness, crossing, whiteness
@@ -135,8 +135,7 @@ class Diagnosis(Printed):
         """
         z, white = standardised(self.run)
         known = Evidence(self.run)
-        parts = (self.run, z, white, excitation(known.rows.phi), known.changes, known.rows, known.tested, known.names)
-        return draw_diagnosis(Health(*parts, lambda name: self[name].ok), ax)
+        return draw_diagnosis(Health(known, z, white, excitation(known.rows.phi), lambda name: self[name].ok), ax)
 
 
 def diagnose(run: Track) -> Diagnosis:

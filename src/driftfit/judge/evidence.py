@@ -14,7 +14,7 @@ from driftfit.judge.changes.dates import LEVEL
 from driftfit.judge.compare import Errors, errors
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.judge.regressors import Distinct, Rows, judged_by_others, regressors
-from driftfit.judge.statistics.parts.coarse_readings import drawn_within
+from driftfit.judge.statistics.coarse_readings import drawn_within
 from driftfit.judge.statistics.robust import fit_in, noisy, orthonormal, sole
 from driftfit.run.result import Track
 
@@ -63,13 +63,14 @@ class Evidence:
         return self.run.used_record
 
     @cached_property
-    def _steady(self) -> Array:
+    def steady(self) -> Array:
+        """Recursive least squares on the regressors of the run."""
         return constant_least_squares(self.run.model, self._record)
 
     @cached_property
     def rows(self) -> Rows:
         """The record as samples of a regression."""
-        return regressors(self.run, self._steady)
+        return regressors(self.run, self.steady)
 
     @cached_property
     def _found(self) -> tuple[Distinct, Rows, Changes | None]:
@@ -112,4 +113,4 @@ class Evidence:
     @cached_property
     def errors(self) -> Errors:
         """One-step errors of the run and of simpler predictors."""
-        return errors(self.run, self._record, self.burn, self._steady)
+        return errors(self.run, self._record, self.burn, self.steady)

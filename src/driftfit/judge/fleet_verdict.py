@@ -22,9 +22,9 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.cores.on_all_cores import on_all_cores
 from driftfit.judge.diagnose import Diagnosis, diagnose, diagnosis
 from driftfit.judge.evidence import Evidence
+from driftfit.judge.on_all_cores import on_all_cores
 from driftfit.judge.verdict import Verdict, change, judged, p_text, verdict
 from driftfit.run.keyed_results import table_by_key
 from driftfit.show.text import Printed, key_text, table_of

@@ -9,9 +9,8 @@ import numpy as np
 import scipy
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.changes import Changes
-from driftfit.judge.excitation import Excitation
-from driftfit.judge.regressors import Rows
+from driftfit.judge.evidence import Evidence
+from driftfit.judge.regressors import Excitation
 from driftfit.judge.statistics.whiteness import Whiteness
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.result import Track
@@ -27,20 +26,12 @@ BRIDGE = 1.36
 
 
 class Health(NamedTuple):
-    """The quantities that a diagnosis examines.
+    """What a diagnosis examines; ``fine`` maps the names of checks to whether they are within their limits."""
 
-    ``tested`` are the rows and ``names`` of the parameters that the test of constancy tells apart, and ``fine`` maps
-    the names of checks to whether they are within their limits.
-    """
-
-    run: Track
+    known: Evidence
     z: Array
     white: Whiteness
     excited: Excitation
-    changes: Changes | None
-    rows: Rows
-    tested: Rows
-    names: tuple[str, ...]
     fine: Callable[[str], bool]
 
 
@@ -50,10 +41,10 @@ def draw_diagnosis(diagnosis: Health, ax: Any = None) -> Figure:
     for draw, axis in zip((_innovations, _correlations, _levels, _quantiles, _excitation, _paths), axes, strict=True):
         draw(axis, diagnosis)
     for axis in (*axes[::2], axes[5]):
-        axis.set_xlabel(time_label(diagnosis.run))
-        date_axis(axis, diagnosis.run)
-        if len(diagnosis.run) > 1 and not np.isfinite(axis.dataLim.intervalx).all():  # nothing is known
-            axis.set_xlim(diagnosis.run.time[0], diagnosis.run.time[-1])
+        axis.set_xlabel(time_label(diagnosis.known.run))
+        date_axis(axis, diagnosis.known.run)
+        if len(diagnosis.known.run) > 1 and not np.isfinite(axis.dataLim.intervalx).all():  # nothing is known
+            axis.set_xlim(diagnosis.known.run.time[0], diagnosis.known.run.time[-1])
     return figure
 
 
@@ -64,7 +55,7 @@ def _titled(axis: Axes, title: str, ok: bool) -> None:
 
 
 def _innovations(axis: Axes, diagnosis: Health) -> None:
-    axis.plot(diagnosis.run.time, diagnosis.z, ls="", marker=".", ms=2.5, color=BLUE)
+    axis.plot(diagnosis.known.run.time, diagnosis.z, ls="", marker=".", ms=2.5, color=BLUE)
     for limit in (-1.96, 1.96):
         axis.axhline(limit, color=GREY, lw=0.8, ls="--")
     shown = np.abs(diagnosis.z[np.isfinite(diagnosis.z)])
@@ -91,7 +82,10 @@ def _levels(axis: Axes, diagnosis: Health) -> None:
         square = np.minimum(diagnosis.z[known] ** 2, 16.0)
         total = np.concatenate([[0.0], np.cumsum(square)])
         axis.plot(
-            diagnosis.run.time[known[window - 1 :]], (total[window:] - total[:-window]) / window, color=BLUE, lw=1.1
+            diagnosis.known.run.time[known[window - 1 :]],
+            (total[window:] - total[:-window]) / window,
+            color=BLUE,
+            lw=1.1,
         )
         half = 1.96 * np.sqrt(2.0 / window)
         axis.axhspan(max(1.0 - half, 0.0), 1.0 + half, color=GREY, alpha=0.25, lw=0)
@@ -113,7 +107,7 @@ def _quantiles(axis: Axes, diagnosis: Health) -> None:
 def _excitation(axis: Axes, diagnosis: Health) -> None:
     excited = diagnosis.excited
     if len(excited.at):
-        time = diagnosis.run.time[diagnosis.rows.at[excited.at]]
+        time = diagnosis.known.run.time[diagnosis.known.rows.at[excited.at]]
         values = np.maximum(excited.eigenvalues, 1e-12)
         for i in range(values.shape[1]):
             last = i in (0, values.shape[1] - 1)
@@ -127,11 +121,11 @@ def _excitation(axis: Axes, diagnosis: Health) -> None:
 
 def _paths(axis: Axes, diagnosis: Health) -> None:
     """Sums of scores of each parameter, a Brownian bridge if it is constant, and what 5 % of these leave."""
-    if diagnosis.changes is not None:
-        path = diagnosis.changes.scores
-        for i, name in enumerate(diagnosis.names):
+    if diagnosis.known.changes is not None:
+        path = diagnosis.known.changes.scores
+        for i, name in enumerate(diagnosis.known.names):
             colour = COLOURS[i % len(COLOURS)]
-            axis.plot(diagnosis.run.time[diagnosis.tested.at], path[:, i], lw=1.1, color=colour, label=name)
+            axis.plot(diagnosis.known.run.time[diagnosis.known.tested.at], path[:, i], lw=1.1, color=colour, label=name)
         axis.axhspan(-BRIDGE, BRIDGE, color=GREY, alpha=0.2, lw=0)
         if path.shape[1] <= 8:
             axis.legend(fontsize=7, ncols=2, frameon=False)

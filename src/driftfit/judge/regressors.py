@@ -1,4 +1,4 @@
-"""The regression behind a run, and which of its columns a test can tell apart."""
+"""The regression behind a run, which of its columns a test can tell apart, and how well windows of it do."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.judge.changes.null import Lags
 from driftfit.judge.constant_fit import constant_least_squares
-from driftfit.judge.statistics.parts.coarse_readings import step_of
+from driftfit.judge.statistics.coarse_readings import step_of
 from driftfit.judge.statistics.robust import orthonormal, sole
 from driftfit.models.base import Model
-from driftfit.run.result import Track
+from driftfit.run.result import Track, burn_in
+from driftfit.smooth.parts.rank import column_sizes
 
 
 class Rows(NamedTuple):
@@ -137,3 +138,48 @@ def earlier_outputs(run: Track, at: Array, phi: Array, y: Array, root: Array) ->
     if not columns:
         return None
     return Lags(np.array(columns), np.stack(source, axis=1), np.stack(ratio, axis=1))
+
+
+INDEX = 100.0
+"""Limit of the condition index. Belsley, Kuh and Welsch call dependence moderate to strong from 30; beyond this limit
+the parameters of a window are determined by earlier samples.
+"""
+
+
+class Excitation(NamedTuple):
+    """Windows of W samples, half overlapping."""
+
+    at: Array
+    """(w,): index of the last sample of each window, among the samples used."""
+    eigenvalues: Array
+    """(w, n) ascending."""
+    direction: Array
+    """(n,): the scaled combination of parameters that the worst window determines least."""
+
+    @property
+    def condition(self) -> Array:
+        """(w,): condition index of each window; inf where a direction is not excited at all."""
+        low, high = self.eigenvalues[:, 0], self.eigenvalues[:, -1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            condition: Array = np.sqrt(high / np.maximum(low, 0.0))
+        return np.where(high > 0.0, condition, np.inf)
+
+
+def excitation(phi: Array, window: int | None = None) -> Excitation:
+    """Whether regressors phi (N, n) distinguish the parameters in a window, of max(50, 5 n) samples unless it is given.
+
+        R_w = (1 / W) sum over a window of psi_t psi_t',     psi_ti = phi_ti / rms of regressor i over the record
+
+    The smallest eigenvalue of R_w over the largest is the reciprocal of the squared condition index of Belsley, Kuh and
+    Welsch (1980). Scaling makes it independent of units, and it is small in a window in which an input is constant.
+    """
+    N, n = phi.shape
+    W = burn_in(n) if window is None else window
+    ends = np.arange(W, N + 1, max(W // 2, 1))
+    if not len(ends):
+        return Excitation(np.zeros(0, int), np.zeros((0, n)), np.full(n, np.nan))
+    scaled = phi / column_sizes(phi)
+    R = np.array([scaled[end - W : end].T @ scaled[end - W : end] / W for end in ends])
+    values, vectors = np.linalg.eigh(R)
+    found = Excitation(ends - 1, np.maximum(values, 0.0), vectors[0, :, 0])
+    return found._replace(direction=vectors[int(np.argmax(found.condition)), :, 0])

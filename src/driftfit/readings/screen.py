@@ -2,7 +2,8 @@
 
 `screen` is one vectorised look at a signal of all series. Where it and `suspect` find something, `Review` runs the
 gate's step over the finished record, with the forecasts and variances of that run, and lists what a gate would have
-refused. A run that was spoilt by one code may say little of later ones.
+refused. A run that was spoilt by one code may say little of later ones. Before there is a run, `apart` finds codes in a
+complete record.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ SUSPECT = 30.0
 """Usual distances from the median beyond which a value may be a code."""
 FEWEST = 20
 """Values that a usual distance needs."""
+GAP = 3.0
+"""Ranges of all other values by which a fault code of a complete record is apart from them."""
 SAMPLED = 64
 """Values of a series that a first look takes for its usual ones."""
 
@@ -35,6 +38,19 @@ def suspect(signal: Array) -> Array:
     moving = away[away > 0.0]
     limit = SUSPECT * float(np.median(moving)) if len(moving) >= FEWEST else 0.0
     return np.asarray(away > limit)
+
+
+def apart(signal: Array) -> Array:
+    """Which values (T,) of a record are `suspect`, and each beyond a gap of `GAP` times the range of all before it."""
+    usual, found = np.isfinite(signal) & ~suspect(signal), np.zeros(len(signal), bool)
+    if not usual.any() or not np.ptp(signal[usual]) > 0.0:
+        return found
+    for side in (signal, -signal):
+        value = np.unique(side[side >= side[usual].max()])
+        wide = np.diff(value) > GAP * (value[:-1] - side[usual].min())
+        alone = int(np.logical_and.accumulate(wide[::-1]).sum())  # a cluster of values is no code
+        found |= side >= (value[-alone] if alone else np.inf)
+    return found
 
 
 def screen(signal: Array, first: Array, length: Array) -> Array:

@@ -53,7 +53,7 @@ def smooth(walk: Walk, keep: str = "fit", rebuild: Callable[[], Walk] | None = N
     if found is None:
         walk = rebuild() if simple and rebuild is not None else walk
         found = safely(walk, scale, unseen, keep)
-    return spread(walk, found)._replace(rank=rank)
+    return spread(walk, found._replace(rank=rank))
 
 
 def safely(walk: Walk, scale: Array, unseen: Array, keep: str) -> Path:
@@ -63,13 +63,24 @@ def safely(walk: Walk, scale: Array, unseen: Array, keep: str) -> Path:
 
 
 def spread(walk: Walk, path: Path) -> Path:
-    """The path with the variance between the paths under all drifts that are possible."""
+    """The path, or that of the mixture, with the variance between the paths under all drifts that are possible."""
+    if walk.mixture is not None:
+        path = mixed(walk, path)
     if not len(walk.paths):
         return path
     away = np.sqrt(walk.belief)[:, None, None] * (walk.paths - path.theta)
     cov = path.cov + np.einsum("kti,ktj->tij", away, away) if len(path.cov) else path.cov
     lag = path.lag_cov + np.einsum("kti,ktj->tij", away[:, :-1], away[:, 1:]) if len(path.lag_cov) else path.lag_cov
     return path._replace(var=path.var + np.sum(away**2, axis=0), cov=cov, lag_cov=lag)
+
+
+def mixed(walk: Walk, path: Path) -> Path:
+    """The path with the moments of the mixture; leverages stay those of one Gaussian."""
+    cov = walk.mixture.cov
+    var = np.where(np.isinf(path.var), np.inf, np.einsum("tii->ti", cov))
+    path = path._replace(theta=walk.mixture.theta.copy(), var=var, cov=cov if len(path.cov) else path.cov)
+    error = np.sqrt(np.where(walk.weight > 0.0, walk.weight, np.nan)) * walk.residual(path.theta)
+    return path._replace(rho=error / np.where(path.c > 0.0, path.c, 1.0) if len(path.c) else path.rho)
 
 
 def turned(walk: Walk, keep: str) -> Path:

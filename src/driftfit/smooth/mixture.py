@@ -130,6 +130,15 @@ class Mixture(NamedTuple):
         """(T,) bool: whether the evidence differs from that of the next sample, so that a hypothesis was lost."""
         return np.append(np.abs(np.diff(self.evidence)) > CONSTANT, False)
 
+    @property
+    def needed(self) -> Array:
+        """(T,): how many components the next smoother of the record should be allowed."""
+        more = self.kept.copy()
+        for t in np.flatnonzero(self.uneven):
+            near = slice(max(t - NEAR, 0), t + NEAR)
+            more[near] = np.minimum(4 * self.kept[near], MOST)
+        return more
+
 
 class Samples(NamedTuple):
     """A block of samples for a pass, and the moves before them, or after them backwards."""
@@ -246,7 +255,7 @@ def meet(
                 c -= 0.5 * e * e
                 if c - ahead < top - UNLIKELY:
                     break
-            c -= log_det(W)
+            c -= max(log_det(W), ahead)  # of a pair that is given up, W lacks rows
             if c < top - UNLIKELY:
                 continue
             w = np.exp(c - top)
@@ -322,18 +331,18 @@ def smooth(problem: Problem, covariances: bool = False, kept: Array | None = Non
 
     ``kept`` (T,) says how many components another smoother of the record needed, with which this one begins.
 
-    Where the evidence is not constant, twice as many components are allowed, up to `MOST`; see `Mixture.uneven`.
+    Where the evidence is not constant, more components are allowed, up to `MOST`; see `Mixture.needed`.
     """
-    keep = np.full(len(problem.y), ROOMY) if kept is None else kept
+    return refined(Passes(problem, np.full(len(problem.y), ROOMY) if kept is None else kept), covariances)
+
+
+def refined(passes: Passes, covariances: bool) -> Mixture:
+    """The same from passes that begin, of which the filter may be done."""
     while True:
-        found = Passes(problem, keep).smoothed(covariances)
-        more = keep.copy()
-        for t in np.flatnonzero(found.uneven):
-            near = slice(max(t - NEAR, 0), t + NEAR)
-            more[near] = np.minimum(2 * keep[near], MOST)
-        if np.array_equal(more, keep):
+        found = passes.smoothed(covariances)
+        if np.array_equal(found.needed, found.kept):
             return found
-        keep = more
+        passes = Passes(passes.problem, found.needed)
 
 
 def filtered(problem: Problem, keep: int) -> tuple[float, float, float]:
@@ -341,11 +350,9 @@ def filtered(problem: Problem, keep: int) -> tuple[float, float, float]:
     first, from a filter with this number of components.
     """
     passes = Passes(problem, np.full(len(problem.y), keep))
-    passes.forward()
-    facts, now = passes.ahead.facts[: passes.ahead.many[0]], passes.ahead
+    evidence, facts = passes.forward(), passes.ahead.facts[: passes.ahead.many[0]]
     weight = np.exp(facts[:, SHARE])
-    evidence = now.level[0] + np.log(weight.sum()) + passes.constant
-    return float(evidence), float(weight @ facts[:, COST] / weight.sum()), float(now.spikes[0])
+    return evidence, float(weight @ facts[:, COST] / weight.sum()), float(passes.ahead.spikes[0])
 
 
 class Passes:
@@ -354,6 +361,7 @@ class Passes:
     def __init__(self, problem: Problem, keep: Array) -> None:
         phi, r, noises = problem.phi, problem.r, problem.noises
         self.problem, self.keep, used = problem, keep, np.isfinite(r)
+        self.places: list[Filter] = []
         T, n = phi.shape
         S, most = len(noises.log_prob), max(int(keep.max()), len(noises.log_prob))
         self.constant = -0.5 * used.sum() * np.log(2.0 * np.pi)
@@ -387,23 +395,28 @@ class Passes:
     def _forward(self, a: int, store: bool) -> None:
         forwards(self._block(a, 0), self.ways[0], self.problem.noises, self.ahead, self.stored, self.room, store)
 
-    def forward(self) -> list[Filter]:
-        """The filter over the record; its components before every block. Those of the last block are stored."""
-        places = []
+    def forward(self) -> float:
+        """The filter over the record, of whose components those before every block and in the last one are stored.
+
+        Returns the log evidence.
+        """
         for a in range(0, len(self.keep), BLOCK):
-            places.append(Filter(*(values.copy() for values in self.ahead)))
+            self.places.append(Filter(*(values.copy() for values in self.ahead)))
             self._forward(a, a + BLOCK >= len(self.keep))
-        return places
+        now = self.ahead
+        return float(now.level[0] + np.log(np.exp(now.facts[: now.many[0], SHARE]).sum()) + self.constant)
 
     def smoothed(self, covariances: bool) -> Mixture:
-        """Both passes."""
+        """Both passes, or the second if the first one is done."""
+        if not self.places:
+            self.forward()
         T, n = self.problem.phi.shape
         E = int(self.problem.alternatives.event.max()) + 1
         found = Mixture(
             np.empty((T, n)), np.empty((T, n, n if covariances else 1)), np.zeros((T + 1, E)), np.zeros((T + 1, n)),
             np.zeros((T + 1, n)), np.empty(T), self.keep,
         )  # fmt: skip
-        for a, place in reversed([*zip(range(0, T, BLOCK), self.forward(), strict=True)]):
+        for a, place in reversed([*zip(range(0, T, BLOCK), self.places, strict=True)]):
             here, after = slice(a, min(a + BLOCK, T)), slice(a + 1, min(a + BLOCK, T) + 1)
             if here.stop < T:
                 for values, before in zip(self.ahead, place, strict=True):

@@ -17,8 +17,8 @@ from driftfit.engine.kernel import Array, Driver, State, kernel
 from driftfit.run.columns import COLLECTED, collect, put_fields
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
-from driftfit.smooth.parts.pooled_drift import average_drift
 from driftfit.smooth.parts.walk import DRIFT, NONE, WEIGHT, Walk, Y, free, room_for_signals
+from driftfit.smooth.unknown_drift import average_drift
 from driftfit.trackers.base import RandomWalk
 
 
@@ -120,22 +120,23 @@ def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -
     own, tracker = prior is None, run.tracker
     drift_root = run.known.extra if own and run.known.extra.size else NONE
     if prior is None:
-        prior = free(run.model.n) if tracker.smoother_fields else tracker.random_walk(run.model)
+        prior = free(run.model.n) if tracker.adapts else tracker.random_walk(run.model)
     phi, signals, fields = collected(run)
+    estimated = own and bool(fields)
     weight, drift = signals[:, WEIGHT], signals[:, DRIFT]
     dt = drift.copy() if prior.slopes or fields else NONE
     first = int(np.argmax(drift > 0.0)) + 1
     drift *= run.known.drift
     basis = NONE
-    if own and fields:
-        q, q_turned, B, r_of = tracker.estimated_variances(
-            run.model, fields, phi[weight > 0.0], np.sqrt(weight) * fields["e"], drift
-        )
+    if estimated:
+        B, r_of, rate, groups = tracker.problem(fields, phi[weight > 0.0])
+        if prior.r is not None:  # of the noise alone
+            weight *= prior.r / r_of
+            estimated = False
+    if estimated:
         phi, signals[:, Y] = tracker.regression(fields, phi, signals[:, Y])
         basis = B if turned and np.any(np.eye(len(B)) != B) else NONE
-        # B and its inverse have entries of the same size
-        q = q @ (B**2).T + q_turned if len(basis) else q + q_turned @ (B**2).T
-        time, drift_root = drift.copy(), np.sqrt(q)
+        time = np.where(rate > 0.0, drift, 0.0)
         weight /= r_of
         drift[:] = 1.0
     trend = dt if prior.slopes else NONE
@@ -145,6 +146,6 @@ def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -
     r = 1.0 if prior.r is None else prior.r
     p0 = None if prior.p0 is None else prior.p0 / r
     walk = Walk(phi, signals, prior.q / r, prior.theta0, p0, prior.r, drift_root, trend, basis=basis)
-    if not (own and fields):
+    if not estimated:
         return walk
-    return average_drift(walk.independent, time, moving)._replace(phi=phi, basis=basis)
+    return average_drift(walk.independent, (time, rate * time), moving, groups)._replace(phi=phi, basis=basis)

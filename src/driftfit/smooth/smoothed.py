@@ -14,7 +14,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
 from driftfit.models.hammerstein_wiener.blocks import Blocks
 from driftfit.run.result import Track
-from driftfit.smooth import exact
+from driftfit.smooth import exact, laws
 from driftfit.smooth.parts.walk import NONE, Path, Walk, ordered
 from driftfit.smooth.plots import plot_smoothed
 from driftfit.smooth.problem import walk_of
@@ -113,6 +113,8 @@ class Smoothed:
                 f"smooth: order_by= needs a drift along that variable, and {run.tracker!r} estimates one in time. "
                 "Use the tracker of tune(model, FLS(), y, u, order_by=..)."
             )
+        if getattr(run.tracker, "laws", None):
+            return cls._by_laws(run, order_by, undetermined)
         walk = walk_of(run, turned=True)
         data, slopes = Data.of(walk), len(walk.trend) > 0
         weight = walk.weight.copy() if keep != "std" else NONE
@@ -121,21 +123,32 @@ class Smoothed:
         smoothed = cls(path, data, run, order_by=order_by)
         if keep != "std":
             smoothed._fit = Fit(weight, path.rho, path.c)
-        unknown = NONE if undetermined == "min_norm" else np.isinf(path.var)
+        unknown = np.isinf(path.var)
         smoothed.std = smoothed._std(path.var)
         smoothed._path = path._replace(var=NONE, rho=NONE, c=NONE)
+        return smoothed._determined(unknown, undetermined, len(run.names) * (2 if slopes else 1))
+
+    @classmethod
+    def _by_laws(cls, run: Track, order_by: Any, undetermined: str) -> Smoothed:
+        """Smooth a run whose parameters have laws (`driftfit.smooth.laws`)."""
+        if order_by is not None:
+            raise ValueError("smooth: order_by= needs random walks, and laws hold in time; leave it out.")
+        path, weight = laws.smooth(run)
+        smoothed = cls(path, Data(int(np.count_nonzero(weight)), np.nan, run.tracker.r, True), run)  # type: ignore[attr-defined]
+        smoothed._fit = Fit(weight, path.rho, path.c)
+        return smoothed._determined(np.isinf(path.var), undetermined, int(path.rank[-1]))
+
+    def _determined(self, unknown: Array, undetermined: str, size: int) -> Smoothed:
+        """This path, NaN or an error where the record does not determine parameters, ``unknown`` (T, n)."""
         if undetermined == "raise" and unknown.any():
-            names = ", ".join(
-                name for name, one in zip(run.names, np.any(unknown, axis=0).tolist(), strict=True) if one
-            )
-            size = len(run.names) * (2 if slopes else 1)
+            names = ", ".join(np.array(self.names)[np.any(unknown, axis=0)].tolist())
             raise ValueError(
-                f"smooth: the record does not determine {names} (rank {smoothed.rank.max()} of {size}); "
+                f"smooth: the record does not determine {names} (rank {self.rank.max()} of {size}); "
                 'leave them out of the model, or take the solution nearest to theta0 with undetermined="min_norm".'
             )
         if undetermined == "nan":
-            smoothed.theta[unknown] = np.nan
-        return smoothed
+            self.theta[unknown] = np.nan
+        return self
 
     def __repr__(self) -> str:
         run = self.run

@@ -22,8 +22,8 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial
+from driftfit.models.hammerstein_wiener.blocks import radius_of
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.thresholds import Thresholds
 from driftfit.systems.drift import Jump, Law, Ramp, RandomWalk, SineIncrement, SineOffset, paths
 from driftfit.systems.inversion import LIMIT, NotMonotoneError, invert
 
@@ -141,8 +141,7 @@ def simulate(
 
 def input_block(basis: Basis, u: Array, c: Array) -> Array:
     """v (T,) for coefficients c (T, n)."""
-    f = basis.split(u, u >= c[:, 1], u <= c[:, 2]) if isinstance(basis, Thresholds) else basis.value(u)
-    return np.asarray(np.sum(f * c, axis=1))
+    return np.asarray(np.sum(basis.for_coefficients(u, c) * c, axis=1))
 
 
 def _linear(model: HammersteinWiener, a: Array, b: Array, v: Array, error: Array) -> Array:
@@ -183,14 +182,8 @@ def _inverted(model: HammersteinWiener, d: Array, w: Array, limit: float, unstab
 
 
 def first_unstable(a: Array) -> int | None:
-    """The first sample at which z^na + a_1 z^(na-1) + .. has a root of size 1 or more; a (T, na)."""
-    T, na = a.shape
-    if not na:
-        return None
-    companion = np.zeros((T, na, na))
-    companion[:, 0] = -a
-    companion[:, range(1, na), range(na - 1)] = 1.0
-    beyond = np.abs(np.linalg.eigvals(companion)).max(axis=1) >= 1.0
+    """The first sample at which the linear block has a pole of size 1 or more; a (T, na)."""
+    beyond = radius_of(a) >= 1.0
     return int(np.argmax(beyond)) if beyond.any() else None
 
 

@@ -45,7 +45,6 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel, nothing
 from driftfit.engine.settings import whole
-from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.mixture.filters import (
     enter_filters,
@@ -71,16 +70,18 @@ from driftfit.trackers.mixture.learned import (
     whiten_noise,
 )
 from driftfit.trackers.mixture.states import (
+    MOST_ALONE,
     SMOOTHER_FIELDS,
     any_noise,
     bank,
-    estimated_variances,
+    centring,
     learn_noise,
     least_noise,
     noise_prior,
     note_reading,
     repeated_rounding,
     store_for_smoother,
+    variances_given_all,
 )
 from driftfit.trackers.parts.coordinates import (
     FRAME,
@@ -322,10 +323,10 @@ class AdaptiveKalman(Tracker):
         running = np.append(False, fields["settled"][:-1] > 0)  # not yet at the sample with which the filters start
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
 
-    def estimated_variances(
-        self, model: Model, fields: Mapping[str, Array], phi: Array, e: Array, time: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        return estimated_variances(fields, phi, time, self.state(model.n))
+    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array, Sequence[Sequence[int]]]:
+        n = phi.shape[1]
+        groups = [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
+        return centring(fields, phi), *variances_given_all(fields, self.state(n)), groups
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:

@@ -62,7 +62,7 @@ class Tracker(Settings, ABC):
     weighs: ClassVar[bool] = False
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
     smoother_fields: ClassVar[tuple[str, ...]] = ()
-    """Fields that `estimated_variances` needs from every sample; ``steps.store_for_smoother`` stores them."""
+    """Fields that `problem` needs from every sample; ``steps.store_for_smoother`` stores them."""
     drift_per_parameter: ClassVar[bool] = False
     """Whether every parameter may have its own drift at every sample (`driftfit.trackers.parts.varying_drift`)."""
     adapts: ClassVar[bool] = False
@@ -146,17 +146,14 @@ class Tracker(Settings, ABC):
         )
 
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
-        """phi (T, n) and y (T,) as the tracker used them; ``fields`` as in `estimated_variances`."""
+        """phi (T, n) and y (T,) as the tracker used them; ``fields`` as in `problem`."""
         return phi, y
 
-    def estimated_variances(
-        self, model: Model, fields: Mapping[str, Array], phi: Array, e: Array, time: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """Variances of the drift before each sample (T, n), those of an independent drift of B^-1 theta (T, n), B
-        (n, n), and variances of the noise (T,), if the tracker estimates them.
+    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array, Sequence[Sequence[int]]]:
+        """What a smoother needs if it is estimated: B (n, n), what drifts being B^-1 theta, the variances of noise and
+        drift (T,), and groups of parameters that may move while the others rest.
 
-        ``fields`` (T, ..) are those that ``smoother_fields`` names, phi (N, n) the regressors of the used samples, e
-        (T,) the innovations of samples of weight 1, time (T,) the intervals of drift.
+        ``fields`` (T, ..) are those that ``smoother_fields`` names, phi (N, n) the regressors of the used samples.
         """
         raise NotImplementedError
 

@@ -11,6 +11,9 @@ with w the weight of the sample and d known factors of the drift, 1 unless given
 Use it if the size of the drift is known or can be tuned; `RLS` needs only a memory length, `AugmentedFLS` has no
 covariance. Without excitation P grows by exactly q per sample: it is finite, and describes the growing uncertainty.
 
+``volatility`` lets the noise variance move, as a random walk of log r (`driftfit.trackers.parts.volatility`): for
+returns, inflation and whatever else is restless for a while. The weights of samples and the bands follow it.
+
 ``laws`` say more of single parameters: that they return to a mean, follow a trend or a season, or drift at their own
 rate (`driftfit.trackers.laws.law`); all others remain random walks.
 
@@ -52,6 +55,7 @@ from driftfit.trackers.parts.diffuse import (
 )
 from driftfit.trackers.parts.information import partly_known, triangular_root
 from driftfit.trackers.parts.varying_drift import read_drift
+from driftfit.trackers.parts.volatility import FIELDS, known_noise, log_density, smoothed_noise, volatile
 
 
 @kernel
@@ -98,15 +102,18 @@ class Kalman(Tracker):
         Mean of theta before the first sample.
     form : "covariance" or "sqrt"
         "sqrt" for collinear or badly scaled regressors: variances are positive by construction.
-    laws : mapping from the name of a parameter to `Law`, or None
+    laws : mapping from the name of a parameter to a `Law` or several, or None
         How single parameters move, instead of a random walk. With laws q is a number or (n,), form is "covariance";
         theta0 and p0 are those of the levels, and slopes and seasons start from no knowledge.
+    volatility : number or None
+        Variance of the change of log r in a nominal sample; positive. r is then the noise variance before the first
+        sample. None: r is constant.
 
     Raises
     ------
     ValueError
-        If q or p0 is not a covariance (with form="sqrt" p0 must be positive definite), r is not positive, or laws do
-        not fit.
+        If q or p0 is not a covariance (with form="sqrt" p0 must be positive definite), r or volatility is not
+            positive, or laws do not fit.
     """
 
     q: Any = None
@@ -115,6 +122,7 @@ class Kalman(Tracker):
     theta0: Any = 0.0
     form: str = "covariance"
     laws: Any = None
+    volatility: float | None = None
 
     required: ClassVar[tuple[str, ...]] = ("q", "r")
     scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
@@ -136,6 +144,10 @@ class Kalman(Tracker):
                     'form="covariance".'
                 )
 
+        if self.volatility is not None:
+            self._set("volatility", numbers("Kalman", "volatility", self.volatility, ndim=0, low=0.0, strict=True))
+            for name, value in FIELDS.items():
+                self._set(name, value)
         self._set("laws", laws_of("Kalman", self.laws))
         if self.laws is not None and (self.form == "sqrt" or np.ndim(self.q) == 2):
             raise ValueError('Kalman: with laws every q is a number or (n,), and form must be "covariance".')
@@ -158,9 +170,12 @@ class Kalman(Tracker):
         names, n = model.names, model.n
         table = table_of("Kalman", self.laws, names, vector("Kalman", "q", self.q, n))
         p0 = None if self.p0 is None else matrix("Kalman", "p0", self.p0, n)
-        laws = {names.index(name): law for name, law in self.laws}
-        start = laws_filter.state(table, vector("Kalman", "theta0", self.theta0, n), p0, laws)
-        return {**start, "r": self.r}
+        means = {names.index(name): law.mean for name, law in self.laws if law.mean is not None}
+        start = laws_filter.state(table, vector("Kalman", "theta0", self.theta0, n), p0, means)
+        return {**start, "r": self.r, **self._noise()}
+
+    def _noise(self) -> Mapping[str, Any]:
+        return {} if self.volatility is None else known_noise(self.volatility)
 
     def state(self, n: int) -> Mapping[str, Any]:
         together, theta0 = np.ndim(self.q) == 2, vector("Kalman", "theta0", self.theta0, n)
@@ -174,6 +189,7 @@ class Kalman(Tracker):
             "G": triangular_root(matrix("Kalman", "q", self.q, n)),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
             **(self._root(n) if self.form == "sqrt" else {}),
+            **self._noise(),
         }
 
     def _root(self, n: int) -> Mapping[str, Any]:
@@ -190,11 +206,17 @@ class Kalman(Tracker):
 
     @property
     def steps(self) -> TrackerSteps:
-        if self.laws is not None:
-            return laws_filter.STEPS
-        if self.form == "sqrt":
-            return square_root.STEPS
-        return TOGETHER if np.ndim(self.q) == 2 else INDEPENDENT
+        together = TOGETHER if np.ndim(self.q) == 2 else INDEPENDENT
+        steps = laws_filter.STEPS if self.laws is not None else square_root.STEPS if self.form == "sqrt" else together
+        return steps if self.volatility is None else volatile(steps)
+
+    def log_density(self, out: Array) -> Array | None:
+        return None if self.volatility is None else log_density(out)
+
+    def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array, Sequence[Sequence[int]]]:
+        """The variance of the noise alone is estimated."""
+        given: Array = np.empty(0)
+        return given, smoothed_noise(fields), given, ()
 
     @property
     def beyond(self) -> str:

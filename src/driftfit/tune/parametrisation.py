@@ -7,6 +7,7 @@ that were left out:
     q and r      Kalman              q_i = r 10^x / p_i;                          -x in the same range, or zero
     q alone      Kalman(r=...)       the same with the given r
     r alone      Kalman(q=...)       r = 10^x v;                                  x from -9 to 3
+    laws         Kalman(laws=...)    variances 10^x v / p_i, deviations 10^x sqrt(v / p_i), times 10^x; r, q
     forgetting   RLS                 forgetting = 1 - 10^-x, 10^x samples of memory; x from log10 2n to log10 100 T
     changes      Bank                q or size^2 of every change times 100^x; x from -3 to 3, of the first also zero;
                                      prior probabilities of the others, where they are given, times 10^x, x from -2
@@ -71,8 +72,8 @@ def _find(task: Task, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
         return _changes(tracker, bounds)
     if groups is not None and missing not in (["mu"], ["q"], ["q", "r"]):
         raise ValueError(f"tune: groups belong to q and mu; {tracker!r} leaves {', '.join(missing) or 'nothing'} open.")
-    if getattr(tracker, "laws", None) is not None and missing != ["r"]:
-        raise ValueError("tune: with laws give q, and leave r open at most; compare laws by run.loglik.")
+    if getattr(tracker, "laws", None) is not None and missing:
+        return _laws(task, tracker, missing, bounds)
     if missing == ["mu"]:
         return _weight(task, tracker, groups, bounds)
     if missing in (["q"], ["q", "r"]):
@@ -130,7 +131,7 @@ def constant(task: Task, tracker: Any) -> Tracker:
     if "mu" in tracker.required:
         return replace(tracker, mu=(np.inf,) * n, p0=None)  # type: ignore[no-any-return]
     if isinstance(tracker, Kalman) and len(tracker.names_for(task.model)) == n:
-        return replace(tracker, q=(0.0,) * n, r=1.0, p0=None)
+        return replace(tracker, q=(0.0,) * n, r=1.0, p0=None, laws=None)
     return Kalman(q=(0.0,) * n, r=1.0)  # other trackers need not know the diffuse start
 
 
@@ -183,7 +184,7 @@ def _weight(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
 
 
 def _drift(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
-    """q of Kalman; a missing r in closed form after a diffuse start, or as a further knob with a given prior."""
+    """q of Kalman; a missing r in closed form, or as a further knob with a given prior or Student's density."""
     names = tracker.names_for(task.model)
     power, variance = still(task, constant(task, tracker))
     if len(names) != len(power):  # the tracker's parameters are not the regression's
@@ -192,7 +193,7 @@ def _drift(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
     share = np.where(power > 0.0, 1.0 / np.where(power > 0.0, power, 1.0), 0.0)
     least, most = _drift_ends(task, tracker)
     low, high = _range(bounds, (-most, -least), share if tracker.r is None else share * tracker.r, group)
-    own_r = tracker.r is None and tracker.p0 is not None
+    own_r = tracker.r is None and (tracker.p0 is not None or bool(tracker.density))
     profiled = tracker.r is None and not own_r
     if own_r:
         low, high = np.append(low, -9.0), np.append(high, 3.0)
@@ -237,6 +238,39 @@ def _noise(task: Task, tracker: Any, bounds: Bounds) -> Knobs:
     _, variance = still(task, constant(task, tracker))
     ends = _range(bounds, (-9.0, 3.0), np.array([variance]), np.zeros(1, int))
     return _single(tracker, "r", ends, lambda x: np.asarray(variance * 10.0**x), False)
+
+
+def _laws(task: Task, tracker: Any, missing: list[str], bounds: Bounds) -> Knobs:
+    """q, r and the settings of laws that are None, each a knob of its own."""
+    if bounds is not None:
+        raise ValueError("tune: bounds= are those of one setting; with laws leave them out, or give the settings.")
+    power, variance = still(task, constant(task, tracker))
+    T, places = np.log10(task.longest), dict(zip(task.model.names, power, strict=True))
+    unit, low, high = np.ones(len(missing)), np.empty(len(missing)), np.empty(len(missing))
+    for k, name in enumerate(missing):
+        setting, parameter = name.rpartition(".")[2], name.partition("[")[2].partition("]")[0]
+        own = variance / (places.get(parameter, power.sum()) or power.max())
+        if name == "r":
+            unit[k], low[k], high[k] = variance, -9.0, 3.0
+        elif setting == "time":
+            low[k], high[k] = -0.5, T + 1.0
+        else:
+            half = 0.5 if setting == "std" else 1.0
+            unit[k], low[k], high[k] = own**half, -half * max(5.0, 4.0 * T), 2.0 * half
+
+    def values(x: Array) -> Array:
+        return np.asarray(10.0**x * unit)
+
+    def build(x: Array, sigma2: float = 1.0) -> Tracker:
+        found = iter(values(x).tolist())
+        own = {name: next(found) for name in missing if name in ("q", "r")}
+        laws = tuple(
+            (name, replace(law, **{one: next(found) for one in missing_settings(law)})) for name, law in tracker.laws
+        )
+        return replace(tracker, **own, laws=laws)  # type: ignore[no-any-return]
+
+    zero = np.array([name.endswith(("q", "level")) for name in missing])
+    return Knobs(low, high, zero, False, build, build, tuple(missing), np.arange(len(missing)), values)
 
 
 MOST_PROBABLE = 0.5

@@ -17,6 +17,11 @@ variance of the estimated mean,
 The result shrinks each unit towards the others, by as much as its own record leaves open and no more; units with short
 records gain most. ``tracker`` starts from N(mean, cov + V), the prediction for a unit that the fleet does not have yet.
 
+With ``noise="each"`` the noise variance of unit i is c_i r, and its drift c_i q. Then t_i is the same, P_i becomes
+c_i P_i, and the nu_i residuals of its record say what c_i is. All c_i maximise, together with mean and cov,
+
+    L - 1/2 sum_i (nu_i log c_i + sum_t e_it^2 / (c_i s_it))                     (e, s: innovations for c_i = 1)
+
 Use it for units of the same type. It assumes that theta_i are normal about one mean: look at ``theta`` for groups. The
 uncertainty of cov itself is left out: with forty units bands of 95 % cover about 90 %.
 
@@ -33,7 +38,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import plain, warn
+from driftfit.engine.settings import one_of, plain, warn
 from driftfit.run.result import Track
 from driftfit.show.text import digits
 from driftfit.smooth.smoothed import Smoothed
@@ -54,8 +59,10 @@ class Pooled:
         Parameters of each unit at its first sample, given its own record and the fleet.
     own : (units, n)
         The same given its own record alone.
+    noise : (units,)
+        Noise variance of each unit.
     tracker : Kalman
-        The fleet's tracker, to start a new unit.
+        The fleet's tracker, to start a new unit; with the geometric mean of ``noise``.
     loglik : float
         The maximised restricted log-likelihood L, without its constant.
     """
@@ -67,6 +74,7 @@ class Pooled:
     theta: Array
     std: Array
     own: Array
+    noise: Array
     tracker: Kalman
     loglik: float
 
@@ -84,19 +92,22 @@ class Pooled:
         return spread
 
 
-def pool(fleet: Mapping[Hashable, Track]) -> Pooled:
+def pool(fleet: Mapping[Hashable, Track], noise: str = "given") -> Pooled:
     """The prior that the units of a fleet share.
 
     Parameters
     ----------
     fleet : Fleet, or mapping from key to Track
         Runs of one model with `Kalman`, each from the diffuse start (p0=None).
+    noise : "given" or "each"
+        The noise variance of the tracker, or one for each unit by restricted likelihood, which keeps q / r.
 
     Raises
     ------
     ValueError
         If units have another tracker than one such Kalman, or fewer than n + 2 of them determine all parameters.
     """
+    each = one_of("pool", "noise", noise, ("given", "each")) == "each"
     runs = dict(fleet.items())
     first = next(iter(runs.values()), None)
     tracker = None if first is None else first.tracker
@@ -109,50 +120,61 @@ def pool(fleet: Mapping[Hashable, Track]) -> Pooled:
         smoothed = Smoothed.of(run, "cov")
         P = smoothed.cov(0)
         if np.isfinite(P).all() and np.diag(P).min() > 0.0:
-            found[key] = smoothed.theta[0], P
+            used = run.ok & np.isfinite(run.innovation_std)
+            z = run.innovation[used] / run.innovation_std[used]
+            found[key] = smoothed.theta[0], P, z.size * each, z @ z
     if len(found) < n + 2:
         raise ValueError(
             f"pool: {len(found)} of {len(runs)} units determine all {n} parameters; at least {n + 2} are needed."
         )
     if len(found) < len(runs):
         warn(f"pool: {len(runs) - len(found)} of {len(runs)} units do not determine all parameters, and are left out.")
-    t, P = (np.array(part) for part in zip(*found.values(), strict=True))
-    mean, cov, V, loglik = maximised(t, P)
+    t, P, nu, rss = (np.array(part) for part in zip(*found.values(), strict=True))
+    mean, cov, V, c, loglik = maximised(t, P, nu, rss)
+    P = c[:, None, None] * P
     K = cov @ np.linalg.inv(cov + P)
     theta = mean + np.einsum("iab,ib->ia", K, t - mean)
     left = np.eye(n) - K
     var = np.einsum("iaa->ia", cov - K @ cov + left @ V @ left.transpose(0, 2, 1))
-    started = replace(tracker, theta0=plain(mean), p0=plain(0.5 * (cov + V + (cov + V).T)))
+    typical = np.exp(np.mean(np.log(c)))
+    q, r = (plain(typical * np.asarray(one)) for one in (tracker.q, tracker.r))
+    started = replace(tracker, q=q, r=r, theta0=plain(mean), p0=plain(0.5 * (cov + V + (cov + V).T)))
     std = np.sqrt(np.maximum(var, 0.0))
-    return Pooled(first.names, tuple(found), mean, cov, theta, std, t, started, loglik)
+    return Pooled(first.names, tuple(found), mean, cov, theta, std, t, c * np.asarray(tracker.r), started, loglik)
 
 
-def maximised(t: Array, P: Array) -> tuple[Array, Array, Array, float]:
-    """(mean, cov, variance of mean, L) from estimates t (units, n) and their covariances P (units, n, n)."""
+def maximised(t: Array, P: Array, nu: Array, rss: Array) -> tuple[Array, Array, Array, Array, float]:
+    """(mean, cov, variance of mean, c, L) from estimates t (units, n) and their covariances P (units, n, n), and the
+    number nu (units,) of residuals and their sums of squares; c is 1 where nu is 0.
+    """
     from scipy import optimize  # a fifth of a second to import
 
-    n = t.shape[1]
+    n, free = t.shape[1], np.flatnonzero(nu)
     unit = np.sqrt(np.mean(np.einsum("iaa->ia", P), axis=0) + np.var(t, axis=0))
     t, P, lower = t / unit, P / np.outer(unit, unit), np.tril_indices(n)
+    entries, log_c = len(lower[0]), np.zeros(len(t))
 
-    def parts(x: Array) -> tuple[float, Array, Array, Array, Array]:
-        """-L, its gradient, mean, cov, V for the entries of a triangular root."""
+    def parts(x: Array) -> tuple[float, Array, Array, Array, Array, Array]:
+        """-L, its gradient, mean, cov, V, c for the entries of a triangular root, and the log c of units with nu."""
         root = np.zeros((n, n))
-        root[lower] = x
-        cov = root @ root.T
-        W = np.linalg.inv(cov + P)
+        root[lower], log_c[free] = x[:entries], x[entries:]
+        cov, c = root @ root.T, np.exp(log_c)
+        scaled = c[:, None, None] * P
+        W = np.linalg.inv(cov + scaled)
         V = np.linalg.inv(W.sum(axis=0))
         mean = V @ np.einsum("iab,ib->a", W, t)
         Wo = np.einsum("iab,ib->ia", W, t - mean)
         logs = np.sum(np.linalg.slogdet(W)[1]) + np.linalg.slogdet(V)[1]
-        loss = 0.5 * (np.einsum("ia,ia->", Wo, t - mean) - logs)
-        slope = W.sum(axis=0) - Wo.T @ Wo - np.sum(W @ V @ W, axis=0)
-        return float(loss), (slope @ root)[lower], mean, cov, V
+        loss = 0.5 * (np.einsum("ia,ia->", Wo, t - mean) - logs + np.sum((nu * log_c + rss / c)[free]))
+        slope = W - Wo[:, :, None] * Wo[:, None, :] - W @ V @ W
+        of_c = 0.5 * (np.einsum("iab,iab->i", slope, scaled) + nu - rss / c)
+        return float(loss), np.append((slope.sum(axis=0) @ root)[lower], of_c[free]), mean, cov, V, c
 
     start = np.linalg.cholesky(np.cov(t.T).reshape(n, n) + 1e-6 * np.eye(n))[lower]
+    begin = np.append(start, np.log(rss[free] / nu[free]))
     found = optimize.minimize(
-        lambda x: parts(x)[:2], start, jac=True, method="L-BFGS-B", options={"ftol": 1e-14, "gtol": 1e-7}
+        lambda x: parts(x)[:2], begin, jac=True, method="L-BFGS-B", options={"ftol": 1e-14, "gtol": 1e-7}
     )
-    loss, _, mean, cov, V = parts(found.x)
+    loss, _, mean, cov, V, c = parts(found.x)
     scale = np.outer(unit, unit)
-    return mean * unit, cov * scale, V * scale, -loss - (len(t) - 1) * float(np.sum(np.log(unit)))
+    return mean * unit, cov * scale, V * scale, c, -loss - (len(t) - 1) * float(np.sum(np.log(unit)))

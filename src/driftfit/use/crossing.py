@@ -11,10 +11,10 @@ crosses a little later, as if the limit were 0.58 sqrt(q) farther away). q is th
 adds in one nominal sample after the end, so an estimated drift (`AdaptiveKalman`) is taken at its last value, and with
 a tracker without drift the parameter can only be beyond the limit already.
 
-If the slope is a random walk, ``FLS(differences=2)``, and for the output, paths are drawn from the covariance of the
-state at T and continued: theta follows its random walk, noise is drawn, and each output is fed back as a lag. F is then
-the share of paths that have crossed, with a standard error of at most 0.5 / sqrt(DRAWS). The output is the measured
-one, including its noise; for the level behind it ask for the parameter.
+If the slope is a random walk, ``FLS(differences=2)``, if parameters have laws, and for the output, paths are drawn
+from the covariance of the state at T and continued: theta moves, noise is drawn, and each output is fed back as a lag.
+F is then the share of paths that have crossed, with a standard error of at most 0.5 / sqrt(DRAWS). The output is the
+measured one, including its noise; for the level behind it ask for the parameter.
 
 F grows more and more slowly, so a limit may well not be crossed within the horizon: ``probability`` is F there, and
 quantiles beyond it are infinite. Parameters of a `Bank` jump and are not random walks, so an error is raised for them.
@@ -41,6 +41,7 @@ from driftfit.engine.settings import near, of_series, whole
 from driftfit.engine.tiles import as_compiled
 from driftfit.run.program import state_of
 from driftfit.run.result import Track
+from driftfit.trackers.laws.law import OWNER, VISIBLE, transition
 from driftfit.use.simulate import noise_at, within
 
 if TYPE_CHECKING:
@@ -148,15 +149,17 @@ def crossing(
     if not run.tracker.covariance or run.tracker.weighs:
         why = "jumps between hypotheses, which is no random walk" if run.tracker.weighs else "carries no covariance"
         raise ValueError(f"crossing: {type(run.tracker).__name__} {why}; track with Kalman, AdaptiveKalman or FLS.")
-    within("crossing", run)
     sign = -1.0 if side == "below" else 1.0
     if what in run.names:
         h = len(run) if horizon is None else whole("crossing", "horizon", horizon, 1)
         place = run.names.index(what)
         lane = state_of(run.program.resting(run.state))
-        drawn = "slope" in lane
-        by = (_along_slopes if drawn else _reflected)(run, lane, place, sign, limit, h)
+        if "law" not in lane:
+            within("crossing", run)
+        way = _along_laws if "law" in lane else _along_slopes if "slope" in lane else _reflected
+        by = way(run, lane, place, sign, limit, h)
     elif what in ("y", run.labels.y):
+        within("crossing", run)
         h = len(u) if horizon is None and u is not None else len(run) if horizon is None else horizon
         by = _of_output(run, sign, limit, whole("crossing", "horizon", h, 1), u)
     else:
@@ -219,17 +222,33 @@ def _along_slopes(run: Track, lane: Mapping[str, Array], place: int, sign: float
     both = np.ix_([place, n + place], [place, n + place])
     full = np.tril(lane["P"]) + np.tril(lane["P"], -1).T
     cov = _known(run, full[both] * scale)
-    rng = np.random.default_rng(0)
     mean = [float(lane["theta"][place]), float(lane["slope"][place])]
-    level, slope = rng.multivariate_normal(mean, cov, DRAWS, method="eigh").T
-    spread = np.sqrt(float(lane["q"][place]) * scale)
-    beyond = sign * (level - limit) >= 0.0
-    by = np.empty(h + 1)
-    by[0] = beyond.mean()
-    for k in range(1, h + 1):
-        slope = slope + spread * rng.normal(size=DRAWS)
-        level = level + slope
-        beyond |= sign * (level - limit) >= 0.0
+    spread = float(lane["q"][place]) * scale
+    return _share(mean, cov, np.array([[1.0, 1.0], [0.0, 1.0]]), np.full((2, 2), spread), sign, limit, h)
+
+
+def _along_laws(run: Track, lane: Mapping[str, Array], place: int, sign: float, limit: float, h: int) -> Array:
+    """F from paths of the components of the parameter, (h + 1,)."""
+    _known(run, np.array([[run.std[-1, place]]]))
+    own = lane["law"][OWNER] == place
+    law, move = lane["law"][:, own], np.ix_(own, own)
+    F, Q = transition(law, 1.0)
+    return _share(lane["x"][own], lane["C"][move], F, Q, sign, limit, h, law[VISIBLE])
+
+
+def _share(
+    mean: Any, cov: Array, F: Array, Q: Array, sign: float, limit: float, h: int, shown: Any = (1.0, 0.0)
+) -> Array:
+    """The share of paths of shown' x that have crossed by each sample, (h + 1,): x <- F x + w, w ~ N(0, Q)."""
+    rng = np.random.default_rng(0)
+    x = rng.multivariate_normal(mean, cov, DRAWS, method="eigh")
+    values, vectors = np.linalg.eigh(Q)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    beyond, by = np.zeros(DRAWS, dtype=bool), np.empty(h + 1)
+    for k in range(h + 1):
+        if k:
+            x = x @ F.T + rng.normal(size=x.shape) @ root.T
+        beyond |= sign * (x @ np.asarray(shown) - limit) >= 0.0
         by[k] = beyond.mean()
     return by
 

@@ -21,7 +21,6 @@ from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.blocks import Blocks
 from driftfit.models.hammerstein_wiener.forward import Inverse
-from driftfit.models.hammerstein_wiener.thresholds import Thresholds
 from driftfit.run.result import burn_in
 from driftfit.use.blocks import blocks_of
 
@@ -75,13 +74,9 @@ def free_run(run: Track, method: str = "svd-joint", start: int | None = None) ->
 
 def _curve(found: Blocks, u: Array, i: int) -> Array:
     """v (T,) of input i, each with the coefficients of the previous sample; a missing input is 0."""
-    basis, c = found.model.bases[i], found.of_input(i)[1]
+    c = found.of_input(i)[1]
     late = np.concatenate([c[:1], c[:-1]])
-    if isinstance(basis, Thresholds):
-        f = basis.split(u, u >= late[:, 1] / late[:, 0], u <= late[:, 2] / late[:, 0])
-    else:
-        f = basis.value(u)
-    v = np.sum(f * late, axis=1)
+    v = np.sum(found.model.bases[i].for_coefficients(u, late) * late, axis=1)
     return np.where(np.abs(v) < LARGEST, v, 0.0)
 
 

@@ -40,8 +40,8 @@ from driftfit.judge.alarms.bootstrap import RECORDS, Normal, drawn_in_blocks, li
 from driftfit.judge.alarms.detect import Alarms, asked_for, chance_of, detect, findings_of, highest, judged
 from driftfit.judge.alarms.frozen import CLIPS
 from driftfit.judge.alarms.reference import Reference, in_samples, modelled
-from driftfit.judge.cores.on_all_cores import on_all_cores
 from driftfit.judge.fleet_verdict import SHOWN, discoveries
+from driftfit.judge.on_all_cores import on_all_cores
 from driftfit.judge.verdict import p_text
 from driftfit.run.keyed_results import table_by_key
 from driftfit.run.live.reference_model import ALPHA, CLIP, CONSTANT

@@ -16,7 +16,7 @@ from driftfit.judge.alarms.bootstrap import Normal
 from driftfit.judge.alarms.frozen import frozen_model
 from driftfit.judge.evidence import judged_rows
 from driftfit.judge.regressors import earlier_outputs, regressors
-from driftfit.judge.statistics.parts.coarse_readings import explained, step_of
+from driftfit.judge.statistics.coarse_readings import explained, step_of
 from driftfit.judge.statistics.robust import orthonormal
 from driftfit.readings import gate
 from driftfit.run.columns import COLLECTED, collect
@@ -196,11 +196,7 @@ def _delays(run: Track, phi: Array, y: Array, first: int, start: int) -> tuple[t
     """(column, lag) of each regressor that is an earlier output."""
     at = np.arange(first, start)
     back = earlier_outputs(run, at, phi, y, np.ones(len(at)))
-    if back is None:
-        return ()
-    known = [np.flatnonzero(one >= 0)[-1] for one in back.source.T]
-    lags = [int(row - source[row]) for row, source in zip(known, back.source.T, strict=True)]
-    return tuple(zip(map(int, back.columns), lags, strict=True))
+    return () if back is None else tuple(zip(back.columns.tolist(), back.delays.tolist(), strict=True))
 
 
 def _drawn(rows: Array, step: float, ok: Array) -> tuple[float, ...]:

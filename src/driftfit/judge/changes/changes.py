@@ -72,7 +72,7 @@ def changes(
     found = dated(model, breaks, ar, prices, dates)
     changed = which(model, found)
     if (changed.dates != found.breaks).any():
-        found = dated(model, changed.dates, ar, prices, dates, settled=True)
+        found = dated(model, changed.dates, ar, prices, dates, final=True)
     moving = tuple(sorted({j for own in changed.at for j in own}))
     if test.p < level and not moving:
         moving = (int(np.argmin(test.p_path[n:])),)

@@ -18,19 +18,9 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.constants import SINGULAR, SMALL, Work
-from driftfit.judge.changes.fit import (
-    MOST,
-    estimated,
-    noise_of,
-    order_of,
-    partitions,
-    regressed,
-    split,
-    white_rows,
-)
-from driftfit.judge.changes.null import Draws, Model, Tested, gains, price, problem_of, radius
-from driftfit.judge.changes.scan import prepared
+from driftfit.judge.changes.fit import estimated, noise_of, order_of, regressed, split, white_rows
+from driftfit.judge.changes.null import Draws, Model, Tested, gains, price, radius
+from driftfit.judge.changes.scan import SINGULAR, SMALL
 from driftfit.judge.statistics.robust import orthonormal
 
 LEVEL = 0.95
@@ -44,84 +34,48 @@ RANK = 1e-12
 """Smallest singular value that counts, as a share of the largest."""
 LEVERAGE = 0.1
 """Smallest share of a residual that its own row is taken to leave."""
-MOVED = 40
-"""Dates within an interval, at most, for which the parameters are computed again."""
 
 
-class Exact:
-    """Sums of squares with breaks at any of some places, for one autoregression."""
+def profile(model: Model, ar: Array, breaks: Array, k: int, gap: int) -> tuple[Array, Array, Array]:
+    """Break k at every place (m,) up to its neighbours, less ``gap`` rows: the places, the sums of squares (m,) of the
+    segments beside it, and their parameters (m, 2, n) in the basis. Rows of two segments have the lags of both."""
+    X, lags, g = model.X, model.noise.lags, model.noise.g
+    (N, n), first = X.shape, order_of(lags)
+    low, high = breaks[k - 1] if k else 0, breaks[k + 1] if k + 1 < len(breaks) else N
+    place = np.union1d(np.arange(low + gap, high - gap + 1, (high - low) // DATES + 1), breaks[k])
+    Z = np.column_stack(white_rows(X[low:high], model.y[low:high], lags, ar, g[low:high]))
+    at = place - low - first  # row 0 of Z is the first one with all its lags
+    edges = np.unique([0, *at, *(at + first)])
+    i, j = np.tril_indices(n + 1)
+    total = np.zeros((len(edges) + 1, n + 1, n + 1))
+    total[1:, i, j] = total[1:, j, i] = np.cumsum(np.add.reduceat(Z[:, i] * Z[:, j], edges), axis=0)
+    G, own = np.zeros((len(at), 2 * n + 1, 2 * n + 1)), np.append(np.arange(n), 2 * n)
+    G[:, own[:, None], own] += total[np.searchsorted(edges, at)]
+    own[:n] += n
+    G[:, own[:, None], own] += total[-1] - total[np.searchsorted(edges, at + first)]
+    for row in range(first):
+        later = X[place + row] - sum(a * X[place + row - lag] for lag, a in zip(lags, ar, strict=True) if lag <= row)
+        later, whole = later * g[place + row, None], Z[at + row]
+        both = np.hstack([whole[:, :n] - later, later, whole[:, n:]])
+        G += both[:, :, None] * both[:, None, :]
+    least = SINGULAR * float(np.sum((X * g[:, None]) ** 2, axis=0).max()) + SMALL
+    A, b = G[:, :-1, :-1] + least * np.eye(2 * n), G[:, :-1, -1]
+    theta = np.linalg.solve(A, b[..., None])[..., 0]
+    rss = np.maximum(G[:, -1, -1] - np.sum(theta * b, axis=1), model.floor)
+    return place, rss, theta.reshape(len(at), 2, n)
 
-    def __init__(self, model: Model, places: Array, ar: Array) -> None:
-        N, n = model.X.shape
-        self.model, self.places, self.ar = model, places, ar
-        problem = problem_of(model, np.zeros((0, n)))._replace(places=places)
-        self.work, rss = Work.of(N, n, problem), np.zeros(1)
-        prepared(model.X, model.y, problem, ar, self.work, rss)
-        self.rss, self.theta = float(rss[0]), self.work.theta.copy()
-        self.least = SINGULAR * float(np.abs(np.einsum("tj,tj->j", self.work.Z, self.work.Z)[:n]).max()) + SMALL
 
-    def _system(self, at: Array) -> tuple[Array, Array]:
-        """M (.., K n, K n) and s (.., K n) of breaks at places at (.., K)."""
-        work, n, K = self.work, self.model.X.shape[1], at.shape[-1]
-        M = np.zeros((*at.shape[:-1], K, n, K, n))
-        for k in range(K):
-            M[..., k, :, k, :] = work.Q[at[..., k]]
-            for m in range(k + 1, K):
-                b, c = at[..., k], at[..., m]
-                own = work.B[c] - np.swapaxes(work.B[b], -1, -2) @ work.U[c]
-                M[..., k, :, m, :], M[..., m, :, k, :] = own, np.swapaxes(own, -1, -2)
-        M = M.reshape(*at.shape[:-1], K * n, K * n)
-        return M + self.least * np.eye(K * n), work.s[at].reshape(*at.shape[:-1], K * n)
-
-    def of(self, at: Array) -> Array:
-        """Sums of squares (..) with breaks at places at (.., K)."""
-        M, s = self._system(at)
-        left = self.rss - np.sum(s * np.linalg.solve(M, s[..., None])[..., 0], axis=-1)
-        return np.asarray(np.maximum(left, self.model.floor))
-
-    def profile(self, at: Array, k: int, gap: int) -> tuple[int, Array]:
-        """The first place, and the sums of squares with break k there and at those after it, up to its neighbours."""
-        N, place, work, n = len(self.model.y), self.places, self.work, self.model.X.shape[1]
-        low = (place[at[k - 1]] if k else 0) + gap
-        high = (place[at[k + 1]] if k + 1 < len(at) else N) - gap
-        first, last = (int(one) for one in np.searchsorted(place, [low, high + 1]))
-        if last <= first:
-            first, last = int(at[k]), int(at[k]) + 1
-        own = slice(first, last)
-        M, s, taken = work.Q[own] + self.least * np.eye(n), work.s[own], 0.0
-        others = np.delete(at, k)
-        if len(others):
-            A, t = self._system(others)
-            ties = np.concatenate([
-                work.B[own] - work.U[b].T @ work.B[own] if j < k
-                else np.swapaxes(work.B[b] - np.swapaxes(work.B[own], 1, 2) @ work.U[b], 1, 2)
-                for j, b in enumerate(others)
-            ], axis=1)  # fmt: skip
-            solved = np.linalg.solve(A, ties)
-            M, s = M - np.swapaxes(ties, 1, 2) @ solved, s - np.swapaxes(solved, 1, 2) @ t
-            taken = float(t @ np.linalg.solve(A, t))
-        left = self.rss - taken - np.sum(s * np.linalg.solve(M, s[..., None])[..., 0], axis=-1)
-        return first, np.asarray(np.maximum(left, self.model.floor))
-
-    def settled(self, at: Array, gap: int) -> Array:
-        """Places, each the best given its neighbours."""
-        at = at.copy()
-        for _ in range(SWEEPS):
-            before = at.copy()
-            for k in range(len(at)):
-                first, rss = self.profile(at, k, gap)
-                at[k] = first + int(np.argmin(rss))
-            if (at == before).all():
-                break
-        return at
-
-    def thetas(self, at: Array) -> Array:
-        """Parameters of the segments (.., K + 1, n) in the basis."""
-        M, s = self._system(at)
-        K, n = at.shape[-1], self.model.X.shape[1]
-        delta = np.linalg.solve(M, s[..., None]).reshape(*at.shape[:-1], K, n)
-        start = self.theta - np.einsum("...kij,...kj->...i", self.work.U[at], delta)
-        return np.cumsum(np.concatenate([start[..., None, :], delta], axis=-2), axis=-2)
+def settled(model: Model, ar: Array, breaks: Array, gap: int) -> Array:
+    """Dates, each the best given its neighbours."""
+    breaks = breaks.copy()
+    for _ in range(SWEEPS):
+        before = breaks.copy()
+        for k in range(len(breaks)):
+            place, rss, _ = profile(model, ar, breaks, k, gap)
+            breaks[k] = place[int(np.argmin(rss))]
+        if (breaks == before).all():
+            break
+    return breaks
 
 
 class Dated(NamedTuple):
@@ -157,61 +111,26 @@ def stepwise(gain: Array, prices: tuple[float, float]) -> int:
             return K
 
 
-def places_of(N: int) -> Array:
-    """Rows at which the likelihood of a date is computed: all of N, or `DATES` of them."""
-    return np.arange(N) if N <= DATES else np.linspace(0, N - 1, DATES).astype(np.int64)
-
-
-Partition = tuple[float, Array, Array]
-"""Sum of squares, breaks, autoregression."""
-
-
-def refined(model: Model, start: Array, breaks: Array) -> Partition:
-    """A partition on cells with its own autoregression, and dates that are the best given each other."""
-    X, y, lags, g = model.X, model.y, model.noise.lags, model.noise.g
-    if len(lags):
-        start = regressed(noise_of(X, y, estimated(X, y, (lags, start, g), breaks)[0], breaks), g, lags)
-    places = places_of(len(y))
-    exact = Exact(model, places, start)
-    at = exact.settled(np.minimum(np.searchsorted(places, breaks), len(places) - 1), model.noise.fewest)
-    return float(exact.of(at)), places[at], start
-
-
-def numbered(found: list[Partition], prices: tuple[float, float], N: int, least: int) -> int:
-    """The number of breaks that pay, ``least`` or more."""
-    gain = N * np.log(found[0][0] / np.array([one[0] for one in found]))
-    return stepwise(gain, prices) or min(least, len(found) - 1)
-
-
 def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Array, Array, tuple[float, float]]:
     """(breaks, autoregression, prices), given that constants are rejected."""
-    X, y, noise = model.X, model.y, model.noise
-    N = len(y)
-    found: list[Partition] = [
-        (float(test.rss[k]), test.breaks[k], test.ar[k]) for k in range(3) if np.isfinite(test.rss[k])
-    ]
-    found[1:] = [min(one, refined(model, one[2], one[1]), key=lambda each: each[0]) for one in found[1:]]
-    first = 1 if test.p_each[:2].min() <= test.p_each[2] else 2
-    prices = (price(test.gains[:, 0], level / SHARE), price(test.gains[:, 1], level / SHARE))
-    most = max(0, min(MOST, N // noise.fewest - 1))
-    starts = [test.ar[len(found) - 1], noise.ar] if len(noise.lags) else [noise.ar]
-    lists = [partitions(X, y, (noise.lags, start, noise.g), most, noise.fewest) for start in starts]
-    for K in range(3, most + 1):
-        if len(lists[0]) <= K or numbered(found, prices, N, first) + 3 < K:
-            break
-        tried = (refined(model, start, own[K]) for start, own in zip(starts, lists, strict=True) if len(own) > K)
-        found.append(min(tried, key=lambda one: one[0]))
-    K = numbered(found, prices, N, first)
+    noise, N = model.noise, len(model.y)
+    room = int(np.isfinite(test.rss).sum())
+    gain = N * np.log(test.rss[0] / test.rss[:room])
+    first = min(1 if test.p_each[:2].min() <= test.p_each[2] else 2, room - 1)
+
+    def number(drawn: Array) -> tuple[int, tuple[float, float]]:
+        prices = price(drawn[:, 0], level / SHARE), price(drawn[:, 1], level / SHARE)
+        return stepwise(gain, prices) or first, prices
+
+    K, prices = number(test.gains)
     if K and (len(noise.lags) or len(model.lags.columns)):  # changes made the dynamics of constants too slow
-        _, breaks, ar = found[K]
-        theta, _ = estimated(X, y, (noise.lags, ar, noise.g), breaks)
+        breaks, ar = test.breaks[K], test.ar[K]
+        theta, _ = estimated(model.X, model.y, (noise.lags, ar, noise.g), breaks)
         mean = model.basis @ (np.diff(np.concatenate([[0], breaks, [N]])) / N @ theta)
         if max(radius(ar, noise.lags), draws.of_outputs(mean)) < 1.0:
             rss = draws.of(mean, ar, len(test.gains), True).rss
-            again = gains(rss[np.isfinite(rss[:, 0])], N)
-            prices = (price(again[:, 0], level / SHARE), price(again[:, 1], level / SHARE))
-            K = numbered(found, prices, N, first)
-    return found[K][1], found[K][2], prices
+            K, prices = number(gains(rss[np.isfinite(rss[:, 0])], N))
+    return test.breaks[K], test.ar[K], prices
 
 
 def shortest_interval(weight: Array, level: float) -> tuple[int, int]:
@@ -224,33 +143,30 @@ def shortest_interval(weight: Array, level: float) -> tuple[int, int]:
 
 
 def dated(
-    model: Model, breaks: Array, ar: Array, prices: tuple[float, float], level: float = LEVEL, settled: bool = False
+    model: Model, breaks: Array, ar: Array, prices: tuple[float, float], level: float = LEVEL, final: bool = False
 ) -> Dated:
-    """Dates at full resolution, unless they are ``settled``, with their intervals, and the parameters of segments."""
+    """Dates at full resolution, unless they are ``final``, with their intervals, and the parameters of segments."""
     X, y, noise = model.X, model.y, model.noise
     N, n = X.shape
     K, first = len(breaks), order_of(noise.lags)
     gap, spans = noise.fewest, np.zeros((K, 2), np.int64)
     moved = np.zeros((K + 1, n))
-    if K:
-        places = np.union1d(places_of(N), breaks)
-        at = np.searchsorted(places, breaks)
-        for _ in range(0 if settled else 2 if len(ar) else 1):
-            exact = Exact(model, places, ar)
-            at = exact.settled(at, gap)
-            if len(ar):
-                theta, _ = estimated(X, y, (noise.lags, ar, noise.g), places[at])
-                ar = regressed(noise_of(X, y, theta, places[at]), noise.g, noise.lags)
-        exact = Exact(model, places, ar)
-        breaks = places[at]
-        for k in range(K):
-            low, rss = exact.profile(at, k, max(n + 1, first + 1, 3))
-            loglik = -0.5 * max(N - (K + 1) * n - first, 5) * np.log(rss / rss.min())
-            weight = np.exp(loglik) / np.exp(loglik).sum()
-            inside = low + np.array(shortest_interval(weight, level))
-            spans[k] = places[[min(inside[0], at[k]), max(inside[1], at[k])]]
-            moved[k : k + 2] += _moved(exact, at, k, low, weight)[k : k + 2]
+    for _ in range(0 if final or not K else 2 if len(ar) else 1):
+        breaks = settled(model, ar, breaks, gap)
+        if len(ar):
+            theta, _ = estimated(X, y, (noise.lags, ar, noise.g), breaks)
+            ar = regressed(noise_of(X, y, theta, breaks), noise.g, noise.lags)
     parts = (noise.lags, ar, noise.g)
+    whole = estimated(X, y, parts, breaks)[1]
+    for k in range(K):
+        place, rss, theta = profile(model, ar, breaks, k, max(n + 1, first + 1, 3))
+        rss += max(whole - rss[place == breaks[k]][0], 0.0)
+        loglik = -0.5 * max(N - (K + 1) * n - first, 5) * np.log(rss / rss.min())
+        weight = np.exp(loglik) / np.exp(loglik).sum()
+        inside = place[list(shortest_interval(weight, level))]
+        spans[k] = min(inside[0], breaks[k]), max(inside[1], breaks[k])
+        theta = theta @ model.basis.T
+        moved[k : k + 2] += np.einsum("m,mkj->kj", weight, (theta - np.einsum("m,mkj->kj", weight, theta)) ** 2)
     edges = [(0, N), *_certain(breaks, spans, N, n)]
     known = [_directions(model, a, b) for a, b in edges]
     rows = np.hstack([part @ one for part, one in zip(np.split(split(X, breaks), K + 1, axis=1), known, strict=True)])
@@ -261,18 +177,6 @@ def dated(
     ]
     std[np.array(unknown)] = np.inf
     return Dated(breaks, spans, theta @ model.basis.T, std, moved, ar, left, prices)
-
-
-def _moved(exact: Exact, at: Array, k: int, low: int, weight: Array) -> Array:
-    """Variances (K + 1, n) of the parameters while date k moves, in units of the model."""
-    likely = np.flatnonzero(weight > 1e-3 * weight.max())
-    likely = likely[np.unique(np.linspace(0, len(likely) - 1, min(MOVED, len(likely))).astype(int))]
-    many = np.tile(at, (len(likely), 1))
-    many[:, k] = low + likely
-    theta = exact.thetas(many) @ exact.model.basis.T
-    share = weight[likely] / weight[likely].sum()
-    mean = np.einsum("m,mkj->kj", share, theta)
-    return np.asarray(np.einsum("m,mkj->kj", share, (theta - mean) ** 2))
 
 
 def covariance(Z: Array, z: Array) -> tuple[Array, Array]:

@@ -25,8 +25,9 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.dates import Dated
-from driftfit.judge.changes.fit import hats, order_of, split, white_rows
+from driftfit.judge.changes.fit import hats, left, order_of, split, white_rows
 from driftfit.judge.changes.null import Model
+from driftfit.judge.changes.scan import SINGULAR, SMALL
 from driftfit.judge.changes.which import Which
 
 KNOTS = (3, 4, 5, 6, 8, 10, 13, 17, 22, 28)
@@ -92,12 +93,6 @@ def innovations(H: Array, q: Array, W: Array) -> tuple[Array, float]:
     return W, float(total[0])
 
 
-def left(Z: Array, z: Array, floor: float) -> float:
-    """Sum of squares of z (N,) that columns Z (N, q) do not explain, beyond rounding."""
-    r = z - Z @ np.linalg.lstsq(Z, z, rcond=None)[0]
-    return max(float(r @ r), floor)
-
-
 def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) -> Kind:
     """The kind of change of the parameters ``moving``."""
     N, n = model.phi.shape
@@ -150,22 +145,24 @@ def _ramp(
     Z: Array, z: Array, columns: Array, model: Model, found: Dated, first: int
 ) -> tuple[float, tuple[int, int], Array]:
     """(sum of squares, ends, white columns (N, J)) of the best single gradual change of columns (N, J)."""
-    N = len(columns)
+    N, J = columns.shape
     Q = np.linalg.qr(Z)[0]
     r = z - Q @ (Q.T @ z)
     places = np.unique(np.linspace(0, N - 1, min(CORNERS, N // 8) + 1).astype(int))
-    best = (np.inf, (0, N - 1), np.zeros((N, columns.shape[1])))
-    for i, a in enumerate(places[:-1]):
-        for b in places[i + 1 :]:
-            made = columns * _rise(N, (int(a), int(b)))[:, None]
-            white = white_rows(made, model.y, model.noise.lags, found.ar, model.noise.g)[0]
-            rest = white - Q @ (Q.T @ white)
-            value = left(rest, r, model.floor)
-            if value < best[0]:
-                whole = np.zeros((N, columns.shape[1]))
-                whole[first:] = white
-                best = (value, (int(a), int(b)), whole)
-    return best
+    best = (-np.inf, (0, N - 1), np.zeros((N, J)))
+    for i, start in enumerate(places[:-1]):
+        ends = [(int(start), int(stop)) for stop in places[i + 1 :]]
+        made = np.hstack([columns * _rise(N, one)[:, None] for one in ends])
+        white = white_rows(made, model.y, model.noise.lags, found.ar, model.noise.g)[0]
+        rest = (white - Q @ (Q.T @ white)).reshape(len(z), -1, J).transpose(1, 2, 0)
+        A, b = rest @ rest.transpose(0, 2, 1), rest @ r
+        least = SINGULAR * np.sum(white**2, axis=0).reshape(-1, J).max(axis=1) + SMALL
+        gain = np.sum(np.linalg.solve(A + least[:, None, None] * np.eye(J), b[..., None])[..., 0] * b, axis=1)
+        k = int(np.argmax(gain))
+        if gain[k] > best[0]:
+            best[2][first:] = white[:, k * J : k * J + J]
+            best = (float(gain[k]), ends[k], best[2])
+    return max(float(r @ r) - best[0], model.floor), *best[1:]
 
 
 def _walks(

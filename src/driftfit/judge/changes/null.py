@@ -10,7 +10,8 @@ and the gain of two, a temporary change. p is that of the smallest of their p-va
 the largest draws by their exponential tail.
 
 Source: Wu (1986) and Liu (1988) for wild residuals; Hansen (2000) for fixed regressors, Goncalves and Kilian (2004) for
-the recursion. Cost: `DRAWS` searches; records that are clearly constant stop after the first `FEW`.
+the recursion. Besag and Clifford (1991) for the end. Cost: `DRAWS`
+searches, fewer the larger p.
 """
 
 from __future__ import annotations
@@ -21,21 +22,19 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.constants import SMALL, Found, Problem, Work
-from driftfit.judge.changes.fit import HELD, Noise, grid, noise, order_of, white_rows
+from driftfit.judge.changes.fit import HELD, MOST, Noise, noise, order_of, white_rows
 from driftfit.judge.changes.recursion import Drawn, Recursion, Results, draw
-from driftfit.judge.changes.scan import searched
+from driftfit.judge.changes.scan import SMALL, Found, Problem, Work, problem_of, searched
 from driftfit.judge.statistics.robust import orthonormal
 
-DRAWS, FEW = 199, 39
-CLEAR = 0.3
-"""p of the first draws above which no others are drawn."""
+DRAWS = (19, 39, 79, 199)
+"""Draws after which it is decided whether there are more."""
+CLEAR = 10.0
+"""Draws beyond the statistic from which on p is known well enough (Besag and Clifford, 1991)."""
 BIASED = 40
 """Draws of constants from which their bias comes."""
 UNIT = 0.9999
 """Largest root of the noise."""
-ROUNDS = 5
-"""Rounds of constants and their autoregression."""
 ROUNDING = 1e-15
 """Standard deviation of rounding, as a share of the outputs."""
 LOST = 1e-7
@@ -56,6 +55,12 @@ class Lags(NamedTuple):
     def none(cls, N: int) -> Lags:
         """No column is."""
         return cls(np.zeros(0, np.int64), np.zeros((N, 0), np.int64), np.zeros((N, 0)))
+
+    @property
+    def delays(self) -> Array:
+        """(k,): by how many rows each is earlier."""
+        known = [np.flatnonzero(one >= 0)[-1] for one in self.source.T]
+        return np.array([row - source[row] for row, source in zip(known, self.source.T, strict=True)], np.int64)
 
     def only(self, rows: Array, columns: Sequence[int]) -> Lags:
         """Those of some rows and columns, given by their indices."""
@@ -80,11 +85,11 @@ class Tested(NamedTuple):
     gains: Array
     """(R, 2): gains of one and of two breaks of the draws."""
     rss: Array
-    """(3,): sum of squares with no, one and two breaks."""
-    breaks: tuple[Array, Array, Array]
+    """(K + 1,): sums of squares with 0 .. K breaks; inf where there is no room."""
+    breaks: tuple[Array, ...]
     """Their dates."""
     ar: Array
-    """(3, p): their autoregressions."""
+    """(K + 1, p): their autoregressions."""
     theta: Array
     """(n,): constants, in units of the model."""
     root: float
@@ -128,14 +133,6 @@ def modelled(
     r = (y - X @ np.linalg.lstsq(X * found.g[:, None], y * found.g, rcond=None)[0]) * found.g
     floor = float(np.sum((rounding * found.g) ** 2) + LOST * (r @ r)) + SMALL
     return Model(phi, y, offset, X, basis, lags, root, found, floor)
-
-
-def problem_of(model: Model, paths: Array) -> Problem:
-    """What all draws share."""
-    places, stride = grid(len(model.y))
-    lags = model.noise.lags
-    sizes = np.array([stride, model.noise.fewest, ROUNDS, 2])
-    return Problem(model.noise.g, lags, places, np.ascontiguousarray(paths), sizes, np.array([model.floor]))
 
 
 def radius(a: Array, lags: Array) -> float:
@@ -194,10 +191,9 @@ class Draws:
         back = self.model.lags
         if not len(back.columns):
             return 0.0
-        known = [np.flatnonzero(one >= 0)[-1] for one in back.source.T]
-        lags = np.array([row - source[row] for row, source in zip(known, back.source.T, strict=True)])
-        order = np.argsort(lags)
-        ratio = np.array([back.ratio[row, i] for i, row in enumerate(known)])
+        lags = back.delays
+        order, last = np.argsort(lags), [np.flatnonzero(one >= 0)[-1] for one in back.source.T]
+        ratio = back.ratio[last, np.arange(len(last))]
         theta = theta + self.model.offset
         return radius((theta[back.columns] * ratio)[order], lags[order])
 
@@ -235,37 +231,38 @@ def smallest(x: Array, drawn: Array) -> tuple[float, Array]:
 
 def tested(model: Model) -> tuple[Tested, Draws]:
     """The test of constancy, and the draws for further ones."""
-    N, n = model.X.shape
-    noise = model.noise
+    N, noise = len(model.y), model.noise
     first = order_of(noise.lags)
     Z = model.X * noise.g[:, None]
     paths = np.vstack([np.linalg.inv(model.basis).T, model.basis @ np.linalg.inv(Z.T @ Z)])
     size = np.sqrt(np.sum((paths @ (Z.T @ Z)) * paths, axis=1))
-    problem = problem_of(model, paths / np.maximum(size, SMALL)[:, None])
-    work, found = Work.of(N, n, problem), Found.of(n, problem)
-    searched(model.X, model.y, problem, work, found)
+    paths /= np.maximum(size, SMALL)[:, None]
+    most = max(2, min(MOST, N // noise.fewest - 1))
+    problem = problem_of(noise.g, noise.lags, noise.fewest, most, paths, model.floor)
+    found, _ = searched(model.X, model.y, problem)
+    few = problem_of(noise.g, noise.lags, noise.fewest, 2, paths, model.floor)
     held = noise.e.copy()
     rows, _ = white_rows(noise.rows, model.y, noise.lags, noise.ar, noise.g)
     Q = np.linalg.qr(rows)[0]
     held[first:] /= np.maximum(1.0 - np.sum(Q * Q, axis=1), 0.1)
     if first or len(model.lags.columns):  # an outlier of the output would be one of the dynamics
         held = np.clip(held, -HELD * noise.level, HELD * noise.level)
-    draws = Draws(model, problem, held)
+    draws = Draws(model, few, held)
     theta, ar = draws.unbiased(model.basis @ found.theta, found.ar[0])
-    x = np.append(found.L[0], gains(found.rss[None], N)[0])
+    x = np.append(found.L[0], gains(found.rss[None, :3], N)[0])
     R, L = np.zeros((0, 2)), np.zeros((0, len(found.L)))
-    for count in (FEW, DRAWS - FEW):
-        drawn = draws.of(theta, ar, count, True)
+    for count in np.diff(DRAWS, prepend=0):
+        drawn = draws.of(theta, ar, int(count), True)
         fine = np.isfinite(drawn.L).all(axis=1) & np.isfinite(drawn.rss[:, 0])
         R, L = np.vstack([R, gains(drawn.rss[fine], N)]), np.vstack([L, drawn.L[fine]])
         p, each = smallest(x, np.column_stack([L[:, 0], R]))
-        if p > CLEAR:
+        if p * len(R) > CLEAR:
             break
     p_path = np.array([p_of(float(one), drawn) for one, drawn in zip(found.L[1:], L.T[1:], strict=True)])
     root = max(draws.of_outputs(theta), radius(ar, noise.lags))
-    dates = tuple(problem.places[found.at[k, :k]] for k in range(3))
+    dates = tuple(problem.places[found.at[k, :k]] for k in range(most + 1))
     constants = model.basis @ found.theta
-    return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, root), draws  # type: ignore[arg-type]
+    return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, root), draws
 
 
 def gains(rss: Array, N: int) -> Array:

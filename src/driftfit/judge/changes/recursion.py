@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from driftfit.engine.kernel import Array, Driver, shared
-from driftfit.judge.changes.constants import Found, Problem, Work, settle
-from driftfit.judge.changes.scan import search
+from driftfit.judge.changes.scan import Found, Problem, Work, search, settle
 
 
 class Recursion(NamedTuple):
@@ -103,7 +102,7 @@ def _draw(
             continue
         for i in range(results.ar.shape[1]):
             results.ar[d, i] = 0.0
-        settle(drawn.X, drawn.y, problem, problem.sizes[2], results.ar[d], work)
+        settle(drawn.X, drawn.y, problem, results.ar[d], work)
         for j in range(n):
             results.theta[d, j] = work.theta[j]
 

@@ -1,299 +1,308 @@
-"""The best one and two breaks of a regression in autoregressive noise, and Nyblom's statistic, compiled.
+"""The best partitions of a regression in autoregressive noise, and Nyblom's statistic, compiled.
 
-    y_t = x_t' theta + sum over breaks b of x_t' delta_b [t >= b] + v_t,    v_t = sum a_l v_(t-l) + e_t / g_t
-    Z, z = rows and outputs times g after whitening,  D_b = the same of x_t [t >= b],  A = Z' Z,  r = residuals of Z
-    gain of breaks b, c, ..  =  s' M^-1 s,   s_b = D_b' r,   M_bc = D_b' D_c - D_b' Z A^-1 Z' D_c
+    y_t = x_t' theta_s + v_t,   v_t = sum a_l v_(t-l) + e_t / g_t         constant theta_s between two breaks
+    Z, z = rows and outputs times g after whitening;  cost of rows i .. j = what constants leave of z_i .. z_j on Z
 
-A row of the first p after a break holds the lags of both segments. D_b differs from Z in these rows only, so that
-D_b' D_c = Z' D_c for b < c at least p rows apart, and the matrices B_b = Z' D_b, Q_b = D_b' D_b give every set of
-breaks exactly. Every number of breaks has its own autoregression: breaks and coefficients of the noise are improved in
-turn, once from the noise of constants and once from white noise, since each explains the residuals that the other
-leaves.
+Sums of products of [Z, z] before each of some places give the cost of any segment between two of them. The best
+partition with every number of breaks is found on cells (Bai and Perron, 2003, section 3; Jackson et al., 2005), and
+each break then moves to the best place within a cell, given its neighbours. Every number of breaks has its own
+autoregression: it is estimated from the residuals of a first partition, and a second one is made with it, once from the
+noise of constants and once from white noise, since breaks and correlation explain the same residuals. After a break,
+lags of the noise are those of the new segment; `driftfit.judge.changes.dates` allows for the old one.
 
-Source: Bai and Perron (1998) for the gain; Cochrane and Orcutt (1949) for the turns; Nyblom (1989), Hansen (1992).
-Cost: O(N n^2) and O(c^2 n^3) for c cells, ten times in correlated noise.
+Source: Bai and Perron (1998, 2003); Cochrane and Orcutt (1949) for the turns; Nyblom (1989), Hansen (1992).
+Cost: O(N n^2) and O(c^2 n^3) for c cells, four times in correlated noise.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, shared
-from driftfit.judge.changes.constants import (
-    SINGULAR,
-    SMALL,
-    Found,
-    Problem,
-    Work,
-    autoregression,
-    constants,
-    settle,
-    whiten,
-)
-from driftfit.judge.statistics.robust import cholesky
+from driftfit.judge.statistics.robust import cholesky, solved
 
+SINGULAR = 1e-9
+"""Information below this share of that of the whole record is none."""
+SMALL = 1e-300
+"""Added to a diagonal, so that it can be inverted."""
 CELLS = 32
-"""Cells between which pairs of breaks are compared."""
-PLACES = 400
-"""Places at which a single break is compared, at most."""
+"""Cells at whose ends breaks are compared."""
+PLACES = 20_000
+"""Places at which a break may be, at most."""
+FINER = 8
+"""Steps of a cell in which a break is moved, before it moves in single places."""
+ROUNDS = 5
+"""Rounds of constants and their autoregression."""
+
+
+class Problem(NamedTuple):
+    """What stays the same in all draws from a record."""
+
+    g: Array
+    """(N,): roots of the weights."""
+    lags: Array
+    """(p,) of whole numbers, ascending: lags of the autoregression."""
+    places: Array
+    """(F + 1,): where there may be a break, from 0 to N."""
+    edges: Array
+    """(m + 1,): which of them bound cells."""
+    paths: Array
+    """(m, n): combinations of scores for which Nyblom's statistic is returned beside that of all."""
+    sizes: Array
+    """(2,): fewest rows of a segment; largest number of breaks."""
+    floor: Array
+    """(1,): smallest sum of squares, that of rounding."""
+
+
+def problem_of(g: Array, lags: Array, fewest: int, most: int, paths: Array, floor: float = SMALL) -> Problem:
+    """The problem of a record with up to ``most`` breaks."""
+    N = len(g)
+    places = np.arange(N + 1) if N <= PLACES else np.linspace(0, N, PLACES + 1).astype(np.int64)
+    edges = np.linspace(0, len(places) - 1, int(np.clip(N // 8, 4, CELLS)) + 1).astype(np.int64)
+    return Problem(g, lags, places, edges, np.ascontiguousarray(paths), np.array([fewest, most]), np.array([floor]))
+
+
+class Work(NamedTuple):
+    """Scratch space for N rows of n regressors, F places, m cells, K breaks and p lags."""
+
+    Z: Array
+    v: Array
+    C: Array
+    G: Array
+    H: Array
+    R: Array
+    cost: Array
+    best: Array
+    theta: Array
+    row: Array
+    sums: Array
+    delta: Array
+    a: Array
+    next: Array
+    back: Array
+    at: Array
+
+    @classmethod
+    def of(cls, N: int, n: int, problem: Problem) -> Work:
+        """Empty space for one record."""
+        F, p, K = len(problem.places), len(problem.lags), int(problem.sizes[1])
+        m = len(problem.edges)
+        shapes = (
+            (N, n + 1), (N,), (F, n + 1, n + 1), (n + 1, n + 1), (p + 1, p + 1), (n, n), (m, m), (K + 1, m), (n,), (n,),
+            (n,), (n,), (p,), (K + 1, p),
+        )  # fmt: skip
+        return cls._make([*map(np.zeros, shapes), np.zeros((K + 1, m), np.int64), np.zeros(K, np.int64)])
+
+
+class Found(NamedTuple):
+    """What `search` fills in for one record, for 0 .. K breaks."""
+
+    rss: Array
+    """(K + 1,): sums of squares; inf where there is no room."""
+    at: Array
+    """(K + 1, K): their places, as indices."""
+    ar: Array
+    """(K + 1, p): their autoregressions."""
+    theta: Array
+    """(n,): constants."""
+    L: Array
+    """(1 + m,): Nyblom's statistics."""
+
+    @classmethod
+    def of(cls, n: int, problem: Problem) -> Found:
+        """Nothing found yet."""
+        p, K = len(problem.lags), int(problem.sizes[1])
+        at, L = np.zeros((K + 1, K), np.int64), np.zeros(1 + len(problem.paths))
+        return cls(np.full(K + 1, np.inf), at, np.zeros((K + 1, p)), np.zeros(n), L)
 
 
 @shared
-def invert(work: Work) -> None:
-    """The inverse of A from its factor G, and the residuals r."""
-    n, N = work.theta.shape[0], work.Z.shape[0]
-    for c in range(n):
-        for i in range(n):
-            total = 1.0 if i == c else 0.0
-            for k in range(i):
-                total -= work.G[i, k] * work.inverse[k, c]
-            work.inverse[i, c] = total / work.G[i, i] if work.G[i, i] > 0.0 else 0.0
-        for i in range(n - 1, -1, -1):
-            total = work.inverse[i, c]
-            for k in range(i + 1, n):
-                total -= work.G[k, i] * work.inverse[k, c]
-            work.inverse[i, c] = total / work.G[i, i] if work.G[i, i] > 0.0 else 0.0
+def whiten(X: Array, y: Array, g: Array, lags: Array, a: Array, Z: Array) -> None:
+    """Z (N, n + 1): rows and outputs after whitening, times g; the rows before the last lag are 0."""
+    N, n, p = X.shape[0], X.shape[1], lags.shape[0]
+    first = lags[p - 1] if p > 0 else 0
     for t in range(N):
-        work.r[t] = work.Z[t, n]
-        for j in range(n):
-            work.r[t] -= work.Z[t, j] * work.theta[j]
-
-
-@shared
-def later(X: Array, problem: Problem, a: Array, t: int, first: int, row: Array) -> None:
-    """Row t of D_b, b = first."""
-    for j in range(X.shape[1]):
-        value = X[t, j]
-        for i in range(a.shape[0]):
-            if t - problem.lags[i] >= first:
-                value -= a[i] * X[t - problem.lags[i], j]
-        row[j] = value * problem.g[t]
-
-
-@shared
-def increments(X: Array, problem: Problem, a: Array, work: Work) -> None:
-    """B, U = A^-1 B, Q less B' U, and s of every place, from the last to the first."""
-    N, n, p = X.shape[0], X.shape[1], a.shape[0]
-    order = problem.lags[p - 1] if p > 0 else 0
-    R, end = work.R, N
-    for i in range(n):
-        work.sums[i] = 0.0
-        for j in range(n):
-            R[i, j] = 0.0
-    for f in range(problem.places.shape[0] - 1, -1, -1):
-        first = problem.places[f]
-        whole = min(max(first + order, order), N)
-        for t in range(whole, end):
-            for i in range(n):
-                work.sums[i] += work.Z[t, i] * work.r[t]
-                for j in range(i + 1):
-                    R[i, j] += work.Z[t, i] * work.Z[t, j]
-        end = whole
-        for i in range(n):
-            work.s[f, i] = work.sums[i]
-            for j in range(n):
-                work.B[f, i, j] = work.Q[f, i, j] = R[max(i, j), min(i, j)]
-        for t in range(max(first, order), whole):
-            later(X, problem, a, t, first, work.row)
-            for i in range(n):
-                work.s[f, i] += work.row[i] * work.r[t]
-                for j in range(n):
-                    work.B[f, i, j] += work.Z[t, i] * work.row[j]
-                    work.Q[f, i, j] += work.row[i] * work.row[j]
-        for i in range(n):
-            for j in range(n):
-                total = 0.0
-                for k in range(n):
-                    total += work.inverse[i, k] * work.B[f, k, j]
-                work.U[f, i, j] = total
-        for i in range(n):
-            for j in range(n):
-                for k in range(n):
-                    work.Q[f, i, j] -= work.B[f, k, i] * work.U[f, k, j]
-
-
-@shared
-def factored(M: Array, k: int, least: float) -> float:
-    """The factor of M (k + 1, k + 1), in place, whose last row is s; returns s' M^-1 s. Directions below ``least`` are
-    left out."""
-    found = 0.0
-    for j in range(k):
-        pivot = M[j, j]
-        for i in range(j):
-            pivot -= M[j, i] * M[j, i]
-        root = np.sqrt(pivot) if pivot > least else 0.0
-        M[j, j] = root
-        for r in range(j + 1, k + 1):
-            total = M[r, j]
-            for i in range(j):
-                total -= M[r, i] * M[j, i]
-            M[r, j] = total / root if root > 0.0 else 0.0
-        found += M[k, j] * M[k, j]
-    return found
-
-
-@shared
-def alone(work: Work, b: int, least: float) -> float:
-    """What a break at place b explains; its factor stays in M."""
-    n = work.row.shape[0]
-    for i in range(n):
-        work.M[n, i] = work.s[b, i]
-        for j in range(i + 1):
-            work.M[i, j] = work.Q[b, i, j]
-    return factored(work.M, n, least)  # type: ignore[no-any-return]
-
-
-@shared
-def beside(work: Work, b: int, c: int, least: float) -> float:
-    """What a break at c explains beside that at b < c, whose factor is in M; its own goes to G, and what ties the two
-    to R."""
-    n, M, G, R = work.row.shape[0], work.M, work.G, work.R
-    for j in range(n):
-        for i in range(n):
-            total = work.B[c, i, j]
-            for k in range(n):
-                total -= work.U[b, k, i] * work.B[c, k, j]
-            for k in range(i):
-                total -= M[i, k] * R[k, j]
-            R[i, j] = total / M[i, i] if M[i, i] > 0.0 else 0.0
-    for i in range(n):
-        total = work.s[c, i]
-        for k in range(n):
-            total -= R[k, i] * M[n, k]
-        G[n, i] = total
-        for j in range(i + 1):
-            total = work.Q[c, i, j]
-            for k in range(n):
-                total -= R[k, i] * R[k, j]
-            G[i, j] = total
-    return factored(G, n, least)  # type: ignore[no-any-return]
-
-
-@shared
-def least_information(work: Work) -> float:
-    """Information that counts as none."""
-    most = 0.0
-    for i in range(work.row.shape[0]):
-        total = 0.0
-        for t in range(work.Z.shape[0]):
-            total += work.Z[t, i] * work.Z[t, i]
-        most = max(most, total)
-    return SINGULAR * most
-
-
-@shared
-def room(problem: Problem, N: int, b: int, c: int) -> bool:
-    """Whether segments between places b < c are long enough."""
-    fewest, first, last = problem.sizes[1], problem.places[b], problem.places[c]
-    return first >= fewest and N - last >= fewest and (b == c or last - first >= fewest)
-
-
-@shared
-def best(problem: Problem, count: int, N: int, work: Work) -> float:
-    """What the best one or two breaks explain, and their places in ``at``; negative where there is no room.
-
-    Two are compared at the bounds of cells, and then moved to the best places within a cell, one after the other.
-    """
-    stride, F, most, at = problem.sizes[0], problem.places.shape[0], -1.0, work.at
-    least = least_information(work)
-    for b in range(0, F, 1 if count == 1 else stride):
-        if not room(problem, N, b, b):
+        for j in range(n + 1):
+            Z[t, j] = 0.0
+        if t < first:
             continue
-        first = alone(work, b, least)
-        if count == 1:
-            if first > most:
-                most = first
-                at[0] = b
-            continue
-        for c in range(b + stride, F, stride):
-            if room(problem, N, b, c):
-                value = first + beside(work, b, c, least)
-                if value > most:
-                    most = value
-                    at[0] = b
-                    at[1] = c
-    if count == 1 or most < 0.0:
-        return most
-    for moved in (1, 0, 1, 0):
-        old, other = at[moved], at[1 - moved]
-        for f in range(max(old - stride, 0), min(old + stride + 1, F)):
-            b, c = (other, f) if moved == 1 else (f, other)
-            if b < c and room(problem, N, b, c):
-                value = alone(work, b, least) + beside(work, b, c, least)
-                if value > most:
-                    most = value
-                    at[moved] = f
-    return most
+        for j in range(n):
+            value = X[t, j]
+            for i in range(p):
+                value -= a[i] * X[t - lags[i], j]
+            Z[t, j] = value * g[t]
+        value = y[t]
+        for i in range(p):
+            value -= a[i] * y[t - lags[i]]
+        Z[t, n] = value * g[t]
 
 
 @shared
-def residuals(X: Array, y: Array, problem: Problem, count: int, work: Work) -> None:
-    """v (N,) of the segments between the places ``at``."""
-    N, n = X.shape
-    at, M, G, R, least = work.at, work.M, work.G, work.R, least_information(work)
-    alone(work, at[0], least)
-    if count == 2:
-        beside(work, at[0], at[1], least)
-        for i in range(n - 1, -1, -1):
-            total = G[n, i]
-            for j in range(i + 1, n):
-                total -= G[j, i] * work.delta[n + j]
-            work.delta[n + i] = total / G[i, i] if G[i, i] > 0.0 else 0.0
-    for i in range(n - 1, -1, -1):
-        total = M[n, i]
-        if count == 2:
-            for j in range(n):
-                total -= R[i, j] * work.delta[n + j]
-        for j in range(i + 1, n):
-            total -= M[j, i] * work.delta[j]
-        work.delta[i] = total / M[i, i] if M[i, i] > 0.0 else 0.0
-    for i in range(n):
-        work.row[i] = work.theta[i]
-        for b in range(count):
-            for j in range(n):
-                work.row[i] -= work.U[at[b], i, j] * work.delta[b * n + j]
-    for t in range(N):
+def autoregression(v: Array, g: Array, lags: Array, H: Array, a: Array) -> None:
+    """Weighted least squares of v (N,) on its lags: a (p,)."""
+    p = lags.shape[0]
+    for i in range(p + 1):
+        for j in range(i + 1):
+            H[i, j] = 0.0
+    for t in range(lags[p - 1], v.shape[0]):
+        w = g[t] * g[t]
+        for i in range(p + 1):
+            left = w * (v[t] if i == p else v[t - lags[i]])
+            for j in range(i + 1):
+                H[i, j] += left * (v[t] if j == p else v[t - lags[j]])
+    for i in range(p):
+        H[i, i] += SINGULAR * H[i, i] + SMALL
+    cholesky(H, p, 0.0)
+    solved(H, a)
+
+
+@shared
+def remainder(X: Array, y: Array, first: int, last: int, work: Work) -> None:
+    """v: what theta leaves of rows first .. last - 1."""
+    for t in range(first, last):
         work.v[t] = y[t]
-        for i in range(n):
-            value = work.row[i]
-            for b in range(count):
-                if t >= problem.places[at[b]]:
-                    value += work.delta[b * n + i]
-            work.v[t] -= X[t, i] * value
+        for j in range(X.shape[1]):
+            work.v[t] -= X[t, j] * work.theta[j]
 
 
 @shared
-def prepare(X: Array, y: Array, problem: Problem, a: Array, work: Work) -> float:
-    """All that `gain` needs, for the noise a; returns the sum of squares of constants."""
-    whiten(X, y, problem.g, problem.lags, a, work.Z)
-    rss: float = constants(work.Z, work.G, work.theta)
-    invert(work)
-    increments(X, problem, a, work)
+def cumulate(problem: Problem, work: Work) -> None:
+    """C: sums of products of [Z, z] before every place, lower triangles."""
+    C, Z, k = work.C, work.Z, work.Z.shape[1]
+    for i in range(k):
+        for j in range(i + 1):
+            C[0, i, j] = 0.0
+    for f in range(1, problem.places.shape[0]):
+        for i in range(k):
+            for j in range(i + 1):
+                C[f, i, j] = C[f - 1, i, j]
+        for t in range(problem.places[f - 1], problem.places[f]):
+            for i in range(k):
+                for j in range(i + 1):
+                    C[f, i, j] += Z[t, i] * Z[t, j]
+
+
+@shared
+def cost(work: Work, first: int, last: int, least: float) -> float:
+    """What constants leave between two places; their factor stays in G. Information up to ``least`` is none."""
+    G, C, k = work.G, work.C, work.G.shape[0]
+    for i in range(k):
+        for j in range(i + 1):
+            G[i, j] = C[last, i, j] - C[first, i, j]
+    return cholesky(G, k - 1, least)  # type: ignore[no-any-return]
+
+
+@shared
+def settle(X: Array, y: Array, problem: Problem, a: Array, work: Work) -> float:
+    """Constants and their autoregression in turn; returns the sum of squares."""
+    rss, last = 0.0, problem.places.shape[0] - 1
+    for round in range(ROUNDS):
+        whiten(X, y, problem.g, problem.lags, a, work.Z)
+        cumulate(problem, work)
+        rss = cost(work, 0, last, 0.0)
+        solved(work.G, work.theta)
+        if a.shape[0] == 0:
+            break
+        if round < ROUNDS - 1:
+            remainder(X, y, 0, X.shape[0], work)
+            autoregression(work.v, problem.g, problem.lags, work.H, a)
     return rss
 
 
 @shared
-def keep(rss: float, count: int, at: Array, a: Array, found: Found) -> None:
-    """Remember breaks that are better than those found before."""
+def prepare(X: Array, y: Array, problem: Problem, a: Array, most: int, work: Work) -> float:
+    """The best partitions on cells with up to ``most`` breaks, in noise a; returns the information that is none."""
+    whiten(X, y, problem.g, problem.lags, a, work.Z)
+    cumulate(problem, work)
+    edges, m, least = problem.edges, work.cost.shape[0], 0.0
+    for i in range(X.shape[1]):
+        least = max(least, SINGULAR * work.C[problem.places.shape[0] - 1, i, i])
+    for j in range(1, m):
+        for i in range(j):
+            long = problem.places[edges[j]] - problem.places[edges[i]] >= problem.sizes[0]
+            work.cost[i, j] = cost(work, edges[i], edges[j], least) if long else np.inf
+        work.best[0, j] = work.cost[0, j]
+    for count in range(1, most + 1):
+        for j in range(1, m):
+            work.best[count, j] = np.inf
+            for i in range(1, j):
+                value = work.best[count - 1, i] + work.cost[i, j]
+                if value < work.best[count, j]:
+                    work.best[count, j] = value
+                    work.back[count, j] = i
+    return least
+
+
+@shared
+def place(problem: Problem, count: int, work: Work, least: float) -> float:
+    """The places ``at`` of so many breaks, moved within cells; returns the sum of squares, inf without room."""
+    fewest, places, at = problem.sizes[0], problem.places, work.at
+    m, last, total = work.cost.shape[0] - 1, places.shape[0] - 1, 0.0
+    if not work.best[count, m] < np.inf:
+        return np.inf
+    for k in range(count, 0, -1):
+        m = work.back[k, m]
+        at[k - 1] = problem.edges[m]
+    wide = problem.edges[1] - problem.edges[0] + 1
+    step = max(1, wide // FINER)
+    for move in range(2 * count):
+        k = move if move < count else 2 * count - 1 - move
+        low, high = at[k - 1] if k > 0 else 0, at[k + 1] if k + 1 < count else last
+        reach, by, most = wide, step, np.inf
+        while by > 0:
+            middle = at[k]
+            for f in range(max(middle - reach, low), min(middle + reach, high) + 1, by):
+                if places[f] - places[low] >= fewest and places[high] - places[f] >= fewest:
+                    value = cost(work, low, f, least) + cost(work, f, high, least)
+                    if value < most:
+                        most = value
+                        at[k] = f
+            reach, by = by, 1 if by > 1 else 0
+    for k in range(count + 1):
+        total += cost(work, at[k - 1] if k > 0 else 0, at[k] if k < count else last, least)
+    return total
+
+
+@shared
+def residuals(X: Array, y: Array, problem: Problem, count: int, work: Work, least: float) -> None:
+    """v (N,) of the segments between the places ``at``."""
+    for k in range(count + 1):
+        first, last = work.at[k - 1] if k > 0 else 0, work.at[k] if k < count else problem.places.shape[0] - 1
+        cost(work, first, last, least)
+        solved(work.G, work.theta)
+        remainder(X, y, problem.places[first], problem.places[last], work)
+
+
+@shared
+def keep(problem: Problem, count: int, work: Work, a: Array, least: float, found: Found) -> bool:
+    """Remember breaks that are better than those found before; whether there is room for any."""
+    rss = max(place(problem, count, work, least), problem.floor[0])
     if rss < found.rss[count]:
         found.rss[count] = rss
         for b in range(count):
-            found.at[count, b] = at[b]
+            found.at[count, b] = work.at[b]
         for i in range(a.shape[0]):
             found.ar[count, i] = a[i]
+    return rss < np.inf  # type: ignore[no-any-return]
 
 
 @shared
 def nyblom(problem: Problem, work: Work, L: Array) -> None:
     """L = sum S_t' V^-1 S_t / N of all scores, V their moments, and sum (w' S_t)^2 / (N w' V w) of every path w."""
-    N, n = work.Z.shape[0], work.theta.shape[0]
+    N, n, r = work.Z.shape[0], work.theta.shape[0], work.v
+    for t in range(N):
+        r[t] = work.Z[t, n]
+        for j in range(n):
+            r[t] -= work.Z[t, j] * work.theta[j]
     for k in range(L.shape[0]):
         L[k] = 0.0
     for i in range(n):
         for j in range(i + 1):
             total = 0.0
             for t in range(N):
-                total += work.Z[t, i] * work.Z[t, j] * work.r[t] * work.r[t]
+                total += work.Z[t, i] * work.Z[t, j] * r[t] * r[t]
             work.R[i, j] = work.R[j, i] = total
     for k in range(1, L.shape[0]):
         for i in range(n):
@@ -306,7 +315,7 @@ def nyblom(problem: Problem, work: Work, L: Array) -> None:
         work.G[i, i] = work.R[i, i] + SINGULAR * work.R[i, i] + SMALL
         for j in range(i):
             work.G[i, j] = work.R[i, j]
-    cholesky(work.G, n)
+    cholesky(work.G, n, 0.0)
     for k in range(1, L.shape[0]):
         for i in range(n):
             work.row[i] = 0.0
@@ -314,13 +323,13 @@ def nyblom(problem: Problem, work: Work, L: Array) -> None:
         for t in range(N):
             value = 0.0
             for i in range(n):
-                work.row[i] += work.Z[t, i] * work.r[t]
+                work.row[i] += work.Z[t, i] * r[t]
                 value += problem.paths[k - 1, i] * work.row[i]
             total += value * value
         L[k] = -total / (N * L[k])
     for t in range(N):
         for i in range(n):
-            work.sums[i] += work.Z[t, i] * work.r[t]
+            work.sums[i] += work.Z[t, i] * r[t]
         for i in range(n):
             value = work.sums[i]
             for j in range(i):
@@ -331,43 +340,44 @@ def nyblom(problem: Problem, work: Work, L: Array) -> None:
 
 @shared
 def search(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> None:
-    """Everything of one record: constants, Nyblom's statistics, the best one and two breaks."""
-    N, n = X.shape
-    p, a = found.ar.shape[1], work.a
-    for count in range(3):
+    """Everything of one record: constants, Nyblom's statistics, the best partition with every number of breaks."""
+    p, K, a = found.ar.shape[1], problem.sizes[1], work.a
+    for count in range(K + 1):
         found.rss[count] = np.inf
     for i in range(p):
         a[i] = 0.0
-    found.rss[0] = max(settle(X, y, problem, problem.sizes[2], a, work), problem.floor[0])
-    for i in range(n):
+    found.rss[0] = max(settle(X, y, problem, a, work), problem.floor[0])
+    for i in range(X.shape[1]):
         found.theta[i] = work.theta[i]
     for i in range(p):
         found.ar[0, i] = a[i]
-    invert(work)
     nyblom(problem, work, found.L)
     for start in range(2 if p > 0 else 1):
-        for count in range(1, problem.sizes[3] + 1):
-            for turn in range(2 if p > 0 else 1):
-                if turn == 0:
-                    for i in range(p):
-                        a[i] = found.ar[0, i] if start == 0 else 0.0
-                if turn > 0 or count == 1 or p > 0:
-                    rss = prepare(X, y, problem, a, work)
-                value = best(problem, count, N, work)
-                if value < 0.0:
-                    break
-                keep(max(rss - value, problem.floor[0]), count, work.at, a, found)
-                if turn == 0 and p > 0:
-                    residuals(X, y, problem, count, work)
-                    autoregression(work.v, problem.g, problem.lags, work.H, a)
+        for i in range(p):
+            a[i] = found.ar[0, i] if start == 0 else 0.0
+        least, room = prepare(X, y, problem, a, K, work), K
+        for count in range(1, K + 1):
+            if not keep(problem, count, work, a, least, found):
+                room = count - 1
+                break
+            if p > 0:
+                residuals(X, y, problem, count, work, least)
+                autoregression(work.v, problem.g, problem.lags, work.H, work.next[count])
+        for count in range(1, room + 1 if p > 0 else 1):
+            least = prepare(X, y, problem, work.next[count], count, work)
+            keep(problem, count, work, work.next[count], least, found)
 
 
 def _once(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> None:
     search(X, y, problem, work, found)
 
 
-def _prepared(X: Array, y: Array, problem: Problem, a: Array, work: Work, rss: Array) -> None:
-    rss[0] = prepare(X, y, problem, a, work)
+_searched = Driver(_once)
 
 
-searched, prepared = Driver(_once), Driver(_prepared)
+def searched(X: Array, y: Array, problem: Problem) -> tuple[Found, Work]:
+    """What `search` finds in one record."""
+    N, n = X.shape
+    found, work = Found.of(n, problem), Work.of(N, n, problem)
+    _searched(X, y, problem, work, found)
+    return found, work

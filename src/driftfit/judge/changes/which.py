@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.constants import SMALL
 from driftfit.judge.changes.dates import Dated, covariance
-from driftfit.judge.changes.fit import split, white_rows
+from driftfit.judge.changes.fit import left, split, white_rows
 from driftfit.judge.changes.null import Model
+from driftfit.judge.changes.scan import SMALL
 
 ALIKE = 6.0
 """Twice the logarithm of the likelihood ratio from which on the evidence is strong (Kass and Raftery, 1995)."""
@@ -123,9 +123,7 @@ class _Search:
 
     def left(self, columns: Array) -> float:
         """The sum of squares that columns leave."""
-        Z, z = self.white(columns)
-        r = z - Z @ np.linalg.lstsq(Z, z, rcond=None)[0]
-        return float(r @ r) + SMALL
+        return left(*self.white(columns))
 
     def alone(self, first: int, last: int | None) -> tuple[Array, Array]:
         """Sums of squares (n,) if one parameter changes at date ``first``, and back at ``last``; the best dates."""

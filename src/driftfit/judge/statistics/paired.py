@@ -30,15 +30,15 @@ class Paired(NamedTuple):
     p: float
 
 
-def newey_west(d: Array) -> float:
-    """Long-run variance of d (N,)."""
+def newey_west(d: Array, about: Array | float | None = None) -> Array:
+    """Long-run variance of d (N, ..) about its mean, or about a value that is known."""
     N = len(d)
-    d = d - d.mean()
+    d = d - (d.mean(axis=0) if about is None else about)
     lags = min(int(4.0 * (N / 100.0) ** (2.0 / 9.0)), N - 1)
-    v = float(d @ d)
+    v = np.sum(d * d, axis=0)
     for k in range(1, lags + 1):
-        v += 2.0 * (1.0 - k / (lags + 1.0)) * float(d[k:] @ d[:-k])
-    return v / N
+        v += 2.0 * (1.0 - k / (lags + 1.0)) * np.sum(d[k:] * d[:-k], axis=0)
+    return np.asarray(v / N)
 
 
 def paired(name: str, rival: Array, own: Array) -> Paired:
@@ -48,7 +48,7 @@ def paired(name: str, rival: Array, own: Array) -> Paired:
         return Paired(name, rms, float("nan"), float("nan"))
     unit = max(np.abs(rival).max(), np.abs(own).max()) or 1.0  # squares of squares would leave the range of numbers
     d = (rival / unit) ** 2 - (own / unit) ** 2
-    mean, v = float(d.mean()), newey_west(d)
+    mean, v = float(d.mean()), float(newey_west(d))
     # where every sample has the same difference, v is 0
     t = mean / math.sqrt(v / len(d)) if v > 0.0 else math.copysign(math.inf, mean) if mean else 0.0
     return Paired(name, rms, t, 0.5 * math.erfc(t / math.sqrt(2.0)))

@@ -18,6 +18,7 @@ import numpy as np
 import scipy
 
 from driftfit.engine.kernel import Array
+from driftfit.judge.statistics.paired import newey_west
 from driftfit.judge.statistics.robust import deviation
 
 LOUDER = 1e-3
@@ -75,9 +76,6 @@ def grows_with(z: Array, phi: Array) -> Array:
     below, up_to = ([np.searchsorted(np.sort(one), one, side) for one in size.T] for side in ("left", "right"))
     x = (np.array(below) + np.array(up_to)).T / (2.0 * N)
     d = (square - square.mean())[:, None] * (x - x.mean(axis=0))
-    lags = int(4.0 * (N / 100.0) ** (2.0 / 9.0))
-    total = np.sum(d * d, axis=0)
-    for k in range(1, lags + 1):
-        total += 2.0 * (1.0 - k / (lags + 1.0)) * np.sum(d[k:] * d[:-k], axis=0)
+    total = N * newey_west(d, 0.0)
     varied = (np.ptp(size, axis=0) > 0.0) & (total > 0.0)
     return np.where(varied, scipy.special.ndtr(-d.sum(axis=0) / np.sqrt(np.where(varied, total, 1.0))), 1.0)

@@ -7,19 +7,22 @@ them), so all structures use the same rows. They run in parallel, in lanes of th
 columns of zeros after its own, whose parameters are known to be 0 (`Tracker.partly_known`). Trackers that do not allow
 that take a driver for each number of columns. Several records are run separately, each from the start, and written one
 after the other.
+
+Of models with several outputs each output is a regression, whose columns are known by their names. Every candidate is
+run once with constant parameters, which gives these regressors with missing lags filled.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.data.record import Known, Record, Records
+from driftfit.data.record import Known, Reading, Record, Records
 from driftfit.engine.kernel import Array, Driver
-from driftfit.judge.constant_fit import constant_least_squares
+from driftfit.judge.constant_fit import constant_least_squares, constant_outputs
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model, Term
 from driftfit.models.regression import Regression
@@ -240,3 +243,33 @@ def _union(models: Sequence[Model]) -> Model:
         nb.append(max(lags) - nk[-1] + 1 if lags else 0)
     start = next((model.start for model in models if isinstance(model, ARX)), "drop")
     return ARX(na, tuple(nb), nk=tuple(nk), inputs=inputs, intercept=constant, start=start)
+
+
+Candidates = tuple[Pool, list[Candidate]]
+
+
+def pools_of(models: Sequence[Model], y: Any, u: Any, reading: Reading, data: Any, by: Any) -> dict[str, Candidates]:
+    """The union of the candidates' regressors, and the candidates, for each output; one entry if they share a theta."""
+    found = [constant_outputs(model, y, u, reading, data, by) for model in models]
+    for model, runs in zip(models, found, strict=True):
+        if runs.keys() != found[0].keys() or model.implicit:
+            raise ValueError(
+                f"select: several outputs are compared for ARX or Regression models with the same outputs; got "
+                f"{models[0]!r} and {model!r}."
+            )
+    return {name: _pool(models, [runs[name] for runs in found]) for name in found[0]}
+
+
+def _pool(models: Sequence[Model], candidates: Sequence[Sequence[Track]]) -> Candidates:
+    """The pool of one output; every candidate has a run for each record."""
+    columns: dict[str, Array] = {}
+    gaps = []
+    for runs in candidates:
+        rows = np.concatenate([constant_least_squares(run.model, run.record) for run in runs])
+        phi = np.where(rows["valid"] > 0.0, rows["phi"][..., 0], np.nan)
+        columns = dict(zip(runs[0].names, phi.T, strict=True)) | columns
+        gaps.append(rows["dt"][:, 0])
+    names, records = tuple(columns), tuple(replace(run.record, time=None) for run in candidates[0])
+    pool = Pool(records, np.column_stack(list(columns.values())), names, np.min(gaps, axis=0))
+    places = [tuple(names.index(name) for name in runs[0].names) for runs in candidates]
+    return pool, [Candidate(repr(one), len(at), one, at) for one, at in zip(models, places, strict=True)]

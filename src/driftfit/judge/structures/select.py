@@ -47,8 +47,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import factor
 from driftfit.judge.plots import plot_selection
 from driftfit.judge.statistics.paired import newey_west
-from driftfit.judge.structures.candidates import Candidate, Pool, Predicted, pool_of, price
-from driftfit.judge.structures.several_outputs import pools_of
+from driftfit.judge.structures.candidates import Candidate, Pool, Predicted, pool_of, pools_of, price
 from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
@@ -357,7 +356,7 @@ def _judged(pool: Pool, tracker: Tracker, structures: list[Candidate], predictio
     for structure, prediction, total in zip(structures, predictions, totals, strict=True):
         lost = predictions[top].loglik - prediction.loglik
         parts = [lost[span][judged[span]] for span in pool.spans]  # records are independent: their variances add up
-        variance = sum(len(part) * max(newey_west(part), 0.0) for part in parts if len(part) > 1)
+        variance = sum(len(part) * max(float(newey_west(part)), 0.0) for part in parts if len(part) > 1)
         spread = float(np.sqrt(variance)) if count > 10 else float("nan")
         error = (y - prediction.y_hat)[judged]
         rms = float(np.sqrt(np.mean(error * error))) if count else float("nan")

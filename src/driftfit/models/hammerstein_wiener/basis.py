@@ -47,12 +47,12 @@ def _over(evaluate: Any) -> Driver:
     return each
 
 
-def values_and_slopes(evaluate: Any, x: Array, p: Array, n: int) -> tuple[Array, Array]:
-    """The functions of a compiled routine at x (k,), and their derivatives, (k, n) each; p may be overwritten."""
+def values_and_slopes(evaluate: Any, x: Array, p: Array, n: int) -> Array:
+    """The functions of a compiled routine at x (k,), and their derivatives, (2, k, n); p may be overwritten."""
     evaluate.load()
-    out, slopes = np.empty((2, len(x), n))
-    _over(evaluate)(np.ascontiguousarray(x), p, out, slopes)
-    return out, slopes
+    found = np.empty((2, len(x), n))
+    _over(evaluate)(np.ascontiguousarray(x), p, *found)
+    return found
 
 
 class Basis(Settings, ABC):
@@ -153,17 +153,20 @@ class Basis(Settings, ABC):
 
     def value(self, x: Any) -> Array:
         """The functions at x (...), as (..., n)."""
-        return self._at(x)[0]
+        return np.asarray(self._at(x)[0])
 
     def derivative(self, x: Any) -> Array:
         """Their derivatives at x (...), as (..., n)."""
-        return self._at(x)[1]
+        return np.asarray(self._at(x)[1])
 
-    def _at(self, x: Any) -> tuple[Array, Array]:
+    def for_coefficients(self, x: Any, c: Array) -> Array:
+        """The functions at x (...) under coefficients c (..., n), on which those of some bases depend, (..., n)."""
+        return self.value(x)
+
+    def _at(self, x: Any) -> Array:
         points = np.asarray(x, dtype=float)
-        out, slopes = values_and_slopes(self.evaluate, points.ravel(), self.parameters.copy(), self.n)
-        shape = (*points.shape, self.n)
-        return out.reshape(shape), slopes.reshape(shape)
+        found = values_and_slopes(self.evaluate, points.ravel(), self.parameters.copy(), self.n)
+        return found.reshape(2, *points.shape, self.n)
 
     @classmethod
     def from_words(cls, words: tuple[Any, ...]) -> Self:

@@ -27,7 +27,6 @@ from driftfit.engine.settings import one_of
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.separation import METHODS, Groups, split
-from driftfit.models.hammerstein_wiener.thresholds import Thresholds
 
 INPUTS, OUTPUTS = ("unit", "c1", "b1"), ("d1", "unit", "slope")
 
@@ -98,16 +97,7 @@ class Blocks:
     @property
     def radius(self) -> Array:
         """The largest size of a pole of the linear block, (T,); 1 and more is unstable."""
-        T, na = self.a.shape
-        if not na:
-            return np.zeros(T)
-        companion = np.zeros((T, na, na))
-        companion[:, 0] = -self.a
-        companion[:, range(1, na), range(na - 1)] = 1.0
-        known = np.isfinite(companion).all(axis=(1, 2))
-        found = np.full(T, np.nan)
-        found[known] = np.abs(np.linalg.eigvals(companion[known])).max(axis=1)
-        return found
+        return radius_of(self.a)
 
     def of_input(self, i: int = 0) -> tuple[Array, Array]:
         """b (T, nb) and c (T, n_in) of input i, an index from 0 on."""
@@ -116,11 +106,8 @@ class Blocks:
 
     def input_curve(self, u: Any, t: int = -1, i: int = 0) -> Array:
         """v of input i at inputs u (...), with the coefficients of sample t."""
-        basis, c = self.model.bases[i], self.of_input(i)[1][t]
-        if isinstance(basis, Thresholds):
-            x = np.asarray(u, dtype=float)
-            return np.asarray(basis.split(x, x >= c[1] / c[0], x <= c[2] / c[0]) @ c)
-        return np.asarray(basis.value(u) @ c)
+        c = self.of_input(i)[1][t]
+        return np.asarray(self.model.bases[i].for_coefficients(u, c) @ c)
 
     def output_curve(self, y: Any, t: int = -1) -> Array:
         """w = F(y) at outputs y (...), with the coefficients of sample t: the inverse of the output block."""
@@ -257,6 +244,17 @@ def deviations(model: HammersteinWiener, var: Array) -> Groups:
     with np.errstate(invalid="ignore"):
         std = np.sqrt(np.maximum(var, 0.0))
     return Groups(*np.split(std, np.cumsum([na, sum(nb), sum(n_in), n_out]), axis=1)[:4])
+
+
+def radius_of(a: Array) -> Array:
+    """The largest size (T,) of a root of z^na + a_1 z^(na-1) + .., for a (T, na); NaN where a is not finite."""
+    T, na = a.shape
+    companion = np.zeros((T, na, na))
+    companion[:, :1] = -a[:, None]
+    companion[:, range(1, na), range(na - 1)] = 1.0
+    found, known = np.full(T, np.nan), np.isfinite(a).all(axis=1)
+    found[known] = np.abs(np.linalg.eigvals(companion[known])).max(axis=1, initial=0.0)
+    return found
 
 
 class Separator:

@@ -33,7 +33,7 @@ from driftfit.engine.settings import covariance, matrix, numbers, vector
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.basis import PiecewiseLinear
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.structure import NUMBER, Structure
+from driftfit.models.hammerstein_wiener.structure import NUMBER, Structure, positions
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import drift, drift_matrix
 from driftfit.trackers.parts.covariance import correct, product_with
@@ -104,7 +104,7 @@ class Minimal(Tracker):
 @lru_cache
 def linearised(structure: Structure) -> Any:
     """A kernel that fills ``s.h_row`` = phi' J(xi) and returns phi' g(xi)."""
-    alone, pairs = structure.alone, structure.pairs
+    alone, pairs = (np.ascontiguousarray(one.T) for one in positions(structure, False))
     lone, paired = len(alone), len(pairs)
 
     @kernel

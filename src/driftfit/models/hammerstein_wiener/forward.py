@@ -9,37 +9,21 @@ O(n + 64).
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.basis import Basis
 from driftfit.models.hammerstein_wiener.output_curve import WIDER
-from driftfit.models.hammerstein_wiener.structure import GRID, Structure
+from driftfit.models.hammerstein_wiener.structure import GRID
 from driftfit.models.hammerstein_wiener.thresholds import INSIDE, Thresholds
 
 NEWTON_STEPS = 3
 
 
-class Blocks(Protocol):
-    """The parts of a `HammersteinWiener` model that this uses."""
-
-    @property
-    def structure(self) -> Structure: ...
-    @property
-    def bases(self) -> tuple[Basis, ...]: ...
-    @property
-    def delays(self) -> tuple[int, ...]: ...
-    @property
-    def out(self) -> Basis: ...
-    @property
-    def linear(self) -> bool: ...
-    def output_weights(self, theta: Array) -> Array: ...
-
-
-def play(model: Blocks, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
-    """Outputs (D, h); arguments as for `driftfit.models.base.Model.play`."""
+def play(model: Any, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
+    """Outputs (D, h) of a `HammersteinWiener` model; arguments as for `driftfit.models.base.Model.play`."""
     na, nbs, n_ins, n_out, intercept = model.structure
     at_b, (_, at_bc, at_ad) = na, model.structure.starts
     D, p, h = len(theta), y.shape[1], noise.shape[1]
@@ -83,7 +67,7 @@ def _inputs(basis: Basis, B: Array, u: Array) -> Array:
 class Inverse:
     """The output blocks of D systems, weights d (D, n_out), inverted on a grid over the span of each."""
 
-    def __init__(self, model: Blocks, d: Array, span: tuple[Any, Any]) -> None:
+    def __init__(self, model: Any, d: Array, span: tuple[Any, Any]) -> None:
         self.basis, self.d = model.out, d
         least, most = (np.atleast_1d(np.asarray(end, float)) for end in span)
         margin = WIDER * np.where(most > least, most - least, 1e-9)

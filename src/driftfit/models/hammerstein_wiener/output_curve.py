@@ -24,9 +24,8 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, part, shared
-from driftfit.engine.simd import fill_four, load_four, plus, reached, times
 from driftfit.models.hammerstein_wiener.curve_kernels import LEGENDRE, POWERS, legendre, powers
-from driftfit.models.hammerstein_wiener.structure import AT, EIGHT, GRID, NUMBER, ROW, Places
+from driftfit.models.hammerstein_wiener.structure import AT, GRID, NUMBER, Places
 
 WIDER = 0.2
 """Share of the range of the outputs by which the grid extends beyond it at both ends."""
@@ -102,34 +101,8 @@ def level(m: Array, p: Places, at: int, i: int) -> Any:
     d, place = p[AT.d_now], at + i
     total = m[place, 0]
     for k in range(1, p[AT.n_out]):
-        total += m[d + k, 0] * m[place + k * ROW, 0]
+        total += m[d + k, 0] * m[place + k * GRID, 0]
     return total
-
-
-@part
-def beneath(m: Array, p: Places, at: int, row: int, right: float) -> int:
-    """How many of the eight levels from ``at`` on are not above ``right``; ``row`` is the length of a row."""
-    d = p[AT.d_now]
-    one, other = load_four(m, at, 0), load_four(m, at + 4, 0)
-    for k in range(1, p[AT.n_out]):
-        weight = fill_four(m[d + k, 0])
-        one = plus(one, times(weight, load_four(m, at + k * row, 0)))
-        other = plus(other, times(weight, load_four(m, at + k * row + 4, 0)))
-    given = fill_four(right)
-    return reached(given, one) + reached(given, other)  # type: ignore[no-any-return]
-
-
-@part
-def beneath_in_lane(m: Array, p: Places, at: int, row: int, right: float) -> int:
-    """The same if the numbers of a lane are not contiguous."""
-    d, count = p[AT.d_now], 0
-    for i in range(EIGHT):
-        place = at + i
-        total = m[place, 0]
-        for k in range(1, p[AT.n_out]):
-            total += m[d + k, 0] * m[place + k * row, 0]
-        count += int(total <= right)
-    return count
 
 
 @shared
@@ -148,7 +121,7 @@ def look(m: Array, p: Places) -> None:
         for k in range(1, n_out):
             most = 0.0
             for i in range(GRID - 1):
-                place = at + k * ROW + i
+                place = at + k * GRID + i
                 most = max(most, abs(m[place + 1, 0] - m[place, 0]) / (m[levels + i + 1, 0] - m[levels + i, 0]))
             m[checked + k, 0], m[reach + k, 0] = m[d + k, 0], most
     else:
@@ -156,25 +129,6 @@ def look(m: Array, p: Places) -> None:
             m[levels + i + 1, 0] = max(m[levels + i + 1, 0], m[levels + i, 0])
         for i in range(GRID // 2, 0, -1):
             m[levels + i - 1, 0] = min(m[levels + i - 1, 0], m[levels + i, 0])
-
-
-@shared
-def on_envelope(m: Array, p: Places, right: float) -> float:
-    """The y at which the envelope has the level ``right``; the end of the grid for a level beyond it."""
-    levels, low, step = p[AT.level], m[NUMBER.low, 0], m[NUMBER.step, 0]
-    if right < m[levels, 0]:
-        return float(low)
-    if right >= m[levels + GRID - 1, 0]:
-        return float(low + (GRID - 1) * step)
-    below, above = 0, GRID - 1
-    while above - below > 1:
-        middle = (below + above) // 2
-        if m[levels + middle, 0] <= right:
-            below = middle
-        else:
-            above = middle
-    before, after = m[levels + below, 0], m[levels + below + 1, 0]
-    return float(low + step * (below + (right - before) / (after - before)))
 
 
 @part
@@ -198,24 +152,26 @@ def cubic(share: float, mean: float, first: float, last: float) -> float:
     return share * (share * (3.0 - 2.0 * share) + rest * (rest * one - share * other))
 
 
-@lru_cache
-def locating(lanes: bool = False) -> Any:
-    """A part (m, p, right) that finds the cell of the grid for a level; returns it, or the y if there is none."""
-    count = beneath_in_lane if lanes else beneath
-
-    def locate(m: Array, p: Places, right: float) -> Any:
-        m[NUMBER.late, 0] = 0.0
-        if not m[NUMBER.step, 0] > 0.0 or right != right:
-            return np.nan
-        right = min(max(right, -LARGEST), LARGEST)  # the level beyond all levels of the grid is infinite
-        if not rises(m, p):
-            return on_envelope(m, p, right)
-        below = EIGHT * count(m, p, p[AT.coarse], EIGHT, right)
-        below += count(m, p, p[AT.curve] + below + 1, ROW, right)
-        m[NUMBER.cell, 0], m[NUMBER.late, 0] = min(below, GRID - 2), 1.0
-        return right
-
-    return part(locate)
+@part
+def locate(m: Array, p: Places, right: float) -> Any:
+    """The level if its cell of the grid was found, which is marked as ``late``; otherwise y: NaN without a grid, or the
+    one at which the envelope has that level, within the grid.
+    """
+    m[NUMBER.late, 0] = 0.0
+    if not m[NUMBER.step, 0] > 0.0 or right != right:
+        return np.nan
+    rising, levels = rises(m, p), p[AT.level]
+    below, above = 0, GRID - 1
+    while above - below > 1:
+        middle = (below + above) // 2
+        here = level(m, p, p[AT.curve], middle) if rising else m[levels + middle, 0]
+        below, above = (middle, above) if here <= right else (below, middle)
+    if rising:
+        m[NUMBER.cell, 0], m[NUMBER.late, 0] = below, 1.0
+        return min(max(right, -LARGEST), LARGEST)
+    before, after = m[levels + below, 0], m[levels + below + 1, 0]
+    share = 1.0 if right >= after else (right - before) / (after - before) if right > before else 0.0
+    return m[NUMBER.low, 0] + m[NUMBER.step, 0] * (below + share)
 
 
 @lru_cache
@@ -249,9 +205,9 @@ def refining(out: Kind) -> Any:
 
 
 @lru_cache
-def inverse_of(out: Kind, lanes: bool = False) -> Any:
+def inverse_of(out: Kind) -> Any:
     """A part (m, p, right) that inverts the output block."""
-    locate, refine = locating(lanes), refining(out)
+    refine = refining(out)
 
     def invert(m: Array, p: Places, right: float) -> Any:
         found = locate(m, p, right)
@@ -262,8 +218,8 @@ def inverse_of(out: Kind, lanes: bool = False) -> Any:
 
 @lru_cache
 def inverting(out: Kind) -> Any:
-    """The same as a core, for any lane, where it is seldom needed."""
-    return shared(inverse_of(out, lanes=True).py_func)
+    """The same as a core, where it is seldom needed."""
+    return shared(inverse_of(out).py_func)
 
 
 @lru_cache
@@ -291,14 +247,8 @@ def laying(out: Kind) -> Any:
         for i in range(GRID):
             values(m, p, min(m[NUMBER.low, 0] + i * m[NUMBER.step, 0], end), g, h)
             for k in range(n_out):
-                m[p[AT.curve] + k * ROW + i, 0] = m[g + k, 0]
-                m[p[AT.bend] + k * ROW + i, 0] = m[h + k, 0]
-        for k in range(n_out):
-            beyond = np.inf if k == 0 else 0.0
-            m[p[AT.curve] + k * ROW + GRID, 0] = beyond
-            for j in range(EIGHT):
-                at = p[AT.curve] + k * ROW + EIGHT * (j + 1)
-                m[p[AT.coarse] + k * EIGHT + j, 0] = m[at, 0] if j < EIGHT - 1 else beyond
+                m[p[AT.curve] + k * GRID + i, 0] = m[g + k, 0]
+                m[p[AT.bend] + k * GRID + i, 0] = m[h + k, 0]
 
     table = part(fill_table)
     return shared(lay)

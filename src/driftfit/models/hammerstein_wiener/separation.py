@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, Driver, shared
+from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.structure import Structure
 
@@ -37,7 +37,8 @@ METHODS = ("average", "svd", "svd-joint", "gls")
 SMALLEST_DIVISOR = 1e-12
 ALTERNATIONS = 200
 """Largest number of iterations of the alternating least squares."""
-SWEEPS = 30
+STILL = 1e-12
+"""The iterations end where nothing changes by more."""
 LEVENBERG_STEPS = 30
 """Largest number of steps; three to ten are typical."""
 SMALLEST_EIGENVALUE = 1e-13
@@ -75,11 +76,7 @@ def split(model: HammersteinWiener, theta: Array, method: str) -> tuple[Array, A
     a, other = A[:, :, 0], np.full(T, np.nan) if method == "average" else np.zeros(T)
     if method != "average" and s.na:
         left, right, other = _rank_one(A)
-        a, first = _headed(left, right)
-        if method == "svd":
-            d = first
-        else:
-            joint(A, d.copy(), a, d)
+        a, d = _headed(left, right) if method == "svd" else _joint(A, d)
     return a, np.concatenate(b, axis=1), np.concatenate(c, axis=1), d, np.stack([worst, other], axis=1)
 
 
@@ -101,104 +98,34 @@ def _average(M: Array) -> tuple[Array, Array, Array]:
     return np.sum(M / _guarded(right)[:, None], axis=2) / M.shape[2], right, np.full(len(M), np.nan)
 
 
-@shared
-def orthogonal(W: Array) -> None:
-    """Rotate pairs of rows until all are orthogonal; their lengths are then the singular values."""
-    k, length = W.shape
-    for _ in range(SWEEPS):
-        turned = False
-        for i in range(k - 1):
-            for j in range(i + 1, k):
-                first, second, mixed = 0.0, 0.0, 0.0
-                for x in range(length):
-                    first += W[i, x] * W[i, x]
-                    second += W[j, x] * W[j, x]
-                    mixed += W[i, x] * W[j, x]
-                if abs(mixed) > 1e-15 * np.sqrt(first * second):
-                    turned = True
-                    zeta = (second - first) / (2.0 * mixed)
-                    t = 1.0 / (abs(zeta) + np.sqrt(1.0 + zeta * zeta))
-                    t = t if zeta >= 0.0 else -t
-                    cosine = 1.0 / np.sqrt(1.0 + t * t)
-                    sine = cosine * t
-                    for x in range(length):
-                        one, other = W[i, x], W[j, x]
-                        W[i, x] = cosine * one - sine * other
-                        W[j, x] = sine * one + cosine * other
-        if not turned:
-            break
-
-
-@Driver
-def nearest(M: Array, W: Array, left: Array, right: Array, quality: Array) -> None:
-    """M (T, m, p) nearly left (T, m) times right (T, p) with |right| = 1, and sigma_2 / sigma_1; W is scratch.
-
-    One-sided Jacobi rotations on the smaller side have high relative accuracy without the squares of a Gram matrix.
-    """
-    T, m, p = M.shape
-    for t in range(T):
-        for i in range(W.shape[0]):
-            for x in range(W.shape[1]):
-                W[i, x] = M[t, i, x] if m <= p else M[t, x, i]
-        orthogonal(W)
-        best, top, second = 0, -1.0, 0.0
-        for i in range(W.shape[0]):
-            square = 0.0
-            for x in range(W.shape[1]):
-                square += W[i, x] * W[i, x]
-            if square > top:
-                best, top, second = i, square, max(top, 0.0)
-            else:
-                second = max(second, square)
-        quality[t] = np.sqrt(second / top) if top > 0.0 else (0.0 if top == 0.0 else np.nan)
-        sigma = np.sqrt(top)
-        for i in range(p):
-            total = W[best, i] if m <= p else 0.0
-            for x in range(m if m > p else 0):
-                total += M[t, x, i] * W[best, x] / sigma
-            right[t, i] = total / sigma if top > 0.0 else 1.0 - min(i, 1)
-        for x in range(m):
-            total = 0.0
-            for i in range(p):
-                total += M[t, x, i] * right[t, i]
-            left[t, x] = total if top > 0.0 else 0.0
-
-
-@Driver
-def joint(M: Array, d0: Array, a: Array, d: Array) -> None:
-    """Alternating least squares on [[1, d], [a, AD]] from a; M = [a, AD], d0 and d have their leading 1."""
-    T, r, q = M.shape
-    for t in range(T):
-        d[t] = d0[t]
-        for _ in range(ALTERNATIONS):
-            moved, size = 0.0, 0.0
-            for k in range(q):
-                size += d[t, k] * d[t, k]
-            for i in range(r):
-                total = 0.0
-                for k in range(q):
-                    total += M[t, i, k] * d[t, k]
-                moved = max(moved, abs(total / size - a[t, i]))
-                a[t, i] = total / size
-            size = 1.0
-            for i in range(r):
-                size += a[t, i] * a[t, i]
-            for k in range(1, q):
-                total = d0[t, k]
-                for i in range(r):
-                    total += M[t, i, k] * a[t, i]
-                moved = max(moved, abs(total / size - d[t, k]))
-                d[t, k] = total / size
-            if moved < SMALLEST_DIVISOR:
-                break
-
-
 def _rank_one(M: Array) -> tuple[Array, Array, Array]:
-    """`nearest` in new arrays."""
-    T, m, p = M.shape
-    left, right, quality = np.empty((T, m)), np.empty((T, p)), np.empty(T)
-    nearest(M, np.empty((min(m, p), max(m, p))), left, right, quality)
-    return left, right, quality
+    """M (T, m, p) nearly left (T, m) times right (T, p) with |right| = 1, and sigma_2 / sigma_1. For numbers that are
+    not finite the product is 0.
+    """
+    known = np.asarray(np.isfinite(M).all(axis=(1, 2)))
+    M = np.where(known[:, None, None], M, 0.0)
+    _, sizes, rights = np.linalg.svd(M, full_matrices=False)
+    top = sizes[:, :1]
+    right = np.where(top > 0.0, rights[:, 0], np.eye(1, M.shape[2]))
+    ratio = np.divide(sizes, top, out=np.zeros_like(sizes), where=top > 0.0)
+    quality = ratio[:, 1] if ratio.shape[1] > 1 else np.zeros(len(M))
+    return _times(M, right), right, np.where(known, quality, np.nan)
+
+
+def _joint(M: Array, d0: Array) -> tuple[Array, Array]:
+    """a and d by alternating least squares on [[1, d], [a, AD]]; M = [a, AD], d0 and d have their leading 1."""
+    a, d, going = M[:, :, 0].copy(), d0.copy(), np.arange(len(M))
+    for _ in range(ALTERNATIONS):
+        A, was = M[going], d[going]
+        one = _times(A, was) / np.sum(was * was, axis=1, keepdims=True)
+        other = (d0[going] + _times(A.transpose(0, 2, 1), one)) / (1.0 + np.sum(one * one, axis=1, keepdims=True))
+        other[:, 0] = 1.0
+        moved = np.maximum(np.abs(one - a[going]).max(axis=1), np.abs(other - was).max(axis=1))
+        a[going], d[going] = one, other
+        going = going[moved >= STILL]
+        if not going.size:
+            break
+    return a, d
 
 
 def _times(M: Array, x: Array) -> Array:
@@ -236,34 +163,8 @@ class LeastSquares:
     """theta = g(zeta) with all of c free, zeta = (a, b, c, d_2 .., l), and its generalised least squares fit."""
 
     def __init__(self, s: Structure) -> None:
-        """The positions in theta and zeta of single parameters, of products, and of b and c of each input."""
-        ends = np.cumsum([s.na, *s.nb, *s.n_in, s.n_out - 1, s.intercept])
-        self.n, self.n_z, inputs = s.n, int(ends[-1]), len(s.nb)
-        spans = [np.arange(first, last) for first, last in zip([0, *ends[:-1]], ends, strict=True)]
-        a, self.b, self.c, d, rest = spans[0], spans[1 : 1 + inputs], spans[1 + inputs : -2], spans[-2], spans[-1]
-        at_d, row, at_ad = s.starts
-        self.alone = np.concatenate([[a, a], [at_d + np.arange(len(d)), d], [s.n - 1 + 0 * rest, rest]], axis=1)
-        pairs = [np.stack([b, b, np.full(len(b), c[0])]) for b, c in zip(self.b, self.c, strict=True)]
-        for b, c in zip(self.b, self.c, strict=True):
-            pairs += [np.stack([row + k * len(b) + np.arange(len(b)), b, 0 * b + c[k + 1]]) for k in range(len(c) - 1)]
-            row += len(b) * (len(c) - 1)
-        pairs += [np.stack([at_ad + k * s.na + a, a, 0 * a + one]) for k, one in enumerate(d)]
-        self.pairs = np.concatenate(pairs, axis=1)
-
-    def products(self, zeta: Array) -> Array:
-        """g(zeta), (T, n)."""
-        theta, (place, first, second) = np.empty((len(zeta), self.n)), self.pairs
-        theta[:, self.alone[0]] = zeta[:, self.alone[1]]
-        theta[:, place] = zeta[:, first] * zeta[:, second]
-        return theta
-
-    def jacobian(self, zeta: Array) -> Array:
-        """dg/dzeta, (T, n, n_z)."""
-        J, (place, first, second) = np.zeros((len(zeta), self.n, self.n_z)), self.pairs
-        J[:, self.alone[0], self.alone[1]] = 1.0
-        J[:, place, first] = zeta[:, second]
-        J[:, place, second] = zeta[:, first]
-        return J
+        spans, inputs = s.spans(free=True), len(s.nb)
+        self.s, self.n_z, self.b, self.c = s, sum(map(len, spans)), spans[1 : 1 + inputs], spans[1 + inputs : -2]
 
     def refine(self, theta: Array, P: Array, zeta: Array) -> tuple[Array, Array, Array]:
         """zeta (T, n_z), its covariance (T, n_z, n_z) and the cost (T,), from a zeta with |c| = 1.
@@ -282,7 +183,7 @@ class LeastSquares:
 
     def _normal(self, W: Array, zeta: Array) -> tuple[Array, Array]:
         """J' P^-1 J, with the scales held, and J' W': adding c c' changes no product, and c'dc = 0 follows."""
-        J = W @ self.jacobian(zeta)
+        J = W @ self.s.jacobian(zeta)
         N = J.transpose(0, 2, 1) @ J
         for c in self.c:
             weight = np.einsum("tii->ti", N)[:, c].sum(axis=1)
@@ -292,7 +193,7 @@ class LeastSquares:
 
     def _minimum(self, theta: Array, W: Array, zeta: Array) -> tuple[Array, Array]:
         """zeta and the cost at the minimum."""
-        rho = _times(W, theta - self.products(zeta))
+        rho = _times(W, theta - self.s.products(zeta))
         best, damping, going = np.sum(rho * rho, axis=1), np.zeros(len(zeta)), np.arange(len(zeta))
         for _ in range(LEVENBERG_STEPS):
             # Gauss-Newton: N step = J' rho, with more damping until the cost does not rise
@@ -301,7 +202,7 @@ class LeastSquares:
             for _ in range(10):
                 t = going[trying]
                 moved = zeta[t] + _solved(N[trying], damping[t], right[trying])
-                off = _times(W[t], theta[t] - self.products(moved))
+                off = _times(W[t], theta[t] - self.s.products(moved))
                 value = np.sum(off * off, axis=1)
                 good = value <= best[t]
                 gain[trying[good]] = (best[t] - value)[good]

@@ -30,7 +30,7 @@ from driftfit.models.hammerstein_wiener.output_curve import (
     believe,
     inverting,
     laying,
-    locating,
+    locate,
     refining,
     values_of,
 )
@@ -205,10 +205,10 @@ def _entering(into: tuple[Kind, ...], i: int = 0, moves: bool = True) -> Any:
 
 
 @lru_cache
-def _regressing(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
+def _regressing(into: tuple[Kind, ...], out: Kind) -> Any:
     """The computation of ``regress``, for the functions of all bases."""
     enter, output_at = _entering(into), values_of(out, AT.out, AT.curve, AT.n_out)
-    lay, locate, invert = laying(out), locating(lanes), inverting(out)
+    lay, invert = laying(out), inverting(out)
 
     def regress_sample(m: Array, p: Places, theta: Array) -> None:
         n_out, rows, g, h = p[AT.n_out], 1 + max(p[AT.na], 1), p[AT.g_past], p[AT.h_past]
@@ -256,7 +256,7 @@ def _regressing(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
 @lru_cache
 def _regress(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
     """The compiled routine of ``regress``."""
-    work, orders, rows, n = _regressing(into, out, lanes), np.array(p), room(p), p[AT.n]
+    work, orders, rows, n = _regressing(into, out), np.array(p), room(p), p[AT.n]
 
     def machine_regress(blocks: int, theta: int, L: int) -> None:
         stride = L if lanes else 1  # known to the compiler

@@ -19,8 +19,7 @@ The positions, `places_of`, are constants of these routines, so that their loops
     d_now   (n_out)           coefficients (1, d_2 ..) before the sample
     trial, trial_bend         functions and slopes at a trial y; spare, slopes that are not used
     into, out                 the numbers of the bases, those of all inputs first
-    curve (n_out, ROW)        functions of the output block on the grid, and one level beyond all; bend, their slopes
-    coarse (n_out, EIGHT)     the same functions at every eighth point of the grid
+    curve (n_out, GRID)       functions of the output block on the grid; bend, their slopes
     level (GRID)              an envelope of the levels
     d_checked, reach (n_out)  coefficients for which the grid increases, and the safe distance from them
     us (inputs)               the inputs of this sample
@@ -30,6 +29,8 @@ from __future__ import annotations
 
 from collections import namedtuple
 from collections.abc import Sequence
+from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -127,49 +128,49 @@ class Structure(NamedTuple):
         c = np.insert(c, self.leads - np.arange(len(self.n_in)), 1.0, axis=-1)
         return a, b, c, np.insert(d, 0, 1.0, axis=-1)
 
-    @property
-    def alone(self) -> Array:
-        """(entry of theta, entry of xi) of the parameters that appear in theta alone, (k, 2)."""
-        at_d, at_l = self.starts[0], self.n - 1
-        x_d = self.n_x - self.intercept - self.n_out + 1
-        d = [(at_d + k, x_d + k) for k in range(self.n_out - 1)]
-        return np.array([*((i, i) for i in range(at_d)), *d, *([(at_l, self.n_x - 1)] if self.intercept else [])])
-
-    @property
-    def pairs(self) -> Array:
-        """(entry of theta, entry of xi, entry of xi) of the products b c and a d, (k, 3)."""
-        at_d, row, _ = self.starts
-        at_b, x_c, found = self.na, at_d, []
-        for nb, n_in in zip(self.nb, self.n_in, strict=True):
-            found += [(row + k * nb + j, at_b + j, x_c + k) for k in range(n_in - 1) for j in range(nb)]
-            at_b, x_c, row = at_b + nb, x_c + n_in - 1, row + nb * (n_in - 1)
-        found += [(row + k * self.na + i, i, x_c + k) for k in range(self.n_out - 1) for i in range(self.na)]
-        return np.array(found, dtype=np.int64).reshape(-1, 3)
-
-    def products(self, xi: Array) -> Array:
-        """theta = g(xi), (..., n)."""
-        theta = np.empty((*xi.shape[:-1], self.n))
-        (rows, entries), (products, first, second) = self.alone.T, self.pairs.T
-        theta[..., rows] = xi[..., entries]
-        theta[..., products] = xi[..., first] * xi[..., second]
+    def products(self, x: Array) -> Array:
+        """theta = g(xi), (..., n), from xi or from zeta, which also has each c_1."""
+        (rows, entries), (products, first, second) = positions(self, x.shape[-1] != self.n_x)
+        theta = np.empty((*x.shape[:-1], self.n))
+        theta[..., rows] = x[..., entries]
+        theta[..., products] = x[..., first] * x[..., second]
         return theta
 
-    def jacobian(self, xi: Array) -> Array:
-        """J (..., n, n_x)."""
-        J = np.zeros((*xi.shape[:-1], self.n, self.n_x))
-        (rows, entries), (products, first, second) = self.alone.T, self.pairs.T
+    def jacobian(self, x: Array) -> Array:
+        """The derivatives of `products`, (..., n, n_x)."""
+        (rows, entries), (products, first, second) = positions(self, x.shape[-1] != self.n_x)
+        J = np.zeros((*x.shape[:-1], self.n, x.shape[-1]))
         J[..., rows, entries] = 1.0
-        J[..., products, first] = xi[..., second]
-        J[..., products, second] = xi[..., first]
+        J[..., products, first] = x[..., second]
+        J[..., products, second] = x[..., first]
         return J
+
+    def spans(self, free: bool) -> list[Array]:
+        """The positions of a, b of each input, c of each input, d_2 .. and l in xi, or in zeta if c_1 is ``free``."""
+        c = [n_in - 1 + free for n_in in self.n_in]
+        ends = np.cumsum([0, self.na, *self.nb, *c, self.n_out - 1, self.intercept])
+        return [np.arange(first, last) for first, last in pairwise(ends)]
+
+
+@lru_cache
+def positions(s: Structure, free: bool) -> tuple[Array, Array]:
+    """(entry of theta, entry of xi) of the parameters that appear in theta alone, (2, k), and (entry of theta, entry of
+    xi, entry of xi) of the products b c and a d, (3, k); for zeta in the place of xi if c_1 is ``free``.
+    """
+    spans, (at_d, row, at_ad), m = s.spans(free), s.starts, len(s.nb)
+    a, bs, cs, d, rest = spans[0], spans[1 : 1 + m], spans[1 + m : -2], spans[-2], spans[-1]
+    alone = [(i, i) for i in (a if free else range(at_d))]
+    alone += [(at_d + k, x) for k, x in enumerate(d)] + [(s.n - 1, x) for x in rest]
+    pairs = [(j, j, c[0]) for b, c in zip(bs, cs, strict=True) for j in (b if free else ())]
+    for b, c in zip(bs, cs, strict=True):
+        pairs += [(row + k * len(b) + j, x, y) for k, y in enumerate(c[free:]) for j, x in enumerate(b)]
+        row += len(b) * len(c[free:])
+    pairs += [(at_ad + k * s.na + i, i, x) for k, x in enumerate(d) for i in a]
+    return np.array(alone, np.int64).reshape(-1, 2).T, np.array(pairs, np.int64).reshape(-1, 3).T
 
 
 GRID = 64
 """Points of the grid on which the output block is inverted."""
-EIGHT = 8
-"""Number of levels that are compared at once; GRID is its square."""
-ROW = GRID + 1
-
 _Numbers = namedtuple(
     "_Numbers",
     "low step lowest highest bottom top rising predicted started minimal given raw variance moved late cell y dt "
@@ -185,9 +186,9 @@ factor of the equation, the least variance that sigma adds to it, and the scale 
 _Places = namedtuple(
     "_Places",
     "na nb n_out n nk identity adaptive d x_d ad now next f_past g_past h_past spare d_now trial trial_bend into out "
-    "curve bend coarse level d_checked reach us inputs count",
+    "curve bend level d_checked reach us inputs count",
 )
-AT = _Places(*range(30))
+AT = _Places(*range(29))
 """Places: orders (nb of all inputs, nk the smallest), whether the output block is the identity and an input basis
 depends on its own coefficients, where d begins in theta and in xi and the products a d in theta, where the arrays
 begin, and how many inputs there are.
@@ -200,7 +201,7 @@ products begin.
 """
 
 Places = Array
-"""Whole numbers (29 + 10 per input,), a constant for the compiler."""
+"""Whole numbers (28 + 10 per input,), a constant for the compiler."""
 
 
 def room(p: Places | tuple[int, ...]) -> int:
@@ -211,11 +212,11 @@ def room(p: Places | tuple[int, ...]) -> int:
 def _arrays(s: Structure, delays: Sequence[int], bases: Sequence[Basis], out: Basis) -> list[Array]:
     """The arrays before the first sample, in the order of AT."""
     lags = sum(width * (count + delay) for width, count, delay in zip(s.n_in, s.nb, delays, strict=True))
-    outputs, grid, none = np.full((1 + max(s.na, 1)) * s.n_out, np.nan), np.zeros(ROW * s.n_out), np.zeros(s.n_out)
+    outputs, grid, none = np.full((1 + max(s.na, 1)) * s.n_out, np.nan), np.zeros(GRID * s.n_out), np.zeros(s.n_out)
     return [
         np.full(s.n, np.nan), np.full(s.n, np.nan), np.full(lags, np.nan), outputs, outputs, np.zeros(max(s.n_in)),
         np.eye(1, s.n_out)[0], none, none, np.concatenate([basis.parameters for basis in bases]), out.parameters,
-        grid, grid, np.zeros(EIGHT * s.n_out), np.zeros(GRID), none, np.full(s.n_out, np.inf), np.zeros(len(bases)),
+        grid, grid, np.zeros(GRID), none, np.full(s.n_out, np.inf), np.zeros(len(bases)),
     ]  # fmt: skip
 
 

@@ -59,6 +59,10 @@ class Thresholds(Basis):
     def expected(self) -> tuple[float, float]:
         return (-self.u_max, self.u_max)
 
+    def for_coefficients(self, x: Any, c: Array) -> Array:
+        u = np.asarray(x, dtype=float)
+        return self.split(u, u >= c[..., 1] / c[..., 0], u <= c[..., 2] / c[..., 0])
+
     @abstractmethod
     def split(self, u: Array, above: Array, below: Array) -> Array:
         """The functions (.., 3), given which inputs are above and below the thresholds."""

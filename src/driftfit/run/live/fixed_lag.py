@@ -84,7 +84,8 @@ class Window:
         k, dt = self.count, float(s["dt"][lane])
         _, noise, factor = known
         walk.phi[k], walk.y[k] = s["phi"][:, lane], s["y"][lane]
-        walk.weight[k] = s["ok"][lane] / noise
+        # the noise variance may move, and then r is its last estimate; otherwise the ratio is 1
+        walk.weight[k] = s["ok"][lane] / noise * ((1.0 if walk.r is None else walk.r) / s["r"][lane])
         walk.drift[k] = dt * factor if self.drifts else 0.0
         walk.drift_root[k] = s["drift_root"][:, lane] if "drift_root" in fields(tile) else 1.0
         walk.trend[k : k + 1] = dt if self.drifts else 0.0

@@ -15,7 +15,7 @@ Readings of a coarse sensor are drawn again within their step:
 
 m is the prediction, S the noise and 2 h the step of the sensor. If m and S are those of the system, z has the errors of
 a fine sensor, whatever the inputs do: the error of rounding, which is the same for as long as they are held, is gone
-(`driftfit.judge.statistics.parts.coarse_readings`). U is a function of the number of the sample and of a seed, which is
+(`driftfit.judge.statistics.coarse_readings`). U is a function of the number of the sample and of a seed, which is
 made from readings: a stream and a record draw the same, and other records draw other numbers.
 
 Source: Dunn and Smyth (1996), whose residuals these are; Steele, Lea and Flood (2014) for the numbers.

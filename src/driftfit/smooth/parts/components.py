@@ -119,7 +119,7 @@ def absorb(A: Array, row: Array) -> float:
 @part
 def convolve(A: Array, G: Array, size: float, row: Array) -> float:
     """theta <- theta + size G w, w ~ N(0, I), in A = [S | d]; returns by how much c falls."""
-    n, logs = A.shape[0], 0.0
+    n, product = A.shape[0], 1.0
     for q in range(n if size > 0.0 else 0):
         if G[q, q] == 0.0:
             continue
@@ -137,8 +137,8 @@ def convolve(A: Array, G: Array, size: float, row: Array) -> float:
             for j in range(i, n + 1):
                 x = row[j]
                 row[j], A[i, j] = c * x + s * A[i, j], c * A[i, j] - s * x
-        logs += np.log(top)
-    return logs
+        product *= top
+    return float(np.log(product))
 
 
 @part
@@ -338,7 +338,7 @@ def ranked(C: int, shares: Array, order: Array) -> int:
 
 
 @shared
-def nearest(N: int, now: Filter, room: Room, k: int, limit: float) -> tuple[int, float]:
+def nearest(N: int, now: Filter, room: Room, k: int, limit: float) -> int:
     """The component of the same mode from which child k has the least divergence below the limit, or -1."""
     more, merged, n, most = room.children.facts, room.merged, now.A.shape[1], len(now.A)
     to, least, logs = -1, limit, more[k, LOG] - more[k, SHARE]
@@ -348,7 +348,7 @@ def nearest(N: int, now: Filter, room: Room, k: int, limit: float) -> tuple[int,
             apart = divergence(now.A[j], room.factors[j, :, n], ahead, room.factors[most], least, room.row)
             if apart < least:
                 to, least = j, apart
-    return to, least
+    return to
 
 
 @shared
@@ -366,8 +366,8 @@ def reduce(C: int, room: Room, keep: int, now: Filter) -> int:
         total += w
         if count > 1:
             moments(Y[k], root, mean)
-        j, apart = nearest(N, now, room, k, SQUEEZE * join * total / w)
-        if j >= 0 and w * apart < (join if keep > N else SQUEEZE * join) * total:
+        j = nearest(N, now, room, k, (join if keep > N else SQUEEZE * join) * total / w)
+        if j >= 0:
             both = w + np.exp(merged[j, TOTAL] - best)
             pool(scratch[j, :, :n], scratch[j, :, n], w / both, root, mean, room.row)
             facts[j, COST] += w / both * (more[k, COST] - facts[j, COST])

@@ -52,6 +52,8 @@ class Walk(NamedTuple):
     """(K, T, n): paths under other drifts that are possible too; empty if the drift is known."""
     belief: Array = NONE
     """(K,): their probabilities."""
+    mixture: Any = None
+    """The moments of a mixture, whose path and variances take the place of those of the walk; None if there is none."""
     basis: Array = NONE
     """(n, n): drifts, ``drift_root`` and ``paths`` are those of z, theta = basis z; empty if they are those of theta.
     """
@@ -79,8 +81,8 @@ class Walk(NamedTuple):
 
     def of(self, which: Array) -> Walk:
         """The problem of some parameters with a diffuse start, if the regressors of the others are 0."""
-        phi, drift_root, q = self.phi[:, which], self.drift_root[:, which], self.q[np.ix_(which, which)]
-        return self._replace(phi=phi, drift_root=drift_root, q=q, theta0=self.theta0[which])
+        phi = np.ascontiguousarray(self.phi[:, which])
+        return self._replace(phi=phi, q=self.q[np.ix_(which, which)], theta0=self.theta0[which])
 
     @property
     def independent(self) -> Walk:

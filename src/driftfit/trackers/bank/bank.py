@@ -42,21 +42,16 @@ from driftfit.trackers.bank import change as changes_
 from driftfit.trackers.bank import reduction as reductions
 from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.layout import (
-    COUNT,
-    FADE,
+    COUNTER,
     HEAD,
-    LEAVES,
     MOST_REPORTED,
-    READING,
     ROW,
-    SETTLED,
-    SIZE,
+    SAMPLE,
     WHOLE,
-    R,
-)
+)  # fmt: skip
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
-from driftfit.trackers.bank.machine.start import begin, limit_forgetting
+from driftfit.trackers.bank.machine.advance import begin, limit_forgetting
 from driftfit.trackers.bank.machine.steps import steps_of
 from driftfit.trackers.bank.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.prior import chains, events, per_sample
@@ -89,11 +84,10 @@ class Bank(Tracker):
     theta0, p0
         Mean and covariance of theta before the first sample; p0=None is the exact diffuse start.
     initial : (H,) or None
-        Distribution of the first event. None: the prior probabilities, or the stationary distribution of the
-        transition.
+        Distribution of the first event. None: the prior probabilities, or the stationary distribution of the chain.
     lag_variance : bool
-        Whether leaves with their own output lags (additive outliers, a frozen sensor) carry the uncertainty of these
-        lags; see `driftfit.trackers.bank.leaves.lags`. False treats the lags as certain.
+        Whether leaves with their own output lags (additive outliers, a frozen sensor) carry their uncertainty
+        (`driftfit.trackers.bank.leaves.lags`).
 
     Raises
     ------
@@ -116,21 +110,22 @@ class Bank(Tracker):
     weighs: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        for name, kind, what in (("changes", Change, "a Change"), ("sensors", Sensor, "a Sensor")):
+        for name, kind in PARTS.items():
             given = getattr(self, name)
             if given is not None:
                 given = (given,) if isinstance(given, kind) else tuple(given)
                 if not given or not all(isinstance(one, kind) for one in given):
-                    raise ValueError(f"Bank: {name} must list at least one hypothesis, each {what}; got {given!r}.")
+                    raise ValueError(
+                        f"Bank: {name} must list at least one hypothesis, each a {kind.__name__}; got {given!r}."
+                    )
                 self._set(name, given)
         if self.reduce is not None and not isinstance(self.reduce, Reduction):
             raise ValueError(f"Bank: reduce must be a reduction such as Beam(9) or Decide(3); got {self.reduce!r}.")
         if self.p0 is not None:
             self._set("p0", covariance("Bank", "p0", self.p0))
         self._set("theta0", numbers("Bank", "theta0", self.theta0))
-        for name in ("transition", "initial"):
-            value = getattr(self, name)
-            self._set(name, None if value is None else _tuples(value))
+        self._set("transition", _tuples(self.transition))
+        self._set("initial", _tuples(self.initial))
         self._check()
 
     def _check(self) -> None:
@@ -143,8 +138,7 @@ class Bank(Tracker):
         if isinstance(self.reduction, reductions.FirstFloor) and any(one.forgets for one in self.all_changes):
             raise ValueError("Bank: FirstFloor supports random walks only; changes that forget need another reduction.")
         self.reduction.losses(self._count)
-        kinds = {other.kind for other in others}
-        reduce = self.reduction
+        kinds, reduce = {other.kind for other in others}, self.reduction
         if isinstance(reduce, Decide) and reduce.deepest == 1 and kinds & {"outlier", "additive"} and not reduce.force:
             raise ValueError(
                 "Bank: Decide(1) with outliers always prefers the outlier and never adapts; use Decide(2) or deeper, "
@@ -216,8 +210,7 @@ class Bank(Tracker):
     @property
     def change_names(self) -> tuple[str, ...]:
         """Names of the changes."""
-        named = [one.name or ("none" if i == 0 else f"change {i}") for i, one in enumerate(self.all_changes)]
-        return tuple(named)
+        return tuple(one.name or (f"change {i}" if i else "none") for i, one in enumerate(self.all_changes))
 
     @property
     def sensor_names(self) -> tuple[str, ...]:
@@ -233,7 +226,7 @@ class Bank(Tracker):
 
     def settings(self) -> dict[str, Any]:
         plain = super().settings()
-        for name in ("changes", "sensors"):
+        for name in PARTS:
             plain[name] = None if plain[name] is None else tuple(one.settings() for one in plain[name])
         if self.reduce is not None:
             plain["reduce"] = {"kind": type(self.reduce).__name__, **self.reduce.settings()}
@@ -242,7 +235,7 @@ class Bank(Tracker):
     @classmethod
     def from_settings(cls, settings: dict[str, Any]) -> Self:
         given = dict(settings)
-        for name, kind in (("changes", Change), ("sensors", Sensor)):
+        for name, kind in PARTS.items():
             if given.get(name) is not None:
                 given[name] = tuple(kind.from_settings(one) for one in given[name])
         if given.get("reduce") is not None:
@@ -267,15 +260,14 @@ class Bank(Tracker):
         unit = 1.0 if nominal.r is not None or nominal.guess is None else 1.0 / nominal.guess
         P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
         theta0 = vector("Bank", "theta0", self.theta0, n)
-        sample, counters = np.zeros(SIZE), np.zeros(COUNT, int)
-        sample[READING], sample[R] = np.nan, 1.0
-        sample[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
-        count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
-        squares *= nominal.guess or 0.0
+        count = nominal.nu if guessed else 0.0
+        squares = count * (nominal.guess or 0.0)
         arrays = arrays_of(self, n, na, unit, theta0)
         scale = 1.0 if nominal.r is not None else np.nan
+        sample = dict.fromkeys(SAMPLE._fields, 0.0) | {"reading": np.nan, "r": 1.0}
+        sample["fade"] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
+        leaf = SimpleNamespace(**arrays, n=n, theta=theta0, cov=P0, **sample, **dict.fromkeys(COUNTER._fields, 0))
         if self.p0 is not None and (nominal.r is not None or guessed):
-            leaf = SimpleNamespace(**arrays, n=n, theta=theta0, cov=P0, counters=counters, sample=sample)
             limit_forgetting.py_func(leaf)
             begin.py_func(leaf, count, squares)
             arrays["root"][:, 0], scale = arrays["leaves"][:, 0], 1.0
@@ -290,8 +282,9 @@ class Bank(Tracker):
             **packed(arrays, numbers),
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "power_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
-            "scale": scale, "count": count, "squares": squares, "sample": sample,
-            "counters": counters, **unresolved(),
+            "scale": scale, "count": count, "squares": squares,
+            "sample": np.array([getattr(leaf, name) for name in SAMPLE._fields]),
+            "counters": np.array([getattr(leaf, name) for name in COUNTER._fields]), **unresolved(),
             **(knowing_nothing(n, ALMOST_ANY if again else WORST) if self.p0 is None else knowing(n)),
             "can_frame": int(not again), "framed": 0, "within": 0.0, "x": np.zeros(n),
             "column": -1,
@@ -353,19 +346,15 @@ class Bank(Tracker):
 
     def _leaves(self, lane: Mapping[str, Array]) -> Array:
         """The leaves of a lane, as a view; before the tree starts, the single filter."""
-        start, rows, columns = lane["table"][ROW["leaves"]]
-        B: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
-        return B[:, : max(int(lane["counters"][LEAVES]), 1)]
+        return self.array(None, lane, "leaves")[:, : max(int(lane["counters"][COUNTER.many_leaves]), 1)]
 
     def reported(self, report: Array, name: str) -> Array:
         """A quantity of reports (.., size): lag_prob (.., levels, H), decided (.., held, 3), or a number."""
         if name in SINGLE:
             return report[..., SINGLE.index(name)]
-        shape = self._shape
-        levels = len(self.reported_levels)
-        start, rows, columns = {
-            "lag_prob": (HEAD, levels, self._count), "decided": (HEAD + levels * self._count, shape.held, 3),
-        }[name]  # fmt: skip
+        start, rows, columns = HEAD, len(self.reported_levels), self._count
+        if name == "decided":
+            start, rows, columns = start + rows * columns, self._shape.held, 3
         return report[..., start : start + rows * columns].reshape(*report.shape[:-1], rows, columns)
 
     @property
@@ -374,7 +363,7 @@ class Bank(Tracker):
         W = self._shape.levels
         return (*range(min(W, MOST_REPORTED) - 1), W - 1)
 
-    def array(self, model: Model, lane: Mapping[str, Array], name: str) -> Array:
+    def array(self, model: Any, lane: Mapping[str, Array], name: str) -> Array:
         """One of the packed arrays of a lane, as a view."""
         table = lane["table"] if "table" in lane else self.state_for(model)["table"]
         start, rows, columns = table[ROW[name]]
@@ -382,18 +371,15 @@ class Bank(Tracker):
         return part.view(np.int64) if name in WHOLE else part
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        hypotheses = run.hypotheses
+        hypotheses, lane = run.hypotheses, run.state
         kinds = [event.kind for event in hypotheses.found()]
         moved, wrong = kinds.count("change"), kinds.count("sensor")
         text = f"{moved} change{'' if moved == 1 else 's'}"
         if len(self.all_sensors) > 1:
             text += f", {wrong} fault{'' if wrong == 1 else 's'} of the sensor"
         facts = [("Events", f"{text}; see run.hypotheses.events()")]
-        if hypotheses.impossible:
-            facts.append(
-                ("Impossible", f"{hypotheses.impossible} samples that every hypothesis ruled out, left unused")
-            )
-        lane = run.state
+        if (count := hypotheses.impossible) > 0:
+            facts.append(("Impossible", f"{count} samples that every hypothesis ruled out, left unused"))
         if (never := np.isinf(lane["var"])).any():
             facts.append(not_learned(run, np.array(run.names)[never]))
         return (*facts, *(resolution(lane) if self.all_sensors[0].r is None else ()))
@@ -404,13 +390,17 @@ class Bank(Tracker):
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])
-        begun = lane["counters"][SETTLED] > 0
+        begun = lane["counters"][COUNTER.settled] > 0
         return never & bool(begun and lane["power_samples"] >= window(len(never)))
 
     @property
     def steps(self) -> TrackerSteps:
         own = tuple(sensor.likelihood for sensor in self.all_sensors if sensor.kind == "own")
         return steps_of(own)
+
+
+PARTS: dict[str, Any] = {"changes": Change, "sensors": Sensor}
+"""Settings that list hypotheses."""
 
 
 def _tuples(value: Any) -> Any:

@@ -5,7 +5,7 @@ Rows of leaves, events of all tables, and parameters are counted as in `driftfit
 With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m sensors, the fields are
 
     parents, leaves         the leaves before and after the tree has grown, one per column
-    history, history_2      the events of every leaf, one leaf per row (`machine.ancestry`); the counter FLIPPED says
+    history, history_2      the events of every leaf, one leaf per row (`machine.ancestry`); ``flipped`` says
                             which of the two is valid
     parent, event           for every leaf the column of its parent, and the joint event that created it
     group, start, order     the leaves that are merged: a group number for every leaf, members in the order of groups
@@ -43,42 +43,48 @@ With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m s
 
 from __future__ import annotations
 
+from collections import namedtuple
 from typing import Any
 
-from driftfit.engine.kernel import kernel
+from numba import types
+
+from driftfit.engine.kernel import Array, kernel
 from driftfit.engine.tracker_part import open_at
 from driftfit.trackers.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
 
-(
-    LEAVES, PARENTS, GROUPS, TREE_LEVELS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED,
-    OPEN, TAKEN, CHAINED, ALIKE, WIDE, PARTED, PHASE, LOOKED, COUNT,
-) = range(21)  # fmt: skip
-"""Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY if
-it begins with the next sample. OPEN levels have passed since the last used sample
-(`driftfit.trackers.bank.machine.gap`); TAKEN steps of its interval are already in the table of a gap. Four counters
-are flags of the present sample: CHAINED if the user gave a chain of changes, ALIKE if all leaves have the same prior,
-WIDE if its level is not that of one nominal interval, PARTED if leaves are continued as two
-(`machine.markov_gap`). PHASE says what the routine is called for, LOOKED for which kind of sample its forecast was.
+_Counters = namedtuple(
+    "_Counters",
+    "many_leaves settled open phase held clock impossible reported_to many_parents groups levels expanded stored "
+    "flipped taken chained alike wide parted looked",
+)
+COUNTER = _Counters(*range(20))
+"""Whole numbers of a bank. ``settled`` is 1 once the tree grows, `WAITING` before, `READY` if it begins with the next
+sample; ``levels`` counts those of the tree. ``open`` levels have passed since the last used sample (`machine.gap`),
+``taken`` steps of its interval are already in the table of a gap. Flags of the present sample: ``chained`` if the user
+gave a chain of changes, ``alike`` if all leaves have the same prior, ``wide`` if its level is not that of one nominal
+interval, ``parted`` if leaves are continued as two (`machine.markov_gap`), ``expanded`` if histories are those of the
+leaves and not of their parents. ``phase`` says what the routine is called for, ``looked`` for which kind of sample its
+forecast was.
 """
 WAITING, READY = 0, -1
 LEARN, FORECAST = 0, 1
-(
-    IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_OBSERVED, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
-    SQUARES, TIMES, ELAPSED, MOST, FREEDOM, SHIFT, READING, UNIT, SIZE,
-) = range(24)  # fmt: skip
-"""Numbers of the present sample: inputs and results. MOST is the largest mean square that a leaf's own prediction may
-have in its output lags (`driftfit.trackers.bank.leaves.lags`). FREEDOM is the degrees of freedom of an estimated noise
-variance before the tree grows, the number of residuals until then; inf for a variance that is given. The reading is y +
-SHIFT (`driftfit.trackers.parts.coarse.resolution`). READING is the last accepted reading, LAST the same minus the
-present shift. UNIT is the mean of the units of the covariances of leaves: 1, or the noise variance where it is unknown.
+_Sample = namedtuple(
+    "_Sample",
+    "y noise dt time ok observed r fade least most y_hat s squares times elapsed freedom shift reading unit last "
+    "evidence window kept",
+)
+SAMPLE = _Sample(*range(23))
+"""Numbers of the present sample: inputs and results. ``most`` is the largest mean square that a leaf's own prediction
+may have in its output lags (`leaves.lags`), ``least`` the smallest noise variance. Before the tree grows ``freedom`` is
+that of an estimated noise variance, inf for one that is given. ``reading`` is y + ``shift`` of the last accepted sample
+(`driftfit.trackers.parts.coarse.resolution`), ``last`` the same minus the present shift. ``unit`` is the mean unit of
+the covariances of leaves: 1, or the noise variance where it is unknown.
 """
 NEVER = 1e9
 """The number of levels since the last change, for a leaf without a change."""
-HEAD = 4
-"""Entries of the report before its arrays: evidence, probability of a change in the window, mass kept, leaves."""
-SAMPLE_HEAD = 3
-"""Entries of a remembered sample before its probabilities: that of a change in the window, whether it was used, and how
-many nominal intervals had passed.
+HEAD, SAMPLE_HEAD = 4, 3
+"""Entries before the arrays of a report: evidence, probability of a change in the window, mass kept, leaves; and before
+the probabilities of a remembered sample: that of such a change, whether it was used, how many intervals had passed.
 """
 MOST_REPORTED = 8
 """Largest number of levels in a report; if more are remembered, it holds the newest and the oldest."""
@@ -90,47 +96,25 @@ MATRICES = (
     "new_events", "gap", "path", "chain", "lag_prob", "scratch",
 )  # fmt: skip
 VECTORS = ("drift", "initial", "row", "given", "given_chain", "reduction", "bases", "stamps")
-WHOLE = ("parent", "event", "start", "order", "group", "slots")
-"""Arrays of whole numbers."""
-REPORTED = ("newest", "decided")
-"""Arrays that are part of the report."""
+WHOLE, REPORTED = ("parent", "event", "start", "order", "group", "slots"), ("newest", "decided")
+"""Arrays of whole numbers, and those that are part of the report."""
 WINDOWS = (
-    "z",
-    "from_C",
-    "C",
-    "m",
-    "g",
-    "from_g",
-    "expected",
-    "scores",
-    "spare",
-    "spare_lags",
-    "lag_coefficients",
-    "answers",
-)
+    "z", "from_C", "C", "m", "g", "from_g", "expected", "scores", "spare", "spare_lags", "lag_coefficients", "answers",
+)  # fmt: skip
 """Rows of the scratch that have names."""
-OUTSIDE = {
-    "report": VECTOR, "phi": VECTOR, "powers": VECTOR, "theta": VECTOR, "cov": MATRIX, "counters": COUNTS,
-    "sample": VECTOR,
-}  # fmt: skip
+OUTSIDE = {"report": VECTOR, "phi": VECTOR, "powers": VECTOR, "theta": VECTOR, "cov": MATRIX}
 """Arrays that are fields of the state themselves."""
+VARIABLES = {"counters_at": (types.int64, COUNTER._fields), "sample_at": (types.float64, SAMPLE._fields)}
+"""Names of single numbers, by the base of the field in which they lie."""
 NUMBERS = (
-    "n",
-    "output_lags",
-    "unknown",
-    "independent",
-    "plain",
-    "walks_only",
-    "apart",
-    "in_coordinates",
-    "own_likelihoods",
-)
+    "n", "output_lags", "unknown", "independent", "plain", "walks_only", "apart", "own_likelihoods",
+)  # fmt: skip
 """n; the number of separate output lags of leaves; whether the noise is unknown, and whether events are independent;
 whether all leaves have one regressor, all changes are walks and all sensors differ in their noise alone; whether all
-changes are walks; whether what may have happened since the last used sample is one level; whether leaves are in
-coordinates of the start (`machine.framed`); and the address of the user's own likelihoods, during a sample.
+changes are walks; whether what may have happened since the last used sample is one level; and the address of the user's
+own likelihoods, during a sample.
 """
-BASES = ("memory", *(f"{name}_at" for name in OUTSIDE))
+BASES = ("memory", *(f"{name}_at" for name in OUTSIDE), *VARIABLES)
 """Rows with addresses: of the field `memory`, in which most arrays lie one after the other, so that banks of all
 shapes have one driver; and of the other arrays. In those of `memory` and `report` the last column is their length.
 """
@@ -142,10 +126,11 @@ TABLE = Table(
     | {name: NUMBER for name in NUMBERS},
     BASES,
     {name: f"{name}_at" for name in OUTSIDE} | {name: "report_at" for name in REPORTED},
+    VARIABLES,
 )  # fmt: skip
 ROW, ROWS = TABLE.row, len(TABLE.row)
 """Rows of the table by the names of fields and bases, and how many there are."""
-MEMORY_AT, REPORT_AT, PHI_AT, POWERS_AT, THETA_AT, COV_AT, COUNTERS_AT, SAMPLE_AT = (ROW[name] for name in BASES)
+MEMORY_AT, REPORT_AT = ROW["memory"], ROW["report_at"]
 table_at = TABLE.at
 """The table at an address, for compiled code."""
 
@@ -163,12 +148,12 @@ def memory_at(s: Any) -> int:
 
 
 @kernel
-def first(t: Any) -> bool:
-    """Whether this is the first level of the tree."""
-    return t.counters[TREE_LEVELS] == 0  # type: ignore[no-any-return]
+def tables(t: Any) -> tuple[Array, Array]:
+    """The table of histories that is valid, and the other one."""
+    return (t.history_2, t.history) if t.flipped > 0 else (t.history, t.history_2)
 
 
 @kernel
 def flip(t: Any) -> None:
     """The two tables of histories change places."""
-    t.counters[FLIPPED] = 1 - t.counters[FLIPPED]
+    t.flipped = 1 - t.flipped

@@ -10,7 +10,6 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.layout import (
-    COUNT,
     HEAD,
     MEMORY_AT,
     MOST_REPORTED,
@@ -20,7 +19,6 @@ from driftfit.trackers.bank.layout import (
     ROW,
     ROWS,
     SAMPLE_HEAD,
-    SIZE,
 )
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
@@ -28,7 +26,6 @@ from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 from driftfit.trackers.bank.machine.ancestry import news_of
 from driftfit.trackers.bank.machine.gap import SINCE
 from driftfit.trackers.bank.reducing import selection
-from driftfit.trackers.bank.reducing.lookahead import NODES
 from driftfit.trackers.bank.sensor import table_of
 
 SINGLE = ("evidence", "window", "kept", "leaves")
@@ -63,10 +60,10 @@ def arrays_of(bank: Any, n: int, na: int, unit: float, theta0: Array) -> dict[st
         "sensors": table_of(bank.all_sensors), "given": np.full(H, np.nan),
         "row": np.zeros(H), "loss": bank.reduction.losses(H), "reduction": shape.knobs,
         "bases": shape.bases, "stamps": np.zeros(shape.held),
-        "components": np.zeros((4 + NODES, K * H if waits else 1)), "root": np.zeros((rows, WIDTH)),
+        "components": np.zeros((4, K * H if waits else 1)), "root": np.zeros((rows, WIDTH)),
         "samples": np.zeros((int(shape.knobs[selection.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
-        "path": path_of(H, Hd, _whole_vectors(tri) if bank.chained else 0),
-        "spare_square": np.zeros((square, children)), "lag_rows": np.zeros((na, n + 1)),
+        "path": np.zeros((3 * H + Hd + 1 if bank.chained else 0, max(H, _whole_vectors(tri)) + 1)),
+        "spare_square": np.zeros((square, children)), "lag_rows": np.eye(na, n + 1),
         "ring": np.zeros((RING, SAMPLE_HEAD + H)), "new_events": news_of(H, Hm, remembered),
         "lag_prob": np.zeros((W, H)), "newest": np.zeros((min(W, MOST_REPORTED), H)),
         "decided": np.full((shape.held, 3), -1.0),
@@ -83,14 +80,15 @@ def _of_changes(bank: Any, n: int, unit: float, theta0: Array) -> dict[str, Arra
     if forgets:
         places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in changes])
     transition, initial = bank.event_probabilities
-    maps = np.array([change.mapping() for change in changes])
+    maps, gap = np.array([change.mapping() for change in changes]), np.zeros((Hd, wide + WIDTH))
+    gap[0, wide + SINCE] = 1.0
     walks = np.array([np.pad(Q[lower] * unit, (0, wide - tri)) for Q, _ in steps])
     return {
         "walks": walks, "fixed_walks": walks,
         "relative_walks": np.array([sizes if scaled else sizes[:0] for _, sizes in steps]), "drift": np.ones(Hd),
         "Q": np.zeros((Hd + 1, wide)), "maps": maps, "maps_nominal": maps, "places": places, "fixed_places": places,
         "transition": transition, "chain": transition.copy(), "initial": initial,
-        "given_chain": np.full(Hd * Hd, np.nan), "gap": _closed(Hd, wide),
+        "given_chain": np.full(Hd * Hd, np.nan), "gap": gap,
     }  # fmt: skip
 
 
@@ -130,7 +128,6 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
     for name in ("phi", "powers", "theta"):
         table[ROW[name]] = 0, 1, n
     table[ROW["report"]], table[ROW["cov"]] = (0, 1, HEAD), (0, n, n)
-    table[ROW["counters"]], table[ROW["sample"]] = (0, 1, COUNT), (0, 1, SIZE)
     walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
     noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
     memory, report = (_padded(np.concatenate(parts), least) for parts, least in zip(flat, (8192, 32), strict=True))
@@ -138,18 +135,6 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
     for name, value in {**numbers, "walks_only": walks, "plain": numbers["plain"] and walks and noises}.items():
         table[ROW[name], 0] = value
     return {"memory": memory, "report": report, "table": table, "flat": np.zeros(1)}
-
-
-def path_of(H: int, Hd: int, wide: int) -> Array:
-    """The table of `driftfit.trackers.bank.machine.markov_gap`; empty if there is none."""
-    return np.zeros((3 * H + Hd + 1 if wide else 0, max(H, wide) + 1))
-
-
-def _closed(Hd: int, wide: int) -> Array:
-    """The table of a gap (`driftfit.trackers.bank.machine.gap`) while there is no gap."""
-    table = np.zeros((Hd, wide + WIDTH))
-    table[0, wide + SINCE] = 1.0
-    return table
 
 
 def _room(parents: int, Hd: int, Hm: int) -> tuple[int, int]:

@@ -121,12 +121,7 @@ def chains(owner: str, P: Array, T: int, Hd: int) -> Array:
     """Chains of the changes P[t, from, to], (T, H_d H_d), checked; where one is NaN the bank's own prior applies."""
     if P.shape != (T, Hd, Hd):
         raise ValueError(f"{owner}: prob of a chain must be ({T}, {Hd}, {Hd}), P[sample, from, to]; got {P.shape}.")
-    given = ~np.isnan(P).all(axis=(1, 2))
-    wrong = given & ~((P >= 0.0).all(axis=(1, 2)) & (np.abs(P.sum(axis=2) - 1.0) < 1e-8).all(axis=1))
-    if wrong.any():
-        t = int(np.argmax(wrong))
-        raise ValueError(f"{owner}: rows of a chain must be probabilities that sum to 1; at sample {t} it is {P[t]}.")
-    return P.reshape(T, Hd * Hd)
+    return _probabilities(owner, "rows of a chain", P).reshape(T, Hd * Hd)
 
 
 def per_sample(owner: str, p: Array, usual: Array, Hd: int) -> Array:
@@ -136,15 +131,19 @@ def per_sample(owner: str, p: Array, usual: Array, Hd: int) -> Array:
     """
     Hm = len(usual) // Hd
     if p.shape[1] == Hd and Hm > 1:
-        sensors = usual.reshape(Hd, Hm).sum(axis=0)
-        p = np.einsum("ti,j->tij", p, sensors).reshape(len(p), -1)
+        p = np.einsum("ti,j->tij", p, usual.reshape(Hd, Hm).sum(axis=0)).reshape(len(p), -1)
     if p.shape[1] != Hd * Hm:
         raise ValueError(
             f"{owner}: prob must have {Hd} columns (changes) or {Hd * Hm} (joint events); got {p.shape[1]}."
         )
-    given = ~np.isnan(p).all(axis=1)
-    wrong = given & ~((p >= 0.0).all(axis=1) & (np.abs(p.sum(axis=1) - 1.0) < 1e-8))
-    if wrong.any():
+    return _probabilities(owner, "prob", p)
+
+
+def _probabilities(owner: str, what: str, p: Array) -> Array:
+    """p[t, .., k], checked: probabilities over k that sum to 1, or NaN for all of a sample."""
+    each = p.reshape(len(p), -1)
+    fits = (each >= 0.0).all(axis=1) & (np.abs(p.sum(axis=-1) - 1.0) < 1e-8).reshape(len(p), -1).all(axis=1)
+    if (wrong := ~fits & ~np.isnan(each).all(axis=1)).any():
         t = int(np.argmax(wrong))
-        raise ValueError(f"{owner}: prob must be probabilities that sum to 1 at every sample; row {t} is {p[t]}.")
+        raise ValueError(f"{owner}: {what} must be probabilities that sum to 1; at sample {t} it is {p[t]}.")
     return p

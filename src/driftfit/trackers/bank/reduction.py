@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -39,6 +39,14 @@ class Shape(NamedTuple):
 
 class Reduction(Settings, ABC):
     """How the tree of a bank is kept small."""
+
+    lowest: ClassVar[dict[str, int]] = {}
+    """The smallest values of settings that are whole numbers."""
+
+    def __post_init__(self) -> None:
+        for name, low in self.lowest.items():
+            if getattr(self, name) != "auto":
+                self._set(name, whole(type(self).__name__, name, getattr(self, name), low))
 
     @abstractmethod
     def shape(self, Hd: int, Hm: int) -> Shape:
@@ -100,11 +108,10 @@ class Decide(Reduction):
     force: bool = False
     ahead: int = 1
 
+    lowest: ClassVar[dict[str, int]] = {"depth": 1, "max_depth": 1, "ahead": 1}
+
     def __post_init__(self) -> None:
-        if self.depth != "auto":
-            self._set("depth", whole("Decide", "depth", self.depth, 1))
-        for name in ("max_depth", "ahead"):
-            self._set(name, whole("Decide", name, getattr(self, name), 1))
+        super().__post_init__()
         self._set("tau", numbers("Decide", "tau", self.tau, ndim=0, low=0.0))
         if self.wait_cost is not None:
             self._set("wait_cost", numbers("Decide", "wait_cost", self.wait_cost, ndim=0, low=0.0, strict=True))
@@ -122,9 +129,8 @@ class Decide(Reduction):
         H, d = Hd * Hm, self.deepest
         children = tree("Decide", H, d, "use Beam(9) or Hybrid(9), whose cost is linear, or a smaller depth")
         auto = {} if self.depth != "auto" else {"tau": self.tau, "wait": self.wait_cost or -1.0, "ahead": self.ahead}
-        return Shape(
-            children // H, children, d, d, knobs(selection.CUT, depth=d, **auto), np.array([children * 1.0, 1, 1])
-        )
+        vector = knobs(selection.CUT, depth=d, **auto)
+        return Shape(children // H, children, d, d, vector, np.array([children * 1.0, 1, 1]))
 
     def losses(self, H: int) -> Array:
         if isinstance(self.loss, str):
@@ -143,9 +149,7 @@ class GPB(Reduction):
     """
 
     order: int = 2
-
-    def __post_init__(self) -> None:
-        self._set("order", whole("GPB", "order", self.order, 1))
+    lowest: ClassVar[dict[str, int]] = {"order": 1}
 
     def shape(self, Hd: int, Hm: int) -> Shape:
         children = tree("GPB", Hd * Hm, self.order, "use IMM(), or a smaller order")
@@ -177,10 +181,7 @@ class Beam(Reduction):
 
     leaves: int = 9
     window: int = REMEMBERED
-
-    def __post_init__(self) -> None:
-        for name in ("leaves", "window"):
-            self._set(name, whole("Beam", name, getattr(self, name), 1))
+    lowest: ClassVar[dict[str, int]] = {"leaves": 1, "window": 1}
 
     def shape(self, Hd: int, Hm: int) -> Shape:
         children = tree("Beam", Hd * Hm * self.leaves, 1, "use fewer leaves")
@@ -202,10 +203,7 @@ class Hybrid(Reduction):
     sensor_events: int = 1
     age_cap: int = 40
     remembered: int = REMEMBERED
-
-    def __post_init__(self) -> None:
-        for name, low in (("leaves", 1), ("window", 1), ("sensor_events", 0), ("age_cap", 1), ("remembered", 1)):
-            self._set(name, whole("Hybrid", name, getattr(self, name), low))
+    lowest: ClassVar[dict[str, int]] = {"leaves": 1, "window": 1, "sensor_events": 0, "age_cap": 1, "remembered": 1}
 
     def shape(self, Hd: int, Hm: int) -> Shape:
         children = tree("Hybrid", Hd * Hm * self.leaves, 1, "use fewer leaves")
@@ -214,14 +212,8 @@ class Hybrid(Reduction):
             raise ValueError(
                 f"Hybrid: a window of {self.window} with {Hd} changes cannot be distinguished; use a smaller one."
             )
-        return Shape(
-            self.leaves,
-            children,
-            self.remembered,
-            1,
-            knobs(selection.HYBRID, leaves=self.leaves, cap=self.age_cap),
-            bases,
-        )
+        vector = knobs(selection.HYBRID, leaves=self.leaves, cap=self.age_cap)
+        return Shape(self.leaves, children, self.remembered, 1, vector, bases)
 
 
 @dataclass(frozen=True)
@@ -233,9 +225,10 @@ class FirstFloor(Reduction):
 
     depth: int = 2
     weights: str = "posterior"
+    lowest: ClassVar[dict[str, int]] = {"depth": 1}
 
     def __post_init__(self) -> None:
-        self._set("depth", whole("FirstFloor", "depth", self.depth, 1))
+        super().__post_init__()
         one_of("FirstFloor", "weights", self.weights, ("posterior", "prior"))
 
     def shape(self, Hd: int, Hm: int) -> Shape:

@@ -13,7 +13,6 @@ With r_f = resolution^2 / (2 pi) the density at the last output is 1 / resolutio
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import FunctionType
@@ -71,13 +70,9 @@ class Sensor(Settings):
 
     @classmethod
     def nominal(
-        cls,
-        r: float | None = None,
-        prob: float | None = None,
-        guess: float | None = None,
-        nu: float = 4.0,
+        cls, r: float | None = None, prob: float | None = None, guess: float | None = None, nu: float = 4.0,
         memory: float | None = 100.0,
-    ) -> Sensor:
+    ) -> Sensor:  # fmt: skip
         """The sensor in its normal state, with noise variance r.
 
         r=None: the variance is unknown, and every leaf carries an inverse gamma distribution of it that forgets over
@@ -95,26 +90,11 @@ class Sensor(Settings):
         return cls(name, prob=prob, factor=scale * scale + (1.0 if plus else 0.0))
 
     @classmethod
-    def offset(
-        cls, value: float | None = None, std: float | None = None, prob: float = 0.01, r: float | None = None
-    ) -> Sensor:
-        """A known offset. One of unknown size that is new at every sample (``std``) is replaced by an outlier, with a
-        warning.
-
-        A lasting offset is a parameter: ``intercept=True`` in the model, and a `Change` of that parameter.
+    def offset(cls, value: float, prob: float = 0.01) -> Sensor:
+        """A known offset. One of unknown size that is new at every sample, of standard deviation s, is an outlier with
+        scale^2 = 1 + s^2 / r; a lasting one is a parameter: ``intercept=True`` in the model, and a `Change` of it.
         """
-        if (value is None) == (std is None):
-            raise ValueError(f"Sensor.offset: give either value= or std=; got value={value!r}, std={std!r}.")
-        if std is None:
-            return cls("offset", prob=prob, value=float(value or 0.0))
-        if r is None:
-            raise ValueError("Sensor.offset: std= needs r=, the noise variance to which it is added.")
-        warnings.warn(
-            "Sensor.offset(std=) is the same hypothesis as an outlier of variance r + std^2, and is replaced by one; "
-            "for a lasting offset add an intercept to the model and a Change of it.",
-            stacklevel=2,
-        )
-        return cls("outlier", prob=prob, factor=1.0 + std * std / r)
+        return cls("offset", prob=prob, value=value)
 
     @classmethod
     def frozen(cls, resolution: float | None = None, prob: float = 0.01) -> Sensor:

@@ -6,8 +6,8 @@
     forecast   h = H' phi;  e = y - h' x;  s = h' C h + r / w
     correct    x <- x + C h e / s;  C <- C - C h h' C / s
 
-F has a block for each component: 1, exp(-dt / time), a shear, or a rotation. theta and P = H C H' are what the result
-shows.
+F has a block for each component: exp(-dt damping), a shear, or a rotation that may shrink. theta and P = H C H' are
+what the result shows.
 
 The start is diffuse in the components whose variance is not known, x_0 = c + delta: x and C are those for delta = 0,
 and A = dx / d delta and the information M about delta are computed beside them (de Jong 1991),
@@ -44,7 +44,7 @@ from driftfit.engine.kernel import (
     shared,
     wholes,
 )
-from driftfit.trackers.laws.law import COSINE, DECAY, KIND, LEVEL, NOISE, OWNER, RATE, ROWS, SLOPE, VISIBLE
+from driftfit.trackers.laws.law import COSINE, DAMPING, KIND, LEVEL, NOISE, OWNER, PLAIN, RATE, ROWS, SLOPE, VISIBLE
 from driftfit.trackers.parts.covariance import LEFT
 from driftfit.trackers.parts.varying_drift import read_drift
 
@@ -65,8 +65,8 @@ logarithm of the likelihood of what delta took."""
  AT_F, ADDRESSES) = range(17)  # fmt: skip
 
 
-def state(table: Array, theta0: Array, p0: Array | None, laws: Mapping[int, Any]) -> Mapping[str, Any]:
-    """Fields before the first sample; ``laws`` by the place of their parameter."""
+def state(table: Array, theta0: Array, p0: Array | None, means: Mapping[int, float]) -> Mapping[str, Any]:
+    """Fields before the first sample; ``means`` are known means, by the place of their parameter."""
     n, N = len(theta0), table.shape[1]
     x, C, free = np.zeros(N), np.zeros((N, N)), np.ones(N)
     first = [int(np.argmax(table[OWNER] == i)) for i in range(n)]
@@ -74,12 +74,11 @@ def state(table: Array, theta0: Array, p0: Array | None, laws: Mapping[int, Any]
     if p0 is not None:
         C[np.ix_(first, first)] = p0
         free[first] = 0.0
-    for k in np.flatnonzero(table[KIND] == DECAY):
+    for k in np.flatnonzero(table[DAMPING]):
         C[k, k], free[k] = table[NOISE, k], 0.0
-        mean = laws[int(table[OWNER, k])].mean
-        if mean is not None:
-            level = first[int(table[OWNER, k])]
-            x[level], C[level], C[:, level], free[level] = mean, 0.0, 0.0, 0.0
+    for i, mean in means.items():
+        level = first[i]
+        x[level], C[level], C[:, level], free[level] = mean, 0.0, 0.0, 0.0
     shown = (table[OWNER] == np.arange(n)[:, None]) * table[VISIBLE]
     return {
         "theta": shown @ x, "P": shown @ C @ shown.T, "law": table, "x": x, "C": C, "A": np.diag(free),
@@ -92,19 +91,18 @@ def state(table: Array, theta0: Array, p0: Array | None, laws: Mapping[int, Any]
 def forward(law: Array, X: Array, dt: float) -> None:
     """X <- F X."""
     for k in range(len(X)):
-        kind = law[KIND, k]
-        if kind == DECAY:
-            keep = exp(-dt * law[RATE, k])
-            for c in range(X.shape[1]):
-                X[k, c] *= keep
-        elif kind == LEVEL:
+        kind, keep = law[KIND, k], exp(-dt * law[DAMPING, k]) if law[DAMPING, k] > 0.0 else 1.0
+        if kind == LEVEL:
             for c in range(X.shape[1]):
                 X[k, c] += dt * X[k + 1, c]
         elif kind == COSINE:
-            ahead, aside = np.cos(dt * law[RATE, k]), np.sin(dt * law[RATE, k])
+            ahead, aside = keep * np.cos(dt * law[RATE, k]), keep * np.sin(dt * law[RATE, k])
             for c in range(X.shape[1]):
                 one, other = X[k, c], X[k + 1, c]
                 X[k, c], X[k + 1, c] = ahead * one + aside * other, ahead * other - aside * one
+        elif kind == PLAIN:
+            for c in range(X.shape[1]):
+                X[k, c] *= keep
 
 
 @shared
@@ -119,12 +117,11 @@ def turn_over(X: Array) -> None:
 def spread(law: Array, root: Array, C: Array, dt: float, drift: float) -> None:
     """C <- C + Q(dt)."""
     for k in range(len(C)):
-        i, kind, noise = int(law[OWNER, k]), law[KIND, k], law[NOISE, k]
-        own = noise * root[i] * root[i] * drift
-        if kind == DECAY:
-            keep = exp(-dt * law[RATE, k])
-            C[k, k] += own * (1.0 - keep * keep)
-        elif kind == SLOPE:
+        i, damping = int(law[OWNER, k]), law[DAMPING, k]
+        own = law[NOISE, k] * root[i] * root[i] * drift
+        if damping > 0.0:
+            C[k, k] += own * (1.0 - exp(-2.0 * dt * damping))
+        elif law[KIND, k] == SLOPE:
             C[k, k] += own * dt
             C[k - 1, k] += own * dt * dt
             C[k, k - 1] += own * dt * dt

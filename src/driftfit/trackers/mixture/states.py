@@ -2,8 +2,8 @@
 
 Modes are rows of the table of `AdaptiveKalman`. Noise has one of three states, told apart by the samples:
 
-    quiet      variance r, the mean of E(v^2 | y) with a memory of `MEMORY` samples
-    restless   variance f, the same with a memory of `QUICK`
+    quiet      variance r, the mean of E(v^2 | y) with a memory of `MEMORY` samples that are no outliers
+    restless   variance f: log f follows log E(v^2 | y, not quiet) with a memory of `QUICK` samples that are not quiet
     outlier    of any size: variance max(30 r, e^2), with a probability that is learned
 
 With p the joint probabilities of modes and states, E(v^2 | y) = sum p (r - r^2 / s + (r e / s)^2), exactly; a noise
@@ -12,19 +12,17 @@ variance that is learned so needs no bounds. Equal readings in a row repeat one 
 that changed. A meter so fine that readings never repeat has no such noise, and neither has a plant without noise whose
 readings repeat because it rests.
 
-The smoother is given one random walk, with the drift that the modes have on average if all samples are known:
+The smoother (`driftfit.smooth.unknown_drift`) is given the noise and the course of the drift over time,
 
     w_t(i) = f_t(i) sum_j T_ij w_{t+1}(j) / sum_h f_t(h) T_hj         probability of mode i at t, given all samples
-    q_t    = sum_k w_t(k) q_tk,    1 / r_t = sum_j nu_tj / v_tj
+    q_t    = r_t sum_k w_t(k) rho_k for rho_k < 1,    1 / r_t = sum_j nu_tj / v_tj
 
 with f_t the probabilities after sample t, T their transitions, and nu_tj those of the states of the noise after the
-sample. `driftfit.smooth.exact` estimates theta from it, on the regressors and outputs from which coloured noise was
-taken. Of learned drift in one direction the variances count, not the covariances. Before the filters start nothing
-drifts.
+sample, on the regressors and outputs from which coloured noise was taken. Before the filters start nothing drifts.
 
 Source: the moments of a noise given the data are those of an EM step, Shumway and Stoffer (1982); step^2 / 12 is
-Sheppard's (1898); the backward pass is Kim's (1994), eq. 2.20. The modes, the rule for repeats, and smoothing one
-random walk instead of one for each mode, are ours. Cost per sample: O(K).
+Sheppard's (1898); the backward pass is Kim's (1994), eq. 2.20. The modes and the rule for repeats are ours. Cost per
+sample: O(K).
 """
 
 from __future__ import annotations
@@ -36,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import ROUNDING
-from driftfit.engine.kernel import Array, State, exp, kernel
+from driftfit.engine.kernel import Array, State, exp, kernel, log
 
 COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
 TREND = (1e-3, 1e-2, 0.1)
@@ -60,14 +58,14 @@ FIRST_ALONE = FIRST_LEARNED + len(LEARNED)
 STATES = 3
 OUTLIER, RARITY, FADE = 0.035, 50.0, 0.999
 """Probability of an outlier before the first sample, samples that this counts for, and fading of those since."""
-STAY, CALM = 0.99, 0.95
+STAY, CALM = 0.995, 0.98
 """Probabilities that quiet noise stays quiet, and that restless noise stays restless."""
 QUIET = 0.8
 """Probability of quiet noise before the first sample."""
-MEMORY, QUICK = 70.0, 10.0
+MEMORY, QUICK = 70.0, 2.0
 """Memories of r and f, in samples."""
-LEAST_RESTLESS, LARGE, WILDEST = 6.0, 30.0, 1e8
-"""Least f, the variance of outliers at least, and the largest f, in units of r."""
+LEAST_RESTLESS, LARGE = 6.0, 30.0
+"""Least f and the variance of outliers at least, in units of r."""
 LEAST_SHARE = 1e-26
 """r is never below this share of the mean square of y, for rounding in the sums of a prediction."""
 
@@ -220,7 +218,7 @@ def learn_noise(s: State, l: int) -> None:
     s.certainty[l] = s.noise[l] * ((1.0 - s.outlier[l]) * usual + s.outlier[l] / far)
     if s.repeats[l] > 0.0:
         return
-    ordinary, share, every = 0.0, 0.0, 0.0
+    ordinary, wild = 0.0, 0.0
     for j in range(STATES):
         least = variance_in(s, j, l)
         widest = np.inf if j == STATES - 1 else 0.0
@@ -229,25 +227,21 @@ def learn_noise(s: State, l: int) -> None:
             own = max(least, min(e2, widest))
             s.row[k, l] = s.joint[j, k, l] * (own * (1.0 - own * v) + own * v * own * v * e2)
         moment = sum_of_row(s, l) / s.noise[l]
-        every += moment
-        if j < STATES - 1:
-            for k in range(K):
-                s.row[k, l] = s.joint[j, k, l]
-            share += sum_of_row(s, l)
-            ordinary += moment
+        ordinary += moment if j < STATES - 1 else 0.0
+        wild += moment if j > 0 else 0.0
     s.count[l] += 1.0
     s.outliers[l] = FADE * s.outliers[l] + s.outlier[l]
     s.watched[l] = FADE * s.watched[l] + 1.0
+    # s.nu counts an outlier for the states that were expected
+    away = 1.0 - s.nu[0, l] + s.outlier[l] * s.nu_prior[0, l] / (1.0 - s.outlying[l])
+    f = variance_in(s, 1, l) / s.noise[l]
+    s.restless[l] = f * exp(away / QUICK * log(wild / (away * f))) if (away > 0.0) & (wild > 0.0) else f
     s.outlying[l] = (OUTLIER * RARITY + s.outliers[l]) / (RARITY + s.watched[l])
-    move = (ordinary / s.r[l] - share) / min(s.count[l] + 1.0, MEMORY)
+    move = (ordinary / s.r[l] - (1.0 - s.outlier[l])) / min(s.count[l] + 1.0, MEMORY)
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
-    s.restless[l] += (min(every, WILDEST * s.r[l]) - s.restless[l]) / QUICK
 
 
-SMOOTHER_FIELDS = (
-    "mu", "prior", "kappa", "r", "certainty", "leap", "c", "drift_unit", "offset", "weight", "direction", "white",
-    "explained", "settled", "constant",
-)  # fmt: skip
+SMOOTHER_FIELDS = ("mu", "prior", "kappa", "r", "certainty", "offset", "white", "explained", "settled", "constant")
 """Fields that are stored at every sample."""
 
 
@@ -257,10 +251,9 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
     for k in range(s.mu.shape[0]):
         o.mu[k, l], o.prior[k, l] = s.mu[k, l], s.prior[k, l]
     for i in range(s.c.shape[0]):
-        o.c[i, l], o.drift_unit[i, l], o.offset[i, l] = s.c[i, l], s.drift_unit[i, l], s.offset[i, l]
-        o.weight[i, l], o.direction[i, l], o.white[i, l] = s.weight[i, l], s.direction[i, l], s.white[i, l]
+        o.offset[i, l], o.white[i, l] = s.offset[i, l], s.white[i, l]
     o.kappa[l], o.r[l], o.certainty[l], o.explained[l] = s.kappa[l], s.r[l], s.certainty[l], s.explained[l]
-    o.settled[l], o.constant[l], o.leap[l] = s.settled[l], s.constant[l], s.leap[l]
+    o.settled[l], o.constant[l] = s.settled[l], s.constant[l]
 
 
 def transitions(state: Mapping[str, Any]) -> tuple[Array, Array]:
@@ -283,32 +276,20 @@ def modes_given_all(fields: Mapping[str, Array], used: Array, state: Mapping[str
     return found
 
 
-def estimated_variances(
-    fields: Mapping[str, Array], phi: Array, time: Array, state: Mapping[str, Any]
-) -> tuple[Array, Array, Array, Array]:
-    """q (T, n), that of the drift about the means, the matrix A (n, n) for which phi A are the regressors less their
-    means, and r (T,) of every sample, from the stored fields (T, ..), the regressors (N, n) of used samples and the
-    intervals of drift.
-    """
-    running = fields["settled"] > 0
-    used = running & (fields["certainty"] > 0.0)
-    r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
-    ratio = state["ratio"] + np.where(state["ratio"] == COMMON[-1], fields["leap"][:, None], 0.0)
-    size = modes_given_all(fields, used, state) * ratio * (r * time)[:, None]
-    centred = fields["offset"] != 0.0
-    learned = size[:, FIRST_LEARNED:FIRST_ALONE].sum(axis=1)
-    common = (size[:, :FIRST_LEARNED].sum(axis=1) + FLOOR * learned)[:, None] * fields["drift_unit"]
-    own = learned[:, None] * (fields["weight"] + fields["direction"] ** 2)
-    for i, first in enumerate(state["alone"]):
-        if first >= 0:
-            own[:, i] += size[:, first : first + state["rungs"]].sum(axis=1)
-    c = np.where(fields["c"] > 0.0, fields["c"], np.inf)
-    drifts = (running & (time > 0.0))[:, None]
-    q = np.where(drifts, own / c + np.where(centred, 0.0, common), 0.0)
-    about = np.where(drifts & centred, common, 0.0)
-    A, constant = np.eye(phi.shape[1]), int(fields["constant"][-1])
+def centring(fields: Mapping[str, Array], phi: Array) -> Array:
+    """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
+    centred, A, constant = fields["offset"] != 0.0, np.eye(phi.shape[1]), int(fields["constant"][-1])
     if constant >= 0 and centred.any():
         mean = phi.mean(axis=0)
         A[constant] = np.where(centred.any(axis=0), -mean / mean[constant], 0.0)
         A[constant, constant] = 1.0
-    return q, about, A, 1.0 / np.where(used, fields["certainty"], 1.0 / r)
+    return A
+
+
+def variances_given_all(fields: Mapping[str, Array], state: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Variance of the noise of every sample (T,), and that of the drift but for jumps, in units of 1 / c (T,)."""
+    running = fields["settled"] > 0
+    r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
+    used = running & (fields["certainty"] > 0.0)
+    drift = modes_given_all(fields, used, state) @ np.where(state["ratio"] < 1.0, state["ratio"], 0.0)
+    return 1.0 / np.where(used, fields["certainty"], 1.0 / r), np.where(running, r * drift, 0.0)

@@ -21,7 +21,7 @@ it.
 The same change of coordinates is made if a sample carries so much more information on z_j than all earlier ones that a
 covariance would keep no digits of the rest (`outgrown`). The prior of z_j is finite then, and correlated with the
 others: they take the sample as always, C_ib - g_i g_b / s, and row j follows from them and from their correlation
--g r / s with v (`driftfit.trackers.bank.machine.entering` derives both). It is exact at any ratio.
+-g r / s with v (`driftfit.trackers.bank.machine.framed` derives both). It is exact at any ratio.
 
 Source: the square-root form is Bierman's (1977); filters in fixed coordinates of it are ours. Cost per sample: O(n^2)
 for x; O(n^3) where a column enters.

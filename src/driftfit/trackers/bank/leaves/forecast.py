@@ -8,8 +8,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, store, sum_of, times
-from driftfit.trackers.bank.layout import ALIKE, IN_NOISE, LAST, R
-from driftfit.trackers.bank.leaves.leaf_matrix import WEIGHT, total
+from driftfit.trackers.bank.leaves.leaf_matrix import WEIGHT
 
 FACTOR, VALUE, FROZEN, STUCK, CLEANS, OWN = range(6)
 """Columns of the table of sensors; OWN is the number of the user's function (`own_sensor`), 0 for none."""
@@ -21,50 +20,31 @@ def expect(t: Any, L: int) -> tuple[float, float]:
 
     Row j of ``shares`` is w p(sensor j | leaf). A frozen sensor repeats the last output, if there was one.
     """
-    w, h, y, factor = t.leaves[WEIGHT], t.expected[0], t.expected[1], t.scores[0]
-    share, shares, prior, sensors, Hm, last = (
-        t.spare[0],
-        t.spare[1:],
-        t.prior,
-        t.sensors,
-        len(t.sensors),
-        t.sample[LAST],
-    )
-    mean, variance, mass = 0.0, 0.0, 0.0
+    w, h, y, factor, prior, sensors, shares = (
+        t.leaves[WEIGHT], t.expected[0], t.expected[1], t.scores[0], t.prior, t.sensors, t.spare,
+    )  # fmt: skip
+    last, Hm, mean, variance, mass = t.last, len(t.sensors), 0.0, 0.0, 0.0
     for j in range(Hm):
         frozen = sensors[j, FROZEN] > 0.0
-        possible = not frozen or abs(last) < np.inf
-        # p(sensor j | leaf), summed over the changes
         for l in range(L):
-            share[l] = 0.0
-        if possible:
+            p = 0.0
             for e in range(j, len(prior), Hm):
-                for l in range(L):
-                    share[l] += prior[e, l]
-        for l in range(L):
-            shares[j, l] = w[l] * share[l]
-        # its contribution to the mean: z'm + offset, or the last output
-        for l in range(L):
-            share[l] = shares[j, l] * (last if frozen and possible else y[l] + sensors[j, VALUE])
-        mean += total(share, L)
-    for j in range(Hm):
-        mass += total(shares[j], L)
-    mean = mean / mass if mass != 1.0 else mean
+                p += prior[e, l]
+            shares[j, l] = w[l] * p if not frozen or abs(last) < np.inf else 0.0
+            mass += shares[j, l]
+            mean += shares[j, l] * (last if frozen and shares[j, l] > 0.0 else y[l] + sensors[j, VALUE])
+    mean /= mass
     # second moment about the mean: the variance within each component, and the distance of its mean
-    r, noise = t.sample[R], t.sample[IN_NOISE]
     for j in range(Hm):
-        if sensors[j, FROZEN] > 0.0 and abs(last) < np.inf:
-            for l in range(L):
-                wide = sensors[j, STUCK] if sensors[j, STUCK] > 0.0 else -sensors[j, STUCK] * r * factor[l]
-                share[l] = shares[j, l] * (wide + (last - mean) ** 2)
-        else:
-            for l in range(L):
-                scatter = y[l] + sensors[j, VALUE] - mean
-                share[l] = shares[j, l] * ((h[l] + sensors[j, FACTOR] * r * noise) * factor[l] + scatter * scatter)
-        variance += total(share, L)
-    if mass != 1.0:
-        variance /= mass
-    return mean, variance if noise < np.inf else np.inf
+        stuck = sensors[j, STUCK]
+        for l in range(L):
+            if sensors[j, FROZEN] == 0.0:
+                wide = (h[l] + sensors[j, FACTOR] * t.r * t.noise) * factor[l]
+                variance += shares[j, l] * (wide + (y[l] + sensors[j, VALUE] - mean) ** 2)
+            elif shares[j, l] > 0.0:
+                wide = stuck if stuck > 0.0 else -stuck * t.r * factor[l]
+                variance += shares[j, l] * (wide + (last - mean) ** 2)
+    return mean, variance / mass if t.noise < np.inf else np.inf
 
 
 @kernel
@@ -86,7 +66,7 @@ def expect_together(t: Any, L: int) -> tuple[float, float]:
     row, and the last of Q, are overwritten.
     """
     theta, P, phi, Q, prior, sensors, X = t.theta, t.cov, t.phi, t.Q, t.prior, t.sensors, t.scores
-    alike, Hm = t.counters[ALIKE] > 0, len(sensors)
+    alike, Hm = t.alike > 0, len(sensors)
     mixed, spare_row = Q[len(Q) - 1], len(Q) - 1
     rest, unit = 0.0, weighted(t.leaves, L, X, 0) if alike else 0.0
     for at in range(0, Q.shape[1], WIDTH):
@@ -112,4 +92,4 @@ def expect_together(t: Any, L: int) -> tuple[float, float]:
             g += (P[j, i] + mixed[j * (j + 1) // 2 + i]) * phi[j]
         mean += phi[i] * theta[i]
         wide += phi[i] * g
-    return mean, wide + rest * (t.sample[R] * t.sample[IN_NOISE])
+    return mean, wide + rest * (t.r * t.noise)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, exp, shared
-from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, blur, spread
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, spread
 
 KEEP, RESET, KIND, GAIN = range(4)
 """Columns of the table of maps: the factor of C, whether all is reset, the kind; of the settings then log forget, of an
@@ -92,12 +92,8 @@ def along(C: Array, n: int, a: int, b: int, z: Array, g: Array, h: Array) -> Non
 
 
 @shared
-def toward(C: Array, n: int, a: int, b: int, z: Array, gain: float, work: Array) -> None:
-    """Directional forgetting; nothing where z or C z is zero."""
-    g, h = work, work[n]
-    along(C, n, a, b, z, g, h)
-    for l in range(a, b):
-        h[l] = gain / h[l] if h[l] > 0.0 else 0.0
+def add_square(C: Array, n: int, a: int, b: int, g: Array, h: Array) -> None:
+    """C <- C + h g g'."""
     at = 0
     for i in range(n):
         for j in range(i + 1):
@@ -107,24 +103,29 @@ def toward(C: Array, n: int, a: int, b: int, z: Array, gain: float, work: Array)
 
 
 @shared
+def toward(C: Array, n: int, a: int, b: int, z: Array, gain: float, work: Array) -> None:
+    """Directional forgetting; nothing where z or C z is zero."""
+    g, h = work, work[n]
+    along(C, n, a, b, z, g, h)
+    for l in range(a, b):
+        h[l] = gain / h[l] if h[l] > 0.0 else 0.0
+    add_square(C, n, a, b, g, h)
+
+
+@shared
 def measure(C: Array, m: Array, a: int, b: int, w: Array, mean: Array, r: float, work: Array) -> None:
     """Measurement update by w' theta = w' mean with noise variance r."""
     n = len(w)
     g, h = work, work[n]
     along(C, n, a, b, w, g, h)
     for l in range(a, b):
-        h[l] = 1.0 / (h[l] + r)
-    at = 0
-    for i in range(n):
-        for j in range(i + 1):
-            for l in range(a, b):
-                C[at, l] -= h[l] * g[i, l] * g[j, l]
-            at += 1
+        h[l] = -1.0 / (h[l] + r)
+    add_square(C, n, a, b, g, h)
     for l in range(a, b):
         away = 0.0
         for j in range(n):
             away += w[j] * (mean[j] - m[j, l])
-        h[l] *= away
+        h[l] *= -away
     for i in range(n):
         for l in range(a, b):
             m[i, l] += h[l] * g[i, l]
@@ -185,74 +186,58 @@ def apply(t: Any, C: Array, m: Array, a: int, b: int, c: int, work: Array) -> No
 
 
 @shared
-def add_moments(t: Any, one: Array, mean: Array, chance: Array, L: int) -> None:
-    """Add the share of one change to the first two moments about the means of the leaves."""
-    B, C, m, n, at = t.leaves, t.C, t.m, t.n, 0
-    for i in range(n):
-        for l in range(L):
-            m[i, l] += chance[l] * (mean[i, l] - B[FIRST + i, l])
-        for j in range(i + 1):
-            for l in range(L):
-                away = (mean[i, l] - B[FIRST + i, l]) * (mean[j, l] - B[FIRST + j, l])
-                C[at, l] += chance[l] * (one[at, l] + away)
-            at += 1
-
-
-@shared
 def average(t: Any, L: int, Hd: int, Hm: int) -> None:
     """Mean m and covariance C of every leaf over all changes, without data: the first two moments
 
         m = sum_c p_c m_c,   C = sum_c p_c (C_c + (m_c - m) (m_c - m)'),
 
-    computed about the leaf's own mean. Needs tri + 2 n + 2 spare rows.
+    computed as differences from the leaf's own. Only the first ``Hd`` changes count, under ``Hm`` sensors. Needs tri +
+    2 n + 2 spare rows, unless all changes are walks.
     """
-    B, C, m, X, n, Q, maps, places = t.leaves, t.C, t.m, t.spare, t.n, t.Q, t.maps, t.places
-    tri = n * (n + 1) // 2
-    chance, work = X[0], X[1 : 2 + n]
-    one, mean = X[2 + n : 2 + n + tri], X[2 + n + tri : 2 + 2 * n + tri]
-    for k in range(tri):
+    B, C, m, X, n, Q, maps, tri = t.leaves, t.C, t.m, t.spare, t.n, t.Q, t.maps, t.n * (t.n + 1) // 2
+    chance, work, one, mean = X[0], X[1 : 2 + n], X[2 + n : 2 + n + tri], X[2 + n + tri : 2 + 2 * n + tri]
+    for k in range(n + tri):
+        to = m[k] if k < n else C[k - n]
         for l in range(L):
-            C[k, l] = 0.0
-    for i in range(n):
-        for l in range(L):
-            m[i, l] = 0.0
+            to[l] = 0.0 if k < n else B[FIRST + k, l]
     for c in range(Hd):
-        for l in range(L):
+        for l in range(L):  # p_c, summed over the sensors
             chance[l] = 0.0
-        # p_c, summed over the sensors
-        for j in range(Hm):
-            for l in range(L):
+            for j in range(Hm):
                 chance[l] += t.prior[c * Hm + j, l]
-        # m_c and C_c
+        if maps[c, KIND] == WALK and maps[c, RESET] == 0.0:
+            for k in range(tri):
+                for l in range(L if Q[c, k] != 0.0 else 0):
+                    C[k, l] += chance[l] * Q[c, k]
+            continue
         for k in range(tri):
             for l in range(L):
                 one[k, l] = maps[c, KEEP] * B[FIRST + n + k, l] + Q[c, k]
         for i in range(n):
             for l in range(L):
-                mean[i, l] = places[MEAN, i] if maps[c, RESET] > 0.0 else B[FIRST + i, l]
+                mean[i, l] = t.places[MEAN, i] if maps[c, RESET] > 0.0 else B[FIRST + i, l]
         apply(t, one, mean, 0, L, c, work)
-        add_moments(t, one, mean, chance, L)
-    # central second moment; then the mean itself instead of its distance from the leaf's
-    at = 0
-    for i in range(n):
-        for j in range(i + 1):
+        for i in range(n):
             for l in range(L):
-                C[at, l] -= m[i, l] * m[j, l]
-            at += 1
+                mean[i, l] -= B[FIRST + i, l]
+                m[i, l] += chance[l] * mean[i, l]
+        for k in range(tri):
+            for l in range(L):
+                C[k, l] += chance[l] * (one[k, l] - B[FIRST + n + k, l])
+        add_square(C, n, 0, L, mean, chance)
+    if t.walks_only == 0:
+        for l in range(L):
+            chance[l] = -1.0
+        add_square(C, n, 0, L, m, chance)
     for i in range(n):
         for l in range(L):
             m[i, l] += B[FIRST + i, l]
 
 
 @shared
-def foresee(t: Any, L: int, Hd: int, Hm: int, used: bool) -> None:
-    """Fill the rows z'C z and z'm of `expected` for every leaf over all changes, and m; also C, unless the sample is
-    ``used``. Only the first ``Hd`` changes count, under ``Hm`` sensors.
-    """
-    if t.walks_only > 0:
-        blur(t, L, Hd, Hm)
-    else:
-        average(t, L, Hd, Hm)
+def foresee(t: Any, L: int, Hd: int, Hm: int) -> None:
+    """Fill the rows z'C z and z'm of `expected` for every leaf over all changes, and m and C."""
+    average(t, L, Hd, Hm)
     spread(t.C, t.z, t.m, L, t.n, t.output_lags, t.g, t.expected)
 
 

@@ -18,9 +18,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from driftfit.engine.kernel import Array, kernel, shared
-from driftfit.trackers.bank.layout import IN_Y, MOST, R
-from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
+from driftfit.trackers.bank.leaves.leaf_matrix import lag_row
 
 PLAUSIBLE, VAGUE = 1e4, 1e12
 """Limits beyond which a prediction is no possible output: its square in mean squares of the outputs, and its variance
@@ -29,53 +30,54 @@ in variances of the noise. Without them the lags of an unstable leaf would diver
 
 
 @kernel
-def plausible(expected: Array, l: int, most: float, r: float) -> bool:
-    """Whether the prediction of leaf l is a possible output."""
-    return expected[1, l] * expected[1, l] <= most and expected[0, l] <= VAGUE * r  # type: ignore[no-any-return]
+def plausible(h: float, y_hat: float, most: float, r: float) -> bool:
+    """Whether a prediction is a possible output."""
+    return y_hat * y_hat <= most and h <= VAGUE * r
+
+
+@kernel
+def covariance_row(t: Any) -> int:
+    """The first row of V, whose lower triangle is stored last in a leaf, if it is."""
+    return lag_row(t) + t.output_lags  # type: ignore[no-any-return]
 
 
 @shared
-def covariance_row(n: int, na: int) -> int:
-    """The first row of V, whose lower triangle is stored last in a leaf."""
-    return FIRST + n + n * (n + 1) // 2 + na
-
-
-@shared
-def push(t: Any, L: int, observed: bool, y_hat: Array, most: float) -> None:
-    """Store output lags of leaves without a measurement update: y if it was observed, otherwise each prediction, within
-    limits.
+def push(t: Any, A: Array, K: int, at: int, columns: int, y: float, own: bool) -> None:
+    """Output lags of the leaves from column ``at`` on, whose parents are K columns of A: moved by one, then y or, under
+    a hypothesis with lags of its ``own`` and where y is missing, the prediction. A may be the leaves themselves.
     """
-    B, n, na, y, limit = t.leaves, t.n, t.output_lags, t.sample[IN_Y], math.sqrt(most)
-    at = FIRST + n + n * (n + 1) // 2
-    for i in range(na - 1, 0, -1):
-        for l in range(L):
-            B[at + i, l] = B[at + i - 1, l]
-    if na > 0:
-        for l in range(L):
-            B[at, l] = y if observed else min(max(y_hat[l], -limit), limit)
+    B, h, y_hat, lags, most, r, limit = (
+        t.leaves, t.expected[0], t.expected[1], lag_row(t), t.most, t.r, math.sqrt(t.most),
+    )  # fmt: skip
+    missing = t.observed == 0.0
+    for i in range(t.output_lags - 1, 0, -1):
+        for c in range(at, at + columns, K):
+            for l in range(K):
+                B[lags + i, np.uint64(c + l)] = A[lags + i - 1, l]
+    for l in range(columns if t.output_lags > 0 else 0):
+        believed = missing or (own and plausible(h[l], y_hat[l], most, r))
+        B[lags, np.uint64(at + l)] = min(max(y_hat[l], -limit), limit) if believed else y
 
 
 @shared
 def write_coefficients(t: Any, columns: int) -> None:
-    """The coefficients of the output lags, where leaves are in coordinates of the start."""
+    """The coefficients of the output lags."""
     m, rows, a = t.m, t.lag_rows, t.lag_coefficients
-    for i in range(t.output_lags if t.in_coordinates > 0 else 0):
+    for i in range(t.output_lags):
         for l in range(columns):
             a[i, l] = 0.0
-            for k in range(t.n):
-                a[i, l] += rows[i, k] * m[k, l]
+        for k in range(t.n):
+            of = rows[i, k]
+            for l in range(columns if of != 0.0 else 0):
+                a[i, l] += of * m[k, l]
 
 
 @shared
 def widen_by_lags(t: Any, B: Array, K: int, columns: int) -> None:
     """h <- h + a' V a for columns c K + l, whose lags are those of leaf l of B."""
-    na, h = t.output_lags, t.expected[0]
-    at = covariance_row(t.n, na)
-    if at >= len(B):
-        return
+    a, h, at = t.lag_coefficients, t.expected[0], covariance_row(t)
     write_coefficients(t, columns)
-    a = t.lag_coefficients if t.in_coordinates > 0 else t.m
-    for i in range(na):
+    for i in range(t.output_lags if at < len(B) else 0):
         for j in range(i + 1):
             twice = 1.0 if i == j else 2.0
             for start in range(0, columns, K):
@@ -89,13 +91,11 @@ def shift_covariance(t: Any, A: Array, K: int, at: int, columns: int, own: bool)
     """V of the leaves from column ``at`` on, whose parents are K columns of A: moved by one lag, with the variance of
     the new entry, which is zero if it was measured or replaced. A may be the leaves themselves.
     """
-    B, na, expected, X = t.leaves, t.output_lags, t.expected, t.spare_lags
-    r, most, block = t.sample[R], t.sample[MOST], slice(at, at + columns)
-    first = covariance_row(t.n, na)
+    B, na, X, a, first = t.leaves, t.output_lags, t.spare_lags, t.lag_coefficients, covariance_row(t)
+    h, y_hat, r, most, block = t.expected[0], t.expected[1], t.r, t.most, slice(at, at + columns)
     if first >= len(B):
         return
     write_coefficients(t, columns)
-    a = t.lag_coefficients if t.in_coordinates > 0 else t.m
     for i in range(na - 1):  # V a, but for its last entry
         for l in range(columns):
             X[i, l] = 0.0
@@ -113,24 +113,7 @@ def shift_covariance(t: Any, A: Array, K: int, at: int, columns: int, own: bool)
     for i in range(na - 1, 0, -1):
         to = B[first + i * (i + 1) // 2, block]
         for l in range(len(to)):
-            to[l] = X[i - 1, l] if own and plausible(expected, l, most, r) else 0.0
+            to[l] = X[i - 1, l] if own and plausible(h[l], y_hat[l], most, r) else 0.0
     to = B[first, block]
     for l in range(len(to)):
-        to[l] = expected[0, l] + r if own and plausible(expected, l, most, r) else 0.0
-
-
-@shared
-def merge_covariance(t: Any, members: Array, share: Array, to: int) -> None:
-    """A parent, column ``to``: the average of V plus the spread of the lags, whose mean is already stored there."""
-    B, A, n, na, unknown = t.leaves, t.parents, t.n, t.output_lags, t.unknown > 0
-    first, lags = covariance_row(n, na), FIRST + n + n * (n + 1) // 2
-    if first >= len(B):
-        return
-    for k in range(len(members)):
-        l, at = members[k], first
-        pull = B[NU, l] / B[S, l] if unknown else 1.0
-        for i in range(na):
-            away = pull * (B[lags + i, l] - A[lags + i, to])
-            for j in range(i + 1):
-                A[at, to] += share[k] * (B[at, l] + away * (B[lags + j, l] - A[lags + j, to]))
-                at += 1
+        to[l] = h[l] + r if own and plausible(h[l], y_hat[l], most, r) else 0.0

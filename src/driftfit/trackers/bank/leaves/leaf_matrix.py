@@ -1,16 +1,12 @@
 """Leaves of the hypothesis tree: the columns of one matrix, and their mixture.
 
-A leaf is one history of events with its Gaussian N(m, C) and its weight. Leaves are adjacent along the last axis, over
-which the compiler vectorises; the rows of a column are
+A leaf is one history of events with its Gaussian N(m, C) and its weight. The rows of a column are
 
-    log w, w, nu, S, code, age, code of sensors, code of changes, m (n), C (lower triangle), cleaned output lags
+    log w, w, nu, S, code, age, code of sensors, code of changes, m (n), C (lower triangle), output lags
 
-nu and S are those of the inverse gamma distribution of the noise variance if that is unknown, and C is then in its
-units. Codes contain the newest events as the digits of a number, for use by the reduction. The history of a leaf is
-needed by the user and not by the recursion; it consists of marginal probabilities of events in a separate table, which
-the children of a leaf share: its block k has the joint events k levels back, and the probability of no change since.
-
-Everything here is compiled once for all sizes.
+nu and S are those of the inverse gamma distribution of the noise variance if that is unknown; C is then in its units.
+Codes contain the newest events as digits of a number, for the reduction. Histories are in a table of their own
+(`driftfit.trackers.bank.machine.ancestry`). Leaves are adjacent along the last axis, over which loops are vectorised.
 """
 
 from __future__ import annotations
@@ -35,42 +31,10 @@ from driftfit.engine.simd import (
     sum_of,
     times,
 )
-from driftfit.trackers.bank.layout import ALIKE, FLIPPED, R
+from driftfit.trackers.bank.layout import tables
 
 LOG, WEIGHT, NU, S, CODE, AGE, SENSORS, CHANGES, FIRST = range(9)
 """Rows of a leaf; the mean begins at FIRST."""
-
-
-@kernel
-def total(x: Array, count: int) -> float:
-    """Sum of the first entries in four interleaved parts, because one chain of additions would have the latency of all
-    of them.
-    """
-    a, b, c, d = 0.0, 0.0, 0.0, 0.0
-    whole = count // 4 * 4
-    for l in range(0, whole, 4):
-        a += x[l]
-        b += x[l + 1]
-        c += x[l + 2]
-        d += x[l + 3]
-    for l in range(whole, count):
-        a += x[l]
-    return (a + c) + (b + d)
-
-
-@kernel
-def largest(x: Array, count: int) -> float:
-    """Largest of the first entries, in four interleaved parts."""
-    a, b, c, d = -np.inf, -np.inf, -np.inf, -np.inf
-    whole = count // 4 * 4
-    for l in range(0, whole, 4):
-        a = x[l] if x[l] > a else a
-        b = x[l + 1] if x[l + 1] > b else b
-        c = x[l + 2] if x[l + 2] > c else c
-        d = x[l + 3] if x[l + 3] > d else d
-    for l in range(whole, count):
-        a = x[l] if x[l] > a else a
-    return max(max(a, b), max(c, d))
 
 
 @shared
@@ -78,7 +42,9 @@ def normalise(B: Array, L: int) -> float:
     """Weights from their logarithms, with zeros after the last; returns the log of their sum, NaN if no leaf is
     possible.
     """
-    top = largest(B[LOG], L)
+    top = -np.inf
+    for l in range(L):
+        top = B[LOG, l] if B[LOG, l] > top else top
     if not abs(top) < np.inf:
         return np.nan
     store(B, LOG, L, fill(-np.inf))
@@ -149,8 +115,8 @@ def priors(t: Any, L: int, expanded: bool) -> None:
     If histories are ``expanded``, the last event of a leaf is given by probabilities.
     """
     prior, row, P, event, H = t.prior, t.row, t.chain, t.event, len(t.row)
-    history = t.history_2 if t.counters[FLIPPED] > 0 else t.history
-    if t.counters[ALIKE] > 0:
+    history = tables(t)[0]
+    if t.alike > 0:
         for e in range(H):
             for l in range(L):
                 prior[e, l] = row[e]
@@ -185,9 +151,9 @@ def later(prior: Array, L: int, P: Array, steps: int, X: Array) -> None:
 
 
 @shared
-def standstill(prior: Array, L: int, Hm: int) -> None:
+def standstill(prior: Array, a: int, b: int, Hm: int) -> None:
     """The prior when no time passes: sensors keep their shares; all changes except the first have probability 0."""
-    for l in range(L):
+    for l in range(a, b):
         for j in range(Hm):
             share = 0.0
             for e in range(j, len(prior), Hm):
@@ -203,7 +169,7 @@ def increments(t: Any, time: float, each: float) -> None:
     The first change takes ``time``, the others ``each``. Relative walks are in units of r / (mean square of phi_k).
     """
     walks, relative, powers, Q = t.walks, t.relative_walks, t.powers, t.Q
-    unit = 1.0 if t.unknown > 0 else t.sample[R]
+    unit = 1.0 if t.unknown > 0 else t.r
     for i in range(len(walks)):
         span = (time if i == 0 else each) * t.drift[i]
         for k in range(0, walks.shape[1], WIDTH):
@@ -213,34 +179,26 @@ def increments(t: Any, time: float, each: float) -> None:
                 Q[i, k * (k + 1) // 2 + k] += relative[i, k] * (unit / powers[k]) * span
 
 
-@shared
-def regressors_from_lags(t: Any, B: Array, L: int, copies: int, phi: Array) -> None:
-    """x of every leaf in coordinates of the start: x + R' d, d the difference of its output lags from the record's."""
-    z, rows, lags = t.z, t.lag_rows, FIRST + t.n + t.n * (t.n + 1) // 2
-    for i in range(t.n):
-        for l in range(copies * L):
-            z[i, l] = phi[i]
-        for k in range(t.output_lags):
-            for at in range(0, copies * L, L):
-                for l in range(L):
-                    z[i, at + l] += rows[k, i] * (B[lags + k, l] - rows[k, t.n])
+@kernel
+def lag_row(t: Any) -> int:
+    """The row of a leaf's newest output lag."""
+    return FIRST + t.n + t.n * (t.n + 1) // 2  # type: ignore[no-any-return]
 
 
 @part
 def regressors(n: int, t: Any, B: Array, L: int, copies: int, phi: Array) -> None:
-    """The regressor of every leaf, with separate output lags if it has any; otherwise phi, for the first eight."""
-    z, na = t.z, t.output_lags
-    lags = FIRST + n + n * (n + 1) // 2
-    if na > 0 and t.in_coordinates > 0:
-        regressors_from_lags(t, B, L, copies, phi)
-        return
-    for i in range(na):
-        for at in range(0, copies * L, L):
-            for l in range(L):
-                z[i, at + l] = B[lags + i, l]
-    for i in range(na, n):
+    """The regressor of every leaf: phi, in the first eight columns, or phi + R' d, where leaves have output lags of
+    their own, which differ by d from those of the record.
+    """
+    z, rows, na, lags = t.z, t.lag_rows, t.output_lags, lag_row(t)
+    for i in range(n):
         for l in range(0, copies * L if na > 0 else 1, WIDTH):
             store(z, i, l, fill(phi[i]))
+        for k in range(na):
+            of, own = rows[k, i], rows[k, n]
+            for at in range(0, copies * L if of != 0.0 else 0, L):
+                for l in range(L):
+                    z[i, at + l] += of * (B[lags + k, l] - own)
 
 
 @part
@@ -259,26 +217,3 @@ def spread(C: Array, z: Array, m: Array, L: int, n: int, na: int, g: Array, expe
             y = plus(y, times(zi, load(m, i, l)))
         store(expected, 0, l, h)
         store(expected, 1, l, y)
-
-
-@shared
-def blur(t: Any, L: int, Hd: int, Hm: int) -> None:
-    """Mean and covariance of every leaf over all random walks, without data: C + sum p_i Q_i, exactly."""
-    B, C, m, Q, prior, chance, n = t.leaves, t.C, t.m, t.Q, t.prior, t.spare[0], t.n
-    at = FIRST + n
-    for i in range(n):
-        for l in range(L):
-            m[i, l] = B[FIRST + i, l]
-    for k in range(n * (n + 1) // 2):
-        for l in range(L):
-            C[k, l] = B[at + k, l]
-    for c in range(Hd):
-        for l in range(L):
-            chance[l] = 0.0
-        for j in range(Hm):
-            for l in range(L):
-                chance[l] += prior[c * Hm + j, l]
-        for k in range(n * (n + 1) // 2):
-            if Q[c, k] != 0.0:
-                for l in range(L):
-                    C[k, l] += chance[l] * Q[c, k]

@@ -1,20 +1,13 @@
-"""Sensors with a likelihood that the user writes: `driftfit.Sensor.own`.
+"""Sensors with a likelihood that the user writes: `driftfit.trackers.bank.sensor.Sensor.own`.
 
-A plain function of numbers evaluates a reading y for one leaf,
-
-    log p(y),  a,  clean = likelihood(y, y_hat, h, r, last)
-
-where y_hat = z'm and h = z'C z are the leaf's forecast without noise, r is the noise variance of the nominal sensor (of
-this leaf, if it is unknown) and last is the last output observed. The leaf is updated by a measurement with noise
-variance a,
+A leaf, whose forecast without noise has mean y_hat = z'm and variance h = z'C z, is updated by a measurement with the
+noise variance a that the function returns,
 
     K = C z / (h + a),     m+ = m + K (y - y_hat),     C+ = C - K (C z)'
 
-so C remains a covariance whatever the function returns; with a = inf nothing is learned about theta (the variance is
-then `LARGEST` times h + r). ``clean`` goes into the leaf's output lags, if the sensor ``cleans``.
-
-The function is compiled by itself, in a second or two, and the compiled routine of a bank calls it by its address
-(`call`), which a step has looked up by its symbol; the routine is not recompiled.
+so C remains a covariance whatever the function returns; a = inf is `LARGEST` times h + r. The function is compiled by
+itself, in a second or two, and the compiled routine of a bank calls it by its address (`call`), which a step has looked
+up by its symbol; the routine is not recompiled.
 """
 
 from __future__ import annotations
@@ -29,8 +22,8 @@ from numba import types
 from driftfit.engine.kernel import Array, State, floats, kernel, machine, shared
 from driftfit.engine.numba_internals import ir, named_intrinsic
 from driftfit.engine.simd import WIDTH
-from driftfit.trackers.bank.layout import READING, ROW, SHIFT
-from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
+from driftfit.trackers.bank.layout import ROW
+from driftfit.trackers.bank.leaves.leaf_matrix import NU, S, lag_row
 
 OWN_AT = ROW["own_likelihoods"]
 LARGEST, LEAST = 1e12, 1e-12
@@ -79,9 +72,8 @@ def judge(t: Any, which: float, at: int, l: int, y: float, r: float, answers: Ar
     B, expected = t.leaves, t.expected
     unit = B[S, at + l] / (B[NU, at + l] - 2.0) if t.unknown > 0 else 1.0
     h = expected[0, l]
-    shift = t.sample[SHIFT]
-    readings = y + shift, expected[1, l] + shift
-    call(t.own_likelihoods, (which, *readings, h * unit, r * unit, t.sample[READING]), answers.ctypes.data)
+    readings = y + t.shift, expected[1, l] + t.shift
+    call(t.own_likelihoods, (which, *readings, h * unit, r * unit, t.reading), answers.ctypes.data)
     most = LARGEST * (h + r)
     answers[NOISE] = max(answers[NOISE] / unit, LEAST * r) if answers[NOISE] < most * unit else most
     answers[LOG_P] = answers[LOG_P] if answers[LOG_P] < np.inf else -np.inf
@@ -90,38 +82,29 @@ def judge(t: Any, which: float, at: int, l: int, y: float, r: float, answers: Ar
 
 @shared
 def judge_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
-    """Evaluate the function for every leaf, three numbers for each in `answers`, and replace h by h + a; h is kept in
-    the first row of `scores`.
+    """Evaluate the function for every leaf: log densities in the first row of `scores`, h + a in the place of h; h and
+    what the function returns as the output in the two rows of `answers`.
 
     The columns up to a whole SIMD vector hold no leaf; their variance must not be zero, because numbers are divided by
     it.
     """
-    answers = t.answers.reshape(t.answers.shape[0] * t.answers.shape[1])
+    h, kept, answer = t.expected[0], t.answers, t.answers[2]
     for l in range(-(-columns // WIDTH) * WIDTH):
-        noise = r
+        kept[0, l], answer[NOISE] = h[l], r
         if l < columns:
-            judge(t, which, at, l, y, r, answers[3 * l : 3 * l + 3])
-            noise = answers[3 * l + NOISE]
-        t.scores[0, l] = t.expected[0, l]
-        t.expected[0, l] += noise
+            judge(t, which, at, l, y, r, answer)
+            t.scores[0, l], kept[1, l] = answer[LOG_P], answer[CLEAN]
+        h[l] += answer[NOISE]
 
 
 @shared
-def weigh_all(t: Any, columns: int) -> None:
-    """Restore h, which `judge_all` kept, and put the log densities in its place."""
-    answers = t.answers.reshape(t.answers.shape[0] * t.answers.shape[1])
+def restore(t: Any, at: int, columns: int, cleans: bool) -> None:
+    """Restore h; with ``cleans``, the output that the function returns is the newest lag."""
+    lags = lag_row(t)
     for l in range(-(-columns // WIDTH) * WIDTH):
-        t.expected[0, l] = t.scores[0, l]
-        if l < columns:
-            t.scores[0, l] = answers[3 * l + LOG_P]
-
-
-@shared
-def clean_all(t: Any, at: int, columns: int) -> None:
-    """Store the output that the function returns as the newest lag."""
-    lag, answers = FIRST + t.n + t.n * (t.n + 1) // 2, t.answers.reshape(t.answers.shape[0] * t.answers.shape[1])
-    for l in range(columns):
-        t.leaves[lag, at + l] = answers[3 * l + CLEAN]
+        t.expected[0, l] = t.answers[0, l]
+    for l in range(columns if cleans else 0):
+        t.leaves[lags, at + l] = t.answers[1, l]
 
 
 @kernel
@@ -152,19 +135,12 @@ def entry_of(functions: tuple[Callable[..., Any], ...]) -> tuple[Any, Any]:
 def _chosen(functions: Sequence[Callable[..., Any]]) -> Any:
     """One of several functions, by its number."""
     first = kernel(functions[0])
-    if len(functions) == 1:
-
-        @kernel
-        def one(which: float, y: float, y_hat: float, h: float, r: float, last: float) -> tuple[float, float, float]:
-            return first(y, y_hat, h, r, last)  # type: ignore[no-any-return]
-
-        return one
-    others = _chosen(functions[1:])
+    others = _chosen(functions[1:]) if len(functions) > 1 else None
 
     @kernel
-    def either(which: float, y: float, y_hat: float, h: float, r: float, last: float) -> tuple[float, float, float]:
-        if which == 1.0:
+    def one(which: float, y: float, y_hat: float, h: float, r: float, last: float) -> tuple[float, float, float]:
+        if others is None or which == 1.0:
             return first(y, y_hat, h, r, last)  # type: ignore[no-any-return]
         return others(which - 1.0, y, y_hat, h, r, last)  # type: ignore[no-any-return]
 
-    return either
+    return one

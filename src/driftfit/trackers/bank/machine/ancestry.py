@@ -1,9 +1,8 @@
-"""The histories of leaves, from which probabilities of past events are computed: marginals of events, and of no change
-since.
+"""The histories of leaves, from which probabilities of past events are computed.
 
-Row l of the table is the history of leaf l: entry k (H + 1) + e is p(joint event e, k levels back | leaf), entry k (H +
-1) + H is p(no change in the newest k + 1 levels | leaf). A history is contiguous, so inheriting it is one copy, and a
-marginal is one sum of rows; the last row of the table is for such sums. A row of `new_events` is what an event adds;
+Row l of the table is the history of leaf l: entry k (H + 1) + e is p(joint event e, k levels back | leaf), entry
+k (H + 1) + H is p(no change in the newest k + 1 levels | leaf). A history is contiguous, so inheriting it is one copy
+and a marginal one sum of rows; the last row of the table is for such sums. Row e of `new_events` is what event e adds;
 two rows of factors for the older entries follow: for no change, and for a change. After growth the table still holds
 the parents; a sample that is not used writes it out for every leaf.
 """
@@ -16,7 +15,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, below, equal, fill, load, plus, store, sum_of, times
-from driftfit.trackers.bank.layout import EXPANDED, FLIPPED, PARENTS, flip
+from driftfit.trackers.bank.layout import flip, tables
 from driftfit.trackers.bank.leaves.leaf_matrix import WEIGHT
 
 
@@ -61,47 +60,57 @@ def hand_on(T: Array, of: int, e: int, H: int, Hm: int, news: Array, T2: Array, 
 
 
 @shared
-def write_out(t: Any, L: int) -> None:
-    """The histories of the children, from those of their parents."""
+def descend(t: Any, L: int, chosen: bool) -> None:
+    """The histories of the leaves, from those of their parents; or only of the ``chosen`` ones, in `order`."""
     H, Hm = len(t.initial), len(t.sensors)
-    now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
-    for l in range(L):
-        hand_on(now, t.parent[l], t.event[l], H, Hm, t.new_events, after, l)
+    now, after = tables(t)
+    for k in range(L):
+        l = t.order[k] if chosen else k
+        if t.expanded > 0:
+            for at in range(now.shape[1]):
+                after[k, at] = now[l, at]
+        else:
+            hand_on(now, t.parent[l], t.event[l], H, Hm, t.new_events, after, k)
     flip(t)
-    t.counters[EXPANDED] = 1
+    t.expanded = 1
 
 
 @shared
-def shift(T: Array, L: int, prior: Array, Hm: int) -> None:
+def shift(t: Any, L: int) -> None:
     """Add a level without an observation: its events keep their prior probabilities."""
-    H = len(prior)
+    T, prior, H = tables(t)[0], t.prior, len(t.initial)
     block = H + 1
     for l in range(L):
         for k in range(T.shape[1] - 1, block - 1, -1):
             T[l, k] = T[l, k - block]
+        quiet = 0.0
         for e in range(H):
             T[l, e] = prior[e, l]
-        quiet = 0.0
-        for e in range(Hm):
-            quiet += prior[e, l]
+            quiet += prior[e, l] if e < len(t.sensors) else 0.0
         T[l, H] = quiet
         for k in range(block + H, T.shape[1], block):
             T[l, k] *= quiet
 
 
 @shared
-def pick(t: Any, G: int) -> None:
-    """Copy the histories of the leaves that were kept, in `order`."""
-    H, Hm = len(t.initial), len(t.sensors)
-    now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
-    for k in range(G):
-        l = t.order[k]
-        if t.counters[EXPANDED] > 0:
-            for at in range(now.shape[1]):
-                after[k, at] = now[l, at]
-        else:
-            hand_on(now, t.parent[l], t.event[l], H, Hm, t.new_events, after, k)
-    flip(t)
+def settle(T: Array, l: int, levels: int, H: int, Hm: int, best: int) -> None:
+    """Row l: one change, ``best``, at each of the newest ``levels``, with the probabilities of sensors as they were."""
+    block = H + 1
+    known = min(levels, T.shape[1] // block)
+    quiet = T[l, (known - 1) * block + H] if known > 0 else 1.0
+    for at in range(0, T.shape[1] - block + 1, block):
+        if at < known * block:
+            for j in range(Hm):
+                share = 0.0
+                for e in range(j, H, Hm):
+                    share += T[l, at + e]
+                    T[l, at + e] = 0.0
+                T[l, at + best * Hm + j] = share
+            T[l, at + H] = 1.0 if best == 0 else 0.0
+        elif best > 0:
+            T[l, at + H] = 0.0
+        elif known > 0:
+            T[l, at + H] = T[l, at + H] / quiet if quiet > 0.0 else 0.0
 
 
 @shared
@@ -115,16 +124,6 @@ def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
 
 
 @shared
-def summary(lags: Array, newest: Array) -> None:
-    """The newest levels and the oldest one."""
-    last = len(newest) - 1
-    for k in range(len(newest)):
-        row = k if k < last else len(lags) - 1
-        for e in range(lags.shape[1]):
-            newest[k, e] = lags[row, e]
-
-
-@shared
 def marginals(t: Any, L: int) -> float:
     """lag_prob[k, e] = p(event e, k levels back); returns the probability of a change among the levels
     of the histories.
@@ -132,8 +131,8 @@ def marginals(t: Any, L: int) -> float:
     Leaves are ordered in blocks of the children of K parents. Two spare rows are overwritten.
     """
     B, X, event, lags = t.leaves, t.spare, t.event, t.lag_prob
-    T = t.history_2 if t.counters[FLIPPED] > 0 else t.history
-    H, Hm, K, expanded = len(t.initial), len(t.sensors), t.counters[PARENTS], t.counters[EXPANDED] > 0
+    T = tables(t)[0]
+    H, Hm, K, expanded = len(t.initial), len(t.sensors), t.many_parents, t.expanded > 0
     block, W, sums, mass, steady = H + 1, len(lags), len(T) - 1, X[0], X[1]
     back, quiet, last = 1, 0.0, W * block - 1
     if expanded:

@@ -1,30 +1,31 @@
 """Gaps: the events that may have happened since the last used sample, as one level of the tree.
 
-A tree that grew by a level at every missing sample would fill up with histories that the data cannot distinguish: for
-independent events it does not matter when in the gap a jump happened. Leaves therefore make only the nominal time
-update, sample by sample. The alternatives are kept in a table: the probability a_0 that only nominal changes happened,
-and for every other change i the probability a_i that it was the first, with the mean A_i of the covariance that it and
-all further changes add. After an interval in which change i is the first with probability r_i (none: r_0) and adds Q_i,
-they are
+A tree that grew by a level at every missing sample would fill up with histories that the data cannot distinguish.
+Leaves therefore make only the nominal time update, sample by sample, and the alternatives are kept in a table: the
+probability a_0 that only nominal changes happened, and for every other change i the probability a_i that it was the
+first, with the mean A_i of the covariance that it and all further changes add. After an interval in which change i is
+the first with probability r_i (none: r_0) and adds Q_i, they are
 
     a_i A_i <- a_i (A_i + D) + a_0 r_i (Q_i + M),    a_i <- a_i + a_0 r_i,    a_0 <- a_0 r_0
 
 where D is the mean of all changes of the interval and M that of those after its first. An interval of dt nominal
 samples has r_0 = p_0^dt, and dt (1 - p_0) changes on average. The next used sample grows one level with the
-probabilities a and the covariances A. Its event represents the whole gap.
+probabilities a and the covariances A; its event represents the whole gap.
 
 That is exact in the probability of any change and in the first two moments of the parameters after the gap given the
 first change, and entirely exact if at most one change falls into a gap; the drift of the normal course is not removed
-for the samples at which another change took its place. Priors that follow a Markov chain describe changes that last:
-there the chain continues and leaves receive the mean of all changes.
-
-Cost: O(H n^2) for each sample that is not used.
+for the samples at which another change took its place. Changes that follow a Markov chain are treated in
+`driftfit.trackers.bank.machine.markov_gap`. Cost: O(H n^2) for each sample that is not used.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 from driftfit.engine.kernel import Array, exp, log, shared
 from driftfit.engine.simd import WIDTH
+from driftfit.trackers.bank.layout import tables
+from driftfit.trackers.bank.machine.ancestry import settle
 
 SINCE, NOW, SCALE, MORE = range(4)
 """Columns of the table of a gap after the covariances: a_i; r_i; r_i over the prior probability for one nominal sample;
@@ -106,10 +107,11 @@ def extend(gap: Array) -> None:
 
 
 @shared
-def close(gap: Array) -> None:
-    """Close the gap after a used sample."""
-    for i in range(len(gap)):
-        gap[i, gap.shape[1] - WIDTH + SINCE] = 1.0 if i == 0 else 0.0
+def close(t: Any, L: int) -> None:
+    """Close the gap before the level that contains it: the levels of the gap in histories have no changes."""
+    T, H, Hm = tables(t)[0], len(t.initial), len(t.sensors)
+    for l in range(L):
+        settle(T, l, t.open, H, Hm, 0)
 
 
 @shared
@@ -122,19 +124,3 @@ def widen(gap: Array, unit: float, P: Array) -> None:
             for j in range(i + 1):
                 P[i, j] += share * gap[c, k]
                 k += 1
-
-
-@shared
-def take_back(T: Array, L: int, levels: int, gap: Array, H: int, Hm: int) -> None:
-    """Clear the changes of the levels of a gap, because the level that ends the gap contains them."""
-    block, width = H + 1, T.shape[1]
-    quiet = gap[0, gap.shape[1] - WIDTH + SINCE]
-    for l in range(L):
-        for k in range(0, width - block + 1, block):
-            if k < levels * block:
-                for e in range(Hm, H):
-                    T[l, k + e % Hm] += T[l, k + e]
-                    T[l, k + e] = 0.0
-                T[l, k + H] = 1.0
-            else:
-                T[l, k + H] = T[l, k + H] / quiet if quiet > 0.0 else 0.0

@@ -22,12 +22,11 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, log, part, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
-from driftfit.trackers.bank.layout import ALIKE, FADE, LEAST, MOST, R
 from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, OWN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KEEP, KIND, MEAN, RESET, apply
-from driftfit.trackers.bank.leaves.lags import plausible, shift_covariance, widen_by_lags
+from driftfit.trackers.bank.leaves.lags import push, shift_covariance, widen_by_lags
 from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
-from driftfit.trackers.bank.leaves.own_sensor import clean_all, judge_all, weigh_all
+from driftfit.trackers.bank.leaves.own_sensor import judge_all, restore
 from driftfit.trackers.parts.covariance import LEFT
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
@@ -127,7 +126,7 @@ def student(t: Any, at: int, columns: int) -> None:
     """The same in `scores` with unknown variance; nu and S of the leaves from column ``at`` on are
     updated.
     """
-    B, X, fade, least = t.leaves, t.scores, t.sample[FADE], t.sample[LEAST]
+    B, X, fade, least = t.leaves, t.scores, t.fade, t.least
     before, ratio = np.nan, 0.0
     for l in range(columns):  # lgamma is expensive, and nu has few different values
         nu = fade * B[NU, at + l]
@@ -157,7 +156,7 @@ def frozen(t: Any, at: int, columns: int, y: float, last: float, width: float) -
     for l in range(columns):
         wide = width
         if width <= 0.0:
-            wide = -width * (B[S, at + l] / (B[NU, at + l] - 2.0) if unknown else t.sample[R])
+            wide = -width * (B[S, at + l] / (B[NU, at + l] - 2.0) if unknown else t.r)
         far = y - last
         out[l] = -0.5 * (LOG_2PI + log(wide) + far * far / wide) if abs(last) < np.inf else -np.inf
 
@@ -172,26 +171,12 @@ def inherit(t: Any, K: int, row: int, at: int, columns: int) -> None:
 
 
 @shared
-def remember(t: Any, K: int, at: int, columns: int, y: float, own: bool) -> None:
-    """Output lags of the children: the parent's, moved by one, and y or the leaf's prediction."""
-    A, B, expected, n, na, r, most = t.parents, t.leaves, t.expected, t.n, t.output_lags, t.sample[R], t.sample[MOST]
-    first = FIRST + n + n * (n + 1) // 2
-    for i in range(na - 1, 0, -1):
-        for c in range(at, at + columns, K):
-            for l in range(K):
-                B[first + i, np.uint64(c + l)] = A[first + i - 1, l]
-    for l in range(columns):
-        believed = own and plausible(expected, l, most, r)
-        B[first, np.uint64(at + l)] = expected[1, l] if believed else y
-
-
-@shared
 def weigh(t: Any, K: int, at: int, columns: int, j: int, own: bool) -> None:
     """log w+ = log w + log p(event | leaf) + log N of the children under sensor j; their ages, parents
     and events.
     """
     A, B, X, prior, parents, events = t.parents, t.leaves, t.scores, t.prior, t.parent, t.event
-    alike, Hm, likely = t.counters[ALIKE] > 0, len(t.sensors), t.scores[0]
+    alike, Hm, likely = t.alike > 0, len(t.sensors), t.scores[0]
     if own:
         for l in range(K):
             B[LOG, at + l] = A[LOG, l] + (likely[l] if l % Hm == j else -np.inf)
@@ -249,11 +234,11 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
             leave(t, at, columns)
             frozen(t, at, columns, y, last, sensors[j, STUCK])
         elif sensors[j, OWN] > 0.0:
-            judge_all(t, sensors[j, OWN], at, columns, y, t.sample[R] * noise)
+            judge_all(t, sensors[j, OWN], at, columns, y, t.r * noise)
             correct(t.n, t, at, columns, y, 0.0)
-            weigh_all(t, columns)
+            restore(t, at, columns, False)
         else:
-            correct(t.n, t, at, columns, y - sensors[j, VALUE], sensors[j, FACTOR] * t.sample[R] * noise)
+            correct(t.n, t, at, columns, y - sensors[j, VALUE], sensors[j, FACTOR] * t.r * noise)
             if t.unknown > 0:
                 student(t, at, columns)
             else:
@@ -261,10 +246,10 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
         if t.output_lags > 0:
             # output lags of the children, and the covariance of lags that are predictions
             own_lags = sensors[j, CLEANS] > 0.0
-            remember(t, K, at, columns, y - sensors[j, VALUE], own_lags)
-            if own_lags and sensors[j, OWN] > 0.0:
-                clean_all(t, at, columns)
+            push(t, t.parents, K, at, columns, y - sensors[j, VALUE], own_lags)
             shift_covariance(t, t.parents, K, at, columns, own_lags)
+        if sensors[j, OWN] > 0.0 and sensors[j, CLEANS] > 0.0 and t.output_lags > 0:
+            restore(t, at, columns, True)
         # prior probability of the event, ancestry, and codes for the reduction
         weigh(t, K, at, columns, j, own)
         encode(t, K, at, columns, j)

@@ -13,20 +13,17 @@ When a sample can be used after k others that could not, each leaf, of weight w,
     all else         w (1 - kappa),   C + (mean[s] - kappa held[c]) / (1 - kappa),   the rest of reach
 
 (c the mode of largest kappa, the sum of stay[s, e] over its events e) and both grow a level as usual, with the chain
-from the events in which they end. So a jump within the gap, after which the course is the normal one again, has a
-separate leaf, and so has a mode that lasted. That is exact in the probabilities of both courses and of what they end
-in, and in the first two moments of the parameters given either; the information of the sample about courses within the
-second is lost. An interval of dt nominal samples is a gap of dt - 1 and a level.
+from the events in which they end. That is exact in the probabilities of both courses and of what they end in, and in
+the first two moments of the parameters given either; the information of the sample about courses within the second is
+lost. An interval of dt nominal samples is a gap of dt - 1 and a level.
 
-Reductions that number leaves by their last events, `Decide` and `GPB`, have room for as many leaves as there are
-numbers, and twice that here. So at most two leaves have one number: of a leaf that was parted by an earlier gap, and
-whose twin is still there, one leaf continues with the moments of both courses. Without that rule the leaves of a
-`Decide` that were all in one branch were split again at every gap, no decision removed any, and they outgrew their
-table.
+`Decide` and `GPB` number leaves by their last events and have room for twice as many as there are numbers. So at most
+two leaves have one number: a leaf whose twin from an earlier gap is still there continues as one, with the moments of
+both courses. Without that rule leaves in one branch were split at every gap, and outgrew their table.
 
-Only random walks, and not under `IMM`, which has one leaf for every event and mixes it from all of them at every
-sample, nor under `FirstFloor`, which grows the tree again from samples alone; both widen by the mean. Cost: O(H^3 + H
-n^2) for each sample that is not used, and twice the leaves for the one that ends the gap.
+Only random walks, and not under `IMM`, which mixes its leaves at every sample, nor under `FirstFloor`, which grows the
+tree again from samples alone; both widen by the mean. Cost: O(H^3 + H n^2) for each sample that is not used, and twice
+the leaves for the one that ends the gap.
 """
 
 from __future__ import annotations
@@ -35,8 +32,9 @@ import math
 from typing import Any
 
 from driftfit.engine.kernel import Array, kernel, shared
-from driftfit.trackers.bank.layout import ALIKE, FLIPPED, IN_DT, OPEN, TAKEN
-from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, LOG, WEIGHT, variance_factor
+from driftfit.trackers.bank.layout import tables
+from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, LOG, WEIGHT, standstill, variance_factor
+from driftfit.trackers.bank.machine.ancestry import settle
 
 SURE = 1e-12
 """Courses of events less likely than this are left out."""
@@ -51,22 +49,16 @@ def further(dt: float) -> int:
 
 
 @shared
-def open_gap(path: Array, H: int) -> None:
-    """Begin a gap: the rows are reach (H), stay (H), held (H_d), mean (H), and a spare one."""
-    for row in range(len(path) - 1):
-        for k in range(path.shape[1]):
-            path[row, k] = 1.0 if row < 2 * H and k == row % H else 0.0
-
-
-@shared
 def step(t: Any, e: int, to: int) -> float:
     """p(next event is ``to`` | e); one row serves all events where the rows are equal."""
-    return t.row[to] if t.counters[ALIKE] > 0 else t.chain[e, to]  # type: ignore[no-any-return]
+    return t.row[to] if t.alike > 0 else t.chain[e, to]  # type: ignore[no-any-return]
 
 
 @shared
 def lengthen(t: Any, share: float) -> None:
-    """Add a sample without an observation, in which change c adds ``share`` of Q[c]."""
+    """Add a sample without an observation, in which change c adds ``share`` of Q[c]. The rows of `path` are reach (H),
+    stay (H), held (H_d), mean (H), and a spare one.
+    """
     path, Q, X, H, Hd, Hm = t.path, t.Q, t.scratch, len(t.row), len(t.walks), len(t.sensors)
     for s in range(H):
         for e in range(H):
@@ -96,14 +88,16 @@ def go_on(t: Any, dt: float, used: bool) -> None:
 
     A sample that is refused later is processed here twice.
     """
-    counters, Q = t.counters, t.Q
-    if counters[OPEN] == 0 and counters[TAKEN] == 0:
-        open_gap(t.path, len(t.row))
+    Q = t.Q
+    if t.open == 0 and t.taken == 0:
+        for row in range(len(t.path) - 1):
+            for k in range(t.path.shape[1]):
+                t.path[row, k] = 1.0 if row < 2 * len(t.row) and k == row % len(t.row) else 0.0
     steps = further(dt) + 1 if dt > 0.0 else 0
     share = 1.0 / max(steps, 1)
-    for _ in range(steps - counters[TAKEN] - (1 if used and steps > 0 else 0)):
+    for _ in range(steps - t.taken - (1 if used and steps > 0 else 0)):
         lengthen(t, share)
-    counters[TAKEN] = steps - 1 if used and steps > 0 else 0
+    t.taken = steps - 1 if used and steps > 0 else 0
     for c in range(len(t.walks)):
         for k in range(Q.shape[1]):
             Q[c, k] *= share if used else 0.0
@@ -138,13 +132,6 @@ def add_covariance(t: Any, L: int) -> None:
 
 
 @shared
-def widen_leaf(t: Any, k: int, q: Array) -> None:
-    """C + q of one parent; q is a lower triangle."""
-    for i in range(t.n * (t.n + 1) // 2):
-        t.parents[FIRST + t.n + i, k] += q[i]
-
-
-@shared
 def origins(t: Any, L: int, K: int) -> None:
     """prior[s, k]: share of the weight of group k that had s as its last event before the gap."""
     group, event, origin = t.group, t.event, t.prior
@@ -163,46 +150,20 @@ def origins(t: Any, L: int, K: int) -> None:
 
 
 @shared
-def next_event(t: Any, standing: bool, p: Array, k: int) -> None:
-    """The prior of the level to come of a leaf whose last event has the probabilities p. Where no time passes
-    (``standing``) nothing changes.
-    """
-    prior, H, Hm = t.prior, len(t.row), len(t.sensors)
+def next_event(t: Any, p: Array, k: int) -> None:
+    """The prior of the level to come of a leaf whose last event has the probabilities p."""
+    prior, H = t.prior, len(t.row)
     for e in range(H):
         prior[e, k] = 0.0
         for last in range(H):
             prior[e, k] += p[last] * step(t, last, e)
-    if standing:
-        for j in range(Hm):
-            for e in range(Hm + j, H, Hm):
-                prior[j, k] += prior[e, k]
-                prior[e, k] = 0.0
+    if t.dt == 0.0:
+        standstill(prior, k, k + 1, len(t.sensors))
 
 
 @shared
-def remember_one(T: Array, k: int, levels: int, H: int, Hm: int, best: int) -> None:
-    """The history of the leaf of one mode: that mode at every level of the gap, and the probabilities of sensors."""
-    block = H + 1
-    known = min(levels, T.shape[1] // block)
-    quiet = T[k, (known - 1) * block + H] if known > 0 else 1.0
-    for at in range(0, T.shape[1] - block + 1, block):
-        if at < known * block:
-            for j in range(Hm):
-                share = 0.0
-                for e in range(j, H, Hm):
-                    share += T[k, at + e]
-                    T[k, at + e] = 0.0
-                T[k, at + best * Hm + j] = share
-            T[k, at + H] = 1.0 if best == 0 else 0.0
-        elif best > 0:
-            T[k, at + H] = 0.0
-        elif known > 0:
-            T[k, at + H] = T[k, at + H] / quiet if quiet > 0.0 else 0.0
-
-
-@shared
-def remember_other(T: Array, k: int, levels: int, H: int, Hm: int, best: int, kappa: float) -> None:
-    """The history of the leaf of all other courses: the mean without the course of one mode."""
+def exclude(T: Array, k: int, levels: int, H: int, Hm: int, best: int, kappa: float) -> None:
+    """Row k: the mean over all courses of the newest ``levels`` without that of one mode, of probability kappa."""
     block = H + 1
     for at in range(0, T.shape[1] - block + 1, block):
         if at < levels * block:
@@ -219,21 +180,6 @@ def remember_other(T: Array, k: int, levels: int, H: int, Hm: int, best: int, ka
                 T[k, at + e] /= total
         if best == 0 and at >= (levels - 1) * block:
             T[k, at + H] = 0.0  # something changed
-
-
-@shared
-def count_codes(t: Any, K: int) -> None:
-    """Count the parents of each code, in `slots`, for reductions that treat leaves of one code as one history."""
-    for k in range(K if t.bases[0] > 1.0 else 0):
-        t.slots[int(t.parents[CODE, k])] = 0
-    for k in range(K if t.bases[0] > 1.0 else 0):
-        t.slots[int(t.parents[CODE, k])] += 1
-
-
-@shared
-def may_part(t: Any, k: int) -> bool:
-    """Whether a leaf may be continued as two: there is room for two of each code."""
-    return t.bases[0] == 1.0 or t.slots[int(t.parents[CODE, k])] == 1  # type: ignore[no-any-return]
 
 
 @shared
@@ -255,41 +201,22 @@ def courses(t: Any, k: int) -> tuple[int, float]:
 
 
 @shared
-def follow_mode(t: Any, k: int, best: int, kappa: float) -> None:
-    """Continue parent k in the course of one mode."""
-    path, stay, H, Hm, q = t.path, t.scratch[1], len(t.row), len(t.sensors), t.path[len(t.path) - 1]
-    for e in range(H):
-        stay[e] = stay[e] / kappa if e // Hm == best else 0.0
-    next_event(t, t.sample[IN_DT] == 0.0, stay, k)
+def follow(t: Any, k: int, to: int, mode: int, kappa: float, alone: bool) -> None:
+    """Continue parent ``to``, a copy of k, in the course of one mode of probability kappa ``alone``, or in all others
+    (kappa = 0: in all).
+    """
+    path, reach, stay, p, H, Hm = t.path, t.scratch[0], t.scratch[1], t.scratch[2], len(t.row), len(t.sensors)
     for i in range(t.n * (t.n + 1) // 2):
-        q[i] = path[2 * H + best, i]
-    widen_leaf(t, k, q)
-
-
-@shared
-def follow_others(t: Any, k: int, to: int, best: int, kappa: float) -> None:
-    """Continue parent ``to``, a copy of k, in all courses except that of one mode of probability kappa (0: in all)."""
-    path, reach, stay, H, Hm = t.path, t.scratch[0], t.scratch[1], len(t.row), len(t.sensors)
-    held, means, q = 2 * H + best, 2 * H + len(t.walks), path[len(path) - 1]
-    for i in range(t.n * (t.n + 1) // 2):
-        mean = 0.0
-        for s in range(H):
-            mean += t.prior[s, k] * path[means + s, i]
-        q[i] = (mean - kappa * path[held, i]) / (1.0 - kappa)
+        add, mean = path[2 * H + mode, i], 0.0
+        if not alone:
+            for s in range(H):
+                mean += t.prior[s, k] * path[2 * H + len(t.walks) + s, i]
+            add = (mean - kappa * add) / (1.0 - kappa)
+        t.parents[FIRST + t.n + i, to] += add
     for e in range(H):
-        own = stay[e] if e // Hm == best and kappa > 0.0 else 0.0
-        reach[e] = max(reach[e] - own, 0.0) / (1.0 - kappa)
-    next_event(t, t.sample[IN_DT] == 0.0, reach, to)
-    widen_leaf(t, to, q)
-
-
-@shared
-def duplicate(t: Any, T: Array, k: int, to: int) -> None:
-    """Copy parent k with its history."""
-    for i in range(len(t.parents)):
-        t.parents[i, to] = t.parents[i, k]
-    for i in range(T.shape[1]):
-        T[to, i] = T[k, i]
+        held = stay[e] if e // Hm == mode and kappa > 0.0 else 0.0
+        p[e] = held / kappa if alone else max(reach[e] - held, 0.0) / (1.0 - kappa)
+    next_event(t, p, to)
 
 
 @shared
@@ -298,22 +225,26 @@ def split(t: Any, K: int) -> int:
 
     `prior` has for every leaf the shares of the events before the gap, and takes those of the level to come.
     """
-    A, T = t.parents, t.history_2 if t.counters[FLIPPED] > 0 else t.history
-    H, Hm, levels, count = len(t.row), len(t.sensors), t.counters[OPEN], K
-    count_codes(t, K)
+    A, T, slots, coded = t.parents, tables(t)[0], t.slots, t.bases[0] > 1.0
+    H, Hm, levels, count = len(t.row), len(t.sensors), t.open, K
+    for k in range(K if coded else 0):  # how many parents have each code
+        slots[int(A[CODE, k])] = 0
+    for k in range(K if coded else 0):
+        slots[int(A[CODE, k])] += 1
     for k in range(K):
-        best, kappa = courses(t, k)
-        parts = SURE < kappa < 1.0 - SURE and may_part(t, k)
+        mode, kappa = courses(t, k)
+        parts = SURE < kappa < 1.0 - SURE and (not coded or slots[int(A[CODE, k])] == 1)
         if parts:
-            duplicate(t, T, k, count)
+            for i in range(len(A)):
+                A[i, count] = A[i, k]
+            for i in range(T.shape[1]):
+                T[count, i] = T[k, i]
             A[LOG, count] += math.log(1.0 - kappa)
             A[LOG, k] += math.log(kappa)
-            remember_other(T, count, levels, H, Hm, best, kappa)
-            remember_one(T, k, levels, H, Hm, best)
-            follow_others(t, k, count, best, kappa)
+            exclude(T, count, levels, H, Hm, mode, kappa)
+            settle(T, k, levels, H, Hm, mode)
+            follow(t, k, count, mode, kappa, False)
             count += 1
-        if parts or kappa >= 1.0 - SURE:
-            follow_mode(t, k, best, kappa)
-        else:
-            follow_others(t, k, k, 0, 0.0)
+        alone = parts or kappa >= 1.0 - SURE
+        follow(t, k, k, mode, kappa if alone else 0.0, alone)
     return count

@@ -9,41 +9,21 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import COMMON, TrackerSteps, diagonal
-from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
+from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing
 from driftfit.trackers.bank.layout import (
-    COUNT,
-    COUNTERS_AT,
-    COV_AT,
+    BASES as BASE_NAMES,
+)  # fmt: skip
+from driftfit.trackers.bank.layout import (
+    COUNTER,
     FORECAST,
-    FREEDOM,
-    IN_DT,
-    IN_NOISE,
-    IN_OBSERVED,
-    IN_OK,
-    IN_TIME,
-    IN_Y,
     LEARN,
-    LEAST,
     MEMORY_AT,
-    MOST,
-    PHASE,
-    PHI_AT,
-    POWERS_AT,
     READY,
     REPORT_AT,
     ROW,
     ROWS,
-    S2,
-    SAMPLE_AT,
-    SETTLED,
-    SHIFT,
-    SIZE,
-    SQUARES,
-    THETA_AT,
-    TIMES,
+    SAMPLE,
     WAITING,
-    Y_HAT,
-    R,
     memory_at,
     report_at,
 )
@@ -51,14 +31,15 @@ from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
 from driftfit.trackers.bank.leaves.own_sensor import OWN_AT, entry_of, no_own_sensor
 from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.framed import (
+    AT,
     FRAMED,
     begin_framed,
+    call_framed,
     enter_bank,
     frame_theta,
     outgrown,
     read_framed,
     spans_lags,
-    write_changes,
 )
 from driftfit.trackers.mixture.states import LEAST_SHARE
 from driftfit.trackers.parts.coarse.resolution import lasting, learn_resolved_scale, least_noise, resolve
@@ -70,6 +51,7 @@ from driftfit.trackers.parts.diffuse import correct_on_roots, forecast_on_roots,
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.few_residuals import RESIDUALS, wider
 
+BASES = len(BASE_NAMES)
 GIVEN, GIVEN_CHAIN, DRIFT = ROW["given"], ROW["given_chain"], ROW["drift"]
 
 
@@ -116,79 +98,47 @@ def only_drifted(s: State, l: int) -> None:
 
 
 @kernel
-def point(s: State) -> None:
-    """Write the addresses of the arrays into the table."""
-    framed = s.framed[0] > 0
-    s.table[MEMORY_AT, 0, 0] = memory_at(s)
-    s.table[REPORT_AT, 0, 0] = report_at(s)
-    s.table[PHI_AT, 0, 0] = s.x.ctypes.data if framed else s.phi.ctypes.data
-    s.table[POWERS_AT, 0, 0] = s.no_power.ctypes.data if framed else s.c.ctypes.data
-    s.table[THETA_AT, 0, 0] = s.d.ctypes.data if framed else s.theta.ctypes.data
-    s.table[COV_AT, 0, 0] = s.Pz.ctypes.data if framed else s.P.ctypes.data
-    s.table[COUNTERS_AT, 0, 0] = s.counters.ctypes.data
-    s.table[SAMPLE_AT, 0, 0] = s.sample.ctypes.data
-
-
-@kernel
-def among(s: State, l: int) -> None:
-    """The same for one of several outputs: the numbers of one lane are not contiguous, so it works on copies."""
-    n, L, framed = s.theta.shape[0], s.theta.shape[1], s.framed[l] > 0
-    N, size = s.table[MEMORY_AT, 2, 0], s.table[REPORT_AT, 2, 0]
-    own_memory, own_report = floats(memory_at(s), N, L), floats(report_at(s), size, L)
-    memory = memory_at(s) + 8 * N * L  # the field flat, behind the memory
-    report = memory + 8 * N
-    vectors = report + 8 * size
-    P = vectors + 24 * n
-    sample = P + 8 * n * n
-    counters = sample + 8 * SIZE
-    at = counters + 8 * COUNT
-    table = wholes(at, ROWS, 3)
-    for k in range(ROWS):
-        for i in range(3):
-            table[k, i] = s.table[k, i, l]
-    table[MEMORY_AT, 0], table[REPORT_AT, 0], table[PHI_AT, 0] = memory, report, vectors
-    table[POWERS_AT, 0], table[THETA_AT, 0], table[COV_AT, 0] = vectors + 8 * n, vectors + 16 * n, P
-    table[COUNTERS_AT, 0], table[SAMPLE_AT, 0] = counters, sample
-    for k in range(N):
-        floats(memory, 1, N)[0, k] = own_memory[k, l]
-    for i in range(n):
-        floats(vectors, 3, n)[0, i] = s.x[i, l] if framed else s.phi[i, l]
-        floats(vectors, 3, n)[1, i] = 0.0 if framed else s.c[i, l]
-        floats(vectors, 3, n)[2, i] = s.d[i, l] if framed else s.theta[i, l]
-        for j in range(n):
-            floats(P, n, n)[i, j] = s.Pz[i, j, l] if framed else s.P[i, j, l]
-    for k in range(SIZE):
-        floats(sample, 1, SIZE)[0, k] = s.sample[k, l]
-    for k in range(COUNT):
-        wholes(counters, 1, COUNT)[0, k] = s.counters[k, l]
-    bank(at)
-    for k in range(N):
-        own_memory[k, l] = floats(memory, 1, N)[0, k]
+def moved(at: int, size: int, L: int, l: int, to: int, back: bool) -> int:
+    """Copy lane l of a field of ``size`` numbers to an address, or ``back``; returns the address behind the copy."""
+    lane, flat = floats(at, size, L), floats(to, 1, size)
     for k in range(size):
-        own_report[k, l] = floats(report, 1, size)[0, k]
-    for k in range(SIZE):
-        s.sample[k, l] = floats(sample, 1, SIZE)[0, k]
-    for k in range(COUNT):
-        s.counters[k, l] = wholes(counters, 1, COUNT)[0, k]
-    for i in range(n):
-        theta = floats(vectors, 3, n)[2, i]
-        s.d[i, l], s.theta[i, l] = theta if framed else s.d[i, l], s.theta[i, l] if framed else theta
-        for j in range(n):
-            entry = floats(P, n, n)[i, j]
-            s.Pz[i, j, l], s.P[i, j, l] = entry if framed else s.Pz[i, j, l], s.P[i, j, l] if framed else entry
+        if back:
+            lane[k, l] = flat[0, k]
+        else:
+            flat[0, k] = lane[k, l]
+    return to + 8 * size
 
 
 @kernel
 def run(s: State, l: int) -> None:
-    """Call the compiled routine; addresses are not part of the state."""
-    if s.theta.shape[1] > 1:
-        among(s, l)
-    else:
-        point(s)
-        bank(s.table.ctypes.data)
-        for k in range(MEMORY_AT, SAMPLE_AT + 1):
-            s.table[k, 0, 0] = 0
-    if s.counters[PHASE, l] == LEARN:
+    """Call the compiled routine, whose table receives the addresses of the fields for that time. The numbers of one of
+    several lanes are not contiguous, so the routine works on copies behind the memory.
+    """
+    n, L, framed = s.theta.shape[0], s.theta.shape[1], s.framed[l] > 0
+    sizes = (
+        s.table[MEMORY_AT, 2, l], s.table[REPORT_AT, 2, l], n, n, n, n * n, s.counters.shape[0], s.sample.shape[0],
+        3 * ROWS,
+    )  # fmt: skip
+    fields = (
+        memory_at(s), report_at(s), np.int64(s.x.ctypes.data if framed else s.phi.ctypes.data),
+        np.int64(s.no_power.ctypes.data if framed else s.c.ctypes.data),
+        np.int64(s.d.ctypes.data if framed else s.theta.ctypes.data),
+        np.int64(s.Pz.ctypes.data if framed else s.P.ctypes.data),
+        np.int64(s.counters.ctypes.data), np.int64(s.sample.ctypes.data), np.int64(s.table.ctypes.data),
+    )  # fmt: skip
+    copies = fields[0] + 8 * sizes[0] * L
+    to = copies
+    for k in range(BASES):
+        s.table[MEMORY_AT + k, 0, l] = to if L > 1 else fields[k]
+        to = moved(fields[k], sizes[k], L, l, to, False) if L > 1 else fields[BASES]
+    if L > 1:
+        moved(fields[BASES], sizes[BASES], L, l, to, False)
+    bank(to)
+    for k in range(BASES if L > 1 else 0):
+        copies = moved(fields[k], sizes[k], L, l, copies, True)
+    for k in range(BASES):  # addresses are not part of the state
+        s.table[MEMORY_AT + k, 0, l] = 0
+    if s.counters[COUNTER.phase, l] == LEARN:
         s.table[OWN_AT, 0, l] = 0
 
 
@@ -201,12 +151,19 @@ def repeated(s: State, l: int) -> float:
 
 @kernel
 def hand_over(s: State, l: int) -> None:
-    """Write the numbers of this sample for the compiled routine."""
-    s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l] * repeated(s, l), s.dt[l]
-    s.sample[IN_TIME, l], s.sample[SHIFT, l] = s.dt[l] * s.drift[l], s.shift[l]
-    s.sample[IN_OK, l], s.sample[IN_OBSERVED, l] = s.ok[l], s.observed[l]
-    s.sample[R, l], s.sample[LEAST, l] = s.r[l], max(LEAST_SHARE * s.power[l] + 1e-300, least_noise(s, l))
-    s.sample[MOST, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
+    """Write the numbers of this sample for the compiled routine, and the output lags of the record."""
+    n, memory = s.theta.shape[0], floats(memory_at(s), s.table[MEMORY_AT, 2, l], s.theta.shape[1])
+    for k in range(s.table[AT.output_lags, 0, l]):
+        memory[s.table[AT.lag_rows, 0, l] // 8 + k * (n + 1) + n, l] = s.phi[k, l]
+    s.sample[SAMPLE.y, l], s.sample[SAMPLE.noise, l], s.sample[SAMPLE.dt, l] = (
+        s.y[l],
+        s.noise[l] * repeated(s, l),
+        s.dt[l],
+    )
+    s.sample[SAMPLE.time, l], s.sample[SAMPLE.shift, l] = s.dt[l] * s.drift[l], s.shift[l]
+    s.sample[SAMPLE.ok, l], s.sample[SAMPLE.observed, l] = s.ok[l], s.observed[l]
+    s.sample[SAMPLE.r, l], s.sample[SAMPLE.least, l] = s.r[l], max(LEAST_SHARE * s.power[l] + 1e-300, least_noise(s, l))
+    s.sample[SAMPLE.most, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
 
 
 @kernel
@@ -214,20 +171,20 @@ def alone(s: State, l: int, counts: bool) -> None:
     """After a sample of the single filter: update scales, noise and lags, and begin the bank as soon as possible."""
     learn_scales(s, l)
     residuals = s.count[l]
-    s.sample[FREEDOM, l] = residuals if s.unknown[l] > 0 else np.inf
+    s.sample[SAMPLE.freedom, l] = residuals if s.unknown[l] > 0 else np.inf
     if counts:
         learn_resolved_scale(s, l)
         s.scale[l] *= wider(s.count[l])
     s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
     hand_over(s, l)
-    s.sample[Y_HAT, l], s.sample[S2, l] = s.y_hat[l], s.s[l] / wider(residuals)
-    s.sample[SQUARES, l], s.sample[TIMES, l] = s.squares[l], s.count[l]
+    s.sample[SAMPLE.y_hat, l], s.sample[SAMPLE.s, l] = s.y_hat[l], s.s[l] / wider(residuals)
+    s.sample[SAMPLE.squares, l], s.sample[SAMPLE.times, l] = s.squares[l], s.count[l]
     ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
     if ready and s.root[l] > 0:
         ready = s.can_frame[l] > 0 and s.within[l] >= RESIDUALS and spans_lags(s, l)
         if ready:
             begin_framed(s, l)
-    s.counters[SETTLED, l] = READY if ready else WAITING
+    s.counters[COUNTER.settled, l] = READY if ready else WAITING
     run(s, l)
     if ready:
         s.scale[l] = 1.0
@@ -245,15 +202,15 @@ def forecast_tree(s: State, l: int) -> None:
         if column >= 0 and s.framed[l] == 0:
             frame_theta(s, l)
     if s.framed[l] > 0:
-        write_changes(s, l)
+        call_framed(s, -1, 1.0 if s.unknown[l] > 0 else s.r[l], l)
     hand_over(s, l)
     s.column[l] = column
     if column >= 0:
-        s.sample[IN_OK, l] = 0.0
-    s.counters[PHASE, l] = FORECAST
+        s.sample[SAMPLE.ok, l] = 0.0
+    s.counters[COUNTER.phase, l] = FORECAST
     run(s, l)
-    s.counters[PHASE, l] = LEARN
-    s.y_hat[l], s.s[l] = s.sample[Y_HAT, l], s.sample[S2, l]
+    s.counters[COUNTER.phase, l] = LEARN
+    s.y_hat[l], s.s[l] = s.sample[SAMPLE.y_hat, l], s.sample[SAMPLE.s, l]
     if outside:
         s.y_hat[l], s.s[l] = y_hat, np.inf
     s.e[l] = s.y[l] - s.y_hat[l]
@@ -263,7 +220,7 @@ def forecast_tree(s: State, l: int) -> None:
 def correct_tree(s: State, l: int) -> None:
     """The tree takes the sample, unless a gate refused it; one that enters a coordinate changes no weight."""
     column, outside = s.column[l], s.s[l] == np.inf
-    s.sample[IN_OK, l], s.sample[IN_OBSERVED, l] = s.ok[l] if column < 0 else 0.0, s.observed[l]
+    s.sample[SAMPLE.ok, l], s.sample[SAMPLE.observed, l] = s.ok[l] if column < 0 else 0.0, s.observed[l]
     run(s, l)
     if column >= 0 and s.ok[l] > 0.0:
         enter_bank(s, column, l)
@@ -278,7 +235,7 @@ def correct_tree(s: State, l: int) -> None:
 @kernel
 def forecast(s: State, l: int) -> None:
     resolve(s, l)
-    if s.counters[SETTLED, l] > 0:
+    if s.counters[COUNTER.settled, l] > 0:
         forecast_tree(s, l)
     else:
         only_drift(s, l)
@@ -288,7 +245,7 @@ def forecast(s: State, l: int) -> None:
 
 @kernel
 def correct(s: State, l: int) -> None:
-    if s.counters[SETTLED, l] > 0:
+    if s.counters[COUNTER.settled, l] > 0:
         correct_tree(s, l)
     else:
         s.s[l] = s.h[l] + s.r[l] * s.noise[l]
@@ -308,7 +265,7 @@ def read(s: State, l: int) -> None:
 @kernel
 def forecast_first(s: State, l: int) -> None:
     resolve(s, l)
-    if s.counters[SETTLED, l] > 0:
+    if s.counters[COUNTER.settled, l] > 0:
         forecast_tree(s, l)
     else:
         only_drifted(s, l)
@@ -318,7 +275,7 @@ def forecast_first(s: State, l: int) -> None:
 
 @kernel
 def correct_first(s: State, l: int) -> None:
-    if s.counters[SETTLED, l] > 0:
+    if s.counters[COUNTER.settled, l] > 0:
         correct_tree(s, l)
     else:
         s.s[l] = s.h[l] + s.r[l] * s.noise[l]
@@ -328,7 +285,7 @@ def correct_first(s: State, l: int) -> None:
 
 @kernel
 def read_first(s: State, l: int) -> None:
-    if s.counters[SETTLED, l] > 0:
+    if s.counters[COUNTER.settled, l] > 0:
         read(s, l)
     else:
         spanned_variance(s, l)

@@ -5,13 +5,12 @@
 
 A minimum of averages is at most the average of minima, so ER_s <= R*: waiting never costs information, only time. For
 several samples y is their mean, which contains less information than all of them: the risk is at most ER_s if they have
-one regressor and nothing happens between them. One sample alone may decide nothing where ten decide all; a rule that
-looks one sample ahead then never begins to wait.
+one regressor and nothing happens between them. One sample alone may decide nothing where ten decide all.
 
-The integral runs over nodes at mean +- 6 standard deviations of every component, by the trapezoidal rule on the union
-of them. The next regressors are not known; the last one before the open events is used instead. A regressor to which
-the leaves have already been fitted, such as the present one, would promise too little, because the leaves agree about
-it. Cost: components x nodes x s; used only while a decision is open.
+The integral is the mean, over the components of the density of y, of min_k sum_e L[e, k] p(e | y), by the trapezoidal
+rule at mean +- 6 standard deviations of each. The next regressors are not known; the last one before the open events is
+used, because the leaves agree about regressors to which they have already been fitted. Cost: components^2 x nodes x s;
+used only while a decision is open.
 """
 
 from __future__ import annotations
@@ -22,24 +21,21 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, exp, shared
-from driftfit.trackers.bank.layout import CHAINED, LAST, R
 from driftfit.trackers.bank.leaves.forecast import FACTOR, FROZEN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KEEP, MEAN, RESET
-from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, NU, WEIGHT, S
+from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, NU, WEIGHT, S, lag_row
 
-NODES = 33
-"""Nodes for every distinct component."""
-SMALL = 1e-9
-"""Components of less weight than this are left out of the nodes, though not of the integral."""
+NODES = 65
+"""Nodes for every component."""
 
 
 @shared
 def regressor(t: Any, l: int, phi: Array) -> None:
     """The regressor of one leaf, in the first column of z."""
-    z, rows, lags = t.z, t.lag_rows, FIRST + t.n + t.n * (t.n + 1) // 2
+    z, rows, lags = t.z, t.lag_rows, lag_row(t)
     for i in range(t.n):
-        z[i, 0] = t.leaves[lags + i, l] if i < t.output_lags and t.in_coordinates == 0 else phi[i]
-        for k in range(t.output_lags if t.in_coordinates > 0 else 0):
+        z[i, 0] = phi[i]
+        for k in range(t.output_lags):
             z[i, 0] += rows[k, i] * (t.leaves[lags + k, l] - rows[k, t.n])
 
 
@@ -60,8 +56,8 @@ def density_parts(t: Any, L: int, top: float, mass: float, phi: Array, samples: 
     deviation.
     """
     B, Q, maps, theta0, sensors, out = t.leaves, t.Q, t.maps, t.places[MEAN], t.sensors, t.components
-    n, z, Hm, count, last, r = t.n, t.z, len(t.sensors), 0, t.sample[LAST], t.sample[R]
-    P, same = t.chain, t.independent > 0 and t.counters[CHAINED] == 0
+    n, z, Hm, count, last, r = t.n, t.z, len(t.sensors), 0, t.last, t.r
+    P, same = t.chain, t.independent > 0 and t.chained == 0
     for l in range(L):
         if t.group[l] < 0:
             continue
@@ -92,55 +88,30 @@ def density_parts(t: Any, L: int, top: float, mass: float, phi: Array, samples: 
 
 
 @shared
-def sort(x: Array, count: int) -> None:
-    """Ascending, in place, by Shell's method."""
-    gap = count // 2
-    while gap > 0:
-        for i in range(gap, count):
-            value, j = x[i], i
-            while j >= gap and x[j - gap] > value:
-                x[j] = x[j - gap]
-                j -= gap
-            x[j] = value
-        gap = gap * 5 // 11 if gap != 2 else 1
-
-
-@shared
-def integrate(parts: Array, count: int, loss: Array, f: Array, nodes: Array) -> float:
+def integrate(parts: Array, count: int, loss: Array, f: Array) -> float:
     """int min_k sum_e L[e, k] f_e(y) dy over all components."""
-    H = len(loss)
-    used = 0
-    for a in range(count):
-        if parts[1, a] > SMALL:
-            for k in range(NODES):
-                nodes[used] = parts[2, a] + parts[3, a] * 12.0 * (k / (NODES - 1) - 0.5)
-                used += 1
-    sort(nodes, used)
-    total, before, y_before = 0.0, 0.0, 0.0
-    for k in range(used):
-        y = nodes[k]
+    H, total, step = len(loss), 0.0, 12.0 / (NODES - 1)
+    for node in range(count * NODES):
+        of, x = node // NODES, step * (node % NODES) - 6.0
+        y, mass, least = parts[2, of] + parts[3, of] * x, 0.0, np.inf
         for e in range(H):
             f[e] = 0.0
         for a in range(count):
             far = (y - parts[2, a]) / parts[3, a]
-            if abs(far) < 9.0:
-                f[int(parts[0, a])] += parts[1, a] / parts[3, a] * exp(-0.5 * far * far) * 0.3989422804014327
-        least = np.inf
+            share = parts[1, a] / parts[3, a] * exp(-0.5 * far * far)
+            f[int(parts[0, a])] += share
+            mass += share
         for d in range(H):
             risk = 0.0
             for e in range(H):
                 risk += loss[e, d] * f[e]
             least = min(least, risk)
-        if k > 0:
-            total += 0.5 * (least + before) * (y - y_before)
-        before, y_before = least, y
+        total += parts[1, of] * exp(-0.5 * x * x) * step / math.sqrt(2.0 * math.pi) * least / mass
     return total
 
 
 @shared
 def expected_risk(t: Any, L: int, top: float, mass: float, phi: Array, samples: int) -> float:
     """ER_s for the oldest event held, whose digit in the codes counts ``top``, of leaves of that mass in all."""
-    components = t.components
-    nodes = components[4:].reshape(NODES * components.shape[1])
     count = density_parts(t, L, top, mass, phi, samples)
-    return float(integrate(components, count, t.loss, t.scratch[2], nodes))
+    return float(integrate(t.components, count, t.loss, t.scratch[2]))

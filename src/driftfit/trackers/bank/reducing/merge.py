@@ -20,9 +20,8 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, shared
 from driftfit.engine.simd import WIDTH, gathered, store
-from driftfit.trackers.bank.layout import FLIPPED, flip
-from driftfit.trackers.bank.leaves.lags import merge_covariance
-from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
+from driftfit.trackers.bank.layout import flip, tables
+from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S, lag_row
 from driftfit.trackers.bank.machine.ancestry import average
 
 LEAST_FREEDOM = 2.5
@@ -67,17 +66,18 @@ def freedom(t: float, start: float) -> float:
 
 
 @shared
-def pool(t: Any, members: Array, share: Array, to: int) -> None:
-    """The covariance of parent ``to``, whose mean is already stored there: sum w (C_l + g_l d_l d_l')."""
-    B, A, n, unknown = t.leaves, t.parents, t.n, t.unknown > 0
+def pool(t: Any, members: Array, share: Array, to: int, mean: int, count: int, at: int) -> None:
+    """sum w (C_l + g_l d_l d_l') of parent ``to`` from row ``at`` on, for ``count`` numbers whose means are already
+    stored from row ``mean`` on.
+    """
+    B, A, first, unknown = t.leaves, t.parents, at, t.unknown > 0
     for k in range(len(members)):
-        l = members[k]
+        l, at = members[k], first
         pull = B[NU, l] / B[S, l] if unknown else 1.0
-        at = FIRST + n
-        for i in range(n):
-            away = pull * (B[FIRST + i, l] - A[FIRST + i, to])
+        for i in range(count):
+            away = pull * (B[mean + i, l] - A[mean + i, to])
             for j in range(i + 1):
-                A[at, to] += share[k] * (B[at, l] + away * (B[FIRST + j, l] - A[FIRST + j, to]))
+                A[at, to] += share[k] * (B[at, l] + away * (B[mean + j, l] - A[mean + j, to]))
                 at += 1
 
 
@@ -85,8 +85,7 @@ def pool(t: Any, members: Array, share: Array, to: int) -> None:
 def match(t: Any, members: Array, share: Array, to: int) -> None:
     """Fill parent ``to`` from the members, whose shares sum to 1."""
     B, A, n, na, unknown = t.leaves, t.parents, t.n, t.output_lags, t.unknown > 0
-    lags = FIRST + n + n * (n + 1) // 2
-    heaviest, g, s = 0, 0.0, 0.0
+    lags, heaviest, g, s = lag_row(t), 0, 0.0, 0.0
     for k in range(len(members)):
         heaviest = k if share[k] > share[heaviest] else heaviest
     best = members[heaviest]
@@ -106,8 +105,9 @@ def match(t: Any, members: Array, share: Array, to: int) -> None:
             A[lags + i, to] += share[k] * B[lags + i, l]
         if unknown:
             s += share[k] * (digamma(0.5 * B[NU, l]) - math.log(0.5 * B[S, l]))
-    pool(t, members, share, to)
-    merge_covariance(t, members, share, to)
+    pool(t, members, share, to, FIRST, n, FIRST + n)
+    if lags + na < len(A):
+        pool(t, members, share, to, lags, na, lags + na)
     if unknown:
         A[NU, to] = max(freedom(s - math.log(g), B[NU, best]), LEAST_FREEDOM)
         A[S, to] = A[NU, to] / g
@@ -137,7 +137,7 @@ def sort(group: Array, L: int, G: int, start: Array, order: Array) -> int:
 def combine(t: Any, L: int, G: int) -> float:
     """Make a parent and its history for every group that `sort` ordered; returns the remaining mass."""
     A, B, start, order = t.parents, t.leaves, t.start, t.order
-    now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
+    now, after = tables(t)
     kept, share = 0.0, t.scratch[0]
     for k in range(G):
         members, part = order[start[k] : start[k + 1]], share[start[k] : start[k + 1]]
@@ -185,7 +185,7 @@ def mix(t: Any, L: int) -> int:
     W_le = w_l p(e | l) / sum_l w_l p(e | l). Returns the number of events.
     """
     A, B, prior, order = t.parents, t.leaves, t.prior, t.order
-    now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
+    now, after = tables(t)
     H, share = len(prior), t.scratch[0]
     for e in range(H):
         mass, count = 0.0, 0

@@ -11,20 +11,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from driftfit.engine.kernel import Array, shared
-from driftfit.trackers.bank.layout import FLIPPED
+from driftfit.engine.kernel import shared
+from driftfit.trackers.bank.layout import tables
 from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, LOG, WEIGHT, increments, normalise
 from driftfit.trackers.bank.machine.grow import grow
 from driftfit.trackers.bank.reducing.selection import DEPTH, PRIOR
 
 Y, NOISE, TIME = 0, 1, 2
 """Columns of a stored sample before its regressor."""
-
-
-@shared
-def grow_level(t: Any, K: int, sample: Array) -> int:
-    """One level of the new tree, with a stored sample."""
-    return int(grow(t, K, False, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE]))
 
 
 @shared
@@ -52,8 +46,8 @@ def refilter(t: Any, L: int) -> int:
     for k in range(len(root)):
         A[k, 0] = root[k, 0]
     A[LOG, 0] = 0.0
-    L = min(D, 1)
-    grow_level(t, L, samples[0])
+    L, one = min(D, 1), samples[0]
+    grow(t, L, False, one[TIME + 1 :], one[Y], one[Y], one[NOISE])
     for k in range(len(root)):
         root[k, 0] = A[k, 0] = B[k, 0]
     root[LOG, 0] = A[LOG, 0] = A[CODE, 0] = 0.0
@@ -62,7 +56,8 @@ def refilter(t: Any, L: int) -> int:
             for l in range(L):
                 prior[e, l] = row[e]
         increments(t, samples[at, TIME], samples[at, TIME])
-        L = grow_level(t, L, samples[at])
+        one = samples[at]
+        L = grow(t, L, False, one[TIME + 1 :], one[Y], one[Y], one[NOISE])
         normalise(B, L)
         for k in range(len(root)):
             for l in range(L):
@@ -77,7 +72,7 @@ def refilter(t: Any, L: int) -> int:
 def histories(t: Any, L: int) -> None:
     """Write the histories of the new tree, which has D - 1 levels."""
     A, D, H, Hm = t.parents, int(t.reduction[DEPTH]), len(t.initial), len(t.sensors)
-    T = t.history_2 if t.counters[FLIPPED] > 0 else t.history
+    T = tables(t)[0]
     block, width = H + 1, T.shape[1]
     for l in range(L):
         for at in range(width):

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, kernel, shared
-from driftfit.engine.simd import WIDTH, fill, load, plus, reaches, store, sum_of
-from driftfit.trackers.bank.layout import CLOCK, HELD
+from driftfit.engine.simd import WIDTH, fill, load, plus, reaches, sum_of
 from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, SENSORS, WEIGHT
 from driftfit.trackers.bank.reducing.lookahead import expected_risk
 
@@ -20,10 +19,6 @@ CUT, MERGE, INTERACT, BEAM, HYBRID, REFILTER = range(6)
 """Kinds of reduction."""
 KIND, LEAVES, DEPTH, TAU, WAIT, CAP, PRIOR, AHEAD = range(8)
 """Entries of the vector of settings of a reduction."""
-
-
-FEW = 64
-"""Largest number of entries that are compared pairwise; for more, and for ties, the bound is searched."""
 
 
 @kernel
@@ -56,25 +51,11 @@ def bound(V: Array, row: int, count: int, M: int) -> float:
 
 
 @shared
-def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array, ranks: Array) -> int:
+def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array) -> int:
     """Number the M largest positive values of a row in their order, ties by their order; -1 for the rest. Returns how
-    many. The rest of the row, up to the end of a SIMD vector, must be zero; ``ranks`` (1, count) is overwritten.
+    many. The rest of the row, up to the end of a SIMD vector, must be zero.
     """
-    value, over, G = V[row], 0, 0
-    if count <= FEW:
-        for l in range(0, count, WIDTH):
-            here, rank = load(V, row, l), fill(0.0)
-            for k in range(count):
-                rank = plus(rank, reaches(fill(value[k]), here))
-            store(ranks, 0, l, rank)
-        for l in range(count):
-            keep = 1 if value[l] > 0.0 and ranks[0, l] <= M else 0
-            group[l], order[G] = G if keep > 0 else -1, l
-            G += keep
-        if G == M:
-            return G
-        G = 0
-    least = bound(V, row, count, M)
+    value, over, G, least = V[row], 0, 0, bound(V, row, count, M)
     for l in range(count):
         over += 1 if value[l] > least else 0
     ties = M - over if least > 0.0 else 0
@@ -97,7 +78,7 @@ def clear(V: Array, row: int, count: int) -> None:
 @shared
 def beam(t: Any, L: int) -> int:
     """The heaviest leaves."""
-    return int(heaviest(t.leaves, WEIGHT, L, int(t.reduction[LEAVES]), t.group, t.order, t.scratch[2:3]))
+    return int(heaviest(t.leaves, WEIGHT, L, int(t.reduction[LEAVES]), t.group, t.order))
 
 
 @shared
@@ -142,7 +123,7 @@ def hybrid(t: Any, L: int) -> int:
         for k in range(G):
             slots[k] = 0
         clear(X, 0, G)
-        kept = heaviest(X, 0, G, M, slots, t.order, X[2:3])
+        kept = heaviest(X, 0, G, M, slots, t.order)
         for k in range(G):
             renumber[k] = slots[k]
         for l in range(L):
@@ -208,7 +189,7 @@ def decide(t: Any, L: int, phi: Array) -> None:
     A leaf that loses a decision leaves its group. ``decided[k]`` is the event, how many samples ago it was first
     visible, and its probability. ``phi`` is used as the next regressor.
     """
-    B, group, stamps, decided, held = t.leaves, t.group, t.stamps, t.decided, t.counters[HELD]
+    B, group, stamps, decided, held = t.leaves, t.group, t.stamps, t.decided, t.held
     p, risk, H, count = t.scratch[0], t.scratch[1], len(t.loss), 0
     for l in range(L):
         group[l] = 0 if B[WEIGHT, l] > 0.0 else -1
@@ -218,7 +199,7 @@ def decide(t: Any, L: int, phi: Array) -> None:
         best = least_risk(t.loss, p, mass, risk)
         if not settled(t, L, held, risk[best], top, mass, phi):
             break
-        decided[count, 0], decided[count, 1], decided[count, 2] = best, float(t.counters[CLOCK]) - stamps[0], p[best]
+        decided[count, 0], decided[count, 1], decided[count, 2] = best, float(t.clock) - stamps[0], p[best]
         count += 1
         for k in range(held - 1):
             stamps[k] = stamps[k + 1]
@@ -229,7 +210,7 @@ def decide(t: Any, L: int, phi: Array) -> None:
                 else:
                     group[l] = -1
         held -= 1
-    t.counters[HELD] = held
+    t.held = held
 
 
 @shared

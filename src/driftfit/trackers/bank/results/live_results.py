@@ -10,7 +10,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.run.live.live import Live
 from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.layout import CLOCK, ELAPSED, IMPOSSIBLE, REPORTED_TO, SAMPLE_HEAD
+from driftfit.trackers.bank.layout import COUNTER, SAMPLE, SAMPLE_HEAD
 from driftfit.trackers.bank.memory import SINGLE
 from driftfit.trackers.bank.results.events import Event, Probabilities, all_of
 from driftfit.trackers.bank.results.mixture import Mixture, mixture_of
@@ -33,7 +33,7 @@ class LiveHypotheses:
         reported = {name: self.tracker.reported(self._lane["report"], name) for name in ("lag_prob", *SINGLE)}
         self.lag_prob: Array = reported["lag_prob"].copy()
         self.evidence, self.window, self.kept, self.leaves = (float(reported[name]) for name in SINGLE)
-        self.impossible = int(self._lane["counters"][IMPOSSIBLE])
+        self.impossible = int(self._lane["counters"][COUNTER.impossible])
 
     def mixture(self) -> Mixture:
         """The present leaves, for use in control."""
@@ -46,7 +46,7 @@ class LiveHypotheses:
         """
         many, bank = self._lane["counters"], self.tracker
         ring = bank.array(self._live.model, self._lane, "ring")
-        now, W = int(many[CLOCK]), bank.reported_levels[-1] + 1
+        now, W = int(many[COUNTER.clock]), bank.reported_levels[-1] + 1
         at = np.arange(max(0, now - len(ring)), now)
         rows = ring[at % len(ring)]
         first = int(at[0]) - W + 1 if len(at) else 0
@@ -54,14 +54,14 @@ class LiveHypotheses:
         latest = np.vstack([rows[:, SAMPLE_HEAD:], np.zeros((W - 1, len(self.names)))])
         given = Probabilities(latest, window, used, W, bank.change_names, bank.sensor_names)
         found = [replace(event, span=event.span.moved(first)) for event in all_of(given, threshold)]
-        busy, reported = window[-1] > threshold, int(many[REPORTED_TO])
+        busy, reported = window[-1] > threshold, int(many[COUNTER.reported_to])
         done = [event for event in found if reported <= event.span.date and event.span.last < now - W + 1 and not busy]
         if not busy:
-            many[REPORTED_TO] = max(now - W + 1, reported)
+            many[COUNTER.reported_to] = max(now - W + 1, reported)
         return [event.timed(lambda sample: self._time(ring, sample)) for event in done]
 
     def _time(self, ring: Array, sample: int) -> Any:
         """The time of a sample of the ring; its number if the stream has no times."""
-        back = float(self._lane["sample"][ELAPSED] - ring[sample % len(ring), 2])
+        back = float(self._lane["sample"][SAMPLE.elapsed] - ring[sample % len(ring), 2])
         time = self._live.before(back)
         return sample if time is None else time

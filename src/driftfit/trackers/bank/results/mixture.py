@@ -8,7 +8,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
-from driftfit.trackers.bank.layout import HELD, LEAVES, NEVER, OPEN, SETTLED
+from driftfit.trackers.bank.layout import COUNTER, NEVER
 from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CODE, FIRST, NU, WEIGHT, S
 from driftfit.trackers.bank.machine.framed import in_theta
 from driftfit.trackers.bank.machine.gap import SINCE
@@ -44,9 +44,9 @@ class Mixture(NamedTuple):
 def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
     """The leaves in the fields of one lane; before the tree starts, the single filter."""
     n = len(lane["theta"])
-    if lane["counters"][SETTLED] != 1:
+    if lane["counters"][COUNTER.settled] != 1:
         return Mixture(np.ones(1), lane["theta"][None].copy(), tracker.cov(lane)[None], np.full(1, np.inf))
-    B = tracker.array(place.model, lane, "leaves")[:, : lane["counters"][LEAVES]]
+    B = tracker.array(place.model, lane, "leaves")[:, : lane["counters"][COUNTER.many_leaves]]
     i, j = np.tril_indices(n)
     C = B[FIRST + n : FIRST + n + len(i)]
     covs = np.zeros((B.shape[1], n, n))
@@ -58,7 +58,7 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
         more[i, j] = more[j, i] = since @ gap[1:, : len(i)]
         covs = covs + more
     path = tracker.array(place.model, lane, "path")
-    if len(path) and lane["counters"][OPEN] > 0:
+    if len(path) and lane["counters"][COUNTER.open] > 0:
         last = tracker.array(place.model, lane, "event")[0, : B.shape[1]]  # events before the gap
         more = np.zeros((B.shape[1], n, n))
         H = len(tracker.all_changes) * len(tracker.all_sensors)
@@ -73,10 +73,10 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
 
 def undecided(tracker: Bank, place: Any, lane: Any, loss: Array) -> list[tuple[int, int, float]]:
     """(sample, event, probability) of the open events, decided one after the other from the leaves at the end."""
-    held, H = int(lane["counters"][HELD]), len(loss)
-    if lane["counters"][SETTLED] != 1 or held == 0:
+    held, H = int(lane["counters"][COUNTER.held]), len(loss)
+    if lane["counters"][COUNTER.settled] != 1 or held == 0:
         return []
-    L = int(lane["counters"][LEAVES])
+    L = int(lane["counters"][COUNTER.many_leaves])
     B, group, stamps = (tracker.array(place.model, lane, name) for name in ("leaves", "group", "stamps"))
     here = group[0, :L] >= 0
     codes, w = B[CODE, :L][here].astype(int), B[WEIGHT, :L][here]

@@ -10,7 +10,7 @@ from driftfit.engine.kernel import Array
 from driftfit.run.live.live import Live
 from driftfit.run.result import Track
 from driftfit.show.axes import BLUE, GREY, RED, date_axis, draw_parameter, panels, time_label
-from driftfit.trackers.bank.layout import LEAVES
+from driftfit.trackers.bank.layout import COUNTER
 from driftfit.trackers.bank.leaves.leaf_matrix import CODE, WEIGHT
 from driftfit.trackers.bank.reduction import GPB, Decide
 from driftfit.trackers.bank.results.events import Event
@@ -66,7 +66,7 @@ def plot_tree(live: Live, levels: int = 3, ax: Any = None) -> Figure:
     if not isinstance(getattr(bank, "reduction", None), Decide | GPB):
         raise ValueError("plot_tree: a tree has codes of its histories under Decide and GPB only.")
     H = len(bank.event_names)
-    B = bank.array(live.model, lane, "leaves")[:, : lane["counters"][LEAVES]]
+    B = bank.array(live.model, lane, "leaves")[:, : lane["counters"][COUNTER.many_leaves]]
     means = mixture_of(bank, live, lane).means
     depth = min(levels, max(1, round(float(np.log(max(B[CODE].max(), 1.0) + 1.0) / np.log(max(H, 2))) + 0.499)))
     figure, (axis,) = panels(ax, (2.2 * depth + 2.4, max(2.5, 0.24 * H**depth + 0.8)))

@@ -16,7 +16,8 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
 from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.layout import IMPOSSIBLE
+from driftfit.trackers.bank.layout import COUNTER
+from driftfit.trackers.bank.memory import SINGLE
 from driftfit.trackers.bank.reduction import Decide
 from driftfit.trackers.bank.results.events import LEVEL, Event, Probabilities, all_of, changes_of
 from driftfit.trackers.bank.results.mixture import Mixture, mixture_of, undecided
@@ -28,25 +29,24 @@ if TYPE_CHECKING:
 
 
 class Alarm(NamedTuple):
-    """A window alarm: the threshold of the probability, and the samples at which it began."""
+    """A window alarm: the threshold of the probability, the samples ``at`` which it began, and where it is ``on``,
+    (T,) bool.
+    """
 
     threshold: float
     at: Array
     on: Array
-    """(T,) bool: whether the alarm is on."""
 
 
 class Decision(NamedTuple):
-    """An event that was decided."""
+    """A joint event that was decided: the first ``sample`` that it affects, the sample after which it was ``decided``,
+    and its probability at that time.
+    """
 
     sample: int
-    """The first sample that it affects."""
     decided: int
-    """The sample after which it was decided."""
     event: int
-    """Joint event."""
     prob: float
-    """Its probability at that time."""
 
 
 class Hypotheses:
@@ -78,6 +78,7 @@ class Hypotheses:
         self.run = run
         self.tracker: Bank = run.tracker  # type: ignore[assignment]
         self._report = run.written("report")
+        self.evidence, self.window, self.kept, self.leaves = map(self._reported, SINGLE)
         self.names = self.tracker.event_names
         self.lags = self.tracker.reported_levels
         self.sensors = len(self.tracker.all_sensors)
@@ -132,30 +133,14 @@ class Hypotheses:
         return p
 
     @property
-    def window(self) -> Array:
-        return self._reported("window")
-
-    @property
-    def evidence(self) -> Array:
-        return self._reported("evidence")
-
-    @property
     def log_evidence(self) -> float:
         """The sum of the evidence: the log density of the record, under the approximations made."""
         return float(self.evidence.sum())
 
     @property
-    def leaves(self) -> Array:
-        return self._reported("leaves")
-
-    @property
-    def kept(self) -> Array:
-        return self._reported("kept")
-
-    @property
     def impossible(self) -> int:
         """Number of samples that no leaf allowed; they were not used."""
-        return int(self.run.state["counters"][IMPOSSIBLE])
+        return int(self.run.state["counters"][COUNTER.impossible])
 
     @cached_property
     def decisions(self) -> list[Decision]:
@@ -174,10 +159,8 @@ class Hypotheses:
         reduce = self.tracker.reduction
         if not isinstance(reduce, Decide) or not len(self.run):
             return []
-        lane, last = self.run.lane(-1), len(self.run) - 1
-        loss = reduce.losses(len(self.names))
-        found = undecided(self.tracker, self.run, lane, loss)
-        return [Decision(sample, last, event, prob) for sample, event, prob in found]
+        found = undecided(self.tracker, self.run, self.run.lane(-1), reduce.losses(len(self.names)))
+        return [Decision(sample, len(self.run) - 1, event, prob) for sample, event, prob in found]
 
     @cached_property
     def smoothed(self) -> SmoothedMixture:
@@ -225,8 +208,7 @@ class Hypotheses:
         given = Probabilities(
             self.latest, self.window, self.run.ok, self.lags[-1] + 1, bank.change_names, bank.sensor_names
         )  # fmt: skip
-        found = [self._early(event, threshold) for event in all_of(given, threshold)]
-        return self._timed(found)
+        return self._timed([self._early(event, threshold) for event in all_of(given, threshold)])
 
     def _early(self, event: Event, threshold: float) -> Event:
         """A fault may have been detected earlier than the last sample at which it was remembered."""
@@ -277,8 +259,7 @@ class Hypotheses:
 
     def mixture(self, t: int = -1) -> Mixture:
         """The leaves after sample t; replays the record up to t."""
-        lane = self.run.lane(t)
-        return mixture_of(self.tracker, self.run, lane)
+        return mixture_of(self.tracker, self.run, self.run.lane(t))
 
     def plot(self, threshold: float = 0.5, level: float = 0.95, ax: Any = None) -> Figure:
         """Parameters with bands, the probabilities of events stacked below them, events marked.

@@ -106,7 +106,6 @@ class SmoothedMixture:
 
     @cached_property
     def std(self) -> Array:
-        """(T, n)"""
         var = self._mean([one.cov + (one.theta - self.theta) ** 2 for one in self._mixtures])
         return np.where(np.isinf(self.run.std[-1]), np.inf, np.sqrt(var))
 

@@ -1,1 +1,0 @@
-"""Judge many runs at once, in threads or in processes."""

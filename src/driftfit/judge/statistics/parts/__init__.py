@@ -1,1 +1,0 @@
-"""Parts of the tests: readings of coarse sensors, and steps that another parameter explains as well."""
