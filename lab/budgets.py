@@ -28,8 +28,8 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 67_367,
-    "statements": 43_717,
+    "lines of the library": 67_368,
+    "statements": 43_719,
     "modules": 347,
     "levels of folders": 3,
     "constants of modules with numbers": 635,

@@ -11,8 +11,6 @@ by what is known h steps before.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from driftfit.engine.kernel import Array
@@ -67,8 +65,10 @@ def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
     paths = (np.vstack([none, path[:-1]]) for path in (run.theta, steady["theta"][..., 0]))
     far = [y - ahead(path, phi, run.model.output_lags or 0, horizon) for path in paths]
     rivals = {"constant ARX": own.constant_arx, "persistence": own.persistence}
-    cases: list[Any] = [(1, own.tracked, own.constant_ls, run.log_density, rivals)]
-    cases += [(horizon, *far, density(far[0]), {"persistence": y - lagged(persistence(y), horizon - 1)})][: horizon - 1]
+    cases = [(1, own.tracked, own.constant_ls, run.log_density, rivals)]
+    if horizon > 1:
+        last = {"persistence": y - lagged(persistence(y), horizon - 1)}
+        cases.append((horizon, far[0], far[1], density(far[0]), last))
     for h, tracked, constants, likely, others in cases:
         w = np.append(np.full(h - 1, 0.5), weights(likely, density(constants)))[: len(y)]
         errors = {"driftfit": w * tracked + (1.0 - w) * constants, "tracked": tracked, "constants": constants, **others}
