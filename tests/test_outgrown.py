@@ -11,7 +11,7 @@ import pytest
 from naive import moved_along, walks
 
 from driftfit import AdaptiveKalman, Bank, Change, Live, Regression, Sensor, track
-from driftfit.trackers.mixture.filters import MEMORY, UNSURE
+from driftfit.trackers.mixture.filters import UNSURE
 
 N, PARTED, T = 3, 40, 60
 EXACT = np.vectorize(Decimal, otypes=[object])
@@ -82,7 +82,5 @@ def test_each_filter_of_adaptive_kalman_keeps_them_too(near, seed):
         mean = EXACT(weights) @ np.array(means)
         P = sum(Decimal(w) * (C + np.outer(m - mean, m - mean)) for w, m, C in zip(weights, means, covs, strict=True))
         np.testing.assert_allclose((live.theta - mean.astype(float)) / stds(P), 0.0, atol=1e-12)
-        wide = np.sqrt(
-            1.0 + UNSURE / np.sqrt(min(after["count"], MEMORY))
-        )  # what is reported allows for estimated settings
+        wide = np.sqrt(1.0 + UNSURE / np.sqrt(after["count"]))  # what is reported allows for estimated settings
         np.testing.assert_allclose(live.std, wide * stds(P), rtol=1e-12)

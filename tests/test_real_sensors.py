@@ -23,7 +23,7 @@ from driftfit import (
     track,
 )
 from driftfit.systems.arc_furnace import switching
-from driftfit.trackers.mixture.filters import MEMORY, UNSURE
+from driftfit.trackers.mixture.filters import UNSURE
 from lab import scenarios
 
 T = 1500
@@ -250,7 +250,7 @@ def test_a_direction_enters_as_the_limit_of_wide_priors_however_weakly(unit):
     exact = track(Regression(2, intercept=True), Kalman(q=0.0, r=float(live.lane()["r"]), form="sqrt"), y, columns)
     assert float(live.lane()["r"]) == pytest.approx(0.01, rel=0.15)
     wide = np.sqrt(
-        1.0 + UNSURE / np.sqrt(min(float(live.lane()["count"]), MEMORY))
+        1.0 + UNSURE / np.sqrt(float(live.lane()["count"]))
     )  # what is reported allows for estimated settings
     np.testing.assert_allclose(run.std[700, 1], wide * exact.std[700, 1], rtol=0.12)  # or a jump
 

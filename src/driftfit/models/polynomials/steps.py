@@ -29,8 +29,7 @@ CONTRACTION, CONTRACTIONS = 0.9, 20
 """Factor of the zeros of C or F while it is unstable, and how often it is applied."""
 
 DOUBLINGS = 12
-"""How often the zeros of D are drawn towards 0 while it is unstable: by 1 - `STABLE`, and then twice as much each time.
-"""
+"""How often the zeros of D are drawn towards 0 while it is unstable: by 1 - `STABLE`, then twice as much each time."""
 
 LEAST_RESIDUAL = 1e-10
 """A residual below this share of the output and the fitted value is rounding that an interpolated sample left: 0."""
@@ -38,8 +37,7 @@ LEAST_RESIDUAL = 1e-10
 BEYOND = 1e6
 """A signal that the model computes is at most so many times the largest reading of its unit. Parameters that one absurd
 reading left behind would otherwise compute absurd signals, which are the regressors of the next samples. An offset that
-cancels the response to a large mean of the input is within it.
-"""
+cancels the response to a large mean of the input is within it."""
 NOISE = 1e3
 """The same for noise and innovation, which nothing cancels."""
 FIRST, RISE, FALL = 10.0, 10.0, 0.1
@@ -353,15 +351,15 @@ def gradient_of(p: Places) -> Any:
             s.signals[ONE, 0, l] = one
             s.phi[at_offset, l] = one if settled else 1.0
         for i in range(na):
-            whole = s.signals[YF, i + 1, l] + s.reference[0, l] * s.signals[ONE, 0, l]
-            lag = whole if settled else s.signals[Y, i + 1, l]
+            lag = s.signals[YF, i + 1, l] + s.reference[0, l] * s.signals[ONE, 0, l]
+            lag = lag if settled else s.signals[Y, i + 1, l]
             s.phi[i, l] = lag if abs(s.signals[Y, i + 1, l]) < LARGEST else np.nan
         for j in range(m):
             own = OWN + EACH * j
             for i in range(nb[j]):
                 at = nk[j] + i
-                whole = s.signals[own + UF, at, l] + s.reference[1 + j, l] * s.signals[ONE, 0, l]
-                lag = whole if settled else s.signals[own + U, at, l]
+                lag = s.signals[own + UF, at, l] + s.reference[1 + j, l] * s.signals[ONE, 0, l]
+                lag = lag if settled else s.signals[own + U, at, l]
                 s.phi[at_b[j] + i, l] = lag if abs(s.signals[own + U, at, l]) < LARGEST else np.nan
             for i in range(nf[j]):
                 s.phi[at_f[j] + i, l] = s.signals[own + WF, i + 1, l] if settled else s.signals[own + W, i + 1, l]

@@ -36,7 +36,6 @@ from driftfit.trackers.mixture.states import (
     FIRST_LEARNED,
     FLOOR,
     JUMP,
-    MEMORY,
     STATES,
     sum_of_row,
     variance_in,
@@ -50,9 +49,9 @@ FADING, BEND = 0.05, 0.1
 """Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""
 STUDENT = 60.0
 """Samples from which on Student's density is taken for normal."""
-UNSURE = 4.0
+UNSURE = 4.5
 """The covariance that is reported is that of the mixture times 1 + this over the square root of the number of samples,
-because r and the probabilities of the filters are estimates. They have a memory: samples count up to `MEMORY`."""
+because the probabilities of the filters, and r, are estimates."""
 LEAST = 1e-100
 """Probability that a mode is never below."""
 
@@ -353,7 +352,7 @@ def mixture(s: State, l: int) -> None:
             s.Z[0, i, j, l] = sum_of_row(s, l)
             s.P[i, j, l] = s.Z[0, i, j, l]
     in_units_of_theta(s, l)
-    wide = 1.0 + UNSURE / np.sqrt(min(max(s.count[l], 1.0), MEMORY))
+    wide = 1.0 + UNSURE / np.sqrt(max(s.count[l], 1.0))
     for i in range(n):
         for j in range(i + 1):
             s.P[i, j, l] *= wide
