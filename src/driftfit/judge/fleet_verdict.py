@@ -325,13 +325,10 @@ def ranked(
     q, q_pays = (
         discoveries(np.array(p)) for p in ([v.p for v in verdicts.values()], [v.constants.p for v in verdicts.values()])
     )
-    rows = [
-        Judgement(
-            key, one, float(a), float(b), *(None if np.isnan(value) else bool(value < level) for value in (a, b)),
-            _coverage(runs[key]), len(runs[key].left_out),
-        )
-        for (key, one), a, b in zip(verdicts.items(), q, q_pays, strict=True)
-    ]  # fmt: skip
+    rows = []
+    for (key, one), a, b in zip(verdicts.items(), q.tolist(), q_pays.tolist(), strict=True):
+        drifts, pays = (None if np.isnan(value) else value < level for value in (a, b))
+        rows.append(Judgement(key, one, a, b, drifts, pays, _coverage(runs[key]), len(runs[key].left_out)))
     return ManyVerdicts(tuple(rows), level, by).ranked("clearest")
 
 
