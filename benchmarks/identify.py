@@ -187,7 +187,7 @@ def ours(plant: Plant) -> Found:
     Z, made = products(plant.table["flow"], record.U, best, record.inputs, "flow", 0)
     why, moves = cause(one.rows.phi, one.rows.y, Z[one.rows.at], made), one.changes.rejected
     if moves and why.products:
-        more = one.rows._replace(phi=np.hstack([one.rows.phi, why.columns]))
+        more = one.rows._replace(phi=np.hstack([one.rows.phi, why.columns]), lags=None)
         again = judged_rows(more.only(np.isfinite(more.phi).all(axis=1), range(more.phi.shape[1])), LEVEL)
         moves = again is None or again.rejected
     kind = why.kind(moves)

@@ -263,7 +263,7 @@ class _Task:
         verdict = judged(known)
         moves_besides = bool(verdict.drifts)
         if moves_besides and why_not.products:
-            more = rows._replace(phi=np.hstack([rows.phi, why_not.columns]))
+            more = rows._replace(phi=np.hstack([rows.phi, why_not.columns]), lags=None)  # products of lags are given
             again = judged_rows(
                 more.only(np.asarray(np.isfinite(more.phi).all(axis=1)), range(more.phi.shape[1])), self.level
             )
