@@ -28,8 +28,8 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 67_402,
-    "statements": 43_733,
+    "lines of the library": 67_399,
+    "statements": 43_736,
     "modules": 347,
     "levels of folders": 3,
     "constants of modules with numbers": 636,
