@@ -24,7 +24,7 @@ from driftfit.run.live.conformal import quantile, widened
 from driftfit.run.program import Program, State, kept, lanes_of, state_of
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.student import log_student, residuals_before, wider
+from driftfit.trackers.student import band_ratio, log_student, residuals_before
 
 
 class Plain:
@@ -272,7 +272,7 @@ class Track(Plain, OfRecord):
         ok, s = self.in_rows("ok") > 0.0, self.in_rows("s")
         if not self.tracker.learns_noise:
             return np.ones(len(s))
-        return wider(
+        return band_ratio(
             residuals_before(ok, s, float((self.start or {}).get("count", 0.0))) + own * (ok & ~np.isinf(s)), level
         )
 

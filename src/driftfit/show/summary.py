@@ -45,7 +45,7 @@ from driftfit.show.text import (
     table_of,
     together,
 )
-from driftfit.trackers.student import wider
+from driftfit.trackers.student import band_ratio
 
 LEVEL_SPREADS = 3.0
 """Deviations from 0 from which on the level of an output calls for a constant."""
@@ -253,7 +253,7 @@ def _rows(result: Track | KeyedResults) -> tuple[Iterator[_Line], int]:
 def _own(key: str, run: Track) -> Iterator[_Line]:
     # the lane's own end, which is cheap; a whole path of standard deviations is not
     theta, std = run.theta[-1], np.sqrt(run.var[-1])
-    half = quantile(LEVEL) * std * (wider(run.state["count"], LEVEL) if run.tracker.learns_noise else 1.0)
+    half = quantile(LEVEL) * std * (band_ratio(run.state["count"], LEVEL) if run.tracker.learns_noise else 1.0)
     for i, name in enumerate(run.names):
         yield key if i == 0 else "", name, float(theta[i]), float(std[i]), float(half[i])
 

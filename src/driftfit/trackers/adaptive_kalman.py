@@ -22,7 +22,7 @@ The results are the mean and covariance of the mixture, the latter enlarged beca
 estimates themselves. The variance before a sample is for samples that are no outliers, and at which no jump begins.
 
 The start is exact diffuse least squares without drift, until there are enough residuals to estimate r; its bands are
-Student's (`driftfit.trackers.parts.few_residuals`). Every filter starts from generalised least squares with its own
+Student's (`driftfit.trackers.student`). Every filter starts from generalised least squares with its own
 drift over the same samples (`driftfit.trackers.mixture.learned`), in the directions that the regressors span.
 Scaling inputs or outputs changes only the units.
 
@@ -103,8 +103,8 @@ from driftfit.trackers.parts.excitation import (
     not_learned,
     window,
 )
-from driftfit.trackers.parts.few_residuals import RESIDUALS, widen_estimates, wider
 from driftfit.trackers.parts.information import partly_known
+from driftfit.trackers.student import RESIDUALS, widen_estimates, wider
 
 
 @kernel

@@ -10,10 +10,9 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, Step
-from driftfit.engine.settings import Settings
+from driftfit.engine.settings import Settings, as_numbers, factor
 from driftfit.models.base import Model
 from driftfit.trackers.parts.information import widen
-from driftfit.trackers.parts.varying_drift import roots
 
 
 class RandomWalk(NamedTuple):
@@ -64,7 +63,7 @@ class Tracker(Settings, ABC):
     smoother_fields: ClassVar[tuple[str, ...]] = ()
     """Fields that `problem` needs from every sample; ``steps.store_for_smoother`` stores them."""
     drift_per_parameter: ClassVar[bool] = False
-    """Whether every parameter may have its own drift at every sample (`driftfit.trackers.parts.varying_drift`)."""
+    """Whether every parameter may have its own drift at every sample (`driftfit.trackers.parts.covariance`)."""
     adapts: ClassVar[bool] = False
     """Whether it estimates drift and noise on-line, so that its innovations are normal again soon after a fault."""
     density: ClassVar[str] = ""
@@ -221,3 +220,15 @@ class Tracker(Settings, ABC):
     def learning(self, lane: Mapping[str, Array]) -> Array:
         """Which entries of theta are distinguished by recent regressors, (n,) bool; see `AdaptiveKalman.learning`."""
         raise ValueError(f"learning: {type(self).__name__} keeps no windowed information; AdaptiveKalman does.")
+
+
+def roots(owner: str, names: Sequence[str], T: int, drift: Any) -> Array:
+    """The square roots (T, n) of factors of the drift; ValueError for another shape, and for what is no factor."""
+    factors, n = as_numbers("drift", drift), len(names)
+    if factors.shape != (T, n):
+        raise ValueError(
+            f"{owner}: drift with a column for each parameter must be ({T}, {n}), for {', '.join(names)}; got shape "
+            f"{factors.shape}."
+        )
+    roots: Array = np.sqrt(factor("drift", factors.ravel(), factors.size)).reshape(T, n)
+    return roots

@@ -41,8 +41,7 @@ from driftfit.engine.kernel import State, exp, kernel, log, shared
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import drift_matrix
-from driftfit.trackers.parts.covariance import LEFT, prediction, symmetric_product
-from driftfit.trackers.parts.varying_drift import read_drift
+from driftfit.trackers.parts.covariance import LEFT, prediction, read_drift, symmetric_product
 
 FAMILIES = ("gaussian", "poisson", "negative binomial", "logistic")
 GAUSSIAN, POISSON, NEGATIVE, LOGISTIC = range(4)

@@ -41,7 +41,7 @@ from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.parts import second_differences
 from driftfit.trackers.parts.covariance import correct as measure
-from driftfit.trackers.parts.covariance import forecast
+from driftfit.trackers.parts.covariance import forecast, read_drift
 from driftfit.trackers.parts.diffuse import (
     SCRATCH,
     correct_on_roots,
@@ -53,7 +53,6 @@ from driftfit.trackers.parts.diffuse import (
     started,
 )
 from driftfit.trackers.parts.information import partly_known
-from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.rls import learn_scale, no_scale
 
 

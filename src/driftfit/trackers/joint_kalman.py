@@ -41,8 +41,7 @@ from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import one_of
 from driftfit.models.state_space import StateSpace, equations_of
 from driftfit.trackers.kalman import drift_matrix
-from driftfit.trackers.parts.covariance import correct, symmetric_product
-from driftfit.trackers.parts.varying_drift import read_drift
+from driftfit.trackers.parts.covariance import correct, read_drift, symmetric_product
 from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
 MOST = 1000.0

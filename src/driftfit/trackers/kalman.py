@@ -42,7 +42,7 @@ from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.laws import filter as laws_filter
 from driftfit.trackers.laws.law import OWNER, Law, laws_of, table_of
 from driftfit.trackers.parts import square_root
-from driftfit.trackers.parts.covariance import correct, forecast
+from driftfit.trackers.parts.covariance import correct, forecast, read_drift
 from driftfit.trackers.parts.diffuse import (
     SCRATCH,
     correct_on_roots,
@@ -54,7 +54,6 @@ from driftfit.trackers.parts.diffuse import (
     started,
 )
 from driftfit.trackers.parts.information import partly_known, triangular_root
-from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.parts.volatility import FIELDS, known_noise, log_density, smoothed_noise, volatile
 
 

@@ -36,8 +36,7 @@ from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.structure import NUMBER, Structure, positions
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import drift, drift_matrix
-from driftfit.trackers.parts.covariance import correct, product_with
-from driftfit.trackers.parts.varying_drift import read_drift
+from driftfit.trackers.parts.covariance import correct, product_with, read_drift
 
 
 def structure_of(owner: str, model: Model) -> Structure:

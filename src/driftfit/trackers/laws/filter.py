@@ -45,8 +45,7 @@ from driftfit.engine.kernel import (
     wholes,
 )
 from driftfit.trackers.laws.law import COSINE, DAMPING, KIND, LEVEL, NOISE, OWNER, PLAIN, RATE, ROWS, SLOPE, VISIBLE
-from driftfit.trackers.parts.covariance import LEFT
-from driftfit.trackers.parts.varying_drift import read_drift
+from driftfit.trackers.parts.covariance import LEFT, read_drift
 
 DETERMINED = 1e-9
 """Smallest pivot of the information about delta, in the units of its diagonal, with which it is taken in."""

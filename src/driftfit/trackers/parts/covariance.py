@@ -4,13 +4,18 @@
     correct    theta <- theta + g e / (h + r);  P <- P - g g' / (h + r)
 
 Only the lower triangle of P is kept. Source: Kalman (1960). Cost: O(n^2).
+
+Where every parameter has a drift of its own at every sample, ``drift=`` of shape (T, n), the covariance of the drift is
+diag(d_t)^(1/2) q diag(d_t)^(1/2): for flexible least squares a separate weight for every step and parameter, mu_i /
+d_ti. Trackers that support it have a field ``drift_root`` (n,), the square roots of d, which are 1 by default.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from driftfit.engine.kernel import State, kernel
+from driftfit.engine.drivers import COMMON
+from driftfit.engine.kernel import Array, State, kernel
 
 LEFT = 1e-14
 """Smallest share of a variance that one sample leaves: below it the rest is rounding, which may be negative. It takes
@@ -43,6 +48,13 @@ def product_with(entry: Any) -> Any:
         return total
 
     return product
+
+
+@kernel
+def read_drift(s: State, known: Array, t: int, l: int) -> None:
+    """Take the roots of d from the columns of ``known`` that only some trackers read."""
+    for i in range(s.theta.shape[0]):
+        s.drift_root[i, l] = known[t, COMMON + i, l]
 
 
 @kernel

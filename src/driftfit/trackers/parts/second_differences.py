@@ -29,7 +29,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.covariance import prediction, reduce_covariance, symmetric_product
+from driftfit.trackers.parts.covariance import prediction, read_drift, reduce_covariance, symmetric_product
 from driftfit.trackers.parts.diffuse import (
     BEFORE,
     MACHINES,
@@ -41,7 +41,6 @@ from driftfit.trackers.parts.diffuse import (
     wander,
 )
 from driftfit.trackers.parts.information import shear
-from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.rls import learn_scale, no_scale
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.covariance import prediction
+from driftfit.trackers.parts.covariance import prediction, read_drift
 from driftfit.trackers.parts.diffuse import (
     MACHINES,
     absorb_on_roots,
@@ -29,7 +29,6 @@ from driftfit.trackers.parts.diffuse import (
     spanned_variance,
 )
 from driftfit.trackers.parts.information import absorb, invert, solve, spread, triangular_root
-from driftfit.trackers.parts.varying_drift import read_drift
 
 
 def state(theta0: Array, p0: Array | None) -> Mapping[str, Any]:

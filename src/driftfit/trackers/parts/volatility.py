@@ -11,7 +11,7 @@
 with h the variance of the prediction, w the weight of the sample and k the share of the noise in v: a sample whose
 prediction is uncertain says little of r. theta is corrected, and smoothed, as if r were known. Before the first sample
 r is the setting, and nu infinite. t / z is the ratio of Student's quantile to the normal one
-(`driftfit.trackers.parts.few_residuals`): y_hat +- 1.96 sqrt(s) holds 95 %.
+(`driftfit.trackers.student`): y_hat +- 1.96 sqrt(s) holds 95 %.
 
 For h = 0 the correction is Bayes' rule. In the long run r has a memory of sqrt(2 / volatility) samples, 14 for 0.01,
 as from variance discounting. Unlike discounting, a gap in the record widens what is known of r by its length only.
@@ -31,8 +31,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.few_residuals import wider
-from driftfit.trackers.student import log_student
+from driftfit.trackers.student import log_student, wider
 
 FIELDS = {
     "outputs": ("degrees", "unwidened"), "density": "degrees", "smoother_fields": ("r", "spread", "degrees"),

@@ -49,7 +49,7 @@ from driftfit.trackers.parts.covariance import forecast as forecast_one
 from driftfit.trackers.parts.covariance import prediction
 from driftfit.trackers.parts.diffuse import correct_on_roots, forecast_on_roots, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
-from driftfit.trackers.parts.few_residuals import RESIDUALS, wider
+from driftfit.trackers.student import RESIDUALS, wider
 
 BASES = len(BASE_NAMES)
 GIVEN, GIVEN_CHAIN, DRIFT = ROW["given"], ROW["given_chain"], ROW["drift"]
