@@ -24,10 +24,10 @@ import argparse
 import sys
 import warnings
 from collections.abc import Callable
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
-from driftfit.judge.statistics.parts.coarse_readings import step_of
 from scipy import signal
 
 from driftfit.engine.kernel import Array
@@ -40,6 +40,7 @@ from driftfit.judge.changes.words import Event, events
 from driftfit.judge.evidence import REJECTED as LEVEL
 from driftfit.judge.evidence import judged_rows
 from driftfit.judge.regressors import Rows
+from driftfit.judge.statistics.coarse_readings import step_of
 
 T = 1500
 BEFORE = 200
@@ -274,10 +275,12 @@ def main() -> None:
     options.add_argument("seeds", type=int, nargs="*", default=[1000, 1001])
     options.add_argument("--of", choices=CHANGES)
     options.add_argument("--by", choices=METHODS)
+    options.add_argument("--quick", action="store_true", help="two plants")
     given = options.parse_args()
     for name in [given.by] if given.by else METHODS:
         rows: dict[str, list[dict[str, float]]] = {}
-        for one in (one for seed in range(*given.seeds) for one in plants(seed) if given.of in (None, one.change)):
+        each = (one for seed in range(*given.seeds) for one in plants(seed) if given.of in (None, one.change))
+        for one in islice(each, 2 if given.quick else None):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 row = scored(one, METHODS[name](one))
@@ -286,10 +289,10 @@ def main() -> None:
             print(".", end="", file=sys.stderr, flush=True)
         heads = list(rows["all"][0])
         print(f"\n{name}, seeds {given.seeds}\n{'':14}{''.join(f'{h:>13}' for h in heads)}  plants")
-        for change, each in rows.items():
-            known = [np.array([row[h] for row in each]) for h in heads]
+        for change, found in rows.items():
+            known = [np.array([row[h] for row in found]) for h in heads]
             cells = (f"{np.nanmean(x):13.2f}" if np.isfinite(x).any() else f"{'':13}" for x in known)
-            print(f"{change:14}{''.join(cells)}  {len(each)}", flush=True)
+            print(f"{change:14}{''.join(cells)}  {len(found)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,7 @@
 
 Records of 2000 returns about a level: settings are estimated on the first half, by maximum likelihood, and judged on
 the second. Four kinds are simulated; rows are means of four records. With `pip install arch` the data sets of that
-package, daily returns in per cent, take their place:
-
-    python examples/volatility.py sp500 nasdaq wti
+package that are named as arguments, daily returns in per cent, take their place: sp500, nasdaq, wti.
 """
 
 import sys

@@ -12,17 +12,14 @@ from driftfit.engine.simd import (
     equal,
     exp_of,
     fill,
-    fill_four,
     gathered,
     higher,
     load,
-    load_four,
     log_of,
     lower,
     only,
     pair,
     put_pair,
-    reached,
     reaches,
     row_sums,
     store,
@@ -100,19 +97,6 @@ def test_pairs_are_the_entries_of_the_last_axis():
     both = x * [2.0, -1.0]
     least = np.column_stack([np.full(6, 0.5), both[:, 0]])
     np.testing.assert_array_equal(out.reshape(6, 2), np.maximum(np.where(x > 0.0, both, 0.0), least))
-
-
-@njit
-def in_fours_of(x, out):
-    each = times(load_four(x, 0, 0), load_four(x, 1, 0))
-    out[0, 0], out[1, 0] = entry(times(each, fill_four(0.1)), 3), reached(fill_four(0.0), each)
-
-
-def test_fours_are_four_rows_of_one_lane():
-    x, out = RNG.normal(size=(5, 1)), np.zeros((2, 1))
-    in_fours_of(x, out)
-    both = x[:4, 0] * x[1:, 0]
-    np.testing.assert_array_equal(out[:, 0], [both[3] * 0.1, np.sum(both <= 0.0)])
 
 
 def test_a_part_of_a_compiled_routine_says_that_it_cannot_be_called():

@@ -24,7 +24,7 @@ from typing import Any, Self
 
 import numpy as np
 from sklearn.base import BaseEstimator, RegressorMixin
-from sklearn.utils.validation import _check_sample_weight, check_array, check_is_fitted, validate_data
+from sklearn.utils.validation import check_array, check_is_fitted, validate_data
 
 from driftfit.data.arguments import chronological, dated, held
 from driftfit.engine.kernel import Array
@@ -109,8 +109,15 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
         if hasattr(X, "columns") and len(X):
             held("X", X)  # names the column of a cell that is no number
         X = validate_data(self, X, reset=first, dtype=float, ensure_all_finite="allow-nan")
-        weights = None if sample_weight is None else np.asarray(sample_weight)[rows]
-        weights = _check_sample_weight(weights, X, dtype=float, ensure_non_negative=True)
+        weights: Any = 1.0
+        if sample_weight is not None:
+            weights = check_array(
+                np.asarray(sample_weight)[rows], ensure_2d=False, dtype=float, ensure_non_negative=True
+            )
+            if weights.shape != (len(X),):
+                raise ValueError(
+                    f"sample_weight must be ({len(X)},), one for each row of X; got shape {weights.shape}."
+                )
         if y is None:
             raise ValueError("this TrackedRegressor estimator requires y to be passed, but the target y is None.")
         y = check_array(y, ensure_2d=False, dtype=float, ensure_all_finite="allow-nan", input_name="y")

@@ -32,7 +32,7 @@ def density(e: Array) -> Array:
     """Log-likelihoods (T,) of errors, Gaussian with the mean of their squares so far; NaN for the first ten."""
     known = np.isfinite(e)
     square, count = np.where(known, e, 0.0) ** 2, np.cumsum(known) - known
-    v = np.maximum(np.cumsum(square) - square, 1e-300) / np.maximum(count, 1)
+    v = np.where(count > 10, np.maximum(np.cumsum(square) - square, 1e-100) / np.maximum(count, 1), 1.0)
     return np.where(known & (count > 10), -0.5 * (np.log(2.0 * np.pi * v) + square / v), np.nan)
 
 

@@ -15,12 +15,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
+from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
-from scipy.special import ndtri
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.diagnose import Diagnosis, diagnose, diagnosis
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 SHOWN = 20
-NORMAL_95 = float(ndtri(0.975))
+NORMAL_95 = NormalDist().inv_cdf(0.975)
 
 
 def discoveries(p: Array) -> Array:

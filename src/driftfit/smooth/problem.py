@@ -130,7 +130,7 @@ def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -
     basis = NONE
     if estimated:
         B, r_of, rate, groups = tracker.problem(fields, phi[weight > 0.0])
-        if prior.r is not None:  # of the noise alone
+        if not tracker.adapts:  # the noise alone is estimated
             weight *= prior.r / r_of
             estimated = False
     if estimated:

@@ -165,7 +165,9 @@ def locate(m: Array, p: Places, right: float) -> Any:
     while above - below > 1:
         middle = (below + above) // 2
         here = level(m, p, p[AT.curve], middle) if rising else m[levels + middle, 0]
-        below, above = (middle, above) if here <= right else (below, middle)
+        under = here <= right
+        below = middle if under else below
+        above = above if under else middle
     if rising:
         m[NUMBER.cell, 0], m[NUMBER.late, 0] = below, 1.0
         return min(max(right, -LARGEST), LARGEST)
