@@ -28,12 +28,12 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 67_369,
-    "statements": 43_714,
+    "lines of the library": 67_380,
+    "statements": 43_721,
     "modules": 345,
     "levels of folders": 3,
     "constants of modules with numbers": 636,
-    "numbers in the source": 2_479,
+    "numbers in the source": 2_480,
     "private names of Numba and llvmlite": 30,
     "modules that the Kalman filter imports": 24,
     "lines of them": 5_268,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 32,
     "bytes of state of Kalman": 840,
     "bytes of state of AdaptiveKalman": 17_064,
-    "lines of tests": 33_536,
+    "lines of tests": 33_520,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 

@@ -118,6 +118,8 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
                 raise ValueError(
                     f"sample_weight must be ({len(X)},), one for each row of X; got shape {weights.shape}."
                 )
+            if not weights.any():
+                raise ValueError("sample_weight is zero for every row, so there is nothing to fit.")
         if y is None:
             raise ValueError("this TrackedRegressor estimator requires y to be passed, but the target y is None.")
         y = check_array(y, ensure_2d=False, dtype=float, ensure_all_finite="allow-nan", input_name="y")
