@@ -28,11 +28,11 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 67_380,
-    "statements": 43_721,
+    "lines of the library": 67_370,
+    "statements": 43_718,
     "modules": 345,
     "levels of folders": 3,
-    "constants of modules with numbers": 636,
+    "constants of modules with numbers": 635,
     "numbers in the source": 2_480,
     "private names of Numba and llvmlite": 30,
     "modules that the Kalman filter imports": 24,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 32,
     "bytes of state of Kalman": 840,
     "bytes of state of AdaptiveKalman": 17_064,
-    "lines of tests": 33_520,
+    "lines of tests": 33_512,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 

@@ -9,7 +9,7 @@ from support import arx_record, rows_of
 
 from driftfit import ARX, AugmentedFLS, JointKalman, Kalman, Live, Regression, StateSpace, track
 from driftfit.judge.alarms.band import normal_limit
-from driftfit.judge.alarms.detect import Alarms, chance_of, onsets
+from driftfit.judge.alarms.detect import Alarms, onsets
 from driftfit.run.live.rule import AlarmRule
 
 K = Kalman(q=1e-3, r=0.01)
@@ -189,20 +189,6 @@ def test_a_tracker_without_covariance_has_no_band():
     run = track(ARX(2, 2), AugmentedFLS(mu=10.0), *arx_record(400, 1))
     with pytest.raises(ValueError, match="no covariance"):
         run.detect("band", reference={run.names[0]: (0.0, 1.0)})
-
-
-def test_chance_of_an_extreme():
-    """Tiny where a fault is, not without one; at the limit it is that of an onset."""
-    y, u = arx_record(3000, 4)
-    quiet = track(ARX(2, 2), Kalman(q=0.0, r=0.01), y, u).detect()
-    loud = track(ARX(2, 2), Kalman(q=0.0, r=0.01), y + 0.3 * (np.arange(3000) > 2000), u).detect(quiet.rule, start=1000)
-    assert quiet.p > 0.01
-    assert loud.p < 1e-6
-    assert "p-value < 0.0001 is the probability that a record without a fault is this extreme" in map(
-        " ".join, rows_of(loud)
-    )
-    at_limit = chance_of(quiet.rule, np.array(quiet.rule.limits), 5000)
-    assert at_limit == pytest.approx(1.0 - np.exp(-0.5))
 
 
 def test_the_cause_of_an_alarm_whose_limit_is_zero():

@@ -7,7 +7,7 @@ from scipy.linalg import toeplitz
 from support import arx_record, rows_of
 
 from driftfit import ARX, AugmentedFLS, Kalman, Live, Regression, track
-from driftfit.judge.alarms.detect import onsets
+from driftfit.judge.alarms.detect import chance_of, onsets
 from driftfit.judge.alarms.frozen import frozen_model, noise_model
 from driftfit.run.live.likelihood_ratio import ALIKE, FEWEST, FINE, scan
 from driftfit.run.live.reference_model import (
@@ -331,6 +331,10 @@ def test_the_chance_of_an_extreme_and_the_default_reference():
     assert quiet.p > 0.01
     assert loud.p < 1e-6
     assert any("since" in row for row in rows_of(loud))
+    assert "p-value < 0.0001 is the probability that a record without a fault is this extreme" in map(
+        " ".join, rows_of(loud)
+    )
+    assert chance_of(quiet.rule, np.array(quiet.rule.limits), 5000) == pytest.approx(1.0 - np.exp(-0.5))
     assert onsets(loud.active)[0] == loud.onsets[0] > 600
     # extrapolation: a limit that is ten times as rare is the one that the tail of a normal variable has, roughly
     rare = track(ARX(2, 2), HELD, y, u).detect(every=100_000.0)

@@ -93,6 +93,8 @@ def test_smoothed_laws_are_the_least_squares_of_all_states():
     mean, var = dense_smoother(used)
     found, var = run.smooth(), (shown @ var @ shown.T).reshape(60, 2, 60, 2)
     np.testing.assert_allclose(found.theta.ravel(), shown @ mean, atol=1e-8)
+    np.testing.assert_allclose(found.theta[-1], run.theta[-1], atol=1e-9)  # the compiled filter moves as `transition`
+    np.testing.assert_allclose(found.std[-1], run.std[-1], rtol=1e-7)
     np.testing.assert_allclose(found.std**2, np.einsum("titi->ti", var), rtol=1e-7)
     np.testing.assert_allclose(found.lag_cov(7), var[7, :, 8], atol=1e-9)
     for t in np.flatnonzero(used)[[0, 20]]:  # leaving a sample out is leaving out its row

@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 SHOWN = 20
-NORMAL_95 = NormalDist().inv_cdf(0.975)
 
 
 def discoveries(p: Array) -> Array:
@@ -182,14 +180,7 @@ class ManyVerdicts(Printed):
         standard error of the change.
         """
         first = [row.moves[0] if row.moves else None for row in self.rows]
-        named = {
-            "parameter": "name",
-            "sample": "at",
-            "when": "when",
-            "before": "before",
-            "after": "after",
-            "std": "std",
-        }
+        named = {"parameter": "name", "sample": "at"} | {name: name for name in ("when", "before", "after", "std")}
         return table_by_key(
             self.by,
             [row.key for row in self.rows],
@@ -333,10 +324,12 @@ def ranked(
 
 
 def _coverage(run: Track) -> float:
-    """The share of readings within the 95 % band of their prediction, where they have both; NaN without any."""
-    z = np.abs(run.innovation[run.ok]) / run.innovation_std[run.ok]
-    z = z[np.isfinite(z)]
-    return float(np.mean(z < NORMAL_95)) if z.size else float("nan")
+    """The share of used readings within their 95 % band; NaN without any, and for models that have no band of y."""
+    if run.model.implicit and not run.tracker.output_error:
+        return float("nan")
+    low, high = run.output_band(0.95)
+    known = run.ok & np.isfinite(high)
+    return float(np.mean((low <= run.y)[known] & (run.y <= high)[known])) if known.any() else float("nan")
 
 
 def diagnoses(runs: Mapping[Hashable, Track], by: tuple[str, ...]) -> ManyDiagnoses:

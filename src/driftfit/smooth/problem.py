@@ -122,22 +122,19 @@ def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -
     if prior is None:
         prior = free(run.model.n) if tracker.adapts else tracker.random_walk(run.model)
     phi, signals, fields = collected(run)
-    estimated = own and bool(fields)
     weight, drift = signals[:, WEIGHT], signals[:, DRIFT]
     dt = drift.copy() if prior.slopes or fields else NONE
     first = int(np.argmax(drift > 0.0)) + 1
     drift *= run.known.drift
     basis = NONE
-    if estimated:
+    if own and fields:
         B, r_of, rate, groups = tracker.problem(fields, phi[weight > 0.0])
-        if not tracker.adapts:  # the noise alone is estimated
-            weight *= prior.r / r_of
-            estimated = False
-    if estimated:
+        weight /= r_of / prior.r
+    adapts = own and tracker.adapts
+    if adapts:
         phi, signals[:, Y] = tracker.regression(fields, phi, signals[:, Y])
         basis = B if turned and np.any(np.eye(len(B)) != B) else NONE
         time = np.where(rate > 0.0, drift, 0.0)
-        weight /= r_of
         drift[:] = 1.0
     trend = dt if prior.slopes else NONE
     moving = dt * np.minimum(run.known.drift, 1.0) if len(dt) else NONE
@@ -146,6 +143,6 @@ def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -
     r = 1.0 if prior.r is None else prior.r
     p0 = None if prior.p0 is None else prior.p0 / r
     walk = Walk(phi, signals, prior.q / r, prior.theta0, p0, prior.r, drift_root, trend, basis=basis)
-    if not estimated:
+    if not adapts:
         return walk
     return average_drift(walk.independent, (time, rate * time), moving, groups)._replace(phi=phi, basis=basis)

@@ -108,7 +108,7 @@ class Smoothed:
             raise ValueError("smooth: a run with a warm start cannot be smoothed; track the whole record.")
         one_of("smooth", "keep", keep, ("std", "fit", "cov"))
         one_of("smooth", "undetermined", undetermined, ("min_norm", "nan", "raise"))
-        if order_by is not None and run.tracker.smoother_fields:
+        if order_by is not None and run.tracker.adapts:
             raise ValueError(
                 f"smooth: order_by= needs a drift along that variable, and {run.tracker!r} estimates one in time. "
                 "Use the tracker of tune(model, FLS(), y, u, order_by=..)."
