@@ -67,7 +67,9 @@ def test_a_table_gives_what_one_machine_gives(session, tmp_path, monkeypatch):
     ends = ends.filter(pl.col("failed").is_null())
     assert same(np.stack(ends["theta"].to_list()), [fleet[unit].theta[-1] for unit in ends["unit"]])
     assert ends["used"].to_list() == [int(fleet[unit].ok.sum()) for unit in ends["unit"]]
-    assert (ends["repeated"].sum(), ends["p"].to_list()[-1]) == (7, fleet[ends["unit"][-1]].verdict().p)
+    assert ends["repeated"].sum() == 7
+    own = ["unit", "p", "constant_ls", "coverage", "left_out", "untested"]  # the rest depends on the rate of discoveries
+    assert ends.select(own).sort("unit").equals(fleet.verdict().table.select(own).sort("unit"))
 
 
 def stream_of(session, folder, parts):

@@ -1,5 +1,6 @@
 """Many runs judged at once: false discovery control, the table, the page; outputs of one record."""
 
+import html
 import math
 import os
 import re
@@ -18,6 +19,8 @@ from driftfit import ARX, DataWarning, Kalman, Regression, track
 from driftfit.judge import on_all_cores
 from driftfit.judge.fleet_verdict import discoveries, verdicts
 from driftfit.judge.on_all_cores import Processes, available
+from driftfit.run import fleet as fleets
+from driftfit.show.text import digits
 
 K = Kalman(q=1e-4, r=0.01)
 MOVED = (1, 4)
@@ -203,6 +206,33 @@ def test_page_of_a_fleet(fleet, tmp_path):
     assert "<h3>&lt;6&gt;" not in text  # pictures only of those that move
     with pytest.raises(ValueError, match=r"\.html"):
         fleet.report(tmp_path / "fleet.txt")
+
+
+def test_a_page_begins_with_what_changed_since(fleet, tmp_path):
+    """The two gains double at sample 150: since 140 they changed, since 160 nothing did."""
+    for since, said in ((160, "None of 7"), (140, "2 of 7")):
+        fleet.report(tmp_path / "fleet.html", since=since)
+        text = (tmp_path / "fleet.html").read_text()
+        assert f'<div class="verdict"><p>{said} series changed since {since}.</p>' in text
+    section = re.search("What changed since 140</h2>(.*?)</section>", text, re.S)
+    cells = [re.findall("<td[^>]*>(.*?)</td>", row) for row in re.findall("<tr>(.*?)</tr>", section[1])[1:]]
+    first = {key: moved for key in ("<1>", "<4>") for moved in fleet.verdict()[key].moves[:1]}
+    shown = {html.unescape(cell[0]): cell for cell in cells if cell[1] == first[html.unescape(cell[0])].name}
+    assert shown.keys() == first.keys()
+    for key, moved in first.items():
+        values = (digits(moved.before, moved.std), digits(moved.after, moved.std))
+        share = f"{100.0 * (moved.after - moved.before) / abs(moved.before):+.0f} %"
+        assert (*shown[key][3:6], shown[key][7]) == (moved.when, *values, share)
+    with pytest.raises(ValueError, match=r"report: since: for this record .* must be a number"):
+        fleet.report(tmp_path / "fleet.html", since="2024-03-01")
+
+
+def test_memory_is_announced_before_the_run(monkeypatch):
+    monkeypatch.setattr(fleets, "PROGRESS_SAMPLES", 100)
+    monkeypatch.setattr(fleets.os, "sysconf", lambda name: 64)
+    y = np.zeros((2, 100))
+    with pytest.warns(DataWarning, match=r"results of 2 series take .* keep='theta'"):
+        track(ARX(2, 2), K, y, y + 1.0, by="row")
 
 
 def test_a_page_counts_what_was_left_out_and_what_cannot_be_computed(tmp_path):

@@ -61,13 +61,15 @@ class Judged(keyed_results.KeyedResults, Exported):
 
     def report(
         self, path: str | PathLike[str], title: str | None = None, *, alarms: ManyAlarms | None = None,
-        labels: Mapping[Hashable, Array] | None = None,
+        labels: Mapping[Hashable, Array] | None = None, since: Any = None,
     ) -> None:  # fmt: skip
         """Write one self-contained HTML page with all runs in one table, and pictures of the clearest.
 
-        ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a separate section.
+        ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a separate section. With
+        ``since``, a time or the number of a sample, the page begins with what changed from then on: where, which
+        parameter, when, from what to what. ValueError if it is no time of these records.
         """
-        text = page_of_many(self._rows(), self.by, title, self.failed, self.dropped, alarms, labels)
+        text = page_of_many(self._rows(), self.by, title, self.failed, self.dropped, alarms, labels, since)
         check_path(path).write_text(text, encoding="utf-8")
 
     def crossing(

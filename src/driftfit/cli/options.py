@@ -41,6 +41,7 @@ Setting = Annotated[Names, Option("-p", help="Setting of the tracker; repeat it.
 Out = Annotated[Path | None, Option("--out", help="Write the result to .csv, .parquet or .npz (complete).")]
 Table = Annotated[Path | None, Option("--out", help="Write the result to .csv or .parquet.")]
 Plot = Annotated[Path | None, Option(help="Save a picture (.png, .pdf, .svg).")]
+Since = Annotated[str | None, Option(help="The page of a fleet begins with what changed from this time on.")]
 Report = Annotated[Path | None, Option(help="Write a page (.html) to send to someone; a fleet has one page.")]
 
 

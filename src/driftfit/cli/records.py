@@ -11,7 +11,7 @@ import polars as pl
 from rich.text import Text
 from typer import Option
 
-from driftfit.cli.options import Given, Out, Plot, Report, Table, check_table, reads
+from driftfit.cli.options import Given, Out, Plot, Report, Since, Table, check_table, reads
 from driftfit.cli.program import app, draw, progress, say
 from driftfit.cli.reading import interval_from, listed, order_of, rows_of
 from driftfit.data.columns import Wanted
@@ -42,6 +42,7 @@ def track(
         Path | None, Option(help="Save a picture of responses, poles and gain over time (ARX, one output).")
     ] = None,
     report: Report = None,
+    since: Since = None,
 ) -> None:
     """Track the parameters of a model in a record, or in a fleet of records."""
     if write_to is not None:
@@ -58,8 +59,15 @@ def track(
     if system is not None and not isinstance(run, Track):
         raise ValueError("--system: this draws one series with one output; leave out --by and further --y.")
     draw(system, lambda: run.plot_system())
-    if report is not None:
-        run.report(report)
+    _page(run, report, since)
+
+
+def _page(run: Any, path: Path | None, since: str | None) -> None:
+    """Write the page of a record or a fleet, if there is a path for it."""
+    if since is not None and (path is None or isinstance(run, Track)):
+        raise ValueError("--since: this is for the page of many series; give --report and --by.")
+    if path is not None:
+        run.report(path, **({} if since is None else {"since": since}))
 
 
 def _with_structure(given: Given) -> Given:
@@ -81,12 +89,12 @@ def verdict(
     level: Annotated[float, Option(help="Error rate of the test; for a fleet, the false discovery rate.")] = 0.05,
     lags: Annotated[int | None, Option(help="Lags of correlation of the noise to allow for.")] = None,
     report: Report = None,
+    since: Since = None,
 ) -> None:
     """Report whether the parameters move, which ones and when, and whether tracking them pays."""
     run = given.run()
     say(run.verdict(level=level, lags=lags))
-    if report is not None:
-        run.report(report)
+    _page(run, report, since)
 
 
 @app.command()

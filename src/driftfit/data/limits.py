@@ -143,6 +143,8 @@ def end_of(what: str, given: Any, axis: Array, zone: str | None, upper: int) -> 
         coarse = unit in ("Y", "M", "W", "D")
         after = stamp + np.array(upper, f"m8[{unit}]") if coarse else instant(stamp)
         moment = _in_utc(after.astype("datetime64[us]") if coarse else after, stamp, zone)
+        if not isinstance(moment, np.datetime64):
+            raise TypeError("a number")
         return moment - np.timedelta64(1, "us") if coarse and upper else moment
     except (TypeError, ValueError):
         kind = "a date or a datetime" if axis.dtype.kind == "M" else "a number"

@@ -33,6 +33,13 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 SHOWN = 20
+COLUMNS = {
+    **{"p": "double", "q": "double", "drifts": "boolean", "moving": "string", "change": "string"},
+    **{"parameter": "string", "sample": "bigint", "when": "string", "before": "double", "after": "double"},
+    **{"change_std": "double", "relative": "double", "rms": "double", "constant_ls": "double", "pays": "boolean"},
+    **{"samples": "bigint", "coverage": "double", "left_out": "bigint", "untested": "string"},
+}
+"""Columns of the table, and their types in Spark."""
 
 
 def discoveries(p: Array) -> Array:
@@ -65,8 +72,9 @@ class Judgement:
 
     @property
     def moves(self) -> tuple[Moved, ...]:
-        """The parameters that move."""
-        return tuple(one for one in self.verdict.parameters if one.moves) if self.drifts else ()
+        """The parameters that move, the clearest first."""
+        named = (one for one in self.verdict.parameters if one.moves and self.drifts)
+        return tuple(sorted(named, key=lambda one: one.p_own))
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -86,12 +94,24 @@ class Judgement:
 
     @property
     def change(self) -> str:
-        """The change of the first parameter that moves, in words."""
+        """The change of the parameter that moves most clearly, in words."""
         moved = self.moves
         more = f" and {len(moved) - 1} more" if len(moved) > 1 else ""
         if not moved:
             return ""
-        return f"{moved[0].name} {change(moved[0], 3)} at {moved[0].when}{more}"
+        when = f"from {moved[0].when} on" if np.isnan(moved[0].std) else f"at {moved[0].when}"
+        return f"{moved[0].name} {change(moved[0], 3)} {when}{more}"
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """A row of `ManyVerdicts.table`, by the names in `COLUMNS`."""
+        one, first = self.verdict, self.moves[0] if self.moves else None
+        named = (getattr(first, name, None) for name in ("name", "at", "when", "before", "after", "std"))
+        values = (
+            *(one.p, self.q, self.drifts, ", ".join(self.moving), self.change, *named, self.relative, one.rms),
+            *(one.rivals[1].rms, self.pays, one.samples, self.coverage, self.left_out, one.untested),
+        )
+        return dict(zip(COLUMNS, values, strict=True))
 
     @property
     def cells(self) -> tuple[str, ...]:
@@ -179,29 +199,9 @@ class ManyVerdicts(Printed):
         that moves there are its name, the sample and the time of the change, its values before and after, and the
         standard error of the change.
         """
-        first = [row.moves[0] if row.moves else None for row in self.rows]
-        named = {"parameter": "name", "sample": "at"} | {name: name for name in ("when", "before", "after", "std")}
-        return table_by_key(
-            self.by,
-            [row.key for row in self.rows],
-            [1] * len(self.rows),
-            {
-                "p": [row.verdict.p for row in self.rows],
-                "q": [row.q for row in self.rows],
-                "drifts": [row.drifts for row in self.rows],
-                "moving": [", ".join(row.moving) for row in self.rows],
-                "change": [row.change for row in self.rows],
-                **{column: [getattr(one, name, None) for one in first] for column, name in named.items()},
-                "relative": [row.relative for row in self.rows],
-                "rms": [row.verdict.rms for row in self.rows],
-                "constant_ls": [row.verdict.rivals[1].rms for row in self.rows],
-                "pays": [row.pays for row in self.rows],
-                "samples": [row.verdict.samples for row in self.rows],
-                "coverage": [row.coverage for row in self.rows],
-                "left_out": [row.left_out for row in self.rows],
-                "untested": [row.verdict.untested for row in self.rows],
-            },
-        )
+        rows = [row.columns for row in self.rows]
+        columns = {name: [row[name] for row in rows] for name in COLUMNS}
+        return table_by_key(self.by, [row.key for row in self.rows], [1] * len(self.rows), columns)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for sentence in self.sentences:
@@ -319,11 +319,11 @@ def ranked(
     rows = []
     for (key, one), a, b in zip(verdicts.items(), q.tolist(), q_pays.tolist(), strict=True):
         drifts, pays = (None if np.isnan(value) else value < level for value in (a, b))
-        rows.append(Judgement(key, one, a, b, drifts, pays, _coverage(runs[key]), len(runs[key].left_out)))
+        rows.append(Judgement(key, one, a, b, drifts, pays, coverage(runs[key]), len(runs[key].left_out)))
     return ManyVerdicts(tuple(rows), level, by).ranked("clearest")
 
 
-def _coverage(run: Track) -> float:
+def coverage(run: Track) -> float:
     """The share of used readings within their 95 % band; NaN without any, and for models that have no band of y."""
     if run.model.implicit and not run.tracker.output_error:
         return float("nan")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Hashable, Mapping, Sequence
 from functools import cached_property
@@ -16,7 +17,7 @@ from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.lanes import Lanes
 from driftfit.run.outputs import Outputs
 from driftfit.run.parallel_lanes import run_lanes
-from driftfit.run.program import Program, State
+from driftfit.run.program import PROGRESS_SAMPLES, Program, State
 from driftfit.run.result import Track
 from driftfit.run.warm_start import Run, carried, ended, first_interval
 
@@ -121,6 +122,7 @@ def run_fleet(
     if not records.keys:
         return Fleet(programs, records, Lanes.of({}, 0), failed or {}, {})
     starts, records = _begun(programs, records, before or {})
+    _check_memory(programs, records, keep, dtype)
     lanes = run_lanes(programs, records, keep, starts, dtype)
     done = lanes.done[:: records.ny].tolist()
     series = zip(records.keys, done, strict=True)
@@ -131,6 +133,20 @@ def run_fleet(
             stacklevel=3,
         )
     return Fleet(programs, records, lanes, {**(failed or {}), **absent}, starts)
+
+
+def _check_memory(programs: Sequence[Program], records: Records, keep: str, dtype: Any) -> None:
+    """Warn before the run of results that exceed the memory of this machine."""
+    samples = int(records.length.sum()) * records.ny
+    if samples > PROGRESS_SAMPLES:
+        size = samples * programs[0].written(programs[0].tile(), 0, keep, dtype).dtype.itemsize / 1e9
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+        if size > memory:
+            warn(
+                f"track: the results of {len(records.keys)} series take {size:.0f} GB, and this machine has "
+                f"{memory:.0f} GB of memory. keep='theta' and dtype='float32' store less, and to= writes the results "
+                "to a folder as they come."
+            )
 
 
 def _begun(

@@ -165,7 +165,8 @@ def run_jobs(jobs: Sequence[Job], records: Records, threads: int | None = None) 
     most = min(TILES_PER_BATCH, max(1, len(jobs) // (BATCHES_PER_THREAD * threads)))
     batches = [jobs[k : k + most] for k in range(0, len(jobs), most)]
     total = sum(map(_samples, batches))
-    with progress("tracking", total, total > PROGRESS_SAMPLES) as advance, ThreadPoolExecutor(threads) as pool:
+    what = f"tracking, results of {sum(job.out.nbytes for job in jobs) / 1e9:.1f} GB"
+    with progress(what, total, total > PROGRESS_SAMPLES) as advance, ThreadPoolExecutor(threads) as pool:
         waiting = {pool.submit(_drive_all, batch, records): batch for batch in batches}
         try:
             for future in as_completed(waiting):

@@ -14,14 +14,16 @@ from collections.abc import Hashable, Mapping
 from html import escape
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from driftfit.data.limits import within
 from driftfit.engine import __version__
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks
 from driftfit.judge.alarms.detect import onsets
+from driftfit.judge.changes.words import rows as listed
 from driftfit.judge.diagnose import Diagnosis, diagnosis
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.fleet_verdict import Judgement, ManyDiagnoses, ManyVerdicts, verdicts_and_diagnoses
@@ -219,23 +221,31 @@ def page_of_many(
     dropped: Mapping[str, int],
     alarms: ManyAlarms | None = None,
     labels: Mapping[Hashable, Array] | None = None,
+    since: Any = None,
 ) -> str:
     """The page as HTML text; ``by`` names the parts of a key, ``failed`` gives the reasons of missing results,
-    ``dropped`` counts the rows that are left out, by reason; ``labels`` by key are true for faults.
+    ``dropped`` counts the rows that are left out, by reason; ``labels`` by key are true for faults. With ``since`` the
+    page begins with what changed from then on.
     """
     if not runs:
         raise ValueError("report: no series has a result to report.")
+    new = {
+        key: within([(since, None)], run.time, np.arange(len(run)), run.labels.zone, "report: since")
+        for key, run in (runs.items() if since is not None else ())
+    }
     verdicts, health = verdicts_and_diagnoses(runs, by, LEVEL)
     heading = title or (", ".join(map(key_text, runs)) if len(runs) < LISTED_BY_NAME else f"{len(runs)} series")
     samples, used = sum(map(len, runs.values())), sum(int(run.ok.sum()) for run in runs.values())
     counted = f"{len(runs)} series, {samples} samples, {used} used, {samples - used} skipped"
     shown = [row for row in verdicts.rows[:PICTURES] if row.drifts] or list(verdicts.rows[:1])
+    first, changed = _since(since, verdicts, new) if new else ((), ())
     return document(
         heading,
         [
             f"<h1>{escape(heading)}</h1>",
             f'<p class="soft">{escape(counted)}</p>',
-            _verdict_of_many(verdicts, health),
+            _verdict_of_many(first, verdicts, health),
+            *changed,
             *([section("Faults and alarms", many_faults(runs, alarms, labels or {}))] if alarms or labels else []),
             section("All series", _rows(verdicts, health)),
             section(
@@ -249,13 +259,34 @@ def page_of_many(
     )
 
 
-def _verdict_of_many(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
+def _since(
+    since: Any, verdicts: ManyVerdicts, new: Mapping[Hashable, Array]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """(a sentence, and a section) about the changes that happened, went on or ended at ``since`` or later."""
+    rows, changed = [], 0
+    for one in verdicts.rows:
+        found = [event for event in one.verdict.events if one.drifts and new[one.key][max(event.at, event.until or 0)]]
+        changed += bool(found)
+        moves = [move for event in found for move in event.moves]
+        for (kind, when, _, ended, *cells), move in zip(listed(found), moves, strict=True):
+            clear = abs(move.before) > np.nan_to_num(move.std)
+            share = f"{100.0 * (move.after - move.before) / abs(move.before):+.0f} %" if clear else ""
+            begun = f"{when} to {ended}" if ended else when
+            rows.append(tuple(map(escape, (key_text(one.key), cells[0], kind, begun, *cells[1:], share))))
+    text = f"{changed or 'None'} of {len(new)} series changed since {since}."
+    heads = ("", "what", "how", "when", "before", "after", "+-", "change")
+    caption = f"The clearest first.{of_all(len(rows), SERIES_LISTED)}"
+    listing = table(caption, heads, rows[:SERIES_LISTED], (1, 2, 3))
+    return (text,), (section(f"What changed since {since}", listing),) if rows else ()
+
+
+def _verdict_of_many(first: tuple[str, ...], verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
     out = sum(not one.ok for one in health.of.values())
     known = len(health.known)
     state = f"{out} of {known} have diagnostics out of bounds." if out else "All diagnostics are within limits."
     if known == 0:
         state = "No diagnostic can be computed."
-    return opening((*verdicts.sentences, state))
+    return opening((*first, *verdicts.sentences, state))
 
 
 def _rows(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:

@@ -30,6 +30,7 @@ from driftfit.bridges.spark.units import (
 )
 from driftfit.data import late
 from driftfit.engine.settings import one_of
+from driftfit.judge.fleet_verdict import COLUMNS, Judgement, coverage
 from driftfit.judge.verdict import verdict
 from driftfit.models.base import Model
 from driftfit.run.outputs import Outputs
@@ -37,7 +38,7 @@ from driftfit.run.result import Track
 from driftfit.trackers.base import Tracker
 
 OUTPUTS = ("samples", "summary", "verdict", "states")
-VERDICT = {"drifts": "boolean", "p": "double", "pays": "boolean", "moved": "string"}
+VERDICT = {name: kind for name, kind in COLUMNS.items() if name not in ("q", "rms", "samples")}
 
 
 def track(
@@ -68,9 +69,9 @@ def track(
     outputs : "samples", "summary", "verdict" or "states"
         A row per sample with the columns of `Track.to_table`; a row per unit with its last parameters, the root mean
         square of its innovations (``rms``) and of its standardised innovations (``standardised``, about 1 where the
-        tracker's variances hold) and counts; the same with what `Track.verdict` says (whether parameters move, its p,
-        whether tracking pays, the parameter that moves most clearly), for which a unit is held in memory; or a row per
-        unit with its state, from which `follow` begins.
+        tracker's variances hold) and counts; the same with the columns of ``fleet.verdict().table`` besides q, for
+        which a unit is held in memory, ``drifts`` and ``pays`` at the level of 5 % for each unit; or a row per unit
+        with its state, from which `follow` begins.
     gate : bool, Gate or None
         As for `driftfit.track`; ``ok`` is false for what it leaves out.
     arrays : bool
@@ -186,7 +187,8 @@ class Partition:
                 runs = Outputs(programs, found.records.some(j, j + 1), own, {}, {}).values()
             for run, of in zip(runs, self.task.suffixes, strict=True):
                 truth = verdict(run)
-                most = min(truth.parameters, key=lambda one: (not one.moves, np.nan_to_num(one.p_own, nan=1.0)))
-                for name, value in zip(VERDICT, (truth.drifts, truth.p, truth.pays, most.name), strict=True):
-                    columns[f"{name}{of}"].append(value)
+                nan = float("nan")
+                one = Judgement(j, truth, nan, nan, truth.drifts, truth.pays, coverage(run), len(run.left_out))
+                for name in VERDICT:
+                    columns[f"{name}{of}"].append(one.columns[name])
         return columns
