@@ -68,7 +68,14 @@ def test_a_table_gives_what_one_machine_gives(session, tmp_path, monkeypatch):
     assert same(np.stack(ends["theta"].to_list()), [fleet[unit].theta[-1] for unit in ends["unit"]])
     assert ends["used"].to_list() == [int(fleet[unit].ok.sum()) for unit in ends["unit"]]
     assert ends["repeated"].sum() == 7
-    own = ["unit", "p", "constant_ls", "coverage", "left_out", "untested"]  # the rest depends on the rate of discoveries
+    own = [
+        "unit",
+        "p",
+        "constant_ls",
+        "coverage",
+        "left_out",
+        "untested",
+    ]  # the rest depends on the rate of discoveries
     assert ends.select(own).sort("unit").equals(fleet.verdict().table.select(own).sort("unit"))
 
 

@@ -117,7 +117,7 @@ def test_numbers_of_the_summary():
     assert [f"{value:.5g}" for value in (c.tracked, c.persistence, c.constant_ls, c.constant_arx)] in printed
     skipped = summary.samples - summary.used
     assert f"Samples {summary.samples}, {summary.used} used, {skipped} skipped".split() in printed
-    assert ["Log-likelihood", f"{run.loglik:.6g}"] in printed
+    assert f"Log-likelihood {run.loglik:.6g}, AIC {run.aic():.6g}, BIC {run.bic():.6g}".split() in printed
     assert [*["Tracker"], *repr(K).split()] in printed
     assert max(map(len, str(summary).splitlines())) <= 96
 

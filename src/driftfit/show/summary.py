@@ -46,6 +46,7 @@ from driftfit.show.text import (
     together,
 )
 from driftfit.trackers.student import band_ratio
+from driftfit.tune.inference import information
 
 LEVEL_SPREADS = 3.0
 """Deviations from 0 from which on the level of an output calls for a constant."""
@@ -75,6 +76,8 @@ class Summary(Printed):
     samples: int
     used: int
     loglik: float
+    aic: float
+    bic: float
     burn: int
     rows: tuple[Row, ...]
     comparison: Comparison
@@ -91,7 +94,10 @@ class Summary(Printed):
             ("Time", self.span),
             ("Samples", f"{self.samples}, {self.used} used, {self.samples - self.used} skipped"),
             ("Rows left out", self.dropped),
-            ("Log-likelihood", f"{self.loglik:.6g}"),
+            (
+                "Log-likelihood",
+                f"{self.loglik:.6g}" + (f", AIC {self.aic:.6g}, BIC {self.bic:.6g}" if self.used else ""),
+            ),
             *self.remarks,
         )
         heads = ("theta", "std", "[0.025", "0.975]", "lowest", "highest")
@@ -110,6 +116,10 @@ class Summary(Printed):
         table.add_row(*(f"{value:.5g}" for value in (c.tracked, c.persistence, c.constant_ls, c.constant_arx)))
         yield table
         yield Text(f" {self._scored}", "dim")
+
+    @property
+    def _likelihood(self) -> str:
+        return f"{self.loglik:.6g}" + (f", AIC {self.aic:.6g}, BIC {self.bic:.6g}" if self.used else "")
 
     @property
     def _scored(self) -> str:
@@ -135,10 +145,15 @@ def summarise(run: Track) -> Summary:
     )  # fmt: skip
     tracker = shortened(repr(run.tracker))
     return Summary(
-        repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
+        repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, *_criteria(run), burn, rows, compare(run),
         _signals(run.labels) if run.labels.u or run.labels.y != "y" else "", _span(run), counts(run.labels.dropped),
         (*remarks, *_missing(run), *_undefined(run), *_level(run), *_gate(run), *run.tracker.remarks(run)),
     )  # fmt: skip
+
+
+def _criteria(run: Track) -> tuple[float, float]:
+    """AIC and BIC with the settings taken as given; NaN without a sample that is used."""
+    return (information(run, 0, 2.0), information(run, 0)) if run.ok.any() else (float("nan"), float("nan"))
 
 
 def summarise_outputs(run: Outputs) -> ByOutput[Summary]:
