@@ -1,4 +1,6 @@
-"""Structural time series by laws: the Nile with its published numbers, and carbon dioxide beside statsmodels."""
+"""Structural time series by laws: the Nile with its published numbers, and two more beside statsmodels: carbon dioxide,
+and monthly counts with a price and a new law, as of drivers killed before and after seat belts.
+"""
 
 import warnings
 
@@ -35,3 +37,29 @@ print(f"log-likelihood            {tuned.loglik - 4 * np.log(2 * np.pi):12.3f}{f
 smoothed, there = track(LEVEL, tuned.tracker, co2).smooth(), fit.smoother_results.smoothed_state
 apart = np.abs(smoothed.theta[:, 0] - np.array([1, 0, 1, 0, 1, 0, 1, 0]) @ there).max()
 print(f"smoothed paths are {apart:.3f} ppm apart at most")
+
+rng, T = np.random.default_rng(7), 192
+price = np.cumsum(0.05 * rng.normal(size=T))
+belts = np.arange(T) >= 169
+month = 2.0 * np.pi * np.arange(T) / 12
+level = 7.0 + np.cumsum(0.016 * rng.normal(size=T)) + 0.12 * np.cos(month) + 0.05 * np.sin(2.0 * month)
+killed = level - 0.29 * price - 0.24 * belts + 0.06 * rng.normal(size=T)
+inputs, model = np.column_stack([price, belts]), Regression(["price", "belts"], intercept=True)
+laws = (Law.walk(), Law.season(12, harmonics=6))
+tuned = tune(model, Kalman(q=0, laws={"intercept": laws}), killed, inputs, intervals=False)
+other = sm.tsa.UnobservedComponents(
+    killed, "llevel", freq_seasonal=[{"period": 12, "harmonics": 6}], stochastic_freq_seasonal=[False], exog=inputs,
+    mle_regression=False, use_exact_diffuse=True,
+)  # fmt: skip
+run, fit = track(model, tuned.tracker, killed, inputs), other.fit(disp=0)
+there, std = fit.smoother_results.filtered_state[-2:, -1], fit.smoother_results.filtered_state_cov[-2:, -2:, -1]
+print()
+print("Killed, 192 months            driftfit  statsmodels")
+for name, own, theirs in zip(
+    ("noise", "level"), (tuned.tracker.r, tuned.tracker.laws[0][1].q), fit.params, strict=True
+):
+    print(f"variance of the {name:10}{own:12.2e}{theirs:13.2e}")
+print(f"log-likelihood            {tuned.loglik - 7 * np.log(2 * np.pi):12.3f}{fit.llf:13.3f}")
+for k, name in enumerate(("price", "belts")):
+    print(f"effect of {name:16}{run.theta[-1, k]:12.3f}{there[k]:13.3f}")
+    print(f"  its std{'':17}{run.std[-1, k]:12.3f}{np.sqrt(std[k, k]):13.3f}")

@@ -105,18 +105,18 @@ def test_smoothed_laws_are_the_least_squares_of_all_states():
 def test_structural_models_are_those_of_statsmodels():
     sm = pytest.importorskip("statsmodels.api", reason="statsmodels is not installed")
     y = sm.datasets.co2.load_pandas().data.co2.resample("MS").mean().interpolate().to_numpy()[:120]
-    laws = (Law.trend(level=None), Law.season(12, harmonics=2, q=None))
+    laws = (Law.trend(level=None), Law.season(12, harmonics=6, q=None))
     tuned = tune(Regression(intercept=True), Kalman(q=0, laws={"intercept": laws}), y, intervals=False)
     other = sm.tsa.UnobservedComponents(
-        y, "lltrend", freq_seasonal=[{"period": 12, "harmonics": 2}], use_exact_diffuse=True
+        y, "lltrend", freq_seasonal=[{"period": 12, "harmonics": 6}], use_exact_diffuse=True
     )
     trend, season = (law for _, law in tuned.tracker.laws)
     given = other.smooth([tuned.tracker.r, trend.level, trend.q, season.q])
-    assert tuned.loglik == pytest.approx(given.llf + 3 * np.log(2.0 * np.pi), abs=1e-6)  # 6 unknown components
+    assert tuned.loglik == pytest.approx(given.llf + 6.5 * np.log(2.0 * np.pi), abs=1e-6)  # 13 unknown components
     best = other.fit(given.params, disp=0)
     assert given.llf > best.llf - 1e-5
     run = track(Regression(intercept=True), tuned.tracker, y)
-    shown = np.array([1, 0, 1, 0, 1, 0])
+    shown = np.array([1, 0] * 7)
     np.testing.assert_allclose(run.smooth().theta[:, 0], shown @ given.smoothed_state, rtol=1e-6)
     ahead, there = run.forecast(24), given.get_forecast(24)
     np.testing.assert_allclose(ahead.y_hat, there.predicted_mean, rtol=1e-6)
@@ -124,6 +124,17 @@ def test_structural_models_are_those_of_statsmodels():
     limit = float(ahead.y_hat[12])
     drawn = run.crossing("intercept", above=limit, horizon=24).by
     assert drawn[-1] > 0.5 > drawn[1]
+
+
+def test_no_sample_determines_two_directions():
+    """A price that hardly moves beside a level and a season: 13 samples determine 13 unknowns, and no 12 do."""
+    rng = np.random.default_rng(7)
+    price, t = -2.3 + np.cumsum(0.02 * rng.normal(size=60)), np.arange(60)
+    y = 7.0 + 0.1 * np.cos(np.pi * t / 6) - 0.3 * price + 0.06 * rng.normal(size=60)
+    laws = {"intercept": (Law.walk(1e-5), Law.season(12, harmonics=5))}
+    run = track(Regression(1, intercept=True), Kalman(q=0, r=0.003, laws=laws), y, price)
+    assert np.isfinite(run.innovation_std).sum() <= 60 - 12
+    np.testing.assert_allclose(run.theta[-1], run.smooth().theta[-1], rtol=1e-8)
 
 
 def test_walks_are_the_kalman_filter_and_trends_are_second_differences():
@@ -197,7 +208,7 @@ def test_what_does_not_fit_a_law_is_refused():
         with pytest.raises(ValueError, match=message):
             track(Regression(2), Kalman(q=0.0, r=1.0, laws=laws), *data())
     for make, message in (
-        (lambda: Law.season(4, harmonics=2), "half a wave"),
+        (lambda: Law.season(4, harmonics=3), "half a wave"),
         (lambda: track(Regression(2), Kalman(0, 1, laws={"theta1": Law.returns()}), *data()), "returns.theta1..time, "),
         (lambda: track(Regression(2), Kalman(0, 1, laws={"theta1": [Law.walk(1), Law.trend(1)]}), *data()), "two laws"),
         (lambda: Law.trend(-1.0), "at least 0"), (lambda: Kalman(q=np.eye(2), r=1.0, laws=LAWS), "must be"),

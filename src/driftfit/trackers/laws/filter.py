@@ -10,13 +10,14 @@ F has a block for each component: exp(-dt damping), a shear, or a rotation that 
 what the result shows.
 
 The start is diffuse in the components whose variance is not known, x_0 = c + delta: x and C are those for delta = 0,
-and A = dx / d delta and the information M about delta are computed beside them (de Jong 1991),
+and A = dx / d delta and the information about delta are computed beside them (de Jong 1991), as least squares in a
+triangle R that rotations keep, so that k samples determine at most k directions, whatever is rounded:
 
-    A <- F A;   a = A' h;   M <- M + a a' / s;   m <- m + a e / s;   A <- A - C h a' / s
+    A <- F A;   a = A' h;   R' R <- R' R + a a' / s;   R' z <- R' z + a e / s;   A <- A - C h a' / s
 
-until M, in the units of its own diagonal, can be inverted: then x <- x + A M^-1 m and C <- C + A M^-1 A'. What no
-regressor has reached stays free, and holds up nothing else. Until then std is inf for the parameters that depend on
-it.
+until R, in the units of its own columns, can be inverted: then x <- x + A R^-1 z and C <- C + A R^-1 (A R^-1)'. What
+no regressor has reached stays free, and holds up nothing else. Until then std is inf for the parameters that depend
+on it.
 
 Source: Harvey (1989), section 3.2; de Jong, The diffuse Kalman filter, Annals of Statistics 19 (1991). Departure:
 delta is taken in as soon as it is determined. Cost per sample: O(N^2) for N components, O(N^3) at the start.
@@ -44,24 +45,37 @@ from driftfit.engine.kernel import (
     shared,
     wholes,
 )
-from driftfit.trackers.laws.law import COSINE, DAMPING, KIND, LEVEL, NOISE, OWNER, PLAIN, RATE, ROWS, SLOPE, VISIBLE
+from driftfit.trackers.laws.law import (
+    COSINE,
+    DAMPING,
+    KIND,
+    LEVEL,
+    NOISE,
+    OWNER,
+    PLAIN,
+    RATE,
+    ROWS,
+    SINE,
+    SLOPE,
+    VISIBLE,
+)
 from driftfit.trackers.parts.covariance import LEFT, read_drift
 
 DETERMINED = 1e-9
-"""Smallest pivot of the information about delta, in the units of its diagonal, with which it is taken in."""
+"""Smallest square on the diagonal of R, in that of its column, with which delta is taken in."""
 
 LOG_2_PI = 1.8378770664093453
 
 H, G, B, W, WORK = range(5)
-"""Rows of ``work``: h, C h, a, and the solution of L w = m."""
+"""Rows of ``work``: h, C h, a, and a row that is turned into R."""
 
 TIME, DRIFT, Y, OK, R, Y_HAT, E, S, REACHED, TOTAL, NOW = range(11)
 """Entries of ``now``: the interval, the factor of the drift, the output, whether it is used, the noise variance; the
 prediction, the innovation and its variance as if delta were known, whether y depends on delta; and -2 times the
 logarithm of the likelihood of what delta took."""
 
-(AT_LAW, AT_ROOT, AT_X, AT_C, AT_A, AT_M, AT_INFO, AT_FREE, AT_PHI, AT_THETA, AT_P, AT_VAR, AT_L, AT_WORK, AT_NOW,
- AT_F, ADDRESSES) = range(17)  # fmt: skip
+(AT_LAW, AT_ROOT, AT_X, AT_C, AT_A, AT_R, AT_Z, AT_FREE, AT_PHI, AT_THETA, AT_P, AT_VAR, AT_WORK, AT_NOW, AT_F,
+ ADDRESSES) = range(16)  # fmt: skip
 
 
 def state(table: Array, theta0: Array, p0: Array | None, means: Mapping[int, float]) -> Mapping[str, Any]:
@@ -73,6 +87,7 @@ def state(table: Array, theta0: Array, p0: Array | None, means: Mapping[int, flo
     if p0 is not None:
         C[np.ix_(first, first)] = p0
         free[first] = 0.0
+    free[(table[KIND] == SINE) & (table[RATE] == np.pi)] = 0.0  # 0 at every sample
     for k in np.flatnonzero(table[DAMPING]):
         C[k, k], free[k] = table[NOISE, k], 0.0
     for i, mean in means.items():
@@ -81,7 +96,7 @@ def state(table: Array, theta0: Array, p0: Array | None, means: Mapping[int, flo
     shown = (table[OWNER] == np.arange(n)[:, None]) * table[VISIBLE]
     return {
         "theta": shown @ x, "P": shown @ C @ shown.T, "law": table, "x": x, "C": C, "A": np.diag(free),
-        "M": np.zeros((N, N)), "information": np.zeros(N), "free": free, "L": np.zeros((N, N)),
+        "R": np.zeros((N, N)), "z": np.zeros(N), "free": free,
         "work": np.zeros((WORK, N)), "now": np.zeros(NOW), "drift_root": np.ones(n), "F": np.ones(N),
     }  # fmt: skip
 
@@ -173,67 +188,66 @@ def correct_state(x: Array, C: Array, work: Array, now: Array) -> None:
 
 
 @shared
-def inform(A: Array, M: Array, information: Array, work: Array, now: Array) -> None:
-    """Take the sample as information about delta."""
-    N = len(A)
+def inform(A: Array, R: Array, z: Array, work: Array, now: Array) -> None:
+    """Take the sample as information about delta: turn a / sqrt(s), e / sqrt(s) into R, z."""
+    N, root = len(A), 1.0 / np.sqrt(now[S])
+    row = work[W]
     for d in range(N):
-        information[d] += work[B, d] * now[E] / now[S]
+        row[d] = work[B, d] * root
         for c in range(N):
-            M[d, c] += work[B, d] * work[B, c] / now[S]
             A[d, c] -= work[G, d] * work[B, c] / now[S]
+    left = now[E] * root
+    for d in range(N):
+        if row[d] != 0.0:
+            length = np.sqrt(R[d, d] * R[d, d] + row[d] * row[d])
+            ahead, aside = R[d, d] / length, row[d] / length
+            for c in range(d, N):
+                one, other = R[d, c], row[c]
+                R[d, c], row[c] = ahead * one + aside * other, ahead * other - aside * one
+            one = z[d]
+            z[d], left = ahead * one + aside * left, ahead * left - aside * one
     now[TOTAL] += LOG_2_PI + log(now[S]) + now[E] * now[E] / now[S]
 
 
 @shared
-def factor(M: Array, L: Array, scale: Array) -> bool:
-    """L, the lower Cholesky factor of M in the units of its diagonal, where that is not 0; whether M is regular."""
-    N = len(M)
-    for i in range(N):
-        scale[i] = 1.0 / np.sqrt(M[i, i]) if M[i, i] > 0.0 else 0.0
-        for j in range(i + 1):
-            total = M[i, j] * scale[i] * scale[j]
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            if i == j:
-                if scale[i] > 0.0 and total < DETERMINED:
-                    return False
-                L[i, i] = np.sqrt(total) if scale[i] > 0.0 else 1.0
-            else:
-                L[i, j] = total / L[j, j]
+def determined(R: Array) -> bool:
+    """Whether R determines all directions of delta that regressors have reached."""
+    for d in range(len(R)):
+        square = 0.0
+        for c in range(d + 1):
+            square += R[c, d] * R[c, d]
+        if R[d, d] * R[d, d] < DETERMINED * square:
+            return False
     return True
 
 
 @shared
-def settle(x: Array, C: Array, A: Array, M: Array, information: Array, free: Array, L: Array, work: Array) -> float:
+def settle(x: Array, C: Array, A: Array, R: Array, z: Array, free: Array) -> float:
     """Take in delta, as far as regressors have reached it; returns -2 log likelihood of it, and 0 if it has to wait."""
-    N, scale, w, total = len(M), work[B], work[W], 0.0
-    if not factor(M, L, scale):
+    N, total = len(R), 0.0
+    if not determined(R):
         return 0.0
     for d in range(N):
-        t = information[d] * scale[d]
-        for c in range(d):
-            t -= L[d, c] * w[c]
-        w[d] = t / L[d, d]
-        total += (2.0 * (log(L[d, d]) - log(scale[d])) - LOG_2_PI if scale[d] > 0.0 else 0.0) - w[d] * w[d]
-    for i in range(N):  # row i of A M^-1/2, in the place of the columns of A that are taken in
+        total += (2.0 * log(R[d, d]) - LOG_2_PI if R[d, d] > 0.0 else 0.0) - z[d] * z[d]
+    for i in range(N):  # row i of A R^-1, in the place of the columns of A that are taken in
         for d in range(N):
-            if scale[d] > 0.0:
-                t = A[i, d] * scale[d]
+            if R[d, d] > 0.0:
+                t = A[i, d]
                 for c in range(d):
-                    t -= L[d, c] * A[i, c] if scale[c] > 0.0 else 0.0
-                A[i, d] = t / L[d, d]
+                    t -= R[c, d] * A[i, c] if R[c, c] > 0.0 else 0.0
+                A[i, d] = t / R[d, d]
     for i in range(N):
         for d in range(N):
-            if scale[d] > 0.0:
-                x[i, 0] += A[i, d] * w[d]
+            if R[d, d] > 0.0:
+                x[i, 0] += A[i, d] * z[d]
                 for j in range(i + 1):
                     C[i, j] += A[i, d] * A[j, d]
                     C[j, i] = C[i, j]
     for d in range(N):
-        if scale[d] > 0.0:
-            free[d], information[d] = 0.0, 0.0
+        if R[d, d] > 0.0:
+            free[d], z[d] = 0.0, 0.0
             for i in range(N):
-                A[i, d], M[i, d], M[d, i] = 0.0, 0.0, 0.0
+                A[i, d], R[d, i] = 0.0, 0.0
     return total
 
 
@@ -284,15 +298,15 @@ def machine_correct(fields: int, n: int, N: int, L: int, l: int) -> None:
     law, now = cubes(at[0, AT_LAW], ROWS, N, L)[:, :, l], floats(at[0, AT_NOW], NOW, L)[:, l]
     x, C = cubes(at[0, AT_X], N, 1, L)[:, :, l], cubes(at[0, AT_C], N, N, L)[:, :, l]
     A, work = cubes(at[0, AT_A], N, N, L)[:, :, l], cubes(at[0, AT_WORK], WORK, N, L)[:, :, l]
-    M, information = cubes(at[0, AT_M], N, N, L)[:, :, l], floats(at[0, AT_INFO], N, L)[:, l]
+    U, z = cubes(at[0, AT_R], N, N, L)[:, :, l], floats(at[0, AT_Z], N, L)[:, l]
     now[S] += now[R]
     informs = now[REACHED] > 0.0 and now[OK] > 0.0
     if informs:
-        inform(A, M, information, work, now)
+        inform(A, U, z, work, now)
     correct_state(x, C, work, now)
     if informs:
         free = floats(at[0, AT_FREE], N, L)[:, l]
-        taken = settle(x, C, A, M, information, free, cubes(at[0, AT_L], N, N, L)[:, :, l], work)
+        taken = settle(x, C, A, U, z, free)
         if taken != 0.0:
             now[TOTAL] += taken
             for k in range(N):  # the factors of the diffuse likelihood, whose logarithms add up to the total
@@ -309,8 +323,8 @@ def calling(machine_of_laws: Any) -> Any:
         N, L = s.x.shape
         fields = packed((
             s.law.ctypes.data, s.drift_root.ctypes.data, s.x.ctypes.data, s.C.ctypes.data, s.A.ctypes.data,
-            s.M.ctypes.data, s.information.ctypes.data, s.free.ctypes.data, s.phi.ctypes.data, s.theta.ctypes.data,
-            s.P.ctypes.data, s.var.ctypes.data, s.L.ctypes.data, s.work.ctypes.data, s.now.ctypes.data,
+            s.R.ctypes.data, s.z.ctypes.data, s.free.ctypes.data, s.phi.ctypes.data, s.theta.ctypes.data,
+            s.P.ctypes.data, s.var.ctypes.data, s.work.ctypes.data, s.now.ctypes.data,
             s.F.ctypes.data,
         ))  # fmt: skip
         machine_of_laws(fields, s.theta.shape[0], N, L, l)

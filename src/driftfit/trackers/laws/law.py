@@ -70,10 +70,10 @@ class Law(Settings):
                 checked = numbers("Law", name, value, ndim=0, low=low, strict=name in ("time", "std", "period"))
                 self._set(name, checked)
         self._set("harmonics", whole("Law", "harmonics", self.harmonics, 1))
-        if self.kind in ("season", "cycle") and not self.harmonics < 0.5 * (self.period or 0.0):
+        if self.kind in ("season", "cycle") and not self.harmonics <= 0.5 * (self.period or 0.0):
             raise ValueError(
-                f"Law: {self.harmonics} harmonics of a period of {self.period or 0.0:g} samples have half a wave or "
-                "more between two samples; give fewer harmonics, or a longer period."
+                f"Law: {self.harmonics} harmonics of a period of {self.period or 0.0:g} samples have more than half a "
+                "wave between two samples; give fewer harmonics, or a longer period."
             )
 
     @property
@@ -108,7 +108,8 @@ class Law(Settings):
     def season(cls, period: float, harmonics: int = 1, q: float | None = 0.0) -> Law:
         """A periodic part of ``harmonics`` waves, whose coefficients gain variance q per nominal sample.
 
-        ``period`` is in nominal samples.
+        ``period`` is in nominal samples. With half as many waves as samples in a period the part is any pattern of sum
+        0; the last wave then changes its sign from sample to sample, and has no sine.
         """
         return cls("season", period=period, harmonics=harmonics, q=q)
 
@@ -135,7 +136,8 @@ class Law(Settings):
         found: list[tuple[float, ...]] = []
         for k in range(1, self.harmonics + 1):
             angle = 2.0 * np.pi * k / (self.period or 1.0)
-            found += [(i, 1.0, COSINE, angle, damping, noise), (i, 0.0, SINE, angle, damping, noise)]
+            hidden = 0.0 if angle == np.pi else noise
+            found += [(i, 1.0, COSINE, angle, damping, noise), (i, 0.0, SINE, angle, damping, hidden)]
         return found
 
 
