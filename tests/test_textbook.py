@@ -232,16 +232,11 @@ def instrumental(draw, record):
 
 CASES = [
     *((kalman, name) for name in MODELS),
-    (kalman_matrix, "ARX(2, 2)"),
-    (kalman_root, "ARX(2, 2)"),
-    (kalman_laws, "Regression(3)"),
-    *((rls, name) for name in ("Regression(3)", "ARX(2, 2)")),
-    (rls_directional, "ARX(2, 2)"),
-    *((fls, name) for name in ("Regression(3)", "ARX(2, 2)")),
-    (fls_slopes, "ARX(2, 2)"),
-    (augmented, "ARX(2, 2)"),
-    (instrumental, "ARX(2, 2)"),
-]
+    *((one, "Regression(3)") for one in (kalman_laws, rls, fls)),
+    *((one, "ARX(2, 2)") for one in (
+        kalman_matrix, kalman_root, rls, rls_directional, fls, fls_slopes, augmented, instrumental,
+    )),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("tracker", "model"), CASES, ids=lambda x: getattr(x, "__name__", x))
