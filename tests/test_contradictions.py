@@ -107,7 +107,7 @@ def test_no_sample_is_between_those_judged_together_and_those_judged_alone(model
 
 @pytest.mark.parametrize(
     ("model", "tracker"),
-    [(one, RLS(0.99)) for one in (OE(1, 1), BoxJenkins(), ARMAX(1, 1, 1))] + [(OE(1, 1), AdaptiveKalman())],
+    [(one, RLS(0.99)) for one in (OE(1, 1), BoxJenkins(), ARMAX(2, 2, 1))] + [(OE(1, 1), AdaptiveKalman())],
     ids=repr,
 )
 @pytest.mark.parametrize("at", [1, 3, 6, 7, 8])

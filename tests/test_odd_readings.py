@@ -1,5 +1,5 @@
 """Fault codes, coarse meters, rests and gaps: behind a gate models that are linearised stay where they were, with every
-tracker.
+tracker; each model with trackers that fail differently.
 
 A linear model with the same tracker recovers as the tracker forgets; these models must not be taken to where no sample
 brings them back.
@@ -38,10 +38,8 @@ MODELS = {
     "hidden": (HIDDEN, (0.8, 0.5, 0.3)),
 }  # fmt: skip
 PAIRS = [
-    *(("continuous", one) for one in (RLS(0.99), K, AdaptiveKalman(), IV)),
-    *(("OE", one) for one in (RLS(0.99), AdaptiveKalman(), IV)),
-    *(("Box-Jenkins", one) for one in (RLS(0.99), AdaptiveKalman(), IV)),
-    *(("equation", one) for one in (RLS(0.99), K, AdaptiveKalman(), Bank())),
+    *(("continuous", one) for one in (K, AdaptiveKalman(), IV)), *(("OE", one) for one in (RLS(0.99), IV)),
+    *(("Box-Jenkins", one) for one in (AdaptiveKalman(), IV)), *(("equation", one) for one in (RLS(0.99), Bank())),
     *(("hidden", one) for one in (
         JointKalman(q=Q, r=0.01, p0=P0), JointKalman(q=Q, r=0.01, p0=P0, method="extended"),
         ParticleFilter(50, q=Q, r=0.01, p0=P0),
@@ -117,7 +115,7 @@ def test_odd_readings_do_no_lasting_harm(name, tracker):
         assert error.max() < 0.15, (what, error)
 
 
-@pytest.mark.parametrize(("name", "tracker"), [PAIRS[1], PAIRS[14]], ids=[NAMES[1], NAMES[14]])
+@pytest.mark.parametrize(("name", "tracker"), [PAIRS[0], PAIRS[9]], ids=[NAMES[0], NAMES[9]])
 def test_a_stream_refuses_the_same_readings(name, tracker):
     model, _ = MODELS[name]
     y, u = cases(name)["9999 for 20 samples"]

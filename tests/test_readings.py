@@ -11,6 +11,7 @@ from driftfit import (
     AdaptiveKalman,
     AugmentedFLS,
     Bank,
+    BoxJenkins,
     Change,
     ExtendedKalman,
     HammersteinWiener,
@@ -60,7 +61,7 @@ def test_no_power_of_a_reading_leaves_one_either(tracker):
 
 @pytest.mark.parametrize(
     ("model", "tracker"),
-    [(EVERY, RLS(0.98)), (EVERY, AdaptiveKalman()), (ARMAX(1, 1, 1, offset=True), Bank())],
+    [(EVERY, RLS(0.98)), (BoxJenkins(1, 1, 1, 1), AdaptiveKalman()), (ARMAX(1, 1, 1, offset=True), Bank())],
     ids=["RLS", "AdaptiveKalman", "Bank"],
 )
 def test_no_computed_signal_leaves_one_either(model, tracker):

@@ -152,13 +152,7 @@ def assert_textbook(record, run, expected, kappa, everywhere=True, first=0, curv
 
 
 DELAYED = "ARX(1, [1, 1], nk=[0, 2], intercept=True)"
-MODELS = {
-    "Regression(1)": (0, 1, 1),
-    "Regression(3)": (0, 1, 3),
-    "ARX(1, 1)": (1, 1, 1),
-    "ARX(2, 2)": (2, 2, 1),
-    DELAYED: (1, 1, 2, 1),
-}
+MODELS = {"Regression(1)": (0, 1, 1), "Regression(3)": (0, 1, 3), "ARX(2, 2)": (2, 2, 1), DELAYED: (1, 1, 2, 1)}
 
 
 def model_of(name, start):
@@ -238,16 +232,11 @@ def instrumental(draw, record):
 
 CASES = [
     *((kalman, name) for name in MODELS),
-    (kalman_matrix, "ARX(2, 2)"),
-    (kalman_root, "ARX(2, 2)"),
-    (kalman_laws, "Regression(3)"),
-    *((rls, name) for name in ("Regression(3)", "ARX(1, 1)", "ARX(2, 2)")),
-    *((rls_directional, name) for name in ("Regression(1)", "ARX(2, 2)")),
-    *((fls, name) for name in ("Regression(1)", "Regression(3)", "ARX(1, 1)", "ARX(2, 2)")),
-    *((fls_slopes, name) for name in ("Regression(1)", "ARX(1, 1)")),
-    *((augmented, name) for name in ("Regression(1)", "ARX(2, 2)")),
-    (instrumental, "ARX(2, 2)"),
-]
+    *((one, "Regression(3)") for one in (kalman_laws, rls, fls)),
+    *((one, "ARX(2, 2)") for one in (
+        kalman_matrix, kalman_root, rls, rls_directional, fls, fls_slopes, augmented, instrumental,
+    )),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("tracker", "model"), CASES, ids=lambda x: getattr(x, "__name__", x))

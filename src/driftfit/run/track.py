@@ -24,9 +24,9 @@ from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
-from driftfit.readings.gate import AT_START, INPUT, REFUSED, SIGNAL, USED, Gate
+from driftfit.readings.gate import INPUT, REFUSED, SIGNAL, USED, Gate
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, ungated
-from driftfit.readings.screen import Review, screen, suspect
+from driftfit.readings.screen import Review, apart, screen, suspect
 from driftfit.run.fleet import Fleet, run_fleet
 from driftfit.run.gating import gate_of
 from driftfit.run.keyed_results import KeyedResults
@@ -292,7 +292,7 @@ def _codes(run: Track) -> dict[str, list[float]]:
         return {}
     e, s, y_hat = (run.in_rows(name).astype(float) for name in ("e", "s", "y_hat"))
     y_hat = np.where(np.isfinite(e), y - e, y_hat) if model.implicit else y_hat
-    begun = _codes_at_start(run, suspect(y))
+    begun = _codes_at_start(run, y, np.any([np.zeros(len(y), bool), *strange], axis=0))
     y, early = np.where(begun, np.nan, y), y[begun]
     reason = _review(model.m, model.input_memory, not run.tracker.covariance)(y, u, y_hat, s, np.isfinite(y_hat))
     blamed = np.flatnonzero(reason % SIGNAL == INPUT)[:, None] - np.arange(model.input_memory + 1)
@@ -310,13 +310,13 @@ def _begins_change(y: Array, reason: Array) -> Array:
     return np.asarray(change | np.append((change & (reason == REFUSED))[1:], False))
 
 
-def _codes_at_start(run: Track, strange: Array) -> Array:
-    """Which readings (T,) a gate would have found to be codes among the first, some of which are ``strange``."""
-    first, found = slice(0, min(START_SAMPLES, len(run))), np.zeros(len(run), bool)
-    if run.start is None and strange[first].any():
-        left = track_record(replace(run.program, gate=Gate()), run.record.part(first)).left_out
-        found[left.sample[left.code == AT_START]] = True
-    return found & strange
+def _codes_at_start(run: Track, y: Array, strange: Array) -> Array:
+    """Which of the first readings (T,), of which a run knows little, are `apart` from all others; those after a
+    ``strange`` input may be responses to it."""
+    if run.start is not None:
+        return np.zeros(len(y), bool)
+    first = np.arange(len(y)) < START_SAMPLES
+    return np.asarray(apart(y) & first & ~np.logical_or.accumulate(strange))
 
 
 @lru_cache
