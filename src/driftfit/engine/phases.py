@@ -135,6 +135,25 @@ def advancing(tracker: Any) -> Any:
     return advance_or_start
 
 
+def forecasting_again(tracker: Any) -> Step:
+    """Forecast and variance of one lane once more, of other regressors: no time passes, and no reading is taken in."""
+    usual = forecasting(tracker._replace(predict=nothing))
+    first = usual if tracker.start is None else forecasting(tracker.start._replace(predict=nothing))
+    starts = tracker.start is not None
+
+    @kernel
+    def again(s: State, l: int) -> None:
+        ok, observed = s.ok[l], s.observed[l]
+        s.ok[l], s.observed[l] = 0.0, 0.0
+        if starts and s.root[l] > 0:
+            first(s, l)
+        else:
+            usual(s, l)
+        s.ok[l], s.observed[l] = ok, observed
+
+    return again  # type: ignore[no-any-return]
+
+
 def _of_lanes(usual: Step, first: Step | None) -> Any:
     """A step of all lanes; those whose ``s.root`` is 1 take the ``first``, if the tracker has a start."""
 

@@ -192,28 +192,26 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
 @lru_cache(maxsize=256)
 def gate_step(
     gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False,
-    lends: bool = False,
+    lends: bool = False, units: tuple[Any, Any] | None = None,
 ) -> Step:  # fmt: skip
     """The gate of a model with n parameters and m inputs, of which it remembers ``ages`` samples besides the present.
 
     ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
-    memory. The regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be
-    as large as predicted. There y is compared with the usual readings alone. With ``lends`` the mean of e^2 takes the
-    place of s, which the tracker does not have.
+    memory. The regressors of an ``implicit`` model contain the reading, and its equation is not one for y: ``units`` are
+    those of `Model.in_output`, between which readings are judged. With ``lends`` the mean of e^2 takes the place of s,
+    which the tracker does not have.
     """
     remember = first_samples(ages, implicit)
     notice, blame = input_rules(gate, ages, refuse)
     hold_frozen = frozen_rule(gate.frozen)
-    judge = output_rule(replace(gate, rare=np.inf) if implicit else gate)
+    judge = output_rule(replace(gate, rare=np.inf) if implicit and units is None else gate)
     resolve = resolution(gate.coarse)
     sure, rare, least = float(gate.sure) ** 2, float(gate.rare) ** 2, 0.0 if lends else 1.0
     learn = usual_rule(sure, lends)
 
     @kernel
-    def step(s: State, l: int) -> None:
-        s.reason[l] = USED
+    def decide(s: State, l: int) -> None:
         seen = s.observed[l] > 0.0
-        remember(s, l)
         notice(s, s.gate_count[l] >= FIRST, l)
         off, own = reading(s, l) - s.gate_mean[l], 1.0 if lends else s.s[l]
         v = own * max(s.gate_ratio[l], least)
@@ -229,5 +227,23 @@ def gate_step(
         resolve(s, l)
         s.gate_before[l] = reading(s, l) if seen else s.gate_before[l]
         learn(s, seen, contradicts, own, v, l)
+
+    into, back = units or (None, None)
+    most = float(gate.far) ** 2
+
+    @kernel
+    def decide_in_output(s: State, l: int) -> None:
+        away = s.raw_y[l] - s.gate_mean[l]
+        of_equation = into(s, away * away > most * s.gate_variance[l], l)
+        decide(s, l)
+        back(s, of_equation, l)
+
+    judged = decide if units is None else decide_in_output
+
+    @kernel
+    def step(s: State, l: int) -> None:
+        s.reason[l] = USED
+        remember(s, l)
+        judged(s, l)
 
     return step  # type: ignore[no-any-return]

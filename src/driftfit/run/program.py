@@ -22,6 +22,7 @@ from driftfit.data.arguments import check_ready
 from driftfit.data.record import Record
 from driftfit.engine.drivers import GATED, NOWHERE, Drivers, TrackerSteps, drivers
 from driftfit.engine.kernel import Array
+from driftfit.engine.phases import forecasting_again
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
@@ -228,7 +229,8 @@ class Program:
             gate = None
             if self.gate is not None:
                 ages, refuse, lends = model.input_memory, model.refuse, not self.tracker.covariance
-                gate = gate_step(self.gate, model.n, model.m, ages, refuse, model.implicit, lends)
+                units = None if self.tracker.output_error else model.in_output(forecasting_again(own))
+                gate = gate_step(self.gate, model.n, model.m, ages, refuse, model.implicit, lends, units)
             found = drivers(model.steps_for(self.steps), own, keep, gate)
             if gate is not None:
                 found = found._replace(run=partial(self._decided, found.run))

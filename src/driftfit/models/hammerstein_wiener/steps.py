@@ -267,13 +267,20 @@ def _regress(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...], lanes: bool)
 
 @lru_cache
 def _push(out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
-    """The compiled routine of ``push``: it predicts if no other step needed the prediction before."""
+    """The compiled routine of ``push``: it predicts if no other step needed the prediction before. With ``slope`` it
+    also writes the functions of the output at the prediction to ``trial``, and F' there to ``trial_bend``.
+    """
     refine, orders, rows = refining(out), np.array(p), room(p)
+    output_at = values_of(out, AT.out, AT.curve, AT.n_out)
 
-    def machine_push(blocks: int, L: int) -> None:
-        m = floats(blocks, rows, L if lanes else 1)
+    def machine_push(blocks: int, L: int, slope: int) -> None:
+        m, bend, d = floats(blocks, rows, L if lanes else 1), orders[AT.trial_bend], orders[AT.d_now]
         if m[NUMBER.late, 0] > 0.0:
-            m[NUMBER.predicted, 0] = refine(m, orders, m[NUMBER.predicted, 0])
+            m[NUMBER.predicted, 0], m[NUMBER.late, 0] = refine(m, orders, m[NUMBER.predicted, 0]), 0.0
+        if slope > 0:
+            output_at(m, orders, m[NUMBER.predicted, 0], orders[AT.trial], bend)
+            for k in range(1, orders[AT.n_out]):
+                m[bend, 0] += m[d + k, 0] * m[bend + k, 0]
 
     return machine(machine_push)
 
@@ -316,9 +323,9 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
         if curved:
             at, L = 8 * l, s.y.shape[0]
             if L == 1:
-                push_one(s.blocks.ctypes.data + at, L)
+                push_one(s.blocks.ctypes.data + at, L, 0)
             else:
-                push_lane(s.blocks.ctypes.data + at, L)
+                push_lane(s.blocks.ctypes.data + at, L, 0)
         s.y_hat[l] = s.blocks[NUMBER.predicted, l]
         settle_output(s, l)
         for i in range(n):
@@ -330,6 +337,43 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
             routine.load()
 
     return ModelSteps(regress, push, ready)
+
+
+@lru_cache
+def in_output(out: Kind, p: tuple[int, ...], forecast: Step) -> tuple[Any, Any]:
+    """`Model.in_output`: y, F^-1 of the level that is predicted, and the variance of the equation over F'^2.
+
+    phi holds functions of y, and with them s grows as fast as the error does: of a reading far off (``asked``), s is
+    that of the forecast.
+    """
+    push_one, push_lane = _push(out, p, False), _push(out, p, True)
+    trial, bend, at_d, more = p[AT.trial], p[AT.trial_bend], p[AT.d], p[AT.n_out] - 1
+
+    @kernel
+    def into(s: State, asked: bool, l: int) -> tuple[float, float, float, float, float]:
+        y, y_hat, e, v, valid = s.y[l], s.y_hat[l], s.e[l], s.s[l], s.valid[l]
+        if s.y.shape[0] == 1:
+            push_one(s.blocks.ctypes.data, 1, 1)
+        else:
+            push_lane(s.blocks.ctypes.data + 8 * l, s.y.shape[0], 1)
+        expected, slope = s.blocks[NUMBER.predicted, l], s.blocks[bend, l]
+        known, own = abs(expected) < LARGEST, v
+        for k in range(2 if asked & known else 0):  # at the forecast, and back
+            for i in range(more):
+                s.phi[at_d + i, l], s.blocks[trial + 1 + i, l] = s.blocks[trial + 1 + i, l], s.phi[at_d + i, l]
+            forecast(s, l)
+            own = s.s[l] if k == 0 else own
+        raw = s.blocks[NUMBER.raw, l] if s.observed[l] > 0.0 else 0.0
+        s.valid[l] = valid if known else 0.0
+        s.y[l], s.y_hat[l], s.e[l] = raw, expected, raw - expected
+        s.s[l] = own / (slope * slope) if known & (slope != 0.0) else np.inf
+        return y, y_hat, e, v, valid
+
+    @kernel
+    def back(s: State, of_equation: tuple[float, float, float, float, float], l: int) -> None:
+        s.y[l], s.y_hat[l], s.e[l], s.s[l], s.valid[l] = of_equation
+
+    return into, back
 
 
 @lru_cache
