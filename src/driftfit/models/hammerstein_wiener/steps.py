@@ -341,10 +341,10 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
 
 @lru_cache
 def in_output(out: Kind, p: tuple[int, ...], forecast: Step) -> tuple[Any, Any]:
-    """`Model.in_output`: y, F^-1 of the level that is predicted, and the variance of the equation over F'^2.
+    """`Model.in_output`: the forecast of y is F^-1 of the level that is predicted, and its variance s / F'^2 there.
 
-    phi holds functions of y, and with them s grows as fast as the error does: of a reading far off (``asked``), s is
-    that of the forecast.
+    phi holds functions of y, with which s grows as fast as the error does. If a reading is far off (``asked``), the
+    error is y - y_hat, and s that of the forecast; otherwise both are the equation's, in units of y.
     """
     push_one, push_lane = _push(out, p, False), _push(out, p, True)
     trial, bend, at_d, more = p[AT.trial], p[AT.trial_bend], p[AT.d], p[AT.n_out] - 1
@@ -356,17 +356,19 @@ def in_output(out: Kind, p: tuple[int, ...], forecast: Step) -> tuple[Any, Any]:
             push_one(s.blocks.ctypes.data, 1, 1)
         else:
             push_lane(s.blocks.ctypes.data + 8 * l, s.y.shape[0], 1)
-        expected, slope = s.blocks[NUMBER.predicted, l], s.blocks[bend, l]
-        known, own = abs(expected) < LARGEST, v
-        for k in range(2 if asked & known else 0):  # at the forecast, and back
-            for i in range(more):
-                s.phi[at_d + i, l], s.blocks[trial + 1 + i, l] = s.blocks[trial + 1 + i, l], s.phi[at_d + i, l]
-            forecast(s, l)
-            own = s.s[l] if k == 0 else own
-        raw = s.blocks[NUMBER.raw, l] if s.observed[l] > 0.0 else 0.0
+        expected, slope = s.blocks[NUMBER.predicted, l], abs(s.blocks[bend, l])
+        known, far, unit = abs(expected) < LARGEST, s.blocks[NUMBER.raw, l] - expected, slope if slope > 0.0 else 1.0
         s.valid[l] = valid if known else 0.0
-        s.y[l], s.y_hat[l], s.e[l] = raw, expected, raw - expected
-        s.s[l] = own / (slope * slope) if known & (slope != 0.0) else np.inf
+        s.e[l], own = e / unit, v
+        if asked & known:
+            for k in range(2):  # at the forecast, and back
+                for i in range(more):
+                    s.phi[at_d + i, l], s.blocks[trial + 1 + i, l] = s.blocks[trial + 1 + i, l], s.phi[at_d + i, l]
+                forecast(s, l)
+                own = s.s[l] if k == 0 else own
+            s.e[l], own = far, own if slope > 0.0 else np.inf
+        s.y[l], s.y_hat[l] = s.blocks[NUMBER.raw, l] if s.observed[l] > 0.0 else 0.0, expected
+        s.s[l] = own / (unit * unit)
         return y, y_hat, e, v, valid
 
     @kernel
