@@ -66,12 +66,15 @@ def no_preparation(L: int) -> None:
 class ModelSteps(NamedTuple):
     """The steps of a model: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags.
 
-    ``ready(L)`` loads the routines that they call by symbol, before a tile of L lanes is driven for the first time.
+    ``ready(L)`` loads the routines that they call by symbol, before a tile of L lanes is driven for the first time. If
+    the equation is not one for y, ``in_output`` makes of a step that repeats the tracker's forecast two functions: one
+    puts y, its forecast and their variance in the place of those of the equation, for a gate, and one puts them back.
     """
 
     regress: Step
     push: Step
     ready: Callable[[int], None] = no_preparation
+    in_output: Callable[[Step], tuple[Any, Any]] | None = None
 
 
 @kernel
@@ -239,7 +242,8 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
     if gate is None:
         between = ungated(phases, part)
     else:
-        between, model = gated(phases[0], gate, phases[1], part), model._replace(regress=raw_kept(model.regress))
+        between = gated(phases[0], gate, phases[1], part, model.in_output is None)
+        model = model._replace(regress=raw_kept(model.regress))
     sample = _sample(model, tracker.note, between, part)
     keep_more = covariance if keep == "cov" else nothing_more
     common = nothing_common if keep == "own" else write_common
@@ -340,7 +344,7 @@ def _sample(model: ModelSteps, note: Step, between: Any, part: Any) -> Any:
     """One sample of all lanes, whose signals and known factors are in the record; ``between`` is what the tracker and
     the gate do between the regression and the lags.
     """
-    regress, push, _ = model
+    regress, push = model.regress, model.push
 
     @kernel
     def sample(s: State) -> None:

@@ -135,25 +135,6 @@ def advancing(tracker: Any) -> Any:
     return advance_or_start
 
 
-def forecasting_again(tracker: Any) -> Step:
-    """Forecast and variance of one lane once more, of other regressors: no time passes, and no reading is taken in."""
-    usual = forecasting(tracker._replace(predict=nothing))
-    first = usual if tracker.start is None else forecasting(tracker.start._replace(predict=nothing))
-    starts = tracker.start is not None
-
-    @kernel
-    def again(s: State, l: int) -> None:
-        ok, observed = s.ok[l], s.observed[l]
-        s.ok[l], s.observed[l] = 0.0, 0.0
-        if starts and s.root[l] > 0:
-            first(s, l)
-        else:
-            usual(s, l)
-        s.ok[l], s.observed[l] = ok, observed
-
-    return again  # type: ignore[no-any-return]
-
-
 def _of_lanes(usual: Step, first: Step | None) -> Any:
     """A step of all lanes; those whose ``s.root`` is 1 take the ``first``, if the tracker has a start."""
 
@@ -235,8 +216,9 @@ def ungated(phases: tuple[Any, ...], part: Any) -> Any:
     return between
 
 
-def gated(look: Any, gate: Step, learn: Any, part: Any) -> Any:
-    """The steps of a tracker with a gate, which sees the inputs and the memory of the model too."""
+def gated(look: Any, gate: Step, learn: Any, part: Any, alone: bool) -> Any:
+    """The steps of a tracker with a gate, which sees the inputs and the memory of the model too; ``alone`` if it does
+    not repeat the forecast."""
 
     @partial(kernel, inline=False)
     def judge(s: State) -> None:
@@ -244,7 +226,7 @@ def gated(look: Any, gate: Step, learn: Any, part: Any) -> Any:
             s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
             gate(s, l)
 
-    judged = outlined(judge)
+    judged = outlined(judge) if alone else judge
 
     @kernel
     def between(s: State) -> None:

@@ -153,12 +153,6 @@ class Model(Settings, ABC):
         """
         return nothing_remembered
 
-    def in_output(self, forecast: Step) -> tuple[Any, Any] | None:
-        """Compiled functions that put y, its forecast, and their variance in the place of those of the equation, for a
-        gate, and back; given what repeats the tracker's forecast. None where they are the same.
-        """
-        return None
-
     def inspect(self, y: Array, u: Array) -> None:
         """Warn of data that do not suit the model; `track` calls it with the whole record, y (T,), u (T, m)."""
 

@@ -38,8 +38,11 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import State, Step, kernel
+from driftfit.engine.drivers import TrackerSteps
+from driftfit.engine.kernel import State, Step, kernel, nothing
+from driftfit.engine.phases import forecasting
 from driftfit.engine.settings import Settings, numbers, whole
+from driftfit.engine.tracker_part import tracker_part, whole_record
 from driftfit.readings.first_samples import first_samples, no_samples
 from driftfit.readings.inputs import input_rules, no_inputs
 from driftfit.readings.repeats import BELIEVED, frozen_rule, no_repeats, reading, repeats_by_nature, resolution
@@ -190,6 +193,27 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
 
 
 @lru_cache(maxsize=256)
+def forecast_again(tracker: TrackerSteps) -> Step:
+    """The forecast of one lane and its variance once more: no time passes, and no reading is taken in."""
+    usual = forecasting(tracker._replace(predict=nothing))
+    first = usual if tracker.start is None else forecasting(tracker.start._replace(predict=nothing))
+    starts = tracker.start is not None
+    part = whole_record if tracker.reads_model else tracker_part
+
+    @kernel
+    def again(s: State, l: int) -> None:
+        ok, observed = s.ok[l], s.observed[l]
+        s.ok[l], s.observed[l] = 0.0, 0.0
+        if starts and s.root[l] > 0:
+            first(part(s), l)
+        else:
+            usual(part(s), l)
+        s.ok[l], s.observed[l] = ok, observed
+
+    return again  # type: ignore[no-any-return]
+
+
+@lru_cache(maxsize=256)
 def gate_step(
     gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False,
     lends: bool = False, units: tuple[Any, Any] | None = None,
@@ -197,9 +221,9 @@ def gate_step(
     """The gate of a model with n parameters and m inputs, of which it remembers ``ages`` samples besides the present.
 
     ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
-    memory. The regressors of an ``implicit`` model contain the reading, and its equation is not one for y: ``units`` are
-    those of `Model.in_output`, between which readings are judged. With ``lends`` the mean of e^2 takes the place of s,
-    which the tracker does not have.
+    memory. The regressors of an ``implicit`` model contain the reading; ``units`` are the functions that its steps
+    make, between which readings are judged. With ``lends`` the mean of e^2 takes the place of s, which the tracker does
+    not have.
     """
     remember = first_samples(ages, implicit)
     notice, blame = input_rules(gate, ages, refuse)

@@ -22,12 +22,11 @@ from driftfit.data.arguments import check_ready
 from driftfit.data.record import Record
 from driftfit.engine.drivers import GATED, NOWHERE, Drivers, TrackerSteps, drivers
 from driftfit.engine.kernel import Array
-from driftfit.engine.phases import forecasting_again
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.readings.first_samples import First, replayed
-from driftfit.readings.gate import AT_START, SIGNAL, Gate, gate_step
+from driftfit.readings.gate import AT_START, SIGNAL, Gate, forecast_again, gate_step
 from driftfit.readings.gate import start as gate_start
 from driftfit.run.columns import COLLECTED, collecting, put_columns
 from driftfit.run.gating import gate_of, without_start
@@ -226,12 +225,14 @@ class Program:
         found = self._drivers.get((keep, steps))
         if found is None:
             model, own = self.model, self.steps if steps is None else steps
+            steps_of_model = model.steps_for(self.steps)
             gate = None
             if self.gate is not None:
                 ages, refuse, lends = model.input_memory, model.refuse, not self.tracker.covariance
-                units = None if self.tracker.output_error else model.in_output(forecasting_again(own))
+                into = None if self.tracker.output_error else steps_of_model.in_output
+                units = None if into is None else into(forecast_again(own))
                 gate = gate_step(self.gate, model.n, model.m, ages, refuse, model.implicit, lends, units)
-            found = drivers(model.steps_for(self.steps), own, keep, gate)
+            found = drivers(steps_of_model, own, keep, gate)
             if gate is not None:
                 found = found._replace(run=partial(self._decided, found.run))
             self._drivers[keep, steps] = found

@@ -48,7 +48,7 @@ from driftfit.engine.settings import numbers, output_names, warn, whole
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.forward import play
-from driftfit.models.hammerstein_wiener.steps import DIGITS, applying, build, in_output, refusing
+from driftfit.models.hammerstein_wiener.steps import DIGITS, applying, build, refusing
 from driftfit.models.hammerstein_wiener.structure import Structure, memory, places_of
 from driftfit.models.hammerstein_wiener.thresholds import settled
 from driftfit.models.inputs import CountedInputs
@@ -252,9 +252,6 @@ class HammersteinWiener(CountedInputs):
     @property
     def refuse(self) -> Any:
         return refusing(self.places)
-
-    def in_output(self, forecast: Step) -> tuple[Any, Any] | None:
-        return None if self.linear else in_output(self.out.kind, self.places, forecast)
 
     @property
     def places(self) -> tuple[int, ...]:

@@ -17,7 +17,7 @@ SIMD vectors directly afterwards, the processor would have to wait until all wri
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -336,12 +336,12 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
         for routine in (*(one[0] for one in into), out[0], *own):
             routine.load()
 
-    return ModelSteps(regress, push, ready)
+    return ModelSteps(regress, push, ready, partial(in_output, out, p) if curved else None)
 
 
 @lru_cache
 def in_output(out: Kind, p: tuple[int, ...], forecast: Step) -> tuple[Any, Any]:
-    """`Model.in_output`: the forecast of y is F^-1 of the level that is predicted, and its variance s / F'^2 there.
+    """`ModelSteps.in_output`: the forecast of y is F^-1 of the level that is predicted, and its variance s / F'^2.
 
     phi holds functions of y, with which s grows as fast as the error does. If a reading is far off (``asked``), the
     error is y - y_hat, and s that of the forecast; otherwise both are the equation's, in units of y.
