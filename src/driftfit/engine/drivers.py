@@ -66,15 +66,15 @@ def no_preparation(L: int) -> None:
 class ModelSteps(NamedTuple):
     """The steps of a model: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags.
 
-    ``ready(L)`` loads the routines that they call by symbol, before a tile of L lanes is driven for the first time. If
-    the equation is not one for y, ``in_output`` makes of a step that repeats the tracker's forecast two functions: one
-    puts y, its forecast and their variance in the place of those of the equation, for a gate, and one puts them back.
+    ``ready(L)`` loads the routines that they call by symbol, before a tile of L lanes is driven for the first time.
+    Where phi holds functions of y, ``foreseeing`` makes of a step that repeats the tracker's forecast one that writes
+    y_hat, e and s as they are before y is seen, for a gate.
     """
 
     regress: Step
     push: Step
     ready: Callable[[int], None] = no_preparation
-    in_output: Callable[[Step], tuple[Any, Any]] | None = None
+    foreseeing: Callable[[Step], Step] | None = None
 
 
 @kernel
@@ -242,7 +242,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
     if gate is None:
         between = ungated(phases, part)
     else:
-        between = gated(phases[0], gate, phases[1], part, model.in_output is None)
+        between = gated(phases[0], gate, phases[1], part, model.foreseeing is None)
         model = model._replace(regress=raw_kept(model.regress))
     sample = _sample(model, tracker.note, between, part)
     keep_more = covariance if keep == "cov" else nothing_more

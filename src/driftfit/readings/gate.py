@@ -197,8 +197,7 @@ def forecast_again(tracker: TrackerSteps) -> Step:
     """The forecast of one lane and its variance once more: no time passes, and no reading is taken in."""
     usual = forecasting(tracker._replace(predict=nothing))
     first = usual if tracker.start is None else forecasting(tracker.start._replace(predict=nothing))
-    starts = tracker.start is not None
-    part = whole_record if tracker.reads_model else tracker_part
+    part, starts = whole_record if tracker.reads_model else tracker_part, tracker.start is not None
 
     @kernel
     def again(s: State, l: int) -> None:
@@ -216,28 +215,34 @@ def forecast_again(tracker: TrackerSteps) -> Step:
 @lru_cache(maxsize=256)
 def gate_step(
     gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False,
-    lends: bool = False, units: tuple[Any, Any] | None = None,
+    lends: bool = False, foresee: Step | None = None,
 ) -> Step:  # fmt: skip
     """The gate of a model with n parameters and m inputs, of which it remembers ``ages`` samples besides the present.
 
     ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
-    memory. The regressors of an ``implicit`` model contain the reading; ``units`` are the functions that its steps
-    make, between which readings are judged. With ``lends`` the mean of e^2 takes the place of s, which the tracker does
-    not have.
+    memory. The regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be
+    as large as predicted. There ``foresee(s, l)`` writes y_hat, e and s before a far reading is seen. With ``lends``
+    the mean of e^2 takes the place of s, which the tracker does not have.
     """
     remember = first_samples(ages, implicit)
     notice, blame = input_rules(gate, ages, refuse)
     hold_frozen = frozen_rule(gate.frozen)
-    judge = output_rule(replace(gate, rare=np.inf) if implicit and units is None else gate)
+    judge = output_rule(replace(gate, rare=np.inf) if implicit and foresee is None else gate)
     resolve = resolution(gate.coarse)
     sure, rare, least = float(gate.sure) ** 2, float(gate.rare) ** 2, 0.0 if lends else 1.0
+    far, curved, look = float(gate.far) ** 2, foresee is not None, foresee or nothing
     learn = usual_rule(sure, lends)
 
     @kernel
-    def decide(s: State, l: int) -> None:
+    def step(s: State, l: int) -> None:
+        s.reason[l] = USED
         seen = s.observed[l] > 0.0
+        remember(s, l)
         notice(s, s.gate_count[l] >= FIRST, l)
-        off, own = reading(s, l) - s.gate_mean[l], 1.0 if lends else s.s[l]
+        off, y_hat, e, variance = reading(s, l) - s.gate_mean[l], s.y_hat[l], s.e[l], s.s[l]
+        if curved and off * off > far * s.gate_variance[l]:
+            look(s, l)
+        own = 1.0 if lends else s.s[l]
         v = own * max(s.gate_ratio[l], least)
         contradicts = (s.ok[l] > 0.0) & (s.e[l] * s.e[l] > sure * v)
         signal = blame(s, contradicts, off * off <= rare * s.gate_variance[l], l) if s.ok[l] > 0.0 else 0
@@ -251,23 +256,6 @@ def gate_step(
         resolve(s, l)
         s.gate_before[l] = reading(s, l) if seen else s.gate_before[l]
         learn(s, seen, contradicts, own, v, l)
-
-    into, back = units or (None, None)
-    most = float(gate.far) ** 2
-
-    @kernel
-    def decide_in_output(s: State, l: int) -> None:
-        away = s.raw_y[l] - s.gate_mean[l]
-        of_equation = into(s, away * away > most * s.gate_variance[l], l)
-        decide(s, l)
-        back(s, of_equation, l)
-
-    judged = decide if units is None else decide_in_output
-
-    @kernel
-    def step(s: State, l: int) -> None:
-        s.reason[l] = USED
-        remember(s, l)
-        judged(s, l)
+        s.y_hat[l], s.e[l], s.s[l] = y_hat, e, variance
 
     return step  # type: ignore[no-any-return]

@@ -229,9 +229,10 @@ class Program:
             gate = None
             if self.gate is not None:
                 ages, refuse, lends = model.input_memory, model.refuse, not self.tracker.covariance
-                into = None if self.tracker.output_error else steps_of_model.in_output
-                units = None if into is None else into(forecast_again(own))
-                gate = gate_step(self.gate, model.n, model.m, ages, refuse, model.implicit, lends, units)
+                foresee = None if self.tracker.output_error else steps_of_model.foreseeing
+                if foresee is not None:
+                    foresee = foresee(forecast_again(own))
+                gate = gate_step(self.gate, model.n, model.m, ages, refuse, model.implicit, lends, foresee)
             found = drivers(steps_of_model, own, keep, gate)
             if gate is not None:
                 found = found._replace(run=partial(self._decided, found.run))

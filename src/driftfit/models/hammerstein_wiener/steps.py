@@ -336,46 +336,32 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
         for routine in (*(one[0] for one in into), out[0], *own):
             routine.load()
 
-    return ModelSteps(regress, push, ready, partial(in_output, out, p) if curved else None)
+    return ModelSteps(regress, push, ready, partial(foreseeing, out, p) if curved else None)
 
 
 @lru_cache
-def in_output(out: Kind, p: tuple[int, ...], forecast: Step) -> tuple[Any, Any]:
-    """`ModelSteps.in_output`: the forecast of y is F^-1 of the level that is predicted, and its variance s / F'^2.
-
-    phi holds functions of y, with which s grows as fast as the error does. If a reading is far off (``asked``), the
-    error is y - y_hat, and s that of the forecast; otherwise both are the equation's, in units of y.
-    """
+def foreseeing(out: Kind, p: tuple[int, ...], forecast: Step) -> Step:
+    """`ModelSteps.foreseeing`: y - y_hat is F' (y - y_hat) in the equation, and s is that of phi at y_hat."""
     push_one, push_lane = _push(out, p, False), _push(out, p, True)
     trial, bend, at_d, more = p[AT.trial], p[AT.trial_bend], p[AT.d], p[AT.n_out] - 1
 
     @kernel
-    def into(s: State, asked: bool, l: int) -> tuple[float, float, float, float, float]:
-        y, y_hat, e, v, valid = s.y[l], s.y_hat[l], s.e[l], s.s[l], s.valid[l]
+    def foresee(s: State, l: int) -> None:
         if s.y.shape[0] == 1:
             push_one(s.blocks.ctypes.data, 1, 1)
         else:
             push_lane(s.blocks.ctypes.data + 8 * l, s.y.shape[0], 1)
-        expected, slope = s.blocks[NUMBER.predicted, l], abs(s.blocks[bend, l])
-        known, far, unit = abs(expected) < LARGEST, s.blocks[NUMBER.raw, l] - expected, slope if slope > 0.0 else 1.0
-        s.valid[l] = valid if known else 0.0
-        s.e[l], own = e / unit, v
-        if asked & known:
-            for k in range(2):  # at the forecast, and back
+        y_hat, own = s.blocks[NUMBER.predicted, l], 0.0
+        if abs(y_hat) < LARGEST:
+            for back in range(2):
                 for i in range(more):
                     s.phi[at_d + i, l], s.blocks[trial + 1 + i, l] = s.blocks[trial + 1 + i, l], s.phi[at_d + i, l]
                 forecast(s, l)
-                own = s.s[l] if k == 0 else own
-            s.e[l], own = far, own if slope > 0.0 else np.inf
-        s.y[l], s.y_hat[l] = s.blocks[NUMBER.raw, l] if s.observed[l] > 0.0 else 0.0, expected
-        s.s[l] = own / (unit * unit)
-        return y, y_hat, e, v, valid
+                own = own if back else s.s[l]
+            s.y_hat[l], s.s[l] = -s.blocks[trial, l], own
+            s.e[l] = s.blocks[bend, l] * (s.blocks[NUMBER.raw, l] - y_hat)
 
-    @kernel
-    def back(s: State, of_equation: tuple[float, float, float, float, float], l: int) -> None:
-        s.y[l], s.y_hat[l], s.e[l], s.s[l], s.valid[l] = of_equation
-
-    return into, back
+    return foresee  # type: ignore[no-any-return]
 
 
 @lru_cache
