@@ -38,7 +38,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps
+from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import State, Step, kernel, nothing
 from driftfit.engine.phases import forecasting
 from driftfit.engine.settings import Settings, numbers, whole
@@ -193,23 +193,24 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
 
 
 @lru_cache(maxsize=256)
-def forecast_again(tracker: TrackerSteps) -> Step:
-    """The forecast of one lane and its variance once more: no time passes, and no reading is taken in."""
-    usual = forecasting(tracker._replace(predict=nothing))
-    first = usual if tracker.start is None else forecasting(tracker.start._replace(predict=nothing))
-    part, starts = whole_record if tracker.reads_model else tracker_part, tracker.start is not None
+def foreseeing(model: ModelSteps, tracker: TrackerSteps) -> Step | None:
+    """``foresee(s, l)``, y_hat, e and s before y is seen, where phi contains it: by the tracker's forecast once more,
+    while no time passes and no reading is taken in."""
+    start, part = tracker.start or tracker, whole_record if tracker.reads_model else tracker_part
+    usual, first = (forecasting(one._replace(predict=nothing)) for one in (tracker, start))
+    started = tracker.start is not None
 
     @kernel
-    def again(s: State, l: int) -> None:
+    def forecast(s: State, l: int) -> None:
         ok, observed = s.ok[l], s.observed[l]
         s.ok[l], s.observed[l] = 0.0, 0.0
-        if starts and s.root[l] > 0:
+        if started and s.root[l] > 0:
             first(part(s), l)
         else:
             usual(part(s), l)
         s.ok[l], s.observed[l] = ok, observed
 
-    return again  # type: ignore[no-any-return]
+    return model.foreseeing and model.foreseeing(forecast)
 
 
 @lru_cache(maxsize=256)

@@ -295,7 +295,7 @@ def settle_output(s: State, l: int) -> None:
 def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
     """The steps for the compiled bases of the inputs and of the output."""
     regress_one, regress_lane = _regress(into, out, p, False), _regress(into, out, p, True)
-    push_one, push_lane = _push(out, p, False), _push(out, p, True)
+    predict = _predicting(out, p)
     curved, us, inputs, n, more = not p[AT.identity], p[AT.us], p[AT.inputs], p[AT.n], p[AT.n_out] - 1
     now, following, present, at_d = p[AT.now], p[AT.next], p[AT.g_past] + 1, p[AT.d]
 
@@ -321,18 +321,14 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
     def push(s: State, l: int) -> None:
         s.noise[l] = s.blocks[NUMBER.given, l]
         if curved:
-            at, L = 8 * l, s.y.shape[0]
-            if L == 1:
-                push_one(s.blocks.ctypes.data + at, L, 0)
-            else:
-                push_lane(s.blocks.ctypes.data + at, L, 0)
+            predict(s, 0, l)
         s.y_hat[l] = s.blocks[NUMBER.predicted, l]
         settle_output(s, l)
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 
     def ready(L: int) -> None:
-        own = (regress_one, push_one) if L == 1 else (regress_lane, push_lane)
+        own = (regress_one if L == 1 else regress_lane), _push(out, p, L > 1)
         for routine in (*(one[0] for one in into), out[0], *own):
             routine.load()
 
@@ -340,17 +336,29 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
 
 
 @lru_cache
+def _predicting(out: Kind, p: tuple[int, ...]) -> Any:
+    """A kernel (s, slope, l) that calls the routine of ``push``, for one lane or several."""
+    push_one, push_lane = _push(out, p, False), _push(out, p, True)
+
+    @kernel
+    def predict(s: State, slope: int, l: int) -> None:
+        at, L = 8 * l, s.y.shape[0]
+        if L == 1:
+            push_one(s.blocks.ctypes.data + at, L, slope)
+        else:
+            push_lane(s.blocks.ctypes.data + at, L, slope)
+
+    return predict
+
+
+@lru_cache
 def foreseeing(out: Kind, p: tuple[int, ...], forecast: Step) -> Step:
     """`ModelSteps.foreseeing`: y - y_hat is F' (y - y_hat) in the equation, and s is that of phi at y_hat."""
-    push_one, push_lane = _push(out, p, False), _push(out, p, True)
-    trial, bend, at_d, more = p[AT.trial], p[AT.trial_bend], p[AT.d], p[AT.n_out] - 1
+    predict, trial, bend, at_d, more = _predicting(out, p), p[AT.trial], p[AT.trial_bend], p[AT.d], p[AT.n_out] - 1
 
     @kernel
     def foresee(s: State, l: int) -> None:
-        if s.y.shape[0] == 1:
-            push_one(s.blocks.ctypes.data, 1, 1)
-        else:
-            push_lane(s.blocks.ctypes.data + 8 * l, s.y.shape[0], 1)
+        predict(s, 1, l)
         y_hat, own = s.blocks[NUMBER.predicted, l], 0.0
         if abs(y_hat) < LARGEST:
             for back in range(2):
