@@ -239,7 +239,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
     if gate is None:
         between = ungated(phases, part)
     else:
-        between, model = gated(*phases, gate, part, model), model._replace(regress=raw_kept(model.regress))
+        between, model = gated(phases[0], phases[1], gate, part, model), model._replace(regress=raw_kept(model.regress))
     sample = _sample(model, tracker.note, between, part)
     keep_more = covariance if keep == "cov" else nothing_more
     common = nothing_common if keep == "own" else write_common

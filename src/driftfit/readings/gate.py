@@ -194,11 +194,9 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
 
 @lru_cache(maxsize=256)
 def foreseeing(model: ModelSteps, tracker: TrackerSteps) -> Step | None:
-    """``foresee(s, l)``, y_hat, e and s before y is seen, where phi contains it: by the tracker's forecast once more,
-    while no time passes and no reading is taken in."""
-    start, part = tracker.start or tracker, whole_record if tracker.reads_model else tracker_part
-    usual, first = (forecasting(one._replace(predict=nothing)) for one in (tracker, start))
-    started = tracker.start is not None
+    """`ModelSteps.foreseeing` with the tracker's forecast once more: no time passes, and no reading is taken in."""
+    started, part = tracker.start is not None, whole_record if tracker.reads_model else tracker_part
+    usual, first = (forecasting(one._replace(predict=nothing)) for one in (tracker, tracker.start or tracker))
 
     @kernel
     def forecast(s: State, l: int) -> None:
