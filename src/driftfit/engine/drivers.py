@@ -338,8 +338,7 @@ def _written(common: Any, store: Any, keep_more: Any, part: Any) -> Any:
 
 def _sample(model: ModelSteps, note: Step, between: Any, part: Any) -> Any:
     """One sample of all lanes, whose signals and known factors are in the record; ``between`` is what the tracker and
-    the gate do between the regression and the lags.
-    """
+    the gate do between the regression and the lags."""
     regress, push = model.regress, model.push
 
     @kernel

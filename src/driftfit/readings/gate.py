@@ -129,9 +129,8 @@ def usual_rule(clip: float, lends: bool) -> Callable[[State, bool, bool, float, 
             s.gate_mean[l] += share * off
             s.gate_variance[l] += share * ((1.0 - share) * off * off - spread)
         if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
-            e2 = s.e[l] * s.e[l]
             # a start may claim any precision for a sample, but the first errors are all there is where none is claimed
-            e2 = e2 if lends & (not known) else min(e2, clip * v)
+            e2 = min(s.e[l] * s.e[l], np.inf if lends & (not known) else clip * v)
             s.gate_ratio[l] += share * (e2 / own - s.gate_ratio[l])
             s.gate_settled[l] = min(v, GROWTH * s.gate_settled[l]) if known else np.inf
 
