@@ -34,7 +34,10 @@ TIMES = re.compile(r"\s*(Milli|Micro|Nano)?seconds\b", re.I)
 CLOCKS = re.compile(
     r"\b(perf_counter|process_time|peak_memory|getrusage|records_of|cppcheck|SparkSession|VmRSS)\b|--data"
 )
-SAMPLED = ("coarse_coverage", "coverage_of_models", "diagnose_constancy", "event_dates", "smoothing_coverage")
+SAMPLED = (
+    "coarse_coverage", "coverage_of_models", "curved_outputs", "diagnose_constancy", "event_dates",
+    "smoothing_coverage",
+)  # fmt: skip
 """Benchmarks of which ``--quick`` prints rows of the page, in a few seconds; others have fewer records then."""
 
 
