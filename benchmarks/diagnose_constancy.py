@@ -80,6 +80,6 @@ def main(
 
 if __name__ == "__main__":
     if "--quick" in sys.argv:
-        main(2, (200,), ("constant",))
+        main(lengths=(200,), trackers=("constant",))
     else:
         main(*map(int, sys.argv[1:2]))

@@ -5,7 +5,7 @@ bands less than 80 % of the path lies: with a slow walk a record can look as if 
 
 The second table is for other paths of two parameters, 800 samples: the error of the smoothed path, that of the filter,
 the coverage of the smoothed bands, and the share of records in which slopes walk instead of levels.
-Run: python benchmarks/smoothing_coverage.py [records, 200 by default] [--quick]
+Run: python benchmarks/smoothing_coverage.py [records, 200 by default] [--quick, a row]
 """
 
 import sys
@@ -49,9 +49,9 @@ def path(kind: str, rng: np.random.Generator, T: int = 800) -> np.ndarray:
     return 1.0 + np.cumsum({"walk": 0.02, "constant": 0.0, "jumps": jump}[kind] * steps, axis=0)
 
 
-def shapes(records: int) -> None:
+def shapes(kinds: tuple[str, ...] = KINDS, records: int = 40) -> None:
     print(f"{'':20} {'smoothed':>9} {'filtered':>9} {'in band':>8} {'slopes':>7}")
-    for kind in KINDS:
+    for kind in kinds:
         rows = []
         for seed in range(records):
             rng = np.random.default_rng([seed, *kind.encode()])
@@ -67,6 +67,8 @@ def shapes(records: int) -> None:
 
 
 if __name__ == "__main__":
-    quick = "--quick" in sys.argv
-    main(*([2] if quick else (int(given) for given in sys.argv[1:2])))
-    shapes(2 if quick else 40)
+    if "--quick" in sys.argv:
+        shapes(KINDS[:1])
+    else:
+        main(*map(int, sys.argv[1:2]))
+        shapes()

@@ -1,11 +1,12 @@
 """What the pages of the docs show, compared with what their scripts print: a page that no longer holds fails.
 
-    python -m lab pages           # a sample of the rows of each reproduction, and the examples, as the tests do
-    python -m lab pages --full    # all rows, in half an hour
+    python -m lab pages           # a sample of the rows of each script, and the examples, as the tests do
+    python -m lab pages --full    # all rows, in half an hour, and those of all benchmarks, in hours
 
 A text block right after "Printed by `examples/NAME.py`:" is all that this example prints. A text block after
-`python -m lab reproduce NAME`, and before another script is named, is a part of what that reproduction prints, unless
-a Python block precedes it, which prints it. Tables of times, whose titles begin with their unit, are not compared.
+`python -m lab reproduce NAME` or a benchmark, and before another script is named, is a part of what that script prints,
+unless a Python block precedes it, which prints it. Tables of times, whose titles begin with their unit, and benchmarks
+that read a clock or records that are no part of the project are not compared.
 """
 
 from __future__ import annotations
@@ -30,6 +31,21 @@ PARTS = re.compile(
     r"```(\w*)\n(.*?)```|`(?:python\s)?((?:-m\s(?:lab\s(?!pages)|benchmarks)|examples/|benchmarks/)[^`]*)`", re.S
 )
 TIMES = re.compile(r"\s*(Milli|Micro|Nano)?seconds\b", re.I)
+CLOCKS = re.compile(
+    r"\b(perf_counter|process_time|peak_memory|getrusage|records_of|cppcheck|SparkSession|VmRSS)\b|--data"
+)
+SAMPLED = (
+    "coarse_coverage", "coverage_of_models", "curved_outputs", "diagnose_constancy", "event_dates",
+    "smoothing_coverage",
+)  # fmt: skip
+"""Benchmarks of which ``--quick`` prints rows of the page, in a few seconds; others have fewer records then."""
+
+
+def name_of(command: str) -> str:
+    """The module of a benchmark whose rows are the same on any computer; nothing for other commands."""
+    found = re.match(r"(?:-m benchmarks\.|benchmarks/)(\w+)", command)
+    path = ROOT / "benchmarks" / f"{found[1]}.py" if found else ROOT
+    return found[1] if found and path.is_file() and not CLOCKS.search(path.read_text(encoding="utf-8")) else ""
 
 
 def shown() -> dict[str, list[str]]:
@@ -43,7 +59,8 @@ def shown() -> dict[str, list[str]]:
                 kind, end = ("named" if text[: part.start()].split()[-2:] == ["Printed", "by"] else ""), part.end()
                 continue
             between = text[end : part.start()].strip()
-            own = command.startswith("-m lab reproduce ") and not (kind == "python" and not between)
+            own = command.startswith("-m lab reproduce ") or bool(name_of(command))
+            own = own and not (kind == "python" and not between)
             if part[1] == "text" and (own or (command.startswith("examples/") and (kind, between) == ("named", ":"))):
                 found.setdefault(command, []).append(part[2])
             kind, end = part[1], part.end()
@@ -59,10 +76,13 @@ def rows(text: str) -> list[str]:
 
 def printed(command: str, quick: bool) -> str:
     """What a script prints, all of it or, of a reproduction, a sample."""
-    text = io.StringIO()
-    with contextlib.redirect_stdout(text), patch.object(sys, "argv", [command]):
-        if command.startswith("examples/"):
-            runpy.run_path(str(ROOT / command), run_name="__main__")
+    text, given = io.StringIO(), command.split()[1 + command.startswith("-m") :]
+    argv = [command, *given, *(["--quick"] if quick else [])] if name_of(command) else [command]
+    folder = patch.object(sys, "path", [str(ROOT / "benchmarks"), *sys.path])
+    with contextlib.redirect_stdout(text), patch.object(sys, "argv", argv), folder, contextlib.suppress(SystemExit):
+        if command.startswith("examples/") or name_of(command):
+            path = f"benchmarks/{name_of(command)}.py" if name_of(command) else command
+            runpy.run_path(str(ROOT / path), run_name="__main__")
         else:
             import_module(f"lab.reproduce.{command.split()[-1].replace('-', '_')}").main(quick=quick)
     return text.getvalue()
@@ -83,7 +103,7 @@ def differences(text: str, blocks: Sequence[str], sample: bool) -> list[str]:
 
 def compared(command: str, quick: bool = True) -> list[str]:
     """The differences between what a script prints and the pages."""
-    return differences(printed(command, quick), shown()[command], quick and command.startswith("-m lab"))
+    return differences(printed(command, quick), shown()[command], quick and not command.startswith("examples/"))
 
 
 def show(
@@ -91,7 +111,8 @@ def show(
     only: Annotated[str, typer.Option(help="Only scripts whose command contains this.")] = "",
 ) -> None:
     """Compare the pages of the docs with what their scripts print."""
-    found = {command: compared(command, not full) for command in shown() if only in command}
+    asked = (command for command in shown() if full or name_of(command) in ("", *SAMPLED))
+    found = {command: compared(command, not full) for command in asked if only in command}
     out = Console(width=200, highlight=False)
     for command, lines in found.items():
         out.print(f"{command}: {len(lines) or 'no'} differences", *lines, sep="\n", markup=False)

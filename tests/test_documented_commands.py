@@ -19,6 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 from driftfit.cli import app
+from lab import pages
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -111,6 +112,9 @@ def test_benchmarks_run_quickly(command, monkeypatch):
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         runpy.run_path(str(ROOT / script), run_name="__main__")
     assert printed.getvalue().strip()
+    own = command.removeprefix("python ")
+    if pages.name_of(own) in pages.SAMPLED:
+        assert pages.differences(printed.getvalue(), pages.shown()[own], sample=True) == []
 
 
 @pytest.mark.parametrize("command", of_kind("record"))

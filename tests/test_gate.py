@@ -8,8 +8,8 @@ import pytest
 from benchmarks.gate import NAMES, Bench, measured
 from benchmarks.gate_cases import AT, CODES, LEVEL, MODELS, REAL, STARTS, honest, level_50, record
 from driftfit.readings.gate import INPUT, REFUSED, SIGNAL, USED, Gate
-from driftfit.readings.left_out import counts, floor_remark, remarks, ungated
-from driftfit.readings.screen import Review, screen
+from driftfit.readings.left_out import floor_remark
+from driftfit.readings.screen import screen
 
 SEEDS = range(10)
 TRACKERS = range(len(NAMES))
@@ -145,20 +145,6 @@ def test_the_floor_of_a_coarse_meter(quantum, noise, floor):
 def looked_at(case):
     whole = np.array([0]), np.array([len(case.y)])
     return any(screen(signal, *whole).any() for signal in (case.y, *case.u.T))
-
-
-@pytest.mark.parametrize("s", [0.01, np.nan])
-def test_codes_of_a_run_without_a_gate_are_listed(s):
-    """Also for a tracker without a variance, which is lent the mean of e^2."""
-    case = CODES["9999 for 8"](np.random.default_rng(0))
-    case.u[400] = -999.0
-    assert looked_at(case)
-    y_hat = case.theta[:, 0] * np.where(case.u[:, 0] == -999.0, -999.0, case.u[:, 0]) + case.theta[:, 1]
-    reason = Review(Gate(), 1, 0, np.isnan(s))(case.y, case.u, y_hat, np.full(600, s), np.ones(600, bool))
-    assert counts(reason)[REFUSED] + counts(reason).get(2, 0) == 8
-    assert reason[400] == INPUT + SIGNAL
-    assert "far outside" in remarks(counts(reason))[0][1]
-    assert "8 values look like fault codes (9999)" in ungated({"y": case.y[case.bad].tolist()}, linear=True)
 
 
 @pytest.mark.parametrize("make", [honest("tails"), honest("steps"), level_50(honest("t3", LEVEL))])

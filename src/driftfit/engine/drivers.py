@@ -67,11 +67,13 @@ class ModelSteps(NamedTuple):
     """The steps of a model: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags.
 
     ``ready(L)`` loads the routines that they call by symbol, before a tile of L lanes is driven for the first time.
+    ``foreseeing(forecast)``, where phi contains y, is the step that writes y_hat, e and s before y is seen, for a gate.
     """
 
     regress: Step
     push: Step
     ready: Callable[[int], None] = no_preparation
+    foreseeing: Callable[[Step], Step] | None = None
 
 
 @kernel
@@ -153,16 +155,15 @@ class TrackerSteps(NamedTuple):
     (`driftfit.trackers.parts.diffuse`); those with ``take_over``, which makes their state from theta and P, also take a
     sample whose ``h`` is above `WIDE` times its noise. ``machines`` are the routines that steps call by symbol.
     ``store(o, s, l)`` copies what the tracker's ``outputs`` name from the record ``s`` to the stored record ``o``.
-    ``read_extra(s, known, t, l)`` reads the extra columns of ``known``, those after
-    interval, noise and drift, for trackers that take more factors. ``store_for_smoother(o, s, l)`` copies the tracker's
-    ``smoother_fields`` when a run is replayed for a smoother. With ``doubts`` the model weighs lags that the tracker
-    doubts; with ``instruments`` a model that has its own writes them to s.zeta (n,), a field of the tracker. Steps see
-    the fields of the tracker and those that every record has but for ``u``, so that they are compiled once for all
-    models (`driftfit.engine.tracker_part`); with ``reads_model`` they see those of the model too. ``outlined`` steps
-    are compiled apart from the drivers, which call them (`driftfit.engine.outlined`): for trackers that take so long
-    that a call costs nothing; ``start`` always is. With ``learns_scale`` s.scale is the noise variance that the
-    tracker estimates, which a gate keeps above that of the rounding of a coarse meter. ``note`` comes before all of
-    them and may write what they change later.
+    ``read_extra(s, known, t, l)`` reads the extra columns of ``known``, those after interval, noise and drift, for
+    trackers that take more factors. ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when a run
+    is replayed for a smoother. With ``doubts`` the model weighs lags that the tracker doubts; with ``instruments`` a
+    model that has its own writes them to s.zeta (n,), a field of the tracker. Steps see the fields of the tracker and
+    those that every record has but for ``u``, so that they are compiled once for all models
+    (`driftfit.engine.tracker_part`); with ``reads_model`` they see those of the model too. ``outlined`` steps are
+    compiled apart from the drivers, which call them (`driftfit.engine.outlined`): for trackers that take so long that a
+    call costs nothing; ``start`` always is. With ``learns_scale`` s.scale is the noise variance that the tracker
+    estimates, which a gate keeps above that of rounding. ``note`` comes first and may write what they change later.
     """
 
     predict: Step
@@ -202,8 +203,7 @@ class Drivers(NamedTuple):
     update_one: Any
 
     def updater(self, tile: Array, m: int) -> Any:
-        """The entry point for one sample of tiles of this type: ``f(as_compiled(tile), y, u)``, u as `one_or_all`
-        gives it.
+        """The entry point of one sample of tiles of this type: ``f(as_compiled(tile), y, u)``, u from `one_or_all`.
 
         A number is read faster than an array, and a model of one input needs no second routine for arrays.
         """
@@ -239,7 +239,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
     if gate is None:
         between = ungated(phases, part)
     else:
-        between, model = gated(phases[0], gate, phases[1], part), model._replace(regress=raw_kept(model.regress))
+        between, model = gated(phases[0], phases[1], gate, part, model), model._replace(regress=raw_kept(model.regress))
     sample = _sample(model, tracker.note, between, part)
     keep_more = covariance if keep == "cov" else nothing_more
     common = nothing_common if keep == "own" else write_common
@@ -338,9 +338,8 @@ def _written(common: Any, store: Any, keep_more: Any, part: Any) -> Any:
 
 def _sample(model: ModelSteps, note: Step, between: Any, part: Any) -> Any:
     """One sample of all lanes, whose signals and known factors are in the record; ``between`` is what the tracker and
-    the gate do between the regression and the lags.
-    """
-    regress, push, _ = model
+    the gate do between the regression and the lags."""
+    regress, push = model.regress, model.push
 
     @kernel
     def sample(s: State) -> None:

@@ -216,7 +216,7 @@ def ungated(phases: tuple[Any, ...], part: Any) -> Any:
     return between
 
 
-def gated(look: Any, gate: Step, learn: Any, part: Any) -> Any:
+def gated(look: Any, learn: Any, gate: Step, part: Any, model: Any) -> Any:
     """The steps of a tracker with a gate, which sees the inputs and the memory of the model too."""
 
     @partial(kernel, inline=False)
@@ -225,7 +225,7 @@ def gated(look: Any, gate: Step, learn: Any, part: Any) -> Any:
             s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
             gate(s, l)
 
-    judged = outlined(judge)
+    judged = judge if model.foreseeing else outlined(judge)
 
     @kernel
     def between(s: State) -> None:

@@ -38,8 +38,11 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import State, Step, kernel
+from driftfit.engine.drivers import ModelSteps, TrackerSteps
+from driftfit.engine.kernel import State, Step, kernel, nothing
+from driftfit.engine.phases import forecasting
 from driftfit.engine.settings import Settings, numbers, whole
+from driftfit.engine.tracker_part import tracker_part, whole_record
 from driftfit.readings.first_samples import first_samples, no_samples
 from driftfit.readings.inputs import input_rules, no_inputs
 from driftfit.readings.repeats import BELIEVED, frozen_rule, no_repeats, reading, repeats_by_nature, resolution
@@ -126,9 +129,8 @@ def usual_rule(clip: float, lends: bool) -> Callable[[State, bool, bool, float, 
             s.gate_mean[l] += share * off
             s.gate_variance[l] += share * ((1.0 - share) * off * off - spread)
         if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
-            e2 = s.e[l] * s.e[l]
             # a start may claim any precision for a sample, but the first errors are all there is where none is claimed
-            e2 = e2 if lends & (not known) else min(e2, clip * v)
+            e2 = min(s.e[l] * s.e[l], np.inf if lends & (not known) else clip * v)
             s.gate_ratio[l] += share * (e2 / own - s.gate_ratio[l])
             s.gate_settled[l] = min(v, GROWTH * s.gate_settled[l]) if known else np.inf
 
@@ -190,23 +192,43 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
 
 
 @lru_cache(maxsize=256)
+def foreseeing(model: ModelSteps, tracker: TrackerSteps) -> Step | None:
+    """`ModelSteps.foreseeing` with the tracker's forecast once more: no time passes, and no reading is taken in."""
+    started, part = tracker.start is not None, whole_record if tracker.reads_model else tracker_part
+    usual, first = (forecasting(one._replace(predict=nothing)) for one in (tracker, tracker.start or tracker))
+
+    @kernel
+    def forecast(s: State, l: int) -> None:
+        ok, observed = s.ok[l], s.observed[l]
+        s.ok[l], s.observed[l] = 0.0, 0.0
+        if started and s.root[l] > 0:
+            first(part(s), l)
+        else:
+            usual(part(s), l)
+        s.ok[l], s.observed[l] = ok, observed
+
+    return model.foreseeing and model.foreseeing(forecast)
+
+
+@lru_cache(maxsize=256)
 def gate_step(
     gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False,
-    lends: bool = False,
+    lends: bool = False, foresee: Step | None = None,
 ) -> Step:  # fmt: skip
     """The gate of a model with n parameters and m inputs, of which it remembers ``ages`` samples besides the present.
 
     ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
     memory. The regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be
-    as large as predicted. There y is compared with the usual readings alone. With ``lends`` the mean of e^2 takes the
-    place of s, which the tracker does not have.
+    as large as predicted. There ``foresee(s, l)`` writes y_hat, e and s before a far reading is seen. With ``lends``
+    the mean of e^2 takes the place of s, which the tracker does not have.
     """
     remember = first_samples(ages, implicit)
     notice, blame = input_rules(gate, ages, refuse)
     hold_frozen = frozen_rule(gate.frozen)
-    judge = output_rule(replace(gate, rare=np.inf) if implicit else gate)
+    judge = output_rule(replace(gate, rare=np.inf) if implicit and foresee is None else gate)
     resolve = resolution(gate.coarse)
     sure, rare, least = float(gate.sure) ** 2, float(gate.rare) ** 2, 0.0 if lends else 1.0
+    far, curved, look = float(gate.far) ** 2, foresee is not None, foresee or nothing
     learn = usual_rule(sure, lends)
 
     @kernel
@@ -215,7 +237,10 @@ def gate_step(
         seen = s.observed[l] > 0.0
         remember(s, l)
         notice(s, s.gate_count[l] >= FIRST, l)
-        off, own = reading(s, l) - s.gate_mean[l], 1.0 if lends else s.s[l]
+        off, y_hat, e, variance = reading(s, l) - s.gate_mean[l], s.y_hat[l], s.e[l], s.s[l]
+        if curved and off * off > far * s.gate_variance[l]:
+            look(s, l)
+        own = 1.0 if lends else s.s[l]
         v = own * max(s.gate_ratio[l], least)
         contradicts = (s.ok[l] > 0.0) & (s.e[l] * s.e[l] > sure * v)
         signal = blame(s, contradicts, off * off <= rare * s.gate_variance[l], l) if s.ok[l] > 0.0 else 0
@@ -229,5 +254,6 @@ def gate_step(
         resolve(s, l)
         s.gate_before[l] = reading(s, l) if seen else s.gate_before[l]
         learn(s, seen, contradicts, own, v, l)
+        s.y_hat[l], s.e[l], s.s[l] = y_hat, e, variance
 
     return step  # type: ignore[no-any-return]

@@ -1,22 +1,15 @@
 """Codes in the record of a run that had no gate: said afterwards, because such a run uses whatever it is given.
 
-`screen` is one vectorised look at a signal of all series. Where it and `suspect` find something, `Review` runs the
-gate's step over the finished record, with the forecasts and variances of that run, and lists what a gate would have
-refused. A run that was spoilt by one code may say little of later ones. Before there is a run, `apart` finds codes in a
-complete record.
+`screen` is one vectorised look at a signal of all series. Where it and `suspect` find something, the record is run once
+more with a gate, and what that leaves out is said. Before there is a run, `apart` finds codes in a complete record.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, Driver, State, kernel
-from driftfit.engine.tiles import make_tile
-from driftfit.readings.gate import Gate, gate_step, start
+from driftfit.engine.kernel import Array
 
 SUSPECT = 30.0
 """Usual distances from the median beyond which a value may be a code."""
@@ -93,40 +86,3 @@ def _middle(rows: Array) -> Array:
     """The lower median of each row (K, N), NaN left out; NaN if there is nothing else."""
     known = np.sum(np.isfinite(rows), axis=1)
     return np.asarray(np.sort(rows, axis=1)[np.arange(len(rows)), np.maximum(known - 1, 0) // 2])
-
-
-@kernel
-def nothing_refused(s: State, signal: int, age: int, l: int) -> None:
-    """The memory of a model that ran already."""
-
-
-class Review:
-    """The gate's step over finished records with m inputs, of which the model remembered ``ages`` samples; ``lends`` as
-    for `gate_step`."""
-
-    def __init__(self, gate: Gate, m: int, ages: int, lends: bool) -> None:
-        gate = replace(gate, first=0)
-        self._start = start(gate, 0, m)
-        step = gate_step(gate, 0, m, ages, nothing_refused, lends=lends)
-
-        def review(tile: Any, y: Any, u: Any, y_hat: Any, s: Any, valid: Any, reason: Any) -> None:
-            of, l = tile[0], 0
-            for t in range(len(y)):
-                for j in range(u.shape[1]):
-                    of.u[j, l] = u[t, j]
-                of.observed[l] = 1.0 if abs(y[t]) < np.inf else 0.0
-                of.y[l] = y[t] if abs(y[t]) < np.inf else 0.0
-                of.valid[l] = 1.0 if valid[t] else 0.0
-                of.ok[l] = of.observed[l] * of.valid[l]
-                of.y_hat[l], of.e[l], of.s[l] = y_hat[t], of.y[l] - y_hat[t], s[t]
-                step(of, l)
-                reason[t] = of.reason[l]
-
-        self._review = Driver(review)
-
-    def __call__(self, y: Array, u: Array, y_hat: Array, s: Array, valid: Array) -> Array:
-        """Reasons (T,), given readings y (T,), inputs u (T, m), forecasts and their variances (T,), and whether there
-        was a forecast (T,)."""
-        tile, reason = make_tile(0, u.shape[1], {}, [self._start]), np.zeros(len(y), np.int64)
-        self._review(tile, y, u, np.where(valid, y_hat, 0.0), s, valid, reason)
-        return reason

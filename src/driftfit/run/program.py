@@ -26,7 +26,7 @@ from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, outpu
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.readings.first_samples import First, replayed
-from driftfit.readings.gate import AT_START, SIGNAL, Gate, gate_step
+from driftfit.readings.gate import AT_START, SIGNAL, Gate, foreseeing, gate_step
 from driftfit.readings.gate import start as gate_start
 from driftfit.run.columns import COLLECTED, collecting, put_columns
 from driftfit.run.gating import gate_of, without_start
@@ -224,11 +224,11 @@ class Program:
         """The compiled loops; ``steps`` replace the tracker's own, to inspect the run."""
         found = self._drivers.get((keep, steps))
         if found is None:
-            model, own = self.model, self.steps if steps is None else steps
-            gate = None
+            model, own, gate = self.model, self.steps if steps is None else steps, None
             if self.gate is not None:
                 ages, refuse, lends = model.input_memory, model.refuse, not self.tracker.covariance
-                gate = gate_step(self.gate, model.n, model.m, ages, refuse, model.implicit, lends)
+                foresee = None if self.tracker.output_error else foreseeing(model.steps_for(self.steps), own)
+                gate = gate_step(self.gate, model.n, model.m, ages, refuse, model.implicit, lends, foresee)
             found = drivers(model.steps_for(self.steps), own, keep, gate)
             if gate is not None:
                 found = found._replace(run=partial(self._decided, found.run))

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -24,9 +23,9 @@ from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
-from driftfit.readings.gate import INPUT, REFUSED, SIGNAL, USED, Gate
+from driftfit.readings.gate import AT_START, REFUSED, USED, Gate
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, ungated
-from driftfit.readings.screen import Review, apart, screen, suspect
+from driftfit.readings.screen import screen, suspect
 from driftfit.run.fleet import Fleet, run_fleet
 from driftfit.run.gating import gate_of
 from driftfit.run.keyed_results import KeyedResults
@@ -47,8 +46,6 @@ BYTES_AT_ONCE = 16_000_000
 """Bytes of results that `parts` holds at a time; a table of them and the writer of Parquet take some six times as much.
 With four times as many a series costs a quarter more, in memory that the process touches for the first time.
 """
-START_SAMPLES = 100
-"""Samples among which codes may be the first that a run has."""
 
 Result = Track | Fleet | Outputs
 """The result of `track`, which depends on the number of series, of settings and of outputs."""
@@ -284,23 +281,20 @@ def warn_of_codes(verb: str, runs: Iterable[Track]) -> None:
 
 
 def _codes(run: Track) -> dict[str, list[float]]:
-    """The values of each signal of a run without a gate that one would have refused."""
-    model = run.program.model
+    """The values of each signal of a run without a gate that a run with one leaves out."""
     y, u = (np.where(np.abs(x) < LARGEST, x, np.nan) for x in (run.record.y, run.record.u))
-    strange = [suspect(signal) for signal in u.T]
-    if not (suspect(y).any() or any(one.any() for one in strange)):
+    strange = [suspect(signal) for signal in (y, *u.T)]
+    if not any(one.any() for one in strange):
         return {}
-    e, s, y_hat = (run.in_rows(name).astype(float) for name in ("e", "s", "y_hat"))
-    y_hat = np.where(np.isfinite(e), y - e, y_hat) if model.implicit else y_hat
-    begun = _codes_at_start(run, y, np.any([np.zeros(len(y), bool), *strange], axis=0))
-    y, early = np.where(begun, np.nan, y), y[begun]
-    reason = _review(model.m, model.input_memory, not run.tracker.covariance)(y, u, y_hat, s, np.isfinite(y_hat))
-    blamed = np.flatnonzero(reason % SIGNAL == INPUT)[:, None] - np.arange(model.input_memory + 1)
-    names = run.labels.u or run.program.signals[1:]
-    entered = (reason == REFUSED) & ~_begins_change(y, reason) & (run.ok | np.isnan(y_hat))
-    found = {run.labels.y: np.append(early, y[entered])}
-    for name, signal, mark in zip(names, u.T, strange, strict=True):
-        found[name] = signal[np.intersect1d(blamed, np.flatnonzero(mark))]
+    left = track_record(replace(run.program, gate=Gate()), run.record).left_out
+    of_y, reason = left.signal == run.program.signals[0], np.full(len(y), USED)
+    reason[left.sample[of_y]] = left.code[of_y]
+    entered = (reason == REFUSED) | (reason == AT_START) & strange[0]
+    found = {run.labels.y: y[entered & ~_begins_change(y, reason) & (run.ok | np.isnan(run.prediction))]}
+    labels = run.labels.u or run.program.signals[1:]
+    for name, label, signal, mark in zip(run.program.signals[1:], labels, u.T, strange[1:], strict=True):
+        blamed = left.sample[left.signal == name][:, None] - np.arange(run.program.model.input_memory + 1)
+        found[label] = signal[np.intersect1d(blamed, np.flatnonzero(mark))]
     return {name: values.tolist() for name, values in found.items() if len(values)}
 
 
@@ -308,21 +302,6 @@ def _begins_change(y: Array, reason: Array) -> Array:
     """Which readings (T,) are the first one or two of a change: the next is as strange, differs, and is believed."""
     change = np.append((reason == USED)[1:] & suspect(y)[1:] & (np.diff(y) != 0.0), False)
     return np.asarray(change | np.append((change & (reason == REFUSED))[1:], False))
-
-
-def _codes_at_start(run: Track, y: Array, strange: Array) -> Array:
-    """Which of the first readings (T,), of which a run knows little, are `apart` from all others; those after a
-    ``strange`` input may be responses to it."""
-    if run.start is not None:
-        return np.zeros(len(y), bool)
-    first = np.arange(len(y)) < START_SAMPLES
-    return np.asarray(apart(y) & first & ~np.logical_or.accumulate(strange))
-
-
-@lru_cache
-def _review(m: int, ages: int, lends: bool) -> Review:
-    """The gate for finished records, which is compiled once."""
-    return Review(Gate(), m, ages, lends)
 
 
 def warn_unlearned(run: Track | KeyedResults) -> None:

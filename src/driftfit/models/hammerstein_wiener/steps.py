@@ -17,7 +17,7 @@ SIMD vectors directly afterwards, the processor would have to wait until all wri
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -267,13 +267,20 @@ def _regress(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...], lanes: bool)
 
 @lru_cache
 def _push(out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
-    """The compiled routine of ``push``: it predicts if no other step needed the prediction before."""
+    """The compiled routine of ``push``: it predicts if no other step needed the prediction before. With ``slope`` it
+    also writes the functions of the output at the prediction to ``trial``, and F' there to ``trial_bend``.
+    """
     refine, orders, rows = refining(out), np.array(p), room(p)
+    output_at = values_of(out, AT.out, AT.curve, AT.n_out)
 
-    def machine_push(blocks: int, L: int) -> None:
-        m = floats(blocks, rows, L if lanes else 1)
+    def machine_push(blocks: int, L: int, slope: int) -> None:
+        m, bend, d = floats(blocks, rows, L if lanes else 1), orders[AT.trial_bend], orders[AT.d_now]
         if m[NUMBER.late, 0] > 0.0:
-            m[NUMBER.predicted, 0] = refine(m, orders, m[NUMBER.predicted, 0])
+            m[NUMBER.predicted, 0], m[NUMBER.late, 0] = refine(m, orders, m[NUMBER.predicted, 0]), 0.0
+        if slope > 0:
+            output_at(m, orders, m[NUMBER.predicted, 0], orders[AT.trial], bend)
+            for k in range(1, orders[AT.n_out]):
+                m[bend, 0] += m[d + k, 0] * m[bend + k, 0]
 
     return machine(machine_push)
 
@@ -288,7 +295,7 @@ def settle_output(s: State, l: int) -> None:
 def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
     """The steps for the compiled bases of the inputs and of the output."""
     regress_one, regress_lane = _regress(into, out, p, False), _regress(into, out, p, True)
-    push_one, push_lane = _push(out, p, False), _push(out, p, True)
+    predict = _predicting(out, p)
     curved, us, inputs, n, more = not p[AT.identity], p[AT.us], p[AT.inputs], p[AT.n], p[AT.n_out] - 1
     now, following, present, at_d = p[AT.now], p[AT.next], p[AT.g_past] + 1, p[AT.d]
 
@@ -314,22 +321,55 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
     def push(s: State, l: int) -> None:
         s.noise[l] = s.blocks[NUMBER.given, l]
         if curved:
-            at, L = 8 * l, s.y.shape[0]
-            if L == 1:
-                push_one(s.blocks.ctypes.data + at, L)
-            else:
-                push_lane(s.blocks.ctypes.data + at, L)
+            predict(s, 0, l)
         s.y_hat[l] = s.blocks[NUMBER.predicted, l]
         settle_output(s, l)
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 
     def ready(L: int) -> None:
-        own = (regress_one, push_one) if L == 1 else (regress_lane, push_lane)
+        own = (regress_one if L == 1 else regress_lane), _push(out, p, L > 1)
         for routine in (*(one[0] for one in into), out[0], *own):
             routine.load()
 
-    return ModelSteps(regress, push, ready)
+    return ModelSteps(regress, push, ready, partial(foreseeing, out, p) if curved else None)
+
+
+@lru_cache
+def _predicting(out: Kind, p: tuple[int, ...]) -> Any:
+    """A kernel (s, slope, l) that calls the routine of ``push``, for one lane or several."""
+    push_one, push_lane = _push(out, p, False), _push(out, p, True)
+
+    @kernel
+    def predict(s: State, slope: int, l: int) -> None:
+        at, L = 8 * l, s.y.shape[0]
+        if L == 1:
+            push_one(s.blocks.ctypes.data + at, L, slope)
+        else:
+            push_lane(s.blocks.ctypes.data + at, L, slope)
+
+    return predict
+
+
+@lru_cache
+def foreseeing(out: Kind, p: tuple[int, ...], forecast: Step) -> Step:
+    """`ModelSteps.foreseeing`: y - y_hat is F' (y - y_hat) in the equation, and s is that of phi at y_hat."""
+    predict, trial, bend, at_d, more = _predicting(out, p), p[AT.trial], p[AT.trial_bend], p[AT.d], p[AT.n_out] - 1
+
+    @kernel
+    def foresee(s: State, l: int) -> None:
+        predict(s, 1, l)
+        y_hat, own = s.blocks[NUMBER.predicted, l], 0.0
+        if abs(y_hat) < LARGEST:
+            for back in range(2):
+                for i in range(more):
+                    s.phi[at_d + i, l], s.blocks[trial + 1 + i, l] = s.blocks[trial + 1 + i, l], s.phi[at_d + i, l]
+                forecast(s, l)
+                own = own if back else s.s[l]
+            s.y_hat[l], s.s[l] = -s.blocks[trial, l], own
+            s.e[l] = s.blocks[bend, l] * (s.blocks[NUMBER.raw, l] - y_hat)
+
+    return foresee  # type: ignore[no-any-return]
 
 
 @lru_cache
