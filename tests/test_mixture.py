@@ -59,7 +59,7 @@ def test_the_table_of_modes():
     modes = table(4, None)
     assert len(modes["ratio"]) == 15 + 3 * 4
     assert modes["start"].sum() == pytest.approx(1.0)
-    assert modes["arrive"][modes["ratio"] >= 1.0].sum() == pytest.approx(2.5e-3)
+    assert modes["arrive"][modes["ratio"] >= 1.0].sum() == pytest.approx(2e-3)
     assert modes["first"].tolist() == [15, 18, 21, 24]
     assert (modes["ratio"][: len(COMMON)] == COMMON).all()
     assert len(table(9, None)["ratio"]) == len(table(1, None)["ratio"]) == 15

@@ -116,9 +116,7 @@ PIECES: dict[str, Piece] = {
         edits=((LEARNED, "share = t[N + 6 * best, best] / positive if sound else 0.0", "share = 0.0"),),
         functions=of(LEARNED, "whitened", "rotate", "turn"),
     ),
-    "arrivals in all modes": Piece(
-        edits=((STATES, "\nJUMP, DRIFT = 2.5e-3, 3e-4\n", "\nJUMP, DRIFT = 2.5e-3, 1e-9\n"),)
-    ),
+    "arrivals in all modes": Piece(edits=((STATES, "\nJUMP, DRIFT = 2e-3, 6e-4\n", "\nJUMP, DRIFT = 2e-3, 1e-9\n"),)),
     "down the ladders": Piece(edits=((STATES, "\nDOWN, AFTER = 1e-3, 0.05\n", "\nDOWN, AFTER = 0.0, 0.05\n"),)),
     "jumps of any size": Piece(
         edits=((BANK, "    unusual = (size > 0.0) &", "    unusual = (size < 0.0) &"),), functions=of(BANK, "leap")

@@ -70,6 +70,7 @@ from driftfit.trackers.mixture.learned import (
     whiten_noise,
 )
 from driftfit.trackers.mixture.states import (
+    AHEAD,
     MOST_ALONE,
     SMOOTHER_FIELDS,
     any_noise,
@@ -326,7 +327,9 @@ class AdaptiveKalman(Tracker):
         groups = [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
         running = fields["settled"] > 0
         noise = np.where(running, fields["usual_noise"], fields["usual_noise"][np.argmax(running)])
-        return centring(phi), noise, np.where(running, fields["rate"], 0.0), groups
+        rate = np.append(fields["rate"], np.full(AHEAD - 1, fields["rate"][-1]))
+        rate = np.lib.stride_tricks.sliding_window_view(rate, AHEAD).mean(axis=1)
+        return centring(phi), noise, np.where(running, rate, 0.0), groups
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:

@@ -14,7 +14,7 @@ readings repeat because it rests.
 
 The smoother (`driftfit.smooth.unknown_drift`) is given the noise and the drift of every sample,
 
-    1 / r_t = sum_j nu_tj / v_tj,    q_t = r sum_k mu_tk rho_k for rho_k < 1
+    1 / r_t = sum_j nu_tj / v_tj,    q_t = r sum_k mu_tk rho_k for rho_k < 1, averaged over the next samples
 
 with nu_tj and mu_tk the probabilities of states and modes after it, and the regressors and outputs from which coloured
 noise was taken. Before the filters start nothing drifts.
@@ -43,7 +43,7 @@ FLOOR = 0.002
 """Share of the common drift in the learned one."""
 MOST_ALONE = 8
 """Number of parameters up to which each has a ladder of its own."""
-JUMP, DRIFT = 2.5e-3, 3e-4
+JUMP, DRIFT = 2e-3, 6e-4
 """Probabilities, from the whole bank: into all modes with ratios of 1 and more, and into all others."""
 DOWN, AFTER = 1e-3, 0.05
 """Probabilities of the next smaller ratio of a ladder, and of that from ratios of 1 and more."""
@@ -222,6 +222,8 @@ def learn_noise(s: State, l: int) -> None:
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
 
 
+AHEAD = 50
+"""Samples over which the drift is averaged, because the filters see it late."""
 SMOOTHER_FIELDS = ("usual_noise", "rate", "white", "explained", "settled")
 """Fields that are stored at every sample."""
 
