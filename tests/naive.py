@@ -61,7 +61,11 @@ def after_jump(lane, phi, y):
     """The same as `before`, with jumps as large as an unusual innovation."""
     mean, variance = expected(lane, phi)
     square = (y - mean) ** 2
-    jump = min(lane["power"], square / lane["noise"]) / lane["r"] if square > COMMON[-1] * variance else 0.0
+    jump = (
+        min(max(lane["power"], lane["astray"]), square / lane["noise"]) / lane["r"]
+        if square > COMMON[-1] * variance
+        else 0.0
+    )
     return before(lane, phi, max(COMMON[-1], jump))
 
 
@@ -103,9 +107,7 @@ def sample(lane, phi, y):
 
 def interaction(lane, mu, m, C):
     """The same after it, with the full matrix of transitions: down a ladder, or from anywhere to a mode."""
-    ratio = lane["ratio"]
-    down = np.where(ratio >= 1.0, of_noise.AFTER, of_noise.DOWN) * np.append(False, np.diff(ratio) > 0.0)
-    T = np.diag(1.0 - down - lane["arrive"].sum()) + np.diag(down[1:], -1) + lane["arrive"]
+    T = of_noise.transitions(lane["ratio"], lane["arrive"])
     share = mu[:, None] * T
     prior = share.sum(axis=0)
     share /= prior

@@ -11,7 +11,7 @@
 | single i | 1 / c_i for parameter i alone (two to eight parameters) | .003, .05, J |
 | group g | 1 / c_i for the parameters of a group, instead of single | .001, .01, .1, 1, J |
 
-J, the largest jump, is 30. Where e^2 > 30 s it is e^2 / r, but no more than the mean square of y.
+J, the largest jump, is 30. Where e^2 > 30 s it is e^2 / r, but no more than the mean square of y or the last outlier.
 Every mode is a Kalman filter. They are merged after every sample (`driftfit.trackers.mixture.filters`).
 Noise is quiet, restless, or an outlier of any size, and coarse readings that repeat share their rounding
 (`driftfit.trackers.mixture.states`). Scales, means, colour of the noise and covariance of the drift are learned
@@ -70,17 +70,18 @@ from driftfit.trackers.mixture.learned import (
     whiten_noise,
 )
 from driftfit.trackers.mixture.states import (
-    AHEAD,
     MOST_ALONE,
     SMOOTHER_FIELDS,
     any_noise,
     bank,
     learn_noise,
     least_noise,
+    modes_given_all,
     noise_prior,
     note_reading,
     repeated_rounding,
     store_for_smoother,
+    transitions,
 )
 from driftfit.trackers.parts.coordinates import (
     FRAME,
@@ -134,6 +135,7 @@ def settle(s: State, l: int) -> None:
             s.C[i, i, k, l] = 1.0 if s.S[i, i, l] > 0.0 else 0.0
     frame(s, l)
     begin_with_drift(s, least_noise(s, l), l)
+    s.usual_noise[l] = s.r[l]
     mixture(s, l)
     go_on(s, l)
 
@@ -327,9 +329,10 @@ class AdaptiveKalman(Tracker):
         groups = [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
         running = fields["settled"] > 0
         noise = np.where(running, fields["usual_noise"], fields["usual_noise"][np.argmax(running)])
-        rate = np.append(fields["rate"], np.full(AHEAD - 1, fields["rate"][-1]))
-        rate = np.lib.stride_tricks.sliding_window_view(rate, AHEAD).mean(axis=1)
-        return centring(phi), noise, np.where(running, rate, 0.0), groups
+        state = self.state(n)
+        modes = modes_given_all(fields["mu"], fields["prior"], transitions(state["ratio"], state["arrive"]))
+        rate = fields["r"] * (modes @ np.where(state["ratio"] < 1.0, state["ratio"], 0.0))
+        return centring(fields, phi), noise, np.where(running, rate, 0.0), groups
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:

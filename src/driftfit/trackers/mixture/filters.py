@@ -227,7 +227,8 @@ def weigh(s: State, more: float, l: int) -> None:
     K = s.modes[l]
     likelihoods(s, s.vague[l], l)
     predictive_density(s, l)
-    size = min(s.power[l], s.e[l] * s.e[l] / s.noise[l]) - COMMON[-1] * s.r[l]
+    square = s.e[l] * s.e[l] / s.noise[l]
+    size = min(max(s.power[l], s.astray[l]), square) - COMMON[-1] * s.r[l]
     unusual = (size > 0.0) & (s.e[l] * s.e[l] > COMMON[-1] * s.s[l]) & (s.drift[l] > 0.0)
     if unusual:
         leap(s, size * s.dt[l] * s.drift[l], l)
@@ -245,6 +246,7 @@ def weigh(s: State, more: float, l: int) -> None:
             s.row[k, l] = s.joint[j, k, l]
         s.nu[j, l] = sum_of_row(s, l)
     s.outlier[l] = s.nu[STATES - 1, l]
+    s.astray[l] = s.outlier[l] * square
     # an outlier says nothing about the state of ordinary noise
     for j in range(STATES - 1):
         s.nu[j, l] += s.nu[STATES - 1, l] * s.nu_prior[j, l] / (1.0 - s.outlying[l])
@@ -278,9 +280,6 @@ def update_filters(s: State, l: int) -> None:
         s.curve[k, l] = a - spread * s.e_k[k, l] * s.e_k[k, l]
         s.row[k, l] = s.mu[k, l] * a
     s.precision[l] = sum_of_row(s, l)
-    for k in range(s.modes[l]):
-        s.row[k, l] = s.mu[k, l] * s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0
-    s.rate[l] = s.r[l] * sum_of_row(s, l)
     absorb(s, l)
     for j in range(s.trend.shape[1]):
         k = len(COMMON) + j

@@ -121,12 +121,13 @@ def learn_means(s: State, l: int) -> None:
         s.offset[i, l] = s.mean[i, l] / s.mean[constant, l] if beside else 0.0
 
 
-def centring(phi: Array) -> Array:
+def centring(fields: Mapping[str, Array], phi: Array) -> Array:
     """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
-    mean, v, A = phi.mean(axis=0), phi.var(axis=0), np.eye(phi.shape[1])
-    still = v <= STILL * mean**2
-    for k in np.flatnonzero(still & (mean != 0.0))[-1:]:
-        A[k] = np.where(~still & (mean**2 > FAR * v), -mean / mean[k], A[k])
+    centred, A, constant = fields["offset"] != 0.0, np.eye(phi.shape[1]), int(fields["constant"][-1])
+    if constant >= 0 and centred.any():
+        mean = phi.mean(axis=0)
+        A[constant] = np.where(centred.any(axis=0), -mean / mean[constant], 0.0)
+        A[constant, constant] = 1.0
     return A
 
 

@@ -12,15 +12,17 @@ variance that is learned so needs no bounds. Equal readings in a row repeat one 
 that changed. A meter so fine that readings never repeat has no such noise, and neither has a plant without noise whose
 readings repeat because it rests.
 
-The smoother (`driftfit.smooth.unknown_drift`) is given the noise and the drift of every sample,
+The smoother (`driftfit.smooth.unknown_drift`) is given the noise and the course of the drift over time,
 
-    1 / r_t = sum_j nu_tj / v_tj,    q_t = r sum_k mu_tk rho_k for rho_k < 1, averaged over the next samples
+    w_t(i) = f_t(i) sum_j T_ij w_{t+1}(j) / sum_h f_t(h) T_hj         probability of mode i at t, given all samples
+    q_t    = r_t sum_k w_t(k) rho_k for rho_k < 1,    1 / r_t = sum_j nu_tj / v_tj
 
-with nu_tj and mu_tk the probabilities of states and modes after it, and the regressors and outputs from which coloured
+with f_t the probabilities of modes after sample t, T their transitions, and nu_tj those of the states of the noise
+after the sample, and the regressors and outputs from which coloured
 noise was taken. Before the filters start nothing drifts.
 
 Source: the moments of a noise given the data are those of an EM step, Shumway and Stoffer (1982); step^2 / 12 is
-Sheppard's (1898). The modes and the rule for repeats are ours. Cost per
+Sheppard's (1898); the backward pass is Kim's (1994), eq. 2.20. The modes and the rule for repeats are ours. Cost per
 sample: O(K).
 """
 
@@ -125,7 +127,7 @@ def any_noise() -> dict[str, Any]:
     """Fields before the first sample."""
     return {
         "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.zeros(STATES), "restless": 1.0, "outlier": 0.0,
-        "precision": 0.0, "usual_noise": 1.0, "rate": 0.0, "outlying": OUTLIER,
+        "precision": 0.0, "usual_noise": 1.0, "outlying": OUTLIER, "astray": 0.0,
         "finest": np.inf, "reading": np.nan, "repeats": 0.0,
     }  # fmt: skip
 
@@ -222,16 +224,31 @@ def learn_noise(s: State, l: int) -> None:
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
 
 
-AHEAD = 50
-"""Samples over which the drift is averaged, because the filters see it late."""
-SMOOTHER_FIELDS = ("usual_noise", "rate", "white", "explained", "settled")
+SMOOTHER_FIELDS = ("mu", "prior", "r", "usual_noise", "offset", "white", "explained", "settled", "constant")
 """Fields that are stored at every sample."""
 
 
 @kernel
 def store_for_smoother(o: State, s: State, l: int) -> None:
     """Store the fields of the smoother."""
+    for k in range(s.mu.shape[0]):
+        o.mu[k, l], o.prior[k, l] = s.mu[k, l], s.prior[k, l]
     for i in range(s.c.shape[0]):
-        o.white[i, l] = s.white[i, l]
-    o.usual_noise[l], o.rate[l] = s.usual_noise[l], s.rate[l]
-    o.explained[l], o.settled[l] = s.explained[l], s.settled[l]
+        o.offset[i, l], o.white[i, l] = s.offset[i, l], s.white[i, l]
+    o.r[l], o.usual_noise[l] = s.r[l], s.usual_noise[l]
+    o.explained[l], o.settled[l], o.constant[l] = s.explained[l], s.settled[l], s.constant[l]
+
+
+def transitions(ratio: Array, arrive: Array) -> Array:
+    """T (K, K): down a ladder, or from the whole bank to a mode."""
+    down = np.where(ratio >= 1.0, AFTER, DOWN) * np.append(False, np.diff(ratio) > 0.0)
+    return np.asarray(np.diag(1.0 - down - arrive.sum()) + np.diag(down[1:], -1) + arrive)
+
+
+def modes_given_all(after: Array, ahead: Array, T: Array) -> Array:
+    """Probabilities (N, K) of the modes given all samples, from those after each sample and before the next."""
+    found, mixed = after.copy(), np.any(after != ahead, axis=1)
+    for t in range(len(found) - 2, -1, -1):
+        found[t] = after[t] * (T @ (found[t + 1] / np.maximum(ahead[t], 1e-300))) if mixed[t] else found[t + 1]
+        found[t] /= max(found[t].sum(), 1e-300)
+    return found
