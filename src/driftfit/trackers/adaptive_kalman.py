@@ -7,7 +7,7 @@
 |---|---|---|
 | common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-4 .. .01, .04, .2, 1, J |
 | trend | as common; theta moves on along its slope | .001, .01, .1 |
-| learned | the drift covariance found by a backward pass of scores over the last 100 samples | .001, .01, .1, 1 |
+| learned | the drift covariance found by a backward pass of scores over the last 50 samples | .001, .01, .1, 1 |
 | single i | 1 / c_i for parameter i alone (two to eight parameters) | .003, .05, J |
 | group g | 1 / c_i for the parameters of a group, instead of single | .001, .01, .1, 1, J |
 
