@@ -51,7 +51,7 @@ def before(lane, phi, jump=COMMON[-1]):
 def expected(lane, phi):
     """Prediction, and its variance if nothing unusual happens."""
     x, m, C, v = before(lane, phi)
-    jumps = lane["kappa"] * lane["arrive"] * (lane["ratio"] >= 1.0)
+    jumps = lane["arrive"] * (lane["ratio"] >= 1.0)
     mean, restless = x @ m @ lane["prior"], states(lane)[1] / (1.0 - lane["outlying"])
     spread = np.maximum(lane["prior"] - jumps, 0.0) @ (np.einsum("i,kij,j->k", x, C, x) + (x @ m - mean) ** 2)
     return mean, spread + v[0] ** (1.0 - restless) * v[1] ** restless
@@ -60,8 +60,12 @@ def expected(lane, phi):
 def after_jump(lane, phi, y):
     """The same as `before`, with jumps as large as an unusual innovation."""
     mean, variance = expected(lane, phi)
-    square, most = (y - mean) ** 2, max(lane["spread"], lane["astray"])
-    jump = min(most, square / lane["noise"]) / lane["r"] if square > COMMON[-1] * variance else 0.0
+    square = (y - mean) ** 2
+    jump = (
+        min(max(lane["power"], lane["astray"]), square / lane["noise"]) / lane["r"]
+        if square > COMMON[-1] * variance
+        else 0.0
+    )
     return before(lane, phi, max(COMMON[-1], jump))
 
 
@@ -101,15 +105,13 @@ def sample(lane, phi, y):
     return mu, m, C, joint
 
 
-def interaction(lane, mu, m, C, kappa):
-    """The same after it, with the full matrix of transitions."""
-    up, down, foot, arrive = (lane[name] for name in ("up", "down", "foot", "arrive"))
-    T = np.diag(1.0 - down - foot - kappa * (up + arrive.sum())) + np.diag(down[1:], -1) + kappa * np.diag(up[:-1], 1)
-    T[:, 0] += foot
-    T += kappa * arrive
+def interaction(lane, mu, m, C):
+    """The same after it, with the full matrix of transitions: down a ladder, or from anywhere to a mode."""
+    T = of_noise.transitions(lane["ratio"], lane["arrive"])
     share = mu[:, None] * T
     prior = share.sum(axis=0)
     share /= prior
     mean = m @ share
     off = m[:, :, None] - mean[:, None, :]
-    return prior, mean, np.einsum("kj,kab->jab", share, C) + np.einsum("kj,akj,bkj->jab", share, off, off), T
+    cov = np.einsum("kj,kab->jab", share, C) + np.einsum("kj,akj,bkj->jab", share, off, off)
+    return prior, mean, cov, T

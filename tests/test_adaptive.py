@@ -214,16 +214,6 @@ def test_the_jump_of_one_parameter_makes_the_others_no_less_certain():
     assert jumped < 0.26
 
 
-def test_what_never_changes_is_expected_to_change_less_often():
-    rng = np.random.default_rng(3)
-    u = rng.normal(size=(6000, 3))
-    run = track(Regression(3), AdaptiveKalman(), u @ [1.0, -0.5, 2.0] + 0.3 * rng.normal(size=6000), u)
-    y = u @ [1.0, -0.5, 2.0] * (1.0 + np.arange(6000) // 100 % 2) + 0.01 * rng.normal(size=6000)
-    jumps = track(Regression(3), AdaptiveKalman(), y, u)
-    assert run.state["kappa"] < 0.5
-    assert jumps.state["kappa"] > 0.9
-
-
 def test_a_signal_far_from_zero_is_learned_next_to_an_intercept_and_one_at_rest_is_not():
     """The window of `excitation`, and variances of least squares: offsets decide nothing."""
     rng = np.random.default_rng(0)

@@ -8,10 +8,8 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
-from naive import moved_along, walks
 
-from driftfit import AdaptiveKalman, Bank, Change, Live, Regression, Sensor, track
-from driftfit.trackers.mixture.filters import UNSURE
+from driftfit import Bank, Change, Regression, Sensor, track
 
 N, PARTED, T = 3, 40, 60
 EXACT = np.vectorize(Decimal, otypes=[object])
@@ -51,36 +49,3 @@ def test_a_bank_keeps_the_correlations_of_an_outgrown_coordinate(near, q):
                 np.testing.assert_allclose(run.std[t], stds(P), rtol=1e-12)
                 if not any(q):
                     np.testing.assert_allclose((guessed.theta[t] - m.astype(float)) / stds(P), 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize(("near", "seed"), [(1e-7, 4), (1e-7, 6), (1e-9, 5)])
-def test_each_filter_of_adaptive_kalman_keeps_them_too(near, seed):
-    """The mixture after the sample at which the columns part, from the filters before it: their weights stay."""
-    y, u = record(near, seed)
-    live = Live(Regression(N), AdaptiveKalman())
-    for t in range(PARTED):
-        live.update(y[t], u[t])
-    lane = {name: np.array(live.lane()[name]) for name in live.lane()}
-    live.update(y[PARTED], u[PARTED])
-    after = live.lane()
-    noise = float(after["noise"] * after["r"])
-    weights, means, covs = lane["prior"] / lane["prior"].sum(), [], []
-    drift = walks(lane)
-    moved = moved_along(lane)
-    with localcontext() as context:
-        context.prec = 80
-        inverse = EXACT(np.eye(N))
-        for i in reversed(range(N)):  # of S, a triangle
-            inverse[i] = (inverse[i] - EXACT(lane["S"][i, i + 1 :]) @ inverse[i + 1 :]) / Decimal(
-                lane["S"][i, i].item()
-            )
-        for k in range(len(weights)):
-            C = np.tril(lane["C"][..., k]) + np.tril(lane["C"][..., k], -1).T
-            P = inverse @ EXACT(C) @ inverse.T + EXACT(drift[k])
-            m, P = taken(inverse @ EXACT(moved[:, k]), P, y[PARTED], u[PARTED], noise)
-            means.append(m), covs.append(P)
-        mean = EXACT(weights) @ np.array(means)
-        P = sum(Decimal(w) * (C + np.outer(m - mean, m - mean)) for w, m, C in zip(weights, means, covs, strict=True))
-        np.testing.assert_allclose((live.theta - mean.astype(float)) / stds(P), 0.0, atol=1e-12)
-        wide = np.sqrt(1.0 + UNSURE / np.sqrt(after["count"]))  # what is reported allows for estimated settings
-        np.testing.assert_allclose(live.std, wide * stds(P), rtol=1e-12)

@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -35,11 +35,10 @@ NEXT_TO_NEVER = 1e-30
 
 @dataclass(frozen=True)
 class Piece:
-    """``modes`` (K,) tells which modes to leave out, and ``state`` what fields are instead; or ``edits`` of a file, an
-    old text and a new one. ``functions`` are those that would go with the piece, "file:name"."""
+    """``modes`` (K,) tells which modes to leave out; or ``edits`` of a file, an old text and a new one. ``functions``
+    are those that would go with the piece, "file:name"."""
 
     modes: Callable[[State], Array] | None = None
-    state: Mapping[str, Any] = field(default_factory=dict)
     edits: tuple[tuple[str, str, str], ...] = ()
     functions: tuple[str, ...] = ()
 
@@ -54,15 +53,13 @@ class Piece:
         return total
 
 
-def never(state: dict[str, Any], ladder: Array, out: Array) -> None:
+def never(state: dict[str, Any], out: Array) -> None:
     """Change transitions so that modes are never entered; jumps together stay as likely as they were."""
     jump = state["ratio"] >= 1.0
     before = state["arrive"][jump].sum()
     arrive = np.where(out, NEXT_TO_NEVER, state["arrive"])
     arrive[jump] *= before / arrive[jump].sum() if (jump & ~out).any() else 1.0
-    leads = np.append(out[1:] & (ladder[1:] == ladder[:-1]), False)
     start = np.where(out, NEXT_TO_NEVER, state["mu"])
-    state["up"] = np.where(leads | out, NEXT_TO_NEVER * (state["up"] > 0.0), state["up"])
     state["arrive"] = arrive
     state["mu"] = state["prior"] = start / start.sum()
 
@@ -78,13 +75,13 @@ class Without(AdaptiveKalman):
 
         state, piece, modes = dict(super().state(n)), PIECES[self.piece], table(n, self.groups)
         if piece.modes is not None:
-            never(state, modes["ladder"], piece.modes(modes))
-        return {**state, **piece.state}
+            never(state, piece.modes(modes))
+        return state
 
 
 def largest(modes: State) -> Array:
     """The largest ratio of each ladder that jumps."""
-    return np.asarray((modes["ratio"] >= 1.0) & (modes["up"] == 0.0))
+    return np.asarray((modes["ratio"] >= 1.0) & (np.diff(modes["ladder"], append=-9) != 0))
 
 
 def of(file: str, *names: str) -> tuple[str, ...]:
@@ -111,20 +108,18 @@ PIECES: dict[str, Piece] = {
         ),
     ),
     "single ladders": Piece(lambda modes: modes["ladder"] >= 0),
-    "jumps": Piece(lambda modes: modes["ratio"] >= 1.0, functions=of(BANK, "leap", "learn_rate")),
+    "jumps": Piece(lambda modes: modes["ratio"] >= 1.0, functions=of(BANK, "leap")),
     "common jumps": Piece(lambda modes: (modes["ladder"] == -3) & (modes["ratio"] >= 1.0)),
     "jumps of size 1": Piece(lambda modes: modes["ratio"] == 1.0),
     "largest jumps": Piece(lambda modes: modes["ratio"] > 1.0),
-    "learned rate of changes": Piece(
-        state={"left_behind": 1e15, "jumps_expected": 1e15}, functions=of(BANK, "learn_rate")
-    ),
     "leading direction": Piece(
         edits=((LEARNED, "share = t[N + 6 * best, best] / positive if sound else 0.0", "share = 0.0"),),
         functions=of(LEARNED, "whitened", "rotate", "turn"),
     ),
-    "arrivals in all modes": Piece(edits=((STATES, "\nJUMP, ARRIVE = 3e-3, 1e-5\n", "\nJUMP, ARRIVE = 3e-3, 1e-9\n"),)),
+    "arrivals in all modes": Piece(edits=((STATES, "\nJUMP, DRIFT = 2e-3, 6e-4\n", "\nJUMP, DRIFT = 2e-3, 1e-9\n"),)),
+    "down the ladders": Piece(edits=((STATES, "\nDOWN, AFTER = 1e-3, 0.05\n", "\nDOWN, AFTER = 0.0, 0.05\n"),)),
     "jumps of any size": Piece(
-        edits=((BANK, "    s.leap[l] = far if", "    s.leap[l] = 0.0 * far if"),), functions=of(BANK, "leap")
+        edits=((BANK, "    unusual = (size > 0.0) &", "    unusual = (size < 0.0) &"),), functions=of(BANK, "leap")
     ),
     "Student's density": Piece(edits=((BANK, "\nSTUDENT = 60.0\n", "\nSTUDENT = 0.0\n"),)),
     "drift about means": Piece(
@@ -135,8 +130,10 @@ PIECES: dict[str, Piece] = {
         functions=of(LEARNED, "whiten_noise", "learn_colour", "colour"),
     ),
     "restless noise": Piece(edits=((STATES, "\nSTAY, CALM = 0.995, 0.98\n", "\nSTAY, CALM = 1.0 - 1e-9, 1e-9\n"),)),
-    "outliers": Piece(edits=((STATES, "RARITY, FADE = 0.035, 50.0, 0.999", "RARITY, FADE = 1e-9, 1e12, 0.999"),)),
-    "learned rate of outliers": Piece(edits=((STATES, "RARITY, FADE = 0.035, 50.0,", "RARITY, FADE = 0.035, 1e12,"),)),
+    "outliers": Piece(edits=((STATES, "RARITY, OFTEN = 0.035, 50.0, 1000.0", "RARITY, OFTEN = 1e-9, 1e12, 1000.0"),)),
+    "learned rate of outliers": Piece(
+        edits=((STATES, "RARITY, OFTEN = 0.035, 50.0,", "RARITY, OFTEN = 0.035, 1e12,"),)
+    ),
     "repeated rounding": Piece(
         edits=(
             (
@@ -151,10 +148,6 @@ PIECES: dict[str, Piece] = {
     "start with drift": Piece(
         edits=((TRACKER, "    begin_with_drift(s, least_noise(s, l), l)\n", ""),),
         functions=of(LEARNED, "keep", "start_regressor", "run_again", "begin_with_drift"),
-    ),
-    "late columns that dominate": Piece(
-        edits=((TRACKER, "column = s.column[l] if s.column[l] >= 0 else outgrown(s, l)", "column = s.column[l]"),),
-        functions=of(BANK, "outgrown"),
     ),
 }
 

@@ -7,11 +7,11 @@
 |---|---|---|
 | common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-4 .. .01, .04, .2, 1, J |
 | trend | as common; theta moves on along its slope | .001, .01, .1 |
-| learned | the drift covariance found by a backward pass of scores over the last 100 samples | .001, .01, .1, 1 |
+| learned | the drift covariance found by a backward pass of scores over the last 50 samples | .001, .01, .1, 1 |
 | single i | 1 / c_i for parameter i alone (two to eight parameters) | .003, .05, J |
 | group g | 1 / c_i for the parameters of a group, instead of single | .001, .01, .1, 1, J |
 
-J, the largest jump, is 30. Where e^2 > 30 s it is e^2 / r, but no more than the variance of y or the last outlier.
+J, the largest jump, is 30. Where e^2 > 30 s it is e^2 / r, but no more than the mean square of y or the last outlier.
 Every mode is a Kalman filter. They are merged after every sample (`driftfit.trackers.mixture.filters`).
 Noise is quiet, restless, or an outlier of any size, and coarse readings that repeat share their rounding
 (`driftfit.trackers.mixture.states`). Scales, means, colour of the noise and covariance of the drift are learned
@@ -51,13 +51,13 @@ from driftfit.trackers.mixture.filters import (
     innovate,
     mix,
     mixture,
-    outgrown,
     predict,
     update_filters,
     weigh,
 )
 from driftfit.trackers.mixture.learned import (
     begin_with_drift,
+    centring,
     colour,
     forecast_start,
     learn_colour,
@@ -74,14 +74,14 @@ from driftfit.trackers.mixture.states import (
     SMOOTHER_FIELDS,
     any_noise,
     bank,
-    centring,
     learn_noise,
     least_noise,
+    modes_given_all,
     noise_prior,
     note_reading,
     repeated_rounding,
     store_for_smoother,
-    variances_given_all,
+    transitions,
 )
 from driftfit.trackers.parts.coordinates import (
     FRAME,
@@ -135,6 +135,7 @@ def settle(s: State, l: int) -> None:
             s.C[i, i, k, l] = 1.0 if s.S[i, i, l] > 0.0 else 0.0
     frame(s, l)
     begin_with_drift(s, least_noise(s, l), l)
+    s.usual_noise[l] = s.r[l]
     mixture(s, l)
     go_on(s, l)
 
@@ -153,9 +154,9 @@ def look_ahead(s: State, entering: int, l: int) -> None:
 @partial(kernel, inline=False)
 def follow(s: State, l: int) -> None:
     """One sample of the running filters."""
-    s.outlier[l], s.certainty[l], s.leap[l], weighed = 0.0, 0.0, 0.0, 0.0
+    s.outlier[l], s.usual_noise[l], weighed = 0.0, s.r[l], 0.0
     note_reading(s, l)
-    column = s.column[l] if s.column[l] >= 0 else outgrown(s, l)
+    column = s.column[l]
     if s.ok[l] > 0.0 and column >= 0:
         enter_filters(s, column, l)
     elif s.ok[l] > 0.0:
@@ -260,7 +261,7 @@ class AdaptiveKalman(Tracker):
     gated: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
         "pivot", "at_start", "gain", "e_k", "step", "h_k", "curve", "inverse", "joint", "share", "row", "walk", "Z",
-        "away", "certainty",
+        "away",
     )  # fmt: skip
     """Not H and work, which `driftfit.trackers.parts.coordinates.frame` fills only where the coordinates change."""
 
@@ -326,7 +327,12 @@ class AdaptiveKalman(Tracker):
     def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array, Sequence[Sequence[int]]]:
         n = phi.shape[1]
         groups = [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
-        return centring(fields, phi), *variances_given_all(fields, self.state(n)), groups
+        running = fields["settled"] > 0
+        noise = np.where(running, fields["usual_noise"], fields["usual_noise"][np.argmax(running)])
+        state = self.state(n)
+        modes = modes_given_all(fields["mu"], fields["prior"], transitions(state["ratio"], state["arrive"]))
+        rate = fields["r"] * (modes @ np.where(state["ratio"] < 1.0, state["ratio"], 0.0))
+        return centring(fields, phi), noise, np.where(running, rate, 0.0), groups
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:

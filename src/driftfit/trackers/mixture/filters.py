@@ -7,13 +7,10 @@
 
 with c_k and nu_j the probabilities of mode k and of state j of the noise (`driftfit.trackers.mixture.states`), and
 t the normal density, or Student's while the noise variance rests on few samples. Modes are merged by their moments
-after every sample, c_j = sum_i mu_i T_ij. T moves a mode up or down its ladder, from the foot of a ladder to rest, and
-leads from the whole bank to mode j with the same small probability a_j, so that it costs O(K) instead of O(K^2):
+after every sample, c_j = sum_i mu_i T_ij. T moves a mode down its ladder, and leads from the whole bank to mode j with
+the same small probability a_j, so that it costs O(K) instead of O(K^2):
 
-    T_ij = kappa (a_j + up_i [j above i]) + down_i [j below i],   the rest stays
-
-kappa, the rate of changes relative to what is usual, is the share of the expected jumps that were left behind by a
-later sample:  kappa = (EVENTS + sum_t sum_j down_j mu_tj) / (EVENTS + sum_t sum_j a_j),  j over the modes of jumps.
+    T_ij = a_j + down_i [j next below i],   the rest stays
 
 The filters use coordinates z = M theta of their start, in which the regressor is x (`driftfit.trackers.parts
 .coordinates`). A regressor in a direction that no earlier one has determined is used by all filters, and does not
@@ -31,7 +28,10 @@ import numpy as np
 
 from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.trackers.mixture.states import (
+    AFTER,
     COMMON,
+    DOWN,
+    DRIFT,
     FIRST_ALONE,
     FIRST_LEARNED,
     FLOOR,
@@ -40,11 +40,9 @@ from driftfit.trackers.mixture.states import (
     sum_of_row,
     variance_in,
 )
-from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
+from driftfit.trackers.parts.coordinates import in_units_of_theta, new_row
 from driftfit.trackers.parts.covariance import LEFT
 
-EVENTS, RAREST, OFTENEST, SPAN = 3.0, 0.05, 3.0, 2e4
-"""Jumps that the prior of their rate counts for, its bounds, and its memory in samples."""
 FADING, BEND = 0.05, 0.1
 """Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""
 STUDENT = 60.0
@@ -173,7 +171,7 @@ def innovate(s: State, l: int) -> None:
         s.row[k, l] = s.prior[k, l] * s.e_k[k, l]
     mean = sum_of_row(s, l)
     for k in range(K):  # the band is for samples at which no jump begins
-        p = s.prior[k, l] - (s.kappa[l] * s.arrive[k, l] if s.ratio[k, l] >= 1.0 else 0.0)
+        p = s.prior[k, l] - (s.arrive[k, l] if s.ratio[k, l] >= 1.0 else 0.0)
         s.row[k, l] = max(p, 0.0) * (s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2)
     v = sum_of_row(s, l) + s.vague[l]
     quiet, restless = variance_in(s, 0, l), s.nu_prior[1, l] / (1.0 - s.outlying[l])
@@ -230,12 +228,11 @@ def weigh(s: State, more: float, l: int) -> None:
     likelihoods(s, s.vague[l], l)
     predictive_density(s, l)
     square = s.e[l] * s.e[l] / s.noise[l]
-    far = min(max(s.spread[l], s.astray[l]), square) / s.r[l] - COMMON[-1]
-    unusual = s.e[l] * s.e[l] > COMMON[-1] * s.s[l]
-    s.leap[l] = far if unusual & (far > 0.0) & (s.drift[l] > 0.0) else 0.0
-    if s.leap[l] > 0.0:
-        leap(s, s.leap[l] * s.r[l] * s.dt[l] * s.drift[l], l)
-    if more > 0.0 or s.leap[l] > 0.0:
+    size = min(max(s.power[l], s.astray[l]), square) - COMMON[-1] * s.r[l]
+    unusual = (size > 0.0) & (s.e[l] * s.e[l] > COMMON[-1] * s.s[l]) & (s.drift[l] > 0.0)
+    if unusual:
+        leap(s, size * s.dt[l] * s.drift[l], l)
+    if more > 0.0 or unusual:
         likelihoods(s, s.vague[l] + more, l)
     for k in range(K):
         s.row[k, l] = s.joint[0, k, l] + s.joint[1, k, l] + s.joint[2, k, l]
@@ -291,48 +288,20 @@ def update_filters(s: State, l: int) -> None:
             s.trend[i, j, l] += share * s.gain[i, k, l]
 
 
-@kernel
-def outgrown(s: State, l: int) -> int:
-    """The coordinate on which this sample carries `OUTGROWN` times as much information as all earlier ones, or -1."""
-    others = variance_in(s, 0, l)
-    for j in range(s.parameters[l]):
-        own = s.x[j, l] * s.x[j, l] * s.C[j, j, 0, l]
-        if own > OUTGROWN * others:
-            return j
-        others += own
-    return -1
-
-
 @partial(kernel, short=True)
 def enter_filters(s: State, j: int, l: int) -> None:
-    """Row j of M becomes the rest of phi. The other coordinates take the sample as always, unless nothing was known of
-    z_j; then z_j = y - sum_{i<j} x_i z_i - v, which is correlated with them also by v.
-    """
-    n, K, fresh = s.parameters[l], s.modes[l], s.S[j, j, l] == 0.0
+    """Row j of M becomes the rest of phi, and z_j = y - sum_{i<j} x_i z_i - v, of which nothing was known."""
+    n, K = s.parameters[l], s.modes[l]
     noise = variance_in(s, 0, l) + s.vague[l]
-    for k in range(K):
-        s.curve[k, l] = 0.0 if fresh or s.h_k[k, l] == 0.0 else 1.0 / (s.h_k[k, l] + noise)
-        s.step[k, l] = s.curve[k, l] * s.e_k[k, l]
-        s.mu[k, l] = s.prior[k, l]
-    absorb(s, l)
     sign = new_row(s, s.white, j, l)
     for t in range(s.trend.shape[1]):
         s.trend[j, t, l] = 0.0
-    for i in range(j, n):
-        s.x[i, l] = 0.0
     for k in range(K):
-        left = noise * s.curve[k, l]  # r / s, the share of the innovation that is noise
-        mean, own = s.y[l] - s.explained[l] - left * s.e_k[k, l], noise * (1.0 - left)
+        s.mu[k, l] = s.prior[k, l]
         for i in range(n):
-            mean -= s.x[i, l] * s.m[i, k, l]
-            if i != j:
-                row = left * s.gain[i, k, l]
-                for b in range(j):
-                    row -= s.x[b, l] * s.C[max(i, b), min(i, b), k, l]
-                own -= s.x[i, l] * (row + left * s.gain[i, k, l])
-                s.C[max(i, j), min(i, j), k, l] = sign * row
-        s.m[j, k, l] = sign * mean
-        s.C[j, j, k, l] = own
+            s.C[max(i, j), min(i, j), k, l] = -sign * s.gain[i, k, l]
+        s.m[j, k, l] = sign * s.e_k[k, l]
+        s.C[j, j, k, l] = s.h_k[k, l] + noise
     s.density[l] = -0.5 * (log(2.0 * np.pi * s.s[l]) + s.e[l] * s.e[l] / s.s[l])
 
 
@@ -349,8 +318,8 @@ def mixture(s: State, l: int) -> None:
             for k in range(K):
                 away = (s.m[i, k, l] - s.d[i, l]) * (s.m[j, k, l] - s.d[j, l])
                 s.row[k, l] = s.mu[k, l] * (s.C[i, j, k, l] + away)
-            s.Z[0, i, j, l] = sum_of_row(s, l)
-            s.P[i, j, l] = s.Z[0, i, j, l]
+            s.Z[i, j, l] = sum_of_row(s, l)
+            s.P[i, j, l] = s.Z[i, j, l]
     in_units_of_theta(s, l)
     wide = 1.0 + UNSURE / np.sqrt(max(s.count[l], 1.0))
     for i in range(n):
@@ -359,92 +328,38 @@ def mixture(s: State, l: int) -> None:
         s.var[i, l] = s.P[i, i, l]
 
 
-@kernel
-def find_shares(s: State, l: int) -> None:
-    """Prior probabilities of the next sample, and of what comes before it: the mode, all modes, and in ``curve`` and
-    ``step`` those below and above."""
-    K, kappa = s.modes[l], s.kappa[l]
-    for k in range(K):
-        s.row[k, l] = s.arrive[k, l]
-    leave = kappa * sum_of_row(s, l)
-    for k in range(K):
-        s.share[0, k, l] = s.mu[k, l] * (1.0 - leave - kappa * s.up[k, l] - s.down[k, l] - s.foot[k, l])
-        s.share[1, k, l] = kappa * s.arrive[k, l]
-        s.share[2, k, l] = s.mu[k, l] * s.foot[k, l]
-        s.curve[k, l] = 0.0
-        s.step[k, l] = 0.0
-        s.row[k, l] = s.share[2, k, l]
-    rests = sum_of_row(s, l)
-    for k in range(1, K):
-        s.curve[k, l] = s.mu[k - 1, l] * kappa * s.up[k - 1, l]
-    for k in range(K - 1):
-        s.step[k, l] = s.mu[k + 1, l] * s.down[k + 1, l]
-    for k in range(K):
-        s.prior[k, l] = (s.share[0, k, l] + s.curve[k, l]) + (s.step[k, l] + s.share[1, k, l])
-    s.prior[0, l] += rests
-    for k in range(K):
-        part = 1.0 / s.prior[k, l]
-        s.share[0, k, l] *= part
-        s.curve[k, l] *= part
-        s.step[k, l] *= part
-        s.share[1, k, l] *= part
-    part = 1.0 / s.prior[0, l]
-    for k in range(K):
-        s.share[2, k, l] *= part
-
-
-@kernel
-def learn_rate(s: State, l: int) -> None:
-    """kappa, from the jumps that later samples have left behind."""
-    for k in range(s.modes[l]):
-        s.row[k, l] = s.mu[k, l] * (s.down[k, l] + s.foot[k, l]) if s.ratio[k, l] >= 1.0 else 0.0
-    fade = 1.0 - 1.0 / SPAN
-    s.left_behind[l] = fade * s.left_behind[l] + sum_of_row(s, l)
-    s.jumps_expected[l] = fade * s.jumps_expected[l] + JUMP
-    s.kappa[l] = min(OFTENEST, max(RAREST, (EVENTS + s.left_behind[l]) / (EVENTS + s.jumps_expected[l])))
-
-
 @partial(kernel, inline=False)
 def mix(s: State, l: int) -> None:
-    """Interaction: every filter continues from the mixture of its predecessors.
+    """Interaction: every filter continues from itself, from the one above it on its ladder, and from the whole bank.
 
     Means are taken relative to that of the mixture, d, so that moments may be added before the mean is subtracted.
     """
     n, K = s.parameters[l], s.modes[l]
-    learn_rate(s, l)
-    find_shares(s, l)
-    for a in range(n):  # what comes to rest
-        for k in range(K):
-            s.m[a, k, l] -= s.d[a, l]
-            s.row[k, l] = s.share[2, k, l] * s.m[a, k, l]
-        s.away[0, a, l] = sum_of_row(s, l)
-        for b in range(a + 1):
-            for k in range(K):
-                s.row[k, l] = s.share[2, k, l] * (s.C[a, b, k, l] + s.m[a, k, l] * s.m[b, k, l])
-            s.Z[1, a, b, l] = sum_of_row(s, l)
-    s.row[0, l], s.row[K + 1, l] = 0.0, 0.0
+    for k in range(K):
+        falls = s.ratio[max(k - 1, 0), l] < s.ratio[k, l]  # the lowest of a ladder stays
+        s.row[k, l] = s.mu[k, l] * (AFTER if s.ratio[k, l] >= 1.0 else DOWN) if falls else 0.0
+    s.row[K, l] = 0.0
+    for k in range(K):
+        above = s.row[k + 1, l] if s.ratio[min(k + 1, K - 1), l] > s.ratio[k, l] else 0.0
+        stays = (1.0 - JUMP - DRIFT) * s.mu[k, l] - s.row[k, l]
+        s.prior[k, l] = stays + above + s.arrive[k, l]
+        s.step[k, l], s.curve[k, l] = stays / s.prior[k, l], above / s.prior[k, l]
+    s.row[K, l] = 0.0
     for a in range(n):
         for k in range(K):
-            s.row[k + 1, l] = s.m[a, k, l]
+            s.row[k, l] = s.m[a, k, l] - s.d[a, l]
         for k in range(K):
-            s.gain[a, k, l] = s.share[0, k, l] * s.row[k + 1, l] + (
-                s.curve[k, l] * s.row[k, l] + s.step[k, l] * s.row[k + 2, l]
-            )
-        s.gain[a, 0, l] += s.away[0, a, l]
+            s.m[a, k, l] = s.row[k, l]
+            s.gain[a, k, l] = s.step[k, l] * s.row[k, l] + s.curve[k, l] * s.row[k + 1, l]
         for b in range(a + 1):
             for k in range(K):
-                s.row[k + 1, l] = s.C[a, b, k, l] + s.m[a, k, l] * s.m[b, k, l]
+                s.row[k, l] = s.C[a, b, k, l] + s.m[a, k, l] * s.m[b, k, l]
             for k in range(K):
-                near = s.curve[k, l] * s.row[k, l] + s.step[k, l] * s.row[k + 2, l]
-                far = s.share[1, k, l] * s.Z[0, a, b, l] - s.gain[a, k, l] * s.gain[b, k, l]
-                s.C[a, b, k, l] = s.share[0, k, l] * s.row[k + 1, l] + (near + far)
-            s.C[a, b, 0, l] += s.Z[1, a, b, l]
+                near = s.step[k, l] * s.row[k, l] + s.curve[k, l] * s.row[k + 1, l]
+                far = (1.0 - s.step[k, l] - s.curve[k, l]) * s.Z[a, b, l]
+                s.C[a, b, k, l] = near + (far - s.gain[a, k, l] * s.gain[b, k, l])
     for a in range(n):
         for k in range(K):
             s.m[a, k, l] = s.d[a, l] + s.gain[a, k, l]
-        before = 0.0
         for j in range(s.trend.shape[1]):
-            k, here = len(COMMON) + j, s.trend[a, j, l]
-            ahead = s.trend[a, min(j + 1, s.trend.shape[1] - 1), l]
-            s.trend[a, j, l] = s.share[0, k, l] * here + s.curve[k, l] * before + s.step[k, l] * ahead
-            before = here
+            s.trend[a, j, l] *= s.step[len(COMMON) + j, l]

@@ -54,16 +54,14 @@ from driftfit.trackers.mixture.states import (
 from driftfit.trackers.parts.diffuse import absorb_on_roots, forecast_on_roots
 from driftfit.trackers.parts.excitation import DULL, LARGE, MEMORY, learn_information, learn_scales
 
-BLOCK, WINDOW = 50, 100
+BLOCK, WINDOW = 25, 50
 """Samples between two passes, and samples of a pass."""
-FADE = 0.97
+FADE = 0.985
 """Factor of the sums at every pass."""
 SWEEPS, ROTATIONS = 30, 6
 """Sweeps over the parameters for the diagonal, and over pairs of them for the eigenvectors."""
 ROUNDED = 1e-6
 """Added to the diagonal of M, relative to it."""
-LONG = 1000.0
-"""Memory of the variance of y, in samples."""
 FAR = 9.0
 """Square of the mean of a regressor, in units of its variance, from which on it drifts about the mean."""
 STILL = 1e-24
@@ -91,7 +89,7 @@ def nothing_learned(n: int) -> dict[str, Any]:
     """Fields before the first sample."""
     return {
         "mean": np.zeros(n), "variance": np.zeros(n), "moved": np.zeros(n),
-        "middle": 0.0, "spread": 0.0, "constant": -1, "drift_unit": np.zeros(n), "offset": np.zeros(n),
+        "constant": -1, "drift_unit": np.zeros(n), "offset": np.zeros(n),
         "samples": np.zeros((WINDOW, PHI + n)), "gains": np.zeros((WINDOW, n)), "remembered": 0, "assumed": np.zeros(n),
         "sums": np.zeros((A + 6 * n, n)), "weight": np.ones(n), "direction": np.zeros(n),
         "white": np.zeros(n), "past": np.zeros(n), "past_y": 0.0, "explained": 0.0, "colour": 0.0, "psi": 0.0,
@@ -102,10 +100,6 @@ def nothing_learned(n: int) -> dict[str, Any]:
 @kernel
 def learn_means(s: State, l: int) -> None:
     """Means and variances of the regressors, and the drift of each: 1 / v_i and m_i / m_k, or 1 / c_i and 0."""
-    share = s.ok[l] / min(max(s.power_samples[l], 1.0), LONG)
-    away = s.y[l] - s.middle[l]
-    s.middle[l] += share * away
-    s.spread[l] += share * ((1.0 - share) * away * away / s.noise[l] - s.spread[l])
     constant = -1
     for i in range(s.parameters[l]):
         off = s.phi[i, l] - s.mean[i, l]
@@ -125,6 +119,16 @@ def learn_means(s: State, l: int) -> None:
         beside = (constant >= 0) & (i != constant) & far
         s.drift_unit[i, l] = 1.0 / v if beside else 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
         s.offset[i, l] = s.mean[i, l] / s.mean[constant, l] if beside else 0.0
+
+
+def centring(fields: Mapping[str, Array], phi: Array) -> Array:
+    """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
+    centred, A, constant = fields["offset"] != 0.0, np.eye(phi.shape[1]), int(fields["constant"][-1])
+    if constant >= 0 and centred.any():
+        mean = phi.mean(axis=0)
+        A[constant] = np.where(centred.any(axis=0), -mean / mean[constant], 0.0)
+        A[constant, constant] = 1.0
+    return A
 
 
 @kernel
@@ -466,7 +470,7 @@ def begin_with_drift(s: State, least: float, l: int) -> None:
     n, K, count, nearest = s.theta.shape[0], s.modes[l], s.count[l], np.inf
     if s.remembered[l] <= WINDOW:
         for k in range(K):
-            s.share[0, k, l] = s.mu[k, l]
+            s.inverse[0, k, l] = s.mu[k, l]
         run_again(s, l)
         for k in range(K):
             # residuals below the floor of r are rounding, and say nothing about the drift
@@ -474,7 +478,7 @@ def begin_with_drift(s: State, least: float, l: int) -> None:
             s.curve[k, l] = s.prior[k, l] + count * log(s.step[k, l])
             nearest = min(nearest, s.curve[k, l])
         for k in range(K):
-            s.row[k, l] = s.share[0, k, l] * exp(-0.5 * (s.curve[k, l] - nearest))
+            s.row[k, l] = s.inverse[0, k, l] * exp(-0.5 * (s.curve[k, l] - nearest))
         share = 1.0 / sum_of_row(s, l)
         for k in range(K):
             s.mu[k, l] = s.row[k, l] * share

@@ -17,8 +17,9 @@ The smoother (`driftfit.smooth.unknown_drift`) is given the noise and the course
     w_t(i) = f_t(i) sum_j T_ij w_{t+1}(j) / sum_h f_t(h) T_hj         probability of mode i at t, given all samples
     q_t    = r_t sum_k w_t(k) rho_k for rho_k < 1,    1 / r_t = sum_j nu_tj / v_tj
 
-with f_t the probabilities after sample t, T their transitions, and nu_tj those of the states of the noise after the
-sample, on the regressors and outputs from which coloured noise was taken. Before the filters start nothing drifts.
+with f_t the probabilities of modes after sample t, T their transitions, and nu_tj those of the states of the noise
+after the sample, and the regressors and outputs from which coloured
+noise was taken. Before the filters start nothing drifts.
 
 Source: the moments of a noise given the data are those of an EM step, Shumway and Stoffer (1982); step^2 / 12 is
 Sheppard's (1898); the backward pass is Kim's (1994), eq. 2.20. The modes and the rule for repeats are ours. Cost per
@@ -27,7 +28,6 @@ sample: O(K).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -45,10 +45,10 @@ FLOOR = 0.002
 """Share of the common drift in the learned one."""
 MOST_ALONE = 8
 """Number of parameters up to which each has a ladder of its own."""
-UP, DOWN, BACK = 2e-4, 1e-3, 0.05
-"""Probabilities: to the next larger ratio, to the next smaller one, and the latter from ratios of 1 and more."""
-JUMP, ARRIVE = 3e-3, 1e-5
-"""Probabilities from the whole bank: into all modes with ratios of 1 and more, and into each other one."""
+JUMP, DRIFT = 2e-3, 6e-4
+"""Probabilities, from the whole bank: into all modes with ratios of 1 and more, and into all others."""
+DOWN, AFTER = 1e-3, 0.05
+"""Probabilities of the next smaller ratio of a ladder, and of that from ratios of 1 and more."""
 AT_REST, ALL, SELDOM = 0.3, 0.45, 0.02
 """Probabilities before the first sample: of no drift at least, of the other common ratios, and the share of jumps in
 these and those of the other ladders."""
@@ -56,8 +56,8 @@ FIRST_LEARNED = len(COMMON) + len(TREND)
 FIRST_ALONE = FIRST_LEARNED + len(LEARNED)
 """Where the ladders begin."""
 STATES = 3
-OUTLIER, RARITY, FADE = 0.035, 50.0, 0.999
-"""Probability of an outlier before the first sample, samples that this counts for, and fading of those since."""
+OUTLIER, RARITY, OFTEN = 0.035, 50.0, 1000.0
+"""Probability of an outlier before the first sample, samples that this counts for, and memory of those since."""
 STAY, CALM = 0.995, 0.98
 """Probabilities that quiet noise stays quiet, and that restless noise stays restless."""
 QUIET = 0.8
@@ -72,7 +72,7 @@ LEAST_SHARE = 1e-26
 
 def table(n: int, groups: Any) -> dict[str, Array]:
     """The modes as arrays (K,): ``ratio``; the ``ladder``, -3 common, -2 trend, -1 learned, or the number of a group;
-    probabilities ``up``, ``down`` and ``arrive``; and ``start``, before the first sample. And ``first`` (n,), the first
+    probabilities ``arrive`` from the whole bank; and ``start``, before the first sample. And ``first`` (n,), the first
     mode of the ladder in which a parameter drifts without all others, or -1.
     """
     each = [[i] for i in range(n)] if groups is None and 1 < n <= MOST_ALONE else list(groups or ())
@@ -80,9 +80,8 @@ def table(n: int, groups: Any) -> dict[str, Array]:
     ladders += [(g, ALONE if groups is None else GROUP) for g in range(len(each))]
     ratio = np.array([rho for _, ladder in ladders for rho in ladder])
     of = np.array([which for which, ladder in ladders for _ in ladder])
-    top = np.array([j + 1 == len(ladder) for _, ladder in ladders for j in range(len(ladder))])
     jump, alone = ratio >= 1.0, of >= 0
-    arrive = np.where(jump, JUMP, ARRIVE)
+    arrive = np.where(jump, JUMP, DRIFT / np.sum(~jump))
     for kind, share in ((alone, 0.5), (~alone, 0.5 if each else 1.0)):
         arrive[jump & kind] *= share / max(int(np.sum(jump & kind)), 1)
     start = np.where(of == -3, ALL / (len(COMMON) - 1), (1.0 - AT_REST - ALL) / np.sum(of != -3))
@@ -91,40 +90,27 @@ def table(n: int, groups: Any) -> dict[str, Array]:
     first = np.full(n, -1)
     for g, members in enumerate(each):
         first[list(members)] = np.argmax(of == g)
-    down = np.where(ratio > 0.0, np.where(jump, BACK, DOWN), 0.0)
-    return {
-        "ratio": ratio, "ladder": of, "up": np.where(top, 0.0, UP), "down": down, "arrive": arrive, "start": start,
-        "first": first,
-    }  # fmt: skip
+    return {"ratio": ratio, "ladder": of, "arrive": arrive, "start": start, "first": first}
 
 
 def bank(n: int, groups: Any) -> dict[str, Any]:
     """Fields of the K filters before the first sample: their modes, means m, covariances C (lower triangle)."""
     modes = table(n, groups)
     K = len(modes["ratio"])
-    foot = np.diff(modes["ladder"], prepend=-3) != 0
     return {
         "modes": K,
         "parameters": n,
         "ratio": modes["ratio"],
-        "up": modes["up"],
-        "down": np.where(foot, 0.0, modes["down"]),
-        "foot": np.where(foot, modes["down"], 0.0),
         "arrive": modes["arrive"],
         "alone": modes["first"],
         "rungs": len(ALONE if groups is None else GROUP),
-        "left_behind": 0.0,
-        "jumps_expected": 0.0,
-        "kappa": 1.0,
-        "leap": 0.0,
-        "astray": 0.0,
         "mu": modes["start"],
         "prior": modes["start"],
         "m": np.zeros((n, K)),
         "C": np.zeros((n, n, K)),
         "trend": np.zeros((n, len(TREND))),
         "walk": np.zeros((2, n, n)),
-        "Z": np.zeros((2, n, n)),
+        "Z": np.zeros((n, n)),
         "away": np.zeros((2, n)),
         "e_k": np.zeros(K),
         "h_k": np.zeros(K),
@@ -133,7 +119,6 @@ def bank(n: int, groups: Any) -> dict[str, Any]:
         "curve": np.zeros(K),
         "inverse": np.zeros((STATES, K)),
         "joint": np.zeros((STATES, K)),
-        "share": np.zeros((3, K)),
         "row": np.zeros(K + 8),
     }
 
@@ -142,7 +127,7 @@ def any_noise() -> dict[str, Any]:
     """Fields before the first sample."""
     return {
         "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.zeros(STATES), "restless": 1.0, "outlier": 0.0,
-        "precision": 0.0, "certainty": 0.0, "outliers": 0.0, "watched": 0.0, "outlying": OUTLIER,
+        "precision": 0.0, "usual_noise": 1.0, "outlying": OUTLIER, "astray": 0.0,
         "finest": np.inf, "reading": np.nan, "repeats": 0.0,
     }  # fmt: skip
 
@@ -215,7 +200,7 @@ def learn_noise(s: State, l: int) -> None:
     K, more = s.modes[l], s.vague[l] + repeated_rounding(s, l)
     usual = s.nu[0, l] / (variance_in(s, 0, l) + more) + s.nu[1, l] / (variance_in(s, 1, l) + more)
     far = max(variance_in(s, STATES - 1, l), s.e[l] * s.e[l]) + more
-    s.certainty[l] = s.noise[l] * ((1.0 - s.outlier[l]) * usual + s.outlier[l] / far)
+    s.usual_noise[l] = 1.0 / (s.noise[l] * ((1.0 - s.outlier[l]) * usual + s.outlier[l] / far))
     if s.repeats[l] > 0.0:
         return
     ordinary, wild = 0.0, 0.0
@@ -230,18 +215,16 @@ def learn_noise(s: State, l: int) -> None:
         ordinary += moment if j < STATES - 1 else 0.0
         wild += moment if j > 0 else 0.0
     s.count[l] += 1.0
-    s.outliers[l] = FADE * s.outliers[l] + s.outlier[l]
-    s.watched[l] = FADE * s.watched[l] + 1.0
     # s.nu counts an outlier for the states that were expected
     away = 1.0 - s.nu[0, l] + s.outlier[l] * s.nu_prior[0, l] / (1.0 - s.outlying[l])
     f = variance_in(s, 1, l) / s.noise[l]
     s.restless[l] = f * exp(away / QUICK * log(wild / (away * f))) if (away > 0.0) & (wild > 0.0) else f
-    s.outlying[l] = (OUTLIER * RARITY + s.outliers[l]) / (RARITY + s.watched[l])
+    s.outlying[l] += (s.outlier[l] - s.outlying[l]) / (RARITY + min(s.count[l], OFTEN))
     move = (ordinary / s.r[l] - (1.0 - s.outlier[l])) / min(s.count[l] + 1.0, MEMORY)
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
 
 
-SMOOTHER_FIELDS = ("mu", "prior", "kappa", "r", "certainty", "offset", "white", "explained", "settled", "constant")
+SMOOTHER_FIELDS = ("mu", "prior", "r", "usual_noise", "offset", "white", "explained", "settled", "constant")
 """Fields that are stored at every sample."""
 
 
@@ -252,44 +235,20 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
         o.mu[k, l], o.prior[k, l] = s.mu[k, l], s.prior[k, l]
     for i in range(s.c.shape[0]):
         o.offset[i, l], o.white[i, l] = s.offset[i, l], s.white[i, l]
-    o.kappa[l], o.r[l], o.certainty[l], o.explained[l] = s.kappa[l], s.r[l], s.certainty[l], s.explained[l]
-    o.settled[l], o.constant[l] = s.settled[l], s.constant[l]
+    o.r[l], o.usual_noise[l] = s.r[l], s.usual_noise[l]
+    o.explained[l], o.settled[l], o.constant[l] = s.explained[l], s.settled[l], s.constant[l]
 
 
-def transitions(state: Mapping[str, Any]) -> tuple[Array, Array]:
-    """Transitions (K, K) of the modes as A + kappa B, from the fields of a bank."""
-    up, down, foot, arrive = state["up"], state["down"], state["foot"], state["arrive"]
-    A = np.diag(1.0 - down - foot) + np.diag(down[1:], -1)
-    A[:, 0] += foot
-    B = np.diag(-arrive.sum() - up) + np.diag(up[:-1], 1) + arrive
-    return A, B
+def transitions(ratio: Array, arrive: Array) -> Array:
+    """T (K, K): down a ladder, or from the whole bank to a mode."""
+    down = np.where(ratio >= 1.0, AFTER, DOWN) * np.append(False, np.diff(ratio) > 0.0)
+    return np.asarray(np.diag(1.0 - down - arrive.sum()) + np.diag(down[1:], -1) + arrive)
 
 
-def modes_given_all(fields: Mapping[str, Array], used: Array, state: Mapping[str, Any]) -> Array:
-    """Probabilities (T, K) of the modes, given all samples; ``used`` (T,) are those that changed them."""
-    after, ahead = np.where(used[:, None], fields["mu"], fields["prior"]), fields["prior"]
-    (A, B), found = transitions(state), after.copy()
+def modes_given_all(after: Array, ahead: Array, T: Array) -> Array:
+    """Probabilities (N, K) of the modes given all samples, from those after each sample and before the next."""
+    found, mixed = after.copy(), np.any(after != ahead, axis=1)
     for t in range(len(found) - 2, -1, -1):
-        later = found[t + 1] / np.maximum(ahead[t], 1e-300)
-        found[t] = after[t] * (A @ later + fields["kappa"][t] * (B @ later)) if used[t] else found[t + 1]
+        found[t] = after[t] * (T @ (found[t + 1] / np.maximum(ahead[t], 1e-300))) if mixed[t] else found[t + 1]
         found[t] /= max(found[t].sum(), 1e-300)
     return found
-
-
-def centring(fields: Mapping[str, Array], phi: Array) -> Array:
-    """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
-    centred, A, constant = fields["offset"] != 0.0, np.eye(phi.shape[1]), int(fields["constant"][-1])
-    if constant >= 0 and centred.any():
-        mean = phi.mean(axis=0)
-        A[constant] = np.where(centred.any(axis=0), -mean / mean[constant], 0.0)
-        A[constant, constant] = 1.0
-    return A
-
-
-def variances_given_all(fields: Mapping[str, Array], state: Mapping[str, Any]) -> tuple[Array, Array]:
-    """Variance of the noise of every sample (T,), and that of the drift but for jumps, in units of 1 / c (T,)."""
-    running = fields["settled"] > 0
-    r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
-    used = running & (fields["certainty"] > 0.0)
-    drift = modes_given_all(fields, used, state) @ np.where(state["ratio"] < 1.0, state["ratio"], 0.0)
-    return 1.0 / np.where(used, fields["certainty"], 1.0 / r), np.where(running, r * drift, 0.0)
