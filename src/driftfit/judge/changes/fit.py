@@ -185,7 +185,7 @@ def divided(
     found, _ = searched(X, y, problem)
     criteria = N * np.log(found.rss) + (n + 2) * np.log(N) * np.arange(most + 1)
     K = int(np.argmin(criteria))
-    return problem.places[found.at[K, :K]], found.ar[K], float(criteria[K])
+    return found.at[K, :K], found.ar[K], float(criteria[K])
 
 
 def together(

@@ -260,7 +260,7 @@ def tested(model: Model) -> tuple[Tested, Draws]:
             break
     p_path = np.array([p_of(float(one), drawn) for one, drawn in zip(found.L[1:], L.T[1:], strict=True)])
     root = max(draws.of_outputs(theta), radius(ar, noise.lags))
-    dates = tuple(problem.places[found.at[k, :k]] for k in range(most + 1))
+    dates = tuple(found.at[k, :k] for k in range(most + 1))
     constants = model.basis @ found.theta
     return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, root), draws
 
