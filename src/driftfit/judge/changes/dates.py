@@ -19,7 +19,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.fit import estimated, noise_of, order_of, regressed, split, white_rows
-from driftfit.judge.changes.null import Draws, Model, Tested, gains, price, radius
+from driftfit.judge.changes.null import DRAWS, Draws, Model, Tested, price, radius
 from driftfit.judge.changes.scan import SINGULAR, SMALL, add
 from driftfit.judge.statistics.robust import cholesky, orthonormal, solved
 
@@ -157,14 +157,15 @@ def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Arr
         prices = price(drawn[:, 0], level / SHARE), price(drawn[:, 1], level / SHARE)
         return stepwise(gain, prices) or first, prices
 
-    K, prices = number(test.gains)
-    if K and (len(noise.lags) or len(model.lags.columns)):  # changes made the dynamics of constants too slow
+    dynamic = len(noise.lags) or len(model.lags.columns)
+    rest = 0 if dynamic else DRAWS[-1] - len(test.gains)
+    K, prices = number(np.vstack([test.gains, draws.gains(*draws.constants, rest)]))
+    if K and dynamic:  # changes made the dynamics of constants too slow
         breaks, ar = test.breaks[K], test.ar[K]
         theta, _ = estimated(model.X, model.y, (noise.lags, ar, noise.g), breaks)
         mean = model.basis @ (np.diff(np.concatenate([[0], breaks, [N]])) / N @ theta)
         if max(radius(ar, noise.lags), draws.of_outputs(mean)) < 1.0:
-            rss = draws.of(mean, ar, len(test.gains), True).rss
-            K, prices = number(gains(rss[np.isfinite(rss[:, 0])], N))
+            K, prices = number(draws.gains(mean, ar, DRAWS[-1]))
     return test.breaks[K], test.ar[K], prices
 
 

@@ -11,7 +11,7 @@ the largest draws by their exponential tail.
 
 Source: Wu (1986) and Liu (1988) for wild residuals; Hansen (2000) for fixed regressors, Goncalves and Kilian (2004) for
 the recursion. Besag and Clifford (1991) for the end. Cost: `DRAWS`
-searches, fewer the larger p.
+searches, fewer if p is clearly large or small.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ DRAWS = (19, 39, 79, 199)
 """Draws after which it is decided whether there are more."""
 CLEAR = 10.0
 """Draws beyond the statistic from which on p is known well enough (Besag and Clifford, 1991)."""
+SURE = 1e-4
+"""p below which the last draws would change no decision; results print no smaller one."""
 BIASED = 40
 """Draws of constants from which their bias comes."""
 UNIT = 0.9999
@@ -122,9 +124,11 @@ def in_basis(phi: Array) -> tuple[Array, Array]:
 
 
 def modelled(
-    phi: Array, y: Array, lags: Lags, root: Array, order: int | None = None, fewest: int | None = None
+    phi: Array, y: Array, lags: Lags | None, root: Array | None, order: int | None = None, fewest: int | None = None
 ) -> Model:
-    """The regression with its noise."""
+    """The regression with its noise; no ``lags`` are none, and no ``root`` is 1."""
+    lags = Lags.none(len(y)) if lags is None else lags
+    root = np.ones(len(y)) if root is None else root
     X, basis = in_basis(phi)
     offset = basis @ np.linalg.lstsq(X, y, rcond=None)[0]
     rounding = ROUNDING * np.abs(y)
@@ -148,6 +152,9 @@ def radius(a: Array, lags: Array) -> float:
 class Draws:
     """Records that a model of constants draws, and what is found in them."""
 
+    constants: tuple[Array, Array]
+    """theta and its autoregression, less their bias."""
+
     def __init__(self, model: Model, problem: Problem, held: Array, seed: int = 0) -> None:
         N, n = model.X.shape
         self.model, self.problem, self.e = model, problem, held
@@ -169,6 +176,11 @@ class Draws:
         )  # fmt: skip
         draw(way, signs, problem, int(whole), self.work, self.found, self.drawn, results)
         return results
+
+    def gains(self, theta: Array, ar: Array, count: int) -> Array:
+        """Gains (R, 2) of one and of two breaks in such draws."""
+        rss = self.of(theta, ar, count, True).rss
+        return gains(rss[np.isfinite(rss[:, 0])], len(self.model.y))
 
     def unbiased(self, theta: Array, ar: Array) -> tuple[Array, Array]:
         """Constants and their autoregression without the bias of the dynamics, as far as they remain stable."""
@@ -248,7 +260,7 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     if first or len(model.lags.columns):  # an outlier of the output would be one of the dynamics
         held = np.clip(held, -HELD * noise.level, HELD * noise.level)
     draws = Draws(model, few, held)
-    theta, ar = draws.unbiased(model.basis @ found.theta, found.ar[0])
+    theta, ar = draws.constants = draws.unbiased(model.basis @ found.theta, found.ar[0])
     x = np.append(found.L[0], gains(found.rss[None, :3], N)[0])
     R, L = np.zeros((0, 2)), np.zeros((0, len(found.L)))
     for count in np.diff(DRAWS, prepend=0):
@@ -256,7 +268,7 @@ def tested(model: Model) -> tuple[Tested, Draws]:
         fine = np.isfinite(drawn.L).all(axis=1) & np.isfinite(drawn.rss[:, 0])
         R, L = np.vstack([R, gains(drawn.rss[fine], N)]), np.vstack([L, drawn.L[fine]])
         p, each = smallest(x, np.column_stack([L[:, 0], R]))
-        if p * len(R) > CLEAR:
+        if p * len(R) > CLEAR or (p < SURE and count >= DRAWS[1]):
             break
     p_path = np.array([p_of(float(one), drawn) for one, drawn in zip(found.L[1:], L.T[1:], strict=True)])
     root = max(draws.of_outputs(theta), radius(ar, noise.lags))

@@ -256,7 +256,8 @@ def segment(problem: Problem, k: int, count: int, work: Work, least: float) -> f
     """What constants leave of segment k of those between ``at``; their factor is left in G."""
     before(problem, work.at[k - 1] if k > 0 else 0, work, work.low)
     before(problem, work.at[k] if k < count else work.Z.shape[0], work, work.high)
-    return cost(work.low, work.high, work.G, least)
+    left: float = cost(work.low, work.high, work.G, least)
+    return left
 
 
 @shared
