@@ -61,7 +61,7 @@ def changes(
     the test. ``order``: that of the autoregression of the noise; None estimates it. ``fewest``: rows
     in a segment.
     """
-    n = phi.shape[1]
+    N, n = phi.shape
     model = modelled(phi, y, lags, root, order, fewest)
     test, draws = tested(model)
     breaks, ar, prices = NONE, test.ar[0], (np.nan, np.nan)
