@@ -88,10 +88,10 @@ def split(X: Array, breaks: Array) -> Array:
     return np.hstack([X, *(X * (t >= b) for b in breaks)])
 
 
-def solution(Z: Array, z: Array, share: Array | float) -> Array:
-    """Least squares of z (N,) on Z (N, q), with this share of the mean information of its columns beside their own."""
+def moments(Z: Array, share: Array | float = ROUNDED) -> Array:
+    """Z' Z of columns Z (N, q), with this share of their mean beside their own, so that it can be inverted."""
     G = Z.T @ Z
-    return np.asarray(np.linalg.solve(G + np.diag(np.trace(G) / len(G) * share + np.full(len(G), SMALL)), Z.T @ z))
+    return np.asarray(G + np.diag(np.trace(G) / len(G) * share + np.full(len(G), SMALL)))
 
 
 def estimated(
@@ -103,7 +103,8 @@ def estimated(
     """
     Z, z = white_rows(split(X, breaks) if rows is None else rows, y, *noise)
     n, K = X.shape[1], len(breaks)
-    beta = solution(Z, z, np.append(np.full(n, ROUNDED), np.full(K * n, SINGULAR)))
+    ridge = np.append(np.full(n, ROUNDED), np.full(K * n, SINGULAR))
+    beta = np.linalg.solve(moments(Z, ridge), Z.T @ z)
     r = z - Z @ beta
     return np.cumsum(beta.reshape(K + 1, n), axis=0), float(r @ r)
 
@@ -193,8 +194,8 @@ def on_lines(Z: Array, z: Array, N: int, knots: int) -> tuple[Array, Array]:
         A = np.hstack([Z[s] * hat[first:][s, k : k + 1], Z[s] * hat[first:][s, k + 1 : k + 2], z[s, None]])
         G[own[:, None], own] += A.T @ A
         own[:-1] += n
-    ridge = ROUNDED * np.trace(G[:-1, :-1]) / len(G) + SMALL
-    path = hat @ np.linalg.solve(G[:-1, :-1] + ridge * np.eye(len(G) - 1), G[:-1, -1]).reshape(knots, n)
+    G[np.diag_indices(knots * n)] += ROUNDED * np.trace(G[:-1, :-1]) / (knots * n) + SMALL
+    path = hat @ np.linalg.solve(G[:-1, :-1], G[:-1, -1]).reshape(knots, n)
     return path, z - np.einsum("tj,tj->t", Z, path[first:])
 
 
@@ -205,7 +206,8 @@ def divided(
     N, n = X.shape
     problem = problem_of(g, lags, shortest(n, lags, given), most, np.zeros((0, n)))
     found, _ = searched(X, y, problem)
-    criteria = N * np.log(found.rss) + (n + 2) * np.log(N) * np.arange(most + 1)
+    rows = N - order_of(lags)  # the sums of squares are those of rows with all lags
+    criteria = N * np.log(found.rss / rows) + (n + 2) * np.log(N) * np.arange(most + 1)
     K = int(np.argmin(criteria))
     return found.at[K, :K], found.ar[K], float(criteria[K])
 
@@ -239,7 +241,7 @@ def together(
         ar = regressed(v, g, lags)
         if len(lags):
             _, r = on_lines(*white_rows(X, y, lags, ar, g), N, knots)
-        criterion = N * np.log(max(float(r @ r), SMALL)) + (n * (knots - 1) + len(lags)) * np.log(N)
+        criterion = N * np.log(max(float(r @ r), SMALL) / len(r)) + (n * (knots - 1) + len(lags)) * np.log(N)
         if criterion < best[0]:
             best = criterion, lags, ar, lined(X, knots)
     return best[1:]
@@ -286,7 +288,7 @@ def noise(X: Array, y: Array, phi: Array, order: int | None = None, fewest: int 
             rows = split(X, breaks)
         Z, z = white_rows(rows, y, lags, ar, g)
         first = order_of(lags)
-        v = y - rows @ solution(Z, z, ROUNDED)
+        v = y - rows @ np.linalg.solve(moments(Z), Z.T @ z)
         e = np.append(np.zeros(first), white_rows(v[:, None], v, lags, ar, np.ones(N))[1])
         size = spread(e, phi)
         level = size * level_of(e / size, first)

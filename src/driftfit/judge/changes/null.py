@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.fit import HELD, MOST, Noise, noise, order_of, white_rows
+from driftfit.judge.changes.fit import HELD, MOST, Noise, moments, noise, order_of, white_rows
 from driftfit.judge.changes.recursion import Drawn, Recursion, Results, draw
 from driftfit.judge.changes.scan import SMALL, Found, Problem, Work, problem_of, searched
 from driftfit.judge.statistics.robust import orthonormal
@@ -254,9 +254,8 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     found, _ = searched(model.X, model.y, problem)
     few = problem_of(noise.g, noise.lags, noise.fewest, 2, paths, model.floor)
     held = noise.e.copy()
-    rows, _ = white_rows(noise.rows, model.y, noise.lags, noise.ar, noise.g)
-    Q = np.linalg.qr(rows)[0]
-    held[first:] /= np.maximum(1.0 - np.sum(Q * Q, axis=1), 0.1)
+    Z, _ = white_rows(noise.rows, model.y, noise.lags, noise.ar, noise.g)
+    held[first:] /= np.maximum(1.0 - np.sum(Z.T * np.linalg.solve(moments(Z), Z.T), axis=0), 0.1)
     if first or len(model.lags.columns):  # an outlier of the output would be one of the dynamics
         held = np.clip(held, -HELD * noise.level, HELD * noise.level)
     draws = Draws(model, few, held)
