@@ -28,8 +28,6 @@ LEVEL = 0.95
 SHARE = 5.0
 """A further break has the level of the test divided by this."""
 SWEEPS = 4
-DATES = 20_000
-"""Places, at most, at which the likelihood of a date is computed."""
 RANK = 1e-12
 """Smallest singular value that counts, as a share of the largest."""
 LEVERAGE = 0.1
@@ -92,7 +90,7 @@ def profile(model: Model, ar: Array, breaks: Array, k: int, gap: int) -> tuple[A
     X, lags, g = model.X, model.noise.lags, model.noise.g
     N, n = X.shape
     low, high = breaks[k - 1] if k else 0, breaks[k + 1] if k + 1 < len(breaks) else N
-    place = np.union1d(np.arange(low + gap, high - gap + 1, (high - low) // DATES + 1), breaks[k])
+    place = np.union1d(np.arange(low + gap, high - gap + 1), breaks[k])
     Z = np.column_stack(white_rows(X[low:high], model.y[low:high], lags, ar, g[low:high]))
     least = SINGULAR * float(np.sum((X * g[:, None]) ** 2, axis=0).max()) + SMALL
     rss, theta = np.empty(len(place)), np.empty((len(place), 2 * n))

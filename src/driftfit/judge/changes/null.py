@@ -23,7 +23,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.changes.fit import HELD, MOST, Noise, moments, noise, order_of, white_rows
-from driftfit.judge.changes.recursion import Drawn, Recursion, Results, draw
+from driftfit.judge.changes.recursion import Recursion, Results, draw
 from driftfit.judge.changes.scan import SMALL, Found, Problem, Work, problem_of, searched
 from driftfit.judge.statistics.robust import orthonormal
 
@@ -160,7 +160,6 @@ class Draws:
         self.model, self.problem, self.e = model, problem, held
         self.work, self.found = Work.of(N, n, problem), Found.of(n, problem)
         self.rng = np.random.default_rng(seed)
-        self.drawn = Drawn(np.zeros((N, n)), np.zeros((N, n)), np.zeros(N))
 
     def of(self, theta: Array, ar: Array, count: int, whole: bool) -> Results:
         """Draws from constants theta (n,) in units of the model; only constants of them unless ``whole``."""
@@ -174,7 +173,7 @@ class Draws:
             np.full((count, 3), np.inf), np.zeros((count, 1 + len(problem.paths))), np.zeros((count, n)),
             np.zeros((count, len(ar))),
         )  # fmt: skip
-        draw(way, signs, problem, int(whole), self.work, self.found, self.drawn, results)
+        draw(way, signs, problem, int(whole), self.work, self.found, results)
         return results
 
     def gains(self, theta: Array, ar: Array, count: int) -> Array:

@@ -62,6 +62,9 @@ def problem_of(g: Array, lags: Array, fewest: int, most: int, paths: Array, floo
 class Work(NamedTuple):
     """Scratch space for N rows of n regressors, m cells, K breaks and p lags."""
 
+    phi: Array
+    X: Array
+    y: Array
     Z: Array
     v: Array
     C: Array
@@ -86,8 +89,8 @@ class Work(NamedTuple):
         """Empty space for one record."""
         p, K, m, k = len(problem.lags), int(problem.sizes[1]), len(problem.edges), n + 1
         shapes = (
-            (N, k), (N,), (m, k, k), *[(k, k)] * 4, (p + 1, p + 1), (m, m), (K + 1, m), (n,), (n,), (n,), (p,),
-            (K + 1, p),
+            (N, n), (N, n), (N,), (N, k), (N,), (m, k, k), *[(k, k)] * 4, (p + 1, p + 1), (m, m), (K + 1, m),
+            *[(n,)] * 3, (p,), (K + 1, p),
         )  # fmt: skip
         return cls._make([*map(np.zeros, shapes), np.zeros((K + 1, m), np.int64), np.zeros(K, np.int64)])
 
@@ -166,17 +169,15 @@ def remainder(X: Array, y: Array, first: int, last: int, work: Work) -> None:
 
 @shared
 def add(Z: Array, first: int, last: int, S: Array) -> None:
-    """Add the products of rows first .. last - 1 of Z to S, a lower triangle; four at a time take half the time."""
-    t = first
-    while t < last:
-        many = t + 4 <= last
+    """Add the products of rows first .. last - 1 of Z to S, a lower triangle; two at a time take less."""
+    if (last - first) % 2 == 1:
         for i in range(Z.shape[1]):
             for j in range(i + 1):
-                total = Z[t, i] * Z[t, j]
-                if many:
-                    total += Z[t + 1, i] * Z[t + 1, j] + Z[t + 2, i] * Z[t + 2, j] + Z[t + 3, i] * Z[t + 3, j]
-                S[i, j] += total
-        t += 4 if many else 1
+                S[i, j] += Z[first, i] * Z[first, j]
+    for t in range(first + (last - first) % 2, last, 2):
+        for i in range(Z.shape[1]):
+            for j in range(i + 1):
+                S[i, j] += Z[t, i] * Z[t, j] + Z[t + 1, i] * Z[t + 1, j]
 
 
 @shared
