@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from datetime import UTC, datetime
 from typing import Any, NamedTuple
-from zoneinfo import ZoneInfo
 
 import numpy as np
 
+from driftfit.data.limits import end_of
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import plain, whole
 from driftfit.judge.alarms.bootstrap import Normal
@@ -92,29 +91,9 @@ def first_third(run: Track, usable: Array, least: int) -> tuple[int, int]:
 
 def _place(run: Track, given: Any) -> int:
     """The first sample at or after a time, or a sample number."""
-    time = run.time
-    if time.dtype.kind != "M":
-        if isinstance(given, str | datetime | np.datetime64):
-            raise ValueError(f"detect: reference names the time {given!r}, but this run has no dates (time=).")
-        return int(np.searchsorted(time, float(given)))
-    if isinstance(given, int | np.integer):
+    if run.time.dtype.kind == "M" and isinstance(given, int | np.integer):
         return min(int(given), len(run))
-    return int(np.searchsorted(time, as_date(given, run.labels.zone)))
-
-
-def as_date(given: Any, zone: str | None) -> np.datetime64:
-    """A date as a time of the record; one without a time zone is in that of the table that the record came from."""
-    try:
-        date = given if isinstance(given, np.datetime64) else datetime.fromisoformat(str(given))
-    except ValueError:
-        raise ValueError(f"detect: {given!r} is not a date; write it as 2024-03-01 or 2024-03-01 12:30.") from None
-    if isinstance(date, np.datetime64):
-        if zone is None:
-            return date
-        date = date.astype("datetime64[us]").item()
-    if date.tzinfo is None and zone is not None:
-        date = date.replace(tzinfo=ZoneInfo(zone))
-    return np.datetime64(date if date.tzinfo is None else date.astimezone(UTC).replace(tzinfo=None))
+    return int(np.searchsorted(run.time, end_of("detect: reference", given, run.time, run.labels.zone, 0)))
 
 
 class Modelled(NamedTuple):
