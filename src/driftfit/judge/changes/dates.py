@@ -250,11 +250,7 @@ def _directions(model: Model, first: int, last: int) -> Array:
         return np.eye(n)
     scale = orthonormal(model.phi).size
     own = kept * (basis.size / scale)
-    return _projector(np.linalg.solve(model.basis, (np.linalg.qr(own.T)[0]) / scale[:, None]))
-
-
-def _projector(W: Array) -> Array:
-    Q = np.linalg.qr(W)[0]
+    Q = np.linalg.qr(np.linalg.solve(model.basis, (np.linalg.qr(own.T)[0]) / scale[:, None]))[0]
     return np.asarray(Q @ Q.T)
 
 

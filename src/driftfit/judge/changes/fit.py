@@ -206,8 +206,7 @@ def divided(
     N, n = X.shape
     problem = problem_of(g, lags, shortest(n, lags, given), most, np.zeros((0, n)))
     found, _ = searched(X, y, problem)
-    rows = N - order_of(lags)  # the sums of squares are those of rows with all lags
-    criteria = N * np.log(found.rss / rows) + (n + 2) * np.log(N) * np.arange(most + 1)
+    criteria = N * np.log(found.rss) + (n + 2) * np.log(N) * np.arange(most + 1)
     K = int(np.argmin(criteria))
     return found.at[K, :K], found.ar[K], float(criteria[K])
 
@@ -241,7 +240,7 @@ def together(
         ar = regressed(v, g, lags)
         if len(lags):
             _, r = on_lines(*white_rows(X, y, lags, ar, g), N, knots)
-        criterion = N * np.log(max(float(r @ r), SMALL) / len(r)) + (n * (knots - 1) + len(lags)) * np.log(N)
+        criterion = N * np.log(max(float(r @ r), SMALL)) + (n * (knots - 1) + len(lags)) * np.log(N)
         if criterion < best[0]:
             best = criterion, lags, ar, lined(X, knots)
     return best[1:]

@@ -117,19 +117,14 @@ class Model(NamedTuple):
     """Smallest sum of squares that is more than rounding."""
 
 
-def in_basis(phi: Array) -> tuple[Array, Array]:
-    """X (N, n) with X' X = N I, and the matrix that makes it of phi."""
-    basis = orthonormal(phi)
-    return basis.Q, np.linalg.inv(basis.R) / basis.size[:, None]
-
-
 def modelled(
     phi: Array, y: Array, lags: Lags | None, root: Array | None, order: int | None = None, fewest: int | None = None
 ) -> Model:
     """The regression with its noise; no ``lags`` are none, and no ``root`` is 1."""
     lags = Lags.none(len(y)) if lags is None else lags
     root = np.ones(len(y)) if root is None else root
-    X, basis = in_basis(phi)
+    X, R, size = orthonormal(phi)
+    basis = np.linalg.inv(R) / size[:, None]
     offset = basis @ np.linalg.lstsq(X, y, rcond=None)[0]
     rounding = ROUNDING * np.abs(y)
     phi, y, basis = (np.ascontiguousarray(one) for one in (phi, y - phi @ offset, basis))
