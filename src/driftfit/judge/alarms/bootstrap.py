@@ -129,7 +129,7 @@ class Source:
         columns, lags = np.array(self.columns, np.int64), np.array([lag for _, lag in self.normal.delays], np.int64)
         source = np.arange(N + T)[:, None] - lags
         way = Recursion(
-            phi, phi, np.zeros((0, 0)), columns, source, root[source] / root[:, None], self.theta, frozen.ar,
+            phi, np.zeros((0, 0)), columns, source, root[source] / root[:, None], self.theta, frozen.ar,
             np.zeros(N + T), self._noise(N + T),
         )  # fmt: skip
         drawn, y = np.empty((N + T, n)), np.empty(N + T)

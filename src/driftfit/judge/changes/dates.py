@@ -133,15 +133,10 @@ class Dated(NamedTuple):
 
 def stepwise(gain: Array, prices: tuple[float, float]) -> int:
     """The number of breaks, of gains (K + 1,) of 0 .. K breaks over none: one more, two or three while they pay."""
-    K, (one, two) = 0, prices
-    needed = (one, two, one + two)
-    while True:
-        for more, least in enumerate(needed, 1):
-            if K + more < len(gain) and gain[K + more] - gain[K] > max(least, 0.0):
-                K += more
-                break
-        else:
-            return K
+    K, needed = 0, np.maximum([*prices, sum(prices)], 0.0)
+    while (pays := gain[K + 1 :][: len(needed)] - gain[K] > needed[: len(gain) - K - 1]).any():
+        K += int(np.argmax(pays)) + 1
+    return K
 
 
 def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Array, Array, tuple[float, float]]:

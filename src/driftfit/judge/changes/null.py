@@ -161,7 +161,7 @@ class Draws:
         model, problem = self.model, self.problem
         n = model.X.shape[1]
         way = Recursion(
-            model.phi, model.X, model.basis, *model.lags, theta + model.offset, ar, model.y - model.phi @ theta, self.e
+            model.phi, model.basis, *model.lags, theta + model.offset, ar, model.y - model.phi @ theta, self.e
         )  # fmt: skip
         signs = self.rng.integers(0, 2, (count, len(model.y))) * 2.0 - 1.0
         results = Results(

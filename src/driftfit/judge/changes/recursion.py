@@ -13,10 +13,8 @@ class Recursion(NamedTuple):
 
     phi: Array
     """(N, n): the regressors, in units of the model."""
-    X: Array
-    """(N, n): the same, orthonormal."""
     basis: Array
-    """(n, n): X = phi basis."""
+    """(n, n): phi basis is orthonormal."""
     columns: Array
     """(k,): columns of phi that are lags of the output."""
     source: Array
@@ -77,11 +75,9 @@ def _draw(
         for t in range(N):
             work.y[t] = work.v[t]  # without what constants explain, which may be far larger
             for j in range(n):
-                work.X[t, j] = way.X[t, j]
-                if way.columns.shape[0] > 0:
-                    work.X[t, j] = 0.0
-                    for i in range(n):
-                        work.X[t, j] += work.phi[t, i] * way.basis[i, j]
+                work.X[t, j] = 0.0
+                for i in range(n):
+                    work.X[t, j] += work.phi[t, i] * way.basis[i, j]
         if whole > 0:
             search(work.X, work.y, problem, work, found)
             for count in range(3):
