@@ -145,7 +145,8 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> Modelled:
     enough = least("glr", n)
     first, start = first_third(run, usable, enough) if reference is None else normal_samples(run, reference)
     rows, names = every[first:start].copy(), run.model.names if n else ()
-    rows[:, n + OK] *= (usable & ~_stuck(run))[first:start]
+    usable[run.left_out.sample[run.left_out.code == gate.FROZEN]] = False  # other refused readings are normal ones
+    rows[:, n + OK] *= usable[first:start]
     ok = rows[:, n + OK] > BLAMED
     if ok.sum() < enough:
         raise ValueError(
@@ -159,7 +160,9 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> Modelled:
     rule = replace(rule, parameters=names, names=("one parameter", "parameters", "noise"))
     rows = with_offset(rows, rule)
     rounding = _drawn(rows, step_of(run.y[first:start]) if n else 0.0, ok)
-    delays = _delays(run, rows[:, :n], every[:, n + Y], first, start) if n else ()
+    at = np.arange(first, start)
+    back = earlier_outputs(run, at, rows[:, :n], every[:, n + Y], np.ones(len(at))) if n else None
+    delays = () if back is None else tuple(zip(back.columns.tolist(), back.delays.tolist(), strict=True))
     found = frozen_model(rows, int(constants[-1]), [column for column, _ in delays])
     if found is None:
         raise ValueError(
@@ -169,13 +172,6 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> Modelled:
     frozen, known = found
     rule = replace(rule, frozen=tuple(plain(one) for one in frozen[:-1]), rounding=rounding)
     return Modelled(rule, Normal(rows, delays, frozen, known), start, every)
-
-
-def _delays(run: Track, phi: Array, y: Array, first: int, start: int) -> tuple[tuple[int, int], ...]:
-    """(column, lag) of each regressor that is an earlier output."""
-    at = np.arange(first, start)
-    back = earlier_outputs(run, at, phi, y, np.ones(len(at)))
-    return () if back is None else tuple(zip(back.columns.tolist(), back.delays.tolist(), strict=True))
 
 
 def _drawn(rows: Array, step: float, ok: Array) -> tuple[float, ...]:
@@ -192,13 +188,6 @@ def _drawn(rows: Array, step: float, ok: Array) -> tuple[float, ...]:
     seed = seed_of(y, step / root)
     rows[ok, n + Y] = root * drawn(y, *found, 0.5 * step / root, chances(0, int(ok.sum()), seed))
     return step, found[1], float(seed + 1)  # later samples draw other numbers
-
-
-def _stuck(run: Track) -> Array:
-    """Samples (T,) of a frozen sensor; other readings that a gate refused are normal if they are in the reference."""
-    left, found = run.left_out, np.zeros(len(run), bool)
-    found[left.sample[left.code == gate.FROZEN]] = True
-    return found
 
 
 def doubt(run: Track, first: int, end: int) -> str:

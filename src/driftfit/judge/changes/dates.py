@@ -56,13 +56,12 @@ def _at_each(
         done = at
         for i in range(n + 1):
             for j in range(i + 1):
-                later = total[i, j] - passed[i, j]
+                G[n + i, n + j] = total[i, j] - passed[i, j]
                 if i < n:
-                    G[i, j], G[n + i, n + j], G[n + i, j], G[n + j, i] = left[i, j], later, 0.0, 0.0
-                elif j < n:
-                    G[k, j], G[k, n + j] = left[n, j], later
-                else:
-                    G[k, k] = left[n, n] + later
+                    G[i, j], G[n + i, j], G[n + j, i] = left[i, j], 0.0, 0.0
+        for i in range(n):
+            G[k, i] = left[n, i]
+        G[k, k] += left[n, n]
         for t in range(place[d], place[d] + first):
             for j in range(n):
                 row[n + j] = X[t, j]

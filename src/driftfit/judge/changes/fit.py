@@ -21,7 +21,7 @@ import scipy
 from driftfit.engine.kernel import Array
 from driftfit.judge.changes.scan import SINGULAR, SMALL, problem_of, searched
 from driftfit.judge.statistics.robust import deviation, robust_fit
-from driftfit.judge.statistics.whiteness import LOUDER, grows_with
+from driftfit.judge.statistics.whiteness import loudest
 
 NONE = np.zeros(0, np.int64)
 HELD = 3.0
@@ -256,9 +256,8 @@ def spread(e: Array, phi: Array) -> Array:
 
     The likelihood of Gaussian noise, by weighted least squares of squares that are limited at three deviations.
     """
-    p = grows_with(e, phi)
-    most = int(np.argmin(p))
-    if not p[most] * len(p) < LOUDER:
+    most = loudest(e, phi)
+    if most is None:
         return np.ones(len(e))
     A = np.column_stack([np.ones(len(e)), phi[:, most] ** 2 / np.mean(phi[:, most] ** 2)])
     square, size = e**2, np.full(len(e), np.mean(e**2))

@@ -53,11 +53,6 @@ class Lags(NamedTuple):
     ratio: Array
     """(N, k): what they are times that output."""
 
-    @classmethod
-    def none(cls, N: int) -> Lags:
-        """No column is."""
-        return cls(np.zeros(0, np.int64), np.zeros((N, 0), np.int64), np.zeros((N, 0)))
-
     @property
     def delays(self) -> Array:
         """(k,): by how many rows each is earlier."""
@@ -121,8 +116,9 @@ def modelled(
     phi: Array, y: Array, lags: Lags | None, root: Array | None, order: int | None = None, fewest: int | None = None
 ) -> Model:
     """The regression with its noise; no ``lags`` are none, and no ``root`` is 1."""
-    lags = Lags.none(len(y)) if lags is None else lags
-    root = np.ones(len(y)) if root is None else root
+    N = len(y)
+    lags = Lags(np.zeros(0, np.int64), np.zeros((N, 0), np.int64), np.zeros((N, 0))) if lags is None else lags
+    root = np.ones(N) if root is None else root
     X, R, size = orthonormal(phi)
     basis = np.linalg.inv(R) / size[:, None]
     offset = basis @ np.linalg.lstsq(X, y, rcond=None)[0]

@@ -89,8 +89,8 @@ class Work(NamedTuple):
         """Empty space for one record."""
         p, K, m, k = len(problem.lags), int(problem.sizes[1]), len(problem.edges), n + 1
         shapes = (
-            (N, n), (N, n), (N,), (N, k), (N,), (m, k, k), *[(k, k)] * 4, (p + 1, p + 1), (m, m), (K + 1, m),
-            *[(n,)] * 3, (p,), (K + 1, p),
+            (N, n), (N, n), (N,), (N, k), (N,), (m, k, k), (k, k), (k, k), (k, k), (k, k), (p + 1, p + 1), (m, m),
+            (K + 1, m), (n,), (n,), (n,), (p,), (K + 1, p),
         )  # fmt: skip
         return cls._make([*map(np.zeros, shapes), np.zeros((K + 1, m), np.int64), np.zeros(K, np.int64)])
 
