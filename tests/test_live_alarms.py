@@ -204,12 +204,12 @@ def test_references_in_times():
     for wrong, match in (
         (("2024-03-05", "2024-03-05 04:00"), "at least 20 are needed"),
         (("2025-03-05", "2025-04-05"), "0 remain, and at least 20 are needed"),
-        (("in March", "2024-03-05"), "'in March' is not a date"),
+        (("in March", "2024-03-05"), "must be a date or a datetime, or None; got 'in March'"),
         ((1, 2, 3), "or an interval"),
     ):
         with pytest.raises(ValueError, match=match):
             dated.detect("band", reference=wrong)
-    with pytest.raises(ValueError, match="has no dates"):
+    with pytest.raises(ValueError, match="must be a number, or None; got '2024-03-05'"):
         plain.detect("band", reference=("2024-03-05", "2024-03-11"))
 
 

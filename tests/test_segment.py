@@ -190,7 +190,7 @@ def resting(rest, seed, T=600):
     return u, 2.0 * u + 3.7 + (np.arange(T) >= 300) + 0.1 * rng.normal(size=T)
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [2, 3])
 def test_where_an_input_rests_neither_its_gain_nor_the_intercept_is_known(seed):
     """The solution of least norm was reported, 1.1175 +- 0.0002 for 2, or one row of the other segment decided."""
     u, y = resting(20.0, seed)

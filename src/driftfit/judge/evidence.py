@@ -11,6 +11,7 @@ from driftfit.data.record import Record
 from driftfit.engine.kernel import Array
 from driftfit.judge.changes.changes import Changes, changes
 from driftfit.judge.changes.dates import LEVEL
+from driftfit.judge.changes.null import modelled, tested
 from driftfit.judge.compare import Errors, errors
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.judge.regressors import Distinct, Rows, judged_by_others, regressors
@@ -27,10 +28,8 @@ def least_rows(n: int) -> int:
     return 4 * n + 8
 
 
-def judged_rows(
-    rows: Rows, level: float, order: int | None = None, dates: float = LEVEL, fewest: int | None = None
-) -> Changes | None:
-    """The changes of rows; None if they are too few, do not determine every parameter, or have no noise."""
+def _testable(rows: Rows) -> tuple[Array, Array] | None:
+    """(basis (N, n), outputs); None if rows are too few, do not determine every parameter, or have no noise."""
     N, n = rows.phi.shape
     if n == 0 or least_rows(n) > N:
         return None
@@ -38,14 +37,27 @@ def judged_rows(
     if not basis.distinct or sole(basis.Q).any():
         return None
     y = rows.y if rows.step is None else drawn_within(basis.Q, rows.y, rows.step)
-    if not noisy(fit_in(basis, y), rows.phi, y):
+    return (basis.Q, y) if noisy(fit_in(basis, y), rows.phi, y) else None
+
+
+def p_of_constants(rows: Rows) -> float:
+    """p-value of constants, NaN if they cannot be tested: `judged_rows` without dates and kinds."""
+    known = _testable(rows)
+    return float("nan") if known is None else tested(modelled(rows.phi, known[1], rows.lags, rows.root))[0].p
+
+
+def judged_rows(
+    rows: Rows, level: float, order: int | None = None, dates: float = LEVEL, fewest: int | None = None
+) -> Changes | None:
+    """The changes of rows; None if these cannot be tested."""
+    known = _testable(rows)
+    if known is None:
         return None
+    Q, y = known
     found = changes(rows.phi, y, rows.lags, rows.root, level, order, dates, fewest)
     if rows.step is None or y is not rows.y or not len(found.found.breaks):
         return found
-    drawn = drawn_within(
-        basis.Q, y, rows.step, found.found.breaks
-    )  # readings of segments, where constants explain none
+    drawn = drawn_within(Q, y, rows.step, found.found.breaks)  # readings of segments, where constants explain none
     return found if drawn is y else changes(rows.phi, drawn, rows.lags, rows.root, level, order, dates, fewest)
 
 

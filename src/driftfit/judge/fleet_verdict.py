@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
@@ -46,10 +47,8 @@ def discoveries(p: Array) -> Array:
     """q-values (N,) of p-values (N,): the smallest false discovery rate at which each is found; NaN where p is NaN."""
     p = np.asarray(p, float)
     known = np.flatnonzero(np.isfinite(p))
-    order = known[np.argsort(-p[known], kind="stable")]
-    rank = np.arange(len(order), 0, -1)
     q = np.full(len(p), np.nan)
-    q[order] = np.minimum.accumulate(np.minimum(p[order] * len(order) / rank, 1.0))
+    q[known] = scipy.stats.false_discovery_control(p[known])
     return q
 
 

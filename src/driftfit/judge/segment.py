@@ -127,7 +127,9 @@ class Segmentation(Printed):
         table = table_of("Segments, from sample", "", "samples", *heads, group=2)
         for part in self.segments:
             pairs = zip(part.theta, part.std, strict=True)
-            numbers = (cell for value, std in pairs for cell in (digits(value, std), error_text(std)))
+            numbers = (
+                cell for value, std in pairs for cell in (digits(value, std), "-" if np.isnan(std) else f"{std:.4g}")
+            )
             table.add_row(str(part.start), str(part.stop - part.start), *numbers)
         yield table
         if self.better:
@@ -265,8 +267,3 @@ def _undivided(run: Track, phi: Array, y: Array, level: float, why: str) -> Segm
             std = np.where(undetermined(phi), np.inf, std)
     one = Segment(0, len(run), theta, std)
     return Segmentation((), (one,), level, float("nan"), spread, (), run, why)
-
-
-def error_text(std: float) -> str:
-    """A standard error as text; one that is not known is not a number of the table."""
-    return "-" if np.isnan(std) else f"{std:.4g}"

@@ -38,7 +38,7 @@ from driftfit.judge.compare import left_at_start
 from driftfit.judge.evidence import REJECTED, Evidence, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
-from driftfit.judge.statistics.whiteness import LOUDER, grows_with
+from driftfit.judge.statistics.whiteness import loudest
 from driftfit.readings.gate import FROZEN
 from driftfit.run.result import Track, root_mean_square
 from driftfit.show.text import Printed, digits, facts, table_of
@@ -383,6 +383,7 @@ def judged(known: Evidence) -> Verdict:
     error, *others = (rounded(each[scored], run.y[scored]) for each in known.errors[:-1])
     rivals = tuple(paired(name, rival, error) for name, rival in zip(RIVALS, others, strict=True))
     lags = () if found is None else found.model.noise.lags
+    loud = None if found is None or found.rejected else loudest(found.model.noise.e, found.model.phi)
     return Verdict(
         drifts=None if found is None else found.rejected,
         pays=None if np.isnan(rivals[1].p) else bool(better_constants(rivals).p < level),
@@ -400,19 +401,12 @@ def judged(known: Evidence) -> Verdict:
         lags=int(max(lags, default=0)),
         burn=left_at_start(run) if known.burn is None else known.burn,
         hidden=run.model.hidden is not None,
-        spread_with=_spread_with(names, found) if found is not None and not found.rejected else (),
+        spread_with=() if loud is None else (names[loud],),
         dependent=tuple(tuple(run.model.names[i] for i in group) for group in known.distinct.groups),
         held=tuple(name for name in run.model.names if name not in names),
         stuck=int(np.sum(run.left_out.code == FROZEN)),
         nearly_walk=found.test.root if found is not None and found.wandering_noise else 0.0,
     )
-
-
-def _spread_with(names: Sequence[str], found: Changes) -> tuple[str, ...]:
-    """The parameter with residuals that grow most clearly with its regressor, if they do."""
-    p = grows_with(found.model.noise.e, found.model.phi)
-    most = int(np.argmin(p))
-    return (names[most],) if p[most] * len(p) < LOUDER else ()
 
 
 def unjudged(name: str) -> Moved:

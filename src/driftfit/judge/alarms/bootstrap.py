@@ -129,7 +129,7 @@ class Source:
         columns, lags = np.array(self.columns, np.int64), np.array([lag for _, lag in self.normal.delays], np.int64)
         source = np.arange(N + T)[:, None] - lags
         way = Recursion(
-            phi, phi, np.zeros((0, 0)), columns, source, root[source] / root[:, None], self.theta, frozen.ar,
+            phi, np.zeros((0, 0)), columns, source, root[source] / root[:, None], self.theta, frozen.ar,
             np.zeros(N + T), self._noise(N + T),
         )  # fmt: skip
         drawn, y = np.empty((N + T, n)), np.empty(N + T)
@@ -201,15 +201,16 @@ def exceeded(values: Array, allowed: float) -> float:
 
 def held_level(joint: Array, allowed: float) -> float:
     """The smallest level of joint (R, T) down to which so many alarms begin at most, if each lasts until log(`OFTENER`)
-    below it; not below that at which most begin: at a lower one they hardly end.
+    below it; not below that at which most begin: at a lower one they hardly end. Those that are on at the first sample
+    began before it; between two levels that are tried the number grows in proportion.
     """
-    width, place, most, found = np.log(OFTENER), np.arange(joint.shape[1]), 0, np.log(STEP)
+    width, place, most, found = np.log(OFTENER), np.arange(joint.shape[1]), 0, float(np.log(STEP))
     for level in np.linspace(found, -found, LEVELS):
         begins = joint > level
         decided = np.maximum.accumulate(np.where(begins | (joint <= level - width), place, 0), axis=1)
         active = np.take_along_axis(begins, decided, axis=1)
-        begun = int(np.sum(active[:, 1:] & ~active[:, :-1]) + np.sum(active[:, 0]))
+        begun = int(np.sum(active[:, 1:] & ~active[:, :-1]))
         if begun > allowed:
-            break
-        most, found = (begun, level) if begun >= most else (most, found)
-    return float(found)
+            return float(level + (found - level) * (begun - allowed) / (begun - most))
+        most, found = (begun, float(level)) if begun >= most else (most, found)
+    return found

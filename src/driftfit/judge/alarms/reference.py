@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from datetime import UTC, datetime
 from typing import Any, NamedTuple
-from zoneinfo import ZoneInfo
 
 import numpy as np
 
+from driftfit.data.limits import end_of
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import plain, whole
 from driftfit.judge.alarms.bootstrap import Normal
@@ -92,29 +91,9 @@ def first_third(run: Track, usable: Array, least: int) -> tuple[int, int]:
 
 def _place(run: Track, given: Any) -> int:
     """The first sample at or after a time, or a sample number."""
-    time = run.time
-    if time.dtype.kind != "M":
-        if isinstance(given, str | datetime | np.datetime64):
-            raise ValueError(f"detect: reference names the time {given!r}, but this run has no dates (time=).")
-        return int(np.searchsorted(time, float(given)))
-    if isinstance(given, int | np.integer):
+    if run.time.dtype.kind == "M" and isinstance(given, int | np.integer):
         return min(int(given), len(run))
-    return int(np.searchsorted(time, as_date(given, run.labels.zone)))
-
-
-def as_date(given: Any, zone: str | None) -> np.datetime64:
-    """A date as a time of the record; one without a time zone is in that of the table that the record came from."""
-    try:
-        date = given if isinstance(given, np.datetime64) else datetime.fromisoformat(str(given))
-    except ValueError:
-        raise ValueError(f"detect: {given!r} is not a date; write it as 2024-03-01 or 2024-03-01 12:30.") from None
-    if isinstance(date, np.datetime64):
-        if zone is None:
-            return date
-        date = date.astype("datetime64[us]").item()
-    if date.tzinfo is None and zone is not None:
-        date = date.replace(tzinfo=ZoneInfo(zone))
-    return np.datetime64(date if date.tzinfo is None else date.astimezone(UTC).replace(tzinfo=None))
+    return int(np.searchsorted(run.time, end_of("detect: reference", given, run.time, run.labels.zone, 0)))
 
 
 class Modelled(NamedTuple):
@@ -166,7 +145,8 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> Modelled:
     enough = least("glr", n)
     first, start = first_third(run, usable, enough) if reference is None else normal_samples(run, reference)
     rows, names = every[first:start].copy(), run.model.names if n else ()
-    rows[:, n + OK] *= (usable & ~_stuck(run))[first:start]
+    usable[run.left_out.sample[run.left_out.code == gate.FROZEN]] = False  # other refused readings are normal ones
+    rows[:, n + OK] *= usable[first:start]
     ok = rows[:, n + OK] > BLAMED
     if ok.sum() < enough:
         raise ValueError(
@@ -180,7 +160,9 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> Modelled:
     rule = replace(rule, parameters=names, names=("one parameter", "parameters", "noise"))
     rows = with_offset(rows, rule)
     rounding = _drawn(rows, step_of(run.y[first:start]) if n else 0.0, ok)
-    delays = _delays(run, rows[:, :n], every[:, n + Y], first, start) if n else ()
+    at = np.arange(first, start)
+    back = earlier_outputs(run, at, rows[:, :n], every[:, n + Y], np.ones(len(at))) if n else None
+    delays = () if back is None else tuple(zip(back.columns.tolist(), back.delays.tolist(), strict=True))
     found = frozen_model(rows, int(constants[-1]), [column for column, _ in delays])
     if found is None:
         raise ValueError(
@@ -190,13 +172,6 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> Modelled:
     frozen, known = found
     rule = replace(rule, frozen=tuple(plain(one) for one in frozen[:-1]), rounding=rounding)
     return Modelled(rule, Normal(rows, delays, frozen, known), start, every)
-
-
-def _delays(run: Track, phi: Array, y: Array, first: int, start: int) -> tuple[tuple[int, int], ...]:
-    """(column, lag) of each regressor that is an earlier output."""
-    at = np.arange(first, start)
-    back = earlier_outputs(run, at, phi, y, np.ones(len(at)))
-    return () if back is None else tuple(zip(back.columns.tolist(), back.delays.tolist(), strict=True))
 
 
 def _drawn(rows: Array, step: float, ok: Array) -> tuple[float, ...]:
@@ -213,13 +188,6 @@ def _drawn(rows: Array, step: float, ok: Array) -> tuple[float, ...]:
     seed = seed_of(y, step / root)
     rows[ok, n + Y] = root * drawn(y, *found, 0.5 * step / root, chances(0, int(ok.sum()), seed))
     return step, found[1], float(seed + 1)  # later samples draw other numbers
-
-
-def _stuck(run: Track) -> Array:
-    """Samples (T,) of a frozen sensor; other readings that a gate refused are normal if they are in the reference."""
-    left, found = run.left_out, np.zeros(len(run), bool)
-    found[left.sample[left.code == gate.FROZEN]] = True
-    return found
 
 
 def doubt(run: Track, first: int, end: int) -> str:

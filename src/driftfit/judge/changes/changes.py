@@ -62,9 +62,7 @@ def changes(
     in a segment.
     """
     N, n = phi.shape
-    model = modelled(
-        phi, y, Lags.none(N) if lags is None else lags, np.ones(N) if root is None else root, order, fewest
-    )
+    model = modelled(phi, y, lags, root, order, fewest)
     test, draws = tested(model)
     breaks, ar, prices = NONE, test.ar[0], (np.nan, np.nan)
     if test.p < level:

@@ -17,52 +17,84 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array
+from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.fit import estimated, noise_of, order_of, regressed, split, white_rows
-from driftfit.judge.changes.null import Draws, Model, Tested, gains, price, radius
-from driftfit.judge.changes.scan import SINGULAR, SMALL
-from driftfit.judge.statistics.robust import orthonormal
+from driftfit.judge.changes.null import DRAWS, Draws, Model, Tested, price, radius
+from driftfit.judge.changes.scan import SINGULAR, SMALL, add
+from driftfit.judge.statistics.robust import cholesky, orthonormal, solved
 
 LEVEL = 0.95
 """Share of the likelihood in the interval of a date."""
 SHARE = 5.0
 """A further break has the level of the test divided by this."""
 SWEEPS = 4
-DATES = 20_000
-"""Places, at most, at which the likelihood of a date is computed."""
 RANK = 1e-12
 """Smallest singular value that counts, as a share of the largest."""
 LEVERAGE = 0.1
 """Smallest share of a residual that its own row is taken to leave."""
 
 
+def _at_each(
+    X: Array, Z: Array, noise: tuple[Array, Array, Array], place: Array, start: int, least: float, rss: Array,
+    theta: Array,
+) -> None:  # fmt: skip
+    """Sums of squares (m,) and parameters (m, 2 n) of the segments beside a break at each ``place``.
+
+    Z: white rows of both, the first of them row ``start`` of X, whose lags are all in the first segment.
+    """
+    (lags, ar, g), n = noise, X.shape[1]
+    p, k = lags.shape[0], 2 * n
+    first = lags[p - 1] if p > 0 else 0
+    total, left, passed = np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1))
+    G, row, done = np.zeros((k + 1, k + 1)), np.zeros(k + 1), 0
+    add(Z, 0, Z.shape[0], total)
+    add(Z, 0, first, passed)
+    for d in range(place.shape[0]):
+        at = place[d] - start
+        add(Z, done, at, left)
+        add(Z, done + first, at + first, passed)
+        done = at
+        for i in range(n + 1):
+            for j in range(i + 1):
+                G[n + i, n + j] = total[i, j] - passed[i, j]
+                if i < n:
+                    G[i, j], G[n + i, j], G[n + j, i] = left[i, j], 0.0, 0.0
+        for i in range(n):
+            G[k, i] = left[n, i]
+        G[k, k] += left[n, n]
+        for t in range(place[d], place[d] + first):
+            for j in range(n):
+                row[n + j] = X[t, j]
+                for i in range(p):
+                    if t - lags[i] >= place[d]:
+                        row[n + j] -= ar[i] * X[t - lags[i], j]
+                row[n + j] *= g[t]
+                row[j] = Z[t - start, j] - row[n + j]
+            row[k] = Z[t - start, n]
+            for i in range(k + 1):
+                for j in range(i + 1):
+                    G[i, j] += row[i] * row[j]
+        for i in range(k):
+            G[i, i] += least
+        rss[d] = cholesky(G, k, 0.0)
+        solved(G, theta[d])
+
+
+_profiled = Driver(_at_each)
+
+
 def profile(model: Model, ar: Array, breaks: Array, k: int, gap: int) -> tuple[Array, Array, Array]:
     """Break k at every place (m,) up to its neighbours, less ``gap`` rows: the places, the sums of squares (m,) of the
     segments beside it, and their parameters (m, 2, n) in the basis. Rows of two segments have the lags of both."""
     X, lags, g = model.X, model.noise.lags, model.noise.g
-    (N, n), first = X.shape, order_of(lags)
+    N, n = X.shape
     low, high = breaks[k - 1] if k else 0, breaks[k + 1] if k + 1 < len(breaks) else N
-    place = np.union1d(np.arange(low + gap, high - gap + 1, (high - low) // DATES + 1), breaks[k])
+    place = np.union1d(np.arange(low + gap, high - gap + 1), breaks[k])
     Z = np.column_stack(white_rows(X[low:high], model.y[low:high], lags, ar, g[low:high]))
-    at = place - low - first  # row 0 of Z is the first one with all its lags
-    edges = np.unique([0, *at, *(at + first)])
-    i, j = np.tril_indices(n + 1)
-    total = np.zeros((len(edges) + 1, n + 1, n + 1))
-    total[1:, i, j] = total[1:, j, i] = np.cumsum(np.add.reduceat(Z[:, i] * Z[:, j], edges), axis=0)
-    G, own = np.zeros((len(at), 2 * n + 1, 2 * n + 1)), np.append(np.arange(n), 2 * n)
-    G[:, own[:, None], own] += total[np.searchsorted(edges, at)]
-    own[:n] += n
-    G[:, own[:, None], own] += total[-1] - total[np.searchsorted(edges, at + first)]
-    for row in range(first):
-        later = X[place + row] - sum(a * X[place + row - lag] for lag, a in zip(lags, ar, strict=True) if lag <= row)
-        later, whole = later * g[place + row, None], Z[at + row]
-        both = np.hstack([whole[:, :n] - later, later, whole[:, n:]])
-        G += both[:, :, None] * both[:, None, :]
     least = SINGULAR * float(np.sum((X * g[:, None]) ** 2, axis=0).max()) + SMALL
-    A, b = G[:, :-1, :-1] + least * np.eye(2 * n), G[:, :-1, -1]
-    theta = np.linalg.solve(A, b[..., None])[..., 0]
-    rss = np.maximum(G[:, -1, -1] - np.sum(theta * b, axis=1), model.floor)
-    return place, rss, theta.reshape(len(at), 2, n)
+    rss, theta = np.empty(len(place)), np.empty((len(place), 2 * n))
+    _profiled(X, Z, (lags, ar, g), place, low + order_of(lags), least, rss, theta)
+    return place, np.maximum(rss, model.floor), theta.reshape(len(place), 2, n)
 
 
 def settled(model: Model, ar: Array, breaks: Array, gap: int) -> Array:
@@ -100,15 +132,10 @@ class Dated(NamedTuple):
 
 def stepwise(gain: Array, prices: tuple[float, float]) -> int:
     """The number of breaks, of gains (K + 1,) of 0 .. K breaks over none: one more, two or three while they pay."""
-    K, (one, two) = 0, prices
-    needed = (one, two, one + two)
-    while True:
-        for more, least in enumerate(needed, 1):
-            if K + more < len(gain) and gain[K + more] - gain[K] > max(least, 0.0):
-                K += more
-                break
-        else:
-            return K
+    K, needed = 0, np.maximum([*prices, sum(prices)], 0.0)
+    while (pays := gain[K + 1 :][: len(needed)] - gain[K] > needed[: len(gain) - K - 1]).any():
+        K += int(np.argmax(pays)) + 1
+    return K
 
 
 def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Array, Array, tuple[float, float]]:
@@ -122,14 +149,15 @@ def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Arr
         prices = price(drawn[:, 0], level / SHARE), price(drawn[:, 1], level / SHARE)
         return stepwise(gain, prices) or first, prices
 
-    K, prices = number(test.gains)
-    if K and (len(noise.lags) or len(model.lags.columns)):  # changes made the dynamics of constants too slow
+    dynamic = len(noise.lags) or len(model.lags.columns)
+    rest = 0 if dynamic else DRAWS[-1] - len(test.gains)
+    K, prices = number(np.vstack([test.gains, draws.gains(*draws.constants, rest)]))
+    if K and dynamic:  # changes made the dynamics of constants too slow
         breaks, ar = test.breaks[K], test.ar[K]
         theta, _ = estimated(model.X, model.y, (noise.lags, ar, noise.g), breaks)
         mean = model.basis @ (np.diff(np.concatenate([[0], breaks, [N]])) / N @ theta)
         if max(radius(ar, noise.lags), draws.of_outputs(mean)) < 1.0:
-            rss = draws.of(mean, ar, len(test.gains), True).rss
-            K, prices = number(gains(rss[np.isfinite(rss[:, 0])], N))
+            K, prices = number(draws.gains(mean, ar, DRAWS[-1]))
     return test.breaks[K], test.ar[K], prices
 
 
@@ -216,11 +244,7 @@ def _directions(model: Model, first: int, last: int) -> Array:
         return np.eye(n)
     scale = orthonormal(model.phi).size
     own = kept * (basis.size / scale)
-    return _projector(np.linalg.solve(model.basis, (np.linalg.qr(own.T)[0]) / scale[:, None]))
-
-
-def _projector(W: Array) -> Array:
-    Q = np.linalg.qr(W)[0]
+    Q = np.linalg.qr(np.linalg.solve(model.basis, (np.linalg.qr(own.T)[0]) / scale[:, None]))[0]
     return np.asarray(Q @ Q.T)
 
 

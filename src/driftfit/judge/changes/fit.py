@@ -21,7 +21,7 @@ import scipy
 from driftfit.engine.kernel import Array
 from driftfit.judge.changes.scan import SINGULAR, SMALL, problem_of, searched
 from driftfit.judge.statistics.robust import deviation, robust_fit
-from driftfit.judge.statistics.whiteness import LOUDER, grows_with
+from driftfit.judge.statistics.whiteness import loudest
 
 NONE = np.zeros(0, np.int64)
 HELD = 3.0
@@ -88,6 +88,12 @@ def split(X: Array, breaks: Array) -> Array:
     return np.hstack([X, *(X * (t >= b) for b in breaks)])
 
 
+def moments(Z: Array, share: Array | float = ROUNDED) -> Array:
+    """Z' Z of columns Z (N, q), with this share of their mean beside their own, so that it can be inverted."""
+    G = Z.T @ Z
+    return np.asarray(G + np.diag(np.trace(G) / len(G) * share + np.full(len(G), SMALL)))
+
+
 def estimated(
     X: Array, y: Array, noise: tuple[Array, Array, Array], breaks: Array, rows: Array | None = None
 ) -> tuple[Array, float]:
@@ -97,9 +103,8 @@ def estimated(
     """
     Z, z = white_rows(split(X, breaks) if rows is None else rows, y, *noise)
     n, K = X.shape[1], len(breaks)
-    G = Z.T @ Z
-    ridge = np.trace(G[:n, :n]) / n * np.append(np.full(n, ROUNDED), np.full(K * n, SINGULAR)) + SMALL
-    beta = np.linalg.solve(G + np.diag(ridge), Z.T @ z)
+    ridge = np.append(np.full(n, ROUNDED), np.full(K * n, SINGULAR))
+    beta = np.linalg.solve(moments(Z, ridge), Z.T @ z)
     r = z - Z @ beta
     return np.cumsum(beta.reshape(K + 1, n), axis=0), float(r @ r)
 
@@ -172,8 +177,26 @@ def hats(N: int, knots: int) -> Array:
 
 
 def lined(X: Array, knots: int) -> Array:
-    """(N, n knots): regressors of parameters on continuous lines between evenly spaced knots."""
-    return np.hstack([X, *(X * hat[:, None] for hat in hats(len(X), knots).T[1:])])
+    """(N, n knots): regressors X (N, n) of parameters on continuous lines between evenly spaced knots."""
+    return np.asarray((hats(len(X), knots)[:, :, None] * X[:, None, :]).reshape(len(X), -1))
+
+
+def on_lines(Z: Array, z: Array, N: int, knots: int) -> tuple[Array, Array]:
+    """(path (N, n), residuals) of parameters on such lines, by least squares of z on the last white rows Z of N.
+
+    Only two hats are not 0 between two knots, so the sums of products there are those of 2 n columns.
+    """
+    n, first, hat = Z.shape[1], N - len(z), hats(N, knots)
+    ends = np.append(0, np.ceil(np.linspace(0.0, N - 1.0, knots)[1:-1]))
+    rows = [slice(max(int(a) - first, 0), max(int(b) - first, 0)) for a, b in pairwise([*ends, N])]
+    G, own = np.zeros((knots * n + 1, knots * n + 1)), np.append(np.arange(2 * n), knots * n)
+    for k, s in enumerate(rows):
+        A = np.hstack([Z[s] * hat[first:][s, k : k + 1], Z[s] * hat[first:][s, k + 1 : k + 2], z[s, None]])
+        G[own[:, None], own] += A.T @ A
+        own[:-1] += n
+    G[np.diag_indices(knots * n)] += ROUNDED * np.trace(G[:-1, :-1]) / (knots * n) + SMALL
+    path = hat @ np.linalg.solve(G[:-1, :-1], G[:-1, -1]).reshape(knots, n)
+    return path, z - np.einsum("tj,tj->t", Z, path[first:])
 
 
 def divided(
@@ -185,7 +208,7 @@ def divided(
     found, _ = searched(X, y, problem)
     criteria = N * np.log(found.rss) + (n + 2) * np.log(N) * np.arange(most + 1)
     K = int(np.argmin(criteria))
-    return problem.places[found.at[K, :K]], found.ar[K], float(criteria[K])
+    return found.at[K, :K], found.ar[K], float(criteria[K])
 
 
 def together(
@@ -211,13 +234,15 @@ def together(
     for knots in KNOTS:
         if n * knots > N // 8:
             break
-        rows = lined(X, knots)
-        v = y - rows @ np.linalg.lstsq(rows * g[:, None], y * g, rcond=None)[0]
+        path, r = on_lines(X * g[:, None], y * g, N, knots)
+        v = y - np.einsum("tj,tj->t", X, path)
         lags = lags_of(v * g, orders)
         ar = regressed(v, g, lags)
-        criterion = N * np.log(left(*white_rows(rows, y, lags, ar, g))) + (n * (knots - 1) + len(lags)) * np.log(N)
+        if len(lags):
+            _, r = on_lines(*white_rows(X, y, lags, ar, g), N, knots)
+        criterion = N * np.log(max(float(r @ r), SMALL)) + (n * (knots - 1) + len(lags)) * np.log(N)
         if criterion < best[0]:
-            best = criterion, lags, ar, rows
+            best = criterion, lags, ar, lined(X, knots)
     return best[1:]
 
 
@@ -231,9 +256,8 @@ def spread(e: Array, phi: Array) -> Array:
 
     The likelihood of Gaussian noise, by weighted least squares of squares that are limited at three deviations.
     """
-    p = grows_with(e, phi)
-    most = int(np.argmin(p))
-    if not p[most] * len(p) < LOUDER:
+    most = loudest(e, phi)
+    if most is None:
         return np.ones(len(e))
     A = np.column_stack([np.ones(len(e)), phi[:, most] ** 2 / np.mean(phi[:, most] ** 2)])
     square, size = e**2, np.full(len(e), np.mean(e**2))
@@ -262,7 +286,7 @@ def noise(X: Array, y: Array, phi: Array, order: int | None = None, fewest: int 
             rows = split(X, breaks)
         Z, z = white_rows(rows, y, lags, ar, g)
         first = order_of(lags)
-        v = y - rows @ np.linalg.lstsq(Z, z, rcond=None)[0]
+        v = y - rows @ np.linalg.solve(moments(Z), Z.T @ z)
         e = np.append(np.zeros(first), white_rows(v[:, None], v, lags, ar, np.ones(N))[1])
         size = spread(e, phi)
         level = size * level_of(e / size, first)

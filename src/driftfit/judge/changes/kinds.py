@@ -97,7 +97,7 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
     """The kind of change of the parameters ``moving``."""
     N, n = model.phi.shape
     lags, g, price = model.noise.lags, model.noise.g, np.log(N)
-    first, K = order_of(lags), len(found.breaks)
+    K = len(found.breaks)
     size = np.sqrt(np.mean(model.phi**2, axis=0))
     phi = model.phi / np.where(size > 0.0, size, 1.0)
     Z, z = white_rows(phi, model.y, lags, found.ar, g)
@@ -106,26 +106,18 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
     scores = {"rest": M * np.log(left(Z, z, model.floor)) + n * price}
     if K:
         scores["steps"] = M * np.log(max(changes.rss, model.floor)) + (changes.used + DATE * K) * price
-    ramp, ends, slope = _ramp(Z, z, phi[:, moves], model, found, first)
-    scores["gradual"] = M * np.log(ramp) + (n + len(moves) + DATE * 2) * price
-    path = np.zeros((N, 0))
-    for knots in KNOTS:
-        if len(moves) * knots > N // 8:
-            break
-        lines = hats(N, knots)
-        more = np.hstack([phi[:, j : j + 1] * lines[:, 1:] for j in moves])
-        both = np.hstack([Z, white_rows(more, model.y, lags, found.ar, g)[0]])
-        score = M * np.log(left(both, z, model.floor)) + (n + len(moves) * (knots - 1)) * price
-        if score < scores["gradual"]:
-            scores["gradual"], ends = score, (0, N - 1)
-            beta = np.linalg.lstsq(both, z, rcond=None)[0]
-            path = np.tile(beta[:n], (N, 1))
-            for i, j in enumerate(moves):
-                path[:, j] += lines[:, 1:] @ beta[n + i * (knots - 1) : n + (i + 1) * (knots - 1)]
-    if not path.size:
-        beta = np.linalg.lstsq(np.hstack([Z, slope[first:]]), z, rcond=None)[0]
-        path = np.tile(beta[:n], (N, 1))
-        path[:, moves] += _rise(N, ends)[:, None] * beta[n:]
+    ends, path = _ramp(Z, z, phi[:, moves], model, found), np.zeros((N, 0))
+    shapes = [(_rise(N, ends)[:, None], ends, DATE * 2)]
+    shapes += [(hats(N, knots)[:, 1:], (0, N - 1), 0.0) for knots in KNOTS if len(moves) * knots <= N // 8]
+    for shape, own, more in shapes:
+        columns = np.hstack([phi[:, j : j + 1] * shape for j in moves])
+        both = np.hstack([Z, white_rows(columns, model.y, lags, found.ar, g)[0]])
+        beta = np.linalg.lstsq(both, z, rcond=None)[0]
+        rss = max(float(np.sum((z - both @ beta) ** 2)), model.floor)
+        score = M * np.log(rss) + (len(beta) + more) * price
+        if score < scores.get("gradual", np.inf):
+            scores["gradual"], ends, path = score, own, np.tile(beta[:n], (N, 1))
+            path[:, moves] += shape @ beta[n:].reshape(len(moves), -1).T
     scores["walk"], scores["jumps"], dates = _walks(phi, model, found, changes, moves)
     low = min(scores.values())
     weights = {name: float(np.exp(-0.5 * (score - low))) for name, score in scores.items()}
@@ -141,15 +133,13 @@ def _rise(N: int, ends: tuple[int, int]) -> Array:
     return np.asarray(np.clip((np.arange(N) - ends[0]) / max(ends[1] - ends[0], 1), 0.0, 1.0))
 
 
-def _ramp(
-    Z: Array, z: Array, columns: Array, model: Model, found: Dated, first: int
-) -> tuple[float, tuple[int, int], Array]:
-    """(sum of squares, ends, white columns (N, J)) of the best single gradual change of columns (N, J)."""
+def _ramp(Z: Array, z: Array, columns: Array, model: Model, found: Dated) -> tuple[int, int]:
+    """The ends of the best single gradual change of columns (N, J)."""
     N, J = columns.shape
     Q = np.linalg.qr(Z)[0]
     r = z - Q @ (Q.T @ z)
     places = np.unique(np.linspace(0, N - 1, min(CORNERS, N // 8) + 1).astype(int))
-    best = (-np.inf, (0, N - 1), np.zeros((N, J)))
+    best = (-np.inf, (0, N - 1))
     for i, start in enumerate(places[:-1]):
         ends = [(int(start), int(stop)) for stop in places[i + 1 :]]
         made = np.hstack([columns * _rise(N, one)[:, None] for one in ends])
@@ -158,11 +148,8 @@ def _ramp(
         A, b = rest @ rest.transpose(0, 2, 1), rest @ r
         least = SINGULAR * np.sum(white**2, axis=0).reshape(-1, J).max(axis=1) + SMALL
         gain = np.sum(np.linalg.solve(A + least[:, None, None] * np.eye(J), b[..., None])[..., 0] * b, axis=1)
-        k = int(np.argmax(gain))
-        if gain[k] > best[0]:
-            best[2][first:] = white[:, k * J : k * J + J]
-            best = (float(gain[k]), ends[k], best[2])
-    return max(float(r @ r) - best[0], model.floor), *best[1:]
+        best = max(best, (float(gain.max()), ends[int(np.argmax(gain))]))
+    return best[1]
 
 
 def _walks(

@@ -11,7 +11,7 @@ the largest draws by their exponential tail.
 
 Source: Wu (1986) and Liu (1988) for wild residuals; Hansen (2000) for fixed regressors, Goncalves and Kilian (2004) for
 the recursion. Besag and Clifford (1991) for the end. Cost: `DRAWS`
-searches, fewer the larger p.
+searches, fewer if p is clearly large or small.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.fit import HELD, MOST, Noise, noise, order_of, white_rows
-from driftfit.judge.changes.recursion import Drawn, Recursion, Results, draw
+from driftfit.judge.changes.fit import HELD, MOST, Noise, moments, noise, order_of, white_rows
+from driftfit.judge.changes.recursion import Recursion, Results, draw
 from driftfit.judge.changes.scan import SMALL, Found, Problem, Work, problem_of, searched
 from driftfit.judge.statistics.robust import orthonormal
 
@@ -31,6 +31,8 @@ DRAWS = (19, 39, 79, 199)
 """Draws after which it is decided whether there are more."""
 CLEAR = 10.0
 """Draws beyond the statistic from which on p is known well enough (Besag and Clifford, 1991)."""
+SURE = 1e-4
+"""p below which the last draws would change no decision; results print no smaller one."""
 BIASED = 40
 """Draws of constants from which their bias comes."""
 UNIT = 0.9999
@@ -50,11 +52,6 @@ class Lags(NamedTuple):
     """(N, k): the row whose output they are; negative where it is none of these rows."""
     ratio: Array
     """(N, k): what they are times that output."""
-
-    @classmethod
-    def none(cls, N: int) -> Lags:
-        """No column is."""
-        return cls(np.zeros(0, np.int64), np.zeros((N, 0), np.int64), np.zeros((N, 0)))
 
     @property
     def delays(self) -> Array:
@@ -115,17 +112,15 @@ class Model(NamedTuple):
     """Smallest sum of squares that is more than rounding."""
 
 
-def in_basis(phi: Array) -> tuple[Array, Array]:
-    """X (N, n) with X' X = N I, and the matrix that makes it of phi."""
-    basis = orthonormal(phi)
-    return basis.Q, np.linalg.inv(basis.R) / basis.size[:, None]
-
-
 def modelled(
-    phi: Array, y: Array, lags: Lags, root: Array, order: int | None = None, fewest: int | None = None
+    phi: Array, y: Array, lags: Lags | None, root: Array | None, order: int | None = None, fewest: int | None = None
 ) -> Model:
-    """The regression with its noise."""
-    X, basis = in_basis(phi)
+    """The regression with its noise; no ``lags`` are none, and no ``root`` is 1."""
+    N = len(y)
+    lags = Lags(np.zeros(0, np.int64), np.zeros((N, 0), np.int64), np.zeros((N, 0))) if lags is None else lags
+    root = np.ones(N) if root is None else root
+    X, R, size = orthonormal(phi)
+    basis = np.linalg.inv(R) / size[:, None]
     offset = basis @ np.linalg.lstsq(X, y, rcond=None)[0]
     rounding = ROUNDING * np.abs(y)
     phi, y, basis = (np.ascontiguousarray(one) for one in (phi, y - phi @ offset, basis))
@@ -148,27 +143,34 @@ def radius(a: Array, lags: Array) -> float:
 class Draws:
     """Records that a model of constants draws, and what is found in them."""
 
+    constants: tuple[Array, Array]
+    """theta and its autoregression, less their bias."""
+
     def __init__(self, model: Model, problem: Problem, held: Array, seed: int = 0) -> None:
         N, n = model.X.shape
         self.model, self.problem, self.e = model, problem, held
         self.work, self.found = Work.of(N, n, problem), Found.of(n, problem)
         self.rng = np.random.default_rng(seed)
-        self.drawn = Drawn(np.zeros((N, n)), np.zeros((N, n)), np.zeros(N))
 
     def of(self, theta: Array, ar: Array, count: int, whole: bool) -> Results:
         """Draws from constants theta (n,) in units of the model; only constants of them unless ``whole``."""
         model, problem = self.model, self.problem
         n = model.X.shape[1]
         way = Recursion(
-            model.phi, model.X, model.basis, *model.lags, theta + model.offset, ar, model.y - model.phi @ theta, self.e
+            model.phi, model.basis, *model.lags, theta + model.offset, ar, model.y - model.phi @ theta, self.e
         )  # fmt: skip
         signs = self.rng.integers(0, 2, (count, len(model.y))) * 2.0 - 1.0
         results = Results(
             np.full((count, 3), np.inf), np.zeros((count, 1 + len(problem.paths))), np.zeros((count, n)),
             np.zeros((count, len(ar))),
         )  # fmt: skip
-        draw(way, signs, problem, int(whole), self.work, self.found, self.drawn, results)
+        draw(way, signs, problem, int(whole), self.work, self.found, results)
         return results
+
+    def gains(self, theta: Array, ar: Array, count: int) -> Array:
+        """Gains (R, 2) of one and of two breaks in such draws."""
+        rss = self.of(theta, ar, count, True).rss
+        return gains(rss[np.isfinite(rss[:, 0])], len(self.model.y))
 
     def unbiased(self, theta: Array, ar: Array) -> tuple[Array, Array]:
         """Constants and their autoregression without the bias of the dynamics, as far as they remain stable."""
@@ -242,13 +244,12 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     found, _ = searched(model.X, model.y, problem)
     few = problem_of(noise.g, noise.lags, noise.fewest, 2, paths, model.floor)
     held = noise.e.copy()
-    rows, _ = white_rows(noise.rows, model.y, noise.lags, noise.ar, noise.g)
-    Q = np.linalg.qr(rows)[0]
-    held[first:] /= np.maximum(1.0 - np.sum(Q * Q, axis=1), 0.1)
+    Z, _ = white_rows(noise.rows, model.y, noise.lags, noise.ar, noise.g)
+    held[first:] /= np.maximum(1.0 - np.sum(Z.T * np.linalg.solve(moments(Z), Z.T), axis=0), 0.1)
     if first or len(model.lags.columns):  # an outlier of the output would be one of the dynamics
         held = np.clip(held, -HELD * noise.level, HELD * noise.level)
     draws = Draws(model, few, held)
-    theta, ar = draws.unbiased(model.basis @ found.theta, found.ar[0])
+    theta, ar = draws.constants = draws.unbiased(model.basis @ found.theta, found.ar[0])
     x = np.append(found.L[0], gains(found.rss[None, :3], N)[0])
     R, L = np.zeros((0, 2)), np.zeros((0, len(found.L)))
     for count in np.diff(DRAWS, prepend=0):
@@ -256,11 +257,11 @@ def tested(model: Model) -> tuple[Tested, Draws]:
         fine = np.isfinite(drawn.L).all(axis=1) & np.isfinite(drawn.rss[:, 0])
         R, L = np.vstack([R, gains(drawn.rss[fine], N)]), np.vstack([L, drawn.L[fine]])
         p, each = smallest(x, np.column_stack([L[:, 0], R]))
-        if p * len(R) > CLEAR:
+        if p * len(R) > CLEAR or (p < SURE and count >= DRAWS[1]):
             break
     p_path = np.array([p_of(float(one), drawn) for one, drawn in zip(found.L[1:], L.T[1:], strict=True)])
     root = max(draws.of_outputs(theta), radius(ar, noise.lags))
-    dates = tuple(problem.places[found.at[k, :k]] for k in range(most + 1))
+    dates = tuple(found.at[k, :k] for k in range(most + 1))
     constants = model.basis @ found.theta
     return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, root), draws
 

@@ -13,10 +13,8 @@ class Recursion(NamedTuple):
 
     phi: Array
     """(N, n): the regressors, in units of the model."""
-    X: Array
-    """(N, n): the same, orthonormal."""
     basis: Array
-    """(n, n): X = phi basis."""
+    """(n, n): phi basis is orthonormal."""
     columns: Array
     """(k,): columns of phi that are lags of the output."""
     source: Array
@@ -30,7 +28,7 @@ class Recursion(NamedTuple):
     start: Array
     """(N,): noise of the first rows, as many as the autoregression has lags."""
     e: Array
-    """(N,): white residuals, whose signs are drawn."""
+    """(N,): white residuals, whose signs are work."""
 
 
 @shared
@@ -67,34 +65,21 @@ class Results(NamedTuple):
     """(R, p)"""
 
 
-class Drawn(NamedTuple):
-    """Scratch space for one draw."""
-
-    phi: Array
-    """(N, n)"""
-    X: Array
-    """(N, n)"""
-    y: Array
-    """(N,)"""
-
-
 def _draw(
-    way: Recursion, signs: Array, problem: Problem, whole: int, work: Work, found: Found, drawn: Drawn, results: Results
+    way: Recursion, signs: Array, problem: Problem, whole: int, work: Work, found: Found, results: Results
 ) -> None:
     """Results of all draws of signs (R, N); only constants and their autoregression unless ``whole``."""
     N, n = way.phi.shape
     for d in range(signs.shape[0]):
-        simulate(way, problem.lags, signs[d], work.v, drawn.phi, drawn.y)
+        simulate(way, problem.lags, signs[d], work.v, work.phi, work.y)
         for t in range(N):
-            drawn.y[t] = work.v[t]  # without what constants explain, which may be far larger
+            work.y[t] = work.v[t]  # without what constants explain, which may be far larger
             for j in range(n):
-                drawn.X[t, j] = way.X[t, j]
-                if way.columns.shape[0] > 0:
-                    drawn.X[t, j] = 0.0
-                    for i in range(n):
-                        drawn.X[t, j] += drawn.phi[t, i] * way.basis[i, j]
+                work.X[t, j] = 0.0
+                for i in range(n):
+                    work.X[t, j] += work.phi[t, i] * way.basis[i, j]
         if whole > 0:
-            search(drawn.X, drawn.y, problem, work, found)
+            search(work.X, work.y, problem, work, found)
             for count in range(3):
                 results.rss[d, count] = found.rss[count]
             for i in range(found.L.shape[0]):
@@ -102,7 +87,7 @@ def _draw(
             continue
         for i in range(results.ar.shape[1]):
             results.ar[d, i] = 0.0
-        settle(drawn.X, drawn.y, problem, results.ar[d], work)
+        settle(work.X, work.y, problem, results.ar[d], work)
         for j in range(n):
             results.theta[d, j] = work.theta[j]
 

@@ -29,8 +29,6 @@ SMALL = 1e-300
 """Added to a diagonal, so that it can be inverted."""
 CELLS = 32
 """Cells at whose ends breaks are compared."""
-PLACES = 20_000
-"""Places at which a break may be, at most."""
 FINER = 8
 """Steps of a cell in which a break is moved, before it moves in single places."""
 ROUNDS = 5
@@ -44,10 +42,8 @@ class Problem(NamedTuple):
     """(N,): roots of the weights."""
     lags: Array
     """(p,) of whole numbers, ascending: lags of the autoregression."""
-    places: Array
-    """(F + 1,): where there may be a break, from 0 to N."""
     edges: Array
-    """(m + 1,): which of them bound cells."""
+    """(m + 1,): rows that bound cells, from 0 to N."""
     paths: Array
     """(m, n): combinations of scores for which Nyblom's statistic is returned beside that of all."""
     sizes: Array
@@ -59,26 +55,30 @@ class Problem(NamedTuple):
 def problem_of(g: Array, lags: Array, fewest: int, most: int, paths: Array, floor: float = SMALL) -> Problem:
     """The problem of a record with up to ``most`` breaks."""
     N = len(g)
-    places = np.arange(N + 1) if N <= PLACES else np.linspace(0, N, PLACES + 1).astype(np.int64)
-    edges = np.linspace(0, len(places) - 1, int(np.clip(N // 8, 4, CELLS)) + 1).astype(np.int64)
-    return Problem(g, lags, places, edges, np.ascontiguousarray(paths), np.array([fewest, most]), np.array([floor]))
+    edges = np.linspace(0, N, int(np.clip(N // 8, 4, CELLS)) + 1).astype(np.int64)
+    return Problem(g, lags, edges, np.ascontiguousarray(paths), np.array([fewest, most]), np.array([floor]))
 
 
 class Work(NamedTuple):
-    """Scratch space for N rows of n regressors, F places, m cells, K breaks and p lags."""
+    """Scratch space for N rows of n regressors, m cells, K breaks and p lags."""
 
+    phi: Array
+    X: Array
+    y: Array
     Z: Array
     v: Array
     C: Array
+    """(m + 1, n + 1, n + 1): sums of products of [Z, z] before every cell, lower triangles; the first is 0."""
     G: Array
+    low: Array
+    here: Array
+    high: Array
     H: Array
-    R: Array
     cost: Array
     best: Array
     theta: Array
-    row: Array
     sums: Array
-    delta: Array
+    score: Array
     a: Array
     next: Array
     back: Array
@@ -87,11 +87,10 @@ class Work(NamedTuple):
     @classmethod
     def of(cls, N: int, n: int, problem: Problem) -> Work:
         """Empty space for one record."""
-        F, p, K = len(problem.places), len(problem.lags), int(problem.sizes[1])
-        m = len(problem.edges)
+        p, K, m, k = len(problem.lags), int(problem.sizes[1]), len(problem.edges), n + 1
         shapes = (
-            (N, n + 1), (N,), (F, n + 1, n + 1), (n + 1, n + 1), (p + 1, p + 1), (n, n), (m, m), (K + 1, m), (n,), (n,),
-            (n,), (n,), (p,), (K + 1, p),
+            (N, n), (N, n), (N,), (N, k), (N,), (m, k, k), (k, k), (k, k), (k, k), (k, k), (p + 1, p + 1), (m, m),
+            (K + 1, m), (n,), (n,), (n,), (p,), (K + 1, p),
         )  # fmt: skip
         return cls._make([*map(np.zeros, shapes), np.zeros((K + 1, m), np.int64), np.zeros(K, np.int64)])
 
@@ -102,7 +101,7 @@ class Found(NamedTuple):
     rss: Array
     """(K + 1,): sums of squares; inf where there is no room."""
     at: Array
-    """(K + 1, K): their places, as indices."""
+    """(K + 1, K): the rows at which they are."""
     ar: Array
     """(K + 1, p): their autoregressions."""
     theta: Array
@@ -124,19 +123,20 @@ def whiten(X: Array, y: Array, g: Array, lags: Array, a: Array, Z: Array) -> Non
     N, n, p = X.shape[0], X.shape[1], lags.shape[0]
     first = lags[p - 1] if p > 0 else 0
     for t in range(N):
-        for j in range(n + 1):
-            Z[t, j] = 0.0
         if t < first:
+            for j in range(n + 1):
+                Z[t, j] = 0.0
             continue
         for j in range(n):
-            value = X[t, j]
-            for i in range(p):
-                value -= a[i] * X[t - lags[i], j]
-            Z[t, j] = value * g[t]
-        value = y[t]
+            Z[t, j] = X[t, j]
+        Z[t, n] = y[t]
         for i in range(p):
-            value -= a[i] * y[t - lags[i]]
-        Z[t, n] = value * g[t]
+            before = t - lags[i]
+            for j in range(n):
+                Z[t, j] -= a[i] * X[before, j]
+            Z[t, n] -= a[i] * y[before]
+        for j in range(n + 1):
+            Z[t, j] *= g[t]
 
 
 @shared
@@ -168,45 +168,60 @@ def remainder(X: Array, y: Array, first: int, last: int, work: Work) -> None:
 
 
 @shared
-def cumulate(problem: Problem, work: Work) -> None:
-    """C: sums of products of [Z, z] before every place, lower triangles."""
-    C, Z, k = work.C, work.Z, work.Z.shape[1]
-    for i in range(k):
-        for j in range(i + 1):
-            C[0, i, j] = 0.0
-    for f in range(1, problem.places.shape[0]):
-        for i in range(k):
+def add(Z: Array, first: int, last: int, S: Array) -> None:
+    """Add the products of rows first .. last - 1 of Z to S, a lower triangle; two at a time take less."""
+    if (last - first) % 2 == 1:
+        for i in range(Z.shape[1]):
             for j in range(i + 1):
-                C[f, i, j] = C[f - 1, i, j]
-        for t in range(problem.places[f - 1], problem.places[f]):
-            for i in range(k):
-                for j in range(i + 1):
-                    C[f, i, j] += Z[t, i] * Z[t, j]
+                S[i, j] += Z[first, i] * Z[first, j]
+    for t in range(first + (last - first) % 2, last, 2):
+        for i in range(Z.shape[1]):
+            for j in range(i + 1):
+                S[i, j] += Z[t, i] * Z[t, j] + Z[t + 1, i] * Z[t + 1, j]
 
 
 @shared
-def cost(work: Work, first: int, last: int, least: float) -> float:
-    """What constants leave between two places; their factor stays in G. Information up to ``least`` is none."""
-    G, C, k = work.G, work.C, work.G.shape[0]
-    for i in range(k):
+def copy(S: Array, into: Array) -> None:
+    """Copy a lower triangle."""
+    for i in range(S.shape[0]):
         for j in range(i + 1):
-            G[i, j] = C[last, i, j] - C[first, i, j]
-    return cholesky(G, k - 1, least)  # type: ignore[no-any-return]
+            into[i, j] = S[i, j]
+
+
+@shared
+def before(problem: Problem, t: int, work: Work, S: Array) -> None:
+    """S: sums of products of [Z, z] before row t."""
+    m = 0
+    while m + 1 < problem.edges.shape[0] and problem.edges[m + 1] <= t:
+        m += 1
+    copy(work.C[m], S)
+    add(work.Z, problem.edges[m], t, S)
+
+
+@shared
+def cost(first: Array, last: Array, G: Array, least: float) -> float:
+    """What constants leave between two places with these sums before them; their factor is left in G. Information up to
+    ``least`` is none."""
+    for i in range(G.shape[0]):
+        for j in range(i + 1):
+            G[i, j] = last[i, j] - first[i, j]
+    return cholesky(G, G.shape[0] - 1, least)  # type: ignore[no-any-return]
 
 
 @shared
 def settle(X: Array, y: Array, problem: Problem, a: Array, work: Work) -> float:
     """Constants and their autoregression in turn; returns the sum of squares."""
-    rss, last = 0.0, problem.places.shape[0] - 1
+    rss, N = 0.0, X.shape[0]
     for round in range(ROUNDS):
         whiten(X, y, problem.g, problem.lags, a, work.Z)
-        cumulate(problem, work)
-        rss = cost(work, 0, last, 0.0)
+        copy(work.C[0], work.G)
+        add(work.Z, 0, N, work.G)
+        rss = cholesky(work.G, X.shape[1], 0.0)
         solved(work.G, work.theta)
         if a.shape[0] == 0:
             break
         if round < ROUNDS - 1:
-            remainder(X, y, 0, X.shape[0], work)
+            remainder(X, y, 0, N, work)
             autoregression(work.v, problem.g, problem.lags, work.H, a)
     return rss
 
@@ -215,14 +230,16 @@ def settle(X: Array, y: Array, problem: Problem, a: Array, work: Work) -> float:
 def prepare(X: Array, y: Array, problem: Problem, a: Array, most: int, work: Work) -> float:
     """The best partitions on cells with up to ``most`` breaks, in noise a; returns the information that is none."""
     whiten(X, y, problem.g, problem.lags, a, work.Z)
-    cumulate(problem, work)
     edges, m, least = problem.edges, work.cost.shape[0], 0.0
+    for j in range(1, m):
+        copy(work.C[j - 1], work.C[j])
+        add(work.Z, edges[j - 1], edges[j], work.C[j])
     for i in range(X.shape[1]):
-        least = max(least, SINGULAR * work.C[problem.places.shape[0] - 1, i, i])
+        least = max(least, SINGULAR * work.C[m - 1, i, i])
     for j in range(1, m):
         for i in range(j):
-            long = problem.places[edges[j]] - problem.places[edges[i]] >= problem.sizes[0]
-            work.cost[i, j] = cost(work, edges[i], edges[j], least) if long else np.inf
+            used = (most > 1 or i == 0 or j == m - 1) and edges[j] - edges[i] >= problem.sizes[0]
+            work.cost[i, j] = cost(work.C[i], work.C[j], work.G, least) if used else np.inf
         work.best[0, j] = work.cost[0, j]
     for count in range(1, most + 1):
         for j in range(1, m):
@@ -236,43 +253,57 @@ def prepare(X: Array, y: Array, problem: Problem, a: Array, most: int, work: Wor
 
 
 @shared
+def segment(problem: Problem, k: int, count: int, work: Work, least: float) -> float:
+    """What constants leave of segment k of those between ``at``; their factor is left in G."""
+    before(problem, work.at[k - 1] if k > 0 else 0, work, work.low)
+    before(problem, work.at[k] if k < count else work.Z.shape[0], work, work.high)
+    left: float = cost(work.low, work.high, work.G, least)
+    return left
+
+
+@shared
 def place(problem: Problem, count: int, work: Work, least: float) -> float:
-    """The places ``at`` of so many breaks, moved within cells; returns the sum of squares, inf without room."""
-    fewest, places, at = problem.sizes[0], problem.places, work.at
-    m, last, total = work.cost.shape[0] - 1, places.shape[0] - 1, 0.0
+    """The rows ``at`` that begin segments of so many breaks, moved within cells; returns the sum of squares, inf
+    without room."""
+    fewest, edges, at, low, here, high = problem.sizes[0], problem.edges, work.at, work.low, work.here, work.high
+    m, N, total = work.cost.shape[0] - 1, work.Z.shape[0], 0.0
     if not work.best[count, m] < np.inf:
         return np.inf
     for k in range(count, 0, -1):
         m = work.back[k, m]
-        at[k - 1] = problem.edges[m]
-    wide = problem.edges[1] - problem.edges[0] + 1
-    step = max(1, wide // FINER)
+        at[k - 1] = edges[m]
+    wide = edges[1] - edges[0] + 1
     for move in range(2 * count):
         k = move if move < count else 2 * count - 1 - move
-        low, high = at[k - 1] if k > 0 else 0, at[k + 1] if k + 1 < count else last
-        reach, by, most = wide, step, np.inf
+        begin, end = at[k - 1] if k > 0 else 0, at[k + 1] if k + 1 < count else N
+        before(problem, begin, work, low)
+        before(problem, end, work, high)
+        reach, by, most = wide, max(1, wide // FINER), np.inf
         while by > 0:
-            middle = at[k]
-            for f in range(max(middle - reach, low), min(middle + reach, high) + 1, by):
-                if places[f] - places[low] >= fewest and places[high] - places[f] >= fewest:
-                    value = cost(work, low, f, least) + cost(work, f, high, least)
-                    if value < most:
-                        most = value
-                        at[k] = f
+            t = max(at[k] - reach, begin + fewest)
+            last = min(at[k] + reach, end - fewest)
+            before(problem, t, work, here)
+            while t <= last:
+                value = cost(low, here, work.G, least) + cost(here, high, work.G, least)
+                if value < most:
+                    most = value
+                    at[k] = t
+                add(work.Z, t, t + by, here)
+                t += by
             reach, by = by, 1 if by > 1 else 0
     for k in range(count + 1):
-        total += cost(work, at[k - 1] if k > 0 else 0, at[k] if k < count else last, least)
+        total += segment(problem, k, count, work, least)
     return total
 
 
 @shared
 def residuals(X: Array, y: Array, problem: Problem, count: int, work: Work, least: float) -> None:
-    """v (N,) of the segments between the places ``at``."""
+    """v (N,) of the segments between ``at``."""
     for k in range(count + 1):
-        first, last = work.at[k - 1] if k > 0 else 0, work.at[k] if k < count else problem.places.shape[0] - 1
-        cost(work, first, last, least)
+        segment(problem, k, count, work, least)
         solved(work.G, work.theta)
-        remainder(X, y, problem.places[first], problem.places[last], work)
+        first, last = work.at[k - 1] if k > 0 else 0, work.at[k] if k < count else X.shape[0]
+        remainder(X, y, first, last, work)
 
 
 @shared
@@ -289,53 +320,48 @@ def keep(problem: Problem, count: int, work: Work, a: Array, least: float, found
 
 
 @shared
+def form(w: Array, V: Array) -> float:
+    """w' V w of a lower triangle V."""
+    total = 0.0
+    for i in range(w.shape[0]):
+        for j in range(i + 1):
+            total += (2.0 if j < i else 1.0) * w[i] * w[j] * V[i, j]
+    return total
+
+
+@shared
 def nyblom(problem: Problem, work: Work, L: Array) -> None:
     """L = sum S_t' V^-1 S_t / N of all scores, V their moments, and sum (w' S_t)^2 / (N w' V w) of every path w."""
-    N, n, r = work.Z.shape[0], work.theta.shape[0], work.v
-    for t in range(N):
-        r[t] = work.Z[t, n]
-        for j in range(n):
-            r[t] -= work.Z[t, j] * work.theta[j]
-    for k in range(L.shape[0]):
-        L[k] = 0.0
+    N, n, V, M, S, score = work.Z.shape[0], work.theta.shape[0], work.G, work.low, work.sums, work.score
     for i in range(n):
+        S[i] = 0.0
         for j in range(i + 1):
-            total = 0.0
-            for t in range(N):
-                total += work.Z[t, i] * work.Z[t, j] * r[t] * r[t]
-            work.R[i, j] = work.R[j, i] = total
-    for k in range(1, L.shape[0]):
-        for i in range(n):
-            for j in range(n):
-                L[k] += problem.paths[k - 1, i] * problem.paths[k - 1, j] * work.R[i, j]
-        L[k] = -max(L[k], SMALL)  # the denominator, until the sum is known
-    for i in range(n):
-        work.sums[i] = 0.0
-        work.delta[i] = 0.0
-        work.G[i, i] = work.R[i, i] + SINGULAR * work.R[i, i] + SMALL
-        for j in range(i):
-            work.G[i, j] = work.R[i, j]
-    cholesky(work.G, n, 0.0)
-    for k in range(1, L.shape[0]):
-        for i in range(n):
-            work.row[i] = 0.0
-        total = 0.0
-        for t in range(N):
-            value = 0.0
-            for i in range(n):
-                work.row[i] += work.Z[t, i] * r[t]
-                value += problem.paths[k - 1, i] * work.row[i]
-            total += value * value
-        L[k] = -total / (N * L[k])
+            V[i, j] = M[i, j] = 0.0
     for t in range(N):
+        r = work.Z[t, n]
+        for j in range(n):
+            r -= work.Z[t, j] * work.theta[j]
         for i in range(n):
-            work.sums[i] += work.Z[t, i] * r[t]
+            score[i] = work.Z[t, i] * r
+            S[i] += score[i]
+            for j in range(i + 1):
+                V[i, j] += score[i] * score[j]
+                M[i, j] += S[i] * S[j]
+    for k in range(1, L.shape[0]):
+        L[k] = form(problem.paths[k - 1], M) / (N * max(form(problem.paths[k - 1], V), SMALL))
+    for i in range(n):
+        V[i, i] += SINGULAR * V[i, i] + SMALL
+    cholesky(V, n, 0.0)
+    # the trace of V^-1 M = F'^-1 F^-1 M, column by column of M
+    L[0] = 0.0
+    for j in range(n):
         for i in range(n):
-            value = work.sums[i]
-            for j in range(i):
-                value -= work.G[i, j] * work.delta[j]
-            work.delta[i] = value / work.G[i, i] if work.G[i, i] > 0.0 else 0.0
-            L[0] += work.delta[i] * work.delta[i] / N
+            V[n, i] = M[i, j] if i >= j else M[j, i]
+            for k in range(i):
+                V[n, i] -= V[i, k] * V[n, k]
+            V[n, i] = V[n, i] / V[i, i] if V[i, i] > 0.0 else 0.0
+        solved(V, score)
+        L[0] += score[j] / N
 
 
 @shared

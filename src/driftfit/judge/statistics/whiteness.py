@@ -68,6 +68,13 @@ def _correlation(z: Array, u: Array, lags: range) -> Whiteness:
     return Whiteness(r, std, Q, float(scipy.special.chdtrc(len(lags), Q)))
 
 
+def loudest(z: Array, phi: Array) -> int | None:
+    """The regressor of phi (N, n) with which residuals z (N,) grow most clearly; None if they do with none."""
+    p = grows_with(z, phi)
+    most = int(np.argmin(p))
+    return most if p[most] * len(p) < LOUDER else None
+
+
 def grows_with(z: Array, phi: Array) -> Array:
     """p-values (n,), one-sided, of no larger residuals z (N,) where a regressor of phi (N, n) is larger; 1 for those of
     constant size."""
