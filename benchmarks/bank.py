@@ -15,9 +15,9 @@ from collections.abc import Callable
 import numpy as np
 
 from driftfit import ARX, Bank, Kalman, Live, track
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide
-from driftfit.trackers.bank.sensor import Sensor
+from driftfit.bank.change import Change
+from driftfit.bank.reduction import GPB, IMM, Beam, Decide
+from driftfit.bank.sensor import Sensor
 
 T, QUICK = 20_000, 400
 THREE = [Change(1e-6), Change(0.5, prob=0.006), Change(1.5, prob=0.004, which=[0])]

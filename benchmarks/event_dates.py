@@ -14,7 +14,7 @@ import sys
 import numpy as np
 
 from driftfit import Bank, Regression, track
-from driftfit.trackers.bank.results.events import Event
+from driftfit.bank.results.events import Event
 
 T, AT = 300, 150
 

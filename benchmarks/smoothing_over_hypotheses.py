@@ -19,11 +19,11 @@ from itertools import combinations
 import numpy as np
 
 from driftfit import Bank, Regression, track
+from driftfit.bank.change import Change
+from driftfit.bank.results.smoothed import problem_of
+from driftfit.bank.sensor import Sensor
 from driftfit.run.result import Track
 from driftfit.smooth import mixture
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.results.smoothed import problem_of
-from driftfit.trackers.bank.sensor import Sensor
 
 T, AT, NEAR, P0, STILL, JUMP, PROB = 60, 30, 6, 100.0, 1e-6, 9.0, 0.01
 GIVEN = Bank([Change(STILL), Change(JUMP, prob=PROB)], [Sensor.nominal(1.0)], p0=P0)

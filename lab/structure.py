@@ -34,13 +34,13 @@ MOVED = "fbfc0a9"
 LAYERS = (
     ("engine",),
     ("models", "systems", "readings"),
-    ("trackers", "models.hammerstein_wiener.extended_kalman", "models.hammerstein_wiener.output_error"),
+    ("trackers", "bank", "models.hammerstein_wiener.extended_kalman", "models.hammerstein_wiener.output_error"),
     # the arithmetic of smoothers works on arrays and not on runs: a stream smooths its last samples with it
     ("data", "smooth.parts"),
     ("run",),
     # how tables and pictures of all results look, which each verb's result needs to print and draw itself
     ("show.text", "show.axes"),
-    ("smooth", "tune", "judge", "use", "trackers.bank.results"),
+    ("smooth", "tune", "judge", "use", "bank.results"),
     ("show",),
     # the facade binds verbs to results
     ("", "results", "fleets", "streams", "tracking", "checks", "extend", "parsing", "identify"),

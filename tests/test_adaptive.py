@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from driftfit import ARX, AdaptiveKalman, Kalman, Live, Regression, track
+from driftfit.trackers.forms.excitation import learned, window
 from driftfit.trackers.mixture.states import COMMON
-from driftfit.trackers.parts.excitation import learned, window
 from lab import scenarios
 
 BURN = 200

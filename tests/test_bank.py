@@ -8,9 +8,9 @@ import pytest
 from support import same
 
 from driftfit import ARX, Bank, Kalman, Regression, track
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
-from driftfit.trackers.bank.sensor import Sensor
+from driftfit.bank.change import Change
+from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+from driftfit.bank.sensor import Sensor
 
 N, R = 2, 0.09
 Q = np.array([1e-4 * np.eye(2), 0.6 * np.eye(2), np.diag([0.0, 1.5])])

@@ -8,10 +8,10 @@ from support import same
 from test_bank import N, R, reported
 
 from driftfit import Bank, Live, Regression, track
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.layout import ROW
-from driftfit.trackers.bank.reduction import GPB, Beam, Decide, Hybrid
-from driftfit.trackers.bank.sensor import Sensor
+from driftfit.bank.change import Change
+from driftfit.bank.layout import ROW
+from driftfit.bank.reduction import GPB, Beam, Decide, Hybrid
+from driftfit.bank.sensor import Sensor
 
 Z = np.array([1.0, -0.5])
 CHAINS = {

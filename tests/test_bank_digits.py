@@ -9,10 +9,10 @@ from support import same
 from test_bank import N, R, record
 
 from driftfit import Bank, Kalman, Live, Regression, track
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
-from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Hybrid
-from driftfit.trackers.bank.sensor import Sensor
+from driftfit.bank.change import Change
+from driftfit.bank.leaves.leaf_matrix import FIRST
+from driftfit.bank.reduction import GPB, IMM, Beam, Hybrid
+from driftfit.bank.sensor import Sensor
 
 T = 90
 Y, U = record(T, 5, (30, 60), (40, 75))

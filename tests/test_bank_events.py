@@ -6,9 +6,9 @@ from support import arx_record, same
 from test_bank import N, R, changes, record, reported
 
 from driftfit import ARX, Bank, Kalman, Live, Regression, track
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.reduction import IMM, Beam, Decide, Hybrid
-from driftfit.trackers.bank.sensor import Sensor
+from driftfit.bank.change import Change
+from driftfit.bank.reduction import IMM, Beam, Decide, Hybrid
+from driftfit.bank.sensor import Sensor
 
 JUMPS = (40, 90)
 KNOWN = [Sensor.nominal(R)]

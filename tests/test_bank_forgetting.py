@@ -6,9 +6,9 @@ from support import same
 from test_bank import N, R, record
 
 from driftfit import RLS, Bank, Kalman, Regression, track
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.reduction import GPB, IMM, Beam, FirstFloor
-from driftfit.trackers.bank.sensor import Sensor
+from driftfit.bank.change import Change
+from driftfit.bank.reduction import GPB, IMM, Beam, FirstFloor
+from driftfit.bank.sensor import Sensor
 
 Y, U = record(80, 4, (40,))
 Y[50:53], U[60] = np.nan, np.nan

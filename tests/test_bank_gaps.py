@@ -11,9 +11,9 @@ from support import same
 from test_bank import N, R, changes, record, reported
 
 from driftfit import ARX, Bank, Kalman, Live, Regression, track, tune
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, Hybrid
-from driftfit.trackers.bank.sensor import Sensor
+from driftfit.bank.change import Change
+from driftfit.bank.reduction import GPB, IMM, Beam, Decide, Hybrid
+from driftfit.bank.sensor import Sensor
 
 KNOWN = [Sensor.nominal(R)]
 P, DRIFT, JUMP = 0.01, 1e-4, 1.0
@@ -201,7 +201,7 @@ def test_fault_codes_are_survived():
 
 def test_the_bound_of_a_beam_is_found_among_large_numbers():
     """The bits of two numbers above 2 overflow when they are added."""
-    from driftfit.trackers.bank.reducing import selection
+    from driftfit.bank.reducing import selection
 
     values, M = np.zeros((1, 72)), 45
     values[0, :66] = np.r_[np.full(40, 4.0), np.linspace(2.0, 3.0, 26)]

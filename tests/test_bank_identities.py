@@ -10,11 +10,11 @@ from scipy import integrate, special, stats
 from test_bank import P3, PROBS, N, Q, R, changes, record, reported, state
 
 from driftfit import ARX, Bank, Regression, track
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S
-from driftfit.trackers.bank.reducing import lookahead, merge
-from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide
-from driftfit.trackers.bank.sensor import Sensor
+from driftfit.bank.change import Change
+from driftfit.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S
+from driftfit.bank.reducing import lookahead, merge
+from driftfit.bank.reduction import GPB, IMM, Beam, Decide
+from driftfit.bank.sensor import Sensor
 
 Y, U = record(60, 11, (25,))
 

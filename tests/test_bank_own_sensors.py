@@ -9,8 +9,8 @@ from support import same
 from test_bank import N, Q, R, changes, reported
 
 from driftfit import ARX, Bank, Live, Regression, track
-from driftfit.trackers.bank.reduction import Beam, Decide
-from driftfit.trackers.bank.sensor import Sensor
+from driftfit.bank.reduction import Beam, Decide
+from driftfit.bank.sensor import Sensor
 
 LIMIT, STEP = 2.0, 0.1
 P_SENSORS = np.array([0.9, 0.06, 0.04])

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from driftfit import RLS, Bank, Live, Regression, track
+from driftfit.bank.change import Change
+from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+from driftfit.bank.sensor import Sensor
 from driftfit.engine.tiles import as_compiled, tile_type
 from driftfit.run.program import Program
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
-from driftfit.trackers.bank.sensor import Sensor
 
 TWO = [Change(0.0), Change(0.5, prob=0.01)]
 KNOWN = [Sensor.nominal(0.1)]

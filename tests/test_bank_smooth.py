@@ -5,11 +5,11 @@ import pytest
 from test_bank import N, R, changes, record
 
 from driftfit import Bank, Kalman, Regression, track
+from driftfit.bank.change import Change
+from driftfit.bank.results.smoothed import problem_of
+from driftfit.bank.sensor import Sensor
 from driftfit.smooth import mixture
 from driftfit.smooth.piecewise import piecewise
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.results.smoothed import problem_of
-from driftfit.trackers.bank.sensor import Sensor
 
 KNOWN = [Sensor.nominal(R)]
 Y, U = record(120, 5, (40, 90))

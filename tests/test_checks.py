@@ -15,8 +15,8 @@ from driftfit.checks import check_tracker
 from driftfit.engine.drivers import TrackerSteps, nothing_extra, unknown
 from driftfit.engine.kernel import kernel, nothing
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.forms.covariance import prediction
 from driftfit.trackers.kalman import INDEPENDENT
-from driftfit.trackers.parts.covariance import prediction
 
 
 def steps(predict, correct) -> TrackerSteps:

@@ -44,7 +44,7 @@ def test_the_graph_is_read_whole():
     assert found.circles == [("a", "b")]
     assert found.upward == ["a -> b"]
     assert "show.export" in HOUSE.imports["results"]
-    low, high = "models.hammerstein_wiener.output_error", "trackers.bank.results.events"
+    low, high = "models.hammerstein_wiener.output_error", "bank.results.events"
     assert layer_of(low) == layer_of("trackers.kalman") > layer_of("models.arx")
     assert layer_of(high) == layer_of("judge.verdict") > layer_of("run.result")
 

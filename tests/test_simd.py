@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
+from driftfit.bank.reducing.merge import digamma
 from driftfit.engine.kernel import exp, log
 from driftfit.engine.simd import (
     WIDTH,
@@ -27,7 +28,6 @@ from driftfit.engine.simd import (
     times,
     two,
 )
-from driftfit.trackers.bank.reducing.merge import digamma
 
 RNG = np.random.default_rng(3)
 

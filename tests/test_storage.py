@@ -172,7 +172,7 @@ def test_nothing_is_imported_by_what_a_file_says(saved, which, place, tmp_path, 
 @pytest.mark.parametrize(
     "forged",
     [
-        {"tracker": {"class": "driftfit.trackers.bank.bank:Bank", "settings": {"sensors": [
+        {"tracker": {"class": "driftfit.bank.bank:Bank", "settings": {"sensors": [
             {"kind": "own", "likelihood": {"function": "trap:density"}}]}}},
         {"model": {"class": "driftfit.models.hammerstein_wiener.model:HammersteinWiener", "settings": {
             "na": 1, "nb": 1, "input": {"class": "Functions", "settings": {

@@ -10,7 +10,7 @@ from driftfit.engine.kernel import Driver
 from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.run.parallel_lanes import FEWEST_LANES, width_of
 from driftfit.run.program import WIDEST_LANES, Program
-from driftfit.trackers.parts.covariance import reduce_covariance, symmetric_product
+from driftfit.trackers.forms.covariance import reduce_covariance, symmetric_product
 
 N = 27
 """Three blocks of eight, and a rest."""

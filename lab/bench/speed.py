@@ -12,6 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.bank.bank import Bank
+from driftfit.bank.change import Change
+from driftfit.bank.reduction import IMM, Beam
+from driftfit.bank.sensor import Sensor
 from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
@@ -19,10 +23,6 @@ from driftfit.models.regression import Regression
 from driftfit.streams import Live
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
-from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.reduction import IMM, Beam
-from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS

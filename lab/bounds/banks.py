@@ -29,9 +29,9 @@ def heavy(y: float, y_hat: float, h: float, r: float, last: float) -> tuple[floa
 
 def move_apart() -> None:
     """Put `APART` NaN after every array of banks made from now on."""
-    from driftfit.trackers.bank.layout import MEMORY_AT, PACKED, REPORTED, ROW, WINDOWS
+    from driftfit.bank.layout import MEMORY_AT, PACKED, REPORTED, ROW, WINDOWS
 
-    bank: Any = import_module("driftfit.trackers.bank.bank")
+    bank: Any = import_module("driftfit.bank.bank")
     packed = bank.packed
     inside = [name for name in PACKED if name not in REPORTED]
 
@@ -55,7 +55,7 @@ def move_apart() -> None:
 
 def trespassed(lane: Any) -> list[str]:
     """The arrays after which something was written."""
-    from driftfit.trackers.bank.layout import PACKED, REPORTED, ROW
+    from driftfit.bank.layout import PACKED, REPORTED, ROW
 
     result = []
     for name in PACKED:
@@ -138,7 +138,7 @@ def bank_of(rng: np.random.Generator, n: int) -> Any:
 
 def reduction(rng: np.random.Generator, H: int) -> Any:
     """A random reduction."""
-    from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+    from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
 
     depth, leaves, window = (
         int(x) for x in (rng.integers(1, 5), rng.choice([1, 2, 7, 9, 22, 33, 64, 100]), rng.choice([1, 3, 8, 30]))

@@ -31,10 +31,10 @@ CONTRACT = ["tests/contract", "-k", "Bank or test_bank"]
 
 PLANTED = {
     "an off-by-one in the reduction Decide": (
-        "trackers/bank/reducing/selection.py", "for k in range(held - 1):", "for k in range(held):",
+        "bank/reducing/selection.py", "for k in range(held - 1):", "for k in range(held):",
     ),
     "a table of leaves with half the room": (
-        "trackers/bank/memory.py", "np.zeros((rows, children + WIDTH))", "np.zeros((rows, children // 2))",
+        "bank/memory.py", "np.zeros((rows, children + WIDTH))", "np.zeros((rows, children // 2))",
     ),
 }  # fmt: skip
 """Faults to plant: the file, a line of it, and what replaces that."""

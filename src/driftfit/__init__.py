@@ -1,5 +1,10 @@
 """driftfit tracks the parameters of a system while they change."""
 
+from driftfit.bank.bank import Bank
+from driftfit.bank.change import Change
+from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+from driftfit.bank.results.pictures import plot_tree
+from driftfit.bank.sensor import Sensor
 from driftfit.checks import check_tracker
 from driftfit.engine import __version__
 from driftfit.engine.settings import DataWarning
@@ -39,11 +44,6 @@ from driftfit.smooth.total_variation import total_variation
 from driftfit.streams import Live
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
-from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
-from driftfit.trackers.bank.results.pictures import plot_tree
-from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.dynamic_glm import DynamicGLM
 from driftfit.trackers.fls import FLS

@@ -6,7 +6,7 @@ from driftfit.engine.settings import Settings, numbers, one_of, vector, whole
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.basis import Basis
 from driftfit.trackers.base import RandomWalk, Tracker
-from driftfit.trackers.parts.covariance import prediction, read_drift
+from driftfit.trackers.forms.covariance import prediction, read_drift
 
 __all__ = [
     "Array",

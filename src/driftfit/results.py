@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
+from driftfit.bank.results.events import Event
+from driftfit.bank.results.results import Hypotheses
+from driftfit.bank.results.smoothed import SmoothedMixture
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.detect import Alarms, detect
 from driftfit.judge.diagnose import Diagnosis, diagnose
@@ -19,9 +22,6 @@ from driftfit.show.report import report
 from driftfit.show.summary import Summary, cell_of, summarise
 from driftfit.smooth.shared_theta import SmoothedShared
 from driftfit.smooth.smoothed import Smoothed
-from driftfit.trackers.bank.results.events import Event
-from driftfit.trackers.bank.results.results import Hypotheses
-from driftfit.trackers.bank.results.smoothed import SmoothedMixture
 from driftfit.tune import inference
 from driftfit.tune.refine import refine
 from driftfit.use import simulate, system
@@ -94,7 +94,7 @@ class Track(result.Track, Exported, public=True):
         needs a tracker whose drift is given.
         ``undetermined``: the value of parameters that the record does not determine, whose std is inf: "min_norm", the
         solution nearest to theta0; "nan"; or "raise". A `Bank` is smoothed over all its
-        hypotheses (`driftfit.trackers.bank.results.smoothed.SmoothedMixture`). ValueError for other trackers that do
+        hypotheses (`driftfit.bank.results.smoothed.SmoothedMixture`). ValueError for other trackers that do
         not describe a random walk in Gaussian noise. Of outputs that share one theta, theta is (T, n) and residuals are
         (T, ny).
         """

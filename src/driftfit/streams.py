@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
+from driftfit.bank.results.live_results import LiveHypotheses
 from driftfit.models.hammerstein_wiener.blocks import Separator
 from driftfit.models.hammerstein_wiener.separation import Groups
 from driftfit.run.live import live
-from driftfit.trackers.bank.results.live_results import LiveHypotheses
 from driftfit.use.constrained import Constrained, constrain
 from driftfit.use.forecast import Forecast, forecast_stream
 from driftfit.use.system import LiveSystem

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from rich.console import Console
 
-from driftfit.trackers.bank.reduction import Decide
+from driftfit.bank.reduction import Decide
 from driftfit.tracking import track
 from lab.jumps import MODEL, jumping
 from lab.reproduce import Claim

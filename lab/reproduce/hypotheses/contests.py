@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from driftfit.bank.bank import Bank
+from driftfit.bank.change import Change
+from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid, Reduction
+from driftfit.bank.results.results import Hypotheses
+from driftfit.bank.sensor import Sensor
 from driftfit.engine.kernel import Array
-from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid, Reduction
-from driftfit.trackers.bank.results.results import Hypotheses
-from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS

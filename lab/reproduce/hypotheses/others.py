@@ -6,14 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from driftfit.bank.bank import Bank
+from driftfit.bank.reduction import Beam, Decide
+from driftfit.bank.results.smoothed import problem_of
+from driftfit.bank.sensor import Sensor
 from driftfit.engine.kernel import Array
 from driftfit.results import Track
 from driftfit.smooth import mixture
 from driftfit.smooth.piecewise import piecewise
-from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.reduction import Beam, Decide
-from driftfit.trackers.bank.results.smoothed import problem_of
-from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.kalman import Kalman
 from driftfit.tracking import track
 from lab.jumps import MODEL, START, Jumping, jumping

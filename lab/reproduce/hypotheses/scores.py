@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from driftfit.bank.bank import Bank
 from driftfit.engine.kernel import Array
 from driftfit.models.regression import Regression
 from driftfit.results import Track
-from driftfit.trackers.bank.bank import Bank
 from driftfit.tracking import track
 from lab.jumps import MODEL, START, Jumping, jumping
 from lab.reproduce.hypotheses.contests import Contest, Entry

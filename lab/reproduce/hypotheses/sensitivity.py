@@ -6,10 +6,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, Reduction
-from driftfit.trackers.bank.sensor import Sensor
+from driftfit.bank.bank import Bank
+from driftfit.bank.change import Change
+from driftfit.bank.reduction import GPB, IMM, Beam, Decide, Reduction
+from driftfit.bank.sensor import Sensor
 from lab.reproduce.hypotheses.contests import P0, Contest, Entry, R
 from lab.reproduce.hypotheses.references import sensitivity
 from lab.reproduce.hypotheses.scores import measure

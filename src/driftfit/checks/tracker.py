@@ -198,7 +198,7 @@ def _each(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
     if not np.allclose(one.theta, each.theta, rtol=1e-6, atol=1e-9):
         yield (
             "It declares drift_per_parameter = True, but the same drift given for each parameter has another effect "
-            "than one drift for all: give its steps read_extra=driftfit.trackers.parts.covariance.read_drift "
+            "than one drift for all: give its steps read_extra=driftfit.trackers.forms.covariance.read_drift "
             "and multiply q by s.drift_root[i, l] ** 2."
         )
 

@@ -152,7 +152,7 @@ class TrackerSteps(NamedTuple):
     ``correct`` is the measurement update, with ``s.ok`` (0 or 1) as a factor of its gain. ``report`` fills ``s.var``.
 
     ``start`` are the steps of a lane while ``s.root`` is 1, for trackers that start from no knowledge at all
-    (`driftfit.trackers.parts.diffuse`); those with ``take_over``, which makes their state from theta and P, also take a
+    (`driftfit.trackers.forms.diffuse`); those with ``take_over``, which makes their state from theta and P, also take a
     sample whose ``h`` is above `WIDE` times its noise. ``machines`` are the routines that steps call by symbol.
     ``store(o, s, l)`` copies what the tracker's ``outputs`` name from the record ``s`` to the stored record ``o``.
     ``read_extra(s, known, t, l)`` reads the extra columns of ``known``, those after interval, noise and drift, for

@@ -16,7 +16,7 @@ for each, which names in one sentence what broke. Tried with the versions in `TR
                    numba._dynfunc, environments
     symbols        llvm_cfunc_wrapper, call_conv   machines and outlined steps are called by name
     arrays         make_array, populate_array      an array at an address without reference counts
-    fields         AttributeTemplate                fields of a table by name; see `driftfit.trackers.bank.table`
+    fields         AttributeTemplate                fields of a table by name; see `driftfit.bank.table`
     vectors        llvmlite.ir                      instructions on SIMD vectors; see `driftfit.engine.simd`
 
 Public means (`numba.njit`, `numba.extending`) serve for types, intrinsics, data models, options and the passes.

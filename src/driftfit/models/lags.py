@@ -20,7 +20,7 @@ normal density with the tails of a Cauchy distribution, because another outlier 
 is the product over all of them. A lag that was filled because its output is missing has d = 1: it adds its variance.
 
 The covariances of lags with each other and with theta are neglected. The leaves of a `Bank` with additive outliers
-decide the same question by hypotheses, and carry the covariance of their lags (`driftfit.trackers.bank.leaves.lags`).
+decide the same question by hypotheses, and carry the covariance of their lags (`driftfit.bank.leaves.lags`).
 
 Source: additive and innovation outliers are Fox's (1972); deciding between them by later samples is the idea of Chang,
 Tiao and Chen (1988); the recursion is ours. Cost per sample: O(na), and O(ny^2 na) for ny outputs.

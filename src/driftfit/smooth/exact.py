@@ -30,7 +30,7 @@ from driftfit.engine.kernel import Array
 from driftfit.smooth.parts import elimination, slopes, two_filters
 from driftfit.smooth.parts.rank import column_scale, ranks
 from driftfit.smooth.parts.walk import Path, Walk
-from driftfit.trackers.parts.information import triangular_root
+from driftfit.trackers.forms.information import triangular_root
 
 
 def smooth(walk: Walk, keep: str = "fit", rebuild: Callable[[], Walk] | None = None) -> Path:

@@ -20,8 +20,8 @@ from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
 from driftfit.smooth.parts.walk import Path
 from driftfit.smooth.problem import replay
+from driftfit.trackers.forms.volatility import smoothed_noise
 from driftfit.trackers.laws.law import OWNER, VISIBLE, transition
-from driftfit.trackers.parts.volatility import smoothed_noise
 
 SPANNED = 1e-10
 """Share of the largest eigenvalue of M, in the units of its diagonal, below which a direction of delta is free."""

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from driftfit.bank.results.results import Hypotheses
+from driftfit.bank.results.smoothed import faulty
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
 from driftfit.smooth.parts.rank import column_sizes
 from driftfit.smooth.plots import plot_segments
 from driftfit.smooth.problem import replay
-from driftfit.trackers.bank.results.results import Hypotheses
-from driftfit.trackers.bank.results.smoothed import faulty
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -46,6 +46,27 @@ from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel, nothing
 from driftfit.engine.settings import whole
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.forms.coordinates import (
+    FRAME,
+    frame,
+    located,
+    located_within,
+    unseen_variance,
+    whiten,
+    whiten_within,
+)
+from driftfit.trackers.forms.covariance import prediction
+from driftfit.trackers.forms.diffuse import knowing_nothing, spanned_variance
+from driftfit.trackers.forms.excitation import (
+    FIRST,
+    learn_information,
+    learn_scales,
+    learned,
+    no_excitation,
+    not_learned,
+    window,
+)
+from driftfit.trackers.forms.information import partly_known
 from driftfit.trackers.mixture.filters import (
     enter_filters,
     innovate,
@@ -83,27 +104,6 @@ from driftfit.trackers.mixture.states import (
     store_for_smoother,
     transitions,
 )
-from driftfit.trackers.parts.coordinates import (
-    FRAME,
-    frame,
-    located,
-    located_within,
-    unseen_variance,
-    whiten,
-    whiten_within,
-)
-from driftfit.trackers.parts.covariance import prediction
-from driftfit.trackers.parts.diffuse import knowing_nothing, spanned_variance
-from driftfit.trackers.parts.excitation import (
-    FIRST,
-    learn_information,
-    learn_scales,
-    learned,
-    no_excitation,
-    not_learned,
-    window,
-)
-from driftfit.trackers.parts.information import partly_known
 from driftfit.trackers.student import RESIDUALS, widen_estimates, wider
 
 
@@ -263,7 +263,7 @@ class AdaptiveKalman(Tracker):
         "pivot", "at_start", "gain", "e_k", "step", "h_k", "curve", "inverse", "joint", "share", "row", "walk", "Z",
         "away",
     )  # fmt: skip
-    """Not H and work, which `driftfit.trackers.parts.coordinates.frame` fills only where the coordinates change."""
+    """Not H and work, which `driftfit.trackers.forms.coordinates.frame` fills only where the coordinates change."""
 
     def __post_init__(self) -> None:
         if self.groups is not None:

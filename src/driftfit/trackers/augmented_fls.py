@@ -30,7 +30,7 @@ from driftfit.engine.drivers import TrackerSteps, no_variance, unknown
 from driftfit.engine.kernel import State, kernel, nothing
 from driftfit.engine.settings import numbers, vector
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.covariance import prediction
+from driftfit.trackers.forms.covariance import prediction
 
 
 @kernel

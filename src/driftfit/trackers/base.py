@@ -12,7 +12,7 @@ from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import Settings, as_numbers, factor
 from driftfit.models.base import Model
-from driftfit.trackers.parts.information import widen
+from driftfit.trackers.forms.information import widen
 
 
 class RandomWalk(NamedTuple):
@@ -56,14 +56,14 @@ class Tracker(Settings, ABC):
     replaces: ClassVar[tuple[str, ...]] = ("shift",)
     """Fields of the model's memory whose start the tracker gives; all its other names must differ from the model's.
     ``shift`` is common to all: what the model subtracted from y, for trackers that judge readings
-    (`driftfit.trackers.parts.coarse.resolution`).
+    (`driftfit.trackers.forms.resolution`).
     """
     weighs: ClassVar[bool] = False
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
     smoother_fields: ClassVar[tuple[str, ...]] = ()
     """Fields that `problem` needs from every sample; ``steps.store_for_smoother`` stores them."""
     drift_per_parameter: ClassVar[bool] = False
-    """Whether every parameter may have its own drift at every sample (`driftfit.trackers.parts.covariance`)."""
+    """Whether every parameter may have its own drift at every sample (`driftfit.trackers.forms.covariance`)."""
     adapts: ClassVar[bool] = False
     """Whether it estimates drift and noise on-line, so that its innovations are normal again soon after a fault."""
     density: ClassVar[str] = ""

@@ -40,8 +40,8 @@ from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import State, exp, kernel, log, shared
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.forms.covariance import LEFT, prediction, read_drift, symmetric_product
 from driftfit.trackers.kalman import drift_matrix
-from driftfit.trackers.parts.covariance import LEFT, prediction, read_drift, symmetric_product
 
 FAMILIES = ("gaussian", "poisson", "negative binomial", "logistic")
 GAUSSIAN, POISSON, NEGATIVE, LOGISTIC = range(4)

@@ -21,7 +21,7 @@ Use it to describe smoothness by one number; `tune` estimates it. `Kalman` has q
 cheaper and has no covariance. `run.smooth()` computes the whole path that minimises J.
 
 Source: Kalaba and Tesfatsion, Time-varying linear regression via flexible least squares (1989), whose matrix recursion
-is used in covariance form. Departures: an exact diffuse start (`driftfit.trackers.parts.diffuse`), which needs no
+is used in covariance form. Departures: an exact diffuse start (`driftfit.trackers.forms.diffuse`), which needs no
 penalty on the first point and no large matrix; the minimum-norm solution about theta0 until the regressors span. In
 Chen et al. this is the classical method, T-FLS: J is (8), the filter (9) to (12), `smooth` (13) to (15). Cost O(n^2).
 """
@@ -39,10 +39,10 @@ from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import covariance, matrix, numbers, plain, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
-from driftfit.trackers.parts import second_differences
-from driftfit.trackers.parts.covariance import correct as measure
-from driftfit.trackers.parts.covariance import forecast, read_drift
-from driftfit.trackers.parts.diffuse import (
+from driftfit.trackers.forms import second_differences
+from driftfit.trackers.forms.covariance import correct as measure
+from driftfit.trackers.forms.covariance import forecast, read_drift
+from driftfit.trackers.forms.diffuse import (
     SCRATCH,
     correct_on_roots,
     drifted,
@@ -52,7 +52,7 @@ from driftfit.trackers.parts.diffuse import (
     spanned_variance,
     started,
 )
-from driftfit.trackers.parts.information import partly_known
+from driftfit.trackers.forms.information import partly_known
 from driftfit.trackers.rls import learn_scale, no_scale
 
 
@@ -116,7 +116,7 @@ class FLS(Tracker):
         Covariance of theta at the first sample, in units of the noise variance. None: a diffuse start.
     differences : 1 or 2
         2 penalises changes of the slope, theta_{k+1} - 2 theta_k + theta_{k-1}, instead of changes of theta, so that
-        a straight line costs nothing (`driftfit.trackers.parts.second_differences`); its start is diffuse.
+        a straight line costs nothing (`driftfit.trackers.forms.second_differences`); its start is diffuse.
 
     Raises
     ------

@@ -56,8 +56,8 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel, nothing
 from driftfit.models.base import Model
-from driftfit.trackers.parts.covariance import LEFT, prediction, product_with, symmetric_product
-from driftfit.trackers.parts.diffuse import MACHINES, forecast_on_roots, spanned_variance
+from driftfit.trackers.forms.covariance import LEFT, prediction, product_with, symmetric_product
+from driftfit.trackers.forms.diffuse import MACHINES, forecast_on_roots, spanned_variance
 from driftfit.trackers.rls import Forgetting, correct_root_form, fade, forget_root_form, learn_settling_scale
 
 FOLLOWING = 0.05

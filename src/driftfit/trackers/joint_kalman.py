@@ -40,8 +40,8 @@ from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import one_of
 from driftfit.models.state_space import StateSpace, equations_of
+from driftfit.trackers.forms.covariance import correct, read_drift, symmetric_product
 from driftfit.trackers.kalman import drift_matrix
-from driftfit.trackers.parts.covariance import correct, read_drift, symmetric_product
 from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
 MOST = 1000.0

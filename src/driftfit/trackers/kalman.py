@@ -11,18 +11,18 @@ with w the weight of the sample and d known factors of the drift, 1 unless given
 Use it if the size of the drift is known or can be tuned; `RLS` needs only a memory length, `AugmentedFLS` has no
 covariance. Without excitation P grows by exactly q per sample: it is finite, and describes the growing uncertainty.
 
-``volatility`` lets the noise variance move, as a random walk of log r (`driftfit.trackers.parts.volatility`): for
+``volatility`` lets the noise variance move, as a random walk of log r (`driftfit.trackers.forms.volatility`): for
 returns, inflation and whatever else is restless for a while. The weights of samples and the bands follow it.
 
 ``laws`` say more of single parameters: that they return to a mean, follow a trend or a season, or drift at their own
 rate (`driftfit.trackers.laws.law`); all others remain random walks.
 
-form="sqrt" keeps the square root of the information instead (`driftfit.trackers.parts.square_root`). It gives the same
+form="sqrt" keeps the square root of the information instead (`driftfit.trackers.forms.square_root`). It gives the same
 numbers for ordinary data, and positive variances for collinear or badly scaled regressors and extreme ratios of q to r,
 at O(n^3).
 
 Source: Kalman (1960); as a parameter tracker Young, Recursive Estimation and Time-Series Analysis (2011), chapter 4.
-Departures: only one triangle of P is kept; an exact diffuse start (`driftfit.trackers.parts.diffuse`), whose form also
+Departures: only one triangle of P is kept; an exact diffuse start (`driftfit.trackers.forms.diffuse`), whose form also
 takes samples after which P would be rounding. Cost per sample: O(n^2).
 """
 
@@ -39,11 +39,9 @@ from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
-from driftfit.trackers.laws import filter as laws_filter
-from driftfit.trackers.laws.law import OWNER, Law, laws_of, table_of
-from driftfit.trackers.parts import square_root
-from driftfit.trackers.parts.covariance import correct, forecast, read_drift
-from driftfit.trackers.parts.diffuse import (
+from driftfit.trackers.forms import square_root
+from driftfit.trackers.forms.covariance import correct, forecast, read_drift
+from driftfit.trackers.forms.diffuse import (
     SCRATCH,
     correct_on_roots,
     drifted,
@@ -53,8 +51,10 @@ from driftfit.trackers.parts.diffuse import (
     spanned_variance,
     started,
 )
-from driftfit.trackers.parts.information import partly_known, triangular_root
-from driftfit.trackers.parts.volatility import FIELDS, known_noise, log_density, smoothed_noise, volatile
+from driftfit.trackers.forms.information import partly_known, triangular_root
+from driftfit.trackers.forms.volatility import FIELDS, known_noise, log_density, smoothed_noise, volatile
+from driftfit.trackers.laws import filter as laws_filter
+from driftfit.trackers.laws.law import OWNER, Law, laws_of, table_of
 
 
 @kernel

@@ -46,9 +46,9 @@ from driftfit.engine.kernel import State, exp, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.covariance import correct as measure
-from driftfit.trackers.parts.covariance import forecast
-from driftfit.trackers.parts.diffuse import (
+from driftfit.trackers.forms.covariance import correct as measure
+from driftfit.trackers.forms.covariance import forecast
+from driftfit.trackers.forms.diffuse import (
     SCRATCH,
     absorb_on_roots,
     correct_on_roots,

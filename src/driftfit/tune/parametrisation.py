@@ -25,9 +25,9 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.bank.bank import Bank
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import missing_settings
-from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.tune.lanes import Task, score

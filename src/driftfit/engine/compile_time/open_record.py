@@ -6,7 +6,7 @@ and of a table of its sizes, which the driver holds as a constant. For each fiel
 distance from the beginning of the record, and the lengths of its axes but for that of lanes, which is 1. Records that
 have these fields are of one type, whatever else they hold.
 
-The tables of banks (`driftfit.trackers.bank.table`) are not of this kind: their arrays lie in several memories, whose
+The tables of banks (`driftfit.bank.table`) are not of this kind: their arrays lie in several memories, whose
 places are known when a bank runs, and their numbers in the table itself. An open record is made where code is compiled.
 
 Private parts: `AttributeTemplate`, `infer_getattr`, `make_array` and `populate_array`.

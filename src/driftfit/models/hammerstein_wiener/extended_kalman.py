@@ -35,8 +35,8 @@ from driftfit.models.hammerstein_wiener.basis import PiecewiseLinear
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.structure import NUMBER, Structure, positions
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.forms.covariance import correct, product_with, read_drift
 from driftfit.trackers.kalman import drift, drift_matrix
-from driftfit.trackers.parts.covariance import correct, product_with, read_drift
 
 
 def structure_of(owner: str, model: Model) -> Structure:

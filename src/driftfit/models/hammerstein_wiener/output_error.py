@@ -37,7 +37,7 @@ from driftfit.models.hammerstein_wiener.extended_kalman import Minimal, minimal_
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.output_curve import Kind, inverse_of, level, rises, values_of
 from driftfit.models.hammerstein_wiener.structure import AT, GRID, INPUT, NUMBER, Places, room
-from driftfit.trackers.parts.covariance import LEFT
+from driftfit.trackers.forms.covariance import LEFT
 
 SLOPE_SHARE = 0.05
 """Least slope of F that the filter divides by, as a share of the slope of its functions."""

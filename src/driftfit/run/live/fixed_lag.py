@@ -1,7 +1,7 @@
 """Fixed-lag smoothing: estimates of the last few samples of a stream from past and future, in constant memory.
 
 A window contains the last ``lag`` + 1 samples. A square-root information filter
-(`driftfit.trackers.parts.information`) holds the information of all samples before the window. Smoothing the window
+(`driftfit.trackers.forms.information`) holds the information of all samples before the window. Smoothing the window
 from there is exact: row 0 equals the smoother of the whole record that ends now.
 
 Cost: one step of the filter per sample, O(n^3), and one exact smoothing of the window, O(lag n^3), per call.
@@ -19,7 +19,7 @@ from driftfit.models.base import Model
 from driftfit.smooth.parts import slopes, two_filters
 from driftfit.smooth.parts.walk import Walk, room_for_signals
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.information import triangular_root
+from driftfit.trackers.forms.information import triangular_root
 
 SAMPLES = ("phi", "y", "weight", "drift", "drift_root", "trend")
 """What is saved of the samples of a window."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.smooth.parts.walk import WEIGHT
-from driftfit.trackers.parts import diffuse
+from driftfit.trackers.forms import diffuse
 
 FAR = 1e250
 """Sums of squares between this and its inverse have lost nothing to overflow or underflow."""

@@ -28,7 +28,7 @@ from driftfit.smooth.parts import two_filters
 from driftfit.smooth.parts.rank import column_scale, ranks
 from driftfit.smooth.parts.two_filters import Start, unspanned
 from driftfit.smooth.parts.walk import Path, Walk
-from driftfit.trackers.parts.information import triangular_root
+from driftfit.trackers.forms.information import triangular_root
 
 
 def smooth(walk: Walk, keep: str = "std") -> Path:

@@ -17,7 +17,7 @@ Both filters run in one loop as two lanes, the meeting as `WIDTH` lanes. Cost: O
 per sample.
 
 Sources: Fraser and Potter (1969) for the two filters; Bierman (1977) for the rotations
-(`driftfit.trackers.parts.information`). Departure: leverage and leave-one-out residuals from the cosines.
+(`driftfit.trackers.forms.information`). Departure: leverage and leave-one-out residuals from the cosines.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, Driver
 from driftfit.engine.tiles import WIDTH, make_tile
 from driftfit.smooth.parts.walk import Path, Walk
-from driftfit.trackers.parts import information
+from driftfit.trackers.forms import information
 
 KNOWN_EXACTLY = 1e8
 """Information on directions that the prior fixes, relative to that of all samples; its square exceeds the precision."""

@@ -14,7 +14,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers
 from driftfit.trackers.base import RandomWalk
-from driftfit.trackers.parts.diffuse import WITHIN_SPAN
+from driftfit.trackers.forms.diffuse import WITHIN_SPAN
 
 NONE = np.zeros((0, 0))
 """No parameter has its own drift, and none has a slope."""

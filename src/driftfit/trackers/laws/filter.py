@@ -45,6 +45,7 @@ from driftfit.engine.kernel import (
     shared,
     wholes,
 )
+from driftfit.trackers.forms.covariance import LEFT, read_drift
 from driftfit.trackers.laws.law import (
     COSINE,
     DAMPING,
@@ -59,7 +60,6 @@ from driftfit.trackers.laws.law import (
     SLOPE,
     VISIBLE,
 )
-from driftfit.trackers.parts.covariance import LEFT, read_drift
 
 DETERMINED = 1e-9
 """Smallest square on the diagonal of R, in that of its column, with which delta is taken in."""

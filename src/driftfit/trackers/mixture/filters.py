@@ -12,7 +12,7 @@ the same small probability a_j, so that it costs O(K) instead of O(K^2):
 
     T_ij = a_j + down_i [j next below i],   the rest stays
 
-The filters use coordinates z = M theta of their start, in which the regressor is x (`driftfit.trackers.parts
+The filters use coordinates z = M theta of their start, in which the regressor is x (`driftfit.trackers.forms
 .coordinates`). A regressor in a direction that no earlier one has determined is used by all filters, and does not
 change their probabilities.
 
@@ -27,6 +27,8 @@ from functools import partial
 import numpy as np
 
 from driftfit.engine.kernel import State, exp, kernel, log
+from driftfit.trackers.forms.coordinates import in_units_of_theta, new_row
+from driftfit.trackers.forms.covariance import LEFT
 from driftfit.trackers.mixture.states import (
     AFTER,
     COMMON,
@@ -40,8 +42,6 @@ from driftfit.trackers.mixture.states import (
     sum_of_row,
     variance_in,
 )
-from driftfit.trackers.parts.coordinates import in_units_of_theta, new_row
-from driftfit.trackers.parts.covariance import LEFT
 
 FADING, BEND = 0.05, 0.1
 """Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""

@@ -43,6 +43,8 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, exp, kernel, log, machine, shared
+from driftfit.trackers.forms.diffuse import absorb_on_roots, forecast_on_roots
+from driftfit.trackers.forms.excitation import DULL, LARGE, MEMORY, learn_information, learn_scales
 from driftfit.trackers.mixture.filters import absorb, project, wander
 from driftfit.trackers.mixture.states import (
     FIRST_ALONE,
@@ -51,8 +53,6 @@ from driftfit.trackers.mixture.states import (
     note_reading,
     sum_of_row,
 )
-from driftfit.trackers.parts.diffuse import absorb_on_roots, forecast_on_roots
-from driftfit.trackers.parts.excitation import DULL, LARGE, MEMORY, learn_information, learn_scales
 
 BLOCK, WINDOW = 25, 50
 """Samples between two passes, and samples of a pass."""

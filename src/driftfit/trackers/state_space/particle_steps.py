@@ -10,8 +10,8 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.models.state_space import equations_of
+from driftfit.trackers.forms.covariance import LEFT, read_drift
 from driftfit.trackers.joint_kalman import MOST, moves_are_finite
-from driftfit.trackers.parts.covariance import LEFT, read_drift
 from driftfit.trackers.state_space.draws import normal, uniform
 
 HALF_LOG_2_PI = 0.9189385332046727

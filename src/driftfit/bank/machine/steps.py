@@ -1,0 +1,321 @@
+"""The steps of a bank in the lane form: one filter until it can begin, then the compiled routine of `advance`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from driftfit.bank.layout import (
+    BASES as BASE_NAMES,
+)  # fmt: skip
+from driftfit.bank.layout import (
+    COUNTER,
+    FORECAST,
+    LEARN,
+    MEMORY_AT,
+    READY,
+    REPORT_AT,
+    ROW,
+    ROWS,
+    SAMPLE,
+    WAITING,
+    memory_at,
+    report_at,
+)
+from driftfit.bank.leaves.lags import PLAUSIBLE
+from driftfit.bank.leaves.own_sensor import OWN_AT, entry_of, no_own_sensor
+from driftfit.bank.machine.advance import bank
+from driftfit.bank.machine.framed import (
+    AT,
+    FRAMED,
+    begin_framed,
+    call_framed,
+    enter_bank,
+    frame_theta,
+    outgrown,
+    read_framed,
+    spans_lags,
+)
+from driftfit.engine.drivers import COMMON, TrackerSteps, diagonal
+from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing
+from driftfit.trackers.forms.coordinates import FRAME, whiten_within
+from driftfit.trackers.forms.covariance import correct as correct_one
+from driftfit.trackers.forms.covariance import forecast as forecast_one
+from driftfit.trackers.forms.covariance import prediction
+from driftfit.trackers.forms.diffuse import correct_on_roots, forecast_on_roots, spanned_variance, wander
+from driftfit.trackers.forms.excitation import learn_scales
+from driftfit.trackers.forms.resolution import lasting, learn_resolved_scale, least_noise, resolve
+from driftfit.trackers.mixture.states import LEAST_SHARE
+from driftfit.trackers.student import RESIDUALS, wider
+
+BASES = len(BASE_NAMES)
+GIVEN, GIVEN_CHAIN, DRIFT = ROW["given"], ROW["given_chain"], ROW["drift"]
+
+
+@kernel
+def keep(o: State, s: State, l: int) -> None:
+    """Store the report of events."""
+    size, L = o.report.shape
+    report = floats(report_at(s), size, L)
+    for k in range(size):
+        o.report[k, l] = report[k, l]
+
+
+@kernel
+def only_drift(s: State, l: int) -> None:
+    """The time update by the first change, for the single filter before the bank starts."""
+    time = s.dt[l] * s.drift[l]
+    keep = s.keep0[l] if s.dt[l] == 1.0 else exp(s.dt[l] * log(s.keep0[l]))
+    at = 0
+    for i in range(s.theta.shape[0]):
+        for j in range(i + 1):
+            s.P[i, j, l] = s.P[i, j, l] * keep + s.q0[at, l] * time
+            at += 1
+        unit = s.r[l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        s.P[i, i, l] += s.size0[i, l] * unit * time
+
+
+@kernel
+def only_drifted(s: State, l: int) -> None:
+    """The same in square-root form."""
+    n = s.theta.shape[0]
+    time = s.dt[l] * s.drift[l]
+    root = exp(-0.5 * s.dt[l] * log(s.keep0[l]))
+    for i in range(n):
+        s.d[i, l] *= root
+        for j in range(i, n):
+            s.S[i, j, l] *= root
+            s.H[i, j, l] = s.G[i, j, l]
+    wander(s, np.sqrt(time), l)
+    for i in range(n):
+        unit = s.r[l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        for j in range(i, n):
+            s.H[i, j, l] = np.sqrt(s.size0[i, l] * unit) if i == j else 0.0
+    wander(s, np.sqrt(time), l)
+
+
+@kernel
+def moved(at: int, size: int, L: int, l: int, to: int, back: bool) -> int:
+    """Copy lane l of a field of ``size`` numbers to an address, or ``back``; returns the address behind the copy."""
+    lane, flat = floats(at, size, L), floats(to, 1, size)
+    for k in range(size):
+        if back:
+            lane[k, l] = flat[0, k]
+        else:
+            flat[0, k] = lane[k, l]
+    return to + 8 * size
+
+
+@kernel
+def run(s: State, l: int) -> None:
+    """Call the compiled routine, whose table receives the addresses of the fields for that time. The numbers of one of
+    several lanes are not contiguous, so the routine works on copies behind the memory.
+    """
+    n, L, framed = s.theta.shape[0], s.theta.shape[1], s.framed[l] > 0
+    sizes = (
+        s.table[MEMORY_AT, 2, l], s.table[REPORT_AT, 2, l], n, n, n, n * n, s.counters.shape[0], s.sample.shape[0],
+        3 * ROWS,
+    )  # fmt: skip
+    fields = (
+        memory_at(s), report_at(s), np.int64(s.x.ctypes.data if framed else s.phi.ctypes.data),
+        np.int64(s.no_power.ctypes.data if framed else s.c.ctypes.data),
+        np.int64(s.d.ctypes.data if framed else s.theta.ctypes.data),
+        np.int64(s.Pz.ctypes.data if framed else s.P.ctypes.data),
+        np.int64(s.counters.ctypes.data), np.int64(s.sample.ctypes.data), np.int64(s.table.ctypes.data),
+    )  # fmt: skip
+    copies = fields[0] + 8 * sizes[0] * L
+    to = copies
+    for k in range(BASES):
+        s.table[MEMORY_AT + k, 0, l] = to if L > 1 else fields[k]
+        to = moved(fields[k], sizes[k], L, l, to, False) if L > 1 else fields[BASES]
+    if L > 1:
+        moved(fields[BASES], sizes[BASES], L, l, to, False)
+    bank(to)
+    for k in range(BASES if L > 1 else 0):
+        copies = moved(fields[k], sizes[k], L, l, copies, True)
+    for k in range(BASES):  # addresses are not part of the state
+        s.table[MEMORY_AT + k, 0, l] = 0
+    if s.counters[COUNTER.phase, l] == LEARN:
+        s.table[OWN_AT, 0, l] = 0
+
+
+@kernel
+def repeated(s: State, l: int) -> float:
+    """The factor of the noise variance for a repeated reading of a coarse meter, in units of the last innovation's."""
+    known = s.coarse[l] > 0.0 and s.s[l] < np.inf
+    return 1.0 + lasting(s, l) / max(s.coarse[l], s.s[l]) if known else 1.0
+
+
+@kernel
+def hand_over(s: State, l: int) -> None:
+    """Write the numbers of this sample for the compiled routine, and the output lags of the record."""
+    n, memory = s.theta.shape[0], floats(memory_at(s), s.table[MEMORY_AT, 2, l], s.theta.shape[1])
+    for k in range(s.table[AT.output_lags, 0, l]):
+        memory[s.table[AT.lag_rows, 0, l] // 8 + k * (n + 1) + n, l] = s.phi[k, l]
+    s.sample[SAMPLE.y, l], s.sample[SAMPLE.noise, l], s.sample[SAMPLE.dt, l] = (
+        s.y[l],
+        s.noise[l] * repeated(s, l),
+        s.dt[l],
+    )
+    s.sample[SAMPLE.time, l], s.sample[SAMPLE.shift, l] = s.dt[l] * s.drift[l], s.shift[l]
+    s.sample[SAMPLE.ok, l], s.sample[SAMPLE.observed, l] = s.ok[l], s.observed[l]
+    s.sample[SAMPLE.r, l], s.sample[SAMPLE.least, l] = s.r[l], max(LEAST_SHARE * s.power[l] + 1e-300, least_noise(s, l))
+    s.sample[SAMPLE.most, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
+
+
+@kernel
+def alone(s: State, l: int, counts: bool) -> None:
+    """After a sample of the single filter: update scales, noise and lags, and begin the bank as soon as possible."""
+    learn_scales(s, l)
+    residuals = s.count[l]
+    s.sample[SAMPLE.freedom, l] = residuals if s.unknown[l] > 0 else np.inf
+    if counts:
+        learn_resolved_scale(s, l)
+        s.scale[l] *= wider(s.count[l])
+    s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
+    hand_over(s, l)
+    s.sample[SAMPLE.y_hat, l], s.sample[SAMPLE.s, l] = s.y_hat[l], s.s[l] / wider(residuals)
+    s.sample[SAMPLE.squares, l], s.sample[SAMPLE.times, l] = s.squares[l], s.count[l]
+    ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
+    if ready and s.root[l] > 0:
+        ready = s.can_frame[l] > 0 and s.within[l] >= RESIDUALS and spans_lags(s, l)
+        if ready:
+            begin_framed(s, l)
+    s.counters[COUNTER.settled, l] = READY if ready else WAITING
+    run(s, l)
+    if ready:
+        s.scale[l] = 1.0
+
+
+@kernel
+def forecast_tree(s: State, l: int) -> None:
+    """The forecast of the tree, in theta or in coordinates of the start."""
+    column, y_hat, outside = -1, 0.0, False
+    if s.framed[l] > 0:
+        column, y_hat = whiten_within(s, s.phi.ctypes.data, l), prediction(s, l)
+        outside = column >= 0
+    if not outside and s.ok[l] > 0.0 and s.can_frame[l] > 0:
+        column = outgrown(s, l)
+        if column >= 0 and s.framed[l] == 0:
+            frame_theta(s, l)
+    if s.framed[l] > 0:
+        call_framed(s, -1, 1.0 if s.unknown[l] > 0 else s.r[l], l)
+    hand_over(s, l)
+    s.column[l] = column
+    if column >= 0:
+        s.sample[SAMPLE.ok, l] = 0.0
+    s.counters[COUNTER.phase, l] = FORECAST
+    run(s, l)
+    s.counters[COUNTER.phase, l] = LEARN
+    s.y_hat[l], s.s[l] = s.sample[SAMPLE.y_hat, l], s.sample[SAMPLE.s, l]
+    if outside:
+        s.y_hat[l], s.s[l] = y_hat, np.inf
+    s.e[l] = s.y[l] - s.y_hat[l]
+
+
+@kernel
+def correct_tree(s: State, l: int) -> None:
+    """The tree takes the sample, unless a gate refused it; one that enters a coordinate changes no weight."""
+    column, outside = s.column[l], s.s[l] == np.inf
+    s.sample[SAMPLE.ok, l], s.sample[SAMPLE.observed, l] = s.ok[l] if column < 0 else 0.0, s.observed[l]
+    run(s, l)
+    if column >= 0 and s.ok[l] > 0.0:
+        enter_bank(s, column, l)
+        if not outside:
+            e, v = s.y[l] - s.y_hat[l], s.s[l]
+            floats(report_at(s), s.table[REPORT_AT, 2, 0], s.theta.shape[1])[0, l] = -0.5 * (
+                log(2.0 * np.pi * v) + e * e / v
+            )
+    learn_scales(s, l)
+
+
+@kernel
+def forecast(s: State, l: int) -> None:
+    resolve(s, l)
+    if s.counters[COUNTER.settled, l] > 0:
+        forecast_tree(s, l)
+    else:
+        only_drift(s, l)
+        forecast_one(s, l)
+        s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l])
+
+
+@kernel
+def correct(s: State, l: int) -> None:
+    if s.counters[COUNTER.settled, l] > 0:
+        correct_tree(s, l)
+    else:
+        s.s[l] = s.h[l] + s.r[l] * s.noise[l]
+        correct_one(s, l)
+        alone(s, l, s.unknown[l] > 0)
+
+
+@kernel
+def read(s: State, l: int) -> None:
+    """theta and its variance from the mixture."""
+    if s.framed[l] > 0:
+        read_framed(s, l)
+    else:
+        diagonal(s, l)
+
+
+@kernel
+def forecast_first(s: State, l: int) -> None:
+    resolve(s, l)
+    if s.counters[COUNTER.settled, l] > 0:
+        forecast_tree(s, l)
+    else:
+        only_drifted(s, l)
+        forecast_on_roots(s, l)
+        s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l]) if s.h[l] < np.inf else np.inf
+
+
+@kernel
+def correct_first(s: State, l: int) -> None:
+    if s.counters[COUNTER.settled, l] > 0:
+        correct_tree(s, l)
+    else:
+        s.s[l] = s.h[l] + s.r[l] * s.noise[l]
+        correct_on_roots(s, l)
+        alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
+
+
+@kernel
+def read_first(s: State, l: int) -> None:
+    if s.counters[COUNTER.settled, l] > 0:
+        read(s, l)
+    else:
+        spanned_variance(s, l)
+
+
+@kernel
+def take_known(s: State, known: Array, t: int, l: int) -> None:
+    """Read the priors of the joint events of this sample, a chain of the changes, and their drift factors."""
+    row, column = t if known.shape[0] > 1 else 0, COMMON
+    memory = floats(memory_at(s), s.table[MEMORY_AT, 2, 0], s.theta.shape[1])
+    for field in (GIVEN, GIVEN_CHAIN, DRIFT):
+        start = s.table[field, 0, l] // 8
+        for k in range(s.table[field, 2, l]):
+            memory[start + k, l] = known[row, column, l]
+            column += 1
+
+
+STEPS = TrackerSteps(
+    no_own_sensor, forecast, correct, read, nothing,
+    start=TrackerSteps(no_own_sensor, forecast_first, correct_first, read_first, nothing),
+    store=keep, read_extra=take_known, machines=(*FRAME, *FRAMED, bank), outlined=True,
+)  # fmt: skip
+
+
+@cache
+def steps_of(own: tuple[Callable[..., Any], ...]) -> TrackerSteps:
+    """The steps, which also know where the user's ``own`` likelihoods are."""
+    if not own:
+        return STEPS
+    entry, point_out = entry_of(own)
+    assert STEPS.start is not None
+    start = STEPS.start._replace(predict=point_out)
+    return STEPS._replace(predict=point_out, start=start, machines=(*STEPS.machines, entry))
