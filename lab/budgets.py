@@ -45,10 +45,10 @@ LIMITS = {
     "state fields of Kalman": 36,
     "state fields of RLS": 46,
     "state fields of FLS": 39,
-    "state fields of AdaptiveKalman": 100,
+    "state fields of AdaptiveKalman": 95,
     "state fields of a gate": 32,
     "bytes of state of Kalman": 840,
-    "bytes of state of AdaptiveKalman": 12_360,
+    "bytes of state of AdaptiveKalman": 12_112,
     "lines of tests": 33_512,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""

@@ -22,9 +22,9 @@ def walks(lane, jump=COMMON[-1]):
     if lane["offset"].any():
         away[lane["constant"]] -= lane["offset"]
     common = (away * lane["drift_unit"]) @ away.T
-    a = np.divide(lane["direction"], np.sqrt(c), out=np.zeros(n), where=c > 0.0)
+    a = np.divide(lane["sums"][of_noise.DIRECTION], np.sqrt(c), out=np.zeros(n), where=c > 0.0)
     inverse = np.divide(1.0, c, out=np.zeros(n), where=c > 0.0)
-    learned = np.diag(lane["weight"] * inverse) + FLOOR * common + np.outer(a, a)
+    learned = np.diag(lane["sums"][of_noise.WEIGHT] * inverse) + FLOOR * common + np.outer(a, a)
     Q = np.zeros((len(rho), n, n))
     Q[:FIRST_LEARNED], Q[FIRST_LEARNED:FIRST_ALONE] = common, learned
     for i, first in enumerate(lane["alone"]):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from driftfit import ARX, AdaptiveKalman, Live, Regression, track
-from driftfit.trackers.mixture.learned import ASSUMED, BLOCK, FADE, PHI, PRECISION, WINDOW, A, B, E, M
-from driftfit.trackers.mixture.states import COMMON, modes_given_all, table, transitions
+from driftfit.trackers.mixture.learned import BLOCK, FADE, PHI, PRECISION, WINDOW, E
+from driftfit.trackers.mixture.states import ASSUMED, COMMON, DIRECTION, A, B, M, modes_given_all, table, transitions
 
 
 def record(T=400, n=3, seed=0):
@@ -79,7 +79,7 @@ def test_a_pass_of_scores_against_matrices():
     live, passes, after = Live(Regression(4), AdaptiveKalman()), 0, None
     for t in range(400):
         before, after = after, {name: np.array(value) for name, value in live.lane().items()}
-        passes += before is not None and not np.array_equal(before["direction"], after["direction"])
+        passes += before is not None and not np.array_equal(before["sums"][DIRECTION], after["sums"][DIRECTION])
         if passes == 3:
             break
         live.update(y[t], u[t])
@@ -104,7 +104,7 @@ def test_a_pass_of_scores_against_matrices():
     values, vectors = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, b).T))
     a = np.linalg.solve(root.T, vectors[:, -1])
     a *= np.sqrt(values[-1] / values[values > 0.0].sum()) / np.abs(a).max()
-    own = after["direction"]
+    own = after["sums"][DIRECTION]
     np.testing.assert_allclose(own * np.sign(own @ a), a, rtol=1e-4, atol=1e-4)
 
 
@@ -113,7 +113,7 @@ def test_a_regressor_that_repeats_another_and_one_that_is_idle_leave_a_finite_dr
     u[:, 1], u[:, 3] = 2.0 * u[:, 0], 0.0
     with pytest.warns(UserWarning, match="could not be learned"):
         run = track(Regression(4), AdaptiveKalman(), y, u)
-    assert np.isfinite(run.state["direction"]).all()
+    assert np.isfinite(run.state["sums"][DIRECTION]).all()
     assert np.isfinite(run.theta).all()
 
 

@@ -261,7 +261,7 @@ class AdaptiveKalman(Tracker):
     gated: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
         "pivot", "at_start", "gain", "e_k", "step", "h_k", "curve", "inverse", "joint", "share", "row", "walk", "Z",
-        "away",
+        "away", "W", "nu_prior",
     )  # fmt: skip
     """Not H and work, which `driftfit.trackers.forms.coordinates.frame` fills only where the coordinates change."""
 

@@ -32,6 +32,7 @@ from driftfit.trackers.forms.covariance import LEFT
 from driftfit.trackers.mixture.states import (
     AFTER,
     COMMON,
+    DIRECTION,
     DOWN,
     DRIFT,
     FIRST_ALONE,
@@ -39,6 +40,7 @@ from driftfit.trackers.mixture.states import (
     FLOOR,
     JUMP,
     STATES,
+    WEIGHT,
     sum_of_row,
     variance_in,
 )
@@ -64,11 +66,11 @@ def walks(s: State, l: int) -> None:
             s.walk[0, a, b, l], s.walk[1, a, b, l] = 0.0, 0.0
     for i in range(n):
         root = 1.0 / np.sqrt(s.c[i, l]) if s.c[i, l] > 0.0 else 0.0
-        own = s.weight[i, l] * root * root
+        own = s.sums[WEIGHT, i, l] * root * root
         rows = i + 1 if s.offset[i, l] == 0.0 else max(i, k) + 1  # S is triangular
         for a in range(rows):
             s.away[0, a, l] = s.S[a, i, l] - (s.offset[i, l] * s.S[a, k, l] if s.offset[i, l] != 0.0 else 0.0)
-            s.away[1, a, l] += s.S[a, i, l] * s.direction[i, l] * root
+            s.away[1, a, l] += s.S[a, i, l] * s.sums[DIRECTION, i, l] * root
             for b in range(a + 1):
                 s.walk[0, a, b, l] += s.drift_unit[i, l] * s.away[0, a, l] * s.away[0, b, l]
                 s.walk[1, a, b, l] += own * s.S[a, i, l] * s.S[b, i, l]

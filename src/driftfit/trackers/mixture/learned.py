@@ -47,9 +47,21 @@ from driftfit.trackers.forms.diffuse import absorb_on_roots, forecast_on_roots
 from driftfit.trackers.forms.excitation import DULL, LARGE, MEMORY, learn_information, learn_scales
 from driftfit.trackers.mixture.filters import absorb, project, wander
 from driftfit.trackers.mixture.states import (
+    ASSUMED,
+    DIRECTION,
     FIRST_ALONE,
     FIRST_LEARNED,
     FLOOR,
+    SCORE,
+    SHIFT,
+    SLOPE,
+    WEIGHT,
+    A,
+    B,
+    M,
+    N,
+    T,
+    V,
     note_reading,
     sum_of_row,
 )
@@ -69,9 +81,6 @@ STILL = 1e-24
 E, PRECISION, PHI = range(3)
 """Entries of a stored sample before its regressor: the innovation over its variance, and the inverse variance, both in
 units of r."""
-ASSUMED, SLOPE, WEIGHT, DIRECTION, SCORE, SHIFT, A, B, M, N, T, V = range(12)
-"""Rows (n,) of the estimation: the diagonal of P, the right side, q, a, u, N k; then those of the sums of squares, of
-B, of M, of N and of two scratch matrices by turns."""
 COLOUR_FADE, SHRUNK, BOUND, MOST, GAP = 0.995, 5.0, 2.0, 0.95, 1.5
 """Fading of the sums for c; the square of its t value up to which noise is white; the bound of innovations in standard
 deviations; the largest c; and the interval that separates a sample from its past."""
@@ -90,8 +99,8 @@ def nothing_learned(n: int) -> dict[str, Any]:
     return {
         "mean": np.zeros(n), "variance": np.zeros(n), "moved": np.zeros(n),
         "constant": -1, "drift_unit": np.zeros(n), "offset": np.zeros(n),
-        "samples": np.zeros((WINDOW, PHI + n)), "gains": np.zeros((WINDOW, n)), "remembered": 0, "assumed": np.zeros(n),
-        "sums": np.zeros((A + 6 * n, n)), "weight": np.ones(n), "direction": np.zeros(n),
+        "samples": np.zeros((WINDOW, PHI + n)), "gains": np.zeros((WINDOW, n)), "remembered": 0,
+        "sums": np.eye(A + 6 * n, 1, -WEIGHT) * np.ones(n), 
         "white": np.zeros(n), "past": np.zeros(n), "past_y": 0.0, "explained": 0.0, "colour": 0.0, "psi": 0.0,
         "colour_scores": np.zeros(3),
     }  # fmt: skip
@@ -356,23 +365,11 @@ def remember(s: State, at: int, l: int) -> None:
     for k in range(FIRST_LEARNED, FIRST_ALONE):
         scaled += s.mu[k, l] * s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0
     for i in range(n):
-        own = together + scaled * (s.weight[i, l] + FLOOR + s.direction[i, l] * s.direction[i, l])
+        own = together + scaled * (s.sums[WEIGHT, i, l] + FLOOR + s.sums[DIRECTION, i, l] * s.sums[DIRECTION, i, l])
         first = s.alone[i, l]
         for k in range(first, first + s.rungs[l] if first >= 0 else first):
             own += s.mu[k, l] * s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0
-        s.assumed[i, l] += own / BLOCK
-
-
-@partial(kernel, short=True)
-def end_block(s: State, newest: int, l: int) -> None:
-    """A pass over the last samples, and the drift that the filters take from it."""
-    n, L = s.d.shape
-    for i in range(n):
-        s.sums[ASSUMED, i, l] = s.assumed[i, l]
-        s.assumed[i, l] = 0.0
-    machine_drift(s.samples.ctypes.data, s.gains.ctypes.data, newest, s.sums.ctypes.data, n, L, l)
-    for i in range(n):
-        s.weight[i, l], s.direction[i, l] = s.sums[WEIGHT, i, l], s.sums[DIRECTION, i, l]
+        s.sums[ASSUMED, i, l] = own / BLOCK + (s.sums[ASSUMED, i, l] if s.remembered[l] % BLOCK > 0 else 0.0)
 
 
 @partial(kernel, inline=False)
@@ -381,12 +378,9 @@ def learn_drift(s: State, l: int) -> None:
     at = s.remembered[l] % WINDOW
     remember(s, at, l)
     s.remembered[l] += 1
-    if s.remembered[l] % BLOCK == 0:
-        if s.remembered[l] >= WINDOW:
-            end_block(s, at, l)
-        else:
-            for i in range(s.parameters[l]):
-                s.assumed[i, l] = 0.0
+    if s.remembered[l] % BLOCK == 0 and s.remembered[l] >= WINDOW:
+        n, L = s.d.shape
+        machine_drift(s.samples.ctypes.data, s.gains.ctypes.data, at, s.sums.ctypes.data, n, L, l)
 
 
 @kernel

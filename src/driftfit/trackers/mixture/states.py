@@ -55,6 +55,9 @@ these and those of the other ladders."""
 FIRST_LEARNED = len(COMMON) + len(TREND)
 FIRST_ALONE = FIRST_LEARNED + len(LEARNED)
 """Where the ladders begin."""
+ASSUMED, SLOPE, WEIGHT, DIRECTION, SCORE, SHIFT, A, B, M, N, T, V = range(12)
+"""Rows (n,) of the estimation: the diagonal of P, the right side, q, a, u, N k; then those of the sums of squares, of
+B, of M, of N and of two scratch matrices by turns."""
 STATES = 3
 OUTLIER, RARITY, OFTEN = 0.035, 50.0, 1000.0
 """Probability of an outlier before the first sample, samples that this counts for, and memory of those since."""
