@@ -37,6 +37,7 @@ from driftfit.smooth.parts.components import (
     Noises,
     Room,
     absorb,
+    copy_upper,
     grow,
     log_det,
     lowered,
@@ -245,9 +246,7 @@ def meet(
             c = facts[f, LOG] + more[k, LOG]
             if facts[f, MODE] != more[k, MODE] or c - ahead < top - UNLIKELY:
                 continue
-            for i in range(n):
-                for j in range(i, n + 1):
-                    W[i, j] = X[f, i, j]
+            copy_upper(X[f], W)
             for q in range(n):
                 for j in range(n + 1):
                     row[j] = Y[k, q, j] if j >= q else 0.0
