@@ -25,7 +25,8 @@ ours. Cost per sample: eleven filters of `FEW` components, two to five smoothers
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 from itertools import product
 from typing import NamedTuple
 
@@ -42,6 +43,7 @@ from driftfit.smooth.parts.slope_drift import compared
 from driftfit.smooth.parts.walk import Walk
 
 Groups = Sequence[Sequence[int]]
+Point = tuple[int, ...]
 SIZES = (15.0, 900.0)
 """Variances of jumps, in units of r / c; a group alone has their geometric mean."""
 PER_SAMPLE = 3e-3
@@ -98,10 +100,18 @@ def averaged(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Group
     unit = r / np.where(power > 0.0, power, 1.0)
     found = times[1] * (times[0].sum() / times[1].sum())
     plain, weighed = (hypotheses(walk, time, unit, groups) for time in (times[0], found))
-    few = np.full(T, FEW)
-    tried = [(Passes(drifting(plain, level * unit), few), 0.0) for level in LEVELS]
-    tried += [(Passes(drifting(weighed, level * unit), few), T / SHARE) for level in LEVELS[1:]]
-    passes, _ = max(tried, key=lambda one: one[0].forward() - one[1])
+
+    @cache
+    def tried(level: int, time: int) -> tuple[Passes, float]:
+        passes = Passes(drifting((plain, weighed)[time], LEVELS[level] * unit), np.full(T, FEW))
+        return passes, passes.forward() - time * T / SHARE
+
+    def near(at: Point) -> list[Point]:
+        return [(level, at[1]) for level in (at[0] - 1, at[0] + 1) if at[1] <= level < len(LEVELS)]
+
+    level, _ = summit(lambda at: tried(*at)[1], (1, 0), near)
+    at = summit(lambda at: tried(*at)[1], (level, 0), lambda at: [*near(at), (max(level, 1), 1)])
+    passes = tried(*at)[0]
     first, problem = passes.smoothed(False), passes.problem
     jumps = (1.0 - first.events[:, :1]) * (first.shift**2 + first.shift_var)
     time = problem.sizes[:, :1] ** 2
@@ -111,6 +121,14 @@ def averaged(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Group
     price = TRENDS + np.sum(1.0 - first.events[:, 0]) * np.log(PER_SAMPLE)
     known = mean_of(problem, likely.q, first.needed)
     return with_slopes(walk._replace(drift_root=np.sqrt(likely.q * time + jumps), mixture=known), likely, trend, price)
+
+
+def summit(value: Callable[[Point], float], best: Point, near: Callable[[Point], list[Point]]) -> Point:
+    """The point that is reached from ``best`` by stepping to the best neighbour until none is better."""
+    while True:
+        before, best = best, max((best, *near(best)), key=value)
+        if best == before:
+            return best
 
 
 def with_slopes(walk: Walk, likely: Tried, trend: Array, price: float) -> Walk:
@@ -167,25 +185,25 @@ def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) 
     least = np.ceil(2.0 * np.log10(EDGE / T**2)) / 2.0
     ratios = np.append(0.0, 10.0 ** np.arange(least, np.log10(EDGE) + 0.25, 0.5))
     size, top = column_scale(walk.phi, walk.signals), len(ratios) - 1
-    known: dict[tuple[int, ...], float] = {}
+    known: dict[Point, float] = {}
 
-    def solved(at: tuple[int, ...]) -> tuple[Array, float]:
+    def solved(at: Point) -> tuple[Array, float]:
         found = smooth_and_weigh(walk._replace(drift_root=np.sqrt(ratios[list(at)] * unit * time + jumps)), size)
         return (jumps, -np.inf) if found is None else (found[0].theta, found[1])
 
-    def value(at: tuple[int, ...]) -> float:
+    def value(at: Point) -> float:
         if at not in known:
             known[at] = solved(at)[1]
         return known[at]
 
-    best, before = max(((level,) * n for level in range(top + 1)), key=value), None
-    while best != before:
-        before = best
-        near = [tuple(np.clip(np.add(best, step), 0, top).tolist()) for step in (-1, 1)]
+    def near(best: Point) -> list[Point]:
+        found = [tuple(np.clip(np.add(best, step), 0, top).tolist()) for step in (-1, 1)]
         for group, step in product(groups, (-top, -1, 1)):
             level = min(max(best[group[0]] + step, 0), top)
-            near.append(tuple(level if i in group else own for i, own in enumerate(best)))
-        best = max((best, *near), key=value)
+            found.append(tuple(level if i in group else own for i, own in enumerate(best)))
+        return found
+
+    best = summit(value, max(((level,) * n for level in range(top + 1)), key=value), near)
     if known[best] == -np.inf:
         return None
     likely = [at for at, logs in known.items() if logs > known[best] + np.log(LEAST)]
