@@ -1,10 +1,12 @@
 """Smoothing given events, and segments."""
 
+import contextlib
+
 import numpy as np
 import pytest
 from test_bank import N, R, changes, record
 
-from driftfit import Bank, Kalman, Regression, track
+from driftfit import AdaptiveKalman, Bank, Kalman, Regression, track
 from driftfit.smooth import mixture
 from driftfit.smooth.piecewise import piecewise
 from driftfit.trackers.bank.change import Change
@@ -34,6 +36,25 @@ def test_events_say_what_moved_and_how_far():
         assert (np.abs(segments.theta[k + 1] - segments.theta[k] - mean) < 2.0 * constant).all()
     with pytest.raises(ValueError, match="has no hypotheses"):
         track(Regression(N), Kalman(0.01, R), Y, U).changes()
+
+
+@pytest.mark.parametrize("excited", [True, False])
+def test_changes_of_the_default_have_dates_names_and_sizes(excited):
+    """Of a parameter whose regressor is always 0 nothing is known, so it did not move."""
+    rng = np.random.default_rng(3)
+    u, theta = rng.standard_normal((400, N)) * [1.0, excited], np.ones((400, N))
+    theta[200:, 0] += 1.0
+    theta[300:] -= 0.6
+    with contextlib.nullcontext() if excited else pytest.warns(UserWarning, match="theta2 could not"):
+        run = track(Regression(N), AdaptiveKalman(), (u * theta).sum(axis=1) + 0.3 * rng.standard_normal(400), u)
+    first, second = run.changes()
+    assert (first.name, second.name) == ("theta1", "all" if excited else "theta1")
+    for event, date, moved in ((first, 200, [1.0, 0.0]), (second, 300, [-0.6, -0.6 * excited])):
+        assert 0.8 < event.prob <= 1.0
+        assert event.first <= date <= event.last < event.first + 12
+        shift, std = (np.array([*values.values()]) for values in (event.shift, event.std))
+        assert (np.abs(shift - moved) <= 3.0 * std).all()
+        assert std.max() < 0.3
 
 
 def test_segments_are_the_limit_of_large_jumps():

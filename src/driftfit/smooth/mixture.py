@@ -19,6 +19,7 @@ samples; the filter runs again from checkpoints.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -84,6 +85,13 @@ class Alternatives(NamedTuple):
             probs[:, self.event[move]] += np.exp(self.log_prob[:, move])
         return probs
 
+    def moved(self) -> Array:
+        """(E, n) bool: which parameters an event moves."""
+        moved = np.zeros((self.event.max() + 1, self.roots.shape[1]), bool)
+        for label, (drift, own) in zip(self.event, self.which, strict=True):
+            moved[label] |= self.roots[own if own >= 0 else drift].any(axis=1)
+        return moved
+
     def moves(self, scale: Array, back: bool = False) -> Moves:
         """The same in one direction of time, for theta multiplied by ``scale``."""
         source, target = (self.target, self.source) if back else (self.source, self.target)
@@ -126,6 +134,31 @@ class Mixture(NamedTuple):
     """(T,): log evidence as computed at each sample, without the constant of a start without information."""
     kept: Array
     """(T,): how many components were allowed."""
+    moves: Array
+    """(E, n) bool: which parameters an event moves."""
+
+    @property
+    def var(self) -> Array:
+        """(T, n)"""
+        return np.asarray(self.cov if self.cov.ndim == 2 else np.einsum("tii->ti", self.cov))
+
+    def increment(self, first: int, last: int) -> tuple[Array, Array]:
+        """Mean and standard deviation (n,) of how far theta moved by events at these samples, if there was one.
+
+        Two events at neighbouring samples have some probability, and each of them may then have been of any size. The
+        mean is therefore that of their sum, and the variance at most that of the path before and after together.
+        """
+        part = slice(first, last + 1)
+        p, each = 1.0 - self.events[part, :1], self.shift[part]
+        mean = np.sum(p * each, axis=0)
+        center = mean / p.sum()
+        var = np.sum(p * (self.shift_var[part] + (each - center) ** 2), axis=0) / p.sum()
+        return mean / min(p.sum(), 1.0), np.sqrt(np.minimum(var, self.var[max(first - 1, 0)] + self.var[last]))
+
+    def turned(self, B: Array) -> Mixture:
+        """That of B theta, B (m, n), if what an event moves, by B, is independent; names of parameters stay."""
+        shift, var = self.shift @ B.T, self.shift_var @ (B**2).T
+        return self._replace(theta=self.theta @ B.T, cov=B @ self.cov @ B.T, shift=shift, shift_var=var)
 
     @property
     def uneven(self) -> Array:
@@ -345,6 +378,21 @@ def refined(passes: Passes, covariances: bool) -> Mixture:
         passes = Passes(passes.problem, found.needed)
 
 
+def average(w: Array, found: Sequence[Mixture]) -> Mixture:
+    """The mixture of mixtures with shares w (K,) that sum to 1; evidence and components are those of the first."""
+    theta = np.asarray(sum(share * one.theta for share, one in zip(w, found, strict=True)))
+    events = np.asarray(sum(share * one.events for share, one in zip(w, found, strict=True)))
+    moved = w[:, None] * np.array([1.0 - one.events[:, 0] for one in found])
+    moved = (moved / np.maximum(moved.sum(axis=0), np.finfo(float).tiny))[:, :, None]
+    shift = np.asarray(sum(share * one.shift for share, one in zip(moved, found, strict=True)))
+    cov, shift_var = np.zeros_like(found[0].cov), np.zeros_like(shift)
+    for share, given, one in zip(w, moved, found, strict=True):
+        away = one.theta - theta
+        cov += share * (one.cov + (away**2 if cov.ndim == 2 else away[:, :, None] * away[:, None, :]))
+        shift_var += given * (one.shift_var + (one.shift - shift) ** 2)
+    return found[0]._replace(theta=theta, cov=cov, events=events, shift=shift, shift_var=shift_var)
+
+
 def filtered(problem: Problem, keep: int) -> tuple[float, float, float]:
     """The log evidence, the expected sum of e_t^2 / s_t, and the expected number of samples with another noise than the
     first, from a filter with this number of components.
@@ -414,7 +462,7 @@ class Passes:
         E = int(self.problem.alternatives.event.max()) + 1
         found = Mixture(
             np.empty((T, n)), np.empty((T, n, n if covariances else 1)), np.zeros((T + 1, E)), np.zeros((T + 1, n)),
-            np.zeros((T + 1, n)), np.empty(T), self.keep,
+            np.zeros((T + 1, n)), np.empty(T), self.keep, self.problem.alternatives.moved(),
         )  # fmt: skip
         for a, place in reversed([*zip(range(0, T, BLOCK), self.places, strict=True)]):
             here, after = slice(a, min(a + BLOCK, T)), slice(a + 1, min(a + BLOCK, T) + 1)
@@ -424,16 +472,16 @@ class Passes:
                 self._forward(a, True)
             part = Mixture(
                 found.theta[here], found.cov[here], found.events[after], found.shift[after], found.shift_var[after],
-                found.evidence[here], found.kept[here],
+                found.evidence[here], found.kept[here], found.moves,
             )  # fmt: skip
             samples, last = self._block(a, 1), here.stop == T
             backwards(samples, self.ways[1], self.problem.noises, self.behind, self.stored, self.room, last, part)
         found.events[0] = np.eye(1, E)
         scale = self.scale
-        return Mixture(
-            found.theta / scale, found.cov / np.outer(scale, scale) if covariances else found.cov[:, :, 0] / scale**2,
-            found.events[:T], found.shift[:T] / scale, found.shift_var[:T] / scale**2, found.evidence + self.constant,
-            self.keep,
+        return found._replace(
+            theta=found.theta / scale, events=found.events[:T], shift=found.shift[:T] / scale,
+            cov=found.cov / np.outer(scale, scale) if covariances else found.cov[:, :, 0] / scale**2,
+            shift_var=found.shift_var[:T] / scale**2, evidence=found.evidence + self.constant,
         )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ found in three steps:
     3. the path is the average over `SCALES` of these ratios, weighted by the evidence.
 
 Variances grow by the spread of the paths of step 2: a slow walk can look as if nothing moved. Slopes that walk are
-another model of the same record (`driftfit.smooth.parts.slope_drift`) and are averaged likewise; where they are more
+another model of the same record (`driftfit.smooth.parts.slopes`) and are averaged likewise; where they are more
 probable than not, they are taken.
 
 Source: Hoeting, Madigan, Raftery and Volinsky (1999) for averaging over models by their likelihood; the three steps are
@@ -39,7 +39,6 @@ from driftfit.smooth.parts import slopes
 from driftfit.smooth.parts.components import Noises
 from driftfit.smooth.parts.elimination import smooth_and_weigh
 from driftfit.smooth.parts.rank import column_scale
-from driftfit.smooth.parts.slope_drift import compared
 from driftfit.smooth.parts.walk import Walk
 
 Groups = Sequence[Sequence[int]]
@@ -85,7 +84,7 @@ def average_drift(walk: Walk, times: tuple[Array, Array], trend: Array, groups: 
     some = averaged(walk.of(moved), times, trend, inner)
     known, whole = some.mixture, np.eye(walk.phi.shape[1])[moved]
     if known is not None:
-        known = known._replace(theta=known.theta @ whole, cov=whole.T @ known.cov @ whole)
+        known = known.turned(whole.T)._replace(moves=known.moves @ whole > 0.0)
     paths, drift_root = some.paths @ whole if len(some.paths) else some.paths, some.drift_root @ whole
     return walk._replace(drift_root=drift_root, trend=some.trend, paths=paths, belief=some.belief, mixture=known)
 
@@ -133,7 +132,7 @@ def summit(value: Callable[[Point], float], best: Point, near: Callable[[Point],
 
 def with_slopes(walk: Walk, likely: Tried, trend: Array, price: float) -> Walk:
     """The problem with slopes if they are more probable, and with the paths of all that are probable at all."""
-    rates, better = compared(walk, trend, likely.theta[np.argmax(likely.p), 0])
+    rates, better = slopes.compared(walk, trend, likely.theta[np.argmax(likely.p), 0])
     p = shares(np.append(0.0, better - price))
     which = np.flatnonzero(p[1:] >= LEAST)
     others = [slopes.smooth(sloped(walk, trend, rates[k])).theta for k in which]
@@ -216,11 +215,4 @@ def mean_of(problem: Problem, q: Array, keep: Array) -> Mixture:
     scales = [Passes(drifting(problem, scale * q), keep) for scale in SCALES]
     logs = np.array([one.forward() for one in scales])
     order = [k for k in np.argsort(-logs) if logs[k] > logs.max() + np.log(LIKELY)]
-    w = shares(logs[order])
-    found = [mixture.refined(scales[k], True) for k in order]
-    theta = np.asarray(np.einsum("k,kti->ti", w, np.array([one.theta for one in found])))
-    cov = np.zeros_like(found[0].cov)
-    for share, one in zip(w, found, strict=True):
-        away = one.theta - theta
-        cov += share * (one.cov + away[:, :, None] * away[:, None, :])
-    return found[0]._replace(theta=theta, cov=cov)
+    return mixture.average(shares(logs[order]), [mixture.refined(scales[k], True) for k in order])

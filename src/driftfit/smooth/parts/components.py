@@ -184,7 +184,7 @@ def grow(K: int, now: Filter, moves: Moves, logp: Array, sizes: Array, room: Roo
     A move with the drift of the move before it takes what that made of the component.
     """
     X, facts, Y, more, row, drifted = now.A, now.facts, room.children.A, room.children.facts, room.row, room.squares[0]
-    C, best, n = 0, -np.inf, X.shape[1]
+    C, best = 0, -np.inf
     for k in range(K):
         best = max(best, facts[k, SHARE])
     for k in range(K):
