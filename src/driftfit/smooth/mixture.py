@@ -52,7 +52,7 @@ BLOCK = 1000
 """Samples between checkpoints."""
 MOST = 48
 """Components that are kept at most, where the evidence is not constant; `ROOMY` elsewhere."""
-NEAR = 25
+NEAR = 10
 """Samples to either side of such a place that get more components."""
 CONSTANT = 0.2
 """Change of the log evidence from one sample to the next that is accepted."""

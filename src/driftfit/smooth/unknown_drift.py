@@ -185,14 +185,16 @@ def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) 
     ratios = np.append(0.0, 10.0 ** np.arange(least, np.log10(EDGE) + 0.25, 0.5))
     size, top = column_scale(walk.phi, walk.signals), len(ratios) - 1
     known: dict[Point, float] = {}
-
-    def solved(at: Point) -> tuple[Array, float]:
-        found = smooth_and_weigh(walk._replace(drift_root=np.sqrt(ratios[list(at)] * unit * time + jumps)), size)
-        return (jumps, -np.inf) if found is None else (found[0].theta, found[1])
+    paths: dict[Point, Array] = {}
 
     def value(at: Point) -> float:
+        nonlocal paths
         if at not in known:
-            known[at] = solved(at)[1]
+            found = smooth_and_weigh(walk._replace(drift_root=np.sqrt(ratios[list(at)] * unit * time + jumps)), size)
+            known[at] = -np.inf if found is None else found[1]
+            if found is not None:
+                paths, least = {**paths, at: found[0].theta}, max(known.values()) + np.log(LEAST)
+                paths = {one: path for one, path in paths.items() if known[one] > least}
         return known[at]
 
     def near(best: Point) -> list[Point]:
@@ -205,9 +207,8 @@ def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) 
     best = summit(value, max(((level,) * n for level in range(top + 1)), key=value), near)
     if known[best] == -np.inf:
         return None
-    likely = [at for at, logs in known.items() if logs > known[best] + np.log(LEAST)]
-    p = shares(np.array([known[at] for at in likely]))
-    return Tried(p, np.array([solved(at)[0] for at in likely]), p @ ratios[np.array(likely)] * unit)
+    p = shares(np.array([known[at] for at in paths]))
+    return Tried(p, np.array([*paths.values()]), p @ ratios[np.array([*paths])] * unit)
 
 
 def mean_of(problem: Problem, q: Array, keep: Array) -> Mixture:
