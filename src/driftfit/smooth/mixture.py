@@ -359,18 +359,17 @@ def backwards(
     now.many[0] = K
 
 
-def smooth(problem: Problem, covariances: bool = False, kept: Array | None = None) -> Mixture:
+def smooth(problem: Problem | Passes, covariances: bool = False, kept: Array | None = None) -> Mixture:
     """Smooth a record; with ``covariances`` of every sample, and otherwise variances.
 
-    ``kept`` (T,) says how many components another smoother of the record needed, with which this one begins.
-
-    Where the evidence is not constant, more components are allowed, up to `MOST`; see `Mixture.needed`.
+    ``kept`` (T,) says how many components another smoother of the record needed, with which this one begins. The filter
+    of `Passes` may be done. Where the evidence is not constant, more components are allowed, up to `MOST`; see
+    `Mixture.needed`.
     """
-    return refined(Passes(problem, np.full(len(problem.y), ROOMY) if kept is None else kept), covariances)
-
-
-def refined(passes: Passes, covariances: bool) -> Mixture:
-    """The same from passes that begin, of which the filter may be done."""
+    if isinstance(problem, Passes):
+        passes = problem
+    else:
+        passes = Passes(problem, np.full(len(problem.y), ROOMY) if kept is None else kept)
     while True:
         found = passes.smoothed(covariances)
         if np.array_equal(found.needed, found.kept):

@@ -102,7 +102,8 @@ def averaged(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Group
 
     @cache
     def tried(level: int, time: int) -> tuple[Passes, float]:
-        passes = Passes(drifting((plain, weighed)[time], LEVELS[level] * unit), np.full(T, FEW))
+        problem = drifting((plain, weighed)[time], np.diag(np.sqrt(LEVELS[level] * unit)))
+        passes = Passes(problem, np.full(T, FEW))
         return passes, passes.forward() - time * T / SHARE
 
     def near(at: Point) -> list[Point]:
@@ -128,6 +129,15 @@ def summit(value: Callable[[Point], float], best: Point, near: Callable[[Point],
         before, best = best, max((best, *near(best)), key=value)
         if best == before:
             return best
+
+
+def neighbours(at: Point, groups: Groups, top: int, steps: Sequence[int] = (-1, 1)) -> list[Point]:
+    """Points one up or down in all coordinates, or a step away in those of one group, within 0 .. top."""
+    near = [tuple(np.clip(np.add(at, step), 0, top).tolist()) for step in (-1, 1)]
+    for group, step in product(groups, steps):
+        level = min(max(at[group[0]] + step, 0), top)
+        near.append(tuple(level if i in group else own for i, own in enumerate(at)))
+    return near
 
 
 def with_slopes(walk: Walk, likely: Tried, trend: Array, price: float) -> Walk:
@@ -171,10 +181,10 @@ def hypotheses(walk: Walk, time: Array, unit: Array, groups: Groups) -> Problem:
     )
 
 
-def drifting(problem: Problem, q: Array) -> Problem:
-    """The problem with this drift (n,) per unit of time."""
+def drifting(problem: Problem, root: Array) -> Problem:
+    """The problem with a drift of this root (n, n) per unit of time, an upper triangle."""
     roots = problem.alternatives.roots.copy()
-    roots[0] = np.diag(np.sqrt(q))
+    roots[0] = root
     return problem._replace(alternatives=problem.alternatives._replace(roots=roots))
 
 
@@ -197,14 +207,8 @@ def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) 
                 paths = {one: path for one, path in paths.items() if known[one] > least}
         return known[at]
 
-    def near(best: Point) -> list[Point]:
-        found = [tuple(np.clip(np.add(best, step), 0, top).tolist()) for step in (-1, 1)]
-        for group, step in product(groups, (-top, -1, 1)):
-            level = min(max(best[group[0]] + step, 0), top)
-            found.append(tuple(level if i in group else own for i, own in enumerate(best)))
-        return found
-
-    best = summit(value, max(((level,) * n for level in range(top + 1)), key=value), near)
+    common = max(((level,) * n for level in range(top + 1)), key=value)
+    best = summit(value, common, lambda at: neighbours(at, groups, top, (-top, -1, 1)))
     if known[best] == -np.inf:
         return None
     p = shares(np.array([known[at] for at in paths]))
@@ -213,7 +217,7 @@ def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) 
 
 def mean_of(problem: Problem, q: Array, keep: Array) -> Mixture:
     """The average of the mixtures with all likely scales of the drift q (n,)."""
-    scales = [Passes(drifting(problem, scale * q), keep) for scale in SCALES]
+    scales = [Passes(drifting(problem, np.diag(np.sqrt(scale * q))), keep) for scale in SCALES]
     logs = np.array([one.forward() for one in scales])
     order = [k for k in np.argsort(-logs) if logs[k] > logs.max() + np.log(LIKELY)]
-    return mixture.average(shares(logs[order]), [mixture.refined(scales[k], True) for k in order])
+    return mixture.average(shares(logs[order]), [mixture.smooth(scales[k], True) for k in order])

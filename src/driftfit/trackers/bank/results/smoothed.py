@@ -23,7 +23,6 @@ components, and that for each likely drift.
 from __future__ import annotations
 
 from functools import cached_property
-from itertools import product
 from statistics import NormalDist
 from typing import Any
 
@@ -36,6 +35,7 @@ from driftfit.smooth import mixture
 from driftfit.smooth.mixture import Alternatives, Problem
 from driftfit.smooth.parts.components import Noises
 from driftfit.smooth.problem import replay
+from driftfit.smooth.unknown_drift import Point, drifting, neighbours, summit
 from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.bank.leaves.leaf_matrix import NU, WEIGHT, S
 from driftfit.trackers.bank.results.events import Event
@@ -280,14 +280,12 @@ def averaged(problem: Problem, drift: Array, free: bool, spikes: bool) -> list[t
     """
     n, count = problem.phi.shape[1], np.isfinite(problem.r).sum() - problem.phi.shape[1]
     free = free and count > 0
-    known: dict[tuple[int, ...], tuple[float, float]] = {}
+    known: dict[Point, tuple[float, float]] = {}
 
-    def at(levels: tuple[int, ...]) -> Problem:
-        roots = problem.alternatives.roots.copy()
-        roots[0] = triangular_root((drift * FACTORS[list(levels)]) @ drift.T)
-        return problem._replace(alternatives=problem.alternatives._replace(roots=roots))
+    def at(levels: Point) -> Problem:
+        return drifting(problem, triangular_root((drift * FACTORS[list(levels)]) @ drift.T))
 
-    def value(levels: tuple[int, ...]) -> float:
+    def value(levels: Point) -> float:
         """Log of the evidence, with the noise variance of greatest likelihood if it is free."""
         if levels not in known:
             evidence, squares, _ = mixture.filtered(at(levels), FEW)
@@ -302,15 +300,8 @@ def averaged(problem: Problem, drift: Array, free: bool, spikes: bool) -> list[t
         problem = matched(at((2,) * n), spikes)
         drift = drift * np.sqrt(problem.r[first] / before[first])
     top = len(FACTORS) - 1
-    best = max(((level,) * n for level in range(0, top + 1, 2)), key=value)
-    changed = True
-    while changed:
-        before = best
-        near = [tuple(np.clip(np.add(best, step), 0, top)) for step in (-1, 1)]
-        near += [(*best[:i], level, *best[i + 1 :]) for i, step in product(range(n), (-1, 1))
-                 if 0 <= (level := best[i] + step) <= top]  # fmt: skip
-        best = max((best, *(tuple(map(int, one)) for one in near)), key=value)
-        changed = best != before
+    common = summit(value, (2,) * n, lambda at: neighbours(at, [], top))
+    best = summit(value, common, lambda at: neighbours(at, [[i] for i in range(n)], top))
     shares = {levels: np.exp(logs - known[best][0]) for levels, (logs, _) in known.items()}
     likely = sorted((one for one in shares if shares[one] > LIKELY), key=lambda one: -shares[one])
     total = sum(shares[one] for one in likely)
