@@ -32,6 +32,7 @@ from driftfit.smooth.parts.components import (
     MOVE,
     ROOMY,
     SHARE,
+    UNLIKELY,
     Filter,
     Moves,
     Noises,
@@ -56,8 +57,6 @@ NEAR = 10
 """Samples to either side of such a place that get more components."""
 CONSTANT = 0.2
 """Change of the log evidence from one sample to the next that is accepted."""
-RARE = 8.0
-"""Log of the ratio to the most probable below which a pair of components is left out."""
 VAGUE = 1e-11
 """Information on theta outside the record, as a share of the root of that in one sample."""
 
@@ -278,7 +277,7 @@ def meet(
         for k in range(C):
             ahead = max(facts[f, LOG] - facts[f, SHARE], more[k, LOG] - more[k, SHARE])
             c = facts[f, LOG] + more[k, LOG]
-            if facts[f, MODE] != more[k, MODE] or c - ahead < top - RARE:
+            if facts[f, MODE] != more[k, MODE] or c - ahead < top - UNLIKELY:
                 continue
             copy_upper(X[f], W)
             for q in range(n):
@@ -286,10 +285,10 @@ def meet(
                     row[j] = Y[k, q, j] if j >= q else 0.0
                 e = absorb(W, row)
                 c -= 0.5 * e * e
-                if c - ahead < top - RARE:
+                if c - ahead < top - UNLIKELY:
                     break
             c -= max(log_det(W), ahead)  # of a pair that is given up, W lacks rows
-            if c < top - RARE:
+            if c < top - UNLIKELY:
                 continue
             w = np.exp(c - top)
             if c > top:

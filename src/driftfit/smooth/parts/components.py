@@ -21,8 +21,8 @@ LOG, MODE, MOVE, COST, SHARE = range(5)
 """Of a component: c, its mode, its last move, the sum of e^2 / s on its path, and the log of its integral."""
 TOTAL, FIRST, MIXED = range(3)
 """Of one that others join: the log of the integral of all, of the first, and whether there are others."""
-UNLIKELY = 11.0
-"""Log of the ratio to the most probable below which a component is dropped."""
+UNLIKELY = 10.0
+"""Log of the ratio to the most probable below which a component, or a pair of them, is dropped."""
 MINOR, FAR = 0.03, 600.0
 """Share of a noise below which it counts as the first, and log of the ratio of two densities at most."""
 ROOMY = 12
@@ -193,15 +193,15 @@ def grow(K: int, now: Filter, moves: Moves, logp: Array, sizes: Array, room: Roo
             if facts[k, SHARE] + logp[at] < best - UNLIKELY:
                 continue
             kind = moves.kind[at]
-            if kind[2] != drift or kind[4] != column:
-                drift, column, lower = kind[2], kind[4], 0.0
+            if kind[2] != drift or kind[-2] != column:
+                drift, column, lower = kind[2], kind[-2], 0.0
                 copy_upper(X[k], drifted)
                 if drift >= 0:
                     lower = convolve(drifted, moves.roots[drift], sizes[column], row)
             copy_upper(drifted, Y[C])
             c = facts[k, LOG] + logp[at] - lower
-            if kind[3] >= 0:
-                c -= convolve(Y[C], moves.roots[kind[3]], sizes[kind[5]], row)
+            if kind[1 + 2] >= 0:
+                c -= convolve(Y[C], moves.roots[kind[1 + 2]], sizes[kind[-1]], row)
             more[C, LOG], more[C, MODE], more[C, MOVE] = c, kind[0], at
             more[C, COST], more[C, SHARE] = facts[k, COST], facts[k, SHARE] + logp[at]
             C += 1
