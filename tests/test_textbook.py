@@ -5,6 +5,7 @@ variance of a prediction beside that of the noise. Until regressors span theta, 
 compared only where all columns have one unit: it is a matter of rounding otherwise.
 """
 
+import copy
 from decimal import Decimal, localcontext
 from typing import NamedTuple
 
@@ -327,8 +328,13 @@ NONLINEAR = {
 @given(data=st.data())
 def test_any_record_of_a_curved_model(name, data):
     record, model, fast, slow, samples = NONLINEAR[name](data.draw)
-    expected = nonlinear.played(slow, samples, record)
-    assert_textbook(record, record.run(model, fast), expected, slow.kappa, curved=True)
+    samples, again = list(samples), copy.deepcopy(slow)
+    expected, kappa = nonlinear.played(slow, samples, record), slow.kappa
+    if name == "unscented states":  # differences of points cancel: what the textbook itself loses in 16 digits
+        rounded = nonlinear.played(again, samples, record, digits=16)[0]
+        lost = np.max(abs(rounded - expected[0]) / abs(expected[0]).max(axis=0))
+        kappa = max(kappa, 0.1 * lost / np.finfo(float).eps)
+    assert_textbook(record, record.run(model, fast), expected, kappa, curved=True)
 
 
 @pytest.mark.parametrize("family", ["poisson", "negative binomial", "logistic"])

@@ -115,10 +115,10 @@ def cholesky(P):
     return L
 
 
-def played(tracker, samples, record):
+def played(tracker, samples, record, digits=DIGITS):
     """theta, var, y_hat, e, s, ok of a record; ``samples`` yields (what the model needs, whether it is complete, y)."""
     with localcontext() as context:
-        context.prec, rows = DIGITS, []
+        context.prec, rows = digits, []
         for (given, complete, y), dt, noise, drift in zip(samples, record.dt, record.noise, record.drift, strict=True):
             shown = np.nan, np.nan, np.nan
             if given is not None:
