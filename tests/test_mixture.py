@@ -1,6 +1,4 @@
-"""The parts of `AdaptiveKalman` against plain NumPy: a sample, the interaction, the pass of scores, all paths."""
-
-from itertools import product
+"""The parts of `AdaptiveKalman` against plain NumPy: a sample, the interaction, the pass of scores."""
 
 import naive
 import numpy as np
@@ -8,7 +6,7 @@ import pytest
 
 from driftfit import ARX, AdaptiveKalman, Live, Regression, track
 from driftfit.trackers.mixture.learned import ASSUMED, BLOCK, FADE, PHI, PRECISION, WINDOW, A, B, E, M
-from driftfit.trackers.mixture.states import COMMON, modes_given_all, table, transitions
+from driftfit.trackers.mixture.states import COMMON, table
 
 
 def record(T=400, n=3, seed=0):
@@ -56,14 +54,12 @@ def test_a_sample_and_the_interaction_against_matrices(groups):
     assert max(leaps) > 0.0
 
 
-def test_transitions_are_probabilities_and_the_smoother_knows_the_same():
+def test_transitions_are_probabilities():
     y, u = record()
     ((one, _),) = lanes(y, u, Regression(3), AdaptiveKalman(), (300,)).values()
     mu, m, C, _ = naive.sample(one, u[300], y[300])
     T = naive.interaction(one, mu, m, C, 0.7)[-1]
     np.testing.assert_allclose(T.sum(axis=1), 1.0, rtol=1e-12)
-    A_, B_ = transitions(AdaptiveKalman().state(3))
-    np.testing.assert_allclose(A_ + 0.7 * B_, T, atol=1e-15)
 
 
 def test_the_table_of_modes():
@@ -117,26 +113,6 @@ def test_a_regressor_that_repeats_another_and_one_that_is_idle_leave_a_finite_dr
         run = track(Regression(4), AdaptiveKalman(), y, u)
     assert np.isfinite(run.state["direction"]).all()
     assert np.isfinite(run.theta).all()
-
-
-def test_probabilities_given_all_are_those_of_all_paths():
-    rng = np.random.default_rng(0)
-    K, steps, kappa = 4, 5, 0.7
-    state = {"up": np.array([0.1, 0.05, 0.0, 0.0]), "down": np.array([0.0, 0.2, 0.1, 0.0]),
-             "foot": np.array([0.0, 0.0, 0.0, 0.3]), "arrive": 0.1 * rng.random(K)}  # fmt: skip
-    A_, B_ = transitions(state)
-    moves, likelihood = A_ + kappa * B_, rng.random((steps, K))
-    after, ahead, before = np.empty((steps, K)), np.empty((steps, K)), np.full(K, 1.0 / K)
-    for t in range(steps):
-        after[t] = before * likelihood[t] / (before @ likelihood[t])
-        before = ahead[t] = after[t] @ moves
-    expected = np.zeros((steps, K))
-    for path in product(range(K), repeat=steps):
-        p = np.prod([likelihood[t, i] * (moves[path[t - 1], i] if t else 1.0) for t, i in enumerate(path)])
-        expected[np.arange(steps), path] += p
-    fields = {"mu": after, "prior": ahead, "kappa": np.full(steps, kappa)}
-    found = modes_given_all(fields, np.ones(steps, bool), state)
-    np.testing.assert_allclose(found, expected / expected.sum(axis=1, keepdims=True), rtol=1e-12)
 
 
 def test_rare_pulses_whose_gain_jumps_twice():

@@ -14,15 +14,14 @@ readings repeat because it rests.
 
 The smoother (`driftfit.smooth.unknown_drift`) is given the noise and the course of the drift over time,
 
-    w_t(i) = f_t(i) sum_j T_ij w_{t+1}(j) / sum_h f_t(h) T_hj         probability of mode i at t, given all samples
-    q_t    = r_t sum_k w_t(k) rho_k for rho_k < 1,    1 / r_t = sum_j nu_tj / v_tj
+    q_t    = r_t times the mean of sum_k mu_k rho_k for rho_k < 1 over the next `MEMORY` samples
+    1 / r_t = sum_j nu_tj / v_tj
 
-with f_t the probabilities after sample t, T their transitions, and nu_tj those of the states of the noise after the
-sample, on the regressors and outputs from which coloured noise was taken. Before the filters start nothing drifts.
+with mu the probabilities of the modes after a sample, which follow a drift with a delay, and nu_tj those of the states
+of the noise, on regressors and outputs from which coloured noise was taken. Before the filters start nothing drifts.
 
 Source: the moments of a noise given the data are those of an EM step, Shumway and Stoffer (1982); step^2 / 12 is
-Sheppard's (1898); the backward pass is Kim's (1994), eq. 2.20. The modes and the rule for repeats are ours. Cost per
-sample: O(K).
+Sheppard's (1898). The modes and the rule for repeats are ours. Cost per sample: O(K).
 """
 
 from __future__ import annotations
@@ -241,7 +240,7 @@ def learn_noise(s: State, l: int) -> None:
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
 
 
-SMOOTHER_FIELDS = ("mu", "prior", "kappa", "r", "certainty", "offset", "white", "explained", "settled", "constant")
+SMOOTHER_FIELDS = ("mu", "r", "certainty", "offset", "white", "explained", "settled", "constant")
 """Fields that are stored at every sample."""
 
 
@@ -249,31 +248,11 @@ SMOOTHER_FIELDS = ("mu", "prior", "kappa", "r", "certainty", "offset", "white", 
 def store_for_smoother(o: State, s: State, l: int) -> None:
     """Store the fields of the smoother."""
     for k in range(s.mu.shape[0]):
-        o.mu[k, l], o.prior[k, l] = s.mu[k, l], s.prior[k, l]
+        o.mu[k, l] = s.mu[k, l]
     for i in range(s.c.shape[0]):
         o.offset[i, l], o.white[i, l] = s.offset[i, l], s.white[i, l]
-    o.kappa[l], o.r[l], o.certainty[l], o.explained[l] = s.kappa[l], s.r[l], s.certainty[l], s.explained[l]
+    o.r[l], o.certainty[l], o.explained[l] = s.r[l], s.certainty[l], s.explained[l]
     o.settled[l], o.constant[l] = s.settled[l], s.constant[l]
-
-
-def transitions(state: Mapping[str, Any]) -> tuple[Array, Array]:
-    """Transitions (K, K) of the modes as A + kappa B, from the fields of a bank."""
-    up, down, foot, arrive = state["up"], state["down"], state["foot"], state["arrive"]
-    A = np.diag(1.0 - down - foot) + np.diag(down[1:], -1)
-    A[:, 0] += foot
-    B = np.diag(-arrive.sum() - up) + np.diag(up[:-1], 1) + arrive
-    return A, B
-
-
-def modes_given_all(fields: Mapping[str, Array], used: Array, state: Mapping[str, Any]) -> Array:
-    """Probabilities (T, K) of the modes, given all samples; ``used`` (T,) are those that changed them."""
-    after, ahead = np.where(used[:, None], fields["mu"], fields["prior"]), fields["prior"]
-    (A, B), found = transitions(state), after.copy()
-    for t in range(len(found) - 2, -1, -1):
-        later = found[t + 1] / np.maximum(ahead[t], 1e-300)
-        found[t] = after[t] * (A @ later + fields["kappa"][t] * (B @ later)) if used[t] else found[t + 1]
-        found[t] /= max(found[t].sum(), 1e-300)
-    return found
 
 
 def centring(fields: Mapping[str, Array], phi: Array) -> Array:
@@ -291,5 +270,8 @@ def variances_given_all(fields: Mapping[str, Array], state: Mapping[str, Any]) -
     running = fields["settled"] > 0
     r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
     used = running & (fields["certainty"] > 0.0)
-    drift = modes_given_all(fields, used, state) @ np.where(state["ratio"] < 1.0, state["ratio"], 0.0)
+    total = np.append(0.0, np.cumsum(fields["mu"] @ np.where(state["ratio"] < 1.0, state["ratio"], 0.0)))
+    now = np.arange(len(r))
+    until = np.minimum(now + int(MEMORY), len(r))
+    drift = (total[until] - total[now]) / (until - now)
     return 1.0 / np.where(used, fields["certainty"], 1.0 / r), np.where(running, r * drift, 0.0)
