@@ -468,10 +468,8 @@ class Passes:
                 for values, before in zip(self.ahead, place, strict=True):
                     values[:] = before
                 self._forward(a, True)
-            part = Mixture(
-                found.theta[here], found.cov[here], found.events[after], found.shift[after], found.shift_var[after],
-                found.evidence[here], found.kept[here], found.moves,
-            )  # fmt: skip
+            places = here, here, after, after, after, here
+            part = Mixture(*(values[at] for values, at in zip(found[:-2], places, strict=True)), *found[-2:])
             samples, last = self._block(a, 1), here.stop == T
             backwards(samples, self.ways[1], self.problem.noises, self.behind, self.stored, self.room, last, part)
         found.events[0] = np.eye(1, E)

@@ -28,7 +28,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 
@@ -58,17 +57,6 @@ LIKELY, LEAST = 0.1, 0.01
 """Shares of the best below which scales, and ratios or slopes, are left out."""
 TRENDS = 3.0
 """Penalty of slopes that walk, in units of the log-likelihood."""
-
-
-class Tried(NamedTuple):
-    """Ratios that are likely, with a Gaussian each."""
-
-    p: Array
-    """(K,)"""
-    theta: Array
-    """(K, T, n)"""
-    q: Array
-    """(n,): the average drift."""
 
 
 def average_drift(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Groups) -> Walk:
@@ -119,8 +107,9 @@ def averaged(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Group
     if likely is None:
         return walk._replace(drift_root=np.sqrt(np.diag(problem.alternatives.roots[0]) ** 2 * time + jumps))
     price = TRENDS + np.sum(1.0 - first.events[:, 0]) * np.log(PER_SAMPLE)
-    known = mean_of(problem, likely.q, first.needed)
-    return with_slopes(walk._replace(drift_root=np.sqrt(likely.q * time + jumps), mixture=known), likely, trend, price)
+    p, paths, q = likely
+    walk = walk._replace(drift_root=np.sqrt(q * time + jumps), mixture=mean_of(problem, q, first.needed))
+    return with_slopes(walk, p, paths, trend, price)
 
 
 def summit(value: Callable[[Point], float], best: Point, near: Callable[[Point], list[Point]]) -> Point:
@@ -140,15 +129,15 @@ def neighbours(at: Point, groups: Groups, top: int, steps: Sequence[int] = (-1, 
     return near
 
 
-def with_slopes(walk: Walk, likely: Tried, trend: Array, price: float) -> Walk:
+def with_slopes(walk: Walk, likely: Array, paths: Array, trend: Array, price: float) -> Walk:
     """The problem with slopes if they are more probable, and with the paths of all that are probable at all."""
-    rates, better = slopes.compared(walk, trend, likely.theta[np.argmax(likely.p), 0])
+    rates, better = slopes.compared(walk, trend, paths[np.argmax(likely), 0])
     p = shares(np.append(0.0, better - price))
     which = np.flatnonzero(p[1:] >= LEAST)
     others = [slopes.smooth(sloped(walk, trend, rates[k])).theta for k in which]
     if p[0] < 0.5:
         walk = sloped(walk, trend, p[1:] @ rates / p[1:].sum())._replace(mixture=None)
-    return walk._replace(paths=np.array([*likely.theta, *others]), belief=np.append(p[0] * likely.p, p[1 + which]))
+    return walk._replace(paths=np.array([*paths, *others]), belief=np.append(p[0] * likely, p[1 + which]))
 
 
 def sloped(walk: Walk, trend: Array, rate: Array) -> Walk:
@@ -188,8 +177,10 @@ def drifting(problem: Problem, root: Array) -> Problem:
     return problem._replace(alternatives=problem.alternatives._replace(roots=roots))
 
 
-def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) -> Tried | None:
-    """Ratios with known squares of jumps (T, n); None if no likelihood is accurate."""
+def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) -> tuple[Array, ...] | None:
+    """Probabilities (K,) and paths (K, T, n) of likely ratios with known squares of jumps (T, n), and the average drift
+    (n,); None if no likelihood is accurate.
+    """
     n, T = len(unit), len(time)
     least = np.ceil(2.0 * np.log10(EDGE / T**2)) / 2.0
     ratios = np.append(0.0, 10.0 ** np.arange(least, np.log10(EDGE) + 0.25, 0.5))
@@ -212,7 +203,7 @@ def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) 
     if known[best] == -np.inf:
         return None
     p = shares(np.array([known[at] for at in paths]))
-    return Tried(p, np.array([*paths.values()]), p @ ratios[np.array([*paths])] * unit)
+    return p, np.array([*paths.values()]), p @ ratios[np.array([*paths])] * unit
 
 
 def mean_of(problem: Problem, q: Array, keep: Array) -> Mixture:
