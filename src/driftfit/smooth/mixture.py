@@ -469,7 +469,7 @@ class Passes:
                     values[:] = before
                 self._forward(a, True)
             places = here, here, after, after, after, here
-            part = Mixture(*(values[at] for values, at in zip(found[:-2], places, strict=True)), *found[-2:])
+            part = Mixture._make([*(values[at] for values, at in zip(found[:-2], places, strict=True)), *found[-2:]])
             samples, last = self._block(a, 1), here.stop == T
             backwards(samples, self.ways[1], self.problem.noises, self.behind, self.stored, self.room, last, part)
         found.events[0] = np.eye(1, E)
