@@ -136,9 +136,8 @@ def record(kind: str, rng: np.random.Generator, T: int = 400) -> tuple[np.ndarra
 
 
 def kinds(tracker: Bank | AdaptiveKalman, records: int) -> None:
-    print(
-        f"{repr(tracker):20} coverage near  overall       rms   rms filtered   dates found, of  held  samples in the set  false"
-    )
+    heads = "coverage near  overall       rms   rms filtered   dates found, of  held  samples in the set  false"
+    print(f"{tracker!r:20} {heads}")
     for kind in KINDS:
         rows, dates = [], []
         for seed in range(records):

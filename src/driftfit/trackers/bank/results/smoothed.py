@@ -300,7 +300,7 @@ def averaged(problem: Problem, drift: Array, free: bool, spikes: bool) -> list[t
         problem = matched(at((2,) * n), spikes)
         drift = drift * np.sqrt(problem.r[first] / before[first])
     top = len(FACTORS) - 1
-    common = summit(value, (2,) * n, lambda at: neighbours(at, [], top))
+    common = max(((level,) * n for level in range(0, top + 1, 2)), key=value)
     best = summit(value, common, lambda at: neighbours(at, [[i] for i in range(n)], top))
     shares = {levels: np.exp(logs - known[best][0]) for levels, (logs, _) in known.items()}
     likely = sorted((one for one in shares if shares[one] > LIKELY), key=lambda one: -shares[one])
