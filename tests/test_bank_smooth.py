@@ -74,12 +74,6 @@ def test_segments_are_the_limit_of_large_jumps():
         piecewise(run, [0])
 
 
-def test_smoothing_beats_filtering():
-    run = track(Regression(N), Bank(), Y, U)
-    truth = np.repeat(piecewise(run, [40, 90]).theta, [40, 50, 30], axis=0)
-    assert np.abs(run.smooth().theta - truth).mean() < np.abs(run.theta - truth).mean()
-
-
 @pytest.mark.parametrize(("walk", "unit"), [((0.05, 0.05), 1.0), ((0.2, 0.2), 1000.0), ((0.05, 0.0), 1.0)])
 def test_bands_of_the_smoothed_path_hold_where_parameters_walk(walk, unit):
     """Random walks in noise 0.5: between events `Bank()` has next to no drift, and covered a quarter. The changes that

@@ -60,9 +60,8 @@ def dated(
 
 def gathered(p: Array, used: Array) -> Array:
     """Probabilities (T, E) of events with those at unused samples moved to the next one that was used."""
-    next_used = np.flatnonzero(used)
-    at = np.searchsorted(next_used, np.arange(len(p)))
-    to = next_used[np.minimum(at, len(next_used) - 1)] if len(next_used) else np.arange(len(p))
+    at = np.minimum(np.cumsum(used) - used, max(used.sum() - 1, 0))
+    to = np.flatnonzero(used)[at] if used.any() else np.arange(len(p))
     result = np.zeros_like(p)
     np.add.at(result[:, 1:], to, p[:, 1:])
     result[:, 0] = 1.0 - result[:, 1:].sum(axis=1)

@@ -177,18 +177,15 @@ class Hypotheses:
         found = self.found(threshold)
         if any(change.forgets for change in self.tracker.all_changes):
             return found
-        faults = [event for event in found if event.kind == "sensor"]
-        return sorted(faults + self._smoothed_changes(found, threshold), key=lambda event: event.span.date)
+        faults, known = ([event for event in found if event.kind == kind] for kind in ("sensor", "change"))
+        smoothed, names, W = self.smoothed, self.tracker.change_names, self.lags[-1] + 1
+        spans = [event.span for event in known]
+        changes = dated(self.run, smoothed.mixture, smoothed.prior[:, :1], names, threshold, W, spans)
+        return sorted(faults + changes, key=lambda event: event.span.date)
 
     def changes(self, threshold: float = 0.5) -> list[Event]:
         """`events` without the faults."""
         return [event for event in self.events(threshold) if event.kind == "change"]
-
-    def _smoothed_changes(self, found: list[Event], threshold: float) -> list[Event]:
-        """Changes with their credible sets of dates, and when the filter knew of them."""
-        known = [event.span for event in found if event.kind == "change"]
-        smoothed, names = self.smoothed, self.tracker.change_names
-        return dated(self.run, smoothed.mixture, smoothed.prior[:, :1], names, threshold, self.lags[-1] + 1, known)
 
     def found(self, threshold: float = 0.5) -> list[Event]:
         """`events` at the time of their detection: with the dates of the leaves, and without shifts."""
