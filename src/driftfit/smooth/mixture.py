@@ -53,7 +53,7 @@ BLOCK = 1000
 """Samples between checkpoints."""
 MOST = 48
 """Components that are kept at most, where the evidence is not constant; `ROOMY` elsewhere."""
-NEAR = 10
+NEAR = 16
 """Samples to either side of such a place that get more components."""
 CONSTANT = 0.2
 """Change of the log evidence from one sample to the next that is accepted."""

@@ -211,4 +211,7 @@ def mean_of(problem: Problem, q: Array, keep: Array) -> Mixture:
     scales = [Passes(drifting(problem, np.diag(np.sqrt(scale * q))), keep) for scale in SCALES]
     logs = np.array([one.forward() for one in scales])
     order = [k for k in np.argsort(-logs) if logs[k] > logs.max() + np.log(LIKELY)]
-    return mixture.average(shares(logs[order]), [mixture.smooth(scales[k], True) for k in order])
+    found = [mixture.smooth(scales[order[0]], True)]
+    enough = np.array_equal(found[0].kept, keep)
+    found += [mixture.smooth(scales[k] if enough else scales[k].problem, True, found[0].kept) for k in order[1:]]
+    return mixture.average(shares(logs[order]), found)
