@@ -5,8 +5,9 @@ standard deviations of the noise. The exact mixture is the sum over all sets of 
 itself; "decided" is the path given the changes that `run.hypotheses.found()` names, with the same noise and drift. A
 sample is near if it is within six of the jump. Coverage is that of 95 % bands, rms in units of that of the exact one.
 
-Second table: `Bank()`, which is given no numbers, on 400 samples of other kinds. The last lines are a record of 20,000
-samples with a jump in every 200: time per sample, and samples at which the evidence is not constant.
+Second and third table: `Bank()` and `AdaptiveKalman()`, which are given no numbers, on 400 samples of other kinds, with
+the dates that `run.changes()` gives. The last lines are a record of 20,000 samples with a jump in every 200: time per
+sample, coverage, and for a bank to which drift and jump are given samples at which the evidence is not constant.
 Run: python benchmarks/smoothing_over_hypotheses.py [records, 200 by default] [--quick]
 """
 
@@ -18,7 +19,7 @@ from itertools import combinations
 
 import numpy as np
 
-from driftfit import Bank, Regression, track
+from driftfit import AdaptiveKalman, Bank, Regression, track
 from driftfit.bank.change import Change
 from driftfit.bank.results.smoothed import problem_of
 from driftfit.bank.sensor import Sensor
@@ -134,19 +135,19 @@ def record(kind: str, rng: np.random.Generator, T: int = 400) -> tuple[np.ndarra
     return y, u, theta, near
 
 
-def kinds(records: int) -> None:
-    print(f"{'':20} coverage near  overall       rms   rms filtered   dates found, of  held  samples in the set  false")
+def kinds(tracker: Bank | AdaptiveKalman, records: int) -> None:
+    heads = "coverage near  overall       rms   rms filtered   dates found, of  held  samples in the set  false"
+    print(f"{tracker!r:20} {heads}")
     for kind in KINDS:
         rows, dates = [], []
         for seed in range(records):
             y, u, theta, near = record(kind, np.random.default_rng([seed, *kind.encode()]))
-            run = track(Regression(2), Bank(), y, u)
-            hypotheses = run.hypotheses
-            smoothed = hypotheses.smoothed
+            run = track(Regression(2), tracker, y, u)
+            smoothed = run.smooth()
             rows.append([*held((smoothed.theta, smoothed.std), theta, near if near.any() else ~near),
                          np.mean((run.theta - theta)[30:] ** 2)])  # fmt: skip
             jumps = np.flatnonzero(np.abs(np.diff(theta[:, 0])) > 1.0) + 1
-            sets = [(event.span.first, event.span.last) for event in hypotheses.changes()]
+            sets = [(event.span.first, event.span.last) for event in run.changes()]
             by = [[one for one in sets if one[0] - 25 <= at <= one[1] + 25] for at in jumps]
             inside = [sum(a <= at <= b for a, b in some) > 0 for at, some in zip(jumps, by, strict=True)]
             right = {one for some in by for one in some}
@@ -160,23 +161,26 @@ def kinds(records: int) -> None:
         )
 
 
-def long(T: int) -> None:
+def long(tracker: Bank | AdaptiveKalman, T: int) -> None:
     rng = np.random.default_rng(0)
     u, theta = rng.standard_normal((T, 2)), np.zeros((T, 2))
     for date in range(100, T, 200):
         theta[date:] += 3.0 * rng.standard_normal(2)
-    run = track(Regression(2), GIVEN, (u * theta).sum(axis=1) + rng.standard_normal(T), u)
+    run = track(Regression(2), tracker, (u * theta).sum(axis=1) + rng.standard_normal(T), u)
     run.smooth()
     begin = time.process_time()
     found = run.smooth()
     taken = 1e6 * (time.process_time() - begin) / T
-    inside = np.mean(np.abs(found.theta - theta) < 1.96 * found.std)
-    print(f"{T} samples: {taken:.0f} us each, coverage {inside:.3f}, evidence not constant at {found.uneven.sum()}")
+    inside, rms = np.mean(np.abs(found.theta - theta) < 1.96 * found.std), np.mean((found.theta - theta) ** 2) ** 0.5
+    uneven = f", evidence not constant at {found.uneven.sum()}" if tracker is GIVEN else ""
+    print(f"{T} samples, {type(tracker).__name__}: {taken:.0f} us each, coverage {inside:.3f}, rms {rms:.3f}{uneven}")
 
 
 if __name__ == "__main__":
     quick = "--quick" in sys.argv
     number = 2 if quick else int(([*filter(str.isdigit, sys.argv[1:]), "200"])[0])
     sizes(number)
-    kinds(number if quick else max(number // 4, 2))
-    long(2000 if quick else 20_000)
+    for tracker in (Bank(), AdaptiveKalman()):
+        kinds(tracker, number if quick else max(number // 4, 2))
+    for tracker in (GIVEN, AdaptiveKalman()):
+        long(tracker, 2000 if quick else 20_000)

@@ -1,10 +1,12 @@
 """Smoothing given events, and segments."""
 
+import contextlib
+
 import numpy as np
 import pytest
 from test_bank import N, R, changes, record
 
-from driftfit import Bank, Kalman, Regression, track
+from driftfit import AdaptiveKalman, Bank, Kalman, Regression, track
 from driftfit.bank.change import Change
 from driftfit.bank.results.smoothed import problem_of
 from driftfit.bank.sensor import Sensor
@@ -36,6 +38,25 @@ def test_events_say_what_moved_and_how_far():
         track(Regression(N), Kalman(0.01, R), Y, U).changes()
 
 
+@pytest.mark.parametrize("excited", [True, False])
+def test_changes_of_the_default_have_dates_names_and_sizes(excited):
+    """Of a parameter whose regressor is always 0 nothing is known, so it did not move."""
+    rng = np.random.default_rng(3)
+    u, theta = rng.standard_normal((400, N)) * [1.0, excited], np.ones((400, N))
+    theta[200:, 0] += 1.0
+    theta[300:] -= 0.6
+    with contextlib.nullcontext() if excited else pytest.warns(UserWarning, match="theta2 could not"):
+        run = track(Regression(N), AdaptiveKalman(), (u * theta).sum(axis=1) + 0.3 * rng.standard_normal(400), u)
+    first, second = run.changes()
+    assert (first.name, second.name) == ("theta1", "all" if excited else "theta1")
+    for event, date, moved in ((first, 200, [1.0, 0.0]), (second, 300, [-0.6, -0.6 * excited])):
+        assert 0.8 < event.prob <= 1.0
+        assert event.first <= date <= event.last < event.first + 12
+        shift, std = (np.array([*values.values()]) for values in (event.shift, event.std))
+        assert (np.abs(shift - moved) <= 3.0 * std).all()
+        assert std.max() < 0.3
+
+
 def test_segments_are_the_limit_of_large_jumps():
     bank = Bank([Change(0.0), Change(1e4, prob=0.01)], KNOWN, p0=1e6)
     run = track(Regression(N), bank, Y, U)
@@ -51,12 +72,6 @@ def test_segments_are_the_limit_of_large_jumps():
     assert i == N - 1
     with pytest.raises(ValueError, match="within 1"):
         piecewise(run, [0])
-
-
-def test_smoothing_beats_filtering():
-    run = track(Regression(N), Bank(), Y, U)
-    truth = np.repeat(piecewise(run, [40, 90]).theta, [40, 50, 30], axis=0)
-    assert np.abs(run.smooth().theta - truth).mean() < np.abs(run.theta - truth).mean()
 
 
 @pytest.mark.parametrize(("walk", "unit"), [((0.05, 0.05), 1.0), ((0.2, 0.2), 1000.0), ((0.05, 0.0), 1.0)])

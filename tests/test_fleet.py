@@ -13,6 +13,7 @@ import pytest
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Track, track
 from driftfit.data.record import Known, Records
+from driftfit.judge import on_all_cores
 from driftfit.run import parallel_lanes
 from driftfit.run.fleet import run_fleet
 from driftfit.run.program import Program
@@ -105,6 +106,21 @@ def test_a_fleet_loads_and_saves_one_series(tmp_path):
     run = track(MODEL, KALMAN, y, u, by="row")[3]
     run.save(tmp_path / "run.npz")
     assert_same(Track.load(tmp_path / "run.npz"), run)
+
+
+def test_smoothed_paths_are_those_of_each_series(monkeypatch):
+    """By threads, and by processes where it takes longer."""
+    y, u = rows(8, 60, seed=9)
+    fleet = track(MODEL, KALMAN, y, u, by="row")
+    for worth in (on_all_cores.WORTH, 0.0):
+        monkeypatch.setattr(on_all_cores, "WORTH", worth)
+        found = fleet.smooth()
+        assert found.columns == ["series", "sample", "theta_a1", "std_a1", "theta_b1", "std_b1"]
+        for key, run in fleet.items():
+            smoothed, own = run.smooth(), found.filter(pl.col("series") == key)
+            for i, name in enumerate(run.names):
+                assert (own[f"theta_{name}"].to_numpy() == smoothed.theta[:, i]).all()
+                assert (own[f"std_{name}"].to_numpy() == smoothed.std[:, i]).all()
 
 
 def test_mapping():

@@ -1,6 +1,4 @@
-"""The parts of `AdaptiveKalman` against plain NumPy: a sample, the interaction, the pass of scores, all paths."""
-
-from itertools import product
+"""The parts of `AdaptiveKalman` against plain NumPy: a sample, the interaction, the pass of scores."""
 
 import naive
 import numpy as np
@@ -8,7 +6,7 @@ import pytest
 
 from driftfit import ARX, AdaptiveKalman, Live, Regression, track
 from driftfit.trackers.mixture.learned import BLOCK, FADE, PHI, PRECISION, WINDOW, E
-from driftfit.trackers.mixture.states import ASSUMED, COMMON, DIRECTION, A, B, M, modes_given_all, table, transitions
+from driftfit.trackers.mixture.states import ASSUMED, COMMON, DIRECTION, A, B, M, table
 
 
 def record(T=400, n=3, seed=0):
@@ -67,13 +65,6 @@ def test_the_table_of_modes():
     assert len(table(9, None)["ratio"]) == len(table(1, None)["ratio"]) == 15
 
 
-def test_transitions_lead_down_a_ladder_and_from_the_whole_bank():
-    T = transitions(np.array([0.0, 0.1, 1.0, 0.01, 30.0]), np.full(5, 0.01))
-    expected = np.full((5, 5), 0.01) + np.diag([0.95, 0.949, 0.9, 0.95, 0.9])
-    expected[1, 0], expected[2, 1], expected[4, 3] = 0.011, 0.06, 0.06
-    np.testing.assert_allclose(T, expected, rtol=1e-12)
-
-
 def test_a_pass_of_scores_against_matrices():
     y, u = record(n=4)
     live, passes, after = Live(Regression(4), AdaptiveKalman()), 0, None
@@ -126,22 +117,6 @@ def test_rare_pulses_whose_gain_jumps_twice():
         run = track(Regression(1), AdaptiveKalman(), gain * u + 0.1 * rng.normal(size=1500), u)
         assert abs(run.theta[-1, 0] - 4.0) < 4.0 * run.std[-1, 0]
         assert run.std[-1, 0] < 1.0
-
-
-def test_probabilities_given_all_are_those_of_all_paths():
-    rng = np.random.default_rng(0)
-    K, steps = 4, 5
-    moves, likelihood = transitions(np.array([0.0, 0.1, 1.0, 30.0]), 0.1 * rng.random(K)), rng.random((steps, K))
-    after, ahead, before = np.empty((steps, K)), np.empty((steps, K)), np.full(K, 1.0 / K)
-    for t in range(steps):
-        after[t] = before * likelihood[t] / (before @ likelihood[t])
-        before = ahead[t] = after[t] @ moves
-    expected = np.zeros((steps, K))
-    for path in product(range(K), repeat=steps):
-        p = np.prod([likelihood[t, i] * (moves[path[t - 1], i] if t else 1.0) for t, i in enumerate(path)])
-        expected[np.arange(steps), path] += p
-    found = modes_given_all(after, ahead, moves)
-    np.testing.assert_allclose(found, expected / expected.sum(axis=1, keepdims=True), rtol=1e-12)
 
 
 def test_a_plant_that_rests_first_in_hardly_any_noise():

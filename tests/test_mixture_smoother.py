@@ -12,8 +12,7 @@ from driftfit.bank.change import Change
 from driftfit.bank.results.smoothed import problem_of
 from driftfit.bank.sensor import Sensor
 from driftfit.smooth import mixture
-from driftfit.smooth.mixture import Alternatives, Problem
-from driftfit.smooth.parts.components import Noises
+from driftfit.smooth.mixture import Problem
 
 KNOWN = [Sensor.nominal(R)]
 
@@ -209,14 +208,3 @@ def test_memory_is_that_of_the_result():
     assert len(passes.stored.A) == mixture.BLOCK
     whole = mixture.Passes(long, np.full(T, 12)).smoothed(False)
     assert np.abs(whole.evidence - whole.evidence[0]).max() < 1.0
-
-
-def test_moves_are_those_of_either_direction():
-    """The forward filter leaves the source of a move, the backward one its target."""
-    table = Alternatives(
-        np.array([0, 1, 0]), np.array([1, 0, 0]), np.arange(3), np.zeros((1, 3)), np.eye(1)[None],
-        np.zeros((3, 2), int), np.zeros((3, 2), int),
-    )  # fmt: skip
-    assert table.moves(np.ones(1)).kind[:, :2].tolist() == [[1, 0], [0, 2], [0, 1]]
-    assert table.moves(np.ones(1), back=True).kind[:, :2].tolist() == [[1, 1], [0, 2], [0, 0]]
-    assert Noises(np.ones((1, 2)), np.zeros((1, 1))).kind.shape == (1, 2)

@@ -10,6 +10,7 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.fleet_alarms import ManyAlarms, alarms
 from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judge.joint_noise import JointNoise
+from driftfit.judge.on_all_cores import on_all_cores
 from driftfit.results import Exported, Track
 from driftfit.run import fleet, keyed_results, outputs, result
 from driftfit.show.plots import plot_fleet, plot_outputs
@@ -23,6 +24,12 @@ from driftfit.use.forecast import Forecast, forecast_outputs
 if TYPE_CHECKING:
     import polars
     from matplotlib.figure import Figure
+
+
+def smoothed_path(run: Track) -> tuple[Array, Array]:
+    """theta and std of a run from its complete record, (T, n) each."""
+    found = run.smooth()
+    return found.theta, found.std
 
 
 class Judged(keyed_results.KeyedResults, Exported):
@@ -99,6 +106,17 @@ class Fleet(fleet.Fleet, Judged, public=True):
         from driftfit.show.export import forecasts_table
 
         return forecasts_table(self, h, u)
+
+    def smooth(self) -> polars.DataFrame:
+        """Every result smoothed, on all cores, as one polars table, one row per sample; see `Track.smooth`.
+
+        Columns: those that identify the results, the time or ``sample``, and for every parameter ``theta_<name>`` and
+        ``std_<name>``. Memory: that of the table twice. ValueError as for `Track.smooth`.
+        """
+        from driftfit.show.export import paths_table
+
+        runs = dict(self.items())
+        return paths_table(self, on_all_cores(runs, lambda key: (runs[key],), smoothed_path, "smoothing"))
 
     def summary(self) -> FleetSummary:
         """Results ranked by how much their parameters moved; print it."""

@@ -20,8 +20,8 @@ from driftfit.run.live.rule import AlarmRule
 from driftfit.show.plots import plot_track
 from driftfit.show.report import report
 from driftfit.show.summary import Summary, cell_of, summarise
-from driftfit.smooth.shared_theta import SmoothedShared
-from driftfit.smooth.smoothed import Smoothed
+from driftfit.smooth.changes import changes
+from driftfit.smooth.smoothed import Smoothed, SmoothedShared
 from driftfit.tune import inference
 from driftfit.tune.refine import refine
 from driftfit.use import simulate, system
@@ -108,8 +108,12 @@ class Track(result.Track, Exported, public=True):
         """The changes of parameters that are more probable than the threshold, given the whole record.
 
         Each has the interval that contains its date with probability 0.95, its probability, the most likely of the
-        changes of the `Bank`, and by how much every parameter moved. ValueError for trackers without hypotheses.
+        changes of the `Bank`, and by how much every parameter moved. Those of `AdaptiveKalman` are named by what they
+        move, "all" or a group of its parameters. ValueError for trackers without hypotheses, and at a warm start.
+        Cost: that of `smooth`.
         """
+        if self.tracker.adapts:
+            return changes(self.rows, threshold)
         return Hypotheses(self.rows).changes(threshold)
 
     def forecast(self, h: int, u: Any = None) -> Forecast:

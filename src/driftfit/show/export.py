@@ -61,11 +61,28 @@ def as_table(result: Result, arrays: bool = False) -> pl.DataFrame:
     signals = [_of_track(one, arrays) if _is_single(one) else _of_outputs(one, arrays) for one in records]
     columns = {name: np.concatenate([part[name] for part in signals]) for name in signals[0]}
     by = result.labels.by if isinstance(result, Fleet) else ()
-    table = table_by_key(by, keys, [len(one) for one in records], columns)
-    zone, time = records[0].labels.zone, _time_name(records[0])
-    if zone is not None:
-        table = table.with_columns(pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(zone))
-    return table
+    return _in_zone(table_by_key(by, keys, [len(one) for one in records], columns), records[0])
+
+
+def _in_zone(table: pl.DataFrame, run: Single) -> pl.DataFrame:
+    """The table with times in the zone of the record."""
+    zone, time = run.labels.zone, _time_name(run)
+    return (
+        table
+        if zone is None
+        else table.with_columns(pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(zone))
+    )
+
+
+def paths_table(fleet: Fleet, paths: Mapping[Hashable, tuple[Array, Array]]) -> pl.DataFrame:
+    """theta and std (T, n) of each result of a fleet in one table, one row per sample."""
+    if not paths:
+        return _of_nothing(fleet, False)
+    runs = [fleet[key] for key in paths]
+    theta, std = (np.concatenate(parts) for parts in zip(*paths.values(), strict=True))
+    columns = {_time_name(runs[0]): np.concatenate([run.time for run in runs])}
+    columns |= _parameters(runs[0].names, theta, std, None)
+    return _in_zone(table_by_key(fleet.by, paths, [len(run) for run in runs], columns), runs[0])
 
 
 class Written(NamedTuple):

@@ -19,6 +19,7 @@ samples; the filter runs again from checkpoints.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +38,7 @@ from driftfit.smooth.parts.components import (
     Noises,
     Room,
     absorb,
+    copy_upper,
     grow,
     log_det,
     lowered,
@@ -51,7 +53,7 @@ BLOCK = 1000
 """Samples between checkpoints."""
 MOST = 48
 """Components that are kept at most, where the evidence is not constant; `ROOMY` elsewhere."""
-NEAR = 25
+NEAR = 16
 """Samples to either side of such a place that get more components."""
 CONSTANT = 0.2
 """Change of the log evidence from one sample to the next that is accepted."""
@@ -81,6 +83,13 @@ class Alternatives(NamedTuple):
         for move in np.flatnonzero(self.source == 0):
             probs[:, self.event[move]] += np.exp(self.log_prob[:, move])
         return probs
+
+    def moved(self) -> Array:
+        """(E, n) bool: which parameters an event moves."""
+        moved = np.zeros((self.event.max() + 1, self.roots.shape[1]), bool)
+        for label, (drift, own) in zip(self.event, self.which, strict=True):
+            moved[label] |= self.roots[own if own >= 0 else drift].any(axis=1)
+        return moved
 
     def moves(self, scale: Array, back: bool = False) -> Moves:
         """The same in one direction of time, for theta multiplied by ``scale``."""
@@ -124,6 +133,31 @@ class Mixture(NamedTuple):
     """(T,): log evidence as computed at each sample, without the constant of a start without information."""
     kept: Array
     """(T,): how many components were allowed."""
+    moves: Array
+    """(E, n) bool: which parameters an event moves."""
+
+    @property
+    def var(self) -> Array:
+        """(T, n)"""
+        return np.asarray(self.cov if self.cov.ndim == 2 else np.einsum("tii->ti", self.cov))
+
+    def increment(self, first: int, last: int) -> tuple[Array, Array]:
+        """Mean and standard deviation (n,) of how far theta moved by events at these samples, if there was one.
+
+        Two events at neighbouring samples have some probability, and each of them may then have been of any size. The
+        mean is therefore that of their sum, and the variance at most that of the path before and after together.
+        """
+        part = slice(first, last + 1)
+        p, each = 1.0 - self.events[part, :1], self.shift[part]
+        mean = np.sum(p * each, axis=0)
+        center = mean / p.sum()
+        var = np.sum(p * (self.shift_var[part] + (each - center) ** 2), axis=0) / p.sum()
+        return mean / min(p.sum(), 1.0), np.sqrt(np.minimum(var, self.var[max(first - 1, 0)] + self.var[last]))
+
+    def turned(self, B: Array) -> Mixture:
+        """That of B theta, B (m, n), if what an event moves, by B, is independent; names of parameters stay."""
+        shift, var = self.shift @ B.T, self.shift_var @ (B**2).T
+        return self._replace(theta=self.theta @ B.T, cov=B @ self.cov @ B.T, shift=shift, shift_var=var)
 
     @property
     def uneven(self) -> Array:
@@ -245,9 +279,7 @@ def meet(
             c = facts[f, LOG] + more[k, LOG]
             if facts[f, MODE] != more[k, MODE] or c - ahead < top - UNLIKELY:
                 continue
-            for i in range(n):
-                for j in range(i, n + 1):
-                    W[i, j] = X[f, i, j]
+            copy_upper(X[f], W)
             for q in range(n):
                 for j in range(n + 1):
                     row[j] = Y[k, q, j] if j >= q else 0.0
@@ -326,23 +358,37 @@ def backwards(
     now.many[0] = K
 
 
-def smooth(problem: Problem, covariances: bool = False, kept: Array | None = None) -> Mixture:
+def smooth(problem: Problem | Passes, covariances: bool = False, kept: Array | None = None) -> Mixture:
     """Smooth a record; with ``covariances`` of every sample, and otherwise variances.
 
-    ``kept`` (T,) says how many components another smoother of the record needed, with which this one begins.
-
-    Where the evidence is not constant, more components are allowed, up to `MOST`; see `Mixture.needed`.
+    ``kept`` (T,) says how many components another smoother of the record needed, with which this one begins. The filter
+    of `Passes` may be done. Where the evidence is not constant, more components are allowed, up to `MOST`; see
+    `Mixture.needed`.
     """
-    return refined(Passes(problem, np.full(len(problem.y), ROOMY) if kept is None else kept), covariances)
-
-
-def refined(passes: Passes, covariances: bool) -> Mixture:
-    """The same from passes that begin, of which the filter may be done."""
+    if isinstance(problem, Passes):
+        passes = problem
+    else:
+        passes = Passes(problem, np.full(len(problem.y), ROOMY) if kept is None else kept)
     while True:
         found = passes.smoothed(covariances)
         if np.array_equal(found.needed, found.kept):
             return found
         passes = Passes(passes.problem, found.needed)
+
+
+def average(w: Array, found: Sequence[Mixture]) -> Mixture:
+    """The mixture of mixtures with shares w (K,) that sum to 1; evidence and components are those of the first."""
+    theta = np.asarray(sum(share * one.theta for share, one in zip(w, found, strict=True)))
+    events = np.asarray(sum(share * one.events for share, one in zip(w, found, strict=True)))
+    moved = w[:, None] * np.array([1.0 - one.events[:, 0] for one in found])
+    moved = (moved / np.maximum(moved.sum(axis=0), np.finfo(float).tiny))[:, :, None]
+    shift = np.asarray(sum(share * one.shift for share, one in zip(moved, found, strict=True)))
+    cov, shift_var = np.zeros_like(found[0].cov), np.zeros_like(shift)
+    for share, given, one in zip(w, moved, found, strict=True):
+        away = one.theta - theta
+        cov += share * (one.cov + (away**2 if cov.ndim == 2 else away[:, :, None] * away[:, None, :]))
+        shift_var += given * (one.shift_var + (one.shift - shift) ** 2)
+    return found[0]._replace(theta=theta, cov=cov, events=events, shift=shift, shift_var=shift_var)
 
 
 def filtered(problem: Problem, keep: int) -> tuple[float, float, float]:
@@ -414,7 +460,7 @@ class Passes:
         E = int(self.problem.alternatives.event.max()) + 1
         found = Mixture(
             np.empty((T, n)), np.empty((T, n, n if covariances else 1)), np.zeros((T + 1, E)), np.zeros((T + 1, n)),
-            np.zeros((T + 1, n)), np.empty(T), self.keep,
+            np.zeros((T + 1, n)), np.empty(T), self.keep, self.problem.alternatives.moved(),
         )  # fmt: skip
         for a, place in reversed([*zip(range(0, T, BLOCK), self.places, strict=True)]):
             here, after = slice(a, min(a + BLOCK, T)), slice(a + 1, min(a + BLOCK, T) + 1)
@@ -422,18 +468,16 @@ class Passes:
                 for values, before in zip(self.ahead, place, strict=True):
                     values[:] = before
                 self._forward(a, True)
-            part = Mixture(
-                found.theta[here], found.cov[here], found.events[after], found.shift[after], found.shift_var[after],
-                found.evidence[here], found.kept[here],
-            )  # fmt: skip
+            places = here, here, after, after, after, here
+            part = Mixture._make([*(values[at] for values, at in zip(found[:-2], places, strict=True)), *found[-2:]])
             samples, last = self._block(a, 1), here.stop == T
             backwards(samples, self.ways[1], self.problem.noises, self.behind, self.stored, self.room, last, part)
         found.events[0] = np.eye(1, E)
         scale = self.scale
-        return Mixture(
-            found.theta / scale, found.cov / np.outer(scale, scale) if covariances else found.cov[:, :, 0] / scale**2,
-            found.events[:T], found.shift[:T] / scale, found.shift_var[:T] / scale**2, found.evidence + self.constant,
-            self.keep,
+        return found._replace(
+            theta=found.theta / scale, events=found.events[:T], shift=found.shift[:T] / scale,
+            cov=found.cov / np.outer(scale, scale) if covariances else found.cov[:, :, 0] / scale**2,
+            shift_var=found.shift_var[:T] / scale**2, evidence=found.evidence + self.constant,
         )  # fmt: skip
 
 

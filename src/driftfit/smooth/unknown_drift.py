@@ -16,7 +16,7 @@ found in three steps:
     3. the path is the average over `SCALES` of these ratios, weighted by the evidence.
 
 Variances grow by the spread of the paths of step 2: a slow walk can look as if nothing moved. Slopes that walk are
-another model of the same record (`driftfit.smooth.parts.slope_drift`) and are averaged likewise; where they are more
+another model of the same record (`driftfit.smooth.parts.slopes`) and are averaged likewise; where they are more
 probable than not, they are taken.
 
 Source: Hoeting, Madigan, Raftery and Volinsky (1999) for averaging over models by their likelihood; the three steps are
@@ -25,9 +25,9 @@ ours. Cost per sample: eleven filters of `FEW` components, two to five smoothers
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 
@@ -38,10 +38,10 @@ from driftfit.smooth.parts import slopes
 from driftfit.smooth.parts.components import Noises
 from driftfit.smooth.parts.elimination import smooth_and_weigh
 from driftfit.smooth.parts.rank import column_scale
-from driftfit.smooth.parts.slope_drift import compared
 from driftfit.smooth.parts.walk import Walk
 
 Groups = Sequence[Sequence[int]]
+Point = tuple[int, ...]
 SIZES = (15.0, 900.0)
 """Variances of jumps, in units of r / c; a group alone has their geometric mean."""
 PER_SAMPLE = 3e-3
@@ -59,17 +59,6 @@ TRENDS = 3.0
 """Penalty of slopes that walk, in units of the log-likelihood."""
 
 
-class Tried(NamedTuple):
-    """Ratios that are likely, with a Gaussian each."""
-
-    p: Array
-    """(K,)"""
-    theta: Array
-    """(K, T, n)"""
-    q: Array
-    """(n,): the average drift."""
-
-
 def average_drift(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Groups) -> Walk:
     """The walk with the average of the drifts, with the moments of all hypotheses, and with paths of other drifts.
 
@@ -83,7 +72,7 @@ def average_drift(walk: Walk, times: tuple[Array, Array], trend: Array, groups: 
     some = averaged(walk.of(moved), times, trend, inner)
     known, whole = some.mixture, np.eye(walk.phi.shape[1])[moved]
     if known is not None:
-        known = known._replace(theta=known.theta @ whole, cov=whole.T @ known.cov @ whole)
+        known = known.turned(whole.T)._replace(moves=known.moves @ whole > 0.0)
     paths, drift_root = some.paths @ whole if len(some.paths) else some.paths, some.drift_root @ whole
     return walk._replace(drift_root=drift_root, trend=some.trend, paths=paths, belief=some.belief, mixture=known)
 
@@ -98,10 +87,19 @@ def averaged(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Group
     unit = r / np.where(power > 0.0, power, 1.0)
     found = times[1] * (times[0].sum() / times[1].sum())
     plain, weighed = (hypotheses(walk, time, unit, groups) for time in (times[0], found))
-    few = np.full(T, FEW)
-    tried = [(Passes(drifting(plain, level * unit), few), 0.0) for level in LEVELS]
-    tried += [(Passes(drifting(weighed, level * unit), few), T / SHARE) for level in LEVELS[1:]]
-    passes, _ = max(tried, key=lambda one: one[0].forward() - one[1])
+
+    @cache
+    def tried(level: int, time: int) -> tuple[Passes, float]:
+        problem = drifting((plain, weighed)[time], np.diag(np.sqrt(LEVELS[level] * unit)))
+        passes = Passes(problem, np.full(T, FEW))
+        return passes, passes.forward() - time * T / SHARE
+
+    def near(at: Point) -> list[Point]:
+        return [(level, at[1]) for level in (at[0] - 1, at[0] + 1) if at[1] <= level < len(LEVELS)]
+
+    level, _ = summit(lambda at: tried(*at)[1], (1, 0), near)
+    at = summit(lambda at: tried(*at)[1], (level, 0), lambda at: [*near(at), (max(level, 1), 1)])
+    passes = tried(*at)[0]
     first, problem = passes.smoothed(False), passes.problem
     jumps = (1.0 - first.events[:, :1]) * (first.shift**2 + first.shift_var)
     time = problem.sizes[:, :1] ** 2
@@ -109,19 +107,37 @@ def averaged(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Group
     if likely is None:
         return walk._replace(drift_root=np.sqrt(np.diag(problem.alternatives.roots[0]) ** 2 * time + jumps))
     price = TRENDS + np.sum(1.0 - first.events[:, 0]) * np.log(PER_SAMPLE)
-    known = mean_of(problem, likely.q, first.needed)
-    return with_slopes(walk._replace(drift_root=np.sqrt(likely.q * time + jumps), mixture=known), likely, trend, price)
+    p, paths, q = likely
+    walk = walk._replace(drift_root=np.sqrt(q * time + jumps), mixture=mean_of(problem, q, first.needed))
+    return with_slopes(walk, p, paths, trend, price)
 
 
-def with_slopes(walk: Walk, likely: Tried, trend: Array, price: float) -> Walk:
+def summit(value: Callable[[Point], float], best: Point, near: Callable[[Point], list[Point]]) -> Point:
+    """The point that is reached from ``best`` by stepping to the best neighbour until none is better."""
+    while True:
+        before, best = best, max((best, *near(best)), key=value)
+        if best == before:
+            return best
+
+
+def neighbours(at: Point, groups: Groups, top: int, steps: Sequence[int] = (-1, 1)) -> list[Point]:
+    """Points one up or down in all coordinates, or a step away in those of one group, within 0 .. top."""
+    near = [tuple(np.clip(np.add(at, step), 0, top).tolist()) for step in (-1, 1)]
+    for group, step in product(groups, steps):
+        level = min(max(at[group[0]] + step, 0), top)
+        near.append(tuple(level if i in group else own for i, own in enumerate(at)))
+    return near
+
+
+def with_slopes(walk: Walk, likely: Array, paths: Array, trend: Array, price: float) -> Walk:
     """The problem with slopes if they are more probable, and with the paths of all that are probable at all."""
-    rates, better = compared(walk, trend, likely.theta[np.argmax(likely.p), 0])
+    rates, better = slopes.compared(walk, trend, paths[np.argmax(likely), 0])
     p = shares(np.append(0.0, better - price))
     which = np.flatnonzero(p[1:] >= LEAST)
     others = [slopes.smooth(sloped(walk, trend, rates[k])).theta for k in which]
     if p[0] < 0.5:
         walk = sloped(walk, trend, p[1:] @ rates / p[1:].sum())._replace(mixture=None)
-    return walk._replace(paths=np.array([*likely.theta, *others]), belief=np.append(p[0] * likely.p, p[1 + which]))
+    return walk._replace(paths=np.array([*paths, *others]), belief=np.append(p[0] * likely, p[1 + which]))
 
 
 def sloped(walk: Walk, trend: Array, rate: Array) -> Walk:
@@ -154,55 +170,48 @@ def hypotheses(walk: Walk, time: Array, unit: Array, groups: Groups) -> Problem:
     )
 
 
-def drifting(problem: Problem, q: Array) -> Problem:
-    """The problem with this drift (n,) per unit of time."""
+def drifting(problem: Problem, root: Array) -> Problem:
+    """The problem with a drift of this root (n, n) per unit of time, an upper triangle."""
     roots = problem.alternatives.roots.copy()
-    roots[0] = np.diag(np.sqrt(q))
+    roots[0] = root
     return problem._replace(alternatives=problem.alternatives._replace(roots=roots))
 
 
-def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) -> Tried | None:
-    """Ratios with known squares of jumps (T, n); None if no likelihood is accurate."""
+def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) -> tuple[Array, ...] | None:
+    """Probabilities (K,) and paths (K, T, n) of likely ratios with known squares of jumps (T, n), and the average drift
+    (n,); None if no likelihood is accurate.
+    """
     n, T = len(unit), len(time)
     least = np.ceil(2.0 * np.log10(EDGE / T**2)) / 2.0
     ratios = np.append(0.0, 10.0 ** np.arange(least, np.log10(EDGE) + 0.25, 0.5))
     size, top = column_scale(walk.phi, walk.signals), len(ratios) - 1
-    known: dict[tuple[int, ...], float] = {}
+    known: dict[Point, float] = {}
+    paths: dict[Point, Array] = {}
 
-    def solved(at: tuple[int, ...]) -> tuple[Array, float]:
-        found = smooth_and_weigh(walk._replace(drift_root=np.sqrt(ratios[list(at)] * unit * time + jumps)), size)
-        return (jumps, -np.inf) if found is None else (found[0].theta, found[1])
-
-    def value(at: tuple[int, ...]) -> float:
+    def value(at: Point) -> float:
+        nonlocal paths
         if at not in known:
-            known[at] = solved(at)[1]
+            found = smooth_and_weigh(walk._replace(drift_root=np.sqrt(ratios[list(at)] * unit * time + jumps)), size)
+            known[at] = -np.inf if found is None else found[1]
+            if found is not None:
+                paths, least = {**paths, at: found[0].theta}, max(known.values()) + np.log(LEAST)
+                paths = {one: path for one, path in paths.items() if known[one] > least}
         return known[at]
 
-    best, before = max(((level,) * n for level in range(top + 1)), key=value), None
-    while best != before:
-        before = best
-        near = [tuple(np.clip(np.add(best, step), 0, top).tolist()) for step in (-1, 1)]
-        for group, step in product(groups, (-top, -1, 1)):
-            level = min(max(best[group[0]] + step, 0), top)
-            near.append(tuple(level if i in group else own for i, own in enumerate(best)))
-        best = max((best, *near), key=value)
+    common = max(((level,) * n for level in range(top + 1)), key=value)
+    best = summit(value, common, lambda at: neighbours(at, groups, top, (-top, -1, 1)))
     if known[best] == -np.inf:
         return None
-    likely = [at for at, logs in known.items() if logs > known[best] + np.log(LEAST)]
-    p = shares(np.array([known[at] for at in likely]))
-    return Tried(p, np.array([solved(at)[0] for at in likely]), p @ ratios[np.array(likely)] * unit)
+    p = shares(np.array([known[at] for at in paths]))
+    return p, np.array([*paths.values()]), p @ ratios[np.array([*paths])] * unit
 
 
 def mean_of(problem: Problem, q: Array, keep: Array) -> Mixture:
     """The average of the mixtures with all likely scales of the drift q (n,)."""
-    scales = [Passes(drifting(problem, scale * q), keep) for scale in SCALES]
+    scales = [Passes(drifting(problem, np.diag(np.sqrt(scale * q))), keep) for scale in SCALES]
     logs = np.array([one.forward() for one in scales])
     order = [k for k in np.argsort(-logs) if logs[k] > logs.max() + np.log(LIKELY)]
-    w = shares(logs[order])
-    found = [mixture.refined(scales[k], True) for k in order]
-    theta = np.asarray(np.einsum("k,kti->ti", w, np.array([one.theta for one in found])))
-    cov = np.zeros_like(found[0].cov)
-    for share, one in zip(w, found, strict=True):
-        away = one.theta - theta
-        cov += share * (one.cov + away[:, :, None] * away[:, None, :])
-    return found[0]._replace(theta=theta, cov=cov)
+    found = [mixture.smooth(scales[order[0]], True)]
+    enough = np.array_equal(found[0].kept, keep)
+    found += [mixture.smooth(scales[k] if enough else scales[k].problem, True, found[0].kept) for k in order[1:]]
+    return mixture.average(shares(logs[order]), found)

@@ -95,14 +95,13 @@ from driftfit.trackers.mixture.states import (
     SMOOTHER_FIELDS,
     any_noise,
     bank,
+    drift_ahead,
     learn_noise,
     least_noise,
-    modes_given_all,
     noise_prior,
     note_reading,
     repeated_rounding,
     store_for_smoother,
-    transitions,
 )
 from driftfit.trackers.student import RESIDUALS, widen_estimates, wider
 
@@ -329,9 +328,7 @@ class AdaptiveKalman(Tracker):
         groups = [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
         running = fields["settled"] > 0
         noise = np.where(running, fields["usual_noise"], fields["usual_noise"][np.argmax(running)])
-        state = self.state(n)
-        modes = modes_given_all(fields["mu"], fields["prior"], transitions(state["ratio"], state["arrive"]))
-        rate = fields["r"] * (modes @ np.where(state["ratio"] < 1.0, state["ratio"], 0.0))
+        rate = fields["r"] * drift_ahead(self.state(n)["ratio"], fields["mu"])
         return centring(fields, phi), noise, np.where(running, rate, 0.0), groups
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:

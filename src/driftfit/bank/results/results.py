@@ -17,12 +17,13 @@ from driftfit.bank.bank import Bank
 from driftfit.bank.layout import COUNTER
 from driftfit.bank.memory import SINGLE
 from driftfit.bank.reduction import Decide
-from driftfit.bank.results.events import LEVEL, Event, Probabilities, all_of, changes_of
+from driftfit.bank.results.events import Event, Probabilities, all_of
 from driftfit.bank.results.mixture import Mixture, mixture_of, undecided
 from driftfit.bank.results.pictures import plot_hypotheses
 from driftfit.bank.results.smoothed import SmoothedMixture
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
+from driftfit.smooth.changes import dated
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -176,31 +177,15 @@ class Hypotheses:
         found = self.found(threshold)
         if any(change.forgets for change in self.tracker.all_changes):
             return found
-        faults = [event for event in found if event.kind == "sensor"]
-        return sorted(faults + self._smoothed_changes(found, threshold), key=lambda event: event.span.date)
+        faults, known = ([event for event in found if event.kind == kind] for kind in ("sensor", "change"))
+        smoothed, names, W = self.smoothed, self.tracker.change_names, self.lags[-1] + 1
+        spans = [event.span for event in known]
+        changes = dated(self.run, smoothed.mixture, smoothed.prior[:, :1], names, threshold, W, spans)
+        return sorted(faults + changes, key=lambda event: event.span.date)
 
     def changes(self, threshold: float = 0.5) -> list[Event]:
         """`events` without the faults."""
         return [event for event in self.events(threshold) if event.kind == "change"]
-
-    def _smoothed_changes(self, found: list[Event], threshold: float) -> list[Event]:
-        """Changes with their credible sets of dates, and when the filter knew of them."""
-        smoothed, W, last = self.smoothed, self.lags[-1] + 1, len(self.run) - 1
-        p, prior = (gathered(one, self.run.ok) for one in (smoothed.change_prob, smoothed.prior))
-        # no more likely than before the record was seen: at the end of a record, say
-        p = np.where(p[:, :1] < prior[:, :1], p, np.eye(1, p.shape[1]))
-        total = np.r_[np.zeros(W), np.cumsum(1.0 - p[:, 0])]
-        given = Probabilities(p, total[W:] - total[:-W], self.run.ok, W, self.tracker.change_names, ("nominal",))
-        known = [event.span for event in found if event.kind == "change"]
-        changes = []
-        for event in changes_of(given, threshold):
-            first, final = event.span.first, event.span.last
-            when = [span.known for span in known if first - W < span.date < final + W and span.known >= first]
-            span = event.span._replace(known=min(when, default=last))
-            changes.append(
-                replace(event, span=span, level=LEVEL).measured(smoothed.names, *smoothed.increment(first, final))
-            )
-        return self._timed(changes)
 
     def found(self, threshold: float = 0.5) -> list[Event]:
         """`events` at the time of their detection: with the dates of the leaves, and without shifts."""
@@ -272,14 +257,3 @@ class Hypotheses:
 def onsets(on: Array) -> Array:
     """Samples at which a condition begins to hold."""
     return np.flatnonzero(on & ~np.r_[False, on[:-1]])
-
-
-def gathered(p: Array, used: Array) -> Array:
-    """Probabilities (T, H_d) of changes with those at unused samples moved to the next one that was used."""
-    next_used = np.flatnonzero(used)
-    at = np.searchsorted(next_used, np.arange(len(p)))
-    to = next_used[np.minimum(at, len(next_used) - 1)] if len(next_used) else np.arange(len(p))
-    result = np.zeros_like(p)
-    np.add.at(result[:, 1:], to, p[:, 1:])
-    result[:, 0] = 1.0 - result[:, 1:].sum(axis=1)
-    return result

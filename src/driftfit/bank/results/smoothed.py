@@ -23,7 +23,6 @@ components, and that for each likely drift.
 from __future__ import annotations
 
 from functools import cached_property
-from itertools import product
 from statistics import NormalDist
 from typing import Any
 
@@ -39,6 +38,7 @@ from driftfit.smooth import mixture
 from driftfit.smooth.mixture import Alternatives, Problem
 from driftfit.smooth.parts.components import Noises
 from driftfit.smooth.problem import replay
+from driftfit.smooth.unknown_drift import Point, drifting, neighbours, summit
 from driftfit.trackers.forms.information import triangular_root
 
 FACTORS = np.append(0.0, 10.0 ** np.arange(8.0))
@@ -81,11 +81,12 @@ class SmoothedMixture:
         problem = problem_of(run, faults)
         self._weighed = hypotheses_of(bank, problem)
         found = self._smoothed(None)
-        self._mixtures, self._weights = found, np.array([weight for weight, _ in self._weighed])
+        self._weights = np.array([weight for weight, _ in self._weighed])
+        self.mixture = mixture.average(self._weights, found)
         self.prior = problem.alternatives.first()[problem.table]
-        self.theta = self._mean([one.theta for one in found])
-        self.change_prob = self._mean([one.events for one in found])
-        self.moved = self.change_prob[:, 1:] @ (moving(run) > 0.0)[1:]
+        self.theta, self.change_prob, self.shift = self.mixture.theta, self.mixture.events, self.mixture.shift
+        self.shift_std = np.sqrt(self.mixture.shift_var)
+        self.moved = self.change_prob[:, 1:] @ self.mixture.moves[1:]
         used = int(np.argmax(np.isfinite(problem.r)))
         scales = np.array([one.r[used] / problem.r[used] for _, one in self._weighed])
         self.r = float(noise_variance(bank, run) * np.sum(self._weights * np.where(scales > 0.0, scales, 1.0)))
@@ -96,9 +97,6 @@ class SmoothedMixture:
         first = mixture.smooth(self._weighed[0][1], covariances, kept)
         return [first, *(mixture.smooth(one, covariances, first.kept) for _, one in self._weighed[1:])]
 
-    def _mean(self, values: list[Array]) -> Array:
-        return np.asarray(np.einsum("k,k...->...", self._weights, np.array(values)))
-
     def __repr__(self) -> str:
         lost = int(self.uneven.sum())
         text = f"; hypotheses of some weight were neglected at {lost} samples" if lost else ""
@@ -106,49 +104,17 @@ class SmoothedMixture:
 
     @cached_property
     def std(self) -> Array:
-        var = self._mean([one.cov + (one.theta - self.theta) ** 2 for one in self._mixtures])
-        return np.where(np.isinf(self.run.std[-1]), np.inf, np.sqrt(var))
-
-    @cached_property
-    def shift(self) -> Array:
-        return self._given_change([one.shift for one in self._mixtures])
-
-    @cached_property
-    def shift_std(self) -> Array:
-        second = [one.shift_var + (one.shift - self.shift) ** 2 for one in self._mixtures]
-        return np.asarray(np.sqrt(self._given_change(second)))
-
-    def _given_change(self, values: list[Array]) -> Array:
-        """The mean over the factors of the drift, weighted by the probability of a change under each."""
-        w = self._weights[:, None] * np.array([1.0 - one.events[:, 0] for one in self._mixtures])
-        total = w.sum(axis=0)
-        return np.asarray(np.einsum("kt,kti->ti", w / np.where(total > 0.0, total, 1.0), np.array(values)))
+        return np.where(np.isinf(self.run.std[-1]), np.inf, np.sqrt(self.mixture.cov))
 
     @cached_property
     def covs(self) -> Array:
         """(T, n, n); computed again, with n n numbers for each sample."""
-        found = self._smoothed(self._mixtures[0].kept, covariances=True)
-        away = [one.theta - self.theta for one in found]
-        return self._mean([one.cov + d[:, :, None] * d[:, None, :] for one, d in zip(found, away, strict=True)])
+        return mixture.average(self._weights, self._smoothed(self.mixture.kept, covariances=True)).cov
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
         """(low, high), each (T, n)."""
         half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
         return self.theta - half, self.theta + half
-
-    def increment(self, first: int, last: int) -> tuple[Array, Array]:
-        """Mean and standard deviation (n,) of how far theta moved by changes at these samples, if there was one.
-
-        Two changes at neighbouring samples have some probability, and each of them may then have been of any size. The
-        mean is therefore that of their sum, and the variance at most that of the path before and after together.
-        """
-        part = slice(first, last + 1)
-        p = 1.0 - self.change_prob[part, :1]
-        mean = np.sum(p * self.shift[part], axis=0) / min(p.sum(), 1.0)
-        each = self.shift[part]
-        center = np.sum(p * each, axis=0) / p.sum()
-        var = np.sum(p * (self.shift_std[part] ** 2 + (each - center) ** 2), axis=0) / p.sum()
-        return mean, np.sqrt(np.minimum(var, self.std[max(first - 1, 0)] ** 2 + self.std[last] ** 2))
 
 
 def hypotheses_of(bank: Bank, problem: Problem) -> list[tuple[float, Problem]]:
@@ -157,12 +123,6 @@ def hypotheses_of(bank: Bank, problem: Problem) -> list[tuple[float, Problem]]:
     if bank.changes is None:
         return averaged(problem, problem.alternatives.roots[0], free, bank.gated)
     return [(1.0, matched(problem, bank.gated) if free else problem)]
-
-
-def moving(run: Track) -> Array:
-    """Variances (H_d, n) of the changes, with squared sizes for those that are free of scale."""
-    n, bank = len(run.names), run.tracker
-    return np.array([np.diag(Q) + sizes for Q, sizes in (one.increments(n) for one in bank.all_changes)])  # type: ignore[attr-defined]
 
 
 def problem_of(run: Track, faults: list[Event], kinds: Array | None = None) -> Problem:
@@ -320,14 +280,12 @@ def averaged(problem: Problem, drift: Array, free: bool, spikes: bool) -> list[t
     """
     n, count = problem.phi.shape[1], np.isfinite(problem.r).sum() - problem.phi.shape[1]
     free = free and count > 0
-    known: dict[tuple[int, ...], tuple[float, float]] = {}
+    known: dict[Point, tuple[float, float]] = {}
 
-    def at(levels: tuple[int, ...]) -> Problem:
-        roots = problem.alternatives.roots.copy()
-        roots[0] = triangular_root((drift * FACTORS[list(levels)]) @ drift.T)
-        return problem._replace(alternatives=problem.alternatives._replace(roots=roots))
+    def at(levels: Point) -> Problem:
+        return drifting(problem, triangular_root((drift * FACTORS[list(levels)]) @ drift.T))
 
-    def value(levels: tuple[int, ...]) -> float:
+    def value(levels: Point) -> float:
         """Log of the evidence, with the noise variance of greatest likelihood if it is free."""
         if levels not in known:
             evidence, squares, _ = mixture.filtered(at(levels), FEW)
@@ -342,15 +300,8 @@ def averaged(problem: Problem, drift: Array, free: bool, spikes: bool) -> list[t
         problem = matched(at((2,) * n), spikes)
         drift = drift * np.sqrt(problem.r[first] / before[first])
     top = len(FACTORS) - 1
-    best = max(((level,) * n for level in range(0, top + 1, 2)), key=value)
-    changed = True
-    while changed:
-        before = best
-        near = [tuple(np.clip(np.add(best, step), 0, top)) for step in (-1, 1)]
-        near += [(*best[:i], level, *best[i + 1 :]) for i, step in product(range(n), (-1, 1))
-                 if 0 <= (level := best[i] + step) <= top]  # fmt: skip
-        best = max((best, *(tuple(map(int, one)) for one in near)), key=value)
-        changed = best != before
+    common = max(((level,) * n for level in range(0, top + 1, 2)), key=value)
+    best = summit(value, common, lambda at: neighbours(at, [[i] for i in range(n)], top))
     shares = {levels: np.exp(logs - known[best][0]) for levels, (logs, _) in known.items()}
     likely = sorted((one for one in shares if shares[one] > LIKELY), key=lambda one: -shares[one])
     total = sum(shares[one] for one in likely)

@@ -21,8 +21,8 @@ LOG, MODE, MOVE, COST, SHARE = range(5)
 """Of a component: c, its mode, its last move, the sum of e^2 / s on its path, and the log of its integral."""
 TOTAL, FIRST, MIXED = range(3)
 """Of one that others join: the log of the integral of all, of the first, and whether there are others."""
-UNLIKELY = 11.0
-"""Log of the ratio to the most probable below which a component is dropped."""
+UNLIKELY = 10.0
+"""Log of the ratio to the most probable below which a component, or a pair of them, is dropped."""
 MINOR, FAR = 0.03, 600.0
 """Share of a noise below which it counts as the first, and log of the ratio of two densities at most."""
 ROOMY = 12
@@ -100,6 +100,14 @@ def room_for(n: int, most: int, children: int) -> Room:
 
 
 @part
+def copy_upper(A: Array, to: Array) -> None:
+    """[S | d] without the zeros below the diagonal."""
+    for i in range(len(A)):
+        for j in range(i, A.shape[1]):
+            to[i, j] = A[i, j]
+
+
+@part
 def absorb(A: Array, row: Array) -> float:
     """Rotate the row [phi | y] of noise variance 1 into A = [S | d], and return what is left of y."""
     n = A.shape[0]
@@ -171,25 +179,30 @@ def moments(A: Array, R: Array, m: Array) -> None:
 
 @shared
 def grow(K: int, now: Filter, moves: Moves, logp: Array, sizes: Array, room: Room) -> int:
-    """All moves of K components; returns the number of the children."""
-    X, facts, Y, more, row = now.A, now.facts, room.children.A, room.children.facts, room.row
-    C, best, n = 0, -np.inf, X.shape[1]
+    """All moves of K components; returns the number of the children.
+
+    A move with the drift of the move before it takes what that made of the component.
+    """
+    X, facts, Y, more, row, drifted = now.A, now.facts, room.children.A, room.children.facts, room.row, room.squares[0]
+    C, best = 0, -np.inf
     for k in range(K):
         best = max(best, facts[k, SHARE])
     for k in range(K):
-        mode = int(facts[k, MODE])
+        mode, drift, column, lower = int(facts[k, MODE]), -2, -1, 0.0
         for at in range(moves.begin[mode], moves.begin[mode + 1]):
             if facts[k, SHARE] + logp[at] < best - UNLIKELY:
                 continue
-            for i in range(n):
-                for j in range(i, n + 1):
-                    Y[C, i, j] = X[k, i, j]
-            c = facts[k, LOG] + logp[at]
-            for which in range(2):
-                G = moves.kind[at, 2 + which]
-                if G >= 0:
-                    c -= convolve(Y[C], moves.roots[G], sizes[moves.kind[at, 4 + which]], row)
-            more[C, LOG], more[C, MODE], more[C, MOVE] = c, moves.kind[at, 0], at
+            kind = moves.kind[at]
+            if kind[2] != drift or kind[-2] != column:
+                drift, column, lower = kind[2], kind[-2], 0.0
+                copy_upper(X[k], drifted)
+                if drift >= 0:
+                    lower = convolve(drifted, moves.roots[drift], sizes[column], row)
+            copy_upper(drifted, Y[C])
+            c = facts[k, LOG] + logp[at] - lower
+            if kind[1 + 2] >= 0:
+                c -= convolve(Y[C], moves.roots[kind[1 + 2]], sizes[kind[-1]], row)
+            more[C, LOG], more[C, MODE], more[C, MOVE] = c, kind[0], at
             more[C, COST], more[C, SHARE] = facts[k, COST], facts[k, SHARE] + logp[at]
             C += 1
     return C
@@ -212,44 +225,48 @@ def observe(C: int, room: Room, phi: Array, y: float, r: float, noises: Noises, 
     Each is updated by every noise that has at least `MINOR` of its probability; the others count as the first. The
     probability of others than the first is added to ``now.spikes``.
     """
-    Y, more, kind, p, copy, n = room.children.A, room.children.facts, noises.kind, room.odds, room.squares[0], len(phi)
+    Y, more, kind, p, copy = room.children.A, room.children.facts, noises.kind, room.odds, room.squares[0]
     count, L, others, everything, best = C, len(kind), 0.0, 0.0, -np.inf
+    unit = np.log(r * kind[0, 0])
     for k in range(C):
-        for i in range(n):
-            for j in range(i, n + 1 if L > 1 else 0):
-                copy[i, j] = Y[k, i, j]
-        earlier, share, total = more[k, LOG] - more[k, SHARE], more[k, SHARE], 0.0
+        if L > 1:
+            copy_upper(Y[k], copy)
+        earlier, share = more[k, LOG] - more[k, SHARE], more[k, SHARE]
         e = absorb_noise(Y[k], phi, y, r, kind[0], room.row)
         size = log_det(Y[k])
-        s = r * kind[0, 0] * np.exp(2.0 * (size - earlier))
-        f, first = e * np.sqrt(s) + kind[0, 1], noises.log_prob[int(more[k, MODE]), 0] - 0.5 * (e * e + np.log(s))
-        for l in range(L):
-            v = s + r * (kind[l, 0] - kind[0, 0])
-            p[l] = noises.log_prob[int(more[k, MODE]), l] - 0.5 * ((f - kind[l, 1]) ** 2 / v + np.log(v)) - first
-            p[l] = np.exp(min(p[l], FAR))
-            total += p[l]
-        w = share + first + np.log(total)
-        scale = np.exp(min(best - w, 0.0))
-        best = max(best, w)
-        others, everything = (
-            others * scale + np.exp(w - best) * (1.0 - p[0] / total),
-            everything * scale + np.exp(w - best),
-        )
-        for l in range(1, L):
-            if p[l] < MINOR * total:
-                p[0] += p[l]
-                continue
-            for i in range(n):
-                for j in range(i, n + 1):
-                    Y[count, i, j] = copy[i, j]
-            own = absorb_noise(Y[count], phi, y, r, kind[l], room.row)
-            more[count, MODE], more[count, MOVE] = more[k, MODE], more[k, MOVE]
-            more[count, COST], more[count, SHARE] = more[k, COST] + own * own, share + first + np.log(p[l])
-            more[count, LOG] = more[count, SHARE] + log_det(Y[count])
-            count += 1
-        more[k, SHARE], more[k, COST] = share + first + np.log(p[0]), more[k, COST] + e * e
+        logs = unit + 2.0 * (size - earlier)  # of the variance of y
+        first = noises.log_prob[int(more[k, MODE]), 0] - 0.5 * (e * e + logs)
+        more[k, COST] += e * e
+        if L > 1:
+            s, cost, total = np.exp(logs), more[k, COST] - e * e, 0.0
+            f = e * np.sqrt(s) + kind[0, 1]
+            for l in range(L):
+                v = s + r * (kind[l, 0] - kind[0, 0])
+                p[l] = noises.log_prob[int(more[k, MODE]), l] - 0.5 * ((f - kind[l, 1]) ** 2 / v + np.log(v)) - first
+                p[l] = np.exp(min(p[l], FAR))
+                total += p[l]
+            w = share + first + np.log(total)
+            scale = np.exp(min(best - w, 0.0))
+            best = max(best, w)
+            others, everything = (
+                others * scale + np.exp(w - best) * (1.0 - p[0] / total),
+                everything * scale + np.exp(w - best),
+            )
+            for l in range(1, L):
+                if p[l] < MINOR * total:
+                    p[0] += p[l]
+                    continue
+                copy_upper(copy, Y[count])
+                own = absorb_noise(Y[count], phi, y, r, kind[l], room.row)
+                more[count, MODE], more[count, MOVE] = more[k, MODE], more[k, MOVE]
+                more[count, COST], more[count, SHARE] = cost + own * own, share + first + np.log(p[l])
+                more[count, LOG] = more[count, SHARE] + log_det(Y[count])
+                count += 1
+            first += np.log(p[0])
+        more[k, SHARE] = share + first
         more[k, LOG] = more[k, SHARE] + size
-    now.spikes[0] += others / everything
+    if L > 1:
+        now.spikes[0] += others / everything
     return count
 
 
@@ -281,25 +298,33 @@ def pool(R: Array, m: Array, share: float, other: Array, mean: Array, row: Array
 
 
 @part
-def divergence(A: Array, m: Array, ahead: float, other: Array, limit: float, d: Array) -> float:
+def divergence(A: Array, m: Array, ahead: float, other: Array, limit: float) -> float:
     """KL of a Gaussian from the component A with mean m; inf beyond the limit. ``other`` are [S^-1 | mean] of the
     Gaussian, ``ahead`` is its log |S| less that of A.
+
+    The means, the diagonal with ``ahead``, and what is above it have a share each, none of them negative.
     """
     n, squares = len(m), 0.0
+    for i in range(n):
+        squares += (A[i, i] * other[i, i]) ** 2 - 1.0
+    apart = 0.5 * squares + ahead
+    if apart > limit:
+        return np.inf
+    squares = 0.0
     for i in range(n):
         t = 0.0
         for j in range(i, n):
             t += A[i, j] * (other[j, n] - m[j])
         squares += t * t
-    if 0.5 * squares > limit:
+    if apart + 0.5 * squares > limit:
         return np.inf
     for i in range(n):
-        for j in range(i, n):
+        for j in range(i + 1, n):
             t = 0.0
             for k in range(i, j + 1):
                 t += A[i, k] * other[k, j]
             squares += t * t
-    return 0.5 * (squares - n) + ahead
+    return apart + 0.5 * squares
 
 
 @shared
@@ -345,7 +370,7 @@ def nearest(N: int, now: Filter, room: Room, k: int, limit: float) -> int:
     for j in range(N):
         if now.facts[j, MODE] == more[k, MODE]:
             ahead = logs - now.facts[j, LOG] + merged[j, FIRST]
-            apart = divergence(now.A[j], room.factors[j, :, n], ahead, room.factors[most], least, room.row)
+            apart = divergence(now.A[j], room.factors[j, :, n], ahead, room.factors[most], least)
             if apart < least:
                 to, least = j, apart
     return to
@@ -373,9 +398,8 @@ def reduce(C: int, room: Room, keep: int, now: Filter) -> int:
             facts[j, COST] += w / both * (more[k, COST] - facts[j, COST])
             merged[j, TOTAL], merged[j, MIXED] = np.log(both) + best, 1.0
         elif keep > N:
-            for i in range(n):
-                for q in range(i, n + 1):
-                    X[N, i, q], scratch[N, i, q] = Y[k, i, q], scratch[len(X), i, q]
+            copy_upper(Y[k], X[N])
+            copy_upper(scratch[len(X)], scratch[N])
             for i in range(facts.shape[1]):
                 facts[N, i] = more[k, i]
             merged[N, TOTAL], merged[N, FIRST], merged[N, MIXED] = more[k, SHARE], more[k, SHARE], 0.0

@@ -14,16 +14,14 @@ readings repeat because it rests.
 
 The smoother (`driftfit.smooth.unknown_drift`) is given the noise and the course of the drift over time,
 
-    w_t(i) = f_t(i) sum_j T_ij w_{t+1}(j) / sum_h f_t(h) T_hj         probability of mode i at t, given all samples
-    q_t    = r_t sum_k w_t(k) rho_k for rho_k < 1,    1 / r_t = sum_j nu_tj / v_tj
+    q_t    = r_t times the mean of sum_k mu_k rho_k for rho_k < 1 over the next `MEMORY` samples
+    1 / r_t = sum_j nu_tj / v_tj
 
-with f_t the probabilities of modes after sample t, T their transitions, and nu_tj those of the states of the noise
-after the sample, and the regressors and outputs from which coloured
-noise was taken. Before the filters start nothing drifts.
+with mu the probabilities of the modes after a sample, which follow a drift with a delay, and nu_tj those of the states
+of the noise, on regressors and outputs from which coloured noise was taken. Before the filters start nothing drifts.
 
 Source: the moments of a noise given the data are those of an EM step, Shumway and Stoffer (1982); step^2 / 12 is
-Sheppard's (1898); the backward pass is Kim's (1994), eq. 2.20. The modes and the rule for repeats are ours. Cost per
-sample: O(K).
+Sheppard's (1898). The modes and the rule for repeats are ours. Cost per sample: O(K).
 """
 
 from __future__ import annotations
@@ -227,7 +225,7 @@ def learn_noise(s: State, l: int) -> None:
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
 
 
-SMOOTHER_FIELDS = ("mu", "prior", "r", "usual_noise", "offset", "white", "explained", "settled", "constant")
+SMOOTHER_FIELDS = ("mu", "r", "usual_noise", "offset", "white", "explained", "settled", "constant")
 """Fields that are stored at every sample."""
 
 
@@ -235,23 +233,16 @@ SMOOTHER_FIELDS = ("mu", "prior", "r", "usual_noise", "offset", "white", "explai
 def store_for_smoother(o: State, s: State, l: int) -> None:
     """Store the fields of the smoother."""
     for k in range(s.mu.shape[0]):
-        o.mu[k, l], o.prior[k, l] = s.mu[k, l], s.prior[k, l]
+        o.mu[k, l] = s.mu[k, l]
     for i in range(s.c.shape[0]):
         o.offset[i, l], o.white[i, l] = s.offset[i, l], s.white[i, l]
     o.r[l], o.usual_noise[l] = s.r[l], s.usual_noise[l]
     o.explained[l], o.settled[l], o.constant[l] = s.explained[l], s.settled[l], s.constant[l]
 
 
-def transitions(ratio: Array, arrive: Array) -> Array:
-    """T (K, K): down a ladder, or from the whole bank to a mode."""
-    down = np.where(ratio >= 1.0, AFTER, DOWN) * np.append(False, np.diff(ratio) > 0.0)
-    return np.asarray(np.diag(1.0 - down - arrive.sum()) + np.diag(down[1:], -1) + arrive)
-
-
-def modes_given_all(after: Array, ahead: Array, T: Array) -> Array:
-    """Probabilities (N, K) of the modes given all samples, from those after each sample and before the next."""
-    found, mixed = after.copy(), np.any(after != ahead, axis=1)
-    for t in range(len(found) - 2, -1, -1):
-        found[t] = after[t] * (T @ (found[t + 1] / np.maximum(ahead[t], 1e-300))) if mixed[t] else found[t + 1]
-        found[t] /= max(found[t].sum(), 1e-300)
-    return found
+def drift_ahead(ratio: Array, mu: Array) -> Array:
+    """The mean over the next `MEMORY` samples of the drift in units of r but for jumps, (T,), of modes mu (T, K)."""
+    total = np.append(0.0, np.cumsum(mu @ np.where(ratio < 1.0, ratio, 0.0)))
+    now = np.arange(len(mu))
+    until = np.minimum(now + int(MEMORY), len(mu))
+    return np.asarray((total[until] - total[now]) / (until - now))
