@@ -395,8 +395,7 @@ class Bank(Tracker):
 
     @property
     def steps(self) -> TrackerSteps:
-        own = tuple(sensor.likelihood for sensor in self.all_sensors if sensor.kind == "own")
-        return steps_of(own)
+        return steps_of(tuple(sensor.likelihood for sensor in self.all_sensors if sensor.kind == "own"))
 
 
 PARTS: dict[str, Any] = {"changes": Change, "sensors": Sensor}

@@ -7,17 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.bank.layout import (
-    HEAD,
-    MEMORY_AT,
-    MOST_REPORTED,
-    PACKED,
-    REPORT_AT,
-    REPORTED,
-    ROW,
-    ROWS,
-    SAMPLE_HEAD,
-)
+from driftfit.bank.layout import HEAD, MEMORY_AT, MOST_REPORTED, PACKED, REPORT_AT, REPORTED, ROW, ROWS, SAMPLE_HEAD
 from driftfit.bank.leaves import forget
 from driftfit.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.bank.leaves.leaf_matrix import FIRST

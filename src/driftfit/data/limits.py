@@ -173,8 +173,7 @@ def _in_utc(moment: Any, given: Any, zone: str | None) -> Any:
     """A moment given without a zone is in that of the table."""
     if zone is None or getattr(given, "tzinfo", None) is not None:
         return moment
-    local = moment.astype("datetime64[us]").item().replace(tzinfo=ZoneInfo(zone))
-    return instant(local)
+    return instant(moment.astype("datetime64[us]").item().replace(tzinfo=ZoneInfo(zone)))
 
 
 def marked(keys: Sequence[Any], owner: Array, reasons: Mapping[str, Array]) -> dict[Any, dict[str, int]]:

@@ -90,8 +90,7 @@ class Expressions:
 
     def of_attribute(self, node: ast.Attribute) -> Value:
         if node.attr == "data" and isinstance(node.value, ast.Attribute) and node.value.attr == "ctypes":
-            array = self.value(node.value.value)
-            return Value("address", begin_of(array))
+            return Value("address", begin_of(self.value(node.value.value)))
         if node.attr == "shape":
             return Value("items", constant=[number(size) for size in self.owner(node.value)[0].shape])
         owner = self.value(node.value)
@@ -174,8 +173,7 @@ class Expressions:
         return self.refuse(node)  # type: ignore[no-any-return]
 
     def of_binop(self, node: ast.BinOp) -> Value:
-        one = self.value(node.left)
-        return self.binary(node.op, one, self.value(node.right))
+        return self.binary(node.op, self.value(node.left), self.value(node.right))
 
     def binary(self, operation: ast.operator, one: Value, other: Value) -> Value:
         """One operation on two numbers."""

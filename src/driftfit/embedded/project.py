@@ -52,8 +52,7 @@ def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
 
 def filled(name: str, **values: Any) -> str:
     """The text of a file with these values."""
-    text = (PLACE / name).read_text(encoding="utf-8")
-    return re.sub(r"@(\w+)@", lambda found: str(values[found[1]]), text)
+    return re.sub(r"@(\w+)@", lambda found: str(values[found[1]]), (PLACE / name).read_text(encoding="utf-8"))
 
 
 KNOWN = """Known of the next samples, and kept until changed: interval (nominal intervals since

@@ -82,8 +82,7 @@ def kernel(function: Callable[..., Any], inline: bool = True, short: bool = Fals
     """
     inline = inline and not short
     compiled = _compiled(function, short=short, forceinline=inline, **internals.LINKED)
-    made = internals.as_part(compiled, internals.StepDispatcher, for_constants=inline, short=short)
-    return made
+    return internals.as_part(compiled, internals.StepDispatcher, for_constants=inline, short=short)
 
 
 def shared(function: Callable[..., Any], arrays: bool = False) -> Any:
@@ -95,8 +94,7 @@ def shared(function: Callable[..., Any], arrays: bool = False) -> Any:
     times as long. One that makes ``arrays``, for drivers only, says so.
     """
     options = {**internals.LINKED, "_nrt": arrays}
-    compiled = _compiled(function, cache=True, forceinline=False, **options)
-    return internals.as_part(compiled)
+    return internals.as_part(_compiled(function, cache=True, forceinline=False, **options))
 
 
 def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] = ()) -> Any:

@@ -265,5 +265,4 @@ def _undivided(run: Track, phi: Array, y: Array, level: float, why: str) -> Segm
             freedom = max(N - np.linalg.matrix_rank(R), 1)
             std = np.sqrt(np.sum(inverse**2, axis=1) / N * (e @ e) / freedom)
             std = np.where(undetermined(phi), np.inf, std)
-    one = Segment(0, len(run), theta, std)
-    return Segmentation((), (one,), level, float("nan"), spread, (), run, why)
+    return Segmentation((), (Segment(0, len(run), theta, std),), level, float("nan"), spread, (), run, why)

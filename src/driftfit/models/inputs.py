@@ -154,8 +154,7 @@ class LinearisedTransfer(CountedInputs):
                 )
 
     def held_at(self, theta: Array) -> Self:
-        held = tuple(np.asarray(theta, dtype=float).tolist())
-        return replace(self, point=held)  # type: ignore[type-var]
+        return replace(self, point=tuple(np.asarray(theta, dtype=float).tolist()))  # type: ignore[type-var]
 
 
 class NamedInputs(Model):

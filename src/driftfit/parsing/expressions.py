@@ -37,8 +37,7 @@ def _call(text: str, main: Mapping[str, type[Any]]) -> Any:
     if len(text) > LONGEST:
         raise ValueError(f"the expression has {len(text)} characters; at most {LONGEST} are read.")
     try:
-        tree = ast.parse(text.strip(), mode="eval").body
-        return _value(tree, {**_known(), **main})
+        return _value(ast.parse(text.strip(), mode="eval").body, {**_known(), **main})
     except (SyntaxError, RecursionError, MemoryError):
         raise ValueError(f"{text!r} is not an expression such as ARX(2, 2) or Kalman(q=1e-4, r=0.1).") from None
 

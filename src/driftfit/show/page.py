@@ -101,8 +101,7 @@ def svg(figure: Figure, thin: bool = False) -> str:
     drawn = re.sub(r"<metadata>.*?</metadata>", "", drawn, flags=re.S)
     for colour, name in COLOURS.items():
         drawn = drawn.replace(colour, f"var(--{name})")
-    drawn = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px system-ui, sans-serif", drawn)
-    return drawn
+    return re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px system-ui, sans-serif", drawn)
 
 
 def _inked(axis: object) -> None:

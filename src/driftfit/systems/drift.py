@@ -123,8 +123,7 @@ class Free(Law):
     function: Callable[[Array], Array]
 
     def path(self, T: int, rng: np.random.Generator) -> Array:
-        values = np.broadcast_to(np.asarray(self.function(np.arange(T)), dtype=float), (T,))
-        return np.array(values)
+        return np.array(np.broadcast_to(np.asarray(self.function(np.arange(T)), dtype=float), (T,)))
 
 
 def paths(laws: Sequence[Law | float | Callable[[Array], Array]], T: int, rng: np.random.Generator) -> Array:

@@ -67,15 +67,7 @@ from driftfit.trackers.forms.excitation import (
     window,
 )
 from driftfit.trackers.forms.information import partly_known
-from driftfit.trackers.mixture.filters import (
-    enter_filters,
-    innovate,
-    mix,
-    mixture,
-    predict,
-    update_filters,
-    weigh,
-)
+from driftfit.trackers.mixture.filters import enter_filters, innovate, mix, mixture, predict, update_filters, weigh
 from driftfit.trackers.mixture.learned import (
     begin_with_drift,
     centring,

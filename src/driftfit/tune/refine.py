@@ -93,8 +93,7 @@ def _at(run: R, point: Array, tracker: Tracker | None = None) -> R:
             f"refine: {type(run.model).__name__} is not linearised, so there is nothing to refine; it is for OE, "
             "ARMAX, BoxJenkins, PolynomialModel and ContinuousTransfer."
         )
-    program = replace(run.program, model=model, tracker=run.tracker if tracker is None else tracker)
-    return run.run_by(program)
+    return run.run_by(replace(run.program, model=model, tracker=run.tracker if tracker is None else tracker))
 
 
 def _downhill(run: Track, point: Array, goal: Array) -> Array | None:

@@ -363,8 +363,7 @@ class Criterion:
 
 def run_task(task: Task, tracker: Tracker) -> list[Track]:
     """Track the records of a task."""
-    program = Program(task.model, tracker)
-    return [track_record(program, record) for record in task.records]
+    return [track_record(Program(task.model, tracker), record) for record in task.records]
 
 
 def _smoothed_score(task: Task, tracker: Tracker, method: str) -> float:

@@ -379,8 +379,7 @@ def drawn(mean: Array, cov: Array, D: int, seed: int) -> Array:
 def _noise(run: Track) -> Array:
     """Innovation variance of the last sample used, (T,)."""
     s = np.where(run.ok & np.isfinite(run.innovation_std), run.innovation_std**2, np.nan)
-    place = np.maximum.accumulate(np.where(np.isfinite(s), np.arange(len(s)), 0))
-    return np.asarray(s[place])
+    return np.asarray(s[np.maximum.accumulate(np.where(np.isfinite(s), np.arange(len(s)), 0))])
 
 
 def _spans(run: Track) -> tuple[Array, Array]:

@@ -139,8 +139,7 @@ def covariances(run: Followed) -> Array:
 
 def _finite(cov: Array) -> Array:
     """Covariances (T, n, n); all entries of one are NaN if a parameter is not determined yet."""
-    known = np.asarray(np.isfinite(cov).all(axis=(1, 2), keepdims=True))
-    return np.where(known, cov, np.nan)
+    return np.where(np.asarray(np.isfinite(cov).all(axis=(1, 2), keepdims=True)), cov, np.nan)
 
 
 def taken(run: Followed, at: Any) -> tuple[Array, Array]:
@@ -161,8 +160,7 @@ def poles(run: Followed, at: Any = None) -> Array:
     theta = run.theta if at is None else run.theta[np.atleast_1d(at)]
     matrices = companion(linear(run).transfers(theta)[0])
     roots = np.linalg.eigvals(matrices).astype(complex) if matrices.shape[1] else np.zeros((len(theta), 0), complex)
-    order = np.argsort(-np.abs(roots), axis=1, kind="stable")
-    return np.take_along_axis(roots, order, axis=1)
+    return np.take_along_axis(roots, np.argsort(-np.abs(roots), axis=1, kind="stable"), axis=1)
 
 
 def largest_pole(run: Followed, at: Any = None) -> Response:

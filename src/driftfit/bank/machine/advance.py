@@ -13,13 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.bank.layout import (
-    FORECAST,
-    NEVER,
-    READY,
-    SAMPLE_HEAD,
-    table_at,
-)
+from driftfit.bank.layout import FORECAST, NEVER, READY, SAMPLE_HEAD, table_at
 from driftfit.bank.leaves.forecast import expect, expect_together, weighted
 from driftfit.bank.leaves.forget import BEFORE, GROWTH, PER_CAP, for_interval, foresee
 from driftfit.bank.leaves.lags import push, shift_covariance, widen_by_lags

@@ -102,8 +102,7 @@ class Store:
 
     def results(self) -> Any:
         """The results of all complete batches: a row per sample."""
-        columns = self.schema_of("results")
-        return self.read("result").select("batch", *columns)
+        return self.read("result").select("batch", *self.schema_of("results"))
 
     def states(self, batch: int | None = None) -> Any:
         """The states after a batch, the last one by default: a row per unit."""

@@ -37,16 +37,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks, numbers, one_of, plain, whole
 from driftfit.judge.alarms.band import band
 from driftfit.judge.alarms.bootstrap import RECORDS, limits, simulated
-from driftfit.judge.alarms.reference import (
-    Reference,
-    burn,
-    doubt,
-    in_samples,
-    least,
-    modelled,
-    rows_of,
-    with_offset,
-)
+from driftfit.judge.alarms.reference import Reference, burn, doubt, in_samples, least, modelled, rows_of, with_offset
 from driftfit.judge.plots import plot_alarms
 from driftfit.judge.verdict import p_text
 from driftfit.run.live.alarm import Change, change_of

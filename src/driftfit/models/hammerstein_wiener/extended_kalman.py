@@ -199,8 +199,7 @@ class ExtendedKalman(Minimal):
         }
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
-        structure = structure_of("ExtendedKalman", model)
-        return {**self.state(structure.n_x), "blocks": minimal_memory(model)}
+        return {**self.state(structure_of("ExtendedKalman", model).n_x), "blocks": minimal_memory(model)}
 
     def steps_for(self, model: Model) -> TrackerSteps:
         return _steps(structure_of("ExtendedKalman", model), np.ndim(self.q) == 2)

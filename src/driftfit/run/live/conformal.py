@@ -89,8 +89,7 @@ class ConformalFactor:
 def factors(e: Array, s: Array, level: float) -> Array:
     """(T + 1,): the factor before each sample of a record, and after the last."""
     factor = ConformalFactor(level)
-    values = [1.0, *(factor.update(*sample) for sample in zip(e.tolist(), s.tolist(), strict=True))]
-    return np.array(values)
+    return np.array([1.0, *(factor.update(*sample) for sample in zip(e.tolist(), s.tolist(), strict=True))])
 
 
 def widened(e: Array, s: Array, level: float, name: str) -> Array:

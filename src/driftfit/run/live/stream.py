@@ -29,18 +29,7 @@ from driftfit.run.live.fixed_lag import Window
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import programs_of, state_of, tile_of
 from driftfit.run.result import Plain, burn_in
-from driftfit.run.warm_start import (
-    KINDS,
-    End,
-    Run,
-    by_output,
-    carried,
-    ended,
-    gate_from,
-    read,
-    restore,
-    written,
-)
+from driftfit.run.warm_start import KINDS, End, Run, by_output, carried, ended, gate_from, read, restore, written
 from driftfit.trackers.base import Tracker
 
 KNOWN = ("interval", "noise", "drift")

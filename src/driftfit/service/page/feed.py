@@ -192,8 +192,7 @@ class Feed:
             writer.write(packed(header, body))
             await writer.drain()
             length = int.from_bytes(await reader.readexactly(4), "big")
-            answer = json.loads(await reader.readexactly(length))
-            return dict(answer)
+            return dict(json.loads(await reader.readexactly(length)))
         finally:
             writer.close()
 

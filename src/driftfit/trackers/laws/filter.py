@@ -190,8 +190,7 @@ def correct_state(x: Array, C: Array, work: Array, now: Array) -> None:
 @shared
 def inform(A: Array, R: Array, z: Array, work: Array, now: Array) -> None:
     """Take the sample as information about delta: turn a / sqrt(s), e / sqrt(s) into R, z."""
-    N, root = len(A), 1.0 / np.sqrt(now[S])
-    row = work[W]
+    N, root, row = len(A), 1.0 / np.sqrt(now[S]), work[W]
     for d in range(N):
         row[d] = work[B, d] * root
         for c in range(N):
@@ -210,35 +209,22 @@ def inform(A: Array, R: Array, z: Array, work: Array, now: Array) -> None:
 
 
 @shared
-def determined(R: Array) -> bool:
-    """Whether R determines all directions of delta that regressors have reached."""
-    for d in range(len(R)):
+def settle(x: Array, C: Array, A: Array, R: Array, z: Array, free: Array) -> float:
+    """Take in delta, as far as regressors have reached it; returns -2 log likelihood of it, and 0 if it has to wait."""
+    N, total = len(R), 0.0
+    for d in range(N):
         square = 0.0
         for c in range(d + 1):
             square += R[c, d] * R[c, d]
         if R[d, d] * R[d, d] < DETERMINED * square:
-            return False
-    return True
-
-
-@shared
-def settle(x: Array, C: Array, A: Array, R: Array, z: Array, free: Array) -> float:
-    """Take in delta, as far as regressors have reached it; returns -2 log likelihood of it, and 0 if it has to wait."""
-    N, total = len(R), 0.0
-    if not determined(R):
-        return 0.0
-    for d in range(N):
+            return 0.0
         total += (2.0 * log(R[d, d]) - LOG_2_PI if R[d, d] > 0.0 else 0.0) - z[d] * z[d]
     for i in range(N):  # row i of A R^-1, in the place of the columns of A that are taken in
         for d in range(N):
             if R[d, d] > 0.0:
-                t = A[i, d]
                 for c in range(d):
-                    t -= R[c, d] * A[i, c] if R[c, c] > 0.0 else 0.0
-                A[i, d] = t / R[d, d]
-    for i in range(N):
-        for d in range(N):
-            if R[d, d] > 0.0:
+                    A[i, d] -= R[c, d] * A[i, c] if R[c, c] > 0.0 else 0.0
+                A[i, d] /= R[d, d]
                 x[i, 0] += A[i, d] * z[d]
                 for j in range(i + 1):
                     C[i, j] += A[i, d] * A[j, d]
