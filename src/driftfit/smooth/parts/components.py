@@ -21,7 +21,7 @@ LOG, MODE, MOVE, COST, SHARE = range(5)
 """Of a component: c, its mode, its last move, the sum of e^2 / s on its path, and the log of its integral."""
 TOTAL, FIRST, MIXED = range(3)
 """Of one that others join: the log of the integral of all, of the first, and whether there are others."""
-UNLIKELY = 10.0
+UNLIKELY = 11.0
 """Log of the ratio to the most probable below which a component, or a pair of them, is dropped."""
 MINOR, FAR = 0.03, 600.0
 """Share of a noise below which it counts as the first, and log of the ratio of two densities at most."""
