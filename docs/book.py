@@ -16,6 +16,7 @@ SCRIPT = re.compile(r"examples/(\w+)\.py")
 MODULE = re.compile(r"\]\((?:\.\./)+src/driftfit/([\w/]+)\.py\)")
 FOLDERS = {
     "trackers": "Trackers",
+    "bank": "Banks of hypotheses",
     "readings": "The gate in front of trackers",
     "models": "Models",
     "smooth": "Smoothers",

@@ -273,7 +273,7 @@ def selftest(folder, name, compiler, run):
 def test_a_wrong_bit_fails_the_self_test(tmp_path):
     export_c(ARX(2, 2), AdaptiveKalman(), tmp_path)
     source = tmp_path / "tracker.c"
-    source.write_text(source.read_text().replace("R(0.97)", "R(0.97000000000001)"))
+    source.write_text(source.read_text().replace("R(0.05)", "R(0.05000000000001)"))
     command = ["gcc", *STRICT, "-o", str(tmp_path / "st"), str(source), str(tmp_path / "selftest.c"), "-lm"]
     subprocess.run(command, check=True)
     assert subprocess.run([str(tmp_path / "st")], capture_output=True, check=False).returncode == 1
