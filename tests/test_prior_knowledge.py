@@ -110,6 +110,7 @@ def test_structural_models_are_those_of_statsmodels():
     other = sm.tsa.UnobservedComponents(
         y, "lltrend", freq_seasonal=[{"period": 12, "harmonics": 6}], use_exact_diffuse=True
     )
+    assert all(Law.season(p, p // 2, q=1.0).components(0)[-1][-1] == 0.0 for p in range(2, 400, 2))  # half a wave
     trend, season = (law for _, law in tuned.tracker.laws)
     given = other.smooth([tuned.tracker.r, trend.level, trend.q, season.q])
     assert tuned.loglik == pytest.approx(given.llf + 6.5 * np.log(2.0 * np.pi), abs=1e-6)  # 13 unknown components

@@ -186,9 +186,8 @@ class Partition:
             else:
                 runs = Outputs(programs, found.records.some(j, j + 1), own, {}, {}).values()
             for run, of in zip(runs, self.task.suffixes, strict=True):
-                truth = verdict(run)
-                nan = float("nan")
-                one = Judgement(j, truth, nan, nan, truth.drifts, truth.pays, coverage(run), len(run.left_out))
+                truth, nan = verdict(run), float("nan")
+                one = Judgement(j, truth, nan, nan, truth.drifts, truth.pays, coverage(run), len(run.left_out)).columns
                 for name in VERDICT:
-                    columns[f"{name}{of}"].append(one.columns[name])
+                    columns[f"{name}{of}"].append(one[name])
         return columns

@@ -135,7 +135,7 @@ class Law(Settings):
         noise = (self.q or 0.0) if self.kind == "season" else (self.std or 0.0) ** 2
         found: list[tuple[float, ...]] = []
         for k in range(1, self.harmonics + 1):
-            angle = 2.0 * np.pi * k / (self.period or 1.0)
+            angle = np.pi * (2.0 * k / (self.period or 1.0))  # exactly pi for half a wave
             hidden = 0.0 if angle == np.pi else noise
             found += [(i, 1.0, COSINE, angle, damping, noise), (i, 0.0, SINE, angle, damping, hidden)]
         return found
