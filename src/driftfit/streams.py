@@ -10,6 +10,7 @@ from driftfit.models.hammerstein_wiener.blocks import Separator
 from driftfit.models.hammerstein_wiener.separation import Groups
 from driftfit.run.live import live
 from driftfit.use.constrained import Constrained, constrain
+from driftfit.use.control import Plan, control
 from driftfit.use.forecast import Forecast, forecast_stream
 from driftfit.use.system import LiveSystem
 
@@ -38,6 +39,41 @@ class Live(live.Live, public=True):
         outstanding the first row of u is the input that it would receive.
         """
         return forecast_stream(self, h, u)
+
+    def control(
+        self, target: Any, horizon: int = 10, limits: Any = None, *, move: Any = None, effort: float = 0.0,
+        caution: float = 1.0, probe: float = 0.0, u: Any = None,
+    ) -> Plan:  # fmt: skip
+        """The next inputs that bring the output of an `ARX` model to a target; see `driftfit.use.control`.
+
+        Parameters
+        ----------
+        target : number or (horizon,)
+            The outputs that are wanted at the next samples.
+        horizon : int
+            Samples ahead; longer than the delays of the inputs.
+        limits : (low, high) or None
+            Of the inputs, each a number or one for every input.
+        move : number, (m,) or None
+            Largest change of an input in a sample.
+        effort : number
+            Cost of a squared change of an input, where a squared error of the output costs 1.
+        caution : number
+            Factor of the standard deviations of theta: 0 is certainty equivalence, 1 cautious control.
+        probe : number
+            How much the first input may cost for what it teaches, as a share of the cost of the uncertainty of theta.
+        u : (horizon, m) or None
+            Inputs that are known, NaN where they are to be chosen; None: all are chosen.
+
+        The first of the inputs is that which `apply` expects, or else that of the next sample. Where nothing can be
+        planned yet the inputs stay as they are, and ``held`` says why.
+
+        Raises
+        ------
+        ValueError
+            For another model, a tracker without a covariance unless caution is 0, or limits that cannot be kept.
+        """
+        return control(self, target, horizon, limits, move, effort, caution, probe, u)
 
     def constrain(self, *constraints: str) -> Constrained:
         """The present theta within constraints, as `Track.constrain`, with T = 1."""
