@@ -73,7 +73,7 @@ class Live(live.Live, public=True):
         ValueError
             For another model, a tracker without a covariance unless caution is 0, or limits that cannot be kept.
         """
-        return control(self, target, horizon, limits, move, effort, caution, probe, u)
+        return control(self, target, horizon, limits, move=move, effort=effort, caution=caution, probe=probe, u=u)
 
     def constrain(self, *constraints: str) -> Constrained:
         """The present theta within constraints, as `Track.constrain`, with T = 1."""

@@ -69,9 +69,29 @@ class Plan(NamedTuple):
             yield f" The inputs are held: {self.held}."
 
 
+class Inputs(NamedTuple):
+    """What is known of the inputs before they are chosen."""
+
+    last: Array
+    """(m,): the input before; 0 within the limits if it is not known."""
+    given: Array
+    """(h, m): inputs that are not to be chosen; NaN elsewhere."""
+    low: Array
+    high: Array
+    """(h, m), infinite without limits; an input that is outside returns by its moves."""
+    move: Array
+    """(m,): largest change, infinite without one."""
+
+    @property
+    def held(self) -> Array:
+        """(h m,): every input stays as it is."""
+        return np.where(np.isfinite(self.given), self.given, self.last).ravel()
+
+
 def control(
-    live: Live, target: Any, horizon: int, limits: Any, move: Any, effort: float, caution: float, probe: float, u: Any
-) -> Plan:
+    live: Live, target: Any, horizon: int, limits: Any, *,
+    move: Any, effort: float, caution: float, probe: float, u: Any,
+) -> Plan:  # fmt: skip
     """See `driftfit.Live.control`."""
     model, tracker = live.model, live.tracker
     if not isinstance(model, ARX) or len(model.outputs) > 1 or not model.m or tracker.slopes:
@@ -79,7 +99,7 @@ def control(
             "control: needs a stream of an ARX model with inputs and one output, whose parameters have no slopes; "
             f"got {model!r} with {tracker!r}."
         )
-    rho, c, share = (
+    cost, c, share = (
         float(numbers("control", name, one, ndim=0, low=0.0))
         for name, one in (("effort", effort), ("caution", caution), ("probe", probe))
     )
@@ -87,29 +107,15 @@ def control(
         raise ValueError(f"control: {type(tracker).__name__} carries no covariance; give caution=0.")
     given, lane, late = future(model, horizon, u), live.lane(), int(live.awaits)
     goal = np.broadcast_to(np.asarray(numbers("control", "target", target)), horizon)
-    last, known = lane["u_lag"][:, late], np.isfinite(given).ravel()
-    low, high, step = _bounds(limits, move, last, horizon)
-    last = np.where(np.isfinite(last), last, np.clip(0.0, low[0], high[0]))
-    v = np.where(np.isfinite(given), given, last).ravel()
-    if held := _held(live, c):
+    inputs = _inputs(limits, move, lane["u_lag"][:, late], given)
+    if held := _held(live, lane, late):
         nothing = np.full(horizon, np.nan)
-        return Plan(_shaped(v, model.m), nothing, nothing.copy(), held)
-    rest, effect = _responses(model, lane, _points(live, horizon, c), late)
-    A, b = effect.reshape(-1, v.size), (goal - rest).ravel()  # a sum over points, for which J has a mean
-    D = np.eye(v.size) - np.eye(v.size, k=-model.m)
-    first = np.concatenate([last, np.zeros(v.size - model.m)])
-    weight = np.sqrt(len(rest) * rho + LIGHT * max(np.max(np.sum(A**2, axis=0)), np.finfo(float).tiny))
-    A, b = np.vstack([A, weight * D]), np.concatenate([b, weight * first])
-    G, h = np.vstack([np.eye(v.size), -np.eye(v.size), D, -D]), np.concatenate(
-        [low.ravel(), -high.ravel(), first - np.tile(step, horizon), -first - np.tile(step, horizon)]
-    )  # fmt: skip
-    b, h = b - A[:, known] @ v[known], h - G[:, known] @ v[known]
-    used = np.isfinite(h) & G[:, ~known].any(axis=1)
-    v[~known] = _least_distance(A[:, ~known], b, G[np.ix_(used, ~known)], h[used])
+        return Plan(_shaped(inputs.held, model.m), nothing, nothing.copy(), held)
+    rest, effect = _responses(model, lane, _points(live, lane, horizon, c), late)
+    v = _cheapest(goal - rest, effect, cost, inputs)
     if share:
-        for j in np.flatnonzero(~known[: model.m]):
-            ends = max(low[0, j], last[j] - step[j]), min(high[0, j], last[j] + step[j])
-            v[j] = _probing(v, j, share, rest, effect, float(A[:, j] @ A[:, j]), ends)
+        for j in np.flatnonzero(np.isnan(given[0])).tolist():
+            v[j] = _probing(v, j, share, rest, effect, inputs)
     outputs = rest + effect @ v
     return Plan(_shaped(v, model.m), outputs.mean(axis=0), outputs.std(axis=0))
 
@@ -118,38 +124,37 @@ def _shaped(v: Array, m: int) -> Array:
     return v if m == 1 else v.reshape(-1, m)
 
 
-def _bounds(limits: Any, move: Any, last: Array, h: int) -> tuple[Array, Array, Array]:
-    """(low (h, m), high (h, m), move (m,)), infinite where there is none; an input outside returns by its moves."""
-    m = len(last)
+def _inputs(limits: Any, move: Any, last: Array, given: Array) -> Inputs:
+    """The inputs within limits, after the last (m,), NaN if it is not known."""
     ends = (-np.inf, np.inf) if limits is None else [numbers("control", "limits", one) for one in limits]
     if len(ends) != 2 or not np.all(np.asarray(ends[0]) <= np.asarray(ends[1])):
         raise ValueError(f"control: limits are (low, high), numbers or one for each input; got {limits!r}.")
-    given = np.inf if move is None else numbers("control", "move", move, low=0.0, strict=True)
-    low, high, step = (np.broadcast_to(np.asarray(one, float), m) for one in (*ends, given))
-    reach = np.arange(1, h + 1)[:, None] * step
-    back = np.where(np.isfinite(last), last, np.clip(0.0, low, high))
-    return np.minimum(low, back + reach), np.maximum(high, back - reach), step
+    most = np.inf if move is None else numbers("control", "move", move, low=0.0, strict=True)
+    low, high, step = (np.broadcast_to(np.asarray(one, float), len(last)) for one in (*ends, most))
+    last = np.where(np.isfinite(last), last, np.clip(0.0, low, high))
+    reach = np.arange(1, len(given) + 1)[:, None] * step
+    return Inputs(last, given, np.minimum(low, last + reach), np.maximum(high, last - reach), step)
 
 
-def _held(live: Live, c: float) -> str:
+def _held(live: Live, lane: Any, late: int) -> str:
     """Why nothing can be planned, if so."""
-    lane, late = live.lane(), int(live.awaits)
     if not np.isfinite(live.theta).all() or (live.tracker.covariance and not np.isfinite(live.std).all()):
         return "the data do not determine all parameters yet; apply a test signal"
-    lags = [lane["y_lag"][:lag] if what == "y" else lane["u_lag"][j, late:lag] for what, j, lag in live.model.terms]
+    lags = [
+        lane["y_lag"][:lag] if what == "y" else lane["u_lag"][j, late:lag] for what, j, lag in live.model.terms or ()
+    ]
     return "" if all(np.isfinite(one).all() for one in lags) else "outputs or inputs of the last samples are missing"
 
 
-def _points(live: Live, h: int, c: float) -> Array:
+def _points(live: Live, lane: Any, h: int, c: float) -> Array:
     """(S, h, n): points with the mean and covariance of theta at the next samples."""
     program = live.programs[0]
-    tile = program.resting(live.lane())
+    tile = program.resting(lane)
     update, nothing = program.drivers().updater(tile, program.model.m), one_or_all(np.full(program.model.m, np.nan))
-    n = program.model.n
+    n, lane = program.model.n, state_of(tile)
     found = np.empty((2 * n if c else 1, h, n))
     for k in range(h):
         update(as_compiled(tile), np.nan, nothing)
-        lane = state_of(tile)
         found[:, k] = lane["theta"]
         if c:
             values, vectors = np.linalg.eigh(live.tracker.cov(lane))
@@ -178,6 +183,24 @@ def _responses(model: ARX, lane: Any, points: Array, late: int) -> tuple[Array, 
     return rest, effect.reshape(S, h, -1)
 
 
+def _cheapest(short: Array, effect: Array, cost: float, inputs: Inputs) -> Array:
+    """The inputs (h m,) that make J smallest, where ``short`` (S, h) is what the outputs lack without them."""
+    v, free = inputs.held, np.isnan(inputs.given).ravel()
+    D = np.eye(v.size) - np.eye(v.size, k=-len(inputs.last))
+    before = np.zeros(v.size)
+    before[: len(inputs.last)] = inputs.last
+    A = effect.reshape(-1, v.size)  # a sum over the points; J has a mean
+    weight = np.sqrt(len(short) * cost + LIGHT * max(np.max(np.sum(A**2, axis=0)), np.finfo(float).tiny))
+    A, b = np.vstack([A, weight * D]), np.concatenate([short.ravel(), weight * before])
+    moves = np.tile(inputs.move, len(inputs.given))
+    G = np.vstack([np.eye(v.size), -np.eye(v.size), D, -D])
+    h = np.concatenate([inputs.low.ravel(), -inputs.high.ravel(), before - moves, -before - moves])
+    b, h = b - A[:, ~free] @ v[~free], h - G[:, ~free] @ v[~free]
+    used = np.isfinite(h) & G[:, free].any(axis=1)
+    v[free] = _least_distance(A[:, free], b, G[np.ix_(used, free)], h[used])
+    return v
+
+
 def _least_distance(A: Array, b: Array, G: Array, h: Array) -> Array:
     """The x for which |A x - b| is smallest, subject to G x >= h; A has full column rank."""
     from scipy.optimize import nnls  # with others a third of the time of importing the package
@@ -198,17 +221,15 @@ def _least_distance(A: Array, b: Array, G: Array, h: Array) -> Array:
     return np.asarray(x + np.linalg.solve(R, -scale * r[:-1] / r[-1]))
 
 
-def _probing(
-    v: Array, j: int, share: float, rest: Array, effect: Array, curvature: float, ends: tuple[float, float]
-) -> float:
+def _probing(v: Array, j: int, share: float, rest: Array, effect: Array, inputs: Inputs) -> float:
     """The first value of input j, moved to where it tells more."""
-    S = len(rest)
-    acts = np.flatnonzero(effect[:, :, j].any(axis=0))
-    outputs = rest + effect @ v
+    outputs, by = rest + effect @ v, effect[:, :, j]
+    acts = np.flatnonzero(by.any(axis=0))
     if not len(acts):
         return float(v[j])
-    d = np.sqrt(share * S * outputs.var(axis=0).sum() / curvature)
+    d = np.sqrt(share * outputs.var(axis=0).sum() / np.sum(np.mean(by**2, axis=0)))
+    last, step = inputs.last[j], inputs.move[j]
+    ends = max(inputs.low[0, j], last - step), min(inputs.high[0, j], last + step)
     around = [float(np.clip(v[j] + off, *ends)) for off in (-d, d)]
-    k = acts[0]
-    told = [np.var(outputs[:, k] + effect[:, k, j] * (one - v[j])) for one in around]
+    told = [np.var(outputs[:, acts[0]] + by[:, acts[0]] * (one - v[j])) for one in around]
     return around[int(np.argmax(told))]
