@@ -37,6 +37,7 @@ from service_support import (
     until,
 )
 
+import driftfit
 from driftfit.service.connect.http import INCOMING
 from driftfit.service.control import Control
 from driftfit.service.core.journal import sum_of
@@ -213,6 +214,23 @@ def test_a_program_on_this_machine_needs_no_password_and_a_foreign_page_cannot_a
     assert ask("POST", "/api/actions", b"[" * 50_000)[0] == 400
     assert ask("POST", "/api/actions", act | {"unit": "nobody"})[0] == 404
     assert engine.intake.take(10, 0.0).actions == []
+
+
+def test_a_unit_from_a_file(client):
+    """The answer of the command for the record that ships, or its message."""
+    ask, pump = client(), Path(driftfit.__file__).parent / "demo" / "pump.csv"
+    status, body = ask("POST", "/api/identify?y=flow&name=../pump 7", pump.read_bytes())
+    found = json.loads(body)
+    assert status == 200
+    assert found["headline"].startswith("The effect of pressure on flow")
+    assert 'name = "___pump_7"' in found["unit"]
+    assert found["page"].startswith("<!doctype html>")
+    for query, text in (("y=level", "no column 'level'"), ("y=--help", "no column '--help'"), ("", "")):
+        status, body = ask("POST", f"/api/identify?{query}", pump.read_bytes()[:3000] if query else b"\x00garbage")
+        assert status == 400
+        assert text in json.loads(body)["error"]
+    viewer = client(user=USERS)
+    assert viewer("POST", "/api/identify", b"", authorization=f"Bearer {WATCHER[0]}")[0] == 403
 
 
 ACT = {"unit": "a", "do": "acknowledge", "why": "seen"}

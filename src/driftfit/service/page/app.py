@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import io
 import json
+import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import AsyncIterator
@@ -34,6 +36,8 @@ from driftfit.service.page.openapi import ACTIONS, OPERATIONS, description
 STATIC = Path(__file__).parent / "static"
 LOGIN_RATE = 0.1
 """Attempts a second to log in, of one client on average; ten at once."""
+IDENTIFY_SECONDS = 180.0
+"""For a record from which a unit is made."""
 REFRESH_SECONDS = 0.4
 """Time between two messages to an open page."""
 REQUEST_BYTES = 2000
@@ -47,7 +51,7 @@ class Page:
         self.options, self.feed, self.sessions = options, feed, sessions
         self.sockets = Sockets(feed, options.viewers)
         self.logins = Rates(LOGIN_RATE, 100.0)
-        self.scrypt = asyncio.Semaphore(1)
+        self.scrypt, self.identifying = asyncio.Semaphore(1), asyncio.Lock()
 
     def app(self) -> Starlette:
         api: list[BaseRoute] = [
@@ -148,9 +152,8 @@ class Page:
             table.write_ipc(file)
             return file.getvalue()
 
-        safe = "".join(one if one.isalnum() or one in "-_" else "_" for one in name)[:100]
         types = {"csv": "text/csv; charset=utf-8", "arrow": "application/vnd.apache.arrow.file"}
-        headers = {"content-disposition": f'attachment; filename="{safe}.{kind}"'}
+        headers = {"content-disposition": f'attachment; filename="{_safe(name)}.{kind}"'}
         return Response(await run_in_threadpool(made), media_type=types[kind], headers=headers)
 
     async def events(self, request: Request) -> Response:
@@ -195,6 +198,33 @@ class Page:
         given |= {"who": user, "why": why.strip()}
         self.number(name)
         return await self.asked({"do": "act", "unit": name, "action": given})
+
+    async def identify(self, request: Request) -> Response:
+        """What `driftfit identify` says of a record, with its page; one record at a time, in a process of its own."""
+        self.operator(request)
+        if self.identifying.locked():
+            raise HTTPException(429, "another record is being identified; wait until it is done")
+        name, y = _safe(request.query_params.get("name", "")) or "unit", request.query_params.get("y", "")
+        async with self.identifying:
+            with tempfile.TemporaryDirectory() as folder:
+                place = Path(folder)
+                (place / f"{name}.csv").write_bytes(await request.body())
+                options = ["--quiet", "--json", "-", "--page", "page.html", *([f"--y={y}"] if y else [])]
+                process = await asyncio.create_subprocess_exec(
+                    sys.executable, "-m", "driftfit", "identify", f"./{name}.csv", *options,
+                    cwd=place, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+                )  # fmt: skip
+                try:
+                    found, said = await asyncio.wait_for(process.communicate(), IDENTIFY_SECONDS)
+                except TimeoutError:
+                    raise HTTPException(503, "the record takes too long; identify a shorter one") from None
+                finally:
+                    if process.returncode is None:
+                        process.kill()
+                if not found:
+                    raise HTTPException(400, said.decode(errors="replace").strip()[-1000:])
+                page = (place / "page.html").read_text(encoding="utf-8")
+        return Answer(json.loads(found) | {"page": page})
 
     async def asked(self, header: dict[str, Any], body: bytes = b"") -> Response:
         try:
@@ -242,6 +272,11 @@ class Page:
 
     async def healthz(self, request: Request) -> Response:
         return JSONResponse(*health(self.feed.status, self.feed.alive, request.scope["user"] is not None))
+
+
+def _safe(name: str) -> str:
+    """The name of a file."""
+    return "".join(one if one.isalnum() or one in "-_" else "_" for one in name)[:100]
 
 
 class Answer(JSONResponse):

@@ -35,8 +35,10 @@ class Operation(NamedTuple):
     query: Mapping[str, str] = {}
     """Descriptions by name; those that end with an asterisk are required."""
     body: Any = None
-    """Its schema in JSON."""
+    """Its schema."""
     method: str = "get"
+    media: str = "application/json"
+    """The type of the body."""
 
     def described(self) -> dict[str, Any]:
         found: dict[str, Any] = {
@@ -57,7 +59,7 @@ class Operation(NamedTuple):
             name = self.public.partition("{")[2].rstrip("}")
             found["parameters"] = [{"name": name, "in": "path", "required": True, "schema": text}]
         if self.body is not None:
-            found["requestBody"] = {"required": True, "content": {"application/json": {"schema": self.body}}}
+            found["requestBody"] = {"required": True, "content": {self.media: {"schema": self.body}}}
         return {self.method: found}
 
     @property
@@ -78,6 +80,8 @@ OPERATIONS = (
               body={"type": "object", "additionalProperties": _SAMPLES}, method="post"),
     Operation("/api/samples/{topic:path}", "samples", "Samples of one topic.", body=_SAMPLES, method="post"),
     Operation("/api/actions", "actions", "An operator's action.", body=_ACTION, method="post"),
+    Operation("/api/identify", "identify", "A unit from a record in CSV: its model, what moved, a page.",
+              {"y": "the output", "name": "name of the unit"}, {"type": "string"}, "post", "text/csv"),
     Operation("/api/login", "login", "A session.", body={"type": "object", "required": ["name", "password"]},
               method="post"),
     Operation("/api/logout", "logout", "End the session.", method="post"),

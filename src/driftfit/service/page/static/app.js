@@ -1,6 +1,7 @@
 // The page: an overview of all units, and one unit with its parameters, predictions and innovations.
 import { Charts } from "./charts.js";
 import { Actions } from "./actions.js";
+import { fromFile } from "./record.js";
 
 const at = (id) => document.getElementById(id);
 export const make = (tag, text, parent, kind) => {
@@ -259,6 +260,7 @@ at("logout").addEventListener("click", async () => { await ask("/api/logout", {}
 paint();
 state.user = await ask("/api/me");
 at("logout").hidden = !state.user.login;
+fromFile(state.user);
 addEventListener("hashchange", route);
 connect();
 await route();
