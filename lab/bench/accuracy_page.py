@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,33 +35,20 @@ def figures(value: float, digits: int = 2) -> str:
     return "diverged" if value > ERA else f"{value:.{digits}f}"
 
 
-def setting_text(setting: Any) -> str:
-    """A setting as a reader would write it."""
-    if isinstance(setting, tuple):
-        return f"q = {setting[0]:.2g} r{' / mean(phi²)' if setting[1] else ''}"
-    return "" if setting is None else f"{setting:.4g}"
-
-
-def spread(values: Sequence[float]) -> str:
-    """Median and quartiles."""
-    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
-    return figures(middle) if middle > ERA else f"{figures(middle)} [{figures(low)}, {figures(high)}]"
-
-
-def table(cell: Cell) -> str:
-    """One scenario and model."""
-    heads = ["", "setting", "RMSE", "/ oracle [quartiles]", "one-step / oracle", "theta in band", "y in band"]
-    jumps = ["found", "delay", "false / 1000"] if cell.detections else []
-    rows = []
-    for name in cell.scores:
-        rmse, error = (float(np.median(v)) for v in (cell.values(name, "rmse"), cell.ratio(name, "error")))
-        theta, y = (float(np.mean(cell.values(name, what))) for what in ("theta", "y"))
-        row = [name, setting_text(cell.settings.get(name)), f"{rmse:.4g}", spread(list(cell.ratio(name)))]
-        row += [figures(error, 3), figures(theta, 3), figures(y, 3)]
-        if jumps:
-            row += detection(cell, name)
-        rows.append(row)
-    return markdown(heads + jumps, rows)
+def table(cells: Sequence[Cell]) -> str:
+    """One scenario, its models side by side; a row that repeats one above is left out."""
+    heads, rows = [""], {name: list[str]() for name in cells[0].scores}
+    for cell in cells:
+        jumps = ["found", "delay", "false / 1000"] if cell.detections else []
+        heads += [f"{cell.kind}: / oracle", "one-step / oracle", "theta in band", "y in band", *jumps]
+        for name, row in rows.items():
+            row += [figures(float(np.median(cell.ratio(name, what))), d) for what, d in (("rmse", 2), ("error", 3))]
+            row += [figures(float(np.mean(cell.values(name, what))), 3) for what in ("theta", "y")]
+            row += detection(cell, name) if jumps else []
+    shown: dict[tuple[str, ...], str] = {}
+    for name, row in rows.items():
+        shown.setdefault(tuple(row), name)
+    return markdown(heads, [[name, *row] for row, name in shown.items()])
 
 
 def detection(cell: Cell, name: str) -> list[str]:
@@ -125,12 +112,9 @@ def lost_table(cells: Sequence[Cell]) -> str:
 
 def real_table(result: Result) -> str:
     """One real record."""
-    rows = [
-        [row.name, setting_text(row.setting), f"{row.error:.4g}", figures(row.y, 3), f"{row.t:+.1f}"]
-        for row in result.rows
-    ]
+    rows = [[row.name, f"{row.error:.4g}", figures(row.y, 3), f"{row.t:+.1f}"] for row in result.rows]
     title = f"### {result.title} ({result.samples} samples scored)"
-    return f"{title}\n\n{markdown(['', 'setting', 'one-step error', 'y in band', 't'], rows)}"
+    return f"{title}\n\n{markdown(['', 'one-step error', 'y in band', 't'], rows)}"
 
 
 def page(cells: Sequence[Cell], real: tuple[Sequence[Result], Sequence[str]], size: Size, absent: Sequence[str]) -> str:
@@ -150,7 +134,7 @@ def page(cells: Sequence[Cell], real: tuple[Sequence[Result], Sequence[str]], si
     for name in dict.fromkeys(cell.scenario for cell in cells):
         parts += [f"## {name}", (scenarios.found()[name].__doc__ or "").strip()]
         parts += [f"![{name}](figures/scoreboard_{name}.png)"]
-        parts += [f"### {name}, {cell.kind}\n\n{table(cell)}" for cell in cells if cell.scenario == name]
+        parts += [table([cell for cell in cells if cell.scenario == name])]
     results, missing = real
     parts += ["## Real records", REAL, *(real_table(result) for result in results)]
     if missing:
@@ -161,13 +145,13 @@ def page(cells: Sequence[Cell], real: tuple[Sequence[Result], Sequence[str]], si
 INTRODUCTION = """\
 Written by `python -m lab bench accuracy --out docs`, which prints every figure.
 
-*RMSE* is the error of the parameters after 200 samples, the median over runs. *Oracle* is the Kalman filter that
-knows the drift covariance and the noise variance of every sample; ratios to it are computed for each run and given
-with quartiles. In *ramp* and *sinusoid* the oracle knows only the size of the steps, not that they persist. *One-
-step* is the error of predictions, divided by the oracle's. *In band* gives shares within 95 % bands; simulated
-outliers of y are not counted. *Default* is a package with its default settings, *tuned* uses the setting of a grid
-with the least parameter error on other runs of the same scenario, and *Kalman, hindsight* is the best setting on
-the scored runs themselves. A tracker without default settings has no such row.
+*RMSE* is the error of the parameters after 200 samples. *Oracle* is the Kalman filter that is given the drift
+covariance and the noise variance of every sample. Ratios to it are computed for each run: tables have the medians of
+RMSE and of the one-step error, pictures the quartiles. A row that repeats one above is left out. In *ramp* and
+*sinusoid* the oracle is told the size of the steps, not that they persist. *In band* gives shares within 95 % bands;
+simulated outliers of y are not counted. *Default* is a package with its default settings, *tuned* uses the setting of
+a grid with the least parameter error on other runs of the same scenario, and *Kalman, hindsight* is the best setting
+on the scored runs themselves. A tracker without default settings has no such row.
 
 All methods start from zero. Peers receive the regressors, since they do not handle lags, and skip samples with a
 missing lag; `track` fills the lag of a missing output. For jumps, the innovations of every method are passed to the
