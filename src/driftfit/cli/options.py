@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
@@ -12,7 +14,6 @@ from typer import Argument, Option
 
 from driftfit.cli.program import progress, writable
 from driftfit.cli.reading import (
-    Part,
     decimal_from,
     interval_from,
     limits_from,
@@ -20,11 +21,10 @@ from driftfit.cli.reading import (
     parse_interval,
     parse_units,
     rows_from,
-    rows_of,
+    sample_of,
     separator_from,
-    table_of,
 )
-from driftfit.data.columns import Columns
+from driftfit.data.files import Files
 from driftfit.engine.settings import missing_settings
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
@@ -160,33 +160,29 @@ class Given:
     def chosen_tracker(self) -> Tracker:
         return parse_tracker(self.tracker, self.p or [], self.own)
 
-    def part(self) -> Part:
-        """Which part of the files is used, and how the files are read."""
-        names = [*self.outputs, *self.inputs]
-        return Part(
-            first=self.first, last=self.last, rows=rows_from(self.rows),
-            separator=separator_from(self.separator), decimal=decimal_from(self.decimal), dates=self.dates,
-            missing=tuple(self.missing or []),
-            limits=tuple(limits_from(entry, names) for entry in self.limits or []),
-            exclude=tuple(map(interval_from, self.exclude or [])),
-        )  # fmt: skip
+    @cached_property
+    def files(self) -> Files:
+        """The files, which part of them is used, and how they are read."""
+        if (self.first or self.last) and self.time is None:
+            raise ValueError("--from and --to are times, so they need --time; rows are chosen with --rows.")
+        source = sys.stdin.buffer.read() if "-" in self.file else self.file
+        how = separator_from(self.separator), decimal_from(self.decimal), self.dates
+        return Files(source, rows_from(self.rows), (self.first, self.last), *how)
 
-    def signals(self, rows: Columns | None = None) -> dict[str, Any]:
-        """The arguments of `track` other than model and tracker; ``rows`` are the data if they were read already."""
-        outputs = self.outputs
-        if rows is None and (not self.part().whole or "-" in self.file):
-            rows = self.read()
-        data: Any = self.file if rows is None else table_of(rows, self.time, self.by or [])
-        signals = {"y": outputs if len(outputs) > 1 else outputs[0], "u": self.inputs, "data": data, "time": self.time}
-        signals |= {**self.part().restrictions(self.time is not None), "gate": self.gate}
-        units = {**({} if rows is None else rows.units), **parse_units(self.unit)}
-        return signals | {"by": self.by or None, "dt": parse_interval(self.dt), "units": units or None}
+    def signals(self) -> dict[str, Any]:
+        """The arguments of `track` other than model and tracker."""
+        outputs, first = self.outputs, self.files.rows[0]
+        exclude: list[tuple[Any, Any]] = list(map(interval_from, self.exclude or []))
+        if self.time is None:  # intervals are rows
+            exclude = [(sample_of(low, first), sample_of(high, first)) for low, high in exclude]
+        limits = dict(limits_from(entry, [*outputs, *self.inputs]) for entry in self.limits or [])
+        return {
+            "y": outputs if len(outputs) > 1 else outputs[0], "u": self.inputs, "data": self.files, "time": self.time,
+            "limits": limits or None, "exclude": exclude or None, "missing": self.missing or (), "gate": self.gate,
+            "by": self.by or None, "dt": parse_interval(self.dt), "units": parse_units(self.unit) or None,
+        }  # fmt: skip
 
-    def read(self, *more: str) -> Columns:
-        """Read the selected part of the columns, and of ``more`` columns."""
-        return rows_of(self.file, [*self.outputs, *self.inputs, *more], self.time, self.by or [], self.part())
-
-    def run(self, rows: Columns | None = None, tracker: Tracker | None = None) -> Any:
+    def run(self, tracker: Tracker | None = None) -> Any:
         """Run the configuration that the options describe: a Track, an Outputs or a fleet."""
         from driftfit.tracking import track
 
@@ -197,7 +193,7 @@ class Given:
             raise ValueError(
                 f"--tracker {self.tracker}: {names} must be given: {typed}; `driftfit tune` estimates them from data."
             )
-        signals: Any = self.signals(rows)
+        signals: Any = self.signals()
         more: Any = {} if before is None else {"warm_start": before}
         if before is not None and self.gate is None:
             signals["gate"] = before.end().programs[0].gate or False

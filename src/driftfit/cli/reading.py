@@ -1,79 +1,15 @@
-"""Read parts of files: ranges of rows and times, separators, stdin; valid ranges and exclusions.
-
-Rows are counted from 1 after the header, as in messages about cells, and ranges include both ends. Valid ranges and
-intervals are passed on unchanged (`driftfit.data.limits`).
-"""
+"""Options of the command line as the library takes them: ranges, intervals, separators, names, units."""
 
 from __future__ import annotations
 
 import csv
 import re
-import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
-
-import numpy as np
-import polars as pl
 
 from driftfit.data.clock import Clock
-from driftfit.data.columns import Columns, Wanted, convert
-from driftfit.data.files import paths_of, read_file, together
-from driftfit.data.limits import marks, within
-from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
 Range = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Part:
-    """Which part of the files is used, and how they are read."""
-
-    first: str | None = None
-    last: str | None = None
-    rows: tuple[int, int | None] = (1, None)
-    separator: str | None = None
-    decimal: str = "."
-    dates: str | None = None
-    missing: tuple[str, ...] = ()
-    limits: tuple[tuple[str, Range], ...] = ()
-    exclude: tuple[tuple[str, str], ...] = ()
-
-    @property
-    def whole(self) -> bool:
-        """Whether the files are read without any restriction."""
-        return self == Part(limits=self.limits, exclude=self.exclude, missing=self.missing)
-
-    def restrictions(self, timed: bool) -> dict[str, Any]:
-        """limits=, exclude= and missing= of `track`; without time, intervals are rows, which `track` numbers from 0."""
-        exclude: list[tuple[Any, Any]] = list(self.exclude)
-        if not timed:
-            exclude = [(self._sample(first), self._sample(last)) for first, last in self.exclude]
-        return {"limits": dict(self.limits) or None, "exclude": exclude or None, "missing": self.missing}
-
-    def _sample(self, row: str) -> int:
-        """The sample of a row."""
-        if not row.isdigit():
-            raise ValueError(f"--exclude: without --time give an interval of rows, such as 100..120; got {row!r}.")
-        return int(row) - self.rows[0]
-
-
-def table_of(rows: Columns, time: str | None, by: Sequence[str]) -> pl.DataFrame:
-    """The rows of all files as a table that `track` reads."""
-    columns: dict[str, Any] = dict(rows.numbers) | ({} if time is None else {time: rows.time})
-    table = pl.DataFrame(columns | dict(zip(by, rows.by, strict=True)))
-    if rows.zone is not None and time is not None:
-        table = table.with_columns(pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(rows.zone))
-    return table
-
-
-def order_of(rows: Columns) -> Array:
-    """Indices of the rows of a single series, sorted by time, with the first of several rows at the same time."""
-    if rows.time is None:
-        return np.arange(rows.rows)
-    known = np.flatnonzero(np.isfinite(rows.time))
-    return known[np.unique(rows.time[known], return_index=True)[1]]
 
 
 def limits_from(entry: str, names: Sequence[str]) -> tuple[str, Range]:
@@ -114,6 +50,13 @@ def separator_from(text: str | None) -> str | None:
     return sign
 
 
+def sample_of(row: str, first: int) -> int:
+    """The sample, from 0, of a row that is given as text."""
+    if not row.isdigit():
+        raise ValueError(f"--exclude: without --time give an interval of rows, such as 100..120; got {row!r}.")
+    return int(row) - first
+
+
 def rows_from(text: str | None) -> tuple[int, int | None]:
     """``100:500`` as the first and the last row, None: to the end."""
     if text is None:
@@ -127,33 +70,6 @@ def rows_from(text: str | None) -> tuple[int, int | None]:
             f"--rows {text}: there are no such rows; rows are counted from 1, and the first must not be after the last."
         )
     return a, b
-
-
-def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Sequence[str], part: Part) -> Columns:
-    """Read columns of several files in the order of the files."""
-    if (part.first or part.last) and time is None:
-        raise ValueError("--from and --to are times, so they need --time; rows are chosen with --rows.")
-    how = marks(part.missing)[0], part.separator, part.decimal, part.dates
-    wanted = Wanted(tuple(dict.fromkeys(names)), time, tuple(by), *how)
-    found = together({path: _one(path, wanted, part) for path in (["-"] if "-" in files else paths_of(list(files)))})
-    if found.time is None or (part.first is None and part.last is None):
-        return found
-    keep = np.flatnonzero(within([(part.first, part.last)], found.time, found.time, found.zone, "--from, --to"))
-    if not len(keep):
-        raise ValueError(f"no row is between --from {part.first or '...'} and --to {part.last or '...'}.")
-    numbers = {name: column[keep] for name, column in found.numbers.items()}
-    units = [[column[k] for k in keep.tolist()] for column in found.by]
-    return Columns(numbers, found.time[keep], found.zone, units, len(keep), found.units)
-
-
-def _one(path: str, wanted: Wanted, part: Part) -> Columns:
-    """The selected rows of one file."""
-    where = "stdin" if path == "-" else path
-    frame, units = read_file(sys.stdin.buffer.read() if path == "-" else path, wanted, where)
-    first, last = part.rows
-    if len(frame) < first:
-        raise ValueError(f"{where} has no row {first}.")
-    return replace(convert(frame, wanted, where, 1, slice(first - 1, last)), units=units)
 
 
 def listed(given: Sequence[str] | None) -> list[str]:

@@ -13,9 +13,12 @@ from typer import Option
 
 from driftfit.cli.options import Given, Out, Plot, Report, Since, Table, check_table, reads
 from driftfit.cli.program import app, draw, progress, say
-from driftfit.cli.reading import interval_from, listed, order_of, rows_of
+from driftfit.cli.reading import interval_from, listed
 from driftfit.data.columns import Wanted
 from driftfit.data.limits import end_of
+from driftfit.data.limits import marks as marks_of
+from driftfit.data.record import Reading
+from driftfit.data.tables import read_records
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks, missing_settings
 from driftfit.identify.answer import chosen
@@ -47,8 +50,7 @@ def track(
     """Track the parameters of a model in a record, or in a fleet of records."""
     if write_to is not None:
         check_ending(write_to)
-    if report is not None:
-        check_path(report)
+    _check_page(given, report, since)
     if given.free:
         given = _with_structure(given)
     run = given.run()
@@ -62,18 +64,24 @@ def track(
     _page(run, report, since)
 
 
+def _check_page(given: Given, path: Path | None, since: str | None) -> None:
+    """ValueError for a page that cannot be written, before anything is run."""
+    if path is not None:
+        check_path(path)
+    if since is not None and (path is None or not (given.by or len(given.outputs) > 1)):
+        raise ValueError("--since: this is for the page of many series; give --report and --by.")
+
+
 def _page(run: Any, path: Path | None, since: str | None) -> None:
     """Write the page of a record or a fleet, if there is a path for it."""
-    if since is not None and (path is None or isinstance(run, Track)):
-        raise ValueError("--since: this is for the page of many series; give --report and --by.")
     if path is not None:
         run.report(path, **({} if since is None else {"since": since}))
 
 
 def _with_structure(given: Given) -> Given:
     """The options with the inputs, the structure and the time that `driftfit identify` finds."""
-    part = given.part()
-    reading = Wanted((), None, (), part.missing, part.separator, part.decimal, part.dates)
+    files = given.files
+    reading = Wanted((), None, (), tuple(given.missing or ()), files.separator, files.decimal, files.dates)
     with progress.status("searching the structure"):
         found, model = chosen(given.file[0], given.outputs[0], given.time, reading)
     text, inputs = short(model), f" --u {','.join(model.input_names)}" if model.input_names else ""
@@ -92,6 +100,7 @@ def verdict(
     since: Since = None,
 ) -> None:
     """Report whether the parameters move, which ones and when, and whether tracking them pays."""
+    _check_page(given, report, since)
     run = given.run()
     say(run.verdict(level=level, lags=lags))
     _page(run, report, since)
@@ -203,15 +212,16 @@ def detect(
     if labels is not None and (given.by or len(given.outputs) > 1):
         raise ValueError("--labels: labels are for one series of one output; leave out --by and further --y.")
     check_table(write_to, "alarms are")
-    if report is not None:
-        check_path(report)
-    rows = given.read(labels) if labels is not None else None
-    run = given.run(rows)
+    _check_page(given, report, None)
+    run = given.run()
     alarms = options.find(run)
     say(alarms)
     faulty = None
-    if rows is not None and labels is not None:
-        faulty = marks("--labels", rows.numbers[labels][order_of(rows)], len(alarms.active))
+    if labels is not None:
+        read = read_records(
+            given.files, labels, None, None, Reading(time=given.time, dt="label", missing=given.missing)
+        )[0]
+        faulty = marks("--labels", read.y, len(alarms.active))
         score = alarms.score(faulty)
         late = "" if np.isnan(score.delay) else f", {score.delay:g} samples after they began (median)"
         found = f" Labels: {score.found} of {score.events} found{late};"
@@ -294,8 +304,9 @@ def forecast(
 def _inputs(given: Given, future: str) -> Array:
     if not given.inputs:
         raise ValueError(f"--future {future}: the model has no inputs; leave it out.")
-    read = rows_of([future], given.inputs, None, [], replace(given.part(), first=None, last=None, rows=(1, None)))
-    return np.stack([read.numbers[name] for name in given.inputs], axis=1)
+    files = replace(given.files, paths=future, rows=(1, None), times=(None, None))
+    numbers = files.columns(Wanted(tuple(given.inputs), missing=marks_of(given.missing)[0]))[0].numbers
+    return np.stack([numbers[name] for name in given.inputs], axis=1)
 
 
 @app.command()

@@ -11,10 +11,9 @@ import glob
 import gzip
 import io
 import os
-import warnings
 import zlib
 from collections.abc import Collection, Hashable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,9 @@ import polars as pl
 
 from driftfit.data.columns import FILE, Columns, Wanted, convert
 from driftfit.data.csv_files import read_csv, start_of
+from driftfit.data.limits import within
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import near
+from driftfit.engine.settings import near, warn
 
 OTHER = {
     b"PK\x03\x04": "an Excel workbook or a ZIP archive",
@@ -48,40 +48,76 @@ def read_columns(path: str | os.PathLike[str], names: Sequence[str], time: str |
     OSError
         If the file cannot be read.
     """
-    wanted = Wanted(tuple(names), time)
     where = os.fspath(path)
-    columns = of_file(where, wanted)
+    columns = Files(where).one(where, Wanted(tuple(names), time), where)
     return {**columns.numbers, **({time: columns.time} if time is not None and columns.time is not None else {})}
 
 
+@dataclass(frozen=True)
+class Files:
+    """Files, which of their rows are used, and how they are read.
+
+    ``paths`` is a path, a pattern or a list of them, or the content of a file. ``rows`` are the first and the last row
+    of each file, counted from 1, and ``times`` the first and the last time; None is an open end. The other fields are
+    those of `Wanted`.
+    """
+
+    paths: Any
+    rows: tuple[int, int | None] = (1, None)
+    times: tuple[str | None, str | None] = (None, None)
+    separator: str | None = None
+    decimal: str = "."
+    dates: str | None = None
+
+    def columns(self, wanted: Wanted) -> tuple[Columns, dict[Hashable, str]]:
+        """The wanted columns of all files, and the reasons why some of them cannot be read.
+
+        A single one, or all of them, raise ValueError.
+        """
+        wanted = replace(wanted, separator=self.separator, decimal=self.decimal, dates=self.dates)
+        sources = {"stdin": self.paths} if isinstance(self.paths, bytes) else {one: one for one in paths_of(self.paths)}
+        parts: dict[str, Columns] = {}
+        failed: dict[Hashable, str] = {}
+        for name, source in sources.items():
+            try:
+                parts[name] = self.one(source, wanted, name)
+            except (ValueError, OSError) as error:
+                if len(sources) == 1:
+                    raise
+                failed[name] = str(error)
+        if not parts:
+            raise ValueError(f"none of the {len(sources)} files can be read; the first: {next(iter(failed.values()))}")
+        if failed:
+            warn(f"{len(failed)} of {len(sources)} files cannot be read: {next(iter(failed.values()))}", UserWarning)
+        return self._between(together(parts)), failed
+
+    def one(self, source: str | bytes, wanted: Wanted, where: str) -> Columns:
+        """The rows of one file, given by its path or its content; ``where`` is named in errors."""
+        frame, units = read_file(source, wanted, where)
+        first, last = self.rows
+        if len(frame) < first:
+            raise ValueError(f"{where} has no row {first}.")
+        return replace(convert(frame, wanted, where, 1, slice(first - 1, last)), units=units)
+
+    def _between(self, found: Columns) -> Columns:
+        """The rows between the first and the last time."""
+        if found.time is None or self.times == (None, None):
+            return found
+        keep = np.flatnonzero(within([self.times], found.time, found.time, found.zone, "--from, --to"))
+        if not len(keep):
+            raise ValueError("no row is between --from {} and --to {}.".format(*(one or "..." for one in self.times)))
+        numbers = {name: column[keep] for name, column in found.numbers.items()}
+        units = [[column[k] for k in keep.tolist()] for column in found.by]
+        return Columns(numbers, found.time[keep], found.zone, units, len(keep), found.units)
+
+
 def read(data: Any, wanted: Wanted) -> tuple[Columns, dict[Hashable, str]]:
-    """The wanted columns of a table, a file, or the concatenation of several files."""
-    if not isinstance(data, str | os.PathLike | list | tuple):
-        return convert(table_frame(data), wanted, "the table", 0), {}
-    paths = paths_of(data)
-    if len(paths) == 1:
-        return of_file(paths[0], wanted), {}
-    parts: dict[str, Columns] = {}
-    failed: dict[Hashable, str] = {}
-    for path in paths:
-        try:
-            frame, units = read_file(path, wanted, path)
-        except (ValueError, OSError) as error:
-            failed[path] = str(error)
-            continue
-        parts[path] = replace(convert(frame, wanted, path, 1), units=units)
-    if not parts:
-        raise ValueError(f"none of the {len(paths)} files can be read; the first: {failed[paths[0]]}")
-    if failed:
-        warnings.warn(
-            f"{len(failed)} of {len(paths)} files cannot be read: {next(iter(failed.values()))}", stacklevel=4
-        )
-    return together(parts), failed
-
-
-def of_file(path: str, wanted: Wanted) -> Columns:
-    frame, units = read_file(path, wanted, path)
-    return replace(convert(frame, wanted, path, 1), units=units)
+    """The wanted columns of a table or of files, and the reasons why some files cannot be read."""
+    if isinstance(data, str | os.PathLike | list | tuple):
+        data = Files(data)
+    if isinstance(data, Files):
+        return data.columns(wanted)
+    return convert(table_frame(data), wanted, "the table", 0), {}
 
 
 def table_frame(data: Any) -> nw.DataFrame[Any]:
