@@ -16,8 +16,7 @@ from driftfit.models.hammerstein_wiener.thresholds import DeadZone
 from driftfit.systems.arc_furnace import THRESHOLDS, A, furnace, length, resistance
 from driftfit.systems.drift import RandomWalk
 from driftfit.systems.hammerstein_wiener import simulate
-from driftfit.use.blocks import diagnose_blocks
-from driftfit.use.free_run import free_run, reflected
+from driftfit.use.blocks import diagnose_blocks, free_run, reflected
 
 SMALL = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(2))
 P2 = Polynomial(2)

@@ -59,8 +59,7 @@ from driftfit.tune.inference import likelihood_ratio
 from driftfit.tune.pool import pool
 from driftfit.tune.tune import tune
 from driftfit.use import prepare
-from driftfit.use.blocks import diagnose_blocks
-from driftfit.use.free_run import free_run
+from driftfit.use.blocks import diagnose_blocks, free_run
 from driftfit.use.system_from_path import rational_model, static_curve
 
 __all__ = [

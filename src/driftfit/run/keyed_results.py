@@ -1,6 +1,6 @@
 """Results by key. Series of a fleet, settings of a grid and outputs of a record are lanes with keys.
 
-The common part of `driftfit.run.fleet.Fleet` and `driftfit.run.outputs.Outputs`: a mapping from key to `Track`, their
+The common part of `driftfit.run.fleet.Fleet` and `driftfit.run.fleet.Outputs`: a mapping from key to `Track`, their
 copies, and their files.
 """
 

@@ -51,8 +51,8 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, whole
 from driftfit.engine.tiles import as_compiled
 from driftfit.models.base import Model
+from driftfit.run.fleet import Outputs
 from driftfit.run.live.live import Live
-from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, state_of
 from driftfit.run.result import Track
 from driftfit.show.text import digits, printed, table_of

@@ -15,7 +15,6 @@ import numpy as np
 import pyarrow as pa
 
 from driftfit.bridges.spark.frames import by_unit, rows_of, task_of
-from driftfit.bridges.spark.task import Task, chunks, parameters_schema, results_schema
 from driftfit.bridges.spark.units import (
     COUNTS,
     JUDGED,
@@ -23,17 +22,21 @@ from driftfit.bridges.spark.units import (
     SQUARES,
     STANDARD,
     Done,
+    Task,
     Units,
     by_output,
+    chunks,
     parameters,
+    parameters_schema,
     results,
+    results_schema,
 )
 from driftfit.data import late
 from driftfit.engine.settings import one_of
 from driftfit.judge.fleet_verdict import COLUMNS, Judgement, coverage
 from driftfit.judge.verdict import verdict
 from driftfit.models.base import Model
-from driftfit.run.outputs import Outputs
+from driftfit.run.fleet import Outputs
 from driftfit.run.result import Track
 from driftfit.trackers.base import Tracker
 

@@ -11,8 +11,20 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from driftfit.bridges.spark.task import Task, chunks, results_schema
-from driftfit.bridges.spark.units import ARROW, COUNTS, PLACES, SAMPLES, Done, Units, numbers, results, times
+from driftfit.bridges.spark.units import (
+    ARROW,
+    COUNTS,
+    PLACES,
+    SAMPLES,
+    Done,
+    Task,
+    Units,
+    chunks,
+    numbers,
+    results,
+    results_schema,
+    times,
+)
 from driftfit.data import late
 from driftfit.data.storage import describe
 from driftfit.engine.kernel import Array

@@ -28,7 +28,7 @@ import numpy as np
 
 from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, results_of, rules_of
 from driftfit.bridges.spark.frames import rows_of, sql_of, task_of
-from driftfit.bridges.spark.task import SETTING, Task, trackers_of
+from driftfit.bridges.spark.units import SETTING, Task, trackers_of
 from driftfit.data.clock import Clock
 from driftfit.data.storage import describe, parts_of, rebuild
 from driftfit.models.base import Model
