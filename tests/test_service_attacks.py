@@ -39,9 +39,9 @@ from service_support import (
 from driftfit import track
 from driftfit.service.config import ProblemsError
 from driftfit.service.connect.base import Batch, Event, Outcome
+from driftfit.service.connect.http import WebhookSink
 from driftfit.service.connect.samples import Receipt, Samples
 from driftfit.service.connect.tables import SqliteSink
-from driftfit.service.connect.webhook import WebhookSink
 from driftfit.service.control import health
 from driftfit.service.core import section
 from driftfit.service.options import Pattern

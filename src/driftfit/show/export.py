@@ -169,7 +169,7 @@ def _columns(run: Single, arrays: bool) -> dict[str, Array]:
             columns[where] = values if single else values[:, j]
             columns |= inputs if single and not name else {}
     columns |= {name: column for name, column in inputs.items() if name not in columns}
-    parts = [(run.names, run.theta, run.std, "")]
+    parts: list[tuple[Any, Array, Array, str]] = [(run.names, run.theta, run.std, "")]
     if isinstance(run, Outputs):
         each = zip(run.outputs, run.names, strict=True)
         parts = [(names, run.theta[:, j], run.std[:, j], f"[{output}]") for j, (output, names) in enumerate(each)]
