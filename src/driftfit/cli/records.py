@@ -28,6 +28,7 @@ from driftfit.judge.structures.select import select as compare
 from driftfit.parsing.settings import given_fields
 from driftfit.readings.left_out import remarks_of
 from driftfit.results import Track
+from driftfit.run.live.conformal import quantile
 from driftfit.show.export import check_ending, write, write_table
 from driftfit.show.report import check_path
 from driftfit.show.text import digits, facts, shortened, table_of
@@ -273,8 +274,7 @@ def forecast(
     write_to: Table = None,
 ) -> None:
     """Forecast the outputs, and the parameters, after the end of the record."""
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"--level must be between 0 and 1, such as 0.95; got {level!r}.")
+    quantile(level, "--level")  # whether there is one
     check_table(write_to, "a forecast is")
     given.check_single("forecast")
     u = None if future is None else _inputs(given, future)

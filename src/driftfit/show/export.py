@@ -30,6 +30,7 @@ import numpy as np
 import polars as pl
 
 from driftfit.data.files import without_formulas
+from driftfit.data.instants import in_zone
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import of_series, one_of
 from driftfit.run.fleet import Fleet, Outputs
@@ -65,12 +66,7 @@ def as_table(result: Result, arrays: bool = False) -> pl.DataFrame:
 
 def _in_zone(table: pl.DataFrame, run: Single) -> pl.DataFrame:
     """The table with times in the zone of the record."""
-    zone, time = run.labels.zone, _time_name(run)
-    return (
-        table
-        if zone is None
-        else table.with_columns(pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(zone))
-    )
+    return in_zone(table, _time_name(run), run.labels.zone)
 
 
 def paths_table(fleet: Fleet, paths: Mapping[Hashable, tuple[Array, Array]]) -> pl.DataFrame:

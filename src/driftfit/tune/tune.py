@@ -37,6 +37,7 @@ from driftfit.engine.settings import one_of, whole
 from driftfit.judge.constant_fit import constant_outputs
 from driftfit.models.base import Model
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
+from driftfit.run.live.conformal import quantile
 from driftfit.run.track import Decisions, decide, records_of, warn_of_codes
 from driftfit.show.text import ByOutput
 from driftfit.trackers.base import Tracker
@@ -128,8 +129,7 @@ def tune(
         model, y = columns_as_outputs(model, y)
     one_of("tune", "method", method, tuple(METHODS))
     whole("tune", "h", h, 1)
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"tune: level must be between 0 and 1, such as 0.95; got {level!r}.")
+    quantile(level, "tune")  # whether there is one
     if method != "h-step" and not tracker.covariance:
         raise ValueError(f"tune: {type(tracker).__name__} has no variance, so {method!r} is undefined; use 'h-step'.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing)
