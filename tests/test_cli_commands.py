@@ -93,7 +93,7 @@ def test_the_other_ways_to_write_a_table(table):
 
 def test_numbers_with_commas_and_groups(tmp_path):
     (tmp_path / "n.csv").write_text("a;t\n1.234,5;2024-01-31\n-0,25;2024-02-01\n 7 ;2024-02-02\n1,5e3;2024-02-03\n;x\n")
-    files, wanted = Files(str(tmp_path / "n.csv"), decimal=","), Wanted(("a",), "t")
+    files, wanted = Files(str(tmp_path / "n.csv"), how=Wanted((), decimal=",")), Wanted(("a",), "t")
     read, _ = replace(files, rows=(1, 4)).columns(wanted)
     assert read.numbers["a"].tolist() == [1234.5, -0.25, 7.0, 1500.0]
     assert str(read.time[0]) == "2024-01-31T00:00:00.000000"

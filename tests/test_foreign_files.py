@@ -34,7 +34,7 @@ def test_decimal_commas_and_days_first_are_read_as_the_options_say(tmp_path):
     ]
     path = str(written(tmp_path, "\r\n".join(rows), "cp1252"))
     wanted = Wanted(("Durchfluß °C", "Druck"), "Datum")
-    found, _ = Files(path, decimal=",", dates="%d.%m.%Y %H:%M").columns(wanted)
+    found, _ = Files(path, how=Wanted((), decimal=",", dates="%d.%m.%Y %H:%M")).columns(wanted)
     np.testing.assert_array_equal(found.numbers["Durchfluß °C"], [1.5, np.nan, -0.5])
     np.testing.assert_array_equal(found.numbers["Druck"], [1234.5, -12.25, 7.0])
     expected = np.array(["2024-03-30T22:00", "2024-03-30T22:15", "2024-04-01T09:30"], "datetime64[us]")
@@ -44,7 +44,7 @@ def test_decimal_commas_and_days_first_are_read_as_the_options_say(tmp_path):
     with pytest.raises(ValueError, match=r"row 1 .* neither a number nor a date in the form 2024-01-31.*--dates '%d"):
         read_columns(path, [], "Datum")
     times = written(tmp_path, "t;y\n0,5;1,5\n1,5;2,5\n")
-    assert Files(times, decimal=",").columns(Wanted(("y",), "t"))[0].time.tolist() == [0.5, 1.5]
+    assert Files(times, how=Wanted((), decimal=",")).columns(Wanted(("y",), "t"))[0].time.tolist() == [0.5, 1.5]
 
 
 @pytest.mark.parametrize(

@@ -10,26 +10,24 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from driftfit.cli.options import Names
+from driftfit.cli.options import Cells, Names, reads
 from driftfit.cli.program import app, progress, say, writable
-from driftfit.cli.reading import decimal_from, limits_from, listed, parse_interval, separator_from
-from driftfit.data.columns import Wanted
+from driftfit.cli.reading import limits_from, listed, parse_interval
 from driftfit.engine.compile_notice import PATIENCE
 from driftfit.identify.answer import Identification, ManyIdentified, identify
 from driftfit.identify.roles import NoAnswerError
 
 
 @app.command("identify")
+@reads
 def identify_command(
     file: Annotated[list[str], Argument(help="CSV or Parquet files, or patterns such as 'runs/*.csv'.")],
+    cells: Cells,
     *,
     y: Annotated[str | None, Option(help="Column of the output.")] = None,
     u: Annotated[Names, Option(help="Inputs to choose from; repeat it, or separate names by commas.")] = None,
     not_u: Annotated[Names, Option(help="Columns that are no inputs.")] = None,
-    time: Annotated[str | None, Option(help="Column of the time.")] = None,
-    dt: Annotated[str | None, Option(help="Nominal interval: a number, for dates 1s, 15min, 1h, 1d.")] = None,
     by: Annotated[str | None, Option(help="Column that identifies records of one structure.")] = None,
-    limits: Annotated[Names, Option(help="Valid range of a column: flow=0:80; outside is missing.")] = None,
     max_lag: Annotated[int, Option(help="Longest lag of an input, in samples.")] = 30,
     forecast: Annotated[
         bool, Option("--forecast/--explain", help="Only inputs of earlier samples, or also of the same.")
@@ -46,10 +44,6 @@ def identify_command(
         ),
     ] = 45.0,
     seed: Annotated[int, Option(help="Seed of the displaced copies of inputs.")] = 0,
-    separator: Annotated[str | None, Option(help="Separator of cells; by default detected.")] = None,
-    decimal: Annotated[str, Option(help="Decimal sign: . or ,")] = ".",
-    dates: Annotated[str | None, Option(help="Form of dates, such as '%d.%m.%Y %H:%M'.")] = None,
-    missing: Annotated[Names, Option(help="What the file holds where there is no reading; repeat it.")] = None,
     page: Annotated[Path | None, Option(help="Write the answer to a page (.html).")] = None,
     json_to: Annotated[Path | None, Option("--json", help="Write the answer as JSON; - is stdout.")] = None,
     quiet: Annotated[bool, Option("--quiet", help="Print the headline alone.")] = False,
@@ -59,8 +53,7 @@ def identify_command(
     Exit codes: 0 answered, 1 undecided, 2 arguments or file, 3 the record cannot answer.
     """
     writable(page, "--page")
-    ranges = dict(limits_from(one, [one.rpartition("=")[0].strip()]) for one in limits or [])
-    reading = Wanted((), None, (), tuple(missing or []), separator_from(separator), decimal_from(decimal), dates)
+    ranges = dict(limits_from(one, [one.rpartition("=")[0].strip()]) for one in cells.limits or [])
     began = monotonic()
     with progress.status("reading") as status:
         if not (progress.is_terminal and not quiet):
@@ -72,10 +65,10 @@ def identify_command(
 
         try:
             found = identify(
-                file if len(file) > 1 else file[0], y, u=listed(u) or None, not_u=listed(not_u), time=time,
-                dt=parse_interval(dt), by=by, limits=ranges,
+                file if len(file) > 1 else file[0], y, u=listed(u) or None, not_u=listed(not_u), time=cells.time,
+                dt=parse_interval(cells.dt), by=by, limits=ranges,
                 max_lag=max_lag, forecast=forecast, horizon=horizon, level=level, gate=gate,
-                budget=budget, seed=seed, reading=reading, progress=tell,
+                budget=budget, seed=seed, reading=cells.wanted, progress=tell,
             )  # fmt: skip
         except NoAnswerError as error:
             status.stop()

@@ -24,6 +24,7 @@ from driftfit.cli.reading import (
     sample_of,
     separator_from,
 )
+from driftfit.data.columns import Wanted
 from driftfit.data.files import Files
 from driftfit.engine.settings import missing_settings
 from driftfit.models.arx import ARX
@@ -51,8 +52,42 @@ def check_table(path: Path | None, what: str) -> None:
         raise ValueError(f"--out {path}: {what} written to .csv or .parquet.")
 
 
-@dataclass(frozen=True)
-class Given:
+@dataclass(frozen=True, kw_only=True)
+class Cells:
+    """The options that say how the cells of a file are read."""
+
+    time: Annotated[str | None, Option(help="Column of the time: numbers or dates.")] = None
+    dt: Annotated[
+        str | None,
+        Option(
+            help="Nominal interval: a number; for dates 10ms, 1s, 15min, 1h, 1d, 1w, 'business day', month, quarter, "
+            "year, or label if samples are one step apart whatever their dates."
+        ),
+    ] = None
+    separator: Annotated[
+        str | None,
+        Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
+    ] = None
+    decimal: Annotated[str, Option(help="Decimal sign of the numbers: . or , (points then group thousands).")] = "."
+    dates: Annotated[
+        str | None, Option(help="Form of dates that do not begin with the year: '%d.%m.%Y %H:%M', as in Python.")
+    ] = None
+    missing: Annotated[
+        Names, Option(help="What the file holds where there is no reading: Offline or -999; repeat it.")
+    ] = None
+    limits: Annotated[
+        Names, Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
+    ] = None
+
+    @property
+    def wanted(self) -> Wanted:
+        """How columns are read that are yet to be named."""
+        how = separator_from(self.separator), decimal_from(self.decimal), self.dates
+        return Wanted((), None, (), tuple(self.missing or ()), *how)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Given(Cells):
     """The options that commands share, as given on the command line."""
 
     file: Annotated[
@@ -76,7 +111,6 @@ class Given:
         str, Option(help="Tracker, as `driftfit trackers` lists them, or as in Python: 'Kalman(q=1e-4, r=0.1)'.")
     ] = "adaptive-kalman"
     p: Annotated[Names, Option("-p", help="Setting of the tracker: q=1e-4, q=1e-4,0,0 or p0=none; repeat it.")] = None
-    time: Annotated[str | None, Option(help="Column of the time: numbers or dates.")] = None
     by: Annotated[
         Names, Option(help="Column that identifies the series of a fleet, or `file`; repeat it for several.")
     ] = None
@@ -84,31 +118,10 @@ class Given:
     own: Annotated[
         str | None, Option("--with", metavar="MODULE:CLASS", help="Your own tracker, from a module in this folder.")
     ] = None
-    dt: Annotated[
-        str | None,
-        Option(
-            help="Nominal interval: a number; for dates 10ms, 1s, 15min, 1h, 1d, 1w, 'business day', month, quarter, "
-            "year, or label if samples are one step apart whatever their dates."
-        ),
-    ] = None
     first: Annotated[str | None, Option("--from", help="First time to use, with --time.")] = None
     last: Annotated[str | None, Option("--to", help="Last time to use, with --time.")] = None
     rows: Annotated[
         str | None, Option(help="Rows to use of each file, counted from 1 after the header: 100:500, 100: or :500.")
-    ] = None
-    separator: Annotated[
-        str | None,
-        Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
-    ] = None
-    decimal: Annotated[str, Option(help="Decimal sign of the numbers: . or , (points then group thousands).")] = "."
-    dates: Annotated[
-        str | None, Option(help="Form of dates that do not begin with the year: '%d.%m.%Y %H:%M', as in Python.")
-    ] = None
-    missing: Annotated[
-        Names, Option(help="What the file holds where there is no reading: Offline or -999; repeat it.")
-    ] = None
-    limits: Annotated[
-        Names, Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
     ] = None
     exclude: Annotated[
         Names, Option(help="Interval to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
@@ -166,8 +179,7 @@ class Given:
         if (self.first or self.last) and self.time is None:
             raise ValueError("--from and --to are times, so they need --time; rows are chosen with --rows.")
         source = sys.stdin.buffer.read() if "-" in self.file else self.file
-        how = separator_from(self.separator), decimal_from(self.decimal), self.dates
-        return Files(source, rows_from(self.rows), (self.first, self.last), *how)
+        return Files(source, rows_from(self.rows), (self.first, self.last), self.wanted)
 
     def signals(self) -> dict[str, Any]:
         """The arguments of `track` other than model and tracker."""

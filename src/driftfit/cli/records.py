@@ -81,10 +81,8 @@ def _page(run: Any, path: Path | None, since: str | None) -> None:
 
 def _with_structure(given: Given) -> Given:
     """The options with the inputs, the structure and the time that `driftfit identify` finds."""
-    files = given.files
-    reading = Wanted((), None, (), tuple(given.missing or ()), files.separator, files.decimal, files.dates)
     with progress.status("searching the structure"):
-        found, model = chosen(given.file[0], given.outputs[0], given.time, reading)
+        found, model = chosen(given.file[0], given.outputs[0], given.time, given.wanted)
     text, inputs = short(model), f" --u {','.join(model.input_names)}" if model.input_names else ""
     say(Text(f" Chosen: --model {text}{inputs}; `driftfit identify` says why."), soft_wrap=True)
     dt = given.dt or (interval(found) if found.clock else None)

@@ -232,28 +232,31 @@ def read_columns(path: str | os.PathLike[str], names: Sequence[str], time: str |
     return {**columns.numbers, **({time: columns.time} if time is not None and columns.time is not None else {})}
 
 
+PLAIN = Wanted(())
+"""Columns that are yet to be named, read without options."""
+
+
 @dataclass(frozen=True)
 class Files:
     """Files, which of their rows are used, and how they are read.
 
     ``paths`` is a path, a pattern or a list of them, or the content of a file. ``rows`` are the first and the last row
-    of each file, counted from 1, and ``times`` the first and the last time; None is an open end. The other fields are
-    those of `Wanted`.
+    of each file, counted from 1, and ``times`` the first and the last time; None is an open end. ``how`` says how their
+    cells are read.
     """
 
     paths: Any
     rows: tuple[int, int | None] = (1, None)
     times: tuple[str | None, str | None] = (None, None)
-    separator: str | None = None
-    decimal: str = "."
-    dates: str | None = None
+    how: Wanted = PLAIN
 
     def columns(self, wanted: Wanted) -> tuple[Columns, dict[Hashable, str]]:
         """The wanted columns of all files, and the reasons why some of them cannot be read.
 
         A single one, or all of them, raise ValueError.
         """
-        wanted = replace(wanted, separator=self.separator, decimal=self.decimal, dates=self.dates)
+        how = self.how
+        wanted = replace(wanted, separator=how.separator, decimal=how.decimal, dates=how.dates)
         sources = {"stdin": self.paths} if isinstance(self.paths, bytes) else {one: one for one in paths_of(self.paths)}
         parts: dict[str, Columns] = {}
         failed: dict[Hashable, str] = {}

@@ -25,6 +25,16 @@ SCALARS = ("y_hat", "e", "s", "ok")
 """Fields that belong to one row, as opposed to the state after it."""
 
 
+def _written(name: str, text: str | None = None) -> Any:
+    """A field of the driver's output as a property."""
+    return property(lambda self: self.written(name), doc=text)
+
+
+def _root_of(name: str) -> Any:
+    """The square root of another property, computed once."""
+    return cached_property(lambda self: np.sqrt(getattr(self, name)))
+
+
 class Columns(ABC):
     """Results of T samples.
 
@@ -62,35 +72,13 @@ class Columns(ABC):
         values = self.in_rows(name)
         return self.by_row(values) if name in SCALARS else self.after_rows(values)
 
-    @property
-    def theta(self) -> Array:
-        return self.written("theta")
-
-    @property
-    def var(self) -> Array:
-        """Variances of the parameters, in the shape of theta."""
-        return self.written("var")
-
-    @cached_property
-    def std(self) -> Array:
-        return np.sqrt(self.var)
-
-    @property
-    def prediction(self) -> Array:
-        return self.written("y_hat")
-
-    @property
-    def innovation(self) -> Array:
-        return self.written("e")
-
-    @property
-    def innovation_var(self) -> Array:
-        """Variances of the innovations, in their shape."""
-        return self.written("s")
-
-    @cached_property
-    def innovation_std(self) -> Array:
-        return np.sqrt(self.innovation_var)
+    theta: Array = _written("theta")
+    var: Array = _written("var", "Variances of the parameters, in the shape of theta.")
+    std: Array = _root_of("var")
+    prediction: Array = _written("y_hat")
+    innovation: Array = _written("e")
+    innovation_var: Array = _written("s", "Variances of the innovations, in their shape.")
+    innovation_std: Array = _root_of("innovation_var")
 
     @cached_property
     def ok(self) -> Array:

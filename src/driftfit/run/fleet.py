@@ -62,11 +62,11 @@ class Outputs(KeyedResults, OfRecord):
 
     @property
     def names(self) -> tuple[tuple[str, ...], ...]:
-        return tuple(one.names for one in self._programs)
+        return tuple(one.names for one in self.programs)
 
     @property
     def trackers(self) -> tuple[Tracker, ...]:
-        return tuple(one.tracker for one in self._programs)
+        return tuple(one.tracker for one in self.programs)
 
     @property
     def by(self) -> tuple[str, ...]:
@@ -116,10 +116,10 @@ class Outputs(KeyedResults, OfRecord):
 
     def replayed(self, store: Any, fields: tuple[str, ...]) -> Array:
         """The run again, (T,) records of a lane for each output, with these fields as ``store`` writes them."""
-        tile = tile_of(self._programs, [self._starts[j] for j in sorted(self._starts)])
-        out = self._programs[0].inspected(tile, len(self), fields)
-        steps = self._programs[0].steps._replace(store=store)
-        self._programs[0].drivers(steps=steps).run(tile, *lanes_of(self.record), out)
+        tile = tile_of(self.programs, [self._starts[j] for j in sorted(self._starts)])
+        out = self.programs[0].inspected(tile, len(self), fields)
+        steps = self.programs[0].steps._replace(store=store)
+        self.programs[0].drivers(steps=steps).run(tile, *lanes_of(self.record), out)
         return out
 
     def __getitem__(self, output: str | int) -> Track:
@@ -137,7 +137,7 @@ class Outputs(KeyedResults, OfRecord):
 
     def _track(self, j: int) -> Track:
         """One output alone, as a regression whose regressors may contain the other outputs."""
-        alone, y, u, lane = self._programs[j].alone, self.y[:, j], self.u, self._lanes[j]
+        alone, y, u, lane = self.programs[j].alone, self.y[:, j], self.u, self._lanes[j]
         left = NOTHING_LEFT_OUT
         known, names, units = self.record.known.for_output(j), self.labels.u, dict(self.labels.units)
         if alone is None:
@@ -146,8 +146,8 @@ class Outputs(KeyedResults, OfRecord):
             held = zip(names, self.model.sources, strict=True)
             units |= {name: units[source] for name, source in held if source in units}
             u = np.where(found["valid"][:, j, None] > 0.0, found["phi"][..., j], np.nan)
-            if self._programs[j].gate is not None:
-                left = left_out_of(lane.written("reason"), y, lane.written("ok") > 0.0, 0, self._programs[j].signals)
+            if self.programs[j].gate is not None:
+                left = left_out_of(lane.written("reason"), y, lane.written("ok") > 0.0, 0, self.programs[j].signals)
                 y, noise = left.applied(y, known.noise)
                 known = known.changed(noise=noise)
         tile = alone.tile()
@@ -174,7 +174,7 @@ class Outputs(KeyedResults, OfRecord):
         lanes = [state_of(lane.tile, lane.lane) for lane in self._lanes]
         states = tuple({name: value.copy() for name, value in lane.items()} for lane in lanes)
         labels = self.labels
-        return End(self._programs, states, self.time[-1] if self.timed else None, dt=labels.dt, zone=labels.zone)
+        return End(self.programs, states, self.time[-1] if self.timed else None, dt=labels.dt, zone=labels.zone)
 
 
 def missing(name: str, output: str) -> str:
@@ -239,7 +239,7 @@ class Fleet(KeyedResults):
             return self._run(k)
         lanes = range(k * self.records.ny, (k + 1) * self.records.ny)
         starts = {place: self._starts[j] for place, j in enumerate(lanes) if j in self._starts}
-        programs = [self._programs[j] for j in lanes]
+        programs = [self.programs[j] for j in lanes]
         return Outputs(programs, self.records.some(k, k + 1), self._lanes.part(lanes), {}, starts)
 
     def _run(self, j: int) -> Track:
@@ -249,7 +249,7 @@ class Fleet(KeyedResults):
             assert isinstance(whole, Outputs)
             return whole[output]
         left_out = self.records.left_out.get(self.records.keys[j], NOTHING_LEFT_OUT)
-        return Track(self._programs[j], self.records.part(j), self._lanes[j], self._starts.get(j), left_out)
+        return Track(self.programs[j], self.records.part(j), self._lanes[j], self._starts.get(j), left_out)
 
     def _absent(self, key: Hashable) -> str:
         if key in self.failed:
@@ -266,7 +266,7 @@ class Fleet(KeyedResults):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, of all outputs."""
-        return tuple(name for one in self._programs[: self.records.ny] for name in one.names)
+        return tuple(name for one in self.programs[: self.records.ny] for name in one.names)
 
 
 def run_fleet(

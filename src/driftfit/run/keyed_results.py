@@ -33,6 +33,8 @@ class KeyedResults(Plain):
 
     _kind: ClassVar[str]
 
+    programs: tuple[Program, ...]
+    """The program of each lane; without a series, those of some tracker."""
     failed: dict[Hashable, str]
     """The reason why a series has no result."""
 
@@ -46,7 +48,7 @@ class KeyedResults(Plain):
     ) -> None:
         self.records = records
         self.failed = dict(failed)
-        self._programs = tuple(programs)
+        self.programs = tuple(programs)
         self._lanes = lanes
         self._starts = dict(starts)
         done = self._lanes.done.tolist()
@@ -54,9 +56,9 @@ class KeyedResults(Plain):
 
     def __reduce__(self) -> Any:
         """A copy does not contain other series of a tile."""
-        alone = {j: self._lanes[j].alone(self._programs[j]) for j in self._index.values()}
+        alone = {j: self._lanes[j].alone(self.programs[j]) for j in self._index.values()}
         lanes = Lanes.of(alone, len(self._lanes))
-        return type(self), (self._programs, self.records, lanes, self.failed, self._starts)
+        return type(self), (self.programs, self.records, lanes, self.failed, self._starts)
 
     def _named(self) -> Sequence[Hashable]:
         """The key of every lane."""
@@ -74,12 +76,7 @@ class KeyedResults(Plain):
     @property
     def model(self) -> Model:
         """The model of all series, with all their outputs."""
-        return self._programs[0].whole
-
-    @property
-    def programs(self) -> tuple[Program, ...]:
-        """The program of each lane; without a series, those of some tracker."""
-        return self._programs
+        return self.programs[0].whole
 
     @property
     def labels(self) -> Labels:
@@ -124,7 +121,7 @@ class KeyedResults(Plain):
         """The programs and final states of the lanes whose record does not determine every parameter."""
         for _, tile, lanes, places in self._lanes.tiles:
             for k in np.flatnonzero(np.isinf(tile["var"][0]).any(axis=0)[places]).tolist():
-                yield self._programs[lanes[k]], state_of(tile, places[k])
+                yield self.programs[lanes[k]], state_of(tile, places[k])
 
     def stack(self, name: str) -> Array:
         """One result of every lane in natural order, (lanes, T, ...), NaN after the end of a series.
@@ -143,7 +140,7 @@ class KeyedResults(Plain):
 
         Keys must be text, numbers, times, or tuples of them.
         """
-        results = Results(self._programs, self.records, self._lanes, self.failed, self._starts)
+        results = Results(self.programs, self.records, self._lanes, self.failed, self._starts)
         write_results(path, self._kind, results)
 
     @classmethod
