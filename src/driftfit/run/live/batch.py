@@ -159,7 +159,7 @@ class Batched(Stream):
             self._ignored += T - len(axis)
             for gap in gaps[: PACE_SAMPLES + 1]:
                 self._pace.see(gap)
-            known = records.known if records.known.constant else Known(records.known.columns[taken])
+            known = records.known.part(taken)
             if len(axis):
                 self._last, known = instant(axis[-1]), known.changed(interval=gaps)
             records = records._replace(
