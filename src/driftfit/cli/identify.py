@@ -10,9 +10,8 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from driftfit.cli.options import Cells, Names, reads
+from driftfit.cli.options import Cells, Names, limits_from, listed, parse_interval, reads
 from driftfit.cli.program import app, progress, say, writable
-from driftfit.cli.reading import limits_from, listed, parse_interval
 from driftfit.engine.compile_notice import PATIENCE
 from driftfit.identify.answer import Identification, ManyIdentified, identify
 from driftfit.identify.roles import NoAnswerError

@@ -11,9 +11,8 @@ import polars as pl
 from rich.text import Text
 from typer import Option
 
-from driftfit.cli.options import Given, Out, Plot, Report, Since, Table, check_table, reads
+from driftfit.cli.options import Given, Out, Plot, Report, Since, Table, check_table, interval_from, listed, reads
 from driftfit.cli.program import app, draw, progress, say
-from driftfit.cli.reading import interval_from, listed
 from driftfit.data.columns import Wanted
 from driftfit.data.limits import end_of
 from driftfit.data.limits import marks as marks_of

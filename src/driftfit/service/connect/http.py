@@ -25,8 +25,22 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from driftfit.service.connect.base import Batch, Event, Outcome, Reader, RefusedError, Sink, Source, Writer
-from driftfit.service.connect.samples import NO_SIGNAL, TOO_MANY_NEW, Receipt, Samples, ShapeError, decode
+from driftfit.service.connect.base import (
+    NO_SIGNAL,
+    TOO_MANY_NEW,
+    Batch,
+    Event,
+    Outcome,
+    Reader,
+    Receipt,
+    RefusedError,
+    Samples,
+    ShapeError,
+    Sink,
+    Source,
+    Writer,
+    decode,
+)
 from driftfit.service.options import Secret
 
 ANSWER_SECONDS = 30.0
