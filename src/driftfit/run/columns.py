@@ -13,6 +13,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,11 @@ from driftfit.engine.kernel import Array, Driver, State, kernel
 
 SCALARS = ("y_hat", "e", "s", "ok")
 """Fields that belong to one row, as opposed to the state after it."""
+
+
+def attribute(path: str, text: str | None = None) -> Any:
+    """A property that is an attribute of a part, such as "program.tracker"."""
+    return property(attrgetter(path), doc=text)
 
 
 def _written(name: str, text: str | None = None) -> Any:

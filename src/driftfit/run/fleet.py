@@ -23,7 +23,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, warn
 from driftfit.models.regression import Regression
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, left_out_of
-from driftfit.run.columns import COLLECTED, OfRecord, collect
+from driftfit.run.columns import COLLECTED, OfRecord, attribute, collect
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.lanes import Lane, Lanes, names_of
 from driftfit.run.parallel_lanes import run_lanes
@@ -50,15 +50,12 @@ class Outputs(KeyedResults, OfRecord):
     """
 
     _kind = "outputs of a record"
+    outputs: tuple[str, ...] = attribute("records.outputs")
 
     @cached_property
     def record(self) -> Record:
         """The record, y (T, ny)."""
         return self.records.part(0)
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return self.records.outputs
 
     @property
     def names(self) -> tuple[tuple[str, ...], ...]:

@@ -293,12 +293,8 @@ class Units:
         """The samples of units in flat arrays, one unit after the other."""
         task = self.task
         keys, first, length = np.unique(self.code[rows], return_index=True, return_counts=True)
-        time, before = self.time[rows], np.roll(self.time[rows], 1)
-        before[first] = self.last[keys]
-        new = first[np.isnat(before[first]) if before.dtype.kind == "M" else np.isnan(before[first])]
-        before[new] = time[new]
-        gaps = task.clock.between(before, time)
-        gaps[new] = 1.0
+        time = self.time[rows]
+        gaps = task.clock.continued(time, first, self.last[keys])
         signals = np.stack([numbers(self.table.column(name))[rows] for name in (*task.y, *task.order)], axis=1)
         every, u = (np.ascontiguousarray(part) for part in np.split(signals, [len(task.y)], axis=1))
         y, known, outputs = every[:, 0], Known.of(gaps), tuple[str, ...]()

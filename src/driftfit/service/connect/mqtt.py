@@ -133,9 +133,9 @@ def rebirth_topic(topic: str) -> str:
 def _samples(topic: str, rows: dict[int, dict[str, Any]], before: dict[str, Any]) -> Samples:
     """A sample for each time, with the values of before where it has none."""
     known, filled = dict(before), []
-    for time in sorted(rows):
-        known |= rows[time]
-        filled.append(known | {"timestamp": time})
+    for when in sorted(rows):
+        known |= rows[when]
+        filled.append(known | {"timestamp": when})
     bounded(len(filled))
     return of_rows(topic, filled)
 
