@@ -8,7 +8,7 @@ import polars as pl
 import pyarrow as pa
 
 from driftfit import ARX, Kalman, track
-from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow
+from driftfit.bridges.spark.batch import NEW, OLD, WAITED, Flow
 from driftfit.bridges.spark.units import ARROW, SETTING, Task
 from driftfit.run import layout
 

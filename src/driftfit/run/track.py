@@ -24,9 +24,8 @@ from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, ungated
 from driftfit.readings.screen import apart, screen
-from driftfit.run.fleet import Fleet, Outputs, run_fleet
+from driftfit.run.fleet import Fleet, KeyedResults, Outputs, run_fleet
 from driftfit.run.gating import gate_of
-from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.lanes import Lane, Lanes
 from driftfit.run.program import Program, State, programs_of, tile_of
 from driftfit.run.result import Track, track_record

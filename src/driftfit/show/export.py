@@ -33,8 +33,7 @@ from driftfit.data.files import without_formulas
 from driftfit.data.instants import in_zone
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import of_series, one_of
-from driftfit.run.fleet import Fleet, Outputs
-from driftfit.run.keyed_results import KeyedResults, table_by_key
+from driftfit.run.fleet import Fleet, KeyedResults, Outputs, table_by_key
 from driftfit.run.result import Track
 from driftfit.show.text import key_text
 from driftfit.trackers.base import Tracker

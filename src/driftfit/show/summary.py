@@ -29,8 +29,7 @@ from driftfit.models.base import GAP
 from driftfit.models.equation import Equation
 from driftfit.models.state_space import StateSpace
 from driftfit.readings.left_out import floor_remark, remarks_of
-from driftfit.run.fleet import Outputs
-from driftfit.run.keyed_results import KeyedResults
+from driftfit.run.fleet import KeyedResults, Outputs
 from driftfit.run.live.conformal import quantile
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.text import (

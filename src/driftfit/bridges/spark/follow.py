@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, results_of, rules_of
+from driftfit.bridges.spark.batch import NEW, OLD, STATE, WAITED, Flow, results_of, rules_of
 from driftfit.bridges.spark.frames import by_unit, rows_of, sql_of, task_of
 from driftfit.bridges.spark.units import SETTING, Task, trackers_of
 from driftfit.data.clock import Clock
