@@ -34,12 +34,10 @@ import numpy as np
 from driftfit import track
 from driftfit.data.storage import describe
 from driftfit.service.config import parse
-from driftfit.service.connect.base import Batch
+from driftfit.service.connect.base import Batch, decode
 from driftfit.service.connect.http import INCOMING, decoded
-from driftfit.service.connect.samples import decode
 from driftfit.service.core.engine import Engine
-from driftfit.service.supervisor import cut_the_tail
-from driftfit.service.threads import SinkThread, SourceThread
+from driftfit.service.supervisor import SinkThread, SourceThread, cut_the_tail
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from service_support import HTTP

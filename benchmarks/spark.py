@@ -118,7 +118,7 @@ def step() -> None:
     import pyarrow as pa
 
     from driftfit.bridges.spark.batch import Partition, schema_of
-    from driftfit.bridges.spark.task import ROWS, Task
+    from driftfit.bridges.spark.units import ROWS, Task
 
     print(
         f"{'units':>8} {'rows each':>9} {'us per row':>11} {'us per unit':>12}   one worker, {ROWS} rows, without Spark"

@@ -6,7 +6,7 @@ import time
 from driftfit import ARX, Kalman, Live
 from driftfit.service.config import parse
 from driftfit.service.core.engine import Engine
-from driftfit.service.threads import SinkThread, SourceThread
+from driftfit.service.supervisor import SinkThread, SourceThread
 
 Live(ARX(1, 1), Kalman(q=1e-4, r=0.1), dt=1.0)  # compiled once for all processes
 

@@ -17,8 +17,7 @@ import numpy as np
 
 from driftfit import ARX, Kalman, track
 from driftfit.service.config import parse
-from driftfit.service.connect.base import Batch
-from driftfit.service.connect.samples import decode
+from driftfit.service.connect.base import Batch, decode
 from driftfit.service.core.engine import Engine
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-4, r=0.1)

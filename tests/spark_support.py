@@ -8,9 +8,8 @@ import polars as pl
 import pyarrow as pa
 
 from driftfit import ARX, Kalman, track
-from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow
-from driftfit.bridges.spark.task import SETTING, Task
-from driftfit.bridges.spark.units import ARROW
+from driftfit.bridges.spark.batch import NEW, OLD, WAITED, Flow
+from driftfit.bridges.spark.units import ARROW, SETTING, Task
 from driftfit.run import layout
 
 MODEL, K = ARX(2, 2), Kalman(q=1e-4, r=0.1)

@@ -16,7 +16,7 @@ from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.separation import METHODS, Groups, LeastSquares, minimal, split
 from driftfit.models.hammerstein_wiener.structure import Structure
 from driftfit.systems.hammerstein_wiener import CUBIC, START, simulate
-from driftfit.use.constant_system import fit_constant
+from driftfit.use.blocks import fit_constant
 
 SMALL = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(2))
 K = Kalman(q=1e-6, r=1e-4, p0=1e2, theta0=0.01)

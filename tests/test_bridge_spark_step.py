@@ -15,7 +15,7 @@ from support import same
 
 from driftfit import AdaptiveKalman, Kalman, Live, track
 from driftfit.bridges import spark
-from driftfit.bridges.spark import task as tasks
+from driftfit.bridges.spark import units as tasks
 from driftfit.bridges.spark.batch import Partition, schema_of
 from driftfit.bridges.spark.frames import java, missing
 from driftfit.bridges.spark.keyed import Unit

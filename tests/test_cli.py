@@ -10,7 +10,7 @@ from cli_support import fails, run
 
 from driftfit import ARX, Kalman, Regression, track, trackers
 from driftfit.cli import main
-from driftfit.cli.reading import parse_interval
+from driftfit.cli.options import parse_interval
 from driftfit.data.clock import Clock
 from driftfit.models.hammerstein_wiener.basis import BSpline, Legendre, PiecewiseLinear, Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ import pytest
 from cli_support import fails, run
 
 from driftfit import ARX, Kalman, Live, Track, cli, track
-from driftfit.cli.reading import Part, rows_of
+from driftfit.data.columns import Wanted
+from driftfit.data.files import Files
 
 K = Kalman(q=1e-4, r=0.01)
 KALMAN = ["--tracker", "kalman", "-p", "q=1e-4", "-p", "r=0.01"]
@@ -91,11 +93,12 @@ def test_the_other_ways_to_write_a_table(table):
 
 def test_numbers_with_commas_and_groups(tmp_path):
     (tmp_path / "n.csv").write_text("a;t\n1.234,5;2024-01-31\n-0,25;2024-02-01\n 7 ;2024-02-02\n1,5e3;2024-02-03\n;x\n")
-    read = rows_of([str(tmp_path / "n.csv")], ["a"], "t", [], Part(decimal=",", rows=(1, 4)))
+    files, wanted = Files(str(tmp_path / "n.csv"), how=Wanted((), decimal=",")), Wanted(("a",), "t")
+    read, _ = replace(files, rows=(1, 4)).columns(wanted)
     assert read.numbers["a"].tolist() == [1234.5, -0.25, 7.0, 1500.0]
     assert str(read.time[0]) == "2024-01-31T00:00:00.000000"
     with pytest.raises(ValueError, match="row 5 of column 't' holds 'x'"):
-        rows_of([str(tmp_path / "n.csv")], ["a"], "t", [], Part(decimal=","))
+        files.columns(wanted)
 
 
 def test_valid_ranges_and_intervals_left_out(table):

@@ -15,7 +15,7 @@ from cli_support import run as command
 
 import driftfit
 from driftfit import ARX, Kalman, track
-from driftfit.data.csv_files import without_formulas
+from driftfit.data.files import without_formulas
 from driftfit.fleets import Fleet, Outputs
 from driftfit.show import export
 

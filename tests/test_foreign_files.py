@@ -11,9 +11,9 @@ from scipy.io import savemat
 
 from driftfit import RLS, DataWarning, Regression, track
 from driftfit.bridges.matlab import read_mat
-from driftfit.cli.reading import Part, rows_of
 from driftfit.data.clock import Clock
-from driftfit.data.files import read_columns
+from driftfit.data.columns import Wanted
+from driftfit.data.files import Files, read_columns
 from driftfit.data.instants import warn_of_counted_years, warn_of_written_numbers
 from driftfit.data.limits import end_of, within
 from driftfit.data.storage import read
@@ -33,7 +33,8 @@ def test_decimal_commas_and_days_first_are_read_as_the_options_say(tmp_path):
         "1.4.2024 9:30;-,5;7",
     ]
     path = str(written(tmp_path, "\r\n".join(rows), "cp1252"))
-    found = rows_of([path], ["Durchfluß °C", "Druck"], "Datum", [], Part(decimal=",", dates="%d.%m.%Y %H:%M"))
+    wanted = Wanted(("Durchfluß °C", "Druck"), "Datum")
+    found, _ = Files(path, how=Wanted((), decimal=",", dates="%d.%m.%Y %H:%M")).columns(wanted)
     np.testing.assert_array_equal(found.numbers["Durchfluß °C"], [1.5, np.nan, -0.5])
     np.testing.assert_array_equal(found.numbers["Druck"], [1234.5, -12.25, 7.0])
     expected = np.array(["2024-03-30T22:00", "2024-03-30T22:15", "2024-04-01T09:30"], "datetime64[us]")
@@ -43,7 +44,7 @@ def test_decimal_commas_and_days_first_are_read_as_the_options_say(tmp_path):
     with pytest.raises(ValueError, match=r"row 1 .* neither a number nor a date in the form 2024-01-31.*--dates '%d"):
         read_columns(path, [], "Datum")
     times = written(tmp_path, "t;y\n0,5;1,5\n1,5;2,5\n")
-    assert rows_of([str(times)], ["y"], "t", [], Part(decimal=",")).time.tolist() == [0.5, 1.5]
+    assert Files(times, how=Wanted((), decimal=",")).columns(Wanted(("y",), "t"))[0].time.tolist() == [0.5, 1.5]
 
 
 @pytest.mark.parametrize(
@@ -136,7 +137,7 @@ def test_a_row_of_units_is_not_a_sample(tmp_path, text, units):
     run = track(Regression(1), RLS(1.0), "y", "u", data=path)
     assert dict(run.labels.units) == units
     assert len(run) == (3 if "Bad" in text else 2)
-    assert rows_of([str(path)], ["y", "u"], None, [], Part(rows=(2, None))).units == units
+    assert Files(path, rows=(2, None)).columns(Wanted(("y", "u")))[0].units == units
 
 
 def test_bytes_of_windows_1252_anywhere(tmp_path):

@@ -8,7 +8,7 @@ from support import same
 
 from driftfit import ExtendedKalman, HammersteinWiener, Kalman, Live, OutputError, track
 from driftfit.models.hammerstein_wiener.basis import Legendre, Polynomial
-from driftfit.run.outputs import Outputs
+from driftfit.run.fleet import Outputs
 
 TANK = HammersteinWiener(
     1, 2, input=Polynomial(2), output=[Legendre(2, (-1, 1)), Legendre(2, (-1200, 1200))], ny=("flow", "level")

@@ -38,23 +38,22 @@ from service_support import (
 
 from driftfit import track
 from driftfit.service.config import ProblemsError
-from driftfit.service.connect.base import Batch, Event, Outcome
-from driftfit.service.connect.samples import Receipt, Samples
+from driftfit.service.connect.base import Batch, Event, Outcome, Receipt, Samples
+from driftfit.service.connect.http import WebhookSink
 from driftfit.service.connect.tables import SqliteSink
-from driftfit.service.connect.webhook import WebhookSink
 from driftfit.service.control import health
 from driftfit.service.core import section
 from driftfit.service.options import Pattern
 from driftfit.service.page.app import metrics_of
 from driftfit.service.page.feed import Feed
-from driftfit.service.threads import EVENT_TRIES, SinkThread, SourceThread
+from driftfit.service.supervisor import EVENT_TRIES, SinkThread, SourceThread
 
 
 @pytest.mark.parametrize("status", [302, 307, 403, 500])
 def test_an_event_that_is_refused_is_tried_again_and_then_set_aside(tmp_path, monkeypatch, status):
     """A redirect was followed, to another address too, and its answer counted; a 5xx held up all alarms behind it."""
-    monkeypatch.setattr("driftfit.service.threads.FIRST_PAUSE", 1e-3)
-    monkeypatch.setattr("driftfit.service.threads.LONGEST_PAUSE", 1e-2)
+    monkeypatch.setattr("driftfit.service.supervisor.FIRST_PAUSE", 1e-3)
+    monkeypatch.setattr("driftfit.service.supervisor.LONGEST_PAUSE", 1e-2)
     with receiver(*[status] * (EVENT_TRIES + 2)) as url:
         sink = f'[[sink]]\nkind = "webhook"\nurl = "{url}"\nevents = ["action"]\n'
         config = configured(more=sink)

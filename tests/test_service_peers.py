@@ -37,13 +37,12 @@ from driftfit.service.connect.base import Event, Outcome
 from driftfit.service.connect.files import ReplaySource, TailSource
 from driftfit.service.connect.http import INCOMING
 from driftfit.service.connect.kafka import KafkaSink, KafkaSource
-from driftfit.service.connect.mqtt import MqttSource
+from driftfit.service.connect.mqtt import REBIRTH, MqttSource
 from driftfit.service.connect.opcua import OpcuaSink, OpcuaSource
-from driftfit.service.connect.sparkplug import REBIRTH
 from driftfit.service.connect.tables import PostgresSink
 from driftfit.service.core.journal import Names
 from driftfit.service.core.results import OK, Results
-from driftfit.service.threads import SinkThread, SourceThread
+from driftfit.service.supervisor import SinkThread, SourceThread
 
 
 def needs(package):

@@ -19,9 +19,9 @@ from driftfit import ARX, AdaptiveKalman, Bank, Change, Kalman, Sensor
 from driftfit.cli import app
 from driftfit.parsing.settings import parse_model, tracker_of
 from driftfit.service.config import ProblemsError, parse, read
+from driftfit.service.connect.base import decode, number, seconds
 from driftfit.service.connect.http import decoded
-from driftfit.service.connect.samples import decode, number, seconds
-from driftfit.service.connect.sparkplug import REBIRTH, Sparkplug, UnknownAliasError, rebirth_topic
+from driftfit.service.connect.mqtt import REBIRTH, Sparkplug, UnknownAliasError, rebirth_topic
 from driftfit.service.options import Pattern, Secret
 
 

@@ -16,8 +16,7 @@ from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.separation import LeastSquares, split
 from driftfit.models.hammerstein_wiener.thresholds import DeadZone, Saturation
 from driftfit.systems.arc_furnace import THRESHOLDS, valve
-from driftfit.use.blocks import free_run
-from driftfit.use.constant_system import fit_constant
+from driftfit.use.blocks import fit_constant, free_run
 
 VALVES = HammersteinWiener(1, [2, 1], nk=[1, 2], input=[PiecewiseLinear((-0.5, 0.5)), Saturation(3.0, start=1.0)])
 K = Kalman(q=0.0, r=4e-4, p0=1e2)

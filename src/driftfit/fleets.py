@@ -12,7 +12,7 @@ from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses,
 from driftfit.judge.joint_noise import JointNoise
 from driftfit.judge.on_all_cores import on_all_cores
 from driftfit.results import Exported, Track
-from driftfit.run import fleet, keyed_results, outputs, result
+from driftfit.run import fleet, result
 from driftfit.show.plots import plot_fleet, plot_outputs
 from driftfit.show.report import check_path, page_of_many
 from driftfit.show.summary import FleetSummary, Summary, summarise_fleet, summarise_outputs
@@ -32,7 +32,7 @@ def smoothed_path(run: Track) -> tuple[Array, Array]:
     return found.theta, found.std
 
 
-class Judged(keyed_results.KeyedResults, Exported):
+class Judged(fleet.KeyedResults, Exported):
     """Verbs of results by key; see `driftfit.judge.fleet_verdict`."""
 
     def values(self) -> Iterator[Track]:
@@ -130,8 +130,8 @@ class Fleet(fleet.Fleet, Judged, public=True):
         return plot_fleet(self, which, most, level, ax)
 
 
-class Outputs(outputs.Outputs, Judged, public=True):
-    __doc__ = outputs.Outputs.__doc__
+class Outputs(fleet.Outputs, Judged, public=True):
+    __doc__ = fleet.Outputs.__doc__
 
     def __getitem__(self, output: str | int) -> Track:
         """The record of one output, by name or index."""

@@ -25,8 +25,7 @@ from driftfit.systems.arc_furnace import THRESHOLDS, A, B, Furnace
 from driftfit.systems.hammerstein_wiener import CUBIC, WALK, Simulated, example
 from driftfit.trackers.kalman import Kalman
 from driftfit.tracking import track
-from driftfit.use.blocks import free_run
-from driftfit.use.constant_system import fit_constant, regression
+from driftfit.use.blocks import fit_constant, free_run, regression
 
 PAPER = Kalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)
 FAST = ExtendedKalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)

@@ -1,6 +1,6 @@
 """The command line; `driftfit --help` lists the commands, docs/command_line.md shows each in use."""
 
-from driftfit.cli import identify, records, serve, tools
+from driftfit.cli import records, tools
 from driftfit.cli.program import app, main
 
-__all__ = ["app", "identify", "main", "records", "serve", "tools"]
+__all__ = ["app", "main", "records", "tools"]

@@ -2,34 +2,129 @@
 
 from __future__ import annotations
 
+import csv
 import inspect
-from collections.abc import Callable
+import re
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 from typer import Argument, Option
 
 from driftfit.cli.program import progress, writable
-from driftfit.cli.reading import (
-    Part,
-    decimal_from,
-    interval_from,
-    limits_from,
-    listed,
-    parse_interval,
-    parse_units,
-    rows_from,
-    rows_of,
-    separator_from,
-    table_of,
-)
-from driftfit.data.columns import Columns
-from driftfit.engine.settings import missing_settings
+from driftfit.data.clock import Clock
+from driftfit.data.columns import Wanted
+from driftfit.data.files import Files
+from driftfit.engine.settings import missing_settings, near
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.parsing.settings import own_tracker, parse_model, parse_tracker
 from driftfit.trackers.base import Tracker
+
+Range = tuple[float, float]
+
+
+def limits_from(entry: str, names: Sequence[str]) -> tuple[str, Range]:
+    """``flow=0:80`` as a name and its range."""
+    name, _, bounds = entry.rpartition("=")
+    low, colon, high = bounds.partition(":")
+    try:
+        found = float(low or "-inf"), float(high or "inf")
+    except ValueError:
+        colon = ""
+    if not colon or not found[0] <= found[1]:
+        raise ValueError(f"--limits {entry}: give a valid range as column=low:high, such as --limits flow=0:80.")
+    if name.strip() not in names:
+        raise ValueError(f"--limits {entry}: no signal has the name {name.strip()!r}; {near(name.strip(), names)}")
+    return name.strip(), found
+
+
+def interval_from(entry: str, option: str = "--exclude") -> tuple[str, str]:
+    """``2024-03-01..2024-03-04`` as a pair of ends."""
+    first, dots, last = entry.partition("..")
+    if not (dots and first.strip() and last.strip()):
+        raise ValueError(f"{option} {entry}: give an interval as FROM..TO, such as {option} 2024-03-01..2024-03-04.")
+    return first.strip(), last.strip()
+
+
+def decimal_from(text: str) -> str:
+    """The decimal sign."""
+    if text not in (".", ","):
+        raise ValueError(f"--decimal {text}: the decimal sign must be a point or a comma.")
+    return text
+
+
+def separator_from(text: str | None) -> str | None:
+    """The separator of cells, one character; None: it is detected."""
+    sign = "\t" if text in ("tab", "\\t") else text
+    if sign is not None and len(sign) != 1:
+        raise ValueError(f"--separator {text}: the separator must be one character, such as ';', or tab.")
+    return sign
+
+
+def sample_of(row: str, first: int) -> int:
+    """The sample, from 0, of a row that is given as text."""
+    if not row.isdigit():
+        raise ValueError(f"--exclude: without --time give an interval of rows, such as 100..120; got {row!r}.")
+    return int(row) - first
+
+
+def rows_from(text: str | None) -> tuple[int, int | None]:
+    """``100:500`` as the first and the last row, None: to the end."""
+    if text is None:
+        return 1, None
+    first, colon, last = text.partition(":")
+    if not colon or not all(part.strip().isdigit() or not part.strip() for part in (first, last)):
+        raise ValueError(f"--rows {text}: rows are counted from 1, as in --rows 100:500, 100: or :500.")
+    a, b = int(first or 1), int(last) if last.strip() else None
+    if a < 1 or (b is not None and b < a):
+        raise ValueError(
+            f"--rows {text}: there are no such rows; rows are counted from 1, and the first must not be after the last."
+        )
+    return a, b
+
+
+def listed(given: Sequence[str] | None) -> list[str]:
+    """Names that were given in several options, or separated by commas; one with a comma is quoted, as in a CSV file.
+
+    In a shell that is ``--u '"flow, cold",temperature'``. Blanks, parentheses and other signs need no quotes here.
+    """
+    try:
+        rows = [next(csv.reader([entry], skipinitialspace=True, strict=True), []) for entry in given or []]
+    except csv.Error:
+        raise ValueError(
+            f"{', '.join(given or [])}: a name with a comma is quoted as in a CSV file, in a shell as "
+            "--u '\"flow, cold\",temperature'."
+        ) from None
+    return [name.strip() for row in rows for name in row if name.strip()]
+
+
+def parse_units(given: Sequence[str] | None) -> dict[str, str]:
+    """``flow=l/min`` as a name and its unit."""
+    pairs = {entry: entry.rpartition("=") for entry in given or []}
+    for entry, (name, _, unit) in pairs.items():
+        if not name.strip() or not unit.strip():
+            raise ValueError(f"--unit {entry}: give a unit as column=unit, such as --unit flow=l/min.")
+    return {name.strip(): unit.strip() for name, _, unit in pairs.values()}
+
+
+def parse_interval(text: str | None) -> float | str | None:
+    """``0.5`` as a number; a duration or a step of the calendar as text, in which ``m`` after a number is minutes."""
+    if text is None:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        given = re.sub(r"(\d\s*)m\s*$", r"\1min", text)
+    try:
+        Clock.of(given)
+    except ValueError as error:
+        raise ValueError(f"--dt {text}: {error}") from None
+    return given
+
 
 Names = list[str] | None
 WRITTEN = {"write_to": "--out", "plot": "--plot", "system": "--system", "report": "--report"}
@@ -51,8 +146,42 @@ def check_table(path: Path | None, what: str) -> None:
         raise ValueError(f"--out {path}: {what} written to .csv or .parquet.")
 
 
-@dataclass(frozen=True)
-class Given:
+@dataclass(frozen=True, kw_only=True)
+class Cells:
+    """The options that say how the cells of a file are read."""
+
+    time: Annotated[str | None, Option(help="Column of the time: numbers or dates.")] = None
+    dt: Annotated[
+        str | None,
+        Option(
+            help="Nominal interval: a number; for dates 10ms, 1s, 15min, 1h, 1d, 1w, 'business day', month, quarter, "
+            "year, or label if samples are one step apart whatever their dates."
+        ),
+    ] = None
+    separator: Annotated[
+        str | None,
+        Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
+    ] = None
+    decimal: Annotated[str, Option(help="Decimal sign of the numbers: . or , (points then group thousands).")] = "."
+    dates: Annotated[
+        str | None, Option(help="Form of dates that do not begin with the year: '%d.%m.%Y %H:%M', as in Python.")
+    ] = None
+    missing: Annotated[
+        Names, Option(help="What the file holds where there is no reading: Offline or -999; repeat it.")
+    ] = None
+    limits: Annotated[
+        Names, Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
+    ] = None
+
+    @property
+    def wanted(self) -> Wanted:
+        """How columns are read that are yet to be named."""
+        how = separator_from(self.separator), decimal_from(self.decimal), self.dates
+        return Wanted((), None, (), tuple(self.missing or ()), *how)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Given(Cells):
     """The options that commands share, as given on the command line."""
 
     file: Annotated[
@@ -76,7 +205,6 @@ class Given:
         str, Option(help="Tracker, as `driftfit trackers` lists them, or as in Python: 'Kalman(q=1e-4, r=0.1)'.")
     ] = "adaptive-kalman"
     p: Annotated[Names, Option("-p", help="Setting of the tracker: q=1e-4, q=1e-4,0,0 or p0=none; repeat it.")] = None
-    time: Annotated[str | None, Option(help="Column of the time: numbers or dates.")] = None
     by: Annotated[
         Names, Option(help="Column that identifies the series of a fleet, or `file`; repeat it for several.")
     ] = None
@@ -84,31 +212,10 @@ class Given:
     own: Annotated[
         str | None, Option("--with", metavar="MODULE:CLASS", help="Your own tracker, from a module in this folder.")
     ] = None
-    dt: Annotated[
-        str | None,
-        Option(
-            help="Nominal interval: a number; for dates 10ms, 1s, 15min, 1h, 1d, 1w, 'business day', month, quarter, "
-            "year, or label if samples are one step apart whatever their dates."
-        ),
-    ] = None
     first: Annotated[str | None, Option("--from", help="First time to use, with --time.")] = None
     last: Annotated[str | None, Option("--to", help="Last time to use, with --time.")] = None
     rows: Annotated[
         str | None, Option(help="Rows to use of each file, counted from 1 after the header: 100:500, 100: or :500.")
-    ] = None
-    separator: Annotated[
-        str | None,
-        Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
-    ] = None
-    decimal: Annotated[str, Option(help="Decimal sign of the numbers: . or , (points then group thousands).")] = "."
-    dates: Annotated[
-        str | None, Option(help="Form of dates that do not begin with the year: '%d.%m.%Y %H:%M', as in Python.")
-    ] = None
-    missing: Annotated[
-        Names, Option(help="What the file holds where there is no reading: Offline or -999; repeat it.")
-    ] = None
-    limits: Annotated[
-        Names, Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
     ] = None
     exclude: Annotated[
         Names, Option(help="Interval to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
@@ -160,33 +267,28 @@ class Given:
     def chosen_tracker(self) -> Tracker:
         return parse_tracker(self.tracker, self.p or [], self.own)
 
-    def part(self) -> Part:
-        """Which part of the files is used, and how the files are read."""
-        names = [*self.outputs, *self.inputs]
-        return Part(
-            first=self.first, last=self.last, rows=rows_from(self.rows),
-            separator=separator_from(self.separator), decimal=decimal_from(self.decimal), dates=self.dates,
-            missing=tuple(self.missing or []),
-            limits=tuple(limits_from(entry, names) for entry in self.limits or []),
-            exclude=tuple(map(interval_from, self.exclude or [])),
-        )  # fmt: skip
+    @cached_property
+    def files(self) -> Files:
+        """The files, which part of them is used, and how they are read."""
+        if (self.first or self.last) and self.time is None:
+            raise ValueError("--from and --to are times, so they need --time; rows are chosen with --rows.")
+        source = sys.stdin.buffer.read() if "-" in self.file else self.file
+        return Files(source, rows_from(self.rows), (self.first, self.last), self.wanted)
 
-    def signals(self, rows: Columns | None = None) -> dict[str, Any]:
-        """The arguments of `track` other than model and tracker; ``rows`` are the data if they were read already."""
-        outputs = self.outputs
-        if rows is None and (not self.part().whole or "-" in self.file):
-            rows = self.read()
-        data: Any = self.file if rows is None else table_of(rows, self.time, self.by or [])
-        signals = {"y": outputs if len(outputs) > 1 else outputs[0], "u": self.inputs, "data": data, "time": self.time}
-        signals |= {**self.part().restrictions(self.time is not None), "gate": self.gate}
-        units = {**({} if rows is None else rows.units), **parse_units(self.unit)}
-        return signals | {"by": self.by or None, "dt": parse_interval(self.dt), "units": units or None}
+    def signals(self) -> dict[str, Any]:
+        """The arguments of `track` other than model and tracker."""
+        outputs, first = self.outputs, self.files.rows[0]
+        exclude: list[tuple[Any, Any]] = list(map(interval_from, self.exclude or []))
+        if self.time is None:  # intervals are rows
+            exclude = [(sample_of(low, first), sample_of(high, first)) for low, high in exclude]
+        limits = dict(limits_from(entry, [*outputs, *self.inputs]) for entry in self.limits or [])
+        return {
+            "y": outputs if len(outputs) > 1 else outputs[0], "u": self.inputs, "data": self.files, "time": self.time,
+            "limits": limits or None, "exclude": exclude or None, "missing": self.missing or (), "gate": self.gate,
+            "by": self.by or None, "dt": parse_interval(self.dt), "units": parse_units(self.unit) or None,
+        }  # fmt: skip
 
-    def read(self, *more: str) -> Columns:
-        """Read the selected part of the columns, and of ``more`` columns."""
-        return rows_of(self.file, [*self.outputs, *self.inputs, *more], self.time, self.by or [], self.part())
-
-    def run(self, rows: Columns | None = None, tracker: Tracker | None = None) -> Any:
+    def run(self, tracker: Tracker | None = None) -> Any:
         """Run the configuration that the options describe: a Track, an Outputs or a fleet."""
         from driftfit.tracking import track
 
@@ -197,7 +299,7 @@ class Given:
             raise ValueError(
                 f"--tracker {self.tracker}: {names} must be given: {typed}; `driftfit tune` estimates them from data."
             )
-        signals: Any = self.signals(rows)
+        signals: Any = self.signals()
         more: Any = {} if before is None else {"warm_start": before}
         if before is not None and self.gate is None:
             signals["gate"] = before.end().programs[0].gate or False

@@ -1,30 +1,55 @@
-"""Commands that read a record: track, verdict, tune, select, detect, forecast, smooth."""
+"""Commands that read a record: track, verdict, tune, select, detect, forecast, smooth; and identify, from a file to an
+answer.
+"""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import monotonic
 from typing import Annotated, Any
 
 import numpy as np
 import polars as pl
+import typer
 from rich.text import Text
-from typer import Option
+from typer import Argument, Option
 
-from driftfit.cli.options import Given, Out, Plot, Report, Since, Table, check_table, reads
-from driftfit.cli.program import app, draw, progress, say
-from driftfit.cli.reading import interval_from, listed, order_of, rows_of
+from driftfit.cli.options import (
+    Cells,
+    Given,
+    Names,
+    Out,
+    Plot,
+    Report,
+    Since,
+    Table,
+    check_table,
+    interval_from,
+    limits_from,
+    listed,
+    parse_interval,
+    reads,
+)
+from driftfit.cli.program import app, draw, progress, say, writable
 from driftfit.data.columns import Wanted
 from driftfit.data.limits import end_of
+from driftfit.data.limits import marks as marks_of
+from driftfit.data.record import Reading
+from driftfit.data.tables import read_records
+from driftfit.engine.compile_notice import PATIENCE
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks, missing_settings
-from driftfit.identify.answer import chosen
+from driftfit.identify.answer import Identification, ManyIdentified, chosen, identify
 from driftfit.identify.page import interval, short
+from driftfit.identify.roles import NoAnswerError
 from driftfit.judge.structures.select import Selection
 from driftfit.judge.structures.select import select as compare
 from driftfit.parsing.settings import given_fields
 from driftfit.readings.left_out import remarks_of
 from driftfit.results import Track
+from driftfit.run.live.conformal import quantile
 from driftfit.show.export import check_ending, write, write_table
 from driftfit.show.report import check_path
 from driftfit.show.text import digits, facts, shortened, table_of
@@ -47,8 +72,7 @@ def track(
     """Track the parameters of a model in a record, or in a fleet of records."""
     if write_to is not None:
         check_ending(write_to)
-    if report is not None:
-        check_path(report)
+    _check_page(given, report, since)
     if given.free:
         given = _with_structure(given)
     run = given.run()
@@ -62,20 +86,24 @@ def track(
     _page(run, report, since)
 
 
+def _check_page(given: Given, path: Path | None, since: str | None) -> None:
+    """ValueError for a page that cannot be written, before anything is run."""
+    if path is not None:
+        check_path(path)
+    if since is not None and (path is None or not (given.by or len(given.outputs) > 1)):
+        raise ValueError("--since: this is for the page of many series; give --report and --by.")
+
+
 def _page(run: Any, path: Path | None, since: str | None) -> None:
     """Write the page of a record or a fleet, if there is a path for it."""
-    if since is not None and (path is None or isinstance(run, Track)):
-        raise ValueError("--since: this is for the page of many series; give --report and --by.")
     if path is not None:
         run.report(path, **({} if since is None else {"since": since}))
 
 
 def _with_structure(given: Given) -> Given:
     """The options with the inputs, the structure and the time that `driftfit identify` finds."""
-    part = given.part()
-    reading = Wanted((), None, (), part.missing, part.separator, part.decimal, part.dates)
     with progress.status("searching the structure"):
-        found, model = chosen(given.file[0], given.outputs[0], given.time, reading)
+        found, model = chosen(given.file[0], given.outputs[0], given.time, given.wanted)
     text, inputs = short(model), f" --u {','.join(model.input_names)}" if model.input_names else ""
     say(Text(f" Chosen: --model {text}{inputs}; `driftfit identify` says why."), soft_wrap=True)
     dt = given.dt or (interval(found) if found.clock else None)
@@ -92,6 +120,7 @@ def verdict(
     since: Since = None,
 ) -> None:
     """Report whether the parameters move, which ones and when, and whether tracking them pays."""
+    _check_page(given, report, since)
     run = given.run()
     say(run.verdict(level=level, lags=lags))
     _page(run, report, since)
@@ -203,15 +232,16 @@ def detect(
     if labels is not None and (given.by or len(given.outputs) > 1):
         raise ValueError("--labels: labels are for one series of one output; leave out --by and further --y.")
     check_table(write_to, "alarms are")
-    if report is not None:
-        check_path(report)
-    rows = given.read(labels) if labels is not None else None
-    run = given.run(rows)
+    _check_page(given, report, None)
+    run = given.run()
     alarms = options.find(run)
     say(alarms)
     faulty = None
-    if rows is not None and labels is not None:
-        faulty = marks("--labels", rows.numbers[labels][order_of(rows)], len(alarms.active))
+    if labels is not None:
+        read = read_records(
+            given.files, labels, None, None, Reading(time=given.time, dt="label", missing=given.missing)
+        )[0]
+        faulty = marks("--labels", read.y, len(alarms.active))
         score = alarms.score(faulty)
         late = "" if np.isnan(score.delay) else f", {score.delay:g} samples after they began (median)"
         found = f" Labels: {score.found} of {score.events} found{late};"
@@ -263,8 +293,7 @@ def forecast(
     write_to: Table = None,
 ) -> None:
     """Forecast the outputs, and the parameters, after the end of the record."""
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"--level must be between 0 and 1, such as 0.95; got {level!r}.")
+    quantile(level, "--level")  # whether there is one
     check_table(write_to, "a forecast is")
     given.check_single("forecast")
     u = None if future is None else _inputs(given, future)
@@ -294,8 +323,9 @@ def forecast(
 def _inputs(given: Given, future: str) -> Array:
     if not given.inputs:
         raise ValueError(f"--future {future}: the model has no inputs; leave it out.")
-    read = rows_of([future], given.inputs, None, [], replace(given.part(), first=None, last=None, rows=(1, None)))
-    return np.stack([read.numbers[name] for name in given.inputs], axis=1)
+    files = replace(given.files, paths=future, rows=(1, None), times=(None, None))
+    numbers = files.columns(Wanted(tuple(given.inputs), missing=marks_of(given.missing)[0]))[0].numbers
+    return np.stack([numbers[name] for name in given.inputs], axis=1)
 
 
 @app.command()
@@ -325,3 +355,75 @@ def smooth(given: Given, write_to: Table = None, plot: Plot = None) -> None:
         columns |= {f"std_{name}": smoothed.std[:, i] for i, name in enumerate(run.names)}
         write_table(pl.DataFrame(columns), write_to)
     draw(plot, smoothed.plot)
+
+
+@app.command("identify")
+@reads
+def identify_command(
+    file: Annotated[list[str], Argument(help="CSV or Parquet files, or patterns such as 'runs/*.csv'.")],
+    cells: Cells,
+    *,
+    y: Annotated[str | None, Option(help="Column of the output.")] = None,
+    u: Annotated[Names, Option(help="Inputs to choose from; repeat it, or separate names by commas.")] = None,
+    not_u: Annotated[Names, Option(help="Columns that are no inputs.")] = None,
+    by: Annotated[str | None, Option(help="Column that identifies records of one structure.")] = None,
+    max_lag: Annotated[int, Option(help="Longest lag of an input, in samples.")] = 30,
+    forecast: Annotated[
+        bool, Option("--forecast/--explain", help="Only inputs of earlier samples, or also of the same.")
+    ] = False,
+    horizon: Annotated[int, Option(help="Steps ahead of the second comparison.")] = 10,
+    level: Annotated[float, Option(help="Error rate of the statement that parameters move.")] = 0.05,
+    gate: Annotated[
+        bool | None, Option("--gate/--no-gate", help="Leave out fault codes however many, or use all readings.")
+    ] = None,
+    budget: Annotated[
+        float,
+        Option(
+            help="Seconds for one record.", metavar="SECONDS", parser=lambda text: float(str(text).removesuffix("s"))
+        ),
+    ] = 45.0,
+    seed: Annotated[int, Option(help="Seed of the displaced copies of inputs.")] = 0,
+    page: Annotated[Path | None, Option(help="Write the answer to a page (.html).")] = None,
+    json_to: Annotated[Path | None, Option("--json", help="Write the answer as JSON; - is stdout.")] = None,
+    quiet: Annotated[bool, Option("--quiet", help="Print the headline alone.")] = False,
+) -> None:
+    """From a file to an answer: which inputs matter, what changed, since when, and is it time or the working point?
+
+    Exit codes: 0 answered, 1 undecided, 2 arguments or file, 3 the record cannot answer.
+    """
+    writable(page, "--page")
+    ranges = dict(limits_from(one, [one.rpartition("=")[0].strip()]) for one in cells.limits or [])
+    began = monotonic()
+    with progress.status("reading") as status:
+        if not (progress.is_terminal and not quiet):
+            status.stop()
+
+        def tell(text: str) -> None:
+            if monotonic() - began > PATIENCE:
+                status.update(text)
+
+        try:
+            found = identify(
+                file if len(file) > 1 else file[0], y, u=listed(u) or None, not_u=listed(not_u), time=cells.time,
+                dt=parse_interval(cells.dt), by=by, limits=ranges,
+                max_lag=max_lag, forecast=forecast, horizon=horizon, level=level, gate=gate,
+                budget=budget, seed=seed, reading=cells.wanted, progress=tell,
+            )  # fmt: skip
+        except NoAnswerError as error:
+            status.stop()
+            typer.echo(f"driftfit: this record cannot answer: {error}", err=True)
+            raise typer.Exit(3) from None
+    write_answer(found, page, json_to, quiet)
+    raise typer.Exit(found.code)
+
+
+def write_answer(found: Identification | ManyIdentified, page: Path | None, json_to: Path | None, quiet: bool) -> None:
+    """Print the answer, and write what the options ask for."""
+    to_stdout = str(json_to) == "-"
+    if json_to is not None:
+        text = json.dumps(found.json(), indent=1)
+        typer.echo(text) if to_stdout else json_to.write_text(text, encoding="utf-8")
+    if not to_stdout:
+        say(" ".join(found.headline.split()) if quiet else found)
+    if page is not None:
+        found.page(page)

@@ -193,6 +193,16 @@ class Clock:
             gaps[1:] = self.between(time[:-1], time[1:])
         return gaps
 
+    def continued(self, time: Array, first: Array, last: Array) -> Array:
+        """Nominal intervals (N,) before the samples of series that begin at ``first`` (K,), after samples at ``last``
+        (K,); 1 where that is NaN or NaT.
+        """
+        before, none = np.roll(time, 1), np.isnat(last) if last.dtype.kind == "M" else np.isnan(last)
+        before[first] = np.where(none, time[first], last)
+        gaps = self.between(before, time)
+        gaps[first[none]] = 1.0
+        return gaps
+
     def since(self, last: Any, time: Any) -> float:
         """Nominal intervals from one instant to another; 1 if there is none before.
 

@@ -166,6 +166,12 @@ def _date_of_text(text: str) -> np.datetime64:
         return np.datetime64("NaT", "us")
 
 
+def in_zone(table: pl.DataFrame, time: str, zone: str | None) -> pl.DataFrame:
+    """A table whose times, in UTC, are shown in a zone; unchanged without one."""
+    shown = pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(zone or "UTC")
+    return table if zone is None else table.with_columns(shown)
+
+
 def zone_name(zone: Any) -> str:
     """The name of a time zone, from a tzinfo or text; a fixed offset of whole hours has a name, others become UTC."""
     name = next((str(getattr(zone, key)) for key in ("key", "zone") if getattr(zone, key, None)), str(zone))

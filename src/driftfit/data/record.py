@@ -11,7 +11,7 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC
 from datetime import time as clock
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any, NamedTuple
 from zoneinfo import ZoneInfo
 
@@ -314,16 +314,6 @@ class Known:
     def __len__(self) -> int:
         return len(self.columns)
 
-    @cached_property
-    def lanes(self) -> Array:
-        """The columns of one output with an axis for its lane, (T, k, 1) or (1, k, 1)."""
-        return self.columns[:, :, None]
-
-    @property
-    def constant(self) -> bool:
-        """Whether one row holds for every sample."""
-        return len(self.columns) == 1
-
     @property
     def interval(self) -> Array:
         """(T,) or (1,): nominal intervals since the sample before."""
@@ -351,7 +341,7 @@ class Known:
 
     def part(self, rows: slice | Array) -> Known:
         """The known numbers of some of the samples."""
-        return self if self.constant else Known(self.columns[rows])
+        return self if len(self) == 1 else Known(self.columns[rows])
 
     def over(self, T: int) -> Known:
         """The same numbers with a row for each of T samples; the arrays must not be changed."""

@@ -22,7 +22,7 @@ from driftfit.data.arguments import dated, noise_of, ordered, warn_of_order, war
 from driftfit.data.arrays import named_outputs, noise_of_outputs
 from driftfit.data.clock import LABEL, Clock
 from driftfit.data.columns import Columns, Wanted
-from driftfit.data.files import read
+from driftfit.data.files import Files, read
 from driftfit.data.instants import warn_of_counted_years, warn_of_written_numbers
 from driftfit.data.limits import marks
 from driftfit.data.record import Known, Labels, Reading, Records
@@ -95,7 +95,7 @@ def _dated(data: Any, used: Sequence[str], reading: Reading) -> tuple[Any, str |
 
     If no time is given, dates label the rows: an index of dates, or the only column of dates that is not ``used``.
     """
-    if reading.time is not None or not reading.indexed or isinstance(data, str | os.PathLike | list | tuple):
+    if reading.time is not None or not reading.indexed or isinstance(data, str | os.PathLike | list | tuple | Files):
         return data, None if reading.time is None else _name("time", reading.time), False
     index: Any = getattr(data, "index", None)
     if dated(index):

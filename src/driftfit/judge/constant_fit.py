@@ -28,8 +28,7 @@ from driftfit.engine.kernel import Array, Driver, State, kernel, shared
 from driftfit.engine.tiles import make_tile, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.run.columns import COLLECTED, collect
-from driftfit.run.fleet import Fleet
-from driftfit.run.outputs import Outputs
+from driftfit.run.fleet import Fleet, Outputs
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
 from driftfit.run.track import track

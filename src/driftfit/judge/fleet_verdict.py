@@ -27,7 +27,7 @@ from driftfit.judge.diagnose import Diagnosis, diagnose, diagnosis
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.on_all_cores import on_all_cores
 from driftfit.judge.verdict import Moved, Verdict, change, judged, p_text, verdict
-from driftfit.run.keyed_results import table_by_key
+from driftfit.run.fleet import table_by_key
 from driftfit.show.text import Printed, key_text, table_of
 
 if TYPE_CHECKING:

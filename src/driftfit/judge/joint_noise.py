@@ -28,7 +28,7 @@ import scipy
 
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.models.regression import Regression
-from driftfit.run.outputs import Outputs
+from driftfit.run.fleet import Outputs
 
 
 @kernel

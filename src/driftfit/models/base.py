@@ -83,7 +83,7 @@ class Model(Settings, ABC):
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs; several outputs are run by `driftfit.run.outputs`."""
+        """Names of the outputs; several outputs are run by `driftfit.run.fleet`."""
         return ("y",)
 
     @property

@@ -1,7 +1,7 @@
 """Codes in the record of a run that had no gate: said afterwards, because such a run uses whatever it is given.
 
-`screen` is one vectorised look at a signal of all series. Where it and `suspect` find something, the record is run once
-more with a gate, and what that leaves out is said. Before there is a run, `apart` finds codes in a complete record.
+`screen` is one vectorised look at a signal of all series. Where it and `apart` find something, the record is run once
+more with a gate, and what that leaves out of the values that are apart is said.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,21 @@ from driftfit.engine.kernel import Array, Driver, State, kernel
 
 SCALARS = ("y_hat", "e", "s", "ok")
 """Fields that belong to one row, as opposed to the state after it."""
+
+
+def attribute(path: str, text: str | None = None) -> Any:
+    """A property that is an attribute of a part, such as "program.tracker"."""
+    return property(attrgetter(path), doc=text)
+
+
+def _written(name: str, text: str | None = None) -> Any:
+    """A field of the driver's output as a property."""
+    return property(lambda self: self.written(name), doc=text)
+
+
+def _root_of(name: str) -> Any:
+    """The square root of another property, computed once."""
+    return cached_property(lambda self: np.sqrt(getattr(self, name)))
 
 
 class Columns(ABC):
@@ -62,35 +78,13 @@ class Columns(ABC):
         values = self.in_rows(name)
         return self.by_row(values) if name in SCALARS else self.after_rows(values)
 
-    @property
-    def theta(self) -> Array:
-        return self.written("theta")
-
-    @property
-    def var(self) -> Array:
-        """Variances of the parameters, in the shape of theta."""
-        return self.written("var")
-
-    @cached_property
-    def std(self) -> Array:
-        return np.sqrt(self.var)
-
-    @property
-    def prediction(self) -> Array:
-        return self.written("y_hat")
-
-    @property
-    def innovation(self) -> Array:
-        return self.written("e")
-
-    @property
-    def innovation_var(self) -> Array:
-        """Variances of the innovations, in their shape."""
-        return self.written("s")
-
-    @cached_property
-    def innovation_std(self) -> Array:
-        return np.sqrt(self.innovation_var)
+    theta: Array = _written("theta")
+    var: Array = _written("var", "Variances of the parameters, in the shape of theta.")
+    std: Array = _root_of("var")
+    prediction: Array = _written("y_hat")
+    innovation: Array = _written("e")
+    innovation_var: Array = _written("s", "Variances of the innovations, in their shape.")
+    innovation_std: Array = _root_of("innovation_var")
 
     @cached_property
     def ok(self) -> Array:

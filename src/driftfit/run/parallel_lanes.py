@@ -22,9 +22,9 @@ import threading
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from functools import cached_property
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -84,16 +84,16 @@ def prepare(
     return sorted(jobs, key=lambda job: -len(job.out))
 
 
+@dataclass(eq=False)
 class Job:
     """One tile with the number of the program in each lane; lanes that are not ``live`` repeat others."""
 
-    def __init__(self, run: Any, tile: Array, lanes: Array, live: Array, out: Array) -> None:
-        self.run = run
-        self.tile = tile
-        self.lanes = lanes
-        self.live = live
-        self.out = out
-        self.done = False
+    run: Any
+    tile: Array
+    lanes: Array
+    live: Array
+    out: Array
+    done: bool = False
 
 
 def _groups(programs: Sequence[Program]) -> list[list[int]]:
@@ -254,15 +254,16 @@ def _gather_factors(known: Array, start: Array, column: Array, to_known: Array) 
                 to_known[t, j, l] = known[(start[l] + t) * changing, j, column[l]] if start[l] >= 0 else 1.0 * (j > 0)
 
 
-class Advanced:
+class Advanced(NamedTuple):
     """The results of a driver for all series of ``records``, and their final states."""
 
-    def __init__(self, programs: Sequence[Program], records: Records, jobs: Sequence[Job]) -> None:
-        self.programs, self.records, self.jobs = programs, records, jobs
+    programs: Sequence[Program]
+    records: Records
+    lanes: Lanes
 
     def column(self, name: str) -> Array:
         """A field of the driver's output at every sample: (N, ..), or (N, ny, ..) for several outputs."""
-        shape, ny = self.jobs[0].out[name].shape[1:-1], self.records.ny
+        shape, ny = self.lanes.tiles[0][0][name].shape[1:-1], self.records.ny
         into = np.empty((len(self.records.y), ny, int(np.prod(shape))))
         self.columns([name], into)
         return into.reshape(-1, *((ny,) if self.records.outputs else ()), *shape)
@@ -272,37 +273,25 @@ class Advanced:
         outputs.
         """
         into = into[:, None] if into.ndim == 2 else into
-        for job in self.jobs:
-            lanes, L = np.flatnonzero(job.live), len(job.lanes)
-            series, output = np.divmod(job.lanes[lanes], self.records.ny)
-            fields: Mapping[str, Any] = job.out.dtype.fields or {}
-            places = (fields[name][:2] for name in names)
-            begin = [np.arange(at, at + kind.itemsize, 8 * L) // 8 for kind, at in places]
-            words = job.out.view(np.float64).reshape(len(job.out), -1)
+        for out, tile, lanes, places in self.lanes.tiles:
+            series, output = np.divmod(lanes, self.records.ny)
+            fields: Mapping[str, Any] = out.dtype.fields or {}
+            parts, L = (fields[name][:2] for name in names), tile["theta"].shape[-1]
+            begin = [np.arange(at, at + kind.itemsize, 8 * L) // 8 for kind, at in parts]
+            words = out.view(np.float64).reshape(len(out), -1)
             first, length = self.records.first[series], self.records.length[series]
-            _natural(words, np.concatenate(begin), lanes, first, length, output, into)
+            _natural(words, np.concatenate(begin), places, first, length, output, into)
 
     def reasons(self) -> Array:
         """What the gate decided of every sample, (N,), of series with one output (`driftfit.readings.gate`)."""
-        into = np.zeros(len(self.records.y), int)
-        for job in self.jobs:
-            for lane in np.flatnonzero(job.live).tolist():
-                k = job.lanes[lane]
-                first, length = self.records.first[k], self.records.length[k]
-                into[first : first + length] = job.out["reason"][:length, lane]
-        return into
-
-    @cached_property
-    def lanes(self) -> Lanes:
-        """The lane of each program."""
-        return lanes_in(self.jobs, self.records)
+        return self.column("reason").view(np.int64)
 
     def states(self) -> Array:
         """The words (K ny, W) after the last samples; of a layout with fewer words the first of them."""
-        layouts = [self.programs[job.lanes[0]].layout for job in self.jobs]
+        layouts = [self.programs[lanes[0]].layout for _, _, lanes, _ in self.lanes.tiles]
         found = np.zeros((len(self.programs), max(one.size for one in layouts)), np.int64)
-        for job, layout in zip(self.jobs, layouts, strict=True):
-            found[job.lanes[job.live], : layout.size] = layout.taken(job.tile)[job.live]
+        for (_, tile, lanes, places), layout in zip(self.lanes.tiles, layouts, strict=True):
+            found[lanes, : layout.size] = layout.taken(tile)[places]
         return found
 
 
@@ -323,7 +312,7 @@ def advance(
             layout = programs[job.lanes[0]].layout
             layout.put(job.tile, lanes, states[job.lanes[lanes], : layout.size])
     run_jobs(jobs, records, threads)
-    return Advanced(programs, records, jobs)
+    return Advanced(programs, records, lanes_in(jobs, records))
 
 
 @Driver

@@ -418,7 +418,7 @@ def lanes_of(record: Record) -> tuple[Array, Array, Array]:
     """(y, u, known) of a record in the form that drivers take: a lane for each output, all with the same inputs."""
     if record.y.ndim > 1:
         return record.y, np.repeat(record.u[:, :, None], record.y.shape[1], axis=2), record.known.columns
-    return record.y[:, None], record.u[:, :, None], record.known.lanes
+    return record.y[:, None], record.u[:, :, None], record.known.columns[:, :, None]
 
 
 def state_of(tile: Array, lane: int = 0) -> dict[str, Array]:

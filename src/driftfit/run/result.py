@@ -17,7 +17,7 @@ from driftfit.models.base import Model
 from driftfit.readings.first_samples import First
 from driftfit.readings.gate import AT_START, SIGNAL
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, left_out_of
-from driftfit.run.columns import OfRecord
+from driftfit.run.columns import OfRecord, attribute
 from driftfit.run.gating import without_codes
 from driftfit.run.lanes import Lane, Lanes, Results, names_of, read_results, write_results
 from driftfit.run.live.conformal import quantile, widened
@@ -79,6 +79,11 @@ class Track(Plain, OfRecord):
     """
 
     record: Record
+    model: Model = attribute("program.whole")
+    tracker: Tracker = attribute("program.tracker")
+    outputs: tuple[str, ...] = attribute("program.whole.outputs", "Names of the outputs of the model.")
+    names: tuple[str, ...] = attribute("program.names")
+    known: Known = attribute("record.known", "The known factors of every row.")
 
     def __init__(
         self,
@@ -108,24 +113,6 @@ class Track(Plain, OfRecord):
     @cached_property
     def _rows(self) -> Track:
         return Track(replace(self.program, shared=None), self.record, self._lane, self.start)
-
-    @property
-    def model(self) -> Model:
-        return self.program.whole
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs of the model."""
-        return self.model.outputs
-
-    @property
-    def tracker(self) -> Tracker:
-        return self.program.tracker
-
-    @property
-    def known(self) -> Known:
-        """The known factors of every row."""
-        return self.record.known
 
     @property
     def keeps_cov(self) -> bool:
@@ -175,10 +162,6 @@ class Track(Plain, OfRecord):
     def __repr__(self) -> str:
         of = "" if self.program.shared is None else f" of {len(self.outputs)} outputs"
         return f"Track of {len(self)} samples{of}, {int(self.ok.sum())} used: {self.model!r}, {self.tracker!r}"
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.program.names
 
     @property
     def units(self) -> tuple[str, ...]:

@@ -19,18 +19,14 @@ import numpy as np
 from driftfit.data.arguments import check_roles, fits
 from driftfit.data.arrays import columns_as_outputs, from_arrays
 from driftfit.data.record import Reading, Record, Records
-from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
-from driftfit.readings.gate import AT_START, REFUSED, USED, Gate
+from driftfit.readings.gate import Gate
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, ungated
-from driftfit.readings.screen import screen, suspect
-from driftfit.run.fleet import Fleet, run_fleet
+from driftfit.readings.screen import apart, screen
+from driftfit.run.fleet import Fleet, KeyedResults, Outputs, run_fleet
 from driftfit.run.gating import gate_of
-from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.lanes import Lane, Lanes
-from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, State, programs_of, tile_of
 from driftfit.run.result import Track, track_record
 from driftfit.run.warm_start import Run, carried, ended, first_interval
@@ -281,27 +277,18 @@ def warn_of_codes(verb: str, runs: Iterable[Track]) -> None:
 
 
 def _codes(run: Track) -> dict[str, list[float]]:
-    """The values of each signal of a run without a gate that a run with one leaves out."""
-    y, u = (np.where(np.abs(x) < LARGEST, x, np.nan) for x in (run.record.y, run.record.u))
-    strange = [suspect(signal) for signal in (y, *u.T)]
-    if not any(one.any() for one in strange):
+    """The values of each signal, far apart from all others, that a run with a gate leaves out."""
+    signals = (run.record.y, *run.record.u.T)
+    far = [np.flatnonzero(apart(signal)) for signal in signals]
+    if not any(map(len, far)):
         return {}
-    left = track_record(replace(run.program, gate=Gate()), run.record).left_out
-    of_y, reason = left.signal == run.program.signals[0], np.full(len(y), USED)
-    reason[left.sample[of_y]] = left.code[of_y]
-    entered = (reason == REFUSED) | (reason == AT_START) & strange[0]
-    found = {run.labels.y: y[entered & ~_begins_change(y, reason) & (run.ok | np.isnan(run.prediction))]}
-    labels = run.labels.u or run.program.signals[1:]
-    for name, label, signal, mark in zip(run.program.signals[1:], labels, u.T, strange[1:], strict=True):
-        blamed = left.sample[left.signal == name][:, None] - np.arange(run.program.model.input_memory + 1)
-        found[label] = signal[np.intersect1d(blamed, np.flatnonzero(mark))]
-    return {name: values.tolist() for name, values in found.items() if len(values)}
-
-
-def _begins_change(y: Array, reason: Array) -> Array:
-    """Which readings (T,) are the first one or two of a change: the next is as strange, differs, and is believed."""
-    change = np.append((reason == USED)[1:] & suspect(y)[1:] & (np.diff(y) != 0.0), False)
-    return np.asarray(change | np.append((change & (reason == REFUSED))[1:], False))
+    left, found = track_record(replace(run.program, gate=Gate()), run.record).left_out, {}
+    names, labels = run.program.signals, (run.labels.y, *(run.labels.u or run.program.signals[1:]))
+    for name, label, signal, places in zip(names, labels, signals, far, strict=True):
+        ages = 0 if name == names[0] else run.program.model.input_memory
+        blamed = left.sample[left.signal == name][:, None] - np.arange(ages + 1)
+        found[label] = signal[np.intersect1d(blamed, places)].tolist()
+    return {label: values for label, values in found.items() if values}
 
 
 def warn_unlearned(run: Track | KeyedResults) -> None:

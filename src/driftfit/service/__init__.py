@@ -2,8 +2,7 @@
 own need.
 """
 
-from driftfit.service.connect.base import Batch, Event, Outcome, Reader, Sink, Source, Writer
-from driftfit.service.connect.samples import Samples
+from driftfit.service.connect.base import Batch, Event, Outcome, Reader, Samples, Sink, Source, Writer
 from driftfit.service.core.results import Result
 
 __all__ = ["Batch", "Event", "Outcome", "Reader", "Result", "Samples", "Sink", "Source", "Writer"]

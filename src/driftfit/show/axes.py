@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 from zoneinfo import ZoneInfo
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.run.live.conformal import quantile
 from driftfit.run.result import Track, burn_in
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def draw_prediction(axis: Axes, run: Track) -> None:
 def draw_innovation(axis: Axes, run: Track, level: float = 0.95) -> None:
     """Innovations and their band."""
     std = np.where(np.isfinite(run.innovation_std), run.innovation_std, np.nan)
-    half = NormalDist().inv_cdf(0.5 + level / 2.0) * std
+    half = quantile(level) * std
     axis.fill_between(run.time, -half, half, color=BLUE, alpha=0.15, lw=0)
     axis.plot(run.time, run.innovation, color=BLUE, lw=0.8)
     late = settled(run)

@@ -29,12 +29,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 import numpy as np
 import polars as pl
 
-from driftfit.data.csv_files import without_formulas
+from driftfit.data.files import without_formulas
+from driftfit.data.instants import in_zone
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import of_series, one_of
-from driftfit.run.fleet import Fleet
-from driftfit.run.keyed_results import KeyedResults, table_by_key
-from driftfit.run.outputs import Outputs
+from driftfit.run.fleet import Fleet, KeyedResults, Outputs, table_by_key
 from driftfit.run.result import Track
 from driftfit.show.text import key_text
 from driftfit.trackers.base import Tracker
@@ -58,7 +57,7 @@ def as_table(result: Result, arrays: bool = False) -> pl.DataFrame:
     if not records:
         assert isinstance(result, Fleet)
         return _of_nothing(result, arrays)
-    signals = [_of_track(one, arrays) if _is_single(one) else _of_outputs(one, arrays) for one in records]
+    signals = [_columns(one, arrays) for one in records]
     columns = {name: np.concatenate([part[name] for part in signals]) for name in signals[0]}
     by = result.labels.by if isinstance(result, Fleet) else ()
     return _in_zone(table_by_key(by, keys, [len(one) for one in records], columns), records[0])
@@ -66,12 +65,7 @@ def as_table(result: Result, arrays: bool = False) -> pl.DataFrame:
 
 def _in_zone(table: pl.DataFrame, run: Single) -> pl.DataFrame:
     """The table with times in the zone of the record."""
-    zone, time = run.labels.zone, _time_name(run)
-    return (
-        table
-        if zone is None
-        else table.with_columns(pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(zone))
-    )
+    return in_zone(table, _time_name(run), run.labels.zone)
 
 
 def paths_table(fleet: Fleet, paths: Mapping[Hashable, tuple[Array, Array]]) -> pl.DataFrame:
@@ -144,14 +138,6 @@ def _is_single(run: Single) -> TypeGuard[Track]:
     return len(run.outputs) == 1
 
 
-def _of_track(run: Track, arrays: bool) -> dict[str, Array]:
-    """The columns of a run, by name; a signal that is called like a result gets a trailing underscore."""
-    columns = {_time_name(run): run.time, _free(run.labels.y): run.y}
-    columns |= {_free(name): run.u[:, j] for j, name in enumerate(_inputs(run))}
-    columns |= {name: getattr(run, name) for name in _OWN}
-    return columns | _parameters(run.names, run.theta, run.std, "" if arrays else None)
-
-
 def _parameters(names: Sequence[str], theta: Array, std: Array, of: str | None) -> dict[str, Array]:
     """The columns of the parameters; ``of`` follows the names of array columns, None gives a column for each."""
     if of is not None:
@@ -164,19 +150,24 @@ def _parameters(names: Sequence[str], theta: Array, std: Array, of: str | None) 
     return dict(each)
 
 
-def _of_outputs(run: Single, arrays: bool) -> dict[str, Array]:
-    """The same of several outputs: each result with its output in brackets, inputs and parameters under their names."""
-    columns: dict[str, Array] = {_time_name(run): run.time}
-    for j, output in enumerate(run.outputs):
-        columns[_free(output)] = run.y[:, j]
-        columns |= {f"{name}[{output}]": getattr(run, name)[:, j] for name in _OWN}
+def _columns(run: Single, arrays: bool) -> dict[str, Array]:
+    """The columns of a record, by name; a signal that is called like a result gets a trailing underscore.
+
+    Of several outputs each result has its output in brackets.
+    """
+    single, columns = _is_single(run), {_time_name(run): run.time}
+    inputs = {} if run.u.ndim > 2 else {_free(name): run.u[:, j] for j, name in enumerate(_inputs(run))}
+    for j, output in enumerate((run.labels.y,) if single else run.outputs):
+        own = {"": run.y} | {name: getattr(run, name) for name in _OWN}
+        for name, values in own.items():
+            where = f"{name}{'' if single else f'[{output}]'}" if name else _free(output)
+            columns[where] = values if single else values[:, j]
+            columns |= inputs if single and not name else {}
+    columns |= {name: column for name, column in inputs.items() if name not in columns}
+    parts: list[tuple[Any, Array, Array, str]] = [(run.names, run.theta, run.std, "")]
     if isinstance(run, Outputs):
-        inputs = {_free(name): run.u[:, j] for j, name in enumerate(_inputs(run))}
-        columns |= {name: column for name, column in inputs.items() if name not in columns}
         each = zip(run.outputs, run.names, strict=True)
         parts = [(names, run.theta[:, j], run.std[:, j], f"[{output}]") for j, (output, names) in enumerate(each)]
-    else:
-        parts = [(run.names, run.theta, run.std, "")]
     for names, theta, std, of in parts:
         columns |= _parameters(names, theta, std, of if arrays else None)
     return columns

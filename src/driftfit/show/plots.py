@@ -6,8 +6,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 from driftfit.engine.settings import near
-from driftfit.run.fleet import Fleet
-from driftfit.run.outputs import Outputs
+from driftfit.run.fleet import Fleet, Outputs
 from driftfit.run.result import Track
 from driftfit.show.axes import date_axis, draw_innovation, draw_parameter, draw_prediction, panels, time_label
 from driftfit.show.summary import summarise_fleet

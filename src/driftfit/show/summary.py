@@ -29,9 +29,8 @@ from driftfit.models.base import GAP
 from driftfit.models.equation import Equation
 from driftfit.models.state_space import StateSpace
 from driftfit.readings.left_out import floor_remark, remarks_of
-from driftfit.run.keyed_results import KeyedResults
+from driftfit.run.fleet import KeyedResults, Outputs
 from driftfit.run.live.conformal import quantile
-from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.text import (
     ByOutput,
@@ -94,10 +93,7 @@ class Summary(Printed):
             ("Time", self.span),
             ("Samples", f"{self.samples}, {self.used} used, {self.samples - self.used} skipped"),
             ("Rows left out", self.dropped),
-            (
-                "Log-likelihood",
-                f"{self.loglik:.6g}" + (f", AIC {self.aic:.6g}, BIC {self.bic:.6g}" if self.used else ""),
-            ),
+            ("Log-likelihood", self._likelihood),
             *self.remarks,
         )
         heads = ("theta", "std", "[0.025", "0.975]", "lowest", "highest")

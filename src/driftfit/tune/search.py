@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ import scipy
 from driftfit.data.record import Known, Record
 from driftfit.engine.kernel import Array
 from driftfit.models.regression import Regression
+from driftfit.run.live.conformal import quantile
 from driftfit.run.program import Program
 from driftfit.run.result import Track, track_record
 from driftfit.smooth.parts.walk import ordered
@@ -49,7 +49,7 @@ EDGE_DECADES = 0.01
 
 def half_chi2(level: float) -> float:
     """Half the chi-square quantile with one degree of freedom: by how much a log-likelihood falls in an interval."""
-    return 0.5 * NormalDist().inv_cdf(0.5 + level / 2.0) ** 2
+    return 0.5 * quantile(level) ** 2
 
 
 class Counted:

@@ -37,9 +37,7 @@ from driftfit.engine.settings import one_of, whole
 from driftfit.judge.constant_fit import constant_outputs
 from driftfit.models.base import Model
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
-from driftfit.readings.screen import screen
-from driftfit.run.program import Program
-from driftfit.run.result import track_record
+from driftfit.run.live.conformal import quantile
 from driftfit.run.track import Decisions, decide, records_of, warn_of_codes
 from driftfit.show.text import ByOutput
 from driftfit.trackers.base import Tracker
@@ -131,8 +129,7 @@ def tune(
         model, y = columns_as_outputs(model, y)
     one_of("tune", "method", method, tuple(METHODS))
     whole("tune", "h", h, 1)
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"tune: level must be between 0 and 1, such as 0.95; got {level!r}.")
+    quantile(level, "tune")  # whether there is one
     if method != "h-step" and not tracker.covariance:
         raise ValueError(f"tune: {type(tracker).__name__} has no variance, so {method!r} is undefined; use 'h-step'.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing)
@@ -161,9 +158,9 @@ def _tuned(
         raise ValueError(_without_noise(task))
     _warn(search)
     built = knobs.build(search.x, sigma2)
-    if task.left_out is None and not task.model.shared:
-        _warn_ungated(task, built)
     runs = run_task(task, built)
+    if task.left_out is None and not task.model.shared:
+        warn_of_codes("tune", runs)
     return Tuned(
         tracker=built,
         method=method,
@@ -229,17 +226,6 @@ def _warn(search: Search) -> None:
 def _of_one(left_out: Decisions) -> LeftOut | Decisions:
     """The decisions of a single record without its key."""
     return left_out if len(left_out) > 1 else next(iter(left_out.values()), NOTHING_LEFT_OUT)
-
-
-def _warn_ungated(task: Task, tracker: Tracker) -> None:
-    """Warn of readings that look like codes, all of which were used."""
-    program, at = Program(task.model, tracker), np.zeros(1, int)
-    strange = (
-        record
-        for record in task.records
-        if any(screen(signal, at, np.array([len(record)])).any() for signal in (record.y, *record.u.T))
-    )
-    warn_of_codes("tune", (track_record(program, record) for record in strange))
 
 
 def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any, by: Any) -> Task:

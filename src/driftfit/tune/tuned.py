@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +31,7 @@ from rich.text import Text
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.readings.left_out import LeftOut, remarks_of
+from driftfit.run.live.conformal import quantile
 from driftfit.run.result import Track
 from driftfit.run.track import Decisions
 from driftfit.show.axes import BLUE, RED, panels
@@ -92,7 +92,7 @@ class Averaged(Printed):
     def band(self, level: float = 0.95, smoothed: bool = False) -> tuple[Array, Array]:
         """Lower and upper ends (T, n) of the bands of theta."""
         theta, std = self._smoothed if smoothed else self._tracked
-        half = NormalDist().inv_cdf(0.5 + level / 2.0) * std
+        half = quantile(level) * std
         return theta - half, theta + half
 
     @cached_property

@@ -34,6 +34,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.run.live.conformal import quantile
 from driftfit.run.live.live import Live
 from driftfit.run.result import Track
 
@@ -82,12 +83,10 @@ class Constrained:
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
         """(low, high), each (T, n): equal-tailed bands, which never leave a bound of a single parameter."""
-        if not 0.0 < level < 1.0:
-            raise ValueError(f"band: level must be between 0 and 1, such as 0.95; got {level!r}.")
+        half = quantile(level) * self.std
         from scipy import stats
 
-        tails = np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
-        low, high = (self.theta + stats.norm.ppf(tail) * self.std for tail in tails)
+        tails, low, high = (0.5 - 0.5 * level, 0.5 + 0.5 * level), self.theta - half, self.theta + half
         for k, one in enumerate(self.within):
             own = np.flatnonzero(one.g)
             if len(own) > 1 or one.low == one.high:

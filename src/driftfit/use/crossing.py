@@ -39,6 +39,7 @@ from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, of_series, whole
 from driftfit.engine.tiles import as_compiled
+from driftfit.run.live.conformal import quantile
 from driftfit.run.program import state_of
 from driftfit.run.result import Track
 from driftfit.trackers.laws.law import OWNER, VISIBLE, transition
@@ -144,8 +145,7 @@ def crossing(
         determined yet, or missing inputs.
     """
     limit, side = _limit(below, above)
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"crossing: level must be between 0 and 1, such as 0.9; got {level!r}.")
+    quantile(level, "crossing")  # whether there is one
     if not run.tracker.covariance or run.tracker.weighs:
         why = "jumps between hypotheses, which is no random walk" if run.tracker.weighs else "carries no covariance"
         raise ValueError(f"crossing: {type(run.tracker).__name__} {why}; track with Kalman, AdaptiveKalman or FLS.")
@@ -298,6 +298,8 @@ def crossings(
     """
     import polars
 
+    from driftfit.data.instants import in_zone
+
     for name, given in (("below", below), ("above", above), ("u", u)):
         of_series("crossing", name, given, runs, every=name != "u")
     rows: list[dict[str, Any]] = []
@@ -319,8 +321,6 @@ def crossings(
     table = polars.DataFrame(rows, infer_schema_length=None)
     zone = next((run.labels.zone for run in runs.values()), None)
     for name, values in times.items():
-        column = polars.Series(name, np.array(values))
-        if zone is not None:
-            column = column.dt.replace_time_zone("UTC").dt.convert_time_zone(zone)
-        table = table.insert_column(table.columns.index(name.removesuffix("_time")) + 1, column)
+        place = table.columns.index(name.removesuffix("_time")) + 1
+        table = in_zone(table.insert_column(place, polars.Series(name, np.array(values))), name, zone)
     return table.sort(["median", "probability"], descending=[False, True])

@@ -37,7 +37,6 @@ import math
 from collections.abc import Iterable
 from copy import copy
 from dataclasses import dataclass, replace
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -51,8 +50,9 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, whole
 from driftfit.engine.tiles import as_compiled
 from driftfit.models.base import Model
+from driftfit.run.fleet import Outputs
+from driftfit.run.live.conformal import quantile
 from driftfit.run.live.live import Live
-from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, state_of
 from driftfit.run.result import Track
 from driftfit.show.text import digits, printed, table_of
@@ -96,7 +96,7 @@ class Forecast:
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
         """(low, high) of the outputs, shaped as y_hat, from the normal distribution."""
-        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.y_std
+        half = quantile(level) * self.y_std
         return self.y_hat - half, self.y_hat + half
 
     def time_text(self, k: int) -> str:
@@ -112,6 +112,8 @@ class Forecast:
         """
         import polars as pl  # this import takes as long as all others together
 
+        from driftfit.data.instants import in_zone
+
         low, high = self.band()
         signals = {"y_hat": self.y_hat, "y_std": self.y_std, "low": low, "high": high}
         axis = {} if self.time is None else {self.axis: self.time}
@@ -125,10 +127,7 @@ class Forecast:
                 columns |= {f"theta_{name}": paths[0][:, i], f"std_{name}": paths[1][:, i]}
             named = [pl.lit(output).alias("output")] if several else []
             parts.append(pl.DataFrame(columns).select(*named, pl.all()))
-        table = pl.concat(parts, how="diagonal")
-        if self.zone is None or self.time is None:
-            return table
-        return table.with_columns(pl.col(self.axis).dt.replace_time_zone("UTC").dt.convert_time_zone(self.zone))
+        return in_zone(pl.concat(parts, how="diagonal"), self.axis, self.zone if self.time is not None else None)
 
     def __repr__(self) -> str:
         """A table of the first outputs, with their standard deviations."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from driftfit.data.arguments import as_output
 from driftfit.engine.kernel import Array
+from driftfit.run.live.conformal import quantile
 from driftfit.show.axes import BLUE, GREY, RED, date_axis, frame, named, panels, settled, time_label
 from driftfit.use.blocks import blocks_of
 from driftfit.use.simulate import fit, simulate
@@ -104,7 +104,7 @@ def _step(axis: Axes, run: Track, j: int, at: Array, h: int, level: float, dt: f
 
 def _frequency(axis: Axes, run: Track, j: int, at: Array, level: float, dt: float, colours: list[Any]) -> None:
     response = frequency_response(run, None, j, at)
-    half = np.exp(NormalDist().inv_cdf(0.5 + level / 2.0) * response.log_magnitude_std)
+    half = np.exp(quantile(level) * response.log_magnitude_std)
     w = response.w / dt
     for k, colour in enumerate(colours):
         if np.isfinite(half[k]).all():

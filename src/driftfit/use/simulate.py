@@ -25,7 +25,6 @@ outputs: an output block is inverted on their range, widened by a fifth. Cost: O
 
 from __future__ import annotations
 
-from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +36,7 @@ from driftfit.engine.settings import whole
 from driftfit.models.base import GAP, Model
 from driftfit.models.continuous.transfer import ContinuousTransfer
 from driftfit.models.polynomial import PolynomialModel
+from driftfit.run.live.conformal import quantile
 from driftfit.run.result import Track
 from driftfit.use.system import covariances, filtered, spread, taken
 
@@ -236,7 +236,7 @@ class Prediction(NamedTuple):
             ends = np.quantile(np.where(known, self.paths, 0.0), [0.5 - level / 2.0, 0.5 + level / 2.0], axis=0)
             low, high = np.where(known, ends, np.nan)
             return low, high
-        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.y_std
+        half = quantile(level) * self.y_std
         return self.y_hat - half, self.y_hat + half
 
 

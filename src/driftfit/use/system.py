@@ -27,7 +27,6 @@ within a standard deviation (a gain whose denominator is near zero), the result 
 from __future__ import annotations
 
 from collections.abc import Callable
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
@@ -36,6 +35,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.arx import ARX
+from driftfit.run.live.conformal import quantile
 from driftfit.show.text import printing, some_rows, table_of
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class Response(NamedTuple):
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
         """(low, high) of a normal approximation."""
-        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
+        half = quantile(level) * self.std
         return self.value - half, self.value + half
 
 
@@ -277,7 +277,7 @@ def long_run(run: Followed, at: int = -1, level: float = 0.95) -> tuple[LongRun,
         top = np.zeros(model.n)
         top[place : place + nb] = 1.0
         place += nb
-        low, high = fieller(theta[0], cov[0], top, over, 1.0, NormalDist().inv_cdf(0.5 + level / 2.0))
+        low, high = fieller(theta[0], cov[0], top, over, 1.0, quantile(level, "long_run"))
         name = model.inputs[j] if isinstance(model.inputs, tuple) else f"u{j + 1}"
         found.append(LongRun(name, float(gain.value[0, j]), float(gain.std[0, j]), low, high))
     return tuple(found)

@@ -44,7 +44,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from itertools import pairwise
-from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,6 +52,7 @@ from driftfit.data.arguments import as_inputs, as_output
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
+from driftfit.run.live.conformal import quantile
 from driftfit.smooth.smoothed import Smoothed
 
 COLLINEAR = 0.8
@@ -215,7 +215,7 @@ def exp_autoregression(y: Any, n: int, delay: int = 1, level: float = 0.95) -> E
 
     best = float(optimize.minimize_scalar(lambda x: project(x)[0], bounds=bracket, method="bounded").x)
     cost, constants = project(best)
-    limit = cost * float(np.exp(NormalDist().inv_cdf(0.5 + level / 2.0) ** 2 / len(output)))
+    limit = cost * float(np.exp(quantile(level, "exp_autoregression") ** 2 / len(output)))
     ends = _profile_end(project, best, low, limit, -np.inf), _profile_end(project, best, high, limit, np.inf)
     if not np.isfinite(ends).all():
         warnings.warn(

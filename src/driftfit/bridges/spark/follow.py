@@ -26,9 +26,9 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, results_of, rules_of
-from driftfit.bridges.spark.frames import rows_of, sql_of, task_of
-from driftfit.bridges.spark.task import SETTING, Task, trackers_of
+from driftfit.bridges.spark.batch import NEW, OLD, STATE, WAITED, Flow, results_of, rules_of
+from driftfit.bridges.spark.frames import by_unit, rows_of, sql_of, task_of
+from driftfit.bridges.spark.units import SETTING, Task, trackers_of
 from driftfit.data.clock import Clock
 from driftfit.data.storage import describe, parts_of, rebuild
 from driftfit.models.base import Model
@@ -321,13 +321,7 @@ class _Batches:
                 every = every.withColumn(name, F.lit(None).cast(kind))
         own = [SETTING + name for name in task.settings]
         every = every.select(*task.columns, *flow.state, *own, "_kind")
-        order = [*task.by, "_kind", task.time, *task.y, *task.u]
-        made = ", ".join(f"`{name}` {kind}" for name, kind in flow.schema.items())
-        return (
-            every.repartition(*task.by)
-            .sortWithinPartitions(*order)
-            .mapInArrow(partial(flow.work, expired=expired), made)
-        )
+        return by_unit(every, task, partial(flow.work, expired=expired), flow.schema, ["_kind"])
 
     def _oldest(self, kept: Any) -> Any:
         """The time before which a unit has been silent for too long."""

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.bridges.spark.task import SETTING, Task, results_schema, trackers_of
+from driftfit.bridges.spark.units import SETTING, Task, results_schema, trackers_of
 from driftfit.data.arguments import check_roles
 from driftfit.data.arrays import named_outputs
 from driftfit.engine.settings import near

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from driftfit.bridges.spark.flow import NEW, OLD, STATE, WAITED, Flow, Known, results_of
+from driftfit.bridges.spark.batch import NEW, OLD, STATE, WAITED, Flow, Known, results_of
 from driftfit.bridges.spark.follow import begun, duration, flow_of
 from driftfit.bridges.spark.frames import rows_of, sql_of, task_of
 from driftfit.bridges.spark.units import ARROW

@@ -43,7 +43,7 @@ from driftfit.judge.alarms.reference import Reference, in_samples, modelled
 from driftfit.judge.fleet_verdict import SHOWN, discoveries
 from driftfit.judge.on_all_cores import on_all_cores
 from driftfit.judge.verdict import p_text
-from driftfit.run.keyed_results import table_by_key
+from driftfit.run.fleet import table_by_key
 from driftfit.run.live.reference_model import ALPHA, CLIP, CONSTANT
 from driftfit.run.live.rule import AlarmRule
 from driftfit.show.text import Printed, facts, key_text, table_of

@@ -19,7 +19,7 @@ from driftfit.engine.kernel import Array
 from driftfit.readings.first_samples import First
 from driftfit.readings.gate import AT_START, SIGNAL
 from driftfit.readings.left_out import Tally
-from driftfit.run.columns import SCALARS, Columns
+from driftfit.run.columns import SCALARS, Columns, attribute
 from driftfit.run.live.stream import HELD, Stream, check_applied
 from driftfit.run.program import Program, lanes_of
 from driftfit.run.track import records_of
@@ -159,7 +159,7 @@ class Batched(Stream):
             self._ignored += T - len(axis)
             for gap in gaps[: PACE_SAMPLES + 1]:
                 self._pace.see(gap)
-            known = records.known if records.known.constant else Known(records.known.columns[taken])
+            known = records.known.part(taken)
             if len(axis):
                 self._last, known = instant(axis[-1]), known.changed(interval=gaps)
             records = records._replace(
@@ -245,6 +245,8 @@ class LiveOutput:
     """
 
     program: Program = _of_output("programs", "Its model and tracker.")
+    tracker: Any = attribute("program.tracker", "Its tracker.")
+    names: tuple[str, ...] = attribute("program.names", "Names of its parameters.")
     theta: Array = _of_output("theta", "Parameters now, (n,).")
     std: Array = _of_output("std", "Their standard deviations (n,), as those of the stream.")
     cov: Array = _of_output("cov", "Their covariance, (n, n).")
@@ -256,16 +258,6 @@ class LiveOutput:
 
     def __repr__(self) -> str:
         return f"{self.output} of {self._stream!r}"
-
-    @property
-    def tracker(self) -> Any:
-        """Its tracker."""
-        return self.program.tracker
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of its parameters."""
-        return self.program.names
 
     @property
     def alarm(self) -> Any:

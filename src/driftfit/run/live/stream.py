@@ -24,6 +24,7 @@ from driftfit.engine.settings import as_numbers, factor, near, numbers, vector, 
 from driftfit.engine.tiles import as_compiled, tile_type
 from driftfit.models.base import Model
 from driftfit.readings.left_out import Tally
+from driftfit.run.columns import attribute
 from driftfit.run.live.alarm import LiveAlarm, check_rule
 from driftfit.run.live.fixed_lag import Window
 from driftfit.run.live.rule import AlarmRule
@@ -95,6 +96,11 @@ class Stream(Plain, storage.Kept):
 
     `driftfit.run.live.live.Live` defines how a sample is processed, and what is reported of it.
     """
+
+    samples: int = attribute(
+        "_samples", "Number of samples so far, without those that were ignored; the first after a warm start is 0."
+    )
+    ignored: int = attribute("_ignored", "Number of samples whose time was not after the last.")
 
     def _begin(
         self, model: Model, tracker: Any, dt: Any, lag: int, warm_start: Run | None, limits: Mapping[Any, Any] | None,
@@ -273,16 +279,6 @@ class Stream(Plain, storage.Kept):
     def awaits(self) -> bool:
         """Whether the input of the last sample is outstanding; it comes with `apply`."""
         return self._awaits != NOTHING
-
-    @property
-    def samples(self) -> int:
-        """Number of samples so far, without those that were ignored; the first after a warm start is number 0."""
-        return self._samples
-
-    @property
-    def ignored(self) -> int:
-        """Number of samples whose time was not after the last."""
-        return self._ignored
 
     @property
     def outside(self) -> dict[str, int]:

@@ -25,8 +25,7 @@ from typing import Any
 import polars as pl
 
 from driftfit.data.files import read_parquet
-from driftfit.service.connect.base import END, Batch, FileSource, Reader
-from driftfit.service.connect.samples import Samples, by_topic, decode, seconds
+from driftfit.service.connect.base import END, Batch, FileSource, Reader, Samples, by_topic, decode, seconds
 
 PIECE_BYTES = 1 << 20
 """Most bytes that are read at once, and of one line."""

@@ -18,12 +18,13 @@ from driftfit.service.connect.base import (
     Connector,
     Outcome,
     Reader,
+    Samples,
     Sink,
     Source,
     Writer,
+    decode,
 )
 from driftfit.service.connect.mqtt import messages
-from driftfit.service.connect.samples import Samples, decode
 
 FLUSH_SECONDS = 30.0
 

@@ -26,8 +26,8 @@ from driftfit.service.connect.base import (
     Sink,
     Source,
     Writer,
+    by_topic,
 )
-from driftfit.service.connect.samples import by_topic
 from driftfit.service.core.results import Result
 from driftfit.service.options import Secret
 

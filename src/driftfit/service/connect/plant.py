@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.service.connect.base import Batch, Reader, Source
-from driftfit.service.connect.samples import Samples
+from driftfit.service.connect.base import Batch, Reader, Samples, Source
 
 PUMPS = 6
 CLOSING = 3

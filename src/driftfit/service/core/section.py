@@ -194,11 +194,7 @@ class Section:
         held = self.streams.held[places]
         known = np.ones((1 if time is None and not held.any() else len(places), 3))
         if time is not None:
-            before = np.roll(time, 1)
-            before[first] = np.where(np.isnan(self.streams.last[own]), time[first], self.streams.last[own])
-            gaps = self.streams.clock.between(before, time)
-            gaps[first[np.isnan(self.streams.last[own])]] = 1.0
-            known[:, INTERVAL] = gaps
+            known[:, INTERVAL] = self.streams.clock.continued(time, first, self.streams.last[own])
         if held.any():
             known[held] = HELD
         return known

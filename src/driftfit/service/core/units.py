@@ -13,7 +13,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.service.config import UnitSettings
-from driftfit.service.connect.samples import NO_SIGNAL, TOO_MANY_NEW, Receipt, Samples, numbers_of, seconds_of
+from driftfit.service.connect.base import NO_SIGNAL, TOO_MANY_NEW, Receipt, Samples, numbers_of, seconds_of
 from driftfit.service.core.journal import Journal, Pending, Rows
 from driftfit.service.core.section import CounterOf, Section, tally
 from driftfit.service.core.unit import SAMPLES, Unit
