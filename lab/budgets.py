@@ -28,12 +28,12 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 67_050,
-    "statements": 43_463,
-    "modules": 327,
+    "lines of the library": 67_360,
+    "statements": 43_661,
+    "modules": 328,
     "levels of folders": 2,
-    "constants of modules with numbers": 631,
-    "numbers in the source": 2_472,
+    "constants of modules with numbers": 633,
+    "numbers in the source": 2_481,
     "private names of Numba and llvmlite": 30,
     "modules that the Kalman filter imports": 24,
     "lines of them": 5_267,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 32,
     "bytes of state of Kalman": 840,
     "bytes of state of AdaptiveKalman": 12_112,
-    "lines of tests": 33_490,
+    "lines of tests": 33_670,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 

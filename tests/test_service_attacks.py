@@ -44,8 +44,7 @@ from driftfit.service.connect.tables import SqliteSink
 from driftfit.service.control import health
 from driftfit.service.core import section
 from driftfit.service.options import Pattern
-from driftfit.service.page.app import metrics_of
-from driftfit.service.page.feed import Feed
+from driftfit.service.page.feed import Feed, metrics_of
 from driftfit.service.supervisor import EVENT_TRIES, SinkThread, SourceThread
 
 

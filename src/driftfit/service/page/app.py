@@ -31,7 +31,16 @@ from driftfit.engine import __version__
 from driftfit.service.control import health
 from driftfit.service.options import PageOptions
 from driftfit.service.page.access import COOKIE, SESSION_SECONDS, Access, Rates, Sessions, password_fits
-from driftfit.service.page.feed import Feed, column_names, columns_of, newest_blocks, reduced, samples
+from driftfit.service.page.feed import (
+    METRICS_TYPE,
+    Feed,
+    column_names,
+    columns_of,
+    metrics_of,
+    newest_blocks,
+    reduced,
+    samples,
+)
 
 ACTIONS = ("hold", "reset", "acknowledge", "limits", "restart")
 _ERROR = {"type": "object", "properties": {"error": {"type": "string"}}}
@@ -469,57 +478,3 @@ class Sockets:
             view["at"] = max(row.number for row in rows)
         on = rows[-1].alarm if rows else None
         return {"view": "unit", "unit": unit, "status": status, "columns": columns, "alarm": on}
-
-
-METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-
-
-def metrics_of(feed: Feed, viewers: int) -> str:
-    """Numbers for Prometheus, in its text format."""
-    status, trouble = feed.status, feed.trouble.items()
-    latency = {'quantile="0.5"': status.get("p50"), 'quantile="0.99"': status.get("p99")}
-    unarmed = {f'unit="{_label(unit)}",what="{_label(what)}",why="{_label(why)}"': 1
-               for unit, found in trouble for what, why in found.items()}  # fmt: skip
-    found: list[tuple[str, str, str, Any]] = [
-        ("up", "gauge", "Whether the engine answers and can write its journal.", int(feed.healthy)),
-        ("samples_total", "counter", "Samples that were processed.", status.get("samples", 0)),
-        ("units", "gauge", "Units.", status.get("units", 0)),
-        ("units_failed", "gauge", "Units that have failed.", status.get("failed", 0)),
-        ("trouble", "gauge", "What does not work in units, at most 100 of them.", unarmed),
-        ("units_in_alarm", "gauge", "Units whose alarm is on.", sum(row.alarm for row in feed.latest.values())),
-        ("waiting_samples", "gauge", "Samples that wait for the journal.", status.get("waiting", 0)),
-        ("held_back_total", "counter", "How often a source was held back.", status.get("held_back", 0)),
-        ("viewers", "gauge", "Open pages.", viewers),
-        ("latency_seconds", "gauge", "From arrival to result, of recent batches.", latency),
-        ("refused_total", "counter", "What was refused, by reason.", _labelled("reason", status.get("refused", {}))),
-        ("left_out_total", "counter", "Samples that gates left out, by reason.",
-         _labelled("reason", status.get("left_out", {}))),
-    ]  # fmt: skip
-    for what in ("source", "sink"):
-        runners: dict[str, Any] = status.get(f"{what}s", {})
-        up = {name: int(one["state"] == "running") for name, one in runners.items()}
-        count, failures = ({name: one[key] for name, one in runners.items()} for key in ("count", "failures"))
-        found += [
-            (f"{what}_up", "gauge", f"Whether the {what} is connected.", _labelled(what, up)),
-            (f"{what}_samples_total", "counter", f"Samples of the {what}.", _labelled(what, count)),
-            (f"{what}_failures_total", "counter", f"Failures of the {what}.", _labelled(what, failures)),
-        ]
-    aside = {name: one["set_aside"] for name, one in status.get("sinks", {}).items()}
-    about = "Events that were refused and set aside."
-    found.append(("sink_set_aside_total", "counter", about, _labelled("sink", aside)))
-    lines = []
-    for name, kind, about, values in found:
-        lines += [f"# HELP driftfit_{name} {about}", f"# TYPE driftfit_{name} {kind}"]
-        if isinstance(values, dict):
-            lines += [f"driftfit_{name}{{{key}}} {value}" for key, value in values.items() if value is not None]
-        else:
-            lines.append(f"driftfit_{name} {values}")
-    return "".join(f"{line}\n" for line in lines)
-
-
-def _labelled(label: str, values: dict[str, Any]) -> dict[str, Any]:
-    return {f'{label}="{_label(key)}"': value for key, value in values.items()}
-
-
-def _label(value: str) -> str:
-    return value.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
