@@ -28,8 +28,8 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 67_050,
-    "statements": 43_463,
+    "lines of the library": 67_011,
+    "statements": 43_438,
     "modules": 327,
     "levels of folders": 2,
     "constants of modules with numbers": 631,
