@@ -159,7 +159,7 @@ def read_mat(
         return Experiments(
             (_experiment({key: variables[key] for key in ("Ts", "Tstart") if key in variables} | plain),)
         )
-    structs = {key: value for key, value in variables.items() if _is_struct(value)}
+    structs = {key: value for key, value in variables.items() if isinstance(value, list) and value}
     if name is None:
         if len(structs) == 1:
             name = next(iter(structs))
@@ -272,10 +272,6 @@ def _cells(file: Any, value: Any) -> list[Any]:
 
     held = isinstance(value, h5py.Dataset) and value.dtype == h5py.ref_dtype and value.attrs.get("MATLAB_class") is None
     return [_from_hdf5(file, file[one]) for one in value[()].ravel()] if held else [_from_hdf5(file, value)]
-
-
-def _is_struct(value: Any) -> bool:
-    return isinstance(value, list) and bool(value) and isinstance(value[0], Mapping)
 
 
 def _experiment(fields: Mapping[str, Any]) -> Experiment:

@@ -177,11 +177,7 @@ def compact(header: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:
     described = [[name, array.dtype.str, array.shape] for name, array in little.items()]
     text = json.dumps({**header, "arrays": described}, default=_encode, separators=(",", ":")).encode()
     body = b"".join([text, *(array.tobytes() for array in little.values())])
-    return HEAD.pack(MAGIC, COMPACT, 0, zlib.crc32(body, zlib.crc32(_length(text))), len(text)) + body
-
-
-def _length(text: bytes) -> bytes:
-    return len(text).to_bytes(4, "little")
+    return HEAD.pack(MAGIC, COMPACT, 0, zlib.crc32(body, zlib.crc32(len(text).to_bytes(4, "little"))), len(text)) + body
 
 
 def _expand(data: bytes) -> tuple[dict[str, Any], dict[str, Array]]:

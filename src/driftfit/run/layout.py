@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 import zlib
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
@@ -157,7 +156,7 @@ def unpacked(data: bytes) -> tuple[bytes, Array]:
     if zlib.crc32(memoryview(data)[CRC_BEGIN:]) != check or sparse > 1:
         raise ValueError("the packed state is damaged: its check sum does not fit its content.")
     if not sparse:
-        return tag, _native(np.frombuffer(data, WORD, count, HEAD.size))
+        return tag, np.frombuffer(data, WORD, count, HEAD.size).astype(np.int64, copy=False)
     bits = -(-count // 8)
     there = np.unpackbits(np.frombuffer(data, np.uint8, bits, HEAD.size), count=count).astype(bool)
     words = np.zeros(count, np.int64)
@@ -168,7 +167,3 @@ def unpacked(data: bytes) -> tuple[bytes, Array]:
 def tag_of(data: bytes) -> bytes:
     """The fingerprint in a packed state, which is not checked."""
     return data[TAG]
-
-
-def _native(words: Array) -> Array:
-    return words if sys.byteorder == "little" else words.astype(np.int64)

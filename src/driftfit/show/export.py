@@ -60,12 +60,9 @@ def as_table(result: Result, arrays: bool = False) -> pl.DataFrame:
     signals = [_columns(one, arrays) for one in records]
     columns = {name: np.concatenate([part[name] for part in signals]) for name in signals[0]}
     by = result.labels.by if isinstance(result, Fleet) else ()
-    return _in_zone(table_by_key(by, keys, [len(one) for one in records], columns), records[0])
-
-
-def _in_zone(table: pl.DataFrame, run: Single) -> pl.DataFrame:
-    """The table with times in the zone of the record."""
-    return in_zone(table, _time_name(run), run.labels.zone)
+    return in_zone(
+        table_by_key(by, keys, [len(one) for one in records], columns), _time_name(records[0]), records[0].labels.zone
+    )
 
 
 def paths_table(fleet: Fleet, paths: Mapping[Hashable, tuple[Array, Array]]) -> pl.DataFrame:
@@ -76,7 +73,9 @@ def paths_table(fleet: Fleet, paths: Mapping[Hashable, tuple[Array, Array]]) -> 
     theta, std = (np.concatenate(parts) for parts in zip(*paths.values(), strict=True))
     columns = {_time_name(runs[0]): np.concatenate([run.time for run in runs])}
     columns |= _parameters(runs[0].names, theta, std, None)
-    return _in_zone(table_by_key(fleet.by, paths, [len(run) for run in runs], columns), runs[0])
+    return in_zone(
+        table_by_key(fleet.by, paths, [len(run) for run in runs], columns), _time_name(runs[0]), runs[0].labels.zone
+    )
 
 
 class Written(NamedTuple):

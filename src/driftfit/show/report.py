@@ -86,7 +86,9 @@ def page(run: Track, title: str | None = None, alarms: Alarms | None = None, lab
     """The page as HTML text."""
     summary, known = summarise(run), Evidence(run)
     truth, health = judged(known), diagnosis(known)
-    heading = title or _heading(run)
+    labelled = run.labels
+    heading = f"{labelled.y} from {', '.join(labelled.u)}" if labelled.u else f"Parameters of {labelled.y}"
+    heading = title or heading
     sections = [
         f"<h1>{escape(heading)}</h1>",
         f'<p class="soft">{escape(_subtitle(run, summary))}</p>',
@@ -107,11 +109,6 @@ SIGNALS = (
     "Above: the output (dots) and its prediction one sample before. Below: the prediction error and its 95 % band."
 )
 DIAGNOSTICS = "The innovations (one-step errors), the excitation, and the constancy of the coefficients. Grey: limits."
-
-
-def _heading(run: Track) -> str:
-    labels = run.labels
-    return f"{labels.y} from {', '.join(labels.u)}" if labels.u else f"Parameters of {labels.y}"
 
 
 def _subtitle(run: Track, summary: Summary) -> str:

@@ -51,7 +51,22 @@ class Frontier(NamedTuple):
 
     def plot(self, ax: Any = None) -> Figure:
         """r_M^2 against r_D^2, and both against mu; a matplotlib figure. ``ax`` as for `Track.plot`."""
-        return _plot(self, ax)
+        figure, (left, right) = panels(ax, (9.0, 3.6), 2, 2)
+        left.loglog(self.dynamic, self.measurement, color=BLUE, lw=1.3, marker="o", ms=2.5)
+        for i in range(0, len(self.mu), max(len(self.mu) // 6, 1)):
+            point = (self.dynamic[i], self.measurement[i])
+            left.annotate(
+                f"{self.mu[i]:.2g}", point, (-4, -10), textcoords="offset points", ha="right", fontsize=7, color=GREY
+            )
+        left.set_xlabel("dynamic cost r_D^2")
+        left.set_ylabel("measurement cost r_M^2 (numbers: mu)")
+        right.loglog(self.mu, self.measurement, color=BLUE, lw=1.3, label="measurement cost r_M^2")
+        right.loglog(self.mu, self.dynamic, color=RED, lw=1.3, label="dynamic cost r_D^2")
+        right.set_xlabel("mu")
+        right.legend(fontsize=8, frameon=False)
+        for axis in (left, right):
+            axis.grid(alpha=0.25, lw=0.5)
+        return figure
 
 
 def frontier(
@@ -114,23 +129,3 @@ def _movement(path: Smoothed) -> float:
         walk.drift[1:, None] * (walk.drift_root[1:] ** 2 if len(walk.drift_root) else 1.0), steps.shape
     )
     return float(np.sum(np.divide(steps, factors, out=np.zeros_like(steps), where=factors > 0.0)))
-
-
-def _plot(frontier: Frontier, ax: Any) -> Figure:
-    """Measurement cost against dynamic cost, and both against mu."""
-    figure, (left, right) = panels(ax, (9.0, 3.6), 2, 2)
-    left.loglog(frontier.dynamic, frontier.measurement, color=BLUE, lw=1.3, marker="o", ms=2.5)
-    for i in range(0, len(frontier.mu), max(len(frontier.mu) // 6, 1)):
-        point = (frontier.dynamic[i], frontier.measurement[i])
-        left.annotate(
-            f"{frontier.mu[i]:.2g}", point, (-4, -10), textcoords="offset points", ha="right", fontsize=7, color=GREY
-        )
-    left.set_xlabel("dynamic cost r_D^2")
-    left.set_ylabel("measurement cost r_M^2 (numbers: mu)")
-    right.loglog(frontier.mu, frontier.measurement, color=BLUE, lw=1.3, label="measurement cost r_M^2")
-    right.loglog(frontier.mu, frontier.dynamic, color=RED, lw=1.3, label="dynamic cost r_D^2")
-    right.set_xlabel("mu")
-    right.legend(fontsize=8, frameon=False)
-    for axis in (left, right):
-        axis.grid(alpha=0.25, lw=0.5)
-    return figure

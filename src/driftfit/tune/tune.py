@@ -154,7 +154,8 @@ def _tuned(
     search = Search(f, knobs, minimise(f, knobs))
     final = score(task, [knobs.run(search.x)], h)
     sigma2 = float(final.sigma2()[0])
-    if knobs.profiled and tracker.covariance and not sigma2 > (ROUNDING * _largest(task)) ** 2:
+    largest = float(np.max(np.abs(_outputs(task)), initial=0.0))
+    if knobs.profiled and tracker.covariance and not sigma2 > (ROUNDING * largest) ** 2:
         raise ValueError(_without_noise(task))
     _warn(search)
     built = knobs.build(search.x, sigma2)
@@ -181,11 +182,6 @@ def _outputs(task: Task) -> Array:
     """Every output that is known, one after the other."""
     y = np.concatenate([record.y.ravel() for record in task.records])
     return np.asarray(y[np.isfinite(y)])
-
-
-def _largest(task: Task) -> float:
-    """Size of the largest output."""
-    return float(np.max(np.abs(_outputs(task)), initial=0.0))
 
 
 def _without_noise(task: Task) -> str:

@@ -306,27 +306,22 @@ class Tuned(Printed):
 
         ``ax`` as for `Track.plot`.
         """
-        return _plot(self, ax)
-
-
-def _plot(tuned: Tuned, ax: Any) -> Figure:
-    """One panel per knob: the criterion over its range, the chosen value, and its interval."""
-    curves = tuned.curves()
-    columns = min(len(curves), 2)
-    figure, axes = panels(ax, (4.6 * columns, 3.2 * -(-len(curves) // 2)), len(curves), columns)
-    for panel, (name, values, criterion) in zip(axes, curves, strict=True):
-        memory = name == "forgetting"
-        axis = (lambda v: 1.0 / (1.0 - np.asarray(v))) if memory else np.asarray
-        best = tuned.chosen[name]
-        with np.errstate(divide="ignore"):
-            panel.semilogx(axis(values), criterion, color=BLUE, lw=1.3)
-            low, high = (float(axis(end)) for end in tuned.interval[name])
-            panel.axvspan(max(low, axis(values).min()), min(high, axis(values).max()), color=BLUE, alpha=0.15, lw=0)
-            if 0.0 < axis(best) < np.inf:
-                panel.axvline(float(axis(best)), color=RED, lw=1.0)
-        if tuned.method == "ml":  # far from the optimum a likelihood falls by hundreds; only the top matters
-            panel.set_ylim(criterion.max() - 12.0, criterion.max() + 1.0)
-        panel.set_xlabel("memory 1 / (1 - forgetting)" if memory else name)
-        panel.set_ylabel({"ml": "log-likelihood", "h-step": "mean square"}.get(tuned.method, tuned.method))
-        panel.grid(alpha=0.25, lw=0.5)
-    return figure
+        curves = self.curves()
+        columns = min(len(curves), 2)
+        figure, axes = panels(ax, (4.6 * columns, 3.2 * -(-len(curves) // 2)), len(curves), columns)
+        for panel, (name, values, criterion) in zip(axes, curves, strict=True):
+            memory = name == "forgetting"
+            axis = (lambda v: 1.0 / (1.0 - np.asarray(v))) if memory else np.asarray
+            best = self.chosen[name]
+            with np.errstate(divide="ignore"):
+                panel.semilogx(axis(values), criterion, color=BLUE, lw=1.3)
+                low, high = (float(axis(end)) for end in self.interval[name])
+                panel.axvspan(max(low, axis(values).min()), min(high, axis(values).max()), color=BLUE, alpha=0.15, lw=0)
+                if 0.0 < axis(best) < np.inf:
+                    panel.axvline(float(axis(best)), color=RED, lw=1.0)
+            if self.method == "ml":  # far from the optimum a likelihood falls by hundreds; only the top matters
+                panel.set_ylim(criterion.max() - 12.0, criterion.max() + 1.0)
+            panel.set_xlabel("memory 1 / (1 - forgetting)" if memory else name)
+            panel.set_ylabel({"ml": "log-likelihood", "h-step": "mean square"}.get(self.method, self.method))
+            panel.grid(alpha=0.25, lw=0.5)
+        return figure

@@ -303,7 +303,9 @@ class Live(Batched):
         They are (lag + 1, ny, n) for outputs that each have their own theta. Row 0 equals the result of `Track.smooth`
         at that sample for a record that ends now.
         """
-        found = [window.smooth(self._tile, lane) for lane, window in self._windowed()]
+        if not self._windows:
+            raise ValueError("Live.smooth: no samples are kept; give their number, as in Live(model, tracker, lag=20).")
+        found = [window.smooth(self._tile, lane) for lane, window in enumerate(self._windows)]
         if len(found) > 1:
             return FixedLag(*(np.stack(part, axis=1) for part in zip(*found, strict=True)))
         ny = self._rows_per_instant

@@ -7,7 +7,7 @@ control loop: the model then stores the same as if both had come in one row of a
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Self
 
@@ -299,12 +299,6 @@ class Stream(Plain, storage.Kept):
         lanes = (state_of(self._tile, lane) for lane in range(len(self.programs)))
         states = tuple({name: np.array(value) for name, value in lane.items()} for lane in lanes)
         return End(tuple(self.programs), states, self._last, self._awaits, self.dt, self._clock.zone)
-
-    def _windowed(self) -> Iterator[tuple[int, Window]]:
-        """The lanes and their windows; ValueError if no samples are kept."""
-        if not self._windows:
-            raise ValueError("Live.smooth: no samples are kept; give their number, as in Live(model, tracker, lag=20).")
-        yield from enumerate(self._windows)
 
     def _written(self) -> tuple[dict[str, Any], dict[str, Array]]:
         extra = {

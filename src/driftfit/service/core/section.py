@@ -86,7 +86,8 @@ class Section:
         if time is None:
             order = np.argsort(places, kind="stable")
         else:
-            self._refuse("time in the future", places, np.flatnonzero(far := self._too_far(places, time)), counter_of)
+            far = time > np.fmax(self.streams.newest[places], wall.time()) + self.streams.settings.ahead
+            self._refuse("time in the future", places, np.flatnonzero(far), counter_of)
             kept = np.flatnonzero(~far)
             order, fate = self.streams.waiting.judge(places[kept], time[kept], self.streams.newest)
             order = kept[order]
@@ -96,11 +97,6 @@ class Section:
             return None
         time = None if time is None else time[order]
         return Rows(self.streams.index, self.streams.numbers[places[order]], time, values[order])
-
-    def _too_far(self, places: Array, time: Array) -> Array:
-        """Which times are further ahead of both the newest and this clock than the settings allow."""
-        newest = np.fmax(self.streams.newest[places], wall.time())
-        return np.asarray(time > newest + self.streams.settings.ahead)
 
     def _refuse(self, name: str, places: Array, which: Array, counter_of: CounterOf) -> None:
         for k in which.tolist():
