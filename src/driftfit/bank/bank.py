@@ -49,7 +49,7 @@ from driftfit.bank.leaves import forget
 from driftfit.bank.leaves.leaf_matrix import FIRST, NU, S
 from driftfit.bank.machine.advance import begin, limit_forgetting
 from driftfit.bank.machine.steps import steps_of
-from driftfit.bank.memory import SINGLE, arrays_of, packed
+from driftfit.bank.memory import SINGLE, arrays_of, outside, packed
 from driftfit.bank.prior import chains, events, per_sample
 from driftfit.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.bank.sensor import Sensor
@@ -252,7 +252,8 @@ class Bank(Tracker):
         if len(model.outputs) == 1 or model.shared:
             return state
         sizes = [np.size(state[name]) for name in ("memory", "report", "sample", "counters", "table")]
-        return {**state, "flat": np.zeros(sum(sizes) + model.n * (model.n + 3))}
+        sizes += [rows * columns for rows, columns in outside(model.n).values()]
+        return {**state, "flat": np.zeros(sum(sizes))}
 
     def _state(self, n: int, na: int) -> Mapping[str, Any]:
         nominal = self.all_sensors[0]
@@ -286,9 +287,9 @@ class Bank(Tracker):
             "sample": np.array([getattr(leaf, name) for name in SAMPLE._fields]),
             "counters": np.array([getattr(leaf, name) for name in COUNTER._fields]), **unresolved(),
             **(knowing_nothing(n, ALMOST_ANY if again else WORST) if self.p0 is None else knowing(n)),
-            "can_frame": int(not again), "framed": 0, "within": 0.0, "x": np.zeros(n),
+            "can_frame": int(not again), "within": 0.0, "x": np.zeros(n),
             "column": -1,
-            "W": np.zeros((n, n)), "Pz": np.zeros((n, n)), "no_power": np.zeros(n),
+            "W": np.zeros((n, n)), "Pz": np.zeros((n, n)),
             "q0": q0, "G": triangular_root(Q0 + np.tril(Q0, -1).T), "size0": self.all_changes[0].increments(n)[1],
             "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
         }  # fmt: skip
@@ -322,7 +323,7 @@ class Bank(Tracker):
             lane["memory"][start : start + len(values)] = values
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
-        n, framed = len(p), bool(lane["framed"])
+        n, framed = len(p), bool(lane["counters"][COUNTER.framed])
         add = np.diag(p)
         if framed:
             np.einsum("ii->i", lane["P"])[:] += p
@@ -338,7 +339,7 @@ class Bank(Tracker):
 
     def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
         """All leaves are moved by the same amount, so that the mixture is at the given value."""
-        name = "d" if lane["framed"] else "theta"
+        name = "d" if lane["counters"][COUNTER.framed] else "theta"
         before = lane[name].copy()
         super().place(lane, which, values)
         B = self._leaves(lane)

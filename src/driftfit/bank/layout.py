@@ -12,6 +12,7 @@ With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m s
     slots                   a hash table for numbering groups
     prior                   p(next joint event | leaf), (H, leaves)
     walks, relative_walks   covariances that changes add in a nominal sample; in units of r / (mean square of phi_i)
+    packed                  W as one row
     fixed_walks             `walks` for theta, where `machine.framed` writes `walks` in other coordinates
     fixed_places            `places` likewise
     lag_rows                for each output lag its coefficients as a function of z, and its value in the record
@@ -55,19 +56,20 @@ from driftfit.engine.tracker_part import open_at
 _Counters = namedtuple(
     "_Counters",
     "many_leaves settled open phase held clock impossible reported_to many_parents groups levels expanded stored "
-    "flipped taken chained alike wide parted looked",
+    "flipped taken chained alike wide parted looked framed",
 )
-COUNTER = _Counters(*range(20))
+COUNTER = _Counters(*range(21))
 """Whole numbers of a bank. ``settled`` is 1 once the tree grows, `WAITING` before, `READY` if it begins with the next
 sample; ``levels`` counts those of the tree. ``open`` levels have passed since the last used sample (`machine.gap`),
 ``taken`` steps of its interval are already in the table of a gap. Flags of the present sample: ``chained`` if the user
 gave a chain of changes, ``alike`` if all leaves have the same prior, ``wide`` if its level is not that of one nominal
 interval, ``parted`` if leaves are continued as two (`machine.markov_gap`), ``expanded`` if histories are those of the
 leaves and not of their parents. ``phase`` says what the routine is called for, ``looked`` for which kind of sample its
-forecast was.
+forecast was. ``framed`` is 1 in the coordinates of `machine.framed`.
 """
 WAITING, READY = 0, -1
-LEARN, FORECAST = 0, 1
+LEARN, FORECAST, ENTER, ENTER_NEW = range(4)
+"""Phases. A sample with which a coordinate enters is learned by all leaves, its coordinate known before or `NEW`."""
 _Sample = namedtuple(
     "_Sample",
     "y noise dt time ok observed r fade least most y_hat s squares times elapsed freedom shift reading unit last "
@@ -102,8 +104,11 @@ WINDOWS = (
     "z", "from_C", "C", "m", "g", "from_g", "expected", "scores", "spare", "spare_lags", "lag_coefficients", "answers",
 )  # fmt: skip
 """Rows of the scratch that have names."""
-OUTSIDE = {"report": VECTOR, "phi": VECTOR, "powers": VECTOR, "theta": VECTOR, "cov": MATRIX}
-"""Arrays that are fields of the state themselves."""
+OUTSIDE = {"report": VECTOR, "phi": VECTOR, "c": VECTOR, "theta": VECTOR, "cov": MATRIX, "S": MATRIX, "R": MATRIX}
+OUTSIDE |= {"H": MATRIX, "W": MATRIX, "work": MATRIX, "at_start": VECTOR}
+"""Arrays that are fields of the state themselves: the report, the sample, the mean squares of its regressors, the
+mixture, and those of the coordinates of the start (`driftfit.trackers.forms.coordinates`).
+"""
 VARIABLES = {"counters_at": (types.int64, COUNTER._fields), "sample_at": (types.float64, SAMPLE._fields)}
 """Names of single numbers, by the base of the field in which they lie."""
 NUMBERS = (
@@ -123,14 +128,14 @@ TABLE = Table(
     "bank",
     {name: MATRIX for name in (*MATRICES, *REPORTED, *WINDOWS)}
     | {name: VECTOR for name in VECTORS} | {name: COUNTS for name in WHOLE} | OUTSIDE
-    | {name: NUMBER for name in NUMBERS},
+    | {name: NUMBER for name in NUMBERS} | {"packed": VECTOR},
     BASES,
-    {name: f"{name}_at" for name in OUTSIDE} | {name: "report_at" for name in REPORTED},
+    {name: f"{name}_at" for name in OUTSIDE} | {name: "report_at" for name in REPORTED} | {"packed": "W_at"},
     VARIABLES,
 )  # fmt: skip
 ROW, ROWS = TABLE.row, len(TABLE.row)
 """Rows of the table by the names of fields and bases, and how many there are."""
-MEMORY_AT, REPORT_AT = ROW["memory"], ROW["report_at"]
+MEMORY_AT, REPORT_AT, OUTPUT_LAGS = ROW["memory"], ROW["report_at"], ROW["output_lags"]
 table_at = TABLE.at
 """The table at an address, for compiled code."""
 

@@ -4,7 +4,8 @@
     y_t = phi_t' theta_t + v_t,    v_t ~ N(offset_l, r_t factor_l) with the probability of noise l in mode s
 
 One filter goes forwards through p(theta_t, s_t | y_1 .. y_t), another backwards through p(y_t .. y_T | theta_t, s_t).
-Both are sums of Gaussians (`driftfit.smooth.parts.components`) and run the same routine. Between t and t + 1 they meet,
+Both are sums of Gaussians (`driftfit.smooth.solvers.components`) and run the same routine. Between t and t + 1 they
+meet,
 
     p(theta_t, i, m, j | y)  proportional to  F_i(theta_t) p_m integral N(w; 0, Q_m) B_j(theta_t + w) dw
 
@@ -25,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, shared
-from driftfit.smooth.parts.components import (
+from driftfit.smooth.solvers.components import (
     COST,
     LOG,
     MODE,
@@ -47,11 +48,11 @@ from driftfit.smooth.parts.components import (
     reduce,
     room_for,
 )
-from driftfit.smooth.parts.rank import column_sizes
+from driftfit.smooth.solvers.rank import column_sizes
 
 BLOCK = 1000
 """Samples between checkpoints."""
-MOST = 48
+MOST_COMPONENTS = 48
 """Components that are kept at most, where the evidence is not constant; `ROOMY` elsewhere."""
 NEAR = 16
 """Samples to either side of such a place that get more components."""
@@ -170,7 +171,7 @@ class Mixture(NamedTuple):
         more = self.kept.copy()
         for t in np.flatnonzero(self.uneven):
             near = slice(max(t - NEAR, 0), t + NEAR)
-            more[near] = np.minimum(4 * self.kept[near], MOST)
+            more[near] = np.minimum(4 * self.kept[near], MOST_COMPONENTS)
         return more
 
 
@@ -362,8 +363,8 @@ def smooth(problem: Problem | Passes, covariances: bool = False, kept: Array | N
     """Smooth a record; with ``covariances`` of every sample, and otherwise variances.
 
     ``kept`` (T,) says how many components another smoother of the record needed, with which this one begins. The filter
-    of `Passes` may be done. Where the evidence is not constant, more components are allowed, up to `MOST`; see
-    `Mixture.needed`.
+    of `Passes` may be done. Where the evidence is not constant, more components are allowed, up to `MOST_COMPONENTS`
+    (`Mixture.needed`).
     """
     if isinstance(problem, Passes):
         passes = problem

@@ -1,4 +1,4 @@
-"""The problem behind a run, for smoothers: see `driftfit.smooth.parts.walk`.
+"""The problem behind a run, for smoothers: see `driftfit.smooth.solvers.walk`.
 
 The regressors are those that the filter used, lags that it filled by its own prediction included: the run is replayed
 once to collect them.
@@ -17,7 +17,7 @@ from driftfit.engine.kernel import Array, Driver, State, kernel
 from driftfit.run.columns import COLLECTED, collect, put_fields
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
-from driftfit.smooth.parts.walk import DRIFT, NONE, WEIGHT, Walk, Y, free, room_for_signals
+from driftfit.smooth.solvers.walk import DRIFT, NONE, WEIGHT, Walk, Y, free, room_for_signals
 from driftfit.smooth.unknown_drift import average_drift
 from driftfit.trackers.base import RandomWalk
 

@@ -36,8 +36,8 @@ from driftfit.engine.settings import matrix
 from driftfit.run.result import Track
 from driftfit.smooth import mixture
 from driftfit.smooth.mixture import Alternatives, Problem
-from driftfit.smooth.parts.components import Noises
 from driftfit.smooth.problem import replay
+from driftfit.smooth.solvers.components import Noises
 from driftfit.smooth.unknown_drift import Point, drifting, neighbours, summit
 from driftfit.trackers.forms.information import triangular_root
 

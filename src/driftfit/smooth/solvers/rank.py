@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
-from driftfit.smooth.parts.walk import WEIGHT
+from driftfit.smooth.solvers.walk import WEIGHT
 from driftfit.trackers.forms import diffuse
 
 FAR = 1e250
@@ -29,7 +29,7 @@ def column_sizes(phi: Array, total: Any = np.mean) -> Array:
 def column_scale(phi: Array, signals: Array) -> Array:
     """Root mean square of each column of phi over the samples that are used; 1 for columns of zeros.
 
-    ``signals`` are those of a `driftfit.smooth.parts.walk.Walk`.
+    ``signals`` are those of a `driftfit.smooth.solvers.walk.Walk`.
     """
     T, n = phi.shape
     top, squares, scale, count = np.zeros(n), np.zeros(n), np.ones(n), 0

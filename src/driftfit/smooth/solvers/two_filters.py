@@ -23,13 +23,13 @@ Sources: Fraser and Potter (1969) for the two filters; Bierman (1977) for the ro
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.engine.tiles import WIDTH, make_tile
-from driftfit.smooth.parts.walk import Path, Walk
+from driftfit.smooth.solvers.walk import Path, Walk
 from driftfit.trackers.forms import information
 
 KNOWN_EXACTLY = 1e8
@@ -45,6 +45,13 @@ class Start(NamedTuple):
     values: Array
     hidden: Array
     """(n,) or (T, n) bool"""
+
+    @classmethod
+    def fixing(cls, natural: Array, scale: Array, scaled: Array, hidden: Array) -> Self:
+        """The start that fixes these directions of theta, in rows, at the first point, ``scaled`` as its columns."""
+        rows = natural / scale
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        return cls(rows, rows[:, : len(scaled)] @ scaled, hidden)
 
 
 def smooth(walk: Walk, scale: Array, G: Array, begin: Start, keep: str = "std") -> Path:
@@ -115,12 +122,8 @@ def start(walk: Walk, scale: Array, unseen: Array) -> Start:
         sure = KNOWN_EXACTLY * np.sqrt(1.0 + walk.weight.sum() * len(scale))
         rows = axes.T / np.sqrt(np.maximum(variance, sure**-2.0))[:, None]
         return Start(rows, rows @ theta0, np.zeros(len(scale), bool))
-    if unseen.shape[1] == 0:
-        return Start(np.zeros((0, len(scale))), np.zeros(0), np.zeros(len(scale), bool))
     natural = unspanned(unseen, scale)
-    rows = natural / scale
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    return Start(rows, rows @ theta0, undetermined(natural))
+    return Start.fixing(natural, scale, theta0, undetermined(natural))
 
 
 def unspanned(unseen: Array, scale: Array) -> Array:

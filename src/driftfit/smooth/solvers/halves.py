@@ -19,7 +19,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, State, kernel, part
 from driftfit.engine.simd import entry, higher, lower, minus, only, over, pair, plus, put_pair, times, two
-from driftfit.smooth.parts.walk import DRIFT, WEIGHT, Y
+from driftfit.smooth.solvers.walk import DRIFT, WEIGHT, Y
 
 BLOCK = 64
 """Steps that are eliminated again at a time."""
@@ -36,7 +36,7 @@ class Samples(NamedTuple):
 
     phi: Array
     signals: Array
-    """(T, 3 or more), see `driftfit.smooth.parts.walk.Walk`."""
+    """(T, 3 or more), see `driftfit.smooth.solvers.walk.Walk`."""
     drift_root: Array
     """(T, n), or (1, n) of ones."""
 
